@@ -1,0 +1,39 @@
+"""The nouns of the project: frozen pytrees of arrays and masks.
+
+Ragged things are capacity + mask: an array of fixed size and a boolean of the same leading shape that says which
+entries are real. What is masked out may hold any finite number and never takes part in a result.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import flax.struct
+from jaxtyping import Array, Bool, Float, Int
+
+
+@flax.struct.dataclass
+class ScanSet:
+    """A set of scans of equal capacity, each in its own sensor frame.
+
+    Attributes:
+        points: beam end points; metres or pixels, the same unit for all.
+        mask: True where the beam measured something.
+    """
+
+    points: Float[Array, "n b d"]
+    mask: Bool[Array, "n b"]
+
+
+class Neighbours(NamedTuple):
+    """The nearest points of each query, nearest first.
+
+    Attributes:
+        indices: row in the searched points; 0 where `mask` is False.
+        squared_distances: in the unit of the points, squared; infinite where `mask` is False.
+        mask: True where a neighbour exists (fewer valid points than `k`, or none within the radius: False).
+    """
+
+    indices: Int[Array, "m k"]
+    squared_distances: Float[Array, "m k"]
+    mask: Bool[Array, "m k"]
