@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -22,6 +22,9 @@ class ScanSequence:
         reference_poses: (n, 3) float64 x, y, heading of the sensor in the world (`unit`, radians), or None.
         odometry_poses: (n, 3) float64, raw odometry in its own world, or None where the source has none.
         times: (n,) float64 seconds, or None.
+
+    Raises:
+        ValueError: shapes that do not belong together, or a unit other than "px" and "m".
     """
 
     name: str
@@ -33,5 +36,63 @@ class ScanSequence:
     odometry_poses: NDArray[np.float64] | None = None
     times: NDArray[np.float64] | None = None
 
+    def __post_init__(self) -> None:
+        if self.unit not in ("px", "m"):
+            raise ValueError(f"unit must be 'px' or 'm', got {self.unit!r}")
+        if self.points.ndim != 3 or self.points.shape[2] != 2:
+            raise ValueError(f"points must be (n, b, 2), got {self.points.shape}")
+        if self.mask.shape != self.points.shape[:2]:
+            raise ValueError(f"mask must be {self.points.shape[:2]} like points, got {self.mask.shape}")
+        count = len(self.points)
+        for name, shape in (("reference_poses", (count, 3)), ("odometry_poses", (count, 3)), ("times", (count,))):
+            value = getattr(self, name)
+            if value is not None and value.shape != shape:
+                raise ValueError(f"{name} must be {shape}, got {value.shape}")
+
     def __len__(self) -> int:
         return len(self.points)
+
+
+def take_scans(sequence: ScanSequence, selection: slice) -> ScanSequence:
+    """Cuts a sub-range out of a sequence, poses and times with it.
+
+    Args:
+        sequence: the whole.
+        selection: start, stop and stride in scans.
+
+    Returns:
+        The part; arrays are views.
+    """
+    reference, odometry, times = sequence.reference_poses, sequence.odometry_poses, sequence.times
+    return replace(
+        sequence,
+        points=sequence.points[selection],
+        mask=sequence.mask[selection],
+        reference_poses=None if reference is None else reference[selection],
+        odometry_poses=None if odometry is None else odometry[selection],
+        times=None if times is None else times[selection],
+    )
+
+
+def has_angular_order(points: NDArray[np.float32], mask: NDArray[np.bool_]) -> bool:
+    """Whether the beams of scans are ordered by angle, so that 1-D convolutions and neighbour normals make sense.
+
+    A scan is in order when at least 95 % of the turns from one valid beam to the next go the same way round and together
+    they make one turn at most (with 5 % to spare, for noise). The sequence is when at least 90 % of its scans are.
+
+    Args:
+        points: (n, b, 2) in the sensor frame.
+        mask: (n, b).
+
+    Returns:
+        True for ordered beams; scans with fewer than three valid beams have no say, and with none left it is False.
+    """
+    verdicts = []
+    for scan, valid in zip(points, mask, strict=True):
+        if valid.sum() < 3:
+            continue
+        angle = np.arctan2(scan[valid, 1], scan[valid, 0])
+        turn = (np.diff(angle.astype(np.float64)) + np.pi) % (2 * np.pi) - np.pi
+        same_way = max((turn > 0).mean(), (turn < 0).mean())
+        verdicts.append(same_way >= 0.95 and np.abs(turn).sum() <= 1.05 * 2 * np.pi)
+    return bool(verdicts) and float(np.mean(verdicts)) >= 0.9

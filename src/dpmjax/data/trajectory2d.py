@@ -28,7 +28,7 @@ class TrajectoryConfig:
     max_rotation_deg: float = 10.0
     mean_step_px: float = 8.16
     clearance_px: float = 8.0
-    leg_px: float = 450.0
+    leg_px: float = 200.0
 
     def __post_init__(self) -> None:
         for name in ("max_rotation_deg", "mean_step_px", "clearance_px", "leg_px"):
@@ -161,7 +161,7 @@ def _shortest_paths(
 
     index = np.full(np.add(coarse.shape, 2), -1)
     index[cells[:, 0] + 1, cells[:, 1] + 1] = np.arange(len(cells))
-    toll = 1.0 + 2.0 * np.exp(-coarse[cells[:, 0], cells[:, 1]] / 15.0) + 3.0 * np.minimum(visits, 1.0)
+    toll = 1.0 + 2.0 * np.exp(-coarse[cells[:, 0], cells[:, 1]] / 15.0) + 1.5 * np.minimum(visits, 1.0)
     tails, heads, weights = [], [], []
     for step in ((0, 1), (1, 0), (0, -1), (-1, 0)):
         near = index[cells[:, 0] + 1 + step[0], cells[:, 1] + 1 + step[1]]
