@@ -147,7 +147,10 @@ def _repair(
         return None, odometry
     if num_wrong:
         _log.warning(
-            "%s: %d of %d lines carry time and odometry of another moment; both are interpolated", path, num_wrong, len(times)
+            "%s: %d of %d lines carry time and odometry of another moment; both are interpolated",
+            path,
+            num_wrong,
+            len(times),
         )
     index = np.arange(len(times))
     pose = odometry[trusted].copy()

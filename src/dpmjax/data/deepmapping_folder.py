@@ -46,7 +46,9 @@ def read_deepmapping_folder(path: str | Path, *, unit: Literal["px", "m"] | None
     scans = [parse_pcd(files[name], f"{path}/{name}")[:, :2] for name in names]
     points, mask = _pad(scans)
     if not mask.any():
-        raise InputError(path, "every point of every scan is zero (an invalid beam)", "give scans that measured something")
+        raise InputError(
+            path, "every point of every scan is zero (an invalid beam)", "give scans that measured something"
+        )
     if unit is None and np.abs(points).max() > _LARGEST_STORED:
         found = f"coordinates up to {np.abs(points).max():g}, too large for pixels / 512"
         raise InputError(path, found, "say --unit m if they are metres")
@@ -126,7 +128,9 @@ def _read_poses(content: bytes, source: str, num_scans: int) -> NDArray[np.float
     try:
         variables = loadmat(io.BytesIO(content))
     except Exception as error:  # SciPy raises whatever its parser trips over.
-        raise InputError(source, f"not a readable MATLAB file ({type(error).__name__})", "save it again, or remove it") from error
+        raise InputError(
+            source, f"not a readable MATLAB file ({type(error).__name__})", "save it again, or remove it"
+        ) from error
     if "pose" not in variables:
         names = [name for name in variables if not name.startswith("__")]
         raise InputError(source, f"variables are {', '.join(names) or 'none'}", "the file needs a variable 'pose'")

@@ -114,7 +114,9 @@ def _parse_header(content: bytes, source: str) -> _Header:
         fields = entries["FIELDS"]
         types = ["<" + _TYPES[t] + s for t, s in zip(entries["TYPE"], entries["SIZE"], strict=True)]
         counts = [int(c) for c in entries.get("COUNT", ["1"] * len(fields))]
-        num_points = int(entries["POINTS"][0]) if "POINTS" in entries else int(entries["WIDTH"][0]) * int(entries["HEIGHT"][0])
+        num_points = (
+            int(entries["POINTS"][0]) if "POINTS" in entries else int(entries["WIDTH"][0]) * int(entries["HEIGHT"][0])
+        )
         if not len(fields) == len(types) == len(counts) or num_points < 0 or not entries["DATA"]:
             raise ValueError("lengths differ")
         np.dtype(",".join(types))

@@ -207,7 +207,9 @@ def _walk(
         along = _aim(route, along, here, clearance, config)
         bearing = np.arctan2(*(route[along] - here)[::-1])
         # The swing is given up, then the straight line, before a wall is touched.
-        spread = np.concatenate([[swing, 0.5 * swing, 0.0], np.deg2rad(np.arange(5, 180, 5).repeat(2)) * np.tile([1, -1], 35)])
+        spread = np.concatenate(
+            [[swing, 0.5 * swing, 0.0], np.deg2rad(np.arange(5, 180, 5).repeat(2)) * np.tile([1, -1], 35)]
+        )
         angles = bearing + spread
         ends = here + length * np.column_stack([np.cos(angles), np.sin(angles)])
         clear = [end for end in ends if _is_clear(here, end, clearance, config.clearance_px)]

@@ -1,0 +1,9 @@
+"""Readers, writers and simulators, on the NumPy side: no algorithm imports them.
+
+`read_sequence` takes whatever 2-D scans there are and `simulate_sequence` makes some; both return a `ScanSequence`. Bad input
+ends in an `InputError` of one line.
+"""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
