@@ -20,9 +20,9 @@ def read_arrays(path: str | Path, *, unit: Literal["px", "m"] | None = None) -> 
     """Reads scans from `.npy` or `.npz`.
 
     A `.npy` holds points (n, b, 2) in the sensor frame; of (n, b, 3) the third coordinate is ignored. A `.npz` holds
-    `points` like that, or `ranges` (n, b) with `angles` (b,) or (n, b) in radians counter-clockwise from straight ahead; and
-    optionally `mask` (n, b), `poses` (the reference) and `odometry` as (n, 3) x, y, heading or (n, 3, 3) `T_world_scan`,
-    `times` (n,) in seconds, and `unit`, "px" or "m".
+    `points` like that, or `ranges` (n, b) with `angles` (b,) or (n, b) in radians counter-clockwise from straight
+    ahead; and optionally `mask` (n, b), `poses` (the reference) and `odometry` as (n, 3) x, y, heading or (n, 3, 3)
+    `T_world_scan`, `times` (n,) in seconds, and `unit`, "px" or "m".
 
     A beam is invalid where `mask` says so, where both coordinates are NaN, or where its range is NaN, infinite or not
     positive (as scanner drivers write what has no echo). A beam with one NaN coordinate is an error.
@@ -35,8 +35,8 @@ def read_arrays(path: str | Path, *, unit: Literal["px", "m"] | None = None) -> 
         The sequence.
 
     Raises:
-        InputError: the file is missing or damaged, lacks an array, has wrong shapes, or holds NaN or infinite values other
-            than for invalid beams.
+        InputError: the file is missing or damaged, lacks an array, has wrong shapes, or holds NaN or infinite values
+            other than for invalid beams.
     """
     table = _load(Path(path))
     points, mask = _points(table, path) if "points" in table else _from_ranges(table, path)
@@ -50,16 +50,16 @@ def read_arrays(path: str | Path, *, unit: Literal["px", "m"] | None = None) -> 
         scan, beam = np.argwhere(bad)[0]
         advice = "mark an invalid beam by NaN in both coordinates"
         raise InputError(path, f"{bad.sum()} NaN or infinite points, the first in scan {scan}, beam {beam}", advice)
-    points = np.where(mask[..., None], points, 0.0).astype(np.float32)
+    stored = np.where(mask[..., None], points, 0.0).astype(np.float32)
     times = table.get("times")
     if times is not None and (times.shape != (len(points),) or times.dtype.kind not in "fiu"):
         raise InputError(path, f"times are {times.shape} {times.dtype}", f"give ({len(points)},) seconds")
     return ScanSequence(
         name=Path(path).stem,
-        points=points,
+        points=stored,
         mask=mask,
         unit=unit or _unit(table, path),
-        is_organised=has_angular_order(points, mask),
+        is_organised=has_angular_order(stored, mask),
         reference_poses=_planar(table, "poses", len(points), path),
         odometry_poses=_planar(table, "odometry", len(points), path),
         times=None if times is None else times.astype(np.float64),
@@ -87,7 +87,7 @@ def _points(
     if points.ndim != 3 or points.shape[2] not in (2, 3) or points.dtype.kind not in "fiu":
         raise InputError(path, f"points are {points.shape} {points.dtype}", "give (n, b, 2): scans, beams, x and y")
     planar = points[..., :2].astype(np.float64)
-    return planar, ~np.isnan(planar).all(axis=2)
+    return planar, np.isnan(planar).sum(axis=2) < 2
 
 
 def _from_ranges(
@@ -125,11 +125,11 @@ def _planar(
         raise InputError(
             path, f"{key} are {poses.shape} for {num_scans} scans", "give (n, 3) x, y, heading or (n, 3, 3)"
         )
-    poses = poses.astype(np.float64)
-    if not np.isfinite(poses).all():
+    values = poses.astype(np.float64)
+    if not np.isfinite(values).all():
         raise InputError(
             path, f"{key} hold NaN or infinite values", "give a pose to every scan, or leave the array out"
         )
-    if poses.ndim == 2:
-        return poses
-    return np.column_stack([poses[:, 0, 2], poses[:, 1, 2], np.arctan2(poses[:, 1, 0], poses[:, 0, 0])])
+    if values.ndim == 2:
+        return values
+    return np.column_stack([values[:, :2, 2], np.arctan2(values[:, 1, 0], values[:, 0, 0])])

@@ -42,16 +42,17 @@ def read_carmen_log(path: str | Path, *, max_range: float | None = None) -> Scan
 
     Args:
         path: `.log`, `.clf` or their `.gz`.
-        max_range: readings of this many metres or more are no echo and become masked. None takes the largest reading of the
-            log, less 0.1 m, if that reading is beyond 7.9 m, and masks nothing for length otherwise. Readings of zero and
-            below are always masked.
+        max_range: readings of this many metres or more are no echo and become masked. None takes the largest reading of
+            the log, less 0.1 m, if that reading is beyond 7.9 m, and masks nothing for length otherwise. Readings of
+            zero and below are always masked.
 
     Returns:
-        The scans in metres; scans with fewer beams than the longest are padded with masked beams. The corrected poses are
-        the reference. No times where the log's stand still.
+        The scans in metres; scans with fewer beams than the longest are padded with masked beams. The corrected poses
+        are the reference. No times where the log's stand still.
 
     Raises:
-        InputError: the file cannot be read, has no FLASER line, or a FLASER line lacks values or holds what is no number.
+        InputError: the file cannot be read, has no FLASER line, or a FLASER line lacks values or holds what is no
+            number.
     """
     lines = [_parse_line(words, f"{path}:{number}") for number, words in _flaser_lines(path)]
     capacity = max(len(line.ranges) for line in lines)
@@ -92,7 +93,7 @@ def scan_angles(num_beams: int) -> NDArray[np.float64]:
         (num_beams,) radians in the sensor frame, from -pi/2 upwards.
     """
     step = np.pi / max(num_beams - 1 if num_beams % 2 else num_beams, 1)
-    return -np.pi / 2 + step * np.arange(num_beams)
+    return -np.pi / 2 + step * np.arange(num_beams, dtype=np.float64)
 
 
 def _flaser_lines(path: str | Path) -> list[tuple[int, list[str]]]:

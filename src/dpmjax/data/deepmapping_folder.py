@@ -32,12 +32,12 @@ def read_deepmapping_folder(path: str | Path, *, unit: Literal["px", "m"] | None
             other people's PCD scans.
 
     Returns:
-        The scans in natural order of their names; scans with fewer points than the longest are padded with masked beams;
-        reference poses where there is a `gt_pose.mat`.
+        The scans in natural order of their names; scans with fewer points than the longest are padded with masked
+        beams; reference poses where there is a `gt_pose.mat`.
 
     Raises:
-        InputError: no such path, no PCD file, a file `parse_pcd` finds fault with, a pose file that does not fit, or (unit
-            None) coordinates too large to be pixels / 512.
+        InputError: no such path, no PCD file, a file `parse_pcd` finds fault with, a pose file that does not fit, or
+            (unit None) coordinates too large to be pixels / 512.
     """
     files = _list_files(Path(path))
     names = sorted((name for name in files if name.lower().endswith(".pcd")), key=natural_key)
@@ -92,7 +92,7 @@ def write_deepmapping_folder(path: str | Path, sequence: ScanSequence) -> Path:
         write_pcd(folder / name, points)
     if sequence.reference_poses is not None:
         buffer = io.BytesIO()
-        savemat(buffer, {"pose": sequence.reference_poses})
+        savemat(buffer, {"pose": sequence.reference_poses})  # type: ignore[arg-type]  # Streams are fine.
         write_atomically(folder / _POSE_FILE, buffer.getvalue())
     return folder
 
@@ -126,7 +126,7 @@ def _read_poses(content: bytes, source: str, num_scans: int) -> NDArray[np.float
     from scipy.io import loadmat
 
     try:
-        variables = loadmat(io.BytesIO(content))
+        variables = loadmat(io.BytesIO(content))  # type: ignore[arg-type]  # Streams are fine.
     except Exception as error:  # SciPy raises whatever its parser trips over.
         raise InputError(
             source, f"not a readable MATLAB file ({type(error).__name__})", "save it again, or remove it"

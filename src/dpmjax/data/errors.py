@@ -17,5 +17,6 @@ class InputError(ValueError):
     """
 
     def __init__(self, source: str | Path, found: str, advice: str) -> None:
+        """Puts the line together."""
         self.source, self.found, self.advice = str(source), found, advice
         super().__init__(" ".join(f"{source}: {found}; {advice}.".split()))

@@ -13,7 +13,7 @@ from dpmjax.data.files import write_atomically
 
 
 class _Header(NamedTuple):
-    """What a PCD header says: names, NumPy types and counts of the fields; number of points; encoding; its own length."""
+    """What a PCD header says: names, NumPy types and counts of the fields, points, encoding; and its own length."""
 
     fields: list[str]
     types: list[str]

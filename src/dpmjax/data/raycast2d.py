@@ -1,8 +1,8 @@
 """The ideal planar lidar: exact meeting points of beams with a world of unit pixel squares.
 
-Frame: pixel `is_obstacle[row, col]` fills the square [col, col + 1) x [row, row + 1); x points right along the columns, y
-points up along the rows (row 0 is the lowest), so that the world is right-handed and a plot with the origin below shows it
-as it is. Angles are counter-clockwise from x.
+Frame: pixel `is_obstacle[row, col]` fills the square [col, col + 1) x [row, row + 1); x points right along the columns,
+y points up along the rows (row 0 is the lowest), so that the world is right-handed and a plot with the origin below
+shows it as it is. Angles are counter-clockwise from x.
 """
 
 from __future__ import annotations
@@ -19,7 +19,8 @@ class RayHits(NamedTuple):
     Attributes:
         points: (m, 2) float64 x, y in the world, px; one coordinate lies exactly on a pixel edge.
         ranges: (m,) float64 distance from the origin of the beam, px.
-        axis: (m,) int64, the axis of the hit edge's normal: 0 for a vertical edge (normal along x), 1 for a horizontal one.
+        axis: (m,) int64, the axis of the hit edge's normal: 0 for a vertical edge (normal along x), 1 for a horizontal
+            one.
         is_border: (m,) bool, True where the beam met nothing but the border of the image.
     """
 
@@ -40,14 +41,14 @@ def beam_angles(num_beams: int) -> NDArray[np.float64]:
     """
     if num_beams < 1:
         raise ValueError(f"num_beams must be at least 1, got {num_beams}")
-    return np.arange(num_beams) * (2.0 * np.pi / num_beams)
+    return np.arange(num_beams, dtype=np.float64) * (2.0 * np.pi / num_beams)
 
 
 def cast_rays(is_obstacle: NDArray[np.bool_], origins: ArrayLike, angles: ArrayLike) -> RayHits:
     """Follows beams through the pixel grid to the first obstacle edge, or to the border of the image.
 
-    Grid traversal in the manner of Amanatides and Woo (1987), in which a beam crosses a whole square of pixels known to be
-    free at once: exact, and a few dozen steps for all beams together. A beam through the common corner of two
+    Grid traversal in the manner of Amanatides and Woo (1987), in which a beam crosses a whole square of pixels known to
+    be free at once: exact, and a few dozen steps for all beams together. A beam through the common corner of two
     diagonal neighbours is stopped by the one beside it in x.
 
     Args:
@@ -82,7 +83,7 @@ def cast_rays(is_obstacle: NDArray[np.bool_], origins: ArrayLike, angles: ArrayL
     # The edge itself is an integer: take it from the cell, not from rounded products.
     points[rows, axis] = cell[rows, axis] + (direction[rows, axis] < 0)
     height, width = is_obstacle.shape
-    is_border = ((cell < 0) | (cell >= [width, height])).any(axis=1)
+    is_border = np.any((cell < 0) | (cell >= [width, height]), axis=1)
     return RayHits(points, length, axis, is_border)
 
 
@@ -101,7 +102,8 @@ def scan_world(
         is_obstacle: (h, w), True where a pixel is solid.
         poses: (n, 3) x, y (px) and heading (radians) of the sensor in the world.
         num_beams: beams per scan.
-        max_range: beams longer than this (px) are masked; None for an unlimited sensor, whose free beams end at the border.
+        max_range: beams longer than this (px) are masked; None for an unlimited sensor, whose free beams end at the
+            border.
         range_noise_px: standard deviation of Gaussian noise on the ranges; ranges never become negative.
         rng: source of the noise; needed where there is noise.
 
@@ -149,8 +151,8 @@ def _leap(
 ) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.int64]]:
     """Moves each beam into the first pixel outside of the free square of half-width `reach` round its pixel.
 
-    With reach 1 this is one step of the plain grid traversal. Returns the new cells (m, 2), the lengths (m,) at which they
-    are entered, and the axes (m,) across whose edge.
+    With reach 1 this is one step of the plain grid traversal. Returns the new cells (m, 2), the lengths (m,) at which
+    they are entered, and the axes (m,) across whose edge.
     """
     ahead = np.where(direction > 0, reach[:, None], -reach[:, None])
     edge = cell + ahead + (direction < 0)

@@ -33,8 +33,8 @@ def read_sequence(
     """Reads a sequence of planar scans, whatever of the known formats it is in.
 
     Args:
-        path: a folder or tar archive of PCD files (`read_deepmapping_folder`), a CARMEN log (`read_carmen_log`), or a NumPy
-            file (`read_arrays`). The ending decides, else the first bytes.
+        path: a folder or tar archive of PCD files (`read_deepmapping_folder`), a CARMEN log (`read_carmen_log`), or a
+            NumPy file (`read_arrays`). The ending decides, else the first bytes.
         start: first scan to keep.
         stop: scan to stop before; None for the end.
         stride: keep every so many-th scan.
@@ -46,8 +46,8 @@ def read_sequence(
         The sequence: two scans at least, each with one valid beam at least.
 
     Raises:
-        InputError: one line with the file, what was found and what to do: no such file, an unknown format, damage, too few
-            scans, a scan without a valid beam, lengths that no such unit explains, or arguments out of range.
+        InputError: one line with the file, what was found and what to do: no such file, an unknown format, damage, too
+            few scans, a scan without a valid beam, lengths that no such unit explains, or arguments out of range.
     """
     path = Path(path)
     if start < 0 or stride < 1 or (stop is not None and stop < 0):

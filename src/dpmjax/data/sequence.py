@@ -77,8 +77,9 @@ def take_scans(sequence: ScanSequence, selection: slice) -> ScanSequence:
 def has_angular_order(points: NDArray[np.float32], mask: NDArray[np.bool_]) -> bool:
     """Whether the beams of scans are ordered by angle, so that 1-D convolutions and neighbour normals make sense.
 
-    A scan is in order when at least 95 % of the turns from one valid beam to the next go the same way round and together
-    they make one turn at most (with 5 % to spare, for noise). The sequence is when at least 90 % of its scans are.
+    A scan is in order when at least 95 % of the turns from one valid beam to the next go the same way round and
+    together they make one turn at most (with 5 % to spare, for noise). The sequence is when at least 90 % of its scans
+    are.
 
     Args:
         points: (n, b, 2) in the sensor frame.

@@ -1,7 +1,7 @@
 """How the robot moves: a wandering walk through a planar world with the step statistics of DeepMapping section 4.1.
 
-The lidar sees all round, so the robot may move in any direction: it steers by the direction of the step, and the heading
-turns by an independent uniform angle, which keeps the statistics of the paper exact.
+The lidar sees all round, so the robot may move in any direction: it steers by the direction of the step, and the
+heading turns by an independent uniform angle, which keeps the statistics of the paper exact.
 """
 
 from __future__ import annotations
@@ -19,8 +19,10 @@ class TrajectoryConfig:
     """Step statistics of a simulated trajectory.
 
     Attributes:
-        max_rotation_deg: headings of consecutive scans differ by a uniform angle within plus or minus this (section 4.1).
-        mean_step_px: mean translation between consecutive scans (section 4.1); steps are uniform between 0.6 and 1.4 of it.
+        max_rotation_deg: headings of consecutive scans differ by a uniform angle within plus or minus this (section
+            4.1).
+        mean_step_px: mean translation between consecutive scans (section 4.1); steps are uniform between 0.6 and 1.4 of
+            it.
         clearance_px: no point of the path comes closer to an obstacle or to the border of the image.
         leg_px: wish for the length of a leg to a new place; after two legs the robot comes home by another way.
     """
@@ -125,7 +127,7 @@ def _plan_route(
     cells = _largest_region(coarse >= config.clearance_px + _PLAN_MARGIN_PX)
     if len(cells) < 2:
         raise ValueError("world is too narrow to move in: no connected free space with the wanted clearance")
-    centres = (cells[:, ::-1] + 0.5) * _CELL_PX
+    centres = (cells[:, ::-1].astype(np.float64) + 0.5) * _CELL_PX
     visits = np.zeros(len(cells))
     home = place = int(rng.integers(len(cells)))
     route, travelled, leg = [place], 0.0, 0
@@ -169,8 +171,10 @@ def _shortest_paths(
         tails.append(tail)
         heads.append(near[tail])
         weights.append(_CELL_PX * 0.5 * (toll[tail] + toll[near[tail]]))
-    edges = (np.concatenate(weights), (np.concatenate(tails), np.concatenate(heads)))
-    return dijkstra(coo_matrix(edges, shape=(len(cells),) * 2).tocsr(), indices=start, return_predecessors=True)
+    ends = (np.concatenate(tails), np.concatenate(heads))
+    graph = coo_matrix((np.concatenate(weights), ends), shape=(len(cells), len(cells))).tocsr()
+    cost, before = dijkstra(graph, indices=np.array([start]), return_predecessors=True)
+    return cost[0], before[0]
 
 
 def _choose_goal(
@@ -198,7 +202,7 @@ def _walk(
     rng: np.random.Generator,
     config: TrajectoryConfig,
 ) -> NDArray[np.float64]:
-    """(num_poses, 2) positions: steps of random length towards the farthest visible point of the route ahead, unsteadily."""
+    """(num_poses, 2) positions: steps of random length towards the farthest visible point of the route, unsteadily."""
     positions, along = [route[0]], 0
     lengths = config.mean_step_px * rng.uniform(0.6, 1.4, num_poses - 1)
     sway = np.deg2rad(12.0) * rng.normal(size=num_poses - 1)
@@ -238,7 +242,7 @@ def _aim(
 def _is_clear(
     start: NDArray[np.float64], end: NDArray[np.float64], clearance: NDArray[np.float64], margin: float
 ) -> bool:
-    """Whether a straight step keeps the margin, sampled every half pixel (between samples it loses a quarter at most)."""
+    """Whether a straight step keeps the margin, sampled every half pixel (a quarter is lost at most)."""
     count = int(np.linalg.norm(end - start) * 2) + 2
     samples = np.floor(np.linspace(start, end, count)).astype(np.int64)
     height, width = clearance.shape

@@ -47,7 +47,9 @@ def planar_to_homogeneous(poses: ArrayLike) -> NDArray[np.float64]:
 def write_tum(
     path: str | Path, poses: ArrayLike, *, times: ArrayLike | None = None, unit: str = "m", frame: str = "T_world_scan"
 ) -> Path:
-    """Writes `stamp tx ty tz qx qy qz qw` (quaternion x y z w, nine decimals; stamps six), with a comment that tells the frame.
+    """Writes `stamp tx ty tz qx qy qz qw` rows under a comment that tells the frame.
+
+    Translations and the quaternion (x y z w) have nine decimals, stamps six.
 
     Args:
         path: file to write, atomically.

@@ -1,18 +1,20 @@
-"""Binary worlds of 1024 x 1024 pixels for the planar lidar, in the manner of DeepMapping Figure 4, each made by its seed.
+"""Binary worlds of 1024 x 1024 pixels in the manner of DeepMapping Figure 4, each made by its seed.
 
-Three kinds, one after the other as the index grows: 0 an office (rooms cut out of rooms), 1 a yard (free-standing blocks, open
-to the border of the image), 2 a clinic (a corridor between two rows of rooms). All are furnished with round, square and
-three-cornered obstacles, so that no two places look alike. The frame is that of `raycast2d`: row 0 is the lowest.
+Three kinds, one after the other as the index grows: 0 an office (rooms cut out of rooms), 1 a yard (free-standing
+blocks, open to the border of the image), 2 a clinic (a corridor between two rows of rooms). All are furnished with
+round, square and three-cornered obstacles, so that no two places look alike. The frame is that of `raycast2d`: row 0 is
+the lowest.
 """
 
 from __future__ import annotations
 
 import io
 from dataclasses import dataclass, field
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from dpmjax.data.errors import InputError
 from dpmjax.data.files import write_atomically
@@ -45,8 +47,8 @@ def make_world(index: int) -> World:
     """Builds the world of an index; the same one every time.
 
     Args:
-        index: 0, 1 and 2 are the three worlds of the demo; any other non-negative number is the seed of a further one of the
-            kind `index % 3`.
+        index: 0, 1 and 2 are the three worlds of the demo; any other non-negative number is the seed of a further one
+            of the kind `index % 3`.
 
     Returns:
         The world; its free space is connected.
@@ -137,7 +139,7 @@ def _build_clinic(grid: NDArray[np.bool_], rng: np.random.Generator) -> None:
     for sign, wall_y in ((1, 570), (-1, 430)):
         widths = rng.dirichlet(np.full(4, 12.0)) * SIZE_PX
         edges = np.concatenate([[0.0], np.cumsum(widths)])
-        for left, right in zip(edges[:-1], edges[1:], strict=True):
+        for left, right in pairwise(edges):
             # Each room stands forward or back by its own amount: the corridor has corners to hold on to.
             y = wall_y + sign * rng.uniform(-15, 45)
             door = rng.uniform(left + 0.2 * (right - left), left + 0.8 * (right - left) - _DOOR_PX)
@@ -194,7 +196,7 @@ def _paint_frame(grid: NDArray[np.bool_]) -> None:
 
 
 def _paint_span(grid: NDArray[np.bool_], along: int, at: float, span: tuple[float, float], doors: list[float]) -> None:
-    """A wall along x (0) or y (1) at the other coordinate `at`, from span[0] to span[1], with gaps that start at `doors`."""
+    """A wall along x (0) or y (1) at the other coordinate `at`, over `span`, with gaps that start at `doors`."""
     line = np.zeros(SIZE_PX, bool)
     line[max(int(span[0]), 0) : int(span[1])] = True
     for door in doors:
@@ -203,24 +205,26 @@ def _paint_span(grid: NDArray[np.bool_], along: int, at: float, span: tuple[floa
     grid[(slice(None), band) if along else (band, slice(None))] |= line[:, None] if along else line
 
 
-def _local(centre: ArrayLike, angle: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _local(centre: NDArray[np.float64], angle: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Coordinates of all pixel centres in a frame at `centre`, turned by `angle`."""
-    x, y = np.asarray(centre, np.float64)
+    x, y = centre
     axis = np.arange(SIZE_PX) + 0.5
     dx, dy = (axis - x)[None, :], (axis - y)[:, None]
     return np.cos(angle) * dx + np.sin(angle) * dy, np.cos(angle) * dy - np.sin(angle) * dx
 
 
-def _paint_box(grid: NDArray[np.bool_], centre: ArrayLike, size: ArrayLike, angle: float) -> None:
-    (u, v), (half_u, half_v) = _local(centre, angle), np.asarray(size)
+def _paint_box(grid: NDArray[np.bool_], centre: NDArray[np.float64], size: NDArray[np.float64], angle: float) -> None:
+    (u, v), (half_u, half_v) = _local(centre, angle), size
     grid |= (np.abs(u) < half_u) & (np.abs(v) < half_v)
 
 
-def _paint_disc(grid: NDArray[np.bool_], centre: ArrayLike, size: ArrayLike, angle: float) -> None:
+def _paint_disc(grid: NDArray[np.bool_], centre: NDArray[np.float64], size: NDArray[np.float64], angle: float) -> None:
     u, v = _local(centre, angle)
     grid |= u**2 + v**2 < np.mean(size) ** 2
 
 
-def _paint_triangle(grid: NDArray[np.bool_], centre: ArrayLike, size: ArrayLike, angle: float) -> None:
-    (u, v), (half_u, half_v) = _local(centre, angle), np.asarray(size)
+def _paint_triangle(
+    grid: NDArray[np.bool_], centre: NDArray[np.float64], size: NDArray[np.float64], angle: float
+) -> None:
+    (u, v), (half_u, half_v) = _local(centre, angle), size
     grid |= (v > -half_v) & (np.abs(u) / half_u < (half_v - v) / (2 * half_v))
