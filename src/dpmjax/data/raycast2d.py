@@ -75,7 +75,9 @@ def cast_rays(is_obstacle: NDArray[np.bool_], origins: ArrayLike, angles: ArrayL
     active = np.arange(len(start))
     while len(active):
         reach = distance[cell[active, 1] + 1, cell[active, 0] + 1].astype(np.int64)
-        cell[active], length[active], axis[active] = _leap(start[active], direction[active], cell[active], reach)
+        cell[active], length[active], axis[active] = _leap(
+            start[active], direction[active], cell[active], reach, length[active]
+        )
         active = active[distance[cell[active, 1] + 1, cell[active, 0] + 1] > 0]
 
     points = start + length[:, None] * direction
@@ -147,11 +149,16 @@ def _free_distance(is_obstacle: NDArray[np.bool_]) -> NDArray[np.int32]:
 
 
 def _leap(
-    start: NDArray[np.float64], direction: NDArray[np.float64], cell: NDArray[np.int64], reach: NDArray[np.int64]
+    start: NDArray[np.float64],
+    direction: NDArray[np.float64],
+    cell: NDArray[np.int64],
+    reach: NDArray[np.int64],
+    reached: NDArray[np.float64],
 ) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.int64]]:
     """Moves each beam into the first pixel outside of the free square of half-width `reach` round its pixel.
 
-    With reach 1 this is one step of the plain grid traversal. Returns the new cells (m, 2), the lengths (m,) at which
+    With reach 1 this is one step of the plain grid traversal. The beams are at length `reached`.
+    Returns the new cells (m, 2), the lengths (m,) at which
     they are entered, and the axes (m,) across whose edge.
     """
     ahead = np.where(direction > 0, reach[:, None], -reach[:, None])
@@ -160,7 +167,8 @@ def _leap(
         time = np.where(direction == 0, np.inf, (edge - start) / direction)
     axis = np.argmin(time, axis=1)
     rows, other = np.arange(len(cell)), 1 - axis
-    length = time[rows, axis]
+    # A beam that starts on an edge and all but follows it may be found to cross it late: never go back.
+    length = np.maximum(time[rows, axis], reached)
     entered = np.empty_like(cell)
     entered[rows, axis] = cell[rows, axis] + ahead[rows, axis]
     # Rounding must not push the beam backwards or out of the square sideways.
