@@ -157,9 +157,8 @@ def _leap(
 ) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.int64]]:
     """Moves each beam into the first pixel outside of the free square of half-width `reach` round its pixel.
 
-    With reach 1 this is one step of the plain grid traversal. The beams are at length `reached`.
-    Returns the new cells (m, 2), the lengths (m,) at which
-    they are entered, and the axes (m,) across whose edge.
+    With reach 1 this is one step of the plain grid traversal. The beams are at length `reached`. Returns the new
+    cells (m, 2), the lengths (m,) at which they are entered, and the axes (m,) across whose edge.
     """
     ahead = np.where(direction > 0, reach[:, None], -reach[:, None])
     edge = cell + ahead + (direction < 0)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import zlib
+
 import numpy as np
 
 from dpmjax.data.raycast2d import scan_world
@@ -45,7 +47,9 @@ def simulate_sequence(
     if num_scans < 2:
         raise ValueError(f"num_scans must be at least 2, got {num_scans}")
     place = world if isinstance(world, World) else make_world(world)
-    walk_rng, noise_rng, odometry_rng = (np.random.default_rng([seed, stream]) for stream in range(3))
+    # The name takes part, so that walks through two worlds are two walks and not one bent by other walls.
+    streams = ([seed, zlib.crc32(place.name.encode()), stream] for stream in range(3))
+    walk_rng, noise_rng, odometry_rng = map(np.random.default_rng, streams)
     poses = simulate_trajectory(place, num_scans, rng=walk_rng, config=trajectory)
     points, mask = scan_world(
         place.is_obstacle, poses, num_beams=num_beams, max_range=max_range, range_noise_px=range_noise_px, rng=noise_rng

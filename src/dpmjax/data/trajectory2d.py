@@ -30,7 +30,7 @@ class TrajectoryConfig:
     max_rotation_deg: float = 10.0
     mean_step_px: float = 8.16
     clearance_px: float = 8.0
-    leg_px: float = 200.0
+    leg_px: float = 260.0
 
     def __post_init__(self) -> None:
         for name in ("max_rotation_deg", "mean_step_px", "clearance_px", "leg_px"):
@@ -129,7 +129,9 @@ def _plan_route(
         raise ValueError("world is too narrow to move in: no connected free space with the wanted clearance")
     centres = (cells[:, ::-1].astype(np.float64) + 0.5) * _CELL_PX
     visits = np.zeros(len(cells))
-    home = place = int(rng.integers(len(cells)))
+    # Of three places the middlemost: from a corner there is little to explore.
+    wishes = rng.integers(len(cells), size=3)
+    home = place = int(wishes[np.argmin(np.linalg.norm(centres[wishes] - centres.mean(axis=0), axis=1))])
     route, travelled, leg = [place], 0.0, 0
     while travelled < length_px:
         cost, before = _shortest_paths(cells, coarse, visits, place)
