@@ -25,8 +25,7 @@ def simulate_sequence(
 ) -> ScanSequence:
     """Simulates a drive through a planar world (DeepMapping section 4.1).
 
-    Walk, range noise and odometry errors have random streams of their own: the same seed gives the same walk with and
-    without noise, and the first k poses do not depend on the noise.
+    Walk, noise and odometry have random streams of their own: a seed gives one walk, with and without noise.
 
     Args:
         world: index for `make_world`, or a world.
@@ -59,7 +58,6 @@ def simulate_sequence(
         points=points,
         mask=mask,
         unit="px",
-        is_organised=True,
         reference_poses=poses,
         odometry_poses=simulate_odometry(poses, rng=odometry_rng) if with_odometry else None,
     )
