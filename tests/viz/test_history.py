@@ -33,7 +33,8 @@ def test_ate_joins_the_measured_records_and_ends_with_its_value():
 
 def test_wide_positive_values_get_a_logarithmic_axis():
     loss_axes, ate_axes = history_figure(example(), "m").axes
-    assert loss_axes.get_yscale() == "linear" and ate_axes.get_yscale() == "log"
+    assert loss_axes.get_yscale() == "linear"
+    assert ate_axes.get_yscale() == "log"
 
 
 def test_without_reference_there_is_one_panel():

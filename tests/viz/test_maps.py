@@ -57,7 +57,8 @@ def test_panels_share_limits_and_lie_on_the_reference():
         "px",
     )
     result, reference = map_axes(figure)
-    assert result.get_xlim() == reference.get_xlim() and result.get_ylim() == reference.get_ylim()
+    assert result.get_xlim() == reference.get_xlim()
+    assert result.get_ylim() == reference.get_ylim()
     drawn = [np.sort(axes.collections[0].get_offsets(), axis=0) for axes in (result, reference)]
     np.testing.assert_allclose(drawn[0], drawn[1], atol=1e-6)
     np.testing.assert_allclose(drawn[1], np.sort(walls.reshape(-1, 2), axis=0), atol=1e-9)
@@ -78,7 +79,8 @@ def test_title_carries_the_numbers_with_their_unit():
         [make_panel("warm start", points, mask, poses, ate=16.13, point_distance=0.0004)], "px"
     )
     texts = [text.get_text() for axes in figure.axes for text in axes.texts]
-    assert "warm start" in texts and "ATE 16.1 px   point distance < 0.001 px" in texts
+    assert "warm start" in texts
+    assert "ATE 16.1 px   point distance < 0.001 px" in texts
 
 
 def test_masked_and_diverged_points_are_not_drawn():

@@ -43,7 +43,8 @@ def test_row_zero_is_the_smallest_y():
     probability, explored = np.zeros((20, 20)), np.ones((20, 20), bool)
     probability[:5] = 1.0
     image = rendered_map(occupancy_figure(probability, explored, (0, 10, 0, 10), None, "m"))
-    assert image[-20:].mean() < 60 and image[20:100].mean() > 240
+    assert image[-20:].mean() < 60
+    assert image[20:100].mean() > 240
 
 
 def test_trajectory_is_drawn_in_world_coordinates():
@@ -51,7 +52,8 @@ def test_trajectory_is_drawn_in_world_coordinates():
     path = np.array([[10.0, 10.0], [90.0, 50.0]])
     figure = occupancy_figure(probability, explored, (0, 100, 0, 60), path, "px")
     assert any(np.array_equal(line.get_xydata(), path) for line in figure.axes[0].lines)
-    assert figure.axes[0].get_xlim() == (0, 100) and figure.axes[0].get_ylim() == (0, 60)
+    assert figure.axes[0].get_xlim() == (0, 100)
+    assert figure.axes[0].get_ylim() == (0, 60)
 
 
 @pytest.mark.parametrize(

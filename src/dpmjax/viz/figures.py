@@ -28,10 +28,12 @@ class Limits(NamedTuple):
 
     @property
     def width(self) -> float:
+        """Extent along x."""
         return self.x_max - self.x_min
 
     @property
     def height(self) -> float:
+        """Extent along y."""
         return self.y_max - self.y_min
 
 
