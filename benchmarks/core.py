@@ -105,7 +105,7 @@ def weighted_svd(source: NDArray[np.floating], target: NDArray[np.floating], wei
 
 def chamfer_distance(a: NDArray[np.floating], b: NDArray[np.floating]) -> object:
     """Mean distance from a to b plus from b to a, with a tree for each."""
-    return KDTree(b).query(a)[0].mean() + KDTree(a).query(b)[0].mean()
+    return np.mean(KDTree(b).query(a)[0]) + np.mean(KDTree(a).query(b)[0])
 
 
 def numpy_info_nce(queries: NDArray[np.floating], keys: NDArray[np.floating], positives: NDArray[np.int32]) -> object:

@@ -12,7 +12,7 @@ from typing import TypeVar
 
 import tyro
 
-from experiments._run_folder import CONFIG, RunFailedError, find_run, load_config
+from experiments._run_folder import RunFailedError, find_run, load_config
 from experiments._stop import Interrupted
 
 EXIT_OK, EXIT_FAILED, EXIT_BAD_INPUT = 0, 1, 2
@@ -77,7 +77,7 @@ def _parse(config_type: type[ConfigT], experiment: str, description: str | None,
     config = tyro.cli(config_type, prog=prog, description=description, args=arguments)
     if not getattr(config, "resume", False):
         return config
-    stored = load_config(find_run(experiment, getattr(config, "output", None)) / CONFIG, config_type)
+    stored = load_config(find_run(experiment, getattr(config, "output", None)), config_type)
     return tyro.cli(config_type, prog=prog, description=description, args=arguments, default=stored)
 
 

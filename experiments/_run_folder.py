@@ -2,24 +2,18 @@
 
 from __future__ import annotations
 
-import csv
-import dataclasses
-import json
 import logging
-import math
 import os
 import shutil
-import typing
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Self, TypeVar
+from typing import Any, TypeVar
 
-import numpy as np
-
+from experiments._json import as_json, load_dataclass, load_json, write_json
 from experiments._machine import environment
 
 CONFIG, METRICS, HISTORY, LOG = "config.json", "metrics.json", "metrics.csv", "log.txt"
@@ -115,18 +109,12 @@ def find_run(experiment: str, output: Path | None, root: Path = Path("results"))
 
 
 def load_config(path: Path, config_type: type[ConfigT]) -> ConfigT:
-    """Reads back the options that `config.json` holds; those that it lacks, and the free ones, get their defaults.
+    """Reads the options of the run in folder `path`; where it writes and the like gets its defaults.
 
     Raises:
-        ValueError: it holds an option that `config_type` does not have, or is no JSON.
+        ValueError: its `config.json` holds an option that `config_type` does not have, or is no JSON.
     """
-    stored = load_json(path)
-    hints = typing.get_type_hints(config_type)
-    unknown = sorted(set(stored) - set(hints))
-    if unknown:
-        raise ValueError(f"{path} holds options that this version does not know: {', '.join(unknown)}")
-    kept = {name: value for name, value in stored.items() if name not in FREE_OPTIONS}
-    return config_type(**{name: _from_json(value, hints[name]) for name, value in kept.items()})
+    return load_dataclass(path / CONFIG, config_type, ignore=FREE_OPTIONS)
 
 
 def write_metrics(folder: RunFolder, metrics: Mapping[str, Any], *, seed: int) -> None:
@@ -162,102 +150,6 @@ def recording(folder: RunFolder) -> Iterator[None]:
             logger.removeHandler(handler)
             logger.setLevel(level)
         handler.close()
-
-
-class HistoryFile:
-    """`metrics.csv`, one row a record, each on disk as soon as it is known.
-
-    Args:
-        folder: the run.
-        columns: names of the columns, the first counts steps.
-        keep_until: in a resumed run, rows with a larger first column are dropped; they will be computed again.
-    """
-
-    def __init__(self, folder: RunFolder, columns: Sequence[str], *, keep_until: int | None = None) -> None:
-        path = folder / HISTORY
-        kept: list[dict[str, str]] = []
-        if keep_until is not None and path.exists():
-            kept = [row for row in read_history(path) if int(row[columns[0]]) <= keep_until]
-        unfinished = path.with_name(f".{path.name}.tmp")
-        with unfinished.open("w", newline="", encoding="utf-8") as file:
-            writer = csv.DictWriter(file, columns, lineterminator="\n")
-            writer.writeheader()
-            writer.writerows(kept)
-        os.replace(unfinished, path)
-        self._file = path.open("a", newline="", encoding="utf-8")
-        self._writer = csv.DictWriter(self._file, columns, lineterminator="\n")
-
-    def append(self, **row: object) -> None:
-        """Adds a row; a column that is not given stays empty."""
-        self._writer.writerow(row)
-        self._file.flush()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, error_type: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
-        self._file.close()
-
-
-def read_history(path: Path) -> list[dict[str, str]]:
-    """Rows of a `metrics.csv`; a last line that was cut off by a crash is left out."""
-    text = path.read_text(encoding="utf-8")
-    return list(csv.DictReader(text[: text.rfind("\n") + 1].splitlines()))
-
-
-def write_json(path: Path, value: Any) -> None:
-    """Writes dataclasses, paths, NumPy values as JSON; the file appears whole or not at all."""
-    text = json.dumps(as_json(value), indent=2, allow_nan=False) + "\n"
-    unfinished = path.with_name(f".{path.name}.tmp")
-    unfinished.write_text(text, encoding="utf-8")
-    os.replace(unfinished, path)
-
-
-def load_json(path: Path) -> dict[str, Any]:
-    """Reads a JSON object.
-
-    Raises:
-        ValueError: it is no JSON object.
-    """
-    try:
-        value = json.loads(path.read_text(encoding="utf-8"))
-    except (UnicodeDecodeError, json.JSONDecodeError) as error:
-        raise ValueError(f"{path} is not JSON: {error}") from error
-    if not isinstance(value, dict):
-        raise ValueError(f"{path}: expected a JSON object, found {type(value).__name__}")
-    return value
-
-
-def as_json(value: Any) -> Any:
-    """The same value out of JSON's types. What JSON cannot say, NaN and infinity, becomes null."""
-    if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        return {field.name: as_json(getattr(value, field.name)) for field in dataclasses.fields(value)}
-    if isinstance(value, Mapping):
-        return {str(name): as_json(entry) for name, entry in value.items()}
-    if isinstance(value, Path):
-        return str(value)
-    if isinstance(value, np.generic) or hasattr(value, "__array__"):
-        return as_json(np.asarray(value).tolist())
-    if isinstance(value, list | tuple):
-        return [as_json(entry) for entry in value]
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return value
-
-
-def _from_json(value: Any, hint: Any) -> Any:
-    choices = typing.get_args(hint) or (hint,)
-    if isinstance(value, dict):
-        nested = next(choice for choice in choices if dataclasses.is_dataclass(choice))
-        hints = typing.get_type_hints(nested)
-        return nested(**{name: _from_json(entry, hints[name]) for name, entry in value.items()})
-    if isinstance(value, list):
-        return tuple(value)
-    if isinstance(value, str) and Path in choices:
-        return Path(value)
-    return value
 
 
 def _check_same_options(stored: dict[str, Any], now: dict[str, Any], path: Path, may_change: frozenset[str]) -> None:

@@ -24,16 +24,9 @@ from tqdm import tqdm
 from tyro.conf import FlagCreatePairsOff, Positional, arg
 
 from experiments._command import run_command
+from experiments._history import HistoryFile, read_history
 from experiments._machine import peak_rss_gb, select_device
-from experiments._run_folder import (
-    HISTORY,
-    HistoryFile,
-    RunFolder,
-    open_run_folder,
-    read_history,
-    recording,
-    write_metrics,
-)
+from experiments._run_folder import HISTORY, RunFolder, open_run_folder, recording, write_metrics
 from experiments._stop import StopFlag
 
 if TYPE_CHECKING:
@@ -180,7 +173,7 @@ def fit(
     keep_until = first_step - 1 if folder.is_resumed else None
     progress = tqdm(total=1.0, bar_format="{desc} {percentage:3.0f}%|{bar}| [{elapsed}{postfix}]", desc="fit")
     step, started = first_step, time.perf_counter()
-    with HistoryFile(folder, columns, keep_until=keep_until) as history, progress:
+    with HistoryFile(folder / HISTORY, columns, keep_until=keep_until) as history, progress:
         while step < num_steps and not stop.is_requested:
             # SEAM: state, report = step_fn(state, batch, key=fold_in(key, step)); a checkpoint now and then
             loss, phase, ate = math.nan, "L-Net", math.nan

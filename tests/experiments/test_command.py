@@ -25,7 +25,8 @@ from pathlib import Path
 from typing import Annotated
 import tyro
 from experiments._command import run_command
-from experiments._run_folder import HistoryFile, open_run_folder, read_history, recording, write_metrics
+from experiments._history import HistoryFile, read_history
+from experiments._run_folder import open_run_folder, recording, write_metrics
 from experiments._stop import StopFlag
 
 @dataclass(frozen=True)
@@ -47,7 +48,8 @@ def main(config):
     with recording(folder), StopFlag() as stop:
         start = len(read_history(folder / "metrics.csv")) if folder.is_resumed else 0
         step = start - 1
-        with HistoryFile(folder, ["step"], keep_until=start - 1 if folder.is_resumed else None) as history:
+        keep_until = start - 1 if folder.is_resumed else None
+        with HistoryFile(folder / "metrics.csv", ["step"], keep_until=keep_until) as history:
             for step in range(start, config.steps):
                 history.append(step=step)
                 print(step, flush=True)

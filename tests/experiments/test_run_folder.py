@@ -11,16 +11,9 @@ import numpy as np
 import pytest
 
 from experiments import _run_folder
-from experiments._run_folder import (
-    HistoryFile,
-    RunFailedError,
-    load_config,
-    open_run_folder,
-    read_history,
-    recording,
-    write_json,
-    write_metrics,
-)
+from experiments._history import HistoryFile, read_history
+from experiments._json import write_json
+from experiments._run_folder import RunFailedError, load_config, open_run_folder, recording, write_metrics
 
 
 @dataclass(frozen=True)
@@ -104,10 +97,10 @@ def test_folder_that_cannot_be_made_is_an_input_error(tmp_path):
 def test_options_survive_the_way_through_the_file():
     config = Config(data=Path("a/b"), seconds=2.5, nested=Nested((3.0,)), resume=True)
     run = open_run(config)
-    assert load_config(run / "config.json", Config) == replace(config, resume=False)
+    assert load_config(run.path, Config) == replace(config, resume=False)
     write_json(run / "config.json", {"sead": 1})
     with pytest.raises(ValueError, match="sead"):
-        load_config(run / "config.json", Config)
+        load_config(run.path, Config)
 
 
 def test_metrics_are_valid_json_with_seed_and_versions():
@@ -134,12 +127,12 @@ def test_failed_write_keeps_the_old_file(tmp_path):
 
 def test_history_of_a_resumed_run_continues_at_its_checkpoint():
     run = open_run()
-    with HistoryFile(run, ["step", "loss", "ate_px"]) as history:
+    with HistoryFile(run / "metrics.csv", ["step", "loss", "ate_px"]) as history:
         for step in range(5):
             history.append(step=step, loss=step / 2)
     with (run / "metrics.csv").open("a") as file:
         file.write("5,2.5")  # killed while writing
-    with HistoryFile(run, ["step", "loss", "ate_px"], keep_until=2) as history:
+    with HistoryFile(run / "metrics.csv", ["step", "loss", "ate_px"], keep_until=2) as history:
         history.append(step=3, loss=9, ate_px=1.5)
     rows = read_history(run / "metrics.csv")
     assert [row["step"] for row in rows] == ["0", "1", "2", "3"]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -195,7 +195,8 @@ def _draw_panel(axes: Axes, panel: Panel, limits: Limits, unit: str, colormap: C
     points, scans = _visible_points(panel)
     order = np.random.default_rng(0).permutation(len(points))[:MAX_POINTS_PER_PANEL]
     axes.scatter(
-        *points[order].T,
+        points[order, 0],
+        points[order, 1],
         c=scans[order],
         cmap=colormap,
         vmin=0,
@@ -212,7 +213,7 @@ def _draw_panel(axes: Axes, panel: Panel, limits: Limits, unit: str, colormap: C
         numbers.append(f"ATE {format_length(panel.ate, unit)}")
     if panel.point_distance is not None:
         numbers.append(f"point distance {format_length(panel.point_distance, unit)}")
-    style = {"xycoords": "axes fraction", "textcoords": "offset points", "va": "baseline"}
+    style: dict[str, Any] = {"xycoords": "axes fraction", "textcoords": "offset points", "va": "baseline"}
     axes.annotate(panel.title, (0, 1), xytext=(1, 21), fontsize=12.5, fontweight="bold", color=INK, **style)
     axes.annotate("   ".join(numbers), (0, 1), xytext=(1, 7), fontsize=9.5, color=MUTED, **style)
 
@@ -223,6 +224,11 @@ def _add_time_bar(figure: Figure, num_scans: int, width_in: float, total_in: flo
     axes = figure.add_axes((0.5 - length_in / 2.0 / width_in, 0.24 / total_in, length_in / width_in, 0.09 / total_in))
     axes.imshow(np.linspace(0.0, 1.0, 256)[None, :], aspect="auto", cmap=colormap)
     axes.set_axis_off()
-    style = {"xycoords": "axes fraction", "textcoords": "offset points", "va": "center", "fontsize": 8.5}
+    style: dict[str, Any] = {
+        "xycoords": "axes fraction",
+        "textcoords": "offset points",
+        "va": "center",
+        "fontsize": 8.5,
+    }
     axes.annotate("first scan", (0, 0.5), xytext=(-6, 0), ha="right", color=MUTED, **style)
     axes.annotate(f"scan {num_scans}", (1, 0.5), xytext=(6, 0), ha="left", color=MUTED, **style)
