@@ -1,0 +1,116 @@
+"""The shared core beside the same computation in NumPy or SciPy: time, and the distance from a float64 result."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import KDTree
+from scipy.special import logsumexp
+
+import dpmjax
+from benchmarks.rows import Row
+from benchmarks.timing import measure
+
+NAME = "core"
+TEMPERATURE = 0.1
+
+
+class Case(NamedTuple):
+    """One computation in both forms; both return what can be compared."""
+
+    name: str
+    ours: Callable[..., object]
+    peer_name: str
+    peer: Callable[..., object]
+    arguments: tuple[NDArray[np.generic], ...]
+
+
+def run(quick: bool) -> list[Row]:
+    """Times each case with both programs on the same arrays."""
+    repeats = 5 if quick else 30
+    rows: list[Row] = []
+    for case in cases(quick):
+        ours, peer = f"{case.name}: dpmjax", f"{case.name}: {case.peer_name}"
+        rows += measure(case.ours, *case.arguments, repeats=repeats).rows(ours)
+        rows += [
+            row for row in measure(case.peer, *case.arguments, repeats=repeats).rows(peer) if row.metric != "compile"
+        ]
+        rows.append(Row(ours, "largest difference", difference(case), ""))
+    return rows
+
+
+def cases(quick: bool) -> list[Case]:
+    """Problems of the sizes that registration and training meet."""
+    rng = np.random.default_rng(0)
+    num_pairs, num_points, num_descriptors = (256, 1024, 256) if quick else (4096, 16384, 1024)
+    source = rng.normal(size=(num_pairs, 3)).astype(np.float32)
+    target = (source @ rotation_about_z(0.3).T + [1.0, 2.0, 3.0] + 0.01 * rng.normal(size=source.shape)).astype(
+        np.float32
+    )
+    weights = rng.uniform(size=num_pairs).astype(np.float32)
+    queries, points = rng.uniform(0.0, 50.0, (2, num_points, 3)).astype(np.float32)
+    scan_a, scan_b = rng.uniform(0.0, 500.0, (2, 256, 2)).astype(np.float32)
+    descriptors, keys = rng.normal(size=(2, num_descriptors, 128)).astype(np.float32)
+    positives = rng.permutation(num_descriptors).astype(np.int32)
+    return [
+        Case(f"weighted_svd {num_pairs}x3", dpmjax.weighted_svd, "NumPy", weighted_svd, (source, target, weights)),
+        Case(
+            f"k_nearest k=8 {num_points}x{num_points}", near_distances, "SciPy tree", tree_distances, (queries, points)
+        ),
+        Case("chamfer 256x256", dpmjax.chamfer_distance, "SciPy tree", chamfer_distance, (scan_a, scan_b)),
+        Case(f"info_nce {num_descriptors}x128", info_nce, "NumPy", numpy_info_nce, (descriptors, keys, positives)),
+    ]
+
+
+def difference(case: Case) -> float:
+    """Largest entry of the difference to the peer on the same numbers in float64."""
+    exact = (array.astype(np.float64) if array.dtype == np.float32 else array for array in case.arguments)
+    return float(np.max(np.abs(np.asarray(case.ours(*case.arguments)) - np.asarray(case.peer(*exact)))))
+
+
+def rotation_about_z(angle: float) -> NDArray[np.float64]:
+    """A (3, 3) rotation by `angle` radians."""
+    cos, sin = np.cos(angle), np.sin(angle)
+    return np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
+
+
+def near_distances(queries: NDArray[np.float32], points: NDArray[np.float32]) -> object:
+    """Squared distances to the eight nearest points."""
+    return dpmjax.k_nearest(queries, points, 8).squared_distances
+
+
+def tree_distances(queries: NDArray[np.floating], points: NDArray[np.floating]) -> object:
+    """The same with a tree, built anew for each call as a moving scan needs it."""
+    return KDTree(points).query(queries, 8)[0] ** 2
+
+
+def info_nce(queries: NDArray[np.float32], keys: NDArray[np.float32], positives: NDArray[np.int32]) -> object:
+    """The loss at the temperature of both forms."""
+    return dpmjax.info_nce(queries, keys, positives, temperature=TEMPERATURE)
+
+
+def weighted_svd(source: NDArray[np.floating], target: NDArray[np.floating], weights: NDArray[np.floating]) -> object:
+    """T_target_source by NumPy's SVD."""
+    shares = (weights / weights.sum())[:, None]
+    source_centre, target_centre = (shares * source).sum(axis=0), (shares * target).sum(axis=0)
+    U, _, Vt = np.linalg.svd((shares * (target - target_centre)).T @ (source - source_centre))
+    T = np.eye(4, dtype=source.dtype)
+    T[:3, :3] = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
+    T[:3, 3] = target_centre - T[:3, :3] @ source_centre
+    return T
+
+
+def chamfer_distance(a: NDArray[np.floating], b: NDArray[np.floating]) -> object:
+    """Mean distance from a to b plus from b to a, with a tree for each."""
+    return np.mean(KDTree(b).query(a)[0]) + np.mean(KDTree(a).query(b)[0])
+
+
+def numpy_info_nce(queries: NDArray[np.floating], keys: NDArray[np.floating], positives: NDArray[np.int32]) -> object:
+    """InfoNCE of cosine similarities."""
+    queries = queries / np.linalg.norm(queries, axis=1, keepdims=True)
+    keys = keys / np.linalg.norm(keys, axis=1, keepdims=True)
+    logits = queries @ keys.T / TEMPERATURE
+    return np.mean(logsumexp(logits, axis=1) - logits[np.arange(len(queries)), positives])

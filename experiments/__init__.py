@@ -1,0 +1,1 @@
+"""Thin commands: one module for each experiment of the papers and each user task."""

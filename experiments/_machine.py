@@ -1,0 +1,110 @@
+"""What a result depends on besides its options: the machine, the versions, the device; and how much memory was used."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import os
+import platform
+import resource
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any, Literal
+
+PACKAGES = ("jax", "jaxlib", "flax", "optax", "numpy", "scipy")
+
+
+def select_device(device: Literal["cpu", "gpu"] | None) -> None:
+    """Tells JAX which device to use; None leaves the choice to JAX.
+
+    Raises:
+        ValueError: there is no such device here.
+    """
+    if device is None:
+        return
+    # JAX reads this when its first array is made, so the command may still decide after parsing its options.
+    import jax
+
+    jax.config.update("jax_platforms", {"cpu": "cpu", "gpu": "cuda"}[device])
+    try:
+        jax.devices()
+    except RuntimeError as error:
+        raise ValueError(
+            f"--device {device}: JAX finds no such device here; leave the option out or install its plugin"
+        ) from error
+
+
+def environment() -> dict[str, Any]:
+    """Versions, device, git commit and machine, ready for `metrics.json`."""
+    return {
+        "versions": versions(),
+        "device": device_name(),
+        "git_hash": git_hash(),
+        "platform": platform.platform(),
+        "cpu": cpu_model(),
+        "num_cores": usable_cores(),
+    }
+
+
+def versions() -> dict[str, str]:
+    """Versions of Python, of this package, and of the packages that its numbers depend on."""
+    import dpmjax
+
+    installed = {name: importlib.metadata.version(name) for name in PACKAGES}
+    return {"python": platform.python_version(), "dpmjax": dpmjax.__version__, **installed}
+
+
+def device_name() -> str | None:
+    """The device that JAX computes on; None in a run that never loaded JAX."""
+    if "jax" not in sys.modules:
+        return None
+    import jax
+
+    devices = jax.devices()
+    return f"{devices[0].platform} ({devices[0].device_kind}) x {len(devices)}"
+
+
+def git_hash() -> str | None:
+    """Commit of the checkout that this file lies in, with `+changes` where it is not clean; None without git."""
+    command = ["git", "-C", str(Path(__file__).parent)]
+    try:
+        commit = subprocess.run([*command, "rev-parse", "HEAD"], capture_output=True, text=True, check=True, timeout=5)
+        changes = subprocess.run(
+            [*command, "status", "--porcelain", "--untracked-files=no"],
+            capture_output=True,
+            text=True,
+            check=True,
+            timeout=5,
+        )
+    except (OSError, subprocess.SubprocessError):
+        return None
+    return commit.stdout.strip() + ("+changes" if changes.stdout.strip() else "")
+
+
+def cpu_model() -> str:
+    """Name of the processor as its maker gives it."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+    except OSError:
+        lines = []
+    names = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
+    return names[0] if names else platform.processor() or platform.machine()
+
+
+def usable_cores() -> int:
+    """Cores that this process may run on, which a container may limit."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def peak_rss_gb() -> float:
+    """Largest resident memory of this process so far, in units of 10^9 bytes."""
+    # On Linux, ru_maxrss starts from the parent's size at the fork; VmHWM belongs to this program alone.
+    try:
+        status = Path("/proc/self/status").read_text(encoding="ascii", errors="replace").splitlines()
+    except OSError:
+        status = []
+    for line in status:
+        if line.startswith("VmHWM:"):
+            return int(line.split()[1]) * 1024 / 1e9
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak * (1 if sys.platform == "darwin" else 1024) / 1e9

@@ -1,0 +1,19 @@
+"""Pictures: registered scans, the learned map, the course of a fit. NumPy in, `matplotlib` figures and PNG files out.
+
+Nothing here needs a screen or touches `pyplot`; matplotlib itself is imported when the first picture is drawn.
+"""
+
+from dpmjax.viz.figures import save_figure
+from dpmjax.viz.history import History, history_figure
+from dpmjax.viz.maps import Panel, make_panel, registered_scans_figure
+from dpmjax.viz.occupancy import occupancy_figure
+
+__all__ = [
+    "History",
+    "Panel",
+    "history_figure",
+    "make_panel",
+    "occupancy_figure",
+    "registered_scans_figure",
+    "save_figure",
+]

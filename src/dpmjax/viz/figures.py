@@ -1,0 +1,111 @@
+"""What all pictures share: an empty figure, the frame of a map, a scale bar, and the way onto the disk."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+INK = "#1b1f24"
+MUTED = "#6a737d"
+FRAME = "#d6dadf"
+ACCENT = "#d1495b"
+
+
+class Limits(NamedTuple):
+    """A rectangle of the plane, in the unit of the map."""
+
+    x_min: float
+    x_max: float
+    y_min: float
+    y_max: float
+
+    @property
+    def width(self) -> float:
+        """Extent along x."""
+        return self.x_max - self.x_min
+
+    @property
+    def height(self) -> float:
+        """Extent along y."""
+        return self.y_max - self.y_min
+
+
+def new_figure(width_in: float, height_in: float) -> Figure:
+    """Makes a white figure that belongs to no window and to no global state."""
+    from matplotlib.figure import Figure
+
+    return Figure(figsize=(width_in, height_in), facecolor="white")
+
+
+def save_figure(figure: Figure, path: str | os.PathLike[str], dpi: int = 160) -> None:
+    """Writes the figure as a PNG; the file appears whole or not at all."""
+    path = Path(path)
+    unfinished = path.with_name(f".{path.name}.tmp")
+    try:
+        figure.savefig(unfinished, dpi=dpi, format="png", facecolor=figure.get_facecolor())
+        os.replace(unfinished, path)
+    finally:
+        unfinished.unlink(missing_ok=True)
+
+
+def frame_map(axes: Axes, limits: Limits) -> None:
+    """Gives a map panel equal axes, its limits, and a thin frame instead of ticks."""
+    axes.set_aspect("equal", adjustable="box")
+    axes.set_xlim(limits.x_min, limits.x_max)
+    axes.set_ylim(limits.y_min, limits.y_max)
+    axes.set_xticks([])
+    axes.set_yticks([])
+    for spine in axes.spines.values():
+        spine.set_color(FRAME)
+        spine.set_linewidth(0.8)
+
+
+def add_scale_bar(axes: Axes, limits: Limits, unit: str) -> None:
+    """Draws a bar of a round length, about a fifth of the width, in the lower left corner."""
+    length = round_length(limits.width / 5.0)
+    x = limits.x_min + 0.04 * limits.width
+    y = limits.y_min + 0.04 * limits.height
+    axes.plot([x, x + length], [y, y], color="white", linewidth=4.5, solid_capstyle="butt", zorder=8)
+    axes.plot([x, x + length], [y, y], color=INK, linewidth=2.0, solid_capstyle="butt", zorder=9)
+    axes.annotate(
+        f"{length:g} {unit}",
+        (x + length / 2.0, y),
+        xytext=(0, 4),
+        textcoords="offset points",
+        ha="center",
+        va="bottom",
+        fontsize=8,
+        color=INK,
+        bbox={"boxstyle": "square,pad=0.15", "facecolor": "white", "edgecolor": "none", "alpha": 0.75},
+        zorder=9,
+    )
+
+
+def round_length(length: float) -> float:
+    """The largest of 1, 2, 5 times a power of ten that is not longer than `length`."""
+    power = 10.0 ** np.floor(np.log10(length))
+    return float(max(step * power for step in (1.0, 2.0, 5.0) if step * power <= length * (1.0 + 1e-9)))
+
+
+def draw_trajectory(axes: Axes, trajectory_world: np.ndarray, color: str) -> None:
+    """Draws the path of the sensor and marks where it starts."""
+    axes.plot(*trajectory_world.T, color="white", linewidth=2.6, alpha=0.7, zorder=5, solid_joinstyle="round")
+    axes.plot(*trajectory_world.T, color=color, linewidth=1.2, zorder=6, solid_joinstyle="round")
+    axes.plot(*trajectory_world[:1].T, "o", markersize=6, color=color, markeredgecolor="white", zorder=7)
+
+
+def format_length(length: float, unit: str) -> str:
+    """At most three significant digits and three decimals, without exponents: `16.1 px`, `0.012 m`, `< 0.001 px`."""
+    if not np.isfinite(length):
+        return f"{length} {unit}"
+    if abs(length) < 1e-3:
+        return f"< 0.001 {unit}"
+    decimals = min(3, max(0, 2 - int(np.floor(np.log10(abs(length))))))
+    return f"{length:.{decimals}f} {unit}"

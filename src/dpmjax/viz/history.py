@@ -1,0 +1,147 @@
+"""The course of a fit over time: the loss, and the trajectory error where a reference exists."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dpmjax.viz.figures import ACCENT, FRAME, INK, MUTED, format_length, new_figure
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+PHASE_COLORS = ("#eef2f7", "#fbf3e6", "#ecf5ee", "#f6eef6")
+LOSS_COLOR = "#30638e"
+RATIO_FOR_LOG_AXIS = 10.0
+
+
+@dataclass(frozen=True)
+class History:
+    """What a fit reported, one entry a record.
+
+    Attributes:
+        seconds: (k,) run time, never decreasing, compile time left out.
+        loss: (k,) value of the phase's own objective; NaN where there is none.
+        phase: (k,) name of the phase of each record ("L-Net", "free poses", "polish").
+        ate: (k,) absolute trajectory error in the unit of the figure, NaN where not measured; None without a reference.
+    """
+
+    seconds: NDArray[np.floating]
+    loss: NDArray[np.floating]
+    phase: Sequence[str]
+    ate: NDArray[np.floating] | None = None
+
+
+class _Phase(NamedTuple):
+    name: str
+    start: int
+    stop: int
+
+
+def history_figure(history: History, unit: str) -> Figure:
+    """Draws loss and ATE over run time, the phases of the fit shaded and named.
+
+    The loss line breaks between phases, because each phase has an objective of its own. A value axis is logarithmic
+    where all its values are positive and span more than a factor of ten.
+
+    Raises:
+        ValueError: no record, or columns of different lengths.
+    """
+    seconds, loss = np.asarray(history.seconds, np.float64), np.asarray(history.loss, np.float64)
+    ate = None if history.ate is None else np.asarray(history.ate, np.float64)
+    lengths = [len(seconds), len(loss), len(history.phase)] + ([] if ate is None else [len(ate)])
+    if len(set(lengths)) != 1 or lengths[0] == 0:
+        raise ValueError(f"expected one or more records and columns of one length; got lengths {lengths}")
+
+    has_ate = ate is not None and bool(np.isfinite(ate).any())
+    figure = new_figure(8.0, 5.2 if has_ate else 3.0)
+    rows = figure.subplots(2 if has_ate else 1, 1, sharex=True, squeeze=False)[:, 0]
+    phases = list(_phases(history.phase))
+    for axes in rows:
+        _shade_phases(axes, phases, seconds)
+    for phase in phases:
+        part = slice(phase.start, phase.stop)
+        _draw_line(rows[0], seconds[part], loss[part], LOSS_COLOR)
+    _finish_value_axis(rows[0], loss, "loss")
+    if has_ate and ate is not None:
+        is_known = np.isfinite(ate)
+        _draw_line(rows[1], seconds[is_known], ate[is_known], ACCENT)
+        _finish_value_axis(rows[1], ate, f"ATE ({unit})")
+        rows[1].annotate(
+            format_length(ate[is_known][-1], unit),
+            (seconds[is_known][-1], ate[is_known][-1]),
+            xytext=(7, 0),
+            textcoords="offset points",
+            va="center",
+            fontsize=9,
+            color=ACCENT,
+            annotation_clip=False,
+        )
+    _name_phases(rows[0], phases, seconds)
+    rows[-1].set_xlabel("run time (s)", color=INK)
+    first, last = seconds[0], seconds[-1]
+    rows[-1].set_xlim(first, last if last > first else first + 1.0)
+    figure.subplots_adjust(
+        left=0.1, right=0.9, top=0.93 if has_ate else 0.89, bottom=0.1 if has_ate else 0.17, hspace=0.08
+    )
+    return figure
+
+
+def _phases(names: Sequence[str]) -> Iterator[_Phase]:
+    """Runs of equal names."""
+    start = 0
+    for index in range(1, len(names) + 1):
+        if index == len(names) or names[index] != names[start]:
+            yield _Phase(names[start], start, index)
+            start = index
+
+
+def _bounds(phase: _Phase, seconds: NDArray[np.floating]) -> tuple[float, float]:
+    """A phase lasts from its predecessor's last record to its own last record."""
+    return float(seconds[max(0, phase.start - 1)]), float(seconds[phase.stop - 1])
+
+
+def _shade_phases(axes: Axes, phases: Sequence[_Phase], seconds: NDArray[np.floating]) -> None:
+    for number, phase in enumerate(phases):
+        axes.axvspan(*_bounds(phase, seconds), color=PHASE_COLORS[number % len(PHASE_COLORS)], linewidth=0, zorder=0)
+
+
+def _name_phases(axes: Axes, phases: Sequence[_Phase], seconds: NDArray[np.floating]) -> None:
+    """Writes the names above the first row; a name that would run into its left neighbour moves right of it."""
+    span = max(seconds[-1] - seconds[0], 1e-9)
+    taken_until = 0.0
+    for phase in phases:
+        start = (_bounds(phase, seconds)[0] - seconds[0]) / span
+        start = max(start, taken_until)
+        axes.annotate(
+            phase.name,
+            (start, 1),
+            xycoords="axes fraction",
+            xytext=(2, 5),
+            textcoords="offset points",
+            fontsize=9.5,
+            color=MUTED,
+        )
+        taken_until = start + 0.0135 * (len(phase.name) + 2)
+
+
+def _draw_line(axes: Axes, seconds: NDArray[np.floating], values: NDArray[np.floating], color: str) -> None:
+    # A phase of one record has no line: it shows as a dot.
+    axes.plot(seconds, values, "-" if len(seconds) > 1 else "o", color=color, linewidth=1.6, markersize=4, zorder=3)
+
+
+def _finish_value_axis(axes: Axes, values: NDArray[np.floating], label: str) -> None:
+    known = values[np.isfinite(values)]
+    if len(known) and known.min() > 0.0 and known.max() > RATIO_FOR_LOG_AXIS * known.min():
+        axes.set_yscale("log")
+    axes.set_ylabel(label, color=INK)
+    axes.grid(axis="y", color=FRAME, linewidth=0.6, zorder=1)
+    axes.tick_params(which="both", colors=MUTED, labelsize=9, length=3)
+    for side, spine in axes.spines.items():
+        spine.set_visible(side in ("left", "bottom"))
+        spine.set_color(FRAME)

@@ -1,0 +1,234 @@
+"""The picture of a registration: the same scans under several sets of poses, side by side in one frame."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from dpmjax.viz.figures import INK, MUTED, Limits, add_scale_bar, draw_trajectory, format_length, frame_map, new_figure
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.colors import Colormap
+    from matplotlib.figure import Figure
+
+PANEL_WIDTH_IN = 4.2
+HEADER_IN = 0.62
+FOOTER_IN = 0.55
+GAP_IN = 0.14
+MAX_POINTS_PER_PANEL = 120_000
+OUTER_QUANTILE = 0.002
+MARGIN = 0.04
+
+
+@dataclass(frozen=True)
+class Panel:
+    """One set of poses, and where it puts the points.
+
+    Attributes:
+        title: what these poses are ("warm start").
+        points_world: (n, b, 2) all scans in this panel's own world frame.
+        mask: (n, b) True where there is a point.
+        trajectory_world: (n, 2) sensor positions in the same frame.
+        ate: absolute trajectory error in the unit of the figure, or None.
+        point_distance: mean point distance in the unit of the figure, or None.
+        is_reference: the other panels are laid onto this one.
+    """
+
+    title: str
+    points_world: NDArray[np.floating]
+    mask: NDArray[np.bool_]
+    trajectory_world: NDArray[np.floating]
+    ate: float | None = None
+    point_distance: float | None = None
+    is_reference: bool = False
+
+
+def make_panel(
+    title: str,
+    points: ArrayLike,
+    mask: ArrayLike,
+    poses: ArrayLike,
+    *,
+    ate: float | None = None,
+    point_distance: float | None = None,
+    is_reference: bool = False,
+) -> Panel:
+    """Makes a panel from scans in their sensor frames and planar poses.
+
+    Args:
+        title: what these poses are.
+        points: (n, b, 2) in the sensor frames.
+        mask: (n, b) True where there is a point.
+        poses: (n, 3) x, y, heading (radians) of the sensor in the world.
+        ate: absolute trajectory error, if known.
+        point_distance: mean point distance, if known.
+        is_reference: whether the other panels are laid onto this one.
+
+    Raises:
+        ValueError: where the shapes do not fit.
+    """
+    points = np.asarray(points, np.float64)
+    mask = np.asarray(mask, bool)
+    poses = np.asarray(poses, np.float64)
+    if points.ndim != 3 or points.shape[-1] != 2 or mask.shape != points.shape[:2] or poses.shape != (len(points), 3):
+        raise ValueError(
+            "expected points (n, b, 2), mask (n, b), poses (n, 3); "
+            f"got points {points.shape}, mask {mask.shape}, poses {poses.shape}"
+        )
+    cos, sin = np.cos(poses[:, 2, None]), np.sin(poses[:, 2, None])
+    x, y = points[..., 0], points[..., 1]
+    points_world = np.stack([cos * x - sin * y, sin * x + cos * y], axis=-1) + poses[:, None, :2]
+    return Panel(title, points_world, mask, poses[:, :2], ate, point_distance, is_reference)
+
+
+def registered_scans_figure(panels: Sequence[Panel], unit: str) -> Figure:
+    """Draws the panels side by side in one frame with one scale.
+
+    Each panel is laid onto the reference panel (or, where there is none, onto the last) by the rigid motion that brings
+    its trajectory closest; then all have the same limits. One colour a scan, running with time; trajectory in black,
+    its start marked with a dot. At most `MAX_POINTS_PER_PANEL` points are drawn, chosen evenly by a fixed seed and in
+    random order, so that late scans do not hide early ones.
+
+    Args:
+        panels: at least one; all of the same scans.
+        unit: unit of lengths, "px" or "m".
+
+    Raises:
+        ValueError: no panel, or panels of different numbers of scans.
+    """
+    if not panels or len({len(panel.trajectory_world) for panel in panels}) != 1:
+        raise ValueError(
+            "expected one or more panels of the same scans; "
+            f"got panels of {[len(panel.trajectory_world) for panel in panels]} scans"
+        )
+    anchor = next((panel for panel in panels if panel.is_reference), panels[-1])
+    aligned = [panel if panel is anchor else _laid_onto(panel, anchor) for panel in panels]
+    limits = _shared_limits(aligned, aligned[panels.index(anchor)])
+
+    height_in = PANEL_WIDTH_IN * limits.height / limits.width
+    width_in = len(panels) * PANEL_WIDTH_IN + (len(panels) + 1) * GAP_IN
+    figure = new_figure(width_in, height_in + HEADER_IN + FOOTER_IN)
+    total_in = height_in + HEADER_IN + FOOTER_IN
+    colormap = time_colormap()
+    for column, panel in enumerate(aligned):
+        left_in = GAP_IN + column * (PANEL_WIDTH_IN + GAP_IN)
+        axes = figure.add_axes(
+            (left_in / width_in, FOOTER_IN / total_in, PANEL_WIDTH_IN / width_in, height_in / total_in)
+        )
+        _draw_panel(axes, panel, limits, unit, colormap)
+        if column == 0:
+            add_scale_bar(axes, limits, unit)
+    _add_time_bar(figure, len(anchor.trajectory_world), width_in, total_in, colormap)
+    return figure
+
+
+def time_colormap() -> Colormap:
+    """Violet over red to amber: even in lightness, and nowhere too pale for a white ground."""
+    import matplotlib
+    from matplotlib.colors import LinearSegmentedColormap
+
+    colors = matplotlib.colormaps["plasma"](np.linspace(0.0, 0.86, 256))
+    return LinearSegmentedColormap.from_list("dpmjax_time", colors)
+
+
+def _laid_onto(panel: Panel, anchor: Panel) -> Panel:
+    """Moves the panel rigidly so that its trajectory is as close as possible to the anchor's (least squares)."""
+    source = panel.trajectory_world @ np.array([1.0, 1.0j])
+    target = anchor.trajectory_world @ np.array([1.0, 1.0j])
+    is_used = np.isfinite(source) & np.isfinite(target)
+    if not is_used.any():
+        return panel
+    source_centre, target_centre = source[is_used].mean(), target[is_used].mean()
+    correlation = np.vdot(source[is_used] - source_centre, target[is_used] - target_centre)
+    turn = correlation / abs(correlation) if abs(correlation) > 0.0 else 1.0 + 0.0j
+
+    def move(points: NDArray[np.floating]) -> NDArray[np.floating]:
+        moved = turn * (points @ np.array([1.0, 1.0j]) - source_centre) + target_centre
+        return np.stack([moved.real, moved.imag], axis=-1)
+
+    return replace(panel, points_world=move(panel.points_world), trajectory_world=move(panel.trajectory_world))
+
+
+def _visible_points(panel: Panel) -> tuple[NDArray[np.floating], NDArray[np.intp]]:
+    """The points (m, 2) that are drawable, and the scan (m,) that each comes from."""
+    is_drawable = panel.mask & np.isfinite(panel.points_world).all(axis=-1)
+    return panel.points_world[is_drawable], np.nonzero(is_drawable)[0]
+
+
+def _shared_limits(panels: Sequence[Panel], anchor: Panel) -> Limits:
+    """Limits that show every panel; a panel that flies apart is cut at half the anchor's size beyond the anchor."""
+    low, high = _extent(anchor)
+    size = np.max(high - low)
+    lows, highs = zip(*(_extent(panel) for panel in panels), strict=True)
+    low = np.maximum(np.min(lows, axis=0), low - 0.5 * size)
+    high = np.minimum(np.max(highs, axis=0), high + 0.5 * size)
+    # A corridor must not become a strip that is too thin to read or too tall for the page.
+    margin = MARGIN * np.max(high - low)
+    width, height = high - low + 2.0 * margin
+    width, height = max(width, 0.7 * height), max(height, 0.45 * width)
+    centre = (low + high) / 2.0
+    return Limits(centre[0] - width / 2.0, centre[0] + width / 2.0, centre[1] - height / 2.0, centre[1] + height / 2.0)
+
+
+def _extent(panel: Panel) -> tuple[NDArray[np.floating], NDArray[np.floating]]:
+    """Corners of the box around the trajectory and nearly all points; a unit box where there is nothing."""
+    points, _ = _visible_points(panel)
+    trajectory = panel.trajectory_world[np.isfinite(panel.trajectory_world).all(axis=-1)]
+    corners = [trajectory]
+    if len(points):
+        corners.append(np.quantile(points, [OUTER_QUANTILE, 1.0 - OUTER_QUANTILE], axis=0))
+    stacked = np.concatenate(corners)
+    if not len(stacked):
+        return np.full(2, -0.5), np.full(2, 0.5)
+    low, high = stacked.min(axis=0), stacked.max(axis=0)
+    if np.max(high - low) <= 0.0:
+        return low - 0.5, high + 0.5
+    return low, high
+
+
+def _draw_panel(axes: Axes, panel: Panel, limits: Limits, unit: str, colormap: Colormap) -> None:
+    points, scans = _visible_points(panel)
+    order = np.random.default_rng(0).permutation(len(points))[:MAX_POINTS_PER_PANEL]
+    axes.scatter(
+        points[order, 0],
+        points[order, 1],
+        c=scans[order],
+        cmap=colormap,
+        vmin=0,
+        vmax=max(1, len(panel.trajectory_world) - 1),
+        s=np.clip(50_000.0 / max(1, len(order)), 0.45, 4.0),
+        linewidths=0,
+        rasterized=True,
+        zorder=2,
+    )
+    draw_trajectory(axes, panel.trajectory_world, "black")
+    frame_map(axes, limits)
+    numbers = []
+    if panel.ate is not None:
+        numbers.append(f"ATE {format_length(panel.ate, unit)}")
+    if panel.point_distance is not None:
+        numbers.append(f"point distance {format_length(panel.point_distance, unit)}")
+    style: dict[str, Any] = {"xycoords": "axes fraction", "textcoords": "offset points", "va": "baseline"}
+    axes.annotate(panel.title, (0, 1), xytext=(1, 21), fontsize=12.5, fontweight="bold", color=INK, **style)
+    axes.annotate("   ".join(numbers), (0, 1), xytext=(1, 7), fontsize=9.5, color=MUTED, **style)
+
+
+def _add_time_bar(figure: Figure, num_scans: int, width_in: float, total_in: float, colormap: Colormap) -> None:
+    """A thin bar under the panels that says which colour is which scan."""
+    length_in = min(3.0, 0.5 * width_in)
+    axes = figure.add_axes((0.5 - length_in / 2.0 / width_in, 0.24 / total_in, length_in / width_in, 0.09 / total_in))
+    axes.imshow(np.linspace(0.0, 1.0, 256)[None, :], aspect="auto", cmap=colormap)
+    axes.set_axis_off()
+    style: dict[str, Any] = {
+        "xycoords": "axes fraction",
+        "textcoords": "offset points",
+        "va": "center",
+        "fontsize": 8.5,
+    }
+    axes.annotate("first scan", (0, 0.5), xytext=(-6, 0), ha="right", color=MUTED, **style)
+    axes.annotate(f"scan {num_scans}", (1, 0.5), xytext=(6, 0), ha="left", color=MUTED, **style)

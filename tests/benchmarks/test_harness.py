@@ -1,0 +1,61 @@
+"""The benchmark harness: compile time apart, one table, memory of each benchmark its own."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from benchmarks.rows import Row, format_table
+from benchmarks.timing import measure
+
+REPOSITORY = Path(__file__).parents[2]
+
+
+def test_first_call_counts_as_compile_time():
+    waits = iter([0.05, 0.01, 0.01, 0.01])
+    timing = measure(lambda: time.sleep(next(waits)), repeats=3)
+    assert timing.compile_s == pytest.approx(0.04, abs=0.02)
+    assert 0.01 <= timing.min_s <= timing.median_s
+    assert [row.metric for row in timing.rows("sleep")] == ["compile", "median", "min"]
+
+
+def test_nothing_to_compile_is_never_negative():
+    waits = iter([0.0, 0.01, 0.01])
+    assert measure(lambda: time.sleep(next(waits)), repeats=2).compile_s == 0.0
+    with pytest.raises(ValueError, match="repeats"):
+        measure(lambda: None, repeats=0)
+
+
+def test_table_is_aligned():
+    rows = [("core", Row("svd", "median", 1.25, "ms")), ("deepmapping", Row("v1", "ate", 1234567.0, "px"))]
+    lines = format_table(rows).splitlines()
+    assert lines[0].split() == ["name", "case", "metric", "value", "unit"]
+    assert lines[2].index("ms") == lines[3].index("px")
+    assert "1.25" in lines[2]
+
+
+def test_command_prints_a_table_and_writes_json(tmp_path):
+    command = [sys.executable, "-m", "benchmarks", "--only", "core", "--quick", "-o", str(tmp_path / "rows.json")]
+    done = subprocess.run(command, cwd=REPOSITORY, capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0, done.stderr
+    assert "cores" in done.stdout.splitlines()[0]
+    rows = json.loads((tmp_path / "rows.json").read_text())["rows"]
+    assert {row["metric"] for row in rows} == {"compile", "median", "min", "largest difference", "peak memory"}
+    errors = {row["case"].split()[0]: row["value"] for row in rows if row["metric"] == "largest difference"}
+    assert errors["weighted_svd"] < 1e-5
+    assert errors["info_nce"] < 1e-4
+    assert errors["chamfer"] < 1e-3
+    (memory,) = (row for row in rows if row["metric"] == "peak memory")
+    assert 0.05 < memory["value"] < 4.0
+
+
+def test_unknown_benchmark_is_refused():
+    command = [sys.executable, "-m", "benchmarks", "--only", "cores"]
+    done = subprocess.run(command, cwd=REPOSITORY, capture_output=True, text=True, timeout=60)
+    assert done.returncode == 2
+    assert done.stderr.startswith("benchmarks: error: no benchmark cores; there are core")

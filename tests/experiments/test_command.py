@@ -1,0 +1,176 @@
+"""The promises of every command to the shell: exit codes, one-line errors, results on Ctrl-C, resume."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+REPOSITORY = Path(__file__).parents[2]
+
+TOY = '''
+"""A toy.
+
+    python -m experiments.toy scans.txt -o out
+"""
+from __future__ import annotations
+import sys, time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+import tyro
+from experiments._command import run_command
+from experiments._history import HistoryFile, read_history
+from experiments._run_folder import open_run_folder, recording, write_metrics
+from experiments._stop import StopFlag
+
+@dataclass(frozen=True)
+class Config:
+    data: tyro.conf.Positional[Path | None] = None
+    """Scans."""
+    output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"])] = None
+    seed: int = 0
+    steps: int = 3
+    fail: bool = False
+    resume: tyro.conf.FlagCreatePairsOff[bool] = False
+    force: tyro.conf.FlagCreatePairsOff[bool] = False
+
+def main(config):
+    if config.data is not None and not config.data.exists():
+        raise ValueError(f"{config.data}: no such file\\n  name a file of scans")
+    folder = open_run_folder(config, "toy", output=config.output, resume=config.resume, force=config.force,
+                             may_change=frozenset({"steps"}))
+    with recording(folder), StopFlag() as stop:
+        start = len(read_history(folder / "metrics.csv")) if folder.is_resumed else 0
+        step = start - 1
+        keep_until = start - 1 if folder.is_resumed else None
+        with HistoryFile(folder / "metrics.csv", ["step"], keep_until=keep_until) as history:
+            for step in range(start, config.steps):
+                history.append(step=step)
+                print(step, flush=True)
+                if config.fail:
+                    raise ValueError("diverged")
+                if config.steps > 100:
+                    time.sleep(0.01)
+                if stop.is_requested:
+                    break
+        if config.seed == 99:
+            while True:  # a step that does not end
+                time.sleep(0.01)
+        write_metrics(folder, {"steps": step + 1}, seed=config.seed)
+    assert "jax" not in sys.modules
+
+if __name__ == "__main__":
+    raise SystemExit(run_command(main, Config, experiment="toy", description=__doc__))
+'''
+
+
+@pytest.fixture
+def toy(tmp_path):
+    (tmp_path / "toy.py").write_text(TOY)
+    paths = [str(REPOSITORY), str(REPOSITORY / "src"), os.environ.get("PYTHONPATH", "")]
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(paths)}
+
+    def start(*arguments):
+        return subprocess.Popen(
+            [sys.executable, "toy.py", *arguments],
+            cwd=tmp_path,
+            env=environment,
+            text=True,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+        )
+
+    return start
+
+
+def finish(process):
+    output, errors = process.communicate(timeout=20)
+    return process.returncode, output, errors
+
+
+def stop_after_first_step(process, *signals):
+    assert process.stdout.readline() == "0\n"
+    for number in signals:
+        process.send_signal(number)
+        time.sleep(0.3)
+    return finish(process)
+
+
+def test_help_shows_the_examples(toy):
+    code, output, _ = finish(toy("--help"))
+    assert code == 0
+    assert "    python -m experiments.toy scans.txt -o out\n" in output
+    assert "usage: python -m experiments.toy" in output
+
+
+def test_version_is_told(toy):
+    import dpmjax
+
+    assert finish(toy("--version"))[:2] == (0, f"dpmjax {dpmjax.__version__}\n")
+
+
+def test_finished_run_exits_with_zero(toy, tmp_path):
+    code, _, errors = finish(toy("-o", "out"))
+    assert (code, errors) == (0, "")
+    assert {path.name for path in (tmp_path / "out").iterdir()} == {
+        "config.json",
+        "metrics.csv",
+        "metrics.json",
+        "log.txt",
+    }
+
+
+def test_bad_input_is_one_line_and_leaves_no_folder(toy, tmp_path):
+    code, _, errors = finish(toy("missing.pcd", "-o", "out"))
+    assert code == 2
+    assert errors == "dpmjax: error: missing.pcd: no such file name a file of scans\n"
+    assert not (tmp_path / "out").exists()
+    assert not (tmp_path / "results").exists()
+
+
+def test_wrong_usage_exits_with_two(toy):
+    code, output, errors = finish(toy("--bad-option"))
+    assert code == 2
+    assert output == ""
+    assert "--bad-option" in errors
+
+
+def test_failure_on_the_way_exits_with_one_and_names_the_partial_results(toy, tmp_path):
+    code, _, errors = finish(toy("-o", "out", "--fail"))
+    assert code == 1
+    assert errors.splitlines()[-1] == "dpmjax: error: ValueError: diverged; what was finished is in out"
+    assert "Traceback" in (tmp_path / "out" / "log.txt").read_text()
+    assert (tmp_path / "out" / "metrics.csv").read_text() == "step\n0\n"
+
+
+@pytest.mark.parametrize(("number", "expected"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_stopped_run_writes_what_it_has_and_resumes(toy, tmp_path, number, expected):
+    code, _, errors = stop_after_first_step(toy("-o", "out", "--steps", "5000"), number)
+    assert code == expected
+    assert errors == f"dpmjax: stopped by {number.name}\n"
+    assert (tmp_path / "out" / "metrics.json").exists()
+    done = len((tmp_path / "out" / "metrics.csv").read_text().splitlines()) - 1
+    code, output, _ = finish(toy("-o", "out", "--resume", "--steps", str(done + 2)))
+    assert code == 0
+    assert output.split() == [str(done), str(done + 1)]
+    rows = (tmp_path / "out" / "metrics.csv").read_text().split()
+    assert rows == ["step", *map(str, range(done + 2))]
+
+
+def test_second_signal_ends_at_once(toy):
+    code, _, errors = stop_after_first_step(toy("--seed", "99"), signal.SIGINT, signal.SIGINT)
+    assert (code, errors) == (130, "dpmjax: stopped by SIGINT\n")
+
+
+def test_resumed_run_keeps_the_options_that_are_not_given(toy):
+    assert finish(toy("-o", "out", "--seed", "5"))[0] == 0
+    assert finish(toy("-o", "out", "--resume"))[0] == 0
+    code, _, errors = finish(toy("-o", "out", "--resume", "--seed", "6"))
+    assert code == 2
+    assert "--seed was 5" in errors
