@@ -65,7 +65,9 @@ def relative_pose2(pose_w_a: Float[AnyArray, "... 3"], pose_w_b: Float[AnyArray,
     return jnp.stack([cos * dx + sin * dy, -sin * dx + cos * dy, heading], axis=-1)
 
 
-def transform_points(T_a_b: Float[AnyArray, "... d1 d1"], points_b: Float[AnyArray, "... n d"]) -> Float[Array, "... n d"]:
+def transform_points(
+    T_a_b: Float[AnyArray, "... d1 d1"], points_b: Float[AnyArray, "... n d"]
+) -> Float[Array, "... n d"]:
     """Points in a, from points in b; d = 2 or 3, and the leading axes of both broadcast.
 
     Raises:
