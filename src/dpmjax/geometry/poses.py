@@ -1,8 +1,8 @@
 """Poses: SE(2) as (x, y, heading) or 3x3 matrices, SE(3) as 4x4 matrices.
 
 `T_a_b` maps b-coordinates to a-coordinates. Lengths keep their unit, angles are radians. Every function takes any
-batch of leading axes, keeps the dtype, and is smooth except where it says otherwise. Exponential and logarithm are
-jaxlie's; tangents are (translation, rotation), in that order.
+batch of leading axes, keeps the dtype, is smooth except where it says otherwise, and compiles once per shape.
+Exponential and logarithm are jaxlie's; tangents are (translation, rotation), in that order.
 """
 
 from __future__ import annotations
@@ -15,12 +15,14 @@ from jaxtyping import Array, Float
 from dpmjax.types import AnyArray
 
 
+@jax.jit
 def wrap_angle(angle: Float[AnyArray, "..."]) -> Float[Array, "..."]:
     """The same angle in [-pi, pi]; small angles come back unchanged, and the derivative is 1 everywhere."""
     angle = jnp.asarray(angle)
     return angle - 2 * jnp.pi * jnp.round(angle / (2 * jnp.pi))
 
 
+@jax.jit
 def matrix_from_pose2(pose: Float[AnyArray, "... 3"]) -> Float[Array, "... 3 3"]:
     """The homogeneous matrix `T_a_b` of a planar pose (x, y, heading) of b in a."""
     pose = jnp.asarray(pose)
@@ -31,6 +33,7 @@ def matrix_from_pose2(pose: Float[AnyArray, "... 3"]) -> Float[Array, "... 3 3"]
     return jnp.stack(rows, axis=-2)
 
 
+@jax.jit
 def pose2_from_matrix(T: Float[AnyArray, "... 3 3"]) -> Float[Array, "... 3"]:
     """The planar pose (x, y, heading in [-pi, pi]) of a homogeneous matrix."""
     T = jnp.asarray(T)
@@ -38,6 +41,7 @@ def pose2_from_matrix(T: Float[AnyArray, "... 3 3"]) -> Float[Array, "... 3"]:
     return jnp.stack([T[..., 0, 2], T[..., 1, 2], heading], axis=-1)
 
 
+@jax.jit
 def compose_pose2(pose_a_b: Float[AnyArray, "... 3"], pose_b_c: Float[AnyArray, "... 3"]) -> Float[Array, "... 3"]:
     """The pose of c in a, from the pose of b in a and that of c in b: `T_a_c = T_a_b @ T_b_c`."""
     pose_a_b, pose_b_c = jnp.asarray(pose_a_b), jnp.asarray(pose_b_c)
@@ -47,6 +51,7 @@ def compose_pose2(pose_a_b: Float[AnyArray, "... 3"], pose_b_c: Float[AnyArray, 
     return jnp.stack([x, y, wrap_angle(pose_a_b[..., 2] + pose_b_c[..., 2])], axis=-1)
 
 
+@jax.jit
 def inverse_pose2(pose_a_b: Float[AnyArray, "... 3"]) -> Float[Array, "... 3"]:
     """The pose of a in b, from the pose of b in a."""
     pose_a_b = jnp.asarray(pose_a_b)
@@ -55,6 +60,7 @@ def inverse_pose2(pose_a_b: Float[AnyArray, "... 3"]) -> Float[Array, "... 3"]:
     return jnp.stack([-cos * x - sin * y, sin * x - cos * y, wrap_angle(-heading)], axis=-1)
 
 
+@jax.jit
 def relative_pose2(pose_w_a: Float[AnyArray, "... 3"], pose_w_b: Float[AnyArray, "... 3"]) -> Float[Array, "... 3"]:
     """The pose of b in a, from the poses of both in w: `T_a_b = inv(T_w_a) @ T_w_b`."""
     pose_w_a, pose_w_b = jnp.asarray(pose_w_a), jnp.asarray(pose_w_b)
@@ -65,6 +71,7 @@ def relative_pose2(pose_w_a: Float[AnyArray, "... 3"], pose_w_b: Float[AnyArray,
     return jnp.stack([cos * dx + sin * dy, -sin * dx + cos * dy, heading], axis=-1)
 
 
+@jax.jit
 def transform_points(
     T_a_b: Float[AnyArray, "... d1 d1"], points_b: Float[AnyArray, "... n d"]
 ) -> Float[Array, "... n d"]:
@@ -86,6 +93,7 @@ def transform_points(
     return points_a
 
 
+@jax.jit
 def invert(T_a_b: Float[AnyArray, "... d1 d1"]) -> Float[Array, "... d1 d1"]:
     """`T_b_a` of a rigid motion `T_a_b`, 3x3 or 4x4; exact in the rotation, for it is the transpose."""
     T_a_b = jnp.asarray(T_a_b)
@@ -96,30 +104,35 @@ def invert(T_a_b: Float[AnyArray, "... d1 d1"]) -> Float[Array, "... d1 d1"]:
     return jnp.concatenate([top, T_a_b[..., dim:, :]], axis=-2)
 
 
+@jax.jit
 def exp_se2(tangent: Float[AnyArray, "... 3"]) -> Float[Array, "... 3 3"]:
     """The motion of a planar twist (vx, vy, angle); the gradient is right at zero too."""
     with jax.default_matmul_precision("highest"):
         return jaxlie.SE2.exp(jnp.asarray(tangent)).as_matrix()
 
 
+@jax.jit
 def log_se2(T: Float[AnyArray, "... 3 3"]) -> Float[Array, "... 3"]:
     """The planar twist (vx, vy, angle in [-pi, pi]) of a motion; not smooth at half a turn."""
     with jax.default_matmul_precision("highest"):
         return jaxlie.SE2.from_matrix(jnp.asarray(T)).log()
 
 
+@jax.jit
 def exp_se3(tangent: Float[AnyArray, "... 6"]) -> Float[Array, "... 4 4"]:
     """The motion of a twist (vx, vy, vz, wx, wy, wz); the gradient is right at zero too."""
     with jax.default_matmul_precision("highest"):
         return jaxlie.SE3.exp(jnp.asarray(tangent)).as_matrix()
 
 
+@jax.jit
 def log_se3(T: Float[AnyArray, "... 4 4"]) -> Float[Array, "... 6"]:
     """The twist (vx, vy, vz, wx, wy, wz) of a motion, of angle at most pi; not smooth at half a turn."""
     with jax.default_matmul_precision("highest"):
         return jaxlie.SE3.from_matrix(jnp.asarray(T)).log()
 
 
+@jax.jit
 def rotation_from_quaternion_xyzw(quaternion: Float[AnyArray, "... 4"]) -> Float[Array, "... 3 3"]:
     """The rotation matrix of a quaternion in file order x, y, z, w, of any length; of zero, the identity."""
     xyzw = jnp.asarray(quaternion)
@@ -129,6 +142,7 @@ def rotation_from_quaternion_xyzw(quaternion: Float[AnyArray, "... 4"]) -> Float
     return jaxlie.SO3.from_quaternion_xyzw(unit).as_matrix()
 
 
+@jax.jit
 def quaternion_xyzw_from_rotation(R: Float[AnyArray, "... 3 3"]) -> Float[Array, "... 4"]:
     """The unit quaternion of a rotation matrix in file order x, y, z, w, with w >= 0."""
     xyzw = jaxlie.SO3.from_matrix(jnp.asarray(R)).as_quaternion_xyzw()

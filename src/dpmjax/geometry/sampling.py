@@ -58,7 +58,7 @@ def voxel_sample(
 def _farthest_point_sample(
     points: Float[Array, "n d"], mask: Bool[Array, " n"], *, num_samples: int
 ) -> Int[Array, " s"]:
-    columns = lax.stop_gradient(points).T
+    columns = jnp.where(mask[:, None], lax.stop_gradient(points), 0).T
     first = jnp.argmax(mask).astype(jnp.int32)
 
     def choose(step: Int[Array, ""], state: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
