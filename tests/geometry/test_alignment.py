@@ -109,7 +109,7 @@ def test_negative_and_nan_weights_count_as_zero(dim: int) -> None:
 
 
 @DIMS
-@pytest.mark.parametrize("factor", [1e-30, 1e-6, 1e6, 1e30])
+@pytest.mark.parametrize("factor", [1e-30, 1e30])
 def test_only_ratios_of_weights_count(dim: int, factor: float) -> None:
     source, target, weights = random_pairs(6, dim)
     scaled = weighted_svd(source, target, weights * np.float32(factor))

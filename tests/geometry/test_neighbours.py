@@ -27,7 +27,7 @@ def clouds(seed: int, dim: int, num_queries: int = 30, num_points: int = 50) -> 
 def test_neighbours_are_those_of_a_tree(dim: int, k: int) -> None:
     queries, points = clouds(0, dim)
     distances, indices = cKDTree(points.astype(np.float64)).query(queries.astype(np.float64), k=[*range(1, k + 1)])
-    near = k_nearest(queries, points, k)
+    near = jax.device_get(k_nearest(queries, points, k))
     np.testing.assert_array_equal(near.indices, indices)
     np.testing.assert_allclose(near.squared_distances, distances**2, **ROUNDING)
     assert near.mask.all()
@@ -40,7 +40,7 @@ def test_masked_points_are_never_found(dim: int, k: int) -> None:
     queries, points = clouds(1, dim)
     mask = np.random.default_rng(2).random(len(points)) < 0.5
     hidden = np.where(mask[:, None], points, np.nan).astype(np.float32)
-    near, expected = k_nearest(queries, hidden, k, mask), k_nearest(queries, points[mask], k)
+    near, expected = jax.device_get((k_nearest(queries, hidden, k, mask), k_nearest(queries, points[mask], k)))
     np.testing.assert_array_equal(near.indices, np.flatnonzero(mask)[expected.indices])
     np.testing.assert_array_equal(near.squared_distances, expected.squared_distances)
 
@@ -55,7 +55,7 @@ def test_equally_near_points_come_in_order(k: int) -> None:
 @pytest.mark.parametrize("k", [1, 4, 9])
 def test_missing_neighbours_are_masked(num_valid: int, k: int) -> None:
     queries, points = clouds(3, 3, num_points=6)
-    near = k_nearest(queries, points, k, np.arange(6) < num_valid)
+    near = jax.device_get(k_nearest(queries, points, k, np.arange(6) < num_valid))
     assert near.indices.shape == near.mask.shape == near.squared_distances.shape == (len(queries), k)
     np.testing.assert_array_equal(near.mask.sum(axis=1), min(k, num_valid))
     assert (near.indices[~near.mask] == 0).all()
@@ -64,7 +64,7 @@ def test_missing_neighbours_are_masked(num_valid: int, k: int) -> None:
 
 @KS
 def test_empty_clouds_have_no_neighbours(k: int) -> None:
-    assert not k_nearest(jnp.ones((4, 2)), jnp.zeros((0, 2)), k).mask.any()
+    assert not np.any(k_nearest(jnp.ones((4, 2)), jnp.zeros((0, 2)), k).mask)
     assert k_nearest(jnp.zeros((0, 2)), jnp.ones((4, 2)), k).indices.shape == (0, k)
 
 
@@ -72,7 +72,7 @@ def test_empty_clouds_have_no_neighbours(k: int) -> None:
 def test_query_that_is_not_finite_has_no_neighbour(k: int) -> None:
     queries, points = clouds(4, 2)
     queries[3] = np.nan
-    mask = k_nearest(queries, points, k).mask
+    mask = np.asarray(k_nearest(queries, points, k).mask)
     assert not mask[3].any()
     assert mask[np.arange(len(queries)) != 3].all()
 
@@ -80,7 +80,7 @@ def test_query_that_is_not_finite_has_no_neighbour(k: int) -> None:
 @DIMS
 def test_small_distances_far_from_the_origin_survive(dim: int) -> None:
     points = np.float32(1000) + np.arange(8, dtype=np.float32)[:, None] / 16 * np.ones(dim, np.float32)
-    near = k_nearest(points, points, 2)
+    near = jax.device_get(k_nearest(points, points, 2))
     np.testing.assert_array_equal(near.squared_distances[:, 0], 0)
     np.testing.assert_allclose(near.squared_distances[:, 1], dim / 256, **ROUNDING)
 
@@ -116,7 +116,7 @@ def test_gradient_of_distances_is_that_of_the_pairs(k: int) -> None:
 @pytest.mark.parametrize("radius", [0.3, 1.0])
 def test_radius_search_finds_those_within(k: int, radius: float) -> None:
     queries, points = clouds(7, 2)
-    near = radius_search(queries, points, radius, k)
+    near = jax.device_get(radius_search(queries, points, radius, k))
     counts = [len(found) for found in cKDTree(points).query_ball_point(queries, radius)]
     np.testing.assert_array_equal(near.mask.sum(axis=1), np.minimum(counts, k))
     assert (near.squared_distances[near.mask] <= radius**2).all()

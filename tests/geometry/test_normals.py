@@ -33,7 +33,7 @@ def normals_in_numpy(points: np.ndarray, k: int) -> tuple[np.ndarray, np.ndarray
 def test_normals_are_those_of_numpy(dim: int) -> None:
     points = surface(0, dim)
     expected, flatness = normals_in_numpy(points, 8)
-    result = estimate_normals(points, 8)
+    result = jax.device_get(estimate_normals(points, 8))
     assert result.mask.all()
     # Where the two smallest spreads are close, the direction is loose in any arithmetic.
     is_firm = flatness > 0.1
@@ -54,7 +54,7 @@ def test_flat_surfaces_have_flatness_one_and_exact_normals(dim: int) -> None:
     rng = np.random.default_rng(2)
     points = rng.normal(size=(50, dim)).astype(np.float32)
     points[:, -1] = 4
-    result = estimate_normals(points, 50)
+    result = jax.device_get(estimate_normals(points, 50))
     np.testing.assert_allclose(result.normals, np.tile(np.eye(dim)[-1] * -1, (50, 1)), rtol=0, atol=1e-5)
     if dim == 2:
         np.testing.assert_allclose(result.flatness, 1, **ROUNDING)
@@ -65,7 +65,7 @@ def test_padding_changes_nothing(dim: int) -> None:
     points = surface(3, dim)
     padded = np.concatenate([points, np.full((7, dim), np.nan, np.float32)])
     mask = np.arange(len(padded)) < len(points)
-    result, expected = estimate_normals(padded, 6, mask), estimate_normals(points, 6)
+    result, expected = jax.device_get((estimate_normals(padded, 6, mask), estimate_normals(points, 6)))
     np.testing.assert_allclose(result.normals[: len(points)], expected.normals, **ACCUMULATED)
     assert not result.mask[len(points) :].any()
     assert (result.normals[len(points) :] == 0).all()
@@ -74,7 +74,7 @@ def test_padding_changes_nothing(dim: int) -> None:
 @DIMS
 @pytest.mark.parametrize("num_valid", [0, 1])
 def test_too_few_points_have_no_normals(dim: int, num_valid: int) -> None:
-    result = estimate_normals(surface(4, dim), 5, np.arange(120) < num_valid)
+    result = jax.device_get(estimate_normals(surface(4, dim), 5, np.arange(120) < num_valid))
     assert not result.mask.any()
     assert (result.normals == 0).all()
     assert (result.flatness == 0).all()
@@ -87,7 +87,7 @@ def test_coincident_points_have_no_normals(dim: int) -> None:
 
 def test_points_on_a_line_in_space_get_a_normal_to_it() -> None:
     points = np.linspace(1, 5, 20, dtype=np.float32)[:, None] * np.array([1, 0, 0], np.float32)
-    result = estimate_normals(points, 5)
+    result = jax.device_get(estimate_normals(points, 5))
     np.testing.assert_allclose(result.normals[:, 0], 0, atol=1e-5)
     np.testing.assert_allclose(result.flatness, 0, atol=1e-5)
 
@@ -96,7 +96,7 @@ def test_radius_keeps_neighbours_of_another_wall_out() -> None:
     wall = np.stack([np.linspace(0, 1, 11), np.full(11, 2.0)], axis=1)
     other = np.array([[3.0, 9.0], [4.0, 9.5]])
     points = np.concatenate([wall, other]).astype(np.float32)
-    result = estimate_normals(points, 13, radius=0.35)
+    result = jax.device_get(estimate_normals(points, 13, radius=0.35))
     np.testing.assert_allclose(result.normals[:11], np.tile([0, -1], (11, 1)), rtol=0, atol=1e-5)
     assert not result.mask[11:].any()
 

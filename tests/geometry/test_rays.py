@@ -14,7 +14,7 @@ def test_samples_lie_on_their_segments(dim: int, is_shared: bool) -> None:
     rng = np.random.default_rng(0)
     origin, points = rng.normal(size=dim).astype(np.float32), rng.normal(size=(7, dim)).astype(np.float32)
     factors = rng.uniform(size=4 if is_shared else (7, 4)).astype(np.float32)
-    samples = sample_free_space(origin, points, factors)
+    samples = np.asarray(sample_free_space(origin, points, factors))
     for beam in range(7):
         for i in range(4):
             factor = factors[i] if is_shared else factors[beam, i]
@@ -23,9 +23,9 @@ def test_samples_lie_on_their_segments(dim: int, is_shared: bool) -> None:
 
 
 def test_factors_zero_and_one_are_the_ends() -> None:
-    origin, points = jnp.array([1.0, 2.0]), jnp.array([[3.0, 5.0], [0.5, -1.0]])
-    samples = sample_free_space(origin, points, jnp.array([0.0, 1.0]))
-    np.testing.assert_array_equal(samples[:, 0], jnp.stack([origin, origin]))
+    origin, points = np.array([1, 2], np.float32), np.array([[3, 5], [0.5, -1]], np.float32)
+    samples = np.asarray(sample_free_space(origin, points, np.array([0, 1], np.float32)))
+    np.testing.assert_array_equal(samples[:, 0], np.stack([origin, origin]))
     np.testing.assert_array_equal(samples[:, 1], points)
 
 

@@ -75,7 +75,7 @@ def test_loss_and_gradient_are_zero_when_nothing_counts(nothing: str) -> None:
     else:
         queries, positives, mask = queries[:0], positives[:0], mask[:0]
     assert float(info_nce(queries, keys, positives, mask=mask)) == 0
-    for gradient in jax.grad(lambda q, k: info_nce(q, k, positives, mask=mask), (0, 1))(queries, keys):
+    for gradient in GRADIENTS(queries, keys, positives, 0.1, None, mask):
         np.testing.assert_array_equal(gradient, 0)
 
 
@@ -90,8 +90,8 @@ def test_padding_changes_nothing() -> None:
     np.testing.assert_allclose(info_nce(*arguments), info_nce(queries, keys, positives), **ROUNDING)
     expected = GRADIENTS(queries, keys, positives)
     for gradient, wanted, size in zip(GRADIENTS(*arguments), expected, (6, 9), strict=True):
-        np.testing.assert_allclose(gradient[:size], wanted, **ROUNDING)
-        np.testing.assert_array_equal(gradient[size:], 0)
+        np.testing.assert_allclose(np.asarray(gradient)[:size], wanted, **ROUNDING)
+        np.testing.assert_array_equal(np.asarray(gradient)[size:], 0)
 
 
 def test_gradient_equals_finite_differences() -> None:
