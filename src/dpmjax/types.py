@@ -9,7 +9,12 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import flax.struct
+import jax
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int
+
+AnyArray = jax.Array | np.ndarray
+"""What public functions take: an array of JAX or of NumPy. They return arrays of JAX."""
 
 
 @flax.struct.dataclass

@@ -1,0 +1,40 @@
+# Every target does its own set-up; Python >= 3.11 and make are all it needs.
+PYTHON ?= python3
+VENV   := .venv
+BIN    := $(VENV)/bin
+STAMP  := $(VENV)/.installed
+
+.DEFAULT_GOAL := help
+.PHONY: help venv check test demo bench clean
+
+help:  ## list the targets
+	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "  make %-8s %s\n", $$1, $$2 }' Makefile
+
+$(STAMP): pyproject.toml
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
+	  { echo "dpmjax needs Python >= 3.11, and '$(PYTHON)' is $$($(PYTHON) --version 2>&1); try: make PYTHON=python3.12"; exit 1; }
+	@test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[dev]'
+	@touch $@
+
+venv: $(STAMP)  ## make .venv and install dpmjax with its development tools
+
+check: $(STAMP)  ## lint, format, types, import rules
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+	$(BIN)/python -m pytest -q tests/test_import_rules.py
+
+test: $(STAMP)  ## the whole test suite
+	$(BIN)/python -m pytest
+
+demo: $(STAMP)  ## register the built-in 2-D world; pictures in results/demo
+	$(BIN)/python -m experiments.deepmapping_2d -o results/demo
+	@echo "Pictures:"; find results/demo/ -name '*.png' | sort | sed 's/^/  /'
+
+bench: $(STAMP)  ## speed and accuracy of everything that is measured
+	$(BIN)/python -m benchmarks
+
+clean:  ## remove .venv and the caches (results/ stays)
+	rm -rf $(VENV) build dist .pytest_cache .ruff_cache .mypy_cache src/*.egg-info
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -1,0 +1,69 @@
+"""Checks at the public edge: shapes and types before anything is traced, with errors that name the argument."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+
+from dpmjax.types import AnyArray
+
+
+def as_float(name: str, value: AnyArray) -> jax.Array:
+    """The array as a JAX float array; floating dtypes are kept, integers become the default float.
+
+    Raises:
+        ValueError: `value` is no array of real numbers.
+    """
+    array = jnp.asarray(value)
+    if jnp.issubdtype(array.dtype, jnp.floating):
+        return array
+    if jnp.issubdtype(array.dtype, jnp.integer):
+        return array.astype(float)
+    raise ValueError(f"{name}: expected real numbers, got dtype {array.dtype}")
+
+
+def as_points(name: str, value: AnyArray, dimensions: tuple[int, ...] | None = None) -> jax.Array:
+    """The array as float points (n, d), with d one of `dimensions` where given.
+
+    Raises:
+        ValueError: the shape is another one.
+    """
+    array = as_float(name, value)
+    is_right = array.ndim == 2 and array.shape[1] > 0 and (dimensions is None or array.shape[1] in dimensions)
+    if not is_right:
+        wanted = "d" if dimensions is None else " or ".join(map(str, dimensions))
+        raise ValueError(f"{name}: expected shape (n, {wanted}), got {array.shape}")
+    return array
+
+
+def as_mask(name: str, value: AnyArray | None, shape: tuple[int, ...]) -> jax.Array:
+    """The array as a boolean mask of `shape`; all True for None.
+
+    Raises:
+        ValueError: the shape is another one, or the dtype is not bool.
+    """
+    if value is None:
+        return jnp.ones(shape, bool)
+    array = jnp.asarray(value)
+    if array.dtype != bool:
+        raise ValueError(f"{name}: expected dtype bool, got {array.dtype}")
+    require_shape(name, array, shape)
+    return array
+
+
+def require_shape(name: str, array: jax.Array, shape: tuple[int, ...]) -> None:
+    """Raises a ValueError that names the argument where the shape is not `shape`."""
+    if array.shape != shape:
+        raise ValueError(f"{name}: expected shape {shape}, got {array.shape}")
+
+
+def require_positive(name: str, value: float | AnyArray) -> None:
+    """Raises a ValueError where a number is not above zero; a traced number is let through."""
+    if not isinstance(value, jax.core.Tracer) and not value > 0:
+        raise ValueError(f"{name}: expected a number above 0, got {value}")
+
+
+def require_count(name: str, value: int) -> None:
+    """Raises a ValueError where an integer is below one."""
+    if value < 1:
+        raise ValueError(f"{name}: expected at least 1, got {value}")

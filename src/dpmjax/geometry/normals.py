@@ -1,0 +1,102 @@
+"""Surface normals by principal components of the nearest points."""
+
+from __future__ import annotations
+
+import functools
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Bool, Float
+
+from dpmjax.checks import as_mask, as_points, require_count, require_positive
+from dpmjax.geometry.neighbours import k_nearest
+from dpmjax.types import AnyArray, Neighbours
+
+
+class Normals(NamedTuple):
+    """Normals of a cloud.
+
+    Attributes:
+        normals: unit vectors that face the origin of the frame (the sensor); zero where `mask` is False.
+        flatness: in [0, 1], how much the neighbourhood is a line (2-D) or a plane (3-D): with the eigenvalues of its
+            covariance, smallest first, (l2 - l1) / l2 in 2-D and (l2 - l1) / l3 in 3-D; zero where `mask` is False.
+        mask: True where the point is valid and has d valid neighbours or more (itself included) that do not coincide.
+    """
+
+    normals: Float[Array, "n d"]
+    flatness: Float[Array, " n"]
+    mask: Bool[Array, " n"]
+
+
+def estimate_normals(
+    points: Float[AnyArray, "n d"], k: int, mask: Bool[AnyArray, " n"] | None = None, radius: float | None = None
+) -> Normals:
+    """The direction in which the k nearest points (the point itself among them) spread least.
+
+    In 3-D a neighbourhood on one line has no normal of its own: it gets one that is normal to the line, flatness 0.
+    Normals are constants of the data: their derivative is zero.
+
+    Args:
+        points: (n, 2) or (n, 3), in the sensor's frame.
+        k: how many neighbours; more average more noise away and round more corners.
+        mask: False for points that are not there; they may hold anything.
+        radius: neighbours farther away than this do not count; unlimited by default.
+
+    Raises:
+        ValueError: the shapes do not match, k is below d, or `radius` is not above 0.
+    """
+    points = as_points("points", points, dimensions=(2, 3))
+    require_count("k", k)
+    if k < points.shape[1]:
+        raise ValueError(f"k: expected at least {points.shape[1]} neighbours in {points.shape[1]}-D, got {k}")
+    if radius is not None:
+        require_positive("radius", radius)
+    mask = as_mask("mask", mask, points.shape[:1])
+    limit = jnp.asarray(jnp.inf if radius is None else radius, points.dtype)
+    return _estimate_normals(points, mask, limit, k=k)
+
+
+@functools.partial(jax.jit, static_argnames="k")
+def _estimate_normals(points: jax.Array, mask: jax.Array, radius: jax.Array, *, k: int) -> Normals:
+    points = jnp.where(mask[:, None], lax.stop_gradient(points), 0)
+    near = k_nearest(points, points, k, mask)
+    weights = (near.mask & (near.squared_distances <= radius**2)).astype(points.dtype)
+    covariance, spread = _covariance(points, near, weights)
+    # Equal coordinates leave only rounding behind; scaled to its own size, the covariance is safe to decompose.
+    is_valid = mask & (jnp.sum(weights, axis=1) >= points.shape[1]) & (spread > 0)
+    covariance = jnp.where(is_valid[:, None, None], covariance / jnp.where(is_valid, spread, 1)[:, None, None], 0)
+    normals, flatness = _smallest_axis_2d(covariance) if points.shape[1] == 2 else _smallest_axis_3d(covariance)
+    faces_away = jnp.sum(normals * points, axis=1) > 0
+    normals = jnp.where(faces_away[:, None], -normals, normals)
+    return Normals(
+        normals=jnp.where(is_valid[:, None], normals, 0), flatness=jnp.where(is_valid, flatness, 0), mask=is_valid
+    )
+
+
+def _covariance(
+    points: Float[Array, "n d"], near: Neighbours, weights: Float[Array, "n k"]
+) -> tuple[Float[Array, "n d d"], Float[Array, " n"]]:
+    """The scatter of each neighbourhood about its mean, and its trace."""
+    difference = jnp.where(weights[..., None] > 0, points[near.indices] - points[:, None], 0)
+    count = jnp.maximum(jnp.sum(weights, axis=1), 1)
+    centred = difference - (jnp.sum(difference, axis=1) / count[:, None])[:, None]
+    centred = centred * weights[..., None]
+    covariance = jnp.einsum("nki,nkj->nij", centred, centred, precision=lax.Precision.HIGHEST)
+    return covariance, jnp.trace(covariance, axis1=1, axis2=2)
+
+
+def _smallest_axis_2d(covariance: Float[Array, "n 2 2"]) -> tuple[Float[Array, "n 2"], Float[Array, " n"]]:
+    xx, xy, yy = covariance[:, 0, 0], covariance[:, 0, 1], covariance[:, 1, 1]
+    along = jnp.arctan2(2 * xy, xx - yy) / 2
+    gap = jnp.hypot(xx - yy, 2 * xy)
+    largest = (xx + yy + gap) / 2
+    return jnp.stack([-jnp.sin(along), jnp.cos(along)], axis=1), gap / jnp.where(largest > 0, largest, 1)
+
+
+def _smallest_axis_3d(covariance: Float[Array, "n 3 3"]) -> tuple[Float[Array, "n 3"], Float[Array, " n"]]:
+    eigenvalues, eigenvectors = jnp.linalg.eigh(covariance)
+    smallest, middle, largest = eigenvalues[:, 0], eigenvalues[:, 1], eigenvalues[:, 2]
+    flatness = (middle - smallest) / jnp.where(largest > 0, largest, 1)
+    return eigenvectors[:, :, 0], jnp.clip(flatness, 0, 1)

@@ -1,0 +1,91 @@
+"""Choosing points: far apart from each other, or one of each voxel. Both depend on coordinates only."""
+
+from __future__ import annotations
+
+import functools
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Bool, Float, Int
+
+from dpmjax.checks import as_mask, as_points, require_count, require_positive
+from dpmjax.types import AnyArray
+
+
+def farthest_point_sample(
+    points: Float[AnyArray, "n d"], num_samples: int, mask: Bool[AnyArray, " n"] | None = None
+) -> Int[Array, " s"]:
+    """Indices of points of which each is the farthest from all before it, starting at the first valid point.
+
+    Each valid point comes at most once, even where points coincide; of equally far ones the lower index comes first.
+    Where there are fewer valid points than samples, the rest repeats the first index; without any valid point, all
+    are 0. The choice has no derivative.
+
+    Args:
+        points: candidates, n >= 1.
+        num_samples: how many to choose.
+        mask: False for points that are not there; they may hold anything.
+
+    Raises:
+        ValueError: there are no points, the shapes do not match, or `num_samples` is below 1.
+    """
+    points = as_points("points", points)
+    if points.shape[0] == 0:
+        raise ValueError("points: expected at least one point to choose from, got none")
+    require_count("num_samples", num_samples)
+    return _farthest_point_sample(points, as_mask("mask", mask, points.shape[:1]), num_samples=num_samples)
+
+
+def voxel_sample(
+    points: Float[AnyArray, "n d"], voxel_size: float, mask: Bool[AnyArray, " n"] | None = None
+) -> Bool[Array, " n"]:
+    """True for the first valid point of each voxel, in the order of the array.
+
+    The voxel of a point is `floor(point / voxel_size)`, computed in the dtype of the points and exact for up to 2^31
+    voxels an axis. The shape is that of the input; changing the voxel size does not compile again.
+
+    Raises:
+        ValueError: the shapes do not match, or `voxel_size` is not above 0.
+    """
+    points = as_points("points", points)
+    require_positive("voxel_size", voxel_size)
+    mask = as_mask("mask", mask, points.shape[:1])
+    return _voxel_sample(points, mask, jnp.asarray(voxel_size, points.dtype))
+
+
+@functools.partial(jax.jit, static_argnames="num_samples")
+def _farthest_point_sample(
+    points: Float[Array, "n d"], mask: Bool[Array, " n"], *, num_samples: int
+) -> Int[Array, " s"]:
+    columns = jnp.where(mask[:, None], lax.stop_gradient(points), 0).T
+    first = jnp.argmax(mask).astype(jnp.int32)
+
+    def choose(step: Int[Array, ""], state: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
+        squared_distance, chosen = state
+        last = chosen[step - 1]
+        to_last = jnp.sum((columns - columns[:, last][:, None]) ** 2, axis=0)
+        # A chosen point, like a masked one, falls out of the race for good.
+        squared_distance = jnp.minimum(squared_distance, to_last).at[last].set(-jnp.inf)
+        farthest = jnp.argmax(squared_distance).astype(jnp.int32)
+        is_any_left = squared_distance[farthest] >= 0
+        return squared_distance, chosen.at[step].set(jnp.where(is_any_left, farthest, first))
+
+    squared_distance = jnp.where(mask, jnp.inf, -jnp.inf).astype(points.dtype)
+    chosen = jnp.full(num_samples, first, jnp.int32)
+    return lax.fori_loop(1, num_samples, choose, (squared_distance, chosen))[1]
+
+
+@jax.jit
+def _voxel_sample(
+    points: Float[Array, "n d"], mask: Bool[Array, " n"], voxel_size: Float[Array, ""]
+) -> Bool[Array, " n"]:
+    num_points, dim = points.shape
+    voxels = jnp.floor(lax.stop_gradient(points) / voxel_size).astype(jnp.int32)
+    # One sort by (valid first, voxel, place in the array): equal voxels stand together, the first one in front.
+    columns = [~mask, *(voxels[:, axis] for axis in range(dim)), jnp.arange(num_points, dtype=jnp.int32)]
+    is_masked, *sorted_voxels, index = lax.sort(columns, num_keys=dim + 1, is_stable=True)
+    is_new = jnp.zeros(num_points, bool).at[:1].set(True)
+    for column in sorted_voxels:
+        is_new = is_new.at[1:].set(is_new[1:] | (column[1:] != column[:-1]))
+    return jnp.zeros(num_points, bool).at[index].set(is_new & ~is_masked)

@@ -1,0 +1,57 @@
+"""The Chamfer distance between two clouds."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from dpmjax.checks import as_mask, as_points
+from dpmjax.geometry.neighbours import k_nearest
+from dpmjax.types import AnyArray
+
+
+def chamfer_distance(
+    a: Float[AnyArray, "n d"],
+    b: Float[AnyArray, "m d"],
+    mask_a: Bool[AnyArray, " n"] | None = None,
+    mask_b: Bool[AnyArray, " m"] | None = None,
+) -> Float[Array, ""]:
+    """Mean distance from each point of a to the nearest of b, plus the same from b to a (DeepMapping eq. 5).
+
+    Distances are Euclidean, not squared, in the unit of the points.
+
+    Args:
+        a: points, in the same frame and unit as `b`.
+        b: points.
+        mask_a: False for points of `a` that are not there; they may hold anything.
+        mask_b: the same for `b`.
+
+    Returns:
+        The sum of both means; 0 if either cloud has no valid point. Where points coincide the derivative of their
+        distance is taken as 0.
+
+    Raises:
+        ValueError: the shapes do not match.
+    """
+    a, b = as_points("a", a), as_points("b", b)
+    if a.shape[1] != b.shape[1]:
+        raise ValueError(f"b: expected {a.shape[1]} columns like a, got {b.shape[1]}")
+    return _chamfer_distance(a, b, as_mask("mask_a", mask_a, a.shape[:1]), as_mask("mask_b", mask_b, b.shape[:1]))
+
+
+@jax.jit
+def _chamfer_distance(a: jax.Array, b: jax.Array, mask_a: jax.Array, mask_b: jax.Array) -> jax.Array:
+    return _mean_distance(a, b, mask_a, mask_b) + _mean_distance(b, a, mask_b, mask_a)
+
+
+def _mean_distance(
+    queries: Float[Array, "n d"], points: Float[Array, "m d"], query_mask: Bool[Array, " n"], mask: Bool[Array, " m"]
+) -> Float[Array, ""]:
+    near = k_nearest(queries, points, 1, mask)
+    is_counted = query_mask & near.mask[:, 0]
+    squared = jnp.where(is_counted, near.squared_distances[:, 0], 0)
+    # The slope of the square root is infinite at zero: guard its input, then its output.
+    is_apart = squared > 0
+    distances = jnp.where(is_apart, jnp.sqrt(jnp.where(is_apart, squared, 1)), 0)
+    return jnp.sum(distances) / jnp.maximum(jnp.sum(is_counted), 1)

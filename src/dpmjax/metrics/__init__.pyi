@@ -1,0 +1,5 @@
+from .trajectory import RelativePoseError as RelativePoseError
+from .trajectory import absolute_trajectory_error as absolute_trajectory_error
+from .trajectory import align_rigid as align_rigid
+from .trajectory import point_distance as point_distance
+from .trajectory import relative_pose_error as relative_pose_error

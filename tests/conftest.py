@@ -1,0 +1,62 @@
+"""Fixtures of all tests. Shapes and types of the core are checked at run time, by jaxtyping and beartype."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager
+
+os.environ.setdefault("JAX_PLATFORMS", "cpu")
+
+import jax
+import jaxtyping
+import pytest
+
+# Before the first import of these packages, so that their functions are wrapped.
+jaxtyping.install_import_hook(["dpmjax.geometry", "dpmjax.losses", "dpmjax.metrics"], "beartype.beartype")
+
+_COMPILE_EVENT = "/jax/core/compile/backend_compile_duration"
+_num_compiled = 0
+
+
+def _count_compilation(event: str, duration_secs: float, **_: object) -> None:
+    global _num_compiled
+    _num_compiled += event == _COMPILE_EVENT
+
+
+jax.monitoring.register_event_duration_secs_listener(_count_compilation)
+
+
+@pytest.fixture
+def count_compilations() -> Callable[[], int]:
+    """How many programs XLA has compiled in this process so far."""
+    return lambda: _num_compiled
+
+
+@pytest.fixture
+def assert_compiles_nothing() -> Callable[[], AbstractContextManager[None]]:
+    """A context in which nothing may be compiled: `with assert_compiles_nothing(): second_call()`."""
+
+    @contextmanager
+    def context() -> Iterator[None]:
+        before = _num_compiled
+        yield
+        assert _num_compiled == before, f"{_num_compiled - before} programs were compiled again"
+
+    return context
+
+
+@pytest.fixture
+def float64() -> Iterator[None]:
+    """JAX with 64-bit floats, for this test only."""
+    jax.config.update("jax_enable_x64", True)
+    yield
+    jax.config.update("jax_enable_x64", False)
+
+
+@pytest.fixture
+def as_user() -> Iterator[None]:
+    """Without the run-time type checks, as users run: so that a test sees the ValueError that a user sees."""
+    jaxtyping.config.update("jaxtyping_disable", True)
+    yield
+    jaxtyping.config.update("jaxtyping_disable", False)

@@ -1,0 +1,123 @@
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.spatial import cKDTree
+
+from dpmjax import estimate_normals
+from tests.tolerances import ACCUMULATED, ROUNDING
+
+DIMS = pytest.mark.parametrize("dim", [2, 3])
+
+
+def surface(seed: int, dim: int, n: int = 120) -> np.ndarray:
+    """A circle or a sphere about a sensor that is off its centre."""
+    points = np.random.default_rng(seed).normal(size=(n, dim))
+    points = 10 * points / np.linalg.norm(points, axis=1, keepdims=True)
+    return (points + np.array([1, 2, 3])[:dim]).astype(np.float32)
+
+
+def normals_in_numpy(points: np.ndarray, k: int) -> tuple[np.ndarray, np.ndarray]:
+    points = points.astype(np.float64)
+    normals, flatness = np.zeros_like(points), np.zeros(len(points))
+    for i, neighbours in enumerate(cKDTree(points).query(points, k)[1]):
+        values, vectors = np.linalg.eigh(np.cov(points[neighbours].T))
+        normals[i] = vectors[:, 0] * (-1 if vectors[:, 0] @ points[i] > 0 else 1)
+        flatness[i] = (values[1] - values[0]) / values[-1]
+    return normals, flatness
+
+
+@DIMS
+def test_normals_are_those_of_numpy(dim: int) -> None:
+    points = surface(0, dim)
+    expected, flatness = normals_in_numpy(points, 8)
+    result = jax.device_get(estimate_normals(points, 8))
+    assert result.mask.all()
+    # Where the two smallest spreads are close, the direction is loose in any arithmetic.
+    is_firm = flatness > 0.1
+    np.testing.assert_allclose(np.asarray(result.normals)[is_firm], expected[is_firm], rtol=0, atol=1e-3)
+    np.testing.assert_allclose(result.flatness, flatness, **ACCUMULATED)
+
+
+@DIMS
+def test_normals_are_unit_and_face_the_sensor(dim: int) -> None:
+    points = surface(1, dim)
+    normals = np.asarray(estimate_normals(points, 6).normals)
+    np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1, **ROUNDING)
+    assert (np.sum(normals * points, axis=1) <= 1e-5).all()
+
+
+@DIMS
+def test_flat_surfaces_have_flatness_one_and_exact_normals(dim: int) -> None:
+    rng = np.random.default_rng(2)
+    points = rng.normal(size=(50, dim)).astype(np.float32)
+    points[:, -1] = 4
+    result = jax.device_get(estimate_normals(points, 50))
+    np.testing.assert_allclose(result.normals, np.tile(np.eye(dim)[-1] * -1, (50, 1)), rtol=0, atol=1e-5)
+    if dim == 2:
+        np.testing.assert_allclose(result.flatness, 1, **ROUNDING)
+
+
+@DIMS
+def test_padding_changes_nothing(dim: int) -> None:
+    points = surface(3, dim)
+    padded = np.concatenate([points, np.full((7, dim), np.nan, np.float32)])
+    mask = np.arange(len(padded)) < len(points)
+    result, expected = jax.device_get((estimate_normals(padded, 6, mask), estimate_normals(points, 6)))
+    np.testing.assert_allclose(result.normals[: len(points)], expected.normals, **ACCUMULATED)
+    assert not result.mask[len(points) :].any()
+    assert (result.normals[len(points) :] == 0).all()
+
+
+@DIMS
+@pytest.mark.parametrize("num_valid", [0, 1])
+def test_too_few_points_have_no_normals(dim: int, num_valid: int) -> None:
+    result = jax.device_get(estimate_normals(surface(4, dim), 5, np.arange(120) < num_valid))
+    assert not result.mask.any()
+    assert (result.normals == 0).all()
+    assert (result.flatness == 0).all()
+
+
+@DIMS
+def test_coincident_points_have_no_normals(dim: int) -> None:
+    assert not estimate_normals(np.full((9, dim), 3.3, np.float32), 4).mask.any()
+
+
+def test_points_on_a_line_in_space_get_a_normal_to_it() -> None:
+    points = np.linspace(1, 5, 20, dtype=np.float32)[:, None] * np.array([1, 0, 0], np.float32)
+    result = jax.device_get(estimate_normals(points, 5))
+    np.testing.assert_allclose(result.normals[:, 0], 0, atol=1e-5)
+    np.testing.assert_allclose(result.flatness, 0, atol=1e-5)
+
+
+def test_radius_keeps_neighbours_of_another_wall_out() -> None:
+    wall = np.stack([np.linspace(0, 1, 11), np.full(11, 2.0)], axis=1)
+    other = np.array([[3.0, 9.0], [4.0, 9.5]])
+    points = np.concatenate([wall, other]).astype(np.float32)
+    result = jax.device_get(estimate_normals(points, 13, radius=0.35))
+    np.testing.assert_allclose(result.normals[:11], np.tile([0, -1], (11, 1)), rtol=0, atol=1e-5)
+    assert not result.mask[11:].any()
+
+
+@DIMS
+def test_gradient_is_zero_and_finite(dim: int) -> None:
+    gradient = jax.jit(jax.grad(lambda p: jnp.sum(estimate_normals(p, 5).normals ** 3)))(jnp.asarray(surface(5, dim)))
+    np.testing.assert_array_equal(gradient, 0)
+
+
+@DIMS
+def test_second_call_compiles_nothing(dim: int, assert_compiles_nothing) -> None:
+    estimate_normals(surface(0, dim), 6, radius=2.0)
+    with assert_compiles_nothing():
+        estimate_normals(surface(1, dim), 6)
+
+
+def test_wrong_arguments_are_named(as_user) -> None:
+    with pytest.raises(ValueError, match="^points: expected shape"):
+        estimate_normals(jnp.ones((5, 4)), 3)
+    with pytest.raises(ValueError, match="^k: expected at least 3"):
+        estimate_normals(jnp.ones((5, 3)), 2)
+    with pytest.raises(ValueError, match="^radius: expected a number above 0"):
+        estimate_normals(jnp.ones((5, 3)), 3, radius=-1.0)

@@ -1,0 +1,40 @@
+from __future__ import annotations
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from dpmjax import sample_free_space
+from tests.tolerances import ROUNDING
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+@pytest.mark.parametrize("is_shared", [True, False])
+def test_samples_lie_on_their_segments(dim: int, is_shared: bool) -> None:
+    rng = np.random.default_rng(0)
+    origin, points = rng.normal(size=dim).astype(np.float32), rng.normal(size=(7, dim)).astype(np.float32)
+    factors = rng.uniform(size=4 if is_shared else (7, 4)).astype(np.float32)
+    samples = np.asarray(sample_free_space(origin, points, factors))
+    for beam in range(7):
+        for i in range(4):
+            factor = factors[i] if is_shared else factors[beam, i]
+            expected = (1 - factor) * origin + factor * points[beam]
+            np.testing.assert_allclose(samples[beam, i], expected, **ROUNDING)
+
+
+def test_factors_zero_and_one_are_the_ends() -> None:
+    origin, points = np.array([1, 2], np.float32), np.array([[3, 5], [0.5, -1]], np.float32)
+    samples = np.asarray(sample_free_space(origin, points, np.array([0, 1], np.float32)))
+    np.testing.assert_array_equal(samples[:, 0], np.stack([origin, origin]))
+    np.testing.assert_array_equal(samples[:, 1], points)
+
+
+def test_no_beams_give_no_samples() -> None:
+    assert sample_free_space(jnp.zeros(2), jnp.zeros((0, 2)), jnp.ones(3)).shape == (0, 3, 2)
+
+
+def test_wrong_shapes_are_named(as_user) -> None:
+    with pytest.raises(ValueError, match="^origin: expected shape"):
+        sample_free_space(jnp.zeros(3), jnp.zeros((4, 2)), jnp.ones(3))
+    with pytest.raises(ValueError, match="^factors: expected shape"):
+        sample_free_space(jnp.zeros(2), jnp.zeros((4, 2)), jnp.ones((5, 3)))

@@ -1,0 +1,121 @@
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from dpmjax import farthest_point_sample, voxel_sample
+
+DIMS = pytest.mark.parametrize("dim", [2, 3])
+SEEDS = pytest.mark.parametrize("seed", [0, 1])
+
+
+def cloud(seed: int, dim: int, n: int = 60) -> np.ndarray:
+    return np.random.default_rng(seed).normal(size=(n, dim)).astype(np.float32)
+
+
+def farthest_in_numpy(points: np.ndarray, num_samples: int, mask: np.ndarray) -> list[int]:
+    points, chosen = points.astype(np.float64), [int(np.argmax(mask))]
+    while len(chosen) < num_samples:
+        distance = np.linalg.norm(points[:, None] - points[chosen], axis=-1).min(axis=1)
+        distance[~mask] = distance[chosen] = -1
+        chosen.append(int(np.argmax(distance)) if distance.max() >= 0 else chosen[0])
+    return chosen
+
+
+@DIMS
+@SEEDS
+def test_samples_are_those_of_numpy(dim: int, seed: int) -> None:
+    points = cloud(seed, dim)
+    expected = farthest_in_numpy(points, 20, np.ones(len(points), bool))
+    index = farthest_point_sample(points, 20)
+    assert index.dtype == jnp.int32
+    np.testing.assert_array_equal(index, expected)
+
+
+@DIMS
+def test_masked_points_are_never_chosen(dim: int) -> None:
+    points = cloud(2, dim)
+    mask = np.random.default_rng(3).random(len(points)) < 0.5
+    hidden = np.where(mask[:, None], points, np.nan).astype(np.float32)
+    np.testing.assert_array_equal(farthest_point_sample(hidden, 15, mask), farthest_in_numpy(points, 15, mask))
+
+
+def test_padded_equals_unpadded() -> None:
+    points = cloud(4, 3)
+    padded = np.concatenate([points, np.full((9, 3), 1e9, np.float32)])
+    mask = np.arange(len(padded)) < len(points)
+    np.testing.assert_array_equal(farthest_point_sample(padded, 12, mask), farthest_point_sample(points, 12))
+
+
+def test_too_few_points_repeat_the_first() -> None:
+    mask = np.zeros(10, bool)
+    mask[[3, 7]] = True
+    np.testing.assert_array_equal(farthest_point_sample(cloud(5, 3, 10), 5, mask), [3, 7, 3, 3, 3])
+    np.testing.assert_array_equal(farthest_point_sample(cloud(5, 3, 10), 3, np.zeros(10, bool)), [0, 0, 0])
+
+
+def test_coincident_points_are_chosen_once_each() -> None:
+    np.testing.assert_array_equal(np.sort(farthest_point_sample(np.ones((6, 3), np.float32), 6)), np.arange(6))
+
+
+def test_gradient_through_chosen_points_is_finite() -> None:
+    points = jnp.asarray(cloud(6, 3))
+    gradient = jax.jit(jax.grad(lambda p: jnp.sum(p[farthest_point_sample(p, 9)] ** 2)))(points)
+    assert np.isfinite(gradient).all()
+    assert np.count_nonzero(np.any(gradient != 0, axis=1)) == 9
+
+
+def first_of_each_voxel(points: np.ndarray, voxel_size: float, mask: np.ndarray) -> np.ndarray:
+    voxels = np.floor(points / np.float32(voxel_size)).astype(np.int64)
+    rows = np.flatnonzero(mask)
+    _, first = np.unique(voxels[rows], axis=0, return_index=True)
+    kept = np.zeros(len(points), bool)
+    kept[rows[first]] = True
+    return kept
+
+
+@DIMS
+@SEEDS
+@pytest.mark.parametrize("voxel_size", [0.1, 0.5, 100.0])
+def test_kept_points_are_the_first_of_their_voxels(dim: int, seed: int, voxel_size: float) -> None:
+    points = cloud(seed, dim, 200)
+    mask = np.random.default_rng(seed).random(200) < 0.8
+    kept = voxel_sample(points, voxel_size, mask)
+    np.testing.assert_array_equal(kept, first_of_each_voxel(points, voxel_size, mask))
+
+
+def test_voxels_are_told_apart_over_a_million_on_each_axis() -> None:
+    # Neighbouring voxels near the corners of a grid of 2^20 voxels an axis: a hash would confuse some.
+    rng = np.random.default_rng(7)
+    corner = rng.choice([-(2**19), 2**19 - 3], size=(300, 3))
+    points = (corner + rng.integers(0, 3, size=(300, 3)) + 0.5).astype(np.float32)
+    np.testing.assert_array_equal(voxel_sample(points, 1.0), first_of_each_voxel(points, 1.0, np.ones(300, bool)))
+
+
+def test_nothing_is_kept_of_an_empty_mask() -> None:
+    assert not voxel_sample(cloud(8, 3), 0.5, np.zeros(60, bool)).any()
+    assert voxel_sample(jnp.zeros((0, 3)), 0.5).shape == (0,)
+
+
+def test_voxels_of_masked_points_do_not_count() -> None:
+    points = np.zeros((3, 3), np.float32)
+    np.testing.assert_array_equal(voxel_sample(points, 1.0, np.array([False, True, True])), [False, True, False])
+
+
+def test_second_call_compiles_nothing(assert_compiles_nothing) -> None:
+    farthest_point_sample(cloud(0, 3), 7)
+    voxel_sample(cloud(0, 3), 0.3)
+    with assert_compiles_nothing():
+        farthest_point_sample(cloud(1, 3), 7)
+        voxel_sample(cloud(1, 3), 0.4)
+
+
+def test_wrong_arguments_are_named(as_user) -> None:
+    with pytest.raises(ValueError, match="^points: expected at least one"):
+        farthest_point_sample(jnp.zeros((0, 3)), 4)
+    with pytest.raises(ValueError, match="^num_samples: expected at least 1"):
+        farthest_point_sample(jnp.zeros((5, 3)), 0)
+    with pytest.raises(ValueError, match="^voxel_size: expected a number above 0"):
+        voxel_sample(jnp.zeros((5, 3)), -1.0)

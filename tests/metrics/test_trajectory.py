@@ -1,0 +1,153 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.optimize import minimize
+from scipy.spatial.transform import Rotation
+
+from dpmjax import absolute_trajectory_error, align_rigid, point_distance, relative_pose_error
+from tests.tolerances import DOUBLE
+
+DIMS = pytest.mark.parametrize("dim", [2, 3])
+
+
+def motion(rng: np.random.Generator, dim: int, scale: float = 1.0) -> np.ndarray:
+    axis = np.array([0, 0, 1]) if dim == 2 else rng.normal(size=3)
+    T = np.eye(dim + 1)
+    T[:dim, :dim] = Rotation.from_rotvec(scale * rng.uniform(-2, 2) * axis).as_matrix()[:dim, :dim]
+    T[:dim, dim] = scale * rng.normal(size=dim)
+    return T
+
+
+def trajectories(seed: int, dim: int, noise: float = 0.1, n: int = 25) -> tuple[np.ndarray, np.ndarray]:
+    rng = np.random.default_rng(seed)
+    reference = [np.eye(dim + 1)]
+    for _ in range(n - 1):
+        reference.append(reference[-1] @ motion(rng, dim))
+    world = motion(rng, dim)
+    return np.stack([world @ T @ motion(rng, dim, noise) for T in reference]), np.stack(reference)
+
+
+def positions(T: np.ndarray) -> np.ndarray:
+    return T[:, :-1, -1]
+
+
+@DIMS
+def test_error_after_a_rigid_motion_is_zero(dim: int) -> None:
+    estimated, reference = trajectories(0, dim, noise=0)
+    assert absolute_trajectory_error(positions(estimated), positions(reference)) < 1e-9
+    expected = reference[0] @ np.linalg.inv(estimated[0])
+    np.testing.assert_allclose(align_rigid(positions(estimated), positions(reference)), expected, **DOUBLE)
+
+
+def test_alignment_is_the_best_one() -> None:
+    estimated, reference = (positions(T) for T in trajectories(1, 2))
+
+    def error(motion: np.ndarray) -> float:
+        R = Rotation.from_euler("z", motion[2]).as_matrix()[:2, :2]
+        return float(np.sum((estimated @ R.T + motion[:2] - reference) ** 2))
+
+    best = min(minimize(error, [0, 0, angle], tol=1e-12).fun for angle in (-2, 0, 2))
+    np.testing.assert_allclose(absolute_trajectory_error(estimated, reference) ** 2 * len(estimated), best, rtol=1e-6)
+
+
+@DIMS
+def test_errors_are_those_of_evo(dim: int) -> None:
+    from evo.core import metrics, trajectory
+
+    estimated, reference = trajectories(2, dim)
+    in_space = []
+    for poses in (estimated, reference):
+        full = np.tile(np.eye(4), (len(poses), 1, 1))
+        full[:, :dim, :dim], full[:, :dim, 3] = poses[:, :dim, :dim], poses[:, :dim, dim]
+        in_space.append(trajectory.PosePath3D(poses_se3=list(full)))
+    error = {}
+    for relation in (metrics.PoseRelation.translation_part, metrics.PoseRelation.rotation_angle_rad):
+        metric = metrics.RPE(relation, delta=2, delta_unit=metrics.Unit.frames, all_pairs=True)
+        metric.process_data((in_space[1], in_space[0]))
+        error[relation] = metric.get_statistic(metrics.StatisticsType.rmse)
+    result = relative_pose_error(estimated, reference, delta=2)
+    np.testing.assert_allclose(result.translation_rmse, error[metrics.PoseRelation.translation_part], rtol=1e-6)
+    np.testing.assert_allclose(result.rotation_rmse, error[metrics.PoseRelation.rotation_angle_rad], rtol=1e-6)
+
+    in_space[0].align(in_space[1], correct_scale=False)
+    metric = metrics.APE(metrics.PoseRelation.translation_part)
+    metric.process_data((in_space[1], in_space[0]))
+    expected = metric.get_statistic(metrics.StatisticsType.rmse)
+    actual = absolute_trajectory_error(positions(estimated), positions(reference))
+    np.testing.assert_allclose(actual, expected, rtol=1e-6)
+
+
+def test_mirrored_trajectory_is_not_mirrored_back() -> None:
+    _, reference = trajectories(3, 2)
+    mirrored = positions(reference) * [1, -1]
+    T = align_rigid(mirrored, positions(reference))
+    np.testing.assert_allclose(np.linalg.det(T[:2, :2]), 1, **DOUBLE)
+    assert absolute_trajectory_error(mirrored, positions(reference)) > 0.1
+
+
+@DIMS
+def test_degenerate_trajectories_are_aligned_without_a_turn(dim: int) -> None:
+    line = np.arange(5.0)[:, None] * np.eye(dim)[0]
+    for path in (line[:1], np.ones((4, dim)), line):
+        T = align_rigid(path, path + 3)
+        np.testing.assert_allclose(T[:dim, :dim], np.eye(dim), **DOUBLE)
+        np.testing.assert_allclose(path @ T[:dim, :dim].T + T[:dim, dim], path + 3, **DOUBLE)
+
+
+@DIMS
+def test_relative_error_does_not_depend_on_the_world(dim: int) -> None:
+    estimated, reference = trajectories(4, dim)
+    world = motion(np.random.default_rng(5), dim)
+    result = relative_pose_error(world @ estimated, reference, delta=3)
+    np.testing.assert_allclose(result, relative_pose_error(estimated, reference, delta=3), **DOUBLE)
+    assert result.num_pairs == len(reference) - 3
+
+
+@DIMS
+def test_relative_error_sees_small_angles(dim: int) -> None:
+    still, turn = np.tile(np.eye(dim + 1), (9, 1, 1)), np.eye(dim + 1)
+    turn[:2, :2] = [[np.cos(1e-9), -np.sin(1e-9)], [np.sin(1e-9), np.cos(1e-9)]]
+    turning = np.stack([np.linalg.matrix_power(turn, i) for i in range(9)])
+    result = relative_pose_error(turning, still)
+    np.testing.assert_allclose(result.rotation_rmse, 1e-9, rtol=1e-5)
+
+
+@DIMS
+def test_point_distance_is_its_definition(dim: int) -> None:
+    estimated, reference = trajectories(7, dim)
+    rng = np.random.default_rng(8)
+    points, mask = rng.normal(size=(25, 6, dim)), rng.random((25, 6)) < 0.7
+    T = align_rigid(positions(estimated), positions(reference))
+    distances = []
+    for i, j in zip(*np.nonzero(mask), strict=True):
+        point = np.append(points[i, j], 1)
+        distances.append(np.linalg.norm(T @ estimated[i] @ point - reference[i] @ point))
+    hidden = np.where(mask[..., None], points, np.nan)
+    np.testing.assert_allclose(point_distance(hidden, mask, estimated, reference), np.mean(distances), **DOUBLE)
+
+
+def test_bad_input_is_named(as_user) -> None:
+    estimated, reference = trajectories(9, 2)
+    points, mask = np.zeros((25, 6, 2)), np.ones((25, 6), bool)
+    broken = estimated.copy()
+    broken[4, 0, 2] = np.nan
+    with pytest.raises(ValueError, match="^estimated: expected finite numbers, .* row 4"):
+        absolute_trajectory_error(positions(broken), positions(reference))
+    with pytest.raises(ValueError, match="^reference: expected shape"):
+        absolute_trajectory_error(positions(estimated), positions(reference)[:-1])
+    with pytest.raises(ValueError, match="^estimated: expected positions"):
+        absolute_trajectory_error(np.zeros((0, 2)), np.zeros((0, 2)))
+    with pytest.raises(ValueError, match="^reference: expected poses"):
+        relative_pose_error(estimated, positions(reference))
+    for delta in (0, 25):
+        with pytest.raises(ValueError, match="^delta: expected 1 <= delta < 25"):
+            relative_pose_error(estimated, reference, delta)
+    with pytest.raises(ValueError, match="^points: expected shape"):
+        point_distance(points[:, :, :1], mask, estimated, reference)
+    with pytest.raises(ValueError, match="^mask: expected bool"):
+        point_distance(points, mask[:, :3], estimated, reference)
+    with pytest.raises(ValueError, match="^mask: expected at least one"):
+        point_distance(points, ~mask, estimated, reference)
+    with pytest.raises(ValueError, match="^T_estimated: expected finite"):
+        point_distance(points, mask, broken, reference)

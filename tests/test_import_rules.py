@@ -1,0 +1,96 @@
+"""Who may import whom: the plan of the house, checked on the source so that it cannot rot."""
+
+from __future__ import annotations
+
+import ast
+from pathlib import Path
+
+import pytest
+
+PACKAGE = Path(__file__).parents[1] / "src" / "dpmjax"
+
+EVERYBODY_MAY = {"types", "checks"}
+NETWORK_PARTS = {"geometry", "scans", "nets", "losses", "registration"}
+ALLOWED: dict[str, set[str]] = {
+    "types": set(),
+    "checks": set(),
+    "geometry": set(),
+    "scans": {"geometry"},
+    "nets": {"geometry"},
+    "losses": {"geometry"},
+    "registration": {"geometry", "losses"},
+    "deepmapping": NETWORK_PARTS,
+    "deeppointmap": NETWORK_PARTS,
+    "slam": {"deeppointmap", "geometry", "scans"},
+    "metrics": {"geometry"},
+    "data": {"geometry"},
+    "viz": {"geometry"},
+    "weights": {"nets", "deeppointmap"},
+}
+ONLY_IN: dict[str, set[str]] = {"matplotlib": {"viz", "data"}, "jaxlie": {"geometry"}}
+NEVER = {"experiments", "benchmarks", "tests", "torch"}
+
+MODULES = sorted(path for path in PACKAGE.rglob("*.py") if path != PACKAGE / "__init__.py")
+
+
+def imported_names(path: Path) -> set[str]:
+    """Full dotted names of everything that a module imports, also inside functions and under TYPE_CHECKING."""
+    own_package = ["dpmjax", *path.relative_to(PACKAGE).parent.parts]
+    names: set[str] = set()
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Import):
+            names.update(alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            base = own_package[: len(own_package) - node.level + 1] if node.level else []
+            stem = ".".join([*base, *([node.module] if node.module else [])])
+            names.update(f"{stem}.{alias.name}" for alias in node.names)
+    return names
+
+
+def room_of(path: Path) -> str:
+    return path.relative_to(PACKAGE).parts[0].removesuffix(".py")
+
+
+@pytest.mark.parametrize("path", MODULES, ids=lambda path: str(path.relative_to(PACKAGE)))
+def test_module_imports_only_what_its_room_may(path: Path) -> None:
+    room = room_of(path)
+    assert room in ALLOWED, f"{room}: a new room needs a line in the plan (CONTRIBUTING.md) and in this test"
+    for name in imported_names(path):
+        top, *rest = name.split(".")
+        assert top not in NEVER, f"{path.name} imports {name}"
+        assert room in ONLY_IN.get(top, {room}), f"{path.name} imports {name}, which only {ONLY_IN[top]} may"
+        if top == "dpmjax":
+            assert rest, f"{path.name} imports the whole package; import from the room"
+            may = ALLOWED[room] | EVERYBODY_MAY | {room}
+            assert rest[0] in may, f"{path.name}: {room} may not import {rest[0]}"
+
+
+def test_nets_and_losses_never_meet() -> None:
+    assert "losses" not in ALLOWED["nets"]
+    assert "nets" not in ALLOWED["losses"]
+
+
+def test_no_algorithm_imports_data_or_viz() -> None:
+    assert not any({"data", "viz"} & rooms for rooms in ALLOWED.values())
+
+
+def test_plan_has_no_cycles() -> None:
+    def reachable(room: str, seen: frozenset[str]) -> None:
+        assert room not in seen, f"{room} reaches itself"
+        for other in ALLOWED[room]:
+            reachable(other, seen | {room})
+
+    for room in ALLOWED:
+        reachable(room, frozenset())
+
+
+def test_package_door_imports_only_the_lazy_loader() -> None:
+    assert {name.split(".")[0] for name in imported_names(PACKAGE / "__init__.py")} == {"lazy_loader"}
+
+
+def test_relative_imports_are_resolved(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(globals(), "PACKAGE", tmp_path)
+    module = tmp_path / "geometry" / "sample.py"
+    module.parent.mkdir()
+    module.write_text("from ..losses.chamfer import x\nfrom . import poses\nimport dpmjax.nets\n")
+    assert imported_names(module) == {"dpmjax.losses.chamfer.x", "dpmjax.geometry.poses", "dpmjax.nets"}

@@ -1,0 +1,42 @@
+from __future__ import annotations
+
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import pytest
+
+import dpmjax
+from dpmjax import geometry, losses, metrics
+
+
+def test_import_loads_no_jax_and_is_fast() -> None:
+    program = (
+        "import sys, time; start = time.perf_counter(); import dpmjax; seconds = time.perf_counter() - start;"
+        "assert 'jax' not in sys.modules and 'numpy' not in sys.modules, 'import dpmjax imports too much';"
+        "print(seconds)"
+    )
+    result = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    # 0.1 s is promised; a busy machine gets some slack.
+    assert float(result.stdout) < 0.5
+
+
+@pytest.mark.parametrize("package", [dpmjax, geometry, losses, metrics], ids=lambda package: package.__name__)
+def test_every_listed_name_resolves(package) -> None:
+    assert package.__all__
+    for name in package.__all__:
+        assert getattr(package, name) is not None
+
+
+def test_version_is_the_one_of_the_distribution() -> None:
+    configuration = tomllib.loads((Path(__file__).parents[1] / "pyproject.toml").read_text())
+    assert dpmjax.__version__ == configuration["project"]["version"]
+
+
+def test_compile_counter_counts(count_compilations) -> None:
+    before = count_compilations()
+    jax.jit(lambda x: x * 3 + 1)(jnp.ones(7)).block_until_ready()
+    assert count_compilations() > before
