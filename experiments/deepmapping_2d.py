@@ -7,11 +7,13 @@
     python -m experiments.deepmapping_2d --resume                     continue the latest run
 
 Results go to results/deepmapping_2d/<time>/ (latest links to the newest): metrics.json, trajectories as TUM, KITTI and
-npy, and pictures: map.png, occupancy.png, loss.png.
+npy, and pictures: map.png, occupancy.png, loss.png. Without --init the start is incremental point-to-line ICP; the
+result is the one of start, fit and polish whose map describes the beams best, so it does not get worse.
 """
 
 from __future__ import annotations
 
+import logging
 import math
 import time
 from dataclasses import dataclass
@@ -20,17 +22,19 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from tqdm import tqdm
 from tyro.conf import FlagCreatePairsOff, Positional, arg
 
 from experiments._command import run_command
-from experiments._history import HistoryFile, read_history
+from experiments._deepmapping_fit import FitRun, run_fit
+from experiments._history import read_history
 from experiments._machine import peak_rss_gb, select_device
 from experiments._run_folder import HISTORY, RunFolder, open_run_folder, recording, write_metrics
 from experiments._stop import StopFlag
 
 if TYPE_CHECKING:
     from dpmjax.data.sequence import ScanSequence
+    from dpmjax.deepmapping import DeepMappingConfig
+    from dpmjax.geometry.lines import LineScans
 
 EXPERIMENT = "deepmapping_2d"
 INITS = ("icp-plane", "icp-point", "odometry", "zero")
@@ -100,27 +104,13 @@ class Result:
     metrics: dict[str, Any]
 
 
-@dataclass(frozen=True)
-class FitResult:
-    """What the fit hands on.
-
-    Attributes:
-        poses: (n, 3) poses that it kept.
-        steps: steps done.
-        compile_s: seconds until the step was compiled.
-    """
-
-    poses: NDArray[np.float64]
-    steps: int
-    compile_s: float
-
-
 def main(config: Config) -> Result:
-    """Reads, starts warm, fits, polishes, writes."""
+    """Reads, starts warm, fits, polishes, keeps the best, writes."""
     started = time.perf_counter()
     select_device(config.device)
     sequence = read_scans(config)
-    initial_poses = warm_start(config, sequence)
+    start = warm_start(config, sequence)
+    settings = fit_settings(config, sequence)
     folder = open_run_folder(
         config,
         EXPERIMENT,
@@ -130,93 +120,170 @@ def main(config: Config) -> Result:
         may_change=frozenset({"seconds"}),
     )
     with recording(folder), StopFlag() as stop:
-        fitted = fit(config, sequence, initial_poses, folder, stop)
-        poses = fitted.poses
+        print(f"{sequence.name}: {len(sequence)} scans of {sequence.points.shape[1]} beams, from {config.init}")
+        fitted = run_fit(
+            folder,
+            sequence,
+            settings,
+            start=None if config.init == "zero" else start,
+            seed=config.seed,
+            seconds=config.seconds,
+            stop=stop,
+        )
+        candidates = {"start": start, "fit": fitted.poses}
         if config.polish and not stop.is_requested:
-            poses = polish(sequence, poses)
+            candidates["polish"] = polish_all(sequence, candidates)
+        chosen, scores = choose_best(sequence, candidates)
+        poses = candidates[chosen]
         metrics = {
             "num_scans": len(sequence),
             "steps": fitted.steps,
-            **score(sequence, initial_poses, poses),
-            "wall_s": time.perf_counter() - started,
+            **compare_to_reference(sequence, start, poses),
+            "chosen": chosen,
+            **{f"score_{name}": value for name, value in scores.items()},
+            "fit_s": fitted.run_s,
             "compile_s": fitted.compile_s,
+            "wall_s": time.perf_counter() - started,
             "peak_rss_gb": peak_rss_gb(),
             "is_interrupted": stop.is_requested,
         }
         # Numbers first: a picture that fails must not cost them.
         write_trajectories(folder, sequence, poses)
         write_metrics(folder, metrics, seed=config.seed)
-        draw(folder, sequence, initial_poses, poses, metrics)
+        draw(folder, sequence, start, poses, metrics)
+        draw_occupancy(folder, sequence, fitted, settings)
         tell(folder, sequence, metrics)
     return Result(folder.path, poses, metrics)
 
 
 def read_scans(config: Config) -> ScanSequence:
     """The scans of DATA or of the built-in world, sub-range and stride applied."""
-    raise NotImplementedError  # SEAM: dpmjax.data readers
+    from dpmjax.data import read_sequence, simulate_sequence, take_scans
+
+    stop = None if config.n_scans is None else config.start + config.n_scans * config.jump
+    if config.data is not None:
+        return read_sequence(config.data, start=config.start, stop=stop, stride=config.jump)
+    sequence = simulate_sequence(config.world, stop or 256, range_noise_px=config.range_noise_px, seed=config.seed)
+    return take_scans(sequence, slice(config.start, stop, config.jump))
 
 
 def warm_start(config: Config, sequence: ScanSequence) -> NDArray[np.float64]:
     """(n, 3) poses to start from; what is no word of `INITS` names a trajectory file."""
     if config.init == "zero":
         return np.zeros((len(sequence), 3))
-    raise NotImplementedError  # SEAM: dpmjax.registration, sequence.odometry_poses, dpmjax.data.trajectory_files
+    if config.init == "odometry":
+        if sequence.odometry_poses is None:
+            raise ValueError(
+                f"{sequence.name}: has no odometry of its own (its odometry column repeats the corrected pose, or is "
+                "missing); use --init icp-plane"
+            )
+        return sequence.odometry_poses
+    if config.init not in INITS:
+        from dpmjax.data import read_start
+
+        if not Path(config.init).exists():
+            raise ValueError(f"--init {config.init}: no such file, and none of {', '.join(INITS)}")
+        return read_start(config.init, len(sequence), sequence.unit)
+
+    from dpmjax.registration import IncrementalConfig, incremental_icp
+
+    metric: Literal["point", "plane"] = "point" if config.init == "icp-point" else "plane"
+    poses, _ = incremental_icp(line_scans(sequence), IncrementalConfig(metric=metric))
+    return poses
 
 
-def fit(
-    config: Config, sequence: ScanSequence, initial_poses: NDArray[np.float64], folder: RunFolder, stop: StopFlag
-) -> FitResult:
-    """Optimises L-Net and M-Net until the steps or the seconds are used up, or a stop is asked for."""
-    first_step, num_steps = 0, config.steps or 1  # SEAM: init or restore the state; the preset's number of steps
-    compile_s = 0.0  # SEAM: compile the step ahead (`lower().compile()`) and time that
-    columns = ["step", "phase", "run_s", "loss", f"ate_{sequence.unit}"]
-    keep_until = first_step - 1 if folder.is_resumed else None
-    progress = tqdm(total=1.0, bar_format="{desc} {percentage:3.0f}%|{bar}| [{elapsed}{postfix}]", desc="fit")
-    step, started = first_step, time.perf_counter()
-    with HistoryFile(folder / HISTORY, columns, keep_until=keep_until) as history, progress:
-        while step < num_steps and not stop.is_requested:
-            # SEAM: state, report = step_fn(state, batch, key=fold_in(key, step)); a checkpoint now and then
-            loss, phase, ate = math.nan, "L-Net", math.nan
-            step += 1
-            run_s = time.perf_counter() - started
-            history.append(step=step, phase=phase, run_s=run_s, loss=loss, **{f"ate_{sequence.unit}": ate})
-            done = max(step / num_steps, run_s / config.seconds if config.seconds else 0.0)
-            show_progress(progress, done, run_s, loss, ate, sequence.unit)
-            if done >= 1.0:
-                break
-    return FitResult(initial_poses, step, compile_s)  # SEAM: keep the fit only where it scores better than its start
+def line_scans(sequence: ScanSequence) -> LineScans:
+    """The scans with a line at every beam; beams without an order are sorted by angle first."""
+    from dpmjax.geometry.lines import fit_lines, sort_by_angle
+    from dpmjax.types import ScanSet
+
+    scans = ScanSet(sequence.points, sequence.mask)
+    return fit_lines(scans if sequence.is_organised else sort_by_angle(scans))
 
 
-def show_progress(progress: tqdm, done: float, run_s: float, loss: float, ate: float, unit: str) -> None:
-    """Moves the bar to the share that is done and tells loss, error and seconds left."""
-    done = min(1.0, done)
-    ate_text = f", ATE {ate:.3g} {unit}" if math.isfinite(ate) else ""
-    progress.set_postfix_str(f"loss {loss:.4f}{ate_text}, {run_s * (1.0 - done) / done:.0f} s left", refresh=False)
-    progress.update(done - progress.n)
+def fit_settings(config: Config, sequence: ScanSequence) -> DeepMappingConfig:
+    """The preset, with the number of steps asked for in its last phase."""
+    from dpmjax.deepmapping import preset, with_steps
+
+    settings = preset(config.preset, is_organised=sequence.is_organised)
+    return settings if config.steps is None else with_steps(settings, config.steps)
 
 
-def polish(sequence: ScanSequence, poses: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Multi-view point-to-line alignment of all scans."""
-    raise NotImplementedError  # SEAM: dpmjax.registration
+def polish_all(sequence: ScanSequence, candidates: dict[str, NDArray[np.float64]]) -> NDArray[np.float64]:
+    """The better of the start and the fit, polished."""
+    from dpmjax.registration import polish
+
+    name, _ = choose_best(sequence, candidates)
+    polished = polish(line_scans(sequence), candidates[name])
+    logging.getLogger("dpmjax").info("polish of the %s: %s", name, polished._replace(poses=None))  # type: ignore[arg-type]
+    return polished.poses
 
 
-def score(sequence: ScanSequence, initial_poses: NDArray[np.float64], poses: NDArray[np.float64]) -> dict[str, Any]:
-    """Errors before and after, in the unit of the scans; nothing where there is no reference."""
-    if sequence.reference_poses is None:
+def choose_best(
+    sequence: ScanSequence, candidates: dict[str, NDArray[np.float64]]
+) -> tuple[str, dict[str, float]]:
+    """The poses whose map takes the fewest nats, without a look at the reference."""
+    from dpmjax.deepmapping import map_code_length
+    from dpmjax.registration import length_scale
+    from dpmjax.types import ScanSet
+
+    cell = 0.1 * length_scale(ScanSet(sequence.points, sequence.mask))
+    scores = {
+        name: map_code_length(sequence.points, sequence.mask, poses, cell=cell) for name, poses in candidates.items()
+    }
+    return min(scores, key=lambda name: scores[name]), scores
+
+
+def compare_to_reference(
+    sequence: ScanSequence, start: NDArray[np.float64], poses: NDArray[np.float64]
+) -> dict[str, Any]:
+    """Errors before and after, in the unit of the scans; `success` is unknown where there is no reference."""
+    from dpmjax.geometry import planar_poses
+    from dpmjax.metrics import absolute_trajectory_error, point_distance
+
+    reference, unit = sequence.reference_poses, sequence.unit
+    if reference is None:
         return {"success": None}
-    raise NotImplementedError  # SEAM: ate_*, ate_initial_*, point_distance_*, success from dpmjax.metrics
+    T_reference = planar_poses.matrices(reference)
+    errors: dict[str, Any] = {}
+    for which, some in (("", poses), ("initial_", start)):
+        errors[f"ate_{which}{unit}"] = absolute_trajectory_error(some[:, :2], reference[:, :2])
+        distance = point_distance(sequence.points, sequence.mask, planar_poses.matrices(some), T_reference)
+        errors[f"point_distance_{which}{unit}"] = distance
+    # The paper's threshold is 20 pixels, 2 % of its world; of a real place, 2 % of what its trajectory spans.
+    threshold = 20.0 if unit == "px" else 0.02 * float(np.linalg.norm(np.ptp(reference[:, :2], axis=0)))
+    return {**errors, f"success_threshold_{unit}": threshold, "success": errors[f"ate_{unit}"] < threshold}
 
 
 def write_trajectories(folder: RunFolder, sequence: ScanSequence, poses: NDArray[np.float64]) -> None:
-    """trajectory.npy, trajectory_tum.txt, trajectory_kitti.txt."""
-    np.save(folder / "trajectory.npy", poses)
-    # SEAM: dpmjax.data.trajectory_files
+    """trajectory.npy, trajectory_tum.txt, trajectory_kitti.txt: T_world_scan of every scan."""
+    from dpmjax.data import write_kitti, write_poses_npy, write_tum
+
+    write_poses_npy(folder / "trajectory.npy", poses)
+    write_tum(folder / "trajectory_tum.txt", poses, times=sequence.times, unit=sequence.unit)
+    write_kitti(folder / "trajectory_kitti.txt", poses)
+
+
+def draw_occupancy(
+    folder: RunFolder, sequence: ScanSequence, fitted: FitRun, settings: DeepMappingConfig
+) -> None:
+    """occupancy.png: what M-Net learned, black, white, and grey where no beam has been."""
+    if not fitted.has_map:
+        return
+    from dpmjax import viz
+    from dpmjax.deepmapping import draw_map
+
+    picture = draw_map(fitted.state, settings, sequence.points, sequence.mask, fitted.poses, reach=fitted.reach)
+    figure = viz.occupancy_figure(
+        picture.probability, picture.explored, picture.extent, fitted.poses[:, :2], sequence.unit
+    )
+    viz.save_figure(figure, folder / "occupancy.png")
 
 
 def draw(
     folder: RunFolder,
     sequence: ScanSequence,
-    initial_poses: NDArray[np.float64],
+    start: NDArray[np.float64],
     poses: NDArray[np.float64],
     metrics: dict[str, Any],
 ) -> None:
@@ -230,7 +297,7 @@ def draw(
         ate, distance = metrics.get(f"ate_{which}{unit}"), metrics.get(f"point_distance_{which}{unit}")
         return viz.make_panel(title, *scans, of_poses, ate=ate, point_distance=distance)
 
-    panels = [panel(f"Start: {sequence.name}", initial_poses, "initial_"), panel("DeepMapping", poses, "")]
+    panels = [panel(f"Start: {sequence.name}", start, "initial_"), panel("DeepMapping", poses, "")]
     if sequence.reference_poses is not None:
         panels.append(viz.make_panel("Reference", *scans, sequence.reference_poses, is_reference=True))
     viz.save_figure(viz.registered_scans_figure(panels, unit), folder / "map.png")
@@ -242,14 +309,14 @@ def draw(
         phases = [row["phase"] for row in rows]
         history = viz.History(columns["run_s"], columns["loss"], phases, columns[f"ate_{unit}"])
         viz.save_figure(viz.history_figure(history, unit), folder / "loss.png")
-    # SEAM: viz.occupancy_figure of what M-Net learned -> occupancy.png
 
 
 def tell(folder: RunFolder, sequence: ScanSequence, metrics: dict[str, Any]) -> None:
     """The last lines on the console: the error before and after, and where to look."""
     unit = sequence.unit
     if f"ate_{unit}" in metrics:
-        print(f"ATE {metrics[f'ate_initial_{unit}']:.3f} {unit} -> {metrics[f'ate_{unit}']:.3f} {unit}")
+        print(f"ATE {metrics[f'ate_initial_{unit}']:.3g} {unit} -> {metrics[f'ate_{unit}']:.3g} {unit}")
+    print(f"kept: the {metrics['chosen']} (its map takes the fewest nats a beam)")
     print(f"results in {folder.path}")
 
 

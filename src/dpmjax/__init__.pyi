@@ -1,3 +1,4 @@
+from .deepmapping.fit import fit as fit_deepmapping
 from .geometry.alignment import weighted_svd as weighted_svd
 from .geometry.neighbours import k_nearest as k_nearest
 from .geometry.neighbours import radius_search as radius_search
@@ -12,6 +13,7 @@ from .metrics.trajectory import absolute_trajectory_error as absolute_trajectory
 from .metrics.trajectory import align_rigid as align_rigid
 from .metrics.trajectory import point_distance as point_distance
 from .metrics.trajectory import relative_pose_error as relative_pose_error
+from .registration.icp import icp as icp
 from .types import Neighbours as Neighbours
 from .types import ScanSet as ScanSet
 

@@ -13,8 +13,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from dpmjax.geometry.nearest import nearest_index
-from dpmjax.scans.lines import LineScans
+from dpmjax.geometry.neighbours import k_nearest
+from dpmjax.geometry.lines import LineScans
 
 Metric = Literal["point", "plane"]
 
@@ -64,7 +64,7 @@ def linearise_pair(
     """
     rotation = _rotation(pose_target_source[2])
     points = source.points @ rotation.T + pose_target_source[:2]
-    nearest = nearest_index(points, target.points, mask=target.mask)
+    nearest = k_nearest(points, target.points, 1, mask=target.mask).indices[:, 0]
     matched, normals = target.points[nearest], target.normals[nearest]
     faces_same_way = ((source.normals @ rotation.T) * normals).sum(-1) > 0.7
     near = ((points - matched) ** 2).sum(-1) < gate**2
@@ -96,11 +96,29 @@ def move(pose: Float[Array, " 3"], delta: Float[Array, " 3"]) -> Float[Array, " 
     return pose + jnp.stack([c * delta[0] - s * delta[1], s * delta[0] + c * delta[1], delta[2]])
 
 
-def _solve(system: PairSystem) -> Float[Array, " 3"]:
+class StepPrior(NamedTuple):
+    """What is believed of relative poses before a beam is compared; it decides where the scans leave a direction open.
+
+    Attributes:
+        mean: expected relative pose (x, y, heading).
+        information: inverse variances of its three parts, in units of one beam's information; zero: no belief.
+    """
+
+    mean: Float[Array, "... 3"]
+    information: Float[Array, "... 3"]
+
+
+def _solve(system: PairSystem, pose: Float[Array, " 3"], prior: StepPrior) -> Float[Array, " 3"]:
+    """The step that the scans and the belief ask for together."""
+    offset = pose - prior.mean
+    turn = offset.at[2].set(jnp.arctan2(jnp.sin(offset[2]), jnp.cos(offset[2])))
+    rotation = jnp.eye(3).at[:2, :2].set(_rotation(pose[2]))
+    pull = rotation.T @ (prior.information * turn)
+    belief = rotation.T @ (prior.information[:, None] * rotation)
     # Damping in proportion to each axis: a pair that fixes one direction only (a corridor) moves in that one alone.
     diagonal = jnp.diagonal(system.information)
     damping = 1e-3 * diagonal + 1e-6 * diagonal.max() + 1e-9
-    return jnp.linalg.solve(system.information + jnp.diag(damping), -system.gradient)
+    return jnp.linalg.solve(system.information + belief + jnp.diag(damping), -system.gradient - pull)
 
 
 @partial(jax.jit, static_argnames=("metric",))
@@ -110,6 +128,7 @@ def align_pairs(
     guesses: Float[Array, "p 3"],
     gates: Float[Array, " t"],
     kernels: Float[Array, " t"],
+    prior: StepPrior,
     *,
     metric: Metric = "plane",
 ) -> tuple[Float[Array, "p 3"], PairSystem]:
@@ -121,18 +140,19 @@ def align_pairs(
         guesses: where to start, x, y, heading of T_target_source.
         gates: largest distance of matched points in each iteration.
         kernels: scale of the robust weight in each iteration.
+        prior: belief in each relative pose (p, 3).
         metric: "point" or "plane".
 
     Returns:
         The aligned relative poses and each pair's system there (its `information` and `weight` tell how well it is fixed).
     """
 
-    def align(source: LineScans, target: LineScans, guess: Float[Array, " 3"]) -> tuple[Array, PairSystem]:
+    def align(source: LineScans, target: LineScans, guess: Float[Array, " 3"], prior: StepPrior) -> tuple[Array, PairSystem]:
         def iterate(pose: Array, scales: tuple[Array, Array]) -> tuple[Array, None]:
             system = linearise_pair(source, target, pose, *scales, metric=metric)
-            return move(pose, _solve(system)), None
+            return move(pose, _solve(system, pose, prior)), None
 
         pose, _ = jax.lax.scan(iterate, guess, (gates, kernels))
         return pose, linearise_pair(source, target, pose, gates[-1], kernels[-1], metric=metric)
 
-    return jax.vmap(align)(source, target, guesses)
+    return jax.vmap(align)(source, target, guesses, prior)

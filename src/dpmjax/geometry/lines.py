@@ -181,3 +181,14 @@ def fit_lines(scans: ScanSet, *, num_doublings: int = 4) -> LineScans:
         mask=mask,
         noise=jnp.broadcast_to(noise, mask.shape[:1]),
     )
+
+
+@jax.jit
+def sort_by_angle(scans: ScanSet) -> ScanSet:
+    """The same scans with their points in the order of the angle at which the sensor saw them; masked ones last."""
+    angle = jnp.where(scans.mask, jnp.arctan2(scans.points[..., 1], scans.points[..., 0]), jnp.inf)
+    order = jnp.argsort(angle, axis=-1)
+    return ScanSet(
+        points=jnp.take_along_axis(scans.points, order[..., None], axis=1),
+        mask=jnp.take_along_axis(scans.mask, order, axis=1),
+    )

@@ -1,0 +1,17 @@
+from .config import DeepMappingConfig as DeepMappingConfig
+from .config import PhaseConfig as PhaseConfig
+from .config import preset as preset
+from .config import with_steps as with_steps
+from .fit import Fitted as Fitted
+from .fit import Report as Report
+from .fit import State as State
+from .fit import as_scan_set as as_scan_set
+from .fit import current_poses as current_poses
+from .fit import fit as fit
+from .fit import init as init
+from .fit import make_step as make_step
+from .fit import measure_reach as measure_reach
+from .fit import next_phase as next_phase
+from .occupancy_map import MapPicture as MapPicture
+from .occupancy_map import draw_map as draw_map
+from .score import map_code_length as map_code_length

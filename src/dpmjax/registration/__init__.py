@@ -1,0 +1,5 @@
+"""Classical registration: ICP, the incremental warm start, loop closure and the multi-view polish."""
+
+import lazy_loader as _lazy
+
+__getattr__, __dir__, __all__ = _lazy.attach_stub(__name__, __file__)

@@ -1,0 +1,12 @@
+from .icp import IcpResult as IcpResult
+from .icp import icp as icp
+from .incremental import IncrementalConfig as IncrementalConfig
+from .incremental import incremental_icp as incremental_icp
+from .loops import LoopConfig as LoopConfig
+from .loops import close_loops as close_loops
+from .multiview import PolishConfig as PolishConfig
+from .multiview import Polished as Polished
+from .multiview import polish as polish
+from .pairs import length_scale as length_scale
+from .planar_graph import Edges as Edges
+from .planar_graph import optimize_planar_graph as optimize_planar_graph

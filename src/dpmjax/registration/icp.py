@@ -1,0 +1,149 @@
+"""Iterated closest point for two clouds, planar or spatial: the textbook method, robust and honest about its result."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Literal, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from dpmjax.checks import as_float, as_points
+from dpmjax.geometry.alignment import weighted_svd
+from dpmjax.geometry.neighbours import k_nearest
+from dpmjax.geometry.normals import estimate_normals
+from dpmjax.geometry.poses import exp_se2, exp_se3, transform_points
+from dpmjax.types import AnyArray
+
+_NORMAL_NEIGHBOURS = 6
+"""Points that a normal is fitted to, as in the published DeepMapping program."""
+
+
+class IcpResult(NamedTuple):
+    """What `icp` found.
+
+    Attributes:
+        T_target_source: homogeneous transform of source points into the target's frame.
+        rmse: root mean square distance of the inlier pairs: to the point, or to the target's line or plane.
+        num_inliers: pairs within three robust deviations.
+        converged: the last step was smaller than a millionth of the cloud.
+    """
+
+    T_target_source: Float[Array, "d1 d1"]
+    rmse: Float[Array, ""]
+    num_inliers: Int[Array, ""]
+    converged: Bool[Array, ""]
+
+
+def icp(
+    source: Float[AnyArray, "n d"],
+    target: Float[AnyArray, "m d"],
+    metric: Literal["point", "plane"] = "plane",
+    init: Float[AnyArray, "d1 d1"] | None = None,
+    *,
+    max_iterations: int = 100,
+) -> IcpResult:
+    """Aligns two clouds from a first guess; planar (d = 2: "plane" means line) or spatial (d = 3).
+
+    Each source point is paired with its nearest target point. Pairs are trusted by a Geman-McClure weight whose scale is the
+    median distance of the pairs, so that what only one cloud has seen does not pull.
+
+    Args:
+        source: finite points.
+        target: finite points, same unit.
+        metric: distance to the nearest point (Besl and McKay), or to its line or plane (Chen and Medioni).
+        init: first guess of T_target_source; None: identity. The basin is about the size of the structures: some degrees.
+        max_iterations: at most so many.
+
+    Returns:
+        IcpResult. With too few points to fix the motion it stays where the data leave it: near `init`, `converged` true.
+
+    Raises:
+        ValueError: wrong shapes, not finite, unknown metric, or an empty cloud.
+    """
+    source, target = as_points("source", source), as_points("target", target)
+    dimensions = source.shape[1]
+    if dimensions not in (2, 3) or target.shape[1] != dimensions:
+        raise ValueError(f"target: expected (m, {dimensions}) with 2 or 3 columns like source, got {target.shape}")
+    for name, cloud in (("source", source), ("target", target)):
+        if len(cloud) == 0:
+            raise ValueError(f"{name}: expected at least one point, got none")
+        if not bool(jnp.isfinite(cloud).all()):
+            raise ValueError(f"{name}: expected finite coordinates; leave invalid points out")
+    if metric not in ("point", "plane"):
+        raise ValueError(f"metric: expected 'point' or 'plane', got {metric!r}")
+    start = jnp.eye(dimensions + 1, dtype=source.dtype) if init is None else as_float("init", init)
+    if start.shape != (dimensions + 1, dimensions + 1):
+        raise ValueError(f"init: expected shape ({dimensions + 1}, {dimensions + 1}), got {start.shape}")
+    return _icp(source, target.astype(source.dtype), start.astype(source.dtype), max_iterations, metric=metric)
+
+
+@partial(jax.jit, static_argnames="metric")
+def _icp(
+    source: Float[Array, "n d"], target: Float[Array, "m d"], start: Float[Array, "d1 d1"], max_iterations: int, *, metric: str
+) -> IcpResult:
+    size = jnp.maximum(jnp.sqrt(jnp.mean(jnp.sum((target - target.mean(0)) ** 2, -1))), jnp.finfo(source.dtype).tiny)
+    normals = estimate_normals(target, min(_NORMAL_NEIGHBOURS, len(target)))
+    tiny = 1e-6 * size
+
+    def distances(T: Float[Array, "d1 d1"]) -> tuple[Array, Array, Array, Array]:
+        moved = transform_points(T, source)
+        nearest = k_nearest(moved, target, 1).indices[:, 0]
+        apart = moved - target[nearest]
+        normal = jnp.where(normals.mask[nearest][:, None], normals.normals[nearest], 0.0)
+        across = jnp.sum(apart * normal, -1)
+        # A point whose neighbourhood is no line or plane counts by its distance to the point itself.
+        residual = jnp.where(normals.mask[nearest], jnp.abs(across), jnp.linalg.norm(apart, axis=-1))
+        residual = residual if metric == "plane" else jnp.linalg.norm(apart, axis=-1)
+        pair_distance = jnp.linalg.norm(apart, axis=-1)
+        scale = jnp.maximum(3.0 * jnp.median(pair_distance), tiny)
+        weight = (scale**2 / (scale**2 + pair_distance**2)) ** 2
+        return moved, nearest, residual, jnp.where(pair_distance <= 2.0 * scale, weight, 0.0)
+
+    def update(T: Float[Array, "d1 d1"]) -> Float[Array, "d1 d1"]:
+        moved, nearest, _, weight = distances(T)
+        if metric == "point":
+            return weighted_svd(source, target[nearest], weight)
+        return _step_to_planes(moved, target[nearest], normals.normals[nearest], weight * normals.mask[nearest]) @ T
+
+    def iterate(carry: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+        T, _, count = carry
+        T_next = update(T)
+        change = jnp.linalg.norm(transform_points(T_next, source) - transform_points(T, source), axis=-1).max()
+        return T_next, change, count + 1
+
+    T, change, _ = jax.lax.while_loop(
+        lambda c: (c[1] > tiny) & (c[2] < max_iterations), iterate, (start, jnp.asarray(jnp.inf, source.dtype), 0)
+    )
+    _, _, residual, _ = distances(T)
+    limit = jnp.maximum(3.0 * 1.4826 * jnp.median(residual), tiny)
+    is_inlier = residual <= limit
+    num_inliers = is_inlier.sum()
+    rmse = jnp.sqrt(jnp.sum(jnp.where(is_inlier, residual**2, 0.0)) / jnp.maximum(num_inliers, 1))
+    return IcpResult(T, rmse, num_inliers, change <= tiny)
+
+
+def _step_to_planes(
+    points: Float[Array, "n d"], matched: Float[Array, "n d"], normals: Float[Array, "n d"], weight: Float[Array, " n"]
+) -> Float[Array, "d1 d1"]:
+    """The small motion that brings points onto the lines or planes of their partners, about the points' mean."""
+    dimensions = points.shape[1]
+    centre = jnp.mean(points, axis=0)
+    lever = points - centre
+    if dimensions == 2:
+        turning = lever[:, :1] * normals[:, 1:] - lever[:, 1:] * normals[:, :1]
+    else:
+        turning = jnp.cross(lever, normals)
+    jacobian = jnp.concatenate([normals, turning], axis=-1)
+    residual = jnp.sum((points - matched) * normals, -1)
+    weighted = weight[:, None] * jacobian
+    system = jnp.einsum("ni,nj->ij", weighted, jacobian, precision="highest")
+    diagonal = jnp.diagonal(system)
+    # Directions that no plane holds stay as they are.
+    damping = 1e-4 * diagonal + 1e-6 * diagonal.max() + jnp.finfo(points.dtype).tiny
+    step = jnp.linalg.solve(system + jnp.diag(damping), -weighted.T @ residual)
+    motion = exp_se2(step) if dimensions == 2 else exp_se3(step)
+    there = jnp.eye(dimensions + 1, dtype=points.dtype).at[:dimensions, dimensions].set(centre)
+    back = jnp.eye(dimensions + 1, dtype=points.dtype).at[:dimensions, dimensions].set(-centre)
+    return jnp.matmul(jnp.matmul(there, motion, precision="highest"), back, precision="highest")
