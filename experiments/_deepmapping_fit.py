@@ -128,7 +128,9 @@ def run_fit(
             state = dm.next_phase(state, scans, settings, is_warm=is_warm)
     progress.close()
     checkpoints.save(int(state.step), state)
-    return FitRun(poses, state, reach, int(state.step), run_s, compile_s, phases[int(state.phase)].occupancy_weight > 0.0)
+    return FitRun(
+        poses, state, reach, int(state.step), run_s, compile_s, phases[int(state.phase)].occupancy_weight > 0.0
+    )
 
 
 def _is_over(stop: StopFlag, seconds: float | None, run_s: float) -> bool:

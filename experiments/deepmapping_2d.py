@@ -219,17 +219,15 @@ def polish_all(sequence: ScanSequence, candidates: dict[str, NDArray[np.float64]
     return polished.poses
 
 
-def choose_best(
-    sequence: ScanSequence, candidates: dict[str, NDArray[np.float64]]
-) -> tuple[str, dict[str, float]]:
+def choose_best(sequence: ScanSequence, candidates: dict[str, NDArray[np.float64]]) -> tuple[str, dict[str, float]]:
     """The poses whose map takes the fewest nats, without a look at the reference."""
     from dpmjax.deepmapping import map_code_length
     from dpmjax.registration import length_scale
     from dpmjax.types import ScanSet
 
-    cell = 0.1 * length_scale(ScanSet(sequence.points, sequence.mask))
+    scale = length_scale(ScanSet(sequence.points, sequence.mask))
     scores = {
-        name: map_code_length(sequence.points, sequence.mask, poses, cell=cell) for name, poses in candidates.items()
+        name: map_code_length(sequence.points, sequence.mask, poses, scale=scale) for name, poses in candidates.items()
     }
     return min(scores, key=lambda name: scores[name]), scores
 
@@ -264,9 +262,7 @@ def write_trajectories(folder: RunFolder, sequence: ScanSequence, poses: NDArray
     write_kitti(folder / "trajectory_kitti.txt", poses)
 
 
-def draw_occupancy(
-    folder: RunFolder, sequence: ScanSequence, fitted: FitRun, settings: DeepMappingConfig
-) -> None:
+def draw_occupancy(folder: RunFolder, sequence: ScanSequence, fitted: FitRun, settings: DeepMappingConfig) -> None:
     """occupancy.png: what M-Net learned, black, white, and grey where no beam has been."""
     if not fitted.has_map:
         return

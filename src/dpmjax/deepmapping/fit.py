@@ -247,7 +247,9 @@ def _bind_map(params: Any, config: OccupancyConfig, frame: MapFrame, level_weigh
         # The hidden layers of all samples at once would take gigabytes: a part at a time, computed again on the way back.
         count = -(-len(points) // _MLP_CHUNK)
         parts = jnp.pad(local, ((0, count * _MLP_CHUNK - len(points)), (0, 0))).reshape(count, _MLP_CHUNK, 2)
-        return jax.lax.map(jax.checkpoint(lambda p: net.apply(params, p, level_weights)), parts).reshape(-1)[: len(points)]
+        return jax.lax.map(jax.checkpoint(lambda p: net.apply(params, p, level_weights)), parts).reshape(-1)[
+            : len(points)
+        ]
 
     return logits
 
@@ -264,9 +266,7 @@ def _level_weights(phase: PhaseConfig, config: DeepMappingConfig, progress: Floa
     return jnp.clip(progress / phase.anneal_until * count - jnp.arange(count) + 1.5, 0.0, 1.0)
 
 
-def make_step(
-    scans: ScanSet, config: DeepMappingConfig, phase: PhaseConfig
-) -> Callable[..., tuple[State, Report]]:
+def make_step(scans: ScanSet, config: DeepMappingConfig, phase: PhaseConfig) -> Callable[..., tuple[State, Report]]:
     """The compiled step of one phase: `state, report = step(state, key=key)` does `config.steps_per_call` steps of Adam.
 
     Args:
@@ -307,9 +307,7 @@ def make_step(
 
     @jax.jit
     def step(state: State, *, key: jax.Array) -> tuple[State, Report]:
-        state, (losses, terms) = jax.lax.scan(
-            lambda s, _: one_step(s, key), state, None, length=config.steps_per_call
-        )
+        state, (losses, terms) = jax.lax.scan(lambda s, _: one_step(s, key), state, None, length=config.steps_per_call)
         poses = current_poses(state, scans, config, phase)
         return state, Report(losses.mean(), jax.tree.map(jnp.mean, terms), poses)
 

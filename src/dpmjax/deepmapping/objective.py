@@ -133,7 +133,9 @@ def registration_loss(
     """
     free_key, offset_key = jax.random.split(key)
     points_world = to_world(poses, batch.points)
-    others = jax.random.choice(offset_key, jnp.arange(2, config.max_offset + 1), (config.num_offsets - 1,), replace=False)
+    others = jax.random.choice(
+        offset_key, jnp.arange(2, config.max_offset + 1), (config.num_offsets - 1,), replace=False
+    )
     offsets = jnp.concatenate([jnp.ones(1, others.dtype), others])
     chamfer = chamfer_term(points_world, batch, offsets)
     gamma = config.occupancy_weight

@@ -81,7 +81,12 @@ def icp(
 
 @partial(jax.jit, static_argnames="metric")
 def _icp(
-    source: Float[Array, "n d"], target: Float[Array, "m d"], start: Float[Array, "d1 d1"], max_iterations: int, *, metric: str
+    source: Float[Array, "n d"],
+    target: Float[Array, "m d"],
+    start: Float[Array, "d1 d1"],
+    max_iterations: int,
+    *,
+    metric: str,
 ) -> IcpResult:
     size = jnp.maximum(jnp.sqrt(jnp.mean(jnp.sum((target - target.mean(0)) ** 2, -1))), jnp.finfo(source.dtype).tiny)
     normals = estimate_normals(target, min(_NORMAL_NEIGHBOURS, len(target)))

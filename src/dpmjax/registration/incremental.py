@@ -43,7 +43,9 @@ def _grip(matches: PairMatches) -> NDArray[np.float64]:
     return np.linalg.eigvalsh(matches.information[:, :2, :2])[:, 0]
 
 
-def _step_prior(matches: PairMatches, residual: NDArray[np.float64], config: IncrementalConfig, scale: float) -> StepPrior:
+def _step_prior(
+    matches: PairMatches, residual: NDArray[np.float64], config: IncrementalConfig, scale: float
+) -> StepPrior:
     """What the clear steps tell of the open ones: the median translation of those with a similar turn.
 
     In a corridor two scans fit at every shift along it; a robot that has made straight steps of one metre elsewhere
@@ -131,7 +133,9 @@ def incremental_icp(
     is_open = _grip(rough) < config.open_grip * num_beams / COARSE.source_stride
     residual = np.where(is_open, 0.05 * scale, 3.0 * noise)
     prior = StepPrior(prior.mean, np.asarray(prior.information) * ((residual / coarse) ** 2)[:, None])
-    start = np.where(is_open[:, None], np.append(1.0, [1.0, 0.0]) * prior.mean + [0.0, 0.0, 1.0] * rough.poses, rough.poses)
+    start = np.where(
+        is_open[:, None], np.append(1.0, [1.0, 0.0]) * prior.mean + [0.0, 0.0, 1.0] * rough.poses, rough.poses
+    )
     steps = match_pairs(
         source, target, np.stack([rough.poses, start], axis=1), FINE, prior, scale=scale, metric=config.metric
     )

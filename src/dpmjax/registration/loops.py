@@ -49,9 +49,10 @@ class LoopConfig:
         neighbourhood: scans within which loops are neighbours.
         sigma: accuracy of a fitted beam in length scales; gives edges their information.
         step_sigma: trust in a step of the start: translation in length scales, turn in radians.
+        step_trust: so many loops must contradict a step before the trajectory is torn there.
     """
 
-    num_rounds: int = 4
+    num_rounds: int = 3
     drift: float = 0.05
     max_radius: float = 15.0
     min_way: float = 15.0
@@ -65,13 +66,16 @@ class LoopConfig:
     neighbourhood: int = 6
     sigma: float = 0.2
     step_sigma: tuple[float, float] = (0.3, 0.15)
+    step_trust: float = 30.0
 
 
 def find_candidates(poses: Floats, config: LoopConfig, scale: float, seed: int = 0) -> tuple[Indices, Indices]:
     """Pairs of scans that may see the same place: later one (source) and earlier one (target)."""
     way = np.append(0.0, np.cumsum(np.hypot(*np.diff(poses[:, :2], axis=0).T)))
     tree = scipy.spatial.cKDTree(poses[:, :2])
-    first, second = tree.query_pairs(min(config.max_radius * scale, 2 * scale + config.drift * way[-1]), output_type="ndarray").T
+    first, second = tree.query_pairs(
+        min(config.max_radius * scale, 2 * scale + config.drift * way[-1]), output_type="ndarray"
+    ).T
     apart = way[second] - way[first]
     distance = np.hypot(*(poses[second, :2] - poses[first, :2]).T)
     keep = (apart > config.min_way * scale) & (distance < 2 * scale + config.drift * apart) & (second - first > 5)
@@ -118,7 +122,11 @@ def _guesses(predicted: Floats, scale: float) -> Floats:
     """Scans that overlap well are near each other, whatever the drift says; only the heading is trusted a little."""
     shifts = 1.5 * scale * np.array([(0, 0), (1, 0), (-1, 0), (0, 1), (0, -1)])
     turns = np.radians([0.0, -12.0, 12.0])
-    fan = [np.stack([x + 0 * predicted[:, 0], y + 0 * predicted[:, 1], predicted[:, 2] + t], -1) for t in turns for x, y in shifts]
+    fan = [
+        np.stack([x + 0 * predicted[:, 0], y + 0 * predicted[:, 1], predicted[:, 2] + t], -1)
+        for t in turns
+        for x, y in shifts
+    ]
     return np.stack([*fan, predicted], axis=1)
 
 
@@ -217,7 +225,8 @@ def close_loops(
             loops = find_loops(lines, poses, config, scale=scale)
         if not len(loops.source):
             return poses, loops, weight
-        poses, weights = optimize_planar_graph(poses, join_edges(steps, loops), GraphConfig())
+        trust = np.repeat([config.step_trust, 1.0], [len(steps.source), len(loops.source)])
+        poses, weights = optimize_planar_graph(poses, join_edges(steps, loops), GraphConfig(), trust=trust)
         weight = weights[len(steps.source) :]
     return poses, loops, weight
 

@@ -14,7 +14,16 @@ import scipy.spatial
 from dpmjax.geometry import planar_poses
 from dpmjax.geometry.lines import LineScans
 from dpmjax.registration.loops import LoopConfig, close_loops, step_edges
-from dpmjax.registration.pairs import FINE, PairMatches, Schedule, length_scale, match_pairs, no_prior, scales, take_scans
+from dpmjax.registration.pairs import (
+    FINE,
+    PairMatches,
+    Schedule,
+    length_scale,
+    match_pairs,
+    no_prior,
+    scales,
+    take_scans,
+)
 from dpmjax.registration.planar import PairSystem, linearise_pair
 from dpmjax.registration.planar_graph import Edges, Floats, Indices, join_edges, move_poses, solve_poses
 

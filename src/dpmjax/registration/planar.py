@@ -11,10 +11,10 @@ from typing import Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
-from dpmjax.geometry.neighbours import k_nearest
 from dpmjax.geometry.lines import LineScans
+from dpmjax.geometry.neighbours import k_nearest
 
 Metric = Literal["point", "plane"]
 
@@ -147,7 +147,9 @@ def align_pairs(
         The aligned relative poses and each pair's system there (its `information` and `weight` tell how well it is fixed).
     """
 
-    def align(source: LineScans, target: LineScans, guess: Float[Array, " 3"], prior: StepPrior) -> tuple[Array, PairSystem]:
+    def align(
+        source: LineScans, target: LineScans, guess: Float[Array, " 3"], prior: StepPrior
+    ) -> tuple[Array, PairSystem]:
         def iterate(pose: Array, scales: tuple[Array, Array]) -> tuple[Array, None]:
             system = linearise_pair(source, target, pose, *scales, metric=metric)
             return move(pose, _solve(system, pose, prior)), None

@@ -46,7 +46,8 @@ class GraphConfig:
     """Settings of the robust pose graph.
 
     Attributes:
-        outlier_chi2: squared Mahalanobis distance beyond which an edge loses most of its say (3 degrees of freedom).
+        outlier_chi2: squared Mahalanobis distance beyond which an edge loses most of its say (3 degrees of freedom); the
+            most that a contradicted edge costs.
         num_iterations: at most so many solves.
         widening: the graduated kernel starts so many times wider; all edges count, then outliers are let go.
     """
@@ -84,7 +85,9 @@ def solve_poses(num_poses: int, edges: Edges, gradient: Floats, *, damping: floa
     blocks = [(i, i, information), (i, j, -information @ turn), (j, i, -turned @ information)]
     blocks.append((j, j, turned @ information @ turn))
     axes = np.arange(3)
-    rows = np.concatenate([np.broadcast_to(3 * a[:, None, None] + axes[:, None], m.shape).ravel() for a, _, m in blocks])
+    rows = np.concatenate(
+        [np.broadcast_to(3 * a[:, None, None] + axes[:, None], m.shape).ravel() for a, _, m in blocks]
+    )
     cols = np.concatenate([np.broadcast_to(3 * b[:, None, None] + axes, m.shape).ravel() for _, b, m in blocks])
     values = np.concatenate([m.ravel() for _, _, m in blocks])
     matrix = sp.csc_matrix((values, (rows, cols)), shape=(3 * num_poses, 3 * num_poses))
@@ -103,13 +106,16 @@ def move_poses(poses: Floats, steps: Floats) -> Floats:
     return planar_poses.compose(poses, steps)
 
 
-def optimize_planar_graph(poses: Floats, edges: Edges, config: GraphConfig | None = None) -> tuple[Floats, Floats]:
+def optimize_planar_graph(
+    poses: Floats, edges: Edges, config: GraphConfig | None = None, *, trust: Floats | float = 1.0
+) -> tuple[Floats, Floats]:
     """Poses that agree with most edges, by graduated non-convexity with a Geman-McClure kernel on every edge.
 
     Args:
         poses: (n, 3) start, T_world_scan; the first one is held.
         edges: measured relative poses; wrong ones are let go.
         config: settings.
+        trust: (e,) how many edges of the ordinary kind must contradict an edge before it is let go.
 
     Returns:
         The poses and each edge's final weight, 0 (let go) to 1.
@@ -121,7 +127,7 @@ def optimize_planar_graph(poses: Floats, edges: Edges, config: GraphConfig | Non
         here = planar_poses.relative(poses[edges.target], poses[edges.source])
         error = planar_poses.relative(edges.poses, here)
         chi2 = np.einsum("ei,eij,ej->e", error, edges.information, error)
-        scaled = widening * config.outlier_chi2
+        scaled = widening * config.outlier_chi2 * np.asarray(trust)
         weight = (scaled / (scaled + chi2)) ** 2
         weighted = edges.information * weight[:, None, None]
         gradient = np.einsum("eij,ej->ei", weighted, error)

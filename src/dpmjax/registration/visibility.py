@@ -29,7 +29,11 @@ class Visibility(NamedTuple):
 
 
 def _view(
-    points: Float[Array, "b 2"], mask: Bool[Array, " b"], beams: Float[Array, "c 2"], valid: Bool[Array, " c"], tolerance: Array
+    points: Float[Array, "b 2"],
+    mask: Bool[Array, " b"],
+    beams: Float[Array, "c 2"],
+    valid: Bool[Array, " c"],
+    tolerance: Array,
 ) -> Visibility:
     """Points (in the frame of the viewing scan) against its beams."""
     reach = jnp.where(valid, jnp.linalg.norm(beams, axis=-1), 0.0)
