@@ -24,8 +24,8 @@ from dpmjax.nets.localization import LocalizationNet
 from dpmjax.nets.occupancy import OccupancyConfig, init_map_net, make_map_net
 from dpmjax.types import ScanSet
 
-# Points that M-Net's hidden layers hold at once when it is an MLP: 64 MB a layer of 512.
-_MLP_CHUNK = 1 << 15
+# Points that M-Net's hidden layers hold at once when it is an MLP: 16 MB a layer of 512.
+_MLP_CHUNK = 1 << 13
 # Scans that are drawn together where a set is too large for one step.
 _BLOCK = 32
 

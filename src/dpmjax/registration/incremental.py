@@ -4,13 +4,21 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import jax.numpy as jnp
 import numpy as np
+import scipy.sparse
+import scipy.sparse.csgraph
 from numpy.typing import NDArray
 
 from dpmjax.geometry import planar_poses
 from dpmjax.geometry.lines import LineScans
 from dpmjax.registration.pairs import COARSE, FINE, PairMatches, length_scale, match_pairs, no_prior, take_scans
 from dpmjax.registration.planar import Metric, StepPrior
+from dpmjax.registration.visibility import compare_views
+from dpmjax.types import ScanSet
+
+Floats = NDArray[np.float64]
+Indices = NDArray[np.int64]
 
 
 @dataclass(frozen=True)
@@ -24,6 +32,7 @@ class IncrementalConfig:
         good_fitness: a pair that is matched better than this is not searched further.
         poor_fitness: one that is matched worse even then is searched at longer steps.
         similar_turn: steps tell of each other's translation if their turns differ by less, in radians.
+        poor_quality: steps whose fitness less twice the share of crossed points is below this are bridged.
         open_grip: a step is open if less than this share of the beams holds it in its softest direction.
         odometry_sigma: trust in a step of the odometry: translation in length scales, turn in radians.
     """
@@ -34,6 +43,7 @@ class IncrementalConfig:
     good_fitness: float = 0.75
     poor_fitness: float = 0.4
     similar_turn: float = 0.15
+    poor_quality: float = 0.2
     open_grip: float = 0.01
     odometry_sigma: tuple[float, float] = (0.15, 0.1)
 
@@ -139,4 +149,85 @@ def incremental_icp(
     steps = match_pairs(
         source, target, np.stack([rough.poses, start], axis=1), FINE, prior, scale=scale, metric=config.metric
     )
-    return planar_poses.chain(steps.poses), steps
+    if odometry is not None:
+        return planar_poses.chain(steps.poses), steps
+    return bridge_bad_scans(lines, steps, config, scale), steps
+
+
+def _quality(lines: LineScans, source: Indices, target: Indices, matches: PairMatches, scale: float) -> Floats:
+    """Fitness, less the share of points that the other scan has looked through."""
+    tolerance = max(0.1 * scale, 3.0 * float(lines.noise[0]))
+    one, other = take_scans(lines, source), take_scans(lines, target)
+    views = compare_views(
+        ScanSet(one.points, one.mask),
+        ScanSet(other.points, other.mask),
+        jnp.asarray(matches.poses, jnp.float32),
+        jnp.asarray(tolerance, jnp.float32),
+    )
+    crossed = np.asarray(views.num_crossed, np.float64) / np.maximum(np.asarray(views.num_seen, np.float64), 20.0)
+    return matches.fitness - 2.0 * crossed
+
+
+def bridge_bad_scans(lines: LineScans, steps: PairMatches, config: IncrementalConfig, scale: float) -> Floats:
+    """Poses through the best matches, around scans that fit to no neighbour (a passer-by, a swapped line of the log).
+
+    Where a step is poor, the scans on either side of it are matched over it, two and three apart. The poses then follow the
+    spanning tree of the most trustworthy matches instead of the plain chain, so that a bad scan is a leaf.
+
+    Args:
+        lines: n scans.
+        steps: n - 1 matched steps.
+        config: settings.
+        scale: `length_scale` of the scans.
+
+    Returns:
+        (n, 3) poses, the first one zero.
+    """
+    num_scans = len(lines.points)
+    later = np.arange(1, num_scans)
+    edges = [(later, later - 1, steps.poses, _quality(lines, later, later - 1, steps, scale))]
+    poor = np.flatnonzero(edges[0][3] < config.poor_quality)
+    plain = planar_poses.chain(steps.poses)
+    for apart in (2, 3):
+        # All pairs that span a poor step.
+        target = np.unique(np.concatenate([poor - k for k in range(apart)])) if len(poor) else poor
+        target = target[(target >= 0) & (target + apart < num_scans)]
+        if not len(target):
+            continue
+        source = target + apart
+        found = match_pairs(
+            take_scans(lines, source), take_scans(lines, target), np.broadcast_to(_wide_fan(config, scale), (len(target), *_wide_fan(config, scale).shape)),
+            COARSE, no_prior(len(target)), scale=scale, metric=config.metric,
+        )  # fmt: skip
+        found = match_pairs(
+            take_scans(lines, source), take_scans(lines, target), found.poses[:, None], FINE, no_prior(len(target)), scale=scale, metric=config.metric
+        )  # fmt: skip
+        edges.append((source, target, found.poses, _quality(lines, source, target, found, scale)))
+    if len(edges) == 1:
+        return plain
+    source, target, poses, quality = (np.concatenate(x) for x in zip(*edges, strict=True))
+    return _follow_tree(num_scans, source, target, poses, quality)
+
+
+def _wide_fan(config: IncrementalConfig, scale: float) -> Floats:
+    """Guesses for scans two or three steps apart, (h, 3)."""
+    turns = np.radians(np.arange(-config.max_turn_deg, config.max_turn_deg + 1e-6, config.turn_step_deg))
+    ways = np.arange(8) * np.pi / 4
+    shifts = [(0.0, 0.0), *((r * np.cos(w), r * np.sin(w)) for r in (1.5, 3.0) for w in ways)]
+    return np.array([(scale * x, scale * y, turn) for turn in turns for x, y in shifts])
+
+
+def _follow_tree(num_scans: int, source: Indices, target: Indices, poses: Floats, quality: Floats) -> Floats:
+    """Poses from the first scan on along the spanning tree of the best edges."""
+    cost = 2.0 - np.clip(quality, -0.9, 1.0)
+    graph = scipy.sparse.csr_matrix((cost, (source, target)), shape=(num_scans, num_scans))
+    tree = scipy.sparse.csgraph.minimum_spanning_tree(graph)
+    order, parents = scipy.sparse.csgraph.breadth_first_order(tree, 0, directed=False)
+    edge_of = {(int(i), int(j)): row for row, (i, j) in enumerate(zip(source, target, strict=True))}
+    world = np.zeros((num_scans, 3))
+    for scan in order[1:]:
+        parent = parents[scan]
+        row = edge_of.get((int(scan), int(parent)))
+        step = poses[row] if row is not None else planar_poses.inverse(poses[edge_of[(int(parent), int(scan))]])
+        world[scan] = planar_poses.compose(world[parent], step)
+    return world

@@ -1,0 +1,159 @@
+"""Time to accuracy of DeepMapping: ATE after 15, 30, 60 s of run time, beside ICP, the polish and the paper.
+
+The authors' trajectory (v1_pose0) and its poor start are used where they lie in `$DPMJAX_DATA/deepmapping_2d`
+(default `../shared/data`); the built-in world always.
+"""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import TypeVar
+
+import jax
+import numpy as np
+from numpy.typing import NDArray
+
+from benchmarks.rows import Row
+from dpmjax import deepmapping as dm
+from dpmjax.data import ScanSequence, read_sequence, simulate_sequence
+from dpmjax.geometry.lines import LineScans, fit_lines
+from dpmjax.metrics import absolute_trajectory_error
+from dpmjax.registration import PolishConfig, incremental_icp, polish
+from dpmjax.types import ScanSet
+
+T = TypeVar("T")
+NAME = "deepmapping"
+DATA = Path(os.environ.get("DPMJAX_DATA", "../shared/data")) / "deepmapping_2d"
+_MARKS_S = (15.0, 30.0, 60.0, 120.0, 180.0)
+
+
+def run(quick: bool) -> list[Row]:
+    """ICP and polish with and without noise, the fit from a poor start and from zero, the paper's step."""
+    rows: list[Row] = []
+    sequences = [simulate_sequence(0, 64 if quick else 256, seed=0)]
+    if DATA.is_dir():
+        sequences.insert(0, read_sequence(DATA / "v1_pose0.tar", stop=64 if quick else None))
+    for sequence in sequences:
+        for noise_px in (0.0, 1.0, 3.0):
+            rows += _classical(_with_noise(sequence, noise_px), f"{sequence.name}, noise {noise_px:g} px", quick)
+    for sequence in sequences:
+        rows += _fit(sequence, None, f"{sequence.name}, cold", quick)
+        rows += _fit(sequence, _poor_start(sequence), f"{sequence.name}, poor start", quick)
+    rows += _paper_step(sequences[0])
+    return rows
+
+
+def _poor_start(sequence: ScanSequence) -> NDArray[np.float64]:
+    """The start that comes with the authors' trajectory; elsewhere a drift of its size."""
+    file = DATA / "start_16px.txt"
+    if file.exists() and sequence.name.startswith("v1_pose0"):
+        return np.loadtxt(file)[: len(sequence)]
+    assert sequence.reference_poses is not None
+    rng = np.random.default_rng(0)
+    drift = np.cumsum(rng.normal(0.0, [1.2, 1.2, 0.004], sequence.reference_poses.shape), axis=0)
+    return sequence.reference_poses + drift
+
+
+def _with_noise(sequence: ScanSequence, noise_px: float) -> ScanSequence:
+    """Gaussian noise along the beams."""
+    ranges = np.linalg.norm(sequence.points, axis=-1, keepdims=True)
+    noise = noise_px * np.random.default_rng(1).standard_normal(ranges.shape)
+    points = sequence.points * (1.0 + noise / np.maximum(ranges, 1e-6))
+    return replace(sequence, points=points.astype(np.float32))
+
+
+def _lines(sequence: ScanSequence) -> LineScans:
+    return fit_lines(ScanSet(sequence.points, sequence.mask))
+
+
+def _ate(sequence: ScanSequence, poses: NDArray[np.float64]) -> float:
+    assert sequence.reference_poses is not None
+    return absolute_trajectory_error(poses[:, :2], sequence.reference_poses[:, :2])
+
+
+def _classical(sequence: ScanSequence, case: str, quick: bool) -> list[Row]:
+    """Incremental point-to-line ICP, then the polish; the second call of each is timed."""
+    rows = []
+
+    def timed(metric: str, function: Callable[[], T]) -> T:
+        begun = time.perf_counter()
+        function()
+        first_s = time.perf_counter() - begun
+        begun = time.perf_counter()
+        result = function()
+        run_s = time.perf_counter() - begun
+        rows.append(Row(f"{case}: {metric}", "compile", max(0.0, first_s - run_s), "s"))
+        rows.append(Row(f"{case}: {metric}", "run", run_s, "s"))
+        return result
+
+    lines = _lines(sequence)
+    poses, _ = timed("icp-plane", lambda: incremental_icp(_lines(sequence)))
+    rows.append(Row(f"{case}: icp-plane", "ate", _ate(sequence, poses), "px"))
+    polished = timed("icp-plane + polish", lambda: polish(lines, poses, PolishConfig()))
+    rows.append(Row(f"{case}: icp-plane + polish", "ate", _ate(sequence, polished.poses), "px"))
+    if not quick:
+        polished = polish(lines, _poor_start(sequence), PolishConfig())
+        rows.append(Row(f"{case}: poor start + polish", "ate", _ate(sequence, polished.poses), "px"))
+    return rows
+
+
+def _fit(sequence: ScanSequence, start: NDArray[np.float64] | None, case: str, quick: bool) -> list[Row]:
+    """Neural losses alone, ATE at the marks and at the end; then the polish of the result."""
+    config = dm.with_steps(dm.preset("fast"), 100) if quick else dm.preset("fast")
+    is_warm = start is not None
+    scans = dm.as_scan_set(ScanSet(sequence.points, sequence.mask))
+    reach = dm.measure_reach(scans)
+    scans = scans.replace(points=scans.points / reach)
+    unit = np.array([reach, reach, 1.0])
+    key = jax.random.key(0)
+    state = dm.init(key, scans, config, start_poses=None if start is None else start / unit)
+    compile_s = run_s = 0.0
+    poses = np.zeros((len(sequence), 3)) if start is None else start
+    rows = [Row(case, "ate at start", _ate(sequence, poses), "px")]
+    marks = list(_MARKS_S)
+    phases = config.phases(is_warm=is_warm)
+    for index, phase in enumerate(phases):
+        begun = time.perf_counter()
+        step = dm.make_step(scans, config, phase).lower(state, key=key).compile()
+        compile_s += time.perf_counter() - begun
+        while int(state.phase_step) < phase.num_steps:
+            begun = time.perf_counter()
+            state, report = step(state, key=key)
+            poses = np.asarray(report.poses, np.float64) * unit
+            run_s += time.perf_counter() - begun
+            if marks and run_s >= marks[0]:
+                rows.append(Row(case, f"ate after {marks.pop(0):.0f} s", _ate(sequence, poses), "px"))
+        if index + 1 < len(phases):
+            state = dm.next_phase(state, scans, config, is_warm=is_warm)
+    rows += [
+        Row(case, "ate at the end", _ate(sequence, poses), "px"),
+        Row(case, "run", run_s, "s"),
+        Row(case, "steps", float(state.step), ""),
+        Row(case, "compile", compile_s, "s"),
+    ]
+    polished = polish(_lines(sequence), poses, PolishConfig())
+    return [*rows, Row(f"{case}: + polish", "ate", _ate(sequence, polished.poses), "px")]
+
+
+def _paper_step(sequence: ScanSequence) -> list[Row]:
+    """One step of the paper's architecture, losses and sampling: a batch of 128 scans, as published."""
+    config = dm.preset("paper")
+    scans = dm.as_scan_set(ScanSet(sequence.points, sequence.mask))
+    scans = scans.replace(points=scans.points / dm.measure_reach(scans))
+    key = jax.random.key(0)
+    state = dm.init(key, scans, config)
+    phase = config.cold_phases[0]
+    begun = time.perf_counter()
+    step = dm.make_step(scans, config, phase).lower(state, key=key).compile()
+    compile_s = time.perf_counter() - begun
+    seconds = []
+    for _ in range(2):
+        begun = time.perf_counter()
+        state, _ = jax.block_until_ready(step(state, key=key))
+        seconds.append(time.perf_counter() - begun)
+    case = f"{sequence.name}, paper preset"
+    return [Row(case, "compile", compile_s, "s"), Row(case, "one step of 128 scans", min(seconds), "s")]
