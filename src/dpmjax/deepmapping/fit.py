@@ -6,6 +6,7 @@ The state is one pytree of arrays, so that a run can be written to disk after an
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import flax.struct
@@ -115,7 +116,7 @@ def as_scan_set(scans: ScanSet | ArrayLike) -> ScanSet:
         if points.ndim != 3 or points.shape[-1] != 2:
             raise ValueError(f"scans: expected shape (n, b, 2), got {points.shape}")
         mask = np.isfinite(points).all(-1) & (np.abs(points).sum(-1) > 0)
-        scans = ScanSet(points=np.where(mask[..., None], points, 0.0), mask=mask)
+        scans = ScanSet(points=jnp.asarray(np.where(mask[..., None], points, 0.0)), mask=jnp.asarray(mask))
     if scans.points.shape[0] < 2:
         raise ValueError(f"scans: expected at least 2, got {scans.points.shape[0]}")
     empty = np.flatnonzero(~np.asarray(scans.mask).any(-1))
@@ -187,10 +188,10 @@ _init_state = init
 
 
 def next_phase(state: State, scans: ScanSet, config: DeepMappingConfig, *, is_warm: bool) -> State:
-    """The state at the start of the following phase: free poses take over where L-Net is, in a map frame around them."""
+    """The state at the start of the next phase: free poses take over where L-Net is, in a map frame around them."""
     phases = config.phases(is_warm=is_warm)
     poses = current_poses(state, scans, config, phases[int(state.phase)])
-    params = state.params.replace(poses=poses)
+    params = replace(state.params, poses=poses)
     optimizer = _make_optimizer(phases[int(state.phase) + 1]).init(params)
     frame = _choose_frame(scans, poses, config)
     zero = jnp.zeros((), jnp.int32)
@@ -219,7 +220,7 @@ def _choose_beams(num_beams: int, phase: PhaseConfig, offset: Int[Array, ""]) ->
 
 
 def _draw_batch(scans: ScanSet, phase: PhaseConfig, step: Int[Array, ""], *, key: jax.Array) -> Batch:
-    """All scans where they are few enough, else random blocks of neighbours in time; beams from a random first one on."""
+    """All scans where they are few enough, else blocks of neighbours in time; beams from a random first one on."""
     beam_key, scan_key = jax.random.split(key)
     num_scans, num_beams = scans.mask.shape
     beams = _choose_beams(num_beams, phase, jax.random.randint(beam_key, (), 0, num_beams))
@@ -238,18 +239,17 @@ def _draw_batch(scans: ScanSet, phase: PhaseConfig, step: Int[Array, ""], *, key
 
 def _bind_map(params: Any, config: OccupancyConfig, frame: MapFrame, level_weights: Float[Array, " l"]) -> MapLogits:
     """M-Net as a function of points in the world, in reaches."""
-    net = make_map_net(config)
+    apply: Callable[..., Any] = make_map_net(config).apply
 
     def logits(points: Float[Array, "n 2"]) -> Float[Array, " n"]:
         local = (points - frame.centre) / frame.half_side
         if config.kind == "grid" or len(points) <= _MLP_CHUNK:
-            return net.apply(params, local, level_weights)
-        # The hidden layers of all samples at once would take gigabytes: a part at a time, computed again on the way back.
+            return apply(params, local, level_weights)
+        # The hidden layers of all samples at once would take gigabytes: a part at a time, again on the way back.
         count = -(-len(points) // _MLP_CHUNK)
         parts = jnp.pad(local, ((0, count * _MLP_CHUNK - len(points)), (0, 0))).reshape(count, _MLP_CHUNK, 2)
-        return jax.lax.map(jax.checkpoint(lambda p: net.apply(params, p, level_weights)), parts).reshape(-1)[
-            : len(points)
-        ]
+        logits_of_parts = jax.lax.map(jax.checkpoint(lambda part: apply(params, part, level_weights)), parts)
+        return logits_of_parts.reshape(-1)[: len(points)]
 
     return logits
 
@@ -267,7 +267,7 @@ def _level_weights(phase: PhaseConfig, config: DeepMappingConfig, progress: Floa
 
 
 def make_step(scans: ScanSet, config: DeepMappingConfig, phase: PhaseConfig) -> Callable[..., tuple[State, Report]]:
-    """The compiled step of one phase: `state, report = step(state, key=key)` does `config.steps_per_call` steps of Adam.
+    """The compiled step of one phase: `state, report = step(state, key=key)` does `config.steps_per_call` steps.
 
     Args:
         scans: all scans, in reaches.
@@ -275,7 +275,8 @@ def make_step(scans: ScanSet, config: DeepMappingConfig, phase: PhaseConfig) -> 
         phase: the phase that the state is in.
 
     Returns:
-        The function. The key is that of the whole run: step k uses `fold_in(key, k)`, so a resumed run equals an unbroken one.
+        The function. The key is that of the whole run: step k uses `fold_in(key, k)`, so that a resumed run equals an
+        unbroken one.
     """
     optimizer = _make_optimizer(phase)
 
@@ -300,8 +301,8 @@ def make_step(scans: ScanSet, config: DeepMappingConfig, phase: PhaseConfig) -> 
         )
         updates, optimizer_state = optimizer.update(gradient, state.optimizer, state.params)
         params = optax.apply_updates(state.params, updates)
-        state = state.replace(
-            params=params, optimizer=optimizer_state, phase_step=state.phase_step + 1, step=state.step + 1
+        state = replace(
+            state, params=params, optimizer=optimizer_state, phase_step=state.phase_step + 1, step=state.step + 1
         )
         return state, (loss, terms)
 
@@ -365,7 +366,7 @@ def fit(
     config = config or DeepMappingConfig()
     scans = as_scan_set(scans)
     reach = measure_reach(scans)
-    scaled = scans.replace(points=scans.points / reach)
+    scaled = replace(scans, points=scans.points / reach)
     unit = np.array([reach, reach, 1.0])
     start = None if init is None else _as_planar(init, scans.mask.shape[0]) / unit
     state = _init_state(key, scaled, config, start_poses=start)

@@ -46,18 +46,20 @@ def icp(
 ) -> IcpResult:
     """Aligns two clouds from a first guess; planar (d = 2: "plane" means line) or spatial (d = 3).
 
-    Each source point is paired with its nearest target point. Pairs are trusted by a Geman-McClure weight whose scale is the
-    median distance of the pairs, so that what only one cloud has seen does not pull.
+    Each source point is paired with its nearest target point. Pairs are trusted by a Geman-McClure weight whose scale
+    is three times the median distance of the pairs, so that what only one cloud has seen does not pull.
 
     Args:
         source: finite points.
         target: finite points, same unit.
         metric: distance to the nearest point (Besl and McKay), or to its line or plane (Chen and Medioni).
-        init: first guess of T_target_source; None: identity. The basin is about the size of the structures: some degrees.
+        init: first guess of T_target_source; None: identity. The basin is about as wide as the structures: some
+            degrees.
         max_iterations: at most so many.
 
     Returns:
-        IcpResult. With too few points to fix the motion it stays where the data leave it: near `init`, `converged` true.
+        IcpResult. With too few points to fix the motion it stays where the data leave it: near `init`, `converged`
+        true.
 
     Raises:
         ValueError: wrong shapes, not finite, unknown metric, or an empty cloud.
@@ -119,7 +121,9 @@ def _icp(
         return T_next, change, count + 1
 
     T, change, _ = jax.lax.while_loop(
-        lambda c: (c[1] > tiny) & (c[2] < max_iterations), iterate, (start, jnp.asarray(jnp.inf, source.dtype), 0)
+        lambda c: (c[1] > tiny) & (c[2] < max_iterations),
+        iterate,
+        (start, jnp.asarray(jnp.inf, source.dtype), jnp.asarray(0)),
     )
     _, _, residual, _ = distances(T)
     limit = jnp.maximum(3.0 * 1.4826 * jnp.median(residual), tiny)

@@ -1,7 +1,7 @@
 """Robust alignment of pairs of planar scans, many at once: the kernel under the warm start, loop search and polish.
 
-A pose is a vector (x, y, heading). Errors of a pair are linearised in the tangent space of T_target_source on the right,
-T_target_source @ exp(delta), so that a pair costs a 3 x 3 matrix and a 3-vector whoever asks.
+A pose is a vector (x, y, heading). Errors of a pair are linearised in the tangent space of T_target_source on the
+right, T_target_source @ exp(delta), so that a pair costs a 3 x 3 matrix and a 3-vector whoever asks.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from jaxtyping import Array, Float
 
 from dpmjax.geometry.lines import LineScans
 from dpmjax.geometry.neighbours import k_nearest
+from dpmjax.types import AnyArray
 
 Metric = Literal["point", "plane"]
 
@@ -104,8 +105,8 @@ class StepPrior(NamedTuple):
         information: inverse variances of its three parts, in units of one beam's information; zero: no belief.
     """
 
-    mean: Float[Array, "... 3"]
-    information: Float[Array, "... 3"]
+    mean: Float[AnyArray, "... 3"]
+    information: Float[AnyArray, "... 3"]
 
 
 def _solve(system: PairSystem, pose: Float[Array, " 3"], prior: StepPrior) -> Float[Array, " 3"]:
@@ -144,7 +145,8 @@ def align_pairs(
         metric: "point" or "plane".
 
     Returns:
-        The aligned relative poses and each pair's system there (its `information` and `weight` tell how well it is fixed).
+        The aligned relative poses and each pair's system there; its `information` and `weight` tell how well it is
+        fixed.
     """
 
     def align(
