@@ -5,6 +5,7 @@ The state is one pytree of arrays, so that a run can be written to disk after an
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from typing import Any, NamedTuple
@@ -109,7 +110,8 @@ def as_scan_set(scans: ScanSet | ArrayLike) -> ScanSet:
     """Scans from an array (n, b, 2); beams with coordinates that are not finite, or both zero, measured nothing.
 
     Raises:
-        ValueError: the shape is not (n, b, 2), there are fewer than two scans, or a scan has no valid beam.
+        ValueError: the shape is not (n, b, 2), there are fewer than two scans, a scan has no valid beam, or what the
+            mask of a ScanSet calls valid is not finite.
     """
     if not isinstance(scans, ScanSet):
         points = np.asarray(scans, np.float32)
@@ -122,7 +124,11 @@ def as_scan_set(scans: ScanSet | ArrayLike) -> ScanSet:
     empty = np.flatnonzero(~np.asarray(scans.mask).any(-1))
     if len(empty):
         raise ValueError(f"scans: scan {empty[0]} has no valid beam; leave it out ({len(empty)} such scans)")
-    return ScanSet(points=jnp.asarray(scans.points, jnp.float32), mask=jnp.asarray(scans.mask, bool))
+    mask = jnp.asarray(scans.mask, bool)
+    clean = jnp.where(mask[..., None], jnp.asarray(scans.points, jnp.float32), 0.0)
+    if not bool(jnp.isfinite(clean).all()):
+        raise ValueError("scans: expected finite coordinates where the mask is True")
+    return ScanSet(points=clean, mask=mask)
 
 
 def measure_reach(scans: ScanSet) -> float:
@@ -228,7 +234,9 @@ def _draw_batch(scans: ScanSet, phase: PhaseConfig, step: Int[Array, ""], *, key
         rows, block = jnp.arange(num_scans), jnp.zeros(num_scans, jnp.int32)
     elif phase.is_free_factor_shared:
         # The published order: batches follow each other in time, none is mixed.
-        first = (step % (num_scans // phase.scans_per_step)) * phase.scans_per_step
+        # The last one reaches back, so that it is as long as the others and no scan is left out.
+        first = step % -(-num_scans // phase.scans_per_step) * phase.scans_per_step
+        first = jnp.minimum(first, num_scans - phase.scans_per_step)
         rows, block = first + jnp.arange(phase.scans_per_step), jnp.zeros(phase.scans_per_step, jnp.int32)
     else:
         num_blocks = phase.scans_per_step // _BLOCK
@@ -361,7 +369,7 @@ def fit(
         Fitted, poses in the unit of the points. The world is that of `init`, or arbitrary after a cold start.
 
     Raises:
-        ValueError: the scans or the poses have a wrong shape, or a scan has no valid beam.
+        ValueError: the scans or the poses have a wrong shape or are not finite, or a scan has no valid beam.
     """
     config = config or DeepMappingConfig()
     scans = as_scan_set(scans)
@@ -370,13 +378,16 @@ def fit(
     unit = np.array([reach, reach, 1.0])
     start = None if init is None else _as_planar(init, scans.mask.shape[0]) / unit
     state = _init_state(key, scaled, config, start_poses=start)
-    *_, (_, state, report) = run_phases(scaled, config, state, key=key, is_warm=start is not None)
+    # One at a time: a list of all states would hold every map that there ever was.
+    ((_, state, report),) = deque(run_phases(scaled, config, state, key=key, is_warm=start is not None), maxlen=1)
     poses = np.asarray(report.poses, np.float64) * unit
     return Fitted(planar_poses.matrices(poses), poses, state.params, report, state, reach)
 
 
 def _as_planar(poses: NDArray[np.float64], num_scans: int) -> NDArray[np.float64]:
     poses = np.asarray(poses, np.float64)
+    if not np.isfinite(poses).all():
+        raise ValueError("init: expected finite poses")
     if poses.shape == (num_scans, 3, 3):
         return np.stack([poses[:, 0, 2], poses[:, 1, 2], np.arctan2(poses[:, 1, 0], poses[:, 0, 0])], axis=-1)
     if poses.shape != (num_scans, 3):

@@ -157,6 +157,8 @@ def fit_lines(scans: ScanSet, *, num_doublings: int = 4) -> LineScans:
     Returns:
         LineScans; a beam without any straight run of its own is masked.
     """
+    # What is masked may hold anything; zero times NaN would be NaN later on.
+    scans = ScanSet(points=jnp.where(scans.mask[..., None], scans.points, 0.0), mask=scans.mask)
     # Rounding of float32 coordinates looks like noise of this size; below it "straight" would mean nothing.
     reach = jnp.max(jnp.where(scans.mask, jnp.linalg.norm(scans.points, axis=-1), 0.0))
     noise = jnp.maximum(range_noise(scans), 1e-6 * reach)

@@ -112,7 +112,8 @@ def _icp(
         moved, nearest, _, weight = distances(T)
         if metric == "point":
             return weighted_svd(source, target[nearest], weight)
-        return _step_to_planes(moved, target[nearest], normals.normals[nearest], weight * normals.mask[nearest]) @ T
+        step = _step_to_planes(moved, target[nearest], normals.normals[nearest], weight * normals.mask[nearest])
+        return jnp.matmul(step, T, precision="highest")
 
     def iterate(carry: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
         T, _, count = carry
@@ -151,7 +152,8 @@ def _step_to_planes(
     diagonal = jnp.diagonal(system)
     # Directions that no plane holds stay as they are.
     damping = 1e-4 * diagonal + 1e-6 * diagonal.max() + jnp.finfo(points.dtype).tiny
-    step = jnp.linalg.solve(system + jnp.diag(damping), -weighted.T @ residual)
+    gradient = jnp.einsum("ni,n->i", weighted, residual, precision="highest")
+    step = jnp.linalg.solve(system + jnp.diag(damping), -gradient)
     motion = exp_se2(step) if dimensions == 2 else exp_se3(step)
     there = jnp.eye(dimensions + 1, dtype=points.dtype).at[:dimensions, dimensions].set(centre)
     back = jnp.eye(dimensions + 1, dtype=points.dtype).at[:dimensions, dimensions].set(-centre)
