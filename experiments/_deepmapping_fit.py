@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -80,7 +80,7 @@ def run_fit(
 
     scans = dm.as_scan_set(ScanSet(sequence.points, sequence.mask))
     reach = dm.measure_reach(scans)
-    scans = scans.replace(points=scans.points / reach)
+    scans = replace(scans, points=scans.points / reach)
     unit = np.array([reach, reach, 1.0])
     is_warm = start is not None
     phases = settings.phases(is_warm=is_warm)

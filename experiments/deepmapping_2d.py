@@ -179,11 +179,11 @@ def warm_start(config: Config, sequence: ScanSequence) -> NDArray[np.float64]:
             )
         return sequence.odometry_poses
     if config.init not in INITS:
-        from dpmjax.data import read_start
+        from dpmjax.data import read_initial_poses
 
         if not Path(config.init).exists():
             raise ValueError(f"--init {config.init}: no such file, and none of {', '.join(INITS)}")
-        return read_start(config.init, len(sequence), sequence.unit)
+        return read_initial_poses(config.init, len(sequence), sequence.unit)
 
     from dpmjax.registration import IncrementalConfig, incremental_icp
 

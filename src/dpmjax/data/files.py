@@ -15,7 +15,7 @@ def write_atomically(path: str | Path, content: bytes | str) -> Path:
 
     Args:
         path: where the file goes; an existing file is replaced.
-        content: bytes, or text (written as UTF-8 with "\\n" line ends).
+        content: bytes, or text (written as UTF-8, lines end with a line feed alone).
 
     Returns:
         The path.

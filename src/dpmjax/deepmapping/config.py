@@ -28,8 +28,8 @@ class PhaseConfig:
         max_offset: which are drawn among the next so many; the next one is always among them.
         num_free: free samples a beam, drawn between sensor and hit.
         is_free_factor_shared: one factor a sample for all beams and scans (the published program), else one each.
-        surface_distance: a further free sample in front of the hit, at about this distance at the start and at the end of
-            the phase; None: none.
+        surface_distance: a further free sample in front of the hit, at about this distance at the start and at the
+            end of the phase; None: none.
         anneal_until: share of the phase after which all levels of the map are on.
         map_decay: weight of the mean square of a grid's nodes.
     """

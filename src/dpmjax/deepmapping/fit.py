@@ -5,7 +5,9 @@ The state is one pytree of arrays, so that a run can be written to disk after an
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import flax.struct
@@ -108,20 +110,25 @@ def as_scan_set(scans: ScanSet | ArrayLike) -> ScanSet:
     """Scans from an array (n, b, 2); beams with coordinates that are not finite, or both zero, measured nothing.
 
     Raises:
-        ValueError: the shape is not (n, b, 2), there are fewer than two scans, or a scan has no valid beam.
+        ValueError: the shape is not (n, b, 2), there are fewer than two scans, a scan has no valid beam, or what the
+            mask of a ScanSet calls valid is not finite.
     """
     if not isinstance(scans, ScanSet):
         points = np.asarray(scans, np.float32)
         if points.ndim != 3 or points.shape[-1] != 2:
             raise ValueError(f"scans: expected shape (n, b, 2), got {points.shape}")
         mask = np.isfinite(points).all(-1) & (np.abs(points).sum(-1) > 0)
-        scans = ScanSet(points=np.where(mask[..., None], points, 0.0), mask=mask)
+        scans = ScanSet(points=jnp.asarray(np.where(mask[..., None], points, 0.0)), mask=jnp.asarray(mask))
     if scans.points.shape[0] < 2:
         raise ValueError(f"scans: expected at least 2, got {scans.points.shape[0]}")
     empty = np.flatnonzero(~np.asarray(scans.mask).any(-1))
     if len(empty):
         raise ValueError(f"scans: scan {empty[0]} has no valid beam; leave it out ({len(empty)} such scans)")
-    return ScanSet(points=jnp.asarray(scans.points, jnp.float32), mask=jnp.asarray(scans.mask, bool))
+    mask = jnp.asarray(scans.mask, bool)
+    clean = jnp.where(mask[..., None], jnp.asarray(scans.points, jnp.float32), 0.0)
+    if not bool(jnp.isfinite(clean).all()):
+        raise ValueError("scans: expected finite coordinates where the mask is True")
+    return ScanSet(points=clean, mask=mask)
 
 
 def measure_reach(scans: ScanSet) -> float:
@@ -187,10 +194,10 @@ _init_state = init
 
 
 def next_phase(state: State, scans: ScanSet, config: DeepMappingConfig, *, is_warm: bool) -> State:
-    """The state at the start of the following phase: free poses take over where L-Net is, in a map frame around them."""
+    """The state at the start of the next phase: free poses take over where L-Net is, in a map frame around them."""
     phases = config.phases(is_warm=is_warm)
     poses = current_poses(state, scans, config, phases[int(state.phase)])
-    params = state.params.replace(poses=poses)
+    params = replace(state.params, poses=poses)
     optimizer = _make_optimizer(phases[int(state.phase) + 1]).init(params)
     frame = _choose_frame(scans, poses, config)
     zero = jnp.zeros((), jnp.int32)
@@ -219,7 +226,7 @@ def _choose_beams(num_beams: int, phase: PhaseConfig, offset: Int[Array, ""]) ->
 
 
 def _draw_batch(scans: ScanSet, phase: PhaseConfig, step: Int[Array, ""], *, key: jax.Array) -> Batch:
-    """All scans where they are few enough, else random blocks of neighbours in time; beams from a random first one on."""
+    """All scans where they are few enough, else blocks of neighbours in time; beams from a random first one on."""
     beam_key, scan_key = jax.random.split(key)
     num_scans, num_beams = scans.mask.shape
     beams = _choose_beams(num_beams, phase, jax.random.randint(beam_key, (), 0, num_beams))
@@ -227,7 +234,9 @@ def _draw_batch(scans: ScanSet, phase: PhaseConfig, step: Int[Array, ""], *, key
         rows, block = jnp.arange(num_scans), jnp.zeros(num_scans, jnp.int32)
     elif phase.is_free_factor_shared:
         # The published order: batches follow each other in time, none is mixed.
-        first = (step % (num_scans // phase.scans_per_step)) * phase.scans_per_step
+        # The last one reaches back, so that it is as long as the others and no scan is left out.
+        first = step % -(-num_scans // phase.scans_per_step) * phase.scans_per_step
+        first = jnp.minimum(first, num_scans - phase.scans_per_step)
         rows, block = first + jnp.arange(phase.scans_per_step), jnp.zeros(phase.scans_per_step, jnp.int32)
     else:
         num_blocks = phase.scans_per_step // _BLOCK
@@ -238,18 +247,17 @@ def _draw_batch(scans: ScanSet, phase: PhaseConfig, step: Int[Array, ""], *, key
 
 def _bind_map(params: Any, config: OccupancyConfig, frame: MapFrame, level_weights: Float[Array, " l"]) -> MapLogits:
     """M-Net as a function of points in the world, in reaches."""
-    net = make_map_net(config)
+    apply: Callable[..., Any] = make_map_net(config).apply
 
     def logits(points: Float[Array, "n 2"]) -> Float[Array, " n"]:
         local = (points - frame.centre) / frame.half_side
         if config.kind == "grid" or len(points) <= _MLP_CHUNK:
-            return net.apply(params, local, level_weights)
-        # The hidden layers of all samples at once would take gigabytes: a part at a time, computed again on the way back.
+            return apply(params, local, level_weights)
+        # The hidden layers of all samples at once would take gigabytes: a part at a time, again on the way back.
         count = -(-len(points) // _MLP_CHUNK)
         parts = jnp.pad(local, ((0, count * _MLP_CHUNK - len(points)), (0, 0))).reshape(count, _MLP_CHUNK, 2)
-        return jax.lax.map(jax.checkpoint(lambda p: net.apply(params, p, level_weights)), parts).reshape(-1)[
-            : len(points)
-        ]
+        logits_of_parts = jax.lax.map(jax.checkpoint(lambda part: apply(params, part, level_weights)), parts)
+        return logits_of_parts.reshape(-1)[: len(points)]
 
     return logits
 
@@ -267,7 +275,7 @@ def _level_weights(phase: PhaseConfig, config: DeepMappingConfig, progress: Floa
 
 
 def make_step(scans: ScanSet, config: DeepMappingConfig, phase: PhaseConfig) -> Callable[..., tuple[State, Report]]:
-    """The compiled step of one phase: `state, report = step(state, key=key)` does `config.steps_per_call` steps of Adam.
+    """The compiled step of one phase: `state, report = step(state, key=key)` does `config.steps_per_call` steps.
 
     Args:
         scans: all scans, in reaches.
@@ -275,7 +283,8 @@ def make_step(scans: ScanSet, config: DeepMappingConfig, phase: PhaseConfig) -> 
         phase: the phase that the state is in.
 
     Returns:
-        The function. The key is that of the whole run: step k uses `fold_in(key, k)`, so a resumed run equals an unbroken one.
+        The function. The key is that of the whole run: step k uses `fold_in(key, k)`, so that a resumed run equals an
+        unbroken one.
     """
     optimizer = _make_optimizer(phase)
 
@@ -300,8 +309,8 @@ def make_step(scans: ScanSet, config: DeepMappingConfig, phase: PhaseConfig) -> 
         )
         updates, optimizer_state = optimizer.update(gradient, state.optimizer, state.params)
         params = optax.apply_updates(state.params, updates)
-        state = state.replace(
-            params=params, optimizer=optimizer_state, phase_step=state.phase_step + 1, step=state.step + 1
+        state = replace(
+            state, params=params, optimizer=optimizer_state, phase_step=state.phase_step + 1, step=state.step + 1
         )
         return state, (loss, terms)
 
@@ -360,22 +369,25 @@ def fit(
         Fitted, poses in the unit of the points. The world is that of `init`, or arbitrary after a cold start.
 
     Raises:
-        ValueError: the scans or the poses have a wrong shape, or a scan has no valid beam.
+        ValueError: the scans or the poses have a wrong shape or are not finite, or a scan has no valid beam.
     """
     config = config or DeepMappingConfig()
     scans = as_scan_set(scans)
     reach = measure_reach(scans)
-    scaled = scans.replace(points=scans.points / reach)
+    scaled = replace(scans, points=scans.points / reach)
     unit = np.array([reach, reach, 1.0])
     start = None if init is None else _as_planar(init, scans.mask.shape[0]) / unit
     state = _init_state(key, scaled, config, start_poses=start)
-    *_, (_, state, report) = run_phases(scaled, config, state, key=key, is_warm=start is not None)
+    # One at a time: a list of all states would hold every map that there ever was.
+    ((_, state, report),) = deque(run_phases(scaled, config, state, key=key, is_warm=start is not None), maxlen=1)
     poses = np.asarray(report.poses, np.float64) * unit
     return Fitted(planar_poses.matrices(poses), poses, state.params, report, state, reach)
 
 
 def _as_planar(poses: NDArray[np.float64], num_scans: int) -> NDArray[np.float64]:
     poses = np.asarray(poses, np.float64)
+    if not np.isfinite(poses).all():
+        raise ValueError("init: expected finite poses")
     if poses.shape == (num_scans, 3, 3):
         return np.stack([poses[:, 0, 2], poses[:, 1, 2], np.arctan2(poses[:, 1, 0], poses[:, 0, 0])], axis=-1)
     if poses.shape != (num_scans, 3):

@@ -1,7 +1,7 @@
 """What DeepMapping minimises: gamma BCE + (1 - gamma) Chamfer of scans moved by their poses (section 3.2 and 3.4).
 
-Read aloud: move the scans to the world; ask M-Net what it thinks of the hits (occupied) and of places on the beams (free);
-compare each scan with its neighbours in time; weigh and add.
+Read aloud: move the scans to the world; ask M-Net what it thinks of the hits (occupied) and of places on the beams
+(free); compare each scan with its neighbours in time; weigh and add.
 """
 
 from __future__ import annotations

@@ -8,6 +8,7 @@ wins; the noise itself is measured from the scans first.
 
 from __future__ import annotations
 
+import dataclasses
 from functools import partial
 
 import flax.struct
@@ -58,7 +59,8 @@ def range_noise(scans: ScanSet) -> Float[Array, ""]:
         scans: organised planar scans (n, b, 2).
 
     Returns:
-        The noise in the unit of the points; about rounding error for noise-free scans, 0 when no beam has two neighbours.
+        The noise in the unit of the points; about rounding error for noise-free scans, 0 when no beam has two
+        neighbours.
     """
     before, here, after = scans.points[:, :-2], scans.points[:, 1:-1], scans.points[:, 2:]
     usable = scans.mask[:, :-2] & scans.mask[:, 1:-1] & scans.mask[:, 2:]
@@ -100,7 +102,7 @@ def _start_at(run: _Moments, offset: int) -> _Moments:
     size = run.xx.shape[-1]
     start = np.arange(size) + offset
     moved = jax.tree.map(lambda x: _shift(x, offset, axis=run.xx.ndim - 1), run)
-    return moved.replace(is_complete=moved.is_complete & ((start >= 0) & (start < size)))
+    return dataclasses.replace(moved, is_complete=moved.is_complete & ((start >= 0) & (start < size)))
 
 
 def _join(first: _Moments, second: _Moments) -> _Moments:
@@ -155,6 +157,8 @@ def fit_lines(scans: ScanSet, *, num_doublings: int = 4) -> LineScans:
     Returns:
         LineScans; a beam without any straight run of its own is masked.
     """
+    # What is masked may hold anything; zero times NaN would be NaN later on.
+    scans = ScanSet(points=jnp.where(scans.mask[..., None], scans.points, 0.0), mask=scans.mask)
     # Rounding of float32 coordinates looks like noise of this size; below it "straight" would mean nothing.
     reach = jnp.max(jnp.where(scans.mask, jnp.linalg.norm(scans.points, axis=-1), 0.0))
     noise = jnp.maximum(range_noise(scans), 1e-6 * reach)

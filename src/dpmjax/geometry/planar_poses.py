@@ -6,9 +6,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 Poses = NDArray[np.float64]
+Angles = NDArray[np.float64] | np.float64
 
 
-def wrap(angle: NDArray[np.float64]) -> NDArray[np.float64]:
+def wrap(angle: Angles) -> Angles:
     """The same angle in [-pi, pi)."""
     return (angle + np.pi) % (2 * np.pi) - np.pi
 

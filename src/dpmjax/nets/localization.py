@@ -39,7 +39,10 @@ class LocalizationConfig:
 
 
 class BeamConvolution(nn.Module):
-    """A dilated convolution of three taps along the beams, as one matrix product: XLA's own is ten times slower on CPUs."""
+    """A dilated convolution of three taps along the beams.
+
+    It is one matrix product: XLA's own convolution is ten times slower on CPUs.
+    """
 
     features: int
     stride: int

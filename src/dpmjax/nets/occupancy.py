@@ -1,15 +1,15 @@
 """M-Net: a place goes in, the log odds of its being occupied come out (DeepMapping sections 3.2 and 3.3).
 
 `MapMLP` is the paper's. `MapGrid` is a network of one layer over multi-resolution hat functions: a sum of learned grids
-from coarse to fine, each interpolated between its nodes. It is as continuous as the MLP, a sample costs four reads a level
-instead of half a million multiplications, a step changes the map only where the sample is, and switching the levels
-on one after the other widens the basin of the poses first and sharpens it later.
+from coarse to fine, each interpolated between its nodes. It is as continuous as the MLP, a sample costs four reads a
+level instead of half a million multiplications, a step changes the map only where the sample is, and switching the
+levels on one after the other widens the basin of the poses first and sharpens it later.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import flax.linen as nn
 import jax
@@ -95,6 +95,6 @@ def make_map_net(config: OccupancyConfig) -> MapMLP | MapGrid:
     return MapMLP(config.features) if config.kind == "mlp" else MapGrid(config.resolutions)
 
 
-def init_map_net(config: OccupancyConfig, *, key: jax.Array, num_dimensions: int = 2) -> dict:
+def init_map_net(config: OccupancyConfig, *, key: jax.Array, num_dimensions: int = 2) -> Any:
     """Fresh parameters."""
     return make_map_net(config).init(key, jnp.zeros((1, num_dimensions)), jnp.ones(config.num_levels))

@@ -46,18 +46,20 @@ def icp(
 ) -> IcpResult:
     """Aligns two clouds from a first guess; planar (d = 2: "plane" means line) or spatial (d = 3).
 
-    Each source point is paired with its nearest target point. Pairs are trusted by a Geman-McClure weight whose scale is the
-    median distance of the pairs, so that what only one cloud has seen does not pull.
+    Each source point is paired with its nearest target point. Pairs are trusted by a Geman-McClure weight whose scale
+    is three times the median distance of the pairs, so that what only one cloud has seen does not pull.
 
     Args:
         source: finite points.
         target: finite points, same unit.
         metric: distance to the nearest point (Besl and McKay), or to its line or plane (Chen and Medioni).
-        init: first guess of T_target_source; None: identity. The basin is about the size of the structures: some degrees.
+        init: first guess of T_target_source; None: identity. The basin is about as wide as the structures: some
+            degrees.
         max_iterations: at most so many.
 
     Returns:
-        IcpResult. With too few points to fix the motion it stays where the data leave it: near `init`, `converged` true.
+        IcpResult. With too few points to fix the motion it stays where the data leave it: near `init`, `converged`
+        true.
 
     Raises:
         ValueError: wrong shapes, not finite, unknown metric, or an empty cloud.
@@ -110,7 +112,8 @@ def _icp(
         moved, nearest, _, weight = distances(T)
         if metric == "point":
             return weighted_svd(source, target[nearest], weight)
-        return _step_to_planes(moved, target[nearest], normals.normals[nearest], weight * normals.mask[nearest]) @ T
+        step = _step_to_planes(moved, target[nearest], normals.normals[nearest], weight * normals.mask[nearest])
+        return jnp.matmul(step, T, precision="highest")
 
     def iterate(carry: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
         T, _, count = carry
@@ -119,7 +122,9 @@ def _icp(
         return T_next, change, count + 1
 
     T, change, _ = jax.lax.while_loop(
-        lambda c: (c[1] > tiny) & (c[2] < max_iterations), iterate, (start, jnp.asarray(jnp.inf, source.dtype), 0)
+        lambda c: (c[1] > tiny) & (c[2] < max_iterations),
+        iterate,
+        (start, jnp.asarray(jnp.inf, source.dtype), jnp.asarray(0)),
     )
     _, _, residual, _ = distances(T)
     limit = jnp.maximum(3.0 * 1.4826 * jnp.median(residual), tiny)
@@ -147,7 +152,8 @@ def _step_to_planes(
     diagonal = jnp.diagonal(system)
     # Directions that no plane holds stay as they are.
     damping = 1e-4 * diagonal + 1e-6 * diagonal.max() + jnp.finfo(points.dtype).tiny
-    step = jnp.linalg.solve(system + jnp.diag(damping), -weighted.T @ residual)
+    gradient = jnp.einsum("ni,n->i", weighted, residual, precision="highest")
+    step = jnp.linalg.solve(system + jnp.diag(damping), -gradient)
     motion = exp_se2(step) if dimensions == 2 else exp_se3(step)
     there = jnp.eye(dimensions + 1, dtype=points.dtype).at[:dimensions, dimensions].set(centre)
     back = jnp.eye(dimensions + 1, dtype=points.dtype).at[:dimensions, dimensions].set(-centre)

@@ -48,7 +48,7 @@ class IncrementalConfig:
     odometry_sigma: tuple[float, float] = (0.15, 0.1)
 
 
-def _grip(matches: PairMatches) -> NDArray[np.float64]:
+def _grip(matches: PairMatches) -> NDArray[np.floating]:
     """How firmly the scans hold each step in its softest direction: beams, as information."""
     return np.linalg.eigvalsh(matches.information[:, :2, :2])[:, 0]
 

@@ -200,7 +200,7 @@ def find_loops(lines: LineScans, poses: Floats, config: LoopConfig, *, scale: fl
     information = matches.information[fits] / (config.sigma * scale) ** 2
     edges = Edges(source[fits], target[fits], matches.poses[fits], information)
     supported = count_support(edges, poses, config, scale) >= config.min_support
-    return Edges(*(x[supported] for x in edges))
+    return jax.tree.map(lambda x: x[supported], edges)
 
 
 def close_loops(

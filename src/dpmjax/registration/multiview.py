@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from typing import NamedTuple
 
@@ -23,6 +23,7 @@ from dpmjax.registration.pairs import (
     no_prior,
     scales,
     take_scans,
+    thin_beams,
 )
 from dpmjax.registration.planar import PairSystem, linearise_pair
 from dpmjax.registration.planar_graph import Edges, Floats, Indices, join_edges, move_poses, solve_poses
@@ -48,14 +49,14 @@ class PolishConfig:
         firm_grip: ... and this share of the beams holds each in its softest direction.
     """
 
-    schedule: Schedule = Schedule(gate=(0.6, 0.1), kernel=(0.4, 0.01), num_iterations=14)
+    schedule: Schedule = field(default_factory=lambda: Schedule(gate=(0.6, 0.1), kernel=(0.4, 0.01), num_iterations=14))
     temporal: tuple[int, ...] = (1, 2, 3)
     num_spatial: int = 8
     radius: float = 4.0
     max_turn: float = 2.0
     refresh: int = 4
     step_sigma: tuple[float, float] = (0.3, 0.15)
-    loops: LoopConfig | None = LoopConfig()
+    loops: LoopConfig | None = field(default_factory=LoopConfig)
     firm_fitness: float = 0.35
     firm_grip: float = 0.005
 
@@ -84,7 +85,8 @@ def choose_pairs(poses: Floats, config: PolishConfig, scale: float) -> tuple[Ind
     tree = scipy.spatial.cKDTree(poses[:, :2])
     apart = max(config.temporal, default=0) + 2
     count = min(num_scans, 6 * config.num_spatial + 2 * apart)
-    distances, rows = tree.query(poses[:, :2], k=count, distance_upper_bound=config.radius * scale)
+    nearest = tree.query(poses[:, :2], k=count, distance_upper_bound=config.radius * scale)
+    distances, rows = np.atleast_2d(nearest[0]), np.atleast_2d(nearest[1])
     for scan in range(num_scans if config.num_spatial else 0):
         near = rows[scan][np.isfinite(distances[scan])]
         near = near[(np.abs(near - scan) > apart)]
@@ -111,7 +113,7 @@ def _linearise_pairs(
     *,
     source_stride: int,
 ) -> PairSystem:
-    thinned = take_scans(lines, jnp.arange(lines.mask.shape[0]), stride=source_stride)
+    thinned = thin_beams(lines, source_stride)
 
     def linearise(pair: tuple[jax.Array, jax.Array, jax.Array]) -> PairSystem:
         i, j, pose = pair
@@ -138,7 +140,7 @@ def _linearise(
         kernel,
         source_stride=stride,
     )
-    system = PairSystem(*(np.asarray(x, np.float64)[: len(source)] for x in system))
+    system = jax.tree.map(lambda x: np.asarray(x, np.float64)[: len(source)], system)
     return Edges(source, target, relative, np.asarray(system.information)), system
 
 

@@ -71,9 +71,14 @@ def length_scale(lines: LineScans | ScanSet) -> float:
     return 0.15 * float(np.median(far)) if far else 1.0
 
 
-def take_scans(lines: LineScans, index: NDArray[np.integer], *, stride: int = 1) -> LineScans:
-    """The scans of these rows, every `stride`-th beam of each."""
-    return jax.tree.map(lambda x: x[index][:, ::stride] if x.ndim > 1 else x[index], lines)
+def take_scans(lines: LineScans, index: NDArray[np.integer]) -> LineScans:
+    """The scans of these rows."""
+    return jax.tree.map(lambda x: x[index], lines)
+
+
+def thin_beams(lines: LineScans, stride: int) -> LineScans:
+    """The same scans with every `stride`-th beam."""
+    return jax.tree.map(lambda x: x[:, ::stride] if x.ndim > 1 else x, lines)
 
 
 def scales(schedule: Schedule, scale: float, noise: float) -> tuple[jax.Array, jax.Array]:
@@ -113,8 +118,7 @@ def match_pairs(
         PairMatches of the guess with the best fitness for each pair.
     """
     num_pairs, num_guesses = guesses.shape[:2]
-    source = jax.tree.map(lambda x: x[:, :: schedule.source_stride] if x.ndim > 1 else x, source)
-    target = jax.tree.map(lambda x: x[:, :: schedule.target_stride] if x.ndim > 1 else x, target)
+    source, target = thin_beams(source, schedule.source_stride), thin_beams(target, schedule.target_stride)
     distances = num_guesses * source.mask.shape[1] * target.mask.shape[1]
     batch = int(np.clip(_LIVE_DISTANCES // distances, 1, max(num_pairs, 1)))
     gates, kernels = scales(schedule, scale, float(jnp.max(source.noise, initial=0.0)))

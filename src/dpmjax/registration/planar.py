@@ -1,7 +1,7 @@
 """Robust alignment of pairs of planar scans, many at once: the kernel under the warm start, loop search and polish.
 
-A pose is a vector (x, y, heading). Errors of a pair are linearised in the tangent space of T_target_source on the right,
-T_target_source @ exp(delta), so that a pair costs a 3 x 3 matrix and a 3-vector whoever asks.
+A pose is a vector (x, y, heading). Errors of a pair are linearised in the tangent space of T_target_source on the
+right, T_target_source @ exp(delta), so that a pair costs a 3 x 3 matrix and a 3-vector whoever asks.
 """
 
 from __future__ import annotations
@@ -15,6 +15,10 @@ from jaxtyping import Array, Float
 
 from dpmjax.geometry.lines import LineScans
 from dpmjax.geometry.neighbours import k_nearest
+from dpmjax.types import AnyArray
+
+# GPUs multiply in TF32 unless told otherwise: centimetres at a hundred metres.
+_matmul = partial(jnp.matmul, precision="highest")
 
 Metric = Literal["point", "plane"]
 
@@ -63,16 +67,16 @@ def linearise_pair(
         PairSystem at this pose.
     """
     rotation = _rotation(pose_target_source[2])
-    points = source.points @ rotation.T + pose_target_source[:2]
+    points = _matmul(source.points, rotation.T) + pose_target_source[:2]
     nearest = k_nearest(points, target.points, 1, mask=target.mask).indices[:, 0]
     matched, normals = target.points[nearest], target.normals[nearest]
-    faces_same_way = ((source.normals @ rotation.T) * normals).sum(-1) > 0.7
+    faces_same_way = (_matmul(source.normals, rotation.T) * normals).sum(-1) > 0.7
     near = ((points - matched) ** 2).sum(-1) < gate**2
     counts = source.mask & target.mask[nearest] & near & faces_same_way
-    lever = jnp.stack([-source.points[:, 1], source.points[:, 0]], -1) @ rotation.T
+    lever = _matmul(jnp.stack([-source.points[:, 1], source.points[:, 0]], -1), rotation.T)
     if metric == "plane":
         residual = (normals * (points - target.centroids[nearest])).sum(-1)
-        jacobian = jnp.concatenate([normals @ rotation, (normals * lever).sum(-1, keepdims=True)], -1)
+        jacobian = jnp.concatenate([_matmul(normals, rotation), (normals * lever).sum(-1, keepdims=True)], -1)
         squared = residual**2
         jacobian, residual = jacobian[:, None], residual[:, None]
     else:
@@ -104,8 +108,8 @@ class StepPrior(NamedTuple):
         information: inverse variances of its three parts, in units of one beam's information; zero: no belief.
     """
 
-    mean: Float[Array, "... 3"]
-    information: Float[Array, "... 3"]
+    mean: Float[AnyArray, "... 3"]
+    information: Float[AnyArray, "... 3"]
 
 
 def _solve(system: PairSystem, pose: Float[Array, " 3"], prior: StepPrior) -> Float[Array, " 3"]:
@@ -113,8 +117,8 @@ def _solve(system: PairSystem, pose: Float[Array, " 3"], prior: StepPrior) -> Fl
     offset = pose - prior.mean
     turn = offset.at[2].set(jnp.arctan2(jnp.sin(offset[2]), jnp.cos(offset[2])))
     rotation = jnp.eye(3).at[:2, :2].set(_rotation(pose[2]))
-    pull = rotation.T @ (prior.information * turn)
-    belief = rotation.T @ (prior.information[:, None] * rotation)
+    pull = _matmul(rotation.T, prior.information * turn)
+    belief = _matmul(rotation.T, prior.information[:, None] * rotation)
     # Damping in proportion to each axis: a pair that fixes one direction only (a corridor) moves in that one alone.
     diagonal = jnp.diagonal(system.information)
     damping = 1e-3 * diagonal + 1e-6 * diagonal.max() + 1e-9
@@ -144,7 +148,8 @@ def align_pairs(
         metric: "point" or "plane".
 
     Returns:
-        The aligned relative poses and each pair's system there (its `information` and `weight` tell how well it is fixed).
+        The aligned relative poses and each pair's system there; its `information` and `weight` tell how well it is
+        fixed.
     """
 
     def align(

@@ -1,7 +1,7 @@
 """Sparse Gauss-Newton over all planar poses: the solver under the polish and under loop closure.
 
-Poses move on the right, T_i @ exp(delta_i). The tangent of an edge T_j_i then moves by delta_i - Ad(T_i_j) delta_j, so one
-3 x 3 matrix and one 3-vector of each edge make the whole sparse system.
+Poses move on the right, T_i @ exp(delta_i). The tangent of an edge T_j_i then moves by delta_i - Ad(T_i_j) delta_j, so
+one 3 x 3 matrix and one 3-vector of each edge make the whole sparse system.
 """
 
 from __future__ import annotations
@@ -46,8 +46,8 @@ class GraphConfig:
     """Settings of the robust pose graph.
 
     Attributes:
-        outlier_chi2: squared Mahalanobis distance beyond which an edge loses most of its say (3 degrees of freedom); the
-            most that a contradicted edge costs.
+        outlier_chi2: squared Mahalanobis distance beyond which an edge loses most of its say (3 degrees of freedom);
+            the most that a contradicted edge costs.
         num_iterations: at most so many solves.
         widening: the graduated kernel starts so many times wider; all edges count, then outliers are let go.
     """
