@@ -1,3 +1,5 @@
+from .choose import Score as Score
+from .choose import choose_trajectory as choose_trajectory
 from .config import DeepMappingConfig as DeepMappingConfig
 from .config import PhaseConfig as PhaseConfig
 from .config import preset as preset

@@ -214,3 +214,23 @@ def polish(lines: LineScans, poses: Floats, config: PolishConfig | None = None) 
         poses, _, weight = close_loops(lines, poses, step_edges(poses, kept, config.loops, scale), config.loops)
         num_loops = int((weight > 0.25).sum())
     return align_all(lines, poses, config, scale=scale)._replace(num_loops=num_loops)
+
+
+def surface_misfit(lines: LineScans, poses: Floats, config: PolishConfig | None = None) -> float:
+    """How badly neighbouring scans agree at these poses, without knowing the truth.
+
+    Args:
+        lines: n scans with lines.
+        poses: (n, 3) x, y, heading.
+        config: settings; its last kernel tells how fine the comparison is.
+
+    Returns:
+        The share of beams, 0 to 1, that do not find their surface in the scans nearby; fractions for near misses.
+    """
+    config = config or PolishConfig()
+    scale = length_scale(lines)
+    gates, kernels = scales(config.schedule, scale, 1.25 * float(lines.noise[0]))
+    source, target = choose_pairs(poses, config, scale)
+    _, system = _linearise(lines, source, target, poses, gates[-1], kernels[-1])
+    num_beams = np.asarray(lines.mask.sum(1), np.float64)
+    return 1.0 - float(np.sum(system.weight) / np.maximum(num_beams[source].sum(), 1.0))
