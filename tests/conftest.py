@@ -13,7 +13,9 @@ import jaxtyping
 import pytest
 
 # Before the first import of these packages, so that their functions are wrapped.
-jaxtyping.install_import_hook(["dpmjax.geometry", "dpmjax.losses", "dpmjax.metrics"], "beartype.beartype")
+jaxtyping.install_import_hook(
+    ["dpmjax.geometry", "dpmjax.losses", "dpmjax.metrics", "dpmjax.nets", "dpmjax.registration"], "beartype.beartype"
+)
 
 _COMPILE_EVENT = "/jax/core/compile/backend_compile_duration"
 _num_compiled = 0

@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+import importlib
+from collections.abc import Callable
 from dataclasses import replace
 
 import jax
@@ -8,7 +10,7 @@ import numpy as np
 import pytest
 
 from dpmjax import deepmapping as dm
-from dpmjax.deepmapping.fit import _draw_batch, run_phases
+from dpmjax.deepmapping.fit import _draw_batch, run_phases, steps_per_call
 from dpmjax.geometry import planar_poses
 from dpmjax.metrics import absolute_trajectory_error
 from dpmjax.nets.localization import LocalizationConfig
@@ -76,25 +78,34 @@ def test_picture_is_dark_at_walls_and_light_in_free_space(tiny_walk, warm) -> No
     assert not picture.explored.all()
 
 
-def test_same_key_same_numbers_and_another_key_others(tiny_scans) -> None:
+@pytest.fixture(scope="module")
+def brief_steps(tiny_scans) -> dict[str, Callable]:
+    """The compiled steps of the brief cold start, one a phase."""
+    return {phase.name: dm.make_step(tiny_scans, BRIEF, phase) for phase in BRIEF.cold_phases}
+
+
+def test_same_key_same_numbers_and_another_key_others(tiny_scans, brief_steps) -> None:
+    step = brief_steps[BRIEF.cold_phases[0].name]
+
     def run(key: jax.Array) -> dm.State:
-        return list(run_phases(tiny_scans, BRIEF, dm.init(key, tiny_scans, BRIEF), key=key, is_warm=False))[-1][1]
+        return step(dm.init(key, tiny_scans, BRIEF), key=key)[0]
 
     one = run(KEY)
-    assert_same(one.params, run(KEY).params)
-    assert not np.array_equal(one.params.poses, run(jax.random.key(4)).params.poses)
+    assert_same(one, run(KEY))
+    assert not np.array_equal(*(jax.tree.leaves(s.params.localization)[-1] for s in (one, run(jax.random.key(4)))))
 
 
-def test_second_step_compiles_nothing(tiny_scans, assert_compiles_nothing) -> None:
-    phase = BRIEF.cold_phases[0]
-    step = dm.make_step(tiny_scans, BRIEF, phase)
+def test_second_step_compiles_nothing(tiny_scans, brief_steps, assert_compiles_nothing) -> None:
+    step = brief_steps[BRIEF.cold_phases[0].name]
     state, _ = step(dm.init(KEY, tiny_scans, BRIEF), key=KEY)
     with assert_compiles_nothing():
         state, report = step(state, key=KEY)
     assert np.isfinite(report.loss)
 
 
-def test_interrupted_and_restored_equals_unbroken(tiny_scans, tmp_path) -> None:
+def test_interrupted_and_restored_equals_unbroken(tiny_scans, brief_steps, tmp_path, monkeypatch) -> None:
+    module = importlib.import_module("dpmjax.deepmapping.fit")
+    monkeypatch.setattr(module, "make_step", lambda scans, config, phase: brief_steps[phase.name])
     start = dm.init(KEY, tiny_scans, BRIEF)
     states = [state for _, state, _ in run_phases(tiny_scans, BRIEF, start, key=KEY, is_warm=False)]
     checkpoints = Checkpoints(tmp_path / "checkpoints")
@@ -153,14 +164,13 @@ def test_every_scan_is_in_some_batch_of_the_published_order() -> None:
 
 def test_masked_beams_never_matter(tiny_scans) -> None:
     mask = tiny_scans.mask & (jax.random.uniform(KEY, tiny_scans.mask.shape) < 0.8)
-    poses = []
-    for filling in (0.0, np.nan):
-        scans = dm.as_scan_set(ScanSet(jnp.where(mask[..., None], tiny_scans.points, filling), mask))
-        step = dm.make_step(scans, BRIEF, BRIEF.warm_phases[0])
-        _, report = step(dm.init(KEY, scans, BRIEF, start_poses=jnp.zeros((20, 3))), key=KEY)
-        poses.append(np.asarray(report.poses))
-    np.testing.assert_array_equal(*poses)
-    assert np.isfinite(poses[0]).all()
+    scans = [
+        dm.as_scan_set(ScanSet(jnp.where(mask[..., None], tiny_scans.points, filling), mask))
+        for filling in (0.0, 1e6, np.nan)
+    ]
+    assert_same(scans[0], scans[1])
+    assert_same(scans[0], scans[2])
+    assert dm.measure_reach(scans[0]) == pytest.approx(1.0, rel=0.1)
 
 
 def test_beams_that_are_zero_or_not_finite_are_masked() -> None:
@@ -193,6 +203,13 @@ def test_unknown_presets_and_too_few_steps_are_refused() -> None:
         dm.preset("quick")
     with pytest.raises(ValueError, match="steps: expected at least one"):
         dm.with_steps(dm.preset("fast"), 1)
+
+
+@pytest.mark.parametrize(("num_steps", "expected"), [(60, 60), (20, 20), (61, 63), (25, 25)])
+def test_calls_of_a_step_share_the_steps_of_the_phase(num_steps: int, expected: int) -> None:
+    config = dm.with_steps(dm.preset("fast"), num_steps)
+    length = steps_per_call(config, config.warm_phases[0])
+    assert length * -(-num_steps // length) == expected
 
 
 def test_scans_without_an_order_get_a_pointnet() -> None:

@@ -80,7 +80,9 @@ def icp(
         raise ValueError(f"init: expected shape ({dimensions + 1}, {dimensions + 1}), got {start.shape}")
     if not bool(jnp.isfinite(start).all()):
         raise ValueError("init: expected finite numbers")
-    return _icp(source, target.astype(source.dtype), start.astype(source.dtype), max_iterations, metric=metric)
+    return _icp(
+        source, target.astype(source.dtype), start.astype(source.dtype), jnp.asarray(max_iterations), metric=metric
+    )
 
 
 @partial(jax.jit, static_argnames="metric")
@@ -88,7 +90,7 @@ def _icp(
     source: Float[Array, "n d"],
     target: Float[Array, "m d"],
     start: Float[Array, "d1 d1"],
-    max_iterations: int,
+    max_iterations: Int[Array, ""],
     *,
     metric: str,
 ) -> IcpResult:
