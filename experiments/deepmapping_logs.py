@@ -7,19 +7,21 @@ Each run keeps its own folder below OUT, with its pictures; a run that is there 
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
 from tyro.conf import Positional, arg
 
-from experiments import deepmapping_2d
 from experiments._command import run_command
 from experiments._json import load_json, write_json
 from experiments._machine import environment
 from experiments._run_folder import METRICS
 
 EXPERIMENT = "deepmapping_logs"
+_BAD_INPUT = 2
 COLUMNS = ("num_scans", "ate_initial_m", "ate_m", "chosen", "fit_s", "wall_s", "peak_rss_gb")
 
 
@@ -57,19 +59,17 @@ def main(config: Config) -> list[dict[str, Any]]:
 
 
 def _run(log: Path, init: str, config: Config) -> dict[str, Any] | None:
-    """Metrics of one run; None where the log has no odometry to start from."""
+    """Metrics of one run in a process (so a peak memory) of its own; None where the log cannot do it."""
     folder = config.output / f"{log.name.split('.')[0]}_{init}"
     if not (folder / METRICS).exists():
-        options = deepmapping_2d.Config(
-            data=log, output=folder, init=init, steps=config.steps, seed=config.seed, force=True
-        )
-        try:
-            deepmapping_2d.main(options)
-        except ValueError as error:
-            if init != "odometry":
-                raise
-            print(f"left out: {error}")
+        command = [sys.executable, "-m", "experiments.deepmapping_2d", str(log), "-o", str(folder), "--force"]
+        command += ["--init", init, "--seed", str(config.seed)]
+        command += [] if config.steps is None else ["--steps", str(config.steps)]
+        code = subprocess.run(command).returncode
+        if code == _BAD_INPUT:
             return None
+        if code != 0:
+            raise RuntimeError(f"{log} from {init}: the run ended with exit code {code}")
     return load_json(folder / METRICS)
 
 

@@ -7,6 +7,8 @@ from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
+# The tests run each program for a moment and compile hundreds: quick compilation is worth more than quick programs.
+os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} --xla_backend_optimization_level=0".strip()
 
 import jax
 import jaxtyping

@@ -1,3 +1,4 @@
+from .deepmapping.fit import fit_deepmapping as fit_deepmapping
 from .geometry.alignment import weighted_svd as weighted_svd
 from .geometry.neighbours import k_nearest as k_nearest
 from .geometry.neighbours import radius_search as radius_search

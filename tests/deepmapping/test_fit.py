@@ -41,7 +41,7 @@ def assert_same(a, b) -> None:
 
 @pytest.fixture(scope="module")
 def warm(tiny_walk, shaken) -> dm.Fitted:
-    return dm.fit(ScanSet(tiny_walk.points, tiny_walk.mask), SMALL, key=KEY, init=shaken)
+    return dm.fit_deepmapping(ScanSet(tiny_walk.points, tiny_walk.mask), SMALL, key=KEY, init=shaken)
 
 
 def test_a_perturbed_start_is_improved(tiny_walk, shaken, warm) -> None:
@@ -51,7 +51,7 @@ def test_a_perturbed_start_is_improved(tiny_walk, shaken, warm) -> None:
 
 
 def test_a_cold_start_finds_the_walk_roughly(tiny_walk) -> None:
-    cold = dm.fit(ScanSet(tiny_walk.points, tiny_walk.mask), dm.with_steps(SMALL, 300), key=KEY)
+    cold = dm.fit_deepmapping(ScanSet(tiny_walk.points, tiny_walk.mask), dm.with_steps(SMALL, 300), key=KEY)
     # All poses at one place are off by the spread of the walk.
     spread = ate(np.zeros((20, 3)), tiny_walk.reference_poses)
     assert ate(cold.poses, tiny_walk.reference_poses) < 0.5 * spread
@@ -195,7 +195,7 @@ def test_beams_that_are_zero_or_not_finite_are_masked() -> None:
 )
 def test_bad_input_is_named(as_user, scans, options, message) -> None:
     with pytest.raises(ValueError, match=message):
-        dm.fit(scans, BRIEF, key=KEY, **options)
+        dm.fit_deepmapping(scans, BRIEF, key=KEY, **options)
 
 
 def test_unknown_presets_and_too_few_steps_are_refused() -> None:

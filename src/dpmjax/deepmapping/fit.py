@@ -1,4 +1,4 @@
-"""Training as registration: `init` a state, `step` it until the phase is over, go to the next phase; `fit` does it all.
+"""Training as registration: `init` a state, `step` it through a phase, go to the next; `fit_deepmapping` does it all.
 
 The state is one pytree of arrays, so that a run can be written to disk after any call and go on exactly.
 """
@@ -87,7 +87,7 @@ class Report(NamedTuple):
 
 
 class Fitted(NamedTuple):
-    """Result of `fit`.
+    """Result of `fit_deepmapping`.
 
     Attributes:
         T_world_scan: (n, 3, 3) float64.
@@ -189,7 +189,7 @@ def init(
     return State(params, _make_optimizer(phase).init(params), poses, frame, zero, zero, zero)
 
 
-# `fit` has an argument of the name `init`, as `icp` has: the start of a registration.
+# `fit_deepmapping` has an argument of the name `init`, as `icp` has: the start of a registration.
 _init_state = init
 
 
@@ -357,7 +357,7 @@ def run_phases(
         state = next_phase(state, scans, config, is_warm=is_warm)
 
 
-def fit(
+def fit_deepmapping(
     scans: ScanSet | ArrayLike,
     config: DeepMappingConfig | None = None,
     *,
