@@ -136,12 +136,13 @@ def main(config: Config) -> Result:
         )
         lines = line_scans(sequence)
         candidates = {"start": start, "fit": fitted.poses}
-        chosen, scores = choose_trajectory(lines, candidates)
         if config.polish and not stop.is_requested:
-            polished = polish(lines, candidates[chosen])
-            LOGGER.info("polished the %s: %d pairs, %d loops", chosen, polished.num_pairs, polished.num_loops)
-            candidates["polish"] = polished.poses
-            chosen, scores = choose_trajectory(lines, candidates)
+            # From both: the fit is sharper near a good start, the start keeps what a robot's odometry knows.
+            for name in ("fit",) if config.init == "zero" else ("start", "fit"):
+                polished = polish(lines, candidates[name])
+                LOGGER.info("polished the %s: %d pairs, %d loops", name, polished.num_pairs, polished.num_loops)
+                candidates[f"polished {name}"] = polished.poses
+        chosen, scores = choose_trajectory(lines, candidates)
         poses = candidates[chosen]
         metrics = {
             "num_scans": len(sequence),
