@@ -1,5 +1,5 @@
 from .cast import CastConfig
-from .drive import Drive, DriveConfig, drive
+from .driving import Drive, DriveConfig, drive
 from .make import Town, TownConfig, make_town
 from .primitives import TownPrimitives
 from .scan import range_image, scan_town

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import flax.struct
@@ -15,8 +15,8 @@ from dpmjax.data.town.ground import cross_ground
 from dpmjax.data.town.intersect import Crossing, cross_box, cross_cylinder, cross_spheroid
 from dpmjax.data.town.primitives import TownPrimitives
 from dpmjax.data.town.sectors import Bodies, bodies_by_sector, nearest_bodies
-from dpmjax.data.town.windows import recess
 from dpmjax.data.town.traffic import traffic_boxes
+from dpmjax.data.town.windows import recess
 
 NOTHING, GROUND, SOLID, SOFT, POLE, MOVING = range(6)
 """What a ray can meet."""
@@ -129,8 +129,8 @@ def cast_turn(
     hits = _nearer(hits, _round_hits(spheroids, directions, depths, _cross_spheroid, SOFT))
     hits = _nearer(hits, _ground_hits(town, start, directions, max_range))
     is_seen = hits.ranges <= max_range
-    return hits.replace(
-        ranges=jnp.where(is_seen, hits.ranges, jnp.inf), surfaces=jnp.where(is_seen, hits.surfaces, NOTHING)
+    return replace(
+        hits, ranges=jnp.where(is_seen, hits.ranges, jnp.inf), surfaces=jnp.where(is_seen, hits.surfaces, NOTHING)
     )
 
 
@@ -155,7 +155,11 @@ def _boxes(town: TownPrimitives, start: Float[Array, " 3"], time: Float[Array, "
 
 
 def _upright(
-    centres: Float[Array, "n 3"], radii: Float[Array, " n"], half_heights: Float[Array, " n"], softness: Array, mask: Array
+    centres: Float[Array, "n 3"],
+    radii: Float[Array, " n"],
+    half_heights: Float[Array, " n"],
+    softness: Array,
+    mask: Array,
 ) -> Bodies:
     """Round bodies by the boxes round them."""
     zero = jnp.zeros_like(radii)

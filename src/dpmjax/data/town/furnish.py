@@ -123,7 +123,9 @@ def _houses(into: Collection, rng: np.random.Generator, side: _Side) -> None:
         place = side.place(middle, setback + 0.5 * depth)
         has_house = rng.random() < quarter.house_rate and side.claim(place, (width - 0.6, depth), _PAVEMENT_M + 0.6)
         if has_house:
-            objects.put_house(into, rng, place, (width, depth), float(rng.uniform(*quarter.eaves)), is_plain=setback < 3.6)
+            objects.put_house(
+                into, rng, place, (width, depth), float(rng.uniform(*quarter.eaves)), is_plain=setback < 3.6
+            )
             if gap > 4 and rng.random() < 0.5:
                 garage = side.place(way + width + 0.5 * gap, setback + 4.0)
                 if side.claim(garage, (3.0, 5.5), _PAVEMENT_M + 0.6):
@@ -136,9 +138,7 @@ def _houses(into: Collection, rng: np.random.Generator, side: _Side) -> None:
         way += width + gap
 
 
-def _garden(
-    into: Collection, rng: np.random.Generator, side: _Side, plot: tuple[float, float], front: float
-) -> None:
+def _garden(into: Collection, rng: np.random.Generator, side: _Side, plot: tuple[float, float], front: float) -> None:
     """Trees and bushes between the pavement and the house."""
     way, width = plot
     if front < _PAVEMENT_M + 2.0:

@@ -59,7 +59,9 @@ def cross_ground(
         place = start[:2] + distance[..., None] * direction[..., :2]
         return start[2] + distance * direction[..., 2] - ground_height(ground, place)
 
-    def look(carry: tuple[Array, Array, Array, Array], distance: Array) -> tuple[tuple[Array, Array, Array, Array], None]:
+    def look(
+        carry: tuple[Array, Array, Array, Array], distance: Array
+    ) -> tuple[tuple[Array, Array, Array, Array], None]:
         near, far, above, below = carry
         here = clearance(jnp.broadcast_to(distance, near.shape))
         is_open = below > 0

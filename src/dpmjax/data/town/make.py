@@ -82,7 +82,7 @@ class Town:
     primitives: TownPrimitives = field(repr=False)
 
 
-def make_town(seed: int, config: TownConfig = TownConfig(), *, trajectory: ArrayLike | None = None) -> Town:  # noqa: B008
+def make_town(seed: int, config: TownConfig = TownConfig(), *, trajectory: ArrayLike | None = None) -> Town:
     """Builds the town of a seed; the same one every time.
 
     Args:
@@ -155,7 +155,9 @@ def _make_traffic(rng: np.random.Generator, streets: Streets, terrain: Terrain, 
             users.append((index, rng.uniform(0, length), rng.uniform(6, 13), -LANE_M, *size))
         for _ in range(rng.poisson(config.walkers_per_km * length / 1000)):
             side = -half_width - rng.uniform(0.4, 1.8)
-            users.append((index, rng.uniform(0, length), rng.uniform(0.8, 1.8), side, 0.2, 0.25, rng.uniform(0.75, 0.93)))
+            users.append(
+                (index, rng.uniform(0, length), rng.uniform(0.8, 1.8), side, 0.2, 0.25, rng.uniform(0.75, 0.93))
+            )
     table = np.array(users, np.float64).reshape(-1, 7)
     capacity = capacity_for(len(table))
     rows = padded(table, capacity)

@@ -75,7 +75,13 @@ def put_box(
 
 
 def put_house(
-    into: Collection, rng: np.random.Generator, place: Place, size: tuple[float, float], height: float, *, is_plain: bool
+    into: Collection,
+    rng: np.random.Generator,
+    place: Place,
+    size: tuple[float, float],
+    height: float,
+    *,
+    is_plain: bool,
 ) -> None:
     """A house: body with windows, stepped roof, and what sticks out towards the street.
 

@@ -41,8 +41,7 @@ class Plots:
             Whether it was free.
         """
         cells = self._cells(centre, half_size, heading)
-        rows, columns = self._is_taken.shape
-        if (cells < 0).any() or (cells >= [columns, rows]).any():
+        if (cells < 0).any() or (cells >= np.array(self._is_taken.shape)[::-1]).any():
             return False
         at = (cells[:, 1], cells[:, 0])
         if self._is_taken[at].any() or (self.terrain.street_distance[at] < kerb_distance).any():
@@ -51,9 +50,7 @@ class Plots:
             self._is_taken[at] = True
         return True
 
-    def _cells(
-        self, centre: NDArray[np.float64], half_size: tuple[float, float], heading: float
-    ) -> NDArray[np.int64]:
+    def _cells(self, centre: NDArray[np.float64], half_size: tuple[float, float], heading: float) -> NDArray[np.int64]:
         axes = [np.linspace(-half, half, max(int(np.ceil(2 * half / CELL_M)) + 1, 2)) for half in half_size]
         u, v = (grid.ravel() for grid in np.meshgrid(*axes))
         cos, sin = np.cos(heading), np.sin(heading)

@@ -128,7 +128,15 @@ def cast_rays_3d(
     middles = phase + jnp.asarray(_azimuths(sensor).reshape(count, -1).mean(axis=1))
     directions = jnp.einsum("ij,srj->sri", T_world_lidar[:3, :3], rays, precision=_HIGHEST)
     return cast_turn(
-        town, T_world_lidar, time, directions, middles, np.pi / count, depths, max_range=sensor.max_range_m, config=config
+        town,
+        T_world_lidar,
+        time,
+        directions,
+        middles,
+        np.pi / count,
+        depths,
+        max_range=sensor.max_range_m,
+        config=config,
     )
 
 

@@ -71,8 +71,8 @@ def azimuth_intervals(
 ) -> tuple[Float[Array, " k"], Float[Array, " k"]]:
     """The azimuths under which the boxes are seen, in the sensor frame.
 
-    A box is the hull of its corners, and so is its shadow on the sensor's x-y plane. Where that shadow holds the sensor,
-    the interval is the whole turn.
+    A box is the hull of its corners, and so is its shadow on the sensor's x-y plane. Where that shadow holds the
+    sensor, the interval is the whole turn.
 
     Args:
         bodies: relative to the sensor, in axes of the world.

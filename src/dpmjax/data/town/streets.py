@@ -113,9 +113,7 @@ def _bend(rng: np.random.Generator, block: float) -> Callable[[NDArray[np.float6
     return place
 
 
-def _plan(
-    rng: np.random.Generator, kind: RouteKind, num_blocks: int
-) -> tuple[list[tuple[int, int]], tuple[int, int]]:
+def _plan(rng: np.random.Generator, kind: RouteKind, num_blocks: int) -> tuple[list[tuple[int, int]], tuple[int, int]]:
     """Corners of a closed route on the lattice, and the size of the lattice."""
     if kind == "loop":
         around = max(num_blocks // 2, 2)
@@ -140,10 +138,10 @@ def _rectangle(high: int, wide: int) -> list[tuple[int, int]]:
 
 
 def _wander(rng: np.random.Generator, side: int, num_blocks: int) -> list[tuple[int, int]]:
-    """A random walk that never turns on the spot, and home along the lattice; drawn again if it ends where it set out."""
+    """A random walk that never turns on the spot, and home; drawn again if it comes in the way it went out."""
     while True:
         route = [(0, 0), (0, 1)]
-        while len(route) < 0.75 * num_blocks:
+        while len(route) < 0.85 * num_blocks:
             steps = _neighbours(route, side)
             route.append(steps[rng.integers(len(steps))])
         while route[-1] != (0, 0):

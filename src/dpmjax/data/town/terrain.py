@@ -1,4 +1,4 @@
-"""The lie of the land: gentle slopes, cambered streets with kerbs, rough meadows; and how far each place is from a street."""
+"""The lie of the land: gentle slopes, cambered streets with kerbs, rough meadows; and the distance from the streets."""
 
 from __future__ import annotations
 
@@ -62,9 +62,7 @@ def make_terrain(
     return Terrain(low, land + _cross_section(distance) + _roughness(rng, distance), distance)
 
 
-def _street_distance(
-    streets: Streets, origin: NDArray[np.float64], shape: tuple[int, int]
-) -> NDArray[np.float64]:
+def _street_distance(streets: Streets, origin: NDArray[np.float64], shape: tuple[int, int]) -> NDArray[np.float64]:
     """Distance from the nearest kerb; streets of different width count by their own."""
     from scipy.ndimage import distance_transform_edt
 
@@ -100,9 +98,10 @@ def _through(support: NDArray[np.float64], origin: NDArray[np.float64], shape: t
     rows, columns = (count // coarse + 2 for count in shape)
     step = CELL_M * coarse
     x, y = np.meshgrid(origin[0] + step * np.arange(columns), origin[1] + step * np.arange(rows))
-    distance, index = KDTree(support[:, :2]).query(np.stack([x, y], -1), k=min(8, len(support)))
-    weight = 1.0 / np.maximum(distance.reshape(rows, columns, -1), 1.0) ** 2
-    values = support[:, 2][index.reshape(weight.shape)]
+    places = np.stack([x, y], axis=-1)
+    distance, index = KDTree(support[:, :2]).query(places, k=list(range(1, min(8, len(support)) + 1)))
+    weight = 1.0 / np.maximum(distance, 1.0) ** 2
+    values = support[:, 2][index]
     land = gaussian_filter((weight * values).sum(-1) / weight.sum(-1), 2.0)
     at = np.stack(np.meshgrid(np.arange(shape[0]) / coarse, np.arange(shape[1]) / coarse, indexing="ij"))
     return map_coordinates(land, at, order=1, mode="nearest")

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -45,7 +47,8 @@ def traffic_boxes(traffic: Traffic, sensor: Float[Array, " 3"], time: Float[Arra
         window_depth=zero,
         mask=traffic.mask & is_free,
     )
-    cabin = body.replace(
+    cabin = replace(
+        body,
         centres=foot + (lift + 2 * half_body + cabin_z)[:, None] * up,
         half_sizes=traffic.half_sizes * jnp.array([0.55, 0.85, 0.0], foot.dtype) + cabin_z[:, None] * up,
         mask=body.mask & is_car,

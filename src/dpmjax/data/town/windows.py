@@ -46,7 +46,10 @@ def recess(ranges: Float[Array, "..."], directions: Float[Array, "... 3"], body:
     cos, sin = body.headings[..., 0], body.headings[..., 1]
     offset = ranges[..., None] * directions - body.centres
     along_x, along_y = cos * offset[..., 0] + sin * offset[..., 1], cos * offset[..., 1] - sin * offset[..., 0]
-    dir_x, dir_y = cos * directions[..., 0] + sin * directions[..., 1], cos * directions[..., 1] - sin * directions[..., 0]
+    dir_x, dir_y = (
+        cos * directions[..., 0] + sin * directions[..., 1],
+        cos * directions[..., 1] - sin * directions[..., 0],
+    )
     half = jnp.maximum(body.half_sizes, _TINY)
     slack = jnp.stack([half[..., 0] - jnp.abs(along_x), half[..., 1] - jnp.abs(along_y)], -1)
     is_x = slack[..., 0] < slack[..., 1]

@@ -60,7 +60,7 @@ class Drive(NamedTuple):
     times: NDArray[np.float64]
 
 
-def drive(town: Town, config: DriveConfig = DriveConfig(), *, seed: int = 0) -> Drive:  # noqa: B008
+def drive(town: Town, config: DriveConfig = DriveConfig(), *, seed: int = 0) -> Drive:
     """Drives along the town's route.
 
     Args:
