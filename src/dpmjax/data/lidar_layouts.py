@@ -242,7 +242,7 @@ def read_learned_folder(folder: Path) -> Drive3D:
         folder: the agent's folder that holds the files.
 
     Returns:
-        The drive; poses only if every readable file has one, and the broken ones get that of the file before.
+        The drive; broken files get the pose of the file before. Where a readable file has none, it is a plain folder.
 
     Raises:
         InputError: a pose that is none.
@@ -256,7 +256,7 @@ def read_learned_folder(folder: Path) -> Drive3D:
             rows = np.column_stack([turn.reshape(3, 3), shift.reshape(3)]).astype(np.float64)
             poses.append(homogeneous(rows.reshape(1, 12))[0])
         except KeyError:
-            return Drive3D(folder.resolve().name, files, None, None)
+            return read_plain_folder(folder)
         except (OSError, ValueError, EOFError):  # The scan is bad too, and is named when it is read.
             poses.append(poses[-1] if poses else None)
     known = next((pose for pose in poses if pose is not None), None)

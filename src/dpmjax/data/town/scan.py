@@ -1,4 +1,4 @@
-"""One turn of a lidar in the town: rays, hits, noise and lost returns. A jitted kernel; `vmap` it over poses."""
+"""One turn of a lidar in the town: rays, hits, noise and lost returns. Pure and jitted; `vmap` it over poses."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
+from dpmjax.checks import require_shape
 from dpmjax.data.town import cast
 from dpmjax.data.town.cast import CastConfig, Hits, cast_turn, num_sectors
 from dpmjax.data.town.primitives import TownPrimitives
@@ -23,7 +24,6 @@ _GLASS_RETURNS = 0.35
 _FADE = 0.18
 
 
-@partial(jax.jit, static_argnames=("sensor", "config"))
 def scan_town(
     town: TownPrimitives,
     T_world_lidar: AnyArray,
@@ -49,14 +49,32 @@ def scan_town(
     Returns:
         (b, 3) points in the sensor frame, m, with b = beams times azimuths: beam by beam from the highest down, each
         clockwise from straight behind; masked where nothing came back (points there are zero).
+
+    Raises:
+        ValueError: the pose is not (4, 4).
     """
     pose = jnp.asarray(T_world_lidar, jnp.float32)
+    require_shape("T_world_lidar", pose, (4, 4))
+    return _scan(town, pose, jnp.asarray(time, jnp.float32), key, sensor=sensor, config=config)
+
+
+@partial(jax.jit, static_argnames=("sensor", "config"))
+def _scan(
+    town: TownPrimitives,
+    pose: Float[Array, "4 4"],
+    time: Float[Array, ""],
+    key: PRNGKeyArray,
+    *,
+    sensor: LidarSensor,
+    config: CastConfig,
+) -> PointCloud:
+    """The kernel of `scan_town`."""
     key_phase, key_depth, key_noise, key_loss = jax.random.split(key, 4)
     shape = ray_shape(sensor, config)
     phase = jax.random.uniform(key_phase, (), minval=0.0, maxval=2 * np.pi / sensor.num_azimuths)
     rays = ray_directions(sensor, config, phase)
     depths = -jnp.log(jax.random.uniform(key_depth, shape, minval=1e-6, maxval=1.0))
-    hits = cast_rays_3d(town, pose, jnp.asarray(time, jnp.float32), rays, phase, depths, sensor=sensor, config=config)
+    hits = cast_rays_3d(town, pose, time, rays, phase, depths, sensor=sensor, config=config)
     ranges = hits.ranges + sensor.range_noise_m * jax.random.normal(key_noise, shape)
     is_back = jax.random.uniform(key_loss, shape) < return_probability(hits, sensor)
     mask = is_back & (ranges >= sensor.min_range_m) & (ranges <= sensor.max_range_m)
