@@ -121,7 +121,7 @@ def test_nothing_stands_in_the_lane(town):
     offset = lane[:, None] - centres[None, :, :2]
     along = np.abs(offset[..., 0] * turn[:, 0] + offset[..., 1] * turn[:, 1]) - half[:, 0]
     across = np.abs(offset[..., 1] * turn[:, 0] - offset[..., 0] * turn[:, 1]) - half[:, 1]
-    assert np.maximum(along, across).min() > 0.2
+    assert np.maximum(along, across).min() > 1.2
 
 
 def test_a_second_scan_of_a_place_fits_the_first(town, way):

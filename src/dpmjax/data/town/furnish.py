@@ -158,7 +158,7 @@ def _kerbside(into: Collection, rng: np.random.Generator, side: _Side) -> None:
     way, rate = float(rng.uniform(3, 9)), side.quarter.parked_rate * rng.uniform(0.4, 1.3)
     while way < side.length - 3:
         if rng.random() < rate:
-            place = side.place(way, -0.45 + float(rng.normal(0, 0.12)))
+            place = side.place(way, -0.2 + float(rng.normal(0, 0.12)))
             turned = Place(place.x, place.y, place.ground - 0.06, place.heading + np.pi + float(rng.normal(0, 0.02)))
             if side.claim(turned, (4.8, 1.7), -1.6):
                 objects.put_car(into, rng, turned)

@@ -72,7 +72,7 @@ def make_streets(rng: np.random.Generator, kind: RouteKind, length: float, block
     route = np.vstack([street(a, b)[:-1] for a, b in pairwise(corners)])
     route = resample(np.vstack([route, route[:1]]), _STEP_M)
     route = resample(smooth(route, _CORNER_M / _STEP_M, is_closed=True), _STEP_M)
-    widths = tuple(float(w) for w in rng.uniform(4.0, 5.2, len(paths)))
+    widths = tuple(float(w) for w in rng.uniform(4.6, 5.6, len(paths)))
     return Streets(tuple(paths), widths, tuple(resample(lane, _STEP_M) for lane in rows + columns), route, True)
 
 
@@ -97,7 +97,7 @@ def streets_along(trajectory: NDArray[np.float64], rng: np.random.Generator) -> 
     middle = resample(shift_left(line, LANE_M), _STEP_M)
     count = max(round(arc_lengths(middle)[-1] / 120), 1)
     pieces = [piece for piece in np.array_split(middle, count) if len(piece) > 1]
-    widths = tuple(float(w) for w in rng.uniform(4.2, 5.2, len(pieces)))
+    widths = tuple(float(w) for w in rng.uniform(4.6, 5.4, len(pieces)))
     return Streets(tuple(pieces), widths, (middle,), middle, False)
 
 
