@@ -332,3 +332,16 @@ def test_real_drives_are_opened(real_data, name):
 def test_the_real_truncated_scan_is_named(real_data):
     with pytest.raises(InputError, match=r"truncated\.bin.*cut off"):
         read_lidar_file(real_data / "bad_input" / "truncated.bin")
+
+
+def test_a_damaged_npz_is_named(tmp_path, clouds, poses):
+    for index, pose in enumerate(poses[:3]):
+        named = {"ego_rotation": pose[:3, :3], "ego_translation": pose[:3, 3:]}
+        np.savez(tmp_path / f"{index}.npz", lidar_pcd=clouds[index], **named)
+    whole = (tmp_path / "1.npz").read_bytes()
+    for content in (whole[:100], b"PK\x03\x04 no archive", b"", b"neither"):
+        (tmp_path / "1.npz").write_bytes(content)
+        bad = []
+        numbers = [scan.number for scan in iterate_scans(open_lidar_sequence(tmp_path), bad)]
+        assert numbers == [0, 2]
+        assert bad[0].file.endswith("1.npz")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import zipfile
+import zlib
 from pathlib import Path
 
 import numpy as np
@@ -23,7 +24,7 @@ def read_lidar_file(path: str | Path, *, bin_columns: int = 4) -> NDArray[np.flo
 
     Args:
         path: `.bin` (float32 rows of x, y, z and more, as of KITTI), `.npy` (n, 3 or more), `.npz` (key `lidar_pcd`,
-            `points`, `xyz`, or its only array), `.pcd` or `.ply`.
+            `points`, `xyz` or `arr_0`), `.pcd` or `.ply`.
         bin_columns: numbers a point has in a `.bin` file: 4 with KITTI and MulRan, 3 or 5 elsewhere.
 
     Returns:
@@ -104,15 +105,32 @@ def _read_npy(path: Path, _: int) -> NDArray[np.float32]:
 
 
 def _read_npz(path: Path, _: int) -> NDArray[np.float32]:
+    table = read_npz(path, _NPZ_KEYS)
+    key = next((key for key in _NPZ_KEYS if key in table), None)
+    if key is None:
+        raise InputError(path, "no array of points", "call it lidar_pcd or points")
+    return _as_points(table[key], path)
+
+
+def read_npz(path: Path, keys: tuple[str, ...]) -> dict[str, NDArray[np.generic]]:
+    """Reads some arrays of a NumPy archive.
+
+    Args:
+        path: the file.
+        keys: the arrays that are wanted.
+
+    Returns:
+        Those of them that are there.
+
+    Raises:
+        InputError: no such file, no archive, or a damaged one.
+    """
     try:
-        with np.load(path, allow_pickle=False) as table:
-            key = next((key for key in _NPZ_KEYS if key in table.files), None)
-            if key is None:
-                raise InputError(path, f"keys are {', '.join(table.files) or 'none'}", "call the points lidar_pcd")
-            values = table[key]
-    except (OSError, EOFError, zipfile.BadZipFile) as error:
-        raise InputError(path, f"not a readable NumPy file ({error})", "save it again with numpy.savez") from error
-    return _as_points(values, path)
+        # An opened file, for numpy.load leaves one open that is no archive.
+        with path.open("rb") as file, np.load(file, allow_pickle=False) as table:
+            return {key: table[key] for key in keys if key in table.files}
+    except (OSError, ValueError, EOFError, TypeError, AttributeError, zipfile.BadZipFile, zlib.error) as error:
+        raise InputError(path, f"not a readable NumPy archive ({error})", "save it again with numpy.savez") from error
 
 
 def _as_points(values: NDArray[np.generic], path: Path) -> NDArray[np.float32]:

@@ -8,10 +8,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from dpmjax.data import lidar_layouts as layouts
 from dpmjax.data.errors import InputError
 from dpmjax.data.files import natural_key
+from dpmjax.data.lidar_drive import Drive3D, scan_files
 from dpmjax.data.lidar_files import read_lidar_file
+from dpmjax.data.lidar_folders import read_learned_folder, read_mulran, read_plain_folder
+from dpmjax.data.lidar_kitti import read_kitti_360, read_kitti_carla, read_kitti_odometry, read_kitti_raw
 from dpmjax.data.lidar_sequence import LidarSequence, take_lidar_scans
 
 _FORMATS = (
@@ -140,14 +142,14 @@ def _kind(path: Path) -> str | None:
         return "kitti_360" if path.resolve().parent.name == "data_3d_raw" else "kitti_raw"
     if (path / "velodyne").is_dir():
         return "kitti_odometry"
-    if layouts.scan_files(path):
-        return "learned" if layouts.scan_files(path)[0].suffix.lower() == ".npz" else "plain"
-    if layouts.scan_files(path / "data"):
+    if scan_files(path):
+        return "learned" if scan_files(path)[0].suffix.lower() == ".npz" else "plain"
+    if scan_files(path / "data"):
         return "plain_data"
     return None
 
 
-def _read(path: Path, poses: Path | None) -> layouts.Drive3D:
+def _read(path: Path, poses: Path | None) -> Drive3D:
     kind = _kind(path)
     if poses is not None:
         homes = {
@@ -158,16 +160,16 @@ def _read(path: Path, poses: Path | None) -> layouts.Drive3D:
             "kitti_odometry": "velodyne",
             "plain_data": "data",
         }
-        drive = layouts.read_plain_folder(path / homes.get(kind or "", ""), poses=poses)
+        drive = read_plain_folder(path / homes.get(kind or "", ""), poses=poses)
         return drive._replace(name=path.resolve().name)
     read = {
-        "kitti_carla": layouts.read_kitti_carla,
-        "mulran": layouts.read_mulran,
-        "kitti_360": layouts.read_kitti_360,
-        "kitti_raw": layouts.read_kitti_raw,
-        "kitti_odometry": layouts.read_kitti_odometry,
-        "learned": layouts.read_learned_folder,
+        "kitti_carla": read_kitti_carla,
+        "mulran": read_mulran,
+        "kitti_360": read_kitti_360,
+        "kitti_raw": read_kitti_raw,
+        "kitti_odometry": read_kitti_odometry,
+        "learned": read_learned_folder,
     }.get(kind or "")
     if read is not None:
         return read(path)
-    return layouts.read_plain_folder(path / "data" if kind == "plain_data" else path)._replace(name=path.resolve().name)
+    return read_plain_folder(path / "data" if kind == "plain_data" else path)._replace(name=path.resolve().name)

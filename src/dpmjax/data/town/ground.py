@@ -72,15 +72,7 @@ def cross_ground(
     def refine(_: int, carry: tuple[Array, Array, Array, Array]) -> tuple[Array, Array, Array, Array]:
         near, far, above, below = carry
         middle = near + (far - near) * jnp.clip(above / jnp.maximum(above - below, 1e-9), 0.02, 0.98)
-        here = clearance(middle)
-        is_above = here > 0
-        # The end that stays counts half the next time, or it would stay for ever.
-        return (
-            jnp.where(is_above, middle, near),
-            jnp.where(is_above, far, middle),
-            jnp.where(is_above, here, 0.5 * above),
-            jnp.where(is_above, 0.5 * below, here),
-        )
+        return _narrow(carry, middle, clearance(middle))
 
     zero = jnp.zeros(direction.shape[:-1], direction.dtype)
     top = start[2] - ground_height(ground, start[:2])
@@ -89,3 +81,20 @@ def cross_ground(
     near, far, above, below = jax.lax.fori_loop(0, _NUM_REFINEMENTS, refine, found)
     last = near + (far - near) * jnp.clip(above / jnp.maximum(above - below, 1e-9), 0.0, 1.0)
     return jnp.where(found[3] <= 0, last, jnp.inf)
+
+
+def _narrow(
+    bracket: tuple[Array, Array, Array, Array], middle: Float[Array, "..."], here: Float[Array, "..."]
+) -> tuple[Array, Array, Array, Array]:
+    """The part of (near, far, height at near, height at far) that holds the crossing (Illinois).
+
+    The end that stays counts half the next time, or it would stay for ever.
+    """
+    near, far, above, below = bracket
+    is_above = here > 0
+    return (
+        jnp.where(is_above, middle, near),
+        jnp.where(is_above, far, middle),
+        jnp.where(is_above, here, 0.5 * above),
+        jnp.where(is_above, 0.5 * below, here),
+    )
