@@ -30,6 +30,19 @@ class ScanSet:
     mask: Bool[Array, "n b"]
 
 
+@flax.struct.dataclass
+class PointCloud:
+    """One scan in space, in the frame of the lidar that took it.
+
+    Attributes:
+        points: metres, x forward, y left, z up.
+        mask: True where there is a point.
+    """
+
+    points: Float[Array, "n 3"]
+    mask: Bool[Array, " n"]
+
+
 class Neighbours(NamedTuple):
     """The nearest points of each query, nearest first.
 

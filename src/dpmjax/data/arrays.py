@@ -69,11 +69,13 @@ def read_arrays(path: str | Path, *, unit: Literal["px", "m"] | None = None) -> 
 def _load(path: Path) -> Mapping[str, NDArray[np.generic]]:
     """The arrays of the file by key; a `.npy` is `points`."""
     try:
-        loaded = np.load(path, allow_pickle=False)
-        if isinstance(loaded, np.ndarray):
-            return {"points": loaded}
-        with loaded:
-            return {key: loaded[key] for key in loaded.files}
+        # An opened file, for numpy.load leaves one open that is no zip archive.
+        with path.open("rb") as file:
+            loaded = np.load(file, allow_pickle=False)
+            if isinstance(loaded, np.ndarray):
+                return {"points": loaded}
+            with loaded:
+                return {key: loaded[key] for key in loaded.files}
     except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
         raise InputError(
             path, f"not a readable NumPy file ({error})", "save it again with numpy.save or numpy.savez"
