@@ -42,3 +42,31 @@ class Neighbours(NamedTuple):
     indices: Int[Array, "m k"]
     squared_distances: Float[Array, "m k"]
     mask: Bool[Array, "m k"]
+
+
+@flax.struct.dataclass
+class PointCloud:
+    """A scan as a cloud of fixed capacity, in the frame of its lidar.
+
+    Attributes:
+        points: metres.
+        mask: True for points that are there.
+    """
+
+    points: Float[Array, "n 3"]
+    mask: Bool[Array, " n"]
+
+
+@flax.struct.dataclass
+class DescriptorCloud:
+    """A scan, or a union of scans, as sparse points that carry learned features (DeepPointMap section 3.1).
+
+    Attributes:
+        positions: metres, in the frame of the lidar or of the map.
+        features: what the network says of the surroundings of each.
+        mask: True for descriptors that are there.
+    """
+
+    positions: Float[Array, "m 3"]
+    features: Float[Array, "m c"]
+    mask: Bool[Array, " m"]
