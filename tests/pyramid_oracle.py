@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import jax.numpy as jnp
 import numpy as np
 
 from dpmjax.geometry.pyramid import Interpolation, PointPyramid, PyramidConfig, PyramidLevel
@@ -45,7 +46,7 @@ def build_pyramid_oracle(points: np.ndarray, config: PyramidConfig, capacity: in
     empty = np.zeros(0, np.int32)
     front = np.full((capacity, 3), np.nan, np.float32)
     front[: len(points)] = points
-    levels = [PyramidLevel(front, np.arange(capacity) < len(points), empty, ())]
+    levels = [PyramidLevel(*map(jnp.asarray, (front, np.arange(capacity) < len(points), empty)), ())]
     for stage in config.stages:
         before, m = valid[-1], min(stage.num_points, len(valid[-1]))
         sample = farthest_points(before, stage.num_points)[:m]
@@ -57,10 +58,10 @@ def build_pyramid_oracle(points: np.ndarray, config: PyramidConfig, capacity: in
         ]
         levels.append(
             PyramidLevel(
-                positions=padded(here.astype(np.float32), stage.num_points),
-                mask=np.arange(stage.num_points) < m,
-                sample_indices=padded(sample.astype(np.int32), stage.num_points),
-                neighbours=tuple(padded(block.astype(np.int32), stage.num_points) for block in blocks),
+                positions=jnp.asarray(padded(here.astype(np.float32), stage.num_points)),
+                mask=jnp.arange(stage.num_points) < m,
+                sample_indices=jnp.asarray(padded(sample.astype(np.int32), stage.num_points)),
+                neighbours=tuple(jnp.asarray(padded(block.astype(np.int32), stage.num_points)) for block in blocks),
             )
         )
         valid.append(here)
@@ -75,7 +76,6 @@ def interpolations(valid: list[np.ndarray], levels: list[PyramidLevel], num_step
         weights = 1 / (distances**2 + 1e-8)
         weights /= weights.sum(axis=1, keepdims=True)
         num_rows = len(levels[-2 - step].mask)
-        steps.append(
-            Interpolation(padded(indices.astype(np.int32), num_rows), padded(weights.astype(np.float32), num_rows))
-        )
+        arrays = (indices.astype(np.int32), weights.astype(np.float32))
+        steps.append(Interpolation(*(jnp.asarray(padded(array, num_rows)) for array in arrays)))
     return steps

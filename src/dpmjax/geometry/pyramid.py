@@ -67,14 +67,14 @@ class PyramidLevel:
     Attributes:
         positions: normalised coordinates.
         mask: True for points that are there.
-        sample_indices: row of each point in the level before.
+        sample_indices: row of each point in the level before; of level 0 there is none.
         neighbours: for each block (m, k) rows, nearest first, those beyond the radius replaced by the nearest. Block 0
             looks into the level before, the others into this one. Points that are not there are nobody's neighbours.
     """
 
     positions: Float[Array, "m 3"]
     mask: Bool[Array, " m"]
-    sample_indices: Int[Array, " m"]
+    sample_indices: Int[Array, " s"]
     neighbours: tuple[Int[Array, "m k"], ...]
 
 

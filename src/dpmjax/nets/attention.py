@@ -12,8 +12,8 @@ from dpmjax.nets.layers import ComputeDtype, TwoLayers, layer_norm, linear
 
 EMBEDDING_TEMPERATURE = 10_000.0
 
-MAX_LIVE_PAIRS = 1 << 20
-"""How many logits of one head a CPU holds at once: 4 MB."""
+MAX_LIVE_LOGITS = 1 << 20
+"""How many logits a CPU holds at once: 4 MB."""
 
 
 def embed_positions(positions: Float[Array, "n 3"], num_channels: int) -> Float[Array, "n c"]:
@@ -40,19 +40,20 @@ def attend(
     queries: Float[Array, "m h c"], keys: Float[Array, "n h c"], values: Float[Array, "n h c"], mask: Bool[Array, " n"]
 ) -> Float[Array, "m h c"]:
     """Softmax of scaled products, in float32, over the keys that are there; zero where none is."""
-    per_head = tuple(jnp.swapaxes(x, 0, 1) for x in (queries / queries.shape[-1] ** 0.5, keys, values))
+    per_head = [jnp.swapaxes(x, 0, 1) for x in (queries / queries.shape[-1] ** 0.5, keys, values)]
 
-    def all_heads(heads: tuple[jax.Array, jax.Array, jax.Array]) -> jax.Array:
-        return jax.vmap(lambda head: _attend_with_one_head(*head, mask))(heads)
+    def all_heads(*heads: jax.Array) -> jax.Array:
+        return jax.vmap(lambda query, key, value: _attend_with_one_head(query, key, value, mask))(*heads)
 
-    def head_by_head(heads: tuple[jax.Array, jax.Array, jax.Array]) -> jax.Array:
-        return lax.map(lambda head: _attend_in_chunks(*head, mask), heads)
+    def head_by_head(*heads: jax.Array) -> jax.Array:
+        return lax.map(lambda head: _attend_in_chunks(head[0], head[1], head[2], mask), heads)
 
-    if queries.shape[0] * keys.shape[0] <= MAX_LIVE_PAIRS:
-        mixed = all_heads(per_head)
+    num_logits = queries.shape[0] * queries.shape[1] * keys.shape[0]
+    if num_logits <= MAX_LIVE_LOGITS:
+        mixed = all_heads(*per_head)
     else:
         # What does not fit the cache of a CPU takes three times as long there.
-        mixed = lax.platform_dependent(per_head, cpu=head_by_head, default=all_heads)
+        mixed = lax.platform_dependent(*per_head, cpu=head_by_head, default=all_heads)
     return jnp.swapaxes(mixed, 0, 1)
 
 
@@ -62,7 +63,7 @@ def _attend_in_chunks(
     def attend_one(query: Float[Array, " c"]) -> Float[Array, " c"]:
         return _attend_with_one_head(query[None], keys, values, mask)[0]
 
-    return lax.map(attend_one, queries, batch_size=max(1, MAX_LIVE_PAIRS // keys.shape[0]))
+    return lax.map(attend_one, queries, batch_size=max(1, MAX_LIVE_LOGITS // keys.shape[0]))
 
 
 def _attend_with_one_head(
@@ -100,7 +101,7 @@ class PairAttention(nn.Module):
         num_rows, num_channels = features.shape
         dtype = jnp.dtype(self.compute_dtype)
         # One matrix for queries, keys and values, side by side.
-        kernel = self.param("in_kernel", nn.initializers.xavier_uniform(), (num_channels, 3 * num_channels))
+        kernel = self.param("in_kernel", nn.initializers.lecun_normal(), (num_channels, 3 * num_channels))
         bias = self.param("in_bias", nn.initializers.zeros_init(), (3 * num_channels,))
         mapped = jnp.matmul(features.astype(dtype), kernel.astype(dtype)) + bias.astype(dtype)
         mapped = mapped.reshape(num_rows, 3, self.num_heads, num_channels // self.num_heads)
@@ -109,8 +110,8 @@ class PairAttention(nn.Module):
         if self.is_crossed:
             contexts.reverse()
         mixed = [attend(query, *context) for query, context in zip(queries, contexts, strict=True)]
-        mixed = jnp.concatenate(mixed).reshape(num_rows, num_channels)
-        return linear(num_channels, self.compute_dtype, "out")(mixed).astype(jnp.float32)
+        rows = jnp.concatenate(mixed).reshape(num_rows, num_channels)
+        return linear(num_channels, self.compute_dtype, "out")(rows).astype(jnp.float32)
 
 
 class AttentionLayer(nn.Module):

@@ -77,7 +77,9 @@ class DescriptorDecoder(nn.Module):
         for i in range(self.config.num_layers):
             x = self.layers[i % len(self.layers)](x, embeddings, masks)
         features_a, features_b = jnp.split(x, [a.mask.size])
-        return _cleared(a.replace(features=features_a)), _cleared(b.replace(features=features_b))
+        correlated_a = DescriptorCloud(a.positions, features_a, masks[0])
+        correlated_b = DescriptorCloud(b.positions, features_b, masks[1])
+        return _cleared(correlated_a), _cleared(correlated_b)
 
     def similarity_features(self, features: Float[Array, "m c"]) -> Float[Array, "m c"]:
         """Correlated features to those whose cosine tells how likely two descriptors are partners."""
@@ -107,7 +109,5 @@ class DescriptorDecoder(nn.Module):
 def _cleared(cloud: DescriptorCloud) -> DescriptorCloud:
     """Zero where nothing is: what stands there may be anything, and must not reach a gradient."""
     mask = cloud.mask[:, None]
-    return cloud.replace(
-        positions=jnp.where(mask, cloud.positions, 0),
-        features=jnp.where(mask, cloud.features, 0),
-    )
+    positions, features = jnp.where(mask, cloud.positions, 0), jnp.where(mask, cloud.features, 0)
+    return DescriptorCloud(positions, features, cloud.mask)

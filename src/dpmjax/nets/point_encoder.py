@@ -12,7 +12,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import flax.linen as nn
-import jax
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float, Int
@@ -70,8 +69,8 @@ class NeighbourhoodMaximum(nn.Module):
         num_channels, num_features = features.shape[1], self.num_features
         kernel = self.param("kernel", nn.initializers.lecun_normal(), (num_channels + 3, num_features))
         bias = self.param("bias", nn.initializers.zeros_init(), (num_features,))
-        scale = self.param("scale", nn.initializers.ones_init(), (num_features,))
-        shift = self.param("shift", nn.initializers.zeros_init(), (num_features,))
+        scale = self.param("norm_scale", nn.initializers.ones_init(), (num_features,))
+        norm_bias = self.param("norm_bias", nn.initializers.zeros_init(), (num_features,))
         # The norm removes the mean over channels: removed from the weights, there is none left to compute.
         kernel, bias = kernel - kernel.mean(axis=1, keepdims=True), bias - bias.mean()
         dtype = jnp.dtype(self.compute_dtype)
@@ -81,7 +80,7 @@ class NeighbourhoodMaximum(nn.Module):
         of_points = from_features + bias + _project(positions, kernel[-3:] / self.radius)
         of_queries = _project(queries, kernel[-3:] / self.radius)
         # relu grows with its argument, so it may follow the maximum.
-        return nn.relu(_maximum_of_normalised(of_points, of_queries, neighbours, scale) + shift)
+        return nn.relu(_maximum_of_normalised(of_points, of_queries, neighbours, scale) + norm_bias)
 
 
 def _project(positions: Float[Array, "n 3"], kernel: Float[Array, "3 f"]) -> Float[Array, "n f"]:
@@ -214,10 +213,6 @@ class PointEncoder(nn.Module):
         for step, interpolation in enumerate(pyramid.interpolation):
             fine = features.pop()
             num_features = config.output_channels if step == num_steps - 1 else fine.shape[1]
-            module = FeaturePropagation(num_features, config.compute_dtype, name=f"propagation_{step}")
-            x = module(fine, x, interpolation)
-        return _clear(x, pyramid.levels[-1 - num_steps].mask)
-
-
-def _clear(features: Float[Array, "m c"], mask: jax.Array) -> Float[Array, "m c"]:
-    return jnp.where(mask[:, None], features, 0)
+            propagation = FeaturePropagation(num_features, config.compute_dtype, name=f"propagation_{step}")
+            x = propagation(fine, x, interpolation)
+        return jnp.where(pyramid.levels[-1 - num_steps].mask[:, None], x, 0)
