@@ -7,6 +7,7 @@ which is a function of its parameters and of this.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import flax.struct
 from jaxtyping import Array, Bool, Float, Int
@@ -72,14 +73,13 @@ class PyramidLevel:
             looks into the level before, the others into this one. Points that are not there are nobody's neighbours.
     """
 
-    positions: Float[Array, "m 3"]
-    mask: Bool[Array, " m"]
-    sample_indices: Int[Array, " s"]
-    neighbours: tuple[Int[Array, "m k"], ...]
+    positions: Float[Array, "*batch m 3"]
+    mask: Bool[Array, "*batch m"]
+    sample_indices: Int[Array, "*batch s"]
+    neighbours: tuple[Int[Array, "*batch m k"], ...]
 
 
-@flax.struct.dataclass
-class Interpolation:
+class Interpolation(NamedTuple):
     """How features of a coarser level are carried to the next finer one.
 
     Attributes:
@@ -87,8 +87,8 @@ class Interpolation:
         weights: their shares; each row sums to one.
     """
 
-    indices: Int[Array, "m 3"]
-    weights: Float[Array, "m 3"]
+    indices: Int[Array, "*batch m 3"]
+    weights: Float[Array, "*batch m 3"]
 
 
 @flax.struct.dataclass

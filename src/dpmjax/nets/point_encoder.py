@@ -177,7 +177,8 @@ class FeaturePropagation(nn.Module):
         self, fine: Float[Array, "n c"], coarse: Float[Array, "m d"], interpolation: Interpolation
     ) -> Float[Array, "n f"]:
         """Features of both levels, (n, c) and (m, d)."""
-        interpolated = jnp.einsum("nk,nkd->nd", interpolation.weights, coarse[interpolation.indices])
+        indices, weights = interpolation
+        interpolated = jnp.einsum("nk,nkd->nd", weights, coarse[indices])
         x = jnp.concatenate([fine, interpolated], axis=-1)
         for layer in range(2):
             x = linear(self.num_features, self.compute_dtype, f"linear_{layer}")(x)
