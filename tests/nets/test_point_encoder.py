@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 
 from dpmjax.deeppointmap.model import Model, ModelConfig, encode_pyramid, init_model
-from dpmjax.geometry.pyramid import PointPyramid, PyramidConfig, PyramidStage
+from dpmjax.geometry.pyramid import PyramidConfig, PyramidStage
+from dpmjax.geometry.pyramid_host import build_pyramid_on_host
 from dpmjax.nets import DecoderConfig, EncoderConfig
 from dpmjax.nets.point_encoder import NeighbourhoodMaximum
-from tests.pyramid_oracle import build_pyramid_oracle
+from dpmjax.types import PointPyramid
 from tests.tolerances import ACCUMULATED, ROUNDING
 
 CONFIG = ModelConfig(
@@ -28,6 +29,14 @@ def model() -> Model:
 
 def points(seed: int, num_points: int = 40) -> np.ndarray:
     return np.random.default_rng(seed).uniform(-1, 1, (num_points, 3)).astype(np.float32)
+
+
+def pyramid_of(cloud: np.ndarray, capacity: int | None = None, config: ModelConfig = CONFIG) -> PointPyramid:
+    """Of the cloud in front of `capacity` rows."""
+    capacity = len(cloud) if capacity is None else capacity
+    front = np.zeros((capacity, 3), np.float32)
+    front[: len(cloud)] = cloud
+    return jax.device_put(build_pyramid_on_host(front, np.arange(capacity) < len(cloud), config.pyramid))
 
 
 def norm(x: np.ndarray, scale: np.ndarray, bias: np.ndarray) -> np.ndarray:
@@ -58,12 +67,12 @@ def test_neighbourhood_maximum_is_that_of_the_whole_formula() -> None:
 
 
 def test_padded_equals_unpadded(model: Model) -> None:
-    # Five points fewer than the first level has room for: every level is padded, or just full.
+    # Five points fewer than the first level has room for.
     cloud = points(1, 19)
-    found = encode_pyramid(model, poisoned(build_pyramid_oracle(cloud, CONFIG.pyramid, capacity=64)))
+    found = encode_pyramid(model, poisoned(pyramid_of(cloud, capacity=64)))
     stages = (PyramidStage(19, (0.3, 0.5), 6), *CONFIG.pyramid.stages[1:])
     unpadded = Model(model.params, ModelConfig(PyramidConfig(stages, 2), CONFIG.encoder, CONFIG.decoder))
-    expected = encode_pyramid(unpadded, build_pyramid_oracle(cloud, unpadded.config.pyramid))
+    expected = encode_pyramid(unpadded, pyramid_of(cloud, config=unpadded.config))
     np.testing.assert_array_equal(found.mask, np.arange(24) < 19)
     np.testing.assert_allclose(found.features[:19], expected.features, **ROUNDING)
     np.testing.assert_allclose(found.positions[:19], expected.positions, **ROUNDING)
@@ -73,14 +82,14 @@ def test_padded_equals_unpadded(model: Model) -> None:
 
 def test_descriptors_stand_on_sampled_points_in_metres(model: Model) -> None:
     cloud = points(2)
-    found = encode_pyramid(model, build_pyramid_oracle(cloud, CONFIG.pyramid))
+    found = encode_pyramid(model, pyramid_of(cloud))
     assert found.positions.shape == (CONFIG.num_descriptors, 3)
     distances = np.linalg.norm(np.asarray(found.positions)[:, None] - 60 * cloud[None], axis=-1)
     np.testing.assert_allclose(distances.min(axis=1), 0, atol=1e-5)
 
 
 def test_order_of_neighbours_changes_nothing(model: Model) -> None:
-    pyramid = build_pyramid_oracle(points(3), CONFIG.pyramid)
+    pyramid = pyramid_of(points(3))
     levels = tuple(
         level.replace(neighbours=tuple(block[:, ::-1] for block in level.neighbours)) for level in pyramid.levels
     )
@@ -89,7 +98,7 @@ def test_order_of_neighbours_changes_nothing(model: Model) -> None:
 
 
 def test_empty_cloud_has_no_descriptors(model: Model) -> None:
-    pyramid = build_pyramid_oracle(points(4), CONFIG.pyramid)
+    pyramid = pyramid_of(points(4))
     levels = tuple(level.replace(mask=jnp.zeros_like(level.mask)) for level in pyramid.levels)
     cloud = encode_pyramid(model, poisoned(pyramid.replace(levels=levels)))
     assert not cloud.mask.any()
@@ -100,14 +109,14 @@ def test_empty_cloud_has_no_descriptors(model: Model) -> None:
 @pytest.mark.parametrize("degenerate", [False, True])
 def test_gradient_is_finite(model: Model, degenerate: bool) -> None:
     cloud = np.zeros((19, 3), np.float32) if degenerate else points(5, 19)
-    pyramid = poisoned(build_pyramid_oracle(cloud, CONFIG.pyramid, capacity=30))
+    pyramid = poisoned(pyramid_of(cloud, capacity=30))
     gradient = jax.jit(jax.grad(lambda model: jnp.sum(encode_pyramid(model, pyramid).features ** 2)))(model)
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(gradient))
     assert any(leaf.any() for leaf in jax.tree.leaves(gradient.params["encoder"]["stage_0"])) or degenerate
 
 
 def test_vmap_equals_a_loop_and_second_call_compiles_nothing(model: Model, assert_compiles_nothing) -> None:
-    pyramids = [build_pyramid_oracle(points(seed), CONFIG.pyramid) for seed in (6, 7)]
+    pyramids = [pyramid_of(points(seed)) for seed in (6, 7)]
     batch = jax.tree.map(lambda *leaves: jnp.stack(leaves), *pyramids)
     found = jax.device_get(jax.vmap(encode_pyramid, (None, 0))(model, batch))
     first = jax.device_get(encode_pyramid(model, pyramids[0]))
@@ -118,7 +127,7 @@ def test_vmap_equals_a_loop_and_second_call_compiles_nothing(model: Model, asser
 
 
 def test_bfloat16_is_close_and_leaves_positions_alone(model: Model) -> None:
-    pyramid = build_pyramid_oracle(points(8), CONFIG.pyramid)
+    pyramid = pyramid_of(points(8))
     low = encode_pyramid(Model(model.params, CONFIG.with_compute_dtype("bfloat16")), pyramid)
     high = encode_pyramid(model, pyramid)
     np.testing.assert_array_equal(low.positions, high.positions)
@@ -135,7 +144,7 @@ def test_paper_size_is_the_published_one() -> None:
 
 
 def test_wrong_pyramids_and_widths_are_named(model: Model) -> None:
-    pyramid = build_pyramid_oracle(points(9), CONFIG.pyramid)
+    pyramid = pyramid_of(points(9))
     with pytest.raises(ValueError, match="^pyramid: expected 4 levels, got 3"):
         encode_pyramid(model, pyramid.replace(levels=pyramid.levels[:-1]))
     short = pyramid.levels[1].replace(neighbours=pyramid.levels[1].neighbours[:1])

@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 
 from dpmjax.deeppointmap import Model, correlate, encode_pyramid, overlap, similarity_features
+from dpmjax.geometry.pyramid import build_pyramid
 from dpmjax.types import DescriptorCloud
 from dpmjax.weights import load_model
-from tests.pyramid_oracle import build_pyramid_oracle
 
 FOLDER = Path(os.environ.get("DPMJAX_PARITY", Path(__file__).parents[3] / "shared" / "parity" / "small"))
 pytestmark = pytest.mark.skipif(
@@ -48,9 +48,8 @@ def published_cloud(case: dict[str, np.ndarray], name: str) -> DescriptorCloud:
 
 
 def encoded(case: dict[str, np.ndarray], model: Model, name: str) -> DescriptorCloud:
-    points = case[f"points_{name}"]
-    valid = points[~case[f"padding_{name}"]]
-    return encode_pyramid(model, build_pyramid_oracle(valid, model.config.pyramid, capacity=len(points)))
+    pyramid = build_pyramid(case[f"points_{name}"], ~case[f"padding_{name}"], model.config.pyramid)
+    return encode_pyramid(model, pyramid)
 
 
 @pytest.mark.parametrize("name", ["a", "b"])

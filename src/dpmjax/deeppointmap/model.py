@@ -15,11 +15,11 @@ import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from dpmjax.checks import require_positive, require_shape
-from dpmjax.geometry.pyramid import Interpolation, PointPyramid, PyramidConfig, PyramidLevel
+from dpmjax.geometry.pyramid import PyramidConfig
 from dpmjax.nets.decoder import DecoderConfig, DescriptorDecoder
 from dpmjax.nets.layers import ComputeDtype
 from dpmjax.nets.point_encoder import EncoderConfig, PointEncoder
-from dpmjax.types import DescriptorCloud
+from dpmjax.types import DescriptorCloud, Interpolation, PointPyramid, PyramidLevel
 
 
 @dataclass(frozen=True)

@@ -17,8 +17,8 @@ from jax import lax
 from jaxtyping import Array, Float, Int
 
 from dpmjax.checks import require_count
-from dpmjax.geometry.pyramid import Interpolation, PointPyramid
 from dpmjax.nets.layers import NORM_EPSILON, ComputeDtype, layer_norm, linear, require_compute_dtype
+from dpmjax.types import Interpolation, PointPyramid
 
 
 @dataclass(frozen=True)
@@ -177,8 +177,7 @@ class FeaturePropagation(nn.Module):
         self, fine: Float[Array, "n c"], coarse: Float[Array, "m d"], interpolation: Interpolation
     ) -> Float[Array, "n f"]:
         """Features of both levels, (n, c) and (m, d)."""
-        indices, weights = interpolation
-        interpolated = jnp.einsum("nk,nkd->nd", weights, coarse[indices])
+        interpolated = jnp.einsum("nk,nkd->nd", interpolation.weights, coarse[interpolation.indices])
         x = jnp.concatenate([fine, interpolated], axis=-1)
         for layer in range(2):
             x = linear(self.num_features, self.compute_dtype, f"linear_{layer}")(x)

@@ -69,10 +69,9 @@ def save_model(
     path = Path(path)
     if path.suffix != SUFFIX:
         raise ValueError(f"path: expected a file that ends in {SUFFIX}, got {str(path)!r}")
-    arrays = {
-        name: np.ascontiguousarray(np.asarray(jax.device_get(array)).astype(dtype))
-        for name, array in flax.traverse_util.flatten_dict(model.params, sep=".").items()
-    }
+    params = flax.traverse_util.flatten_dict(jax.device_get(model.params), sep=".")
+    with np.errstate(over="ignore"):  # what overflows is found below
+        arrays = {name: np.ascontiguousarray(array, dtype) for name, array in params.items()}
     for name, array in arrays.items():
         if not np.isfinite(array).all():
             raise ValueError(f"model: {name} holds numbers that are not finite in {dtype}")
