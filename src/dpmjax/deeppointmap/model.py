@@ -186,7 +186,7 @@ def _encode_pyramid(model: Model, pyramid: PointPyramid) -> DescriptorCloud:
     features: Any = _encoder(model.config).apply({"params": model.params["encoder"]}, pyramid)
     level = pyramid.levels[-1 - len(pyramid.interpolation)]
     positions = jnp.where(level.mask[:, None], level.positions, 0) * model.config.scale_m
-    return DescriptorCloud(positions, features, level.mask)
+    return DescriptorCloud(positions, features, jnp.asarray(level.mask))
 
 
 @jax.jit
