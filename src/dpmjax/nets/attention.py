@@ -69,11 +69,11 @@ def _attend_in_chunks(
 def _attend_with_one_head(
     queries: Float[Array, "m c"], keys: Float[Array, "n c"], values: Float[Array, "n c"], mask: Bool[Array, " n"]
 ) -> Float[Array, "m c"]:
+    logits = jnp.matmul(queries, keys.T, preferred_element_type=jnp.float32) + jnp.where(mask, 0, -jnp.inf)
+    # Finite even where there is no key, so that what is masked has a share of exactly zero.
     lowest = jnp.finfo(jnp.float32).min
-    logits = jnp.matmul(queries, keys.T, preferred_element_type=jnp.float32)
-    logits = jnp.where(mask, logits, lowest)
     largest = lax.stop_gradient(jnp.max(logits, axis=-1, keepdims=True, initial=lowest))
-    shares = jnp.where(mask, jnp.exp(logits - largest), 0)
+    shares = jnp.exp(logits - largest)
     # Divided after the product: (m, c) numbers instead of (m, n).
     total = jnp.sum(shares, axis=-1, keepdims=True)
     mixed = jnp.matmul(shares.astype(values.dtype), values, preferred_element_type=jnp.float32)

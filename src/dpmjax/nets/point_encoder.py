@@ -18,7 +18,7 @@ from jaxtyping import Array, Float, Int
 
 from dpmjax.checks import require_count
 from dpmjax.nets.layers import NORM_EPSILON, ComputeDtype, layer_norm, linear, require_compute_dtype
-from dpmjax.types import Interpolation, PointPyramid
+from dpmjax.types import AnyArray, Interpolation, PointPyramid
 
 
 @dataclass(frozen=True)
@@ -63,7 +63,7 @@ class NeighbourhoodMaximum(nn.Module):
         features: Float[Array, "n c"],
         positions: Float[Array, "n 3"],
         queries: Float[Array, "m 3"],
-        neighbours: Int[Array, "m k"],
+        neighbours: Int[AnyArray, "m k"],
     ) -> Float[Array, "m f"]:
         """Features (n, c) and positions (n, 3) of the level searched; queries (m, 3); rows of neighbours (m, k)."""
         num_channels, num_features = features.shape[1], self.num_features
@@ -90,7 +90,7 @@ def _project(positions: Float[Array, "n 3"], kernel: Float[Array, "3 f"]) -> Flo
 def _maximum_of_normalised(
     of_points: Float[Array, "n f"],
     of_queries: Float[Array, "m f"],
-    neighbours: Int[Array, "m k"],
+    neighbours: Int[AnyArray, "m k"],
     scale: Float[Array, " f"],
 ) -> Float[Array, "m f"]:
     """max_j scale * x_ij / |x_ij| with x_ij = of_points_j - of_queries_i, its mean over channels being zero."""
@@ -114,7 +114,7 @@ class InvertedResidual(nn.Module):
 
     @nn.compact
     def __call__(
-        self, features: Float[Array, "m f"], positions: Float[Array, "m 3"], neighbours: Int[Array, "m k"]
+        self, features: Float[Array, "m f"], positions: Float[Array, "m 3"], neighbours: Int[AnyArray, "m k"]
     ) -> Float[Array, "m f"]:
         """Features (m, f) and positions (m, 3) of one level, and neighbours (m, k) in it."""
         num_features = features.shape[1]
@@ -148,7 +148,7 @@ class Stage(nn.Module):
         features: Float[Array, "n c"],
         positions: Float[Array, "n 3"],
         queries: Float[Array, "m 3"],
-        neighbours: tuple[Int[Array, "m k"], ...],
+        neighbours: tuple[Int[AnyArray, "m k"], ...],
     ) -> Float[Array, "m f"]:
         """Features and positions of the level before, positions of this one, and the neighbours of each block."""
         first_radius, *radii = self.radii
