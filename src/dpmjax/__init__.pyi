@@ -1,3 +1,10 @@
+from .deeppointmap.model import Model as Model
+from .deeppointmap.model import ModelConfig as ModelConfig
+from .deeppointmap.model import correlate as correlate
+from .deeppointmap.model import encode_pyramid as encode_pyramid
+from .deeppointmap.model import init_model as init_model
+from .deeppointmap.model import overlap as overlap
+from .deeppointmap.presets import model_preset as model_preset
 from .geometry.alignment import weighted_svd as weighted_svd
 from .geometry.neighbours import k_nearest as k_nearest
 from .geometry.neighbours import radius_search as radius_search
@@ -13,7 +20,11 @@ from .metrics.trajectory import align_rigid as align_rigid
 from .metrics.trajectory import point_distance as point_distance
 from .metrics.trajectory import relative_pose_error as relative_pose_error
 from .registration.icp import icp as icp
+from .types import DescriptorCloud as DescriptorCloud
 from .types import Neighbours as Neighbours
+from .types import PointCloud as PointCloud
 from .types import ScanSet as ScanSet
+from .weights.checkpoint import load_model as load_model
+from .weights.checkpoint import save_model as save_model
 
 __version__: str

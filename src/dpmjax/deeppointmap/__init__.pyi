@@ -1,0 +1,12 @@
+from .model import Model as Model
+from .model import ModelConfig as ModelConfig
+from .model import coarse_features as coarse_features
+from .model import correlate as correlate
+from .model import encode_pyramid as encode_pyramid
+from .model import init_model as init_model
+from .model import overlap as overlap
+from .model import overlap_logit as overlap_logit
+from .model import predict_offsets as predict_offsets
+from .model import similarity_features as similarity_features
+from .presets import PRESETS as PRESETS
+from .presets import model_preset as model_preset
