@@ -66,8 +66,8 @@ class PointCloud:
         mask: True for points that are there.
     """
 
-    points: Float[Array, "n 3"]
-    mask: Bool[Array, " n"]
+    points: Float[AnyArray, "n 3"]
+    mask: Bool[AnyArray, " n"]
 
 
 @flax.struct.dataclass

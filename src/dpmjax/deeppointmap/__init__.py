@@ -1,4 +1,4 @@
-"""DeepPointMap: each 3-D scan to a few hundred descriptors, and descriptor clouds registered against each other."""
+"""DeepPointMap: descriptor clouds, how they are matched, and how the networks that make them are trained."""
 
 import lazy_loader as _lazy
 

@@ -10,3 +10,13 @@ from .model import predict_offsets as predict_offsets
 from .model import similarity_features as similarity_features
 from .presets import PRESETS as PRESETS
 from .presets import model_preset as model_preset
+from .matching import MatchConfig as MatchConfig
+from .matching import PredictOffsets as PredictOffsets
+from .matching import match_descriptors as match_descriptors
+from .merging import merge_clouds as merge_clouds
+from .objective import ClosePairs as ClosePairs
+from .objective import ObjectiveConfig as ObjectiveConfig
+from .objective import ObjectiveTerms as ObjectiveTerms
+from .objective import TrainingSide as TrainingSide
+from .objective import close_pairs as close_pairs
+from .objective import registration_loss as registration_loss

@@ -80,7 +80,8 @@ def _farthest_point_sample(
     return lax.fori_loop(1, num_samples, choose, (jnp.where(mask, unseen, -1), chosen))[1]
 
 
-def _as_bits(values: jax.Array) -> jax.Array:
+def _as_bits(values: jax.Array | int) -> jax.Array:
+    values = jnp.asarray(values)
     return lax.bitcast_convert_type(values, f"int{8 * values.dtype.itemsize}")
 
 
