@@ -1,3 +1,7 @@
+from .matching import MatchConfig as MatchConfig
+from .matching import PredictOffsets as PredictOffsets
+from .matching import match_descriptors as match_descriptors
+from .merging import merge_clouds as merge_clouds
 from .model import Model as Model
 from .model import ModelConfig as ModelConfig
 from .model import coarse_features as coarse_features
@@ -8,15 +12,11 @@ from .model import overlap as overlap
 from .model import overlap_logit as overlap_logit
 from .model import predict_offsets as predict_offsets
 from .model import similarity_features as similarity_features
-from .presets import PRESETS as PRESETS
-from .presets import model_preset as model_preset
-from .matching import MatchConfig as MatchConfig
-from .matching import PredictOffsets as PredictOffsets
-from .matching import match_descriptors as match_descriptors
-from .merging import merge_clouds as merge_clouds
 from .objective import ClosePairs as ClosePairs
 from .objective import ObjectiveConfig as ObjectiveConfig
 from .objective import ObjectiveTerms as ObjectiveTerms
 from .objective import TrainingSide as TrainingSide
 from .objective import close_pairs as close_pairs
 from .objective import registration_loss as registration_loss
+from .presets import PRESETS as PRESETS
+from .presets import model_preset as model_preset
