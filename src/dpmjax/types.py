@@ -32,15 +32,15 @@ class ScanSet:
 
 @flax.struct.dataclass
 class PointCloud:
-    """One scan in space, in the frame of the lidar that took it.
+    """A scan as a cloud of fixed capacity, in the frame of the lidar that took it.
 
     Attributes:
         points: metres, x forward, y left, z up.
         mask: True where there is a point.
     """
 
-    points: Float[Array, "n 3"]
-    mask: Bool[Array, " n"]
+    points: Float[AnyArray, "n 3"]
+    mask: Bool[AnyArray, " n"]
 
 
 class Neighbours(NamedTuple):
@@ -55,19 +55,6 @@ class Neighbours(NamedTuple):
     indices: Int[Array, "m k"]
     squared_distances: Float[Array, "m k"]
     mask: Bool[Array, "m k"]
-
-
-@flax.struct.dataclass
-class PointCloud:
-    """A scan as a cloud of fixed capacity, in the frame of its lidar.
-
-    Attributes:
-        points: metres.
-        mask: True for points that are there.
-    """
-
-    points: Float[AnyArray, "n 3"]
-    mask: Bool[AnyArray, " n"]
 
 
 @flax.struct.dataclass

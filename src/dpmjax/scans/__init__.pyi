@@ -1,7 +1,6 @@
 from .augment import AugmentConfig as AugmentConfig
 from .augment import AugmentedScan as AugmentedScan
 from .augment import augment_scan as augment_scan
-from .lines import LineScans as LineScans
 from .occlusion import BoxConfig as BoxConfig
 from .occlusion import SectorConfig as SectorConfig
 from .preprocess import PreprocessConfig as PreprocessConfig

@@ -206,7 +206,7 @@ def range_image(cloud: PointCloud, sensor: LidarSensor) -> tuple[Float[Array, "b
         Ranges in m (0 where nothing came back), and where something did.
     """
     shape = (len(sensor.elevations_deg), sensor.num_azimuths)
-    return jnp.linalg.norm(cloud.points, axis=-1).reshape(shape), cloud.mask.reshape(shape)
+    return jnp.linalg.norm(cloud.points, axis=-1).reshape(shape), jnp.asarray(cloud.mask).reshape(shape)
 
 
 def _azimuths(sensor: LidarSensor) -> np.ndarray:
