@@ -1,9 +1,11 @@
+from .deeppointmap.inference import encode as encode
+from .deeppointmap.inference import overlap as overlap
+from .deeppointmap.inference import register as register
 from .deeppointmap.model import Model as Model
 from .deeppointmap.model import ModelConfig as ModelConfig
 from .deeppointmap.model import correlate as correlate
 from .deeppointmap.model import encode_pyramid as encode_pyramid
 from .deeppointmap.model import init_model as init_model
-from .deeppointmap.model import overlap as overlap
 from .deeppointmap.presets import model_preset as model_preset
 from .geometry.alignment import weighted_svd as weighted_svd
 from .geometry.neighbours import k_nearest as k_nearest

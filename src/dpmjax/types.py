@@ -96,6 +96,11 @@ class Registration:
     scores: Float[Array, " p"]
     is_inlier: Bool[Array, " p"]
 
+    @property
+    def rmse(self) -> Float[Array, ""]:
+        """`rmse_m`, under the name that all registrations have."""
+        return self.rmse_m
+
 
 @flax.struct.dataclass
 class PyramidLevel:

@@ -1,3 +1,8 @@
+from .inference import encode as encode
+from .inference import overlap as overlap
+from .inference import pyramid_of_cloud as pyramid_of_cloud
+from .inference import pyramid_of_scan as pyramid_of_scan
+from .inference import register as register
 from .matching import MatchConfig as MatchConfig
 from .matching import PredictOffsets as PredictOffsets
 from .matching import match_descriptors as match_descriptors
@@ -8,8 +13,8 @@ from .model import coarse_features as coarse_features
 from .model import correlate as correlate
 from .model import encode_pyramid as encode_pyramid
 from .model import init_model as init_model
-from .model import overlap as overlap
 from .model import overlap_logit as overlap_logit
+from .model import overlap_probability as overlap_probability
 from .model import predict_offsets as predict_offsets
 from .model import similarity_features as similarity_features
 from .objective import ClosePairs as ClosePairs

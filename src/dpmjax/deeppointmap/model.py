@@ -15,10 +15,12 @@ import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from dpmjax.checks import require_positive, require_shape
+from dpmjax.deeppointmap.matching import MatchConfig
 from dpmjax.geometry.pyramid import PyramidConfig
 from dpmjax.nets.decoder import DecoderConfig, DescriptorDecoder
 from dpmjax.nets.layers import ComputeDtype
 from dpmjax.nets.point_encoder import EncoderConfig, PointEncoder
+from dpmjax.scans.preprocess import PreprocessConfig
 from dpmjax.types import DescriptorCloud, Interpolation, PointPyramid, PyramidLevel
 
 
@@ -31,12 +33,16 @@ class ModelConfig:
         encoder: its widths.
         decoder: its widths.
         scale_m: metres in one unit of the pyramid's normalised coordinates.
+        preprocess: what is kept of a raw scan, in training and in use alike.
+        matching: which pairs of descriptors are chosen and believed.
     """
 
     pyramid: PyramidConfig = field(default_factory=PyramidConfig)
     encoder: EncoderConfig = field(default_factory=EncoderConfig)
     decoder: DecoderConfig = field(default_factory=DecoderConfig)
     scale_m: float = 60.0
+    preprocess: PreprocessConfig = field(default_factory=PreprocessConfig)
+    matching: MatchConfig = field(default_factory=MatchConfig)
 
     def __post_init__(self) -> None:
         require_positive("scale_m", self.scale_m)
@@ -135,7 +141,7 @@ def correlate(model: Model, a: DescriptorCloud, b: DescriptorCloud) -> tuple[Des
     return _correlate(model, a, b)
 
 
-def overlap(model: Model, a: DescriptorCloud, b: DescriptorCloud) -> Float[Array, ""]:
+def overlap_probability(model: Model, a: DescriptorCloud, b: DescriptorCloud) -> Float[Array, ""]:
     """Probability that two clouds see the same place, less than 20 m apart (DeepPointMap section 3.2).
 
     Args:

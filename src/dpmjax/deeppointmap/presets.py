@@ -8,6 +8,7 @@ from dpmjax.deeppointmap.model import ModelConfig
 from dpmjax.geometry.pyramid import PyramidConfig, PyramidStage
 from dpmjax.nets.decoder import DecoderConfig
 from dpmjax.nets.point_encoder import EncoderConfig
+from dpmjax.scans.preprocess import PreprocessConfig
 
 Preset = Literal["tiny", "small", "paper"]
 
@@ -17,13 +18,14 @@ PRESETS: dict[Preset, ModelConfig] = {
             stages=(
                 PyramidStage(1024, (0.05, 0.1), 16),
                 PyramidStage(512, (0.1, 0.2), 16),
-                PyramidStage(128, (0.2, 0.4), 16),
-                PyramidStage(32, (0.4, 0.8), 16),
-                PyramidStage(8, (0.8,), 8),
+                PyramidStage(256, (0.2, 0.4), 16),
+                PyramidStage(64, (0.4, 0.8), 16),
+                PyramidStage(16, (0.8,), 8),
             )
         ),
         encoder=EncoderConfig(stem_channels=8, expansion=2, output_channels=64),
         decoder=DecoderConfig(input_channels=64, model_channels=64, num_heads=4),
+        preprocess=PreprocessConfig(capacity=4096),
     ),
     "small": ModelConfig(
         pyramid=PyramidConfig(
