@@ -17,6 +17,7 @@ from .geometry.sampling import voxel_sample as voxel_sample
 from .losses.chamfer import chamfer_distance as chamfer_distance
 from .losses.contrastive import info_nce as info_nce
 from .losses.occupancy import occupancy_loss as occupancy_loss
+from .metrics.recall import registration_recall as registration_recall
 from .metrics.trajectory import absolute_trajectory_error as absolute_trajectory_error
 from .metrics.trajectory import align_rigid as align_rigid
 from .metrics.trajectory import point_distance as point_distance

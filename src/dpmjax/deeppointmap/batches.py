@@ -10,10 +10,10 @@ from collections.abc import Sequence
 import flax.struct
 import jax
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Bool, Float, Int
 
 from dpmjax.deeppointmap.sampling import Group, SamplingConfig
-from dpmjax.types import PointPyramid
+from dpmjax.types import AnyArray, PointPyramid
 
 
 @flax.struct.dataclass
@@ -26,9 +26,9 @@ class MapOfScans:
         T_map_scan: poses of the scans in the frame of the map, metres.
     """
 
-    rows: Int[Array, "*b g s"]
-    mask: Bool[Array, "*b g s"]
-    T_map_scan: Float[Array, "*b g s 4 4"]
+    rows: Int[AnyArray, "*b g s"]
+    mask: Bool[AnyArray, "*b g s"]
+    T_map_scan: Float[AnyArray, "*b g s 4 4"]
 
 
 @flax.struct.dataclass
@@ -46,8 +46,8 @@ class RegistrationSample:
     pyramids: PointPyramid
     source: MapOfScans
     target: MapOfScans
-    T_target_source: Float[Array, "*b g 4 4"]
-    mask: Bool[Array, "*b g"]
+    T_target_source: Float[AnyArray, "*b g 4 4"]
+    mask: Bool[AnyArray, "*b g"]
 
 
 @flax.struct.dataclass
@@ -62,7 +62,7 @@ class OverlapSample:
 
     first: PointPyramid
     second: PointPyramid
-    is_overlap: Bool[Array, "*b p"]
+    is_overlap: Bool[AnyArray, "*b p"]
 
 
 def arrange_groups(

@@ -9,6 +9,7 @@ from dpmjax.deeppointmap.model import ModelConfig
 from dpmjax.deeppointmap.objective import ObjectiveConfig
 from dpmjax.deeppointmap.presets import Preset, model_preset
 from dpmjax.deeppointmap.sampling import SamplingConfig
+from dpmjax.scans.augment import AugmentConfig
 
 
 @dataclass(frozen=True)
@@ -38,6 +39,7 @@ class TrainingConfig:
         curriculum: the stages of the registration part.
         overlap_steps: steps of the part after it, in which only the overlap head learns; may be 0.
         sampling: which scans make a sample.
+        augment: what is done to each scan.
         objective: the losses of the registration part.
         learning_rate: at the start of the cosine.
         final_learning_rate: at its end.
@@ -54,6 +56,7 @@ class TrainingConfig:
     )
     overlap_steps: int = 20000
     sampling: SamplingConfig = field(default_factory=SamplingConfig)
+    augment: AugmentConfig = field(default_factory=AugmentConfig)
     objective: ObjectiveConfig = field(default_factory=ObjectiveConfig)
     learning_rate: float = 1e-3
     final_learning_rate: float = 1e-5
@@ -118,9 +121,10 @@ def training_preset(name: Preset) -> TrainingConfig:
     if name == "tiny":
         return TrainingConfig(
             model=model,
-            curriculum=(CurriculumStage(2, 400), CurriculumStage(4, 100)),
-            overlap_steps=60,
-            sampling=SamplingConfig(num_scans=16, num_overlap_pairs=8),
+            curriculum=(CurriculumStage(2, 360), CurriculumStage(4, 20)),
+            overlap_steps=40,
+            sampling=SamplingConfig(num_scans=16, max_side=2, num_overlap_pairs=8),
+            augment=AugmentConfig(max_tilt_rad=0.05, translation_sigma_m=1.0),
             objective=ObjectiveConfig(max_close=4),
             warmup_steps=20,
             max_gradient_norm=5.0,
