@@ -168,7 +168,8 @@ def write_model(folder: RunFolder, model: Model, config: Config, metrics: dict[s
     card = (
         f"{config.preset}, trained on {', '.join(config.data)} ({metrics['num_scans']} scans), "
         f"{metrics['steps']} steps, seed {config.seed}. Held-out town, {metrics['num_held_out_pairs']} pairs "
-        f"2-10 m apart, any yaw: recall (2 m, 5 deg) {metrics['recall']:.3f}, untrained {metrics['recall_untrained']:.3f}."
+        f"2-10 m apart, any yaw: recall (2 m, 5 deg) {metrics['recall']:.3f}, "
+        f"untrained {metrics['recall_untrained']:.3f}."
     )
     unfinished = folder / f".tmp_{MODEL}"
     save_model(model, unfinished, card=card)
@@ -182,7 +183,10 @@ def draw(folder: RunFolder, run: TrainRun) -> None:
     rows = read_history(folder / HISTORY)
     if rows:
         names = {"loss": "loss", "pairing": "pairing", "offset": "offset", "top1_accuracy": "top-1", "recall": "recall"}
+        names["overlap_accuracy"] = "overlap"
         curves = {label: np.array([float(row[name] or "nan") for row in rows]) for name, label in names.items()}
+        # The loss of the overlap part is another one.
+        curves["loss"][[row["stage"] == "overlap" for row in rows]] = np.nan
         steps = [int(row["step"]) for row in rows]
         viz.save_figure(viz.curves_figure(steps, curves), folder / "loss.png")
     viz.save_figure(matches_picture(run.examined, run.examination), folder / "matches.png")

@@ -12,7 +12,7 @@ import jax
 import numpy as np
 import pytest
 
-from dpmjax.deeppointmap import Model, correlate, encode_pyramid, overlap, similarity_features
+from dpmjax.deeppointmap import Model, correlate, encode_pyramid, overlap, register, similarity_features
 from dpmjax.geometry.pyramid import build_pyramid
 from dpmjax.types import DescriptorCloud
 from dpmjax.weights import load_model
@@ -75,3 +75,13 @@ def test_similarity_is_the_published_one_from_the_scans_on(case, model) -> None:
 def test_overlap_probability_is_the_published_one(case, model) -> None:
     probability = overlap(model, encoded(case, model, "a"), encoded(case, model, "b"))
     assert_close(probability[None], case["overlap_probability"])
+
+
+def test_registration_is_the_published_one_from_the_scans_on(case, model) -> None:
+    match = register(model, encoded(case, model, "a"), encoded(case, model, "b"))
+    assert_close(match.T_target_source[:3, :3], case["registration_rotation"])
+    assert_close(match.T_target_source[:3, 3], case["registration_translation"].reshape(3))
+    assert_close(match.rmse[None], case["registration_rmse"].reshape(-1)[:1])
+    published = case["registration_confidence"]
+    assert int(match.num_inliers) == len(published)
+    assert_close(match.confidence[None], published[:30].mean(keepdims=True))

@@ -182,8 +182,9 @@ def draw_overlap_pairs(table: ScanTable, config: SamplingConfig, rng: np.random.
         distances = np.linalg.norm(table.positions - table.positions[anchor], axis=1)
         distances = np.where(table.scene == table.scene[anchor], distances, np.inf)
         choices = [np.flatnonzero((distances > low) & (distances <= high)) for low, high in bands]
-        choices.append(np.flatnonzero(distances > config.far_distance_m))
-        usable = [rows for rows in (choices[kind], *choices[::-1]) if len(rows) > 0]
+        choices.append(np.flatnonzero(np.isfinite(distances) & (distances > config.far_distance_m)))
+        elsewhere = np.flatnonzero(np.isinf(distances))
+        usable = [rows for rows in (choices[kind], elsewhere, *choices[::-1]) if len(rows) > 0]
         first.append(anchor)
         second.append(int(rng.choice(usable[0])) if usable else anchor)
     a, b = np.array(first), np.array(second)

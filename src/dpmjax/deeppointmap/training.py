@@ -5,12 +5,13 @@
     state, report = step(state, batch)
 
 Nothing in the step is random: what is, the samples and their augmentation, is drawn when a batch is made. A batch of
-`RegistrationSample` trains everything but the overlap head (which the losses do not reach), one of `OverlapSample` the
+`RegistrationSample` trains everything but the overlap head, which the losses do not reach; one of `OverlapSample` the
 overlap head alone.
 """
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any, NamedTuple, TypeVar
@@ -112,14 +113,14 @@ def make_step(config: TrainingConfig) -> Step:
     Batches carry samples along their first axis and may be spread over devices by `shard_batch`; the loss is the mean
     over all groups of all samples, so that the number of devices changes nothing but the speed.
     """
+    return functools.partial(_step, config=config)
 
-    @jax.jit
-    def step(state: TrainingState, batch: Sample) -> tuple[TrainingState, TrainingReport]:
-        if isinstance(batch, OverlapSample):
-            return _overlap_step(state, batch, config)
-        return _registration_step(state, batch, config)
 
-    return step
+@functools.partial(jax.jit, static_argnames="config")
+def _step(state: TrainingState, batch: Sample, *, config: TrainingConfig) -> tuple[TrainingState, TrainingReport]:
+    if isinstance(batch, OverlapSample):
+        return _overlap_step(state, batch, config)
+    return _registration_step(state, batch, config)
 
 
 def batch_loss(
@@ -191,7 +192,7 @@ def _registration_step(
         loss=loss,
         terms=terms,
         overlap_accuracy=jnp.full((), jnp.nan),
-        gradient_norm=optax.global_norm(gradient),
+        gradient_norm=_length(gradient),
         learning_rate=jnp.asarray(_schedule(config, is_overlap=False)(state.step)),
     )
     params = optax.apply_updates(state.params, updates)
@@ -218,7 +219,7 @@ def _overlap_step(
         loss=loss,
         terms=ObjectiveTerms(nothing, nothing, nothing, nothing, nothing),
         overlap_accuracy=accuracy,
-        gradient_norm=optax.global_norm(gradient),
+        gradient_norm=_length(gradient),
         learning_rate=jnp.asarray(_schedule(config, is_overlap=True)(state.step - config.registration_steps)),
     )
     params = _with_head(state.params, optax.apply_updates(head, updates))
@@ -233,6 +234,10 @@ def _correlated_pairs(model: Model, batch: OverlapSample) -> tuple[DescriptorClo
 
     clouds = jax.vmap(jax.vmap(of_pair))(batch.first, batch.second)
     return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), clouds)
+
+
+def _length(gradient: Any) -> Float[Array, ""]:
+    return jnp.sqrt(sum(jnp.sum(leaf**2) for leaf in jax.tree.leaves(gradient)))
 
 
 def _with_head(params: dict[str, Any], head: Any) -> dict[str, Any]:

@@ -77,7 +77,7 @@ def matches_figure(
     pa, pb = np.asarray(source_matched, np.float64), np.asarray(target_matched, np.float64)
     figure = new_figure(12.0, 4.6)
     left, right = figure.subplots(1, 2, width_ratios=(2, 1))
-    shift = np.array([1.1 * (np.ptp(a[:, 0]) + np.ptp(b[:, 0])) / 2, 0.0])
+    shift = np.array([a[:, 0].max(initial=0) - b[:, 0].min(initial=0) + 5.0, 0.0])
     _dots(left, a[:, :2], CURVE_COLOR)
     _dots(left, b[:, :2] + shift, MUTED)
     for start, end, fits in zip(pa[:, :2], pb[:, :2] + shift, np.asarray(is_right, bool), strict=True):
