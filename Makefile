@@ -29,7 +29,7 @@ test: $(STAMP)  ## the whole test suite
 	$(BIN)/python -m pytest
 
 demo: $(STAMP)  ## register the built-in 2-D world; pictures in results/demo
-	$(BIN)/python -m experiments.deepmapping_2d -o results/demo
+	$(BIN)/python -m experiments.deepmapping_2d --init odometry --force -o results/demo
 	@echo "Pictures:"; find results/demo/ -name '*.png' | sort | sed 's/^/  /'
 
 bench: $(STAMP)  ## speed and accuracy of everything that is measured

@@ -37,6 +37,7 @@ if TYPE_CHECKING:
     from dpmjax.geometry.lines import LineScans
 
 EXPERIMENT = "deepmapping_2d"
+LOGGER = logging.getLogger("dpmjax.deepmapping_2d")
 INITS = ("icp-plane", "icp-point", "odometry", "zero")
 
 
@@ -106,6 +107,9 @@ class Result:
 
 def main(config: Config) -> Result:
     """Reads, starts warm, fits, polishes, keeps the best, writes."""
+    from dpmjax.deepmapping import choose_trajectory
+    from dpmjax.registration import polish
+
     started = time.perf_counter()
     select_device(config.device)
     sequence = read_scans(config)
@@ -130,17 +134,22 @@ def main(config: Config) -> Result:
             seconds=config.seconds,
             stop=stop,
         )
+        lines = line_scans(sequence)
         candidates = {"start": start, "fit": fitted.poses}
         if config.polish and not stop.is_requested:
-            candidates["polish"] = polish_all(sequence, candidates)
-        chosen, scores = choose_best(sequence, candidates)
+            # From both: the fit is sharper near a good start, the start keeps what a robot's odometry knows.
+            for name in ("fit",) if config.init == "zero" else ("start", "fit"):
+                polished = polish(lines, candidates[name])
+                LOGGER.info("polished the %s: %d pairs, %d loops", name, polished.num_pairs, polished.num_loops)
+                candidates[f"polished {name}"] = polished.poses
+        chosen, scores = choose_trajectory(lines, candidates)
         poses = candidates[chosen]
         metrics = {
             "num_scans": len(sequence),
             "steps": fitted.steps,
             **compare_to_reference(sequence, start, poses),
             "chosen": chosen,
-            **{f"score_{name}": value for name, value in scores.items()},
+            "scores": {name: score._asdict() for name, score in scores.items()},
             "fit_s": fitted.run_s,
             "compile_s": fitted.compile_s,
             "wall_s": time.perf_counter() - started,
@@ -163,7 +172,9 @@ def read_scans(config: Config) -> ScanSequence:
     stop = None if config.n_scans is None else config.start + config.n_scans * config.jump
     if config.data is not None:
         return read_sequence(config.data, start=config.start, stop=stop, stride=config.jump)
-    sequence = simulate_sequence(config.world, stop or 256, range_noise_px=config.range_noise_px, seed=config.seed)
+    sequence = simulate_sequence(
+        config.world, stop or 256, range_noise_px=config.range_noise_px, seed=config.seed, with_odometry=True
+    )
     return take_scans(sequence, slice(config.start, stop, config.jump))
 
 
@@ -207,29 +218,6 @@ def fit_settings(config: Config, sequence: ScanSequence) -> DeepMappingConfig:
 
     settings = preset(config.preset, is_organised=sequence.is_organised)
     return settings if config.steps is None else with_steps(settings, config.steps)
-
-
-def polish_all(sequence: ScanSequence, candidates: dict[str, NDArray[np.float64]]) -> NDArray[np.float64]:
-    """The better of the start and the fit, polished."""
-    from dpmjax.registration import polish
-
-    name, _ = choose_best(sequence, candidates)
-    polished = polish(line_scans(sequence), candidates[name])
-    logging.getLogger("dpmjax").info("polish of the %s: %s", name, polished._replace(poses=None))  # type: ignore[arg-type]
-    return polished.poses
-
-
-def choose_best(sequence: ScanSequence, candidates: dict[str, NDArray[np.float64]]) -> tuple[str, dict[str, float]]:
-    """The poses whose map takes the fewest nats, without a look at the reference."""
-    from dpmjax.deepmapping import map_code_length
-    from dpmjax.registration import length_scale
-    from dpmjax.types import ScanSet
-
-    scale = length_scale(ScanSet(sequence.points, sequence.mask))
-    scores = {
-        name: map_code_length(sequence.points, sequence.mask, poses, scale=scale) for name, poses in candidates.items()
-    }
-    return min(scores, key=lambda name: scores[name]), scores
 
 
 def compare_to_reference(
@@ -312,7 +300,7 @@ def tell(folder: RunFolder, sequence: ScanSequence, metrics: dict[str, Any]) -> 
     unit = sequence.unit
     if f"ate_{unit}" in metrics:
         print(f"ATE {metrics[f'ate_initial_{unit}']:.3g} {unit} -> {metrics[f'ate_{unit}']:.3g} {unit}")
-    print(f"kept: the {metrics['chosen']} (its map takes the fewest nats a beam)")
+    print(f"kept: the {metrics['chosen']} (judged by the scans alone)")
     print(f"results in {folder.path}")
 
 

@@ -7,13 +7,17 @@ from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
+# The tests run each program for a moment and compile hundreds: quick compilation is worth more than quick programs.
+os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} --xla_backend_optimization_level=0".strip()
 
 import jax
 import jaxtyping
 import pytest
 
 # Before the first import of these packages, so that their functions are wrapped.
-jaxtyping.install_import_hook(["dpmjax.geometry", "dpmjax.losses", "dpmjax.metrics"], "beartype.beartype")
+jaxtyping.install_import_hook(
+    ["dpmjax.geometry", "dpmjax.losses", "dpmjax.metrics", "dpmjax.nets", "dpmjax.registration"], "beartype.beartype"
+)
 
 _COMPILE_EVENT = "/jax/core/compile/backend_compile_duration"
 _num_compiled = 0

@@ -1,3 +1,5 @@
+from .choose import Score as Score
+from .choose import choose_trajectory as choose_trajectory
 from .config import DeepMappingConfig as DeepMappingConfig
 from .config import PhaseConfig as PhaseConfig
 from .config import preset as preset
@@ -7,7 +9,7 @@ from .fit import Report as Report
 from .fit import State as State
 from .fit import as_scan_set as as_scan_set
 from .fit import current_poses as current_poses
-from .fit import fit as fit
+from .fit import fit_deepmapping as fit_deepmapping
 from .fit import init as init
 from .fit import make_step as make_step
 from .fit import measure_reach as measure_reach

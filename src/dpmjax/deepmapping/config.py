@@ -114,7 +114,7 @@ class DeepMappingConfig:
         warm_phases: phases from given poses.
         localization: shape of L-Net.
         occupancy: shape of M-Net.
-        steps_per_call: steps that are compiled into one call.
+        steps_per_call: at most so many steps are compiled into one call.
         map_margin: the map's square is so many times larger than what the scans cover at the start of a phase.
     """
 

@@ -1,4 +1,4 @@
-"""Training as registration: `init` a state, `step` it until the phase is over, go to the next phase; `fit` does it all.
+"""Training as registration: `init` a state, `step` it through a phase, go to the next; `fit_deepmapping` does it all.
 
 The state is one pytree of arrays, so that a run can be written to disk after any call and go on exactly.
 """
@@ -87,7 +87,7 @@ class Report(NamedTuple):
 
 
 class Fitted(NamedTuple):
-    """Result of `fit`.
+    """Result of `fit_deepmapping`.
 
     Attributes:
         T_world_scan: (n, 3, 3) float64.
@@ -189,7 +189,7 @@ def init(
     return State(params, _make_optimizer(phase).init(params), poses, frame, zero, zero, zero)
 
 
-# `fit` has an argument of the name `init`, as `icp` has: the start of a registration.
+# `fit_deepmapping` has an argument of the name `init`, as `icp` has: the start of a registration.
 _init_state = init
 
 
@@ -274,8 +274,14 @@ def _level_weights(phase: PhaseConfig, config: DeepMappingConfig, progress: Floa
     return jnp.clip(progress / phase.anneal_until * count - jnp.arange(count) + 1.5, 0.0, 1.0)
 
 
+def steps_per_call(config: DeepMappingConfig, phase: PhaseConfig) -> int:
+    """Steps of one call: the calls share those of the phase evenly, so that the last one hardly goes beyond."""
+    num_calls = -(-phase.num_steps // config.steps_per_call)
+    return -(-phase.num_steps // num_calls)
+
+
 def make_step(scans: ScanSet, config: DeepMappingConfig, phase: PhaseConfig) -> Callable[..., tuple[State, Report]]:
-    """The compiled step of one phase: `state, report = step(state, key=key)` does `config.steps_per_call` steps.
+    """The compiled step of one phase: `state, report = step(state, key=key)` does `steps_per_call` steps.
 
     Args:
         scans: all scans, in reaches.
@@ -287,6 +293,7 @@ def make_step(scans: ScanSet, config: DeepMappingConfig, phase: PhaseConfig) -> 
         unbroken one.
     """
     optimizer = _make_optimizer(phase)
+    length = steps_per_call(config, phase)
 
     def loss_of(params: Params, state: State, key: jax.Array) -> tuple[Float[Array, ""], Terms]:
         batch_key, loss_key = jax.random.split(key)
@@ -316,7 +323,7 @@ def make_step(scans: ScanSet, config: DeepMappingConfig, phase: PhaseConfig) -> 
 
     @jax.jit
     def step(state: State, *, key: jax.Array) -> tuple[State, Report]:
-        state, (losses, terms) = jax.lax.scan(lambda s, _: one_step(s, key), state, None, length=config.steps_per_call)
+        state, (losses, terms) = jax.lax.scan(lambda s, _: one_step(s, key), state, None, length=length)
         poses = current_poses(state, scans, config, phase)
         return state, Report(losses.mean(), jax.tree.map(jnp.mean, terms), poses)
 
@@ -350,7 +357,7 @@ def run_phases(
         state = next_phase(state, scans, config, is_warm=is_warm)
 
 
-def fit(
+def fit_deepmapping(
     scans: ScanSet | ArrayLike,
     config: DeepMappingConfig | None = None,
     *,

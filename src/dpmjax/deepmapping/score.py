@@ -17,9 +17,9 @@ from dpmjax.geometry import planar_poses
 # Hits and passages that are counted at most; more would only take longer.
 _MAX_BEAMS = 40_000
 _SAMPLES_A_BEAM = 32
-_GRID_TURNS = (0.2, 0.9)
-# Cells of a room's detail, of a wall's thickness, and of the finest doubling that beams can tell.
-_CELLS = (0.1, 0.03, 0.01)
+_GRID_TURNS = (0.2, 0.5, 0.9, 1.3)
+# Side of a cell in length scales: some thicknesses of a wall. Finer agreement is the business of `surface_misfit`.
+_CELL = 0.1
 
 
 def map_code_length(
@@ -28,7 +28,7 @@ def map_code_length(
     """Nats a beam that the map of all scans needs at these poses; lower is better.
 
     Comparable among poses of one set of scans. How the walls lie in the cells must not decide, so the mean over turned
-    grids of several sizes is taken: coarse ones see a wrong turn, fine ones a wall that is doubled by a pixel.
+    grids is taken.
 
     Args:
         points: (n, b, 2) in the sensor frames.
@@ -43,8 +43,7 @@ def map_code_length(
     sensors = np.broadcast_to(poses[:, None, :2], world.shape)
     stride = max(1, int(np.ceil(mask.sum() / _MAX_BEAMS)))
     hits, sensors = world[mask][::stride], sensors[mask][::stride]
-    grids = [(angle, part * scale) for angle in _GRID_TURNS for part in _CELLS]
-    return float(np.mean([_code_length(hits @ _turn(a), sensors @ _turn(a), cell) for a, cell in grids]))
+    return float(np.mean([_code_length(hits @ _turn(a), sensors @ _turn(a), _CELL * scale) for a in _GRID_TURNS]))
 
 
 def _turn(angle: float) -> NDArray[np.float64]:

@@ -27,7 +27,7 @@ _NOISE_SAMPLES = 65536
 
 @flax.struct.dataclass
 class LineScans:
-    """Planar scans with a line fitted at every beam, in the sensor frame of each scan.
+    """Planar scans (or one) with a line fitted at every beam, in the sensor frame of each scan.
 
     Attributes:
         points: measured beam end points.
@@ -37,11 +37,11 @@ class LineScans:
         noise: standard deviation of the range noise that was measured in all scans together, in the unit of the points.
     """
 
-    points: Float[Array, "n b 2"]
-    normals: Float[Array, "n b 2"]
-    centroids: Float[Array, "n b 2"]
-    mask: Bool[Array, "n b"]
-    noise: Float[Array, " n"]
+    points: Float[Array, "*n b 2"]
+    normals: Float[Array, "*n b 2"]
+    centroids: Float[Array, "*n b 2"]
+    mask: Bool[Array, "*n b"]
+    noise: Float[Array, "*n"]
 
 
 def _cross(a: Float[Array, "... 2"], b: Float[Array, "... 2"]) -> Float[Array, "..."]:

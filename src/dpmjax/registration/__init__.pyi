@@ -7,6 +7,7 @@ from .loops import close_loops as close_loops
 from .multiview import PolishConfig as PolishConfig
 from .multiview import Polished as Polished
 from .multiview import polish as polish
+from .multiview import surface_misfit as surface_misfit
 from .pairs import length_scale as length_scale
 from .planar_graph import Edges as Edges
 from .planar_graph import optimize_planar_graph as optimize_planar_graph

@@ -78,7 +78,11 @@ def icp(
     start = jnp.eye(dimensions + 1, dtype=source.dtype) if init is None else as_float("init", init)
     if start.shape != (dimensions + 1, dimensions + 1):
         raise ValueError(f"init: expected shape ({dimensions + 1}, {dimensions + 1}), got {start.shape}")
-    return _icp(source, target.astype(source.dtype), start.astype(source.dtype), max_iterations, metric=metric)
+    if not bool(jnp.isfinite(start).all()):
+        raise ValueError("init: expected finite numbers")
+    return _icp(
+        source, target.astype(source.dtype), start.astype(source.dtype), jnp.asarray(max_iterations), metric=metric
+    )
 
 
 @partial(jax.jit, static_argnames="metric")
@@ -86,13 +90,15 @@ def _icp(
     source: Float[Array, "n d"],
     target: Float[Array, "m d"],
     start: Float[Array, "d1 d1"],
-    max_iterations: int,
+    max_iterations: Int[Array, ""],
     *,
     metric: str,
 ) -> IcpResult:
-    size = jnp.maximum(jnp.sqrt(jnp.mean(jnp.sum((target - target.mean(0)) ** 2, -1))), jnp.finfo(source.dtype).tiny)
-    normals = estimate_normals(target, min(_NORMAL_NEIGHBOURS, len(target)))
-    tiny = 1e-6 * size
+    size = jnp.sqrt(jnp.mean(jnp.sum((target - target.mean(0)) ** 2, -1)))
+    normals = estimate_normals(target, _NORMAL_NEIGHBOURS)
+    # Not below rounding, and its square is no zero: one point, or equal ones, have no size.
+    rounding = jnp.finfo(source.dtype).eps * jnp.max(jnp.abs(target))
+    tiny = jnp.maximum(jnp.maximum(1e-6 * size, rounding), 1e-12)
 
     def distances(T: Float[Array, "d1 d1"]) -> tuple[Array, Array, Array, Array]:
         moved = transform_points(T, source)

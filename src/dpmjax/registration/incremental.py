@@ -171,8 +171,8 @@ def _quality(lines: LineScans, source: Indices, target: Indices, matches: PairMa
 def bridge_bad_scans(lines: LineScans, steps: PairMatches, config: IncrementalConfig, scale: float) -> Floats:
     """Poses through the best matches, around scans that fit to no neighbour (a passer-by, a swapped line of the log).
 
-    Where a step is poor, the scans on either side of it are matched over it, two and three apart. The poses then follow the
-    spanning tree of the most trustworthy matches instead of the plain chain, so that a bad scan is a leaf.
+    Where a step is poor, the scans on either side of it are matched over it, two and three apart. The poses then follow
+    the spanning tree of the most trustworthy matches instead of the plain chain, so that a bad scan is a leaf.
 
     Args:
         lines: n scans.
@@ -187,24 +187,20 @@ def bridge_bad_scans(lines: LineScans, steps: PairMatches, config: IncrementalCo
     later = np.arange(1, num_scans)
     edges = [(later, later - 1, steps.poses, _quality(lines, later, later - 1, steps, scale))]
     poor = np.flatnonzero(edges[0][3] < config.poor_quality)
-    plain = planar_poses.chain(steps.poses)
+    if not len(poor):
+        return planar_poses.chain(steps.poses)
+    fan = _wide_fan(config, scale)
     for apart in (2, 3):
         # All pairs that span a poor step.
-        target = np.unique(np.concatenate([poor - k for k in range(apart)])) if len(poor) else poor
+        target = np.unique(np.concatenate([poor - k for k in range(apart)]))
         target = target[(target >= 0) & (target + apart < num_scans)]
-        if not len(target):
-            continue
-        source = target + apart
-        found = match_pairs(
-            take_scans(lines, source), take_scans(lines, target), np.broadcast_to(_wide_fan(config, scale), (len(target), *_wide_fan(config, scale).shape)),
-            COARSE, no_prior(len(target)), scale=scale, metric=config.metric,
-        )  # fmt: skip
-        found = match_pairs(
-            take_scans(lines, source), take_scans(lines, target), found.poses[:, None], FINE, no_prior(len(target)), scale=scale, metric=config.metric
-        )  # fmt: skip
+        source, count = target + apart, len(target)
+        one, other = take_scans(lines, source), take_scans(lines, target)
+        guesses = np.broadcast_to(fan, (count, *fan.shape))
+        for schedule in (COARSE, FINE):
+            found = match_pairs(one, other, guesses, schedule, no_prior(count), scale=scale, metric=config.metric)
+            guesses = found.poses[:, None]
         edges.append((source, target, found.poses, _quality(lines, source, target, found, scale)))
-    if len(edges) == 1:
-        return plain
     source, target, poses, quality = (np.concatenate(x) for x in zip(*edges, strict=True))
     return _follow_tree(num_scans, source, target, poses, quality)
 

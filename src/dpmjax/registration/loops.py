@@ -22,7 +22,7 @@ from dpmjax.registration.planar_graph import Edges, Floats, GraphConfig, Indices
 from dpmjax.registration.visibility import compare_views
 from dpmjax.types import ScanSet
 
-_SEARCH = Schedule(gate=(1.2, 0.3), kernel=(0.6, 0.15), num_iterations=8, source_stride=4, target_stride=2)
+_SEARCH = Schedule(gate=(1.2, 0.3), kernel=(0.6, 0.15), num_iterations=7, source_stride=5, target_stride=3)
 _REFINE = Schedule(gate=(0.5, 0.15), kernel=(0.15, 0.03), num_iterations=10, target_stride=2)
 
 

@@ -13,6 +13,7 @@ import scipy.spatial
 
 from dpmjax.geometry import planar_poses
 from dpmjax.geometry.lines import LineScans
+from dpmjax.registration.incremental import incremental_icp
 from dpmjax.registration.loops import LoopConfig, close_loops, step_edges
 from dpmjax.registration.pairs import (
     FINE,
@@ -205,12 +206,29 @@ def polish(lines: LineScans, poses: Floats, config: PolishConfig | None = None) 
     steps = match_steps(lines, poses, scale=scale)
     num_loops = 0
     if config.loops is not None and not is_sound(lines, steps, config):
-        start = planar_poses.relative(poses[:-1], poses[1:])
-        # A step that jumps away from its start has found another wall.
-        moved = planar_poses.relative(start, steps.poses)
-        is_kept = (np.hypot(moved[:, 0], moved[:, 1]) < 0.7 * scale) & (steps.fitness > 0.1)
-        information = np.where(is_kept[:, None, None], steps.information, 0.0)
-        kept = steps._replace(poses=np.where(is_kept[:, None], steps.poses, start), information=information)
-        poses, _, weight = close_loops(lines, poses, step_edges(poses, kept, config.loops, scale), config.loops)
+        # The steps again, with those of the start as guess and as belief, where the scans leave a direction open.
+        chained, steps = incremental_icp(lines, odometry=poses)
+        edges = step_edges(chained, steps, config.loops, scale)
+        poses, _, weight = close_loops(lines, chained, edges, config.loops)
         num_loops = int((weight > 0.25).sum())
     return align_all(lines, poses, config, scale=scale)._replace(num_loops=num_loops)
+
+
+def surface_misfit(lines: LineScans, poses: Floats, config: PolishConfig | None = None) -> float:
+    """How badly neighbouring scans agree at these poses, without knowing the truth.
+
+    Args:
+        lines: n scans with lines.
+        poses: (n, 3) x, y, heading.
+        config: settings; its last kernel tells how fine the comparison is.
+
+    Returns:
+        The share of beams, 0 to 1, that do not find their surface in the scans nearby; fractions for near misses.
+    """
+    config = config or PolishConfig()
+    scale = length_scale(lines)
+    gates, kernels = scales(config.schedule, scale, 1.25 * float(lines.noise[0]))
+    source, target = choose_pairs(poses, config, scale)
+    _, system = _linearise(lines, source, target, poses, gates[-1], kernels[-1])
+    num_beams = np.asarray(lines.mask.sum(1), np.float64)
+    return 1.0 - float(np.sum(system.weight) / np.maximum(num_beams[source].sum(), 1.0))

@@ -120,7 +120,8 @@ def match_pairs(
     num_pairs, num_guesses = guesses.shape[:2]
     source, target = thin_beams(source, schedule.source_stride), thin_beams(target, schedule.target_stride)
     distances = num_guesses * source.mask.shape[1] * target.mask.shape[1]
-    batch = int(np.clip(_LIVE_DISTANCES // distances, 1, max(num_pairs, 1)))
+    # A power of two whatever the number of pairs: calls of about the same size share one compiled program.
+    batch = 1 << int(np.log2(np.clip(_LIVE_DISTANCES // distances, 1, max(2 * num_pairs - 1, 1))))
     gates, kernels = scales(schedule, scale, float(jnp.max(source.noise, initial=0.0)))
     parts = []
     for start in range(0, num_pairs, batch):

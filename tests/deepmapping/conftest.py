@@ -1,0 +1,31 @@
+"""A tiny walk that the tests of this folder share: read-only."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from dpmjax import deepmapping as dm
+from dpmjax.data import ScanSequence, simulate_sequence
+from dpmjax.types import ScanSet
+
+NUM_SCANS, NUM_BEAMS = 20, 64
+
+
+@pytest.fixture(scope="session")
+def tiny_walk() -> ScanSequence:
+    return simulate_sequence(0, NUM_SCANS, num_beams=NUM_BEAMS)
+
+
+@pytest.fixture(scope="session")
+def tiny_scans(tiny_walk: ScanSequence) -> ScanSet:
+    """In reaches."""
+    scans = dm.as_scan_set(ScanSet(tiny_walk.points, tiny_walk.mask))
+    return ScanSet(scans.points / dm.measure_reach(scans), scans.mask)
+
+
+@pytest.fixture(scope="session")
+def shaken(tiny_walk: ScanSequence) -> np.ndarray:
+    """Poses some pixels and degrees off."""
+    rng = np.random.default_rng(0)
+    return tiny_walk.reference_poses + rng.normal(size=(NUM_SCANS, 3)) * [8.0, 8.0, 0.05]

@@ -1,0 +1,143 @@
+"""Whole runs of the main command on tiny scans, and what it says to bad ones."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from evo.tools import file_interface
+
+from dpmjax.data import ScanSequence, simulate_sequence, write_deepmapping_folder, write_pcd
+from experiments._command import run_command
+from experiments.deepmapping_2d import EXPERIMENT, Config, main
+
+REPOSITORY = Path(__file__).parents[2]
+NUM_SCANS = 16
+METRICS = (
+    "ate_px", "ate_initial_px", "point_distance_px", "point_distance_initial_px", "num_scans", "steps", "wall_s",
+    "compile_s", "peak_rss_gb", "success", "seed",
+)  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def walk() -> ScanSequence:
+    return simulate_sequence(0, NUM_SCANS, num_beams=64)
+
+
+@pytest.fixture(scope="module")
+def scans_npz(walk, tmp_path_factory) -> Path:
+    path = tmp_path_factory.mktemp("scans") / "scans.npz"
+    np.savez(path, points=np.where(walk.mask[..., None], walk.points, 0.0), poses=walk.reference_poses)
+    return path
+
+
+def run(*options: object, interrupt: bool = False) -> subprocess.CompletedProcess[str]:
+    """The command in a process of its own; interrupted after the first call of the step where asked."""
+    command = ["-m", "experiments.deepmapping_2d"]
+    if interrupt:
+        code = (
+            "import os, signal; from experiments import _deepmapping_fit as fit, deepmapping_2d as m;"
+            "from experiments._command import run_command;"
+            "fit.show_progress = lambda *_: os.kill(os.getpid(), signal.SIGINT);"
+            "raise SystemExit(run_command(m.main, m.Config, experiment=m.EXPERIMENT, description=None))"
+        )
+        command = ["-c", code]
+    return subprocess.run(
+        [sys.executable, *command, *map(str, options)], cwd=REPOSITORY, capture_output=True, text=True, timeout=300
+    )
+
+
+def metrics_of(folder: Path) -> dict:
+    return json.loads((folder / "metrics.json").read_text())
+
+
+def test_a_run_on_the_authors_folder_writes_everything_it_promises(walk, tmp_path) -> None:
+    folder = write_deepmapping_folder(tmp_path / "scans", walk)
+    np.save(tmp_path / "start.npy", walk.reference_poses + np.array([3.0, -2.0, 0.0]))
+    done = run(folder, "-o", tmp_path / "out", "--steps", 20, "--init", tmp_path / "start.npy")
+    assert done.returncode == 0, done.stderr
+    metrics = metrics_of(tmp_path / "out")
+    assert not [name for name in METRICS if metrics.get(name) is None]
+    assert (metrics["num_scans"], metrics["steps"], metrics["success"]) == (NUM_SCANS, 20, True)
+    # From a good start it never gets worse.
+    assert metrics["ate_initial_px"] < 1e-3
+    assert metrics["ate_px"] < 0.1
+    assert json.loads((tmp_path / "out" / "config.json").read_text())["steps"] == 20
+    for name in ("map.png", "occupancy.png", "loss.png"):
+        assert (tmp_path / "out" / name).read_bytes().startswith(b"\x89PNG"), name
+    assert len(np.load(tmp_path / "out" / "trajectory.npy")) == NUM_SCANS
+    tum = file_interface.read_tum_trajectory_file(tmp_path / "out" / "trajectory_tum.txt")
+    kitti = file_interface.read_kitti_poses_file(tmp_path / "out" / "trajectory_kitti.txt")
+    np.testing.assert_allclose(tum.positions_xyz, kitti.positions_xyz, atol=1e-4)
+    assert tum.num_poses == NUM_SCANS
+
+
+def test_an_interrupted_run_is_resumed_to_the_same_numbers(scans_npz, tmp_path) -> None:
+    options = (scans_npz, "--steps", 60, "--no-polish", "--init", "zero")
+    broken = run(*options, "-o", tmp_path / "broken", interrupt=True)
+    assert broken.returncode == 130, broken.stderr
+    stopped = metrics_of(tmp_path / "broken")
+    assert stopped["is_interrupted"]
+    assert 0 < stopped["steps"] < 60
+    resumed = run("--resume", "-o", tmp_path / "broken")
+    assert resumed.returncode == 0, resumed.stderr
+    unbroken = run(*options, "-o", tmp_path / "unbroken")
+    assert unbroken.returncode == 0, unbroken.stderr
+    assert metrics_of(tmp_path / "broken")["steps"] == metrics_of(tmp_path / "unbroken")["steps"]
+    one, other = (np.load(tmp_path / name / "trajectory.npy") for name in ("broken", "unbroken"))
+    np.testing.assert_array_equal(one, other)
+    steps = [line.split(",")[0] for line in (tmp_path / "broken" / "metrics.csv").read_text().splitlines()[1:]]
+    assert steps == [
+        line.split(",")[0] for line in (tmp_path / "unbroken" / "metrics.csv").read_text().splitlines()[1:]
+    ]
+
+
+def refused(tmp_path: Path, capsys, *options: object) -> str:
+    """What stderr says to bad input; there must be one line, exit code 2, and nothing written."""
+    out = tmp_path / "out"
+    arguments = [*map(str, options), "-o", str(out)]
+    code = run_command(main, Config, experiment=EXPERIMENT, description=None, args=arguments)
+    error = capsys.readouterr().err.strip()
+    assert code == 2, error
+    assert not out.exists()
+    assert len(error.splitlines()) == 1, error
+    return error
+
+
+def test_a_missing_file_is_named(as_user, tmp_path, capsys) -> None:
+    assert "nowhere.npz" in refused(tmp_path, capsys, tmp_path / "nowhere.npz")
+
+
+def test_a_truncated_cloud_is_named(as_user, walk, tmp_path, capsys) -> None:
+    folder = write_deepmapping_folder(tmp_path / "scans", walk)
+    path = folder / "003.pcd"
+    write_pcd(path, np.ones((40, 3), np.float32))
+    path.write_bytes(path.read_bytes()[:-30])
+    error = refused(tmp_path, capsys, folder)
+    assert "003.pcd" in error
+    assert "truncated" in error
+
+
+@pytest.mark.parametrize(
+    ("spoil", "found"),
+    [("all_zero", "scans.npy"), ("all_nan", "scans.npy"), ("one_scan", "scan")],
+)
+def test_scans_without_a_valid_beam_are_refused(as_user, walk, tmp_path, capsys, spoil, found) -> None:
+    points = np.where(walk.mask[..., None], walk.points, 0.0)
+    if spoil == "one_scan":
+        points = points[:1]
+    else:
+        points[:] = np.nan if spoil == "all_nan" else 0.0
+    np.save(tmp_path / "scans.npy", points)
+    assert found in refused(tmp_path, capsys, tmp_path / "scans.npy")
+
+
+@pytest.mark.parametrize(
+    ("init", "found"), [("odometry", "no odometry"), ("guess", "--init guess"), ("x.npy", "x.npy")]
+)
+def test_a_start_that_is_not_there_is_named(as_user, scans_npz, tmp_path, capsys, init, found) -> None:
+    assert found in refused(tmp_path, capsys, scans_npz, "--init", init)

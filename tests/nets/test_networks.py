@@ -1,0 +1,106 @@
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from dpmjax.deepmapping import preset
+from dpmjax.nets.localization import LocalizationConfig, LocalizationNet
+from dpmjax.nets.occupancy import OccupancyConfig, init_map_net, interpolate_grid, make_map_net
+from tests.tolerances import ACCUMULATED
+
+KEY = jax.random.key(0)
+
+
+def layer_sizes(params) -> list[tuple[int, int]]:
+    return sorted(tuple(x.shape) for x in jax.tree.leaves(params) if x.ndim == 2)
+
+
+def test_paper_networks_have_the_published_sizes() -> None:
+    config = preset("paper")
+    net = LocalizationNet(config.localization)
+    localization = jax.eval_shape(net.init, KEY, jnp.zeros((256, 2)), jnp.ones(256, bool))
+    # Convolutions of three taps are matrices of three times the channels.
+    convolutions = [(3 * 2, 64), (3 * 64, 128), (3 * 128, 1024)]
+    assert layer_sizes(localization) == sorted([*convolutions, (1024, 512), (512, 256), (256, 3)])
+    occupancy = jax.eval_shape(lambda key: init_map_net(config.occupancy, key=key), KEY)
+    assert layer_sizes(occupancy) == sorted([(2, 64), (64, 512), (512, 512), (512, 256), (256, 128), (128, 1)])
+    assert config.localization.dilation == 3
+    assert not config.localization.is_circular
+
+
+def test_weights_start_xavier_uniform_with_the_gain_of_relu() -> None:
+    params = init_map_net(OccupancyConfig(), key=KEY)
+    for weight in (x for x in jax.tree.leaves(params) if x.ndim == 2 and x.size > 10_000):
+        limit = np.sqrt(2.0) * np.sqrt(6.0 / sum(weight.shape))
+        assert 0.95 * limit < float(jnp.abs(weight).max()) <= limit
+    assert all(not np.asarray(x).any() for x in jax.tree.leaves(params) if x.ndim == 1)
+
+
+def test_convolution_is_that_of_the_textbook() -> None:
+    config = LocalizationConfig(features=(5,), strides=(2,), hidden=())
+    net, points = LocalizationNet(config), jax.random.normal(KEY, (20, 2))
+    params = net.init(KEY, points, jnp.ones(20, bool))["params"]
+    weight = np.asarray(params["BeamConvolution_0"]["Dense_0"]["kernel"], np.float64).reshape(3, 2, 5)
+    padded = np.pad(np.asarray(points, np.float64), ((3, 3), (0, 0)))
+    features = np.array([sum(padded[b + 3 * k] @ weight[k] for k in range(3)) for b in range(0, 20, 2)])
+    expected = features.max(0) @ np.asarray(params["Dense_0"]["kernel"], np.float64)
+    np.testing.assert_allclose(net.apply({"params": params}, points, jnp.ones(20, bool)), expected, **ACCUMULATED)
+
+
+@pytest.mark.parametrize("kind", ["conv", "point"])
+def test_masked_beams_never_matter_and_no_beam_is_finite(kind) -> None:
+    net = LocalizationNet(LocalizationConfig(kind=kind, features=(8, 16), strides=(1, 2), hidden=(8,)))
+    points, mask = jax.random.normal(KEY, (32, 2)), jnp.arange(32) % 3 > 0
+    params = net.init(KEY, points, mask)
+    filled = jnp.where(mask[:, None], points, jnp.nan)
+    np.testing.assert_array_equal(net.apply(params, points, mask), net.apply(params, filled, mask))
+    nothing = jnp.zeros(32, bool)
+    assert np.isfinite(net.apply(params, filled, nothing)).all()
+    gradient = jax.jit(jax.grad(lambda p: net.apply(p, filled, nothing).sum()))(params)
+    assert all(np.isfinite(x).all() for x in jax.tree.leaves(gradient))
+
+
+def test_pointnet_does_not_see_the_order() -> None:
+    net = LocalizationNet(LocalizationConfig(kind="point", features=(8, 16), hidden=(8,)))
+    points, mask = jax.random.normal(KEY, (32, 2)), jnp.arange(32) % 3 > 0
+    params, order = net.init(KEY, points, mask), np.random.default_rng(0).permutation(32)
+    np.testing.assert_allclose(
+        net.apply(params, points[order], mask[order]), net.apply(params, points, mask), **ACCUMULATED
+    )
+
+
+def test_circular_convolution_does_not_see_where_the_turn_begins() -> None:
+    net = LocalizationNet(LocalizationConfig(features=(8, 16), strides=(1, 1), is_circular=True, hidden=(8,)))
+    points, mask = jax.random.normal(KEY, (32, 2)), jnp.ones(32, bool)
+    params = net.init(KEY, points, mask)
+    np.testing.assert_allclose(
+        net.apply(params, jnp.roll(points, 5, axis=0), mask), net.apply(params, points, mask), **ACCUMULATED
+    )
+
+
+def test_grid_is_exact_at_its_nodes_and_linear_between() -> None:
+    grid = jnp.asarray(np.random.default_rng(0).normal(size=(5, 5)), jnp.float32)
+    x, y = np.meshgrid(np.linspace(-1, 1, 5), np.linspace(-1, 1, 5), indexing="ij")
+    nodes = jnp.asarray(np.stack([x, y], -1).reshape(-1, 2), jnp.float32)
+    np.testing.assert_allclose(interpolate_grid(grid, nodes), grid.reshape(-1), **ACCUMULATED)
+    middle = interpolate_grid(grid, jnp.array([[-0.75, -0.75]]))[0]
+    np.testing.assert_allclose(middle, grid[:2, :2].mean(), **ACCUMULATED)
+    outside = interpolate_grid(grid, jnp.array([[-3.0, 9.0]]))[0]
+    np.testing.assert_allclose(outside, grid[0, -1], **ACCUMULATED)
+
+
+def test_levels_that_are_off_do_not_count() -> None:
+    config = OccupancyConfig(kind="grid", resolutions=(4, 8))
+    net, params = make_map_net(config), init_map_net(config, key=KEY)
+    assert not any(np.asarray(x).any() for x in jax.tree.leaves(params))
+    params = jax.tree.map(jnp.ones_like, params)
+    points = jax.random.uniform(KEY, (9, 2), minval=-1.0)
+    for weights, expected in (([0.0, 0.0], 0.0), ([1.0, 0.0], 1.0), ([1.0, 0.5], 1.5)):
+        np.testing.assert_allclose(net.apply(params, points, jnp.array(weights)), expected, **ACCUMULATED)
+
+
+def test_strides_belong_to_layers() -> None:
+    with pytest.raises(ValueError, match="strides"):
+        LocalizationConfig(strides=(1, 1))

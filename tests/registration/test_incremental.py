@@ -1,0 +1,66 @@
+from __future__ import annotations
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from dpmjax.geometry import planar_poses
+from dpmjax.metrics import absolute_trajectory_error
+from dpmjax.registration import IncrementalConfig, incremental_icp
+from dpmjax.registration.pairs import Schedule, length_scale
+
+
+def ate(poses: np.ndarray, reference: np.ndarray) -> float:
+    return absolute_trajectory_error(poses[:, :2], reference[:, :2])
+
+
+@pytest.fixture(scope="module")
+def chained(walk_lines) -> np.ndarray:
+    return incremental_icp(walk_lines)[0]
+
+
+def test_chain_recovers_a_noise_free_walk(walk, chained) -> None:
+    assert ate(chained, walk.reference_poses) < 0.05
+    true = planar_poses.relative(walk.reference_poses[:1], walk.reference_poses)
+    np.testing.assert_allclose(chained, true, atol=0.2)
+    np.testing.assert_array_equal(chained[0], np.zeros(3))
+
+
+def test_same_scans_give_the_same_numbers(walk_lines, chained) -> None:
+    np.testing.assert_array_equal(incremental_icp(walk_lines)[0], chained)
+
+
+def test_chain_is_bounded_under_noise(noisy_walk, noisy_walk_lines) -> None:
+    assert ate(incremental_icp(noisy_walk_lines)[0], noisy_walk.reference_poses) < 1.5
+
+
+def test_point_metric_recovers_the_walk_roughly(walk, walk_lines) -> None:
+    poses, steps = incremental_icp(walk_lines, IncrementalConfig(metric="point"))
+    assert ate(poses, walk.reference_poses) < 3.0
+    assert len(steps.poses) == len(poses) - 1
+
+
+def test_odometry_is_the_guess(walk, walk_lines) -> None:
+    # Without it, a scan turned by half a turn against the one before would not be found.
+    turned = walk.reference_poses.copy()
+    turned[12:, 2] += np.pi
+    sign = jnp.where(jnp.arange(24) < 12, 1.0, -1.0)[:, None, None]
+    lines = walk_lines.replace(
+        points=sign * walk_lines.points, normals=sign * walk_lines.normals, centroids=sign * walk_lines.centroids
+    )
+    rng = np.random.default_rng(0)
+    steps = planar_poses.relative(turned[:-1], turned[1:]) + rng.normal(size=(23, 3)) * [2.0, 2.0, 0.03]
+    poses, _ = incremental_icp(lines, odometry=planar_poses.chain(steps))
+    assert ate(poses, turned) < 0.1
+    assert abs(planar_poses.wrap(poses[12:13, 2] - poses[11, 2])[0]) > 2.5
+
+
+def test_length_scale_grows_with_the_scans_and_survives_empty_ones(walk_lines) -> None:
+    scale = length_scale(walk_lines)
+    assert length_scale(walk_lines.replace(points=3 * walk_lines.points)) == pytest.approx(3 * scale, rel=1e-5)
+    assert length_scale(walk_lines.replace(mask=jnp.zeros_like(walk_lines.mask))) == 1.0
+
+
+def test_schedule_refuses_what_never_shrinks() -> None:
+    with pytest.raises(ValueError, match="must be positive"):
+        Schedule(gate=(1.0, 0.0), kernel=(1.0, 1.0), num_iterations=3)
