@@ -1,3 +1,4 @@
+from .deepmapping.fit import fit_deepmapping as fit_deepmapping
 from .deeppointmap.inference import encode as encode
 from .deeppointmap.inference import overlap as overlap
 from .deeppointmap.inference import register as register
@@ -7,7 +8,6 @@ from .deeppointmap.model import correlate as correlate
 from .deeppointmap.model import encode_pyramid as encode_pyramid
 from .deeppointmap.model import init_model as init_model
 from .deeppointmap.presets import model_preset as model_preset
-from .deepmapping.fit import fit_deepmapping as fit_deepmapping
 from .geometry.alignment import weighted_svd as weighted_svd
 from .geometry.neighbours import k_nearest as k_nearest
 from .geometry.neighbours import radius_search as radius_search
