@@ -16,7 +16,15 @@ import pytest
 
 # Before the first import of these packages, so that their functions are wrapped.
 jaxtyping.install_import_hook(
-    ["dpmjax.geometry", "dpmjax.losses", "dpmjax.metrics", "dpmjax.nets", "dpmjax.registration"], "beartype.beartype"
+    [
+        "dpmjax.geometry",
+        "dpmjax.losses",
+        "dpmjax.metrics",
+        "dpmjax.nets.localization",
+        "dpmjax.nets.occupancy",
+        "dpmjax.registration",
+    ],
+    "beartype.beartype",
 )
 
 _COMPILE_EVENT = "/jax/core/compile/backend_compile_duration"

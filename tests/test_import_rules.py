@@ -25,10 +25,10 @@ ALLOWED: dict[str, set[str]] = {
     "metrics": {"geometry"},
     "data": {"geometry"},
     "viz": {"geometry"},
-    "weights": {"nets", "deeppointmap"},
+    "weights": {"geometry", "nets", "deeppointmap"},
 }
-ONLY_IN: dict[str, set[str]] = {"matplotlib": {"viz", "data"}, "jaxlie": {"geometry"}}
-NEVER = {"experiments", "benchmarks", "tests", "torch"}
+ONLY_IN: dict[str, set[str]] = {"matplotlib": {"viz", "data"}, "jaxlie": {"geometry"}, "torch": {"weights"}}
+NEVER = {"experiments", "benchmarks", "tests"}
 
 MODULES = sorted(path for path in PACKAGE.rglob("*.py") if path != PACKAGE / "__init__.py")
 

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import pytest
 
 import dpmjax
-from dpmjax import geometry, losses, metrics
+from dpmjax import deeppointmap, geometry, losses, metrics, nets, weights
 
 
 def test_import_loads_no_jax_and_is_fast() -> None:
@@ -24,7 +24,9 @@ def test_import_loads_no_jax_and_is_fast() -> None:
     assert float(result.stdout) < 0.5
 
 
-@pytest.mark.parametrize("package", [dpmjax, geometry, losses, metrics], ids=lambda package: package.__name__)
+@pytest.mark.parametrize(
+    "package", [dpmjax, deeppointmap, geometry, losses, metrics, nets, weights], ids=lambda package: package.__name__
+)
 def test_every_listed_name_resolves(package) -> None:
     assert package.__all__
     for name in package.__all__:

@@ -1,4 +1,13 @@
 from .deepmapping.fit import fit_deepmapping as fit_deepmapping
+from .deeppointmap.inference import encode as encode
+from .deeppointmap.inference import overlap as overlap
+from .deeppointmap.inference import register as register
+from .deeppointmap.model import Model as Model
+from .deeppointmap.model import ModelConfig as ModelConfig
+from .deeppointmap.model import correlate as correlate
+from .deeppointmap.model import encode_pyramid as encode_pyramid
+from .deeppointmap.model import init_model as init_model
+from .deeppointmap.presets import model_preset as model_preset
 from .geometry.alignment import weighted_svd as weighted_svd
 from .geometry.neighbours import k_nearest as k_nearest
 from .geometry.neighbours import radius_search as radius_search
@@ -9,12 +18,17 @@ from .geometry.sampling import voxel_sample as voxel_sample
 from .losses.chamfer import chamfer_distance as chamfer_distance
 from .losses.contrastive import info_nce as info_nce
 from .losses.occupancy import occupancy_loss as occupancy_loss
+from .metrics.recall import registration_recall as registration_recall
 from .metrics.trajectory import absolute_trajectory_error as absolute_trajectory_error
 from .metrics.trajectory import align_rigid as align_rigid
 from .metrics.trajectory import point_distance as point_distance
 from .metrics.trajectory import relative_pose_error as relative_pose_error
 from .registration.icp import icp as icp
+from .types import DescriptorCloud as DescriptorCloud
 from .types import Neighbours as Neighbours
+from .types import PointCloud as PointCloud
 from .types import ScanSet as ScanSet
+from .weights.checkpoint import load_model as load_model
+from .weights.checkpoint import save_model as save_model
 
 __version__: str

@@ -30,6 +30,19 @@ class ScanSet:
     mask: Bool[Array, "n b"]
 
 
+@flax.struct.dataclass
+class PointCloud:
+    """A scan as a cloud of fixed capacity, in the frame of the lidar that took it.
+
+    Attributes:
+        points: metres, x forward, y left, z up.
+        mask: True where there is a point.
+    """
+
+    points: Float[AnyArray, "n 3"]
+    mask: Bool[AnyArray, " n"]
+
+
 class Neighbours(NamedTuple):
     """The nearest points of each query, nearest first.
 
@@ -42,3 +55,92 @@ class Neighbours(NamedTuple):
     indices: Int[Array, "m k"]
     squared_distances: Float[Array, "m k"]
     mask: Bool[Array, "m k"]
+
+
+@flax.struct.dataclass
+class DescriptorCloud:
+    """A scan, or a union of scans, as sparse points that carry learned features (DeepPointMap section 3.1).
+
+    Attributes:
+        positions: metres, in the frame of the lidar or of the map.
+        features: what the network says of the surroundings of each.
+        mask: True for descriptors that are there.
+    """
+
+    positions: Float[Array, "m 3"]
+    features: Float[Array, "m c"]
+    mask: Bool[Array, " m"]
+
+
+@flax.struct.dataclass
+class Registration:
+    """The motion between two descriptor clouds, and how far it can be trusted; failure is data.
+
+    Attributes:
+        T_target_source: maps points of the source to the target; the identity where no pair was left.
+        confidence: mean score of the first inliers, in [0, 1]; 0 without any.
+        rmse_m: of the inliers after alignment; infinite without any.
+        num_inliers: how many pairs the motion rests on, both directions counted.
+        source_indices: row of each pair in the source; first the pairs of eq. 1, then the same of eq. 2.
+        target_indices: the same in the target.
+        scores: how well the two of a pair match, in [0, 1].
+        is_inlier: True for pairs that the motion rests on.
+    """
+
+    T_target_source: Float[Array, "4 4"]
+    confidence: Float[Array, ""]
+    rmse_m: Float[Array, ""]
+    num_inliers: Int[Array, ""]
+    source_indices: Int[Array, " p"]
+    target_indices: Int[Array, " p"]
+    scores: Float[Array, " p"]
+    is_inlier: Bool[Array, " p"]
+
+    @property
+    def rmse(self) -> Float[Array, ""]:
+        """`rmse_m`, under the name that all registrations have."""
+        return self.rmse_m
+
+
+@flax.struct.dataclass
+class PyramidLevel:
+    """One level; level 0 is the input, with `sample_indices` and `neighbours` empty.
+
+    Attributes:
+        positions: normalised coordinates; 0 for points that are not there.
+        mask: True for points that are there.
+        sample_indices: row of each point in the level before.
+        neighbours: for each block (m, k) rows, nearest first, those beyond the radius replaced by the nearest. Block 0
+            looks into the level before, the others into this one. Points that are not there are nobody's neighbours.
+    """
+
+    positions: Float[AnyArray, "m 3"]
+    mask: Bool[AnyArray, " m"]
+    sample_indices: Int[AnyArray, " s"]
+    neighbours: tuple[Int[AnyArray, "m k"], ...]
+
+
+@flax.struct.dataclass
+class Interpolation:
+    """How features of a coarser level are carried to the next finer one.
+
+    Attributes:
+        indices: the three nearest points of the coarser level.
+        weights: their shares; each row sums to one, or to zero where either side is not there.
+    """
+
+    indices: Int[AnyArray, "m 3"]
+    weights: Float[AnyArray, "m 3"]
+
+
+@flax.struct.dataclass
+class PointPyramid:
+    """All levels, fine to coarse, and the way up again.
+
+    Attributes:
+        levels: the input and one level for each stage.
+        interpolation: from the coarsest level upwards.
+    """
+
+    levels: tuple[PyramidLevel, ...]
+    interpolation: tuple[Interpolation, ...]

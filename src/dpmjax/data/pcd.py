@@ -23,11 +23,12 @@ class _Header(NamedTuple):
     size: int
 
 
-def read_pcd(path: str | Path) -> NDArray[np.float32]:
+def read_pcd(path: str | Path, *, drop_nan: bool = False) -> NDArray[np.float32]:
     """Reads the points of a PCD file.
 
     Args:
         path: the file.
+        drop_nan: leaves out points of NaN, by which organised clouds mark beams that met nothing.
 
     Returns:
         (m, 3) float32 x, y, z in the file's unit; z is zero where the file has none.
@@ -39,15 +40,16 @@ def read_pcd(path: str | Path) -> NDArray[np.float32]:
         content = Path(path).read_bytes()
     except OSError as error:
         raise InputError(path, f"cannot be read ({error.strerror})", "check the path") from error
-    return parse_pcd(content, str(path))
+    return parse_pcd(content, str(path), drop_nan=drop_nan)
 
 
-def parse_pcd(content: bytes, source: str) -> NDArray[np.float32]:
+def parse_pcd(content: bytes, source: str, *, drop_nan: bool = False) -> NDArray[np.float32]:
     """Reads the points out of the bytes of a PCD file (DATA ascii or binary, fields in any order).
 
     Args:
         content: the whole file.
         source: its name, for messages.
+        drop_nan: leaves out points whose coordinates are all NaN.
 
     Returns:
         (m, 3) float32 x, y, z in the file's unit; z is zero where the file has none.
@@ -67,6 +69,8 @@ def parse_pcd(content: bytes, source: str) -> NDArray[np.float32]:
     columns = read(body, header, source)
     zeros = np.zeros(header.num_points, np.float32)
     points = np.stack([np.asarray(columns.get(name, zeros), np.float32) for name in "xyz"], axis=1)
+    if drop_nan:
+        points = points[~np.isnan(points).all(axis=1)]
     bad = ~np.isfinite(points).all(axis=1)
     if bad.any():
         found = f"{bad.sum()} of {len(points)} points are NaN or infinite, the first at row {int(np.argmax(bad))}"

@@ -17,6 +17,10 @@ from .poses import relative_pose2 as relative_pose2
 from .poses import rotation_from_quaternion_xyzw as rotation_from_quaternion_xyzw
 from .poses import transform_points as transform_points
 from .poses import wrap_angle as wrap_angle
+from .pyramid import PyramidConfig as PyramidConfig
+from .pyramid import PyramidStage as PyramidStage
+from .pyramid import build_pyramid as build_pyramid
+from .pyramid_host import build_pyramid_on_host as build_pyramid_on_host
 from .rays import sample_free_space as sample_free_space
 from .sampling import farthest_point_sample as farthest_point_sample
 from .sampling import voxel_sample as voxel_sample

@@ -1,3 +1,5 @@
+from .recall import RegistrationRecall as RegistrationRecall
+from .recall import registration_recall as registration_recall
 from .trajectory import RelativePoseError as RelativePoseError
 from .trajectory import absolute_trajectory_error as absolute_trajectory_error
 from .trajectory import align_rigid as align_rigid

@@ -7,12 +7,15 @@ from dpmjax.viz.figures import save_figure
 from dpmjax.viz.history import History, history_figure
 from dpmjax.viz.maps import Panel, make_panel, registered_scans_figure
 from dpmjax.viz.occupancy import occupancy_figure
+from dpmjax.viz.training import curves_figure, matches_figure
 
 __all__ = [
     "History",
     "Panel",
+    "curves_figure",
     "history_figure",
     "make_panel",
+    "matches_figure",
     "occupancy_figure",
     "registered_scans_figure",
     "save_figure",

@@ -1,0 +1,213 @@
+"""Trains the networks of DeepPointMap: descriptors of lidar scans, and how two clouds of them are registered.
+
+    python -m experiments.dpm_train                                   tiny network, simulated towns, two cores
+    python -m experiments.dpm_train --preset small --num-towns 40     on one GPU
+    python -m experiments.dpm_train --data kitti town --preset paper  drives from files, and towns
+    python -m experiments.dpm_train --resume                          continue the latest run
+
+Results go to results/dpm_train/<time>/ (latest links to the newest): model.safetensors for dpmjax.load_model,
+metrics.csv, metrics.json, checkpoints, and pictures: loss.png, matches.png. Recall is the share of pairs of a held-out
+town, 2 to 10 m apart and turned by any yaw, that are registered within 2 m and 5 degrees.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import numpy as np
+from tyro.conf import FlagCreatePairsOff, arg
+
+from experiments._command import run_command
+from experiments._dpm_fit import TrainRun, run_training
+from experiments._history import read_history
+from experiments._machine import peak_rss_gb, select_device
+from experiments._run_folder import HISTORY, RunFolder, open_run_folder, recording, write_metrics
+from experiments._stop import StopFlag
+
+if TYPE_CHECKING:
+    from dpmjax.deeppointmap import Model, TrainingConfig
+    from experiments._dpm_recall import Examination, Examined
+
+EXPERIMENT = "dpm_train"
+MODEL = "model.safetensors"
+
+
+@dataclass(frozen=True)
+class Config:
+    """Options of the run."""
+
+    data: Annotated[tuple[str, ...], arg(metavar="town|PATH")] = ("town",)
+    """Drives to train on: simulated towns, or folders of scans with poses (KITTI, KITTI-360, MulRan, plain ...)."""
+    output: Annotated[Path | None, arg(aliases=["-o"], metavar="OUT")] = None
+    """Folder for the results, instead of results/dpm_train/<time>."""
+    preset: Literal["tiny", "small", "paper"] = "tiny"
+    """Size of the network and length of its training."""
+    steps: Annotated[int | None, arg(metavar="N")] = None
+    """Train for about N steps in all, stages in proportion; without it, the preset decides."""
+    num_towns: Annotated[int, arg(metavar="N")] = 4
+    """How many towns to train on, where town is among the data."""
+    town_length_m: Annotated[float, arg(metavar="M")] = 600.0
+    """Length of the drive through each town."""
+    held_out_pairs: Annotated[int, arg(metavar="N")] = 60
+    """Pairs of scans of the held-out town that recall is measured on."""
+    recall_every: Annotated[int, arg(metavar="N")] = 100
+    """Measure it every N steps, and at the end."""
+    bfloat16: FlagCreatePairsOff[bool] = False
+    """Multiply matrices of the networks in bfloat16; geometry stays in float32."""
+    seed: int = 0
+    """Seed of everything random."""
+    device: Annotated[Literal["cpu", "gpu"] | None, arg(metavar="cpu|gpu")] = None
+    """Where to compute; without it, JAX chooses. All devices of that kind are used."""
+    resume: FlagCreatePairsOff[bool] = False
+    """Continue an interrupted run, the latest or that in OUT; options not given are the same as then."""
+    force: FlagCreatePairsOff[bool] = False
+    """Replace an earlier run in OUT."""
+
+    def __post_init__(self) -> None:
+        """Checks ranges."""
+        for name, least in (("steps", 3), ("num_towns", 1), ("held_out_pairs", 1), ("recall_every", 1), ("seed", 0)):
+            value = getattr(self, name)
+            if value is not None and value < least:
+                raise ValueError(f"--{name.replace('_', '-')}: expected at least {least}, got {value}")
+        if not (math.isfinite(self.town_length_m) and self.town_length_m >= 100.0):
+            raise ValueError(f"--town-length-m: expected at least 100, got {self.town_length_m}")
+        if not self.data:
+            raise ValueError("--data: expected town or a folder of scans")
+
+
+@dataclass(frozen=True)
+class Result:
+    """What a run made.
+
+    Attributes:
+        folder: where it was written.
+        metrics: what `metrics.json` says.
+    """
+
+    folder: Path
+    metrics: dict[str, Any]
+
+
+def main(config: Config) -> Result:
+    """Opens the drives, trains, measures, writes."""
+    from experiments._dpm_data import HELD_OUT_SEED, ScanStore, open_drives, town_drive
+    from experiments._dpm_recall import draw_pairs
+
+    started = time.perf_counter()
+    select_device(config.device)
+    settings = training_settings(config)
+    drives = open_drives(config.data, num_towns=config.num_towns, town_length_m=config.town_length_m, seed=config.seed)
+    store = ScanStore(drives, settings)
+    folder = open_run_folder(config, EXPERIMENT, output=config.output, resume=config.resume, force=config.force)
+    with recording(folder), StopFlag() as stop:
+        print(f"{len(drives)} drives of {len(store.table)} scans; {config.preset}: {settings.num_steps} steps")
+        held_out = town_drive(HELD_OUT_SEED, length_m=config.town_length_m)
+        paired = draw_pairs(held_out, config.held_out_pairs, seed=0)
+        run = run_training(
+            folder, store, settings, paired, seed=config.seed, recall_every=config.recall_every, stop=stop
+        )
+        metrics = measure(run, run.examination) | {
+            "num_scans": len(store.table),
+            "bad_scans": store.bad,
+            "steps": run.steps,
+            "train_s": run.run_s,
+            "compile_s": run.compile_s,
+            "scans_per_s": run.scans_per_s,
+            "wall_s": time.perf_counter() - started,
+            "peak_rss_gb": peak_rss_gb(),
+            "is_interrupted": stop.is_requested,
+        }
+        # Numbers first: a picture that fails must not cost them.
+        write_metrics(folder, metrics, seed=config.seed)
+        write_model(folder, run.model, config, metrics)
+        draw(folder, run)
+        print(f"recall on the held-out town {metrics['recall_untrained']:.2f} -> {metrics['recall']:.2f}")
+        print(f"results in {folder.path}")
+    return Result(folder.path, metrics)
+
+
+def training_settings(config: Config) -> TrainingConfig:
+    """The preset, with the options applied."""
+    from dataclasses import replace
+
+    from dpmjax.deeppointmap import training_preset
+
+    settings = training_preset(config.preset)
+    if config.bfloat16:
+        settings = replace(settings, model=settings.model.with_compute_dtype("bfloat16"))
+    return settings if config.steps is None else settings.with_steps(config.steps)
+
+
+def measure(run: TrainRun, examination: Examination) -> dict[str, Any]:
+    """Recall of the trained and of the untrained network, errors, and how well overlap is told."""
+    from experiments._dpm_recall import examine, overlap_accuracy
+
+    trained, untrained = run.examined, examine(run.untrained, examination)
+    found = trained.recall
+    return {
+        "recall": found.recall,
+        "recall_untrained": untrained.recall.recall,
+        "num_held_out_pairs": len(found.is_right),
+        "translation_error_median_m": float(np.median(found.translation_errors_m)),
+        "rotation_error_median_deg": float(np.median(found.rotation_errors_deg)),
+        "translation_error_median_untrained_m": float(np.median(untrained.recall.translation_errors_m)),
+        "rotation_error_median_untrained_deg": float(np.median(untrained.recall.rotation_errors_deg)),
+        "overlap_accuracy": overlap_accuracy(run.model, trained, examination),
+        "overlap_accuracy_untrained": overlap_accuracy(run.untrained, untrained, examination),
+    }
+
+
+def write_model(folder: RunFolder, model: Model, config: Config, metrics: dict[str, Any]) -> None:
+    """model.safetensors, with a card that says where it comes from."""
+    from dpmjax.weights import save_model
+
+    card = (
+        f"{config.preset}, trained on {', '.join(config.data)} ({metrics['num_scans']} scans), "
+        f"{metrics['steps']} steps, seed {config.seed}. Held-out town, {metrics['num_held_out_pairs']} pairs "
+        f"2-10 m apart, any yaw: recall (2 m, 5 deg) {metrics['recall']:.3f}, "
+        f"untrained {metrics['recall_untrained']:.3f}."
+    )
+    unfinished = folder / f".tmp_{MODEL}"
+    save_model(model, unfinished, card=card)
+    unfinished.replace(folder / MODEL)
+
+
+def draw(folder: RunFolder, run: TrainRun) -> None:
+    """loss.png and matches.png."""
+    from dpmjax import viz
+
+    rows = read_history(folder / HISTORY)
+    if rows:
+        names = {"loss": "loss", "pairing": "pairing", "offset": "offset", "top1_accuracy": "top-1", "recall": "recall"}
+        names["overlap_accuracy"] = "overlap"
+        curves = {label: np.array([float(row[name] or "nan") for row in rows]) for name, label in names.items()}
+        # The loss of the overlap part is another one.
+        curves["loss"][[row["stage"] == "overlap" for row in rows]] = np.nan
+        steps = [int(row["step"]) for row in rows]
+        viz.save_figure(viz.curves_figure(steps, curves), folder / "loss.png")
+    viz.save_figure(matches_picture(run.examined, run.examination), folder / "matches.png")
+
+
+def matches_picture(examined: Examined, examination: Examination) -> Any:
+    """The held-out pair whose error is the median one."""
+    from dpmjax import viz
+
+    errors = examined.recall.translation_errors_m
+    number = int(np.argsort(errors)[len(errors) // 2])
+    a, b = examination.pairs[number]
+    match, T_true = examined.matches[number], examined.T_true[number]
+    is_inlier = np.asarray(match.is_inlier)
+    p = np.asarray(examined.clouds[a].positions)[np.asarray(match.source_indices)[is_inlier]]
+    q = np.asarray(examined.clouds[b].positions)[np.asarray(match.target_indices)[is_inlier]]
+    distances = np.linalg.norm(p @ T_true[:3, :3].T + T_true[:3, 3] - q, axis=1)
+    source, target = (examination.scan_points(int(row)) for row in (a, b))
+    title = f"held-out pair of median error, {errors[number]:.2f} m; green: matches less than 3 m apart"
+    return viz.matches_figure(source, target, match.T_target_source, p, q, distances < 3.0, title)
+
+
+if __name__ == "__main__":
+    raise SystemExit(run_command(main, Config, experiment=EXPERIMENT, description=__doc__))

@@ -1,0 +1,5 @@
+"""DeepPointMap: descriptor clouds, how they are matched, and how the networks that make them are trained."""
+
+import lazy_loader as _lazy
+
+__getattr__, __dir__, __all__ = _lazy.attach_stub(__name__, __file__)

@@ -1,0 +1,246 @@
+"""What the networks of DeepPointMap are trained for: descriptors of one place alike, offsets right.
+
+The order of use: `close_pairs` finds, from true poses, which descriptors lie close to each other; the offset head is
+asked about those; `registration_loss` puts the three losses together. Everything here takes arrays, not networks.
+"""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Bool, Float, Int
+
+from dpmjax.checks import as_float, as_mask, as_points, require_count, require_positive, require_shape
+from dpmjax.geometry.neighbours import radius_search
+from dpmjax.geometry.poses import invert, transform_points
+from dpmjax.losses.contrastive import info_nce
+from dpmjax.losses.offset import offset_loss
+from dpmjax.types import AnyArray
+
+
+@dataclass(frozen=True)
+class ObjectiveConfig:
+    """Weights and distances (DeepPointMap section 3.3).
+
+    Attributes:
+        pairing_weight: of the pairing loss.
+        coarse_weight: of the coarse pairing loss.
+        offset_weight: of the offset loss.
+        temperature: of both pairing losses.
+        positive_radius_m: the nearest descriptor is the positive one if it is this close; others this close neutral.
+        offset_radius_m: offsets are learned for all pairs this close.
+        max_close: of those, so many of each descriptor, the nearest. Two scans need 4; maps of many scans more.
+    """
+
+    pairing_weight: float = 1.0
+    coarse_weight: float = 0.1
+    offset_weight: float = 1.0
+    temperature: float = 0.1
+    positive_radius_m: float = 1.0
+    offset_radius_m: float = 2.0
+    max_close: int = 16
+
+    def __post_init__(self) -> None:
+        for name in ("temperature", "positive_radius_m", "offset_radius_m"):
+            require_positive(name, getattr(self, name))
+        for name in ("pairing_weight", "coarse_weight", "offset_weight"):
+            if not getattr(self, name) >= 0:
+                raise ValueError(f"{name}: expected at least 0, got {getattr(self, name)}")
+        require_count("max_close", self.max_close)
+
+
+@flax.struct.dataclass
+class ClosePairs:
+    """For each descriptor of one cloud, those of the other that lie close to it, nearest first.
+
+    Attributes:
+        indices: row in the other cloud; 0 where `mask` is False.
+        mask: True where there is one.
+        offsets: from the descriptor to that one, metres, in the frame of the descriptor; 0 where `mask` is False.
+    """
+
+    indices: Int[Array, "m k"]
+    mask: Bool[Array, "m k"]
+    offsets: Float[Array, "m k 3"]
+
+
+@flax.struct.dataclass
+class TrainingSide:
+    """All that the losses need of one of two clouds.
+
+    Attributes:
+        positions: metres, in the frame of the cloud.
+        mask: True for descriptors that are there; others may hold anything.
+        matched_features: correlated descriptors after the similarity head.
+        coarse_features: unified descriptors after the coarse head.
+        close: from `close_pairs`.
+        offsets: what the offset head says of the close pairs, metres, in the frame of the cloud.
+    """
+
+    positions: Float[Array, "m 3"]
+    mask: Bool[Array, " m"]
+    matched_features: Float[Array, "m c"]
+    coarse_features: Float[Array, "m e"]
+    close: ClosePairs
+    offsets: Float[Array, "m k 3"]
+
+
+class ObjectiveTerms(NamedTuple):
+    """The parts of the loss, not weighted, each the mean of both directions.
+
+    Attributes:
+        pairing: eq. 4, on correlated descriptors.
+        coarse: eq. 5, on unified descriptors.
+        offset: eq. 6.
+        top1_accuracy: share of the descriptors with a positive that are most similar to it.
+        num_positives: how many descriptors have one, in both clouds together.
+    """
+
+    pairing: Float[Array, ""]
+    coarse: Float[Array, ""]
+    offset: Float[Array, ""]
+    top1_accuracy: Float[Array, ""]
+    num_positives: Int[Array, ""]
+
+
+def close_pairs(
+    positions_a: Float[AnyArray, "m 3"],
+    positions_b: Float[AnyArray, "n 3"],
+    T_b_a: Float[AnyArray, "4 4"],
+    mask_a: Bool[AnyArray, " m"] | None = None,
+    mask_b: Bool[AnyArray, " n"] | None = None,
+    *,
+    config: ObjectiveConfig,
+) -> tuple[ClosePairs, ClosePairs]:
+    """Which pairs are closer than `offset_radius_m`, and their true offsets: of a (to b), and of b (to a).
+
+    Args:
+        positions_a: metres, in the frame of a.
+        positions_b: metres, in the frame of b.
+        T_b_a: the true motion.
+        mask_a: False for descriptors of a that are not there; they may hold anything.
+        mask_b: the same for b.
+        config: radius and capacity.
+
+    Raises:
+        ValueError: the shapes do not match.
+    """
+    positions_a = as_points("positions_a", positions_a, dimensions=(3,))
+    positions_b = as_points("positions_b", positions_b, dimensions=(3,))
+    T_b_a = as_float("T_b_a", T_b_a)
+    require_shape("T_b_a", T_b_a, (4, 4))
+    mask_a, mask_b = as_mask("mask_a", mask_a, positions_a.shape[:1]), as_mask("mask_b", mask_b, positions_b.shape[:1])
+    of_a = _close_of(positions_a, transform_points(invert(T_b_a), positions_b), mask_a, mask_b, config)
+    of_b = _close_of(positions_b, transform_points(T_b_a, positions_a), mask_b, mask_a, config)
+    return of_a, of_b
+
+
+def registration_loss(
+    a: TrainingSide, b: TrainingSide, T_b_a: Float[AnyArray, "4 4"], *, config: ObjectiveConfig
+) -> tuple[Float[Array, ""], ObjectiveTerms]:
+    """Pairing, coarse pairing and offset loss of two clouds, both directions averaged (DeepPointMap eq. 4 to 7).
+
+    For one pair of clouds; `vmap` for more. Without any close pair the loss and its gradient are 0.
+
+    Args:
+        a: one cloud, with what the networks say of it.
+        b: the other.
+        T_b_a: the true motion, metres.
+        config: weights and distances.
+
+    Returns:
+        The weighted sum, and its parts.
+
+    Raises:
+        ValueError: the shapes do not match.
+    """
+    T_b_a = as_float("T_b_a", T_b_a)
+    require_shape("T_b_a", T_b_a, (4, 4))
+    for name, side in (("a", a), ("b", b)):
+        require_shape(f"{name}.offsets", side.offsets, side.close.offsets.shape)
+        require_shape(f"{name}.mask", side.mask, side.positions.shape[:1])
+    return _registration_loss(a, b, T_b_a, config=config)
+
+
+@functools.partial(jax.jit, static_argnames="config")
+def _registration_loss(
+    a: TrainingSide, b: TrainingSide, T_b_a: jax.Array, *, config: ObjectiveConfig
+) -> tuple[jax.Array, ObjectiveTerms]:
+    positions_b = jnp.where(a.mask[:, None], transform_points(T_b_a, jnp.where(a.mask[:, None], a.positions, 0)), 0)
+    squared = _squared_distances(positions_b, jnp.where(b.mask[:, None], b.positions, 0))
+    squared = lax.stop_gradient(jnp.where(a.mask[:, None] & b.mask[None, :], squared, jnp.inf))
+    forward = _direction(a, b, squared, config)
+    backward = _direction(b, a, squared.T, config)
+    mean = jax.tree.map(lambda one, other: (one + other) / 2, forward, backward)
+    terms = mean._replace(num_positives=forward.num_positives + backward.num_positives)
+    total = (
+        config.pairing_weight * terms.pairing
+        + config.coarse_weight * terms.coarse
+        + config.offset_weight * terms.offset
+    )
+    return total, terms
+
+
+def _direction(
+    source: TrainingSide, target: TrainingSide, squared: Float[Array, "m n"], config: ObjectiveConfig
+) -> ObjectiveTerms:
+    is_close = squared <= config.positive_radius_m**2
+    has_positive = jnp.any(is_close, axis=1)
+    nearest = jnp.argmin(squared, axis=1) if squared.shape[1] > 0 else jnp.zeros(len(squared), int)
+    positives = jnp.where(has_positive, nearest, -1)
+    is_absent = jnp.broadcast_to(~target.mask, squared.shape)
+    matched, coarse = (
+        info_nce(features, keys, positives, config.temperature, ignore=ignore)
+        for features, keys, ignore in (
+            (source.matched_features, target.matched_features, is_absent),
+            (source.coarse_features, target.coarse_features, is_absent | is_close),
+        )
+    )
+    return ObjectiveTerms(
+        pairing=matched,
+        coarse=coarse,
+        offset=offset_loss(
+            source.offsets.reshape(-1, 3), source.close.offsets.reshape(-1, 3), source.close.mask.reshape(-1)
+        ),
+        top1_accuracy=_top1_accuracy(source, target, positives),
+        num_positives=jnp.sum(has_positive),
+    )
+
+
+def _top1_accuracy(source: TrainingSide, target: TrainingSide, positives: Int[Array, " m"]) -> Float[Array, ""]:
+    if len(target.mask) == 0:
+        return jnp.zeros(())
+    is_counted = positives >= 0
+    queries = jnp.where(is_counted[:, None], source.matched_features, 0)
+    keys = jnp.where(target.mask[:, None], target.matched_features, 0)
+    length = jnp.linalg.norm(lax.stop_gradient(keys), axis=1)
+    cosines = jnp.matmul(queries, keys.T, precision=lax.Precision.HIGHEST) / jnp.where(length > 0, length, 1)
+    best = jnp.argmax(jnp.where(target.mask, cosines, -jnp.inf), axis=1)
+    return jnp.sum(is_counted & (best == positives)) / jnp.maximum(jnp.sum(is_counted), 1)
+
+
+def _squared_distances(a: Float[Array, "m 3"], b: Float[Array, "n 3"]) -> Float[Array, "m n"]:
+    difference = [a[:, None, axis] - b[None, :, axis] for axis in range(3)]
+    return difference[0] ** 2 + difference[1] ** 2 + difference[2] ** 2
+
+
+def _close_of(
+    positions: Float[Array, "m 3"],
+    others: Float[Array, "n 3"],
+    mask: Bool[Array, " m"],
+    others_mask: Bool[Array, " n"],
+    config: ObjectiveConfig,
+) -> ClosePairs:
+    positions = jnp.where(mask[:, None], positions, 0)
+    near = radius_search(positions, others, config.offset_radius_m, config.max_close, others_mask)
+    is_close = near.mask & mask[:, None]
+    if len(others) == 0:
+        return ClosePairs(near.indices, is_close, jnp.zeros((*near.mask.shape, 3), positions.dtype))
+    offsets = jnp.where(is_close[..., None], others[near.indices] - positions[:, None], 0)
+    return ClosePairs(jnp.where(is_close, near.indices, 0), is_close, offsets)

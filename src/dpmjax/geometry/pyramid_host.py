@@ -1,0 +1,180 @@
+"""The point pyramid on the host: what `build_pyramid` makes, ten times faster on a CPU, by trees and buckets."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from scipy.spatial import cKDTree
+
+from dpmjax.checks import require_count
+from dpmjax.geometry.pyramid import (
+    RADIUS_SLACK,
+    WEIGHT_EPSILON,
+    PyramidConfig,
+    PyramidStage,
+)
+from dpmjax.geometry.sampling import farthest_point_sample
+from dpmjax.types import Interpolation, PointPyramid, PyramidLevel
+
+BUCKET_TREE_HEIGHT = 6
+MIN_BUCKETED_POINTS = 1 << (BUCKET_TREE_HEIGHT + 1)
+TIED_ROWS_AT_ONCE = 256
+
+
+def build_pyramid_on_host(
+    points: Float[np.ndarray, "n 3"],
+    mask: Bool[np.ndarray, " n"] | None,
+    config: PyramidConfig,
+    *,
+    num_threads: int = 2,
+) -> PointPyramid:
+    """What `build_pyramid` returns, as arrays of NumPy, the same up to rounding.
+
+    Neighbours are measured in float64. So two that are equally near up to the rounding of float32 may come in the other
+    order; points that coincide come in that of the array, here as there.
+
+    Args:
+        points: normalised coordinates, n >= 1, float32.
+        mask: False for points that are not there; they may hold anything. All are there for None.
+        config: sizes and radii.
+        num_threads: of the neighbour search.
+
+    Raises:
+        ValueError: there are no points, the shapes do not match, or `num_threads` is below 1.
+    """
+    points = np.asarray(points, np.float32)
+    if points.ndim != 2 or points.shape[1] != 3 or len(points) == 0:
+        raise ValueError(f"points: expected shape (n, 3) with n >= 1, got {points.shape}")
+    mask = np.ones(len(points), bool) if mask is None else np.asarray(mask)
+    if mask.shape != points.shape[:1] or mask.dtype != bool:
+        raise ValueError(f"mask: expected bool of shape {points.shape[:1]}, got {mask.dtype} of {mask.shape}")
+    require_count("num_threads", num_threads)
+    points = np.where(mask[:, None], points, np.float32(0))
+    levels = [PyramidLevel(points, mask, np.zeros(0, np.int32), ())]
+    order = farthest_points_on_host(points, mask, config.stages[0].num_points)
+    # Valid points stand in front on every level but the first, where `rows` says which they are.
+    below = _Searchable(points[mask], np.flatnonzero(mask).astype(np.int32), num_threads)
+    searched = [below]
+    for stage in config.stages:
+        chosen = order[: stage.num_points] if len(levels) == 1 else np.arange(min(stage.num_points, len(order)))
+        here = _Searchable(points[order[: stage.num_points]], np.arange(len(chosen), dtype=np.int32), num_threads)
+        levels.append(_level(here, below, chosen.astype(np.int32), stage))
+        searched.append(here)
+        below = here
+    steps = range(config.num_interpolations)
+    up = [_interpolate(levels[-2 - step], searched[-2 - step], searched[-1 - step]) for step in steps]
+    return PointPyramid(tuple(levels), tuple(up))
+
+
+def farthest_points_on_host(
+    points: Float[np.ndarray, "n 3"], mask: Bool[np.ndarray, " n"], num_samples: int
+) -> Int[np.ndarray, " s"]:
+    """The first min(num_samples, number of valid points) of `farthest_point_sample`.
+
+    Where the first valid point is also the one farthest from the origin (`preprocess_scan` sees to that), points are
+    kept in buckets of a tree (QuickFPS, Han et al. 2023): four times faster, with the same result.
+    """
+    rows = np.flatnonzero(mask)
+    num_samples = min(num_samples, len(rows))
+    chosen = _sample_by_buckets(points[rows], num_samples)
+    if chosen is not None:
+        return rows[chosen]
+    with jax.default_device(jax.local_devices(backend="cpu")[0]):
+        chosen = np.asarray(farthest_point_sample(points, max(num_samples, 1), mask))
+    return chosen[:num_samples]
+
+
+def _sample_by_buckets(points: Float[np.ndarray, "n 3"], num_samples: int) -> Int[np.ndarray, " s"] | None:
+    """The samples, starting at point 0; None where that is not to be had."""
+    if len(points) < MIN_BUCKETED_POINTS or num_samples < 2:
+        return None
+    ranges = np.sqrt(np.sum(points.astype(np.float64) ** 2, axis=1))
+    if ranges[0] < ranges.max() or ranges[0] == 0:
+        return None
+    try:
+        import fpsample
+    except ImportError:
+        return None
+    # The package counts its start in the order of its own tree, where the outermost point of the negative side comes
+    # first. So a far point is put opposite to point 0 (mirrored to the positive side: distances stay), sampling starts
+    # there, and the next, the farthest from it, is point 0; the far point itself is then too far to matter.
+    mirrored = points * np.where(points[0] < 0, np.float32(-1), np.float32(1))
+    far = -8 * mirrored[:1]
+    chosen = fpsample.bucket_fps_kdline_sampling(
+        np.concatenate([far, mirrored]), num_samples + 1, h=BUCKET_TREE_HEIGHT, start_idx=0
+    )
+    chosen = np.asarray(chosen).astype(np.int64)
+    is_right = chosen[0] == 0 and chosen[1] == 1 and np.bincount(chosen).max() == 1  # points that coincide may repeat
+    return chosen[1:] - 1 if is_right else None
+
+
+class _Searchable:
+    """Valid points with a tree, and the row of each in the padded level."""
+
+    def __init__(self, points: Float[np.ndarray, "n 3"], rows: Int[np.ndarray, " n"], num_threads: int):
+        self.points = points.astype(np.float64)
+        self.rows = rows
+        self.num_threads = num_threads
+        self.tree = cKDTree(self.points, leafsize=16, balanced_tree=False, compact_nodes=False)
+
+    def nearest(self, queries: Float[np.ndarray, "m 3"], k: int) -> _Found:
+        """The min(k, n) nearest of each query, nearest first; of equally near ones the lower index first."""
+        num_points = len(self.points)
+        num_found = min(k, num_points)
+        num_asked = min(num_found + 1, num_points)  # one more shows whether the last is tied with what was left out
+        answer = self.tree.query(queries, [*range(1, num_asked + 1)], workers=self.num_threads)
+        distances, indices = np.asarray(answer[0]), np.asarray(answer[1])
+        tied = np.flatnonzero(np.any(distances[:, 1:] == distances[:, :-1], axis=1))
+        for start in range(0, len(tied), TIED_ROWS_AT_ONCE):
+            rows = tied[start : start + TIED_ROWS_AT_ONCE]
+            exact = np.sqrt(np.sum((queries[rows, None] - self.points) ** 2, axis=-1))
+            indices[rows] = np.argsort(exact, axis=1, kind="stable")[:, :num_asked]
+            distances[rows] = np.take_along_axis(exact, indices[rows], axis=1)
+        return _Found(self.rows[indices[:, :num_found]], distances[:, :num_found])
+
+
+class _Found(NamedTuple):
+    rows: Int[np.ndarray, "m k"]
+    distances: Float[np.ndarray, "m k"]
+
+
+def _level(here: _Searchable, below: _Searchable, chosen: Int[np.ndarray, " v"], stage: PyramidStage) -> PyramidLevel:
+    num_rows, num_valid = stage.num_points, len(chosen)
+    positions = _padded(here.points.astype(np.float32), num_rows)
+    neighbours = [np.zeros((num_rows, stage.num_neighbours), np.int32) for _ in stage.radii]
+    if num_valid > 0:
+        searches = [below.nearest(here.points, stage.num_neighbours)]
+        if len(stage.radii) > 1:
+            searches.append(here.nearest(here.points, stage.num_neighbours))
+        for block, radius in enumerate(stage.radii):
+            found = searches[min(block, 1)]
+            is_within = found.distances <= radius * RADIUS_SLACK
+            neighbours[block][:num_valid] = found.rows[:, :1]
+            neighbours[block][:num_valid, : found.rows.shape[1]] = np.where(is_within, found.rows, found.rows[:, :1])
+    return PyramidLevel(
+        positions=positions,
+        mask=np.arange(num_rows) < num_valid,
+        sample_indices=_padded(chosen, num_rows),
+        neighbours=tuple(neighbours),
+    )
+
+
+def _interpolate(fine_level: PyramidLevel, fine: _Searchable, coarse: _Searchable) -> Interpolation:
+    num_rows = len(fine_level.mask)
+    indices, weights = np.zeros((num_rows, 3), np.int32), np.zeros((num_rows, 3), np.float32)
+    if len(coarse.points) > 0:
+        found = coarse.nearest(fine.points, 3)
+        inverse = 1 / (found.distances**2 + WEIGHT_EPSILON)
+        num_found = found.rows.shape[1]
+        indices[fine.rows, :num_found] = found.rows
+        weights[fine.rows, :num_found] = inverse / inverse.sum(axis=1, keepdims=True)
+    return Interpolation(indices, weights)
+
+
+def _padded(rows: np.ndarray, num_rows: int) -> np.ndarray:
+    result = np.zeros((num_rows, *rows.shape[1:]), rows.dtype)
+    result[: len(rows)] = rows
+    return result

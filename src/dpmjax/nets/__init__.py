@@ -1,0 +1,5 @@
+"""Flax modules and nothing else: no loss, no file, no pose graph."""
+
+import lazy_loader as _lazy
+
+__getattr__, __dir__, __all__ = _lazy.attach_stub(__name__, __file__)

@@ -1,0 +1,5 @@
+"""Raw scans to masked clouds of fixed capacity, and what training does to them."""
+
+import lazy_loader as _lazy
+
+__getattr__, __dir__, __all__ = _lazy.attach_stub(__name__, __file__)

@@ -1,0 +1,42 @@
+"""Frozen configurations to JSON values and back, by their fields."""
+
+from __future__ import annotations
+
+import dataclasses
+import typing
+from typing import Any, TypeVar
+
+ConfigT = TypeVar("ConfigT")
+
+
+def config_to_json(config: Any) -> dict[str, Any]:
+    """The fields by name; nested configurations become nested objects, tuples become lists."""
+    return dataclasses.asdict(config)
+
+
+def config_from_json(value: Any, config_type: type[ConfigT]) -> ConfigT:
+    """A configuration from what `config_to_json` made; fields that are missing have their defaults.
+
+    Raises:
+        ValueError: a field is unknown, or a value is not what its field takes.
+    """
+    return _restored(value, config_type, config_type.__name__)
+
+
+def _restored(value: Any, expected: Any, name: str) -> Any:
+    if dataclasses.is_dataclass(expected) and isinstance(expected, type):
+        if not isinstance(value, dict):
+            raise ValueError(f"{name}: expected an object, got {value!r}")
+        types = typing.get_type_hints(expected)
+        if unknown := value.keys() - types.keys():
+            raise ValueError(f"{name}: unknown field {min(unknown)!r}")
+        return expected(**{key: _restored(item, types[key], f"{name}.{key}") for key, item in value.items()})
+    if typing.get_origin(expected) is tuple:
+        if not isinstance(value, list | tuple):
+            raise ValueError(f"{name}: expected a list, got {value!r}")
+        (item_type, _) = typing.get_args(expected)
+        return tuple(_restored(item, item_type, f"{name}[{i}]") for i, item in enumerate(value))
+    is_number = expected is float and isinstance(value, int) and not isinstance(value, bool)
+    if isinstance(expected, type) and (type(value) is not expected) and not is_number:
+        raise ValueError(f"{name}: expected {expected.__name__}, got {value!r}")
+    return float(value) if is_number else value

@@ -1,0 +1,78 @@
+"""What users call: encode, register, overlap."""
+
+from __future__ import annotations
+
+import jax
+import numpy as np
+import pytest
+
+import dpmjax
+from dpmjax.types import PointCloud
+from tests.deeppointmap import toy
+from tests.tolerances import ACCUMULATED
+
+
+@pytest.fixture(scope="module")
+def model() -> dpmjax.Model:
+    return dpmjax.init_model(jax.random.key(0), toy.MODEL)
+
+
+@pytest.fixture(scope="module")
+def scans() -> list[np.ndarray]:
+    drive = toy.drive()
+    return [drive.read_scan(index) for index in range(2)]
+
+
+def test_scans_and_their_descriptors_register_alike(model, scans) -> None:
+    of_scans = dpmjax.register(model, *scans)
+    of_clouds = dpmjax.register(model, *(dpmjax.encode(model, scan) for scan in scans))
+    np.testing.assert_allclose(of_scans.T_target_source, of_clouds.T_target_source, **ACCUMULATED)
+    assert 0 <= of_scans.confidence <= 1
+    assert of_scans.rmse == of_scans.rmse_m
+    assert 0 < dpmjax.overlap(model, scans[0], dpmjax.encode(model, scans[1])) < 1
+
+
+def test_a_scan_on_itself_does_not_move(model, scans) -> None:
+    match = dpmjax.register(model, scans[0], scans[0])
+    assert match.T_target_source.shape == (4, 4)
+    assert np.isfinite(match.T_target_source).all()
+
+
+def test_descriptors_are_in_metres_in_the_frame_of_the_scan(model, scans) -> None:
+    cloud = dpmjax.encode(model, scans[0])
+    assert cloud.positions.shape == (model.config.num_descriptors, 3)
+    distances = np.linalg.norm(np.asarray(cloud.positions)[:, None] - scans[0], axis=-1).min(axis=1)
+    np.testing.assert_allclose(distances, 0, atol=1e-4)
+
+
+def test_points_that_are_not_there_change_nothing(model, scans) -> None:
+    padded = np.concatenate([scans[0], np.full((7, 3), np.nan, np.float32)])
+    mask = np.arange(len(padded)) < len(scans[0])
+    expected = dpmjax.encode(model, scans[0])
+    for cloud in (dpmjax.encode(model, padded), dpmjax.encode(model, PointCloud(padded, mask))):
+        np.testing.assert_array_equal(cloud.features, expected.features)
+
+
+def test_an_empty_scan_is_a_failure_as_data(model, scans) -> None:
+    empty = np.zeros((0, 3), np.float32)
+    assert not dpmjax.encode(model, empty).mask.any()
+    match = dpmjax.register(model, empty, scans[0])
+    np.testing.assert_array_equal(match.T_target_source, np.eye(4))
+    assert match.confidence == 0
+    assert np.isinf(match.rmse)
+    assert np.isfinite(dpmjax.overlap(model, empty, scans[0]))
+
+
+def test_second_call_compiles_nothing(model, scans, assert_compiles_nothing) -> None:
+    dpmjax.register(model, *scans)
+    with assert_compiles_nothing():
+        dpmjax.register(model, scans[1], scans[0][:200])
+
+
+@pytest.mark.parametrize(
+    ("points", "message"),
+    [(np.zeros((5, 4)), r"points\[:, :3\]"), (np.zeros(3), "shape"), (np.array([["a", "b", "c"]]), "real numbers")],
+)
+def test_what_is_no_scan_is_refused(model, points, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        dpmjax.encode(model, points)

@@ -1,0 +1,219 @@
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from dpmjax.deeppointmap import MatchConfig, match_descriptors, merge_clouds
+from dpmjax.deeppointmap.matching import best_pairs
+from dpmjax.geometry import exp_se3, transform_points
+from dpmjax.types import DescriptorCloud, Registration
+from tests.tolerances import ACCUMULATED, ROUNDING
+
+T = np.asarray(exp_se3(np.array([5.0, -3.0, 0.5, 0.02, -0.05, 1.2], np.float32)))
+CONFIG = MatchConfig()
+
+
+def no_offsets(source: jax.Array, target: jax.Array) -> tuple[jax.Array, jax.Array]:
+    return jnp.zeros((len(source), 3)), jnp.zeros((len(target), 3))
+
+
+def clouds(seed: int, n: int = 80, num_outliers: int = 0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Positions in both frames, in different orders, and a similarity that knows which belong together."""
+    rng = np.random.default_rng(seed)
+    source = (20 * rng.normal(size=(n, 3))).astype(np.float32)
+    order = rng.permutation(n)
+    target = np.asarray(transform_points(T, source))[order]
+    similarity = rng.uniform(-0.2, 0.2, size=(n, n)).astype(np.float32)
+    similarity[order, np.arange(n)] = 0.95
+    target[:num_outliers] = 20 * rng.normal(size=(num_outliers, 3))
+    return source, target, similarity
+
+
+def dual_softmax_in_numpy(similarity: np.ndarray, temperature: float) -> np.ndarray:
+    powers = np.exp(similarity.astype(np.float64) / temperature)
+    return powers / powers.sum(axis=0) * (powers / powers.sum(axis=1, keepdims=True))
+
+
+@pytest.mark.parametrize("shape", [(30, 30), (20, 50)])
+def test_best_pairs_have_the_highest_dual_softmax(shape: tuple[int, int]) -> None:
+    similarity = np.random.default_rng(0).uniform(-1, 1, shape).astype(np.float32)
+    best = best_pairs(similarity, jnp.ones(shape[0], bool), jnp.ones(shape[1], bool), config=CONFIG)
+    scores = dual_softmax_in_numpy(similarity, 0.1)
+    count = sum(shape) // 4
+    assert best.mask.all()
+    assert len(best.scores) == count
+    np.testing.assert_allclose(best.scores, np.sort(scores.ravel())[::-1][:count], **ACCUMULATED)
+    np.testing.assert_allclose(best.scores, scores[best.source_indices, best.target_indices], **ACCUMULATED)
+
+
+@pytest.mark.parametrize("num_outliers", [0, 10])
+def test_motion_is_found(num_outliers: int) -> None:
+    # All pairs are asked for, so that some of them are wrong.
+    source, target, similarity = clouds(1, num_outliers=num_outliers)
+    config = MatchConfig(pair_ratio=1.0)
+    match = match_descriptors(source, target, similarity, no_offsets, config=config)
+    if num_outliers == 0:
+        np.testing.assert_allclose(match.T_target_source, T, atol=2e-4)
+        assert match.num_inliers > 140
+        assert match.rmse_m < 1e-3
+    else:
+        plain = match_descriptors(source, target, similarity, no_offsets, config=MatchConfig(1.0, num_rounds=1))
+        assert match.num_inliers < 160
+        assert match.rmse_m <= plain.rmse_m
+    assert match.confidence > 0.9
+
+
+def test_one_far_outlier_is_dropped_in_rounds() -> None:
+    source, target, similarity = clouds(2)
+    target[0] += np.float32(100)
+    match = match_descriptors(source, target, similarity, no_offsets, config=MatchConfig(pair_ratio=1.0))
+    is_wrong = (
+        np.linalg.norm(transform_points(T, source[match.source_indices]) - target[match.target_indices], axis=1) > 1
+    )
+    assert is_wrong.sum() == 2
+    assert not np.any(np.asarray(match.is_inlier)[is_wrong])
+    assert match.num_inliers > 140
+    np.testing.assert_allclose(match.T_target_source, T, atol=5e-4)
+
+
+def test_offsets_of_both_directions_move_points_onto_each_other() -> None:
+    # Eq. 1 and 2: each descriptor lies up to a metre from its partner, and the offsets tell exactly where.
+    rng = np.random.default_rng(3)
+    source, target, similarity = clouds(3)
+    shift = rng.uniform(-1, 1, size=target.shape).astype(np.float32)
+    target = target + shift
+    source_in_target = np.asarray(transform_points(T, source))
+    target_in_source = np.asarray(transform_points(np.linalg.inv(T), target))
+
+    def true_offsets(i: jax.Array, j: jax.Array) -> tuple[jax.Array, jax.Array]:
+        return jnp.asarray(target_in_source)[j] - source[i], jnp.asarray(source_in_target)[i] - target[j]
+
+    with_offsets = match_descriptors(source, target, similarity, true_offsets, config=CONFIG)
+    without = match_descriptors(source, target, similarity, no_offsets, config=CONFIG)
+    np.testing.assert_allclose(with_offsets.T_target_source, T, atol=5e-4)
+    assert with_offsets.rmse_m < 1e-3 < 0.1 < without.rmse_m
+
+
+def test_pairs_with_long_offsets_are_dropped() -> None:
+    source, target, similarity = clouds(4)
+
+    def offsets(i: jax.Array, j: jax.Array) -> tuple[jax.Array, jax.Array]:
+        return jnp.full((len(i), 3), 2.0), jnp.zeros((len(j), 3))
+
+    match = match_descriptors(source, target, similarity, offsets, config=CONFIG)
+    assert 30 <= match.num_inliers <= 40
+    assert not np.any(match.is_inlier[:40])
+    np.testing.assert_allclose(match.T_target_source, T, atol=2e-4)
+
+
+def test_confidence_is_the_mean_score_of_the_first_inliers() -> None:
+    source, target, similarity = clouds(5)
+    match = jax.device_get(match_descriptors(source, target, similarity, no_offsets, config=CONFIG))
+    np.testing.assert_allclose(match.confidence, match.scores[match.is_inlier][:30].mean(), **ROUNDING)
+
+
+def test_padded_equals_unpadded() -> None:
+    source, target, similarity = clouds(6)
+    target = target + np.random.default_rng(6).normal(scale=0.1, size=target.shape).astype(np.float32)
+    padded_source = np.concatenate([source, np.full((20, 3), np.nan, np.float32)])
+    padded_target = np.concatenate([np.full((7, 3), np.nan, np.float32), target])
+    padded_similarity = np.full((100, 87), np.nan, np.float32)
+    padded_similarity[:80, 7:] = similarity
+    padded = jax.device_get(
+        match_descriptors(
+            padded_source,
+            padded_target,
+            padded_similarity,
+            no_offsets,
+            np.arange(100) < 80,
+            np.arange(87) >= 7,
+            config=CONFIG,
+        )
+    )
+    plain = jax.device_get(match_descriptors(source, target, similarity, no_offsets, config=CONFIG))
+    np.testing.assert_allclose(padded.T_target_source, plain.T_target_source, atol=1e-4)
+    np.testing.assert_allclose(padded.confidence, plain.confidence, **ROUNDING)
+    np.testing.assert_allclose(padded.rmse_m, plain.rmse_m, atol=1e-4)
+    assert padded.num_inliers == plain.num_inliers
+
+
+@pytest.mark.parametrize(("num_source", "num_target"), [(0, 0), (0, 80), (1, 1), (3, 3)])
+def test_too_few_descriptors_are_told_by_the_result(num_source: int, num_target: int) -> None:
+    source, target, similarity = clouds(7)
+    masks = np.arange(80) < num_source, np.arange(80) < num_target
+    match = jax.device_get(match_descriptors(source, target, similarity, no_offsets, *masks, config=CONFIG))
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(match.replace(rmse_m=0.0)))
+    assert match.num_inliers <= 2 * min(num_source, num_target)
+    if num_source == 0:
+        np.testing.assert_array_equal(match.T_target_source, np.eye(4))
+        assert match.confidence == 0
+        assert np.isinf(match.rmse_m)
+
+
+def test_gradient_is_finite() -> None:
+    source, target, similarity = clouds(8)
+
+    @jax.jit
+    @jax.grad
+    def gradient(offset: jax.Array, mask: jax.Array) -> jax.Array:
+        def offsets(i: jax.Array, j: jax.Array) -> tuple[jax.Array, jax.Array]:
+            return jnp.tile(offset, (len(i), 1)), jnp.tile(offset, (len(j), 1))
+
+        match = match_descriptors(source, target, similarity, offsets, mask, config=CONFIG)
+        return jnp.sum(match.T_target_source**2) + jnp.where(jnp.isfinite(match.rmse_m), match.rmse_m, 0)
+
+    for num_valid in (0, 1, 80):
+        assert np.isfinite(gradient(jnp.full(3, 0.1), np.arange(80) < num_valid)).all()
+
+
+def test_vmap_equals_a_loop() -> None:
+    many = [clouds(seed) for seed in (9, 10)]
+    match = lambda s, t, m: match_descriptors(s, t, m, no_offsets, config=CONFIG)  # noqa: E731
+    batched: Registration = jax.vmap(match)(*(jnp.stack(arrays) for arrays in zip(*many, strict=True)))
+    for i, arrays in enumerate(many):
+        np.testing.assert_allclose(batched.T_target_source[i], match(*arrays).T_target_source, atol=1e-4)
+
+
+def test_second_call_compiles_nothing(assert_compiles_nothing) -> None:
+    step = jax.jit(lambda s, t, m: match_descriptors(s, t, m, no_offsets, config=CONFIG))
+    step(*clouds(11))
+    with assert_compiles_nothing():
+        step(*clouds(12))
+
+
+def test_map_to_map_is_scan_to_scan_of_merged_clouds() -> None:
+    source, target, similarity = clouds(13)
+    cloud = DescriptorCloud(jnp.asarray(source), jnp.ones((80, 4)), jnp.arange(80) < 80)
+    halves = jax.tree.map(lambda leaf: leaf.reshape(2, 40, *leaf.shape[1:]), cloud)
+    T_map_cloud = jnp.stack([jnp.eye(4), jnp.asarray(T)])
+    in_own_frames = halves.positions.at[1].set(transform_points(np.linalg.inv(T), halves.positions[1]))
+    merged = merge_clouds(halves.replace(positions=in_own_frames), T_map_cloud)
+    np.testing.assert_allclose(merged.positions, source, atol=1e-4)
+    match = match_descriptors(
+        merged.positions, target, similarity, no_offsets, merged.mask, jnp.ones(80, bool), config=CONFIG
+    )
+    np.testing.assert_allclose(match.T_target_source, T, atol=5e-4)
+
+
+def test_merging_ignores_what_is_masked() -> None:
+    positions = jnp.full((2, 3, 3), jnp.nan).at[0, 0].set(1.0)
+    mask = jnp.zeros((2, 3), bool).at[0, 0].set(True)
+    T_map_cloud = jnp.stack([jnp.eye(4), jnp.full((4, 4), jnp.nan)])
+    merged = merge_clouds(DescriptorCloud(positions, jnp.ones((2, 3, 5)), mask), T_map_cloud)
+    assert merged.features.shape == (6, 5)
+    np.testing.assert_array_equal(merged.mask, [True] + 5 * [False])
+    np.testing.assert_array_equal(merged.positions, [[1.0] * 3] + 5 * [[0.0] * 3])
+
+
+def test_wrong_arguments_are_named() -> None:
+    source, target, similarity = clouds(14)
+    with pytest.raises(ValueError, match="^similarity: expected shape"):
+        match_descriptors(source, target, similarity[:5], no_offsets, config=CONFIG)
+    with pytest.raises(ValueError, match="^target_mask: expected shape"):
+        match_descriptors(source, target, similarity, no_offsets, None, np.ones(3, bool), config=CONFIG)
+    with pytest.raises(ValueError, match="^pair_ratio: expected"):
+        MatchConfig(pair_ratio=1.5)
+    with pytest.raises(ValueError, match="^T_map_cloud: expected shape"):
+        merge_clouds(DescriptorCloud(jnp.ones((2, 3, 3)), jnp.ones((2, 3, 5)), jnp.ones((2, 3), bool)), np.eye(4))

@@ -1,0 +1,169 @@
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from dpmjax.deeppointmap import ObjectiveConfig, TrainingSide, close_pairs, registration_loss
+from dpmjax.geometry import exp_se3, transform_points
+from tests.tolerances import ACCUMULATED
+
+T_B_A = np.asarray(exp_se3(np.array([5.0, -3.0, 0.5, 0.02, -0.05, 1.2], np.float32)))
+CONFIG = ObjectiveConfig(max_close=12)
+
+
+def positions(seed: int, m: int = 40, n: int = 50) -> tuple[np.ndarray, np.ndarray]:
+    rng = np.random.default_rng(seed)
+    a = rng.uniform(0, 6, size=(m, 3)).astype(np.float32)
+    b = np.asarray(transform_points(T_B_A, rng.uniform(0, 6, size=(n, 3)).astype(np.float32)))
+    return a, b
+
+
+def sides(seed: int, mask_a=None, mask_b=None, poison: bool = False) -> tuple[TrainingSide, TrainingSide]:
+    rng = np.random.default_rng(100 + seed)
+    places = positions(seed)
+    masks = [np.ones(len(p), bool) if m is None else m for p, m in zip(places, (mask_a, mask_b), strict=True)]
+    close = close_pairs(*places, T_B_A, *masks, config=CONFIG)
+    result = []
+    for place, mask, pairs in zip(places, masks, close, strict=True):
+        matched, coarse = rng.normal(size=(2, len(place), 16)).astype(np.float32)
+        offsets = rng.normal(size=pairs.offsets.shape).astype(np.float32)
+        arrays = [place, matched, coarse]
+        if poison:
+            arrays = [np.where(mask[:, None], array, np.nan).astype(np.float32) for array in arrays]
+            offsets = np.where(np.asarray(pairs.mask)[..., None], offsets, np.nan)
+        place, matched, coarse = (jnp.asarray(array) for array in arrays)
+        result.append(TrainingSide(place, jnp.asarray(mask), matched, coarse, pairs, jnp.asarray(offsets)))
+    return result[0], result[1]
+
+
+def info_nce_in_numpy(queries, keys, distances, *, is_coarse: bool) -> tuple[float, float]:
+    queries, keys = (x / np.linalg.norm(x, axis=1, keepdims=True) for x in (queries, keys))
+    losses, hits = [], []
+    for i, distance in enumerate(distances):
+        positive = int(np.argmin(distance))
+        if distance[positive] > 1.0:
+            continue
+        logits = keys @ queries[i] / 0.1
+        used = [j for j in range(len(keys)) if j == positive or not is_coarse or distance[j] > 1.0]
+        losses.append(np.log(np.sum(np.exp(logits[used]))) - logits[positive])
+        hits.append(np.argmax(logits) == positive)
+    return float(np.mean(losses)), float(np.mean(hits))
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_terms_are_those_of_numpy(seed: int) -> None:
+    a, b = sides(seed)
+    in_b = np.asarray(transform_points(T_B_A, a.positions))
+    distances = np.linalg.norm(in_b[:, None].astype(np.float64) - np.asarray(b.positions), axis=-1)
+    total, terms = registration_loss(a, b, T_B_A, config=CONFIG)
+    matched, coarse = (
+        (a.matched_features, b.matched_features),
+        (a.coarse_features, b.coarse_features),
+    )
+    for features, value, is_coarse in ((matched, terms.pairing, False), (coarse, terms.coarse, True)):
+        features = [np.asarray(array, np.float64) for array in features]
+        there = info_nce_in_numpy(*features, distances, is_coarse=is_coarse)
+        back = info_nce_in_numpy(*features[::-1], distances.T, is_coarse=is_coarse)
+        np.testing.assert_allclose(value, (there[0] + back[0]) / 2, **ACCUMULATED)
+        if not is_coarse:
+            np.testing.assert_allclose(terms.top1_accuracy, (there[1] + back[1]) / 2, **ACCUMULATED)
+    offset = 0.0
+    for side in (a, b):
+        mask = np.asarray(side.close.mask)
+        residuals = (np.asarray(side.offsets) - np.asarray(side.close.offsets))[mask].astype(np.float64)
+        inverse = np.linalg.inv(np.cov(residuals.T))
+        offset += np.sqrt(np.einsum("ni,ij,nj->n", residuals, inverse, residuals)).mean() / 2
+    np.testing.assert_allclose(terms.offset, offset, **ACCUMULATED)
+    np.testing.assert_allclose(total, terms.pairing + 0.1 * terms.coarse + terms.offset, **ACCUMULATED)
+    assert terms.num_positives == np.sum(distances.min(axis=1) <= 1) + np.sum(distances.min(axis=0) <= 1)
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_close_pairs_are_all_pairs_within_the_radius(seed: int) -> None:
+    a, b = positions(seed)
+    of_a, of_b = jax.device_get(close_pairs(a, b, T_B_A, config=replace(CONFIG, max_close=50)))
+    in_a = np.asarray(transform_points(np.linalg.inv(T_B_A), b))
+    is_close = np.linalg.norm(a[:, None] - in_a, axis=-1) <= 2
+    np.testing.assert_array_equal(of_a.mask.sum(axis=1), is_close.sum(axis=1))
+    np.testing.assert_array_equal(of_b.mask.sum(axis=1), is_close.sum(axis=0))
+    # Moved by its offset, a descriptor lies on its partner.
+    landed = a[:, None] + of_a.offsets
+    np.testing.assert_allclose(landed[of_a.mask], in_a[of_a.indices][of_a.mask], atol=1e-4)
+    in_b = np.asarray(transform_points(T_B_A, a))
+    np.testing.assert_allclose((b[:, None] + of_b.offsets)[of_b.mask], in_b[of_b.indices][of_b.mask], atol=1e-4)
+
+
+def test_directions_are_symmetric() -> None:
+    a, b = sides(2)
+    forward, backward = (
+        registration_loss(a, b, T_B_A, config=CONFIG),
+        registration_loss(b, a, np.linalg.inv(T_B_A), config=CONFIG),
+    )
+    np.testing.assert_allclose(forward[0], backward[0], **ACCUMULATED)
+
+
+@jax.jit
+@jax.value_and_grad
+def value_and_gradient(features: tuple[jax.Array, ...], a: TrainingSide, b: TrainingSide) -> jax.Array:
+    a = a.replace(matched_features=features[0], coarse_features=features[1], offsets=features[2])
+    return registration_loss(a, b, T_B_A, config=CONFIG)[0]
+
+
+def gradients(a: TrainingSide, b: TrainingSide) -> tuple[jax.Array, tuple[jax.Array, ...]]:
+    return value_and_gradient((a.matched_features, a.coarse_features, a.offsets), a, b)
+
+
+@pytest.mark.parametrize("num_valid", [0, 1, 30])
+def test_masked_descriptors_reach_neither_value_nor_gradient(num_valid: int) -> None:
+    masks = np.arange(40) < num_valid, np.random.default_rng(3).random(50) < 0.7
+    clean, poisoned = sides(3, *masks), sides(3, *masks, poison=True)
+
+    (expected, _), (value, gradient) = gradients(*clean), gradients(*poisoned)
+    np.testing.assert_allclose(value, expected, **ACCUMULATED)
+    for leaf in gradient:
+        assert np.isfinite(leaf).all()
+        assert not np.any(leaf[num_valid:])
+
+
+def test_clouds_far_apart_cost_nothing() -> None:
+    a, b = positions(4)
+    T_far = T_B_A.copy()
+    T_far[:3, 3] += 1000
+    close = close_pairs(a, b, T_far, config=CONFIG)
+    assert not any(np.any(pairs.mask) for pairs in close)
+    near = sides(4)
+    far = [side.replace(close=pairs) for side, pairs in zip(near, close, strict=True)]
+    total, terms = registration_loss(*far, T_far, config=CONFIG)
+    assert total == 0
+    assert terms.num_positives == 0
+
+
+def test_vmap_equals_a_loop() -> None:
+    pairs = [sides(seed) for seed in (5, 6)]
+    stacked = [jax.tree.map(lambda *leaves: jnp.stack(leaves), *some) for some in zip(*pairs, strict=True)]
+    totals, _ = jax.vmap(partial(registration_loss, config=CONFIG), (0, 0, None))(*stacked, T_B_A)
+    for i, pair in enumerate(pairs):
+        np.testing.assert_allclose(totals[i], registration_loss(*pair, T_B_A, config=CONFIG)[0], **ACCUMULATED)
+
+
+def test_second_call_compiles_nothing(assert_compiles_nothing) -> None:
+    first, second = sides(7), sides(8)
+    registration_loss(*first, T_B_A, config=CONFIG)
+    with assert_compiles_nothing():
+        registration_loss(*second, T_B_A, config=CONFIG)
+        close_pairs(*positions(9), T_B_A, np.ones(40, bool), np.ones(50, bool), config=CONFIG)
+
+
+def test_wrong_arguments_are_named() -> None:
+    a, b = sides(9)
+    with pytest.raises(ValueError, match="^b.offsets: expected shape"):
+        registration_loss(a, b.replace(offsets=b.offsets[:3]), T_B_A, config=CONFIG)
+    with pytest.raises(ValueError, match="^T_b_a: expected shape"):
+        close_pairs(*positions(0), np.eye(3), config=CONFIG)
+    with pytest.raises(ValueError, match="^offset_weight: expected"):
+        ObjectiveConfig(offset_weight=-1)

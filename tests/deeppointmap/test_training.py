@@ -1,0 +1,151 @@
+"""The step of training: what it changes, what it does not, how often it compiles, on how many devices."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from dpmjax.deeppointmap import (
+    RegistrationSample,
+    TrainingState,
+    arrange_groups,
+    batch_loss,
+    draw_groups,
+    init,
+    make_step,
+    stack,
+)
+from experiments._dpm_data import SampleMaker, ScanStore
+from tests.deeppointmap import toy
+from tests.tolerances import ACCUMULATED
+
+REPOSITORY = Path(__file__).parents[2]
+
+
+@pytest.fixture(scope="module")
+def maker() -> SampleMaker:
+    return SampleMaker(ScanStore([toy.drive()], toy.TRAINING), toy.TRAINING, seed=0)
+
+
+@pytest.fixture(scope="module")
+def step():
+    return make_step(toy.TRAINING)
+
+
+@pytest.fixture(scope="module")
+def start() -> TrainingState:
+    return init(jax.random.key(0), toy.TRAINING)
+
+
+@pytest.fixture(scope="module")
+def value_and_grad():
+    return jax.jit(jax.value_and_grad(lambda params, batch: batch_loss(params, batch, toy.TRAINING)[0]))
+
+
+def changed(before: TrainingState, after: TrainingState) -> dict[str, bool]:
+    """For each part of the network, whether any parameter in it moved."""
+    parts = {"encoder": lambda p: p["encoder"]} | {
+        name: lambda p, name=name: p["decoder"][name] for name in before.params["decoder"]
+    }
+    return {
+        name: any(
+            bool(np.any(np.asarray(a) != np.asarray(b)))
+            for a, b in zip(jax.tree.leaves(part(before.params)), jax.tree.leaves(part(after.params)), strict=True)
+        )
+        for name, part in parts.items()
+    }
+
+
+def test_loss_falls_on_one_batch_and_all_parts_but_the_overlap_head_learn(maker, step, start) -> None:
+    batch, state, losses = maker(0), start, []
+    for _ in range(15):
+        state, report = step(state, batch)
+        losses.append(float(report.loss))
+    assert losses[-1] < losses[0] - 0.2
+    assert report.terms.num_positives > 0
+    moved = changed(start, state)
+    del moved["overlap_head"]  # by weight decay alone
+    assert all(moved.values()), moved
+
+
+def test_the_overlap_part_changes_the_overlap_head_alone(maker, step, start) -> None:
+    batch = maker(toy.TRAINING.registration_steps)
+    state, report = step(start, batch)
+    assert changed(start, state) == {name: name == "overlap_head" for name in changed(start, state)}
+    assert 0 <= report.overlap_accuracy <= 1
+    assert np.isnan(report.terms.pairing)
+
+
+def test_a_step_compiles_once_for_each_stage(maker, start, assert_compiles_nothing) -> None:
+    step = make_step(toy.TRAINING)
+    state = start
+    for first in (0, 3, 5):
+        state, _ = step(state, maker(first))
+        following = maker(first + 1)
+        with assert_compiles_nothing():
+            state, _ = step(state, following)
+
+
+def test_spare_places_change_nothing(maker, value_and_grad, start) -> None:
+    config = toy.TRAINING.sampling
+    roomy = replace(config, num_scans=9)
+    table = maker._store.table
+    groups = draw_groups(table, 3, 2, config, np.random.default_rng(1))
+    rows = np.concatenate([side for group in groups for side in group])
+    scans = maker._augmented(rows, 0, 0)
+    T = table.T_world_lidar[rows] @ np.linalg.inv(scans.T_augmented_lidar)
+    tight, loose = (stack([arrange_groups(groups, scans.pyramids, T, 2, c)]) for c in (config, roomy))
+    assert loose.mask.shape[1] > tight.mask.shape[1]
+    one, other = value_and_grad(start.params, tight), value_and_grad(start.params, loose)
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, **ACCUMULATED), one, other)
+
+
+def test_empty_scans_have_a_finite_gradient(maker, value_and_grad, start) -> None:
+    batch: RegistrationSample = maker(0)
+    levels = tuple(replace(level, mask=jnp.zeros_like(level.mask)) for level in batch.pyramids.levels)
+    empty = replace(batch, pyramids=replace(batch.pyramids, levels=levels))
+    loss, gradient = value_and_grad(start.params, empty)
+    assert loss == 0
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(gradient))
+
+
+def test_a_sample_depends_on_seed_and_step_alone(maker) -> None:
+    fresh = SampleMaker(ScanStore([toy.drive()], toy.TRAINING), toy.TRAINING, seed=0)
+    jax.tree.map(np.testing.assert_array_equal, fresh(4), maker(4))
+    assert np.any(fresh(4).pyramids.levels[0].positions != fresh(3).pyramids.levels[0].positions)
+
+
+EIGHT_DEVICES = """
+import jax, numpy as np
+from dpmjax.deeppointmap import batch_loss, device_mesh, init, replicate, shard_batch
+from experiments._dpm_data import SampleMaker, ScanStore
+from tests.deeppointmap import toy
+assert jax.device_count() == 8
+maker = SampleMaker(ScanStore([toy.drive()], toy.TRAINING), toy.TRAINING, seed=0, num_samples=8)
+batch, params = maker(0), init(jax.random.key(0), toy.TRAINING).params
+gradient = jax.jit(jax.grad(lambda params, batch: batch_loss(params, batch, toy.TRAINING)[0]))
+alone = gradient(params, batch)
+mesh = device_mesh()
+spread = shard_batch(batch, mesh)
+assert len(spread.mask.sharding.device_set) == 8 and spread.mask.addressable_shards[0].data.shape[0] == 1
+together = gradient(replicate(params, mesh), spread)
+for a, b in zip(jax.tree.leaves(alone), jax.tree.leaves(together), strict=True):
+    np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-5)
+"""
+
+
+def test_eight_devices_find_the_gradient_of_one() -> None:
+    environment = os.environ | {"XLA_FLAGS": "--xla_force_host_platform_device_count=8", "JAX_PLATFORMS": "cpu"}
+    environment["PYTHONPATH"] = os.pathsep.join([str(REPOSITORY / "src"), str(REPOSITORY)])
+    done = subprocess.run(
+        [sys.executable, "-c", EIGHT_DEVICES], cwd=REPOSITORY, env=environment, capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stderr

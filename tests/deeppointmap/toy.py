@@ -1,0 +1,41 @@
+"""A network that compiles in seconds, and scans for it: boxes about a street."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from dpmjax.data import LidarSequence
+from dpmjax.deeppointmap import CurriculumStage, ModelConfig, ObjectiveConfig, SamplingConfig, TrainingConfig
+from dpmjax.geometry.pyramid import PyramidConfig, PyramidStage
+from dpmjax.nets.decoder import DecoderConfig
+from dpmjax.nets.point_encoder import EncoderConfig
+from dpmjax.scans import PreprocessConfig
+
+MODEL = ModelConfig(
+    pyramid=PyramidConfig(stages=(PyramidStage(32, (0.2,), 8), PyramidStage(8, (0.4,), 4)), num_interpolations=1),
+    encoder=EncoderConfig(stem_channels=4, expansion=2, output_channels=8),
+    decoder=DecoderConfig(input_channels=8, model_channels=12, num_layers=1, num_heads=2),
+    preprocess=PreprocessConfig(capacity=128, num_outlier_neighbours=0, voxel_size_m=0.5),
+)
+
+TRAINING = TrainingConfig(
+    model=MODEL,
+    curriculum=(CurriculumStage(2, 3), CurriculumStage(4, 2)),
+    overlap_steps=2,
+    sampling=SamplingConfig(num_scans=6, num_overlap_pairs=4, max_side=2),
+    objective=ObjectiveConfig(max_close=4, positive_radius_m=3.0, offset_radius_m=5.0),
+)
+
+
+def drive(seed: int = 0, num_scans: int = 24, step_m: float = 4.0) -> LidarSequence:
+    """A straight drive past random points that stand still."""
+    rng = np.random.default_rng(seed)
+    world = rng.uniform([-30, -20, -1], [30 + num_scans * step_m, 20, 3], (1500, 3))
+    poses = np.tile(np.eye(4), (num_scans, 1, 1))
+    poses[:, 0, 3] = step_m * np.arange(num_scans)
+
+    def read_scan(index: int) -> np.ndarray:
+        points = world - poses[index, :3, 3]
+        return points[np.linalg.norm(points, axis=1) < 30].astype(np.float32)
+
+    return LidarSequence(f"toy {seed}", tuple(map(str, range(num_scans))), read_scan, poses)

@@ -1,0 +1,180 @@
+from __future__ import annotations
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from dpmjax.deeppointmap import (
+    Model,
+    coarse_features,
+    correlate,
+    init_model,
+    model_preset,
+    overlap,
+    overlap_logit,
+    predict_offsets,
+    similarity_features,
+)
+from dpmjax.nets import DecoderConfig, attention, embed_positions
+from dpmjax.types import DescriptorCloud
+from tests.tolerances import ACCUMULATED, ROUNDING
+
+CONFIG = replace(model_preset("tiny"), decoder=DecoderConfig(64, model_channels=32, num_layers=2, num_heads=4))
+
+
+@pytest.fixture(scope="module")
+def model() -> Model:
+    return init_model(jax.random.key(1), CONFIG)
+
+
+def cloud(seed: int, num_descriptors: int, capacity: int | None = None) -> DescriptorCloud:
+    """Valid descriptors in front, NaN behind."""
+    rng = np.random.default_rng(seed)
+    capacity = num_descriptors if capacity is None else capacity
+    positions, features = np.full((capacity, 3), np.nan), np.full((capacity, 64), np.nan)
+    positions[:num_descriptors] = rng.normal(size=(num_descriptors, 3)) * 20
+    features[:num_descriptors] = rng.normal(size=(num_descriptors, 64))
+    arrays = (jnp.asarray(x, jnp.float32) for x in (positions, features))
+    return DescriptorCloud(*arrays, jnp.arange(capacity) < num_descriptors)
+
+
+def test_position_embedding_is_sines_and_cosines_by_turns() -> None:
+    positions = np.random.default_rng(0).normal(size=(5, 3)) * 20
+    found = embed_positions(jnp.asarray(positions, jnp.float32), 16)
+    for axis in range(3):
+        for pair in range(2):
+            angle = np.pi * positions[:, axis] / 10_000 ** (2 * pair / 4)
+            column = 4 * axis + 2 * pair
+            expected = np.stack([np.sin(angle), np.cos(angle)], axis=1)
+            np.testing.assert_allclose(found[:, column : column + 2], expected, atol=2e-5)
+    assert not found[:, 12:].any()
+
+
+@pytest.mark.parametrize("max_live_logits", [1 << 20, 20])
+def test_attention_is_a_masked_softmax(max_live_logits: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(attention, "MAX_LIVE_LOGITS", max_live_logits)
+    rng = np.random.default_rng(1)
+    queries, keys, values = (rng.normal(size=(n, 2, 3)) for n in (7, 5, 5))
+    mask = np.array([True, False, True, True, False])
+    found = attention.attend(*(jnp.asarray(x, jnp.float32) for x in (queries, keys, values)), jnp.asarray(mask))
+    for head in range(2):
+        shares = np.exp(queries[:, head] @ keys[mask, head].T / np.sqrt(3))
+        expected = shares / shares.sum(axis=1, keepdims=True) @ values[mask, head]
+        np.testing.assert_allclose(found[:, head], expected, **ACCUMULATED)
+
+
+def test_attention_to_nothing_is_zero() -> None:
+    ones = jnp.ones((4, 2, 3))
+    assert not attention.attend(ones, ones, ones, jnp.zeros(4, bool)).any()
+    assert not attention.attend(ones, ones[:0], ones[:0], jnp.zeros(0, bool)).any()
+
+
+def test_padded_equals_unpadded(model: Model) -> None:
+    a, b = cloud(2, 8), cloud(3, 8)
+    expected = correlate(model, a, b)
+    padded_a, padded_b = cloud(2, 8, capacity=12), cloud(3, 8, capacity=10)
+    found = correlate(model, padded_a, padded_b)
+    for of_padded, of_unpadded in zip(found, expected, strict=True):
+        num = of_unpadded.mask.size
+        np.testing.assert_allclose(of_padded.features[:num], of_unpadded.features, **ACCUMULATED)
+        np.testing.assert_array_equal(of_padded.positions[:num], of_unpadded.positions)
+        assert not of_padded.features[num:].any()
+    np.testing.assert_allclose(overlap(model, padded_a, padded_b), overlap(model, a, b), **ACCUMULATED)
+
+
+def test_order_of_descriptors_changes_nothing(model: Model) -> None:
+    a, b = cloud(4, 8), cloud(5, 8)
+    order = np.random.default_rng(0).permutation(8)
+    shuffled = jax.tree.map(lambda x: x[order], b)
+    (of_a, of_b), (again_a, again_b) = correlate(model, a, b), correlate(model, a, shuffled)
+    np.testing.assert_allclose(again_a.features, of_a.features, **ACCUMULATED)
+    np.testing.assert_allclose(again_b.features, of_b.features[order], **ACCUMULATED)
+
+
+def test_clouds_change_places_together(model: Model) -> None:
+    a, b = cloud(6, 8), cloud(7, 8)
+    for found, expected in zip(correlate(model, b, a), correlate(model, a, b)[::-1], strict=True):
+        np.testing.assert_allclose(found.features, expected.features, **ACCUMULATED)
+
+
+def test_heads_have_their_shapes(model: Model) -> None:
+    a, b = correlate(model, cloud(8, 8), cloud(9, 8))
+    assert similarity_features(model, a).shape == (8, 32)
+    assert coarse_features(model, cloud(8, 8)).shape == (8, 64)
+    assert predict_offsets(model, a.features[:5], b.features[:5]).shape == (5, 3)
+    assert overlap_logit(model, a, b).shape == ()
+
+
+def test_overlap_is_a_probability(model: Model) -> None:
+    assert 0 < overlap(model, cloud(10, 8), cloud(11, 8)) < 1
+
+
+def test_empty_clouds_give_finite_numbers(model: Model) -> None:
+    empty, full = cloud(12, 0, capacity=8), cloud(13, 8)
+    for pair in ((empty, full), (empty, empty)):
+        correlated = correlate(model, *pair)
+        assert not correlated[0].features.any()
+        assert all(np.isfinite(side.features).all() for side in correlated)
+        assert np.isfinite(overlap(model, *pair))
+
+
+@pytest.mark.parametrize("num_valid", [0, 6])
+def test_gradient_is_finite(num_valid: int) -> None:
+    model = init_model(jax.random.key(2), replace(CONFIG, decoder=replace(CONFIG.decoder, num_layers=1)))
+    a, b = cloud(14, num_valid, capacity=8), cloud(15, 8)
+    value, gradient = loss_and_gradient(model, a, b)
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves((value, gradient)))
+
+
+@jax.jit
+@jax.value_and_grad
+def loss_and_gradient(model: Model, a: DescriptorCloud, b: DescriptorCloud) -> jax.Array:
+    p, q = correlate(model, a, b)
+    offsets = predict_offsets(model, p.features, q.features)
+    return jnp.sum(offsets**2) + jnp.sum(similarity_features(model, q) ** 2) + overlap_logit(model, p, q)
+
+
+def test_gradient_of_attention_in_chunks_is_that_of_the_whole(monkeypatch: pytest.MonkeyPatch) -> None:
+    arrays = [jax.random.normal(jax.random.key(i), (5, 2, 3)) for i in range(3)]
+    mask = jnp.array([True, False, True, True, False])
+
+    def gradient() -> list[jax.Array]:
+        return jax.jit(jax.grad(lambda arrays: jnp.sum(attention.attend(*arrays, mask) ** 2)))(arrays)
+
+    whole = gradient()
+    monkeypatch.setattr(attention, "MAX_LIVE_LOGITS", 15)
+    parts = gradient()
+    jax.tree.map(lambda x, y: np.testing.assert_allclose(x, y, **ACCUMULATED), parts, whole)
+
+
+def test_shared_layers_are_one_layer_applied_again(model: Model) -> None:
+    shared_config = replace(CONFIG, decoder=replace(CONFIG.decoder, shares_layers=True))
+    decoder = {name: value for name, value in model.params["decoder"].items() if name != "layer_1"}
+    repeated = {**model.params["decoder"], "layer_1": model.params["decoder"]["layer_0"]}
+    shared = Model({**model.params, "decoder": decoder}, shared_config)
+    unshared = Model({**model.params, "decoder": repeated}, CONFIG)
+    a, b = cloud(16, 8), cloud(17, 8)
+    for found, expected in zip(correlate(shared, a, b), correlate(unshared, a, b), strict=True):
+        np.testing.assert_allclose(found.features, expected.features, **ROUNDING)
+
+
+def test_second_call_compiles_nothing(model: Model, assert_compiles_nothing) -> None:
+    pairs = [(cloud(18, 8), cloud(19, 8)), (cloud(20, 8), cloud(21, 8))]
+    overlap(model, *pairs[0])
+    with assert_compiles_nothing():
+        overlap(model, *pairs[1])
+
+
+def test_wrong_channels_are_named(model: Model) -> None:
+    wrong = cloud(22, 4).replace(features=jnp.ones((4, 3)))
+    with pytest.raises(ValueError, match="^b.features: expected shape .4, 64., got .4, 3."):
+        correlate(model, cloud(22, 4), wrong)
+    with pytest.raises(
+        ValueError, match="^model_channels: expected at least 6 and a multiple of num_heads = 8, got 20"
+    ):
+        DecoderConfig(model_channels=20)
+    with pytest.raises(ValueError, match="^name: expected one of tiny, small, paper, got 'huge'"):
+        model_preset("huge")

@@ -1,0 +1,157 @@
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from dpmjax.deeppointmap.model import Model, ModelConfig, encode_pyramid, init_model, model_shapes
+from dpmjax.geometry.pyramid import PyramidConfig, PyramidStage
+from dpmjax.geometry.pyramid_host import build_pyramid_on_host
+from dpmjax.nets import DecoderConfig, EncoderConfig
+from dpmjax.nets.point_encoder import NeighbourhoodMaximum
+from dpmjax.types import PointPyramid
+from tests.tolerances import ACCUMULATED, ROUNDING
+
+CONFIG = ModelConfig(
+    pyramid=PyramidConfig(
+        (PyramidStage(24, (0.3, 0.5), 6), PyramidStage(12, (0.6, 0.8), 6), PyramidStage(4, (1.0,), 3)), 2
+    ),
+    encoder=EncoderConfig(stem_channels=4, expansion=2, output_channels=10),
+    decoder=DecoderConfig(input_channels=10, model_channels=16, num_heads=2),
+)
+
+
+@pytest.fixture(scope="module")
+def model() -> Model:
+    return init_model(jax.random.key(0), CONFIG)
+
+
+def points(seed: int, num_points: int = 40) -> np.ndarray:
+    return np.random.default_rng(seed).uniform(-1, 1, (num_points, 3)).astype(np.float32)
+
+
+def pyramid_of(cloud: np.ndarray, capacity: int | None = None, config: ModelConfig = CONFIG) -> PointPyramid:
+    """Of the cloud in front of `capacity` rows."""
+    capacity = len(cloud) if capacity is None else capacity
+    front = np.zeros((capacity, 3), np.float32)
+    front[: len(cloud)] = cloud
+    return jax.device_put(build_pyramid_on_host(front, np.arange(capacity) < len(cloud), config.pyramid))
+
+
+def norm(x: np.ndarray, scale: np.ndarray, bias: np.ndarray) -> np.ndarray:
+    return (x - x.mean(-1, keepdims=True)) / np.sqrt(x.var(-1, keepdims=True) + 1e-5) * scale + bias
+
+
+def poisoned(pyramid: PointPyramid) -> PointPyramid:
+    """The same with NaN wherever nothing is."""
+    levels = tuple(
+        level.replace(positions=jnp.where(level.mask[:, None], level.positions, jnp.nan)) for level in pyramid.levels
+    )
+    return pyramid.replace(levels=levels)
+
+
+def test_neighbourhood_maximum_is_that_of_the_whole_formula() -> None:
+    rng = np.random.default_rng(0)
+    features, positions, queries = rng.normal(size=(9, 5)), rng.normal(size=(9, 3)), rng.normal(size=(6, 3))
+    neighbours = rng.integers(0, 9, (6, 4))
+    inputs = [jnp.asarray(x, jnp.float32) for x in (features, positions, queries)]
+    module = NeighbourhoodMaximum(7, radius=0.3)
+    params = module.init(jax.random.key(0), *inputs, neighbours)["params"]
+    params = {name: rng.normal(size=value.shape).astype(np.float32) for name, value in params.items()}
+    offsets = (positions[neighbours] - queries[:, None]) / 0.3
+    rows = np.concatenate([features[neighbours], offsets], axis=-1)
+    rows = norm(rows @ params["kernel"] + params["bias"], params["norm_scale"], params["norm_bias"])
+    expected = np.maximum(rows, 0).max(axis=1)
+    np.testing.assert_allclose(module.apply({"params": params}, *inputs, neighbours), expected, **ACCUMULATED)
+
+
+def test_padded_equals_unpadded(model: Model) -> None:
+    # Five points fewer than the first level has room for.
+    cloud = points(1, 19)
+    found = encode_pyramid(model, poisoned(pyramid_of(cloud, capacity=64)))
+    stages = (PyramidStage(19, (0.3, 0.5), 6), *CONFIG.pyramid.stages[1:])
+    unpadded = Model(model.params, ModelConfig(PyramidConfig(stages, 2), CONFIG.encoder, CONFIG.decoder))
+    expected = encode_pyramid(unpadded, pyramid_of(cloud, config=unpadded.config))
+    np.testing.assert_array_equal(found.mask, np.arange(24) < 19)
+    np.testing.assert_allclose(found.features[:19], expected.features, **ROUNDING)
+    np.testing.assert_allclose(found.positions[:19], expected.positions, **ROUNDING)
+    assert not found.features[19:].any()
+    assert not found.positions[19:].any()
+
+
+def test_descriptors_stand_on_sampled_points_in_metres(model: Model) -> None:
+    cloud = points(2)
+    found = encode_pyramid(model, pyramid_of(cloud))
+    assert found.positions.shape == (CONFIG.num_descriptors, 3)
+    distances = np.linalg.norm(np.asarray(found.positions)[:, None] - 60 * cloud[None], axis=-1)
+    np.testing.assert_allclose(distances.min(axis=1), 0, atol=1e-5)
+
+
+def test_order_of_neighbours_changes_nothing(model: Model) -> None:
+    pyramid = pyramid_of(points(3))
+    levels = tuple(
+        level.replace(neighbours=tuple(block[:, ::-1] for block in level.neighbours)) for level in pyramid.levels
+    )
+    found = encode_pyramid(model, pyramid.replace(levels=levels))
+    np.testing.assert_array_equal(found.features, encode_pyramid(model, pyramid).features)
+
+
+def test_empty_cloud_has_no_descriptors(model: Model) -> None:
+    pyramid = pyramid_of(points(4))
+    levels = tuple(level.replace(mask=jnp.zeros_like(level.mask)) for level in pyramid.levels)
+    cloud = encode_pyramid(model, poisoned(pyramid.replace(levels=levels)))
+    assert not cloud.mask.any()
+    assert not cloud.features.any()
+    assert not cloud.positions.any()
+
+
+def test_gradient_is_finite_in_degenerate_clouds_too(model: Model) -> None:
+    gradient_of = jax.jit(jax.grad(lambda model, pyramid: jnp.sum(encode_pyramid(model, pyramid).features ** 2)))
+    for cloud in (np.zeros((19, 3), np.float32), points(5, 19)):
+        gradient = gradient_of(model, poisoned(pyramid_of(cloud, capacity=30)))
+        assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(gradient))
+    assert any(leaf.any() for leaf in jax.tree.leaves(gradient.params["encoder"]["stage_0"]))
+
+
+def test_vmap_equals_a_loop_and_second_call_compiles_nothing(model: Model, assert_compiles_nothing) -> None:
+    pyramids = [pyramid_of(points(seed)) for seed in (6, 7)]
+    batch = jax.tree.map(lambda *leaves: jnp.stack(leaves), *pyramids)
+    found = jax.device_get(jax.vmap(encode_pyramid, (None, 0))(model, batch))
+    first = jax.device_get(encode_pyramid(model, pyramids[0]))
+    with assert_compiles_nothing():
+        second = jax.device_get(encode_pyramid(model, pyramids[1]))
+    for i, cloud in enumerate((first, second)):
+        np.testing.assert_allclose(found.features[i], cloud.features, **ACCUMULATED)
+
+
+def test_bfloat16_is_close_and_leaves_positions_alone(model: Model) -> None:
+    pyramid = pyramid_of(points(8))
+    low = encode_pyramid(Model(model.params, CONFIG.with_compute_dtype("bfloat16")), pyramid)
+    high = encode_pyramid(model, pyramid)
+    np.testing.assert_array_equal(low.positions, high.positions)
+    assert low.features.dtype == jnp.float32
+    # bfloat16 has 8 bits: 0.4 % a product, a few of them one after the other.
+    assert jnp.linalg.norm(low.features - high.features) < 0.03 * jnp.linalg.norm(high.features)
+
+
+def test_paper_size_is_the_published_one() -> None:
+    shapes = model_shapes(ModelConfig())
+    counts = {part: sum(leaf.size for leaf in jax.tree.leaves(params)) for part, params in shapes.items()}
+    assert counts == {"encoder": 3_824_224, "decoder": 2_776_260}
+    assert ModelConfig().num_descriptors == 256
+
+
+def test_wrong_pyramids_and_widths_are_named(model: Model) -> None:
+    pyramid = pyramid_of(points(9))
+    with pytest.raises(ValueError, match="^pyramid: expected 4 levels, got 3"):
+        encode_pyramid(model, pyramid.replace(levels=pyramid.levels[:-1]))
+    short = pyramid.levels[1].replace(neighbours=pyramid.levels[1].neighbours[:1])
+    with pytest.raises(ValueError, match="^pyramid.levels.1.: expected 2 neighbourhoods, got 1"):
+        encode_pyramid(model, pyramid.replace(levels=(pyramid.levels[0], short, *pyramid.levels[2:])))
+    with pytest.raises(ValueError, match="^stem_channels: expected at least 1"):
+        EncoderConfig(stem_channels=0)
+    with pytest.raises(ValueError, match="^compute_dtype: expected one of float32, bfloat16, got 'float16'"):
+        EncoderConfig(compute_dtype="float16")
+    with pytest.raises(ValueError, match="^decoder.input_channels: expected the encoder's output_channels 128, got 64"):
+        ModelConfig(decoder=DecoderConfig(input_channels=64))

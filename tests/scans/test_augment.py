@@ -1,0 +1,186 @@
+from __future__ import annotations
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from dpmjax.geometry import invert, transform_points
+from dpmjax.scans import AugmentConfig, BoxConfig, SectorConfig, augment_scan
+from dpmjax.scans.augment import random_motion
+from dpmjax.scans.occlusion import is_behind_box, is_behind_boxes, is_behind_sectors
+from dpmjax.types import PointCloud
+from tests.tolerances import ACCUMULATED
+
+NOTHING = AugmentConfig(
+    max_drop_ratio=0,
+    sector_probability=0,
+    box_probability=0,
+    max_yaw_rad=0,
+    max_tilt_rad=0,
+    translation_sigma_m=0,
+    jitter_sigma_m=0,
+)
+KEYS = [jax.random.key(seed) for seed in range(40)]
+
+
+def cloud(n: int = 300, num_valid: int = 250) -> PointCloud:
+    points = (10 * np.random.default_rng(0).normal(size=(n, 3))).astype(np.float32)
+    return PointCloud(jnp.asarray(points), jnp.arange(n) < num_valid)
+
+
+def augment_all(config: AugmentConfig, scan: PointCloud):
+    return jax.device_get(jax.jit(jax.vmap(lambda key: augment_scan(scan, config, key=key)))(jnp.stack(KEYS)))
+
+
+def test_nothing_asked_for_nothing_done() -> None:
+    scan = cloud()
+    augmented = jax.tree.map(lambda leaf: leaf[0], augment_all(NOTHING, scan))
+    np.testing.assert_array_equal(augmented.T_augmented_lidar, np.eye(4))
+    valid = augmented.cloud.points[augmented.cloud.mask]
+    np.testing.assert_array_equal(np.sort(valid, axis=0), np.sort(np.asarray(scan.points)[:250], axis=0))
+    assert np.argmax(np.linalg.norm(valid, axis=1)) == 0
+
+
+def test_motion_is_the_one_that_is_told() -> None:
+    config, scan = replace(NOTHING, max_yaw_rad=3.0, max_tilt_rad=0.3, translation_sigma_m=3.0), cloud()
+    many = augment_all(config, scan)
+    for T, points, mask in zip(many.T_augmented_lidar, many.cloud.points, many.cloud.mask, strict=True):
+        np.testing.assert_allclose(T[:3, :3] @ T[:3, :3].T, np.eye(3), **ACCUMULATED)
+        assert np.linalg.det(T[:3, :3]) > 0
+        back = transform_points(invert(T), points[mask])
+        order, expected = (np.lexsort(np.round(p, 2).T) for p in (np.asarray(back), np.asarray(scan.points)[:250]))
+        np.testing.assert_allclose(np.asarray(back)[order], np.asarray(scan.points)[:250][expected], atol=1e-4)
+
+
+def test_motion_is_turned_about_x_then_y_then_z() -> None:
+    def rotation(axis: int, angle: float) -> np.ndarray:
+        cos, sin = np.cos(angle), np.sin(angle)
+        R = np.eye(3)
+        i, j = [k for k in range(3) if k != axis]
+        R[i, i], R[j, j] = cos, cos
+        R[i, j], R[j, i] = (-sin, sin) if axis != 1 else (sin, -sin)
+        return R
+
+    for T in np.asarray(jax.vmap(lambda key: random_motion(AugmentConfig(), key=key))(jnp.stack(KEYS))):
+        pitch = np.arcsin(T[0, 2])
+        roll, yaw = np.arctan2(-T[1, 2], T[2, 2]), np.arctan2(-T[0, 1], T[0, 0])
+        np.testing.assert_allclose(T[:3, :3], rotation(0, roll) @ rotation(1, pitch) @ rotation(2, yaw), atol=1e-6)
+        assert abs(roll) <= np.pi / 10
+        assert abs(pitch) <= np.pi / 10
+
+
+def test_motions_have_the_spread_that_is_asked_for() -> None:
+    keys = jax.random.split(jax.random.key(1), 4000)
+    T = np.asarray(jax.vmap(lambda key: random_motion(AugmentConfig(), key=key))(keys))
+    np.testing.assert_allclose(T[:, :3, 3].std(axis=0), [3, 3, 1.5], rtol=0.05)
+    assert np.histogram(np.arctan2(-T[:, 0, 1], T[:, 0, 0]), 8, (-np.pi, np.pi))[0].min() > 400
+
+
+def test_relative_poses_stay_right() -> None:
+    T_a_b = np.asarray(random_motion(AugmentConfig(), key=jax.random.key(9)))
+    points_b = cloud().points
+    T_aug_a = np.asarray(random_motion(AugmentConfig(), key=KEYS[0]))
+    T_aug_b = np.asarray(random_motion(AugmentConfig(), key=KEYS[1]))
+    T = T_aug_a @ T_a_b @ np.asarray(invert(T_aug_b))
+    direct = transform_points(T_aug_a, transform_points(T_a_b, points_b))
+    np.testing.assert_allclose(transform_points(T, transform_points(T_aug_b, points_b)), direct, atol=1e-4)
+
+
+def test_drop_ratio_is_uniform() -> None:
+    many = augment_all(replace(NOTHING, max_drop_ratio=0.5), cloud())
+    ratio = 1 - many.cloud.mask.sum(axis=1) / 250
+    assert ratio.min() < 0.1
+    assert 0.4 < ratio.max() < 0.62
+    assert 0.15 < ratio.mean() < 0.35
+
+
+def test_jitter_is_clipped() -> None:
+    scan = cloud(300, 300)
+    many = augment_all(replace(NOTHING, jitter_sigma_m=0.1, jitter_clip_sigmas=1.0), scan)
+    nearest = np.linalg.norm(many.cloud.points[0][:, None] - np.asarray(scan.points), axis=-1).min(axis=1)
+    assert 0 < nearest.max() <= 0.1 * np.sqrt(3) + 1e-5
+
+
+def test_sectors_hide_a_wedge_from_some_range_on() -> None:
+    angle, radius = np.meshgrid(np.linspace(-np.pi, np.pi, 720, endpoint=False), [1.0, 4.9, 5.1, 40.0])
+    points = np.stack([radius * np.cos(angle), radius * np.sin(angle), 0 * angle], axis=-1).astype(np.float32)
+    config = SectorConfig(max_count=1, width_deg=(60, 60), min_range_m=(5, 5))
+    hide = jax.jit(lambda key: is_behind_sectors(points.reshape(-1, 3), config, key=key))
+    for key in KEYS[:5]:
+        hidden = np.asarray(hide(key)).reshape(radius.shape)
+        assert not hidden[:2].any()
+        np.testing.assert_allclose(hidden[2:].sum(axis=1), 120, atol=2)
+        assert np.count_nonzero(hidden[3] != np.roll(hidden[3], 1)) == 2  # one piece
+
+
+def test_box_hides_what_lies_behind_it() -> None:
+    centre, size = np.array([5.0, 0, 0], np.float32), np.array([2.0, 2.0, 2.0], np.float32)
+    points = np.array(
+        [[10, 0, 0], [5, 0, 0], [3.9, 0, 0], [-10, 0, 0], [10, 3, 0], [10, 1, 0], [10, 0, 3], [10, 0, 1], [0, 0, 0]],
+        np.float32,
+    )
+    hidden = is_behind_box(points, centre, size, jnp.float32(0))
+    np.testing.assert_array_equal(hidden, [True, True, False, False, False, True, False, True, False])
+    # Turned by an eighth of a turn it is wider across the beam, by the square root of two.
+    wide = np.array([[10, 2.4, 0], [10, 3.0, 0]], np.float32)
+    np.testing.assert_array_equal(is_behind_box(wide, centre, size, jnp.float32(np.pi / 4)), [True, False])
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_box_shadow_is_that_of_dense_samples_on_the_beam(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    points = (6 * rng.normal(size=(200, 3))).astype(np.float32)
+    centre, size, heading = rng.normal(size=3) * 3, rng.uniform(0.5, 3, 3), rng.uniform(-3, 3)
+    hidden = is_behind_box(points, *(jnp.asarray(x, jnp.float32) for x in (centre, size, heading)))
+    samples = points[:, None] * np.linspace(0, 1, 4001)[:, None] - centre
+    cos, sin = np.cos(heading), np.sin(heading)
+    turned = samples @ np.array([[cos, sin, 0], [-sin, cos, 0], [0, 0, 1]]).T
+    depth = (np.abs(turned) - size / 2).max(axis=-1).min(axis=1)
+    np.testing.assert_array_equal(np.asarray(hidden)[np.abs(depth) > 1e-2], (depth < 0)[np.abs(depth) > 1e-2])
+
+
+def test_boxes_never_hide_what_is_nearer_than_their_gap() -> None:
+    directions = np.random.default_rng(0).normal(size=(500, 3))
+    near = (2.9 * directions / np.linalg.norm(directions, axis=1, keepdims=True)).astype(np.float32)
+    far = 20 * near
+    config = BoxConfig(gap_m=(3, 6))
+    hide = jax.jit(jax.vmap(lambda key, points: is_behind_boxes(points, config, key=key), (0, None)))
+    assert not np.any(hide(jnp.stack(KEYS), near))
+    assert np.any(hide(jnp.stack(KEYS), far))
+
+
+def test_masked_points_reach_neither_value_nor_gradient() -> None:
+    config = AugmentConfig(sector_probability=1, box_probability=1)
+
+    @jax.jit
+    @jax.value_and_grad
+    def loss(points: jax.Array, mask: jax.Array) -> jax.Array:
+        return jnp.sum(augment_scan(PointCloud(points, mask), config, key=KEYS[0]).cloud.points ** 2)
+
+    for num_valid in (0, 1, 250):
+        scan = cloud(300, num_valid)
+        poisoned = jnp.where(scan.mask[:, None], scan.points, jnp.nan)
+        (value, gradient), (expected, _) = loss(poisoned, scan.mask), loss(scan.points, scan.mask)
+        assert np.isfinite(gradient).all()
+        np.testing.assert_array_equal(value, expected)
+        assert not np.any(gradient[num_valid:])
+
+
+def test_same_key_same_scan() -> None:
+    augment = jax.jit(lambda key: augment_scan(cloud(), AugmentConfig(), key=key))
+    first, second, other = jax.device_get([augment(KEYS[seed]) for seed in (3, 3, 4)])
+    jax.tree.map(np.testing.assert_array_equal, first, second)
+    assert not np.array_equal(first.cloud.points, other.cloud.points)
+
+
+def test_wrong_numbers_are_named() -> None:
+    for name, value in (("max_drop_ratio", 1.5), ("box_probability", -1.0), ("max_tilt_rad", -0.1)):
+        with pytest.raises(ValueError, match=f"^{name}: expected"):
+            AugmentConfig(**{name: value})
+    with pytest.raises(ValueError, match="^width_deg: expected"):
+        SectorConfig(width_deg=(3, 1))
+    with pytest.raises(ValueError, match="^max_count: expected"):
+        BoxConfig(max_count=0)

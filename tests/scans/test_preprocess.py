@@ -1,0 +1,154 @@
+from __future__ import annotations
+
+import os
+from dataclasses import replace
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from dpmjax.scans import PreprocessConfig, preprocess_scan, preprocess_scan_on_host
+from dpmjax.types import PointCloud
+
+CONFIG = PreprocessConfig(max_range_m=30.0, num_outlier_neighbours=5, capacity=512)
+DATA = Path(os.environ.get("DPMJAX_DATA", Path(__file__).parents[3] / "shared" / "data"))
+BUILDERS = pytest.mark.parametrize("preprocess", [preprocess_scan, preprocess_scan_on_host])
+
+
+def scan(seed: int, n: int = 1000, spread: float = 10.0) -> np.ndarray:
+    return (spread * np.random.default_rng(seed).normal(size=(n, 3))).astype(np.float32)
+
+
+def preprocessed_in_numpy(points: np.ndarray, config: PreprocessConfig) -> np.ndarray:
+    ranges = np.linalg.norm(points.astype(np.float64), axis=1)
+    kept, voxels = [], set()
+    for point, distance in zip(points, ranges, strict=True):
+        voxel = tuple(np.floor(point / np.float32(config.voxel_size_m)).astype(int))
+        if config.min_range_m <= distance <= config.max_range_m and voxel not in voxels:
+            kept.append(point)
+            voxels.add(voxel)
+    if len(kept) > config.capacity:
+        kept = [kept[slot * len(kept) // config.capacity] for slot in range(config.capacity)]
+    kept = np.array(kept)
+    distances = np.sort(np.linalg.norm(kept[:, None].astype(np.float64) - kept, axis=-1), axis=1)
+    spread = distances[:, 1 : config.num_outlier_neighbours + 1].mean(axis=1)
+    kept = kept[spread <= spread.mean() + config.outlier_sigmas * spread.std()]
+    farthest = int(np.argmax(np.linalg.norm(kept, axis=1)))
+    kept[[0, farthest]] = kept[[farthest, 0]]
+    return kept
+
+
+@BUILDERS
+@pytest.mark.parametrize("seed", [0, 1])
+@pytest.mark.parametrize("voxel_size", [0.3, 4.0])
+def test_kept_points_are_those_of_numpy(preprocess, seed: int, voxel_size: float) -> None:
+    config = replace(CONFIG, voxel_size_m=voxel_size)
+    cloud = jax.device_get(preprocess(scan(seed), None, config))
+    expected = preprocessed_in_numpy(scan(seed), config)
+    assert 100 < len(expected) < 512
+    np.testing.assert_array_equal(cloud.mask, np.arange(512) < len(expected))
+    np.testing.assert_array_equal(cloud.points[cloud.mask], expected)
+    assert (cloud.points[~cloud.mask] == 0).all()
+
+
+@pytest.mark.parametrize("case", ["masked", "not finite", "one", "none", "duplicates", "grid", "too near"])
+def test_both_forms_agree(case: str) -> None:
+    points, mask = scan(2), np.random.default_rng(3).random(1000) < 0.7
+    if case == "not finite":
+        points = np.where(mask[:, None], points, np.array([np.nan, np.inf, 1], np.float32))
+    elif case in ("one", "none"):
+        mask = np.arange(1000) < {"one": 1, "none": 0}[case]
+        points[0] = [3, 4, 0]
+    elif case == "duplicates":
+        points = np.repeat(points[:100], 10, axis=0)
+    elif case == "grid":
+        points = np.stack(np.meshgrid(*[np.arange(1, 11, dtype=np.float32)] * 3), axis=-1).reshape(-1, 3)
+    elif case == "too near":
+        points = points / 1000
+    device, host = jax.device_get(preprocess_scan(points, mask, CONFIG)), preprocess_scan_on_host(points, mask, CONFIG)
+    jax.tree.map(np.testing.assert_array_equal, device, host)
+    assert host.mask.sum() == {"one": 1, "none": 0, "too near": 0}.get(case, host.mask.sum())
+
+
+@pytest.mark.skipif(not (DATA / "lidar_3d").is_dir(), reason="real scans: set DPMJAX_DATA to their folder")
+@pytest.mark.parametrize("sequence", ["kitti_07"])
+def test_both_forms_agree_on_real_scans(sequence: str) -> None:
+    path = sorted((DATA / "lidar_3d" / sequence / "velodyne").glob("*.bin"))[0]
+    points = np.fromfile(path, np.float32).reshape(-1, 4)[:, :3]
+    config = PreprocessConfig(voxel_size_m=1.0, capacity=4096)
+    device, host = jax.device_get(preprocess_scan(points, None, config)), preprocess_scan_on_host(points, None, config)
+    jax.tree.map(np.testing.assert_array_equal, device, host)
+    assert host.mask.sum() > 200
+
+
+@BUILDERS
+def test_capacity_thins_evenly(preprocess) -> None:
+    angle = np.linspace(0, 2 * np.pi, 1000, endpoint=False)
+    circle = 20 * np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=1).astype(np.float32)
+    config = PreprocessConfig(voxel_size_m=0.01, num_outlier_neighbours=0, capacity=64)
+    points = np.asarray(preprocess(circle, None, config).points)
+    gaps = np.diff(np.sort(np.arctan2(points[:, 1], points[:, 0])))
+    assert gaps.max() < 2.1 * 2 * np.pi / 64
+
+
+@BUILDERS
+def test_outliers_are_dropped(preprocess) -> None:
+    points = scan(4, 300, spread=1.0) + np.float32(10)
+    points[7] = [-20, -20, -10]
+    cloud = preprocess(points, None, CONFIG)
+    assert (np.asarray(cloud.points)[np.asarray(cloud.mask)] > 0).all()
+    kept = preprocess(points, None, replace(CONFIG, num_outlier_neighbours=0))
+    np.testing.assert_array_equal(kept.points[0], points[7])
+
+
+def test_padded_equals_unpadded() -> None:
+    points = scan(5, 200)
+    padded = np.concatenate([points, np.full((56, 3), np.nan, np.float32)])
+    short, long = preprocess_scan(points, None, CONFIG), preprocess_scan(padded, np.arange(256) < 200, CONFIG)
+    jax.tree.map(np.testing.assert_array_equal, jax.device_get(short), jax.device_get(long))
+
+
+def test_gradient_is_finite() -> None:
+    gradient = jax.jit(jax.grad(lambda p, mask: jnp.sum(preprocess_scan(p, mask, CONFIG).points ** 2)))
+    for n in (200, 1, 0):
+        assert np.isfinite(gradient(scan(6, 200), np.arange(200) < n)).all()
+
+
+def test_vmap_equals_a_loop() -> None:
+    scans = np.stack([scan(seed, 200) for seed in range(3)])
+    batched = jax.device_get(jax.vmap(lambda p: preprocess_scan(p, None, CONFIG))(scans))
+    for i in range(3):
+        one = jax.device_get(preprocess_scan(scans[i], None, CONFIG))
+        jax.tree.map(np.testing.assert_array_equal, one, PointCloud(batched.points[i], batched.mask[i]))
+
+
+def test_second_call_compiles_nothing(assert_compiles_nothing) -> None:
+    preprocess_scan(scan(7, 200), None, CONFIG)
+    with assert_compiles_nothing():
+        preprocess_scan(scan(8, 200), None, CONFIG)
+
+
+def test_empty_scan_is_an_empty_cloud() -> None:
+    for preprocess in (preprocess_scan, preprocess_scan_on_host):
+        assert not np.any(preprocess(np.zeros((0, 3), np.float32), None, CONFIG).mask)
+
+
+def test_wrong_arguments_are_named() -> None:
+    for preprocess in (preprocess_scan, preprocess_scan_on_host):
+        with pytest.raises(ValueError, match="^points: expected shape"):
+            preprocess(np.ones((5, 4), np.float32), None, CONFIG)
+        with pytest.raises(ValueError, match="^mask: expected"):
+            preprocess(scan(0), np.ones(5, bool), CONFIG)
+    for name, value in (
+        ("min_range_m", 90.0),
+        ("voxel_size_m", 0.0),
+        ("voxel_size_m", 1e-6),
+        ("capacity", 0),
+        ("capacity", 1 << 16),
+        ("num_outlier_neighbours", -1),
+        ("outlier_sigmas", 0.0),
+    ):
+        with pytest.raises(ValueError, match=f"^{name}: expected"):
+            PreprocessConfig(**{name: value})

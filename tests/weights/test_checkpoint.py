@@ -1,0 +1,198 @@
+from __future__ import annotations
+
+import importlib.util
+import io
+import os
+import pickle
+import subprocess
+import sys
+import zipfile
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from dpmjax.deeppointmap import Model, ModelConfig, init_model, model_preset
+from dpmjax.weights import load_model, read_card, read_torch_file, save_model
+from dpmjax.weights.__main__ import main
+from dpmjax.weights.config_json import config_from_json, config_to_json
+from tests.weights.published import published_tensors
+
+needs_torch = pytest.mark.skipif(
+    importlib.util.find_spec("torch") is None, reason="PyTorch is not installed (pip install dpmjax[torch])"
+)
+
+
+@pytest.fixture(scope="module")
+def model() -> Model:
+    return init_model(jax.random.key(0), model_preset("tiny"))
+
+
+def assert_same(a: Model, b: Model, rtol: float = 0) -> None:
+    assert a.config == b.config
+    jax.tree.map(lambda x, y: np.testing.assert_allclose(x, y, rtol=rtol, atol=rtol / 100), a.params, b.params)
+
+
+def test_saved_model_is_the_loaded_one(model: Model, tmp_path: Path) -> None:
+    save_model(model, tmp_path / "m.safetensors", card="trained on a town")
+    assert_same(load_model(tmp_path / "m.safetensors"), model)
+    assert read_card(tmp_path / "m.safetensors") == "trained on a town"
+
+
+def test_half_precision_costs_three_digits_and_is_half_the_size(model: Model, tmp_path: Path) -> None:
+    for dtype in ("float16", "float32"):
+        save_model(model, tmp_path / f"{dtype}.safetensors", dtype=dtype)
+    half = load_model(tmp_path / "float16.safetensors")
+    assert all(leaf.dtype == jnp.float32 for leaf in jax.tree.leaves(half.params))
+    assert_same(half, model, rtol=1e-3)
+    sizes = [(tmp_path / f"{dtype}.safetensors").stat().st_size for dtype in ("float16", "float32")]
+    assert sizes[0] < 0.6 * sizes[1]
+
+
+@pytest.mark.parametrize("config", [model_preset("tiny"), model_preset("paper")], ids=["tiny", "paper"])
+def test_configuration_survives_json(config: ModelConfig) -> None:
+    assert config_from_json(config_to_json(config), ModelConfig) == config
+
+
+def test_wrong_configurations_are_named() -> None:
+    with pytest.raises(ValueError, match="ModelConfig: unknown field 'colour'"):
+        config_from_json({"colour": 1}, ModelConfig)
+    with pytest.raises(ValueError, match="ModelConfig.encoder.stem_channels: expected int, got 'x'"):
+        config_from_json({"encoder": {"stem_channels": "x"}}, ModelConfig)
+
+
+@needs_torch
+def test_full_size_checkpoint_is_loaded_by_its_tensors(tmp_path: Path) -> None:
+    import torch
+
+    config = ModelConfig()
+    tensors = published_tensors(config)
+    torch.save(
+        {part: {k: torch.tensor(v) for k, v in named.items()} for part, named in tensors.items()}, tmp_path / "x.pth"
+    )
+    model = load_model(tmp_path / "x.pth")
+    assert model.config == config
+    kernel = tensors["encoder"]["downsampler.2.irm.1.pw_conv.0.weight"][:, :, 0].T
+    np.testing.assert_array_equal(model.params["encoder"]["stage_2"]["inverted_residual_1"]["expand"]["kernel"], kernel)
+    kernel = tensors["decoder"]["descriptor_attention.2.cross_attn.in_proj_weight"].T
+    np.testing.assert_array_equal(model.params["decoder"]["layer_2"]["cross_attention"]["in_kernel"], kernel)
+
+
+@needs_torch
+def test_old_format_is_read_by_pytorch(model: Model, tmp_path: Path) -> None:
+    import torch
+
+    content = {"a": torch.arange(6.0).reshape(2, 3).T, "b": {"c": torch.ones(2, dtype=torch.float16)}}
+    torch.save(content, tmp_path / "old.pth", _use_new_zipfile_serialization=False)
+    torch.save(content, tmp_path / "new.pth")
+    for name in ("old.pth", "new.pth"):
+        found = read_torch_file(tmp_path / name)
+        np.testing.assert_array_equal(found["a"], np.arange(6.0).reshape(2, 3).T)
+        np.testing.assert_array_equal(found["b"]["c"], np.ones(2))
+
+
+@needs_torch
+def test_parameters_and_ordered_dictionaries_are_read(tmp_path: Path) -> None:
+    import torch
+
+    torch.save(torch.nn.Linear(2, 3).state_dict(), tmp_path / "x.pth")
+    assert {name: array.shape for name, array in read_torch_file(tmp_path / "x.pth").items()} == {
+        "weight": (3, 2),
+        "bias": (3,),
+    }
+
+
+def archive(path: Path, content: bytes) -> Path:
+    with zipfile.ZipFile(path, "w") as file:
+        file.writestr("x/data.pkl", content)
+    return path
+
+
+class Evil:
+    def __reduce__(self) -> tuple[object, tuple[str]]:
+        return os.system, ("exit 1",)
+
+
+def test_checkpoint_that_would_run_something_is_refused(tmp_path: Path) -> None:
+    path = archive(tmp_path / "x.pth", pickle.dumps({"encoder": Evil()}))
+    with pytest.raises(ValueError, match="which is no tensor"):
+        load_model(path)
+
+
+def test_tensor_beyond_its_storage_is_refused(tmp_path: Path) -> None:
+    class TorchPickler(pickle._Pickler):
+        """Writes the name of a storage and of the function that makes tensors, without PyTorch."""
+
+        def save(self, obj: object, *_: object, **__: object) -> None:
+            if isinstance(obj, str) and obj.startswith("c"):
+                self.write(obj.encode())
+            else:
+                super().save(obj)
+
+    stream = io.BytesIO()
+    stream.write(pickle.PROTO + b"\x02ctorch._utils\n_rebuild_tensor_v2\n(")
+    # persistent id ('storage', torch.FloatStorage, '0', 'cpu', 2), then offset 0, shape (3,), strides (1,)
+    stream.write(b"(X\x07\x00\x00\x00storagectorch\nFloatStorage\nX\x01\x00\x00\x000X\x03\x00\x00\x00cpuK\x02tQ")
+    stream.write(b"K\x00(K\x03t(K\x01t\x89}tR.")
+    path = tmp_path / "x.pth"
+    with zipfile.ZipFile(path, "w") as file:
+        file.writestr("x/data.pkl", stream.getvalue())
+        file.writestr("x/data/0", np.ones(2, np.float32).tobytes())
+    with pytest.raises(ValueError, match="reaches beyond its storage"):
+        read_torch_file(path)
+
+
+def test_old_format_without_pytorch_says_what_to_install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "torch", None)
+    (tmp_path / "x.pth").write_bytes(b"\x80\x02no archive")
+    with pytest.raises(ValueError, match=r"pip install dpmjax\[torch\]"):
+        load_model(tmp_path / "x.pth")
+
+
+def test_other_layouts_are_named(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="expected a dictionary of encoder and decoder"):
+        load_model(archive(tmp_path / "a.pth", pickle.dumps({"encoder": {}})))
+    with pytest.raises(ValueError, match="encoder: unknown tensor point_mlp9.weight"):
+        load_model(archive(tmp_path / "b.pth", pickle.dumps({"encoder": {"point_mlp9.weight": 1}, "decoder": {}})))
+    with pytest.raises(ValueError, match="0 stages"):
+        load_model(archive(tmp_path / "c.pth", pickle.dumps({"encoder": {}, "decoder": {}})))
+
+
+def test_broken_files_are_named(model: Model, tmp_path: Path) -> None:
+    save_model(model, tmp_path / "whole.safetensors")
+    content = (tmp_path / "whole.safetensors").read_bytes()
+    (tmp_path / "cut.safetensors").write_bytes(content[: len(content) // 2])
+    with pytest.raises(ValueError, match="cut.safetensors: not a whole safetensors file"):
+        load_model(tmp_path / "cut.safetensors")
+    with pytest.raises(ValueError, match="none.safetensors: no such file"):
+        load_model(tmp_path / "none.safetensors")
+    with pytest.raises(ValueError, match="none.pth: no such file"):
+        load_model(tmp_path / "none.pth")
+
+
+def test_unknown_name_lists_what_is_shipped() -> None:
+    with pytest.raises(ValueError, match="name of a shipped model .*got 'dpm_huge'"):
+        load_model("dpm_huge")
+
+
+def test_parameters_that_half_precision_cannot_hold_are_refused(model: Model, tmp_path: Path) -> None:
+    large = Model(jax.tree.map(lambda leaf: leaf + 1e6, model.params), model.config)
+    with pytest.raises(ValueError, match="not finite in float16"):
+        save_model(large, tmp_path / "x.safetensors", dtype="float16")
+
+
+def test_converter_converts(model: Model, tmp_path: Path) -> None:
+    save_model(model, tmp_path / "a.safetensors")
+    assert main([str(tmp_path / "a.safetensors"), str(tmp_path / "b.safetensors"), "--card", "copy"]) == 0
+    assert_same(load_model(tmp_path / "b.safetensors"), model)
+    assert read_card(tmp_path / "b.safetensors") == "copy"
+
+
+def test_converter_tells_bad_input_in_one_line(tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "dpmjax.weights", str(tmp_path / "no.pth"), str(tmp_path / "x.safetensors")]
+    result = subprocess.run(command, capture_output=True, text=True)
+    assert result.returncode == 2
+    assert result.stderr.strip().count("\n") == 0
+    assert "no.pth: no such file" in result.stderr
