@@ -7,7 +7,7 @@ import pytest
 
 from dpmjax.deeppointmap import MatchConfig, match_descriptors, merge_clouds
 from dpmjax.deeppointmap.matching import best_pairs
-from dpmjax.geometry import exp_se3, transform_points
+from dpmjax.geometry import ConsensusConfig, exp_se3, transform_points
 from dpmjax.types import DescriptorCloud, Registration
 from tests.tolerances import ACCUMULATED, ROUNDING
 
@@ -217,3 +217,19 @@ def test_wrong_arguments_are_named() -> None:
         MatchConfig(pair_ratio=1.5)
     with pytest.raises(ValueError, match="^T_map_cloud: expected shape"):
         merge_clouds(DescriptorCloud(jnp.ones((2, 3, 3)), jnp.ones((2, 3, 5)), jnp.ones((2, 3), bool)), np.eye(4))
+
+
+def test_consensus_finds_the_motion_where_scores_mislead() -> None:
+    """A fifth of the pairs is right, and those are not the ones with the best scores."""
+    rng = np.random.default_rng(3)
+    source, target, _ = clouds(4, n=128)
+    right = np.linalg.norm(np.asarray(transform_points(T, source))[:, None] - target, axis=2) < 1e-3
+    similarity = rng.uniform(-0.2, 0.2, right.shape).astype(np.float32)
+    wrong = rng.permutation(128)
+    similarity[wrong, np.arange(128)] = 0.9
+    similarity[np.where(right & (rng.random(128) < 0.4)[:, None])] = 0.92
+    by_score = match_descriptors(source, target, similarity, no_offsets, config=MatchConfig(pair_ratio=1.0))
+    config = MatchConfig(pair_ratio=1.0, consensus=ConsensusConfig())
+    by_consensus = match_descriptors(source, target, similarity, no_offsets, config=config)
+    np.testing.assert_allclose(by_consensus.T_target_source, T, atol=0.1)
+    assert np.abs(by_score.T_target_source - T).max() > 1.0

@@ -1,15 +1,18 @@
 from __future__ import annotations
 
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from dpmjax.deeppointmap.model import Model, ModelConfig, encode_pyramid, init_model, model_shapes
 from dpmjax.geometry.pyramid import PyramidConfig, PyramidStage
 from dpmjax.geometry.pyramid_host import build_pyramid_on_host
 from dpmjax.nets import DecoderConfig, EncoderConfig
-from dpmjax.nets.point_encoder import NeighbourhoodMaximum
+from dpmjax.nets.point_encoder import NeighbourhoodMaximum, turn_to_bearing
 from dpmjax.types import PointPyramid
 from tests.tolerances import ACCUMULATED, ROUNDING
 
@@ -155,3 +158,26 @@ def test_wrong_pyramids_and_widths_are_named(model: Model) -> None:
         EncoderConfig(compute_dtype="float16")
     with pytest.raises(ValueError, match="^decoder.input_channels: expected the encoder's output_channels 128, got 64"):
         ModelConfig(decoder=DecoderConfig(input_channels=64))
+
+
+def test_bearing_frame_does_not_see_a_turn_about_the_vertical() -> None:
+    config = replace(CONFIG, encoder=replace(CONFIG.encoder, frame="bearing"))
+    model = init_model(jax.random.key(0), config)
+    pyramid = pyramid_of(points(5))
+    turn = Rotation.from_euler("z", 130, degrees=True).as_matrix().astype(np.float32)
+    turned = pyramid.replace(
+        levels=tuple(level.replace(positions=level.positions @ turn.T) for level in pyramid.levels)
+    )
+    before, after = encode_pyramid(model, pyramid), encode_pyramid(model, turned)
+    np.testing.assert_allclose(after.features, before.features, atol=1e-4)
+    np.testing.assert_allclose(after.positions, before.positions @ turn.T, atol=1e-4)
+    in_lidar_frame = encode_pyramid(init_model(jax.random.key(0), CONFIG), turned).features
+    assert np.abs(in_lidar_frame - before.features).max() > 0.1
+
+
+def test_direction_along_the_ray_is_x() -> None:
+    positions = np.array([[3.0, 4, 5], [0, 0, 2], [0, -2, 0]], np.float32)
+    across = np.array([[-0.8, 0.6, 0], [0, 1, 0], [1, 0, 0]], np.float32)
+    expected = np.array([[5.0, 0, 5], [0, 0, 2], [2, 0, 0]])
+    np.testing.assert_allclose(turn_to_bearing(positions, positions), expected, atol=1e-6)
+    np.testing.assert_allclose(turn_to_bearing(across, positions), np.tile([0.0, 1, 0], (3, 1)), atol=1e-6)

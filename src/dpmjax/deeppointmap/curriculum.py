@@ -121,11 +121,13 @@ def training_preset(name: Preset) -> TrainingConfig:
     if name == "tiny":
         return TrainingConfig(
             model=model,
-            curriculum=(CurriculumStage(2, 360), CurriculumStage(4, 20)),
-            overlap_steps=40,
+            curriculum=(CurriculumStage(2, 700), CurriculumStage(4, 40)),
+            overlap_steps=60,
             sampling=SamplingConfig(num_scans=16, max_side=2, num_overlap_pairs=8),
-            augment=AugmentConfig(max_tilt_rad=0.05, translation_sigma_m=1.0),
-            objective=ObjectiveConfig(max_close=4),
+            # In so few steps: less disturbance, more positives, and the encoder is told directly.
+            augment=AugmentConfig(max_drop_ratio=0.3, max_tilt_rad=0.05, translation_sigma_m=0.3),
+            objective=ObjectiveConfig(coarse_weight=1.0, positive_radius_m=1.5, max_close=4),
+            learning_rate=2e-3,
             warmup_steps=20,
             max_gradient_norm=5.0,
         )

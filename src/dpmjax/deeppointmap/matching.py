@@ -17,6 +17,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from dpmjax.checks import as_float, as_mask, as_points, require_count, require_positive, require_shape
 from dpmjax.geometry.alignment import weighted_svd
+from dpmjax.geometry.consensus import ConsensusConfig, find_consensus
 from dpmjax.geometry.poses import transform_points
 from dpmjax.types import AnyArray, Registration
 
@@ -42,6 +43,8 @@ class MatchConfig:
         inlier_sigmas: inliers are no farther than mean + so many standard deviations of those before.
         min_num_inliers: a choice of fewer is not taken.
         num_confident: the confidence is the mean score of so many first inliers.
+        consensus: where given, the first inliers are instead the pairs that agree on one motion. Right pairs may
+            then be few: networks of little training, or places that look alike.
     """
 
     temperature: float = 0.1
@@ -53,6 +56,7 @@ class MatchConfig:
     inlier_sigmas: float = 3.0
     min_num_inliers: int = 30
     num_confident: int = 30
+    consensus: ConsensusConfig | None = None
 
     def __post_init__(self) -> None:
         for name in ("temperature", "pair_ratio", "max_offset_m", "inlier_sigmas"):
@@ -205,6 +209,16 @@ def _first_inliers(scores: Float[Array, " p"], is_used: Bool[Array, " p"], confi
     return is_good | is_best
 
 
+def _agreeing(
+    source: Float[Array, "p 3"], target: Float[Array, "p 3"], is_used: Bool[Array, " p"], config: ConsensusConfig
+) -> Bool[Array, " p"]:
+    """Pairs that the consensus supports, in both directions; it is sought in the first one only, a quarter of the work."""
+    half = len(source) // 2
+    T_target_source = find_consensus(source[:half], target[:half], is_used[:half], config=config).T_target_source
+    squared = jnp.sum((transform_points(T_target_source, source) - target) ** 2, axis=1)
+    return is_used & (squared < config.inlier_m**2)
+
+
 def _choose_inliers(
     source: Float[Array, "p 3"],
     target: Float[Array, "p 3"],
@@ -221,7 +235,11 @@ def _choose_inliers(
         # Taken where they are enough; a choice that does not change any more stays as it is.
         return jnp.where(jnp.sum(chosen) >= config.min_num_inliers, chosen, is_inlier)
 
-    return lax.fori_loop(0, config.num_rounds, choose, _first_inliers(scores, is_used, config))
+    if config.consensus is None:
+        first = _first_inliers(scores, is_used, config)
+    else:
+        first = _agreeing(source, target, is_used, config.consensus)
+    return lax.fori_loop(0, config.num_rounds, choose, first)
 
 
 def _solve(

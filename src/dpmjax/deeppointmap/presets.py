@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from typing import Literal
 
+from dpmjax.deeppointmap.matching import MatchConfig
 from dpmjax.deeppointmap.model import ModelConfig
+from dpmjax.geometry.consensus import ConsensusConfig
 from dpmjax.geometry.pyramid import PyramidConfig, PyramidStage
 from dpmjax.nets.decoder import DecoderConfig
 from dpmjax.nets.point_encoder import EncoderConfig
@@ -23,9 +25,10 @@ PRESETS: dict[Preset, ModelConfig] = {
                 PyramidStage(16, (0.8,), 8),
             )
         ),
-        encoder=EncoderConfig(stem_channels=8, expansion=2, output_channels=64),
-        decoder=DecoderConfig(input_channels=64, model_channels=64, num_heads=4),
+        encoder=EncoderConfig(stem_channels=8, expansion=2, output_channels=64, frame="bearing"),
+        decoder=DecoderConfig(input_channels=64, model_channels=64, num_heads=2),
         preprocess=PreprocessConfig(capacity=4096),
+        matching=MatchConfig(consensus=ConsensusConfig()),
     ),
     "small": ModelConfig(
         pyramid=PyramidConfig(
@@ -37,8 +40,9 @@ PRESETS: dict[Preset, ModelConfig] = {
                 PyramidStage(16, (0.8, 1.6), 16),
             )
         ),
-        encoder=EncoderConfig(stem_channels=16, expansion=2, output_channels=128),
+        encoder=EncoderConfig(stem_channels=16, expansion=2, output_channels=128, frame="bearing"),
         decoder=DecoderConfig(input_channels=128, model_channels=128),
+        matching=MatchConfig(consensus=ConsensusConfig()),
     ),
     "paper": ModelConfig(),
 }

@@ -3,13 +3,14 @@
 Down the pyramid each stage gathers what lies around its points (set abstraction) and refines it (inverted residual
 blocks); then the features of the coarse levels are carried up again (feature propagation).
 
-A linear map of [feature_j, (position_j - position_i) / r] is a map of j's row minus a map of i's position. So the
-large matrix products run over points, and what is done for each neighbour is one subtraction, norm and maximum.
+A linear map of [feature_j, (position_j - position_i) / r] is a map of j's features and one of three numbers. So the
+large matrix products run over points, and what is done for each neighbour is one sum, norm and maximum.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal, get_args
 
 import flax.linen as nn
 import jax.numpy as jnp
@@ -17,8 +18,12 @@ from jax import lax
 from jaxtyping import Array, Float, Int
 
 from dpmjax.checks import require_count
-from dpmjax.nets.layers import NORM_EPSILON, ComputeDtype, layer_norm, linear, require_compute_dtype
+from dpmjax.nets.layers import ComputeDtype, layer_norm, linear, require_compute_dtype
+from dpmjax.nets.neighbourhood import maximum_of_normalised
 from dpmjax.types import AnyArray, Interpolation, PointPyramid
+
+
+Frame = Literal["lidar", "bearing"]
 
 
 @dataclass(frozen=True)
@@ -29,18 +34,24 @@ class EncoderConfig:
         stem_channels: of the input level; each stage down doubles them.
         expansion: of the hidden layer in inverted residual blocks.
         output_channels: of a descriptor.
+        frame: in which directions are seen: "lidar", its axes (the published networks, which have to learn that a
+            scan may be turned), or "bearing", along and across the ray from the lidar to each point; descriptors then
+            do not change when the scan is turned about the vertical.
         compute_dtype: of the matrix products over features.
     """
 
     stem_channels: int = 16
     expansion: int = 4
     output_channels: int = 128
+    frame: Frame = "lidar"
     compute_dtype: ComputeDtype = "float32"
 
     def __post_init__(self) -> None:
         require_count("stem_channels", self.stem_channels)
         require_count("expansion", self.expansion)
         require_count("output_channels", self.output_channels)
+        if self.frame not in get_args(Frame):
+            raise ValueError(f"frame: expected one of {', '.join(get_args(Frame))}, got {self.frame!r}")
         require_compute_dtype(self.compute_dtype)
 
 
@@ -50,11 +61,13 @@ class NeighbourhoodMaximum(nn.Module):
     Attributes:
         num_features: channels of the result.
         radius: of the neighbourhood, normalised.
+        frame: in which offsets are seen.
         compute_dtype: of the matrix product over features; the part of the positions is float32.
     """
 
     num_features: int
     radius: float
+    frame: Frame = "lidar"
     compute_dtype: ComputeDtype = "float32"
 
     @nn.compact
@@ -77,26 +90,26 @@ class NeighbourhoodMaximum(nn.Module):
         from_features = jnp.matmul(
             features.astype(dtype), kernel[:-3].astype(dtype), preferred_element_type=jnp.float32
         )
-        of_points = from_features + bias + _project(positions, kernel[-3:] / self.radius)
-        of_queries = _project(queries, kernel[-3:] / self.radius)
+        offsets = (positions[neighbours] - queries[:, None]) / self.radius
+        if self.frame == "bearing":
+            offsets = turn_to_bearing(offsets, queries[:, None])
         # relu grows with its argument, so it may follow the maximum.
-        return nn.relu(_maximum_of_normalised(of_points, of_queries, neighbours, scale) + norm_bias)
+        maximum = maximum_of_normalised(from_features + bias, offsets, kernel[-3:], neighbours, scale)
+        return nn.relu(maximum + norm_bias)
 
 
-def _project(positions: Float[Array, "n 3"], kernel: Float[Array, "3 f"]) -> Float[Array, "n f"]:
-    return jnp.matmul(positions, kernel, precision=lax.Precision.HIGHEST)
+def turn_to_bearing(vectors: Float[Array, "... 3"], positions: Float[Array, "... 3"]) -> Float[Array, "... 3"]:
+    """Vectors at positions as seen along the ray from the lidar: x away from it, y to the left, z up.
 
-
-def _maximum_of_normalised(
-    of_points: Float[Array, "n f"],
-    of_queries: Float[Array, "m f"],
-    neighbours: Int[AnyArray, "m k"],
-    scale: Float[Array, " f"],
-) -> Float[Array, "m f"]:
-    """max_j scale * x_ij / |x_ij| with x_ij = of_points_j - of_queries_i, its mean over channels being zero."""
-    differences = of_points[neighbours] - of_queries[:, None]
-    inverse_deviation = lax.rsqrt(jnp.mean(differences**2, axis=-1, keepdims=True) + NORM_EPSILON)
-    return jnp.max(differences * inverse_deviation * scale, axis=1)
+    A turn of the lidar about its z axis changes nothing in them. On the axis itself x stays x.
+    """
+    squared = jnp.sum(positions[..., :2] ** 2, axis=-1)
+    is_off_axis = squared > 0
+    inverse = lax.rsqrt(jnp.where(is_off_axis, squared, 1))
+    cosine = jnp.where(is_off_axis, positions[..., 0] * inverse, 1)
+    sine = jnp.where(is_off_axis, positions[..., 1] * inverse, 0)
+    x, y, z = vectors[..., 0], vectors[..., 1], vectors[..., 2]
+    return jnp.stack([cosine * x + sine * y, cosine * y - sine * x, z], axis=-1)
 
 
 class InvertedResidual(nn.Module):
@@ -105,11 +118,13 @@ class InvertedResidual(nn.Module):
     Attributes:
         radius: of the neighbourhood, normalised.
         expansion: how much wider the hidden layer is.
+        frame: in which offsets are seen.
         compute_dtype: of the matrix products.
     """
 
     radius: float
     expansion: int
+    frame: Frame = "lidar"
     compute_dtype: ComputeDtype = "float32"
 
     @nn.compact
@@ -118,7 +133,7 @@ class InvertedResidual(nn.Module):
     ) -> Float[Array, "m f"]:
         """Features (m, f) and positions (m, 3) of one level, and neighbours (m, k) in it."""
         num_features = features.shape[1]
-        x = NeighbourhoodMaximum(num_features, self.radius, self.compute_dtype, name="neighbourhood")(
+        x = NeighbourhoodMaximum(num_features, self.radius, self.frame, self.compute_dtype, name="neighbourhood")(
             features, positions, positions, neighbours
         )
         x = linear(num_features * self.expansion, self.compute_dtype, "expand")(x)
@@ -134,12 +149,14 @@ class Stage(nn.Module):
         num_features: channels of the result.
         radii: of the set abstraction, and of each block after it.
         expansion: of the blocks.
+        frame: in which offsets are seen.
         compute_dtype: of the matrix products.
     """
 
     num_features: int
     radii: tuple[float, ...]
     expansion: int
+    frame: Frame = "lidar"
     compute_dtype: ComputeDtype = "float32"
 
     @nn.compact
@@ -152,11 +169,11 @@ class Stage(nn.Module):
     ) -> Float[Array, "m f"]:
         """Features and positions of the level before, positions of this one, and the neighbours of each block."""
         first_radius, *radii = self.radii
-        x = NeighbourhoodMaximum(self.num_features, first_radius, self.compute_dtype, name="set_abstraction")(
-            features, positions, queries, neighbours[0]
-        )
+        rest = (self.frame, self.compute_dtype)
+        abstraction = NeighbourhoodMaximum(self.num_features, first_radius, *rest, name="set_abstraction")
+        x = abstraction(features, positions, queries, neighbours[0])
         for block, radius in enumerate(radii):
-            residual = InvertedResidual(radius, self.expansion, self.compute_dtype, name=f"inverted_residual_{block}")
+            residual = InvertedResidual(radius, self.expansion, *rest, name=f"inverted_residual_{block}")
             x = residual(x, queries, neighbours[block + 1])
         return x
 
@@ -202,10 +219,13 @@ class PointEncoder(nn.Module):
         config = self.config
         # What is not there may hold anything; cleared here, it cannot reach a gradient.
         positions = [jnp.where(level.mask[:, None], level.positions, 0) for level in pyramid.levels]
-        features = [linear(config.stem_channels, "float32", "stem")(positions[0])]
+        is_turned = config.frame == "bearing"
+        seen = turn_to_bearing(positions[0], positions[0]) if is_turned else positions[0]
+        features = [linear(config.stem_channels, "float32", "stem")(seen)]
         for stage, radii in enumerate(self.radii):
             num_features = config.stem_channels * 2 ** (stage + 1)
-            module = Stage(num_features, radii, config.expansion, config.compute_dtype, name=f"stage_{stage}")
+            rest = (config.expansion, config.frame, config.compute_dtype)
+            module = Stage(num_features, radii, *rest, name=f"stage_{stage}")
             level = pyramid.levels[stage + 1]
             features.append(module(features[-1], positions[stage], positions[stage + 1], level.neighbours))
         x = features.pop()

@@ -1,0 +1,118 @@
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from dpmjax.geometry import ConsensusConfig, find_consensus, transform_points
+
+
+def pairs_with_outliers(seed: int, num_right: int, num_wrong: int, noise_m: float = 0.2) -> tuple[np.ndarray, ...]:
+    """Source, target, the true motion, and who is right; positions as of descriptors in a street."""
+    rng = np.random.default_rng(seed)
+    extent = np.array([30.0, 30.0, 3.0])
+    source = rng.uniform(-extent, extent, (num_right + num_wrong, 3))
+    T = np.eye(4)
+    T[:3, :3] = Rotation.from_euler("z", rng.uniform(-180, 180), degrees=True).as_matrix()
+    T[:3, 3] = rng.uniform(-8, 8, 3)
+    target = source @ T[:3, :3].T + T[:3, 3] + noise_m * rng.normal(size=source.shape)
+    target[num_right:] = rng.uniform(-extent, extent, (num_wrong, 3))
+    order = rng.permutation(len(source))
+    return (
+        source[order].astype(np.float32),
+        target[order].astype(np.float32),
+        T,
+        np.arange(num_right + num_wrong)[order] < num_right,
+    )
+
+
+def errors(T: jax.Array, T_true: np.ndarray) -> tuple[float, float]:
+    difference = np.asarray(T, np.float64) @ np.linalg.inv(T_true)
+    angle = np.degrees(np.linalg.norm(Rotation.from_matrix(difference[:3, :3]).as_rotvec()))
+    return float(np.linalg.norm(np.asarray(T)[:3, 3] - T_true[:3, 3])), float(angle)
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize(("num_right", "num_wrong"), [(12, 0), (12, 116), (40, 88)])
+def test_motion_is_found_among_wrong_pairs(seed: int, num_right: int, num_wrong: int) -> None:
+    source, target, T, is_right = pairs_with_outliers(seed, num_right, num_wrong)
+    found = find_consensus(source, target)
+    metres, degrees = errors(found.T_target_source, T)
+    assert metres < 0.5
+    assert degrees < 1.0
+    assert np.asarray(found.is_inlier)[is_right].all()
+    assert not num_wrong or found.is_inlier[~is_right].mean() < 0.1
+
+
+def test_without_a_right_pair_support_is_that_of_chance() -> None:
+    chance = [float(find_consensus(*pairs_with_outliers(seed, 0, 128)[:2]).support) for seed in range(4)]
+    right = [float(find_consensus(*pairs_with_outliers(seed, 20, 108)[:2]).support) for seed in range(4)]
+    assert max(chance) < min(right)
+
+
+def test_padded_equals_unpadded() -> None:
+    source, target, _, _ = pairs_with_outliers(1, 15, 40)
+    plain = find_consensus(source, target)
+    padding = np.full((9, 3), np.nan, np.float32)
+    mask = np.arange(64) < 55
+    padded = find_consensus(np.concatenate([source, padding]), np.concatenate([target, padding]), mask)
+    np.testing.assert_allclose(padded.T_target_source, plain.T_target_source, atol=1e-5)
+    assert not padded.is_inlier[55:].any()
+    np.testing.assert_array_equal(padded.is_inlier[:55], plain.is_inlier)
+
+
+def test_moving_both_frames_moves_the_motion() -> None:
+    source, target, _, _ = pairs_with_outliers(2, 20, 40)
+    motions = [np.eye(4, dtype=np.float32) for _ in range(2)]
+    for T, angle in zip(motions, (70.0, -25.0), strict=True):
+        T[:3, :3] = Rotation.from_euler("xyz", [3, -2, angle], degrees=True).as_matrix()
+        T[:3, 3] = (4, -7, 1)
+    plain = np.asarray(find_consensus(source, target).T_target_source)
+    moved = find_consensus(transform_points(motions[0], source), transform_points(motions[1], target)).T_target_source
+    np.testing.assert_allclose(moved, motions[1] @ plain @ np.linalg.inv(motions[0]), atol=2e-3)
+
+
+@pytest.mark.parametrize("num_pairs", [0, 1, 2])
+def test_too_few_pairs_give_a_finite_motion_with_little_support(num_pairs: int) -> None:
+    source, target, _, _ = pairs_with_outliers(3, num_pairs, 0)
+    found = find_consensus(source, target)
+    assert np.isfinite(found.T_target_source).all()
+    assert found.support <= num_pairs
+
+
+def test_pairs_of_one_point_tell_nothing() -> None:
+    """Many pairs of one descriptor agree in all distances, 0; that must not outvote the others."""
+    source, target, T, _ = pairs_with_outliers(4, 12, 20)
+    crowd = np.tile(source[:1], (40, 1)), np.tile(target[:1] + 15, (40, 1))
+    found = find_consensus(np.concatenate([source, crowd[0]]), np.concatenate([target, crowd[1]]))
+    assert errors(found.T_target_source, T)[0] < 0.5
+
+
+def test_many_sets_at_once_and_no_gradient() -> None:
+    sets = [pairs_with_outliers(seed, 15, 30)[:2] for seed in (5, 6)]
+    source, target = (jnp.stack([pair[side] for pair in sets]) for side in (0, 1))
+    together = jax.vmap(find_consensus)(source, target)
+    for number in range(2):
+        alone = find_consensus(source[number], target[number])
+        np.testing.assert_allclose(together.T_target_source[number], alone.T_target_source, atol=1e-4)
+    gradient = jax.grad(lambda s: jnp.sum(find_consensus(s, target[0]).T_target_source))(source[0])
+    assert not gradient.any()
+
+
+@pytest.mark.parametrize("wrong", [{"agreement_m": 0.0}, {"num_seeds": 0}])
+def test_config_says_what_is_wrong(wrong: dict[str, float]) -> None:
+    with pytest.raises(ValueError, match=next(iter(wrong))):
+        ConsensusConfig(**wrong)  # type: ignore[arg-type]
+
+
+def test_wrong_shapes_are_named(as_user) -> None:
+    with pytest.raises(ValueError, match="^target: expected shape"):
+        find_consensus(np.zeros((3, 3), np.float32), np.zeros((4, 3), np.float32))
+
+
+def test_second_call_compiles_nothing(assert_compiles_nothing) -> None:
+    find_consensus(*pairs_with_outliers(7, 10, 3)[:2])
+    with assert_compiles_nothing():
+        find_consensus(*pairs_with_outliers(8, 10, 3)[:2])
