@@ -212,7 +212,7 @@ def _first_inliers(scores: Float[Array, " p"], is_used: Bool[Array, " p"], confi
 def _agreeing(
     source: Float[Array, "p 3"], target: Float[Array, "p 3"], is_used: Bool[Array, " p"], config: ConsensusConfig
 ) -> Bool[Array, " p"]:
-    """Pairs that the consensus supports, in both directions; it is sought in the first one only, a quarter of the work."""
+    """Pairs of both directions that the consensus supports; it is sought in the first alone, a quarter of the work."""
     half = len(source) // 2
     T_target_source = find_consensus(source[:half], target[:half], is_used[:half], config=config).T_target_source
     squared = jnp.sum((transform_points(T_target_source, source) - target) ** 2, axis=1)

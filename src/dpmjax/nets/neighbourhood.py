@@ -1,4 +1,4 @@
-"""The maximum over neighbours of normalised differences: the inner loop of the encoder, with a backward pass of its own.
+"""The maximum over neighbours of normalised differences, the inner loop of the encoder, with its own backward pass.
 
 Left to itself, the derivative of gather, norm and maximum over (m, k, f) numbers takes fifteen times as long as the
 value on a CPU. Here one neighbour after the other is done, forward and back, on (m, f) numbers that stay in the cache.

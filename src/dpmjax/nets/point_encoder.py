@@ -22,7 +22,6 @@ from dpmjax.nets.layers import ComputeDtype, layer_norm, linear, require_compute
 from dpmjax.nets.neighbourhood import maximum_of_normalised
 from dpmjax.types import AnyArray, Interpolation, PointPyramid
 
-
 Frame = Literal["lidar", "bearing"]
 
 
