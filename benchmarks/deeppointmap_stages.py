@@ -143,7 +143,7 @@ def _cloud(model: dpmjax.Model, num_descriptors: int, *, seed: int) -> Descripto
     return DescriptorCloud(jnp.asarray(positions), jnp.asarray(features), jnp.ones(num_descriptors, bool))
 
 
-def _timed(case: str, parts: dict[str, Callable[[], object]], quick: bool, repeats: int = 20) -> list[Row]:
+def _timed(case: str, parts: dict[str, Callable[[], object]], quick: bool, repeats: int = 12) -> list[Row]:
     rows: list[Row] = []
     for name, function in parts.items():
         timing = measure(function, repeats=3 if quick else repeats).rows(f"{case}: {name}")
