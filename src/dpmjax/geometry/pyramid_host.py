@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from concurrent.futures import Future, ThreadPoolExecutor
 from typing import NamedTuple
 
 import jax
@@ -53,17 +54,26 @@ def build_pyramid_on_host(
         raise ValueError(f"mask: expected bool of shape {points.shape[:1]}, got {mask.dtype} of {mask.shape}")
     require_count("num_threads", num_threads)
     points = np.where(mask[:, None], points, np.float32(0))
-    levels = [PyramidLevel(points, mask, np.zeros(0, np.int32), ())]
-    order = farthest_points_on_host(points, mask, config.stages[0].num_points)
+    order = farthest_points_on_host(points, mask, config.stages[0].num_points).astype(np.int32)
+    # Two searches at a time: what each does besides its tree is then hidden as well.
+    num_workers = max(1, num_threads // 2)
     # Valid points stand in front on every level but the first, where `rows` says which they are.
-    below = _Searchable(points[mask], np.flatnonzero(mask).astype(np.int32), num_threads)
-    searched = [below]
+    searched = [_Searchable(points[mask], np.flatnonzero(mask).astype(np.int32), num_workers)]
     for stage in config.stages:
-        chosen = order[: stage.num_points] if len(levels) == 1 else np.arange(min(stage.num_points, len(order)))
-        here = _Searchable(points[order[: stage.num_points]], np.arange(len(chosen), dtype=np.int32), num_threads)
-        levels.append(_level(here, below, chosen.astype(np.int32), stage))
-        searched.append(here)
-        below = here
+        sampled = points[order[: stage.num_points]]
+        searched.append(_Searchable(sampled, np.arange(len(sampled), dtype=np.int32), num_workers))
+    levels = [PyramidLevel(points, mask, np.zeros(0, np.int32), ())]
+    with ThreadPoolExecutor(min(num_threads, 2)) as pool:
+        searches = [
+            _Searches(
+                pool.submit(below.nearest, here.points, stage.num_neighbours),
+                pool.submit(here.nearest, here.points, stage.num_neighbours) if len(stage.radii) > 1 else None,
+            )
+            for below, here, stage in zip(searched, searched[1:], config.stages, strict=False)
+        ]
+        for here, found, stage in zip(searched[1:], searches, config.stages, strict=True):
+            chosen = order[: stage.num_points] if len(levels) == 1 else here.rows
+            levels.append(_level(here.points, chosen, found, stage))
     steps = range(config.num_interpolations)
     up = [_interpolate(levels[-2 - step], searched[-2 - step], searched[-1 - step]) for step in steps]
     return PointPyramid(tuple(levels), tuple(up))
@@ -114,18 +124,20 @@ def _sample_by_buckets(points: Float[np.ndarray, "n 3"], num_samples: int) -> In
 class _Searchable:
     """Valid points with a tree, and the row of each in the padded level."""
 
-    def __init__(self, points: Float[np.ndarray, "n 3"], rows: Int[np.ndarray, " n"], num_threads: int):
+    def __init__(self, points: Float[np.ndarray, "n 3"], rows: Int[np.ndarray, " n"], num_workers: int):
         self.points = points.astype(np.float64)
         self.rows = rows
-        self.num_threads = num_threads
+        self.num_workers = num_workers
         self.tree = cKDTree(self.points, leafsize=16, balanced_tree=False, compact_nodes=False)
 
     def nearest(self, queries: Float[np.ndarray, "m 3"], k: int) -> _Found:
         """The min(k, n) nearest of each query, nearest first; of equally near ones the lower index first."""
         num_points = len(self.points)
         num_found = min(k, num_points)
+        if num_found == 0:
+            return _Found(np.zeros((len(queries), 0), np.int32), np.zeros((len(queries), 0)))
         num_asked = min(num_found + 1, num_points)  # one more shows whether the last is tied with what was left out
-        answer = self.tree.query(queries, [*range(1, num_asked + 1)], workers=self.num_threads)
+        answer = self.tree.query(queries, [*range(1, num_asked + 1)], workers=self.num_workers)
         distances, indices = np.asarray(answer[0]), np.asarray(answer[1])
         tied = np.flatnonzero(np.any(distances[:, 1:] == distances[:, :-1], axis=1))
         for start in range(0, len(tied), TIED_ROWS_AT_ONCE):
@@ -141,16 +153,20 @@ class _Found(NamedTuple):
     distances: Float[np.ndarray, "m k"]
 
 
-def _level(here: _Searchable, below: _Searchable, chosen: Int[np.ndarray, " v"], stage: PyramidStage) -> PyramidLevel:
+class _Searches(NamedTuple):
+    below: Future[_Found]
+    here: Future[_Found] | None
+
+
+def _level(
+    points: Float[np.ndarray, "v 3"], chosen: Int[np.ndarray, " v"], searches: _Searches, stage: PyramidStage
+) -> PyramidLevel:
     num_rows, num_valid = stage.num_points, len(chosen)
-    positions = _padded(here.points.astype(np.float32), num_rows)
+    positions = _padded(points.astype(np.float32), num_rows)
     neighbours = [np.zeros((num_rows, stage.num_neighbours), np.int32) for _ in stage.radii]
     if num_valid > 0:
-        searches = [below.nearest(here.points, stage.num_neighbours)]
-        if len(stage.radii) > 1:
-            searches.append(here.nearest(here.points, stage.num_neighbours))
         for block, radius in enumerate(stage.radii):
-            found = searches[min(block, 1)]
+            found = (searches.below if block == 0 or searches.here is None else searches.here).result()
             is_within = found.distances <= radius * RADIUS_SLACK
             neighbours[block][:num_valid] = found.rows[:, :1]
             neighbours[block][:num_valid, : found.rows.shape[1]] = np.where(is_within, found.rows, found.rows[:, :1])

@@ -1,4 +1,4 @@
-"""Preprocessing on the host: what `preprocess_scan` makes, faster on a CPU, by a sort and a tree."""
+"""Preprocessing on the host: what `preprocess_scan` makes, faster on a CPU, by a table and a tree."""
 
 from __future__ import annotations
 
@@ -7,8 +7,11 @@ from jaxtyping import Bool, Float, Int
 from scipy.spatial import cKDTree
 
 from dpmjax.checks import require_count
-from dpmjax.scans.preprocess import MAX_VOXELS, OUTLIER_SLACK, PreprocessConfig
+from dpmjax.scans.preprocess import OUTLIER_SLACK, PreprocessConfig
 from dpmjax.types import PointCloud
+
+MAX_TABLE_ENTRIES = 1 << 24
+"""Voxels of a scan's bounding box that a table may hold; a scan of 60 m and 0.3 m has 6 million."""
 
 
 def preprocess_scan_on_host(
@@ -35,7 +38,8 @@ def preprocess_scan_on_host(
     if mask is not None and (np.shape(mask) != points.shape[:1] or np.asarray(mask).dtype != bool):
         raise ValueError(f"mask: expected bool of shape {points.shape[:1]}, got {np.shape(mask)}")
     require_count("num_threads", num_threads)
-    kept = points[_is_within(points, config) if mask is None else _is_within(points, config) & mask]
+    is_kept = _is_within(points, config) if mask is None else _is_within(points, config) & mask
+    kept = points.take(np.flatnonzero(is_kept), axis=0)  # four times faster than by the mask
     kept = kept[_first_of_each_voxel(kept, config.voxel_size_m)]
     kept = kept[_evenly_spaced(len(kept), config.capacity)]
     if config.num_outlier_neighbours > 0 and len(kept) > 1:
@@ -56,10 +60,19 @@ def _is_within(points: Float[np.ndarray, "n 3"], config: PreprocessConfig) -> Bo
 
 
 def _first_of_each_voxel(points: Float[np.ndarray, "n 3"], voxel_size: float) -> Int[np.ndarray, " v"]:
-    voxels = np.floor(points / np.float32(voxel_size)).astype(np.int64) + MAX_VOXELS
-    bits = (2 * MAX_VOXELS - 1).bit_length()
-    packed = (voxels[:, 0] << (2 * bits)) | (voxels[:, 1] << bits) | voxels[:, 2]
-    return np.sort(np.unique(packed, return_index=True)[1])
+    rows = np.arange(len(points))
+    if len(points) == 0:
+        return rows
+    voxels = np.floor(points / np.float32(voxel_size)).astype(np.int64)
+    columns = [column - column.min() for column in voxels.T]
+    num_x, num_y, num_z = (int(column.max()) + 1 for column in columns)
+    packed = (columns[0] * num_y + columns[1]) * num_z + columns[2]  # below 2^63: MAX_VOXELS bounds each
+    if num_x * num_y * num_z > MAX_TABLE_ENTRIES:
+        return np.sort(np.unique(packed, return_index=True)[1])
+    # Only entries that are written are read. Of several rows in one entry the last written stays: the first of all.
+    table = np.empty(num_x * num_y * num_z, np.int32)
+    table[packed[::-1]] = rows[::-1]
+    return np.flatnonzero(table[packed] == rows)
 
 
 def _evenly_spaced(num_kept: int, capacity: int) -> Int[np.ndarray, " r"]:
@@ -68,8 +81,11 @@ def _evenly_spaced(num_kept: int, capacity: int) -> Int[np.ndarray, " r"]:
 
 
 def _is_inlier(points: Float[np.ndarray, "n 3"], config: PreprocessConfig, num_threads: int) -> Bool[np.ndarray, " n"]:
-    tree = cKDTree(points, leafsize=16)
+    tree = cKDTree(points, leafsize=16, balanced_tree=False)
     num_asked = min(config.num_outlier_neighbours + 1, len(points))
-    distances = np.asarray(tree.query(points, [*range(2, num_asked + 1)], workers=num_threads)[0])
-    spread = distances.mean(axis=1)
+    # Asked in the order of the tree, what a query needs is still in the cache.
+    queries = tree.data[tree.indices]
+    distances = np.asarray(tree.query(queries, [*range(2, num_asked + 1)], workers=num_threads)[0])
+    spread = np.empty(len(points))
+    spread[tree.indices] = distances.mean(axis=1)
     return spread <= (spread.mean() + config.outlier_sigmas * spread.std()) * OUTLIER_SLACK
