@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from experiments._machine import usable_cores
 
@@ -49,7 +50,7 @@ def open_drives(data: Sequence[str], *, num_towns: int, town_length_m: float, se
     """The drives to train on.
 
     Raises:
-        ValueError: a path that cannot be read, or a drive without poses.
+        ValueError: a path that cannot be read, or in which no drive is of use.
     """
     from dpmjax.data import list_lidar_sequences, open_lidar_sequence
 
@@ -60,14 +61,40 @@ def open_drives(data: Sequence[str], *, num_towns: int, town_length_m: float, se
             continue
         names: Sequence[str | None] = list_lidar_sequences(entry) or [None]
         found = [open_lidar_sequence(entry, sequence=name) for name in names]
-        known = [drive for drive in found if drive.T_world_lidar is not None]
-        if not known:
-            raise ValueError(f"{entry}: no poses; training needs a pose for each scan")
+        reasons = {drive.name: why_useless(drive) for drive in found}
+        useful = [drive for drive in found if reasons[drive.name] is None]
+        if not useful:
+            raise ValueError("; ".join(f"{entry}: {reason}" for reason in dict.fromkeys(reasons.values())))
         for drive in found:
-            if drive.T_world_lidar is None:
-                LOGGER.warning("%s has no poses and is left out", drive.name)
-        drives += known
+            if reasons[drive.name] is not None:
+                LOGGER.warning("%s is left out: %s", drive.name, reasons[drive.name])
+        drives += useful
     return drives
+
+
+def why_useless(drive: LidarSequence) -> str | None:
+    """Why nothing can be learned from a drive; None where something can."""
+    from dpmjax.data import InputError
+    from dpmjax.deeppointmap import SamplingConfig
+
+    limits = SamplingConfig()
+    if drive.T_world_lidar is None:
+        return "no poses; training needs a pose for each scan"
+    places = drive.T_world_lidar[:, :3, 3]
+    tree = cKDTree(places)
+    num_near, num_too_near = (tree.count_neighbors(tree, r) for r in (limits.max_distance_m, limits.min_distance_m))
+    if num_near == num_too_near:
+        found = f"{len(places)} scans, no two of them {limits.min_distance_m} to {limits.max_distance_m} m apart"
+        return f"{found}; training needs such pairs (are the poses in metres?)"
+    reason = ""
+    for number in range(len(drive)):
+        try:
+            drive.read_scan(number)
+        except InputError as error:
+            reason = reason or f"{drive.sources[number]}: {error.found}"
+            continue
+        return None
+    return f"all {len(drive)} scans are bad; the first, {reason}"
 
 
 class ScanStore:

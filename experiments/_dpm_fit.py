@@ -4,19 +4,23 @@ from __future__ import annotations
 
 import math
 import time
-from dataclasses import dataclass
+from contextlib import nullcontext
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Self
 
+import numpy as np
 from tqdm import tqdm
 
 from experiments._history import HistoryFile, read_history
+from experiments._processes import from_first, together
 from experiments._run_folder import CHECKPOINTS, HISTORY, RunFolder
 from experiments._stop import StopFlag
 
 if TYPE_CHECKING:
-    from dpmjax.deeppointmap import Model, TrainingConfig
+    from dpmjax.deeppointmap import Model, TrainingConfig, TrainingState
     from experiments._dpm_data import ScanStore
+    from experiments._dpm_progress import Progress
     from experiments._dpm_recall import Examination, Examined, PairedScans
 
 COLUMNS = ("step", "stage", "run_s", "loss", "pairing", "coarse", "offset", "top1_accuracy", "overlap_accuracy")
@@ -34,11 +38,12 @@ class TrainRun:
     """What the training hands on.
 
     Attributes:
-        model: as it is at the end.
+        model: the best one by recall, of those measured; where none was, that of the last step.
         untrained: as it was at the beginning.
         examination: the held-out pairs.
         examined: what the model makes of them.
         steps: steps done in all.
+        best_step: after how many steps the model had its best recall; None where it was never measured.
         run_s: seconds of stepping, compile time apart; with those before a resume.
         compile_s: seconds of the first call of each stage, this time.
         scans_per_s: that the steps of this time took in.
@@ -49,98 +54,174 @@ class TrainRun:
     examination: Examination
     examined: Examined
     steps: int
+    best_step: int | None
     run_s: float
     compile_s: float
     scans_per_s: float
 
 
 def run_training(
-    folder: RunFolder,
+    folder: RunFolder | None,
     store: ScanStore,
     config: TrainingConfig,
-    paired: PairedScans,
+    paired: PairedScans | None,
     *,
     seed: int,
     recall_every: int,
     stop: StopFlag,
-) -> TrainRun:
+) -> TrainRun | None:
     """Trains, or continues where the checkpoints of the folder end.
 
+    Of several processes (`experiments._processes`) each calls this with the same arguments; the first one alone writes
+    and measures.
+
     Args:
-        folder: of the run; gets `metrics.csv` and checkpoints.
+        folder: of the run; gets `metrics.csv` and checkpoints. None in all processes but the first.
         store: the scans.
         config: of training.
-        paired: held-out pairs.
+        paired: held-out pairs. None in all processes but the first.
         seed: of the run.
         recall_every: steps from one measurement of recall to the next.
         stop: asked between steps.
 
+    Returns:
+        The run; None in all processes but the first.
+
     Raises:
         TrainingLostError: the loss is not finite.
+        OtherProcessError: another process failed.
     """
     import jax
 
     from dpmjax import deeppointmap as dpm
-    from experiments._checkpoint import Checkpoints
     from experiments._dpm_data import SampleMaker, made_ahead
-    from experiments._dpm_recall import examine, prepare
+    from experiments._dpm_progress import after_measurement, before_step, params_to_use
 
     state = dpm.init(jax.random.key(seed), config)
     untrained = dpm.model_of(state, config)
-    examination = prepare(untrained, paired)
-    checkpoints = Checkpoints(Path(folder.path) / CHECKPOINTS)
-    if folder.is_resumed:
-        state = checkpoints.restore_latest(state, fallback=state)
-    first = int(state.step)
-    clock = _Clock(_earlier_seconds(folder, first))
+    with together():
+        records = None if folder is None or paired is None else _Records(folder, paired, untrained)
+        progress = _start(state, records)
     mesh, num_local = dpm.device_mesh(), jax.local_device_count()
-    state, step = dpm.replicate(state, mesh), dpm.make_step(config)
+    progress = dpm.replicate(from_first(progress), mesh)
+    first = int(progress.state.step)
+    step = dpm.make_step(config, mesh if jax.device_count() > 1 else None)
     maker = SampleMaker(store, config, seed=seed, num_samples=num_local, first_sample=jax.process_index() * num_local)
-    progress = tqdm(total=config.num_steps, initial=first, desc="train", unit=" steps", dynamic_ncols=True)
+    clock = _Clock(0.0 if records is None else records.begin(first, config))
     seen: set[Any] = set()
-    recall = math.nan
-    last_saved = time.perf_counter()
-    keep_until = first if folder.is_resumed else None
-    with (
-        HistoryFile(folder / HISTORY, COLUMNS, keep_until=keep_until) as history,
-        made_ahead(maker, first, config.num_steps) as batches,
-    ):
-        for number in range(first, config.num_steps):
-            if stop.is_requested:
-                break
+    with records or nullcontext(), made_ahead(maker, first, config.num_steps) as batches:
+        begun = time.perf_counter()
+        with together(stop):
+            batch = next(batches, None)
+        waited_s = time.perf_counter() - begun
+        while batch is not None and not stop.is_requested:
+            progress = before_step(progress, config)
+            number = int(progress.state.step)
             stage = config.stage_at(number)
-            if stage not in seen:
-                progress.set_postfix_str(f"compiling {_stage_name(stage)}")
+            if records is not None and stage not in seen:
+                records.bar.set_postfix_str(f"compiling {_stage_name(stage)}")
             begun = time.perf_counter()
-            state, report = step(state, dpm.shard_batch(next(batches), mesh))
-            report = jax.device_get(report)
-            clock.add(time.perf_counter() - begun, is_compiling=stage not in seen)
+            state, report = step(progress.state, dpm.shard_batch(batch, mesh))
+            report, progress = jax.device_get(report), replace(progress, state=state)
+            clock.add(waited_s + time.perf_counter() - begun, is_compiling=stage not in seen)
             seen.add(stage)
             if not math.isfinite(report.loss):
                 raise TrainingLostError(f"the loss of step {number + 1} is {report.loss}; --resume goes on before it")
+            recall = math.nan
             is_last_registration = number + 1 == config.registration_steps
-            is_due = stage is not None and ((number + 1) % recall_every == 0 or is_last_registration)
-            measured = examine(_local(dpm.model_of(state, config)), examination).recall.recall if is_due else math.nan
-            recall = measured if is_due else recall
-            history.append(**_row(number + 1, _stage_name(stage), clock.run_s, report, measured))
-            _tell(progress, stage, report, recall, clock.rate * config.sampling.num_scans * jax.device_count())
-            if time.perf_counter() - last_saved > _SAVE_EVERY_S:
-                checkpoints.save(int(state.step), state)
-                last_saved = time.perf_counter()
-    progress.close()
+            if stage is not None and ((number + 1) % recall_every == 0 or is_last_registration):
+                with together():
+                    recall = 0.0 if records is None else records.examine(dpm.model_of(state, config)).recall.recall
+                progress = after_measurement(progress, float(from_first(np.float32(recall))))
+            with together(stop):
+                if records is not None:
+                    scans_per_s = clock.rate * config.sampling.num_scans * jax.device_count()
+                    records.write(number + 1, stage, clock.run_s, report, recall, scans_per_s, progress)
+                begun = time.perf_counter()
+                batch = next(batches, None)
+                waited_s = time.perf_counter() - begun
     maker.close()
-    checkpoints.save(int(state.step), state)
-    model = _local(dpm.model_of(state, config))
+    if records is None:
+        return None
+    records.save(progress)
+    model = _local(dpm.Model(params_to_use(progress, config), config.model))
     return TrainRun(
         model,
         untrained,
-        examination,
-        examine(model, examination),
-        steps=int(state.step),
+        records.examination,
+        records.examine(model),
+        steps=int(progress.state.step),
+        best_step=int(progress.best_step) or None,
         run_s=clock.run_s,
         compile_s=clock.compile_s,
         scans_per_s=clock.rate * config.sampling.num_scans * jax.device_count(),
     )
+
+
+def _start(state: TrainingState, records: _Records | None) -> Progress:
+    from experiments._dpm_progress import begin
+
+    progress = begin(state)
+    if records is None or not records.folder.is_resumed:
+        return progress
+    return records.checkpoints.restore_latest(progress, fallback=progress)
+
+
+class _Records:
+    """All that one process does for all: the table, the bar, checkpoints, and the examination.
+
+    Args:
+        folder: of the run.
+        paired: held-out pairs.
+        model: any one of the configuration.
+    """
+
+    def __init__(self, folder: RunFolder, paired: PairedScans, model: Model) -> None:
+        from experiments._checkpoint import Checkpoints
+        from experiments._dpm_recall import prepare
+
+        self.folder = folder
+        self.checkpoints = Checkpoints(Path(folder.path) / CHECKPOINTS)
+        self.examination = prepare(model, paired)
+        self._recall = math.nan
+
+    def begin(self, first: int, config: TrainingConfig) -> float:
+        """Opens table and bar for the steps from `first` on; returns the seconds that those before took."""
+        keep_until = first if self.folder.is_resumed else None
+        earlier_s = _earlier_seconds(self.folder, first)
+        self._history = HistoryFile(self.folder / HISTORY, COLUMNS, keep_until=keep_until)
+        self.bar = tqdm(total=config.num_steps, initial=first, desc="train", unit=" steps", dynamic_ncols=True)
+        self._last_saved = time.perf_counter()
+        return earlier_s
+
+    def examine(self, model: Model) -> Examined:
+        """What the model makes of the held-out pairs."""
+        from experiments._dpm_recall import examine
+
+        return examine(_local(model), self.examination)
+
+    def write(
+        self, step: int, stage: Any, run_s: float, report: Any, recall: float, scans_per_s: float, progress: Progress
+    ) -> None:
+        """A row, the bar, and now and then a checkpoint."""
+        self._recall = recall if math.isfinite(recall) else self._recall
+        self._history.append(**_row(step, _stage_name(stage), run_s, report, recall))
+        _tell(self.bar, stage, report, self._recall, scans_per_s)
+        if time.perf_counter() - self._last_saved > _SAVE_EVERY_S:
+            self.save(progress)
+            self._last_saved = time.perf_counter()
+
+    def save(self, progress: Progress) -> None:
+        """A checkpoint."""
+        self.checkpoints.save(int(progress.state.step), progress)
+
+    def __enter__(self) -> Self:
+        self._history.__enter__()
+        return self
+
+    def __exit__(self, *error: Any) -> None:
+        self._history.__exit__(*error)
+        self.bar.close()
 
 
 class _Clock:
@@ -167,7 +248,6 @@ class _Clock:
 def _local(tree: Any) -> Any:
     """What every device holds alike, as arrays of one device."""
     import jax
-    import numpy as np
 
     return jax.tree.map(lambda x: jax.numpy.asarray(np.asarray(x)), tree)
 

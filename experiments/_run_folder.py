@@ -22,7 +22,7 @@ CHECKPOINTS = "checkpoints"
 RESULT_SUFFIXES = (".json", ".csv", ".txt", ".npy", ".npz", ".png", ".ply", ".g2o")
 LOGGERS = ("dpmjax", "experiments", "__main__")
 # Options that do not change what is computed.
-FREE_OPTIONS = frozenset({"output", "resume", "force", "device"})
+FREE_OPTIONS = frozenset({"output", "resume", "force", "device", "coordinator", "num_processes", "process_id"})
 
 ConfigT = TypeVar("ConfigT")
 

@@ -45,6 +45,16 @@ class StopFlag:
         """Whether a signal came."""
         return self._received is not None
 
+    @property
+    def received(self) -> int | None:
+        """The number of the signal, None where none came."""
+        return self._received
+
+    def request(self, signal_number: int) -> None:
+        """As if the signal had come here: where it came to another process of the same run."""
+        if self._received is None:
+            self._received = signal_number
+
     def __enter__(self) -> Self:
         if threading.current_thread() is threading.main_thread():
             self._previous = {number: signal.signal(number, self._on_signal) for number in SIGNALS}

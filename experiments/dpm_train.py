@@ -4,16 +4,20 @@
     python -m experiments.dpm_train --preset small --num-towns 40     on one GPU
     python -m experiments.dpm_train --data kitti town --preset paper  drives from files, and towns
     python -m experiments.dpm_train --resume                          continue the latest run
+    python -m experiments.dpm_train --coordinator host0:8476 --num-processes 2 --process-id 0     on two hosts, and
+                                                                      the same with --process-id 1 on the other
 
 Results go to results/dpm_train/<time>/ (latest links to the newest): model.safetensors for dpmjax.load_model,
 metrics.csv, metrics.json, checkpoints, and pictures: loss.png, matches.png. Recall is the share of pairs of a held-out
-town, 2 to 10 m apart and turned by any yaw, that are registered within 2 m and 5 degrees.
+town, 2 to 10 m apart and turned by any yaw, that are registered within 2 m and 5 degrees; the model is the one of the
+step with the best recall (metrics.json: best_step), and the overlap head is trained on that one.
 """
 
 from __future__ import annotations
 
 import math
 import time
+from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -25,7 +29,8 @@ from experiments._command import run_command
 from experiments._dpm_fit import TrainRun, run_training
 from experiments._history import read_history
 from experiments._machine import peak_rss_gb, select_device
-from experiments._run_folder import HISTORY, RunFolder, open_run_folder, recording, write_metrics
+from experiments._processes import is_first, join_processes, merged, together
+from experiments._run_folder import HISTORY, METRICS, RunFolder, open_run_folder, recording, write_metrics
 from experiments._stop import StopFlag
 
 if TYPE_CHECKING:
@@ -34,6 +39,8 @@ if TYPE_CHECKING:
 
 EXPERIMENT = "dpm_train"
 MODEL = "model.safetensors"
+# More bad scans than this are counted only.
+MAX_TOLD = 10
 
 
 @dataclass(frozen=True)
@@ -62,6 +69,12 @@ class Config:
     """Seed of everything random."""
     device: Annotated[Literal["cpu", "gpu"] | None, arg(metavar="cpu|gpu")] = None
     """Where to compute; without it, JAX chooses. All devices of that kind are used."""
+    coordinator: Annotated[str | None, arg(metavar="HOST:PORT|auto")] = None
+    """Train in several processes as one, at this address of process 0; auto: as Slurm, Open MPI or a TPU pod says."""
+    num_processes: Annotated[int | None, arg(metavar="N")] = None
+    """How many processes there are."""
+    process_id: Annotated[int | None, arg(metavar="I")] = None
+    """Which of them this one is, from 0; process 0 alone writes and prints."""
     resume: FlagCreatePairsOff[bool] = False
     """Continue an interrupted run, the latest or that in OUT; options not given are the same as then."""
     force: FlagCreatePairsOff[bool] = False
@@ -84,11 +97,11 @@ class Result:
     """What a run made.
 
     Attributes:
-        folder: where it was written.
+        folder: where it was written; None in all processes but the first.
         metrics: what `metrics.json` says.
     """
 
-    folder: Path
+    folder: Path | None
     metrics: dict[str, Any]
 
 
@@ -98,22 +111,32 @@ def main(config: Config) -> Result:
     from experiments._dpm_recall import draw_pairs
 
     started = time.perf_counter()
+    join_processes(config.coordinator, config.num_processes, config.process_id)
     select_device(config.device)
-    settings = training_settings(config)
-    drives = open_drives(config.data, num_towns=config.num_towns, town_length_m=config.town_length_m, seed=config.seed)
-    store = ScanStore(drives, settings)
-    folder = open_run_folder(config, EXPERIMENT, output=config.output, resume=config.resume, force=config.force)
-    with recording(folder), StopFlag() as stop:
-        print(f"{len(drives)} drives of {len(store.table)} scans; {config.preset}: {settings.num_steps} steps")
-        held_out = town_drive(HELD_OUT_SEED, length_m=config.town_length_m)
-        paired = draw_pairs(held_out, config.held_out_pairs, seed=0)
+    with together():
+        settings = training_settings(config)
+        drives = open_drives(
+            config.data, num_towns=config.num_towns, town_length_m=config.town_length_m, seed=config.seed
+        )
+        store = ScanStore(drives, settings)
+        folder = _open_folder(config)
+    with recording(folder) if folder is not None else nullcontext(), StopFlag() as stop:
+        paired = None
+        if folder is not None:
+            print(f"{len(drives)} drives of {len(store.table)} scans; {config.preset}: {settings.num_steps} steps")
+            held_out = town_drive(HELD_OUT_SEED, length_m=config.town_length_m)
+            paired = draw_pairs(held_out, config.held_out_pairs, seed=0)
         run = run_training(
             folder, store, settings, paired, seed=config.seed, recall_every=config.recall_every, stop=stop
         )
+        bad = merged(store.bad)
+        if folder is None or run is None:
+            return Result(None, {})
         metrics = measure(run, run.examination) | {
             "num_scans": len(store.table),
-            "bad_scans": store.bad,
+            "bad_scans": bad,
             "steps": run.steps,
+            "best_step": run.best_step,
             "train_s": run.run_s,
             "compile_s": run.compile_s,
             "scans_per_s": run.scans_per_s,
@@ -125,9 +148,27 @@ def main(config: Config) -> Result:
         write_metrics(folder, metrics, seed=config.seed)
         write_model(folder, run.model, config, metrics)
         draw(folder, run)
-        print(f"recall on the held-out town {metrics['recall_untrained']:.2f} -> {metrics['recall']:.2f}")
-        print(f"results in {folder.path}")
+        tell(folder, metrics)
     return Result(folder.path, metrics)
+
+
+def _open_folder(config: Config) -> RunFolder | None:
+    """The run folder, in the process that writes."""
+    if not is_first():
+        return None
+    return open_run_folder(config, EXPERIMENT, output=config.output, resume=config.resume, force=config.force)
+
+
+def tell(folder: RunFolder, metrics: dict[str, Any]) -> None:
+    """The last lines on the console: recall, the scans that were left out, and where to look."""
+    at = "" if metrics["best_step"] is None else f" (best, after step {metrics['best_step']})"
+    print(f"recall on the held-out town {metrics['recall_untrained']:.2f} -> {metrics['recall']:.2f}{at}")
+    bad = metrics["bad_scans"]
+    if bad:
+        print(f"{len(bad)} scans left out, all of them in {folder / METRICS}:")
+        for source, reason in list(bad.items())[:MAX_TOLD]:
+            print(f"  {source}: {reason}")
+    print(f"results in {folder.path}")
 
 
 def training_settings(config: Config) -> TrainingConfig:
@@ -165,9 +206,10 @@ def write_model(folder: RunFolder, model: Model, config: Config, metrics: dict[s
     """model.safetensors, with a card that says where it comes from."""
     from dpmjax.weights import save_model
 
+    best = "" if metrics["best_step"] is None else f" (best recall after {metrics['best_step']})"
     card = (
         f"{config.preset}, trained on {', '.join(config.data)} ({metrics['num_scans']} scans), "
-        f"{metrics['steps']} steps, seed {config.seed}. Held-out town, {metrics['num_held_out_pairs']} pairs "
+        f"{metrics['steps']} steps{best}, seed {config.seed}. Held-out town, {metrics['num_held_out_pairs']} pairs "
         f"2-10 m apart, any yaw: recall (2 m, 5 deg) {metrics['recall']:.3f}, "
         f"untrained {metrics['recall_untrained']:.3f}."
     )

@@ -27,6 +27,8 @@ TRAINING = replace(toy.TRAINING, curriculum=(CurriculumStage(2, 4),))
 class StopAfter:
     """Asks to stop when it was asked so often."""
 
+    received = None
+
     def __init__(self, num: int) -> None:
         self._left = num
 

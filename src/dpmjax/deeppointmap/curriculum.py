@@ -47,6 +47,8 @@ class TrainingConfig:
         warmup_steps: the learning rate rises from 0 for so long.
         max_gradient_norm: longer gradients are shortened to this.
         overlap_ratio: learning rates and weight decay of the overlap part, relative to those above.
+        scans_at_once: about so many scans of a sample are worked on at a time, for the rest waits: more need more
+            memory and keep a large device busy. It changes nothing but rounding.
     """
 
     model: ModelConfig = field(default_factory=ModelConfig)
@@ -64,6 +66,7 @@ class TrainingConfig:
     warmup_steps: int = 0
     max_gradient_norm: float = 35.0
     overlap_ratio: float = 0.1
+    scans_at_once: int = 8
 
     def __post_init__(self) -> None:
         for name in ("learning_rate", "final_learning_rate", "max_gradient_norm", "overlap_ratio"):
@@ -72,6 +75,7 @@ class TrainingConfig:
             if not getattr(self, name) >= 0:
                 raise ValueError(f"{name}: expected at least 0, got {getattr(self, name)}")
         require_count("len(curriculum)", len(self.curriculum))
+        require_count("scans_at_once", self.scans_at_once)
         largest = max(stage.max_group for stage in self.curriculum)
         if largest > self.sampling.num_scans:
             raise ValueError(

@@ -46,7 +46,7 @@ from dpmjax.deeppointmap.objective import (
     registration_loss,
 )
 from dpmjax.losses.overlap import overlap_loss
-from dpmjax.types import AnyArray, DescriptorCloud
+from dpmjax.types import AnyArray, DescriptorCloud, PointPyramid
 
 Sample = RegistrationSample | OverlapSample
 BATCH_AXIS = "batch"
@@ -107,20 +107,25 @@ def model_of(state: TrainingState, config: TrainingConfig) -> Model:
     return Model(state.params, config.model)
 
 
-def make_step(config: TrainingConfig) -> Step:
+def make_step(config: TrainingConfig, mesh: Mesh | None = None) -> Step:
     """The jitted step. It compiles once for each shape of batch: once a stage of the curriculum, once for the overlap.
 
     Batches carry samples along their first axis and may be spread over devices by `shard_batch`; the loss is the mean
-    over all groups of all samples, so that the number of devices changes nothing but the speed.
+    over all groups of all samples, so that the number of devices changes nothing but the speed. With a mesh, each of
+    its devices gets the whole state and the whole report, so that every process can read them.
     """
-    return functools.partial(_step, config=config)
+    if mesh is None:
+        return functools.partial(_step, config=config)
+    return jax.jit(functools.partial(_one_step, config=config), out_shardings=NamedSharding(mesh, PartitionSpec()))
 
 
-@functools.partial(jax.jit, static_argnames="config")
-def _step(state: TrainingState, batch: Sample, *, config: TrainingConfig) -> tuple[TrainingState, TrainingReport]:
+def _one_step(state: TrainingState, batch: Sample, *, config: TrainingConfig) -> tuple[TrainingState, TrainingReport]:
     if isinstance(batch, OverlapSample):
         return _overlap_step(state, batch, config)
     return _registration_step(state, batch, config)
+
+
+_step = jax.jit(_one_step, static_argnames="config")
 
 
 def batch_loss(
@@ -130,14 +135,17 @@ def batch_loss(
     model = Model(params, config.model)
 
     def of_sample(sample: RegistrationSample) -> tuple[Array, ObjectiveTerms]:
-        clouds = jax.vmap(encode_pyramid, (None, 0))(model, sample.pyramids)
+        clouds = _in_parts(functools.partial(encode_pyramid, model), sample.pyramids, config.scans_at_once)
 
-        def of_group(source: MapOfScans, target: MapOfScans, T_target_source: AnyArray) -> tuple[Array, ObjectiveTerms]:
+        def of_group(group: tuple[MapOfScans, MapOfScans, AnyArray]) -> tuple[Array, ObjectiveTerms]:
+            source, target, T_target_source = group
             return map_pair_loss(
                 model, _merged(clouds, source), _merged(clouds, target), T_target_source, config.objective
             )
 
-        return jax.vmap(of_group)(sample.source, sample.target, sample.T_target_source)
+        scans_of_group = sample.source.rows.shape[-1] + sample.target.rows.shape[-1]
+        groups = (sample.source, sample.target, sample.T_target_source)
+        return _in_parts(of_group, groups, config.scans_at_once // scans_of_group)
 
     losses, terms = jax.vmap(of_sample)(batch)
     count = jnp.maximum(jnp.sum(batch.mask), 1)
@@ -156,6 +164,18 @@ def map_pair_loss(
         _side(model, b, correlated_b, correlated_a, close_b),
     )
     return registration_loss(*sides, T_b_a, config=config)
+
+
+def _in_parts(function: Callable[[Any], Any], trees: Any, at_once: int) -> Any:
+    """The function of each entry along the first axis, about so many at a time, at least one.
+
+    What happens inside is computed again for the gradient instead of being kept: a tenth of the memory, and on a CPU
+    no time is lost, for what stays small stays in the cache.
+    """
+    num = len(jax.tree.leaves(trees)[0])
+    # A divisor: a last part of another size would be compiled apart.
+    size = max(size for size in range(1, max(1, min(at_once, num)) + 1) if num % size == 0)
+    return jax.lax.map(jax.checkpoint(function), trees, batch_size=size)
 
 
 def _side(
@@ -203,7 +223,7 @@ def _overlap_step(
     state: TrainingState, batch: OverlapSample, config: TrainingConfig
 ) -> tuple[TrainingState, TrainingReport]:
     head = state.params["decoder"]["overlap_head"]
-    correlated = _correlated_pairs(Model(state.params, config.model), batch)
+    correlated = _correlated_pairs(Model(state.params, config.model), batch, config.scans_at_once // 2)
     labels = batch.is_overlap.reshape(-1)
 
     def loss_of(head: dict[str, Any]) -> tuple[Array, Array]:
@@ -226,13 +246,19 @@ def _overlap_step(
     return replace(state, params=params, overlap_optimizer=optimizer_state, step=state.step + 1), report
 
 
-def _correlated_pairs(model: Model, batch: OverlapSample) -> tuple[DescriptorCloud, DescriptorCloud]:
+def _correlated_pairs(
+    model: Model, batch: OverlapSample, pairs_at_once: int
+) -> tuple[DescriptorCloud, DescriptorCloud]:
     """Of all pairs of all samples, one after the other; no gradient is asked of it."""
 
-    def of_pair(first: Any, second: Any) -> tuple[DescriptorCloud, DescriptorCloud]:
+    def of_pair(pair: tuple[PointPyramid, PointPyramid]) -> tuple[DescriptorCloud, DescriptorCloud]:
+        first, second = pair
         return correlate(model, encode_pyramid(model, first), encode_pyramid(model, second))
 
-    clouds = jax.vmap(jax.vmap(of_pair))(batch.first, batch.second)
+    def of_sample(first: PointPyramid, second: PointPyramid) -> tuple[DescriptorCloud, DescriptorCloud]:
+        return _in_parts(of_pair, (first, second), pairs_at_once)
+
+    clouds = jax.vmap(of_sample)(batch.first, batch.second)
     return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), clouds)
 
 

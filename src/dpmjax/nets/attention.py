@@ -60,6 +60,7 @@ def attend(
 def _attend_in_chunks(
     queries: Float[Array, "m c"], keys: Float[Array, "n c"], values: Float[Array, "n c"], mask: Bool[Array, " n"]
 ) -> Float[Array, "m c"]:
+    @jax.checkpoint  # a gradient would keep all logits of all chunks
     def attend_one(query: Float[Array, " c"]) -> Float[Array, " c"]:
         return _attend_with_one_head(query[None], keys, values, mask)[0]
 

@@ -1,0 +1,119 @@
+"""Two processes that train as one: the numbers of one process, one writer, and one Ctrl-C for both."""
+
+from __future__ import annotations
+
+import os
+import socket
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+
+from dpmjax.deeppointmap import CurriculumStage, init, make_step
+from experiments._checkpoint import Checkpoints
+from experiments._dpm_data import SampleMaker, ScanStore
+from experiments._dpm_progress import begin
+from experiments._history import read_history
+from experiments._processes import join_processes
+from experiments._run_folder import CHECKPOINTS, HISTORY
+from tests.deeppointmap import toy
+from tests.tolerances import ACCUMULATED
+
+REPOSITORY = Path(__file__).parents[2]
+TRAINING = replace(toy.TRAINING, curriculum=(CurriculumStage(2, 4),), overlap_steps=0)
+
+# The second process gets a signal in its second step of four.
+PROCESS = """
+import os, signal, sys
+from experiments import _dpm_fit, _processes
+from experiments._dpm_data import ScanStore
+from experiments._dpm_recall import draw_pairs
+from experiments._run_folder import RunFolder
+from experiments._stop import Interrupted, StopFlag
+from pathlib import Path
+from tests.deeppointmap import toy
+from tests.experiments.test_dpm_processes import TRAINING
+
+coordinator, number, folder = sys.argv[1], int(sys.argv[2]), Path(sys.argv[3])
+_processes.join_processes(coordinator, 2, number)
+add = _dpm_fit._Clock.add
+calls = []
+
+def add_and_interrupt(self, *args, **options):
+    add(self, *args, **options)
+    calls.append(0)
+    if number == 1 and len(calls) == 2:
+        os.kill(os.getpid(), signal.SIGINT)
+
+_dpm_fit._Clock.add = add_and_interrupt
+assert _processes.merged({str(number): "bad"}) == {"0": "bad", "1": "bad"}
+is_first = _processes.is_first()
+try:
+    with StopFlag() as stop:
+        paired = draw_pairs(toy.drive(seed=9), 1, seed=0) if is_first else None
+        run = RunFolder(folder, False) if is_first else None
+        store = ScanStore([toy.drive()], TRAINING)
+        done = _dpm_fit.run_training(run, store, TRAINING, paired, seed=0, recall_every=1, stop=stop)
+        assert (done is not None) == is_first
+except Interrupted as stopped:
+    sys.exit(stopped.exit_code)
+"""
+
+
+def free_port() -> int:
+    with socket.socket() as sock:
+        sock.bind(("localhost", 0))
+        return int(sock.getsockname()[1])
+
+
+def test_two_processes_train_as_one_and_stop_as_one(tmp_path: Path) -> None:
+    environment = os.environ | {"JAX_PLATFORMS": "cpu"}
+    environment["PYTHONPATH"] = os.pathsep.join([str(REPOSITORY / "src"), str(REPOSITORY)])
+    arguments = [sys.executable, "-c", PROCESS, f"localhost:{free_port()}"]
+    both = [
+        subprocess.Popen(
+            [*arguments, str(number), str(tmp_path)],
+            cwd=REPOSITORY,
+            env=environment,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        for number in range(2)
+    ]
+    try:
+        told = [process.communicate(timeout=300) for process in both]
+    finally:
+        for process in both:
+            process.kill()
+    assert [process.returncode for process in both] == [130, 130], told
+    # The second one shows nothing but what JAX itself says.
+    assert told[1][0] == ""
+    assert "train:" in told[0][1]
+    assert "train:" not in told[1][1]
+    assert [row["step"] for row in read_history(tmp_path / HISTORY)] == ["1", "2"]
+
+    state, step = init(jax.random.key(0), TRAINING), make_step(TRAINING)
+    maker = SampleMaker(ScanStore([toy.drive()], TRAINING), TRAINING, seed=0, num_samples=2)
+    progress = Checkpoints(tmp_path / CHECKPOINTS).restore_latest(begin(state), fallback=None)
+    for number in range(2):
+        state, _ = step(state, maker(number))
+    assert progress.state.step == progress.best_step == 2
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, **ACCUMULATED), progress.state.params, state.params)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ((None, 2, 0), "--coordinator"),
+        (("localhost:1", None, 0), "--num-processes"),
+        (("localhost:1", 2, 2), "--process-id: expected from 0 to 1, got 2"),
+    ],
+)
+def test_options_that_do_not_go_together_are_refused(options, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        join_processes(*options)
