@@ -17,18 +17,30 @@ LOGGER = logging.getLogger("dpmjax.checkpoint")
 class Checkpoints:
     """The checkpoints in a folder, one a step.
 
+    Of several processes one alone uses it, without the others.
+
     Args:
         folder: is made when the first one is saved.
         num_kept: older ones are removed.
     """
 
     def __init__(self, folder: Path, *, num_kept: int = 2) -> None:
-        self._options = ocp.CheckpointManagerOptions(max_to_keep=num_kept, enable_async_checkpointing=False)
+        alone = None
+        if jax.process_count() > 1:  # orbax would wait for the others
+            this = jax.process_index()
+            alone = ocp.options.MultiprocessingOptions(this, {this}, barrier_sync_key_prefix=f"process_{this}")
+        self._options = ocp.CheckpointManagerOptions(
+            max_to_keep=num_kept,
+            create=False,
+            enable_async_checkpointing=False,
+            **({} if alone is None else {"multiprocessing_options": alone}),
+        )
         self._folder = folder.resolve()
 
     def save(self, step: int, state: object) -> None:
         """Writes the state; the same step is not written twice."""
         logging.getLogger("absl").setLevel(logging.ERROR)
+        self._folder.mkdir(parents=True, exist_ok=True)
         with ocp.CheckpointManager(self._folder, options=self._options) as manager:
             if step not in manager.all_steps():
                 manager.save(step, args=ocp.args.StandardSave(jax.tree.map(np.asarray, state)))

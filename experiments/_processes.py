@@ -18,6 +18,8 @@ TreeT = TypeVar("TreeT")
 # Above all numbers of signals.
 _FAILED = 1000
 AUTO = "auto"
+# A process that is not heard of for so long is taken for dead, and the others end.
+_SILENCE_S = 300
 
 
 class OtherProcessError(RuntimeError):
@@ -49,7 +51,9 @@ def join_processes(coordinator: str | None, num_processes: int | None, process_i
 
     jax.config.update("jax_cpu_collectives_implementation", "gloo")
     try:
-        jax.distributed.initialize(None if is_auto else coordinator, num_processes, process_id)
+        jax.distributed.initialize(
+            None if is_auto else coordinator, num_processes, process_id, heartbeat_timeout_seconds=_SILENCE_S
+        )
     except (RuntimeError, ValueError) as error:
         said = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise ValueError(f"--coordinator {coordinator}: the processes do not find each other: {said}") from error

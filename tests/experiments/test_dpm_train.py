@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import subprocess
 import sys
 from dataclasses import dataclass, replace
@@ -11,13 +12,16 @@ import jax
 import numpy as np
 import pytest
 
-from dpmjax.deeppointmap import CurriculumStage
+from dpmjax.deeppointmap import CurriculumStage, init
+from experiments import _dpm_fit
+from experiments._command import run_command
 from experiments._dpm_data import ScanStore, made_ahead
 from experiments._dpm_fit import run_training
+from experiments._dpm_progress import after_measurement, before_step, begin, params_to_use
 from experiments._dpm_recall import draw_pairs
 from experiments._history import read_history
-from experiments._run_folder import HISTORY, RunFolder
-from experiments.dpm_train import Config
+from experiments._run_folder import CHECKPOINTS, HISTORY, RunFolder
+from experiments.dpm_train import EXPERIMENT, Config, main
 from tests.deeppointmap import toy
 
 REPOSITORY = Path(__file__).parents[2]
@@ -46,16 +50,60 @@ def train(folder: Path, *, stop_after: int = 99, is_resumed: bool = False):
     return run_training(run_folder, store, TRAINING, paired, seed=0, recall_every=2, stop=stop)
 
 
-def test_a_broken_off_run_goes_on_with_the_numbers_of_an_unbroken_one(tmp_path: Path) -> None:
-    whole = train(tmp_path / "whole")
-    assert train(tmp_path / "parts", stop_after=3).steps == 3
-    parts = train(tmp_path / "parts", is_resumed=True)
-    assert parts.steps == whole.steps == TRAINING.num_steps
-    jax.tree.map(np.testing.assert_array_equal, parts.model.params, whole.model.params)
-    rows = [read_history(tmp_path / name / HISTORY) for name in ("whole", "parts")]
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    """An unbroken run and its folder."""
+    folder = tmp_path_factory.mktemp("whole")
+    return train(folder), folder
+
+
+def assert_same_run(parts, folder: Path, whole) -> None:
+    """Parameters and history bit for bit, but for the seconds."""
+    assert (parts.steps, parts.best_step) == (whole[0].steps, whole[0].best_step)
+    jax.tree.map(np.testing.assert_array_equal, parts.model.params, whole[0].model.params)
+    rows = [read_history(where / HISTORY) for where in (whole[1], folder)]
     for one, other in zip(*rows, strict=True):
         assert {**one, "run_s": ""} == {**other, "run_s": ""}
-    assert 0 <= parts.examined.recall.recall <= 1
+
+
+@pytest.mark.parametrize("num_before", [0, 1, 3, 5])
+def test_a_broken_off_run_goes_on_with_the_numbers_of_an_unbroken_one(tmp_path: Path, whole, num_before) -> None:
+    # Before the first step, before and after the first recall, in the overlap part.
+    assert whole[0].steps == TRAINING.num_steps
+    assert train(tmp_path, stop_after=num_before).steps == num_before
+    assert_same_run(train(tmp_path, is_resumed=True), tmp_path, whole)
+
+
+def test_a_cut_off_checkpoint_is_passed_over_for_the_one_before(tmp_path: Path, whole, monkeypatch, caplog) -> None:
+    monkeypatch.setattr(_dpm_fit, "_SAVE_EVERY_S", 0.0)
+    train(tmp_path, stop_after=3)
+    saved = sorted((tmp_path / CHECKPOINTS).iterdir(), key=lambda path: int(path.name))
+    assert [path.name for path in saved] == ["2", "3"]
+    for file in saved[-1].rglob("*"):
+        if file.is_file() and file.stat().st_size > 100:
+            file.write_bytes(file.read_bytes()[:50])
+    assert_same_run(train(tmp_path, is_resumed=True), tmp_path, whole)
+    assert "checkpoint 3 cannot be read" in caplog.text
+
+
+def test_the_best_of_equal_models_is_the_later_and_the_overlap_part_goes_on_from_it() -> None:
+    state = init(jax.random.key(0), TRAINING)
+    first = after_measurement(begin(state), 0.5)
+
+    def after(step: int, scale: float):
+        params = jax.tree.map(lambda leaf: scale * leaf, state.params)
+        return replace(state, params=params, step=np.int32(step))
+
+    last = TRAINING.registration_steps
+    worse = after_measurement(replace(first, state=after(2, 2.0)), 0.4)
+    equal = after_measurement(replace(first, state=after(last, 3.0)), 0.5)
+    assert (int(worse.best_step), int(equal.best_step)) == (0, last)
+    assert worse.best_params is first.best_params
+    second = after_measurement(replace(first, state=after(1, 2.0)), 0.6)
+    over = before_step(replace(second, state=after(last, 3.0)), TRAINING)
+    assert over.state.params is second.best_params
+    assert before_step(replace(second, state=after(last - 1, 3.0)), TRAINING).state.params is not second.best_params
+    assert params_to_use(replace(second, state=after(last + 1, 3.0)), TRAINING) is not second.best_params
 
 
 def test_results_made_ahead_come_in_order_and_errors_where_they_belong() -> None:
@@ -107,3 +155,57 @@ def test_help_needs_no_jax_and_shows_examples() -> None:
 def test_options_out_of_range_are_refused(options, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         Config(**options)
+
+
+def write_drive(folder: Path, *, step_m: float = 2.0, has_poses: bool = True, num: int = 4) -> Path:
+    (folder / "velodyne").mkdir(parents=True)
+    points = np.random.default_rng(0).uniform(-20, 20, (200, 4)).astype("<f4")
+    for number in range(num):
+        (folder / "velodyne" / f"{number:06d}.bin").write_bytes(points.tobytes())
+    poses = np.tile(np.eye(4)[:3], (num, 1, 1))
+    poses[:, 0, 3] = step_m * np.arange(num)
+    if has_poses:
+        np.savetxt(folder / "poses_lidar.txt", poses.reshape(num, 12))
+    return folder
+
+
+def refused(tmp_path: Path, capsys, *options: object) -> str:
+    """What stderr says to bad input; there must be one line, exit code 2, and nothing written."""
+    out = tmp_path / "out"
+    arguments = [*map(str, options), *(() if "-o" in options else ("-o", str(out)))]
+    code = run_command(main, Config, experiment=EXPERIMENT, description=None, args=arguments)
+    error = capsys.readouterr().err.strip()
+    assert code == 2, error
+    assert not out.exists()
+    assert len(error.splitlines()) == 1, error
+    return error
+
+
+def test_data_that_cannot_be_trained_on_is_named(as_user, tmp_path, capsys) -> None:
+    (tmp_path / "empty").mkdir()
+    assert "nowhere" in refused(tmp_path, capsys, "--data", tmp_path / "nowhere")
+    assert "empty" in refused(tmp_path, capsys, "--data", tmp_path / "empty")
+    without = write_drive(tmp_path / "without", has_poses=False)
+    assert "no poses" in refused(tmp_path, capsys, "--data", without)
+    wide = write_drive(tmp_path / "wide", step_m=50.0)
+    assert "no two of them 0.25 to 20.0 m apart" in refused(tmp_path, capsys, "--data", wide)
+    spoiled = write_drive(tmp_path / "spoiled")
+    for file in (spoiled / "velodyne").iterdir():
+        file.write_bytes(file.read_bytes()[:-3])
+    assert "all 4 scans are bad" in refused(tmp_path, capsys, "--data", spoiled)
+
+
+def test_a_folder_that_cannot_be_written_is_named(as_user, tmp_path, capsys) -> None:
+    good = write_drive(tmp_path / "good")
+    (tmp_path / "file").write_text("")
+    assert "cannot write to" in refused(tmp_path, capsys, "--data", good, "-o", tmp_path / "file" / "out")
+
+
+def test_a_full_disk_is_told_and_what_was_written_stays(tmp_path, monkeypatch) -> None:
+    def full(*_: object, **__: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(_dpm_fit._Records, "save", full)
+    with pytest.raises(OSError, match="No space left"):
+        train(tmp_path, stop_after=1)
+    assert [row["step"] for row in read_history(tmp_path / HISTORY)] == ["1"]
