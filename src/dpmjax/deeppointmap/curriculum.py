@@ -125,7 +125,7 @@ def training_preset(name: Preset) -> TrainingConfig:
     if name == "tiny":
         return TrainingConfig(
             model=model,
-            curriculum=(CurriculumStage(2, 500), CurriculumStage(4, 40)),
+            curriculum=(CurriculumStage(2, 700), CurriculumStage(4, 40)),
             overlap_steps=60,
             sampling=SamplingConfig(num_scans=16, max_side=2, num_overlap_pairs=8),
             # In so few steps: less disturbance, more positives, and the encoder is told directly.
