@@ -16,7 +16,7 @@ import numpy as np
 from dpmjax.geometry import planar_poses
 from dpmjax.registration.correlative import Candidates, Floats, Indices
 from dpmjax.registration.planar_graph import Edges, GraphConfig, optimize_planar_graph
-from dpmjax.registration.profiles import Profiles, judge_pairs
+from dpmjax.registration.profiles import Margins, Profiles, judge_pairs
 
 
 @dataclass(frozen=True)
@@ -33,13 +33,16 @@ class AssembleConfig:
         sigma: accuracy of a pair with all its beams: translation, radians.
     """
 
-    crossed_weight: float = 2.0
+    crossed_weight: float = 4.0
     radius: float = 8.0
     agreement: tuple[float, float] = (0.4, 0.1)
     min_score: float = 40.0
     num_seeds: int = 2
     num_revisions: int = 3
     sigma: tuple[float, float] = (0.03, 0.01)
+
+
+PCT = 90
 
 
 class Assembly(NamedTuple):
@@ -56,6 +59,9 @@ class Assembly(NamedTuple):
     support: Floats
     edges: Edges
     total: float
+
+
+VALUE = lambda m, c: np.maximum(m - c, 0.0)
 
 
 class _Offers(NamedTuple):
@@ -87,7 +93,10 @@ class _Judge(NamedTuple):
     profiles: Profiles
     config: AssembleConfig
     scale: float
-    tolerance: float
+    margins: Margins
+    chance: float
+    noisy_share: float
+    is_ordered: bool
 
     def against(self, scan: Indices, places: Floats, placed: Indices, poses: Floats) -> Floats:
         """(m,) sum over `placed` of matched less weighted crossed beams of `scan` at `places`."""
@@ -97,8 +106,13 @@ class _Judge(NamedTuple):
         keep = other != scan[row]
         row, other = row[keep], other[keep]
         relative = planar_poses.relative(poses[other], places[row])
-        verdict = judge_pairs(self.profiles, scan[row], other, relative, tolerance=self.tolerance, stride=4)
-        value = verdict.matched - self.config.crossed_weight * verdict.crossed
+        verdict = judge_pairs(self.profiles, scan[row], other, relative, margins=self.margins, stride=4)
+        # What two scans of different places reach by chance says nothing; else rooms would be stacked on rooms.
+        is_next = self.is_ordered & (np.abs(scan[row] - other) == 1)
+        by_chance = np.where(is_next, 0.5, 1.0) * self.chance
+        matched = VALUE(verdict.matched, by_chance)
+        crossed = np.maximum(verdict.crossed - self.noisy_share * verdict.seen, 0.0)
+        value = matched - self.config.crossed_weight * crossed
         return np.bincount(row, value, minlength=len(scan))
 
 
@@ -172,7 +186,8 @@ def assemble(
     config: AssembleConfig | None = None,
     *,
     scale: float,
-    tolerance: float,
+    margins: Margins,
+    is_ordered: bool = False,
 ) -> Assembly:
     """Poses of all scans from candidates of their pairs; no order, no first guess.
 
@@ -181,14 +196,16 @@ def assemble(
         candidates: of pairs that connect all scans.
         config: settings.
         scale: `length_scale` of the scans.
-        tolerance: a hit matches a surface up to about so much, unit of the points.
+        margins: how exactly hits are compared.
+        is_ordered: neighbours in the array are neighbours in time, so likely to overlap.
 
     Returns:
         Assembly; the first pose is zero.
     """
     config = config or AssembleConfig()
     num_scans = profiles.mask.shape[0]
-    judge, offers = _Judge(profiles, config, scale, tolerance), _offers(candidates)
+    chance, share = chance_level(candidates), noisy_share(profiles, candidates, margins)
+    judge, offers = _Judge(profiles, config, scale, margins, chance, share, is_ordered), _offers(candidates)
     everyone = np.arange(num_scans)
     best: Assembly | None = None
     seeds = _choose_seeds(offers, config.num_seeds)
@@ -208,6 +225,62 @@ def assemble(
     if best is None:
         return Assembly(np.zeros((num_scans, 3)), np.zeros(num_scans), agreeing_edges(np.zeros((num_scans, 3)), candidates, config, scale), 0.0)
     return best
+
+
+def place_in_map(
+    profiles: Profiles,
+    poses: Floats,
+    placed: Indices,
+    candidates: Candidates,
+    config: AssembleConfig,
+    *,
+    scale: float,
+    margins: Margins,
+) -> Floats:
+    """Poses of the scans that are not yet placed: of what their pairs offer, where the placed scans match best.
+
+    Args:
+        profiles: n scans.
+        poses: (n, 3); right for those of `placed`.
+        placed: rows.
+        candidates: of pairs of a placed scan and another.
+        config: settings.
+        scale: `length_scale` of the scans.
+        margins: how exactly hits are compared.
+
+    Returns:
+        (n, 3) poses. Scans without any offer stand where `poses` has them.
+    """
+    share = noisy_share(profiles, candidates, margins)
+    # Places of one scan compete with each other alone: no need to subtract what chance would give.
+    judge, offers = _Judge(profiles, config, scale, margins, 0.0, share, False), _offers(candidates)
+    is_placed = np.zeros(len(poses), bool)
+    is_placed[placed] = True
+    rows = np.flatnonzero(is_placed[offers.anchor] & ~is_placed[offers.scan])
+    places = planar_poses.compose(poses[offers.anchor[rows]], offers.poses[rows])
+    said = judge.against(offers.scan[rows], places, placed, poses)
+    order = np.argsort(said, kind="stable")
+    poses = poses.copy()
+    # The best one of each scan is written last.
+    poses[offers.scan[rows[order]]] = places[order]
+    return poses
+
+
+def chance_level(candidates: Candidates) -> float:
+    """Beams that a wrong pose of a pair reaches at most, three times in four: second candidates are mostly wrong."""
+    second = candidates.scores[:, 1]
+    second = second[np.isfinite(second)]
+    return float(np.percentile(second, PCT)) if len(second) else 0.0
+
+
+def noisy_share(profiles: Profiles, candidates: Candidates, margins: Margins) -> float:
+    """Share of beams that seem to cross a surface in pairs that are right: what noise alone does."""
+    best = np.argsort(-candidates.scores[:, 0])[: profiles.mask.shape[0]]
+    verdict = judge_pairs(
+        profiles, candidates.source[best], candidates.target[best], candidates.poses[best, 0], margins=margins
+    )
+    share = verdict.crossed / np.maximum(verdict.seen, 1.0)
+    return 3.0 * float(np.percentile(share, 90)) if len(share) else 0.0
 
 
 def _choose_seeds(offers: _Offers, count: int) -> list[int]:

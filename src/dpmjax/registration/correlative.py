@@ -18,7 +18,7 @@ from jaxtyping import Array, Bool, Float, Int
 from numpy.typing import NDArray
 
 from dpmjax.geometry import planar_poses
-from dpmjax.registration.profiles import Profiles, judge_pair
+from dpmjax.registration.profiles import Margins, Profiles, judge_pair
 
 Floats = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -131,7 +131,7 @@ def search_pairs(
     config: CorrelativeConfig | None = None,
     *,
     scale: float,
-    tolerance: float,
+    margins: Margins,
     turns: NDArray[np.bool_] | None = None,
 ) -> Candidates:
     """The most likely relative poses of pairs of scans, from no guess at all.
@@ -142,7 +142,7 @@ def search_pairs(
         target: (p,) rows.
         config: settings.
         scale: `length_scale` of the scans.
-        tolerance: how near to a surface a hit must come in the end, unit of the points.
+        margins: how exactly hits are compared in the end.
         turns: (p, num_turns) which headings of T_target_source to try, multiples of 2 pi / num_turns; None: all.
 
     Returns:
@@ -169,7 +169,7 @@ def search_pairs(
         poses[rows, number, :, :2] = cell * np.asarray(shift, np.float64)[: len(rows)]
         poses[rows, number, :, 2] = planar_poses.wrap(np.asarray(turn))
     best, values = _keep_apart(poses.reshape(len(source), -1, 3), scores.reshape(len(source), -1), config, scale)
-    return _refine(profiles, Candidates(source, target, best, values), config, scale=scale, tolerance=tolerance)
+    return _refine(profiles, Candidates(source, target, best, values), config, scale=scale, margins=margins)
 
 
 def _keep_apart(poses: Floats, scores: Floats, config: CorrelativeConfig, scale: float) -> tuple[Floats, Floats]:
@@ -189,7 +189,7 @@ def _keep_apart(poses: Floats, scores: Floats, config: CorrelativeConfig, scale:
 @partial(jax.jit, static_argnames="config")
 def _refine_batch(
     profiles: Profiles, source: Int[Array, " p"], target: Int[Array, " p"], poses: Float[Array, "p 3"],
-    step: Float[Array, " 3"], tolerance: Float[Array, ""], *, config: CorrelativeConfig,
+    step: Float[Array, " 3"], margins: Margins, *, config: CorrelativeConfig,
 ) -> tuple[Float[Array, "p 3"], Float[Array, " p"]]:  # fmt: skip
     """The best pose on a grid of five steps along each axis around each pose."""
     axis = jnp.arange(-2.0, 3.0)
@@ -198,7 +198,7 @@ def _refine_batch(
     def refine(pair: tuple[jax.Array, jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
         i, j, pose = pair
         one, other = jax.tree.map(lambda x: x[i], profiles), jax.tree.map(lambda x: x[j], profiles)
-        verdict = jax.vmap(lambda offset: judge_pair(one, other, pose + offset, tolerance, stride=4))(grid)
+        verdict = jax.vmap(lambda offset: judge_pair(one, other, pose + offset, margins, stride=4))(grid)
         score = 4.0 * (verdict.matched - config.crossed_weight * verdict.crossed)
         best = score.argmax()
         return pose + grid[best], score[best]
@@ -207,7 +207,7 @@ def _refine_batch(
 
 
 def _refine(
-    profiles: Profiles, found: Candidates, config: CorrelativeConfig, *, scale: float, tolerance: float
+    profiles: Profiles, found: Candidates, config: CorrelativeConfig, *, scale: float, margins: Margins
 ) -> Candidates:
     """Sharper candidates, from a grid of half a cell down."""
     count = found.poses.shape[1]
@@ -218,13 +218,14 @@ def _refine(
     for level in range(config.num_levels):
         share = 0.5 ** (level + 1)
         step = share * np.array([config.cell * scale, config.cell * scale, turn])
-        width = max(tolerance, 0.7 * share * config.cell * scale)
+        blur = 0.7 * share * config.cell * scale
+        blurred = Margins(max(margins.match, blur), max(margins.cross, 3.0 * blur))
         for start in range(0, len(rows), _REFINE_BATCH):
             part = np.resize(np.arange(start, min(start + _REFINE_BATCH, len(rows))), _REFINE_BATCH)
             moved, score = _refine_batch(
                 profiles, jnp.asarray(source[part]), jnp.asarray(target[part]),
                 jnp.asarray(poses[rows[part]], jnp.float32), jnp.asarray(step, jnp.float32),
-                jnp.asarray(width, jnp.float32), config=config,
+                blurred, config=config,
             )  # fmt: skip
             poses[rows[part]], scores[rows[part]] = np.asarray(moved, np.float64), np.asarray(score, np.float64)
     order = np.argsort(-scores.reshape(found.scores.shape), axis=1, kind="stable")

@@ -50,6 +50,18 @@ class Profiles:
     is_seen: Bool[Array, "*n c"]
 
 
+class Margins(NamedTuple):
+    """How exactly hits are compared, unit of the points.
+
+    Attributes:
+        match: standard deviation of a hit about the surface that it belongs to.
+        cross: a hit that is farther than this in front of a surface contradicts it.
+    """
+
+    match: float | Float[Array, ""]
+    cross: float | Float[Array, ""]
+
+
 class Verdict(NamedTuple):
     """What two scans say of each other at a relative pose; both directions added, in beams.
 
@@ -124,25 +136,25 @@ def _profile(
     )
 
 
-def _view(points: Float[Array, "b 2"], mask: Bool[Array, " b"], viewer: Profiles, tolerance: Float[Array, ""]) -> Verdict:
+def _view(points: Float[Array, "b 2"], mask: Bool[Array, " b"], viewer: Profiles, margins: Margins) -> Verdict:
     """Points in the frame of the viewer against its profile."""
     count = viewer.surface.shape[-1]
     turn = jnp.mod(jnp.arctan2(points[:, 1], points[:, 0]), 2 * jnp.pi) * (count / (2 * jnp.pi))
     k = jnp.minimum(turn.astype(jnp.int32), count - 1)
     distance = jnp.linalg.norm(points, axis=-1)
     near, far, slant = viewer.near[k], viewer.far[k], viewer.slant[k]
-    is_jump = far - near > 3.0 * tolerance / _MIN_COSINE
+    is_jump = far - near > 10.0 * margins.match
     to_edge = jnp.minimum(jnp.abs(distance - near), jnp.abs(distance - far))
     off = jnp.where(is_jump, to_edge, jnp.abs(distance - viewer.surface[k])) * slant
     counts = (mask & viewer.is_seen[k]).astype(points.dtype)
-    matched = counts * jnp.exp(-0.5 * (off / tolerance) ** 2)
-    crossed = counts * (distance < near - 3.0 * tolerance / slant)
-    seen = counts * (distance < far + 3.0 * tolerance / slant)
+    matched = counts * jnp.exp(-0.5 * (off / margins.match) ** 2)
+    crossed = counts * (distance < near - margins.cross / slant)
+    seen = counts * (distance < far + margins.cross / slant)
     return Verdict(matched.sum(), crossed.sum(), seen.sum())
 
 
 def judge_pair(
-    source: Profiles, target: Profiles, pose: Float[Array, " 3"], tolerance: Float[Array, ""], *, stride: int = 1
+    source: Profiles, target: Profiles, pose: Float[Array, " 3"], margins: Margins, *, stride: int = 1
 ) -> Verdict:
     """Both directions of one pair at `pose`, x, y, heading of T_target_source; every `stride`-th beam."""
     c, s = jnp.cos(pose[2]), jnp.sin(pose[2])
@@ -150,19 +162,19 @@ def judge_pair(
     own, others = source.points[::stride], target.points[::stride]
     moved = jnp.matmul(own, rotation.T, precision="highest") + pose[:2]
     back = jnp.matmul(others - pose[:2], rotation, precision="highest")
-    there = _view(moved, source.mask[::stride], target, tolerance)
-    return Verdict(*(a + b for a, b in zip(there, _view(back, target.mask[::stride], source, tolerance), strict=True)))
+    there = _view(moved, source.mask[::stride], target, margins)
+    return Verdict(*(a + b for a, b in zip(there, _view(back, target.mask[::stride], source, margins), strict=True)))
 
 
 @partial(jax.jit, static_argnames="stride")
 def _judge(
     profiles: Profiles, source: Int[Array, " p"], target: Int[Array, " p"], poses: Float[Array, "p 3"],
-    tolerance: Float[Array, ""], *, stride: int,
+    margins: Margins, *, stride: int,
 ) -> Verdict:  # fmt: skip
     def one(pair: tuple[jax.Array, jax.Array, jax.Array]) -> Verdict:
         i, j, pose = pair
         return judge_pair(
-            jax.tree.map(lambda x: x[i], profiles), jax.tree.map(lambda x: x[j], profiles), pose, tolerance, stride=stride
+            jax.tree.map(lambda x: x[i], profiles), jax.tree.map(lambda x: x[j], profiles), pose, margins, stride=stride
         )
 
     return jax.lax.map(one, (source, target, poses), batch_size=64)
@@ -174,7 +186,7 @@ def judge_pairs(
     target: NDArray[np.int64],
     poses: NDArray[np.float64],
     *,
-    tolerance: float,
+    margins: Margins,
     stride: int = 2,
 ) -> Verdict:
     """Verdicts on p relative poses.
@@ -184,7 +196,7 @@ def judge_pairs(
         source: (p,) rows.
         target: (p,) rows.
         poses: (p, 3) T_target_source.
-        tolerance: a hit matches a surface up to about so much, unit of the points.
+        margins: how near is a match, how far in front a contradiction.
         stride: every so manyth beam is asked.
 
     Returns:
@@ -195,7 +207,7 @@ def judge_pairs(
         rows = np.resize(np.arange(start, min(start + _BATCH, len(source))), _BATCH)
         verdict = _judge(
             profiles, jnp.asarray(source[rows]), jnp.asarray(target[rows]), jnp.asarray(poses[rows], jnp.float32),
-            jnp.asarray(tolerance, jnp.float32), stride=stride,
+            margins, stride=stride,
         )  # fmt: skip
         parts.append([np.asarray(x, np.float64)[: len(source) - start] for x in verdict])
     if not parts:
