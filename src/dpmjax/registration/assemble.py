@@ -42,9 +42,6 @@ class AssembleConfig:
     sigma: tuple[float, float] = (0.03, 0.01)
 
 
-PCT = 90
-
-
 class Assembly(NamedTuple):
     """A map of all scans.
 
@@ -59,9 +56,6 @@ class Assembly(NamedTuple):
     support: Floats
     edges: Edges
     total: float
-
-
-VALUE = lambda m, c: np.maximum(m - c, 0.0)
 
 
 class _Offers(NamedTuple):
@@ -110,7 +104,7 @@ class _Judge(NamedTuple):
         # What two scans of different places reach by chance says nothing; else rooms would be stacked on rooms.
         is_next = self.is_ordered & (np.abs(scan[row] - other) == 1)
         by_chance = np.where(is_next, 0.5, 1.0) * self.chance
-        matched = VALUE(verdict.matched, by_chance)
+        matched = np.maximum(verdict.matched - by_chance, 0.0)
         crossed = np.maximum(verdict.crossed - self.noisy_share * verdict.seen, 0.0)
         value = matched - self.config.crossed_weight * crossed
         return np.bincount(row, value, minlength=len(scan))
@@ -267,10 +261,10 @@ def place_in_map(
 
 
 def chance_level(candidates: Candidates) -> float:
-    """Beams that a wrong pose of a pair reaches at most, three times in four: second candidates are mostly wrong."""
+    """Beams that a wrong pose of a pair reaches at most, nine times in ten: second candidates are mostly wrong."""
     second = candidates.scores[:, 1]
     second = second[np.isfinite(second)]
-    return float(np.percentile(second, PCT)) if len(second) else 0.0
+    return float(np.percentile(second, 90)) if len(second) else 0.0
 
 
 def noisy_share(profiles: Profiles, candidates: Candidates, margins: Margins) -> float:
