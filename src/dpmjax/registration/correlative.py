@@ -23,8 +23,8 @@ from dpmjax.registration.profiles import Margins, Profiles, judge_pair
 Floats = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
-# Pairs of one turn are filled up to a multiple of this, so that few shapes are compiled.
-_PAIR_ROUNDING = 128
+# Pairs of one turn are filled up to a power of two, at least this, so that few shapes are compiled.
+_SMALLEST = 64
 _REFINE_BATCH = 256
 
 
@@ -161,7 +161,7 @@ def search_pairs(
             continue
         turn = 2 * np.pi * number / config.num_turns
         turned = _spectra(sources, jnp.asarray(turn, jnp.float32), jnp.asarray(cell, jnp.float32), config=config)
-        filled = np.resize(rows, _PAIR_ROUNDING * -(-len(rows) // _PAIR_ROUNDING))
+        filled = np.resize(rows, max(_SMALLEST, 1 << (len(rows) - 1).bit_length()))
         score, shift = _search_turn(
             turned, still, jnp.asarray(compact[filled]), jnp.asarray(target[filled]), config=config
         )
