@@ -1,5 +1,6 @@
 from .choose import Score as Score
 from .choose import choose_trajectory as choose_trajectory
+from .direct import optimize_directly as optimize_directly
 from .config import DeepMappingConfig as DeepMappingConfig
 from .config import PhaseConfig as PhaseConfig
 from .config import preset as preset
@@ -17,3 +18,6 @@ from .fit import next_phase as next_phase
 from .occupancy_map import MapPicture as MapPicture
 from .occupancy_map import draw_map as draw_map
 from .score import map_code_length as map_code_length
+from .confidence import Confidence as Confidence
+from .confidence import ConfidenceConfig as ConfidenceConfig
+from .confidence import judge_trajectory as judge_trajectory
