@@ -111,7 +111,7 @@ class Result:
 def main(config: Config) -> Result:
     """Reads, starts warm, fits, polishes, keeps the best, writes."""
     from dpmjax.deepmapping import choose_trajectory, judge_trajectory
-    from dpmjax.registration import PolishConfig, polish
+    from dpmjax.registration import polish
 
     started = time.perf_counter()
     select_device(config.device)

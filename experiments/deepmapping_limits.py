@@ -137,7 +137,9 @@ def summary(rows: list[dict[str, Any]], config: Config) -> list[str]:
             if mine:
                 eighth = [row["success"] for row in mine if row["stride"] == 8]
                 at_eighth = f", at every 8th scan {np.mean(eighth):.0%} of {len(eighth)}" if eighth else ""
-                lines.append(f"{order}, {method}: {np.mean([r['success'] for r in mine]):.0%} of {len(mine)}{at_eighth}")
+                lines.append(
+                    f"{order}, {method}: {np.mean([r['success'] for r in mine]):.0%} of {len(mine)}{at_eighth}"
+                )
     return lines
 
 

@@ -131,8 +131,9 @@ def table(rows: list[dict[str, Any]], methods: tuple[str, ...]) -> str:
             s = summarise(mine)
             right = "-" if s["success_of_good"] is None else f"{s['success_of_good']:.1%}"
             lines.append(
-                f"| {method} | {s['num_trajectories']} | {s['median_ate_px']:.3g} | {s['median_point_distance_px']:.3g} "
-                f"| {s['success']:.1%} | {s['median_s']:.1f} | {s['num_called_good']} | {right} |"
+                f"| {method} | {s['num_trajectories']} | {s['median_ate_px']:.3g} "
+                f"| {s['median_point_distance_px']:.3g} | {s['success']:.1%} "
+                f"| {s['median_s']:.1f} | {s['num_called_good']} | {right} |"
             )
     return "\n".join(lines)
 

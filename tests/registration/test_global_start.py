@@ -17,8 +17,8 @@ from dpmjax.registration import (
     CorrelativeConfig,
     GlobalConfig,
     Margins,
-    Profiles,
     PolishConfig,
+    Profiles,
     assemble,
     global_start,
     judge_pairs,
@@ -51,8 +51,8 @@ def look(sequence: ScanSequence) -> Views:
 
 @pytest.fixture(scope="module")
 def views() -> Views:
-    """Seven scans of the yard, 60 px apart."""
-    return look(take_scans(simulate_sequence(1, 49, num_beams=128, seed=1), slice(0, None, 8)))
+    """Seven scans of the office, 60 px apart."""
+    return look(take_scans(simulate_sequence(0, 49, seed=1), slice(0, None, 8)))
 
 
 def all_pairs(count: int) -> tuple[np.ndarray, np.ndarray]:
@@ -96,7 +96,7 @@ def test_right_pose_crosses_nothing_and_wrong_pose_does(views: Views) -> None:
     reference = views.sequence.reference_poses
     source, target = np.array([1, 1]), np.array([0, 0])
     right = planar_poses.relative(reference[0], reference[1])
-    poses = np.stack([right, right + [0.0, 60.0, 0.5]])
+    poses = np.stack([right, right + np.array([0.0, 60.0, 0.5])])
     verdict = judge_pairs(views.profiles, source, target, poses, margins=views.margins)
     assert verdict.crossed[0] <= 2
     assert verdict.crossed[1] > 20
@@ -132,12 +132,8 @@ def test_search_finds_the_relative_pose_from_any_yaw(views: Views, yaw: float) -
     c, s = np.cos(-yaw), np.sin(-yaw)
     points[1] = points[1] @ np.array([[c, -s], [s, c]], np.float32).T
     reference[1, 2] += yaw
-    some = look(
-        replace(views.sequence, points=points, mask=views.sequence.mask[:2], reference_poses=reference)
-    )
-    found = search_pairs(
-        some.profiles, np.array([1]), np.array([0]), COARSE, scale=some.scale, margins=some.margins
-    )
+    some = look(replace(views.sequence, points=points, mask=views.sequence.mask[:2], reference_poses=reference))
+    found = search_pairs(some.profiles, np.array([1]), np.array([0]), COARSE, scale=some.scale, margins=some.margins)
     error = planar_poses.relative(planar_poses.relative(reference[0], reference[1]), found.poses[0, 0])
     assert np.hypot(error[0], error[1]) < 3.0
     assert abs(error[2]) < 0.03

@@ -82,7 +82,7 @@ def judge_trajectory(
     graph = scipy.sparse.csr_matrix((2.0 - share, (source, target)), shape=(num_scans, num_scans))
     tree = scipy.sparse.csgraph.minimum_spanning_tree(graph)
     joint = 2.0 - float(tree.data.max()) if tree.nnz == num_scans - 1 else 0.0
-    contradiction = float(verdict.crossed.sum() / max(verdict.seen.sum(), 1.0))
+    contradiction = float(np.sum(verdict.crossed)) / max(float(np.sum(verdict.seen)), 1.0)
     noisiness = min(1.0, float(lines.noise[0]) / (0.1 * scale))
     limit = config.max_contradiction + noisiness * config.noisy_contradiction
     return Confidence(joint, contradiction, joint >= config.min_joint and contradiction <= limit)

@@ -107,7 +107,7 @@ class _Judge(NamedTuple):
         matched = np.maximum(verdict.matched - by_chance, 0.0)
         crossed = np.maximum(verdict.crossed - self.noisy_share * verdict.seen, 0.0)
         value = matched - self.config.crossed_weight * crossed
-        return np.bincount(row, value, minlength=len(scan))
+        return np.asarray(np.bincount(row, value, minlength=len(scan)), np.float64)
 
 
 def _grow(offers: _Offers, judge: _Judge, num_scans: int, seed: int) -> tuple[Floats, float]:
@@ -217,7 +217,12 @@ def assemble(
             poses = planar_poses.relative(poses[0], poses)
             best = Assembly(poses, support, edges, float(support.sum()))
     if best is None:
-        return Assembly(np.zeros((num_scans, 3)), np.zeros(num_scans), agreeing_edges(np.zeros((num_scans, 3)), candidates, config, scale), 0.0)
+        return Assembly(
+            np.zeros((num_scans, 3)),
+            np.zeros(num_scans),
+            agreeing_edges(np.zeros((num_scans, 3)), candidates, config, scale),
+            0.0,
+        )
     return best
 
 

@@ -147,9 +147,7 @@ def global_start(
     alike, turned = likeness(profiles, scale)
     keyframes = choose_keyframes(alike, config, is_ordered=is_ordered)
     first, second = (x.astype(np.int64) for x in np.nonzero(np.tri(len(keyframes), k=-1, dtype=bool)))
-    found = search_pairs(
-        profiles, keyframes[first], keyframes[second], config.search, scale=scale, margins=margins
-    )
+    found = search_pairs(profiles, keyframes[first], keyframes[second], config.search, scale=scale, margins=margins)
     inside = Candidates(first, second, found.poses, found.scores)
     key_profiles = _rows(profiles, keyframes)
     assembly = assemble(key_profiles, inside, config.assembly, scale=scale, margins=margins, is_ordered=is_ordered)

@@ -17,6 +17,7 @@ from jaxtyping import Array, Bool, Float, Int
 from numpy.typing import NDArray
 
 from dpmjax.geometry.lines import LineScans
+from dpmjax.types import AnyArray
 
 # Beams farther apart than so many times an even spread leave a gap that says nothing.
 _MAX_GAP = 2.5
@@ -71,9 +72,9 @@ class Verdict(NamedTuple):
         seen: hits in directions that the other has measured, not farther than its surface.
     """
 
-    matched: Float[Array, "..."]
-    crossed: Float[Array, "..."]
-    seen: Float[Array, "..."]
+    matched: Float[AnyArray, "..."]
+    crossed: Float[AnyArray, "..."]
+    seen: Float[AnyArray, "..."]
 
 
 def smooth_ranges(lines: LineScans) -> Float[Array, "n b 2"]:
