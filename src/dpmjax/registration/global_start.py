@@ -9,6 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
+import jax
 import numpy as np
 from numpy.typing import NDArray
 
@@ -165,8 +166,6 @@ def global_start(
 
 
 def _rows(profiles: Profiles, rows: Indices) -> Profiles:
-    import jax
-
     return jax.tree.map(lambda x: x[rows], profiles)
 
 
