@@ -4,6 +4,7 @@
     python -m experiments.deepmapping_2d scans.tar -o out             a folder or .tar of .pcd + gt_pose.mat
     python -m experiments.deepmapping_2d robot.log.gz --init odometry a CARMEN log
     python -m experiments.deepmapping_2d scans.npz --seconds 60       arrays (n, b, 2)
+    python -m experiments.deepmapping_2d --jump 8 --init global       large steps: no first guess is needed
     python -m experiments.deepmapping_2d --resume                     continue the latest run
 
 Results go to results/deepmapping_2d/<time>/ (latest links to the newest): metrics.json, trajectories as TUM, KITTI and
@@ -38,7 +39,7 @@ if TYPE_CHECKING:
 
 EXPERIMENT = "deepmapping_2d"
 LOGGER = logging.getLogger("dpmjax.deepmapping_2d")
-INITS = ("icp-plane", "icp-point", "odometry", "zero")
+INITS = ("icp-plane", "icp-point", "global", "odometry", "zero")
 
 
 @dataclass(frozen=True)
@@ -51,8 +52,10 @@ class Config:
     """Folder for the results, instead of results/deepmapping_2d/<time>."""
     preset: Literal["fast", "paper"] = "fast"
     """fast: minutes on two cores; paper: architecture, losses and sampling of the paper."""
-    init: Annotated[str, arg(metavar="icp-plane|icp-point|odometry|zero|FILE")] = "icp-plane"
-    """Where the poses start; FILE is a trajectory."""
+    init: Annotated[str, arg(metavar="icp-plane|icp-point|global|odometry|zero|FILE")] = "icp-plane"
+    """Where the poses start; global: an exhaustive search of scan pairs, needs no guess; FILE is a trajectory."""
+    ordered: bool = True
+    """Scans lie in the order of time; --no-ordered with --init global makes no use of it."""
     polish: bool = True
     """Finish with a multi-view point-to-line alignment."""
     steps: Annotated[int | None, arg(metavar="N")] = None
@@ -107,7 +110,7 @@ class Result:
 
 def main(config: Config) -> Result:
     """Reads, starts warm, fits, polishes, keeps the best, writes."""
-    from dpmjax.deepmapping import choose_trajectory
+    from dpmjax.deepmapping import choose_trajectory, judge_trajectory
     from dpmjax.registration import polish
 
     started = time.perf_counter()
@@ -139,17 +142,19 @@ def main(config: Config) -> Result:
         if config.polish and not stop.is_requested:
             # From both: the fit is sharper near a good start, the start keeps what a robot's odometry knows.
             for name in ("fit",) if config.init == "zero" else ("start", "fit"):
-                polished = polish(lines, candidates[name])
+                polished = polish(lines, candidates[name], how)
                 LOGGER.info("polished the %s: %d pairs, %d loops", name, polished.num_pairs, polished.num_loops)
                 candidates[f"polished {name}"] = polished.poses
         chosen, scores = choose_trajectory(lines, candidates)
         poses = candidates[chosen]
+        confidence = judge_trajectory(lines, sequence.mask, poses)
         metrics = {
             "num_scans": len(sequence),
             "steps": fitted.steps,
             **compare_to_reference(sequence, start, poses),
             "chosen": chosen,
             "scores": {name: score._asdict() for name, score in scores.items()},
+            "confidence": confidence._asdict(),
             "fit_s": fitted.run_s,
             "compile_s": fitted.compile_s,
             "wall_s": time.perf_counter() - started,
@@ -182,6 +187,10 @@ def warm_start(config: Config, sequence: ScanSequence) -> NDArray[np.float64]:
     """(n, 3) poses to start from; what is no word of `INITS` names a trajectory file."""
     if config.init == "zero":
         return np.zeros((len(sequence), 3))
+    if config.init == "global":
+        from dpmjax.registration import global_start
+
+        return global_start(line_scans(sequence), sequence.mask, is_ordered=config.ordered).poses
     if config.init == "odometry":
         if sequence.odometry_poses is None:
             raise ValueError(
@@ -302,6 +311,12 @@ def tell(folder: RunFolder, sequence: ScanSequence, metrics: dict[str, Any]) -> 
         print(f"ATE {metrics[f'ate_initial_{unit}']:.3g} {unit} -> {metrics[f'ate_{unit}']:.3g} {unit}")
     print(f"kept: the {metrics['chosen']} (judged by the scans alone)")
     print(f"results in {folder.path}")
+    confidence = metrics["confidence"]
+    verdict = "can be trusted" if confidence["is_good"] else "DO NOT TRUST this map"
+    print(
+        f"{verdict}: weakest joint {confidence['weakest_joint']:.0%} of the beams, "
+        f"{confidence['contradiction']:.1%} contradict others"
+    )
 
 
 if __name__ == "__main__":

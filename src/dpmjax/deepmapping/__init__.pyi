@@ -1,9 +1,13 @@
 from .choose import Score as Score
 from .choose import choose_trajectory as choose_trajectory
+from .confidence import Confidence as Confidence
+from .confidence import ConfidenceConfig as ConfidenceConfig
+from .confidence import judge_trajectory as judge_trajectory
 from .config import DeepMappingConfig as DeepMappingConfig
 from .config import PhaseConfig as PhaseConfig
 from .config import preset as preset
 from .config import with_steps as with_steps
+from .direct import optimize_directly as optimize_directly
 from .fit import Fitted as Fitted
 from .fit import Report as Report
 from .fit import State as State

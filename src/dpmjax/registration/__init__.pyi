@@ -1,3 +1,13 @@
+from .assemble import AssembleConfig as AssembleConfig
+from .assemble import Assembly as Assembly
+from .assemble import assemble as assemble
+from .correlative import Candidates as Candidates
+from .correlative import CorrelativeConfig as CorrelativeConfig
+from .correlative import search_pairs as search_pairs
+from .global_start import GlobalConfig as GlobalConfig
+from .global_start import GlobalStart as GlobalStart
+from .global_start import global_start as global_start
+from .global_start import view_margins as view_margins
 from .icp import IcpResult as IcpResult
 from .icp import icp as icp
 from .incremental import IncrementalConfig as IncrementalConfig
@@ -11,3 +21,8 @@ from .multiview import surface_misfit as surface_misfit
 from .pairs import length_scale as length_scale
 from .planar_graph import Edges as Edges
 from .planar_graph import optimize_planar_graph as optimize_planar_graph
+from .profiles import Margins as Margins
+from .profiles import Profiles as Profiles
+from .profiles import Verdict as Verdict
+from .profiles import judge_pairs as judge_pairs
+from .profiles import make_profiles as make_profiles

@@ -48,6 +48,8 @@ class PolishConfig:
         loops: settings of the loop search; None: never.
         firm_fitness: the start is sound, and no loops are searched, if all its steps fit better than this ...
         firm_grip: ... and this share of the beams holds each in its softest direction.
+        is_ordered: neighbours in the array are neighbours in time; else only neighbours in space count, the steps of
+            the start mean nothing, and no loops are searched.
     """
 
     schedule: Schedule = field(default_factory=lambda: Schedule(gate=(0.6, 0.1), kernel=(0.4, 0.01), num_iterations=14))
@@ -60,6 +62,7 @@ class PolishConfig:
     loops: LoopConfig | None = field(default_factory=LoopConfig)
     firm_fitness: float = 0.35
     firm_grip: float = 0.005
+    is_ordered: bool = True
 
 
 class Polished(NamedTuple):
@@ -81,10 +84,12 @@ class Polished(NamedTuple):
 def choose_pairs(poses: Floats, config: PolishConfig, scale: float) -> tuple[Indices, Indices]:
     """Pairs (source, target) of neighbours in time and in space; of each visit of a place the nearest scan."""
     num_scans = len(poses)
-    source = [np.arange(k, num_scans) for k in config.temporal]
-    target = [np.arange(num_scans - k) for k in config.temporal]
+    temporal = config.temporal if config.is_ordered else ()
+    source = [np.arange(k, num_scans) for k in temporal]
+    target = [np.arange(num_scans - k) for k in temporal]
     tree = scipy.spatial.cKDTree(poses[:, :2])
-    apart = max(config.temporal, default=0) + 2
+    # Of each visit of a place one scan is enough; without an order every scan is a visit.
+    apart, visit = (max(temporal, default=0) + 2, 2) if config.is_ordered else (0, 0)
     count = min(num_scans, 6 * config.num_spatial + 2 * apart)
     nearest = tree.query(poses[:, :2], k=count, distance_upper_bound=config.radius * scale)
     distances, rows = np.atleast_2d(nearest[0]), np.atleast_2d(nearest[1])
@@ -94,7 +99,7 @@ def choose_pairs(poses: Floats, config: PolishConfig, scale: float) -> tuple[Ind
         near = near[np.abs(planar_poses.wrap(poses[near, 2] - poses[scan, 2])) < config.max_turn]
         chosen: list[int] = []
         for other in near:
-            if all(abs(other - c) > 2 for c in chosen):
+            if all(abs(other - c) > visit for c in chosen):
                 chosen.append(int(other))
             if len(chosen) == config.num_spatial:
                 break
@@ -161,7 +166,8 @@ def align_all(lines: LineScans, poses: Floats, config: PolishConfig, *, scale: f
     gates, kernels = scales(config.schedule, scale, 1.25 * noise)
     steps = step_edges(poses, None, LoopConfig(step_sigma=config.step_sigma), scale)
     # In units of one beam's information, as the systems of the pairs are.
-    steps = steps._replace(information=steps.information * max(noise, 0.005 * scale) ** 2)
+    trust = max(noise, 0.005 * scale) ** 2 if config.is_ordered else 1e-9
+    steps = steps._replace(information=steps.information * trust)
     source, target, system = np.zeros(0, np.int64), np.zeros(0, np.int64), None
     for round_number, (gate, kernel) in enumerate(zip(gates, kernels, strict=True)):
         if round_number % config.refresh == 0:
@@ -203,6 +209,8 @@ def polish(lines: LineScans, poses: Floats, config: PolishConfig | None = None) 
     """
     config = config or PolishConfig()
     scale = length_scale(lines)
+    if not config.is_ordered:
+        return align_all(lines, poses, config, scale=scale)
     steps = match_steps(lines, poses, scale=scale)
     num_loops = 0
     if config.loops is not None and not is_sound(lines, steps, config):

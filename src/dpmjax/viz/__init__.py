@@ -3,6 +3,7 @@
 Nothing here needs a screen or touches `pyplot`; matplotlib itself is imported when the first picture is drawn.
 """
 
+from dpmjax.viz.comparison import error_boxes_figure, success_grids_figure
 from dpmjax.viz.figures import save_figure
 from dpmjax.viz.history import History, history_figure
 from dpmjax.viz.maps import Panel, make_panel, registered_scans_figure
@@ -13,10 +14,12 @@ __all__ = [
     "History",
     "Panel",
     "curves_figure",
+    "error_boxes_figure",
     "history_figure",
     "make_panel",
     "matches_figure",
     "occupancy_figure",
     "registered_scans_figure",
     "save_figure",
+    "success_grids_figure",
 ]

@@ -1,0 +1,217 @@
+"""The methods that the suite and the limits compare: each from scans to poses, none of them sees the truth."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    from dpmjax.data.sequence import ScanSequence
+    from dpmjax.geometry.lines import LineScans
+
+Floats = NDArray[np.float64]
+
+SUCCESS_PX = 20.0
+"""ATE below which the paper calls a run a success (section 4.1)."""
+
+NOT_RUN = {
+    "pso": "no particle swarm library is among the dependencies",
+    "go-icp": "the packages of Go-ICP on PyPI register two 3-D clouds, and none does 2-D",
+    "multiway": "needs Open3D, which is not among the dependencies",
+}
+"""Baselines of the paper that have no column, and why."""
+
+
+@dataclass(frozen=True)
+class Problem:
+    """What a method is given.
+
+    Attributes:
+        sequence: the scans; methods do not look at its reference.
+        lines: the same with lines.
+        is_ordered: the scans lie in the order of time.
+        steps: of Adam, for what optimises.
+        seed: of everything random.
+    """
+
+    sequence: ScanSequence
+    lines: LineScans
+    is_ordered: bool
+    steps: int
+    seed: int
+
+
+def make_problem(sequence: ScanSequence, *, is_ordered: bool, steps: int, seed: int) -> Problem:
+    """The scans as methods want them; without an order they are shuffled."""
+    from dpmjax.geometry.lines import fit_lines
+    from dpmjax.types import ScanSet
+
+    if not is_ordered:
+        order = np.random.default_rng([seed, 77]).permutation(len(sequence))
+        assert sequence.reference_poses is not None
+        sequence = replace(
+            sequence,
+            points=sequence.points[order],
+            mask=sequence.mask[order],
+            reference_poses=sequence.reference_poses[order],
+            odometry_poses=None,
+        )
+    return Problem(sequence, fit_lines(ScanSet(sequence.points, sequence.mask)), is_ordered, steps, seed)
+
+
+def icp_point(problem: Problem) -> Floats:
+    """Incremental ICP, point to point."""
+    return _incremental(problem, "point")
+
+
+def icp_plane(problem: Problem) -> Floats:
+    """Incremental ICP, point to line."""
+    return _incremental(problem, "plane")
+
+
+def multiview(problem: Problem) -> Floats:
+    """Incremental ICP, loops, and all scans aligned together."""
+    from dpmjax.registration import polish
+
+    return polish(problem.lines, icp_plane(problem)).poses
+
+
+def direct_adam(problem: Problem) -> Floats:
+    """The same loss without L-Net, poses from zero, by Adam."""
+    from dpmjax.deepmapping import preset
+
+    config = preset("fast")
+    return _fit(problem, None, replace(config, cold_phases=config.warm_phases))
+
+
+def direct_lbfgs(problem: Problem) -> Floats:
+    """The same loss without L-Net, poses from zero, by L-BFGS."""
+    import jax
+
+    from dpmjax.deepmapping import optimize_directly, preset
+    from dpmjax.types import ScanSet
+
+    scans = ScanSet(problem.sequence.points, problem.sequence.mask)
+    key = jax.random.key(problem.seed)
+    return optimize_directly(scans, preset("fast"), num_iterations=max(1, problem.steps // 4), key=key)
+
+
+def cold(problem: Problem) -> Floats:
+    """DeepMapping from the global search of scan pairs: no ICP, no polish; the better map of search and fit."""
+    from dpmjax.deepmapping import choose_trajectory
+
+    start = _global(problem)
+    candidates = {"start": start, "fit": _fit_in_order(problem, start)}
+    return candidates[choose_trajectory(problem.lines, candidates)[0]]
+
+
+def warm(problem: Problem) -> Floats:
+    """DeepMapping from ICP and from the global search, polished; what describes the beams best is kept."""
+    from dpmjax.deepmapping import choose_trajectory, judge_trajectory
+    from dpmjax.registration import PolishConfig, polish
+
+    free = PolishConfig(is_ordered=False)
+    candidates: dict[str, Floats] = {}
+    if problem.is_ordered:
+        candidates["icp"] = polish(problem.lines, icp_plane(problem)).poses
+    is_sure = bool(candidates) and judge_trajectory(problem.lines, problem.sequence.mask, candidates["icp"]).is_good
+    if not is_sure:
+        candidates["global"] = polish(problem.lines, _global(problem), free).poses
+    best = candidates[choose_trajectory(problem.lines, candidates)[0]]
+    fitted = _fit_in_order(problem, best)
+    candidates |= {"fit": fitted, "polished fit": polish(problem.lines, fitted, free).poses}
+    return candidates[choose_trajectory(problem.lines, candidates)[0]]
+
+
+METHODS: dict[str, Callable[[Problem], Floats]] = {
+    "icp-point": icp_point,
+    "icp-plane": icp_plane,
+    "multiview": multiview,
+    "direct-adam": direct_adam,
+    "direct-lbfgs": direct_lbfgs,
+    "deepmapping-cold": cold,
+    "deepmapping-warm": warm,
+}
+
+
+def run_method(name: str, problem: Problem) -> dict[str, Any]:
+    """Errors, time and confidence of one method on one problem."""
+    from dpmjax.deepmapping import judge_trajectory
+    from dpmjax.geometry import planar_poses
+    from dpmjax.metrics import absolute_trajectory_error, point_distance
+
+    sequence = problem.sequence
+    reference = sequence.reference_poses
+    assert reference is not None
+    begun, begun_cpu = time.perf_counter(), time.process_time()
+    poses = METHODS[name](problem)
+    seconds, cpu_seconds = time.perf_counter() - begun, time.process_time() - begun_cpu
+    ate = absolute_trajectory_error(poses[:, :2], reference[:, :2])
+    distance = point_distance(
+        sequence.points, sequence.mask, planar_poses.matrices(poses), planar_poses.matrices(reference)
+    )
+    confidence = judge_trajectory(problem.lines, sequence.mask, poses)
+    return {
+        "ate_px": ate,
+        "point_distance_px": distance,
+        "success": ate < SUCCESS_PX,
+        "seconds": seconds,
+        "cpu_s": cpu_seconds,
+        **confidence._asdict(),
+    }
+
+
+def _incremental(problem: Problem, metric: Literal["point", "plane"]) -> Floats:
+    from dpmjax.registration import IncrementalConfig, incremental_icp
+
+    return incremental_icp(problem.lines, IncrementalConfig(metric=metric))[0]
+
+
+def _global(problem: Problem) -> Floats:
+    from dpmjax.registration import global_start
+
+    return global_start(problem.lines, problem.sequence.mask, is_ordered=problem.is_ordered).poses
+
+
+def _fit(problem: Problem, start: Floats | None, config: Any) -> Floats:
+    import jax
+
+    from dpmjax.deepmapping import fit_deepmapping, with_steps
+    from dpmjax.types import ScanSet
+
+    scans = ScanSet(problem.sequence.points, problem.sequence.mask)
+    settings = with_steps(config, problem.steps)
+    return fit_deepmapping(scans, settings, key=jax.random.key(problem.seed), init=start).poses
+
+
+def _fit_in_order(problem: Problem, start: Floats) -> Floats:
+    """The fit of scans in an order in which neighbours are near each other: that of time, or a tour of the start."""
+    from dpmjax.deepmapping import preset
+
+    if problem.is_ordered:
+        return _fit(problem, start, preset("fast"))
+    tour = nearest_tour(start)
+    sequence = problem.sequence
+    ordered = replace(
+        problem,
+        sequence=replace(sequence, points=sequence.points[tour], mask=sequence.mask[tour], reference_poses=None),
+    )
+    poses = np.empty_like(start)
+    poses[tour] = _fit(ordered, start[tour], preset("fast"))
+    return poses
+
+
+def nearest_tour(poses: Floats) -> NDArray[np.int64]:
+    """From each scan to the nearest one not yet visited."""
+    left = set(range(1, len(poses)))
+    tour = [0]
+    while left:
+        here = poses[tour[-1], :2]
+        tour.append(min(left, key=lambda scan: (float(np.hypot(*(poses[scan, :2] - here))), scan)))
+        left.remove(tour[-1])
+    return np.array(tour, np.int64)

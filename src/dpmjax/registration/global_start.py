@@ -1,0 +1,173 @@
+"""Poses of all scans from nothing but the scans: no first guess, no iterated closest points, and if need be no order.
+
+A few dozen scans that differ most are searched against each other exhaustively and assembled into one map; the others
+then look for their places in it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import jax
+import numpy as np
+from numpy.typing import NDArray
+
+from dpmjax.geometry import planar_poses
+from dpmjax.geometry.lines import LineScans
+from dpmjax.registration.assemble import AssembleConfig, agreeing_edges, assemble, place_in_map
+from dpmjax.registration.correlative import Candidates, CorrelativeConfig, Floats, Indices, search_pairs
+from dpmjax.registration.pairs import length_scale
+from dpmjax.registration.planar_graph import Edges, optimize_planar_graph
+from dpmjax.registration.profiles import Margins, Profiles, make_profiles
+
+# Directions that profiles are compared at for likeness.
+_LIKENESS_BEARINGS = 128
+
+
+@dataclass(frozen=True)
+class GlobalConfig:
+    """Settings. Lengths are in length scales of the scans.
+
+    Attributes:
+        max_keyframes: so many scans are searched all against all.
+        num_anchors: every other scan is searched against so many keyframes that look like it.
+        num_likely_turns: headings that are tried for these, by likeness, and their neighbours.
+        match: how near a hit must come to count as matched; never below half the range noise.
+        cross: how far in front of a surface a hit contradicts it; never below five times the range noise.
+        search: of pairs.
+        assembly: of the map.
+    """
+
+    max_keyframes: int = 32
+    num_anchors: int = 4
+    num_likely_turns: int = 3
+    match: float = 0.04
+    cross: float = 0.12
+    search: CorrelativeConfig = field(default_factory=CorrelativeConfig)
+    assembly: AssembleConfig = field(default_factory=AssembleConfig)
+
+
+class GlobalStart(NamedTuple):
+    """Result of `global_start`.
+
+    Attributes:
+        poses: (n, 3) T_world_scan, the first one zero.
+        keyframes: rows of the scans that were searched all against all.
+        num_edges: pairs that agree with the map.
+    """
+
+    poses: Floats
+    keyframes: Indices
+    num_edges: int
+
+
+def view_margins(lines: LineScans, config: GlobalConfig | None = None) -> Margins:
+    """How exactly hits of these scans can be compared."""
+    config = config or GlobalConfig()
+    scale, noise = length_scale(lines), float(lines.noise[0])
+    return Margins(max(config.match * scale, 0.5 * noise), max(config.cross * scale, 5.0 * noise))
+
+
+def likeness(profiles: Profiles, scale: float) -> tuple[Floats, Floats]:
+    """How alike the views of all pairs are when turned rightly, (n, n), and for each turn, (n, n, 128).
+
+    Turn k of pair (i, j) is the heading 2 pi k / 128 of T_i_j.
+    """
+    stride = profiles.surface.shape[1] // _LIKENESS_BEARINGS
+    reach = np.asarray(profiles.surface, np.float64).reshape(-1, _LIKENESS_BEARINGS, stride).mean(-1)
+    # Near surfaces move most between two views of one place, so far ones are worth less.
+    seen = np.asarray(profiles.is_seen).reshape(-1, _LIKENESS_BEARINGS, stride).any(-1)
+    view = np.where(seen, np.log1p(reach / scale), 0.0)
+    view = view - view.mean(axis=1, keepdims=True)
+    view /= np.maximum(np.linalg.norm(view, axis=1, keepdims=True), 1e-9)
+    spectrum = np.fft.rfft(view, axis=1)
+    turned = np.fft.irfft(spectrum[:, None] * np.conj(spectrum[None]), n=_LIKENESS_BEARINGS, axis=-1)
+    return turned.max(-1), turned
+
+
+def choose_keyframes(alike: Floats, config: GlobalConfig, *, is_ordered: bool) -> Indices:
+    """Scans that cover the place: evenly in time where there is an order, else each as unlike the others as can be."""
+    num_scans = len(alike)
+    count = min(num_scans, config.max_keyframes)
+    if is_ordered or count == num_scans:
+        return np.unique(np.round(np.linspace(0, num_scans - 1, count)).astype(np.int64))
+    chosen = [0]
+    nearest = alike[0].copy()
+    for _ in range(count - 1):
+        chosen.append(int(nearest.argmin()))
+        nearest = np.maximum(nearest, alike[chosen[-1]])
+    return np.unique(chosen).astype(np.int64)
+
+
+def _anchor_pairs(
+    alike: Floats, turned: Floats, keyframes: Indices, config: GlobalConfig, *, is_ordered: bool
+) -> tuple[Indices, Indices, NDArray[np.bool_]]:
+    """Pairs (keyframe, other scan) to search, and which turns to try for each."""
+    others = np.setdiff1d(np.arange(len(alike)), keyframes)
+    order = np.argsort(-alike[np.ix_(others, keyframes)], axis=1)[:, : config.num_anchors]
+    pairs = {(int(keyframes[k]), int(scan)) for scan, row in zip(others, order, strict=True) for k in row}
+    if is_ordered:
+        after = np.clip(np.searchsorted(keyframes, others), 1, len(keyframes) - 1)
+        pairs |= {(int(keyframes[a + d]), int(s)) for s, a in zip(others, after, strict=True) for d in (-1, 0)}
+    source, target = np.array(sorted(pairs), np.int64).reshape(-1, 2).T
+    # T_target_source of a keyframe in the frame of the other scan.
+    curve = turned[target, source]
+    num_turns, count = config.search.num_turns, curve.shape[-1]
+    turns = np.zeros((len(source), num_turns), bool)
+    row = np.arange(len(source))
+    for _ in range(config.num_likely_turns):
+        best = curve.argmax(axis=1)
+        middle = np.round(best * num_turns / count).astype(int)
+        for offset in (-2, -1, 0, 1, 2):
+            turns[row, (middle + offset) % num_turns] = True
+        for offset in range(-6, 7):
+            curve[row, (best + offset) % count] = -np.inf
+    return source, target, turns
+
+
+def global_start(
+    lines: LineScans, valid: NDArray[np.bool_], config: GlobalConfig | None = None, *, is_ordered: bool = True
+) -> GlobalStart:
+    """Poses of all scans from no guess.
+
+    Args:
+        lines: n scans with lines.
+        valid: (n, b) beams that measured something.
+        config: settings.
+        is_ordered: neighbours in the array are neighbours in time; else no order is used, and shuffled scans give
+            the same map.
+
+    Returns:
+        GlobalStart.
+    """
+    config = config or GlobalConfig()
+    scale, margins = length_scale(lines), view_margins(lines, config)
+    profiles = make_profiles(lines, np.asarray(valid))
+    num_scans = len(np.asarray(valid))
+    alike, turned = likeness(profiles, scale)
+    keyframes = choose_keyframes(alike, config, is_ordered=is_ordered)
+    first, second = (x.astype(np.int64) for x in np.nonzero(np.tri(len(keyframes), k=-1, dtype=bool)))
+    found = search_pairs(profiles, keyframes[first], keyframes[second], config.search, scale=scale, margins=margins)
+    inside = Candidates(first, second, found.poses, found.scores)
+    key_profiles = _rows(profiles, keyframes)
+    assembly = assemble(key_profiles, inside, config.assembly, scale=scale, margins=margins, is_ordered=is_ordered)
+    poses = np.zeros((num_scans, 3))
+    poses[keyframes] = assembly.poses
+    edges = agreeing_edges(poses, found, config.assembly, scale)
+    if len(keyframes) < num_scans:
+        source, target, turns = _anchor_pairs(alike, turned, keyframes, config, is_ordered=is_ordered)
+        more = search_pairs(profiles, source, target, config.search, scale=scale, margins=margins, turns=turns)
+        poses = place_in_map(profiles, poses, keyframes, more, config.assembly, scale=scale, margins=margins)
+        edges = _both(edges, agreeing_edges(poses, more, config.assembly, scale))
+        if len(edges.source):
+            poses, _ = optimize_planar_graph(poses, edges)
+    return GlobalStart(planar_poses.relative(poses[0], poses), keyframes, len(edges.source))
+
+
+def _rows(profiles: Profiles, rows: Indices) -> Profiles:
+    return jax.tree.map(lambda x: x[rows], profiles)
+
+
+def _both(one: Edges, other: Edges) -> Edges:
+    return Edges(*(np.concatenate(pair) for pair in zip(one, other, strict=True)))

@@ -1,0 +1,182 @@
+"""The global start: profiles, the exhaustive search of pairs, and maps grown from pairs."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from dpmjax.data import ScanSequence, simulate_sequence, take_scans
+from dpmjax.geometry import planar_poses
+from dpmjax.geometry.lines import LineScans, fit_lines
+from dpmjax.metrics import absolute_trajectory_error
+from dpmjax.registration import (
+    CorrelativeConfig,
+    GlobalConfig,
+    Margins,
+    PolishConfig,
+    Profiles,
+    assemble,
+    global_start,
+    judge_pairs,
+    length_scale,
+    make_profiles,
+    polish,
+    search_pairs,
+    view_margins,
+)
+from dpmjax.types import ScanSet
+
+# Coarse, so that a test takes a second: what is law does not depend on it.
+COARSE = CorrelativeConfig(num_cells=64, cell=0.5, num_turns=72, block=8, num_levels=5, num_candidates=3)
+CONFIG = GlobalConfig(search=COARSE)
+
+
+class Views(NamedTuple):
+    sequence: ScanSequence
+    lines: LineScans
+    profiles: Profiles
+    scale: float
+    margins: Margins
+
+
+def look(sequence: ScanSequence) -> Views:
+    lines = fit_lines(ScanSet(jnp.asarray(sequence.points), jnp.asarray(sequence.mask)))
+    profiles = make_profiles(lines, jnp.asarray(sequence.mask))
+    return Views(sequence, lines, profiles, length_scale(lines), view_margins(lines))
+
+
+@pytest.fixture(scope="module")
+def views() -> Views:
+    """Seven scans of the office, 60 px apart."""
+    return look(take_scans(simulate_sequence(0, 49, seed=1), slice(0, None, 8)))
+
+
+def all_pairs(count: int) -> tuple[np.ndarray, np.ndarray]:
+    first, second = np.nonzero(np.tri(count, k=-1, dtype=bool))
+    return first.astype(np.int64), second.astype(np.int64)
+
+
+def ate(poses: np.ndarray, sequence: ScanSequence) -> float:
+    return absolute_trajectory_error(poses[:, :2], sequence.reference_poses[:, :2])
+
+
+def square_room(half: float, num_beams: int = 256) -> np.ndarray:
+    angle = 2 * np.pi * np.arange(num_beams) / num_beams
+    reach = half / np.maximum(np.abs(np.cos(angle)), np.abs(np.sin(angle)))
+    return (reach[:, None] * np.stack([np.cos(angle), np.sin(angle)], -1)).astype(np.float32)
+
+
+def test_profile_of_a_square_room_is_its_distance() -> None:
+    points = jnp.asarray(square_room(100.0))[None]
+    mask = jnp.ones(points.shape[:2], bool)
+    profiles = make_profiles(fit_lines(ScanSet(points, mask)), mask)
+    bearing = 2 * np.pi * (np.arange(512) + 0.5) / 512
+    expected = 100.0 / np.maximum(np.abs(np.cos(bearing)), np.abs(np.sin(bearing)))
+    assert bool(profiles.is_seen.all())
+    np.testing.assert_allclose(np.asarray(profiles.surface[0]), expected, rtol=1e-3)
+
+
+def test_profile_sees_nothing_in_a_gap_or_without_beams() -> None:
+    points = jnp.asarray(np.stack([square_room(100.0)] * 2))
+    mask = np.ones((2, 256), bool)
+    mask[0, :128] = False
+    mask[1] = False
+    profiles = make_profiles(fit_lines(ScanSet(points, jnp.asarray(mask))), jnp.asarray(mask))
+    seen = np.asarray(profiles.is_seen)
+    assert not seen[0, 4:250].any()
+    assert seen[0, 260:500].all()
+    assert not seen[1].any()
+
+
+def test_right_pose_crosses_nothing_and_wrong_pose_does(views: Views) -> None:
+    reference = views.sequence.reference_poses
+    source, target = np.array([1, 1]), np.array([0, 0])
+    right = planar_poses.relative(reference[0], reference[1])
+    poses = np.stack([right, right + np.array([0.0, 60.0, 0.5])])
+    verdict = judge_pairs(views.profiles, source, target, poses, margins=views.margins)
+    assert verdict.crossed[0] <= 2
+    assert verdict.crossed[1] > 20
+    assert verdict.matched[0] > 2 * verdict.matched[1]
+
+
+def test_verdict_is_mutual(views: Views) -> None:
+    reference = views.sequence.reference_poses
+    pose = planar_poses.relative(reference[0], reference[2])[None]
+    one = judge_pairs(views.profiles, np.array([2]), np.array([0]), pose, margins=views.margins, stride=1)
+    other = judge_pairs(
+        views.profiles, np.array([0]), np.array([2]), planar_poses.inverse(pose), margins=views.margins, stride=1
+    )
+    for a, b in zip(one, other, strict=True):
+        np.testing.assert_allclose(a, b, atol=1.5)
+
+
+def test_masked_beams_hold_anything(views: Views) -> None:
+    mask = views.sequence.mask & (np.random.default_rng(0).uniform(size=views.sequence.mask.shape) < 0.9)
+    results = []
+    for filling in (0.0, 1e4):
+        points = np.where(mask[..., None], views.sequence.points, np.float32(filling))
+        some = look(replace(views.sequence, points=points, mask=mask))
+        poses = np.array([[10.0, 5.0, 0.1]])
+        results.append(judge_pairs(some.profiles, np.array([1]), np.array([0]), poses, margins=views.margins))
+    np.testing.assert_array_equal(np.stack(results[0]), np.stack(results[1]))
+
+
+@pytest.mark.parametrize("yaw", [0.0, 1.3, 3.1, -2.0])
+def test_search_finds_the_relative_pose_from_any_yaw(views: Views, yaw: float) -> None:
+    reference = views.sequence.reference_poses[:2].copy()
+    points = views.sequence.points[:2].copy()
+    c, s = np.cos(-yaw), np.sin(-yaw)
+    points[1] = points[1] @ np.array([[c, -s], [s, c]], np.float32).T
+    reference[1, 2] += yaw
+    some = look(replace(views.sequence, points=points, mask=views.sequence.mask[:2], reference_poses=reference))
+    found = search_pairs(some.profiles, np.array([1]), np.array([0]), COARSE, scale=some.scale, margins=some.margins)
+    error = planar_poses.relative(planar_poses.relative(reference[0], reference[1]), found.poses[0, 0])
+    assert np.hypot(error[0], error[1]) < 3.0
+    assert abs(error[2]) < 0.03
+    assert found.scores[0, 0] > found.scores[0, 1] + 20
+
+
+def test_assembly_rejects_a_false_pair(views: Views) -> None:
+    source, target = all_pairs(len(views.sequence))
+    found = search_pairs(views.profiles, source, target, COARSE, scale=views.scale, margins=views.margins)
+    lie = int(np.flatnonzero((source == 6) & (target == 0))[0])
+    found.poses[lie, 0] = [5.0, -20.0, 2.0]
+    found.scores[lie, 0] = 0.9 * found.scores.max()
+    result = assemble(views.profiles, found, scale=views.scale, margins=views.margins)
+    assert ate(result.poses, views.sequence) < 4.0
+    assert not ((result.edges.source == 6) & (result.edges.target == 0)).any()
+
+
+def test_shuffling_the_scans_permutes_the_result(views: Views) -> None:
+    order = np.array([3, 0, 6, 2, 5, 1, 4])
+    sequence = views.sequence
+    shuffled = look(
+        replace(
+            sequence,
+            points=sequence.points[order],
+            mask=sequence.mask[order],
+            reference_poses=sequence.reference_poses[order],
+        )
+    )
+    one = global_start(views.lines, sequence.mask, CONFIG, is_ordered=False).poses
+    other = global_start(shuffled.lines, shuffled.sequence.mask, CONFIG, is_ordered=False).poses
+    assert ate(one, sequence) < 4.0
+    apart = absolute_trajectory_error(one[order][:, :2], other[:, :2])
+    assert apart < 4.0
+
+
+def test_scans_beyond_the_keyframes_find_their_place(views: Views) -> None:
+    config = replace(CONFIG, max_keyframes=4)
+    start = global_start(views.lines, views.sequence.mask, config)
+    assert len(start.keyframes) == 4
+    assert ate(start.poses, views.sequence) < 4.0
+
+
+def test_polish_without_order_is_exact(views: Views) -> None:
+    rng = np.random.default_rng(0)
+    poses = views.sequence.reference_poses + rng.normal(size=(len(views.sequence), 3)) * [2.0, 2.0, 0.01]
+    assert ate(polish(views.lines, poses, PolishConfig(is_ordered=False)).poses, views.sequence) < 0.05
