@@ -148,8 +148,6 @@ def load_fit(run: Path, options: deepmapping_2d.Config, sequence: ScanSequence) 
     else:
         raise ValueError(f"{run} holds no checkpoint that can be read")
     poses = np.load(trajectory)
-    if poses.shape != (len(sequence), 3):
-        poses = np.column_stack([poses[:, 0, 2], poses[:, 1, 2], np.arctan2(poses[:, 1, 0], poses[:, 0, 0])])
     report = Report(np.nan, None, state.params.poses)  # type: ignore[arg-type]
     return dm.Fitted(planar_poses.matrices(poses), poses, state.params, report, state, reach, settings)
 
