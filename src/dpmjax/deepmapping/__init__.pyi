@@ -31,3 +31,15 @@ from .toy import init_toy as init_toy
 from .toy import minimize_direct as minimize_direct
 from .toy import network_value as network_value
 from .toy import toy_loss as toy_loss
+from .depth_config import DepthMappingConfig as DepthMappingConfig
+from .depth_config import as_direct as as_direct
+from .depth_config import depth_preset as depth_preset
+from .depth_fit import DepthFitted as DepthFitted
+from .depth_fit import DepthScans as DepthScans
+from .depth_fit import as_depth_scans as as_depth_scans
+from .depth_fit import fit_depth as fit_depth
+from .depth_fit import init_depth as init_depth
+from .depth_fit import make_depth_step as make_depth_step
+from .depth_fit import measure_depth_reach as measure_depth_reach
+from .depth_fit import motion_matrices as motion_matrices
+from .depth_fit import next_depth_phase as next_depth_phase

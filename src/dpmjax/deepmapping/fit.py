@@ -257,7 +257,7 @@ def _bind_map(params: Any, config: OccupancyConfig, frame: MapFrame, level_weigh
             return apply(params, local, level_weights)
         # The hidden layers of all samples at once would take gigabytes: a part at a time, again on the way back.
         count = -(-len(points) // _MLP_CHUNK)
-        parts = jnp.pad(local, ((0, count * _MLP_CHUNK - len(points)), (0, 0))).reshape(count, _MLP_CHUNK, 2)
+        parts = jnp.pad(local, ((0, count * _MLP_CHUNK - len(points)), (0, 0))).reshape(count, _MLP_CHUNK, -1)
         logits_of_parts = jax.lax.map(jax.checkpoint(lambda part: apply(params, part, level_weights)), parts)
         return logits_of_parts.reshape(-1)[: len(points)]
 
