@@ -43,3 +43,5 @@ from .depth_fit import make_depth_step as make_depth_step
 from .depth_fit import measure_depth_reach as measure_depth_reach
 from .depth_fit import motion_matrices as motion_matrices
 from .depth_fit import next_depth_phase as next_depth_phase
+from .depth_start import DepthStartConfig as DepthStartConfig
+from .depth_start import place_images as place_images

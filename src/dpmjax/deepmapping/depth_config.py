@@ -17,22 +17,36 @@ LOCALIZE_DEPTH = PhaseConfig(
     poses="network",
     num_steps=400,
     occupancy_weight=0.0,
-    learning_rate=2e-3,
+    learning_rate=1e-3,
     final_learning_rate=0.05,
     adam_decay=(0.9, 0.99),
     beams_per_step=400,
     num_offsets=2,
     max_offset=3,
-    chamfer_limit=0.5,
 )
 """Cold start: L-Net moves all poses together."""
 
-REFINE_DEPTH = PhaseConfig(
-    name="free poses",
+UNROLL_DEPTH = PhaseConfig(
+    name="free poses, Chamfer",
     poses="free",
-    num_steps=500,
+    num_steps=300,
+    occupancy_weight=0.0,
+    learning_rate=1e-2,
+    final_learning_rate=0.02,
+    adam_decay=(0.9, 0.99),
+    beams_per_step=400,
+    num_offsets=2,
+    max_offset=3,
+    chamfer_limit=(0.5, 0.05),
+)
+"""The Chamfer distance pulls views of low overlap onto each other; with its limit falling, that pull goes."""
+
+REFINE_DEPTH = PhaseConfig(
+    name="free poses and map",
+    poses="free",
+    num_steps=300,
     occupancy_weight=0.3,
-    learning_rate=4e-3,
+    learning_rate=2e-3,
     final_learning_rate=0.02,
     map_learning_rate=0.1,
     adam_decay=(0.9, 0.99),
@@ -40,10 +54,10 @@ REFINE_DEPTH = PhaseConfig(
     num_offsets=2,
     max_offset=3,
     num_free=2,
-    surface_distance=(0.1, 0.02),
+    surface_distance=(0.05, 0.01),
     anneal_until=0.7,
     map_decay=1e-3,
-    chamfer_limit=0.1,
+    chamfer_limit=(0.1, 0.03),
 )
 """Free poses and a map that sharpens from coarse to fine."""
 
@@ -77,7 +91,7 @@ class DepthMappingConfig:
     """
 
     motion: Motion = "planar"
-    cold_phases: tuple[PhaseConfig, ...] = (LOCALIZE_DEPTH, REFINE_DEPTH)
+    cold_phases: tuple[PhaseConfig, ...] = (LOCALIZE_DEPTH, UNROLL_DEPTH, REFINE_DEPTH)
     warm_phases: tuple[PhaseConfig, ...] = (REFINE_DEPTH,)
     localization: DepthLocalizationConfig = field(
         default_factory=lambda: DepthLocalizationConfig(features=(32, 64, 128), strides=(2, 2, 1), hidden=(128, 64))

@@ -97,7 +97,7 @@ def occupancy_term(
 
 
 def chamfer_term(
-    points_world: Float[Array, "m b d"], batch: Batch, offsets: Int[Array, " o"], max_distance: float | None = None
+    points_world: Float[Array, "m b d"], batch: Batch, offsets: Int[Array, " o"], max_distance: Float[Array, ""] | None = None
 ) -> Float[Array, ""]:
     """DeepMapping eq. 7: mean Chamfer distance between each scan and the scans `offsets` later in its block."""
     num_scans = batch.rows.shape[0]
@@ -112,6 +112,13 @@ def chamfer_term(
 
     totals, counts = jax.lax.map(compare, offsets)
     return totals.sum() / jnp.maximum(counts.sum(), 1)
+
+
+def _chamfer_limit(config: PhaseConfig, progress: Float[Array, ""]) -> Float[Array, ""] | None:
+    if config.chamfer_limit is None:
+        return None
+    first, last = jnp.log(config.chamfer_limit[0]), jnp.log(config.chamfer_limit[1])
+    return jnp.exp(first + progress * (last - first))
 
 
 def registration_loss(
@@ -155,7 +162,7 @@ def world_loss(
         offset_key, jnp.arange(2, config.max_offset + 1), (config.num_offsets - 1,), replace=False
     )
     offsets = jnp.concatenate([jnp.ones(1, others.dtype), others])
-    chamfer = chamfer_term(points_world, batch, offsets, config.chamfer_limit)
+    chamfer = chamfer_term(points_world, batch, offsets, _chamfer_limit(config, progress))
     gamma = config.occupancy_weight
     if gamma == 0.0:
         return chamfer, Terms(jnp.zeros(()), chamfer)

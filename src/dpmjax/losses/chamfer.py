@@ -17,7 +17,7 @@ def chamfer_distance(
     mask_a: Bool[AnyArray, " n"] | None = None,
     mask_b: Bool[AnyArray, " m"] | None = None,
     *,
-    max_distance: float | None = None,
+    max_distance: float | Float[AnyArray, ""] | None = None,
 ) -> Float[Array, ""]:
     """Mean distance from each point of a to the nearest of b, plus the same from b to a (DeepMapping eq. 5).
 
