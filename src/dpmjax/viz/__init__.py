@@ -9,6 +9,7 @@ from dpmjax.viz.maps import Panel, make_panel, registered_scans_figure
 from dpmjax.viz.occupancy import occupancy_figure
 from dpmjax.viz.relocalization import ErrorMap, error_maps_figure
 from dpmjax.viz.rgbd import box_plots_figure, from_above_figure
+from dpmjax.viz.size import size_figure
 from dpmjax.viz.toy import endings_figure, toy_figure
 from dpmjax.viz.training import curves_figure, matches_figure
 
@@ -27,5 +28,6 @@ __all__ = [
     "occupancy_figure",
     "registered_scans_figure",
     "save_figure",
+    "size_figure",
     "toy_figure",
 ]
