@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
+import itertools
 
 if TYPE_CHECKING:
     from dpmjax.data.rgbd import DepthSequence
@@ -59,7 +60,7 @@ def chain_icp(sequence: DepthSequence, *, seed: int) -> NDArray[np.float64]:
         for points, mask in zip(sequence.points, sequence.mask, strict=True)
     ]
     T = [np.eye(4)]
-    for before, after in zip(clouds[:-1], clouds[1:], strict=True):
+    for before, after in itertools.pairwise(clouds):
         T.append(T[-1] @ np.asarray(icp(after, before, metric="plane").T_target_source, np.float64))
     return np.stack(T)
 

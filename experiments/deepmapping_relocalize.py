@@ -1,4 +1,4 @@
-"""Draws how well L-Net re-localises scans that it has never seen, at every free pixel of a world (DeepMapping figure 7).
+"""Draws how well L-Net re-localises unseen scans, at every free pixel of a world (DeepMapping figure 7).
 
     python -m experiments.deepmapping_2d --world 1 --init zero -o run
     python -m experiments.deepmapping_relocalize run
@@ -24,6 +24,7 @@ from experiments._command import run_command
 from experiments._json import write_json
 from experiments._machine import environment
 from experiments._run_folder import CHECKPOINTS, find_run, load_config
+import itertools
 
 if TYPE_CHECKING:
     from dpmjax.data.sequence import ScanSequence
@@ -186,7 +187,7 @@ def summarise(
 
     distance, _ = KDTree(sequence.reference_poses[:, :2]).query(truth[:, :2])
     bins = []
-    for low, high in zip(_BINS_PX[:-1], _BINS_PX[1:], strict=True):
+    for low, high in itertools.pairwise(_BINS_PX):
         inside = (distance >= low) & (distance < high)
         if inside.any():
             row = {"from_px": low, "to_px": high, "num_places": int(inside.sum())}

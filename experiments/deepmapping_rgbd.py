@@ -173,7 +173,9 @@ def run_one(
         from dpmjax import viz
 
         panels = [(f"{name}, ATE {row[name]['ate_mm']:.0f} mm", T) for name, T in found.items() if name != "zero"]
-        figure = viz.from_above_figure([*panels, ("reference", sequence.T_world_camera)], sequence.points, sequence.mask)
+        figure = viz.from_above_figure(
+            [*panels, ("reference", sequence.T_world_camera)], sequence.points, sequence.mask
+        )
         viz.save_figure(figure, folder / f"map_{index}.png", dpi=110)
     return row
 

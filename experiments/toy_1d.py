@@ -24,6 +24,7 @@ from tyro.conf import FlagCreatePairsOff, arg
 from experiments._command import run_command
 from experiments._machine import peak_rss_gb, select_device
 from experiments._run_folder import RunFolder, open_run_folder, recording, write_metrics
+import itertools
 
 if TYPE_CHECKING:
     from dpmjax.deepmapping import Descent, ToyConfig
@@ -132,7 +133,10 @@ def run_paper(toy: ToyConfig, config: Config) -> tuple[dict[str, NDArray[np.floa
     from dpmjax.nets.scalar import ScalarNet
 
     network, direct = descend_both(toy, config)
-    ends = {f"{name} form, gradient descent": np.asarray(run.x[:, -1]) for name, run in zip(FORMS, (network, direct), strict=True)}
+    ends = {
+        f"{name} form, gradient descent": np.asarray(run.x[:, -1])
+        for name, run in zip(FORMS, (network, direct), strict=True)
+    }
     x0 = jax.vmap(lambda start: network_value(start, toy))(starts(toy, config))
     for solver in SOLVERS:
         solve = jax.jit(jax.vmap(lambda x, solver=solver: minimize_direct(x, solver, max_iterations=config.steps)))
@@ -204,7 +208,7 @@ def torch_seconds(toy: ToyConfig, seed: int) -> float:
     torch.manual_seed(seed)
     widths = (1, *toy.net.features, 1)
     layers: list[Any] = []
-    for before, after in zip(widths[:-1], widths[1:], strict=True):
+    for before, after in itertools.pairwise(widths):
         layers += [torch.nn.Linear(before, after), torch.nn.ELU()]
     net = torch.nn.Sequential(*layers[:-1])
     z = torch.randn(1, requires_grad=True)

@@ -58,7 +58,9 @@ def test_a_fit_goes_through_all_phases_and_returns_rigid_motions(scans, motion) 
     fitted = dm.fit_depth(scans, small(motion), key=KEY)
     T = fitted.T_world_camera
     assert T.shape == (4, 4, 4)
-    np.testing.assert_allclose(np.einsum("nji,njk->nik", T[:, :3, :3], T[:, :3, :3]), np.tile(np.eye(3), (4, 1, 1)), atol=1e-5)
+    np.testing.assert_allclose(
+        np.einsum("nji,njk->nik", T[:, :3, :3], T[:, :3, :3]), np.tile(np.eye(3), (4, 1, 1)), atol=1e-5
+    )
     assert int(fitted.state.step) == 8
     assert np.isfinite(float(fitted.report.loss))
     if motion == "planar":

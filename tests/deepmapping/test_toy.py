@@ -7,7 +7,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-
 from dpmjax import deepmapping as dm
 from dpmjax.nets.scalar import ScalarNet, ScalarNetConfig
 from tests.tolerances import ROUNDING

@@ -215,9 +215,7 @@ def make_depth_step(config: DepthMappingConfig, phase: PhaseConfig) -> StepFunct
     optimizer = _make_optimizer(phase)
     length = steps_per_call(config, phase)  # type: ignore[arg-type]
 
-    def loss_of(
-        params: Params, state: DepthState, scans: DepthScans, key: jax.Array
-    ) -> tuple[Float[Array, ""], Terms]:
+    def loss_of(params: Params, state: DepthState, scans: DepthScans, key: jax.Array) -> tuple[Float[Array, ""], Terms]:
         batch_key, loss_key = jax.random.split(key)
         batch = _draw_points(scans, phase.beams_per_step, key=batch_key)
         progress = state.phase_step / phase.num_steps
@@ -230,17 +228,13 @@ def make_depth_step(config: DepthMappingConfig, phase: PhaseConfig) -> StepFunct
             loss += phase.map_decay * sum(jnp.sum(x**2) for x in jax.tree.leaves(params.occupancy)) / batch.mask.size
         return loss, terms
 
-    def one_step(
-        state: DepthState, scans: DepthScans, key: jax.Array
-    ) -> tuple[DepthState, tuple[Array, Terms]]:
+    def one_step(state: DepthState, scans: DepthScans, key: jax.Array) -> tuple[DepthState, tuple[Array, Terms]]:
         (loss, terms), gradient = jax.value_and_grad(loss_of, has_aux=True)(
             state.params, state, scans, jax.random.fold_in(key, state.step)
         )
         updates, moments = optimizer.update(gradient, state.optimizer, state.params)
         params = optax.apply_updates(state.params, updates)
-        state = replace(
-            state, params=params, optimizer=moments, phase_step=state.phase_step + 1, step=state.step + 1
-        )
+        state = replace(state, params=params, optimizer=moments, phase_step=state.phase_step + 1, step=state.step + 1)
         return state, (loss, terms)
 
     @jax.jit

@@ -97,7 +97,10 @@ def occupancy_term(
 
 
 def chamfer_term(
-    points_world: Float[Array, "m b d"], batch: Batch, offsets: Int[Array, " o"], max_distance: Float[Array, ""] | None = None
+    points_world: Float[Array, "m b d"],
+    batch: Batch,
+    offsets: Int[Array, " o"],
+    max_distance: Float[Array, ""] | None = None,
 ) -> Float[Array, ""]:
     """DeepMapping eq. 7: mean Chamfer distance between each scan and the scans `offsets` later in its block."""
     num_scans = batch.rows.shape[0]

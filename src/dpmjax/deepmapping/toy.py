@@ -94,7 +94,7 @@ def init_toy(key: jax.Array, config: ToyConfig) -> NetworkStart:
 
 
 def network_value(start: NetworkStart, config: ToyConfig) -> Float[Array, ""]:
-    """x = f(z): where the direct form starts, so that both start alike."""
+    """The output f(z) = x: where the direct form starts, so that both start alike."""
     return ScalarNet(config.net).apply(start.params, start.z)  # type: ignore[return-value]
 
 

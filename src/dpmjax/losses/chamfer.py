@@ -47,9 +47,7 @@ def chamfer_distance(
 
 
 @jax.jit
-def _chamfer_distance(
-    a: jax.Array, b: jax.Array, mask_a: jax.Array, mask_b: jax.Array, limit: jax.Array
-) -> jax.Array:
+def _chamfer_distance(a: jax.Array, b: jax.Array, mask_a: jax.Array, mask_b: jax.Array, limit: jax.Array) -> jax.Array:
     return _mean_distance(a, b, mask_a, mask_b, limit) + _mean_distance(b, a, mask_b, mask_a, limit)
 
 

@@ -46,7 +46,9 @@ def toy_figure(
     axes.plot(np.asarray(z), np.asarray(converted_loss), "--", color=CONVERTED, lw=1.4, label="L(f(z)), fitted f")
     axes.plot(*map(np.asarray, visited), "*", color=VISITED, ms=7, mew=0, alpha=0.5, label="x visited by the network")
     axes.plot(*direct_end, "o", color=DIRECT, ms=9, mec="white", label="direct descent ends", zorder=5)
-    axes.plot(network_end_z, network_end[1], "P", color=NETWORK, ms=10, mec="white", label="z* of the network", zorder=6)
+    axes.plot(
+        network_end_z, network_end[1], "P", color=NETWORK, ms=10, mec="white", label="z* of the network", zorder=6
+    )
     axes.plot(*network_end, "o", color=NETWORK, ms=9, mec="white", label="x* = f(z*)", zorder=6)
     axes.set_xlabel("x, or z for the dashed line", color=INK, fontsize=9)
     axes.set_ylabel("L", color=INK, fontsize=9)

@@ -85,7 +85,7 @@ def is_active_vision(path: Path) -> bool:
 def _walk(
     known: list[str], links: dict[str, Any], num_views: int, move_share: float, rng: np.random.Generator
 ) -> list[str]:
-    """Names of the images; where the grid ends, a view is repeated by its next neighbour in the other kind of step."""
+    """Names of the images; where no step of one kind is known, one of the other kind is taken."""
     is_known = set(known)
 
     def reachable(name: str, kinds: tuple[str, ...]) -> list[str]:
@@ -111,7 +111,9 @@ def _read_poses(path: Path) -> dict[str, NDArray[np.float64]]:
         content = loadmat(path, squeeze_me=True, struct_as_record=False)
         structs, scale_mm = np.atleast_1d(content["image_structs"]), float(content["scale"])
     except (OSError, KeyError, ValueError, TypeError) as error:
-        raise InputError(path, f"not the dataset's pose file ({error})", "copy image_structs.mat of the scene") from error
+        raise InputError(
+            path, f"not the dataset's pose file ({error})", "copy image_structs.mat of the scene"
+        ) from error
     poses = {}
     for entry in structs:
         R, t = np.asarray(entry.R, np.float64), np.asarray(entry.t, np.float64).reshape(-1)
@@ -140,5 +142,7 @@ def _read_camera(path: Path) -> Camera:
             try:
                 return Camera(int(words[2]), int(words[3]), *(float(word) for word in words[4:8]))
             except ValueError as error:
-                raise InputError(path, f"not a camera: {line.strip()} ({error})", "give COLMAP's cameras.txt") from error
+                raise InputError(
+                    path, f"not a camera: {line.strip()} ({error})", "give COLMAP's cameras.txt"
+                ) from error
     raise InputError(path, "no camera in it", "give COLMAP's cameras.txt")

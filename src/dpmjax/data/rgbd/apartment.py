@@ -40,10 +40,8 @@ class Apartment:
 
         Lower furniture counts too: the robot below the camera has to pass.
         """
-        inside = (places > clearance_m).all(1) & (places < [self.size_x_m - clearance_m, self.size_z_m - clearance_m])[
-            :, 0
-        ]
-        inside &= places[:, 1] < self.size_z_m - clearance_m
+        far = np.array([self.size_x_m, self.size_z_m]) - clearance_m
+        inside = ((places > clearance_m) & (places < far)).all(1)
         for centre, half, yaw in zip(
             self.centres[~self.is_seen_through],
             self.half_sizes[~self.is_seen_through],
@@ -83,9 +81,7 @@ def make_apartment(seed: int) -> Apartment:
         boxes += _furniture(rng, size_x, size_z, floor, ceiling, cut, doorway)
     centres, halves, yaws = zip(*boxes, strict=True)
     is_shell = np.arange(len(boxes)) == 0
-    return Apartment(
-        f"apartment-{seed}", np.array(centres), np.array(halves), np.array(yaws), size_x, size_z, is_shell
-    )
+    return Apartment(f"apartment-{seed}", np.array(centres), np.array(halves), np.array(yaws), size_x, size_z, is_shell)
 
 
 def _furniture(

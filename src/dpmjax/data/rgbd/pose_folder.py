@@ -15,9 +15,7 @@ from dpmjax.data.rgbd.depth_sequence import DepthSequence
 _NOTHING_MM = 65535  # besides 0
 
 
-def read_pose_folder(
-    path: str | Path, *, height: int = 30, width: int = 40, max_depth_m: float = 5.0
-) -> DepthSequence:
+def read_pose_folder(path: str | Path, *, height: int = 30, width: int = 40, max_depth_m: float = 5.0) -> DepthSequence:
     """Reads NAME.depth.png, NAME.pose.txt and one *intrinsics.txt.
 
     Args:

@@ -87,9 +87,7 @@ def simulate_depth_sequence(
     return DepthSequence(f"{home.name}, walk {seed}", points, mask, is_planar=True, T_world_camera=T_world_camera)
 
 
-def _walk(
-    home: Apartment, num_views: int, config: GridWalkConfig, rng: np.random.Generator
-) -> NDArray[np.float64]:
+def _walk(home: Apartment, num_views: int, config: GridWalkConfig, rng: np.random.Generator) -> NDArray[np.float64]:
     """(n, 3) x, z and angle about y: one step to a neighbouring place, or one turn, from view to view."""
     x, z = np.arange(0.0, home.size_x_m, config.grid_m), np.arange(0.0, home.size_z_m, config.grid_m)
     places = np.stack(np.meshgrid(x, z, indexing="ij"), axis=-1)
