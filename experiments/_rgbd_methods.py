@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
+import itertools
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
-import itertools
 
 if TYPE_CHECKING:
     from dpmjax.data.rgbd import DepthSequence

@@ -10,6 +10,7 @@ for L-Net taught the poses that the run found.
 
 from __future__ import annotations
 
+import itertools
 import time
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -24,7 +25,6 @@ from experiments._command import run_command
 from experiments._json import write_json
 from experiments._machine import environment
 from experiments._run_folder import CHECKPOINTS, find_run, load_config
-import itertools
 
 if TYPE_CHECKING:
     from dpmjax.data.sequence import ScanSequence

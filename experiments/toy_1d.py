@@ -12,6 +12,7 @@ installed.
 from __future__ import annotations
 
 import importlib.util
+import itertools
 import time
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -24,7 +25,6 @@ from tyro.conf import FlagCreatePairsOff, arg
 from experiments._command import run_command
 from experiments._machine import peak_rss_gb, select_device
 from experiments._run_folder import RunFolder, open_run_folder, recording, write_metrics
-import itertools
 
 if TYPE_CHECKING:
     from dpmjax.deepmapping import Descent, ToyConfig
