@@ -32,6 +32,8 @@ class PhaseConfig:
             end of the phase; None: none.
         anneal_until: share of the phase after which all levels of the map are on.
         map_decay: weight of the mean square of a grid's nodes.
+        chamfer_limit: larger distances count as this one in the Chamfer term, at the start and at the end of the phase,
+            so that what only one scan has seen does not pull; None: no limit.
     """
 
     name: str
@@ -51,6 +53,7 @@ class PhaseConfig:
     surface_distance: tuple[float, float] | None = None
     anneal_until: float = 0.0
     map_decay: float = 0.0
+    chamfer_limit: tuple[float, float] | None = None
 
     def __post_init__(self) -> None:
         if not 0.0 <= self.occupancy_weight <= 1.0:

@@ -96,6 +96,7 @@ class Fitted(NamedTuple):
         report: of the last step.
         state: to continue or to draw the map from.
         reach: the length that the state counts in, unit of the points.
+        config: settings of the fit.
     """
 
     T_world_scan: NDArray[np.float64]
@@ -104,6 +105,7 @@ class Fitted(NamedTuple):
     report: Report
     state: State
     reach: float
+    config: DeepMappingConfig
 
 
 def as_scan_set(scans: ScanSet | ArrayLike) -> ScanSet:
@@ -255,7 +257,7 @@ def _bind_map(params: Any, config: OccupancyConfig, frame: MapFrame, level_weigh
             return apply(params, local, level_weights)
         # The hidden layers of all samples at once would take gigabytes: a part at a time, again on the way back.
         count = -(-len(points) // _MLP_CHUNK)
-        parts = jnp.pad(local, ((0, count * _MLP_CHUNK - len(points)), (0, 0))).reshape(count, _MLP_CHUNK, 2)
+        parts = jnp.pad(local, ((0, count * _MLP_CHUNK - len(points)), (0, 0))).reshape(count, _MLP_CHUNK, -1)
         logits_of_parts = jax.lax.map(jax.checkpoint(lambda part: apply(params, part, level_weights)), parts)
         return logits_of_parts.reshape(-1)[: len(points)]
 
@@ -388,7 +390,7 @@ def fit_deepmapping(
     # One at a time: a list of all states would hold every map that there ever was.
     ((_, state, report),) = deque(run_phases(scaled, config, state, key=key, is_warm=start is not None), maxlen=1)
     poses = np.asarray(report.poses, np.float64) * unit
-    return Fitted(planar_poses.matrices(poses), poses, state.params, report, state, reach)
+    return Fitted(planar_poses.matrices(poses), poses, state.params, report, state, reach, config)
 
 
 def _as_planar(poses: NDArray[np.float64], num_scans: int) -> NDArray[np.float64]:

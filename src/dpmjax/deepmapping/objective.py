@@ -7,6 +7,7 @@ Read aloud: move the scans to the world; ask M-Net what it thinks of the hits (o
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -17,20 +18,20 @@ from dpmjax.deepmapping.config import PhaseConfig
 from dpmjax.geometry.rays import sample_free_space
 from dpmjax.losses import chamfer_distance, occupancy_loss
 
-MapLogits = Callable[[Float[Array, "n 2"]], Float[Array, " n"]]
+MapLogits = Callable[[Float[Array, "n d"]], Float[Array, " n"]]
 
 
 class Batch(NamedTuple):
     """The scans of one step, neighbours in time side by side.
 
     Attributes:
-        points: (m, b, 2) in the sensor frames, in reaches.
+        points: (m, b, d) in the sensor frames, in reaches.
         mask: (m, b).
         rows: (m,) which scan each is; consecutive within a block.
         block: (m,) which block each belongs to.
     """
 
-    points: Float[Array, "m b 2"]
+    points: Float[Array, "m b d"]
     mask: Bool[Array, "m b"]
     rows: Int[Array, " m"]
     block: Int[Array, " m"]
@@ -79,34 +80,48 @@ def free_factors(
 
 
 def occupancy_term(
-    poses: Float[Array, "m 3"],
-    points_world: Float[Array, "m b 2"],
+    sensors_world: Float[Array, "m d"],
+    points_world: Float[Array, "m b d"],
     batch: Batch,
     map_logits: MapLogits,
     factors: Float[Array, "m b s"],
 ) -> Float[Array, ""]:
     """DeepMapping eq. 4: hits are occupied, places on the beams are free; both means count alike."""
-    free = jax.vmap(sample_free_space)(poses[:, :2], points_world, factors)
-    num_hits = batch.mask.size
-    logits = map_logits(jnp.concatenate([points_world.reshape(-1, 2), free.reshape(-1, 2)]))
+    free = jax.vmap(sample_free_space)(sensors_world, points_world, factors)
+    num_hits, dimensions = batch.mask.size, points_world.shape[-1]
+    logits = map_logits(jnp.concatenate([points_world.reshape(-1, dimensions), free.reshape(-1, dimensions)]))
     weights = batch.mask.astype(logits.dtype)
     hit = occupancy_loss(logits[:num_hits], jnp.ones(()), weights.reshape(-1))
     free_weights = jnp.broadcast_to(weights[..., None], factors.shape).reshape(-1)
     return hit + occupancy_loss(logits[num_hits:], jnp.zeros(()), free_weights)
 
 
-def chamfer_term(points_world: Float[Array, "m b 2"], batch: Batch, offsets: Int[Array, " o"]) -> Float[Array, ""]:
+def chamfer_term(
+    points_world: Float[Array, "m b d"],
+    batch: Batch,
+    offsets: Int[Array, " o"],
+    max_distance: Float[Array, ""] | None = None,
+) -> Float[Array, ""]:
     """DeepMapping eq. 7: mean Chamfer distance between each scan and the scans `offsets` later in its block."""
     num_scans = batch.rows.shape[0]
 
     def compare(offset: Int[Array, ""]) -> tuple[Float[Array, ""], Float[Array, ""]]:
         later = jnp.minimum(jnp.arange(num_scans) + offset, num_scans - 1)
         is_pair = (batch.rows[later] == batch.rows + offset) & (batch.block[later] == batch.block)
-        distance = jax.vmap(chamfer_distance)(points_world, points_world[later], batch.mask, batch.mask[later])
+        distance = jax.vmap(partial(chamfer_distance, max_distance=max_distance))(
+            points_world, points_world[later], batch.mask, batch.mask[later]
+        )
         return jnp.sum(jnp.where(is_pair, distance, 0.0)), is_pair.sum()
 
     totals, counts = jax.lax.map(compare, offsets)
     return totals.sum() / jnp.maximum(counts.sum(), 1)
+
+
+def _chamfer_limit(config: PhaseConfig, progress: Float[Array, ""]) -> Float[Array, ""] | None:
+    if config.chamfer_limit is None:
+        return None
+    first, last = jnp.log(config.chamfer_limit[0]), jnp.log(config.chamfer_limit[1])
+    return jnp.exp(first + progress * (last - first))
 
 
 def registration_loss(
@@ -131,16 +146,29 @@ def registration_loss(
     Returns:
         The loss, and its terms before weighting.
     """
+    return world_loss(poses[:, :2], to_world(poses, batch.points), batch, map_logits, config, progress, key=key)
+
+
+def world_loss(
+    sensors_world: Float[Array, "m d"],
+    points_world: Float[Array, "m b d"],
+    batch: Batch,
+    map_logits: MapLogits,
+    config: PhaseConfig,
+    progress: Float[Array, ""],
+    *,
+    key: jax.Array,
+) -> tuple[Float[Array, ""], Terms]:
+    """The same of scans that are in the world already, planar or spatial: `sensors_world` are their centres."""
     free_key, offset_key = jax.random.split(key)
-    points_world = to_world(poses, batch.points)
     others = jax.random.choice(
         offset_key, jnp.arange(2, config.max_offset + 1), (config.num_offsets - 1,), replace=False
     )
     offsets = jnp.concatenate([jnp.ones(1, others.dtype), others])
-    chamfer = chamfer_term(points_world, batch, offsets)
+    chamfer = chamfer_term(points_world, batch, offsets, _chamfer_limit(config, progress))
     gamma = config.occupancy_weight
     if gamma == 0.0:
         return chamfer, Terms(jnp.zeros(()), chamfer)
     factors = free_factors(batch, config, progress, key=free_key)
-    occupancy = occupancy_term(poses, points_world, batch, map_logits, factors)
+    occupancy = occupancy_term(sensors_world, points_world, batch, map_logits, factors)
     return gamma * occupancy + (1.0 - gamma) * chamfer, Terms(occupancy, chamfer)

@@ -16,6 +16,8 @@ def chamfer_distance(
     b: Float[AnyArray, "m d"],
     mask_a: Bool[AnyArray, " n"] | None = None,
     mask_b: Bool[AnyArray, " m"] | None = None,
+    *,
+    max_distance: float | Float[AnyArray, ""] | None = None,
 ) -> Float[Array, ""]:
     """Mean distance from each point of a to the nearest of b, plus the same from b to a (DeepMapping eq. 5).
 
@@ -26,6 +28,7 @@ def chamfer_distance(
         b: points.
         mask_a: False for points of `a` that are not there; they may hold anything.
         mask_b: the same for `b`.
+        max_distance: larger distances count as this one and have no derivative; None: no limit.
 
     Returns:
         The sum of both means; 0 if either cloud has no valid point. Where points coincide the derivative of their
@@ -37,16 +40,23 @@ def chamfer_distance(
     a, b = as_points("a", a), as_points("b", b)
     if a.shape[1] != b.shape[1]:
         raise ValueError(f"b: expected {a.shape[1]} columns like a, got {b.shape[1]}")
-    return _chamfer_distance(a, b, as_mask("mask_a", mask_a, a.shape[:1]), as_mask("mask_b", mask_b, b.shape[:1]))
+    limit = jnp.asarray(jnp.inf if max_distance is None else max_distance, a.dtype)
+    return _chamfer_distance(
+        a, b, as_mask("mask_a", mask_a, a.shape[:1]), as_mask("mask_b", mask_b, b.shape[:1]), limit
+    )
 
 
 @jax.jit
-def _chamfer_distance(a: jax.Array, b: jax.Array, mask_a: jax.Array, mask_b: jax.Array) -> jax.Array:
-    return _mean_distance(a, b, mask_a, mask_b) + _mean_distance(b, a, mask_b, mask_a)
+def _chamfer_distance(a: jax.Array, b: jax.Array, mask_a: jax.Array, mask_b: jax.Array, limit: jax.Array) -> jax.Array:
+    return _mean_distance(a, b, mask_a, mask_b, limit) + _mean_distance(b, a, mask_b, mask_a, limit)
 
 
 def _mean_distance(
-    queries: Float[Array, "n d"], points: Float[Array, "m d"], query_mask: Bool[Array, " n"], mask: Bool[Array, " m"]
+    queries: Float[Array, "n d"],
+    points: Float[Array, "m d"],
+    query_mask: Bool[Array, " n"],
+    mask: Bool[Array, " m"],
+    limit: Float[Array, ""],
 ) -> Float[Array, ""]:
     near = k_nearest(queries, points, 1, mask)
     is_counted = query_mask & near.mask[:, 0]
@@ -54,4 +64,4 @@ def _mean_distance(
     # The slope of the square root is infinite at zero: guard its input, then its output.
     is_apart = squared > 0
     distances = jnp.where(is_apart, jnp.sqrt(jnp.where(is_apart, squared, 1)), 0)
-    return jnp.sum(distances) / jnp.maximum(jnp.sum(is_counted), 1)
+    return jnp.sum(jnp.minimum(distances, limit)) / jnp.maximum(jnp.sum(is_counted), 1)

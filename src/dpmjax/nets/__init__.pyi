@@ -7,3 +7,5 @@ from .heads import OffsetHead as OffsetHead
 from .heads import OverlapHead as OverlapHead
 from .point_encoder import EncoderConfig as EncoderConfig
 from .point_encoder import PointEncoder as PointEncoder
+from .scalar import ScalarNet as ScalarNet
+from .scalar import ScalarNetConfig as ScalarNetConfig

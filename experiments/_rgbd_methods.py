@@ -1,0 +1,82 @@
+"""What deepmapping_rgbd compares: DeepMapping cold and warm, the direct optimisation, the starts themselves."""
+
+from __future__ import annotations
+
+import itertools
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    from dpmjax.data.rgbd import DepthSequence
+    from dpmjax.deepmapping import DepthMappingConfig
+
+METHODS = ("zero", "placed", "deepmapping", "deepmapping-cold", "direct", "icp", "deepmapping-icp")
+_ICP_POINTS = 800
+
+
+def run_method(
+    name: str, sequence: DepthSequence, settings: DepthMappingConfig, *, seed: int, cache: dict[str, Any]
+) -> NDArray[np.float64]:
+    """(n, 4, 4) T_world_camera by one method.
+
+    Args:
+        name: one of `METHODS`. "zero": all cameras at one place. "placed": the start that contradicts itself least.
+            "deepmapping": from there. "deepmapping-cold": L-Net from zero. "direct": its losses without L-Net, from
+            L-Net's first forward pass, as in the paper. "icp": each image onto the one before; "deepmapping-icp": from
+            there.
+        sequence: depth images.
+        settings: of DeepMapping.
+        seed: of everything random.
+        cache: compiled steps, kept between calls.
+    """
+    import jax
+
+    from dpmjax import deepmapping as dm
+
+    scans, key = dm.as_depth_scans(sequence.points, sequence.mask), jax.random.key(seed)
+    if name == "zero":
+        return np.tile(np.eye(4), (len(sequence), 1, 1))
+    if name == "placed":
+        return dm.place_images(scans, motion=settings.motion, key=key)
+    if name == "icp":
+        return chain_icp(sequence, seed=seed)
+    start = {"deepmapping": "placed", "deepmapping-icp": "icp"}.get(name)
+    init = None if start is None else run_method(start, sequence, settings, seed=seed, cache=cache)
+    used = dm.as_direct(settings) if name == "direct" else settings
+    steps = cache.setdefault(f"{name == 'direct'}, {start is None}", {})
+    return dm.fit_depth(scans, used, key=key, init=init, steps=steps).T_world_camera
+
+
+def chain_icp(sequence: DepthSequence, *, seed: int) -> NDArray[np.float64]:
+    """Point-to-plane ICP of each image onto the one before, from where it stands."""
+    from dpmjax.registration import icp
+
+    rng = np.random.default_rng(seed)
+    # One size for all clouds, so that ICP compiles once.
+    clouds = [
+        points[mask][rng.choice(int(mask.sum()), _ICP_POINTS)]
+        for points, mask in zip(sequence.points, sequence.mask, strict=True)
+    ]
+    T = [np.eye(4)]
+    for before, after in itertools.pairwise(clouds):
+        T.append(T[-1] @ np.asarray(icp(after, before, metric="plane").T_target_source, np.float64))
+    return np.stack(T)
+
+
+def errors_of(T: NDArray[np.float64], sequence: DepthSequence) -> dict[str, float]:
+    """ATE (mm), mean point distance (mm) and the largest error of a turn between neighbours (degrees)."""
+    from dpmjax.metrics import absolute_trajectory_error, point_distance
+
+    reference = sequence.T_world_camera
+    assert reference is not None
+    ate = absolute_trajectory_error(T[:, :3, 3], reference[:, :3, 3])
+    count = len(sequence)
+    points = sequence.points.reshape(count, -1, 3)
+    distance = point_distance(points, sequence.mask.reshape(count, -1), T, reference)
+    relative = np.swapaxes(T[:-1, :3, :3], 1, 2) @ T[1:, :3, :3]
+    true = np.swapaxes(reference[:-1, :3, :3], 1, 2) @ reference[1:, :3, :3]
+    cosine = (np.einsum("nij,nij->n", relative, true) - 1.0) / 2.0
+    turn = np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))
+    return {"ate_mm": 1e3 * ate, "point_distance_mm": 1e3 * distance, "largest_turn_error_deg": float(turn.max())}

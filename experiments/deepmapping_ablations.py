@@ -1,0 +1,227 @@
+"""Which part of DeepMapping does what: the ablations of the paper (supplement A, figures 10 to 13), and two more.
+
+    python -m experiments.deepmapping_ablations --limit 5
+    python -m experiments.deepmapping_ablations --only lnet chamfer --steps 300
+    python -m experiments.deepmapping_ablations --resume -o out
+
+As in the paper on short walks of a depth camera (here through simulated apartments), from zero: L-Net and M-Net are
+trained together. lnet: CNN or PointNet; mnet: MLP or ResMLP, or our grid; depth: 4 to 7 layers of 64; width: 32 to 128
+with 4 layers; chamfer: with and without; free: number of free samples a ray. All others stay as they are; the basis is
+a small CNN and an MLP of 6 layers of 64, so that a run takes half a minute on a CPU. Each run is written to runs.json
+when it is done; ablations.png has the box plots.
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import numpy as np
+from tqdm import tqdm
+from tyro.conf import FlagCreatePairsOff, arg
+
+from experiments._command import run_command
+from experiments._json import load_json, write_json
+from experiments._machine import select_device
+from experiments._rgbd_methods import errors_of
+from experiments._run_folder import RunFolder, open_run_folder, recording, write_metrics
+from experiments._stop import StopFlag
+
+if TYPE_CHECKING:
+    from dpmjax.deepmapping import DepthMappingConfig
+
+EXPERIMENT = "deepmapping_ablations"
+RUNS = "runs.json"
+_SUCCESS_MM = 450.0
+VARIANTS: dict[str, tuple[str, ...]] = {
+    "lnet": ("CNN", "PointNet"),
+    "mnet": ("MLP", "ResMLP", "grid"),
+    "depth": ("4", "5", "6", "7"),
+    "width": ("32", "64", "96", "128"),
+    "chamfer": ("with", "without"),
+    "free": ("1", "4", "12", "35"),
+}
+
+
+@dataclass(frozen=True)
+class Config:
+    """Options of the ablations."""
+
+    output: Annotated[Path | None, arg(aliases=["-o"], metavar="OUT")] = None
+    """Folder for the results, instead of results/deepmapping_ablations/<time>."""
+    limit: Annotated[int, arg(metavar="N")] = 10
+    """Trajectories a variant."""
+    steps: Annotated[int, arg(metavar="N")] = 600
+    """Steps of each fit."""
+    only: tuple[str, ...] = tuple(VARIANTS)
+    """Which ablations."""
+    views: Annotated[int, arg(metavar="N")] = 8
+    """Images a trajectory."""
+    points: Annotated[int, arg(metavar="N")] = 200
+    """Pixels of each image in a step."""
+    seed: int = 0
+    """Seed of walks and fits."""
+    device: Annotated[Literal["cpu", "gpu"] | None, arg(metavar="cpu|gpu")] = None
+    """Where to compute; without it, JAX chooses."""
+    resume: FlagCreatePairsOff[bool] = False
+    """Continue an interrupted run, the latest or that in OUT."""
+    force: FlagCreatePairsOff[bool] = False
+    """Replace an earlier run in OUT."""
+
+    def __post_init__(self) -> None:
+        """Checks ranges."""
+        for name, least in (("limit", 1), ("steps", 1), ("views", 2), ("points", 1)):
+            if getattr(self, name) < least:
+                raise ValueError(f"--{name}: expected at least {least}, got {getattr(self, name)}")
+        unknown = [name for name in self.only if name not in VARIANTS]
+        if unknown or not self.only:
+            raise ValueError(f"--only: expected some of {', '.join(VARIANTS)}, got {', '.join(unknown) or 'none'}")
+
+
+def main(config: Config) -> dict[str, Any]:
+    """Runs what is missing, variant by variant, then writes the table and the box plots."""
+    select_device(config.device)
+    folder = open_run_folder(
+        config,
+        EXPERIMENT,
+        output=config.output,
+        resume=config.resume,
+        force=config.force,
+        may_change=frozenset({"limit", "only"}),
+    )
+    with recording(folder), StopFlag() as stop:
+        rows = load_json(folder / RUNS)["rows"] if folder.is_resumed and (folder / RUNS).exists() else []
+        done = {(row["ablation"], row["variant"], row["trajectory"]) for row in rows}
+        missing = [
+            (ablation, variant, trajectory)
+            for ablation in config.only
+            for variant in VARIANTS[ablation]
+            for trajectory in range(config.limit)
+            if (ablation, variant, trajectory) not in done
+        ]
+        steps: dict[DepthMappingConfig, dict[Any, Any]] = {}
+        for ablation, variant, trajectory in tqdm(missing, unit=" runs"):
+            if stop.is_requested:
+                break
+            settings = settings_of(ablation, variant, config)
+            rows.append(run_one(ablation, variant, trajectory, settings, config, steps.setdefault(settings, {})))
+            write_json(folder / RUNS, {"rows": rows, "seed": config.seed})
+        if rows:
+            table = summarise(rows)
+            write_metrics(folder, {"variants": table, "is_interrupted": stop.is_requested}, seed=config.seed)
+            draw(folder, rows)
+            for row in table:
+                print(
+                    f"{row['ablation']:8} {row['variant']:9} median ATE {row['median_ate_mm']:7.1f} mm, success "
+                    f"{100 * row['success']:5.1f} % of {row['num_runs']}, {row['median_run_s']:.1f} s"
+                )
+            print(f"results in {folder.path}")
+            return {"variants": table}
+    return {}
+
+
+def settings_of(ablation: str, variant: str, config: Config) -> DepthMappingConfig:
+    """The basis with one thing changed."""
+    from dpmjax.deepmapping import depth_preset
+    from dpmjax.deepmapping.depth_config import JOINT_DEPTH, DepthMappingConfig
+    from dpmjax.nets.occupancy import OccupancyConfig
+
+    phase = replace(
+        JOINT_DEPTH,
+        num_steps=config.steps,
+        occupancy_weight=0.5,
+        final_learning_rate=0.1,
+        beams_per_step=config.points,
+        num_free=4,
+        is_free_factor_shared=False,
+    )
+    localization = depth_preset("fast").localization
+    occupancy = OccupancyConfig(features=(64,) * 6)
+    if ablation == "lnet" and variant == "PointNet":
+        localization = replace(localization, kind="point")
+    elif ablation == "mnet":
+        occupancy = {
+            "MLP": occupancy,
+            "ResMLP": OccupancyConfig(kind="resmlp", features=(64, 64, 64, 128, 128)),
+            "grid": depth_preset("fast").occupancy,
+        }[variant]
+        if variant == "grid":
+            phase = replace(phase, map_learning_rate=0.1, map_decay=1e-3)
+    elif ablation == "depth":
+        occupancy = OccupancyConfig(features=(64,) * int(variant))
+    elif ablation == "width":
+        occupancy = OccupancyConfig(features=(int(variant),) * 4)
+    elif ablation == "chamfer" and variant == "without":
+        phase = replace(phase, occupancy_weight=1.0)
+    elif ablation == "free":
+        phase = replace(phase, num_free=int(variant))
+    per_call = min(50, config.steps)
+    return DepthMappingConfig("planar", (phase,), (phase,), localization, occupancy, steps_per_call=per_call)
+
+
+def run_one(
+    ablation: str,
+    variant: str,
+    trajectory: int,
+    settings: DepthMappingConfig,
+    config: Config,
+    steps: dict[Any, Any],
+) -> dict[str, Any]:
+    """One fit; the first of a variant compiles, and its `run_s` contains that."""
+    import jax
+
+    from dpmjax import deepmapping as dm
+    from dpmjax.data import rgbd
+
+    seed = 1000 * config.seed + trajectory
+    sequence = rgbd.simulate_depth_sequence(seed % 15, config.views, seed=seed)
+    begun = time.perf_counter()
+    scans = dm.as_depth_scans(sequence.points, sequence.mask)
+    fitted = dm.fit_depth(scans, settings, key=jax.random.key(config.seed), steps=steps)
+    errors = errors_of(fitted.T_world_camera, sequence)
+    return {
+        "ablation": ablation,
+        "variant": variant,
+        "trajectory": trajectory,
+        **errors,
+        "run_s": time.perf_counter() - begun,
+    }
+
+
+def summarise(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """A row a variant."""
+    table = []
+    for ablation, variants in VARIANTS.items():
+        for variant in variants:
+            some = [row for row in rows if (row["ablation"], row["variant"]) == (ablation, variant)]
+            if not some:
+                continue
+            ate = np.array([row["ate_mm"] for row in some])
+            table.append(
+                {
+                    "ablation": ablation,
+                    "variant": variant,
+                    "num_runs": len(some),
+                    "median_ate_mm": float(np.median(ate)),
+                    "quartiles_ate_mm": [float(q) for q in np.quantile(ate, [0.25, 0.75])],
+                    "success": float((ate < _SUCCESS_MM).mean()),
+                    "median_run_s": float(np.median([row["run_s"] for row in some])),
+                }
+            )
+    return table
+
+
+def draw(folder: RunFolder, rows: list[dict[str, Any]]) -> None:
+    """ablations.png."""
+    from dpmjax import viz
+
+    groups: dict[str, dict[str, list[float]]] = {}
+    for row in rows:
+        groups.setdefault(row["ablation"], {}).setdefault(row["variant"], []).append(row["ate_mm"])
+    viz.save_figure(viz.box_plots_figure(groups, "ATE, mm", _SUCCESS_MM), folder / "ablations.png")
+
+
+if __name__ == "__main__":
+    raise SystemExit(run_command(main, Config, experiment=EXPERIMENT, description=__doc__))

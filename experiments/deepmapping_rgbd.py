@@ -1,0 +1,222 @@
+"""Registers depth images by DeepMapping, many short trajectories at low overlap (DeepMapping section 4.2, figure 9).
+
+    python -m experiments.deepmapping_rgbd                        105 walks through simulated apartments
+    python -m experiments.deepmapping_rgbd --limit 7 -o out
+    python -m experiments.deepmapping_rgbd Home_001_1             walks through a scene of the Active Vision Dataset
+    python -m experiments.deepmapping_rgbd rgbd_folder            depth PNG + pose files + intrinsics, in SE(3)
+    python -m experiments.deepmapping_rgbd --resume -o out
+
+The simulated apartments follow the dataset's protocol: places 300 mm apart, views every 30 degrees, 8 or 16 views. Each
+trajectory is written to runs.json as soon as all methods have done it; metrics.json has the success rates (ATE below
+450 mm, the paper's threshold, and below 100 mm, for the first is met by not moving at all on most walks),
+errors.png the box plots, map_K.png some trajectories from above.
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from tqdm import tqdm
+from tyro.conf import FlagCreatePairsOff, Positional, arg
+
+from experiments._command import run_command
+from experiments._json import load_json, write_json
+from experiments._machine import peak_rss_gb, select_device
+from experiments._rgbd_methods import METHODS, errors_of, run_method
+from experiments._run_folder import RunFolder, open_run_folder, recording, write_metrics
+from experiments._stop import StopFlag
+
+if TYPE_CHECKING:
+    from dpmjax.data.rgbd import DepthSequence
+    from dpmjax.deepmapping import DepthMappingConfig
+
+EXPERIMENT = "deepmapping_rgbd"
+RUNS = "runs.json"
+_SUCCESS_MM = 450.0
+_CLOSE_MM = 100.0
+
+
+@dataclass(frozen=True)
+class Config:
+    """Options of the comparison."""
+
+    data: Annotated[Positional[Path | None], arg(metavar="[DATA]")] = None
+    """A scene of the Active Vision Dataset, or a folder of NAME.depth.png; without it, simulated apartments."""
+    output: Annotated[Path | None, arg(aliases=["-o"], metavar="OUT")] = None
+    """Folder for the results, instead of results/deepmapping_rgbd/<time>."""
+    limit: Annotated[int, arg(metavar="N")] = 105
+    """Trajectories."""
+    methods: tuple[str, ...] = ("zero", "placed", "deepmapping", "deepmapping-cold", "direct")
+    """What to compare; also icp and deepmapping-icp."""
+    preset: Literal["fast", "paper"] = "fast"
+    """fast: seconds a trajectory; paper: its networks and sampling, for a GPU."""
+    motion: Literal["auto", "planar", "full"] = "auto"
+    """planar: x, z and an angle, as in the paper; full: SE(3); auto: as the data say."""
+    views: Annotated[int, arg(metavar="N")] = 0
+    """Images a trajectory; 0: 8 and 16 in turn."""
+    depth_noise_m: Annotated[float, arg(metavar="M")] = 0.0
+    """Depth noise of the simulated camera at one metre."""
+    pictures: Annotated[int, arg(metavar="N")] = 4
+    """Trajectories to draw from above."""
+    seed: int = 0
+    """Seed of walks and fits."""
+    device: Annotated[Literal["cpu", "gpu"] | None, arg(metavar="cpu|gpu")] = None
+    """Where to compute; without it, JAX chooses."""
+    resume: FlagCreatePairsOff[bool] = False
+    """Continue an interrupted run, the latest or that in OUT."""
+    force: FlagCreatePairsOff[bool] = False
+    """Replace an earlier run in OUT."""
+
+    def __post_init__(self) -> None:
+        """Checks ranges."""
+        if self.limit < 1:
+            raise ValueError(f"--limit: expected at least 1, got {self.limit}")
+        if self.views != 0 and self.views < 2:
+            raise ValueError(f"--views: expected 0 or at least 2, got {self.views}")
+        if not self.depth_noise_m >= 0.0:
+            raise ValueError(f"--depth-noise-m: expected zero or more, got {self.depth_noise_m}")
+        unknown = [name for name in self.methods if name not in METHODS]
+        if unknown or not self.methods:
+            raise ValueError(f"--methods: expected some of {', '.join(METHODS)}, got {', '.join(unknown) or 'none'}")
+
+
+def main(config: Config) -> dict[str, Any]:
+    """Runs what is missing, then writes the table and the pictures."""
+    select_device(config.device)
+    first = read_trajectory(config, 0)
+    settings = fit_settings(config, first)
+    folder = open_run_folder(
+        config,
+        EXPERIMENT,
+        output=config.output,
+        resume=config.resume,
+        force=config.force,
+        may_change=frozenset({"limit", "pictures"}),
+    )
+    with recording(folder), StopFlag() as stop:
+        begun = time.perf_counter()
+        rows = load_json(folder / RUNS)["rows"] if folder.is_resumed and (folder / RUNS).exists() else []
+        cache: dict[str, Any] = {}
+        for index in tqdm(range(len(rows), num_trajectories(config)), unit=" trajectories"):
+            if stop.is_requested:
+                break
+            sequence = first if index == 0 else read_trajectory(config, index)
+            rows.append(run_one(folder, config, sequence, settings, index, cache))
+            write_json(folder / RUNS, {"rows": rows, "seed": config.seed})
+        if rows:
+            metrics = summarise(rows, config.methods)
+            metrics |= {"wall_s": time.perf_counter() - begun, "peak_rss_gb": peak_rss_gb()}
+            write_metrics(folder, {**metrics, "is_interrupted": stop.is_requested}, seed=config.seed)
+            draw_errors(folder, rows, config.methods)
+            tell(folder, metrics)
+            return metrics
+    return {}
+
+
+def num_trajectories(config: Config) -> int:
+    """As many as asked for; of a folder of images no more than there are windows."""
+    from dpmjax.data import rgbd
+
+    if config.data is None or (config.data / "image_structs.mat").is_file():
+        return config.limit
+    count, views = len(rgbd.read_pose_folder(config.data)), config.views or 8
+    return min(config.limit, max(1, (count - views) // (views // 2) + 1))
+
+
+def read_trajectory(config: Config, index: int) -> DepthSequence:
+    """One trajectory; of a folder of images windows that overlap by half."""
+    from dpmjax.data import rgbd
+
+    views = config.views or (8 if index % 2 == 0 else 16)
+    seed = 1000 * config.seed + index
+    if config.data is None:
+        walk = rgbd.GridWalkConfig(depth_noise_m=config.depth_noise_m)
+        return rgbd.simulate_depth_sequence(seed % 15, views, seed=seed, config=walk)
+    if (config.data / "image_structs.mat").is_file():
+        return rgbd.read_active_vision(config.data, views, seed=seed)
+    sequence, views = rgbd.read_pose_folder(config.data), config.views or 8
+    if sequence.T_world_camera is None:
+        raise ValueError(f"{config.data}: has no pose files, so nothing to compare to")
+    begin = index * (views // 2)
+    return rgbd.take_frames(sequence, slice(begin, begin + views))
+
+
+def fit_settings(config: Config, sequence: DepthSequence) -> DepthMappingConfig:
+    """The preset, with the motion of the data."""
+    from dpmjax.deepmapping import depth_preset
+
+    is_planar = sequence.is_planar if config.motion == "auto" else config.motion == "planar"
+    return depth_preset(config.preset, motion="planar" if is_planar else "full")
+
+
+def run_one(
+    folder: RunFolder,
+    config: Config,
+    sequence: DepthSequence,
+    settings: DepthMappingConfig,
+    index: int,
+    cache: dict[str, Any],
+) -> dict[str, Any]:
+    """All methods on one trajectory; `run_s` of the first of each length contains its compilation."""
+    found: dict[str, NDArray[np.float64]] = {}
+    row: dict[str, Any] = {"name": sequence.name, "views": len(sequence)}
+    for name in config.methods:
+        begun = time.perf_counter()
+        found[name] = run_method(name, sequence, settings, seed=config.seed, cache=cache)
+        row[name] = {**errors_of(found[name], sequence), "run_s": time.perf_counter() - begun}
+    if index < config.pictures:
+        from dpmjax import viz
+
+        panels = [(f"{name}, ATE {row[name]['ate_mm']:.0f} mm", T) for name, T in found.items() if name != "zero"]
+        figure = viz.from_above_figure(
+            [*panels, ("reference", sequence.T_world_camera)], sequence.points, sequence.mask
+        )
+        viz.save_figure(figure, folder / f"map_{index}.png", dpi=110)
+    return row
+
+
+def summarise(rows: list[dict[str, Any]], methods: tuple[str, ...]) -> dict[str, Any]:
+    """Success rates and medians by method."""
+    table = {}
+    for name in methods:
+        values = {key: np.array([row[name][key] for row in rows]) for key in rows[0][name]}
+        table[name] = {
+            "success": float((values["ate_mm"] < _SUCCESS_MM).mean()),
+            "success_100_mm": float((values["ate_mm"] < _CLOSE_MM).mean()),
+            "median_ate_mm": float(np.median(values["ate_mm"])),
+            "median_point_distance_mm": float(np.median(values["point_distance_mm"])),
+            "median_run_s": float(np.median(values["run_s"])),
+        }
+    return {"num_trajectories": len(rows), "methods": table}
+
+
+def draw_errors(folder: RunFolder, rows: list[dict[str, Any]], methods: tuple[str, ...]) -> None:
+    """errors.png."""
+    from dpmjax import viz
+
+    groups = {
+        title: {name: [row[name][key] for row in rows] for name in methods}
+        for title, key in (("ATE", "ate_mm"), ("point distance", "point_distance_mm"))
+    }
+    viz.save_figure(viz.box_plots_figure(groups, "mm", _SUCCESS_MM), folder / "errors.png")
+
+
+def tell(folder: RunFolder, metrics: dict[str, Any]) -> None:
+    """The table."""
+    print(f"{metrics['num_trajectories']} trajectories; success is an ATE below 450 mm (the paper's), below 100 mm")
+    for name, row in metrics["methods"].items():
+        print(
+            f"{name:17} {100 * row['success']:5.1f} %  {100 * row['success_100_mm']:5.1f} %  median ATE "
+            f"{row['median_ate_mm']:7.1f} mm, point distance {row['median_point_distance_mm']:7.1f} mm, "
+            f"{row['median_run_s']:.1f} s"
+        )
+    print(f"results in {folder.path}")
+
+
+if __name__ == "__main__":
+    raise SystemExit(run_command(main, Config, experiment=EXPERIMENT, description=__doc__))

@@ -1,0 +1,124 @@
+"""Time and memory of DeepMapping against the number of scans, 64 to 4,096, each size in a process of its own.
+
+    python -m experiments.deepmapping_size
+    python -m experiments.deepmapping_size --sizes 64 256 1024 -o out
+
+Steps take at most 256 scans in windows of 32 neighbours in time and every fourth beam, so that M-Net sees a random part
+of the rays: a step costs the same however many scans there are, and an epoch (every scan seen once) grows linearly. The
+report has both, the peak of memory, and the exponents; size.png draws them.
+"""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+from tyro.conf import FlagCreatePairsOff, arg
+
+from experiments._command import run_command
+from experiments._json import load_json
+from experiments._run_folder import open_run_folder, recording, write_metrics
+
+EXPERIMENT = "deepmapping_size"
+# The exponent is that of large sizes: below, a step does not hold its full number of scans.
+_FULL_STEP = 256
+
+
+@dataclass(frozen=True)
+class Config:
+    """Options of the measurement."""
+
+    output: Annotated[Path | None, arg(aliases=["-o"], metavar="OUT")] = None
+    """Folder for the results, instead of results/deepmapping_size/<time>."""
+    sizes: tuple[int, ...] = (64, 128, 256, 512, 1024, 2048, 4096)
+    """Numbers of scans."""
+    calls: Annotated[int, arg(metavar="N")] = 3
+    """Calls of 25 steps of each phase; the quickest counts."""
+    seed: int = 0
+    """Seed of walks and fits."""
+    resume: FlagCreatePairsOff[bool] = False
+    """Measure only the sizes that are missing in OUT."""
+    force: FlagCreatePairsOff[bool] = False
+    """Replace an earlier run in OUT."""
+
+    def __post_init__(self) -> None:
+        """Checks ranges."""
+        if not self.sizes or min(self.sizes) < 2:
+            raise ValueError(f"--sizes: expected numbers of at least 2, got {self.sizes}")
+        if self.calls < 1:
+            raise ValueError(f"--calls: expected at least 1, got {self.calls}")
+
+
+def main(config: Config) -> dict[str, Any]:
+    """Measures what is missing, fits the exponents, draws."""
+    folder = open_run_folder(
+        config,
+        EXPERIMENT,
+        output=config.output,
+        resume=config.resume,
+        force=config.force,
+        may_change=frozenset({"sizes"}),
+    )
+    with recording(folder):
+        rows = []
+        for size in sorted(config.sizes):
+            file = folder / f"size_{size}.json"
+            if not (folder.is_resumed and file.exists()):
+                command = [sys.executable, "-m", "experiments._size_child", str(size), str(config.calls)]
+                subprocess.run([*command, str(config.seed), str(file)], check=True, cwd=Path(__file__).parents[1])
+            rows.append(load_json(file))
+            tell(rows[-1])
+        metrics = {"rows": [{key: row[key] for key in _KEYS} for row in rows], "exponents": exponents(rows)}
+        write_metrics(folder, metrics, seed=config.seed)
+        from dpmjax import viz
+
+        viz.save_figure(viz.size_figure(curves(rows), memory_limit_gb=4.0), folder / "size.png")
+        print(", ".join(f"{name}: n^{value:.2f}" for name, value in metrics["exponents"].items() if value is not None))
+        print(f"results in {folder.path}")
+    return metrics
+
+
+_KEYS = ("num_scans", "network", "free", "data_gb", "peak_rss_gb")
+
+
+def curves(rows: list[dict[str, Any]]) -> dict[str, Any]:
+    """What is drawn and fitted, by name."""
+    return {
+        "num_scans": np.array([row["num_scans"] for row in rows], np.float64),
+        "step, L-Net (s)": np.array([row["network"]["step_s"] for row in rows]),
+        "step, free poses (s)": np.array([row["free"]["step_s"] for row in rows]),
+        "epoch, L-Net (s)": np.array([row["network"]["epoch_s"] for row in rows]),
+        "epoch, free poses (s)": np.array([row["free"]["epoch_s"] for row in rows]),
+        "peak memory (GB)": np.array([row["peak_rss_gb"] for row in rows]),
+    }
+
+
+def exponents(rows: list[dict[str, Any]]) -> dict[str, float | None]:
+    """Slopes in the log-log plane from the size on at which a step is full; None with fewer than two such sizes."""
+    columns = curves(rows)
+    sizes = columns.pop("num_scans")
+    is_full = sizes >= _FULL_STEP
+    if is_full.sum() < 2:
+        return dict.fromkeys(columns)
+    return {
+        name: float(np.polyfit(np.log(sizes[is_full]), np.log(values[is_full]), 1)[0])
+        for name, values in columns.items()
+    }
+
+
+def tell(row: dict[str, Any]) -> None:
+    """One line a size."""
+    print(
+        f"{row['num_scans']:5d} scans: step {1e3 * row['network']['step_s']:.1f} ms (L-Net), "
+        f"{1e3 * row['free']['step_s']:.1f} ms (free poses); epoch {row['network']['epoch_s']:.2f} s, "
+        f"{row['free']['epoch_s']:.2f} s; peak {row['peak_rss_gb']:.2f} GB",
+        flush=True,
+    )
+
+
+if __name__ == "__main__":
+    raise SystemExit(run_command(main, Config, experiment=EXPERIMENT, description=__doc__))

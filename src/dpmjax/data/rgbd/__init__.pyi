@@ -1,0 +1,11 @@
+from .active_vision import read_active_vision as read_active_vision
+from .apartment import Apartment as Apartment
+from .apartment import make_apartment as make_apartment
+from .camera import Camera as Camera
+from .camera import back_project as back_project
+from .depth_sequence import DepthSequence as DepthSequence
+from .depth_sequence import take_frames as take_frames
+from .pose_folder import read_pose_folder as read_pose_folder
+from .ray_depth import cast_depth as cast_depth
+from .simulate import GridWalkConfig as GridWalkConfig
+from .simulate import simulate_depth_sequence as simulate_depth_sequence

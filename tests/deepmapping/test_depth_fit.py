@@ -1,0 +1,140 @@
+"""Laws of DeepMapping on depth images."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from dpmjax import deepmapping as dm
+from dpmjax.data import rgbd
+from dpmjax.deepmapping.depth_start import DepthStartConfig, agreement, fit_pinhole
+from dpmjax.metrics import absolute_trajectory_error
+from dpmjax.nets.depth_localization import DepthLocalizationConfig
+from dpmjax.nets.occupancy import OccupancyConfig
+from tests.tolerances import ROUNDING
+
+KEY = jax.random.key(0)
+
+
+@pytest.fixture(scope="module")
+def walk() -> rgbd.DepthSequence:
+    config = rgbd.GridWalkConfig(height=12, width=16)
+    return rgbd.simulate_depth_sequence(0, 4, seed=1, config=config)
+
+
+@pytest.fixture(scope="module")
+def scans(walk) -> dm.DepthScans:
+    return dm.as_depth_scans(walk.points, walk.mask)
+
+
+def small(motion: str) -> dm.DepthMappingConfig:
+    """The fast preset in small."""
+    config = dm.depth_preset("fast", motion=motion)
+    phases = [replace(phase, num_steps=4, beams_per_step=64) for phase in config.cold_phases]
+    return replace(
+        config,
+        cold_phases=(phases[0], phases[2]),
+        warm_phases=(phases[2],),
+        localization=DepthLocalizationConfig(features=(8, 16), strides=(2, 1), hidden=(16,)),
+        occupancy=OccupancyConfig(kind="grid", resolutions=(4, 8)),
+        steps_per_call=2,
+    )
+
+
+def test_planar_motions_turn_about_the_vertical_axis() -> None:
+    T = np.asarray(dm.motion_matrices(jnp.array([[1.0, 2.0, 0.3]])))[0]
+    np.testing.assert_allclose(T[:3, 3], [1.0, 0.0, 2.0], **ROUNDING)
+    np.testing.assert_allclose(T[:3, :3] @ [0, 0, 1], [np.sin(0.3), 0.0, np.cos(0.3)], **ROUNDING)
+    full = np.asarray(dm.motion_matrices(jnp.array([[0.0, 0.0, 0.0, 0.0, 0.3, 0.0]])))[0]
+    np.testing.assert_allclose(full[:3, :3], T[:3, :3], **ROUNDING)
+
+
+@pytest.mark.parametrize("motion", ["planar", "full"])
+def test_a_fit_goes_through_all_phases_and_returns_rigid_motions(scans, motion) -> None:
+    fitted = dm.fit_depth(scans, small(motion), key=KEY)
+    T = fitted.T_world_camera
+    assert T.shape == (4, 4, 4)
+    np.testing.assert_allclose(
+        np.einsum("nji,njk->nik", T[:, :3, :3], T[:, :3, :3]), np.tile(np.eye(3), (4, 1, 1)), atol=1e-5
+    )
+    assert int(fitted.state.step) == 8
+    assert np.isfinite(float(fitted.report.loss))
+    if motion == "planar":
+        np.testing.assert_array_equal(T[:, 1, 3], 0.0)
+
+
+def test_sets_of_one_shape_share_their_compilation(scans, assert_compiles_nothing) -> None:
+    steps: dict = {}
+    config = small("planar")
+    T = np.tile(np.eye(4), (4, 1, 1))
+    one = dm.fit_depth(scans, config, key=KEY, init=T, steps=steps)
+    with assert_compiles_nothing():
+        two = dm.fit_depth(scans, config, key=KEY, init=T, steps=steps)
+    np.testing.assert_array_equal(one.T_world_camera, two.T_world_camera)
+
+
+def test_masked_pixels_never_matter(walk) -> None:
+    mask = walk.mask.copy()
+    mask[:, 3:5] = False
+    results = []
+    for filling in (0.0, 1e6, np.nan):
+        points = np.where(mask[..., None], walk.points, filling)
+        results.append(dm.as_depth_scans(points, mask))
+    jax.tree.map(np.testing.assert_array_equal, results[0], results[1])
+    jax.tree.map(np.testing.assert_array_equal, results[0], results[2])
+
+
+def test_direct_form_starts_where_the_network_does(scans) -> None:
+    config = small("planar")
+    direct = dm.init_depth(KEY, scans, dm.as_direct(config))
+    network = dm.init_depth(KEY, scans, config)
+    assert float(jnp.abs(direct.params.poses).max()) > 0.0
+    assert float(jnp.abs(network.params.poses).max()) == 0.0
+    assert all(phase.poses == "free" for phase in dm.as_direct(config).cold_phases)
+
+
+def test_pinhole_is_found_in_the_clouds(walk) -> None:
+    pinhole = fit_pinhole(walk.points, walk.mask)
+    x, y, z = walk.points[0, 7, 11]
+    np.testing.assert_allclose(pinhole.fx * x / z + pinhole.cx, 11.0, atol=0.02)
+    np.testing.assert_allclose(pinhole.fy * y / z + pinhole.cy, 7.0, atol=0.02)
+
+
+def test_an_image_agrees_with_itself_and_contradicts_itself_from_elsewhere(walk) -> None:
+    points, mask = jnp.asarray(walk.points[0].reshape(-1, 3)), jnp.asarray(walk.mask[0].reshape(-1))
+    depth = jnp.where(walk.mask[0], walk.points[0, ..., 2], 0.0)
+    pinhole, tolerance = fit_pinhole(walk.points, walk.mask), jnp.float32(0.05)
+    assert float(agreement(jnp.eye(4), points, mask, depth, pinhole, tolerance)) > 0.99
+    nearer = jnp.eye(4).at[2, 3].set(-0.6)
+    assert float(agreement(nearer, points, mask, depth, pinhole, tolerance)) < -0.2
+    hidden = jnp.zeros_like(mask)
+    assert float(agreement(jnp.eye(4), points, hidden, depth, pinhole, tolerance)) == 0.0
+
+
+def test_images_are_placed_without_a_first_guess(walk, scans) -> None:
+    config = DepthStartConfig(num_candidates=512, num_kept=16, num_points=100, num_references=2)
+    T = dm.place_images(scans, config, key=KEY)
+    p = walk.T_world_camera[:, :3, 3]
+    relative = np.linalg.inv(walk.T_world_camera[0]) @ walk.T_world_camera
+    assert absolute_trajectory_error(T[:, :3, 3], p) < 0.15
+    assert np.abs(T[:, 0, 2] - relative[:, 0, 2]).max() < 0.1
+
+
+@pytest.mark.parametrize(
+    ("points", "options", "message"),
+    [
+        (np.ones((2, 3, 4)), {}, "points: expected shape"),
+        (np.ones((1, 3, 4, 3)), {}, "points: expected shape"),
+        (np.stack([np.ones((3, 4, 3)), np.zeros((3, 4, 3))]), {}, "image 1 has no valid pixel"),
+        (np.ones((2, 3, 4, 3)), {"init": np.zeros((3, 4, 4))}, "init: expected finite"),
+    ],
+)
+def test_bad_input_is_named(points, options, message) -> None:
+    with pytest.raises(ValueError, match=message):
+        dm.fit_depth(points, small("planar"), key=KEY, **options)
+    with pytest.raises(ValueError, match="preset"):
+        dm.depth_preset("quick")

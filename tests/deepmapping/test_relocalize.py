@@ -1,0 +1,92 @@
+"""Laws of re-localisation by L-Net."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import dpmjax
+from dpmjax import deepmapping as dm
+from dpmjax.deepmapping.relocalize import turn_scan
+from dpmjax.geometry import planar_poses
+from dpmjax.nets.localization import LocalizationConfig
+from dpmjax.nets.occupancy import OccupancyConfig
+from dpmjax.types import ScanSet
+from tests.tolerances import ROUNDING
+
+KEY = jax.random.key(0)
+
+
+@pytest.fixture(scope="module")
+def fitted(tiny_walk) -> dm.Fitted:
+    """A fit of the shape of a cold start, whose poses are the truth."""
+    config = replace(
+        dm.preset("fast"),
+        occupancy=OccupancyConfig(kind="grid", resolutions=(4,)),
+        localization=LocalizationConfig(features=(16, 32), strides=(1, 2), is_circular=True, hidden=(32,)),
+    )
+    scans = dm.as_scan_set(ScanSet(tiny_walk.points, tiny_walk.mask))
+    reach = dm.measure_reach(scans)
+    state = dm.init(KEY, ScanSet(scans.points / reach, scans.mask), config)
+    poses = tiny_walk.reference_poses - tiny_walk.reference_poses.mean(axis=0)
+    T = planar_poses.matrices(poses)
+    return dm.Fitted(T, poses, state.params, None, state, reach, config)  # type: ignore[arg-type]
+
+
+@pytest.fixture(scope="module")
+def taught(fitted, tiny_walk) -> dm.Fitted:
+    scans = ScanSet(tiny_walk.points, tiny_walk.mask)
+    return dm.teach_localization(fitted, scans, dm.TeachConfig(num_steps=300, scans_per_step=20), key=KEY)
+
+
+def test_taught_scans_come_back_near_their_poses(taught, tiny_walk) -> None:
+    found = dpmjax.relocalize(taught, ScanSet(tiny_walk.points, tiny_walk.mask))
+    spread = np.linalg.norm(taught.poses[:, :2], axis=1)
+    error = np.linalg.norm(found.pose[:, :2] - taught.poses[:, :2], axis=1)
+    assert np.median(error) < 0.4 * np.median(spread)
+    np.testing.assert_allclose(found.T_world_scan, planar_poses.matrices(found.pose))
+
+
+def test_one_scan_is_one_row_of_many(taught, tiny_walk) -> None:
+    scans = np.where(tiny_walk.mask[..., None], tiny_walk.points, 0.0)
+    many = dpmjax.relocalize(taught, scans)
+    one = dpmjax.relocalize(taught, scans[3])
+    assert one.pose.shape == (3,)
+    np.testing.assert_allclose(one.pose, many.pose[3], rtol=1e-4, atol=1e-3)
+
+
+def test_teaching_keeps_poses_and_map(fitted, taught) -> None:
+    np.testing.assert_array_equal(fitted.poses, taught.poses)
+    jax.tree.map(np.testing.assert_array_equal, fitted.params.occupancy, taught.params.occupancy)
+
+
+def test_a_turned_sensor_sees_points_turned_back() -> None:
+    points = np.random.default_rng(0).normal(size=(5, 2))
+    world = planar_poses.transform(np.array([[0.0, 0.0, 0.7]]), points[None])[0]
+    turned = np.asarray(turn_scan(jnp.asarray(points, jnp.float32), jnp.float32(0.4)))
+    np.testing.assert_allclose(planar_poses.transform(np.array([[0.0, 0.0, 1.1]]), turned[None])[0], world, **ROUNDING)
+
+
+def test_a_second_call_compiles_nothing(taught, tiny_walk, assert_compiles_nothing) -> None:
+    scans = ScanSet(tiny_walk.points, tiny_walk.mask)
+    dpmjax.relocalize(taught, scans)
+    with assert_compiles_nothing():
+        dpmjax.relocalize(taught, scans)
+
+
+def test_bad_input_is_named(fitted, tiny_walk) -> None:
+    with pytest.raises(ValueError, match="scan: expected shape"):
+        dpmjax.relocalize(fitted, np.ones((4, 3, 3)))
+    with pytest.raises(ValueError, match="no valid beam"):
+        dpmjax.relocalize(fitted, np.zeros((64, 2)))
+    warm = fitted._replace(state=replace(fitted.state, start_poses=jnp.ones((20, 3))))
+    with pytest.raises(ValueError, match="teach_localization"):
+        dpmjax.relocalize(warm, tiny_walk.points)
+    with pytest.raises(ValueError, match="the 20 scans of the fit"):
+        dm.teach_localization(fitted, tiny_walk.points[:5], key=KEY)
+    with pytest.raises(ValueError, match="drop"):
+        dm.TeachConfig(drop=1.0)

@@ -1,0 +1,87 @@
+"""Laws of the one-dimensional example (supplement D)."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from dpmjax import deepmapping as dm
+from dpmjax.nets.scalar import ScalarNet, ScalarNetConfig
+from tests.tolerances import ROUNDING
+
+SHORT = dm.ToyConfig(num_steps=20)
+
+
+def loss64(x):
+    return 0.5 * x**2 + 5.0 * np.sin(10.0 * x) + 20.0 * np.sin(x)
+
+
+def test_global_minimum_is_where_brute_force_finds_it() -> None:
+    x = np.linspace(-30.0, 30.0, 2_000_001)
+    x_best, loss_best = dm.global_minimum()
+    assert x_best == pytest.approx(x[np.argmin(loss64(x))], abs=1e-4)
+    assert loss_best == pytest.approx(loss64(x).min(), abs=1e-6)
+    assert (round(x_best, 3), round(loss_best, 3)) == (-1.417, -23.757)
+
+
+def test_direct_form_is_plain_gradient_descent() -> None:
+    x = expected = 0.7
+    for _ in range(SHORT.num_steps):
+        expected -= SHORT.learning_rate * (expected + 50.0 * np.cos(10.0 * expected) + 20.0 * np.cos(expected))
+    run = dm.descend_direct(jnp.float32(x), SHORT)
+    assert run.x.shape == (SHORT.num_steps + 1,)
+    np.testing.assert_allclose(run.x[-1], expected, **ROUNDING)
+
+
+def test_both_forms_start_alike_and_the_first_network_step_is_descent_on_all_of_it() -> None:
+    start = dm.init_toy(jax.random.key(0), SHORT)
+    x0 = dm.network_value(start, SHORT)
+    run = dm.descend_network(start, SHORT)
+    assert run.x[0] == x0 == dm.descend_direct(x0, SHORT).x[0]
+    gradient = jax.grad(lambda at: dm.toy_loss(dm.network_value(at, SHORT)))(start)
+    moved = jax.tree.map(lambda value, slope: value - SHORT.learning_rate * slope, start, gradient)
+    np.testing.assert_allclose(run.x[1], dm.network_value(moved, SHORT), **ROUNDING)
+    assert run.z != start.z
+
+
+def test_network_is_a_chain_of_linear_maps_and_elus() -> None:
+    start = dm.init_toy(jax.random.key(1), SHORT)
+    layers = [start.params["params"][f"Dense_{k}"] for k in range(5)]
+    x = np.array([start.z], np.float64)
+    for k, layer in enumerate(layers):
+        x = x @ np.asarray(layer["kernel"], np.float64) + np.asarray(layer["bias"], np.float64)
+        x = np.where(x > 0, x, np.expm1(x)) if k < 4 else x
+    np.testing.assert_allclose(dm.network_value(start, SHORT), x[0], **ROUNDING)
+    assert [layer["kernel"].shape[1] for layer in layers] == [10, 20, 30, 40, 1]
+
+
+@pytest.mark.parametrize("name", ["xavier-relu", "xavier", "he", "lecun", "pytorch"])
+def test_initialisations_have_their_spread(name: str) -> None:
+    net = ScalarNet(ScalarNetConfig(features=(400, 300), initialization=name))
+    layer = net.init(jax.random.key(2), jnp.zeros(()))["params"]["Dense_1"]
+    variance = {"xavier-relu": 4 / 700, "xavier": 2 / 700, "he": 2 / 400, "lecun": 1 / 400, "pytorch": 1 / 1200}[name]
+    assert float(jnp.var(layer["kernel"])) == pytest.approx(variance, rel=0.03)
+    assert bool(jnp.any(layer["bias"] != 0)) == (name == "pytorch")
+
+
+@pytest.mark.parametrize("method", ["gradient-descent", "lbfgs", "bfgs"])
+def test_solvers_end_at_the_minimum_of_their_valley(method: str) -> None:
+    x_best, _ = dm.global_minimum()
+    x = dm.minimize_direct(jnp.float32(x_best + 0.05), method, max_iterations=50)
+    assert float(x) == pytest.approx(x_best, abs=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: dm.minimize_direct(jnp.zeros(()), "newton"), "method: expected one of"),
+        (lambda: dm.ToyConfig(learning_rate=0.0), "learning_rate"),
+        (lambda: dm.ToyConfig(num_steps=0), "num_steps"),
+        (lambda: ScalarNetConfig(initialization="zeros"), "initialization"),
+    ],
+)
+def test_bad_settings_are_named(call, message) -> None:
+    with pytest.raises(ValueError, match=message):
+        call()

@@ -1,0 +1,107 @@
+"""The commands of the smaller experiments: options, tiny runs, resume."""
+
+from __future__ import annotations
+
+import json
+import math
+
+import numpy as np
+import pytest
+
+from experiments import deepmapping_ablations, deepmapping_relocalize, deepmapping_rgbd, deepmapping_size, toy_1d
+from experiments._command import run_command
+
+MODULES = (deepmapping_ablations, deepmapping_relocalize, deepmapping_rgbd, deepmapping_size, toy_1d)
+
+
+def run(module, *options) -> int:
+    arguments = list(map(str, options))
+    return run_command(
+        module.main, module.Config, experiment=module.EXPERIMENT, description=module.__doc__, args=arguments
+    )
+
+
+@pytest.mark.parametrize("module", MODULES, ids=lambda module: module.EXPERIMENT)
+def test_help_shows_examples(module, capsys) -> None:
+    assert run(module, "--help") == 0
+    assert f"python -m experiments.{module.EXPERIMENT}" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("module", "options", "message"),
+    [
+        (toy_1d, ["--seeds", 0], "--seeds"),
+        (toy_1d, ["--device", "tpu"], "--device"),
+        (deepmapping_size, ["--sizes", 1], "--sizes"),
+        (deepmapping_ablations, ["--only", "colour"], "--only"),
+        (deepmapping_ablations, ["--views", 1], "--views"),
+        (deepmapping_rgbd, ["--methods", "guess"], "--methods"),
+        (deepmapping_rgbd, ["--limit", 0], "--limit"),
+        (deepmapping_rgbd, ["/no/such/folder"], "no such folder"),
+        (deepmapping_relocalize, ["/no/such/run"], "config.json"),
+    ],
+)
+def test_bad_input_is_one_line_and_exit_code_2(module, options, message, capsys) -> None:
+    assert run(module, *options) == 2
+    errors = capsys.readouterr().err
+    assert message in errors
+    assert len(errors.strip().splitlines()) == 1
+
+
+def test_toy_writes_its_pictures_and_shares(tmp_path, capsys) -> None:
+    options = ["--seeds", 4, "--steps", 3, "--learning-rates", 2e-4, "-o", tmp_path / "out"]
+    assert run(toy_1d, *options) == 0
+    metrics = json.loads((tmp_path / "out" / "metrics.json").read_text())
+    assert metrics["x_global"] == pytest.approx(-1.417, abs=1e-3)
+    assert len(metrics["share_at_global_minimum"]) == 5
+    assert {row["initialization"] for row in metrics["variants"]} >= {"xavier-relu", "pytorch"}
+    assert (tmp_path / "out" / "toy.png").exists()
+    assert (tmp_path / "out" / "endings.png").exists()
+
+
+def test_the_chosen_seed_is_one_that_tells_the_story() -> None:
+    x = -1.41707
+    network = np.array([[0.0, 4.0], [9.0, x], [1.0, x], [2.0, x]])
+    direct = np.array([[0.0, 4.0], [9.0, 8.9], [1.0, x], [2.0, 2.3]])
+    assert toy_1d.choose_seed(network, direct) == 3
+
+
+def test_rgbd_resumes_trajectory_by_trajectory(tmp_path) -> None:
+    out = tmp_path / "out"
+    assert run(deepmapping_rgbd, "--limit", 1, "--methods", "zero", "-o", out, "--pictures", 0) == 0
+    first = json.loads((out / "runs.json").read_text())["rows"]
+    assert run(deepmapping_rgbd, "--resume", "-o", out, "--limit", 2) == 0
+    rows = json.loads((out / "runs.json").read_text())["rows"]
+    assert rows[0] == first[0]
+    assert [row["views"] for row in rows] == [8, 16]
+    metrics = json.loads((out / "metrics.json").read_text())
+    assert metrics["num_trajectories"] == 2
+    assert metrics["methods"]["zero"]["median_ate_mm"] > 0.0
+    assert (out / "errors.png").exists()
+
+
+def test_ablations_change_one_thing_each() -> None:
+    config = deepmapping_ablations.Config()
+    basis = deepmapping_ablations.settings_of("lnet", "CNN", config)
+    for ablation, variants in deepmapping_ablations.VARIANTS.items():
+        settings = [deepmapping_ablations.settings_of(ablation, variant, config) for variant in variants]
+        assert len(set(settings)) == len(variants)
+        for one in settings:
+            changed = (
+                (one.localization != basis.localization)
+                + (one.occupancy != basis.occupancy)
+                + (one.cold_phases != basis.cold_phases)
+            )
+            assert changed <= (2 if ablation == "mnet" else 1)
+
+
+def test_exponents_are_those_of_full_steps() -> None:
+    def row(size):
+        part = {"step_s": 0.5, "epoch_s": 1e-3 * size}
+        return {"num_scans": size, "network": part, "free": part, "peak_rss_gb": 0.1 * math.sqrt(size)}
+
+    found = deepmapping_size.exponents([row(size) for size in (64, 256, 1024, 4096)])
+    assert found["step, L-Net (s)"] == pytest.approx(0.0, abs=1e-9)
+    assert found["epoch, free poses (s)"] == pytest.approx(1.0)
+    assert found["peak memory (GB)"] == pytest.approx(0.5)
+    assert deepmapping_size.exponents([row(64)])["peak memory (GB)"] is None
