@@ -14,7 +14,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Complex, Float, Int
 from numpy.typing import NDArray
 
 from dpmjax.geometry import planar_poses
@@ -79,7 +79,7 @@ class Candidates(NamedTuple):
 
 def _draw(
     profiles: Profiles, turn: Float[Array, ""], cell: Float[Array, ""], config: CorrelativeConfig
-) -> tuple[Float[Array, "n g f"], Float[Array, "n g f"]]:
+) -> tuple[Complex[Array, "n g f"], Complex[Array, "n g f"]]:
     """Spectra of the two pictures of each scan, turned by `turn`, its sensor in the middle."""
     size = config.num_cells
     axis = (jnp.arange(size) - size // 2) * cell
