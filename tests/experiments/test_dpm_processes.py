@@ -12,6 +12,7 @@ from pathlib import Path
 import jax
 import numpy as np
 import pytest
+from optax.tree_utils import tree_get
 
 from dpmjax.deeppointmap import CurriculumStage, init, make_step
 from experiments._checkpoint import Checkpoints
@@ -21,7 +22,6 @@ from experiments._history import read_history
 from experiments._processes import join_processes
 from experiments._run_folder import CHECKPOINTS, HISTORY
 from tests.deeppointmap import toy
-from tests.tolerances import ACCUMULATED
 
 REPOSITORY = Path(__file__).parents[2]
 TRAINING = replace(toy.TRAINING, curriculum=(CurriculumStage(2, 4),), overlap_steps=0)
@@ -103,7 +103,10 @@ def test_two_processes_train_as_one_and_stop_as_one(tmp_path: Path) -> None:
     for number in range(2):
         state, _ = step(state, maker(number))
     assert progress.state.step == progress.best_step == 2
-    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, **ACCUMULATED), progress.state.params, state.params)
+    # Of the gradients, not of the parameters: Adam makes a whole step of the rounding of a gradient that is zero.
+    found, expected = (tree_get(s.registration_optimizer, "mu") for s in (progress.state, state))
+    largest = max(float(np.abs(leaf).max()) for leaf in jax.tree.leaves(expected))
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-4 * largest), found, expected)
 
 
 @pytest.mark.parametrize(

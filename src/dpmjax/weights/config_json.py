@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import types
 import typing
 from typing import Any, TypeVar
 
@@ -24,13 +25,17 @@ def config_from_json(value: Any, config_type: type[ConfigT]) -> ConfigT:
 
 
 def _restored(value: Any, expected: Any, name: str) -> Any:
+    if typing.get_origin(expected) in (types.UnionType, typing.Union):
+        if value is None and type(None) in typing.get_args(expected):
+            return None
+        (expected,) = (choice for choice in typing.get_args(expected) if choice is not type(None))
     if dataclasses.is_dataclass(expected) and isinstance(expected, type):
         if not isinstance(value, dict):
             raise ValueError(f"{name}: expected an object, got {value!r}")
-        types = typing.get_type_hints(expected)
-        if unknown := value.keys() - types.keys():
+        fields = typing.get_type_hints(expected)
+        if unknown := value.keys() - fields.keys():
             raise ValueError(f"{name}: unknown field {min(unknown)!r}")
-        return expected(**{key: _restored(item, types[key], f"{name}.{key}") for key, item in value.items()})
+        return expected(**{key: _restored(item, fields[key], f"{name}.{key}") for key, item in value.items()})
     if typing.get_origin(expected) is tuple:
         if not isinstance(value, list | tuple):
             raise ValueError(f"{name}: expected a list, got {value!r}")
