@@ -49,7 +49,7 @@ class DepthStartConfig:
     num_rounds: int = 7
     num_references: int = 4
     num_points: int = 200
-    tolerance: tuple[float, float] = (0.12, 0.03)
+    tolerance: tuple[float, float] = (0.12, 0.01)
 
     def __post_init__(self) -> None:
         if min(self.num_candidates, self.num_kept, self.num_rounds, self.num_references, self.num_points) < 1:
@@ -95,16 +95,32 @@ def agreement(
     seen = transform_points(T_other_camera, points)
     depth = seen[:, 2]
     safe = jnp.maximum(depth, 1e-3)
-    column = jnp.round(pinhole.fx * seen[:, 0] / safe + pinhole.cx).astype(jnp.int32)
-    row = jnp.round(pinhole.fy * seen[:, 1] / safe + pinhole.cy).astype(jnp.int32)
-    height, width = depth_other.shape
-    is_inside = mask & (depth > 1e-3) & (column >= 0) & (column < width) & (row >= 0) & (row < height)
-    surface = depth_other[jnp.clip(row, 0, height - 1), jnp.clip(column, 0, width - 1)]
-    is_inside &= surface > 0.0
-    gap = (surface - depth) / (tolerance * jnp.maximum(surface, 1e-3))
+    column = pinhole.fx * seen[:, 0] / safe + pinhole.cx
+    row = pinhole.fy * seen[:, 1] / safe + pinhole.cy
+    inverse, is_smooth = _inverse_depth_at(depth_other, row, column)
+    is_told = mask & (depth > 1e-3) & is_smooth
+    # How far the point is in front of the surface, in shares of the surface's depth, over the tolerance.
+    gap = jnp.where(is_told, 1.0 - depth * inverse, 0.0) / tolerance
     floats = jax.nn.sigmoid(3.0 * (gap - 2.0))
-    score = jnp.where(is_inside, jnp.exp(-(gap**2)) - floats, 0.0)
+    score = jnp.where(is_told, jnp.exp(-(gap**2)) - floats, 0.0)
     return score.sum() / jnp.maximum(mask.sum(), 1)
+
+
+def _inverse_depth_at(
+    depth: Float[Array, "h w"], row: Float[Array, " p"], column: Float[Array, " p"]
+) -> tuple[Float[Array, " p"], Bool[Array, " p"]]:
+    """One over the depth between four pixels, which is linear on a plane; and whether they lie on one surface."""
+    height, width = depth.shape
+    top = jnp.clip(jnp.floor(row).astype(jnp.int32), 0, height - 2)
+    left = jnp.clip(jnp.floor(column).astype(jnp.int32), 0, width - 2)
+    inverse = jnp.where(depth > 0.0, 1.0 / jnp.where(depth > 0.0, depth, 1.0), 0.0)
+    corners = jnp.stack([inverse[top + i, left + j] for i in (0, 1) for j in (0, 1)], axis=-1)
+    v, u = row - top, column - left
+    shares = jnp.stack([(1 - v) * (1 - u), (1 - v) * u, v * (1 - u), v * u], axis=-1)
+    is_inside = (row >= 0.0) & (row <= height - 1) & (column >= 0.0) & (column <= width - 1)
+    low, high = corners.min(-1), corners.max(-1)
+    is_smooth = is_inside & (low > 0.0) & (high - low < _EDGE * high)
+    return jnp.sum(jnp.where(is_inside[:, None], shares, 0.0) * corners, axis=-1), is_smooth
 
 
 def place_images(

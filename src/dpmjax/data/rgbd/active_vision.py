@@ -110,10 +110,9 @@ def _read_poses(path: Path) -> dict[str, NDArray[np.float64]]:
     try:
         content = loadmat(path, squeeze_me=True, struct_as_record=False)
         structs, scale_mm = np.atleast_1d(content["image_structs"]), float(content["scale"])
-    except (OSError, KeyError, ValueError, TypeError) as error:
-        raise InputError(
-            path, f"not the dataset's pose file ({error})", "copy image_structs.mat of the scene"
-        ) from error
+    except Exception as error:  # SciPy raises whatever its parser trips over.
+        found = f"not the dataset's pose file ({type(error).__name__})"
+        raise InputError(path, found, "copy image_structs.mat of the scene") from error
     poses = {}
     for entry in structs:
         R, t = np.asarray(entry.R, np.float64), np.asarray(entry.t, np.float64).reshape(-1)
