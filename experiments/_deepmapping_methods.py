@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -13,6 +14,7 @@ from numpy.typing import NDArray
 if TYPE_CHECKING:
     from dpmjax.data.sequence import ScanSequence
     from dpmjax.geometry.lines import LineScans
+    from dpmjax.types import ScanSet
 
 Floats = NDArray[np.float64]
 
@@ -20,11 +22,13 @@ SUCCESS_PX = 20.0
 """ATE below which the paper calls a run a success (section 4.1)."""
 
 NOT_RUN = {
-    "pso": "no particle swarm library is among the dependencies",
-    "go-icp": "the packages of Go-ICP on PyPI register two 3-D clouds, and none does 2-D",
-    "multiway": "needs Open3D, which is not among the dependencies",
+    "go-icp": "its packages on PyPI search the turns of 3-D clouds, which may turn a flat scan over; py-goicp does not "
+    "build with today's setuptools, py-simple-go-icp-interface took 20 s for one pair of flat scans and gave up",
 }
 """Baselines of the paper that have no column, and why."""
+
+EXTRAS = {"pso": "evosax", "multiway": "open3d"}
+"""Methods that need a package of the extra `baselines`."""
 
 
 @dataclass(frozen=True)
@@ -44,6 +48,23 @@ class Problem:
     is_ordered: bool
     steps: int
     seed: int
+
+    @property
+    def scans(self) -> ScanSet:
+        """The scans without their names and truth."""
+        from dpmjax.types import ScanSet
+
+        return ScanSet(self.sequence.points, self.sequence.mask)
+
+
+def split_by_extras(methods: tuple[str, ...]) -> tuple[tuple[str, ...], dict[str, str]]:
+    """Methods that can run here; and why the others cannot."""
+    missing = {
+        name: f"needs {EXTRAS[name]}: pip install dpmjax[baselines]"
+        for name in methods
+        if name in EXTRAS and importlib.util.find_spec(EXTRAS[name]) is None
+    }
+    return tuple(name for name in methods if name not in missing), missing
 
 
 def make_problem(sequence: ScanSequence, *, is_ordered: bool, steps: int, seed: int) -> Problem:
@@ -81,6 +102,22 @@ def multiview(problem: Problem) -> Floats:
     return polish(problem.lines, icp_plane(problem)).poses
 
 
+def multiway(problem: Problem) -> Floats:
+    """Open3D's multiway registration."""
+    from dpmjax.registration import multiway
+
+    return multiway(problem.scans)
+
+
+def pso(problem: Problem) -> Floats:
+    """Each scan onto the one before by particle swarms."""
+    import jax
+
+    from dpmjax.registration import swarm_chain
+
+    return swarm_chain(problem.scans, key=jax.random.key(problem.seed))
+
+
 def direct_adam(problem: Problem) -> Floats:
     """The same loss without L-Net, poses from zero, by Adam."""
     from dpmjax.deepmapping import preset
@@ -94,11 +131,9 @@ def direct_lbfgs(problem: Problem) -> Floats:
     import jax
 
     from dpmjax.deepmapping import optimize_directly, preset
-    from dpmjax.types import ScanSet
 
-    scans = ScanSet(problem.sequence.points, problem.sequence.mask)
     key = jax.random.key(problem.seed)
-    return optimize_directly(scans, preset("fast"), num_iterations=max(1, problem.steps // 4), key=key)
+    return optimize_directly(problem.scans, preset("fast"), num_iterations=max(1, problem.steps // 4), key=key)
 
 
 def cold(problem: Problem) -> Floats:
@@ -132,6 +167,8 @@ METHODS: dict[str, Callable[[Problem], Floats]] = {
     "icp-point": icp_point,
     "icp-plane": icp_plane,
     "multiview": multiview,
+    "multiway": multiway,
+    "pso": pso,
     "direct-adam": direct_adam,
     "direct-lbfgs": direct_lbfgs,
     "deepmapping-cold": cold,
@@ -182,11 +219,9 @@ def _fit(problem: Problem, start: Floats | None, config: Any) -> Floats:
     import jax
 
     from dpmjax.deepmapping import fit_deepmapping, with_steps
-    from dpmjax.types import ScanSet
 
-    scans = ScanSet(problem.sequence.points, problem.sequence.mask)
     settings = with_steps(config, problem.steps)
-    return fit_deepmapping(scans, settings, key=jax.random.key(problem.seed), init=start).poses
+    return fit_deepmapping(problem.scans, settings, key=jax.random.key(problem.seed), init=start).poses
 
 
 def _fit_in_order(problem: Problem, start: Floats) -> Floats:

@@ -18,9 +18,9 @@ from tqdm import tqdm
 from tyro.conf import FlagCreatePairsOff, arg
 
 from experiments._command import run_command
-from experiments._deepmapping_methods import METHODS, NOT_RUN, SUCCESS_PX, make_problem, run_method
+from experiments._deepmapping_methods import METHODS, NOT_RUN, SUCCESS_PX, make_problem, run_method, split_by_extras
 from experiments._resumable_rows import do_row
-from experiments._run_folder import open_run_folder, recording, write_metrics
+from experiments._run_folder import RunFolder, open_run_folder, recording, write_metrics
 from experiments._stop import StopFlag
 
 EXPERIMENT = "deepmapping_suite"
@@ -78,6 +78,8 @@ def main(config: Config) -> list[dict[str, Any]]:
         force=config.force,
         may_change=frozenset({"limit", "methods"}),
     )
+    methods, missing = split_by_extras(config.methods)
+    not_run = NOT_RUN | missing
     rows: list[dict[str, Any]] = []
     with recording(folder), StopFlag() as stop:
         for entry in tqdm(list_trajectories()[: config.limit], desc="suite", unit=" trajectories"):
@@ -85,7 +87,7 @@ def main(config: Config) -> list[dict[str, Any]]:
                 entry["world"], entry["num_scans"], seed=entry["walk"], range_noise_px=config.range_noise_px
             )
             problem = make_problem(sequence, is_ordered=True, steps=config.steps, seed=config.seed)
-            for method in config.methods:
+            for method in methods:
                 if stop.is_requested:
                     break
                 case = {"method": method, **entry}
@@ -93,11 +95,9 @@ def main(config: Config) -> list[dict[str, Any]]:
             if stop.is_requested:
                 break
             if rows:
-                _write(folder, rows, config)
-        if rows:
-            _write(folder, rows, config)
-    print(table(rows, config.methods))
-    for name, reason in NOT_RUN.items():
+                _write(folder, rows, methods, not_run, config.seed)
+    print(table(rows, methods))
+    for name, reason in not_run.items():
         print(f"{name}: not run ({reason})")
     print(f"results in {folder.path}")
     return rows
@@ -138,20 +138,22 @@ def table(rows: list[dict[str, Any]], methods: tuple[str, ...]) -> str:
     return "\n".join(lines)
 
 
-def _write(folder: Any, rows: list[dict[str, Any]], config: Config) -> None:
+def _write(
+    folder: RunFolder, rows: list[dict[str, Any]], methods: tuple[str, ...], not_run: dict[str, str], seed: int
+) -> None:
     """table.md, metrics.json, boxes.png."""
     from dpmjax import viz
 
-    present = [method for method in config.methods if any(row["method"] == method for row in rows)]
-    (folder / "table.md").write_text(table(rows, config.methods) + "\n", encoding="utf-8")
+    present = [method for method in methods if any(row["method"] == method for row in rows)]
+    (folder / "table.md").write_text(table(rows, methods) + "\n", encoding="utf-8")
     by_method = {method: [row for row in rows if row["method"] == method] for method in present}
     metrics = {
         "success_threshold_px": SUCCESS_PX,
         "methods": {method: summarise(mine) for method, mine in by_method.items()},
-        "not_run": NOT_RUN,
+        "not_run": not_run,
         "rows": rows,
     }
-    write_metrics(folder, metrics, seed=config.seed)
+    write_metrics(folder, metrics, seed=seed)
     panels = {
         label: {method: [row[key] for row in mine] for method, mine in by_method.items()}
         for label, key in (("ATE, px", "ate_px"), ("point distance, px", "point_distance_px"))

@@ -18,6 +18,8 @@ from .multiview import PolishConfig as PolishConfig
 from .multiview import Polished as Polished
 from .multiview import polish as polish
 from .multiview import surface_misfit as surface_misfit
+from .multiway import MultiwayConfig as MultiwayConfig
+from .multiway import multiway as multiway
 from .pairs import length_scale as length_scale
 from .planar_graph import Edges as Edges
 from .planar_graph import optimize_planar_graph as optimize_planar_graph
@@ -26,3 +28,5 @@ from .profiles import Profiles as Profiles
 from .profiles import Verdict as Verdict
 from .profiles import judge_pairs as judge_pairs
 from .profiles import make_profiles as make_profiles
+from .swarm import SwarmConfig as SwarmConfig
+from .swarm import swarm_chain as swarm_chain

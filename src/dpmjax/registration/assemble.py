@@ -25,6 +25,7 @@ class AssembleConfig:
 
     Attributes:
         crossed_weight: matched beams that make up for a crossed one.
+        next_weight: how much more the matched beams of neighbours in time count, where there is an order.
         radius: scans farther apart than this do not judge each other.
         agreement: a pair agrees with a map within this: translation, radians.
         min_score: beams by which a pair must hold to count as an edge.
@@ -34,10 +35,11 @@ class AssembleConfig:
     """
 
     crossed_weight: float = 4.0
+    next_weight: float = 4.0
     radius: float = 8.0
     agreement: tuple[float, float] = (0.4, 0.1)
     min_score: float = 40.0
-    num_seeds: int = 2
+    num_seeds: int = 6
     num_revisions: int = 3
     sigma: tuple[float, float] = (0.03, 0.01)
 
@@ -103,8 +105,8 @@ class _Judge(NamedTuple):
         verdict = judge_pairs(self.profiles, scan[row], other, relative, margins=self.margins, stride=4)
         # What two scans of different places reach by chance says nothing; else rooms would be stacked on rooms.
         is_next = self.is_ordered & (np.abs(scan[row] - other) == 1)
-        by_chance = np.where(is_next, 0.5, 1.0) * self.chance
-        matched = np.maximum(verdict.matched - by_chance, 0.0)
+        matched = np.maximum(verdict.matched - np.where(is_next, 0.5, 1.0) * self.chance, 0.0)
+        matched *= np.where(is_next, self.config.next_weight, 1.0)
         crossed = np.maximum(verdict.crossed - self.noisy_share * verdict.seen, 0.0)
         value = matched - self.config.crossed_weight * crossed
         return np.asarray(np.bincount(row, value, minlength=len(scan)), np.float64)

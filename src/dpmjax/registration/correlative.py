@@ -228,9 +228,6 @@ def _refine(
                 blurred, config=config,
             )  # fmt: skip
             poses[rows[part]], scores[rows[part]] = np.asarray(moved, np.float64), np.asarray(score, np.float64)
-    order = np.argsort(-scores.reshape(found.scores.shape), axis=1, kind="stable")
-    shaped = poses.reshape(found.poses.shape)
-    return found._replace(
-        poses=np.take_along_axis(shaped, order[..., None], axis=1),
-        scores=np.take_along_axis(scores.reshape(found.scores.shape), order, axis=1),
-    )
+    # Two may have met at one place.
+    best, values = _keep_apart(poses.reshape(found.poses.shape), scores.reshape(found.scores.shape), config, scale)
+    return found._replace(poses=best, scores=values)

@@ -33,6 +33,8 @@ class GlobalConfig:
         max_keyframes: so many scans are searched all against all.
         num_anchors: every other scan is searched against so many keyframes that look like it.
         num_likely_turns: headings that are tried for these, by likeness, and their neighbours.
+        max_bend: a scan's heading is within this of what the keyframes before and after it say, radians; only where
+            there is an order.
         match: how near a hit must come to count as matched; never below half the range noise.
         cross: how far in front of a surface a hit contradicts it; never below five times the range noise.
         search: of pairs.
@@ -40,8 +42,9 @@ class GlobalConfig:
     """
 
     max_keyframes: int = 32
-    num_anchors: int = 4
+    num_anchors: int = 3
     num_likely_turns: int = 3
+    max_bend: float = 0.7
     match: float = 0.04
     cross: float = 0.12
     search: CorrelativeConfig = field(default_factory=CorrelativeConfig)
@@ -101,16 +104,12 @@ def choose_keyframes(alike: Floats, config: GlobalConfig, *, is_ordered: bool) -
 
 
 def _anchor_pairs(
-    alike: Floats, turned: Floats, keyframes: Indices, config: GlobalConfig, *, is_ordered: bool
+    alike: Floats, turned: Floats, keyframes: Indices, config: GlobalConfig
 ) -> tuple[Indices, Indices, NDArray[np.bool_]]:
-    """Pairs (keyframe, other scan) to search, and which turns to try for each."""
+    """Pairs (keyframe, other scan) that look alike, and which turns to try for each."""
     others = np.setdiff1d(np.arange(len(alike)), keyframes)
     order = np.argsort(-alike[np.ix_(others, keyframes)], axis=1)[:, : config.num_anchors]
-    pairs = {(int(keyframes[k]), int(scan)) for scan, row in zip(others, order, strict=True) for k in row}
-    if is_ordered:
-        after = np.clip(np.searchsorted(keyframes, others), 1, len(keyframes) - 1)
-        pairs |= {(int(keyframes[a + d]), int(s)) for s, a in zip(others, after, strict=True) for d in (-1, 0)}
-    source, target = np.array(sorted(pairs), np.int64).reshape(-1, 2).T
+    source, target = keyframes[order].reshape(-1), np.repeat(others, order.shape[1])
     # T_target_source of a keyframe in the frame of the other scan.
     curve = turned[target, source]
     num_turns, count = config.search.num_turns, curve.shape[-1]
@@ -124,6 +123,32 @@ def _anchor_pairs(
         for offset in range(-6, 7):
             curve[row, (best + offset) % count] = -np.inf
     return source, target, turns
+
+
+def _neighbour_pairs(
+    num_scans: int, keyframes: Indices, headings: Floats, config: GlobalConfig
+) -> tuple[Indices, Indices, NDArray[np.bool_]]:
+    """The same of the keyframes before and after each other scan, which has about a heading between theirs."""
+    others = np.setdiff1d(np.arange(num_scans), keyframes)
+    after = np.clip(np.searchsorted(keyframes, others), 1, len(keyframes) - 1)
+    between = np.interp(others, keyframes, np.unwrap(headings))
+    source, target = np.concatenate([keyframes[after - 1], keyframes[after]]), np.concatenate([others, others])
+    expected = np.concatenate([headings[after - 1], headings[after]]) - np.concatenate([between, between])
+    turn = 2 * np.pi * np.arange(config.search.num_turns) / config.search.num_turns
+    return source, target, np.abs(planar_poses.wrap(turn - expected[:, None])) < config.max_bend
+
+
+def _search_others(
+    profiles: Profiles, keyframes: Indices, poses: Floats, config: GlobalConfig, scale: float, margins: Margins,
+    *, is_ordered: bool,
+) -> Candidates:  # fmt: skip
+    """Candidates of the scans that are no keyframes, against some keyframes each."""
+    alike, turned = likeness(profiles, scale)
+    source, target, turns = _anchor_pairs(alike, turned, keyframes, config)
+    if is_ordered:
+        near = _neighbour_pairs(len(alike), keyframes, poses[keyframes, 2], config)
+        source, target, turns = (np.concatenate(x) for x in zip((source, target, turns), near, strict=True))
+    return search_pairs(profiles, source, target, config.search, scale=scale, margins=margins, turns=turns)
 
 
 def global_start(
@@ -145,8 +170,7 @@ def global_start(
     scale, margins = length_scale(lines), view_margins(lines, config)
     profiles = make_profiles(lines, np.asarray(valid))
     num_scans = len(np.asarray(valid))
-    alike, turned = likeness(profiles, scale)
-    keyframes = choose_keyframes(alike, config, is_ordered=is_ordered)
+    keyframes = choose_keyframes(likeness(profiles, scale)[0], config, is_ordered=is_ordered)
     first, second = (x.astype(np.int64) for x in np.nonzero(np.tri(len(keyframes), k=-1, dtype=bool)))
     found = search_pairs(profiles, keyframes[first], keyframes[second], config.search, scale=scale, margins=margins)
     inside = Candidates(first, second, found.poses, found.scores)
@@ -156,8 +180,7 @@ def global_start(
     poses[keyframes] = assembly.poses
     edges = agreeing_edges(poses, found, config.assembly, scale)
     if len(keyframes) < num_scans:
-        source, target, turns = _anchor_pairs(alike, turned, keyframes, config, is_ordered=is_ordered)
-        more = search_pairs(profiles, source, target, config.search, scale=scale, margins=margins, turns=turns)
+        more = _search_others(profiles, keyframes, poses, config, scale, margins, is_ordered=is_ordered)
         poses = place_in_map(profiles, poses, keyframes, more, config.assembly, scale=scale, margins=margins)
         edges = _both(edges, agreeing_edges(poses, more, config.assembly, scale))
         if len(edges.source):
