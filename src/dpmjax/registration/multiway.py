@@ -1,4 +1,4 @@
-"""Multiway registration of planar scans by Open3D: a baseline of DeepMapping (an extra: `pip install dpmjax[baselines]`).
+"""Multiway registration of planar scans by Open3D, a baseline of DeepMapping: `pip install dpmjax[baselines]`.
 
 Pairs by iterated closest points, neighbours in time as sure and others as doubtful edges of a pose graph, whose line
 process lets the wrong ones go (Choi, Zhou and Koltun, Robust Reconstruction of Indoor Scenes, CVPR 2015).
@@ -65,7 +65,7 @@ def multiway(scans: ScanSet, config: MultiwayConfig | None = None) -> Floats:
         graph.nodes.append(_node(T_world[-1]))
     chain = np.stack(T_world)
     apart = np.linalg.norm(chain[:, None, :3, 3] - chain[None, :, :3, 3], axis=-1)
-    for source, target in np.argwhere(np.triu(apart < config.radius * scale, k=2)):
+    for source, target in np.argwhere(np.triu(apart < config.radius * scale, k=2)).tolist():
         guess = np.linalg.inv(chain[target]) @ chain[source]
         graph.edges.append(_edge(clouds, source, target, guess, (coarse, fine), is_doubtful=True))
     registration = open3d.pipelines.registration
@@ -111,4 +111,4 @@ def _edge(
     information = registration.get_information_matrix_from_point_clouds(
         clouds[source], clouds[target], distances[-1], T
     )
-    return registration.PoseGraphEdge(int(source), int(target), T, information, uncertain=is_doubtful)
+    return registration.PoseGraphEdge(source, target, T, information, uncertain=is_doubtful)
