@@ -1,4 +1,3 @@
-from .assemble import AssembleConfig as AssembleConfig
 from .assemble import Assembly as Assembly
 from .assemble import assemble as assemble
 from .correlative import Candidates as Candidates
@@ -14,6 +13,7 @@ from .incremental import IncrementalConfig as IncrementalConfig
 from .incremental import incremental_icp as incremental_icp
 from .loops import LoopConfig as LoopConfig
 from .loops import close_loops as close_loops
+from .map_judge import AssembleConfig as AssembleConfig
 from .multiview import PolishConfig as PolishConfig
 from .multiview import Polished as Polished
 from .multiview import polish as polish

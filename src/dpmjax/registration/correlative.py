@@ -77,6 +77,11 @@ class Candidates(NamedTuple):
     scores: Floats
 
 
+def join_candidates(*candidates: Candidates) -> Candidates:
+    """All pairs in one; each has as many candidates."""
+    return Candidates(*(np.concatenate(parts) for parts in zip(*candidates, strict=True)))
+
+
 def _draw(
     profiles: Profiles, turn: Float[Array, ""], cell: Float[Array, ""], config: CorrelativeConfig
 ) -> tuple[Complex[Array, "n g f"], Complex[Array, "n g f"]]:

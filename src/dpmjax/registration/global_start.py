@@ -11,15 +11,24 @@ from typing import NamedTuple
 
 import jax
 import numpy as np
+import scipy.spatial
 from numpy.typing import NDArray
 
 from dpmjax.geometry import planar_poses
 from dpmjax.geometry.lines import LineScans
-from dpmjax.registration.assemble import AssembleConfig, agreeing_edges, assemble, place_in_map
-from dpmjax.registration.correlative import Candidates, CorrelativeConfig, Floats, Indices, search_pairs
+from dpmjax.registration.assemble import agreeing_edges, assemble, place_in_map
+from dpmjax.registration.correlative import (
+    Candidates,
+    CorrelativeConfig,
+    Floats,
+    Indices,
+    join_candidates,
+    search_pairs,
+)
+from dpmjax.registration.map_judge import AssembleConfig, chance_level
 from dpmjax.registration.pairs import length_scale
 from dpmjax.registration.planar_graph import Edges, optimize_planar_graph
-from dpmjax.registration.profiles import Margins, Profiles, make_profiles
+from dpmjax.registration.profiles import Margins, Profiles, judge_pairs, make_profiles
 
 # Directions that profiles are compared at for likeness.
 _LIKENESS_BEARINGS = 128
@@ -32,9 +41,12 @@ class GlobalConfig:
     Attributes:
         max_keyframes: so many scans are searched all against all.
         num_anchors: every other scan is searched against so many keyframes that look like it.
+        num_twins: and against so many of all scans that look like it most.
         num_likely_turns: headings that are tried for these, by likeness, and their neighbours.
         max_bend: a scan's heading is within this of what the keyframes before and after it say, radians; only where
             there is an order.
+        min_company: a scan whose best neighbour matches less than this share of what is usual is lost ...
+        max_stragglers: ... and so many of these are searched against all keyframes.
         match: how near a hit must come to count as matched; never below half the range noise.
         cross: how far in front of a surface a hit contradicts it; never below five times the range noise.
         search: of pairs.
@@ -43,8 +55,11 @@ class GlobalConfig:
 
     max_keyframes: int = 32
     num_anchors: int = 3
+    num_twins: int = 3
     num_likely_turns: int = 3
     max_bend: float = 0.7
+    min_company: float = 0.6
+    max_stragglers: int = 12
     match: float = 0.04
     cross: float = 0.12
     search: CorrelativeConfig = field(default_factory=CorrelativeConfig)
@@ -90,26 +105,35 @@ def likeness(profiles: Profiles, scale: float) -> tuple[Floats, Floats]:
 
 
 def choose_keyframes(alike: Floats, config: GlobalConfig, *, is_ordered: bool) -> Indices:
-    """Scans that cover the place: evenly in time where there is an order, else each as unlike the others as can be."""
+    """Scans that cover the place: evenly in time where there is an order, else those that others look like."""
     num_scans = len(alike)
     count = min(num_scans, config.max_keyframes)
     if is_ordered or count == num_scans:
         return np.unique(np.round(np.linspace(0, num_scans - 1, count)).astype(np.int64))
-    chosen = [0]
-    nearest = alike[0].copy()
-    for _ in range(count - 1):
-        chosen.append(int(nearest.argmin()))
-        nearest = np.maximum(nearest, alike[chosen[-1]])
-    return np.unique(chosen).astype(np.int64)
+    chosen: list[int] = []
+    # How well each scan is stood for by the chosen ones; each choice adds as much to that as it can.
+    covered = np.full(num_scans, -1.0)
+    for _ in range(count):
+        gain = np.maximum(alike - covered[:, None], 0.0).sum(axis=0)
+        gain[chosen] = -1.0
+        chosen.append(int(gain.argmax()))
+        covered = np.maximum(covered, alike[:, chosen[-1]])
+    return np.sort(np.array(chosen, np.int64))
 
 
 def _anchor_pairs(
     alike: Floats, turned: Floats, keyframes: Indices, config: GlobalConfig
 ) -> tuple[Indices, Indices, NDArray[np.bool_]]:
-    """Pairs (keyframe, other scan) that look alike, and which turns to try for each."""
+    """Pairs that look alike, of each other scan with keyframes and with any scans; and which turns to try for each."""
     others = np.setdiff1d(np.arange(len(alike)), keyframes)
     order = np.argsort(-alike[np.ix_(others, keyframes)], axis=1)[:, : config.num_anchors]
-    source, target = keyframes[order].reshape(-1), np.repeat(others, order.shape[1])
+    unlike_itself = alike - 2.0 * np.eye(len(alike))
+    twins = np.argsort(-unlike_itself[others], axis=1)[:, : config.num_twins]
+    pairs = np.concatenate([keyframes[order], twins], axis=1)
+    # Each pair once, with one scan that is turned for all its partners.
+    ends = np.stack([pairs.reshape(-1), np.repeat(others, pairs.shape[1])], axis=-1)
+    _, first = np.unique(np.sort(ends, axis=1), axis=0, return_index=True)
+    source, target = ends[np.sort(first)].T
     # T_target_source of a keyframe in the frame of the other scan.
     curve = turned[target, source]
     num_turns, count = config.search.num_turns, curve.shape[-1]
@@ -151,6 +175,17 @@ def _search_others(
     return search_pairs(profiles, source, target, config.search, scale=scale, margins=margins, turns=turns)
 
 
+def _find_stragglers(profiles: Profiles, poses: Floats, margins: Margins, config: GlobalConfig) -> Indices:
+    """Scans that share far fewer beams with any neighbour than is usual, the worst first."""
+    num_scans = len(poses)
+    near = scipy.spatial.cKDTree(poses[:, :2]).query(poses[:, :2], k=min(7, num_scans))[1]
+    scan, other = np.repeat(np.arange(num_scans), near.shape[1]), near.reshape(-1).astype(np.int64)
+    verdict = judge_pairs(profiles, scan, other, planar_poses.relative(poses[other], poses[scan]), margins=margins)
+    matched = np.where(scan == other, 0.0, verdict.matched).reshape(near.shape).max(axis=1)
+    worst = np.argsort(matched)[: config.max_stragglers]
+    return worst[matched[worst] < config.min_company * np.median(matched)].astype(np.int64)
+
+
 def global_start(
     lines: LineScans, valid: NDArray[np.bool_], config: GlobalConfig | None = None, *, is_ordered: bool = True
 ) -> GlobalStart:
@@ -181,7 +216,22 @@ def global_start(
     edges = agreeing_edges(poses, found, config.assembly, scale)
     if len(keyframes) < num_scans:
         more = _search_others(profiles, keyframes, poses, config, scale, margins, is_ordered=is_ordered)
-        poses = place_in_map(profiles, poses, keyframes, more, config.assembly, scale=scale, margins=margins)
+
+        def place(poses: Floats, candidates: Candidates) -> Floats:
+            return place_in_map(
+                profiles, poses, keyframes, candidates, config.assembly, scale=scale, margins=margins,
+                chance=chance_level(found), is_ordered=is_ordered,
+            )  # fmt: skip
+
+        poses = place(poses, join_candidates(found, more))
+        lost = _find_stragglers(profiles, poses, margins, config)
+        if len(lost):
+            # Likeness has misled these; nothing is left out for them.
+            source, target = np.tile(keyframes, len(lost)), np.repeat(lost, len(keyframes))
+            more = join_candidates(
+                more, search_pairs(profiles, source, target, config.search, scale=scale, margins=margins)
+            )
+            poses = place(poses, join_candidates(found, more))
         edges = _both(edges, agreeing_edges(poses, more, config.assembly, scale))
         if len(edges.source):
             poses, _ = optimize_planar_graph(poses, edges)
