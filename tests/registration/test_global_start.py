@@ -14,6 +14,8 @@ from dpmjax.geometry import planar_poses
 from dpmjax.geometry.lines import LineScans, fit_lines
 from dpmjax.metrics import absolute_trajectory_error
 from dpmjax.registration import (
+    AssembleConfig,
+    Candidates,
     CorrelativeConfig,
     GlobalConfig,
     Margins,
@@ -28,6 +30,8 @@ from dpmjax.registration import (
     search_pairs,
     view_margins,
 )
+from dpmjax.registration.block_moves import move_blocks, weakest_cuts
+from dpmjax.registration.map_judge import MapJudge, make_offers
 from dpmjax.types import ScanSet
 
 # Coarse, so that a test takes a second: what is law does not depend on it.
@@ -53,6 +57,13 @@ def look(sequence: ScanSequence) -> Views:
 def views() -> Views:
     """Seven scans of the office, 60 px apart."""
     return look(take_scans(simulate_sequence(0, 49, seed=1), slice(0, None, 8)))
+
+
+@pytest.fixture(scope="module")
+def found(views) -> Candidates:
+    """All pairs, searched."""
+    source, target = all_pairs(len(views.sequence))
+    return search_pairs(views.profiles, source, target, COARSE, scale=views.scale, margins=views.margins)
 
 
 def all_pairs(count: int) -> tuple[np.ndarray, np.ndarray]:
@@ -140,15 +151,47 @@ def test_search_finds_the_relative_pose_from_any_yaw(views: Views, yaw: float) -
     assert found.scores[0, 0] > found.scores[0, 1] + 20
 
 
-def test_assembly_rejects_a_false_pair(views: Views) -> None:
-    source, target = all_pairs(len(views.sequence))
-    found = search_pairs(views.profiles, source, target, COARSE, scale=views.scale, margins=views.margins)
-    lie = int(np.flatnonzero((source == 6) & (target == 0))[0])
-    found.poses[lie, 0] = [5.0, -20.0, 2.0]
-    found.scores[lie, 0] = 0.9 * found.scores.max()
-    result = assemble(views.profiles, found, scale=views.scale, margins=views.margins)
+def test_candidates_of_a_pair_are_different_places(views, found) -> None:
+    poses = np.where(np.isfinite(found.scores)[..., None], found.poses, np.nan)
+    for first, second in ((0, 1), (0, 2), (1, 2)):
+        off = poses[:, first] - poses[:, second]
+        is_near = np.hypot(off[:, 0], off[:, 1]) < COARSE.apart[0] * views.scale
+        assert not (is_near & (np.abs(planar_poses.wrap(off[:, 2])) < COARSE.apart[1])).any()
+
+
+def test_assembly_rejects_a_false_pair(views, found) -> None:
+    lie = int(np.flatnonzero((found.source == 6) & (found.target == 0))[0])
+    poses, scores = found.poses.copy(), found.scores.copy()
+    poses[lie, 0] = [5.0, -20.0, 2.0]
+    scores[lie, 0] = 0.9 * scores.max()
+    result = assemble(
+        views.profiles, found._replace(poses=poses, scores=scores), scale=views.scale, margins=views.margins
+    )
     assert ate(result.poses, views.sequence) < 4.0
     assert not ((result.edges.source == 6) & (result.edges.target == 0)).any()
+
+
+def test_a_block_at_a_wrong_place_moves_back_as_a_whole(views, found) -> None:
+    judge = MapJudge(views.profiles, AssembleConfig(), views.scale, views.margins, 100.0, 0.02, False)
+    torn = views.sequence.reference_poses.copy()
+    torn[4:] = planar_poses.compose(np.array([300.0, 150.0, 0.4]), torn[4:])
+    mended, num_moved = move_blocks(torn, make_offers(found), judge)
+    assert num_moved == 1
+    assert ate(torn, views.sequence) > 50.0
+    assert ate(mended, views.sequence) < 4.0
+    _, num_moved = move_blocks(mended, make_offers(found), judge)
+    assert num_moved == 0
+
+
+def test_weakest_cut_is_between_two_groups() -> None:
+    values = np.full((5, 5), 100.0)
+    values[3:, :3] = 0.0
+    values[3, 1] = 10.0
+    np.testing.assert_array_equal(weakest_cuts(np.tril(values, k=-1), 2)[0], [False, False, False, True, True])
+
+
+def test_a_map_of_contradictions_has_cuts_too() -> None:
+    assert len(weakest_cuts(np.full((3, 3), -5.0), 6)) == 2
 
 
 def test_shuffling_the_scans_permutes_the_result(views: Views) -> None:

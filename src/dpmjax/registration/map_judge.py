@@ -113,7 +113,7 @@ class MapJudge(NamedTuple):
         return np.asarray(matched - self.config.crossed_weight * crossed, np.float64)
 
 
-def is_firmly_more(said: Floats, support: Floats) -> NDArray[np.bool_]:
+def is_firmly_more(said: Floats | np.float64, support: Floats | np.float64) -> NDArray[np.bool_]:
     """More than a little: what is only a little better is the same place, told by another pair."""
     return np.asarray(said > support + 0.02 * np.abs(support))
 
