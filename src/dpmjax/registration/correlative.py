@@ -7,6 +7,9 @@ turn. What is best is then sharpened on ever finer local grids, by the profiles 
 
 from __future__ import annotations
 
+import os
+from collections.abc import Callable, Iterable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
 from typing import NamedTuple
@@ -129,6 +132,12 @@ def _search_turn(
     return jax.lax.map(search, (source, target), batch_size=32)
 
 
+def on_all_cores(work: Callable[[int], None], items: Iterable[int]) -> None:
+    """Does the work on each item, some at a time: XLA's small transforms use one core each on a CPU."""
+    with ThreadPoolExecutor(os.cpu_count() if jax.default_backend() == "cpu" else 1) as pool:
+        list(pool.map(work, items))
+
+
 def search_pairs(
     profiles: Profiles,
     source: Indices,
@@ -160,10 +169,11 @@ def search_pairs(
     still = _spectra(profiles, jnp.zeros(()), jnp.asarray(cell, jnp.float32), config=config)
     poses = np.zeros((len(source), config.num_turns, config.num_peaks, 3))
     scores = np.full(poses.shape[:-1], -np.inf)
-    for number in range(config.num_turns):
+
+    def search_turn(number: int) -> None:
         rows = np.arange(len(source)) if turns is None else np.flatnonzero(turns[:, number])
         if not len(rows):
-            continue
+            return
         turn = 2 * np.pi * number / config.num_turns
         turned = _spectra(sources, jnp.asarray(turn, jnp.float32), jnp.asarray(cell, jnp.float32), config=config)
         filled = np.resize(rows, max(_SMALLEST, 1 << (len(rows) - 1).bit_length()))
@@ -173,6 +183,8 @@ def search_pairs(
         scores[rows, number] = np.asarray(score, np.float64)[: len(rows)]
         poses[rows, number, :, :2] = cell * np.asarray(shift, np.float64)[: len(rows)]
         poses[rows, number, :, 2] = planar_poses.wrap(np.asarray(turn))
+
+    on_all_cores(search_turn, range(config.num_turns))
     best, values = _keep_apart(poses.reshape(len(source), -1, 3), scores.reshape(len(source), -1), config, scale)
     return _refine(profiles, Candidates(source, target, best, values), config, scale=scale, margins=margins)
 
@@ -225,7 +237,8 @@ def _refine(
         step = share * np.array([config.cell * scale, config.cell * scale, turn])
         blur = 0.7 * share * config.cell * scale
         blurred = Margins(max(margins.match, blur), max(margins.cross, 3.0 * blur))
-        for start in range(0, len(rows), _REFINE_BATCH):
+
+        def refine(start: int, step: Floats = step, blurred: Margins = blurred) -> None:
             part = np.resize(np.arange(start, min(start + _REFINE_BATCH, len(rows))), _REFINE_BATCH)
             moved, score = _refine_batch(
                 profiles, jnp.asarray(source[part]), jnp.asarray(target[part]),
@@ -233,6 +246,8 @@ def _refine(
                 blurred, config=config,
             )  # fmt: skip
             poses[rows[part]], scores[rows[part]] = np.asarray(moved, np.float64), np.asarray(score, np.float64)
+
+        on_all_cores(refine, range(0, len(rows), _REFINE_BATCH))
     # Two may have met at one place.
     best, values = _keep_apart(poses.reshape(found.poses.shape), scores.reshape(found.scores.shape), config, scale)
     return found._replace(poses=best, scores=values)

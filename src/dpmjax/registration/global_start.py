@@ -41,7 +41,7 @@ class GlobalConfig:
     Attributes:
         max_keyframes: so many scans are searched all against all.
         num_anchors: every other scan is searched against so many keyframes that look like it.
-        num_twins: and against so many of all scans that look like it most.
+        num_twins: and, without an order, against so many of all scans that look like it most.
         num_likely_turns: headings that are tried for these, by likeness, and their neighbours.
         max_bend: a scan's heading is within this of what the keyframes before and after it say, radians; only where
             there is an order.
@@ -54,7 +54,7 @@ class GlobalConfig:
     """
 
     max_keyframes: int = 32
-    num_anchors: int = 3
+    num_anchors: int = 2
     num_twins: int = 3
     num_likely_turns: int = 3
     max_bend: float = 0.7
@@ -122,13 +122,13 @@ def choose_keyframes(alike: Floats, config: GlobalConfig, *, is_ordered: bool) -
 
 
 def _anchor_pairs(
-    alike: Floats, turned: Floats, keyframes: Indices, config: GlobalConfig
+    alike: Floats, turned: Floats, keyframes: Indices, config: GlobalConfig, *, num_twins: int
 ) -> tuple[Indices, Indices, NDArray[np.bool_]]:
     """Pairs that look alike, of each other scan with keyframes and with any scans; and which turns to try for each."""
     others = np.setdiff1d(np.arange(len(alike)), keyframes)
     order = np.argsort(-alike[np.ix_(others, keyframes)], axis=1)[:, : config.num_anchors]
     unlike_itself = alike - 2.0 * np.eye(len(alike))
-    twins = np.argsort(-unlike_itself[others], axis=1)[:, : config.num_twins]
+    twins = np.argsort(-unlike_itself[others], axis=1)[:, :num_twins]
     pairs = np.concatenate([keyframes[order], twins], axis=1)
     # Each pair once, with one scan that is turned for all its partners.
     ends = np.stack([pairs.reshape(-1), np.repeat(others, pairs.shape[1])], axis=-1)
@@ -168,7 +168,9 @@ def _search_others(
 ) -> Candidates:  # fmt: skip
     """Candidates of the scans that are no keyframes, against some keyframes each."""
     alike, turned = likeness(profiles, scale)
-    source, target, turns = _anchor_pairs(alike, turned, keyframes, config)
+    # Neighbours in time are better twins than any that look alike.
+    num_twins = 0 if is_ordered else config.num_twins
+    source, target, turns = _anchor_pairs(alike, turned, keyframes, config, num_twins=num_twins)
     if is_ordered:
         near = _neighbour_pairs(len(alike), keyframes, poses[keyframes, 2], config)
         source, target, turns = (np.concatenate(x) for x in zip((source, target, turns), near, strict=True))
