@@ -38,6 +38,11 @@ def test_collapsed_poses_are_not(walk) -> None:
     assert not judge_trajectory(lines_of(walk), walk.mask, np.zeros((len(walk), 3))).is_good
 
 
+def test_what_noise_has_drowned_is_not_trusted() -> None:
+    walk = take_scans(simulate_sequence(0, 41, seed=1, range_noise_px=12.0), slice(0, None, 4))
+    assert not judge_trajectory(lines_of(walk), walk.mask, walk.reference_poses).is_good
+
+
 def test_trust_does_not_depend_on_the_world_frame(walk) -> None:
     moved = walk.reference_poses + np.array([500.0, -300.0, 0.0])
     one = judge_trajectory(lines_of(walk), walk.mask, walk.reference_poses)

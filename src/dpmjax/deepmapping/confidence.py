@@ -23,19 +23,21 @@ from dpmjax.registration import judge_pairs, length_scale, make_profiles, view_m
 
 @dataclass(frozen=True)
 class ConfidenceConfig:
-    """Settings, calibrated on the simulated suite.
+    """Settings, calibrated on right and wrong maps of simulated worlds (docs/deepmapping_notes.md).
 
     Attributes:
         num_neighbours: each scan is compared with so many nearest ones.
         min_joint: share of beams that the weakest joint of a good map holds by.
         max_contradiction: share of beams that may contradict others in a good map, without noise ...
-        noisy_contradiction: ... and so much more when the range noise is as large as the margin of a match.
+        noisy_contradiction: ... and so much more when the range noise is a tenth of the length scale or above.
+        max_noise: with more range noise than this, in length scales, right and wrong maps look alike: never good.
     """
 
     num_neighbours: int = 12
-    min_joint: float = 0.35
+    min_joint: float = 0.36
     max_contradiction: float = 0.01
-    noisy_contradiction: float = 0.05
+    noisy_contradiction: float = 0.03
+    max_noise: float = 0.15
 
 
 class Confidence(NamedTuple):
@@ -44,7 +46,7 @@ class Confidence(NamedTuple):
     Attributes:
         weakest_joint: share of beams, 0 to 1, that the weakest joint of the best chain holds by.
         contradiction: share of beams, 0 to 1, that end in the free space of another scan.
-        is_good: both are within what right maps reach.
+        is_good: both are within what right maps reach, and there is not too much noise to tell.
     """
 
     weakest_joint: float
@@ -83,6 +85,7 @@ def judge_trajectory(
     tree = scipy.sparse.csgraph.minimum_spanning_tree(graph)
     joint = 2.0 - float(tree.data.max()) if tree.nnz == num_scans - 1 else 0.0
     contradiction = float(np.sum(verdict.crossed)) / max(float(np.sum(verdict.seen)), 1.0)
-    noisiness = min(1.0, float(lines.noise[0]) / (0.1 * scale))
-    limit = config.max_contradiction + noisiness * config.noisy_contradiction
-    return Confidence(joint, contradiction, joint >= config.min_joint and contradiction <= limit)
+    noise = float(lines.noise[0]) / scale
+    limit = config.max_contradiction + min(1.0, noise / 0.1) * config.noisy_contradiction
+    is_good = joint >= config.min_joint and contradiction <= limit and noise <= config.max_noise
+    return Confidence(joint, contradiction, is_good)
