@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -35,7 +36,19 @@ def scans_npz(walk, tmp_path_factory) -> Path:
     return path
 
 
-def run(*options: object, interrupt: bool = False) -> subprocess.CompletedProcess[str]:
+@pytest.fixture(scope="module")
+def environment(tmp_path_factory) -> dict[str, str]:
+    """One cache of compiled programs for all runs."""
+    return os.environ | {
+        "JAX_COMPILATION_CACHE_DIR": str(tmp_path_factory.mktemp("compiled")),
+        "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
+        "JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES": "-1",
+    }
+
+
+def run(
+    environment: dict[str, str], *options: object, interrupt: bool = False
+) -> subprocess.CompletedProcess[str]:
     """The command in a process of its own; interrupted after the first call of the step where asked."""
     command = ["-m", "experiments.deepmapping_2d"]
     if interrupt:
@@ -47,7 +60,12 @@ def run(*options: object, interrupt: bool = False) -> subprocess.CompletedProces
         )
         command = ["-c", code]
     return subprocess.run(
-        [sys.executable, *command, *map(str, options)], cwd=REPOSITORY, capture_output=True, text=True, timeout=300
+        [sys.executable, *command, *map(str, options)],
+        cwd=REPOSITORY,
+        env=environment,
+        capture_output=True,
+        text=True,
+        timeout=300,
     )
 
 
@@ -55,10 +73,10 @@ def metrics_of(folder: Path) -> dict:
     return json.loads((folder / "metrics.json").read_text())
 
 
-def test_a_run_on_the_authors_folder_writes_everything_it_promises(walk, tmp_path) -> None:
+def test_a_run_on_the_authors_folder_writes_everything_it_promises(environment, walk, tmp_path) -> None:
     folder = write_deepmapping_folder(tmp_path / "scans", walk)
     np.save(tmp_path / "start.npy", walk.reference_poses + np.array([3.0, -2.0, 0.0]))
-    done = run(folder, "-o", tmp_path / "out", "--steps", 20, "--init", tmp_path / "start.npy")
+    done = run(environment, folder, "-o", tmp_path / "out", "--steps", 20, "--init", tmp_path / "start.npy")
     assert done.returncode == 0, done.stderr
     metrics = metrics_of(tmp_path / "out")
     assert not [name for name in METRICS if metrics.get(name) is None]
@@ -76,16 +94,16 @@ def test_a_run_on_the_authors_folder_writes_everything_it_promises(walk, tmp_pat
     assert tum.num_poses == NUM_SCANS
 
 
-def test_an_interrupted_run_is_resumed_to_the_same_numbers(scans_npz, tmp_path) -> None:
+def test_an_interrupted_run_is_resumed_to_the_same_numbers(environment, scans_npz, tmp_path) -> None:
     options = (scans_npz, "--steps", 60, "--no-polish", "--init", "zero")
-    broken = run(*options, "-o", tmp_path / "broken", interrupt=True)
+    broken = run(environment, *options, "-o", tmp_path / "broken", interrupt=True)
     assert broken.returncode == 130, broken.stderr
     stopped = metrics_of(tmp_path / "broken")
     assert stopped["is_interrupted"]
     assert 0 < stopped["steps"] < 60
-    resumed = run("--resume", "-o", tmp_path / "broken")
+    resumed = run(environment, "--resume", "-o", tmp_path / "broken")
     assert resumed.returncode == 0, resumed.stderr
-    unbroken = run(*options, "-o", tmp_path / "unbroken")
+    unbroken = run(environment, *options, "-o", tmp_path / "unbroken")
     assert unbroken.returncode == 0, unbroken.stderr
     assert metrics_of(tmp_path / "broken")["steps"] == metrics_of(tmp_path / "unbroken")["steps"]
     one, other = (np.load(tmp_path / name / "trajectory.npy") for name in ("broken", "unbroken"))
