@@ -26,7 +26,7 @@ check: $(STAMP)  ## lint, format, types, import rules
 	$(BIN)/python -m pytest -q tests/test_import_rules.py
 
 test: $(STAMP)  ## the whole test suite
-	$(BIN)/python -m pytest -n 2
+	$(BIN)/python -m pytest -n 2 --dist worksteal
 
 demo: $(STAMP)  ## register the built-in 2-D world; pictures in results/demo
 	$(BIN)/python -m experiments.deepmapping_2d --init odometry --force -o results/demo
