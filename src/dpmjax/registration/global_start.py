@@ -27,7 +27,7 @@ from dpmjax.registration.correlative import (
 )
 from dpmjax.registration.map_judge import AssembleConfig, chance_level
 from dpmjax.registration.pairs import length_scale
-from dpmjax.registration.planar_graph import Edges, optimize_planar_graph
+from dpmjax.registration.planar_graph import join_edges, optimize_planar_graph
 from dpmjax.registration.profiles import Margins, Profiles, judge_pairs, make_profiles
 
 # Directions that profiles are compared at for likeness.
@@ -188,6 +188,30 @@ def _find_stragglers(profiles: Profiles, poses: Floats, margins: Margins, config
     return worst[matched[worst] < config.min_company * np.median(matched)].astype(np.int64)
 
 
+def _place_others(
+    profiles: Profiles, keyframes: Indices, poses: Floats, found: Candidates, config: GlobalConfig,
+    *, scale: float, margins: Margins, is_ordered: bool,
+) -> tuple[Floats, Candidates]:  # fmt: skip
+    """Poses of all scans from those of the keyframes, and the pairs that told them."""
+
+    def place(poses: Floats, more: Candidates) -> Floats:
+        return place_in_map(
+            profiles, poses, keyframes, join_candidates(found, more), config.assembly, scale=scale, margins=margins,
+            chance=chance_level(found), is_ordered=is_ordered,
+        )  # fmt: skip
+
+    more = _search_others(profiles, keyframes, poses, config, scale, margins, is_ordered=is_ordered)
+    poses = place(poses, more)
+    lost = _find_stragglers(profiles, poses, margins, config)
+    if len(lost):
+        # Likeness has misled these; nothing is left out for them.
+        source, target = np.tile(keyframes, len(lost)), np.repeat(lost, len(keyframes))
+        again = search_pairs(profiles, source, target, config.search, scale=scale, margins=margins)
+        more = join_candidates(more, again)
+        poses = place(poses, more)
+    return poses, more
+
+
 def global_start(
     lines: LineScans, valid: NDArray[np.bool_], config: GlobalConfig | None = None, *, is_ordered: bool = True
 ) -> GlobalStart:
@@ -217,24 +241,10 @@ def global_start(
     poses[keyframes] = assembly.poses
     edges = agreeing_edges(poses, found, config.assembly, scale)
     if len(keyframes) < num_scans:
-        more = _search_others(profiles, keyframes, poses, config, scale, margins, is_ordered=is_ordered)
-
-        def place(poses: Floats, candidates: Candidates) -> Floats:
-            return place_in_map(
-                profiles, poses, keyframes, candidates, config.assembly, scale=scale, margins=margins,
-                chance=chance_level(found), is_ordered=is_ordered,
-            )  # fmt: skip
-
-        poses = place(poses, join_candidates(found, more))
-        lost = _find_stragglers(profiles, poses, margins, config)
-        if len(lost):
-            # Likeness has misled these; nothing is left out for them.
-            source, target = np.tile(keyframes, len(lost)), np.repeat(lost, len(keyframes))
-            more = join_candidates(
-                more, search_pairs(profiles, source, target, config.search, scale=scale, margins=margins)
-            )
-            poses = place(poses, join_candidates(found, more))
-        edges = _both(edges, agreeing_edges(poses, more, config.assembly, scale))
+        poses, more = _place_others(
+            profiles, keyframes, poses, found, config, scale=scale, margins=margins, is_ordered=is_ordered
+        )
+        edges = join_edges(edges, agreeing_edges(poses, more, config.assembly, scale))
         if len(edges.source):
             poses, _ = optimize_planar_graph(poses, edges)
     return GlobalStart(planar_poses.relative(poses[0], poses), keyframes, len(edges.source))
@@ -242,7 +252,3 @@ def global_start(
 
 def _rows(profiles: Profiles, rows: Indices) -> Profiles:
     return jax.tree.map(lambda x: x[rows], profiles)
-
-
-def _both(one: Edges, other: Edges) -> Edges:
-    return Edges(*(np.concatenate(pair) for pair in zip(one, other, strict=True)))

@@ -63,10 +63,11 @@ def success_grids_figure(
     figure = new_figure(1.2 + 2.1 * len(grids), 1.3 + 0.42 * len(rows))
     axes = np.atleast_1d(figure.subplots(1, len(grids), sharey=True))
     for number, (ax, (method, rates)) in enumerate(zip(axes, grids.items(), strict=True)):
-        ax.imshow(rates, vmin=0.0, vmax=1.0, cmap="RdYlGn", aspect="auto")
+        ax.imshow(rates, vmin=0.0, vmax=1.0, cmap="cividis", aspect="auto")
         for (i, j), rate in np.ndenumerate(rates):
             if np.isfinite(rate):
-                ax.text(j, i, f"{100 * rate:.0f}", ha="center", va="center", fontsize=8, color=INK)
+                ink = INK if rate > 0.5 else "white"
+                ax.text(j, i, f"{100 * rate:.0f}", ha="center", va="center", fontsize=8, color=ink)
         ax.set_title(method, fontsize=9, color=INK)
         ax.set_xticks(range(len(columns)), list(columns), fontsize=8)
         ax.set_yticks(range(len(rows)), list(rows), fontsize=8)
