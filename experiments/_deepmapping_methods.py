@@ -69,19 +69,13 @@ def split_by_extras(methods: tuple[str, ...]) -> tuple[tuple[str, ...], dict[str
 
 def make_problem(sequence: ScanSequence, *, is_ordered: bool, steps: int, seed: int) -> Problem:
     """The scans as methods want them; without an order they are shuffled."""
+    from dpmjax.data import take_scans
     from dpmjax.geometry.lines import fit_lines
     from dpmjax.types import ScanSet
 
     if not is_ordered:
         order = np.random.default_rng([seed, 77]).permutation(len(sequence))
-        assert sequence.reference_poses is not None
-        sequence = replace(
-            sequence,
-            points=sequence.points[order],
-            mask=sequence.mask[order],
-            reference_poses=sequence.reference_poses[order],
-            odometry_poses=None,
-        )
+        sequence = replace(take_scans(sequence, order), odometry_poses=None)
     return Problem(sequence, fit_lines(ScanSet(sequence.points, sequence.mask)), is_ordered, steps, seed)
 
 
@@ -226,27 +220,14 @@ def _fit(problem: Problem, start: Floats | None, config: Any) -> Floats:
 
 def _fit_in_order(problem: Problem, start: Floats) -> Floats:
     """The fit of scans in an order in which neighbours are near each other: that of time, or a tour of the start."""
+    from dpmjax.data import take_scans
     from dpmjax.deepmapping import preset
+    from dpmjax.geometry import planar_poses
 
     if problem.is_ordered:
         return _fit(problem, start, preset("fast"))
-    tour = nearest_tour(start)
-    sequence = problem.sequence
-    ordered = replace(
-        problem,
-        sequence=replace(sequence, points=sequence.points[tour], mask=sequence.mask[tour], reference_poses=None),
-    )
+    tour = planar_poses.nearest_tour(start)
+    ordered = replace(problem, sequence=take_scans(problem.sequence, tour))
     poses = np.empty_like(start)
     poses[tour] = _fit(ordered, start[tour], preset("fast"))
     return poses
-
-
-def nearest_tour(poses: Floats) -> NDArray[np.int64]:
-    """From each scan to the nearest one not yet visited."""
-    left = set(range(1, len(poses)))
-    tour = [0]
-    while left:
-        here = poses[tour[-1], :2]
-        tour.append(min(left, key=lambda scan: (float(np.hypot(*(poses[scan, :2] - here))), scan)))
-        left.remove(tour[-1])
-    return np.array(tour, np.int64)

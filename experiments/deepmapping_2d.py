@@ -17,7 +17,7 @@ from __future__ import annotations
 import logging
 import math
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -55,7 +55,7 @@ class Config:
     init: Annotated[str, arg(metavar="icp-plane|icp-point|global|odometry|zero|FILE")] = "icp-plane"
     """Where the poses start; global: an exhaustive search of scan pairs, needs no guess; FILE is a trajectory."""
     ordered: bool = True
-    """Scans lie in the order of time; --no-ordered with --init global makes no use of it."""
+    """Scans lie in the order of time; --no-ordered makes no use of it, and needs --init global."""
     polish: bool = True
     """Finish with a multi-view point-to-line alignment."""
     steps: Annotated[int | None, arg(metavar="N")] = None
@@ -89,6 +89,8 @@ class Config:
                 raise ValueError(f"--{name.replace('_', '-')}: expected at least {least}, got {value}")
         if self.seconds is not None and not self.seconds > 0.0:
             raise ValueError(f"--seconds: expected a positive time, got {self.seconds}")
+        if not self.ordered and self.init != "global":
+            raise ValueError(f"--no-ordered: only --init global needs no order, got --init {self.init}")
         if not (math.isfinite(self.range_noise_px) and self.range_noise_px >= 0.0):
             raise ValueError(f"--range-noise-px: expected zero or more, got {self.range_noise_px}")
 
@@ -110,8 +112,10 @@ class Result:
 
 def main(config: Config) -> Result:
     """Reads, starts warm, fits, polishes, keeps the best, writes."""
+    from dpmjax.data import take_scans
     from dpmjax.deepmapping import choose_trajectory, judge_trajectory
-    from dpmjax.registration import polish
+    from dpmjax.geometry import planar_poses
+    from dpmjax.registration import PolishConfig, polish
 
     started = time.perf_counter()
     select_device(config.device)
@@ -128,19 +132,23 @@ def main(config: Config) -> Result:
     )
     with recording(folder), StopFlag() as stop:
         print(f"{sequence.name}: {len(sequence)} scans of {sequence.points.shape[1]} beams, from {config.init}")
+        # The losses compare each scan with the next ones, so these must be near; in time they are.
+        order = np.arange(len(sequence)) if config.ordered else planar_poses.nearest_tour(start)
         fitted = run_fit(
             folder,
-            sequence,
+            take_scans(sequence, order),
             settings,
-            start=None if config.init == "zero" else start,
+            start=None if config.init == "zero" else start[order],
             seed=config.seed,
             seconds=config.seconds,
             stop=stop,
         )
+        fitted = replace(fitted, poses=fitted.poses[np.argsort(order)])
         lines = line_scans(sequence)
         candidates = {"start": start, "fit": fitted.poses}
         if config.polish and not stop.is_requested:
             # From both: the fit is sharper near a good start, the start keeps what a robot's odometry knows.
+            how = PolishConfig(is_ordered=config.init != "global")
             for name in ("fit",) if config.init == "zero" else ("start", "fit"):
                 polished = polish(lines, candidates[name], how)
                 LOGGER.info("polished the %s: %d pairs, %d loops", name, polished.num_pairs, polished.num_loops)

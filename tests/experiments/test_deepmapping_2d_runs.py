@@ -46,9 +46,7 @@ def environment(tmp_path_factory) -> dict[str, str]:
     }
 
 
-def run(
-    environment: dict[str, str], *options: object, interrupt: bool = False
-) -> subprocess.CompletedProcess[str]:
+def run(environment: dict[str, str], *options: object, interrupt: bool = False) -> subprocess.CompletedProcess[str]:
     """The command in a process of its own; interrupted after the first call of the step where asked."""
     command = ["-m", "experiments.deepmapping_2d"]
     if interrupt:
@@ -159,3 +157,7 @@ def test_scans_without_a_valid_beam_are_refused(as_user, walk, tmp_path, capsys,
 )
 def test_a_start_that_is_not_there_is_named(as_user, scans_npz, tmp_path, capsys, init, found) -> None:
     assert found in refused(tmp_path, capsys, scans_npz, "--init", init)
+
+
+def test_no_order_needs_a_start_that_needs_none(as_user, scans_npz, tmp_path, capsys) -> None:
+    assert "--no-ordered" in refused(tmp_path, capsys, scans_npz, "--no-ordered", "--init", "icp-plane")

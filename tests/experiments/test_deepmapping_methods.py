@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from experiments import deepmapping_limits, deepmapping_suite
-from experiments._deepmapping_methods import make_problem, nearest_tour
+from experiments._deepmapping_methods import make_problem
 from experiments._resumable_rows import do_row, row_path
 
 
@@ -40,13 +40,6 @@ def test_failed_row_leaves_no_file(tmp_path) -> None:
     with pytest.raises(RuntimeError):
         do_row(tmp_path, {"method": "x"}, work)
     assert not list(tmp_path.rglob("*.json"))
-
-
-def test_tour_follows_a_line() -> None:
-    order = np.random.default_rng(0).permutation(np.arange(1, 9))
-    x = np.concatenate([[0], order]).astype(float)
-    poses = np.stack([x, 0 * x, 0 * x], -1)
-    assert list(poses[nearest_tour(poses), 0]) == sorted(x)
 
 
 def test_shuffled_problem_keeps_scans_with_their_truth() -> None:

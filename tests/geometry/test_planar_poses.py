@@ -76,3 +76,13 @@ def test_wrap_keeps_the_direction(angle: float) -> None:
     wrapped = planar_poses.wrap(np.array([angle]))
     assert -np.pi <= wrapped[0] < np.pi
     np.testing.assert_allclose(np.exp(1j * wrapped), np.exp(1j * np.array([angle])), **DOUBLE)
+
+
+def test_tour_follows_a_line() -> None:
+    x = np.concatenate([[0], np.random.default_rng(0).permutation(np.arange(1, 9))]).astype(float)
+    poses = np.stack([x, 0 * x, 0 * x], -1)
+    assert list(poses[planar_poses.nearest_tour(poses), 0]) == sorted(x)
+
+
+def test_tour_of_one_is_short() -> None:
+    assert list(planar_poses.nearest_tour(np.zeros((1, 3)))) == [0]

@@ -53,15 +53,15 @@ class ScanSequence:
         return len(self.points)
 
 
-def take_scans(sequence: ScanSequence, selection: slice) -> ScanSequence:
-    """Cuts a sub-range out of a sequence, poses and times with it.
+def take_scans(sequence: ScanSequence, selection: slice | NDArray[np.integer]) -> ScanSequence:
+    """Some scans of a sequence, poses and times with them.
 
     Args:
         sequence: the whole.
-        selection: start, stop and stride in scans.
+        selection: start, stop and stride in scans; or rows, in the order wanted.
 
     Returns:
-        The part; arrays are views.
+        The part; of a slice, arrays are views.
     """
     reference, odometry, times = sequence.reference_poses, sequence.odometry_poses, sequence.times
     return replace(

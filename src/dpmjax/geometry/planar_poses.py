@@ -65,3 +65,21 @@ def transform(poses: Poses, points: NDArray[np.floating]) -> NDArray[np.float64]
     x = c * points[..., 0] - s * points[..., 1] + poses[:, 0, None]
     y = s * points[..., 0] + c * points[..., 1] + poses[:, 1, None]
     return np.stack([x, y], axis=-1)
+
+
+def nearest_tour(poses: Poses) -> NDArray[np.int64]:
+    """An order in which neighbours are near each other: from each pose to the nearest one not yet visited.
+
+    Args:
+        poses: (n, 3) x, y, heading.
+
+    Returns:
+        (n,) rows, the first one 0.
+    """
+    left = set(range(1, len(poses)))
+    tour = [0]
+    while left:
+        here = poses[tour[-1], :2]
+        tour.append(min(left, key=lambda scan: (float(np.hypot(*(poses[scan, :2] - here))), scan)))
+        left.remove(tour[-1])
+    return np.array(tour, np.int64)
