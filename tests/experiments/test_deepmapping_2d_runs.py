@@ -159,5 +159,6 @@ def test_a_start_that_is_not_there_is_named(as_user, scans_npz, tmp_path, capsys
     assert found in refused(tmp_path, capsys, scans_npz, "--init", init)
 
 
-def test_no_order_needs_a_start_that_needs_none(as_user, scans_npz, tmp_path, capsys) -> None:
-    assert "--no-ordered" in refused(tmp_path, capsys, scans_npz, "--no-ordered", "--init", "icp-plane")
+def test_no_order_needs_a_start_that_needs_none() -> None:
+    with pytest.raises(ValueError, match="--no-ordered"):
+        Config(ordered=False, init="icp-plane")
