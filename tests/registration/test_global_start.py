@@ -31,7 +31,8 @@ from dpmjax.registration import (
     view_margins,
 )
 from dpmjax.registration.block_moves import move_blocks, weakest_cuts
-from dpmjax.registration.map_judge import MapJudge, make_offers
+from dpmjax.registration.global_start import _leash_between
+from dpmjax.registration.map_judge import Leash, MapJudge, make_offers
 from dpmjax.types import ScanSet
 
 # Coarse, so that a test takes a second: what is law does not depend on it.
@@ -223,3 +224,19 @@ def test_polish_without_order_is_exact(views: Views) -> None:
     rng = np.random.default_rng(0)
     poses = views.sequence.reference_poses + rng.normal(size=(len(views.sequence), 3)) * [2.0, 2.0, 0.01]
     assert ate(polish(views.lines, poses, PolishConfig(is_ordered=False)).poses, views.sequence) < 0.05
+
+
+def test_scans_between_keyframes_are_kept_between_them() -> None:
+    poses = np.array([[0.0, 0.0, 0.0], [9.0, 9.0, 0.0], [10.0, 0.0, 0.0]])
+    leash = _leash_between(poses, np.array([0, 2]), GlobalConfig(), 5.0)
+    np.testing.assert_allclose(leash.middle, [[0.0, 0.0], [5.0, 0.0], [10.0, 0.0]])
+    np.testing.assert_allclose(leash.length, [2.0, 12.0, 2.0])
+
+
+def test_no_place_beyond_the_leash_is_worth_anything(views) -> None:
+    truth = views.sequence.reference_poses
+    leash = Leash(truth[:, :2] + np.array([500.0, 0.0]), np.full(7, 50.0))
+    free = MapJudge(views.profiles, AssembleConfig(), views.scale, views.margins, 100.0, 0.02, False)
+    scan, everyone = np.array([3]), np.arange(7)
+    assert free.against(scan, truth[3:4], everyone, truth)[0] > 0.0
+    assert free._replace(leash=leash).against(scan, truth[3:4], everyone, truth)[0] < -1e5

@@ -17,6 +17,7 @@ from dpmjax.registration.block_moves import move_blocks
 from dpmjax.registration.correlative import Candidates, Floats, Indices
 from dpmjax.registration.map_judge import (
     AssembleConfig,
+    Leash,
     MapJudge,
     Offers,
     chance_level,
@@ -170,6 +171,7 @@ def place_in_map(
     margins: Margins,
     chance: float,
     is_ordered: bool = False,
+    leash: Leash | None = None,
 ) -> Floats:
     """Poses of the scans that are not yet placed: of what their pairs offer, where the placed scans match best.
 
@@ -185,13 +187,14 @@ def place_in_map(
         margins: how exactly hits are compared.
         chance: `chance_level` of the pairs of placed scans.
         is_ordered: neighbours in the array are neighbours in time.
+        leash: where scans can be; None: anywhere.
 
     Returns:
         (n, 3) poses. Scans without any offer stand where `poses` has them.
     """
     share = noisy_share(profiles, candidates, margins)
     # Places of one scan compete with each other alone: no need to subtract what chance would give.
-    judge, offers = MapJudge(profiles, config, scale, margins, 0.0, share, False), make_offers(candidates)
+    judge, offers = MapJudge(profiles, config, scale, margins, 0.0, share, False, leash), make_offers(candidates)
     is_placed = np.zeros(len(poses), bool)
     is_placed[placed] = True
     rows = np.flatnonzero(is_placed[offers.anchor] & ~is_placed[offers.scan])

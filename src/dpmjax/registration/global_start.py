@@ -25,7 +25,7 @@ from dpmjax.registration.correlative import (
     join_candidates,
     search_pairs,
 )
-from dpmjax.registration.map_judge import AssembleConfig, chance_level
+from dpmjax.registration.map_judge import AssembleConfig, Leash, chance_level
 from dpmjax.registration.pairs import length_scale
 from dpmjax.registration.planar_graph import join_edges, optimize_planar_graph
 from dpmjax.registration.profiles import Margins, Profiles, judge_pairs, make_profiles
@@ -188,16 +188,27 @@ def _find_stragglers(profiles: Profiles, poses: Floats, margins: Margins, config
     return worst[matched[worst] < config.min_company * np.median(matched)].astype(np.int64)
 
 
+def _leash_between(poses: Floats, keyframes: Indices, config: GlobalConfig, scale: float) -> Leash:
+    """Scans are between the keyframes before and after them, give or take the way from one to the other."""
+    scans = np.arange(len(poses))
+    middle = np.stack([np.interp(scans, keyframes, poses[keyframes, axis]) for axis in (0, 1)], axis=-1)
+    step = np.hypot(*np.diff(poses[keyframes, :2], axis=0).T)
+    gap = step[np.clip(np.searchsorted(keyframes, scans) - 1, 0, len(step) - 1)]
+    slack = config.assembly.agreement[0] * scale
+    return Leash(middle, np.where(np.isin(scans, keyframes), slack, gap + slack))
+
+
 def _place_others(
     profiles: Profiles, keyframes: Indices, poses: Floats, found: Candidates, config: GlobalConfig,
     *, scale: float, margins: Margins, is_ordered: bool,
 ) -> tuple[Floats, Candidates]:  # fmt: skip
     """Poses of all scans from those of the keyframes, and the pairs that told them."""
+    leash = _leash_between(poses, keyframes, config, scale) if is_ordered else None
 
     def place(poses: Floats, more: Candidates) -> Floats:
         return place_in_map(
             profiles, poses, keyframes, join_candidates(found, more), config.assembly, scale=scale, margins=margins,
-            chance=chance_level(found), is_ordered=is_ordered,
+            chance=chance_level(found), is_ordered=is_ordered, leash=leash,
         )  # fmt: skip
 
     more = _search_others(profiles, keyframes, poses, config, scale, margins, is_ordered=is_ordered)

@@ -68,6 +68,22 @@ def make_offers(candidates: Candidates) -> Offers:
     )
 
 
+class Leash(NamedTuple):
+    """Where scans can be at all.
+
+    Attributes:
+        middle: (n, 2).
+        length: (n,) farthest from there.
+    """
+
+    middle: Floats
+    length: Floats
+
+
+# Said of places that cannot be: less than any scans could say.
+_IMPOSSIBLE = -1e6
+
+
 class MapJudge(NamedTuple):
     """Scores places of scans against placed ones.
 
@@ -79,6 +95,7 @@ class MapJudge(NamedTuple):
         chance: beams that two scans of different places match by chance.
         noisy_share: share of beams that seem to cross surfaces where all is right.
         is_ordered: neighbours in the array are neighbours in time.
+        leash: where scans can be; None: anywhere.
     """
 
     profiles: Profiles
@@ -88,6 +105,7 @@ class MapJudge(NamedTuple):
     chance: float
     noisy_share: float
     is_ordered: bool
+    leash: Leash | None = None
 
     def against(self, scan: Indices, places: Floats, placed: Indices, poses: Floats) -> Floats:
         """(m,) sum over `placed` of matched less weighted crossed beams of `scan` at `places`."""
@@ -100,7 +118,11 @@ class MapJudge(NamedTuple):
         row, column = np.nonzero(apart < limit[:, None])
         other = placed[column]
         value = self.of_pairs(scan[row], other, planar_poses.relative(poses[other], places[row]))
-        return np.asarray(np.bincount(row, value, minlength=len(scan)), np.float64)
+        said = np.asarray(np.bincount(row, value, minlength=len(scan)), np.float64)
+        if self.leash is not None:
+            off = places[:, :2] - self.leash.middle[scan]
+            said += np.where(np.hypot(off[:, 0], off[:, 1]) > self.leash.length[scan], _IMPOSSIBLE, 0.0)
+        return said
 
     def of_pairs(self, source: Indices, target: Indices, poses: Floats) -> Floats:
         """(p,) matched less weighted crossed beams of pairs at `poses`, T_target_source."""
