@@ -24,6 +24,9 @@ from dpmjax.deepmapping.depth_config import Motion
 from dpmjax.deepmapping.depth_fit import DepthScans, motion_matrices
 from dpmjax.geometry.poses import invert, transform_points
 
+# Four pixels whose inverse depths differ by less than this share lie on one surface; else an edge runs between them.
+_EDGE = 0.15
+
 
 @dataclass(frozen=True)
 class DepthStartConfig:
