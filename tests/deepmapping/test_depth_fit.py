@@ -11,7 +11,9 @@ import pytest
 
 from dpmjax import deepmapping as dm
 from dpmjax.data import rgbd
-from dpmjax.deepmapping.depth_start import DepthStartConfig, agreement, fit_pinhole
+from dpmjax.deepmapping.depth_agreement import agreement
+from dpmjax.deepmapping.depth_scans import fit_pinhole
+from dpmjax.deepmapping.depth_start import DepthStartConfig
 from dpmjax.metrics import absolute_trajectory_error
 from dpmjax.nets.depth_localization import DepthLocalizationConfig
 from dpmjax.nets.occupancy import OccupancyConfig
