@@ -17,6 +17,11 @@ from dpmjax.geometry.poses import invert, transform_points
 
 # Four pixels whose inverse depths differ by less than this share lie on one surface; else an edge runs between them.
 _EDGE = 0.15
+# What a contradiction costs in agreements: along a bare wall a wrong place agrees nearly everywhere, and overlaps more.
+_CONTRADICTION = 3.0
+# Agreements count as a share of what is told, not of all points, or else every image would be pulled onto the others;
+# with this share of all points added, a little overlap that agrees is worth little.
+_UNTOLD = 0.1
 
 
 def agreement(
@@ -51,8 +56,8 @@ def agreement(
     # How far the point is in front of the surface, in shares of the surface's depth, over the tolerance.
     gap = jnp.where(is_told, 1.0 - depth * inverse, 0.0) / tolerance
     floats = jax.nn.sigmoid(3.0 * (gap - 2.0))
-    score = jnp.where(is_told, jnp.exp(-(gap**2)) - floats, 0.0)
-    return score.sum() / jnp.maximum(mask.sum(), 1)
+    score = jnp.where(is_told, jnp.exp(-(gap**2)) - _CONTRADICTION * floats, 0.0)
+    return score.sum() / jnp.maximum(is_told.sum() + _UNTOLD * mask.sum(), 1.0)
 
 
 def _inverse_depth_at(

@@ -53,7 +53,7 @@ class DepthStartConfig:
     num_references: int = 4
     num_points: int = 150
     tolerance: tuple[float, float] = (0.12, 0.01)
-    rest_weight: float = 0.02
+    rest_weight: float = 0.1
 
     def __post_init__(self) -> None:
         counts = (self.num_tries, self.num_candidates, self.num_kept, self.num_varied, self.num_rounds)
@@ -77,7 +77,12 @@ def place_images(
     """
     config = config or DepthStartConfig()
     tries = [_place(scans, config, motion, key=jax.random.fold_in(key, k)) for k in range(config.num_tries)]
-    return max(tries, key=lambda T: float(mean_agreement(scans, jnp.asarray(T, jnp.float32))))
+
+    def score(T: NDArray[np.float64]) -> float:
+        rest = np.linalg.norm(np.diff(T[:, :3, 3], axis=0), axis=-1).mean() / config.max_translation
+        return float(mean_agreement(scans, jnp.asarray(T, jnp.float32))) - config.rest_weight * float(rest)
+
+    return max(tries, key=score)
 
 
 def _place(scans: DepthScans, config: DepthStartConfig, motion: Motion, *, key: jax.Array) -> NDArray[np.float64]:
@@ -137,7 +142,7 @@ def _search(
 
         scores = jax.vmap(against)(T_last_reference, reference_points, reference_depth)
         rest = jnp.linalg.norm(T_last_scan[:3, 3]) / config.max_translation
-        return jnp.sum(weights * scores) - 2.0 * config.rest_weight * rest
+        return jnp.sum(weights * (scores - 2.0 * config.rest_weight * rest))
 
     turn, tilt = np.deg2rad(config.max_turn_deg), np.deg2rad(config.max_tilt_deg)
     reach = config.max_translation
