@@ -154,6 +154,14 @@ def _draw_points(scans: DepthScans, count: int, *, key: jax.Array) -> Batch:
     return Batch(points, mask, jnp.arange(num_scans), jnp.zeros(num_scans, jnp.int32))
 
 
+def _draw_offsets(num_scans: int, phase: DepthPhaseConfig, *, key: jax.Array) -> Int[Array, " o"]:
+    """1, so that neighbours always meet, and further ones at random."""
+    furthest = min(phase.max_offset, num_scans - 1)
+    count = min(phase.num_offsets, furthest) - 1
+    drawn = jax.random.choice(key, jnp.arange(2, max(furthest, 2) + 1), (count,), replace=False)
+    return jnp.concatenate([jnp.ones(1, drawn.dtype), drawn])
+
+
 def _projected_loss(
     T: Float[Array, "n 4 4"],
     scans: DepthScans,
@@ -169,10 +177,7 @@ def _projected_loss(
     free_key, offset_key = jax.random.split(key)
     first, last = np.log(phase.projection_tolerance)
     tolerance = jnp.exp(first + progress * (last - first))
-    furthest = min(phase.max_offset, len(T) - 1)
-    others = min(phase.num_offsets, furthest) - 1
-    drawn = jax.random.choice(offset_key, jnp.arange(2, furthest + 1), (others,), replace=False) if others else []
-    offsets = jnp.concatenate([jnp.ones(1, jnp.int32), jnp.asarray(drawn, jnp.int32)])
+    offsets = _draw_offsets(len(T), phase, key=offset_key)
     pairs = agreement_of_pairs(T, batch.points, batch.mask, scans.depth, scans.pinhole, offsets, tolerance)
     gamma = phase.occupancy_weight
     if gamma == 0.0:

@@ -26,8 +26,11 @@ def fit_pinhole(points: NDArray[np.floating], mask: NDArray[np.bool_]) -> Pinhol
     """The camera of organised clouds (n, h, w, 3), by least squares."""
     _, row, column = np.nonzero(mask)
     valid = np.asarray(points, np.float64)[mask]
-    fx, cx = np.polyfit(valid[:, 0] / valid[:, 2], column, 1)
-    fy, cy = np.polyfit(valid[:, 1] / valid[:, 2], row, 1)
+
+    def line(ratio: NDArray[np.float64], cell: NDArray[np.intp]) -> NDArray[np.float64]:
+        return np.linalg.lstsq(np.stack([ratio, np.ones_like(ratio)], axis=-1), cell, rcond=None)[0]
+
+    (fx, cx), (fy, cy) = line(valid[:, 0] / valid[:, 2], column), line(valid[:, 1] / valid[:, 2], row)
     return Pinhole(*(jnp.asarray(value, jnp.float32) for value in (fx, fy, cx, cy)))
 
 

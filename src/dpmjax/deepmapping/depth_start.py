@@ -48,10 +48,10 @@ class DepthStartConfig:
     num_tries: int = 2
     num_candidates: int = 2048
     num_kept: int = 16
-    num_varied: int = 48
+    num_varied: int = 24
     num_rounds: int = 7
     num_references: int = 4
-    num_points: int = 150
+    num_points: int = 100
     tolerance: tuple[float, float] = (0.12, 0.01)
     rest_weight: float = 0.1
 
