@@ -134,7 +134,8 @@ def depth_preset(name: Literal["fast", "paper"], *, motion: Motion = "planar") -
         ValueError: the name is unknown.
     """
     if name == "fast":
-        return DepthMappingConfig(motion=motion)
+        config = DepthMappingConfig(motion=motion)
+        return config if motion == "planar" else _for_hand_held(config)
     if name == "paper":
         return DepthMappingConfig(
             motion,
@@ -145,6 +146,12 @@ def depth_preset(name: Literal["fast", "paper"], *, motion: Motion = "planar") -
             steps_per_call=1,
         )
     raise ValueError(f"preset: expected 'fast' or 'paper', got {name!r}")
+
+
+def _for_hand_held(config: DepthMappingConfig) -> DepthMappingConfig:
+    """Real depth images in SE(3) do not agree to half a percent of the depth, and their first poses are rougher."""
+    refine = replace(REFINE_DEPTH, projection_tolerance=(0.1, 0.02))
+    return replace(config, cold_phases=(*config.cold_phases[:-1], refine), warm_phases=(refine,))
 
 
 def as_direct(config: DepthMappingConfig) -> DepthMappingConfig:

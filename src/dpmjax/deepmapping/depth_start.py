@@ -40,6 +40,7 @@ class DepthStartConfig:
         tolerance: share of the depth by which agreeing points may differ, in the first and in the last round.
         rest_weight: what the largest translation costs, in agreement with one image: along a bare wall nothing else
             tells how far the camera has moved, and then the shortest move is taken.
+        turn_weight: what the largest turn costs, likewise.
     """
 
     max_translation: float = 0.7
@@ -54,11 +55,26 @@ class DepthStartConfig:
     num_points: int = 100
     tolerance: tuple[float, float] = (0.12, 0.01)
     rest_weight: float = 0.1
+    turn_weight: float = 0.0
 
     def __post_init__(self) -> None:
         counts = (self.num_tries, self.num_candidates, self.num_kept, self.num_varied, self.num_rounds)
         if min(*counts, self.num_references, self.num_points) < 1:
             raise ValueError(f"all counts must be at least 1, got {self}")
+
+
+PLANAR_START = DepthStartConfig()
+"""A level camera on wheels."""
+
+FULL_START = DepthStartConfig(
+    num_candidates=16384,
+    num_kept=32,
+    num_varied=48,
+    tolerance=(0.12, 0.03),
+    rest_weight=0.2,
+    turn_weight=0.3,
+)
+"""A hand-held camera: six numbers to search instead of three, small moves between images, and the noise of a real one."""
 
 
 def place_images(
@@ -68,14 +84,14 @@ def place_images(
 
     Args:
         scans: in order of time; neighbours overlap.
-        config: of the search.
+        config: of the search; None: `PLANAR_START` or `FULL_START`, by the motion.
         motion: "planar" or "full".
         key: of the search.
 
     Returns:
         (n, 4, 4) T_world_camera, unit of the points.
     """
-    config = config or DepthStartConfig()
+    config = config or (PLANAR_START if motion == "planar" else FULL_START)
     tries = [_place(scans, config, motion, key=jax.random.fold_in(key, k)) for k in range(config.num_tries)]
 
     def score(T: NDArray[np.float64]) -> float:
@@ -141,8 +157,10 @@ def _search(
             return there + back
 
         scores = jax.vmap(against)(T_last_reference, reference_points, reference_depth)
-        rest = jnp.linalg.norm(T_last_scan[:3, 3]) / config.max_translation
-        return jnp.sum(weights * (scores - 2.0 * config.rest_weight * rest))
+        rest = config.rest_weight * jnp.linalg.norm(T_last_scan[:3, 3]) / config.max_translation
+        turned = jnp.arccos(jnp.clip(0.5 * (jnp.trace(T_last_scan[:3, :3]) - 1.0), -1.0, 1.0))
+        rest += config.turn_weight * turned / np.deg2rad(config.max_turn_deg)
+        return jnp.sum(weights * (scores - 2.0 * rest))
 
     turn, tilt = np.deg2rad(config.max_turn_deg), np.deg2rad(config.max_tilt_deg)
     reach = config.max_translation
