@@ -74,7 +74,7 @@ FULL_START = DepthStartConfig(
     rest_weight=0.2,
     turn_weight=0.3,
 )
-"""A hand-held camera: six numbers to search instead of three, small moves between images, and the noise of a real one."""
+"""A hand-held camera: six numbers to search instead of three, small moves between images, a real sensor's noise."""
 
 
 def place_images(
