@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -17,7 +18,13 @@ _ICP_POINTS = 800
 
 
 def run_method(
-    name: str, sequence: DepthSequence, settings: DepthMappingConfig, *, seed: int, cache: dict[str, Any]
+    name: str,
+    sequence: DepthSequence,
+    settings: DepthMappingConfig,
+    found: Mapping[str, NDArray[np.float64]],
+    *,
+    seed: int,
+    cache: dict[str, Any],
 ) -> NDArray[np.float64]:
     """(n, 4, 4) T_world_camera by one method.
 
@@ -25,9 +32,10 @@ def run_method(
         name: one of `METHODS`. "zero": all cameras at one place. "placed": the start that contradicts itself least.
             "deepmapping": from there. "deepmapping-cold": L-Net from zero. "direct": its losses without L-Net, from
             L-Net's first forward pass, as in the paper. "icp": each image onto the one before; "deepmapping-icp": from
-            there.
+            there. Of a start and the fit from it that is kept of which the images agree better.
         sequence: depth images.
         settings: of DeepMapping.
+        found: what other methods have found for this sequence: a start that is there is not computed again.
         seed: of everything random.
         cache: compiled steps, kept between calls.
     """
@@ -42,11 +50,14 @@ def run_method(
         return dm.place_images(scans, motion=settings.motion, key=key)
     if name == "icp":
         return chain_icp(sequence, seed=seed)
-    start = {"deepmapping": "placed", "deepmapping-icp": "icp"}.get(name)
-    init = None if start is None else run_method(start, sequence, settings, seed=seed, cache=cache)
     used = dm.as_direct(settings) if name == "direct" else settings
+    start = {"deepmapping": "placed", "deepmapping-icp": "icp"}.get(name)
     steps = cache.setdefault(f"{name == 'direct'}, {start is None}", {})
-    return dm.fit_depth(scans, used, key=key, init=init, steps=steps).T_world_camera
+    if start is None:
+        return dm.fit_depth(scans, used, key=key, steps=steps).T_world_camera
+    init = found[start] if start in found else run_method(start, sequence, settings, found, seed=seed, cache=cache)
+    fitted = dm.fit_depth(scans, used, key=key, init=init, steps=steps).T_world_camera
+    return max(fitted, init, key=lambda T: float(dm.mean_agreement(scans, T)))
 
 
 def chain_icp(sequence: DepthSequence, *, seed: int) -> NDArray[np.float64]:

@@ -11,7 +11,9 @@ import pytest
 
 from dpmjax import deepmapping as dm
 from dpmjax.data import rgbd
-from dpmjax.deepmapping.depth_start import DepthStartConfig, agreement, fit_pinhole
+from dpmjax.deepmapping.depth_agreement import agreement
+from dpmjax.deepmapping.depth_scans import fit_pinhole
+from dpmjax.deepmapping.depth_start import DepthStartConfig
 from dpmjax.metrics import absolute_trajectory_error
 from dpmjax.nets.depth_localization import DepthLocalizationConfig
 from dpmjax.nets.occupancy import OccupancyConfig
@@ -117,7 +119,7 @@ def test_an_image_agrees_with_itself_and_contradicts_itself_from_elsewhere(walk)
     points, mask = jnp.asarray(walk.points[0].reshape(-1, 3)), jnp.asarray(walk.mask[0].reshape(-1))
     depth = jnp.where(walk.mask[0], walk.points[0, ..., 2], 0.0)
     pinhole, tolerance = fit_pinhole(walk.points, walk.mask), jnp.float32(0.05)
-    assert float(agreement(jnp.eye(4), points, mask, depth, pinhole, tolerance)) > 0.99
+    assert float(agreement(jnp.eye(4), points, mask, depth, pinhole, tolerance)) > 0.8
     nearer = jnp.eye(4).at[2, 3].set(-0.6)
     assert float(agreement(nearer, points, mask, depth, pinhole, tolerance)) < 0.0
     hidden = jnp.zeros_like(mask)
@@ -147,3 +149,23 @@ def test_bad_input_is_named(points, options, message) -> None:
         dm.fit_depth(points, small("planar"), key=KEY, **options)
     with pytest.raises(ValueError, match="preset"):
         dm.depth_preset("quick")
+
+
+def test_the_truth_agrees_more_than_a_walk_with_one_wrong_turn(walk, scans) -> None:
+    turned = walk.T_world_camera.copy()
+    turned[2] = turned[2] @ np.asarray(dm.motion_matrices(jnp.array([[0.0, 0.0, 0.3]])))[0]
+    truth, wrong = (float(dm.mean_agreement(scans, T)) for T in (walk.T_world_camera, turned))
+    assert truth > wrong + 0.02
+    assert truth <= 1.0
+
+
+def test_agreement_has_finite_slopes_where_nothing_overlaps(scans) -> None:
+    def slope(turn: float) -> jax.Array:
+        def loss(values: jax.Array) -> jax.Array:
+            return dm.mean_agreement(scans, dm.motion_matrices(values), 0.05)
+
+        motions = jnp.zeros((4, 3)).at[:, 2].set(turn * jnp.arange(4))
+        return jax.grad(loss)(motions)
+
+    assert jnp.isfinite(slope(1.5)).all()
+    assert jnp.isfinite(slope(0.1)).all()

@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from dpmjax import deepmapping as dm
-from dpmjax.deepmapping.fit import _draw_batch, run_phases, steps_per_call
+from dpmjax.deepmapping.fit import _draw_batch, run_phases
+from dpmjax.deepmapping.stepping import steps_per_call
 from dpmjax.geometry import planar_poses
 from dpmjax.metrics import absolute_trajectory_error
 from dpmjax.nets.localization import LocalizationConfig

@@ -37,6 +37,18 @@ def test_help_shows_examples(module, capsys) -> None:
         (deepmapping_ablations, ["--views", 1], "--views"),
         (deepmapping_rgbd, ["--methods", "guess"], "--methods"),
         (deepmapping_rgbd, ["--limit", 0], "--limit"),
+    ],
+)
+def test_wrong_usage_names_the_option(module, options, message, capsys) -> None:
+    assert run(module, *options) == 2
+    errors = capsys.readouterr().err
+    assert message in errors
+    assert "Traceback" not in errors
+
+
+@pytest.mark.parametrize(
+    ("module", "options", "message"),
+    [
         (deepmapping_rgbd, ["/no/such/folder"], "no such folder"),
         (deepmapping_relocalize, ["/no/such/run"], "config.json"),
     ],

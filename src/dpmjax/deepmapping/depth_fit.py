@@ -15,38 +15,19 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float, Int
 from numpy.typing import ArrayLike, NDArray
 
-from dpmjax.deepmapping.config import PhaseConfig
-from dpmjax.deepmapping.depth_config import DepthMappingConfig
-from dpmjax.deepmapping.fit import (
-    MapFrame,
-    Params,
-    _bind_map,
-    _level_weights,
-    _make_optimizer,
-    steps_per_call,
-)
-from dpmjax.deepmapping.objective import Batch, Terms, world_loss
-from dpmjax.geometry.poses import exp_se3, transform_points
+from dpmjax.deepmapping.depth_agreement import agreement_of_pairs
+from dpmjax.deepmapping.depth_config import DepthMappingConfig, DepthPhaseConfig
+from dpmjax.deepmapping.depth_scans import DepthScans, as_depth_scans, measure_depth_reach, motion_matrices
+from dpmjax.deepmapping.objective import Batch, MapLogits, Terms, free_factors, occupancy_term, world_loss
+from dpmjax.deepmapping.stepping import MapFrame, Params, bind_map, level_weights, make_optimizer, steps_per_call
+from dpmjax.geometry.poses import transform_points
 from dpmjax.nets.depth_localization import DepthLocalizationNet
 from dpmjax.nets.occupancy import init_map_net
 
 StepFunction = Callable[..., tuple["DepthState", "DepthReport"]]
-
-
-@flax.struct.dataclass
-class DepthScans:
-    """Organised depth images as clouds in their camera frames (x right, y down, z forward).
-
-    Attributes:
-        points: metres, or reaches inside of the fit.
-        mask: True where something was measured.
-    """
-
-    points: Float[Array, "n h w 3"]
-    mask: Bool[Array, "n h w"]
 
 
 @flax.struct.dataclass
@@ -96,44 +77,6 @@ class DepthFitted(NamedTuple):
     reach: float
 
 
-def as_depth_scans(points: ArrayLike, mask: ArrayLike | None = None) -> DepthScans:
-    """Depth images from arrays; without a mask, pixels that are not finite or all zero measured nothing.
-
-    Raises:
-        ValueError: the shapes are not (n, h, w, 3) and (n, h, w) with n >= 2, an image has no valid pixel, or what the
-            mask calls valid is not finite.
-    """
-    cloud = np.asarray(points, np.float32)
-    if cloud.ndim != 4 or cloud.shape[-1] != 3 or len(cloud) < 2:
-        raise ValueError(f"points: expected shape (n, h, w, 3) with n >= 2, got {cloud.shape}")
-    is_finite = np.isfinite(cloud).all(-1)
-    valid = is_finite & (np.abs(cloud).sum(-1) > 0) if mask is None else np.asarray(mask)
-    if valid.shape != cloud.shape[:3] or valid.dtype != bool:
-        raise ValueError(f"mask: expected bool of shape {cloud.shape[:3]}, got {valid.dtype} of {valid.shape}")
-    if (valid & ~is_finite).any():
-        raise ValueError("points: expected finite coordinates where the mask is True")
-    empty = np.flatnonzero(~valid.any((1, 2)))
-    if len(empty):
-        raise ValueError(f"mask: image {empty[0]} has no valid pixel; leave it out ({len(empty)} such images)")
-    return DepthScans(jnp.asarray(np.where(valid[..., None], cloud, 0.0)), jnp.asarray(valid))
-
-
-def measure_depth_reach(scans: DepthScans) -> float:
-    """The unit of length of the fit: the range that nine pixels in ten stay below, median over the images."""
-    ranges = np.linalg.norm(np.asarray(scans.points), axis=-1)
-    return float(np.median([np.percentile(r[m], 90) for r, m in zip(ranges, np.asarray(scans.mask), strict=True)]))
-
-
-def motion_matrices(values: Float[Array, "n k"]) -> Float[Array, "n 4 4"]:
-    """Motions as matrices: k = 3 are x, z and the angle about y (section 4.2), k = 6 is a twist (v, w)."""
-    if values.shape[-1] == 6:
-        return exp_se3(values)
-    x, z, cos, sin = values[:, 0], values[:, 1], jnp.cos(values[:, 2]), jnp.sin(values[:, 2])
-    zero, one = jnp.zeros_like(x), jnp.ones_like(x)
-    rows = ((cos, zero, sin, x), (zero, one, zero, zero), (-sin, zero, cos, z), (zero, zero, zero, one))
-    return jnp.stack([jnp.stack(row, axis=-1) for row in rows], axis=-2)
-
-
 def _compose(T_a_b: Float[Array, "n 4 4"], T_b_c: Float[Array, "n 4 4"]) -> Float[Array, "n 4 4"]:
     return jnp.einsum("nij,njk->nik", T_a_b, T_b_c, precision=jax.lax.Precision.HIGHEST)
 
@@ -167,7 +110,7 @@ def init_depth(
         params = replace(params, poses=_network_motions(params, scans, config))
     zero = jnp.zeros((), jnp.int32)
     frame = _choose_frame(scans, start, config)
-    return DepthState(params, _make_optimizer(phase).init(params), start, frame, zero, zero, zero)
+    return DepthState(params, make_optimizer(phase).init(params), start, frame, zero, zero, zero)
 
 
 def _network_motions(params: Params, scans: DepthScans, config: DepthMappingConfig) -> Float[Array, "n k"]:
@@ -176,7 +119,11 @@ def _network_motions(params: Params, scans: DepthScans, config: DepthMappingConf
 
 
 def _poses(
-    params: Params, T_start: Float[Array, "n 4 4"], scans: DepthScans, config: DepthMappingConfig, phase: PhaseConfig
+    params: Params,
+    T_start: Float[Array, "n 4 4"],
+    scans: DepthScans,
+    config: DepthMappingConfig,
+    phase: DepthPhaseConfig,
 ) -> Float[Array, "n 4 4"]:
     motions = params.poses if phase.poses == "free" else _network_motions(params, scans, config)
     return _compose(T_start, motion_matrices(motions))
@@ -187,7 +134,7 @@ def next_depth_phase(state: DepthState, scans: DepthScans, config: DepthMappingC
     phases = config.phases(is_warm=is_warm)
     T = _poses(state.params, state.T_start, scans, config, phases[int(state.phase)])
     params = replace(state.params, poses=jnp.zeros_like(state.params.poses))
-    optimizer = _make_optimizer(phases[int(state.phase) + 1]).init(params)
+    optimizer = make_optimizer(phases[int(state.phase) + 1]).init(params)
     zero = jnp.zeros((), jnp.int32)
     return DepthState(params, optimizer, T, _choose_frame(scans, T, config), state.phase + 1, zero, state.step)
 
@@ -207,23 +154,59 @@ def _draw_points(scans: DepthScans, count: int, *, key: jax.Array) -> Batch:
     return Batch(points, mask, jnp.arange(num_scans), jnp.zeros(num_scans, jnp.int32))
 
 
-def make_depth_step(config: DepthMappingConfig, phase: PhaseConfig) -> StepFunction:
+def _draw_offsets(num_scans: int, phase: DepthPhaseConfig, *, key: jax.Array) -> Int[Array, " o"]:
+    """1, so that neighbours always meet, and further ones at random."""
+    furthest = min(phase.max_offset, num_scans - 1)
+    count = min(phase.num_offsets, furthest) - 1
+    drawn = jax.random.choice(key, jnp.arange(2, max(furthest, 2) + 1), (count,), replace=False)
+    return jnp.concatenate([jnp.ones(1, drawn.dtype), drawn])
+
+
+def _projected_loss(
+    T: Float[Array, "n 4 4"],
+    scans: DepthScans,
+    batch: Batch,
+    logits: MapLogits,
+    phase: DepthPhaseConfig,
+    progress: Float[Array, ""],
+    *,
+    key: jax.Array,
+) -> tuple[Float[Array, ""], Terms]:
+    """Eq. 6 with the agreement of projected images in the place of the Chamfer distance (as 1 - agreement)."""
+    assert phase.projection_tolerance is not None
+    free_key, offset_key = jax.random.split(key)
+    first, last = np.log(phase.projection_tolerance)
+    tolerance = jnp.exp(first + progress * (last - first))
+    offsets = _draw_offsets(len(T), phase, key=offset_key)
+    pairs = agreement_of_pairs(T, batch.points, batch.mask, scans.depth, scans.pinhole, offsets, tolerance)
+    gamma = phase.occupancy_weight
+    if gamma == 0.0:
+        return 1.0 - pairs, Terms(jnp.zeros(()), 1.0 - pairs)
+    factors = free_factors(batch, phase, progress, key=free_key)
+    occupancy = occupancy_term(T[:, :3, 3], transform_points(T, batch.points), batch, logits, factors)
+    return gamma * occupancy + (1.0 - gamma) * (1.0 - pairs), Terms(occupancy, 1.0 - pairs)
+
+
+def make_depth_step(config: DepthMappingConfig, phase: DepthPhaseConfig) -> StepFunction:
     """The compiled step of one phase: `state, report = step(state, scans, key=key)` does `steps_per_call` steps.
 
     The scans are an argument, so that sets of one shape share one compilation. Step k uses `fold_in(key, k)`.
     """
-    optimizer = _make_optimizer(phase)
-    length = steps_per_call(config, phase)  # type: ignore[arg-type]
+    optimizer = make_optimizer(phase)
+    length = steps_per_call(config, phase)
 
     def loss_of(params: Params, state: DepthState, scans: DepthScans, key: jax.Array) -> tuple[Float[Array, ""], Terms]:
         batch_key, loss_key = jax.random.split(key)
         batch = _draw_points(scans, phase.beams_per_step, key=batch_key)
         progress = state.phase_step / phase.num_steps
         T = _poses(params, state.T_start, scans, config, phase)
-        weights = _level_weights(phase, config, progress)  # type: ignore[arg-type]
-        logits = _bind_map(params.occupancy, config.occupancy, state.frame, weights)
-        world = transform_points(T, batch.points)
-        loss, terms = world_loss(T[:, :3, 3], world, batch, logits, phase, progress, key=loss_key)
+        weights = level_weights(phase, config, progress)
+        logits = bind_map(params.occupancy, config.occupancy, state.frame, weights)
+        if phase.projection_tolerance is None:
+            world = transform_points(T, batch.points)
+            loss, terms = world_loss(T[:, :3, 3], world, batch, logits, phase, progress, key=loss_key)
+        else:
+            loss, terms = _projected_loss(T, scans, batch, logits, phase, progress, key=loss_key)
         if phase.map_decay > 0.0:
             loss += phase.map_decay * sum(jnp.sum(x**2) for x in jax.tree.leaves(params.occupancy)) / batch.mask.size
         return loss, terms
@@ -252,7 +235,7 @@ def fit_depth(
     *,
     key: jax.Array,
     init: ArrayLike | None = None,
-    steps: dict[PhaseConfig, StepFunction] | None = None,
+    steps: dict[DepthPhaseConfig, StepFunction] | None = None,
 ) -> DepthFitted:
     """Registers depth images by optimising L-Net and M-Net on them alone (DeepMapping section 4.2).
 

@@ -1,28 +1,25 @@
 """A start for depth images without any first guess: one image after the other is placed where it contradicts the
 images before it least.
 
-What two depth images say of each other costs one projection: a point of one that lands on the surface that the other
-sees agrees with it; a point that floats in front of that surface contradicts it, for the other camera looked through
-it (the self-contradictory occupancy of DeepMapping figure 3, asked of the images instead of the map); a point behind it
-is hidden and says nothing. A beam search over motions maximises agreements less contradictions against the last images
-together, coarse to fine.
+A search over motions maximises agreements less contradictions against the last images together, coarse to fine. It is
+done several times over with other samples, and the walk of which all images agree best is kept.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import partial
-from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 from numpy.typing import NDArray
 
+from dpmjax.deepmapping.depth_agreement import agreement, mean_agreement
 from dpmjax.deepmapping.depth_config import Motion
-from dpmjax.deepmapping.depth_fit import DepthScans, motion_matrices
-from dpmjax.geometry.poses import invert, transform_points
+from dpmjax.deepmapping.depth_scans import DepthScans, Pinhole, motion_matrices
+from dpmjax.geometry.poses import invert
 
 
 @dataclass(frozen=True)
@@ -33,94 +30,51 @@ class DepthStartConfig:
         max_translation: between neighbouring images, along each axis.
         max_turn_deg: between neighbouring images, about the vertical axis of the camera.
         max_tilt_deg: about the other axes; full motion only.
+        num_tries: walks that are placed, each with other samples; that of which all images agree best is kept.
         num_candidates: motions that are tried at first, spread evenly.
         num_kept: best ones that go on to the next round.
+        num_varied: new motions around each kept one in a round.
         num_rounds: each kept motion is varied, half as widely as in the round before.
         num_references: images before that are compared to.
         num_points: of each image.
         tolerance: share of the depth by which agreeing points may differ, in the first and in the last round.
+        rest_weight: what the largest translation costs, in agreement with one image: along a bare wall nothing else
+            tells how far the camera has moved, and then the shortest move is taken.
+        turn_weight: what the largest turn costs, likewise.
     """
 
     max_translation: float = 0.7
     max_turn_deg: float = 75.0
     max_tilt_deg: float = 30.0
-    num_candidates: int = 4096
-    num_kept: int = 32
+    num_tries: int = 2
+    num_candidates: int = 2048
+    num_kept: int = 16
+    num_varied: int = 24
     num_rounds: int = 7
     num_references: int = 4
-    num_points: int = 200
+    num_points: int = 100
     tolerance: tuple[float, float] = (0.12, 0.01)
+    rest_weight: float = 0.1
+    turn_weight: float = 0.0
 
     def __post_init__(self) -> None:
-        if min(self.num_candidates, self.num_kept, self.num_rounds, self.num_references, self.num_points) < 1:
+        counts = (self.num_tries, self.num_candidates, self.num_kept, self.num_varied, self.num_rounds)
+        if min(*counts, self.num_references, self.num_points) < 1:
             raise ValueError(f"all counts must be at least 1, got {self}")
 
 
-class Pinhole(NamedTuple):
-    """Where a ray meets the image, in cells: column = fx x/z + cx, row = fy y/z + cy."""
+PLANAR_START = DepthStartConfig()
+"""A level camera on wheels."""
 
-    fx: Array
-    fy: Array
-    cx: Array
-    cy: Array
-
-
-def fit_pinhole(points: NDArray[np.floating], mask: NDArray[np.bool_]) -> Pinhole:
-    """The camera of organised clouds (n, h, w, 3), by least squares."""
-    _, row, column = np.nonzero(mask)
-    valid = np.asarray(points, np.float64)[mask]
-    fx, cx = np.polyfit(valid[:, 0] / valid[:, 2], column, 1)
-    fy, cy = np.polyfit(valid[:, 1] / valid[:, 2], row, 1)
-    return Pinhole(*(jnp.asarray(value, jnp.float32) for value in (fx, fy, cx, cy)))
-
-
-def agreement(
-    T_other_camera: Float[Array, "4 4"],
-    points: Float[Array, "p 3"],
-    mask: Bool[Array, " p"],
-    depth_other: Float[Array, "h w"],
-    pinhole: Pinhole,
-    tolerance: Float[Array, ""],
-) -> Float[Array, ""]:
-    """Agreements less contradictions of points with what another camera sees, per point, in [-1, 1].
-
-    Args:
-        T_other_camera: brings the points into the frame of the other camera.
-        points: in their camera frame.
-        mask: False for points that are not there.
-        depth_other: depth image of the other camera, 0 where nothing was measured.
-        pinhole: of the other camera.
-        tolerance: share of the depth by which agreeing points may differ.
-    """
-    seen = transform_points(T_other_camera, points)
-    depth = seen[:, 2]
-    safe = jnp.maximum(depth, 1e-3)
-    column = pinhole.fx * seen[:, 0] / safe + pinhole.cx
-    row = pinhole.fy * seen[:, 1] / safe + pinhole.cy
-    inverse, is_smooth = _inverse_depth_at(depth_other, row, column)
-    is_told = mask & (depth > 1e-3) & is_smooth
-    # How far the point is in front of the surface, in shares of the surface's depth, over the tolerance.
-    gap = jnp.where(is_told, 1.0 - depth * inverse, 0.0) / tolerance
-    floats = jax.nn.sigmoid(3.0 * (gap - 2.0))
-    score = jnp.where(is_told, jnp.exp(-(gap**2)) - floats, 0.0)
-    return score.sum() / jnp.maximum(mask.sum(), 1)
-
-
-def _inverse_depth_at(
-    depth: Float[Array, "h w"], row: Float[Array, " p"], column: Float[Array, " p"]
-) -> tuple[Float[Array, " p"], Bool[Array, " p"]]:
-    """One over the depth between four pixels, which is linear on a plane; and whether they lie on one surface."""
-    height, width = depth.shape
-    top = jnp.clip(jnp.floor(row).astype(jnp.int32), 0, height - 2)
-    left = jnp.clip(jnp.floor(column).astype(jnp.int32), 0, width - 2)
-    inverse = jnp.where(depth > 0.0, 1.0 / jnp.where(depth > 0.0, depth, 1.0), 0.0)
-    corners = jnp.stack([inverse[top + i, left + j] for i in (0, 1) for j in (0, 1)], axis=-1)
-    v, u = row - top, column - left
-    shares = jnp.stack([(1 - v) * (1 - u), (1 - v) * u, v * (1 - u), v * u], axis=-1)
-    is_inside = (row >= 0.0) & (row <= height - 1) & (column >= 0.0) & (column <= width - 1)
-    low, high = corners.min(-1), corners.max(-1)
-    is_smooth = is_inside & (low > 0.0) & (high - low < _EDGE * high)
-    return jnp.sum(jnp.where(is_inside[:, None], shares, 0.0) * corners, axis=-1), is_smooth
+FULL_START = DepthStartConfig(
+    num_candidates=16384,
+    num_kept=32,
+    num_varied=48,
+    tolerance=(0.12, 0.03),
+    rest_weight=0.2,
+    turn_weight=0.3,
+)
+"""A hand-held camera: six numbers to search instead of three, small moves between images, a real sensor's noise."""
 
 
 def place_images(
@@ -130,18 +84,27 @@ def place_images(
 
     Args:
         scans: in order of time; neighbours overlap.
-        config: of the search.
+        config: of the search; None: `PLANAR_START` or `FULL_START`, by the motion.
         motion: "planar" or "full".
         key: of the search.
 
     Returns:
         (n, 4, 4) T_world_camera, unit of the points.
     """
-    config = config or DepthStartConfig()
+    config = config or (PLANAR_START if motion == "planar" else FULL_START)
+    tries = [_place(scans, config, motion, key=jax.random.fold_in(key, k)) for k in range(config.num_tries)]
+
+    def score(T: NDArray[np.float64]) -> float:
+        rest = np.linalg.norm(np.diff(T[:, :3, 3], axis=0), axis=-1).mean() / config.max_translation
+        return float(mean_agreement(scans, jnp.asarray(T, jnp.float32))) - config.rest_weight * float(rest)
+
+    return max(tries, key=score)
+
+
+def _place(scans: DepthScans, config: DepthStartConfig, motion: Motion, *, key: jax.Array) -> NDArray[np.float64]:
+    """One walk, image after image."""
     num_scans = scans.mask.shape[0]
-    points, mask = np.asarray(scans.points), np.asarray(scans.mask)
-    pinhole = fit_pinhole(points, mask)
-    depth = jnp.asarray(np.where(mask, points[..., 2], 0.0))
+    points, mask, depth = np.asarray(scans.points), np.asarray(scans.mask), scans.depth
     rng = np.random.default_rng(np.asarray(jax.random.key_data(key)).tolist())
     chosen = [rng.choice(np.flatnonzero(m), config.num_points) for m in mask.reshape(num_scans, -1)]
     some = jnp.asarray(np.stack([p[c] for p, c in zip(points.reshape(num_scans, -1, 3), chosen, strict=True)]))
@@ -158,7 +121,7 @@ def place_images(
             depth[rows],
             some[scan],
             depth[scan],
-            pinhole,
+            scans.pinhole,
             jax.random.fold_in(key, scan),
             config=config,
             motion=motion,
@@ -194,7 +157,10 @@ def _search(
             return there + back
 
         scores = jax.vmap(against)(T_last_reference, reference_points, reference_depth)
-        return jnp.sum(weights * scores)
+        rest = config.rest_weight * jnp.linalg.norm(T_last_scan[:3, 3]) / config.max_translation
+        turned = jnp.arccos(jnp.clip(0.5 * (jnp.trace(T_last_scan[:3, :3]) - 1.0), -1.0, 1.0))
+        rest += config.turn_weight * turned / np.deg2rad(config.max_turn_deg)
+        return jnp.sum(weights * (scores - 2.0 * rest))
 
     turn, tilt = np.deg2rad(config.max_turn_deg), np.deg2rad(config.max_tilt_deg)
     reach = config.max_translation
@@ -203,14 +169,13 @@ def _search(
     values = widths * jax.random.uniform(first_key, (config.num_candidates, len(widths)), minval=-1.0, maxval=1.0)
     values = values.at[0].set(0.0)
     first, last = np.log(config.tolerance[0]), np.log(config.tolerance[1])
-    num_varied = config.num_candidates // config.num_kept
     for step in range(config.num_rounds):
         tolerance = jnp.exp(first + (last - first) * step / max(config.num_rounds - 1, 1))
         scores = jax.lax.map(partial(score, tolerance=tolerance), values, batch_size=256)
         best = values[jax.lax.top_k(scores, config.num_kept)[1]]
         if step + 1 == config.num_rounds:
             return motion_matrices(best[:1])[0]
-        noise = jax.random.normal(jax.random.fold_in(round_key, step), (num_varied, *best.shape))
+        noise = jax.random.normal(jax.random.fold_in(round_key, step), (config.num_varied, *best.shape))
         spread = 0.25 * widths * 0.5**step
         # The kept ones themselves stay in the race.
         values = (best + spread * noise.at[0].set(0.0)).reshape(-1, len(widths))

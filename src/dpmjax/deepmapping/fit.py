@@ -20,33 +20,15 @@ from numpy.typing import ArrayLike, NDArray
 
 from dpmjax.deepmapping.config import DeepMappingConfig, PhaseConfig
 from dpmjax.deepmapping.objective import Batch, MapLogits, Terms, registration_loss, to_world
+from dpmjax.deepmapping.stepping import MapFrame, Params, bind_map, level_weights, make_optimizer, steps_per_call
 from dpmjax.geometry import planar_poses
 from dpmjax.geometry.poses import compose_pose2
 from dpmjax.nets.localization import LocalizationNet
-from dpmjax.nets.occupancy import OccupancyConfig, init_map_net, make_map_net
+from dpmjax.nets.occupancy import init_map_net
 from dpmjax.types import ScanSet
 
-# Points that M-Net's hidden layers hold at once when it is an MLP: 16 MB a layer of 512.
-_MLP_CHUNK = 1 << 13
 # Scans that are drawn together where a set is too large for one step.
 _BLOCK = 32
-
-
-@flax.struct.dataclass
-class MapFrame:
-    """The square of the world that M-Net sees as [-1, 1]^2, in reaches."""
-
-    centre: Float[Array, " 2"]
-    half_side: Float[Array, ""]
-
-
-@flax.struct.dataclass
-class Params:
-    """What Adam changes: L-Net, the free poses (in reaches and radians), M-Net."""
-
-    localization: Any
-    poses: Float[Array, "n 3"]
-    occupancy: Any
 
 
 @flax.struct.dataclass
@@ -149,19 +131,6 @@ def _choose_frame(scans: ScanSet, poses: Float[Array, "n 3"], config: DeepMappin
     return MapFrame(centre=0.5 * (low + high), half_side=0.5 * config.map_margin * jnp.max(high - low))
 
 
-def _make_optimizer(phase: PhaseConfig) -> optax.GradientTransformation:
-    """Adam for what the phase optimises; the rest stands still."""
-    decay = optax.cosine_decay_schedule(phase.learning_rate, phase.num_steps, phase.final_learning_rate)
-    moving = optax.adam(decay, *phase.adam_decay)
-    map_adam = optax.adam(phase.map_learning_rate, 0.8 if phase.poses == "free" else 0.9, phase.adam_decay[1])
-    labels = {"network": ("moving", "fixed"), "free": ("fixed", "moving")}[phase.poses]
-    occupancy = "map" if phase.occupancy_weight > 0.0 else "fixed"
-    return optax.multi_transform(
-        {"moving": moving, "map": map_adam, "fixed": optax.set_to_zero()},
-        Params(localization=labels[0], poses=labels[1], occupancy=occupancy),  # type: ignore[arg-type]
-    )
-
-
 def init(
     key: jax.Array, scans: ScanSet, config: DeepMappingConfig, *, start_poses: Float[Array, "n 3"] | None = None
 ) -> State:
@@ -188,7 +157,7 @@ def init(
     )
     zero = jnp.zeros((), jnp.int32)
     frame = _choose_frame(scans, poses, config)
-    return State(params, _make_optimizer(phase).init(params), poses, frame, zero, zero, zero)
+    return State(params, make_optimizer(phase).init(params), poses, frame, zero, zero, zero)
 
 
 # `fit_deepmapping` has an argument of the name `init`, as `icp` has: the start of a registration.
@@ -200,7 +169,7 @@ def next_phase(state: State, scans: ScanSet, config: DeepMappingConfig, *, is_wa
     phases = config.phases(is_warm=is_warm)
     poses = current_poses(state, scans, config, phases[int(state.phase)])
     params = replace(state.params, poses=poses)
-    optimizer = _make_optimizer(phases[int(state.phase) + 1]).init(params)
+    optimizer = make_optimizer(phases[int(state.phase) + 1]).init(params)
     frame = _choose_frame(scans, poses, config)
     zero = jnp.zeros((), jnp.int32)
     return State(params, optimizer, state.start_poses, frame, state.phase + 1, zero, state.step)
@@ -247,39 +216,9 @@ def _draw_batch(scans: ScanSet, phase: PhaseConfig, step: Int[Array, ""], *, key
     return Batch(scans.points[rows][:, beams], scans.mask[rows][:, beams], rows, block)
 
 
-def _bind_map(params: Any, config: OccupancyConfig, frame: MapFrame, level_weights: Float[Array, " l"]) -> MapLogits:
-    """M-Net as a function of points in the world, in reaches."""
-    apply: Callable[..., Any] = make_map_net(config).apply
-
-    def logits(points: Float[Array, "n 2"]) -> Float[Array, " n"]:
-        local = (points - frame.centre) / frame.half_side
-        if config.kind == "grid" or len(points) <= _MLP_CHUNK:
-            return apply(params, local, level_weights)
-        # The hidden layers of all samples at once would take gigabytes: a part at a time, again on the way back.
-        count = -(-len(points) // _MLP_CHUNK)
-        parts = jnp.pad(local, ((0, count * _MLP_CHUNK - len(points)), (0, 0))).reshape(count, _MLP_CHUNK, -1)
-        logits_of_parts = jax.lax.map(jax.checkpoint(lambda part: apply(params, part, level_weights)), parts)
-        return logits_of_parts.reshape(-1)[: len(points)]
-
-    return logits
-
-
 def map_logits(state: State, config: DeepMappingConfig) -> MapLogits:
     """M-Net of a state with all its levels on, as a function of points in the world, in reaches."""
-    return _bind_map(state.params.occupancy, config.occupancy, state.frame, jnp.ones(config.occupancy.num_levels))
-
-
-def _level_weights(phase: PhaseConfig, config: DeepMappingConfig, progress: Float[Array, ""]) -> Float[Array, " l"]:
-    count = config.occupancy.num_levels
-    if phase.anneal_until == 0.0:
-        return jnp.ones(count)
-    return jnp.clip(progress / phase.anneal_until * count - jnp.arange(count) + 1.5, 0.0, 1.0)
-
-
-def steps_per_call(config: DeepMappingConfig, phase: PhaseConfig) -> int:
-    """Steps of one call: the calls share those of the phase evenly, so that the last one hardly goes beyond."""
-    num_calls = -(-phase.num_steps // config.steps_per_call)
-    return -(-phase.num_steps // num_calls)
+    return bind_map(state.params.occupancy, config.occupancy, state.frame, jnp.ones(config.occupancy.num_levels))
 
 
 def make_step(scans: ScanSet, config: DeepMappingConfig, phase: PhaseConfig) -> Callable[..., tuple[State, Report]]:
@@ -294,7 +233,7 @@ def make_step(scans: ScanSet, config: DeepMappingConfig, phase: PhaseConfig) -> 
         The function. The key is that of the whole run: step k uses `fold_in(key, k)`, so that a resumed run equals an
         unbroken one.
     """
-    optimizer = _make_optimizer(phase)
+    optimizer = make_optimizer(phase)
     length = steps_per_call(config, phase)
 
     def loss_of(params: Params, state: State, key: jax.Array) -> tuple[Float[Array, ""], Terms]:
@@ -305,7 +244,7 @@ def make_step(scans: ScanSet, config: DeepMappingConfig, phase: PhaseConfig) -> 
             poses = _network_poses(params, state.start_poses[batch.rows], batch, config)
         else:
             poses = params.poses[batch.rows]
-        logits = _bind_map(params.occupancy, config.occupancy, state.frame, _level_weights(phase, config, progress))
+        logits = bind_map(params.occupancy, config.occupancy, state.frame, level_weights(phase, config, progress))
         loss, terms = registration_loss(poses, batch, logits, phase, progress, key=loss_key)
         if phase.map_decay > 0.0:
             squares = sum(jnp.sum(x**2) for x in jax.tree.leaves(params.occupancy))

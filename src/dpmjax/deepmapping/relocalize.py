@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, NamedTuple
@@ -145,7 +146,7 @@ def _teach(
     optimizer = optax.adam(optax.cosine_decay_schedule(config.learning_rate, config.num_steps, 0.01))
     num_scans, num_beams = scans.mask.shape
     stride = max(1, -(-num_beams // fit_config.cold_phases[0].beams_per_step))
-    net = jax.vmap(LocalizationNet(fit_config.localization).apply, in_axes=(None, 0, 0))
+    net: Callable[..., Array] = jax.vmap(LocalizationNet(fit_config.localization).apply, in_axes=(None, 0, 0))  # type: ignore[assignment]
 
     def loss_of(params: Any, step_key: jax.Array) -> Array:
         row_key, first_key, turn_key, share_key, drop_key = jax.random.split(step_key, 5)
@@ -212,4 +213,4 @@ def _beams_of_fit(num_beams: int, config: DeepMappingConfig) -> slice:
 def _apply(
     params: Any, points: Float[Array, "m b 2"], mask: Bool[Array, "m b"], config: LocalizationConfig
 ) -> Float[Array, "m 3"]:
-    return jax.vmap(LocalizationNet(config).apply, in_axes=(None, 0, 0))(params, points, mask)
+    return jax.vmap(LocalizationNet(config).apply, in_axes=(None, 0, 0))(params, points, mask)  # type: ignore[return-value]

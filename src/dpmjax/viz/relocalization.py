@@ -76,6 +76,9 @@ def error_maps_figure(
             color=MUTED,
         )
     add_scale_bar(axes_row[0], limits, unit)
-    figure.tight_layout()
-    figure.colorbar(image, ax=axes_row.tolist(), label=f"error, {unit}", fraction=0.03, pad=0.01, extend="max")
+    # The bar and its label need about 0.9 inches at the right, whatever the number of maps.
+    right = 1.0 - 0.9 / figure.get_figwidth()
+    figure.tight_layout(rect=(0.0, 0.0, right, 1.0))
+    bar = figure.add_axes((right + 0.005, 0.1, 0.15 / figure.get_figwidth(), 0.75))
+    figure.colorbar(image, cax=bar, label=f"error, {unit}", extend="max")
     return figure

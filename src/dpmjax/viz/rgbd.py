@@ -42,6 +42,8 @@ def from_above_figure(
         clouds.append(np.einsum("nij,nhwj->nhwi", T[:, :3, :3], cloud) + T[:, None, None, :3, 3])
         sensors.append(T[:, :3, 3])
     low, high = np.quantile(clouds[-1][valid][:, [0, 2]], [0.002, 0.998], axis=0)
+    places = sensors[-1][:, [0, 2]]
+    low, high = np.minimum(low, places.min(0)), np.maximum(high, places.max(0))
     margin = 0.12 * float((high - low).max())
     limits = Limits(low[0] - margin, high[0] + margin, low[1] - margin, high[1] + margin)
     figure = new_figure(4.4 * len(panels), 4.4 * limits.height / limits.width + 0.5)

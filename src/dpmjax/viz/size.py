@@ -1,4 +1,4 @@
-"""Time and memory against the number of scans, in the log-log plane."""
+"""Time (in the log-log plane) and memory against the number of scans."""
 
 from __future__ import annotations
 
@@ -38,10 +38,10 @@ def size_figure(curves: Mapping[str, ArrayLike], *, memory_limit_gb: float) -> F
     for name in (name for name in others if name.endswith("(GB)")):
         right.plot(sizes, others[name], "-o", ms=4, lw=1.4, color=COLORS[0], label=name)
     right.axhline(memory_limit_gb, color=MUTED, ls=":", lw=1.0)
-    right.set_ylim(bottom=0.1, top=2.0 * memory_limit_gb)
+    right.set_ylim(bottom=0.0, top=1.15 * memory_limit_gb)
+    left.set_yscale("log")
     for axes in (left, right):
         axes.set_xscale("log", base=2)
-        axes.set_yscale("log")
         axes.set_xlabel("scans", fontsize=9, color=INK)
         axes.set_xticks(sizes, [f"{int(size)}" for size in sizes])
         axes.grid(color=FRAME, lw=0.6)

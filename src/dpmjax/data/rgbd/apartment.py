@@ -41,7 +41,7 @@ class Apartment:
         Lower furniture counts too: the robot below the camera has to pass.
         """
         far = np.array([self.size_x_m, self.size_z_m]) - clearance_m
-        inside = ((places > clearance_m) & (places < far)).all(1)
+        inside: NDArray[np.bool_] = np.all((places > clearance_m) & (places < far), axis=1)
         for centre, half, yaw in zip(
             self.centres[~self.is_seen_through],
             self.half_sizes[~self.is_seen_through],
