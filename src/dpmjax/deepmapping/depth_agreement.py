@@ -32,7 +32,7 @@ def agreement(
     pinhole: Pinhole,
     tolerance: Float[Array, ""],
 ) -> Float[Array, ""]:
-    """Agreements less contradictions of points with what another camera sees, per point, in [-1, 1].
+    """Agreements less contradictions of points with what another camera sees, per told point, in [-3, 1].
 
     A point that lands on the surface that the other camera sees agrees with it; one that floats in front of that
     surface contradicts it, for the other camera looked through it (the self-contradictory occupancy of DeepMapping
@@ -122,7 +122,7 @@ def mean_agreement(
         tolerance: share of the depth by which agreeing points may differ.
 
     Returns:
-        -1 (everything floats in front of something) to 1; images that see nothing of each other count 0.
+        -3 (everything floats in front of something) to 1; images that see nothing of each other count 0.
     """
     count = scans.mask.shape[0]
     points, mask = scans.points.reshape(count, -1, 3), scans.mask.reshape(count, -1)
