@@ -9,7 +9,7 @@ Trajectories of 256 poses in the built-in worlds, thinned to every 1st, 2nd, 4th
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -19,7 +19,7 @@ from tqdm import tqdm
 from tyro.conf import FlagCreatePairsOff, arg
 
 from experiments._command import run_command
-from experiments._deepmapping_methods import METHODS, SUCCESS_PX, make_problem, run_method
+from experiments._deepmapping_methods import METHODS, SUCCESS_PX, make_problem, run_method, split_by_extras
 from experiments._resumable_rows import do_row
 from experiments._run_folder import open_run_folder, recording, write_metrics
 from experiments._stop import StopFlag
@@ -70,6 +70,8 @@ class Config:
 
 def main(config: Config) -> list[dict[str, Any]]:
     """Runs what is missing, cell by cell."""
+    methods, missing = split_by_extras(config.methods)
+    config = replace(config, methods=methods)
     folder = open_run_folder(
         config,
         EXPERIMENT,
@@ -94,6 +96,8 @@ def main(config: Config) -> list[dict[str, Any]]:
             _write(folder, rows, config)
     for line in summary(rows, config):
         print(line)
+    for name, reason in missing.items():
+        print(f"{name}: not run ({reason})")
     print(f"results in {folder.path}")
     return rows
 

@@ -122,7 +122,7 @@ def num_trajectories(config: Config) -> int:
     """As many as asked for; of a folder of images no more than there are windows."""
     from dpmjax.data import rgbd
 
-    if config.data is None or (config.data / "image_structs.mat").is_file():
+    if config.data is None or rgbd.is_active_vision(config.data):
         return config.limit
     count, views = len(rgbd.read_pose_folder(config.data)), config.views or 8
     return min(config.limit, max(1, (count - views) // (views // 2) + 1))
@@ -137,7 +137,7 @@ def read_trajectory(config: Config, index: int) -> DepthSequence:
     if config.data is None:
         walk = rgbd.GridWalkConfig(depth_noise_m=config.depth_noise_m)
         return rgbd.simulate_depth_sequence(seed % 15, views, seed=seed, config=walk)
-    if (config.data / "image_structs.mat").is_file():
+    if rgbd.is_active_vision(config.data):
         return rgbd.read_active_vision(config.data, views, seed=seed)
     sequence, views = rgbd.read_pose_folder(config.data), config.views or 8
     if sequence.T_world_camera is None:

@@ -34,15 +34,11 @@ class Assembly(NamedTuple):
 
     Attributes:
         poses: (n, 3) T_world_scan.
-        support: (n,) matched less weighted crossed beams of each scan against all the others.
         edges: pairs that agree with it.
-        total: sum of the support over all pairs.
     """
 
     poses: Floats
-    support: Floats
     edges: Edges
-    total: float
 
 
 def _grow(offers: Offers, judge: MapJudge, num_scans: int, seed: int) -> Floats:
@@ -156,8 +152,7 @@ def assemble(
     edges = agreeing_edges(poses, candidates, config, scale)
     if len(edges.source):
         poses, _ = optimize_planar_graph(poses, edges, GraphConfig())
-    support = judge.against(everyone, poses, everyone, poses)
-    return Assembly(planar_poses.relative(poses[0], poses), support, edges, float(support.sum()))
+    return Assembly(planar_poses.relative(poses[0], poses), edges)
 
 
 def place_in_map(

@@ -163,11 +163,10 @@ def _neighbour_pairs(
 
 
 def _search_others(
-    profiles: Profiles, keyframes: Indices, poses: Floats, config: GlobalConfig, scale: float, margins: Margins,
-    *, is_ordered: bool,
+    profiles: Profiles, alike: Floats, turned: Floats, keyframes: Indices, poses: Floats, config: GlobalConfig,
+    *, scale: float, margins: Margins, is_ordered: bool,
 ) -> Candidates:  # fmt: skip
     """Candidates of the scans that are no keyframes, against some keyframes each."""
-    alike, turned = likeness(profiles, scale)
     # Neighbours in time are better twins than any that look alike.
     num_twins = 0 if is_ordered else config.num_twins
     source, target, turns = _anchor_pairs(alike, turned, keyframes, config, num_twins=num_twins)
@@ -199,10 +198,10 @@ def _leash_between(poses: Floats, keyframes: Indices, config: GlobalConfig, scal
 
 
 def _place_others(
-    profiles: Profiles, keyframes: Indices, poses: Floats, found: Candidates, config: GlobalConfig,
+    profiles: Profiles, keyframes: Indices, poses: Floats, found: Candidates, more: Candidates, config: GlobalConfig,
     *, scale: float, margins: Margins, is_ordered: bool,
 ) -> tuple[Floats, Candidates]:  # fmt: skip
-    """Poses of all scans from those of the keyframes, and the pairs that told them."""
+    """Poses of all scans from those of the keyframes, and the pairs that told them: `more` and those of stragglers."""
     leash = _leash_between(poses, keyframes, config, scale) if is_ordered else None
 
     def place(poses: Floats, more: Candidates) -> Floats:
@@ -211,7 +210,6 @@ def _place_others(
             chance=chance_level(found), is_ordered=is_ordered, leash=leash,
         )  # fmt: skip
 
-    more = _search_others(profiles, keyframes, poses, config, scale, margins, is_ordered=is_ordered)
     poses = place(poses, more)
     lost = _find_stragglers(profiles, poses, margins, config)
     if len(lost):
@@ -242,7 +240,8 @@ def global_start(
     scale, margins = length_scale(lines), view_margins(lines, config)
     profiles = make_profiles(lines, np.asarray(valid))
     num_scans = len(np.asarray(valid))
-    keyframes = choose_keyframes(likeness(profiles, scale)[0], config, is_ordered=is_ordered)
+    alike, turned = likeness(profiles, scale)
+    keyframes = choose_keyframes(alike, config, is_ordered=is_ordered)
     first, second = (x.astype(np.int64) for x in np.nonzero(np.tri(len(keyframes), k=-1, dtype=bool)))
     found = search_pairs(profiles, keyframes[first], keyframes[second], config.search, scale=scale, margins=margins)
     inside = Candidates(first, second, found.poses, found.scores)
@@ -252,8 +251,11 @@ def global_start(
     poses[keyframes] = assembly.poses
     edges = agreeing_edges(poses, found, config.assembly, scale)
     if len(keyframes) < num_scans:
+        more = _search_others(
+            profiles, alike, turned, keyframes, poses, config, scale=scale, margins=margins, is_ordered=is_ordered
+        )
         poses, more = _place_others(
-            profiles, keyframes, poses, found, config, scale=scale, margins=margins, is_ordered=is_ordered
+            profiles, keyframes, poses, found, more, config, scale=scale, margins=margins, is_ordered=is_ordered
         )
         edges = join_edges(edges, agreeing_edges(poses, more, config.assembly, scale))
         if len(edges.source):

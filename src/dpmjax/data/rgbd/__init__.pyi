@@ -1,3 +1,4 @@
+from .active_vision import is_active_vision as is_active_vision
 from .active_vision import read_active_vision as read_active_vision
 from .apartment import Apartment as Apartment
 from .apartment import make_apartment as make_apartment
