@@ -4,14 +4,16 @@
     python -m experiments.deepmapping_suite --resume         go on where the last run stopped
 
 Three built-in worlds, 50 trajectories of 128 poses and 25 of 256, made by seed. Every trajectory of every method is a
-file of its own, so that a killed run goes on. Results: table.md, metrics.json (with all rows), boxes.png.
+file of its own, so that a killed run goes on. With --range-noise-px the rows also say the least error that one scan
+allows where the world is known (`dpmjax.data.position_bound`). Results: table.md, metrics.json (with all rows),
+boxes.png.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 from tqdm import tqdm
@@ -22,6 +24,9 @@ from experiments._deepmapping_methods import METHODS, NOT_RUN, SUCCESS_PX, make_
 from experiments._resumable_rows import do_row
 from experiments._run_folder import RunFolder, open_run_folder, recording, write_metrics
 from experiments._stop import StopFlag
+
+if TYPE_CHECKING:
+    from dpmjax.data.sequence import ScanSequence
 
 EXPERIMENT = "deepmapping_suite"
 NUM_WORLDS, NUM_SHORT, NUM_LONG = 3, 50, 25
@@ -87,20 +92,40 @@ def main(config: Config) -> list[dict[str, Any]]:
                 entry["world"], entry["num_scans"], seed=entry["walk"], range_noise_px=config.range_noise_px
             )
             problem = make_problem(sequence, is_ordered=True, steps=config.steps, seed=config.seed)
+            bound = _bound(entry["world"], sequence, config.range_noise_px)
             for method in methods:
                 if stop.is_requested:
                     break
                 case = {"method": method, **entry}
-                rows.append(do_row(folder.path, case, lambda m=method, p=problem: run_method(m, p)))
+                rows.append(do_row(folder.path, case, lambda m=method, p=problem, b=bound: run_method(m, p) | b))
             if stop.is_requested:
                 break
             if rows:
                 _write(folder, rows, methods, not_run, config.seed)
     print(table(rows, methods))
+    if config.range_noise_px and rows:
+        bound = summarise(rows)["median_bound_px"]
+        print(f"no unbiased estimate can have a median ATE below {bound:.3g} px, not even with the world known")
     for name, reason in not_run.items():
         print(f"{name}: not run ({reason})")
     print(f"results in {folder.path}")
     return rows
+
+
+def _bound(world: int, sequence: ScanSequence, range_noise_px: float) -> dict[str, float]:
+    """The bound on the ATE, px; nothing without noise."""
+    from dpmjax.data import make_world, position_bound
+
+    if not range_noise_px:
+        return {}
+    assert sequence.reference_poses is not None
+    bound = position_bound(
+        make_world(world).is_obstacle,
+        sequence.reference_poses,
+        range_noise_px=range_noise_px,
+        num_beams=sequence.mask.shape[1],
+    )
+    return {"bound_px": float(np.sqrt(np.mean(bound**2)))}
 
 
 def summarise(rows: list[dict[str, Any]]) -> dict[str, Any]:
@@ -115,6 +140,7 @@ def summarise(rows: list[dict[str, Any]]) -> dict[str, Any]:
         "median_cpu_s": float(np.median([row["cpu_s"] for row in rows])),
         "num_called_good": len(good),
         "success_of_good": float(np.mean([row["success"] for row in good])) if good else None,
+        **({"median_bound_px": float(np.median([row["bound_px"] for row in rows]))} if "bound_px" in rows[0] else {}),
     }
 
 

@@ -8,6 +8,7 @@ from .lidar_readers import list_lidar_sequences, open_lidar_sequence
 from .lidar_sequence import BadScan, IndexedScan, LidarSequence, iterate_scans, take_lidar_scans
 from .pcd import read_pcd, write_pcd
 from .ply import read_ply, write_ply
+from .position_bound import position_bound
 from .raycast2d import RayHits, beam_angles, cast_rays, scan_world
 from .readers import read_sequence
 from .sequence import ScanSequence, has_angular_order, take_scans
@@ -67,6 +68,7 @@ __all__ = [
     "make_world",
     "open_lidar_sequence",
     "planar_to_homogeneous",
+    "position_bound",
     "range_image",
     "read_arrays",
     "read_carmen_log",

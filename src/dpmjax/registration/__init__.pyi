@@ -30,3 +30,5 @@ from .profiles import judge_pairs as judge_pairs
 from .profiles import make_profiles as make_profiles
 from .swarm import SwarmConfig as SwarmConfig
 from .swarm import swarm_chain as swarm_chain
+from .walls import WallConfig as WallConfig
+from .walls import align_to_walls as align_to_walls

@@ -1,4 +1,7 @@
-"""The polish: every scan against its neighbours in time and in space, all poses in one sparse robust Gauss-Newton."""
+"""The polish: every scan against its neighbours in time and in space, all poses in one sparse robust Gauss-Newton.
+
+Where there is range noise the scans are then aligned to walls that they make together (walls.py).
+"""
 
 from __future__ import annotations
 
@@ -28,6 +31,7 @@ from dpmjax.registration.pairs import (
 )
 from dpmjax.registration.planar import PairSystem, linearise_pair
 from dpmjax.registration.planar_graph import Edges, Floats, Indices, join_edges, move_poses, solve_poses
+from dpmjax.registration.walls import WallConfig, align_to_walls
 
 # Distances of one round are kept below this by leaving out beams of the sources: about two seconds on two cores.
 _ROUND_DISTANCES = 1.5e9
@@ -48,6 +52,8 @@ class PolishConfig:
         loops: settings of the loop search; None: never.
         firm_fitness: the start is sound, and no loops are searched, if all its steps fit better than this ...
         firm_grip: ... and this share of the beams holds each in its softest direction.
+        walls: settings of the last step, the alignment to common walls ...
+        min_noise: ... which is done from this range noise on, in length scales.
         is_ordered: neighbours in the array are neighbours in time; else only neighbours in space count, the steps of
             the start mean nothing, and no loops are searched.
     """
@@ -62,6 +68,8 @@ class PolishConfig:
     loops: LoopConfig | None = field(default_factory=LoopConfig)
     firm_fitness: float = 0.35
     firm_grip: float = 0.005
+    walls: WallConfig = field(default_factory=WallConfig)
+    min_noise: float = 1e-3
     is_ordered: bool = True
 
 
@@ -197,7 +205,7 @@ def is_sound(lines: LineScans, steps: PairMatches, config: PolishConfig) -> bool
 
 
 def polish(lines: LineScans, poses: Floats, config: PolishConfig | None = None) -> Polished:
-    """Closes loops where the start leaves doubt, then aligns all scans together.
+    """Closes loops where the start leaves doubt, then aligns all scans together, and to walls if there is noise.
 
     Args:
         lines: n scans with lines (`fit_lines`), in time order.
@@ -209,17 +217,27 @@ def polish(lines: LineScans, poses: Floats, config: PolishConfig | None = None) 
     """
     config = config or PolishConfig()
     scale = length_scale(lines)
-    if not config.is_ordered:
-        return align_all(lines, poses, config, scale=scale)
-    steps = match_steps(lines, poses, scale=scale)
     num_loops = 0
-    if config.loops is not None and not is_sound(lines, steps, config):
-        # The steps again, with those of the start as guess and as belief, where the scans leave a direction open.
-        chained, steps = incremental_icp(lines, odometry=poses)
-        edges = step_edges(chained, steps, config.loops, scale)
-        poses, _, weight = close_loops(lines, chained, edges, config.loops)
-        num_loops = int((weight > 0.25).sum())
-    return align_all(lines, poses, config, scale=scale)._replace(num_loops=num_loops)
+    if config.is_ordered and config.loops is not None:
+        poses, num_loops = _close_loops_in_doubt(lines, poses, config, config.loops, scale)
+    polished = align_all(lines, poses, config, scale=scale)
+    if float(lines.noise[0]) > config.min_noise * scale:
+        polished = polished._replace(poses=align_to_walls(lines, polished.poses, config.walls))
+    return polished._replace(num_loops=num_loops)
+
+
+def _close_loops_in_doubt(
+    lines: LineScans, poses: Floats, config: PolishConfig, loops: LoopConfig, scale: float
+) -> tuple[Floats, int]:
+    """Poses with loops closed, and how many; the poses as they are, if all their steps are sound."""
+    steps = match_steps(lines, poses, scale=scale)
+    if is_sound(lines, steps, config):
+        return poses, 0
+    # The steps again, with those of the start as guess and as belief, where the scans leave a direction open.
+    chained, steps = incremental_icp(lines, odometry=poses)
+    edges = step_edges(chained, steps, loops, scale)
+    closed, _, weight = close_loops(lines, chained, edges, loops)
+    return closed, int((weight > 0.25).sum())
 
 
 def surface_misfit(lines: LineScans, poses: Floats, config: PolishConfig | None = None) -> float:

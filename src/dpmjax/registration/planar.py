@@ -39,7 +39,8 @@ class PairSystem(NamedTuple):
     squares: Float[Array, ""]
 
 
-def _rotation(heading: Float[Array, ""]) -> Float[Array, "2 2"]:
+def rotation_of(heading: Float[Array, ""]) -> Float[Array, "2 2"]:
+    """Matrix of a heading."""
     c, s = jnp.cos(heading), jnp.sin(heading)
     return jnp.stack([jnp.stack([c, -s]), jnp.stack([s, c])])
 
@@ -66,7 +67,7 @@ def linearise_pair(
     Returns:
         PairSystem at this pose.
     """
-    rotation = _rotation(pose_target_source[2])
+    rotation = rotation_of(pose_target_source[2])
     points = _matmul(source.points, rotation.T) + pose_target_source[:2]
     nearest = k_nearest(points, target.points, 1, mask=target.mask).indices[:, 0]
     matched, normals = target.points[nearest], target.normals[nearest]
@@ -116,7 +117,7 @@ def _solve(system: PairSystem, pose: Float[Array, " 3"], prior: StepPrior) -> Fl
     """The step that the scans and the belief ask for together."""
     offset = pose - prior.mean
     turn = offset.at[2].set(jnp.arctan2(jnp.sin(offset[2]), jnp.cos(offset[2])))
-    rotation = jnp.eye(3).at[:2, :2].set(_rotation(pose[2]))
+    rotation = jnp.eye(3).at[:2, :2].set(rotation_of(pose[2]))
     pull = _matmul(rotation.T, prior.information * turn)
     belief = _matmul(rotation.T, prior.information[:, None] * rotation)
     # Damping in proportion to each axis: a pair that fixes one direction only (a corridor) moves in that one alone.
