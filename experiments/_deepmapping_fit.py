@@ -89,7 +89,8 @@ def run_fit(
     checkpoints = Checkpoints(Path(folder.path) / CHECKPOINTS)
     if folder.is_resumed:
         state = checkpoints.restore_latest(state, fallback=state)
-    columns = ["step", "phase", "run_s", "loss", "occupancy", "chamfer", f"ate_{sequence.unit}"]
+    ate_column = f"ate_{sequence.unit}"
+    columns = ["step", "phase", "run_s", "loss", "occupancy", "chamfer", ate_column]
     run_s, compile_s = _earlier_seconds(folder, int(state.step)), 0.0
     measure = _ate_of(sequence)
     poses = np.asarray(dm.current_poses(state, scans, settings, phases[int(state.phase)]), np.float64) * unit
@@ -109,15 +110,8 @@ def run_fit(
                 poses = np.asarray(report.poses, np.float64) * unit
                 run_s += time.perf_counter() - begun
                 ate = measure(poses)
-                history.append(
-                    step=int(state.step),
-                    phase=phase.name,
-                    run_s=round(run_s, 4),
-                    loss=float(report.loss),
-                    occupancy=float(report.terms.occupancy),
-                    chamfer=float(report.terms.chamfer),
-                    **{f"ate_{sequence.unit}": ate},
-                )
+                row = {"step": int(state.step), "phase": phase.name, "run_s": round(run_s, 4), ate_column: ate}
+                history.append(**row, **_losses(report))
                 done = max(int(state.step) / total, run_s / seconds if seconds else 0.0)
                 show_progress(progress, phase.name, done, run_s, float(report.loss), ate, sequence.unit)
                 if time.perf_counter() - last_saved > _SAVE_EVERY_S:
@@ -131,6 +125,12 @@ def run_fit(
     return FitRun(
         poses, state, reach, int(state.step), run_s, compile_s, phases[int(state.phase)].occupancy_weight > 0.0
     )
+
+
+def _losses(report: Any) -> dict[str, float]:
+    """The loss of a step and its terms, by the names of the table."""
+    terms = report.terms
+    return {"loss": float(report.loss), "occupancy": float(terms.occupancy), "chamfer": float(terms.chamfer)}
 
 
 def _is_over(stop: StopFlag, seconds: float | None, run_s: float) -> bool:

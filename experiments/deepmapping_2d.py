@@ -112,10 +112,7 @@ class Result:
 
 def main(config: Config) -> Result:
     """Reads, starts warm, fits, polishes, keeps the best, writes."""
-    from dpmjax.data import take_scans
     from dpmjax.deepmapping import choose_trajectory, judge_trajectory
-    from dpmjax.geometry import planar_poses
-    from dpmjax.registration import PolishConfig, polish
 
     started = time.perf_counter()
     select_device(config.device)
@@ -132,27 +129,11 @@ def main(config: Config) -> Result:
     )
     with recording(folder), StopFlag() as stop:
         print(f"{sequence.name}: {len(sequence)} scans of {sequence.points.shape[1]} beams, from {config.init}")
-        # The losses compare each scan with the next ones, so these must be near; in time they are.
-        order = np.arange(len(sequence)) if config.ordered else planar_poses.nearest_tour(start)
-        fitted = run_fit(
-            folder,
-            take_scans(sequence, order),
-            settings,
-            start=None if config.init == "zero" else start[order],
-            seed=config.seed,
-            seconds=config.seconds,
-            stop=stop,
-        )
-        fitted = replace(fitted, poses=fitted.poses[np.argsort(order)])
+        fitted = _fit(folder, sequence, settings, start, config, stop)
         lines = line_scans(sequence)
         candidates = {"start": start, "fit": fitted.poses}
         if config.polish and not stop.is_requested:
-            # From both: the fit is sharper near a good start, the start keeps what a robot's odometry knows.
-            how = PolishConfig(is_ordered=config.init != "global")
-            for name in ("fit",) if config.init == "zero" else ("start", "fit"):
-                polished = polish(lines, candidates[name], how)
-                LOGGER.info("polished the %s: %d pairs, %d loops", name, polished.num_pairs, polished.num_loops)
-                candidates[f"polished {name}"] = polished.poses
+            candidates |= _polish(lines, candidates, config.init)
         chosen, scores = choose_trajectory(lines, candidates)
         poses = candidates[chosen]
         confidence = judge_trajectory(lines, sequence.mask, poses)
@@ -176,6 +157,43 @@ def main(config: Config) -> Result:
         draw_occupancy(folder, sequence, fitted, settings)
         tell(folder, sequence, metrics)
     return Result(folder.path, poses, metrics)
+
+
+def _fit(
+    folder: RunFolder,
+    sequence: ScanSequence,
+    settings: DeepMappingConfig,
+    start: NDArray[np.float64],
+    config: Config,
+    stop: StopFlag,
+) -> FitRun:
+    """DeepMapping; its losses compare each scan with the next ones, so these must be near: in time they are."""
+    from dpmjax.data import take_scans
+    from dpmjax.geometry import planar_poses
+
+    order = np.arange(len(sequence)) if config.ordered else planar_poses.nearest_tour(start)
+    fitted = run_fit(
+        folder,
+        take_scans(sequence, order),
+        settings,
+        start=None if config.init == "zero" else start[order],
+        seed=config.seed,
+        seconds=config.seconds,
+        stop=stop,
+    )
+    return replace(fitted, poses=fitted.poses[np.argsort(order)])
+
+
+def _polish(lines: LineScans, candidates: dict[str, NDArray[np.float64]], init: str) -> dict[str, NDArray[np.float64]]:
+    """Both polished: the fit is sharper near a good start, the start keeps what a robot's odometry knows."""
+    from dpmjax.registration import PolishConfig, polish
+
+    polished = {}
+    for name in ("fit",) if init == "zero" else ("start", "fit"):
+        result = polish(lines, candidates[name], PolishConfig(is_ordered=init != "global"))
+        LOGGER.info("polished the %s: %d pairs, %d loops", name, result.num_pairs, result.num_loops)
+        polished[f"polished {name}"] = result.poses
+    return polished
 
 
 def read_scans(config: Config) -> ScanSequence:

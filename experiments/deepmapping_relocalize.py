@@ -63,8 +63,8 @@ def main(config: Config) -> dict[str, Any]:
     import jax
 
     from dpmjax import deepmapping as dm
-    from dpmjax import viz
     from dpmjax.data import make_world, scan_world
+    from dpmjax.types import ScanSet
 
     options = load_config(find_run(deepmapping_2d.EXPERIMENT, config.run), deepmapping_2d.Config)
     if options.data is not None:
@@ -74,8 +74,6 @@ def main(config: Config) -> dict[str, Any]:
     grid = make_world(options.world).is_obstacle
     truth = free_poses(grid, sequence, config)
     points, mask = scan_world(grid, truth, num_beams=sequence.points.shape[1])
-    from dpmjax.types import ScanSet
-
     nets: dict[str, Fitted] = {}
     if not np.any(np.asarray(fitted.state.start_poses)):
         nets["L-Net as fitted"] = fitted
@@ -84,20 +82,12 @@ def main(config: Config) -> dict[str, Any]:
     teach = dm.TeachConfig(num_steps=config.steps)
     nets["L-Net taught"] = dm.teach_localization(fitted, scans, teach, key=jax.random.key(config.seed))
     teach_s = time.perf_counter() - begun
-    results, panels = {}, []
-    for name, net in nets.items():
-        errors, turns = errors_at(dm.relocalize(net, ScanSet(points, mask)).pose, truth, fitted, sequence)
-        results[name] = summarise(errors, turns, truth, sequence)
-        image = np.full(grid.shape, np.nan)[:: config.stride_px, :: config.stride_px]
-        image[tuple((truth[:, 1::-1] // config.stride_px).astype(int).T)] = errors
-        share = 100 * results[name]["share_below_20_px"]
-        median = f"median {results[name]['median_px']:.0f} px"
-        panels.append(viz.ErrorMap(name, f"{median}; {share:.0f} % of the free space below 20 px", image))
-    side = config.stride_px * np.array(panels[0].error.shape)
-    figure = viz.error_maps_figure(
-        panels, (0.0, side[1], 0.0, side[0]), sequence.reference_poses[:, :2], "px", worst=200.0
-    )
-    viz.save_figure(figure, config.run / "relocalization.png")
+    errors = {
+        name: errors_at(dm.relocalize(net, ScanSet(points, mask)).pose, truth, fitted, sequence)
+        for name, net in nets.items()
+    }
+    results = {name: summarise(far, turns, truth, sequence) for name, (far, turns) in errors.items()}
+    draw(config, sequence, grid.shape, truth, {name: far for name, (far, _) in errors.items()}, results)
     report = {
         "world": sequence.name,
         "num_scans": len(sequence),
@@ -112,6 +102,31 @@ def main(config: Config) -> dict[str, Any]:
     tell(report)
     print(f"results in {config.run}")
     return report
+
+
+def draw(
+    config: Config,
+    sequence: ScanSequence,
+    shape: tuple[int, ...],
+    truth: NDArray[np.float64],
+    errors: dict[str, NDArray[np.float64]],
+    results: dict[str, dict[str, Any]],
+) -> None:
+    """relocalization.png: a map of the errors a net."""
+    from dpmjax import viz
+
+    panels = []
+    for name, far in errors.items():
+        image = np.full(shape, np.nan)[:: config.stride_px, :: config.stride_px]
+        image[tuple((truth[:, 1::-1] // config.stride_px).astype(int).T)] = far
+        share = 100 * results[name]["share_below_20_px"]
+        median = f"median {results[name]['median_px']:.0f} px"
+        panels.append(viz.ErrorMap(name, f"{median}; {share:.0f} % of the free space below 20 px", image))
+    side = config.stride_px * np.array(panels[0].error.shape)
+    assert sequence.reference_poses is not None
+    extent = (0.0, side[1], 0.0, side[0])
+    figure = viz.error_maps_figure(panels, extent, sequence.reference_poses[:, :2], "px", worst=200.0)
+    viz.save_figure(figure, config.run / "relocalization.png")
 
 
 def load_fit(run: Path, options: deepmapping_2d.Config, sequence: ScanSequence) -> Fitted:

@@ -104,6 +104,7 @@ def endings_figure(
 
 def _plain(axes: Axes) -> None:
     axes.grid(color=FRAME, lw=0.6)
+    axes.set_axisbelow(True)
     axes.tick_params(colors=MUTED, labelsize=8)
     for spine in axes.spines.values():
         spine.set_color(FRAME)
