@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 if TYPE_CHECKING:
     from dpmjax.data.sequence import ScanSequence
+    from dpmjax.deepmapping import Confidence
     from dpmjax.geometry.lines import LineScans
     from dpmjax.types import ScanSet
 
@@ -140,21 +141,33 @@ def cold(problem: Problem) -> Floats:
 
 
 def warm(problem: Problem) -> Floats:
-    """DeepMapping from ICP and from the global search, polished; what describes the beams best is kept."""
-    from dpmjax.deepmapping import choose_trajectory, judge_trajectory
+    """DeepMapping from ICP, or from the global search where that holds better; the sharpest result is kept."""
+    from dpmjax.deepmapping import choose_trajectory
     from dpmjax.registration import PolishConfig, polish
 
-    free = PolishConfig(is_ordered=False)
-    candidates: dict[str, Floats] = {}
-    if problem.is_ordered:
-        candidates["icp"] = polish(problem.lines, icp_plane(problem)).poses
-    is_sure = bool(candidates) and judge_trajectory(problem.lines, problem.sequence.mask, candidates["icp"]).is_good
-    if not is_sure:
-        candidates["global"] = polish(problem.lines, _global(problem), free).poses
-    best = candidates[choose_trajectory(problem.lines, candidates)[0]]
+    best = _best_start(problem)
     fitted = _fit_in_order(problem, best)
-    candidates |= {"fit": fitted, "polished fit": polish(problem.lines, fitted, free).poses}
+    polished = polish(problem.lines, fitted, PolishConfig(is_ordered=False)).poses
+    candidates = {"start": best, "fit": fitted, "polished fit": polished}
     return candidates[choose_trajectory(problem.lines, candidates)[0]]
+
+
+def _best_start(problem: Problem) -> Floats:
+    """ICP if it can be trusted; else the one of ICP and search whose weakest joint is the stronger."""
+    from dpmjax.deepmapping import judge_trajectory
+    from dpmjax.registration import PolishConfig, polish
+
+    starts: list[tuple[Confidence, Floats]] = []
+
+    def add(poses: Floats) -> None:
+        starts.append((judge_trajectory(problem.lines, problem.sequence.mask, poses), poses))
+
+    if problem.is_ordered:
+        add(polish(problem.lines, icp_plane(problem)).poses)
+    if not starts or not starts[0][0].is_good:
+        add(polish(problem.lines, _global(problem), PolishConfig(is_ordered=False)).poses)
+    # Other than between fits of one map, the sharper of two maps may be the wrong one.
+    return max(starts, key=lambda start: start[0].weakest_joint)[1]
 
 
 METHODS: dict[str, Callable[[Problem], Floats]] = {
