@@ -46,7 +46,7 @@ class Config:
     """A scan is taken at the centre of every square of so many pixels that is free."""
     heading: Literal["nearest", "east"] = "nearest"
     """Orientation of these scans: that of the nearest scan of the fit, or along x everywhere."""
-    steps: Annotated[int, arg(metavar="N")] = 1500
+    steps: Annotated[int, arg(metavar="N")] = 5000
     """Steps in which L-Net is taught the poses of the run."""
     seed: int = 0
     """Seed of the teaching."""
@@ -81,6 +81,7 @@ def main(config: Config) -> dict[str, Any]:
     scans = ScanSet(sequence.points, sequence.mask)
     teach = dm.TeachConfig(num_steps=config.steps)
     nets["L-Net taught"] = dm.teach_localization(fitted, scans, teach, key=jax.random.key(config.seed))
+    jax.block_until_ready(nets["L-Net taught"].params)
     teach_s = time.perf_counter() - begun
     errors = {
         name: errors_at(dm.relocalize(net, ScanSet(points, mask)).pose, truth, fitted, sequence)

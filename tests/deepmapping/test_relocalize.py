@@ -11,7 +11,8 @@ import pytest
 
 import dpmjax
 from dpmjax import deepmapping as dm
-from dpmjax.deepmapping.relocalize import turn_scan
+from dpmjax.data import scan_world
+from dpmjax.deepmapping.relocalize import shift_scan, turn_scan
 from dpmjax.geometry import planar_poses
 from dpmjax.nets.localization import LocalizationConfig
 from dpmjax.nets.occupancy import OccupancyConfig
@@ -69,6 +70,31 @@ def test_a_turned_sensor_sees_points_turned_back() -> None:
     world = planar_poses.transform(np.array([[0.0, 0.0, 0.7]]), points[None])[0]
     turned = np.asarray(turn_scan(jnp.asarray(points, jnp.float32), jnp.float32(0.4)))
     np.testing.assert_allclose(planar_poses.transform(np.array([[0.0, 0.0, 1.1]]), turned[None])[0], world, **ROUNDING)
+
+
+def test_a_shifted_scan_is_the_scan_of_the_place_in_a_convex_room() -> None:
+    room = np.ones((202, 202), bool)
+    room[1:-1, 1:-1] = False
+    here, there = np.array([[90.0, 110.0, 0.4]]), np.array([[90.0, 110.0, 0.4]])
+    shift = np.array([14.0, -9.0])
+    cos, sin = np.cos(0.4), np.sin(0.4)
+    there[0, :2] += [cos * shift[0] - sin * shift[1], sin * shift[0] + cos * shift[1]]
+    (near, mask), (truth, _) = scan_world(room, here), scan_world(room, there)
+    seen = np.asarray(shift_scan(jnp.asarray(near[0]), jnp.asarray(mask[0]), jnp.asarray(shift, jnp.float32)))
+    error = np.linalg.norm(seen - truth[0], axis=-1)
+    # Ranges are interpolated over corners; on the walls nothing is lost.
+    assert np.median(error) < 0.05
+    assert (error < 1.0).mean() > 0.95
+    unmoved = shift_scan(jnp.asarray(near[0]), jnp.asarray(mask[0]), jnp.zeros(2))
+    np.testing.assert_array_equal(np.asarray(unmoved), near[0])
+
+
+def test_a_shifted_scan_of_no_or_few_beams_stays_finite() -> None:
+    points = jnp.asarray(np.random.default_rng(0).normal(size=(16, 2)), jnp.float32)
+    for valid in (0, 1, 2):
+        seen = shift_scan(points, jnp.arange(16) < valid, jnp.asarray([0.3, 0.1]))
+        assert np.isfinite(np.asarray(seen)).all()
+        np.testing.assert_array_equal(np.asarray(seen)[valid:], np.asarray(points)[valid:])
 
 
 def test_a_second_call_compiles_nothing(taught, tiny_walk, assert_compiles_nothing) -> None:

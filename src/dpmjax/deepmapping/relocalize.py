@@ -47,13 +47,16 @@ class TeachConfig:
         scans_per_step: drawn with replacement.
         max_turn_deg: scans are turned by a random angle up to this, heading with them: L-Net becomes so much less
             dependent on the orientations that the sensor happened to have.
+        max_shift: scans are taken again from places around their own (`shift_scan`), up to so far off, in parts of the
+            reach of the scans: L-Net learns the surroundings of the trajectory.
         drop: share of the beams that is hidden from L-Net, at most; how many differs from scan to scan.
     """
 
-    num_steps: int = 1500
+    num_steps: int = 5000
     learning_rate: float = 2e-3
     scans_per_step: int = 64
     max_turn_deg: float = 20.0
+    max_shift: float = 0.2
     drop: float = 0.2
 
     def __post_init__(self) -> None:
@@ -61,6 +64,8 @@ class TeachConfig:
             raise ValueError(
                 f"num_steps, scans_per_step: expected at least 1, got {self.num_steps}, {self.scans_per_step}"
             )
+        if not self.max_shift >= 0.0:
+            raise ValueError(f"max_shift: expected zero or more, got {self.max_shift}")
         if not 0.0 <= self.drop < 1.0:
             raise ValueError(f"drop: expected 0 to below 1, got {self.drop}")
 
@@ -108,7 +113,8 @@ def teach_localization(
 ) -> Fitted:
     """Fits L-Net to the poses that the fit has found, so that `relocalize` speaks of the same world.
 
-    The labels are the fit's own: no ground truth enters. Each scan is seen from turned sensors and with beams hidden.
+    The labels are the fit's own: no ground truth enters. Scans are seen from turned and shifted sensors, with beams
+    hidden.
 
     Args:
         fitted: any fit, also from given poses.
@@ -149,20 +155,23 @@ def _teach(
     net: Callable[..., Array] = jax.vmap(LocalizationNet(fit_config.localization).apply, in_axes=(None, 0, 0))  # type: ignore[assignment]
 
     def loss_of(params: Any, step_key: jax.Array) -> Array:
-        row_key, first_key, turn_key, share_key, drop_key = jax.random.split(step_key, 5)
+        row_key, first_key, turn_key, share_key, drop_key, shift_key = jax.random.split(step_key, 6)
         rows = jax.random.randint(row_key, (config.scans_per_step,), 0, num_scans)
         first = jax.random.randint(first_key, (), 0, stride)
         beams = first + stride * jnp.arange(num_beams // stride)
         points, mask = scans.points[rows][:, beams], scans.mask[rows][:, beams]
         limit = np.deg2rad(config.max_turn_deg)
         turn = jax.random.uniform(turn_key, rows.shape, minval=-limit, maxval=limit)
+        shift = _draw_shifts(shift_key, len(rows), config.max_shift)
+        points = jax.vmap(shift_scan)(points, mask, shift)
+        moved = jax.vmap(turn_scan)(shift[:, None], -poses[rows, 2])[:, 0]
         points = jax.vmap(turn_scan)(points, turn)
         hidden = jax.random.uniform(drop_key, mask.shape) < config.drop * jax.random.uniform(
             share_key, (*rows.shape, 1)
         )
         # A scan of one beam must keep it.
         seen = jnp.where((mask & ~hidden).any(-1, keepdims=True), mask & ~hidden, mask)
-        error = net(params, points, seen) - poses[rows] - jnp.stack([0 * turn, 0 * turn, turn], axis=-1)
+        error = net(params, points, seen) - poses[rows] - jnp.concatenate([moved, turn[:, None]], axis=-1)
         place, heading = error[:, :2], wrap_angle(error[:, 2])
         return jnp.mean(jnp.sum(jnp.abs(place), -1) + jnp.abs(heading))
 
@@ -179,10 +188,45 @@ def _teach(
     return run(params)
 
 
+def _draw_shifts(key: jax.Array, count: int, largest: float) -> Float[Array, "n 2"]:
+    """Shifts of random sides and lengths; half of the scans stay where they are, which are the only true ones."""
+    length_key, side_key = jax.random.split(key)
+    length = largest * jax.random.uniform(length_key, (count,), minval=-1.0).clip(0.0)
+    side = jax.random.uniform(side_key, (count,), maxval=2.0 * jnp.pi)
+    return length[:, None] * jnp.stack([jnp.cos(side), jnp.sin(side)], axis=-1)
+
+
 def turn_scan(points: Float[Array, "b 2"], turn: Float[Array, ""]) -> Float[Array, "b 2"]:
     """What the sensor would have seen with its heading larger by `turn`: every point turned back by it."""
     cos, sin = jnp.cos(turn), jnp.sin(turn)
     return jnp.stack([cos * points[:, 0] + sin * points[:, 1], cos * points[:, 1] - sin * points[:, 0]], axis=-1)
+
+
+def shift_scan(points: Float[Array, "b 2"], mask: Bool[Array, " b"], shift: Float[Array, " 2"]) -> Float[Array, "b 2"]:
+    """About what the sensor would have seen from a place nearby, at the same angles.
+
+    What hides behind what is not asked: the points are sorted by their new angles, and ranges are interpolated.
+
+    Args:
+        points: in the sensor frame; beams without a measurement keep none.
+        mask: beams that measured something.
+        shift: the new place in the sensor frame.
+
+    Returns:
+        Points in the frame of the sensor at the new place; without a shift the points themselves.
+    """
+    safe = jnp.where(mask[:, None], points, 1.0)
+    moved = safe - shift
+    angle = jnp.where(mask, jnp.arctan2(moved[:, 1], moved[:, 0]), jnp.inf)
+    order = jnp.argsort(angle)
+    # Walls are straight in the inverse range, nearly.
+    inverse = 1.0 / jnp.maximum(jnp.linalg.norm(moved, axis=-1), 1e-6)
+    target = jnp.arctan2(safe[:, 1], safe[:, 0])
+    last = jnp.maximum(mask.sum() - 1, 0)
+    known = jnp.where(jnp.arange(len(order)) <= last, angle[order], 4.0)
+    ranges = 1.0 / jnp.interp(target, known, jnp.where(known < 4.0, inverse[order], inverse[order][last]))
+    seen = ranges[:, None] * jnp.stack([jnp.cos(target), jnp.sin(target)], -1)
+    return jnp.where(mask[:, None], jnp.where((shift == 0).all(), points, seen), points)
 
 
 def _as_scans(scan: ScanSet | ArrayLike) -> ScanSet:

@@ -30,7 +30,7 @@ def error_boxes_figure(
     axes = np.atleast_1d(figure.subplots(1, len(panels)))
     for number, (ax, (measure, methods)) in enumerate(zip(axes, panels.items(), strict=True)):
         values = [np.maximum(np.asarray(errors, float), 1e-4) for errors in methods.values()]
-        ax.boxplot(values, widths=0.55, medianprops={"color": ACCENT}, flierprops={"markersize": 3}, whis=(5, 95))
+        ax.boxplot(values, widths=0.55, medianprops={"color": ACCENT}, showfliers=False, whis=(5, 95))
         for place, errors in enumerate(values, start=1):
             spread = np.linspace(-0.18, 0.18, len(errors)) if len(errors) > 1 else np.zeros(len(errors))
             ax.plot(place + spread, errors, ".", color=MUTED, markersize=3, alpha=0.6)
