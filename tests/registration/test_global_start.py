@@ -31,7 +31,7 @@ from dpmjax.registration import (
     view_margins,
 )
 from dpmjax.registration.block_moves import move_blocks, weakest_cuts
-from dpmjax.registration.global_start import _leash_between
+from dpmjax.registration.global_start import _find_stragglers, _leash_between
 from dpmjax.registration.map_judge import Leash, MapJudge, make_offers
 from dpmjax.types import ScanSet
 
@@ -240,3 +240,11 @@ def test_no_place_beyond_the_leash_is_worth_anything(views) -> None:
     scan, everyone = np.array([3]), np.arange(7)
     assert free.against(scan, truth[3:4], everyone, truth)[0] > 0.0
     assert free._replace(leash=leash).against(scan, truth[3:4], everyone, truth)[0] < -1e5
+
+
+def test_scans_that_are_lost_together_do_not_vouch_for_each_other() -> None:
+    there = look(simulate_sequence(0, 24, num_beams=128))
+    poses = np.array(there.sequence.reference_poses)
+    assert len(_find_stragglers(there.profiles, poses, there.margins, GlobalConfig())) == 0
+    poses[[9, 10], :2] += 5000.0
+    assert set(_find_stragglers(there.profiles, poses, there.margins, GlobalConfig())) == {9, 10}

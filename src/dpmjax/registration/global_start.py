@@ -11,6 +11,8 @@ from typing import NamedTuple
 
 import jax
 import numpy as np
+import scipy.sparse
+import scipy.sparse.csgraph
 import scipy.spatial
 from numpy.typing import NDArray
 
@@ -45,8 +47,9 @@ class GlobalConfig:
         num_likely_turns: headings that are tried for these, by likeness, and their neighbours.
         max_bend: a scan's heading is within this of what the keyframes before and after it say, radians; only where
             there is an order.
-        min_company: a scan whose best neighbour matches less than this share of what is usual is lost ...
-        max_stragglers: ... and so many of these are searched against all keyframes.
+        min_company: a scan whose best neighbour matches less than this share of what is usual is lost.
+        min_hold: scans hold together by more than this share of what is usual; a few that hold to none else are lost.
+        max_stragglers: so many lost scans are searched against all keyframes; half as many make an island.
         match: how near a hit must come to count as matched; never below half the range noise.
         cross: how far in front of a surface a hit contradicts it; never below five times the range noise.
         search: of pairs.
@@ -59,6 +62,7 @@ class GlobalConfig:
     num_likely_turns: int = 3
     max_bend: float = 0.7
     min_company: float = 0.6
+    min_hold: float = 0.3
     max_stragglers: int = 12
     match: float = 0.04
     cross: float = 0.12
@@ -177,14 +181,24 @@ def _search_others(
 
 
 def _find_stragglers(profiles: Profiles, poses: Floats, margins: Margins, config: GlobalConfig) -> Indices:
-    """Scans that share far fewer beams with any neighbour than is usual, the worst first."""
+    """Scans that share far fewer beams than is usual with any neighbour outside of their own island, the worst first.
+
+    An island is a few scans that hold together and to nothing else: lost together, they would vouch for each other.
+    """
     num_scans = len(poses)
     near = scipy.spatial.cKDTree(poses[:, :2]).query(poses[:, :2], k=min(7, num_scans))[1]
     scan, other = np.repeat(np.arange(num_scans), near.shape[1]), near.reshape(-1).astype(np.int64)
     verdict = judge_pairs(profiles, scan, other, planar_poses.relative(poses[other], poses[scan]), margins=margins)
-    matched = np.where(scan == other, 0.0, verdict.matched).reshape(near.shape).max(axis=1)
-    worst = np.argsort(matched)[: config.max_stragglers]
-    return worst[matched[worst] < config.min_company * np.median(matched)].astype(np.int64)
+    matched = np.where(scan == other, 0.0, verdict.matched)
+    usual = float(np.median(matched.reshape(near.shape).max(axis=1)))
+    holds = matched > config.min_hold * usual
+    graph = scipy.sparse.csr_matrix((matched[holds], (scan[holds], other[holds])), shape=(num_scans, num_scans))
+    island = scipy.sparse.csgraph.connected_components(graph, directed=False)[1]
+    is_small = np.bincount(island)[island] <= config.max_stragglers // 2
+    matched = np.where(is_small[scan] & (island[scan] == island[other]), 0.0, matched)
+    company = matched.reshape(near.shape).max(axis=1)
+    worst = np.argsort(company)[: config.max_stragglers]
+    return worst[company[worst] < config.min_company * usual].astype(np.int64)
 
 
 def _leash_between(poses: Floats, keyframes: Indices, config: GlobalConfig, scale: float) -> Leash:
