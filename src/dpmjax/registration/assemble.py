@@ -20,6 +20,7 @@ from dpmjax.registration.map_judge import (
     Leash,
     MapJudge,
     Offers,
+    add_up,
     chance_level,
     is_firmly_more,
     make_offers,
@@ -46,19 +47,22 @@ def _grow(offers: Offers, judge: MapJudge, num_scans: int, seed: int) -> Floats:
     poses, is_placed = np.zeros((num_scans, 3)), np.zeros(num_scans, bool)
     scan, anchor = int(offers.scan[seed]), int(offers.anchor[seed])
     is_placed[anchor] = True
-    # Open offers: which scan, where in the world, and what the placed scans say so far.
-    whose, where, said = np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros(0)
+    # Open offers: which scan, where in the world, and what each placed scan says.
+    whose, where, said = np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, num_scans))
     newest = anchor
     while not is_placed.all():
         fresh = np.flatnonzero((offers.anchor == newest) & ~is_placed[offers.scan])
         placed = np.flatnonzero(is_placed)
         places = planar_poses.compose(poses[newest], offers.poses[fresh])
-        said = said + judge.against(whose, where, np.array([newest]), poses)
-        new_said = judge.against(offers.scan[fresh], places, placed, poses)
+        _fill(said, judge.opinions(whose, where, np.array([newest]), poses), np.array([newest]))
+        new_said = np.zeros((len(fresh), num_scans))
+        _fill(new_said, judge.opinions(offers.scan[fresh], places, placed, poses), placed)
         whose, where = np.concatenate([whose, offers.scan[fresh]]), np.concatenate([where, places])
         said = np.concatenate([said, new_said])
         if len(whose):
-            best = int(said.argmax()) if is_placed.sum() > 1 else int(np.flatnonzero(whose == scan)[0])
+            row, column = (x.astype(np.int64) for x in np.nonzero(said))
+            support = add_up(row, said[row, column], len(said))
+            best = int(support.argmax()) if is_placed.sum() > 1 else int(np.flatnonzero(whose == scan)[0])
             newest, place = int(whose[best]), where[best]
         else:
             newest, place = int(np.flatnonzero(~is_placed)[0]), np.zeros(3)
@@ -66,6 +70,11 @@ def _grow(offers: Offers, judge: MapJudge, num_scans: int, seed: int) -> Floats:
         keep = whose != newest
         whose, where, said = whose[keep], where[keep], said[keep]
     return poses
+
+
+def _fill(said: Floats, opinions: tuple[Indices, Indices, Floats], placed: Indices) -> None:
+    row, column, value = opinions
+    said[row, placed[column]] = value
 
 
 def _revise(poses: Floats, offers: Offers, judge: MapJudge) -> tuple[Floats, int]:

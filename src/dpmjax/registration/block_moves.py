@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from dpmjax.geometry import planar_poses
 from dpmjax.registration.correlative import Floats
-from dpmjax.registration.map_judge import MapJudge, Offers, is_firmly_more
+from dpmjax.registration.map_judge import MapJudge, Offers, add_up, is_firmly_more
 
 
 def move_blocks(poses: Floats, offers: Offers, judge: MapJudge) -> tuple[Floats, int]:
@@ -77,8 +77,16 @@ def _better_place(poses: Floats, block: NDArray[np.bool_], offers: Offers, judge
     moved = planar_poses.compose(motions[:, None], poses[inside][None])
     apart = moved[:, :, None, :2] - poses[outside][None, None, :, :2]
     which, i, j = np.nonzero(np.hypot(apart[..., 0], apart[..., 1]) < judge.config.radius * judge.scale)
-    relative = planar_poses.relative(poses[outside[j]], moved[which, i])
-    value = judge.of_pairs(inside[i], outside[j], relative)
-    said = np.bincount(which, value, minlength=len(motions))
+    value = judge.of_pairs(inside[i], outside[j], planar_poses.relative(poses[outside[j]], moved[which, i]))
+    # Pairs on one side of the cut are the same for all motions.
+    is_kept = np.tri(len(poses), k=-1, dtype=bool) & (block == block[:, None])
+    one, other = (x.astype(np.int64) for x in np.nonzero(is_kept))
+    kept = pair_values(poses, judge)[one, other]
+    motion = np.concatenate([np.repeat(np.arange(len(motions)), len(one)), which])
+    first = np.concatenate([np.tile(one, len(motions)), inside[i]])
+    second = np.concatenate([np.tile(other, len(motions)), outside[j]])
+    value = np.concatenate([np.tile(kept, len(motions)), value])
+    row = np.concatenate([motion, motion]) * len(poses) + np.concatenate([first, second])
+    said = add_up(row, np.concatenate([value, value]), len(motions) * len(poses)).reshape(len(motions), -1).sum(axis=1)
     best = int(said.argmax())
     return motions[best] if is_firmly_more(said[best], said[0]) else None

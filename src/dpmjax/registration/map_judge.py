@@ -92,7 +92,7 @@ class MapJudge(NamedTuple):
         config: settings.
         scale: `length_scale` of the scans.
         margins: how exactly hits are compared.
-        chance: beams that two scans of different places match by chance.
+        chance: beams that two scans of different places match by chance; they do not count.
         noisy_share: share of beams that seem to cross surfaces where all is right.
         is_ordered: neighbours in the array are neighbours in time.
         leash: where scans can be; None: anywhere.
@@ -108,24 +108,31 @@ class MapJudge(NamedTuple):
     leash: Leash | None = None
 
     def against(self, scan: Indices, places: Floats, placed: Indices, poses: Floats) -> Floats:
-        """(m,) sum over `placed` of matched less weighted crossed beams of `scan` at `places`."""
+        """(m,) what all of `placed` together say of each `scan` at its place."""
+        row, _, value = self.opinions(scan, places, placed, poses)
+        return add_up(row, value, len(scan))
+
+    def opinions(
+        self, scan: Indices, places: Floats, placed: Indices, poses: Floats
+    ) -> tuple[Indices, Indices, Floats]:
+        """What single ones of `placed` say of single ones of `scan` (m,) at `places`: row, column, value."""
         apart = places[:, None, :2] - poses[placed][None, :, :2]
         apart = np.hypot(apart[..., 0], apart[..., 1])
         apart[scan[:, None] == placed[None]] = np.inf
         limit = np.full(len(scan), self.config.radius * self.scale)
         if len(placed) > self.config.num_judges:
             limit = np.minimum(limit, np.partition(apart, self.config.num_judges, axis=1)[:, self.config.num_judges])
-        row, column = np.nonzero(apart < limit[:, None])
+        row, column = (x.astype(np.int64) for x in np.nonzero(apart < limit[:, None]))
         other = placed[column]
         value = self.of_pairs(scan[row], other, planar_poses.relative(poses[other], places[row]))
-        said = np.asarray(np.bincount(row, value, minlength=len(scan)), np.float64)
         if self.leash is not None:
             off = places[:, :2] - self.leash.middle[scan]
-            said += np.where(np.hypot(off[:, 0], off[:, 1]) > self.leash.length[scan], _IMPOSSIBLE, 0.0)
-        return said
+            is_off = np.hypot(off[:, 0], off[:, 1]) > self.leash.length[scan]
+            value = np.where(is_off[row], _IMPOSSIBLE, value)
+        return row, column, value
 
     def of_pairs(self, source: Indices, target: Indices, poses: Floats) -> Floats:
-        """(p,) matched less weighted crossed beams of pairs at `poses`, T_target_source."""
+        """(p,) what the scans of pairs say of each other at `poses`, T_target_source: matched less weighted crossed."""
         verdict = judge_pairs(self.profiles, source, target, poses, margins=self.margins, stride=4)
         # What two scans of different places reach by chance says nothing; else rooms would be stacked on rooms.
         is_next = self.is_ordered & (np.abs(source - target) == 1)
@@ -135,16 +142,28 @@ class MapJudge(NamedTuple):
         return np.asarray(matched - self.config.crossed_weight * crossed, np.float64)
 
 
+def add_up(row: Indices, value: Floats, count: int) -> Floats:
+    """All that is said of each of `count` rows: objections in full, and of what speaks for it the k-th best by 1 / k.
+
+    A place needs a few scans that know it well. Were all counted alike, rooms that look alike would be stacked: the
+    more scans overlap, the more beams match.
+    """
+    order = np.lexsort((-value, row))
+    row, value = row[order], value[order]
+    rank = np.arange(len(row)) - np.searchsorted(row, row)
+    return np.bincount(row, np.where(value > 0.0, value / (1.0 + rank), value), minlength=count).astype(np.float64)
+
+
 def is_firmly_more(said: Floats | np.float64, support: Floats | np.float64) -> NDArray[np.bool_]:
     """More than a little: what is only a little better is the same place, told by another pair."""
     return np.asarray(said > support + 0.02 * np.abs(support))
 
 
 def chance_level(candidates: Candidates) -> float:
-    """Beams that a wrong pose of a pair reaches at most, nine times in ten: second candidates are mostly wrong."""
+    """Beams by which a wrong pose of a pair holds, the median: second candidates are mostly wrong."""
     second = candidates.scores[:, 1]
     second = second[np.isfinite(second)]
-    return float(np.percentile(second, 90)) if len(second) else 0.0
+    return max(0.0, float(np.median(second))) if len(second) else 0.0
 
 
 def noisy_share(profiles: Profiles, candidates: Candidates, margins: Margins) -> float:

@@ -19,11 +19,15 @@ from numpy.typing import NDArray
 from dpmjax.geometry.lines import LineScans
 from dpmjax.types import AnyArray
 
+_matmul = partial(jnp.matmul, precision="highest")
+
 # Beams farther apart than so many times an even spread leave a gap that says nothing.
 _MAX_GAP = 2.5
 # Surfaces that are more slanted than this count as no more slanted, and do not correct the range of a beam.
 _MIN_COSINE = 0.3
 _UNKNOWN_COSINE = 0.7
+# Walls that are turned away from the viewer by more than this sine are not the ones it sees.
+_MAX_AVERTED = 0.1
 # Pairs that are judged at a time, all batches of one shape.
 _BATCH = 2048
 
@@ -35,6 +39,7 @@ class Profiles:
     Attributes:
         points: hits, their ranges smoothed along walls.
         mask: beams that measured something.
+        normals: unit normals of the walls that were hit, towards the sensor; zero where there is no line.
         surface: distance of the surface, on the chord between the two beams around the bearing.
         near: the smaller range of the two; what is nearer is free.
         far: the larger one; what is farther is hidden.
@@ -44,6 +49,7 @@ class Profiles:
 
     points: Float[Array, "*n b 2"]
     mask: Bool[Array, "*n b"]
+    normals: Float[Array, "*n b 2"]
     surface: Float[Array, "*n c"]
     near: Float[Array, "*n c"]
     far: Float[Array, "*n c"]
@@ -67,7 +73,7 @@ class Verdict(NamedTuple):
     """What two scans say of each other at a relative pose; both directions added, in beams.
 
     Attributes:
-        matched: hits on the other's surface; parts for near misses.
+        matched: hits on the other's surface, on the side that the other sees; parts for near misses.
         crossed: hits in the other's free space.
         seen: hits in directions that the other has measured, not farther than its surface.
     """
@@ -104,11 +110,16 @@ def make_profiles(lines: LineScans, valid: Bool[Array, "n b"], *, num_bearings: 
     beam = points / jnp.maximum(jnp.linalg.norm(points, axis=-1, keepdims=True), 1e-9)
     cosine = jnp.maximum(jnp.abs(jnp.sum(lines.normals * beam, -1)), _MIN_COSINE)
     slant = jnp.where(lines.mask, cosine, _UNKNOWN_COSINE)
-    return jax.vmap(partial(_profile, num_bearings=num_bearings))(points, slant, valid)
+    return jax.vmap(partial(_profile, num_bearings=num_bearings))(points, lines.normals, slant, valid)
 
 
 def _profile(
-    points: Float[Array, "b 2"], slant: Float[Array, " b"], valid: Bool[Array, " b"], *, num_bearings: int
+    points: Float[Array, "b 2"],
+    normals: Float[Array, "b 2"],
+    slant: Float[Array, " b"],
+    valid: Bool[Array, " b"],
+    *,
+    num_bearings: int,
 ) -> Profiles:
     angle = jnp.where(valid, jnp.mod(jnp.arctan2(points[:, 1], points[:, 0]), 2 * jnp.pi), jnp.inf)
     order = jnp.argsort(angle)
@@ -129,6 +140,7 @@ def _profile(
     return Profiles(
         points=points,
         mask=valid,
+        normals=normals,
         surface=surface,
         near=near,
         far=far,
@@ -137,8 +149,14 @@ def _profile(
     )
 
 
-def _view(points: Float[Array, "b 2"], mask: Bool[Array, " b"], viewer: Profiles, margins: Margins) -> Verdict:
-    """Points in the frame of the viewer against its profile."""
+def _view(
+    points: Float[Array, "b 2"],
+    normals: Float[Array, "b 2"],
+    mask: Bool[Array, " b"],
+    viewer: Profiles,
+    margins: Margins,
+) -> Verdict:
+    """Points and their normals in the frame of the viewer against its profile."""
     count = viewer.surface.shape[-1]
     turn = jnp.mod(jnp.arctan2(points[:, 1], points[:, 0]), 2 * jnp.pi) * (count / (2 * jnp.pi))
     k = jnp.minimum(turn.astype(jnp.int32), count - 1)
@@ -148,7 +166,9 @@ def _view(points: Float[Array, "b 2"], mask: Bool[Array, " b"], viewer: Profiles
     to_edge = jnp.minimum(jnp.abs(distance - near), jnp.abs(distance - far))
     off = jnp.where(is_jump, to_edge, jnp.abs(distance - viewer.surface[k])) * slant
     counts = (mask & viewer.is_seen[k]).astype(points.dtype)
-    matched = counts * jnp.exp(-0.5 * (off / margins.match) ** 2)
+    # A thin wall has two sides, and two rooms that share it must not match through it.
+    is_facing = jnp.sum(points * normals, axis=-1) <= _MAX_AVERTED * distance
+    matched = counts * is_facing * jnp.exp(-0.5 * (off / margins.match) ** 2)
     crossed = counts * (distance < near - margins.cross / slant)
     seen = counts * (distance < far + margins.cross / slant)
     return Verdict(matched.sum(), crossed.sum(), seen.sum())
@@ -160,11 +180,14 @@ def judge_pair(
     """Both directions of one pair at `pose`, x, y, heading of T_target_source; every `stride`-th beam."""
     c, s = jnp.cos(pose[2]), jnp.sin(pose[2])
     rotation = jnp.stack([jnp.stack([c, -s]), jnp.stack([s, c])])
-    own, others = source.points[::stride], target.points[::stride]
-    moved = jnp.matmul(own, rotation.T, precision="highest") + pose[:2]
-    back = jnp.matmul(others - pose[:2], rotation, precision="highest")
-    there = _view(moved, source.mask[::stride], target, margins)
-    return Verdict(*(a + b for a, b in zip(there, _view(back, target.mask[::stride], source, margins), strict=True)))
+    own, others = jax.tree.map(lambda x: x[::stride], (_hits(source), _hits(target)))
+    there = _view(_matmul(own[0], rotation.T) + pose[:2], _matmul(own[1], rotation.T), own[2], target, margins)
+    back = _view(_matmul(others[0] - pose[:2], rotation), _matmul(others[1], rotation), others[2], source, margins)
+    return Verdict(*(a + b for a, b in zip(there, back, strict=True)))
+
+
+def _hits(scan: Profiles) -> tuple[jax.Array, jax.Array, jax.Array]:
+    return scan.points, scan.normals, scan.mask
 
 
 @partial(jax.jit, static_argnames="stride")
