@@ -32,7 +32,7 @@ from dpmjax.registration import (
 )
 from dpmjax.registration.block_moves import move_blocks, weakest_cuts
 from dpmjax.registration.global_start import _find_stragglers, _leash_between
-from dpmjax.registration.map_judge import Leash, MapJudge, make_offers
+from dpmjax.registration.map_judge import Leash, MapJudge, add_up, make_offers
 from dpmjax.types import ScanSet
 
 # Coarse, so that a test takes a second: what is law does not depend on it.
@@ -113,6 +113,29 @@ def test_right_pose_crosses_nothing_and_wrong_pose_does(views: Views) -> None:
     assert verdict.crossed[0] <= 2
     assert verdict.crossed[1] > 20
     assert verdict.matched[0] > 2 * verdict.matched[1]
+
+
+def test_rooms_do_not_match_through_the_wall_between_them() -> None:
+    points = jnp.asarray(np.stack([square_room(100.0)] * 2))
+    mask = jnp.ones(points.shape[:2], bool)
+    profiles = make_profiles(fit_lines(ScanSet(points, mask)), mask)
+    # On top of each other; side by side, with one wall in common, a quarter of the beams of both.
+    poses = np.array([[0.0, 0.0, 0.0], [200.0, 0.0, 0.0]])
+    verdict = judge_pairs(profiles, np.array([1, 1]), np.array([0, 0]), poses, margins=Margins(2.0, 6.0), stride=1)
+    assert verdict.matched[0] > 500
+    # Hits at corners have no side.
+    assert verdict.matched[1] < 20
+    assert verdict.crossed[1] == 0
+
+
+def test_support_counts_by_rank_and_objections_in_full() -> None:
+    rng = np.random.default_rng(0)
+    row, value = rng.integers(0, 4, 40), rng.normal(size=40)
+    expected = np.zeros(6)
+    for k in range(6):
+        mine = np.sort(value[row == k])[::-1]
+        expected[k] = sum(v / (i + 1) if v > 0 else v for i, v in enumerate(mine))
+    np.testing.assert_allclose(add_up(row, value, 6), expected, atol=1e-12)
 
 
 def test_verdict_is_mutual(views: Views) -> None:
@@ -239,7 +262,10 @@ def test_no_place_beyond_the_leash_is_worth_anything(views) -> None:
     free = MapJudge(views.profiles, AssembleConfig(), views.scale, views.margins, 100.0, 0.02, False)
     scan, everyone = np.array([3]), np.arange(7)
     assert free.against(scan, truth[3:4], everyone, truth)[0] > 0.0
-    assert free._replace(leash=leash).against(scan, truth[3:4], everyone, truth)[0] < -1e5
+    held = free._replace(leash=leash)
+    assert held.against(scan, truth[3:4], everyone, truth)[0] < -1e5
+    # Where no scan is near enough to have a say, too.
+    assert held.against(scan, truth[3:4] + np.array([0.0, 1e5, 0.0]), everyone, truth)[0] < -1e5
 
 
 def test_scans_that_are_lost_together_do_not_vouch_for_each_other() -> None:

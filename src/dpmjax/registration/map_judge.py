@@ -110,7 +110,11 @@ class MapJudge(NamedTuple):
     def against(self, scan: Indices, places: Floats, placed: Indices, poses: Floats) -> Floats:
         """(m,) what all of `placed` together say of each `scan` at its place."""
         row, _, value = self.opinions(scan, places, placed, poses)
-        return add_up(row, value, len(scan))
+        said = add_up(row, value, len(scan))
+        if self.leash is not None:
+            off = places[:, :2] - self.leash.middle[scan]
+            said += np.where(np.hypot(off[:, 0], off[:, 1]) > self.leash.length[scan], _IMPOSSIBLE, 0.0)
+        return said
 
     def opinions(
         self, scan: Indices, places: Floats, placed: Indices, poses: Floats
@@ -125,10 +129,6 @@ class MapJudge(NamedTuple):
         row, column = (x.astype(np.int64) for x in np.nonzero(apart < limit[:, None]))
         other = placed[column]
         value = self.of_pairs(scan[row], other, planar_poses.relative(poses[other], places[row]))
-        if self.leash is not None:
-            off = places[:, :2] - self.leash.middle[scan]
-            is_off = np.hypot(off[:, 0], off[:, 1]) > self.leash.length[scan]
-            value = np.where(is_off[row], _IMPOSSIBLE, value)
         return row, column, value
 
     def of_pairs(self, source: Indices, target: Indices, poses: Floats) -> Floats:
