@@ -5,7 +5,7 @@ BIN    := $(VENV)/bin
 STAMP  := $(VENV)/.installed
 
 .DEFAULT_GOAL := help
-.PHONY: help venv check test demo bench clean
+.PHONY: help venv check test slow demo bench clean
 
 help:  ## list the targets
 	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "  make %-8s %s\n", $$1, $$2 }' Makefile
@@ -25,8 +25,11 @@ check: $(STAMP)  ## lint, format, types, import rules
 	$(BIN)/mypy
 	$(BIN)/python -m pytest -q tests/test_import_rules.py
 
-test: $(STAMP)  ## the whole test suite
+test: $(STAMP)  ## the test suite, without what is slow
 	$(BIN)/python -m pytest -n 2 --dist worksteal
+
+slow: $(STAMP)  ## the tests that train or start processes
+	$(BIN)/python -m pytest -n 2 --dist worksteal -m slow
 
 demo: $(STAMP)  ## register the built-in 2-D world; pictures in results/demo
 	$(BIN)/python -m experiments.deepmapping_2d --init odometry --force -o results/demo

@@ -94,6 +94,7 @@ def test_a_step_compiles_once_for_each_stage(maker, start, assert_compiles_nothi
             state, _ = step(state, following)
 
 
+@pytest.mark.slow
 def test_spare_places_change_nothing(maker, value_and_grad, start) -> None:
     config = toy.TRAINING.sampling
     roomy = replace(config, num_scans=9)
@@ -143,6 +144,7 @@ for a, b in zip(jax.tree.leaves(alone), jax.tree.leaves(together), strict=True):
 """
 
 
+@pytest.mark.slow
 def test_eight_devices_find_the_gradient_of_one() -> None:
     flags = "--xla_force_host_platform_device_count=8 --xla_backend_optimization_level=0"
     environment = os.environ | {"XLA_FLAGS": flags, "JAX_PLATFORMS": "cpu"}

@@ -92,6 +92,7 @@ def test_a_run_on_the_authors_folder_writes_everything_it_promises(environment, 
     assert tum.num_poses == NUM_SCANS
 
 
+@pytest.mark.slow
 def test_an_interrupted_run_is_resumed_to_the_same_numbers(environment, scans_npz, tmp_path) -> None:
     options = (scans_npz, "--steps", 60, "--no-polish", "--init", "zero")
     broken = run(environment, *options, "-o", tmp_path / "broken", interrupt=True)

@@ -66,6 +66,7 @@ def assert_same_run(parts, folder: Path, whole) -> None:
         assert {**one, "run_s": ""} == {**other, "run_s": ""}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("num_before", [0, 1, 3, 5])
 def test_a_broken_off_run_goes_on_with_the_numbers_of_an_unbroken_one(tmp_path: Path, whole, num_before) -> None:
     # Before the first step, before and after the first recall, in the overlap part.
@@ -74,6 +75,7 @@ def test_a_broken_off_run_goes_on_with_the_numbers_of_an_unbroken_one(tmp_path: 
     assert_same_run(train(tmp_path, is_resumed=True), tmp_path, whole)
 
 
+@pytest.mark.slow
 def test_a_cut_off_checkpoint_is_passed_over_for_the_one_before(tmp_path: Path, whole, monkeypatch, caplog) -> None:
     monkeypatch.setattr(_dpm_fit, "_SAVE_EVERY_S", 0.0)
     train(tmp_path, stop_after=3)
