@@ -7,9 +7,6 @@ turn. What is best is then sharpened on ever finer local grids, by the profiles 
 
 from __future__ import annotations
 
-import os
-from collections.abc import Callable, Iterable
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
 from typing import NamedTuple
@@ -21,6 +18,7 @@ from jaxtyping import Array, Complex, Float, Int
 from numpy.typing import NDArray
 
 from dpmjax.geometry import planar_poses
+from dpmjax.registration.cores import on_all_cores
 from dpmjax.registration.profiles import Margins, Profiles, judge_pair
 
 Floats = NDArray[np.float64]
@@ -130,12 +128,6 @@ def _search_turn(
         return value, (shift + size // 2) % size - size // 2
 
     return jax.lax.map(search, (source, target), batch_size=32)
-
-
-def on_all_cores(work: Callable[[int], None], items: Iterable[int]) -> None:
-    """Does the work on each item, some at a time: XLA's small transforms use one core each on a CPU."""
-    with ThreadPoolExecutor(os.cpu_count() if jax.default_backend() == "cpu" else 1) as pool:
-        list(pool.map(work, items))
 
 
 def search_pairs(

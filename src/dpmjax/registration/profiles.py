@@ -17,6 +17,7 @@ from jaxtyping import Array, Bool, Float, Int
 from numpy.typing import NDArray
 
 from dpmjax.geometry.lines import LineScans
+from dpmjax.registration.cores import on_all_cores
 from dpmjax.types import AnyArray
 
 _matmul = partial(jnp.matmul, precision="highest")
@@ -28,8 +29,8 @@ _MIN_COSINE = 0.3
 _UNKNOWN_COSINE = 0.7
 # Walls that are turned away from the viewer by more than this sine are not the ones it sees.
 _MAX_AVERTED = 0.1
-# Pairs that are judged at a time, all batches of one shape.
-_BATCH = 2048
+# Pairs that are judged at a time, all batches of one shape; many calls have but a few hundred.
+_BATCH = 256
 
 
 @flax.struct.dataclass
@@ -226,14 +227,16 @@ def judge_pairs(
     Returns:
         Verdict with float64 arrays (p,) on the host.
     """
-    parts = []
-    for start in range(0, len(source), _BATCH):
+    result = np.zeros((3, len(source)))
+
+    def judge(start: int) -> None:
         rows = np.resize(np.arange(start, min(start + _BATCH, len(source))), _BATCH)
         verdict = _judge(
             profiles, jnp.asarray(source[rows]), jnp.asarray(target[rows]), jnp.asarray(poses[rows], jnp.float32),
             margins, stride=stride,
         )  # fmt: skip
-        parts.append([np.asarray(x, np.float64)[: len(source) - start] for x in verdict])
-    if not parts:
-        return Verdict(np.zeros(0), np.zeros(0), np.zeros(0))
-    return Verdict(*(stride * np.concatenate(x) for x in zip(*parts, strict=True)))
+        part = result[:, start : start + _BATCH]
+        part[:] = stride * np.stack([np.asarray(x, np.float64)[: part.shape[1]] for x in verdict])
+
+    on_all_cores(judge, range(0, len(source), _BATCH))
+    return Verdict(*result)
