@@ -61,6 +61,7 @@ def steps() -> dict:
     return {}
 
 
+@pytest.mark.slow
 def test_a_fit_goes_through_all_phases_and_returns_rigid_motions(scans, steps) -> None:
     fitted = dm.fit_depth(scans, small("planar"), key=KEY, steps=steps)
     assert_rigid(fitted.T_world_camera)

@@ -51,6 +51,7 @@ def test_a_perturbed_start_is_improved(tiny_walk, shaken, warm) -> None:
     assert int(warm.state.step) == 150
 
 
+@pytest.mark.slow
 def test_a_cold_start_finds_the_walk_roughly(tiny_walk) -> None:
     cold = dm.fit_deepmapping(ScanSet(tiny_walk.points, tiny_walk.mask), dm.with_steps(SMALL, 300), key=KEY)
     # All poses at one place are off by the spread of the walk.

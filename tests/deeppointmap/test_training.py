@@ -64,6 +64,7 @@ def changed(before: TrainingState, after: TrainingState) -> dict[str, bool]:
     }
 
 
+@pytest.mark.slow
 def test_loss_falls_on_one_batch_and_all_parts_but_the_overlap_head_learn(maker, step, start) -> None:
     batch, state, losses = maker(0), start, []
     for _ in range(15):
@@ -84,6 +85,7 @@ def test_the_overlap_part_changes_the_overlap_head_alone(maker, step, start) -> 
     assert np.isnan(report.terms.pairing)
 
 
+@pytest.mark.slow
 def test_a_step_compiles_once_for_each_stage(maker, start, assert_compiles_nothing) -> None:
     step = make_step(toy.TRAINING)
     state = start

@@ -60,6 +60,7 @@ def test_bad_input_is_one_line_and_exit_code_2(module, options, message, capsys)
     assert len(errors.strip().splitlines()) == 1
 
 
+@pytest.mark.slow
 def test_toy_writes_its_pictures_and_shares(tmp_path, capsys) -> None:
     options = ["--seeds", 4, "--steps", 3, "--learning-rates", 2e-4, "-o", tmp_path / "out"]
     assert run(toy_1d, *options) == 0

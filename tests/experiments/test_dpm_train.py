@@ -203,6 +203,7 @@ def test_a_folder_that_cannot_be_written_is_named(as_user, tmp_path, capsys) -> 
     assert "cannot write to" in refused(tmp_path, capsys, "--data", good, "-o", tmp_path / "file" / "out")
 
 
+@pytest.mark.slow
 def test_a_full_disk_is_told_and_what_was_written_stays(tmp_path, monkeypatch) -> None:
     def full(*_: object, **__: object) -> None:
         raise OSError(errno.ENOSPC, "No space left on device")
