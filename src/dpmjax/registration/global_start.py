@@ -49,7 +49,8 @@ class GlobalConfig:
             there is an order.
         min_company: a scan whose best neighbour matches less than this share of what is usual is lost.
         min_hold: scans hold together by more than this share of what is usual; a few that hold to none else are lost.
-        max_stragglers: so many lost scans are searched against all keyframes; half as many make an island.
+        max_stragglers: so many lost scans are searched against all keyframes, and those that are lost still against
+            as many of the other scans; half as many make an island.
         match: how near a hit must come to count as matched; never below half the range noise.
         cross: how far in front of a surface a hit contradicts it; never below five times the range noise.
         search: of pairs.
@@ -212,8 +213,8 @@ def _leash_between(poses: Floats, keyframes: Indices, config: GlobalConfig, scal
 
 
 def _place_others(
-    profiles: Profiles, keyframes: Indices, poses: Floats, found: Candidates, more: Candidates, config: GlobalConfig,
-    *, scale: float, margins: Margins, is_ordered: bool,
+    profiles: Profiles, alike: Floats, keyframes: Indices, poses: Floats, found: Candidates, more: Candidates,
+    config: GlobalConfig, *, scale: float, margins: Margins, is_ordered: bool,
 ) -> tuple[Floats, Candidates]:  # fmt: skip
     """Poses of all scans from those of the keyframes, and the pairs that told them: `more` and those of stragglers."""
     leash = _leash_between(poses, keyframes, config, scale) if is_ordered else None
@@ -225,14 +226,25 @@ def _place_others(
         )  # fmt: skip
 
     poses = place(poses, more)
-    lost = _find_stragglers(profiles, poses, margins, config)
-    if len(lost):
-        # Likeness has misled these; nothing is left out for them.
-        source, target = np.tile(keyframes, len(lost)), np.repeat(lost, len(keyframes))
+    # A scan that sees no keyframe, and a keyframe that sees no other one, have their neighbours among the others.
+    for partners in (keyframes, np.setdiff1d(np.arange(len(poses)), keyframes)):
+        lost = _find_stragglers(profiles, poses, margins, config)
+        if not len(lost):
+            break
+        # Likeness has misled these, so all turns are tried.
+        source, target = _straggler_pairs(alike, lost, partners, len(keyframes))
         again = search_pairs(profiles, source, target, config.search, scale=scale, margins=margins)
         more = join_candidates(more, again)
         poses = place(poses, more)
     return poses, more
+
+
+def _straggler_pairs(alike: Floats, lost: Indices, partners: Indices, count: int) -> tuple[Indices, Indices]:
+    """Pairs of each lost scan with those `count` of the partners that look like it most."""
+    views = np.where(lost[:, None] == partners, -np.inf, alike[np.ix_(lost, partners)])
+    order = np.argsort(-views, axis=1, kind="stable")[:, :count]
+    source, target = partners[order].reshape(-1), np.repeat(lost, order.shape[1])
+    return source[source != target], target[source != target]
 
 
 def global_start(
@@ -269,8 +281,9 @@ def global_start(
             profiles, alike, turned, keyframes, poses, config, scale=scale, margins=margins, is_ordered=is_ordered
         )
         poses, more = _place_others(
-            profiles, keyframes, poses, found, more, config, scale=scale, margins=margins, is_ordered=is_ordered
-        )
+            profiles, alike, keyframes, poses, found, more, config,
+            scale=scale, margins=margins, is_ordered=is_ordered,
+        )  # fmt: skip
         edges = join_edges(edges, agreeing_edges(poses, more, config.assembly, scale))
         if len(edges.source):
             poses, _ = optimize_planar_graph(poses, edges)

@@ -70,6 +70,14 @@ class Margins(NamedTuple):
     cross: float | Float[Array, ""]
 
 
+class _Hits(NamedTuple):
+    """What one scan hit, in one frame."""
+
+    points: Float[Array, "b 2"]
+    normals: Float[Array, "b 2"]
+    mask: Bool[Array, " b"]
+
+
 class Verdict(NamedTuple):
     """What two scans say of each other at a relative pose; both directions added, in beams.
 
@@ -150,14 +158,9 @@ def _profile(
     )
 
 
-def _view(
-    points: Float[Array, "b 2"],
-    normals: Float[Array, "b 2"],
-    mask: Bool[Array, " b"],
-    viewer: Profiles,
-    margins: Margins,
-) -> Verdict:
-    """Points and their normals in the frame of the viewer against its profile."""
+def _view(hits: _Hits, viewer: Profiles, margins: Margins) -> Verdict:
+    """Hits in the frame of the viewer against its profile."""
+    points, normals, mask = hits
     count = viewer.surface.shape[-1]
     turn = jnp.mod(jnp.arctan2(points[:, 1], points[:, 0]), 2 * jnp.pi) * (count / (2 * jnp.pi))
     k = jnp.minimum(turn.astype(jnp.int32), count - 1)
@@ -181,14 +184,18 @@ def judge_pair(
     """Both directions of one pair at `pose`, x, y, heading of T_target_source; every `stride`-th beam."""
     c, s = jnp.cos(pose[2]), jnp.sin(pose[2])
     rotation = jnp.stack([jnp.stack([c, -s]), jnp.stack([s, c])])
-    own, others = jax.tree.map(lambda x: x[::stride], (_hits(source), _hits(target)))
-    there = _view(_matmul(own[0], rotation.T) + pose[:2], _matmul(own[1], rotation.T), own[2], target, margins)
-    back = _view(_matmul(others[0] - pose[:2], rotation), _matmul(others[1], rotation), others[2], source, margins)
-    return Verdict(*(a + b for a, b in zip(there, back, strict=True)))
+    theirs, ours = _every(source, stride), _every(target, stride)
+    there = theirs._replace(
+        points=_matmul(theirs.points, rotation.T) + pose[:2], normals=_matmul(theirs.normals, rotation.T)
+    )
+    back = ours._replace(points=_matmul(ours.points - pose[:2], rotation), normals=_matmul(ours.normals, rotation))
+    both = zip(_view(there, target, margins), _view(back, source, margins), strict=True)
+    return Verdict(*(a + b for a, b in both))
 
 
-def _hits(scan: Profiles) -> tuple[jax.Array, jax.Array, jax.Array]:
-    return scan.points, scan.normals, scan.mask
+def _every(scan: Profiles, stride: int) -> _Hits:
+    """Every `stride`-th beam."""
+    return _Hits(scan.points[::stride], scan.normals[::stride], scan.mask[::stride])
 
 
 @partial(jax.jit, static_argnames="stride")
