@@ -20,7 +20,10 @@ from experiments._stop import StopFlag
 if TYPE_CHECKING:
     from dpmjax.data.sequence import ScanSequence
     from dpmjax.deepmapping import DeepMappingConfig
+    from dpmjax.types import ScanSet
 
+# Of the table; the error, named with its unit, comes last.
+_COLUMNS = ("step", "phase", "run_s", "loss", "occupancy", "chamfer")
 # A checkpoint so often; Ctrl-C and the end write one too.
 _SAVE_EVERY_S = 20.0
 
@@ -75,12 +78,9 @@ def run_fit(
     import jax
 
     from dpmjax import deepmapping as dm
-    from dpmjax.types import ScanSet
     from experiments._checkpoint import Checkpoints
 
-    scans = dm.as_scan_set(ScanSet(sequence.points, sequence.mask))
-    reach = dm.measure_reach(scans)
-    scans = replace(scans, points=scans.points / reach)
+    scans, reach = _scaled(sequence)
     unit = np.array([reach, reach, 1.0])
     is_warm = start is not None
     phases = settings.phases(is_warm=is_warm)
@@ -90,14 +90,14 @@ def run_fit(
     if folder.is_resumed:
         state = checkpoints.restore_latest(state, fallback=state)
     ate_column = f"ate_{sequence.unit}"
-    columns = ["step", "phase", "run_s", "loss", "occupancy", "chamfer", ate_column]
     run_s, compile_s = _earlier_seconds(folder, int(state.step)), 0.0
     measure = _ate_of(sequence)
     poses = np.asarray(dm.current_poses(state, scans, settings, phases[int(state.phase)]), np.float64) * unit
     total = sum(phase.num_steps for phase in phases)
     progress = tqdm(total=1.0, bar_format="{desc} {percentage:3.0f}%|{bar}| [{elapsed}{postfix}]", desc="fit")
     last_saved = time.perf_counter()
-    with HistoryFile(folder / HISTORY, columns, keep_until=int(state.step) if folder.is_resumed else None) as history:
+    keep_until = int(state.step) if folder.is_resumed else None
+    with HistoryFile(folder / HISTORY, (*_COLUMNS, ate_column), keep_until=keep_until) as history:
         while True:
             phase = phases[int(state.phase)]
             begun = time.perf_counter()
@@ -125,6 +125,16 @@ def run_fit(
     return FitRun(
         poses, state, reach, int(state.step), run_s, compile_s, phases[int(state.phase)].occupancy_weight > 0.0
     )
+
+
+def _scaled(sequence: ScanSequence) -> tuple[ScanSet, float]:
+    """The scans with their reach as unit, and the reach."""
+    from dpmjax import deepmapping as dm
+    from dpmjax.types import ScanSet
+
+    scans = dm.as_scan_set(ScanSet(sequence.points, sequence.mask))
+    reach = dm.measure_reach(scans)
+    return replace(scans, points=scans.points / reach), reach
 
 
 def _losses(report: Any) -> dict[str, float]:

@@ -95,7 +95,7 @@ def run_training(
 
     from dpmjax import deeppointmap as dpm
     from experiments._dpm_data import SampleMaker, made_ahead
-    from experiments._dpm_progress import after_measurement, before_step, params_to_use
+    from experiments._dpm_progress import before_step
 
     state = dpm.init(jax.random.key(seed), config)
     untrained = dpm.model_of(state, config)
@@ -107,6 +107,7 @@ def run_training(
     first = int(progress.state.step)
     step = dpm.make_step(config, mesh if jax.device_count() > 1 else None)
     maker = SampleMaker(store, config, seed=seed, num_samples=num_local, first_sample=jax.process_index() * num_local)
+    scans_a_step = config.sampling.num_scans * jax.device_count()
     clock = _Clock(0.0 if records is None else records.begin(first, config))
     seen: set[Any] = set()
     with records or nullcontext(), made_ahead(maker, first, config.num_steps) as batches:
@@ -127,22 +128,53 @@ def run_training(
             seen.add(stage)
             if not math.isfinite(report.loss):
                 raise TrainingLostError(f"the loss of step {number + 1} is {report.loss}; --resume goes on before it")
-            recall = math.nan
-            is_last_registration = number + 1 == config.registration_steps
-            if stage is not None and ((number + 1) % recall_every == 0 or is_last_registration):
-                with together():
-                    recall = 0.0 if records is None else records.examine(dpm.model_of(state, config)).recall.recall
-                progress = after_measurement(progress, float(from_first(np.float32(recall))))
+            progress, recall = _measure_when_due(progress, stage, records, config, recall_every)
             with together(stop):
                 if records is not None:
-                    scans_per_s = clock.rate * config.sampling.num_scans * jax.device_count()
-                    records.write(number + 1, stage, clock.run_s, report, recall, scans_per_s, progress)
+                    records.write(number + 1, stage, clock.run_s, report, recall, clock.rate * scans_a_step, progress)
                 begun = time.perf_counter()
                 batch = next(batches, None)
                 waited_s = time.perf_counter() - begun
     maker.close()
-    if records is None:
-        return None
+    return None if records is None else _finish(records, progress, config, untrained, clock, scans_a_step)
+
+
+def _start(state: TrainingState, records: _Records | None) -> Progress:
+    from experiments._dpm_progress import begin
+
+    progress = begin(state)
+    if records is None or not records.folder.is_resumed:
+        return progress
+    return records.checkpoints.restore_latest(progress, fallback=progress)
+
+
+def _measure_when_due(
+    progress: Progress, stage: Any, records: _Records | None, config: TrainingConfig, recall_every: int
+) -> tuple[Progress, float]:
+    """Progress and recall after a step of registration, where it is time to measure; NaN elsewhere."""
+    from dpmjax import deeppointmap as dpm
+    from experiments._dpm_progress import after_measurement
+
+    done = int(progress.state.step)
+    if stage is None or (done % recall_every and done != config.registration_steps):
+        return progress, math.nan
+    with together():
+        recall = 0.0 if records is None else records.examine(dpm.model_of(progress.state, config)).recall.recall
+    return after_measurement(progress, float(from_first(np.float32(recall)))), recall
+
+
+def _finish(
+    records: _Records,
+    progress: Progress,
+    config: TrainingConfig,
+    untrained: Model,
+    clock: _Clock,
+    scans_a_step: int,
+) -> TrainRun:
+    """Saves, and examines the best model."""
+    from dpmjax import deeppointmap as dpm
+    from experiments._dpm_progress import params_to_use
+
     records.save(progress)
     model = _local(dpm.Model(params_to_use(progress, config), config.model))
     return TrainRun(
@@ -154,17 +186,8 @@ def run_training(
         best_step=int(progress.best_step) or None,
         run_s=clock.run_s,
         compile_s=clock.compile_s,
-        scans_per_s=clock.rate * config.sampling.num_scans * jax.device_count(),
+        scans_per_s=clock.rate * scans_a_step,
     )
-
-
-def _start(state: TrainingState, records: _Records | None) -> Progress:
-    from experiments._dpm_progress import begin
-
-    progress = begin(state)
-    if records is None or not records.folder.is_resumed:
-        return progress
-    return records.checkpoints.restore_latest(progress, fallback=progress)
 
 
 class _Records:

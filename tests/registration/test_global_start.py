@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -31,7 +32,7 @@ from dpmjax.registration import (
     view_margins,
 )
 from dpmjax.registration.block_moves import move_blocks, weakest_cuts
-from dpmjax.registration.global_start import _find_stragglers, _leash_between
+from dpmjax.registration.global_start import _find_stragglers, _leash_between, _place_others, likeness
 from dpmjax.registration.map_judge import Leash, MapJudge, add_up, make_offers
 from dpmjax.types import ScanSet
 
@@ -274,3 +275,32 @@ def test_scans_that_are_lost_together_do_not_vouch_for_each_other() -> None:
     assert len(_find_stragglers(there.profiles, poses, there.margins, GlobalConfig())) == 0
     poses[[9, 10], :2] += 5000.0
     assert set(_find_stragglers(there.profiles, poses, there.margins, GlobalConfig())) == {9, 10}
+
+
+def test_a_scan_that_sees_no_keyframe_is_found_by_the_others(monkeypatch: pytest.MonkeyPatch) -> None:
+    there = look(take_scans(simulate_sequence(0, 97, seed=2), slice(0, None, 16)))
+    truth, keyframes, lost = np.asarray(there.sequence.reference_poses), np.array([0, 1]), 5
+
+    def know(profiles: Profiles, source: np.ndarray, target: np.ndarray, *_: object, **__: object) -> Candidates:
+        """A search that is right where two scans share a third of their beams or more, and else finds nothing."""
+        relative = planar_poses.relative(truth[target], truth[source])
+        matched = judge_pairs(profiles, source, target, relative, margins=there.margins).matched
+        scores = np.where(matched > 170.0, matched, 0.0)[:, None]
+        return Candidates(
+            source, target, relative[:, None].repeat(2, 1), np.concatenate([scores, 0.0 * scores], axis=-1)
+        )
+
+    monkeypatch.setattr(importlib.import_module("dpmjax.registration.global_start"), "search_pairs", know)
+    others = np.array([2, 3, 4, 6])
+    poses = truth.copy()
+    poses[lost] += [5000.0, 0.0, 0.0]
+    alike, _ = likeness(there.profiles, there.scale)
+    placed, more = _place_others(
+        there.profiles, alike, keyframes, poses, know(there.profiles, keyframes[1:], keyframes[:1]),
+        know(there.profiles, np.array([1, 2, 3, 3]), others), replace(CONFIG, max_stragglers=4),
+        scale=there.scale, margins=there.margins, is_ordered=False,
+    )  # fmt: skip
+    partners = more.source[more.target == lost]
+    assert set(keyframes) < set(partners)
+    assert len(partners) == 2 * len(keyframes)
+    assert ate(placed, there.sequence) < 0.01
