@@ -10,6 +10,7 @@ Trajectories of 256 poses in the built-in worlds, thinned to every 1st, 2nd, 4th
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cache, partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -19,7 +20,7 @@ from tqdm import tqdm
 from tyro.conf import FlagCreatePairsOff, arg
 
 from experiments._command import run_command
-from experiments._deepmapping_methods import METHODS, SUCCESS_PX, make_problem, run_method, split_by_extras
+from experiments._deepmapping_methods import METHODS, SUCCESS_PX, Problem, make_problem, run_method, split_by_extras
 from experiments._resumable_rows import do_row
 from experiments._run_folder import open_run_folder, recording, write_metrics
 from experiments._stop import StopFlag
@@ -104,21 +105,27 @@ def main(config: Config) -> list[dict[str, Any]]:
 
 def _run_cell(folder: Path, cell: tuple[int, int, float, str], config: Config) -> list[dict[str, Any]]:
     """All methods on one trajectory of one cell."""
+    walk, stride, noise, order = cell
+    named = {"stride": stride, "noise_px": noise, "order": order, "walk": walk}
+    # Made once, and not at all where all rows are there.
+    problem = cache(partial(_make_cell_problem, cell, config))
+    return [
+        do_row(folder, {"method": method, **named}, lambda m=method: run_method(m, problem()))
+        for method in config.methods
+    ]
+
+
+def _make_cell_problem(cell: tuple[int, int, float, str], config: Config) -> Problem:
     from dpmjax.data import simulate_sequence, take_scans
 
     walk, stride, noise, order = cell
     sequence = simulate_sequence(walk % NUM_WORLDS, NUM_SCANS, seed=200 + walk, range_noise_px=noise)
-    problem = make_problem(
+    return make_problem(
         take_scans(sequence, slice(None, None, stride)),
         is_ordered=order == "ordered",
         steps=config.steps,
         seed=config.seed,
     )
-    named = {"stride": stride, "noise_px": noise, "order": order, "walk": walk}
-    return [
-        do_row(folder, {"method": method, **named}, lambda m=method: run_method(m, problem))
-        for method in config.methods
-    ]
 
 
 def success_grid(rows: list[dict[str, Any]], method: str, order: str, config: Config) -> NDArray[np.float64]:

@@ -11,7 +11,9 @@ boxes.png.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -20,7 +22,15 @@ from tqdm import tqdm
 from tyro.conf import FlagCreatePairsOff, arg
 
 from experiments._command import run_command
-from experiments._deepmapping_methods import METHODS, NOT_RUN, SUCCESS_PX, make_problem, run_method, split_by_extras
+from experiments._deepmapping_methods import (
+    METHODS,
+    NOT_RUN,
+    SUCCESS_PX,
+    Problem,
+    make_problem,
+    run_method,
+    split_by_extras,
+)
 from experiments._resumable_rows import do_row
 from experiments._run_folder import RunFolder, open_run_folder, recording, write_metrics
 from experiments._stop import StopFlag
@@ -73,8 +83,6 @@ def list_trajectories() -> list[dict[str, int]]:
 
 def main(config: Config) -> list[dict[str, Any]]:
     """Runs what is missing, writes the table after every trajectory."""
-    from dpmjax.data import simulate_sequence
-
     folder = open_run_folder(
         config,
         EXPERIMENT,
@@ -88,16 +96,13 @@ def main(config: Config) -> list[dict[str, Any]]:
     rows: list[dict[str, Any]] = []
     with recording(folder), StopFlag() as stop:
         for entry in tqdm(list_trajectories()[: config.limit], desc="suite", unit=" trajectories"):
-            sequence = simulate_sequence(
-                entry["world"], entry["num_scans"], seed=entry["walk"], range_noise_px=config.range_noise_px
-            )
-            problem = make_problem(sequence, is_ordered=True, steps=config.steps, seed=config.seed)
-            bound = _bound(entry["world"], sequence, config.range_noise_px)
+            # Made once, and not at all where all rows are there.
+            prepare = cache(partial(_prepare, entry, config))
             for method in methods:
                 if stop.is_requested:
                     break
                 case = {"method": method, **entry}
-                rows.append(do_row(folder.path, case, lambda m=method, p=problem, b=bound: run_method(m, p) | b))
+                rows.append(do_row(folder.path, case, partial(_measure, method, prepare)))
             if stop.is_requested:
                 break
             if rows:
@@ -110,6 +115,22 @@ def main(config: Config) -> list[dict[str, Any]]:
         print(f"{name}: not run ({reason})")
     print(f"results in {folder.path}")
     return rows
+
+
+def _prepare(entry: dict[str, Any], config: Config) -> tuple[Problem, dict[str, float]]:
+    """The scans of a trajectory, and the bound on their ATE."""
+    from dpmjax.data import simulate_sequence
+
+    sequence = simulate_sequence(
+        entry["world"], entry["num_scans"], seed=entry["walk"], range_noise_px=config.range_noise_px
+    )
+    problem = make_problem(sequence, is_ordered=True, steps=config.steps, seed=config.seed)
+    return problem, _bound(entry["world"], sequence, config.range_noise_px)
+
+
+def _measure(method: str, prepare: Callable[[], tuple[Problem, dict[str, float]]]) -> dict[str, Any]:
+    problem, bound = prepare()
+    return run_method(method, problem) | bound
 
 
 def _bound(world: int, sequence: ScanSequence, range_noise_px: float) -> dict[str, float]:

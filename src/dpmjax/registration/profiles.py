@@ -184,11 +184,13 @@ def judge_pair(
     """Both directions of one pair at `pose`, x, y, heading of T_target_source; every `stride`-th beam."""
     c, s = jnp.cos(pose[2]), jnp.sin(pose[2])
     rotation = jnp.stack([jnp.stack([c, -s]), jnp.stack([s, c])])
-    theirs, ours = _every(source, stride), _every(target, stride)
-    there = theirs._replace(
-        points=_matmul(theirs.points, rotation.T) + pose[:2], normals=_matmul(theirs.normals, rotation.T)
+    from_source, from_target = _every(source, stride), _every(target, stride)
+    there = from_source._replace(
+        points=_matmul(from_source.points, rotation.T) + pose[:2], normals=_matmul(from_source.normals, rotation.T)
     )
-    back = ours._replace(points=_matmul(ours.points - pose[:2], rotation), normals=_matmul(ours.normals, rotation))
+    back = from_target._replace(
+        points=_matmul(from_target.points - pose[:2], rotation), normals=_matmul(from_target.normals, rotation)
+    )
     both = zip(_view(there, target, margins), _view(back, source, margins), strict=True)
     return Verdict(*(a + b for a, b in both))
 
