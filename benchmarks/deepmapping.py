@@ -19,10 +19,11 @@ from numpy.typing import NDArray
 
 from benchmarks.rows import Row
 from dpmjax import deepmapping as dm
-from dpmjax.data import ScanSequence, read_sequence, simulate_sequence
-from dpmjax.geometry.lines import LineScans, fit_lines
+from dpmjax.io import ScanSequence, read_sequence
 from dpmjax.metrics import absolute_trajectory_error
 from dpmjax.registration import PolishConfig, incremental_icp, polish
+from dpmjax.registration.line_fitting import LineScans, fit_lines
+from dpmjax.simulation import simulate_sequence
 from dpmjax.types import ScanSet
 
 T = TypeVar("T")

@@ -18,8 +18,8 @@ from experiments._run_folder import CHECKPOINTS, HISTORY, RunFolder
 from experiments._stop import StopFlag
 
 if TYPE_CHECKING:
-    from dpmjax.data.sequence import ScanSequence
     from dpmjax.deepmapping import DeepMappingConfig
+    from dpmjax.io.scans2d.sequence import ScanSequence
     from dpmjax.types import ScanSet
 
 # Of the table; the error, named with its unit, comes last.

@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 if TYPE_CHECKING:
-    from dpmjax.data.sequence import ScanSequence
     from dpmjax.deepmapping import Confidence
-    from dpmjax.geometry.lines import LineScans
+    from dpmjax.io.scans2d.sequence import ScanSequence
+    from dpmjax.registration.line_fitting import LineScans
     from dpmjax.types import ScanSet
 
 Floats = NDArray[np.float64]
@@ -70,8 +70,8 @@ def split_by_extras(methods: tuple[str, ...]) -> tuple[tuple[str, ...], dict[str
 
 def make_problem(sequence: ScanSequence, *, is_ordered: bool, steps: int, seed: int) -> Problem:
     """The scans as methods want them; without an order they are shuffled."""
-    from dpmjax.data import take_scans
-    from dpmjax.geometry.lines import fit_lines
+    from dpmjax.io import take_scans
+    from dpmjax.registration.line_fitting import fit_lines
     from dpmjax.types import ScanSet
 
     if not is_ordered:
@@ -99,7 +99,7 @@ def multiview(problem: Problem) -> Floats:
 
 def multiway(problem: Problem) -> Floats:
     """Open3D's multiway registration."""
-    from dpmjax.registration import multiway
+    from experiments.baselines.multiway import multiway
 
     return multiway(problem.scans)
 
@@ -108,7 +108,7 @@ def pso(problem: Problem) -> Floats:
     """Each scan onto the one before by particle swarms."""
     import jax
 
-    from dpmjax.registration import swarm_chain
+    from experiments.baselines.swarm import swarm_chain
 
     return swarm_chain(problem.scans, key=jax.random.key(problem.seed))
 
@@ -125,7 +125,8 @@ def direct_lbfgs(problem: Problem) -> Floats:
     """The same loss without L-Net, poses from zero, by L-BFGS."""
     import jax
 
-    from dpmjax.deepmapping import optimize_directly, preset
+    from dpmjax.deepmapping import preset
+    from experiments.baselines.direct import optimize_directly
 
     key = jax.random.key(problem.seed)
     return optimize_directly(problem.scans, preset("fast"), num_iterations=max(1, problem.steps // 4), key=key)
@@ -133,7 +134,7 @@ def direct_lbfgs(problem: Problem) -> Floats:
 
 def cold(problem: Problem) -> Floats:
     """DeepMapping from the global search of scan pairs: no ICP, no polish; the better map of search and fit."""
-    from dpmjax.deepmapping import choose_trajectory
+    from dpmjax.registration import choose_trajectory
 
     start = _global(problem)
     candidates = {"start": start, "fit": _fit_in_order(problem, start)}
@@ -142,8 +143,7 @@ def cold(problem: Problem) -> Floats:
 
 def warm(problem: Problem) -> Floats:
     """DeepMapping from ICP, or from the global search where that holds better; the sharpest result is kept."""
-    from dpmjax.deepmapping import choose_trajectory
-    from dpmjax.registration import PolishConfig, polish
+    from dpmjax.registration import PolishConfig, choose_trajectory, polish
 
     best = _best_start(problem)
     fitted = _fit_in_order(problem, best)
@@ -154,8 +154,7 @@ def warm(problem: Problem) -> Floats:
 
 def _best_start(problem: Problem) -> Floats:
     """ICP if it can be trusted; else the one of ICP and search whose weakest joint is the stronger."""
-    from dpmjax.deepmapping import judge_trajectory
-    from dpmjax.registration import PolishConfig, polish
+    from dpmjax.registration import PolishConfig, judge_trajectory, polish
 
     starts: list[tuple[Confidence, Floats]] = []
 
@@ -185,9 +184,9 @@ METHODS: dict[str, Callable[[Problem], Floats]] = {
 
 def run_method(name: str, problem: Problem) -> dict[str, Any]:
     """Errors, time and confidence of one method on one problem."""
-    from dpmjax.deepmapping import judge_trajectory
-    from dpmjax.geometry import planar_poses
+    from dpmjax.geometry import se2
     from dpmjax.metrics import absolute_trajectory_error, point_distance
+    from dpmjax.registration import judge_trajectory
 
     sequence = problem.sequence
     reference = sequence.reference_poses
@@ -196,9 +195,7 @@ def run_method(name: str, problem: Problem) -> dict[str, Any]:
     poses = METHODS[name](problem)
     seconds, cpu_seconds = time.perf_counter() - begun, time.process_time() - begun_cpu
     ate = absolute_trajectory_error(poses[:, :2], reference[:, :2])
-    distance = point_distance(
-        sequence.points, sequence.mask, planar_poses.matrices(poses), planar_poses.matrices(reference)
-    )
+    distance = point_distance(sequence.points, sequence.mask, se2.to_matrix(poses), se2.to_matrix(reference))
     confidence = judge_trajectory(problem.lines, sequence.mask, poses)
     return {
         "ate_px": ate,
@@ -233,13 +230,12 @@ def _fit(problem: Problem, start: Floats | None, config: Any) -> Floats:
 
 def _fit_in_order(problem: Problem, start: Floats) -> Floats:
     """The fit of scans in an order in which neighbours are near each other: that of time, or a tour of the start."""
-    from dpmjax.data import take_scans
     from dpmjax.deepmapping import preset
-    from dpmjax.geometry import planar_poses
+    from dpmjax.io import take_scans
 
     if problem.is_ordered:
         return _fit(problem, start, preset("fast"))
-    tour = planar_poses.nearest_tour(start)
+    tour = nearest_tour(start)
     ordered = replace(problem, sequence=take_scans(problem.sequence, tour))
     poses = np.empty_like(start)
     poses[tour] = _fit(ordered, start[tour], preset("fast"))

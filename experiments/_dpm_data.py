@@ -22,8 +22,8 @@ from scipy.spatial import cKDTree
 from experiments._machine import usable_cores
 
 if TYPE_CHECKING:
-    from dpmjax.data import LidarSequence
     from dpmjax.deeppointmap import ScanTable, TrainingConfig
+    from dpmjax.io import LidarSequence
     from dpmjax.scans import AugmentConfig
     from dpmjax.types import PointCloud, PointPyramid
 
@@ -36,7 +36,7 @@ HELD_OUT_SEED = 1_000_000
 
 def town_drive(seed: int, *, length_m: float) -> LidarSequence:
     """A drive through a town: 64 beams, a third of the columns, a scan every two metres."""
-    from dpmjax.data import HDL64E, DriveConfig, TownConfig, simulate_lidar_sequence
+    from dpmjax.simulation import HDL64E, DriveConfig, TownConfig, simulate_lidar_sequence
 
     return simulate_lidar_sequence(
         seed,
@@ -52,7 +52,7 @@ def open_drives(data: Sequence[str], *, num_towns: int, town_length_m: float, se
     Raises:
         ValueError: a path that cannot be read, or in which no drive is of use.
     """
-    from dpmjax.data import list_lidar_sequences, open_lidar_sequence
+    from dpmjax.io import list_lidar_sequences, open_lidar_sequence
 
     drives: list[LidarSequence] = []
     for entry in data:
@@ -74,8 +74,8 @@ def open_drives(data: Sequence[str], *, num_towns: int, town_length_m: float, se
 
 def why_useless(drive: LidarSequence) -> str | None:
     """Why nothing can be learned from a drive; None where something can."""
-    from dpmjax.data import InputError
     from dpmjax.deeppointmap import SamplingConfig
+    from dpmjax.io import InputError
 
     limits = SamplingConfig()
     if drive.T_world_lidar is None:
@@ -128,7 +128,7 @@ class ScanStore:
         return PointCloud(points, np.arange(len(points)) < len(kept))
 
     def _read(self, row: int) -> NDArray[np.float32]:
-        from dpmjax.data import InputError
+        from dpmjax.io import InputError
         from dpmjax.scans import preprocess_scan_on_host
 
         drive, number = self._drives[int(self.table.scene[row])], int(self._number[row])

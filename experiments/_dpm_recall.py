@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 if TYPE_CHECKING:
-    from dpmjax.data import LidarSequence
     from dpmjax.deeppointmap import Model
+    from dpmjax.io import LidarSequence
     from dpmjax.metrics import RegistrationRecall
     from dpmjax.types import PointPyramid
 

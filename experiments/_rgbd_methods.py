@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 if TYPE_CHECKING:
-    from dpmjax.data.rgbd import DepthSequence
     from dpmjax.deepmapping import DepthMappingConfig
+    from dpmjax.io import DepthSequence
 
 METHODS = ("zero", "placed", "deepmapping", "deepmapping-cold", "direct", "icp", "deepmapping-icp")
 _ICP_POINTS = 800

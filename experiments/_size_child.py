@@ -19,8 +19,8 @@ def main(num_scans: str, num_calls: str, seed: str, output: str) -> None:
     import jax
 
     from dpmjax import deepmapping as dm
-    from dpmjax.data import simulate_sequence
     from dpmjax.deepmapping.stepping import steps_per_call
+    from dpmjax.simulation import simulate_sequence
     from dpmjax.types import ScanSet
 
     sequence = simulate_sequence(0, int(num_scans), seed=int(seed), with_odometry=True)

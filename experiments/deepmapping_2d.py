@@ -33,9 +33,9 @@ from experiments._run_folder import HISTORY, RunFolder, open_run_folder, recordi
 from experiments._stop import StopFlag
 
 if TYPE_CHECKING:
-    from dpmjax.data.sequence import ScanSequence
     from dpmjax.deepmapping import DeepMappingConfig
-    from dpmjax.geometry.lines import LineScans
+    from dpmjax.io.scans2d.sequence import ScanSequence
+    from dpmjax.registration.line_fitting import LineScans
 
 EXPERIMENT = "deepmapping_2d"
 LOGGER = logging.getLogger("dpmjax.deepmapping_2d")
@@ -112,7 +112,7 @@ class Result:
 
 def main(config: Config) -> Result:
     """Reads, starts warm, fits, polishes, keeps the best, writes."""
-    from dpmjax.deepmapping import choose_trajectory, judge_trajectory
+    from dpmjax.registration import choose_trajectory, judge_trajectory
 
     started = time.perf_counter()
     select_device(config.device)
@@ -168,10 +168,10 @@ def _fit(
     stop: StopFlag,
 ) -> FitRun:
     """DeepMapping; its losses compare each scan with the next ones, so these must be near: in time they are."""
-    from dpmjax.data import take_scans
-    from dpmjax.geometry import planar_poses
+    from dpmjax.io import take_scans
+    from dpmjax.registration import nearest_tour
 
-    order = np.arange(len(sequence)) if config.ordered else planar_poses.nearest_tour(start)
+    order = np.arange(len(sequence)) if config.ordered else nearest_tour(start)
     fitted = run_fit(
         folder,
         take_scans(sequence, order),
@@ -198,7 +198,8 @@ def _polish(lines: LineScans, candidates: dict[str, NDArray[np.float64]], init: 
 
 def read_scans(config: Config) -> ScanSequence:
     """The scans of DATA or of the built-in world, sub-range and stride applied."""
-    from dpmjax.data import read_sequence, simulate_sequence, take_scans
+    from dpmjax.io import read_sequence, take_scans
+    from dpmjax.simulation import simulate_sequence
 
     stop = None if config.n_scans is None else config.start + config.n_scans * config.jump
     if config.data is not None:
@@ -225,7 +226,7 @@ def warm_start(config: Config, sequence: ScanSequence) -> NDArray[np.float64]:
             )
         return sequence.odometry_poses
     if config.init not in INITS:
-        from dpmjax.data import read_initial_poses
+        from dpmjax.io import read_initial_poses
 
         if not Path(config.init).exists():
             raise ValueError(f"--init {config.init}: no such file, and none of {', '.join(INITS)}")
@@ -240,7 +241,7 @@ def warm_start(config: Config, sequence: ScanSequence) -> NDArray[np.float64]:
 
 def line_scans(sequence: ScanSequence) -> LineScans:
     """The scans with a line at every beam; beams without an order are sorted by angle first."""
-    from dpmjax.geometry.lines import fit_lines, sort_by_angle
+    from dpmjax.registration.line_fitting import fit_lines, sort_by_angle
     from dpmjax.types import ScanSet
 
     scans = ScanSet(sequence.points, sequence.mask)
@@ -259,17 +260,17 @@ def compare_to_reference(
     sequence: ScanSequence, start: NDArray[np.float64], poses: NDArray[np.float64]
 ) -> dict[str, Any]:
     """Errors before and after, in the unit of the scans; `success` is unknown where there is no reference."""
-    from dpmjax.geometry import planar_poses
+    from dpmjax.geometry import se2
     from dpmjax.metrics import absolute_trajectory_error, point_distance
 
     reference, unit = sequence.reference_poses, sequence.unit
     if reference is None:
         return {"success": None}
-    T_reference = planar_poses.matrices(reference)
+    T_reference = se2.to_matrix(reference)
     errors: dict[str, Any] = {}
     for which, some in (("", poses), ("initial_", start)):
         errors[f"ate_{which}{unit}"] = absolute_trajectory_error(some[:, :2], reference[:, :2])
-        distance = point_distance(sequence.points, sequence.mask, planar_poses.matrices(some), T_reference)
+        distance = point_distance(sequence.points, sequence.mask, se2.to_matrix(some), T_reference)
         errors[f"point_distance_{which}{unit}"] = distance
     # The paper's threshold is 20 pixels, 2 % of its world; of a real place, 2 % of what its trajectory spans.
     threshold = 20.0 if unit == "px" else 0.02 * float(np.linalg.norm(np.ptp(reference[:, :2], axis=0)))
@@ -278,7 +279,7 @@ def compare_to_reference(
 
 def write_trajectories(folder: RunFolder, sequence: ScanSequence, poses: NDArray[np.float64]) -> None:
     """trajectory.npy, trajectory_tum.txt, trajectory_kitti.txt: T_world_scan of every scan."""
-    from dpmjax.data import write_kitti, write_poses_npy, write_tum
+    from dpmjax.io import write_kitti, write_poses_npy, write_tum
 
     write_poses_npy(folder / "trajectory.npy", poses)
     write_tum(folder / "trajectory_tum.txt", poses, times=sequence.times, unit=sequence.unit)

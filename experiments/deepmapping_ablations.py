@@ -173,10 +173,10 @@ def run_one(
     import jax
 
     from dpmjax import deepmapping as dm
-    from dpmjax.data import rgbd
+    from dpmjax import simulation
 
     seed = 1000 * config.seed + trajectory
-    sequence = rgbd.simulate_depth_sequence(seed % 15, config.views, seed=seed)
+    sequence = simulation.simulate_depth_sequence(seed % 15, config.views, seed=seed)
     begun = time.perf_counter()
     scans = dm.as_depth_scans(sequence.points, sequence.mask)
     fitted = dm.fit_depth(scans, settings, key=jax.random.key(config.seed), steps=steps)

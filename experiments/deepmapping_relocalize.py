@@ -27,8 +27,8 @@ from experiments._machine import environment
 from experiments._run_folder import CHECKPOINTS, find_run, load_config
 
 if TYPE_CHECKING:
-    from dpmjax.data.sequence import ScanSequence
     from dpmjax.deepmapping import Fitted
+    from dpmjax.io.scans2d.sequence import ScanSequence
 
 EXPERIMENT = "deepmapping_relocalize"
 # A fit counts as a success below this error (section 4.1); so does a re-localisation.
@@ -63,7 +63,7 @@ def main(config: Config) -> dict[str, Any]:
     import jax
 
     from dpmjax import deepmapping as dm
-    from dpmjax.data import make_world, scan_world
+    from dpmjax.simulation import make_world, scan_world
     from dpmjax.types import ScanSet
 
     options = load_config(find_run(deepmapping_2d.EXPERIMENT, config.run), deepmapping_2d.Config)
@@ -140,7 +140,7 @@ def load_fit(run: Path, options: deepmapping_2d.Config, sequence: ScanSequence) 
 
     from dpmjax import deepmapping as dm
     from dpmjax.deepmapping import Report
-    from dpmjax.geometry import planar_poses
+    from dpmjax.geometry import se2
     from dpmjax.types import ScanSet
     from experiments._checkpoint import Checkpoints
 
@@ -166,7 +166,7 @@ def load_fit(run: Path, options: deepmapping_2d.Config, sequence: ScanSequence) 
         raise ValueError(f"{run} holds no checkpoint that can be read")
     poses = np.load(trajectory)
     report = Report(np.nan, None, state.params.poses)  # type: ignore[arg-type]
-    return dm.Fitted(planar_poses.matrices(poses), poses, state.params, report, state, reach, settings)
+    return dm.Fitted(se2.to_matrix(poses), poses, state.params, report, state, reach, settings)
 
 
 def free_poses(grid: NDArray[np.bool_], sequence: ScanSequence, config: Config) -> NDArray[np.float64]:
@@ -186,12 +186,12 @@ def errors_at(
     poses: NDArray[np.float64], truth: NDArray[np.float64], fitted: Fitted, sequence: ScanSequence
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Distance (px) and angle (degrees) to the truth, in the frame that lays the run's trajectory onto the truth."""
-    from dpmjax.geometry import planar_poses
+    from dpmjax.geometry import se2
     from dpmjax.metrics import align_rigid
 
     T = align_rigid(fitted.poses[:, :2], sequence.reference_poses[:, :2])
     moved = poses[:, :2] @ T[:2, :2].T + T[:2, 2]
-    turn = planar_poses.wrap(poses[:, 2] + np.arctan2(T[1, 0], T[0, 0]) - truth[:, 2])
+    turn = se2.wrap_angle(poses[:, 2] + np.arctan2(T[1, 0], T[0, 0]) - truth[:, 2])
     return np.linalg.norm(moved - truth[:, :2], axis=1), np.degrees(np.abs(turn))
 
 

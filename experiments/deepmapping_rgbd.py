@@ -32,8 +32,8 @@ from experiments._run_folder import RunFolder, open_run_folder, recording, write
 from experiments._stop import StopFlag
 
 if TYPE_CHECKING:
-    from dpmjax.data.rgbd import DepthSequence
     from dpmjax.deepmapping import DepthMappingConfig
+    from dpmjax.io import DepthSequence
 
 EXPERIMENT = "deepmapping_rgbd"
 RUNS = "runs.json"
@@ -120,30 +120,30 @@ def main(config: Config) -> dict[str, Any]:
 
 def num_trajectories(config: Config) -> int:
     """As many as asked for; of a folder of images no more than there are windows."""
-    from dpmjax.data import rgbd
+    from dpmjax import io
 
-    if config.data is None or rgbd.is_active_vision(config.data):
+    if config.data is None or io.is_active_vision(config.data):
         return config.limit
-    count, views = len(rgbd.read_pose_folder(config.data)), config.views or 8
+    count, views = len(io.read_pose_folder(config.data)), config.views or 8
     return min(config.limit, max(1, (count - views) // (views // 2) + 1))
 
 
 def read_trajectory(config: Config, index: int) -> DepthSequence:
     """One trajectory; of a folder of images windows that overlap by half."""
-    from dpmjax.data import rgbd
+    from dpmjax import io, simulation
 
     views = config.views or (8 if index % 2 == 0 else 16)
     seed = 1000 * config.seed + index
     if config.data is None:
-        walk = rgbd.GridWalkConfig(depth_noise_m=config.depth_noise_m)
-        return rgbd.simulate_depth_sequence(seed % 15, views, seed=seed, config=walk)
-    if rgbd.is_active_vision(config.data):
-        return rgbd.read_active_vision(config.data, views, seed=seed)
-    sequence, views = rgbd.read_pose_folder(config.data), config.views or 8
+        walk = simulation.GridWalkConfig(depth_noise_m=config.depth_noise_m)
+        return simulation.simulate_depth_sequence(seed % 15, views, seed=seed, config=walk)
+    if io.is_active_vision(config.data):
+        return io.read_active_vision(config.data, views, seed=seed)
+    sequence, views = io.read_pose_folder(config.data), config.views or 8
     if sequence.T_world_camera is None:
         raise ValueError(f"{config.data}: has no pose files, so nothing to compare to")
     begin = index * (views // 2)
-    window = rgbd.take_frames(sequence, slice(begin, begin + views))
+    window = io.take_frames(sequence, slice(begin, begin + views))
     return replace(window, name=f"{sequence.name}, images {begin} to {begin + len(window) - 1}")
 
 

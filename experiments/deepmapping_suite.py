@@ -5,7 +5,7 @@
 
 Three built-in worlds, 50 trajectories of 128 poses and 25 of 256, made by seed. Every trajectory of every method is a
 file of its own, so that a killed run goes on. With --range-noise-px the rows also say the least error that one scan
-allows where the world is known (`dpmjax.data.position_bound`). Results: table.md, metrics.json (with all rows),
+allows where the world is known (`dpmjax.simulation.position_bound`). Results: table.md, metrics.json (with all rows),
 boxes.png.
 """
 
@@ -36,7 +36,7 @@ from experiments._run_folder import RunFolder, open_run_folder, recording, write
 from experiments._stop import StopFlag
 
 if TYPE_CHECKING:
-    from dpmjax.data.sequence import ScanSequence
+    from dpmjax.io.scans2d.sequence import ScanSequence
 
 EXPERIMENT = "deepmapping_suite"
 NUM_WORLDS, NUM_SHORT, NUM_LONG = 3, 50, 25
@@ -119,7 +119,7 @@ def main(config: Config) -> list[dict[str, Any]]:
 
 def _prepare(entry: dict[str, Any], config: Config) -> tuple[Problem, dict[str, float]]:
     """The scans of a trajectory, and the bound on their ATE."""
-    from dpmjax.data import simulate_sequence
+    from dpmjax.simulation import simulate_sequence
 
     sequence = simulate_sequence(
         entry["world"], entry["num_scans"], seed=entry["walk"], range_noise_px=config.range_noise_px
@@ -135,7 +135,7 @@ def _measure(method: str, prepare: Callable[[], tuple[Problem, dict[str, float]]
 
 def _bound(world: int, sequence: ScanSequence, range_noise_px: float) -> dict[str, float]:
     """The bound on the ATE, px; nothing without noise."""
-    from dpmjax.data import make_world, position_bound
+    from dpmjax.simulation import make_world, position_bound
 
     if not range_noise_px:
         return {}

@@ -5,10 +5,16 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
+from pathlib import Path
 
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
 # The tests run each program for a moment and compile hundreds: quick compilation is worth more than quick programs.
 os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} --xla_backend_optimization_level=0".strip()
+
+# Both workers, and the next run, take programs of the same code from one cache instead of compiling them again.
+os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(Path(__file__).parents[1] / ".pytest_cache" / "jax"))
+os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
+os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES", "-1")
 
 import jax
 import jaxtyping
@@ -22,6 +28,7 @@ jaxtyping.install_import_hook(
         "dpmjax.metrics",
         "dpmjax.nets.localization",
         "dpmjax.nets.occupancy",
+        "dpmjax.pose_graph",
         "dpmjax.registration",
     ],
     "beartype.beartype",

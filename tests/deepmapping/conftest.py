@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from dpmjax import deepmapping as dm
-from dpmjax.data import ScanSequence, simulate_sequence
+from dpmjax.io import ScanSequence
+from dpmjax.simulation import simulate_sequence
 from dpmjax.types import ScanSet
 
 NUM_SCANS, NUM_BEAMS = 20, 64

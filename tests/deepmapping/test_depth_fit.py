@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from dpmjax import deepmapping as dm
-from dpmjax.data import rgbd
+from dpmjax import io, simulation
 from dpmjax.deepmapping.depth_agreement import agreement
 from dpmjax.deepmapping.depth_scans import fit_pinhole
 from dpmjax.deepmapping.depth_start import DepthStartConfig
@@ -23,9 +23,9 @@ KEY = jax.random.key(0)
 
 
 @pytest.fixture(scope="module")
-def walk() -> rgbd.DepthSequence:
-    config = rgbd.GridWalkConfig(height=12, width=16)
-    return rgbd.simulate_depth_sequence(0, 4, seed=1, config=config)
+def walk() -> io.DepthSequence:
+    config = simulation.GridWalkConfig(height=12, width=16)
+    return simulation.simulate_depth_sequence(0, 4, seed=1, config=config)
 
 
 @pytest.fixture(scope="module")

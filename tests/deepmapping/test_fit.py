@@ -12,7 +12,7 @@ import pytest
 from dpmjax import deepmapping as dm
 from dpmjax.deepmapping.fit import _draw_batch, run_phases
 from dpmjax.deepmapping.stepping import steps_per_call
-from dpmjax.geometry import planar_poses
+from dpmjax.geometry import se2
 from dpmjax.metrics import absolute_trajectory_error
 from dpmjax.nets.localization import LocalizationConfig
 from dpmjax.nets.occupancy import OccupancyConfig
@@ -47,7 +47,7 @@ def warm(tiny_walk, shaken) -> dm.Fitted:
 
 def test_a_perturbed_start_is_improved(tiny_walk, shaken, warm) -> None:
     assert ate(warm.poses, tiny_walk.reference_poses) < 0.4 * ate(shaken, tiny_walk.reference_poses)
-    np.testing.assert_allclose(planar_poses.matrices(warm.poses), warm.T_world_scan)
+    np.testing.assert_allclose(se2.to_matrix(warm.poses), warm.T_world_scan)
     assert int(warm.state.step) == 150
 
 
@@ -63,7 +63,7 @@ def test_picture_is_dark_at_walls_and_light_in_free_space(tiny_walk, warm) -> No
     picture = dm.draw_map(
         warm.state, SMALL, tiny_walk.points, tiny_walk.mask, warm.poses, reach=warm.reach, num_cells=200
     )
-    world = planar_poses.transform(warm.poses, tiny_walk.points)
+    world = se2.transform_points(warm.poses, tiny_walk.points)
     sensors = np.broadcast_to(warm.poses[:, None, :2], world.shape)
     x_min, x_max, y_min, y_max = picture.extent
     height, width = picture.probability.shape

@@ -16,7 +16,7 @@ from dpmjax.deepmapping.objective import (
     registration_loss,
     to_world,
 )
-from dpmjax.geometry import planar_poses
+from dpmjax.geometry import se2
 from tests.tolerances import ACCUMULATED, ROUNDING
 
 NUM_SCANS, NUM_POINTS = 6, 10
@@ -45,7 +45,7 @@ def slow_chamfer(a: np.ndarray, b: np.ndarray) -> float:
 
 def test_to_world_is_the_rigid_motion() -> None:
     batch, poses = make_batch(), some_poses()
-    expected = planar_poses.transform(np.asarray(poses, np.float64), np.asarray(batch.points, np.float64))
+    expected = se2.transform_points(np.asarray(poses, np.float64), np.asarray(batch.points, np.float64))
     np.testing.assert_allclose(to_world(poses, batch.points), expected, **ROUNDING)
 
 

@@ -11,11 +11,11 @@ import pytest
 
 import dpmjax
 from dpmjax import deepmapping as dm
-from dpmjax.data import scan_world
 from dpmjax.deepmapping.relocalize import shift_scan, turn_scan
-from dpmjax.geometry import planar_poses
+from dpmjax.geometry import se2
 from dpmjax.nets.localization import LocalizationConfig
 from dpmjax.nets.occupancy import OccupancyConfig
+from dpmjax.simulation import scan_world
 from dpmjax.types import ScanSet
 from tests.tolerances import ROUNDING
 
@@ -34,7 +34,7 @@ def fitted(tiny_walk) -> dm.Fitted:
     reach = dm.measure_reach(scans)
     state = dm.init(KEY, ScanSet(scans.points / reach, scans.mask), config)
     poses = tiny_walk.reference_poses - tiny_walk.reference_poses.mean(axis=0)
-    T = planar_poses.matrices(poses)
+    T = se2.to_matrix(poses)
     return dm.Fitted(T, poses, state.params, None, state, reach, config)  # type: ignore[arg-type]
 
 
@@ -49,7 +49,7 @@ def test_taught_scans_come_back_near_their_poses(taught, tiny_walk) -> None:
     spread = np.linalg.norm(taught.poses[:, :2], axis=1)
     error = np.linalg.norm(found.pose[:, :2] - taught.poses[:, :2], axis=1)
     assert np.median(error) < 0.4 * np.median(spread)
-    np.testing.assert_allclose(found.T_world_scan, planar_poses.matrices(found.pose))
+    np.testing.assert_allclose(found.T_world_scan, se2.to_matrix(found.pose))
 
 
 def test_one_scan_is_one_row_of_many(taught, tiny_walk) -> None:
@@ -67,9 +67,9 @@ def test_teaching_keeps_poses_and_map(fitted, taught) -> None:
 
 def test_a_turned_sensor_sees_points_turned_back() -> None:
     points = np.random.default_rng(0).normal(size=(5, 2))
-    world = planar_poses.transform(np.array([[0.0, 0.0, 0.7]]), points[None])[0]
+    world = se2.transform_points(np.array([[0.0, 0.0, 0.7]]), points[None])[0]
     turned = np.asarray(turn_scan(jnp.asarray(points, jnp.float32), jnp.float32(0.4)))
-    np.testing.assert_allclose(planar_poses.transform(np.array([[0.0, 0.0, 1.1]]), turned[None])[0], world, **ROUNDING)
+    np.testing.assert_allclose(se2.transform_points(np.array([[0.0, 0.0, 1.1]]), turned[None])[0], world, **ROUNDING)
 
 
 def test_a_shifted_scan_is_the_scan_of_the_place_in_a_convex_room() -> None:

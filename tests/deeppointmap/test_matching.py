@@ -7,11 +7,11 @@ import pytest
 
 from dpmjax.deeppointmap import MatchConfig, match_descriptors, merge_clouds
 from dpmjax.deeppointmap.matching import best_pairs
-from dpmjax.geometry import ConsensusConfig, exp_se3, transform_points
+from dpmjax.geometry import ConsensusConfig, rigid, se3
 from dpmjax.types import DescriptorCloud, Registration
 from tests.tolerances import ACCUMULATED, ROUNDING
 
-T = np.asarray(exp_se3(np.array([5.0, -3.0, 0.5, 0.02, -0.05, 1.2], np.float32)))
+T = np.asarray(se3.exp(np.array([5.0, -3.0, 0.5, 0.02, -0.05, 1.2], np.float32)))
 CONFIG = MatchConfig()
 
 
@@ -24,7 +24,7 @@ def clouds(seed: int, n: int = 80, num_outliers: int = 0) -> tuple[np.ndarray, n
     rng = np.random.default_rng(seed)
     source = (20 * rng.normal(size=(n, 3))).astype(np.float32)
     order = rng.permutation(n)
-    target = np.asarray(transform_points(T, source))[order]
+    target = np.asarray(rigid.transform_points(T, source))[order]
     similarity = rng.uniform(-0.2, 0.2, size=(n, n)).astype(np.float32)
     similarity[order, np.arange(n)] = 0.95
     target[:num_outliers] = 20 * rng.normal(size=(num_outliers, 3))
@@ -70,7 +70,8 @@ def test_one_far_outlier_is_dropped_in_rounds() -> None:
     target[0] += np.float32(100)
     match = match_descriptors(source, target, similarity, no_offsets, config=MatchConfig(pair_ratio=1.0))
     is_wrong = (
-        np.linalg.norm(transform_points(T, source[match.source_indices]) - target[match.target_indices], axis=1) > 1
+        np.linalg.norm(rigid.transform_points(T, source[match.source_indices]) - target[match.target_indices], axis=1)
+        > 1
     )
     assert is_wrong.sum() == 2
     assert not np.any(np.asarray(match.is_inlier)[is_wrong])
@@ -84,8 +85,8 @@ def test_offsets_of_both_directions_move_points_onto_each_other() -> None:
     source, target, similarity = clouds(3)
     shift = rng.uniform(-1, 1, size=target.shape).astype(np.float32)
     target = target + shift
-    source_in_target = np.asarray(transform_points(T, source))
-    target_in_source = np.asarray(transform_points(np.linalg.inv(T), target))
+    source_in_target = np.asarray(rigid.transform_points(T, source))
+    target_in_source = np.asarray(rigid.transform_points(np.linalg.inv(T), target))
 
     def true_offsets(i: jax.Array, j: jax.Array) -> tuple[jax.Array, jax.Array]:
         return jnp.asarray(target_in_source)[j] - source[i], jnp.asarray(source_in_target)[i] - target[j]
@@ -188,7 +189,7 @@ def test_map_to_map_is_scan_to_scan_of_merged_clouds() -> None:
     cloud = DescriptorCloud(jnp.asarray(source), jnp.ones((80, 4)), jnp.arange(80) < 80)
     halves = jax.tree.map(lambda leaf: leaf.reshape(2, 40, *leaf.shape[1:]), cloud)
     T_map_cloud = jnp.stack([jnp.eye(4), jnp.asarray(T)])
-    in_own_frames = halves.positions.at[1].set(transform_points(np.linalg.inv(T), halves.positions[1]))
+    in_own_frames = halves.positions.at[1].set(rigid.transform_points(np.linalg.inv(T), halves.positions[1]))
     merged = merge_clouds(halves.replace(positions=in_own_frames), T_map_cloud)
     np.testing.assert_allclose(merged.positions, source, atol=1e-4)
     match = match_descriptors(
@@ -223,7 +224,7 @@ def test_consensus_finds_the_motion_where_scores_mislead() -> None:
     """A fifth of the pairs is right, and those are not the ones with the best scores."""
     rng = np.random.default_rng(3)
     source, target, _ = clouds(4, n=128)
-    right = np.linalg.norm(np.asarray(transform_points(T, source))[:, None] - target, axis=2) < 1e-3
+    right = np.linalg.norm(np.asarray(rigid.transform_points(T, source))[:, None] - target, axis=2) < 1e-3
     similarity = rng.uniform(-0.2, 0.2, right.shape).astype(np.float32)
     wrong = rng.permutation(128)
     similarity[wrong, np.arange(128)] = 0.9

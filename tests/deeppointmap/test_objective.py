@@ -9,17 +9,17 @@ import numpy as np
 import pytest
 
 from dpmjax.deeppointmap import ObjectiveConfig, TrainingSide, close_pairs, registration_loss
-from dpmjax.geometry import exp_se3, transform_points
+from dpmjax.geometry import rigid, se3
 from tests.tolerances import ACCUMULATED
 
-T_B_A = np.asarray(exp_se3(np.array([5.0, -3.0, 0.5, 0.02, -0.05, 1.2], np.float32)))
+T_B_A = np.asarray(se3.exp(np.array([5.0, -3.0, 0.5, 0.02, -0.05, 1.2], np.float32)))
 CONFIG = ObjectiveConfig(max_close=12)
 
 
 def positions(seed: int, m: int = 40, n: int = 50) -> tuple[np.ndarray, np.ndarray]:
     rng = np.random.default_rng(seed)
     a = rng.uniform(0, 6, size=(m, 3)).astype(np.float32)
-    b = np.asarray(transform_points(T_B_A, rng.uniform(0, 6, size=(n, 3)).astype(np.float32)))
+    b = np.asarray(rigid.transform_points(T_B_A, rng.uniform(0, 6, size=(n, 3)).astype(np.float32)))
     return a, b
 
 
@@ -58,7 +58,7 @@ def info_nce_in_numpy(queries, keys, distances, *, is_coarse: bool) -> tuple[flo
 @pytest.mark.parametrize("seed", [0, 1])
 def test_terms_are_those_of_numpy(seed: int) -> None:
     a, b = sides(seed)
-    in_b = np.asarray(transform_points(T_B_A, a.positions))
+    in_b = np.asarray(rigid.transform_points(T_B_A, a.positions))
     distances = np.linalg.norm(in_b[:, None].astype(np.float64) - np.asarray(b.positions), axis=-1)
     total, terms = registration_loss(a, b, T_B_A, config=CONFIG)
     matched, coarse = (
@@ -87,14 +87,14 @@ def test_terms_are_those_of_numpy(seed: int) -> None:
 def test_close_pairs_are_all_pairs_within_the_radius(seed: int) -> None:
     a, b = positions(seed)
     of_a, of_b = jax.device_get(close_pairs(a, b, T_B_A, config=replace(CONFIG, max_close=50)))
-    in_a = np.asarray(transform_points(np.linalg.inv(T_B_A), b))
+    in_a = np.asarray(rigid.transform_points(np.linalg.inv(T_B_A), b))
     is_close = np.linalg.norm(a[:, None] - in_a, axis=-1) <= 2
     np.testing.assert_array_equal(of_a.mask.sum(axis=1), is_close.sum(axis=1))
     np.testing.assert_array_equal(of_b.mask.sum(axis=1), is_close.sum(axis=0))
     # Moved by its offset, a descriptor lies on its partner.
     landed = a[:, None] + of_a.offsets
     np.testing.assert_allclose(landed[of_a.mask], in_a[of_a.indices][of_a.mask], atol=1e-4)
-    in_b = np.asarray(transform_points(T_B_A, a))
+    in_b = np.asarray(rigid.transform_points(T_B_A, a))
     np.testing.assert_allclose((b[:, None] + of_b.offsets)[of_b.mask], in_b[of_b.indices][of_b.mask], atol=1e-4)
 
 

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from dpmjax.data import LidarSequence
 from dpmjax.deeppointmap import CurriculumStage, ModelConfig, ObjectiveConfig, SamplingConfig, TrainingConfig
 from dpmjax.geometry.pyramid import PyramidConfig, PyramidStage
+from dpmjax.io import LidarSequence
 from dpmjax.nets.decoder import DecoderConfig
 from dpmjax.nets.point_encoder import EncoderConfig
 from dpmjax.scans import PreprocessConfig

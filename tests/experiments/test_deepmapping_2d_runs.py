@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 from evo.tools import file_interface
 
-from dpmjax.data import ScanSequence, simulate_sequence, write_deepmapping_folder, write_pcd
+from dpmjax.io import ScanSequence, write_deepmapping_folder, write_pcd
+from dpmjax.simulation import simulate_sequence
 from experiments._command import run_command
 from experiments.deepmapping_2d import EXPERIMENT, Config, main
 

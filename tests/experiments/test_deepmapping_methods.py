@@ -43,7 +43,7 @@ def test_failed_row_leaves_no_file(tmp_path) -> None:
 
 
 def test_shuffled_problem_keeps_scans_with_their_truth() -> None:
-    from dpmjax.data import simulate_sequence
+    from dpmjax.simulation import simulate_sequence
 
     sequence = simulate_sequence(1, 6, num_beams=32, seed=0)
     problem = make_problem(sequence, is_ordered=False, steps=2, seed=0)

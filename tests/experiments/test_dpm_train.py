@@ -121,7 +121,7 @@ def test_results_made_ahead_come_in_order_and_errors_where_they_belong() -> None
 
 
 def test_a_bad_scan_is_empty_and_named() -> None:
-    from dpmjax.data import InputError
+    from dpmjax.io import InputError
 
     drive = toy.drive()
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from dpmjax.geometry import ConsensusConfig, find_consensus, transform_points
+from dpmjax.geometry import ConsensusConfig, find_consensus, rigid
 
 
 def pairs_with_outliers(seed: int, num_right: int, num_wrong: int, noise_m: float = 0.2) -> tuple[np.ndarray, ...]:
@@ -70,7 +70,9 @@ def test_moving_both_frames_moves_the_motion() -> None:
         T[:3, :3] = Rotation.from_euler("xyz", [3, -2, angle], degrees=True).as_matrix()
         T[:3, 3] = (4, -7, 1)
     plain = np.asarray(find_consensus(source, target).T_target_source)
-    moved = find_consensus(transform_points(motions[0], source), transform_points(motions[1], target)).T_target_source
+    moved = find_consensus(
+        rigid.transform_points(motions[0], source), rigid.transform_points(motions[1], target)
+    ).T_target_source
     np.testing.assert_allclose(moved, motions[1] @ plain @ np.linalg.inv(motions[0]), atol=2e-3)
 
 

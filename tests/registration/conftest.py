@@ -5,8 +5,9 @@ from __future__ import annotations
 import jax.numpy as jnp
 import pytest
 
-from dpmjax.data import ScanSequence, simulate_sequence
-from dpmjax.geometry.lines import LineScans, fit_lines
+from dpmjax.io import ScanSequence
+from dpmjax.registration.line_fitting import LineScans, fit_lines
+from dpmjax.simulation import simulate_sequence
 from dpmjax.types import ScanSet
 
 NUM_SCANS, NUM_BEAMS = 24, 128

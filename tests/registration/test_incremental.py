@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from dpmjax.geometry import planar_poses
+from dpmjax.geometry import se2
 from dpmjax.metrics import absolute_trajectory_error
 from dpmjax.registration import IncrementalConfig, incremental_icp
 from dpmjax.registration.pairs import Schedule, length_scale
@@ -21,7 +21,7 @@ def chained(walk_lines) -> np.ndarray:
 
 def test_chain_recovers_a_noise_free_walk(walk, chained) -> None:
     assert ate(chained, walk.reference_poses) < 0.05
-    true = planar_poses.relative(walk.reference_poses[:1], walk.reference_poses)
+    true = se2.relative(walk.reference_poses[:1], walk.reference_poses)
     np.testing.assert_allclose(chained, true, atol=0.2)
     np.testing.assert_array_equal(chained[0], np.zeros(3))
 
@@ -49,10 +49,10 @@ def test_odometry_is_the_guess(walk, walk_lines) -> None:
         points=sign * walk_lines.points, normals=sign * walk_lines.normals, centroids=sign * walk_lines.centroids
     )
     rng = np.random.default_rng(0)
-    steps = planar_poses.relative(turned[:-1], turned[1:]) + rng.normal(size=(23, 3)) * [2.0, 2.0, 0.03]
-    poses, _ = incremental_icp(lines, odometry=planar_poses.chain(steps))
+    steps = se2.relative(turned[:-1], turned[1:]) + rng.normal(size=(23, 3)) * [2.0, 2.0, 0.03]
+    poses, _ = incremental_icp(lines, odometry=se2.chain(steps))
     assert ate(poses, turned) < 0.1
-    assert abs(planar_poses.wrap(poses[12:13, 2] - poses[11, 2])[0]) > 2.5
+    assert abs(se2.wrap_angle(poses[12:13, 2] - poses[11, 2])[0]) > 2.5
 
 
 def test_length_scale_grows_with_the_scans_and_survives_empty_ones(walk_lines) -> None:

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from dpmjax.geometry import invert, transform_points
+from dpmjax.geometry import rigid
 from dpmjax.scans import AugmentConfig, BoxConfig, SectorConfig, augment_scan
 from dpmjax.scans.augment import random_motion
 from dpmjax.scans.occlusion import is_behind_box, is_behind_boxes, is_behind_sectors
@@ -50,7 +50,7 @@ def test_motion_is_the_one_that_is_told() -> None:
     for T, points, mask in zip(many.T_augmented_lidar, many.cloud.points, many.cloud.mask, strict=True):
         np.testing.assert_allclose(T[:3, :3] @ T[:3, :3].T, np.eye(3), **ACCUMULATED)
         assert np.linalg.det(T[:3, :3]) > 0
-        back = transform_points(invert(T), points[mask])
+        back = rigid.transform_points(rigid.inverse(T), points[mask])
         order, expected = (np.lexsort(np.round(p, 2).T) for p in (np.asarray(back), np.asarray(scan.points)[:250]))
         np.testing.assert_allclose(np.asarray(back)[order], np.asarray(scan.points)[:250][expected], atol=1e-4)
 
@@ -84,9 +84,9 @@ def test_relative_poses_stay_right() -> None:
     points_b = cloud().points
     T_aug_a = np.asarray(random_motion(AugmentConfig(), key=KEYS[0]))
     T_aug_b = np.asarray(random_motion(AugmentConfig(), key=KEYS[1]))
-    T = T_aug_a @ T_a_b @ np.asarray(invert(T_aug_b))
-    direct = transform_points(T_aug_a, transform_points(T_a_b, points_b))
-    np.testing.assert_allclose(transform_points(T, transform_points(T_aug_b, points_b)), direct, atol=1e-4)
+    T = T_aug_a @ T_a_b @ np.asarray(rigid.inverse(T_aug_b))
+    direct = rigid.transform_points(T_aug_a, rigid.transform_points(T_a_b, points_b))
+    np.testing.assert_allclose(rigid.transform_points(T, rigid.transform_points(T_aug_b, points_b)), direct, atol=1e-4)
 
 
 def test_drop_ratio_is_uniform() -> None:

@@ -1,8 +1,3 @@
-from .choose import Score as Score
-from .choose import choose_trajectory as choose_trajectory
-from .confidence import Confidence as Confidence
-from .confidence import ConfidenceConfig as ConfidenceConfig
-from .confidence import judge_trajectory as judge_trajectory
 from .config import DeepMappingConfig as DeepMappingConfig
 from .config import PhaseConfig as PhaseConfig
 from .config import preset as preset
@@ -22,7 +17,6 @@ from .depth_scans import measure_depth_reach as measure_depth_reach
 from .depth_scans import motion_matrices as motion_matrices
 from .depth_start import DepthStartConfig as DepthStartConfig
 from .depth_start import place_images as place_images
-from .direct import optimize_directly as optimize_directly
 from .fit import Fitted as Fitted
 from .fit import Report as Report
 from .fit import State as State
@@ -39,7 +33,6 @@ from .relocalize import Relocalized as Relocalized
 from .relocalize import TeachConfig as TeachConfig
 from .relocalize import relocalize as relocalize
 from .relocalize import teach_localization as teach_localization
-from .score import map_code_length as map_code_length
 from .toy import Descent as Descent
 from .toy import NetworkStart as NetworkStart
 from .toy import ToyConfig as ToyConfig

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from dpmjax.deepmapping.depth_scans import DepthScans, Pinhole
-from dpmjax.geometry.poses import invert, transform_points
+from dpmjax.geometry import rigid
 
 # Four pixels whose inverse depths differ by less than this share lie on one surface; else an edge runs between them.
 _EDGE = 0.15
@@ -46,7 +46,7 @@ def agreement(
         pinhole: of the other camera.
         tolerance: share of the depth by which agreeing points may differ.
     """
-    seen = transform_points(T_other_camera, points)
+    seen = rigid.transform_points(T_other_camera, points)
     depth = seen[:, 2]
     safe = jnp.maximum(depth, 1e-3)
     column = pinhole.fx * seen[:, 0] / safe + pinhole.cx
@@ -102,9 +102,11 @@ def agreement_of_pairs(
 
     def against(offset: Int[Array, ""]) -> Float[Array, ""]:
         other = (jnp.arange(count) + offset) % count
-        T_other_camera = jnp.matmul(invert(T_world_camera[other]), T_world_camera, precision=jax.lax.Precision.HIGHEST)
+        T_other_camera = jnp.matmul(
+            rigid.inverse(T_world_camera[other]), T_world_camera, precision=jax.lax.Precision.HIGHEST
+        )
         there = compare(T_other_camera, points, mask, depth[other])
-        back = compare(invert(T_other_camera), points[other], mask[other], depth)
+        back = compare(rigid.inverse(T_other_camera), points[other], mask[other], depth)
         return 0.5 * (there + back).mean()
 
     return jax.lax.map(against, offsets).mean()

@@ -23,7 +23,7 @@ from dpmjax.deepmapping.depth_config import DepthMappingConfig, DepthPhaseConfig
 from dpmjax.deepmapping.depth_scans import DepthScans, as_depth_scans, measure_depth_reach, motion_matrices
 from dpmjax.deepmapping.objective import Batch, MapLogits, Terms, free_factors, occupancy_term, world_loss
 from dpmjax.deepmapping.stepping import MapFrame, Params, bind_map, level_weights, make_optimizer, steps_per_call
-from dpmjax.geometry.poses import transform_points
+from dpmjax.geometry import rigid
 from dpmjax.nets.depth_localization import DepthLocalizationNet
 from dpmjax.nets.occupancy import init_map_net
 
@@ -84,7 +84,7 @@ def _compose(T_a_b: Float[Array, "n 4 4"], T_b_c: Float[Array, "n 4 4"]) -> Floa
 def _choose_frame(scans: DepthScans, T: Float[Array, "n 4 4"], config: DepthMappingConfig) -> MapFrame:
     """The cube that the scans cover at these poses, with a margin."""
     count = scans.mask.shape[0]
-    world = transform_points(T, scans.points.reshape(count, -1, 3)).reshape(-1, 3)
+    world = rigid.transform_points(T, scans.points.reshape(count, -1, 3)).reshape(-1, 3)
     valid = scans.mask.reshape(-1, 1)
     low = jnp.where(valid, world, jnp.inf).min(0)
     high = jnp.where(valid, world, -jnp.inf).max(0)
@@ -183,7 +183,7 @@ def _projected_loss(
     if gamma == 0.0:
         return 1.0 - pairs, Terms(jnp.zeros(()), 1.0 - pairs)
     factors = free_factors(batch, phase, progress, key=free_key)
-    occupancy = occupancy_term(T[:, :3, 3], transform_points(T, batch.points), batch, logits, factors)
+    occupancy = occupancy_term(T[:, :3, 3], rigid.transform_points(T, batch.points), batch, logits, factors)
     return gamma * occupancy + (1.0 - gamma) * (1.0 - pairs), Terms(occupancy, 1.0 - pairs)
 
 
@@ -203,7 +203,7 @@ def make_depth_step(config: DepthMappingConfig, phase: DepthPhaseConfig) -> Step
         weights = level_weights(phase, config, progress)
         logits = bind_map(params.occupancy, config.occupancy, state.frame, weights)
         if phase.projection_tolerance is None:
-            world = transform_points(T, batch.points)
+            world = rigid.transform_points(T, batch.points)
             loss, terms = world_loss(T[:, :3, 3], world, batch, logits, phase, progress, key=loss_key)
         else:
             loss, terms = _projected_loss(T, scans, batch, logits, phase, progress, key=loss_key)

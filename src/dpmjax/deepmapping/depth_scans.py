@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 from numpy.typing import ArrayLike, NDArray
 
-from dpmjax.geometry.poses import exp_se3
+from dpmjax.geometry import se3
 
 
 class Pinhole(NamedTuple):
@@ -88,7 +88,7 @@ def measure_depth_reach(scans: DepthScans) -> float:
 def motion_matrices(values: Float[Array, "n k"]) -> Float[Array, "n 4 4"]:
     """Motions as matrices: k = 3 are x, z and the angle about y (section 4.2), k = 6 is a twist (v, w)."""
     if values.shape[-1] == 6:
-        return exp_se3(values)
+        return se3.exp(values)
     x, z, cos, sin = values[:, 0], values[:, 1], jnp.cos(values[:, 2]), jnp.sin(values[:, 2])
     zero, one = jnp.zeros_like(x), jnp.ones_like(x)
     rows = ((cos, zero, sin, x), (zero, one, zero, zero), (-sin, zero, cos, z), (zero, zero, zero, one))

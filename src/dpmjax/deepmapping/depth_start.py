@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from dpmjax.deepmapping.depth_agreement import agreement, mean_agreement
 from dpmjax.deepmapping.depth_config import Motion
 from dpmjax.deepmapping.depth_scans import DepthScans, Pinhole, motion_matrices
-from dpmjax.geometry.poses import invert
+from dpmjax.geometry import rigid
 
 
 @dataclass(frozen=True)
@@ -151,9 +151,9 @@ def _search(
         T_last_scan = motion_matrices(values[None])[0]
 
         def against(T_last_ref: Array, ref_points: Array, ref_depth: Array) -> Array:
-            T_ref_scan = jnp.matmul(invert(T_last_ref), T_last_scan, precision=jax.lax.Precision.HIGHEST)
+            T_ref_scan = jnp.matmul(rigid.inverse(T_last_ref), T_last_scan, precision=jax.lax.Precision.HIGHEST)
             there = agreement(T_ref_scan, points, everywhere, ref_depth, pinhole, tolerance)
-            back = agreement(invert(T_ref_scan), ref_points, everywhere, depth, pinhole, tolerance)
+            back = agreement(rigid.inverse(T_ref_scan), ref_points, everywhere, depth, pinhole, tolerance)
             return there + back
 
         scores = jax.vmap(against)(T_last_reference, reference_points, reference_depth)

@@ -21,8 +21,7 @@ from numpy.typing import ArrayLike, NDArray
 from dpmjax.deepmapping.config import DeepMappingConfig, PhaseConfig
 from dpmjax.deepmapping.objective import Batch, MapLogits, Terms, registration_loss, to_world
 from dpmjax.deepmapping.stepping import MapFrame, Params, bind_map, level_weights, make_optimizer, steps_per_call
-from dpmjax.geometry import planar_poses
-from dpmjax.geometry.poses import compose_pose2
+from dpmjax.geometry import se2
 from dpmjax.nets.localization import LocalizationNet
 from dpmjax.nets.occupancy import init_map_net
 from dpmjax.types import ScanSet
@@ -178,7 +177,7 @@ def next_phase(state: State, scans: ScanSet, config: DeepMappingConfig, *, is_wa
 def _network_poses(params: Params, start: Float[Array, "m 3"], batch: Batch, config: DeepMappingConfig) -> Array:
     net = LocalizationNet(config.localization)
     outputs = jax.vmap(net.apply, in_axes=(None, 0, 0))(params.localization, batch.points, batch.mask)
-    return compose_pose2(start, outputs)
+    return se2.compose(start, outputs)
 
 
 def current_poses(state: State, scans: ScanSet, config: DeepMappingConfig, phase: PhaseConfig) -> Float[Array, "n 3"]:
@@ -329,7 +328,7 @@ def fit_deepmapping(
     # One at a time: a list of all states would hold every map that there ever was.
     ((_, state, report),) = deque(run_phases(scaled, config, state, key=key, is_warm=start is not None), maxlen=1)
     poses = np.asarray(report.poses, np.float64) * unit
-    return Fitted(planar_poses.matrices(poses), poses, state.params, report, state, reach, config)
+    return Fitted(se2.to_matrix(poses), poses, state.params, report, state, reach, config)
 
 
 def _as_planar(poses: NDArray[np.float64], num_scans: int) -> NDArray[np.float64]:

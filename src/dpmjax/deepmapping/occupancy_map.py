@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from dpmjax.deepmapping.config import DeepMappingConfig
 from dpmjax.deepmapping.fit import State, map_logits
-from dpmjax.geometry import planar_poses
+from dpmjax.geometry import se2
 
 # Samples on a beam for what counts as explored.
 _SAMPLES = 64
@@ -54,7 +54,7 @@ def draw_map(
     Returns:
         MapPicture.
     """
-    world = planar_poses.transform(poses, points)
+    world = se2.transform_points(poses, points)
     hits = world[mask]
     low, high = hits.min(axis=0), hits.max(axis=0)
     margin = 0.03 * float((high - low).max())

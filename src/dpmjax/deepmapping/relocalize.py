@@ -16,8 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from dpmjax.deepmapping.config import DeepMappingConfig
 from dpmjax.deepmapping.fit import Fitted, as_scan_set
-from dpmjax.geometry import planar_poses
-from dpmjax.geometry.poses import wrap_angle
+from dpmjax.geometry import se2
 from dpmjax.nets.localization import LocalizationConfig, LocalizationNet
 from dpmjax.types import ScanSet
 
@@ -103,8 +102,8 @@ def relocalize(fitted: Fitted, scan: ScanSet | ArrayLike) -> Relocalized:
     ]
     poses = np.concatenate([np.asarray(part, np.float64) for part in parts])
     poses[:, :2] *= fitted.reach
-    poses[:, 2] = planar_poses.wrap(poses[:, 2])
-    T_world_scan = planar_poses.matrices(poses)
+    poses[:, 2] = se2.wrap_angle(poses[:, 2])
+    T_world_scan = se2.to_matrix(poses)
     return Relocalized(T_world_scan[0], poses[0]) if is_one else Relocalized(T_world_scan, poses)
 
 
@@ -172,7 +171,7 @@ def _teach(
         # A scan of one beam must keep it.
         seen = jnp.where((mask & ~hidden).any(-1, keepdims=True), mask & ~hidden, mask)
         error = net(params, points, seen) - poses[rows] - jnp.concatenate([moved, turn[:, None]], axis=-1)
-        place, heading = error[:, :2], wrap_angle(error[:, 2])
+        place, heading = error[:, :2], se2.wrap_angle(error[:, 2])
         return jnp.mean(jnp.sum(jnp.abs(place), -1) + jnp.abs(heading))
 
     def one_step(carry: tuple[Any, Any], step: Array) -> tuple[tuple[Any, Any], None]:

@@ -16,9 +16,9 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from dpmjax.checks import as_float, as_mask, as_points, require_count, require_positive, require_shape
+from dpmjax.geometry import rigid
 from dpmjax.geometry.alignment import weighted_svd
 from dpmjax.geometry.consensus import ConsensusConfig, find_consensus
-from dpmjax.geometry.poses import transform_points
 from dpmjax.types import AnyArray, Registration
 
 PredictOffsets = Callable[[Int[Array, " k"], Int[Array, " k"]], tuple[Float[Array, "k 3"], Float[Array, "k 3"]]]
@@ -215,7 +215,7 @@ def _agreeing(
     """Pairs of both directions that the consensus supports; it is sought in the first alone, a quarter of the work."""
     half = len(source) // 2
     T_target_source = find_consensus(source[:half], target[:half], is_used[:half], config=config).T_target_source
-    squared = jnp.sum((transform_points(T_target_source, source) - target) ** 2, axis=1)
+    squared = jnp.sum((rigid.transform_points(T_target_source, source) - target) ** 2, axis=1)
     return is_used & (squared < config.inlier_m**2)
 
 
@@ -246,7 +246,7 @@ def _solve(
     source: Float[Array, "p 3"], target: Float[Array, "p 3"], scores: Float[Array, " p"], is_inlier: Bool[Array, " p"]
 ) -> tuple[Float[Array, "4 4"], Float[Array, " p"]]:
     T_target_source = weighted_svd(source, target, jnp.where(is_inlier, scores, 0))
-    squared = jnp.sum((transform_points(T_target_source, source) - target) ** 2, axis=1)
+    squared = jnp.sum((rigid.transform_points(T_target_source, source) - target) ** 2, axis=1)
     is_apart = squared > 0
     return T_target_source, jnp.where(is_apart, jnp.sqrt(jnp.where(is_apart, squared, 1)), 0)
 

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Float
 
 from dpmjax.checks import as_float, require_shape
-from dpmjax.geometry.poses import transform_points
+from dpmjax.geometry import rigid
 from dpmjax.types import AnyArray, DescriptorCloud
 
 
@@ -36,7 +36,7 @@ def merge_clouds(clouds: DescriptorCloud, T_map_cloud: Float[AnyArray, "s 4 4"])
 def _merge_clouds(clouds: DescriptorCloud, T_map_cloud: jax.Array) -> DescriptorCloud:
     positions_cloud = jnp.where(clouds.mask[..., None], clouds.positions, 0)
     T_map_cloud = jnp.where(jnp.any(clouds.mask, axis=1)[:, None, None], T_map_cloud, 0)
-    positions_map = jnp.where(clouds.mask[..., None], transform_points(T_map_cloud, positions_cloud), 0)
+    positions_map = jnp.where(clouds.mask[..., None], rigid.transform_points(T_map_cloud, positions_cloud), 0)
     return DescriptorCloud(
         positions=positions_map.reshape(-1, 3),
         features=clouds.features.reshape(-1, clouds.features.shape[-1]),

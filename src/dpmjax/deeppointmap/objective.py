@@ -17,8 +17,8 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from dpmjax.checks import as_float, as_mask, as_points, require_count, require_positive, require_shape
+from dpmjax.geometry import rigid
 from dpmjax.geometry.neighbours import radius_search
-from dpmjax.geometry.poses import invert, transform_points
 from dpmjax.losses.contrastive import info_nce
 from dpmjax.losses.offset import offset_loss
 from dpmjax.types import AnyArray
@@ -136,8 +136,8 @@ def close_pairs(
     T_b_a = as_float("T_b_a", T_b_a)
     require_shape("T_b_a", T_b_a, (4, 4))
     mask_a, mask_b = as_mask("mask_a", mask_a, positions_a.shape[:1]), as_mask("mask_b", mask_b, positions_b.shape[:1])
-    of_a = _close_of(positions_a, transform_points(invert(T_b_a), positions_b), mask_a, mask_b, config)
-    of_b = _close_of(positions_b, transform_points(T_b_a, positions_a), mask_b, mask_a, config)
+    of_a = _close_of(positions_a, rigid.transform_points(rigid.inverse(T_b_a), positions_b), mask_a, mask_b, config)
+    of_b = _close_of(positions_b, rigid.transform_points(T_b_a, positions_a), mask_b, mask_a, config)
     return of_a, of_b
 
 
@@ -172,7 +172,9 @@ def registration_loss(
 def _registration_loss(
     a: TrainingSide, b: TrainingSide, T_b_a: jax.Array, *, config: ObjectiveConfig
 ) -> tuple[jax.Array, ObjectiveTerms]:
-    positions_b = jnp.where(a.mask[:, None], transform_points(T_b_a, jnp.where(a.mask[:, None], a.positions, 0)), 0)
+    positions_b = jnp.where(
+        a.mask[:, None], rigid.transform_points(T_b_a, jnp.where(a.mask[:, None], a.positions, 0)), 0
+    )
     squared = _squared_distances(positions_b, jnp.where(b.mask[:, None], b.positions, 0))
     squared = lax.stop_gradient(jnp.where(a.mask[:, None] & b.mask[None, :], squared, jnp.inf))
     forward = _direction(a, b, squared, config)

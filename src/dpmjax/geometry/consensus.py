@@ -19,8 +19,8 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from dpmjax.checks import as_float, as_mask, as_points, require_count, require_positive, require_shape
+from dpmjax.geometry import rigid
 from dpmjax.geometry.alignment import weighted_svd
-from dpmjax.geometry.poses import transform_points
 from dpmjax.types import AnyArray
 
 
@@ -146,7 +146,7 @@ def _closeness(
     T: Float[Array, "4 4"], source: Float[Array, "k 3"], target: Float[Array, "k 3"], config: ConsensusConfig
 ) -> Float[Array, " k"]:
     """1 for a pair that meets under the motion, falling to 0 at `inlier_m`."""
-    errors = jnp.sqrt(jnp.sum((transform_points(T, source) - target) ** 2, axis=1))
+    errors = jnp.sqrt(jnp.sum((rigid.transform_points(T, source) - target) ** 2, axis=1))
     return jnp.maximum(1 - errors / config.inlier_m, 0)
 
 

@@ -12,9 +12,9 @@ import scipy.sparse
 import scipy.sparse.csgraph
 from numpy.typing import NDArray
 
-from dpmjax.geometry import planar_poses
-from dpmjax.registration.correlative import Floats
-from dpmjax.registration.map_judge import MapJudge, Offers, add_up, is_firmly_more
+from dpmjax.geometry import se2
+from dpmjax.registration.pair_search import Floats
+from dpmjax.registration.pose_scoring import MapJudge, Offers, add_up, is_firmly_more
 
 
 def move_blocks(poses: Floats, offers: Offers, judge: MapJudge) -> tuple[Floats, int]:
@@ -36,7 +36,7 @@ def move_blocks(poses: Floats, offers: Offers, judge: MapJudge) -> tuple[Floats,
         place = _better_place(poses, blocks[cut], offers, judge)
         if place is not None:
             poses = poses.copy()
-            poses[blocks[cut]] = planar_poses.compose(place, poses[blocks[cut]])
+            poses[blocks[cut]] = se2.compose(place, poses[blocks[cut]])
             moved += 1
     return poses, moved
 
@@ -44,7 +44,7 @@ def move_blocks(poses: Floats, offers: Offers, judge: MapJudge) -> tuple[Floats,
 def pair_values(poses: Floats, judge: MapJudge) -> Floats:
     """(n, n) what each pair of scans says of the map, below the diagonal; 0 for those too far apart to judge."""
     source, target = (x.astype(np.int64) for x in np.nonzero(np.tri(len(poses), k=-1, dtype=bool)))
-    relative = planar_poses.relative(poses[target], poses[source])
+    relative = se2.relative(poses[target], poses[source])
     near = np.hypot(relative[:, 0], relative[:, 1]) < judge.config.radius * judge.scale
     values = np.zeros((len(poses), len(poses)))
     values[source[near], target[near]] = judge.of_pairs(source[near], target[near], relative[near])
@@ -70,14 +70,14 @@ def _better_place(poses: Floats, block: NDArray[np.bool_], offers: Offers, judge
     """The motion (3,) in the world of the block to the best place that offers across the cut give; None: it stays."""
     across = np.flatnonzero(block[offers.scan] & ~block[offers.anchor])
     across = across[np.argsort(-offers.scores[across], kind="stable")[: judge.config.num_block_places]]
-    places = planar_poses.compose(poses[offers.anchor[across]], offers.poses[across])
-    motions = planar_poses.compose(places, planar_poses.inverse(poses[offers.scan[across]]))
+    places = se2.compose(poses[offers.anchor[across]], offers.poses[across])
+    motions = se2.compose(places, se2.inverse(poses[offers.scan[across]]))
     motions = np.concatenate([np.zeros((1, 3)), motions])
     inside, outside = np.flatnonzero(block), np.flatnonzero(~block)
-    moved = planar_poses.compose(motions[:, None], poses[inside][None])
+    moved = se2.compose(motions[:, None], poses[inside][None])
     apart = moved[:, :, None, :2] - poses[outside][None, None, :, :2]
     which, i, j = np.nonzero(np.hypot(apart[..., 0], apart[..., 1]) < judge.config.radius * judge.scale)
-    value = judge.of_pairs(inside[i], outside[j], planar_poses.relative(poses[outside[j]], moved[which, i]))
+    value = judge.of_pairs(inside[i], outside[j], se2.relative(poses[outside[j]], moved[which, i]))
     # Pairs on one side of the cut are the same for all motions.
     is_kept = np.tri(len(poses), k=-1, dtype=bool) & (block == block[:, None])
     one, other = (x.astype(np.int64) for x in np.nonzero(is_kept))

@@ -10,10 +10,10 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from dpmjax.checks import as_float, as_points
+from dpmjax.geometry import rigid, se2, se3
 from dpmjax.geometry.alignment import weighted_svd
 from dpmjax.geometry.neighbours import k_nearest
 from dpmjax.geometry.normals import estimate_normals
-from dpmjax.geometry.poses import exp_se2, exp_se3, transform_points
 from dpmjax.types import AnyArray
 
 _NORMAL_NEIGHBOURS = 6
@@ -101,7 +101,7 @@ def _icp(
     tiny = jnp.maximum(jnp.maximum(1e-6 * size, rounding), 1e-12)
 
     def distances(T: Float[Array, "d1 d1"]) -> tuple[Array, Array, Array, Array]:
-        moved = transform_points(T, source)
+        moved = rigid.transform_points(T, source)
         nearest = k_nearest(moved, target, 1).indices[:, 0]
         apart = moved - target[nearest]
         normal = jnp.where(normals.mask[nearest][:, None], normals.normals[nearest], 0.0)
@@ -124,7 +124,9 @@ def _icp(
     def iterate(carry: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
         T, _, count = carry
         T_next = update(T)
-        change = jnp.linalg.norm(transform_points(T_next, source) - transform_points(T, source), axis=-1).max()
+        change = jnp.linalg.norm(
+            rigid.transform_points(T_next, source) - rigid.transform_points(T, source), axis=-1
+        ).max()
         return T_next, change, count + 1
 
     T, change, _ = jax.lax.while_loop(
@@ -160,7 +162,7 @@ def _step_to_planes(
     damping = 1e-4 * diagonal + 1e-6 * diagonal.max() + jnp.finfo(points.dtype).tiny
     gradient = jnp.einsum("ni,n->i", weighted, residual, precision="highest")
     step = jnp.linalg.solve(system + jnp.diag(damping), -gradient)
-    motion = exp_se2(step) if dimensions == 2 else exp_se3(step)
+    motion = se2.exp(step) if dimensions == 2 else se3.exp(step)
     there = jnp.eye(dimensions + 1, dtype=points.dtype).at[:dimensions, dimensions].set(centre)
     back = jnp.eye(dimensions + 1, dtype=points.dtype).at[:dimensions, dimensions].set(-centre)
     return jnp.matmul(jnp.matmul(there, motion, precision="highest"), back, precision="highest")

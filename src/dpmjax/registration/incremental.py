@@ -10,10 +10,10 @@ import scipy.sparse
 import scipy.sparse.csgraph
 from numpy.typing import NDArray
 
-from dpmjax.geometry import planar_poses
-from dpmjax.geometry.lines import LineScans
+from dpmjax.geometry import se2
+from dpmjax.registration.line_fitting import LineScans
+from dpmjax.registration.pair_alignment import Metric, StepPrior
 from dpmjax.registration.pairs import COARSE, FINE, PairMatches, length_scale, match_pairs, no_prior, take_scans
-from dpmjax.registration.planar import Metric, StepPrior
 from dpmjax.registration.visibility import compare_views
 from dpmjax.types import ScanSet
 
@@ -66,7 +66,7 @@ def _step_prior(
     clear, turns = matches.poses[is_clear], matches.poses[:, 2]
     mean, information = np.zeros((len(turns), 3)), np.zeros((len(turns), 3))
     for row, turn in enumerate(turns):
-        alike = clear[np.abs(planar_poses.wrap(clear[:, 2] - turn)) < config.similar_turn]
+        alike = clear[np.abs(se2.wrap_angle(clear[:, 2] - turn)) < config.similar_turn]
         alike = alike if len(alike) >= 5 else clear
         if len(alike) >= 5:
             mean[row, :2] = np.median(alike[:, :2], axis=0)
@@ -126,7 +126,7 @@ def incremental_icp(
     coarse = np.full(num_steps, 0.1 * scale)
     turns = np.radians([0.0, -0.5, 0.5]) * config.turn_step_deg
     if odometry is not None:
-        guess = planar_poses.relative(odometry[:-1], odometry[1:])
+        guess = se2.relative(odometry[:-1], odometry[1:])
         sigma = np.array([scale, scale, 1.0]) * np.array(config.odometry_sigma)[[0, 0, 1]]
         unit_information = np.broadcast_to((np.array([1.0, 1.0, 1.0 / scale]) / sigma) ** 2, guess.shape)
         prior = StepPrior(guess, unit_information * coarse[:, None] ** 2)
@@ -150,7 +150,7 @@ def incremental_icp(
         source, target, np.stack([rough.poses, start], axis=1), FINE, prior, scale=scale, metric=config.metric
     )
     if odometry is not None:
-        return planar_poses.chain(steps.poses), steps
+        return se2.chain(steps.poses), steps
     return bridge_bad_scans(lines, steps, config, scale), steps
 
 
@@ -188,7 +188,7 @@ def bridge_bad_scans(lines: LineScans, steps: PairMatches, config: IncrementalCo
     edges = [(later, later - 1, steps.poses, _quality(lines, later, later - 1, steps, scale))]
     poor = np.flatnonzero(edges[0][3] < config.poor_quality)
     if not len(poor):
-        return planar_poses.chain(steps.poses)
+        return se2.chain(steps.poses)
     fan = _wide_fan(config, scale)
     for apart in (2, 3):
         # All pairs that span a poor step.
@@ -224,6 +224,6 @@ def _follow_tree(num_scans: int, source: Indices, target: Indices, poses: Floats
     for scan in order[1:]:
         parent = parents[scan]
         row = edge_of.get((int(scan), int(parent)))
-        step = poses[row] if row is not None else planar_poses.inverse(poses[edge_of[(int(parent), int(scan))]])
-        world[scan] = planar_poses.compose(world[parent], step)
+        step = poses[row] if row is not None else se2.inverse(poses[edge_of[(int(parent), int(scan))]])
+        world[scan] = se2.compose(world[parent], step)
     return world

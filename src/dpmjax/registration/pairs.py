@@ -10,8 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
-from dpmjax.geometry.lines import LineScans
-from dpmjax.registration.planar import Metric, StepPrior, align_pairs
+from dpmjax.registration.line_fitting import LineScans
+from dpmjax.registration.pair_alignment import Metric, StepPrior, align_pairs
 from dpmjax.types import ScanSet
 
 # How many distances one batch of pairs may hold at once: 128 MB of float32 with what XLA keeps beside them.
@@ -152,3 +152,21 @@ def match_pairs(
         information=information[row, best],
         squares=squares[row, best] / np.maximum(chosen, 1e-9),
     )
+
+
+def nearest_tour(poses: NDArray[np.float64]) -> NDArray[np.int64]:
+    """An order in which neighbours are near each other: from each pose to the nearest one not yet visited.
+
+    Args:
+        poses: (n, 3) x, y, heading.
+
+    Returns:
+        (n,) rows, the first one 0.
+    """
+    left = set(range(1, len(poses)))
+    tour = [0]
+    while left:
+        here = poses[tour[-1], :2]
+        tour.append(min(left, key=lambda scan: (float(np.hypot(*(poses[scan, :2] - here))), scan)))
+        left.remove(tour[-1])
+    return np.array(tour, np.int64)

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
-from dpmjax.geometry.poses import transform_points
+from dpmjax.geometry import rigid
 from dpmjax.scans.occlusion import BoxConfig, SectorConfig, is_behind_boxes, is_behind_sectors
 from dpmjax.scans.preprocess import farthest_first
 from dpmjax.types import PointCloud
@@ -59,8 +59,8 @@ class AugmentedScan(NamedTuple):
     Attributes:
         cloud: in a frame of its own, metres; the valid point farthest from its origin stands first.
         T_augmented_lidar: the motion that was applied, (4, 4). So the pose of the new frame is
-            `T_world_augmented = T_world_lidar @ invert(T_augmented_lidar)`, and that of b in a is
-            `T_augmented_lidar_a @ T_a_b @ invert(T_augmented_lidar_b)`.
+            `T_world_augmented = T_world_lidar @ rigid.inverse(T_augmented_lidar)`, and that of b in a is
+            `T_augmented_lidar_a @ T_a_b @ rigid.inverse(T_augmented_lidar_b)`.
     """
 
     cloud: PointCloud
@@ -86,7 +86,7 @@ def augment_scan(cloud: PointCloud, config: AugmentConfig, *, key: PRNGKeyArray)
     noise = jnp.clip(
         jax.random.normal(jitter_key, points.shape, points.dtype), -config.jitter_clip_sigmas, config.jitter_clip_sigmas
     )
-    points = transform_points(T_augmented_lidar, points) + config.jitter_sigma_m * noise
+    points = rigid.transform_points(T_augmented_lidar, points) + config.jitter_sigma_m * noise
     return AugmentedScan(farthest_first(PointCloud(jnp.where(mask[:, None], points, 0), mask)), T_augmented_lidar)
 
 

@@ -1,0 +1,114 @@
+"""Multiway registration of planar scans by Open3D, a baseline of DeepMapping: `pip install dpmjax[baselines]`.
+
+Pairs by iterated closest points, neighbours in time as sure and others as doubtful edges of a pose graph, whose line
+process lets the wrong ones go (Choi, Zhou and Koltun, Robust Reconstruction of Indoor Scenes, CVPR 2015).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dpmjax.geometry import se2
+from dpmjax.registration.pairs import length_scale
+from dpmjax.types import ScanSet
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class MultiwayConfig:
+    """Settings. Lengths are in length scales of the scans.
+
+    Attributes:
+        coarse: largest distance of matched points, first round.
+        fine: second round, and that of the graph.
+        radius: scans that the chain puts nearer than this are matched too.
+        prune: doubtful edges below this confidence are taken out.
+    """
+
+    coarse: float = 0.6
+    fine: float = 0.15
+    radius: float = 2.0
+    prune: float = 0.25
+
+
+def multiway(scans: ScanSet, config: MultiwayConfig | None = None) -> Floats:
+    """Poses of planar scans by Open3D's multiway registration.
+
+    Args:
+        scans: n scans in order of time.
+        config: settings.
+
+    Returns:
+        (n, 3) T_world_scan, x, y, heading; the first one zero.
+
+    Raises:
+        ModuleNotFoundError: Open3D is not installed.
+    """
+    import open3d
+
+    config = config or MultiwayConfig()
+    scale = length_scale(scans)
+    clouds = [_cloud(p[m]) for p, m in zip(np.asarray(scans.points), np.asarray(scans.mask), strict=True)]
+    coarse, fine = config.coarse * scale, config.fine * scale
+    graph = open3d.pipelines.registration.PoseGraph()
+    T_world = [np.eye(4)]
+    graph.nodes.append(_node(T_world[0]))
+    for scan in range(1, len(clouds)):
+        graph.edges.append(_edge(clouds, scan - 1, scan, np.eye(4), (coarse, fine), is_doubtful=False))
+        # An edge maps its source, the earlier scan, into the later one.
+        T_world.append(T_world[-1] @ np.linalg.inv(graph.edges[-1].transformation))
+        graph.nodes.append(_node(T_world[-1]))
+    chain = np.stack(T_world)
+    apart = np.linalg.norm(chain[:, None, :3, 3] - chain[None, :, :3, 3], axis=-1)
+    for source, target in np.argwhere(np.triu(apart < config.radius * scale, k=2)).tolist():
+        guess = np.linalg.inv(chain[target]) @ chain[source]
+        graph.edges.append(_edge(clouds, source, target, guess, (coarse, fine), is_doubtful=True))
+    registration = open3d.pipelines.registration
+    with open3d.utility.VerbosityContextManager(open3d.utility.VerbosityLevel.Error):
+        registration.global_optimization(
+            graph,
+            registration.GlobalOptimizationLevenbergMarquardt(),
+            registration.GlobalOptimizationConvergenceCriteria(),
+            registration.GlobalOptimizationOption(
+                max_correspondence_distance=fine, edge_prune_threshold=config.prune, reference_node=0
+            ),
+        )
+    poses = np.stack([node.pose for node in graph.nodes])
+    planar = np.stack([poses[:, 0, 3], poses[:, 1, 3], np.arctan2(poses[:, 1, 0], poses[:, 0, 0])], -1)
+    return se2.relative(planar[0], planar)
+
+
+def _cloud(points: NDArray[np.floating]) -> Any:
+    import open3d
+
+    flat = np.concatenate([points, np.zeros((len(points), 1))], axis=1).astype(np.float64)
+    return open3d.geometry.PointCloud(open3d.utility.Vector3dVector(flat))
+
+
+def _node(T_world_scan: Floats) -> Any:
+    import open3d
+
+    return open3d.pipelines.registration.PoseGraphNode(T_world_scan)
+
+
+def _edge(
+    clouds: list[Any], source: int, target: int, T_guess: Floats, distances: tuple[float, float], *, is_doubtful: bool
+) -> Any:
+    """T_target_source by points to points (planes of flat clouds leave three directions open), with its information."""
+    import open3d
+
+    registration = open3d.pipelines.registration
+    T = T_guess
+    for distance in distances:
+        T = registration.registration_icp(
+            clouds[source], clouds[target], distance, T, registration.TransformationEstimationPointToPoint()
+        ).transformation
+    information = registration.get_information_matrix_from_point_clouds(
+        clouds[source], clouds[target], distances[-1], T
+    )
+    return registration.PoseGraphEdge(source, target, T, information, uncertain=is_doubtful)

@@ -1,0 +1,122 @@
+"""A chain of scans by particle swarms: a baseline of DeepMapping section 4.1 that needs no derivative.
+
+The swarm itself is evosax's (an extra: `pip install dpmjax[baselines]`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+from numpy.typing import NDArray
+
+from dpmjax.geometry import se2
+from dpmjax.losses import chamfer_distance
+from dpmjax.registration.pairs import length_scale
+from dpmjax.types import ScanSet
+
+
+@dataclass(frozen=True)
+class SwarmConfig:
+    """Settings. Lengths are in length scales of the scans.
+
+    Attributes:
+        num_particles: relative poses that are tried at a time.
+        num_iterations: of a swarm.
+        num_rounds: swarms from fresh particles; the best round of each pair is kept.
+        reach: particles start within this: translation along each axis, radians.
+        num_beams: beams of each scan that are compared.
+        pairs_at_once: pairs that are worked on together.
+    """
+
+    num_particles: int = 32
+    num_iterations: int = 60
+    num_rounds: int = 3
+    reach: tuple[float, float] = (1.0, 0.5)
+    num_beams: int = 86
+    pairs_at_once: int = 32
+
+    def __post_init__(self) -> None:
+        if min(self.num_particles, self.num_iterations, self.num_rounds, self.num_beams, self.pairs_at_once) < 1:
+            raise ValueError(f"all counts must be at least 1, got {self}")
+
+
+def swarm_chain(scans: ScanSet, config: SwarmConfig | None = None, *, key: jax.Array) -> NDArray[np.float64]:
+    """Poses of planar scans, each onto the one before by a swarm that minimises their Chamfer distance (eq. 5).
+
+    A swarm over all poses at once does not converge; over one relative pose of three numbers it does.
+
+    Args:
+        scans: n scans in order of time.
+        config: settings.
+        key: of the swarms.
+
+    Returns:
+        (n, 3) T_world_scan, x, y, heading; the first one zero.
+
+    Raises:
+        ModuleNotFoundError: evosax is not installed.
+    """
+    config = config or SwarmConfig()
+    points, mask = jnp.asarray(scans.points), jnp.asarray(scans.mask)
+    stride = max(1, -(-mask.shape[1] // config.num_beams))
+    scale = length_scale(scans)
+    widths = jnp.array([config.reach[0] * scale, config.reach[0] * scale, config.reach[1]])
+    steps = _swarm_pairs(points[:, ::stride], mask[:, ::stride], widths, key, config=config)
+    poses = np.zeros((len(mask), 3))
+    for scan, step in enumerate(np.asarray(steps, np.float64), start=1):
+        poses[scan] = se2.compose(poses[scan - 1], step)
+    return poses
+
+
+@partial(jax.jit, static_argnames="config")
+def _swarm_pairs(
+    points: Float[Array, "n b 2"],
+    mask: Bool[Array, "n b"],
+    widths: Float[Array, " 3"],
+    key: jax.Array,
+    *,
+    config: SwarmConfig,
+) -> Float[Array, "m 3"]:
+    """T_before_scan of every scan but the first."""
+
+    def best_of_rounds(pair: tuple[jax.Array, ...]) -> Array:
+        before, before_mask, after, after_mask, pair_key = pair
+
+        def misfit(pose: Float[Array, " 3"]) -> Array:
+            c, s = jnp.cos(pose[2]), jnp.sin(pose[2])
+            rotation = jnp.stack([jnp.stack([c, -s]), jnp.stack([s, c])])
+            moved = jnp.matmul(after, rotation.T, precision=jax.lax.Precision.HIGHEST) + pose[:2]
+            return chamfer_distance(moved, before, after_mask, before_mask)
+
+        swarm = partial(_swarm, lambda x: jax.vmap(misfit)(x * widths), config=config)
+        found, values = jax.lax.map(swarm, jax.random.split(pair_key, config.num_rounds))
+        return found[values.argmin()] * widths
+
+    keys = jax.random.split(key, len(mask) - 1)
+    pairs = (points[:-1], mask[:-1], points[1:], mask[1:], keys)
+    return jax.lax.map(best_of_rounds, pairs, batch_size=config.pairs_at_once)
+
+
+def _swarm(misfit: Any, key: jax.Array, *, config: SwarmConfig) -> tuple[Float[Array, " 3"], Float[Array, ""]]:
+    """The best particle of one swarm in the box from -1 to 1, and its misfit."""
+    from evosax.algorithms import PSO
+
+    start_key, init_key, key = jax.random.split(key, 3)
+    algorithm = PSO(population_size=config.num_particles, solution=jnp.zeros(3))
+    particles = jax.random.uniform(start_key, (config.num_particles, 3), minval=-1.0, maxval=1.0)
+    state = algorithm.init(init_key, particles, misfit(particles), algorithm.default_params)
+
+    def iterate(state: Any, key: jax.Array) -> tuple[Any, None]:
+        ask_key, tell_key = jax.random.split(key)
+        particles, state = algorithm.ask(ask_key, state, algorithm.default_params)
+        state, _ = algorithm.tell(tell_key, particles, misfit(particles), state, algorithm.default_params)
+        return state, None
+
+    state, _ = jax.lax.scan(iterate, state, jax.random.split(key, config.num_iterations))
+    return state.best_solution, state.best_fitness

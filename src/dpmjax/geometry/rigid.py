@@ -1,0 +1,44 @@
+"""Rigid motions as homogeneous matrices, planar (3x3) or spatial (4x4): `T_a_b` maps b-coordinates to a-coordinates."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from dpmjax.types import AnyArray
+
+
+def inverse(T_a_b: Any) -> Any:
+    """`T_b_a` of a rigid motion (..., d+1, d+1), exact in the rotation; NumPy arrays stay NumPy's, float64."""
+    xp = jnp if isinstance(T_a_b, jax.Array) else np
+    dim = T_a_b.shape[-1] - 1
+    R_b_a = xp.swapaxes(T_a_b[..., :dim, :dim], -1, -2)
+    translation = -xp.sum(R_b_a * T_a_b[..., None, :dim, dim], axis=-1)
+    top = xp.concatenate([R_b_a, translation[..., None]], axis=-1)
+    return xp.concatenate([top, T_a_b[..., dim:, :]], axis=-2)
+
+
+@jax.jit
+def transform_points(
+    T_a_b: Float[AnyArray, "... d1 d1"], points_b: Float[AnyArray, "... n d"]
+) -> Float[Array, "... n d"]:
+    """Points in a, from points in b; d = 2 or 3, and the leading axes of both broadcast.
+
+    Raises:
+        ValueError: the matrix is not (d+1, d+1).
+    """
+    T_a_b, points_b = jnp.asarray(T_a_b), jnp.asarray(points_b)
+    dim = points_b.shape[-1]
+    if points_b.ndim < 2 or T_a_b.shape[-2:] != (dim + 1, dim + 1):
+        raise ValueError(
+            f"T_a_b: expected shape (..., d+1, d+1) for points_b (..., n, d), got {T_a_b.shape} for {points_b.shape}"
+        )
+    # Products and sums rather than a contraction: full precision on every device, and one fused loop for small d.
+    points_a = T_a_b[..., None, :dim, dim]
+    for axis in range(dim):
+        points_a = points_a + T_a_b[..., None, :dim, axis] * points_b[..., axis, None]
+    return points_a

@@ -1,0 +1,121 @@
+"""Planar poses (x, y, heading): `pose_a_b` maps b-coordinates to a-coordinates.
+
+Every function takes NumPy arrays (float64 on the host: trajectories, graphs) or JAX arrays (traced, differentiable),
+with any leading axes, and returns the same kind and dtype. Lengths keep their unit, angles are radians.
+"""
+
+from __future__ import annotations
+
+from types import ModuleType
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import jaxlie
+import numpy as np
+from jaxtyping import Array, Float
+from numpy.typing import NDArray
+
+from dpmjax.types import AnyArray
+
+Poses = NDArray[np.float64]
+
+
+def _namespace(*arrays: Any) -> ModuleType:
+    """`jax.numpy` as soon as one array is JAX's, else `numpy`."""
+    return jnp if any(isinstance(array, jax.Array) for array in arrays) else np
+
+
+def wrap_angle(angle: Any) -> Any:
+    """The same angle in [-pi, pi]; small angles come back unchanged, and the derivative is 1 everywhere."""
+    return angle - 2 * np.pi * _namespace(angle).round(angle / (2 * np.pi))
+
+
+def compose(pose_a_b: Any, pose_b_c: Any) -> Any:
+    """The pose of c in a: `T_a_c = T_a_b @ T_b_c`, (..., 3) each."""
+    xp = _namespace(pose_a_b, pose_b_c)
+    cos, sin = xp.cos(pose_a_b[..., 2]), xp.sin(pose_a_b[..., 2])
+    x = pose_a_b[..., 0] + cos * pose_b_c[..., 0] - sin * pose_b_c[..., 1]
+    y = pose_a_b[..., 1] + sin * pose_b_c[..., 0] + cos * pose_b_c[..., 1]
+    return xp.stack([x, y, wrap_angle(pose_a_b[..., 2] + pose_b_c[..., 2])], axis=-1)
+
+
+def inverse(pose_a_b: Any) -> Any:
+    """The pose of a in b, (..., 3)."""
+    xp = _namespace(pose_a_b)
+    x, y, heading = pose_a_b[..., 0], pose_a_b[..., 1], pose_a_b[..., 2]
+    cos, sin = xp.cos(heading), xp.sin(heading)
+    return xp.stack([-cos * x - sin * y, sin * x - cos * y, wrap_angle(-heading)], axis=-1)
+
+
+def relative(pose_w_a: Any, pose_w_b: Any) -> Any:
+    """The pose of b in a: `T_a_b = inverse(T_w_a) @ T_w_b`, (..., 3) each."""
+    xp = _namespace(pose_w_a, pose_w_b)
+    cos, sin = xp.cos(pose_w_a[..., 2]), xp.sin(pose_w_a[..., 2])
+    # The difference first: poses far from the origin lose no digits to each other.
+    dx, dy = pose_w_b[..., 0] - pose_w_a[..., 0], pose_w_b[..., 1] - pose_w_a[..., 1]
+    heading = wrap_angle(pose_w_b[..., 2] - pose_w_a[..., 2])
+    return xp.stack([cos * dx + sin * dy, -sin * dx + cos * dy, heading], axis=-1)
+
+
+def chain(steps: Poses) -> Poses:
+    """Poses from steps: `T_world_next = T_world_scan @ T_scan_next`, the first pose zero.
+
+    Args:
+        steps: (n - 1, 3) T_scan_next.
+
+    Returns:
+        (n, 3) T_world_scan.
+    """
+    poses = [np.zeros(3)]
+    for step in steps:
+        poses.append(compose(poses[-1], step))
+    return np.array(poses)
+
+
+def rotation(heading: Any) -> Any:
+    """Rotation matrices (..., 2, 2) of headings (...)."""
+    xp = _namespace(heading)
+    cos, sin = xp.cos(heading), xp.sin(heading)
+    return xp.stack([xp.stack([cos, -sin], axis=-1), xp.stack([sin, cos], axis=-1)], axis=-2)
+
+
+def to_matrix(pose_a_b: Any) -> Any:
+    """The homogeneous matrix `T_a_b` (..., 3, 3) of a pose (..., 3)."""
+    xp = _namespace(pose_a_b)
+    x, y = pose_a_b[..., 0], pose_a_b[..., 1]
+    cos, sin = xp.cos(pose_a_b[..., 2]), xp.sin(pose_a_b[..., 2])
+    zero, one = xp.zeros_like(x), xp.ones_like(x)
+    rows = [xp.stack(row, axis=-1) for row in ((cos, -sin, x), (sin, cos, y), (zero, zero, one))]
+    return xp.stack(rows, axis=-2)
+
+
+def from_matrix(T_a_b: Any) -> Any:
+    """The pose (..., 3), heading in [-pi, pi], of a homogeneous matrix (..., 3, 3)."""
+    xp = _namespace(T_a_b)
+    return xp.stack([T_a_b[..., 0, 2], T_a_b[..., 1, 2], xp.arctan2(T_a_b[..., 1, 0], T_a_b[..., 0, 0])], axis=-1)
+
+
+def transform_points(pose_a_b: Any, points_b: Any) -> Any:
+    """Points in a: poses (..., 3) and points (..., n, 2) of one scan each -> (..., n, 2)."""
+    xp = _namespace(pose_a_b, points_b)
+    cos, sin = xp.cos(pose_a_b[..., 2, None]), xp.sin(pose_a_b[..., 2, None])
+    x = cos * points_b[..., 0] - sin * points_b[..., 1] + pose_a_b[..., 0, None]
+    y = sin * points_b[..., 0] + cos * points_b[..., 1] + pose_a_b[..., 1, None]
+    return xp.stack([x, y], axis=-1)
+
+
+def adjoint(pose_a_b: Any) -> Any:
+    """The adjoint (..., 3, 3) of T_a_b on tangents (dx, dy, dheading): moves them from b to a."""
+    xp = _namespace(pose_a_b)
+    cos, sin = xp.cos(pose_a_b[..., 2]), xp.sin(pose_a_b[..., 2])
+    zero, one = xp.zeros_like(cos), xp.ones_like(cos)
+    rows = ((cos, -sin, pose_a_b[..., 1]), (sin, cos, -pose_a_b[..., 0]), (zero, zero, one))
+    return xp.stack([xp.stack(row, axis=-1) for row in rows], axis=-2)
+
+
+@jax.jit
+def exp(tangent: Float[AnyArray, "... 3"]) -> Float[Array, "... 3 3"]:
+    """The matrix of a planar twist (vx, vy, angle); the gradient is right at zero too."""
+    with jax.default_matmul_precision("highest"):
+        return jaxlie.SE2.exp(jnp.asarray(tangent)).as_matrix()

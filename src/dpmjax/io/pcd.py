@@ -1,0 +1,162 @@
+"""Point Cloud Data files (PCD 0.7): what planar scans need of the format."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from dpmjax.io.errors import InputError
+from dpmjax.io.files import write_atomically
+
+
+class _Header(NamedTuple):
+    """What a PCD header says: names, NumPy types and counts of the fields, points, encoding; and its own length."""
+
+    fields: list[str]
+    types: list[str]
+    counts: list[int]
+    num_points: int
+    encoding: str
+    size: int
+
+
+def read_pcd(path: str | Path, *, drop_nan: bool = False) -> NDArray[np.float32]:
+    """Reads the points of a PCD file.
+
+    Args:
+        path: the file.
+        drop_nan: leaves out points of NaN, by which organised clouds mark beams that met nothing.
+
+    Returns:
+        (m, 3) float32 x, y, z in the file's unit; z is zero where the file has none.
+
+    Raises:
+        InputError: the file is missing, or `parse_pcd` finds fault with it.
+    """
+    try:
+        content = Path(path).read_bytes()
+    except OSError as error:
+        raise InputError(path, f"cannot be read ({error.strerror})", "check the path") from error
+    return parse_pcd(content, str(path), drop_nan=drop_nan)
+
+
+def parse_pcd(content: bytes, source: str, *, drop_nan: bool = False) -> NDArray[np.float32]:
+    """Reads the points out of the bytes of a PCD file (DATA ascii or binary, fields in any order).
+
+    Args:
+        content: the whole file.
+        source: its name, for messages.
+        drop_nan: leaves out points whose coordinates are all NaN.
+
+    Returns:
+        (m, 3) float32 x, y, z in the file's unit; z is zero where the file has none.
+
+    Raises:
+        InputError: a broken header, no x or y column, a truncated body, NaN or infinite coordinates, or the compressed
+            encoding, which is not supported.
+    """
+    header = _parse_header(content, source)
+    for name in ("x", "y"):
+        if name not in header.fields:
+            raise InputError(source, f"fields are {' '.join(header.fields)}", f"the file needs a column {name}")
+    body = content[header.size :]
+    read = {"ascii": _read_ascii, "binary": _read_binary}.get(header.encoding)
+    if read is None:
+        raise InputError(source, f"DATA {header.encoding} is not supported", "save the cloud as ascii or binary PCD")
+    columns = read(body, header, source)
+    zeros = np.zeros(header.num_points, np.float32)
+    points = np.stack([np.asarray(columns.get(name, zeros), np.float32) for name in "xyz"], axis=1)
+    if drop_nan:
+        points = points[~np.isnan(points).all(axis=1)]
+    bad = ~np.isfinite(points).all(axis=1)
+    if bad.any():
+        found = f"{bad.sum()} of {len(points)} points are NaN or infinite, the first at row {int(np.argmax(bad))}"
+        raise InputError(source, found, "write invalid beams as 0 0 0")
+    return points
+
+
+def write_pcd(path: str | Path, points: ArrayLike) -> Path:
+    """Writes points in the layout of the DeepMapping authors: fields x y z, float32, binary, one row of points.
+
+    Args:
+        path: file to write, atomically.
+        points: (m, 2) or (m, 3); z is zero where there is none.
+
+    Returns:
+        The path.
+
+    Raises:
+        ValueError: another shape.
+    """
+    values = np.asarray(points, "<f4")
+    if values.ndim != 2 or values.shape[1] not in (2, 3):
+        raise ValueError(f"points must be (m, 2) or (m, 3), got {values.shape}")
+    cloud = np.zeros((len(values), 3), "<f4")
+    cloud[:, : values.shape[1]] = values
+    header = (
+        "# .PCD v0.7 - Point Cloud Data file format\nVERSION 0.7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\n"
+        f"WIDTH {len(cloud)}\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS {len(cloud)}\nDATA binary\n"
+    )
+    return write_atomically(path, header.encode("ascii") + cloud.tobytes())
+
+
+def _parse_header(content: bytes, source: str) -> _Header:
+    entries: dict[str, list[str]] = {}
+    size = 0
+    while "DATA" not in entries:
+        end = content.find(b"\n", size)
+        if end < 0 or size > 4096:
+            raise InputError(source, "no PCD header", "give PCD files (VERSION, FIELDS, SIZE, TYPE, ..., DATA)")
+        words = content[size:end].decode("latin-1").split()
+        size = end + 1
+        if words and not words[0].startswith("#"):
+            entries[words[0].upper()] = words[1:]
+    try:
+        fields = entries["FIELDS"]
+        types = ["<" + _TYPES[t] + s for t, s in zip(entries["TYPE"], entries["SIZE"], strict=True)]
+        counts = [int(c) for c in entries.get("COUNT", ["1"] * len(fields))]
+        num_points = (
+            int(entries["POINTS"][0]) if "POINTS" in entries else int(entries["WIDTH"][0]) * int(entries["HEIGHT"][0])
+        )
+        if not len(fields) == len(types) == len(counts) or num_points < 0 or not entries["DATA"]:
+            raise ValueError("lengths differ")
+        np.dtype(",".join(types))
+    except (KeyError, ValueError, IndexError, TypeError) as error:
+        found = f"broken PCD header ({type(error).__name__}: {error})"
+        raise InputError(source, found, "write FIELDS, SIZE, TYPE, COUNT of one length, POINTS and DATA") from error
+    return _Header(fields, types, counts, num_points, entries["DATA"][0].lower(), size)
+
+
+_TYPES = {"F": "f", "I": "i", "U": "u"}
+
+
+def _read_binary(body: bytes, header: _Header, source: str) -> dict[str, NDArray[np.generic]]:
+    layout = np.dtype([(f"{i}", t, (c,)) for i, (t, c) in enumerate(zip(header.types, header.counts, strict=True))])
+    expected = header.num_points * layout.itemsize
+    if len(body) < expected:
+        found = f"truncated: {header.num_points} points need {expected} bytes, {len(body)} are there"
+        raise InputError(source, found, "copy the file again")
+    table = np.frombuffer(body, layout, count=header.num_points)
+    return {name: table[f"{i}"][:, 0] for i, name in enumerate(header.fields) if header.counts[i]}
+
+
+def _read_ascii(body: bytes, header: _Header, source: str) -> dict[str, NDArray[np.generic]]:
+    rows = [line.split() for line in body.decode("latin-1").splitlines() if line.strip()]
+    if len(rows) < header.num_points:
+        found = f"truncated: the header tells of {header.num_points} points, {len(rows)} are there"
+        raise InputError(source, found, "copy the file again")
+    rows = rows[: header.num_points]
+    width = sum(header.counts)
+    wrong = next((i for i, row in enumerate(rows) if len(row) != width), None)
+    if wrong is not None:
+        found = f"row {wrong} has {len(rows[wrong])} columns, the header tells of {width}"
+        raise InputError(source, found, "write one value per field in each row")
+    try:
+        table = np.array(rows, np.float64).reshape(len(rows), width)
+    except ValueError as error:
+        raise InputError(source, f"not a number ({error})", "write plain decimal numbers") from error
+    first = np.cumsum([0, *header.counts[:-1]])
+    return {name: table[:, first[i]] for i, name in enumerate(header.fields) if header.counts[i]}

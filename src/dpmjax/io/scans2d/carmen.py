@@ -1,0 +1,178 @@
+"""CARMEN logs: planar scans of a front laser with the pose a SLAM program gave them and the robot's odometry.
+
+A line is `FLASER n r1 .. rn x y theta odom_x odom_y odom_theta ipc_timestamp host timestamp`: ranges in metres over 180
+degrees from right to left, the corrected pose, the raw odometry. Every other line is passed over.
+
+Two traps of the published logs are met here. Some lines carry time stamp and odometry of another moment (they break the
+order of the time stamps, and the odometry jumps by metres there and back): those entries are interpolated. And where
+odometry equals the corrected pose throughout, the raw odometry is lost: there is none.
+"""
+
+from __future__ import annotations
+
+import bisect
+import gzip
+import logging
+import zlib
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dpmjax.io.errors import InputError
+from dpmjax.io.scans2d.sequence import ScanSequence
+
+_log = logging.getLogger(__name__)
+_SHORTEST_SCALE_M = 7.9  # No laser of these logs has a shorter scale: a log that ends before has no code for "no echo".
+_CODE_BAND_M = 0.1  # Codes for "no echo" scatter by a few centimetres (81.87 to 81.91 m on a SICK LMS).
+
+
+class _Line(NamedTuple):
+    """One FLASER line: ranges, m; corrected pose, odometry (x, y, theta); time stamp, s."""
+
+    ranges: NDArray[np.float64]
+    corrected: NDArray[np.float64]
+    odometry: NDArray[np.float64]
+    time: float
+
+
+def read_carmen_log(path: str | Path, *, max_range: float | None = None) -> ScanSequence:
+    """Reads a CARMEN log.
+
+    Args:
+        path: `.log`, `.clf` or their `.gz`.
+        max_range: readings of this many metres or more are no echo and become masked. None takes the largest reading of
+            the log, less 0.1 m, if that reading is beyond 7.9 m, and masks nothing for length otherwise. Readings of
+            zero and below are always masked.
+
+    Returns:
+        The scans in metres; scans with fewer beams than the longest are padded with masked beams. The corrected poses
+        are the reference. No times where the log's stand still.
+
+    Raises:
+        InputError: the file cannot be read, has no FLASER line, or a FLASER line lacks values or holds what is no
+            number.
+    """
+    lines = [_parse_line(words, f"{path}:{number}") for number, words in _flaser_lines(path)]
+    capacity = max(len(line.ranges) for line in lines)
+    points = np.zeros((len(lines), capacity, 2), np.float32)
+    mask = np.zeros((len(lines), capacity), bool)
+    limit = _no_echo_limit(lines) if max_range is None else max_range
+    for row, valid, line in zip(points, mask, lines, strict=True):
+        count = len(line.ranges)
+        angles = scan_angles(count)
+        row[:count] = line.ranges[:, None] * np.column_stack([np.cos(angles), np.sin(angles)])
+        valid[:count] = (line.ranges > 0) & (line.ranges < limit)
+    points[~mask] = 0
+    corrected, odometry = np.array([line.corrected for line in lines]), np.array([line.odometry for line in lines])
+    has_odometry = not np.allclose(corrected, odometry, atol=1e-6)
+    times, odometry = _repair(np.array([line.time for line in lines]), odometry, path)
+    return ScanSequence(
+        name=Path(path).name.split(".")[0],
+        points=points,
+        mask=mask,
+        unit="m",
+        is_organised=True,
+        reference_poses=corrected,
+        odometry_poses=odometry if has_odometry else None,
+        times=times,
+    )
+
+
+def scan_angles(num_beams: int) -> NDArray[np.float64]:
+    """Directions of the beams of a scan over 180 degrees, from right to left.
+
+    An odd number of beams (181, 361) includes both ends; an even one (180, 360) has the step 180 / n and leaves out the
+    left end. Consecutive scans of real logs agree best this way.
+
+    Args:
+        num_beams: number of beams.
+
+    Returns:
+        (num_beams,) radians in the sensor frame, from -pi/2 upwards.
+    """
+    step = np.pi / max(num_beams - 1 if num_beams % 2 else num_beams, 1)
+    return -np.pi / 2 + step * np.arange(num_beams, dtype=np.float64)
+
+
+def _flaser_lines(path: str | Path) -> list[tuple[int, list[str]]]:
+    """Line numbers and words of the FLASER lines."""
+    try:
+        content = Path(path).read_bytes()
+        text = (gzip.decompress(content) if content[:2] == b"\x1f\x8b" else content).decode("latin-1")
+    except (OSError, EOFError, zlib.error) as error:
+        raise InputError(path, f"cannot be read ({error})", "check the path, or copy the file again") from error
+    lines = text.splitlines()
+    found = [(number, line.split()) for number, line in enumerate(lines, 1) if line.startswith("FLASER")]
+    if not found:
+        newer = any(line.startswith("ROBOTLASER1") for line in lines)
+        told = "ROBOTLASER1 lines but no FLASER line" if newer else "no FLASER line"
+        raise InputError(path, told, "give a CARMEN log with FLASER lines")
+    return found
+
+
+def _parse_line(words: list[str], source: str) -> _Line:
+    advice = "a line reads FLASER n r1..rn x y theta odom_x odom_y odom_theta timestamp host timestamp"
+    try:
+        count = int(words[1])
+        values = np.array(words[2 : 2 + count + 6], np.float64)
+        time = float(words[count + 8]) if len(words) > count + 8 else 0.0
+    except (ValueError, IndexError) as error:
+        raise InputError(source, f"not a FLASER line ({error})", advice) from error
+    if count < 1 or len(values) < count + 6:
+        raise InputError(source, f"{len(words) - 2} values after n = {count}, at least {count + 6} expected", advice)
+    ranges, corrected, odometry = values[:count], values[count : count + 3], values[count + 3 :]
+    if np.isnan(values).any() or not np.isfinite(values[count:]).all() or not np.isfinite(time):
+        raise InputError(source, "NaN or infinite values", "remove the line")
+    return _Line(ranges, corrected, odometry, time)
+
+
+def _no_echo_limit(lines: list[_Line]) -> float:
+    largest = max(float(line.ranges.max()) for line in lines)
+    if np.isinf(largest):
+        return np.inf
+    return largest - _CODE_BAND_M if largest >= _SHORTEST_SCALE_M else np.inf
+
+
+def _repair(
+    times: NDArray[np.float64], odometry: NDArray[np.float64], path: str | Path
+) -> tuple[NDArray[np.float64] | None, NDArray[np.float64]]:
+    """Interpolates time and odometry where the time stamp is out of order; no times where they stand still."""
+    if np.ptp(times) == 0:
+        return None, odometry
+    trusted = _longest_increasing(times)
+    num_wrong = len(times) - len(trusted)
+    if 2 * num_wrong > len(times):
+        _log.warning("%s: time stamps are in no order; odometry is taken as it stands, times are dropped", path)
+        return None, odometry
+    if num_wrong:
+        _log.warning(
+            "%s: %d of %d lines carry time and odometry of another moment; both are interpolated",
+            path,
+            num_wrong,
+            len(times),
+        )
+    index = np.arange(len(times))
+    pose = odometry[trusted].copy()
+    pose[:, 2] = np.unwrap(pose[:, 2])
+    repaired = np.column_stack([np.interp(index, trusted, column) for column in pose.T])
+    repaired[:, 2] = np.pi - (np.pi - repaired[:, 2]) % (2 * np.pi)
+    repaired[trusted] = odometry[trusted]
+    return np.interp(index, trusted, times[trusted]), repaired
+
+
+def _longest_increasing(values: NDArray[np.float64]) -> NDArray[np.int64]:
+    """Indices of the longest subsequence that strictly increases (patience sorting)."""
+    tails: list[float] = []
+    ends: list[int] = []
+    before = np.full(len(values), -1)
+    for index, value in enumerate(values.tolist()):
+        pile = bisect.bisect_left(tails, value)
+        tails[pile : pile + 1] = [value]
+        ends[pile : pile + 1] = [index]
+        before[index] = ends[pile - 1] if pile else -1
+    chain = [ends[-1]]
+    while before[chain[-1]] >= 0:
+        chain.append(int(before[chain[-1]]))
+    return np.array(chain[::-1])

@@ -1,0 +1,142 @@
+"""The DeepMapping authors' layout of a 2-D trajectory: one PCD file per scan, and gt_pose.mat beside them.
+
+Coordinates in the PCD files are pixels / 512, poses are pixels and radians; an invalid beam is a point of zeros.
+"""
+
+from __future__ import annotations
+
+import io
+import tarfile
+from pathlib import Path, PurePosixPath
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dpmjax.io.errors import InputError
+from dpmjax.io.files import natural_key, write_atomically
+from dpmjax.io.pcd import parse_pcd, write_pcd
+from dpmjax.io.scans2d.sequence import ScanSequence, has_angular_order
+
+PIXELS_PER_UNIT = 512.0
+_LARGEST_STORED = 8.0  # A picture of 2048 pixels has a diagonal of 5.7 stored units.
+_POSE_FILE = "gt_pose.mat"
+
+
+def read_deepmapping_folder(path: str | Path, *, unit: Literal["px", "m"] | None = None) -> ScanSequence:
+    """Reads a folder or an uncompressed or compressed tar archive of `*.pcd` and `gt_pose.mat`.
+
+    Args:
+        path: the folder, or the archive.
+        unit: "px" (or None) multiplies coordinates by 512, as the authors' files need; "m" takes them as they are, for
+            other people's PCD scans.
+
+    Returns:
+        The scans in natural order of their names; scans with fewer points than the longest are padded with masked
+        beams; reference poses where there is a `gt_pose.mat`.
+
+    Raises:
+        InputError: no such path, no PCD file, a file `parse_pcd` finds fault with, a pose file that does not fit, or
+            (unit None) coordinates too large to be pixels / 512.
+    """
+    files = _list_files(Path(path))
+    names = sorted((name for name in files if name.lower().endswith(".pcd")), key=natural_key)
+    if not names:
+        raise InputError(path, "no .pcd file in it", "give the authors' folder or .tar of .pcd files")
+    scans = [parse_pcd(files[name], f"{path}/{name}")[:, :2] for name in names]
+    points, mask = _pad(scans)
+    if not mask.any():
+        raise InputError(
+            path, "every point of every scan is zero (an invalid beam)", "give scans that measured something"
+        )
+    if unit is None and np.abs(points).max() > _LARGEST_STORED:
+        found = f"coordinates up to {np.abs(points).max():g}, too large for pixels / 512"
+        raise InputError(path, found, "say --unit m if they are metres")
+    if unit != "m":
+        points *= np.float32(PIXELS_PER_UNIT)
+    pose_name = next((name for name in files if PurePosixPath(name).name == _POSE_FILE), None)
+    return ScanSequence(
+        name=Path(path).stem,
+        points=points,
+        mask=mask,
+        unit="m" if unit == "m" else "px",
+        is_organised=has_angular_order(points, mask),
+        reference_poses=None if pose_name is None else _read_poses(files[pose_name], f"{path}/{pose_name}", len(names)),
+    )
+
+
+def write_deepmapping_folder(path: str | Path, sequence: ScanSequence) -> Path:
+    """Writes a sequence in the authors' layout, so that it is interchangeable with theirs.
+
+    Args:
+        path: folder to write to; it is made where missing.
+        sequence: scans in px (written as pixels / 512) or in m (written as they are); masked beams become zeros.
+
+    Returns:
+        The folder with `000.pcd`, `001.pcd`, ... and, where the sequence has a reference, `gt_pose.mat`.
+
+    Raises:
+        InputError: the folder holds other PCD files, which would be read along with ours.
+    """
+    from scipy.io import savemat
+
+    folder = Path(path)
+    digits = max(3, len(str(len(sequence) - 1)))
+    names = [f"{index:0{digits}d}.pcd" for index in range(len(sequence))]
+    strangers = sorted({file.name for file in folder.glob("*.pcd")} - set(names)) if folder.is_dir() else []
+    if strangers:
+        raise InputError(folder, f"{len(strangers)} other .pcd files, such as {strangers[0]}", "give an empty folder")
+    scale = PIXELS_PER_UNIT if sequence.unit == "px" else 1.0
+    stored = np.where(sequence.mask[..., None], sequence.points, 0.0) / scale
+    for name, points in zip(names, stored, strict=True):
+        write_pcd(folder / name, points)
+    if sequence.reference_poses is not None:
+        buffer = io.BytesIO()
+        savemat(buffer, {"pose": sequence.reference_poses})  # type: ignore[arg-type]  # Streams are fine.
+        write_atomically(folder / _POSE_FILE, buffer.getvalue())
+    return folder
+
+
+def _list_files(path: Path) -> dict[str, bytes]:
+    """The PCD and MAT files by name; archives are read in memory and never unpacked."""
+    if path.is_dir():
+        chosen = [file for file in path.iterdir() if file.suffix.lower() in (".pcd", ".mat")]
+        return {file.name: file.read_bytes() for file in chosen if file.is_file()}
+    if not path.exists():
+        raise InputError(path, "no such file or folder", "check the path")
+    try:
+        with tarfile.open(path) as archive:
+            members = [m for m in archive if m.isfile() and m.name.lower().endswith((".pcd", ".mat"))]
+            members = [m for m in members if not PurePosixPath(m.name).name.startswith("._")]
+            return {m.name: file.read() for m in members if (file := archive.extractfile(m)) is not None}
+    except (tarfile.TarError, EOFError, OSError) as error:
+        raise InputError(path, f"not a readable tar archive ({error})", "copy the archive again") from error
+
+
+def _pad(scans: list[NDArray[np.float32]]) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+    """Ragged scans as points (n, b, 2) and mask (n, b); a point of zeros is an invalid beam."""
+    points = np.zeros((len(scans), max(len(scan) for scan in scans), 2), np.float32)
+    for row, scan in zip(points, scans, strict=True):
+        row[: len(scan)] = scan
+    return points, (points != 0).any(axis=2)
+
+
+def _read_poses(content: bytes, source: str, num_scans: int) -> NDArray[np.float64]:
+    """The (n, 3) array `pose` of a MATLAB file."""
+    from scipy.io import loadmat
+
+    try:
+        variables = loadmat(io.BytesIO(content))  # type: ignore[arg-type]  # Streams are fine.
+    except Exception as error:  # SciPy raises whatever its parser trips over.
+        raise InputError(
+            source, f"not a readable MATLAB file ({type(error).__name__})", "save it again, or remove it"
+        ) from error
+    if "pose" not in variables:
+        names = [name for name in variables if not name.startswith("__")]
+        raise InputError(source, f"variables are {', '.join(names) or 'none'}", "the file needs a variable 'pose'")
+    pose = variables["pose"]
+    if pose.shape != (num_scans, 3) or pose.dtype.kind not in "fiu":
+        raise InputError(source, f"pose is {pose.shape} for {num_scans} scans", "give (n, 3) x px, y px, theta rad")
+    if not np.isfinite(pose).all():
+        raise InputError(source, "pose holds NaN or infinite values", "give a pose to every scan")
+    return pose.astype(np.float64)

@@ -1,0 +1,1 @@
+"""Pose graphs: relative poses in, poses that agree with most of them out."""

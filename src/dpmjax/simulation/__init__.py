@@ -1,0 +1,5 @@
+"""Simulated worlds made by seed: 2-D worlds, apartments, a town. No algorithm imports them."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

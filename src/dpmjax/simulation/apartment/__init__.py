@@ -1,0 +1,1 @@
+"""Simulated apartments seen by a depth camera."""

@@ -1,0 +1,141 @@
+"""A drive along the route of a town: where the sensor is, and when."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dpmjax.simulation.town.make import Town, lane_of
+from dpmjax.simulation.town.paths import arc_lengths, at_way, tangents
+
+_WHEELBASE_M = 2.7
+_TRACK_M = 1.6
+_DRIVE_STREAM = 8151
+
+
+@dataclass(frozen=True)
+class DriveConfig:
+    """How the car drives.
+
+    Attributes:
+        speed_m_s: on straight streets; in corners it is a third of that at least.
+        rate_hz: scans per second.
+        start_m: where on the route the drive begins.
+        length_m: way that is driven; None for once round (a closed route) or to the end.
+        is_reversed: the other way round, in the other lane.
+        sensor_height_m: above the ground.
+        sway_m: standard deviation of the way the car wanders in its lane.
+        shake_deg: standard deviation of fast roll and pitch.
+
+    Raises:
+        ValueError: speed, rate or length not positive.
+    """
+
+    speed_m_s: float = 8.0
+    rate_hz: float = 10.0
+    start_m: float = 0.0
+    length_m: float | None = None
+    is_reversed: bool = False
+    sensor_height_m: float = 1.73
+    sway_m: float = 0.15
+    shake_deg: float = 0.25
+
+    def __post_init__(self) -> None:
+        if not (self.speed_m_s > 0 and self.rate_hz > 0 and (self.length_m is None or self.length_m > 0)):
+            raise ValueError("speed_m_s, rate_hz and length_m must be positive")
+
+
+class Drive(NamedTuple):
+    """Poses and times of a drive.
+
+    Attributes:
+        T_world_lidar: (n, 4, 4) float64, x forward, y left, z up, m.
+        times: (n,) s, from 0.
+    """
+
+    T_world_lidar: NDArray[np.float64]
+    times: NDArray[np.float64]
+
+
+def drive(town: Town, config: DriveConfig = DriveConfig(), *, seed: int = 0) -> Drive:
+    """Drives along the town's route.
+
+    Args:
+        town: the town.
+        config: how.
+        seed: of sway and shake.
+
+    Returns:
+        The drive. A drive once round a closed route ends one step before the place where it began.
+    """
+    rng = np.random.default_rng([_DRIVE_STREAM, seed])
+    lane = lane_of(town.streets, is_reversed=config.is_reversed)
+    whole = arc_lengths(lane)[-1]
+    is_closed = town.streets.is_closed
+    length = config.length_m or (whole if is_closed else whole - config.start_m)
+    if not is_closed:
+        length = min(length, whole - config.start_m)
+    way, times = _timetable(lane, length, config, is_closed=is_closed)
+    way = way % whole if is_closed else way
+    along = _directions(lane, way)
+    left = np.column_stack([-along[:, 1], along[:, 0]])
+    places = at_way(lane, way) + (config.sway_m * _slow_noise(rng, way))[:, None] * left
+    return Drive(_poses(town, places, along, left, config, rng), times)
+
+
+def _timetable(
+    lane: NDArray[np.float64], length: float, config: DriveConfig, *, is_closed: bool
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Ways along the lane and times of the scans."""
+    way = np.arange(0.0, length, 0.5)
+    whole = arc_lengths(lane)[-1]
+    at = (config.start_m + way) % whole if is_closed else config.start_m + way
+    before, after = _directions(lane, at), _directions(lane, (at + 5.0) % whole if is_closed else at + 5.0)
+    cosine = np.clip((before * after).sum(1), -1.0, 1.0)
+    speed = config.speed_m_s * np.clip(1.0 - 0.9 * np.arccos(cosine), 1 / 3, 1.0)
+    clock = np.concatenate([[0.0], np.cumsum(np.diff(way) / (0.5 * (speed[1:] + speed[:-1])))])
+    times = np.arange(0.0, clock[-1] + 1e-9, 1.0 / config.rate_hz)
+    return config.start_m + np.interp(times, clock, way), times
+
+
+def _directions(lane: NDArray[np.float64], way: NDArray[np.float64]) -> NDArray[np.float64]:
+    lengths = arc_lengths(lane)
+    slope = tangents(lane)
+    found = np.column_stack([np.interp(way, lengths, column) for column in slope.T])
+    return found / np.maximum(np.linalg.norm(found, axis=1, keepdims=True), 1e-9)
+
+
+def _slow_noise(rng: np.random.Generator, way: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Unit noise that changes over tens of metres."""
+    phases = rng.uniform(0, 2 * np.pi, 3)
+    waves = 2 * np.pi / np.array([31.0, 53.0, 97.0])
+    return np.sqrt(2 / 3) * np.sin(way[:, None] * waves + phases).sum(1)
+
+
+def _poses(
+    town: Town,
+    places: NDArray[np.float64],
+    along: NDArray[np.float64],
+    left: NDArray[np.float64],
+    config: DriveConfig,
+    rng: np.random.Generator,
+) -> NDArray[np.float64]:
+    """Stands the car on its wheels: pitch and roll from the ground under the axles, and a little shaking."""
+    height = town.terrain.height_at
+    shake = np.radians(config.shake_deg) * rng.normal(size=(2, len(places)))
+    half = 0.5 * _WHEELBASE_M
+    climb = (height(places + half * along) - height(places - half * along)) / _WHEELBASE_M + shake[0]
+    bank = (height(places + 0.5 * _TRACK_M * left) - height(places - 0.5 * _TRACK_M * left)) / _TRACK_M + shake[1]
+    forward = np.column_stack([along, climb])
+    forward /= np.linalg.norm(forward, axis=1, keepdims=True)
+    sideways = np.column_stack([left, bank])
+    up = np.cross(forward, sideways)
+    up /= np.linalg.norm(up, axis=1, keepdims=True)
+    poses = np.tile(np.eye(4), (len(places), 1, 1))
+    poses[:, :3, 0], poses[:, :3, 1], poses[:, :3, 2] = forward, np.cross(up, forward), up
+    poses[:, :2, 3] = places
+    poses[:, 2, 3] = height(places) + config.sensor_height_m
+    return poses

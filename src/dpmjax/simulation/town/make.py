@@ -1,0 +1,195 @@
+"""Makes towns by seed."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import jax.numpy as jnp
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from dpmjax.simulation.town.furnish import furnish
+from dpmjax.simulation.town.objects import Collection
+from dpmjax.simulation.town.paths import arc_lengths, resample, shift_left
+from dpmjax.simulation.town.plots import Plots
+from dpmjax.simulation.town.primitives import (
+    LANE_STEP_M,
+    Ground,
+    TownPrimitives,
+    Traffic,
+    capacity_for,
+    mask_of,
+    pack_boxes,
+    pack_cylinders,
+    pack_spheroids,
+    padded,
+)
+from dpmjax.simulation.town.streets import LANE_M, RouteKind, Streets, make_streets, streets_along
+from dpmjax.simulation.town.terrain import CELL_M, Terrain, make_terrain
+
+_SENSOR_HEIGHT_M = 1.73
+_TOWN_STREAM = 8150
+
+
+@dataclass(frozen=True)
+class TownConfig:
+    """What a town is like.
+
+    Attributes:
+        route: kind of the drive's route; "there_and_back" drives the same street in both directions.
+        route_length_m: wanted length of the route, met within a block or two.
+        block_m: side of a block.
+        steepness: typical slope of the land, rise over run.
+        cars_per_km: driving cars for each kilometre of lane.
+        walkers_per_km: people that walk for each kilometre of lane.
+
+    Raises:
+        ValueError: a length that is not positive, or a negative rate.
+    """
+
+    route: RouteKind = "loop"
+    route_length_m: float = 1000.0
+    block_m: float = 100.0
+    steepness: float = 0.015
+    cars_per_km: float = 10.0
+    walkers_per_km: float = 15.0
+
+    def __post_init__(self) -> None:
+        if self.route not in ("loop", "there_and_back", "wander"):
+            raise ValueError(f"route must be loop, there_and_back or wander, got {self.route!r}")
+        if not (self.route_length_m > 0 and self.block_m >= 50):
+            raise ValueError(
+                f"route_length_m must be positive and block_m at least 50, got {self.route_length_m} and {self.block_m}"
+            )
+        if min(self.steepness, self.cars_per_km, self.walkers_per_km) < 0:
+            raise ValueError("steepness, cars_per_km and walkers_per_km must not be negative")
+
+
+@dataclass(frozen=True)
+class Town:
+    """A town.
+
+    Attributes:
+        name: with its seed, for titles.
+        streets: the streets and the route, on the host.
+        terrain: the ground, on the host.
+        primitives: what a beam meets, on the device.
+    """
+
+    name: str
+    streets: Streets = field(repr=False)
+    terrain: Terrain = field(repr=False)
+    primitives: TownPrimitives = field(repr=False)
+
+
+def make_town(seed: int, config: TownConfig = TownConfig(), *, trajectory: ArrayLike | None = None) -> Town:
+    """Builds the town of a seed; the same one every time.
+
+    Args:
+        seed: of all choices, not negative.
+        config: what the town is like; with a trajectory, its route and slopes do not count.
+        trajectory: (n, 4, 4) `T_world_lidar` of a real drive, z up (of KITTI: in the lidar's frame, not the camera's).
+            One street is laid along it, and the ground goes 1.73 m below it.
+
+    Returns:
+        The town.
+
+    Raises:
+        ValueError: a negative seed, or a trajectory of another shape or shorter than 20 m.
+    """
+    if seed < 0:
+        raise ValueError(f"seed must not be negative, got {seed}")
+    rng = np.random.default_rng([_TOWN_STREAM, seed])
+    support = None
+    if trajectory is None:
+        streets = make_streets(rng, config.route, config.route_length_m, config.block_m)
+    else:
+        positions = _positions(trajectory)
+        streets = streets_along(positions[:, :2], rng)
+        support = positions - [0.0, 0.0, _SENSOR_HEIGHT_M]
+    terrain = make_terrain(rng, streets, steepness=config.steepness, support=support)
+    standing = furnish(rng, streets, Plots(terrain))
+    traffic = _make_traffic(rng, streets, terrain, config)
+    return Town(f"town-{seed}", streets, terrain, pack_town(standing, terrain, traffic))
+
+
+def pack_town(standing: Collection, terrain: Terrain, traffic: Traffic) -> TownPrimitives:
+    """Brings a town to the device.
+
+    Args:
+        standing: rows of primitives.
+        terrain: the ground.
+        traffic: what moves.
+
+    Returns:
+        The primitives.
+    """
+    return TownPrimitives(
+        boxes=pack_boxes(np.array(standing.boxes, np.float64)),
+        cylinders=pack_cylinders(np.array(standing.cylinders, np.float64)),
+        spheroids=pack_spheroids(np.array(standing.spheroids, np.float64)),
+        ground=Ground(
+            heights=jnp.asarray(terrain.heights, jnp.float32),
+            origin=jnp.asarray(terrain.origin, jnp.float32),
+            cell=jnp.asarray(CELL_M, jnp.float32),
+        ),
+        traffic=traffic,
+    )
+
+
+def _positions(trajectory: ArrayLike) -> NDArray[np.float64]:
+    poses = np.asarray(trajectory, np.float64)
+    if poses.ndim != 3 or poses.shape[1:] != (4, 4) or not np.isfinite(poses).all():
+        raise ValueError(f"trajectory must be finite (n, 4, 4) poses, got {poses.shape}")
+    return poses[:, :3, 3]
+
+
+def _make_traffic(rng: np.random.Generator, streets: Streets, terrain: Terrain, config: TownConfig) -> Traffic:
+    lanes = [resample(lane, LANE_STEP_M) for line in streets.lanes for lane in (line, line[::-1])]
+    lengths = np.array([arc_lengths(lane)[-1] for lane in lanes])
+    users: list[tuple[float, ...]] = []
+    half_width = float(np.mean(streets.half_widths))
+    for index, length in enumerate(lengths):
+        for _ in range(rng.poisson(config.cars_per_km * length / 1000)):
+            size = (rng.uniform(1.9, 2.5), rng.uniform(0.82, 0.95), rng.uniform(0.7, 0.9))
+            users.append((index, rng.uniform(0, length), rng.uniform(6, 13), -LANE_M, *size))
+        for _ in range(rng.poisson(config.walkers_per_km * length / 1000)):
+            side = -half_width - rng.uniform(0.4, 1.8)
+            users.append(
+                (index, rng.uniform(0, length), rng.uniform(0.8, 1.8), side, 0.2, 0.25, rng.uniform(0.75, 0.93))
+            )
+    table = np.array(users, np.float64).reshape(-1, 7)
+    capacity = capacity_for(len(table))
+    rows = padded(table, capacity)
+    samples = capacity_for(max(len(lane) for lane in lanes))
+    points = np.stack([_fill(np.column_stack([lane, terrain.height_at(lane)]), samples) for lane in lanes])
+    lane_capacity = capacity_for(len(lanes), least=2)
+    return Traffic(
+        lane_points=padded(points, lane_capacity),
+        lane_lengths=jnp.maximum(padded(lengths, lane_capacity), 1.0),
+        lanes=rows[:, 0].astype(jnp.int32),
+        starts=rows[:, 1],
+        speeds=rows[:, 2],
+        sides=rows[:, 3],
+        half_sizes=rows[:, 4:7],
+        mask=mask_of(len(table), capacity),
+    )
+
+
+def _fill(points: NDArray[np.float64], count: int) -> NDArray[np.float64]:
+    """Repeats the last row up to `count` rows."""
+    return np.vstack([points, np.repeat(points[-1:], count - len(points), axis=0)])
+
+
+def lane_of(streets: Streets, *, is_reversed: bool) -> NDArray[np.float64]:
+    """The right lane of the route.
+
+    Args:
+        streets: with the route.
+        is_reversed: drive the route the other way round, on the other side of the street.
+
+    Returns:
+        (k, 2) points at steps of about half a metre.
+    """
+    line = streets.route[::-1] if is_reversed else streets.route
+    return resample(shift_left(line, -LANE_M), 0.5)

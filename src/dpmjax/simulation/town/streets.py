@@ -1,0 +1,160 @@
+"""Streets of a town and routes along them: a shaken, bent lattice of blocks, or one street laid along a trajectory."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dpmjax.simulation.town.paths import arc_lengths, resample, shift_left, smooth
+
+RouteKind = Literal["loop", "there_and_back", "wander"]
+LANE_M = 1.7
+"""From the middle of a street to the middle of a lane."""
+_STEP_M = 0.5
+_CORNER_M = 4.0
+
+
+@dataclass(frozen=True)
+class Streets:
+    """The streets, by their middle lines.
+
+    Attributes:
+        paths: (k, 2) points of each street at steps of half a metre, from side street to side street.
+        half_widths: from the middle to the kerb, m, of each street.
+        lanes: (k, 2) points of the long ways that traffic takes, in one direction; it also takes them in the other.
+        route: (k, 2) points of the drive's middle line at steps of half a metre.
+        is_closed: the route ends where it began.
+    """
+
+    paths: tuple[NDArray[np.float64], ...]
+    half_widths: tuple[float, ...]
+    lanes: tuple[NDArray[np.float64], ...]
+    route: NDArray[np.float64]
+    is_closed: bool
+
+
+def make_streets(rng: np.random.Generator, kind: RouteKind, length: float, block: float) -> Streets:
+    """Lays out blocks and a closed route round them.
+
+    Args:
+        rng: source of all choices.
+        kind: "loop": once round some blocks; "there_and_back": down a street, round a block and back on the other side
+            of the street, round a block there; "wander": at random, and home by the shortest way.
+        length: wanted length of the route, m; met within a block or two.
+        block: side of a block, m.
+
+    Returns:
+        The streets.
+    """
+    corners, size = _plan(rng, kind, max(round(length / block), 4))
+    place = _bend(rng, block)
+    shaken = np.stack(np.meshgrid(np.arange(size[0]), np.arange(size[1]), indexing="ij"), -1).astype(np.float64)
+    shaken = (shaken + rng.uniform(-0.14, 0.14, shaken.shape)) * block
+
+    def street(start: tuple[int, int], end: tuple[int, int]) -> NDArray[np.float64]:
+        line = np.linspace(shaken[start], shaken[end], 60)
+        return resample(place(line), _STEP_M)
+
+    paths = [
+        street((i, j), (i + di, j + dj))
+        for i in range(size[0])
+        for j in range(size[1])
+        for di, dj in ((1, 0), (0, 1))
+        if i + di < size[0] and j + dj < size[1]
+    ]
+    rows = [np.vstack([street((i, j), (i, j + 1)) for j in range(size[1] - 1)]) for i in range(size[0])]
+    columns = [np.vstack([street((i, j), (i + 1, j)) for i in range(size[0] - 1)]) for j in range(size[1])]
+    route = np.vstack([street(a, b)[:-1] for a, b in pairwise(corners)])
+    route = resample(np.vstack([route, route[:1]]), _STEP_M)
+    route = resample(smooth(route, _CORNER_M / _STEP_M, is_closed=True), _STEP_M)
+    widths = tuple(float(w) for w in rng.uniform(4.6, 5.6, len(paths)))
+    return Streets(tuple(paths), widths, tuple(resample(lane, _STEP_M) for lane in rows + columns), route, True)
+
+
+def streets_along(trajectory: NDArray[np.float64], rng: np.random.Generator) -> Streets:
+    """A street along a driven trajectory, which is its right lane.
+
+    Args:
+        trajectory: (n, 2) positions of the car, m, in order.
+        rng: source of the widths.
+
+    Returns:
+        One street for every 120 m or so of way, each with its own width.
+
+    Raises:
+        ValueError: the trajectory is shorter than 20 m.
+    """
+    moved = np.concatenate([[True], np.linalg.norm(np.diff(trajectory, axis=0), axis=1) > 0.02])
+    driven = trajectory[moved]
+    if len(driven) < 2 or arc_lengths(driven)[-1] < 20:
+        raise ValueError("a trajectory must be at least 20 m long")
+    line = smooth(resample(driven, _STEP_M), 1.5 / _STEP_M, is_closed=False)
+    middle = resample(shift_left(line, LANE_M), _STEP_M)
+    count = max(round(arc_lengths(middle)[-1] / 120), 1)
+    pieces = [piece for piece in np.array_split(middle, count) if len(piece) > 1]
+    widths = tuple(float(w) for w in rng.uniform(4.6, 5.4, len(pieces)))
+    return Streets(tuple(pieces), widths, (middle,), middle, False)
+
+
+def _bend(rng: np.random.Generator, block: float) -> Callable[[NDArray[np.float64]], NDArray[np.float64]]:
+    """A smooth displacement of the plane, which bends straight streets by some metres."""
+    waves = rng.normal(size=(4, 2)) / (4 * block)
+    sway = rng.normal(size=(4, 2)) * 0.05 * block
+    phases = rng.uniform(0, 2 * np.pi, 4)
+
+    def place(points: NDArray[np.float64]) -> NDArray[np.float64]:
+        return points + np.sin(2 * np.pi * points @ waves.T + phases) @ sway
+
+    return place
+
+
+def _plan(rng: np.random.Generator, kind: RouteKind, num_blocks: int) -> tuple[list[tuple[int, int]], tuple[int, int]]:
+    """Corners of a closed route on the lattice, and the size of the lattice."""
+    if kind == "loop":
+        around = max(num_blocks // 2, 2)
+        high = int(rng.integers(max(around // 3, 1), max(2 * around // 3, 1) + 1))
+        return _rectangle(high, around - high), (high + 1, around - high + 1)
+    if kind == "there_and_back":
+        stem = max((num_blocks - 8) // 2, 1)
+        there = [(1, j) for j in range(1, stem + 2)]
+        east = [(0, stem + 1), (0, stem + 2), (1, stem + 2)]
+        west = [(1, 0), (2, 0), (2, 1), (1, 1)]
+        return [*there, *east, *there[::-1], *west], (3, stem + 3)
+    side = max(round(np.sqrt(num_blocks) * 0.8), 3)
+    return _wander(rng, side, num_blocks), (side, side)
+
+
+def _rectangle(high: int, wide: int) -> list[tuple[int, int]]:
+    up = [(i, 0) for i in range(high)]
+    across = [(high, j) for j in range(wide)]
+    down = [(i, wide) for i in range(high, 0, -1)]
+    home = [(0, j) for j in range(wide, -1, -1)]
+    return up + across + down + home
+
+
+def _wander(rng: np.random.Generator, side: int, num_blocks: int) -> list[tuple[int, int]]:
+    """A random walk that never turns on the spot, and home; drawn again if it comes in the way it went out."""
+    while True:
+        route = [(0, 0), (0, 1)]
+        while len(route) < 0.85 * num_blocks:
+            steps = _neighbours(route, side)
+            route.append(steps[rng.integers(len(steps))])
+        while route[-1] != (0, 0):
+            # Leftwards, but not along the first row, on which the route set out; then down the first column.
+            (i, j), steps = route[-1], _neighbours(route, side)
+            wishes = [(i, j - 1), (i - 1, j), (i + 1, j), (i, j + 1)] if i else [(1, j), (0, j - 1), (0, j + 1)]
+            route.append(next(step for step in wishes if step in steps))
+        if route[-2] == (1, 0):
+            return route
+
+
+def _neighbours(route: list[tuple[int, int]], side: int) -> list[tuple[int, int]]:
+    """Where the route can go on without turning on the spot."""
+    i, j = route[-1]
+    steps = [(i + 1, j), (i - 1, j), (i, j + 1), (i, j - 1)]
+    return [s for s in steps if s != route[-2] and 0 <= s[0] < side and 0 <= s[1] < side]

@@ -1,0 +1,1 @@
+"""Planar worlds and walks through them."""

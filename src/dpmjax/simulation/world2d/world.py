@@ -1,0 +1,230 @@
+"""Binary worlds of 1024 x 1024 pixels in the manner of DeepMapping Figure 4, each made by its seed.
+
+Three kinds, one after the other as the index grows: 0 an office (rooms cut out of rooms), 1 a yard (free-standing
+blocks, open to the border of the image), 2 a clinic (a corridor between two rows of rooms). All are furnished with
+round, square and three-cornered obstacles, so that no two places look alike. The frame is that of `raycast2d`: row 0 is
+the lowest.
+"""
+
+from __future__ import annotations
+
+import io
+from dataclasses import dataclass, field
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dpmjax.io.errors import InputError
+from dpmjax.io.files import write_atomically
+
+SIZE_PX = 1024
+_WALL_PX = 10
+_DOOR_PX = 72
+
+
+@dataclass(frozen=True)
+class World:
+    """A planar world.
+
+    Attributes:
+        name: kind and index, for titles.
+        is_obstacle: (h, w) bool, True where a pixel is solid; row 0 is the lowest; one connected free space.
+    """
+
+    name: str
+    is_obstacle: NDArray[np.bool_] = field(repr=False)
+
+    def __post_init__(self) -> None:
+        if self.is_obstacle.ndim != 2 or self.is_obstacle.dtype != np.bool_:
+            raise ValueError(f"is_obstacle must be (h, w) bool, got {self.is_obstacle.shape} {self.is_obstacle.dtype}")
+        if self.is_obstacle.all():
+            raise ValueError("is_obstacle must leave free space, got a solid world")
+
+
+def make_world(index: int) -> World:
+    """Builds the world of an index; the same one every time.
+
+    Args:
+        index: 0, 1 and 2 are the three worlds of the demo; any other non-negative number is the seed of a further one
+            of the kind `index % 3`.
+
+    Returns:
+        The world; its free space is connected.
+
+    Raises:
+        ValueError: a negative index.
+    """
+    if index < 0:
+        raise ValueError(f"index must not be negative, got {index}")
+    kind, build = (("office", _build_office), ("yard", _build_yard), ("clinic", _build_clinic))[index % 3]
+    rng = np.random.default_rng([2024, index])
+    grid = np.zeros((SIZE_PX, SIZE_PX), bool)
+    build(grid, rng)
+    return World(f"{kind}-{index}", _fill_enclosed(grid))
+
+
+def write_world_png(path: str | Path, world: World) -> Path:
+    """Saves the world as a picture: white is free, black is solid, y up as in a plot.
+
+    Args:
+        path: file to write, atomically.
+        world: the world.
+
+    Returns:
+        The path.
+    """
+    from matplotlib.image import imsave
+
+    buffer = io.BytesIO()
+    imsave(buffer, ~world.is_obstacle[::-1], cmap="gray", vmin=0, vmax=1, format="png")
+    return write_atomically(path, buffer.getvalue())
+
+
+def read_world_png(path: str | Path) -> World:
+    """Reads a floor plan: pixels darker than half are solid, the lowest picture row is row 0.
+
+    Args:
+        path: a PNG picture.
+
+    Returns:
+        The world, with free pockets that cannot be reached from the largest free space filled in.
+
+    Raises:
+        InputError: the file is missing, no picture, or solid everywhere.
+    """
+    from matplotlib.image import imread
+
+    try:
+        image = np.asarray(imread(path), np.float64)
+    except (OSError, SyntaxError, ValueError) as error:
+        raise InputError(path, f"not a readable picture ({error})", "give a black and white PNG") from error
+    gray = image if image.ndim == 2 else image[..., : 1 if image.shape[2] < 3 else 3].mean(axis=2)
+    is_obstacle = gray[::-1] < 0.5 * max(1.0, gray.max())
+    if is_obstacle.all():
+        raise InputError(path, "no white pixel", "free space must be white, obstacles black")
+    return World(Path(path).stem, _fill_enclosed(is_obstacle))
+
+
+def _fill_enclosed(grid: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Keeps the largest free space and makes every other free pixel solid."""
+    from scipy.ndimage import label
+
+    labels, _ = label(~grid)
+    sizes = np.bincount(labels.ravel())
+    sizes[0] = 0
+    return labels != sizes.argmax()
+
+
+def _build_office(grid: NDArray[np.bool_], rng: np.random.Generator) -> None:
+    """Rooms by repeated division, each wall with its doors."""
+    _paint_frame(grid)
+    _divide(grid, rng, (0, 0, SIZE_PX, SIZE_PX), depth=0)
+    _furnish(grid, rng, num_tries=320, gap=40)
+
+
+def _build_yard(grid: NDArray[np.bool_], rng: np.random.Generator) -> None:
+    """Blocks of one to three boxes on a shaken 4 x 4 raster; the border is open, as in the authors' worlds."""
+    for x, y in rng.permutation([(x, y) for x in range(4) for y in range(4)])[:13]:
+        centre = (np.array([x, y]) + 0.5) * SIZE_PX / 4 + rng.uniform(-25, 25, 2)
+        for _ in range(rng.integers(1, 4)):
+            _paint_box(grid, centre + rng.uniform(-42, 42, 2), rng.uniform(18, [78, 50])[:: rng.choice([-1, 1])], 0.0)
+    _furnish(grid, rng, num_tries=160, gap=40)
+
+
+def _build_clinic(grid: NDArray[np.bool_], rng: np.random.Generator) -> None:
+    """A crooked corridor from left to right, a row of rooms above and one below, and doors from room to room."""
+    _paint_frame(grid)
+    for sign, wall_y in ((1, 570), (-1, 430)):
+        widths = rng.dirichlet(np.full(4, 12.0)) * SIZE_PX
+        edges = np.concatenate([[0.0], np.cumsum(widths)])
+        for left, right in pairwise(edges):
+            # Each room stands forward or back by its own amount: the corridor has corners to hold on to.
+            y = wall_y + sign * rng.uniform(-15, 45)
+            door = rng.uniform(left + 0.2 * (right - left), left + 0.8 * (right - left) - _DOOR_PX)
+            _paint_span(grid, 0, y, (left, right), [door])
+            if right < SIZE_PX - 1:
+                span = (y, SIZE_PX) if sign > 0 else (0, y)
+                doors = [rng.uniform(span[0] + 50, span[1] - 50 - _DOOR_PX)] if rng.random() < 0.7 else []
+                _paint_span(grid, 1, right, (span[0] - sign * 30 * (sign > 0), span[1] + 30 * (sign < 0)), doors)
+    _furnish(grid, rng, num_tries=320, gap=38)
+
+
+def _divide(grid: NDArray[np.bool_], rng: np.random.Generator, room: tuple[int, int, int, int], depth: int) -> None:
+    """Cuts a room (x, y, width, height) in two by a wall with one or two doors, and goes on with both halves."""
+    x, y, width, height = room
+    if max(width, height) < 330 or (depth >= 3 and max(width, height) < 420):
+        return
+    along = 1 if width > height else 0  # The wall runs across the longer side.
+    extent, start, other = (width, x, height) if along else (height, y, width)
+    cut = start + int(extent * rng.uniform(0.36, 0.64))
+    low = y if along else x
+    wishes = low + other * rng.uniform(0.12, 0.88, 2 if other > 600 else 1) - _DOOR_PX / 2
+    doors = np.clip(wishes, low + 20, low + other - 20 - _DOOR_PX).tolist()
+    _paint_span(grid, along, cut, (low, low + other), doors)
+    if along:
+        halves = [(x, y, cut - x, height), (cut, y, x + width - cut, height)]
+    else:
+        halves = [(x, y, width, cut - y), (x, cut, width, y + height - cut)]
+    for half in halves:
+        _divide(grid, rng, half, depth + 1)
+    for door in doors:
+        _clear_door(grid, along, cut, door)
+
+
+def _clear_door(grid: NDArray[np.bool_], along: int, at: float, door: float) -> None:
+    """Takes away what a later wall put into a doorway."""
+    reach = slice(max(int(at) - 40, _WALL_PX), int(at) + 40)
+    width = slice(int(door), int(door) + _DOOR_PX)
+    grid[(width, reach) if along else (reach, width)] = False
+
+
+def _furnish(grid: NDArray[np.bool_], rng: np.random.Generator, num_tries: int, gap: int) -> None:
+    """Puts obstacles of different shapes wherever a passage of `gap` pixels is left all round."""
+    for _ in range(num_tries):
+        centre, size = rng.uniform(40, SIZE_PX - 40, 2), rng.uniform(9, 34, 2)
+        reach = int(np.hypot(*size)) + gap
+        row, col = (int(v) for v in centre[::-1])
+        if grid[max(row - reach, 0) : row + reach, max(col - reach, 0) : col + reach].any():
+            continue
+        (_paint_box, _paint_disc, _paint_triangle)[rng.integers(3)](grid, centre, size, rng.uniform(0, np.pi))
+
+
+def _paint_frame(grid: NDArray[np.bool_]) -> None:
+    grid[:_WALL_PX], grid[-_WALL_PX:], grid[:, :_WALL_PX], grid[:, -_WALL_PX:] = True, True, True, True
+
+
+def _paint_span(grid: NDArray[np.bool_], along: int, at: float, span: tuple[float, float], doors: list[float]) -> None:
+    """A wall along x (0) or y (1) at the other coordinate `at`, over `span`, with gaps that start at `doors`."""
+    line = np.zeros(SIZE_PX, bool)
+    line[max(int(span[0]), 0) : int(span[1])] = True
+    for door in doors:
+        line[max(int(door), 0) : int(door) + _DOOR_PX] = False
+    band = slice(int(at) - _WALL_PX // 2, int(at) + _WALL_PX // 2)
+    grid[(slice(None), band) if along else (band, slice(None))] |= line[:, None] if along else line
+
+
+def _local(centre: NDArray[np.float64], angle: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Coordinates of all pixel centres in a frame at `centre`, turned by `angle`."""
+    x, y = centre
+    axis = np.arange(SIZE_PX) + 0.5
+    dx, dy = (axis - x)[None, :], (axis - y)[:, None]
+    return np.cos(angle) * dx + np.sin(angle) * dy, np.cos(angle) * dy - np.sin(angle) * dx
+
+
+def _paint_box(grid: NDArray[np.bool_], centre: NDArray[np.float64], size: NDArray[np.float64], angle: float) -> None:
+    (u, v), (half_u, half_v) = _local(centre, angle), size
+    grid |= (np.abs(u) < half_u) & (np.abs(v) < half_v)
+
+
+def _paint_disc(grid: NDArray[np.bool_], centre: NDArray[np.float64], size: NDArray[np.float64], angle: float) -> None:
+    u, v = _local(centre, angle)
+    grid |= u**2 + v**2 < np.mean(size) ** 2
+
+
+def _paint_triangle(
+    grid: NDArray[np.bool_], centre: NDArray[np.float64], size: NDArray[np.float64], angle: float
+) -> None:
+    (u, v), (half_u, half_v) = _local(centre, angle), size
+    grid |= (v > -half_v) & (np.abs(u) / half_u < (half_v - v) / (2 * half_v))

@@ -1,0 +1,73 @@
+"""Baselines that stand on other packages: swarms and Open3D's multiway registration."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import jax
+import numpy as np
+import pytest
+
+from dpmjax.io import ScanSequence
+from dpmjax.metrics import absolute_trajectory_error
+from dpmjax.simulation import simulate_sequence
+from dpmjax.types import ScanSet
+from experiments.baselines.multiway import multiway
+from experiments.baselines.swarm import SwarmConfig, swarm_chain
+
+QUICK = SwarmConfig(num_particles=24, num_iterations=30, num_rounds=1, num_beams=64)
+
+
+@pytest.fixture(scope="module")
+def walk() -> ScanSequence:
+    return simulate_sequence(0, 6, seed=3)
+
+
+def scans_of(walk: ScanSequence, hidden: float = 0.0) -> ScanSet:
+    """The scans; what is hidden holds `hidden`."""
+    return ScanSet(np.where(walk.mask[..., None], walk.points, np.float32(hidden)), walk.mask)
+
+
+def ate(poses: np.ndarray, walk: ScanSequence) -> float:
+    return absolute_trajectory_error(poses[:, :2], walk.reference_poses[:, :2])
+
+
+@pytest.fixture
+def with_swarms() -> None:
+    pytest.importorskip("evosax", reason="evosax is not installed (pip install dpmjax[baselines])")
+
+
+@pytest.fixture
+def with_open3d() -> None:
+    reason = "Open3D is not installed (pip install dpmjax[baselines])"
+    pytest.importorskip("open3d", reason=reason, exc_type=ImportError)
+
+
+@pytest.mark.usefixtures("with_swarms")
+def test_swarms_find_a_short_walk(walk) -> None:
+    start = ate(np.zeros((len(walk), 3)), walk)
+    found = ate(swarm_chain(scans_of(walk), QUICK, key=jax.random.key(0)), walk)
+    assert start > 10.0
+    assert found < 3.0
+
+
+@pytest.mark.usefixtures("with_swarms")
+def test_swarms_never_see_masked_beams(walk) -> None:
+    mask = walk.mask & (np.random.default_rng(0).uniform(size=walk.mask.shape) < 0.9)
+    one, other = (
+        swarm_chain(scans_of(replace(walk, mask=mask), hidden), replace(QUICK, num_iterations=3), key=jax.random.key(1))
+        for hidden in (0.0, 1e4)
+    )
+    np.testing.assert_array_equal(one, other)
+
+
+@pytest.mark.usefixtures("with_open3d")
+def test_multiway_finds_a_short_walk(walk) -> None:
+    poses = multiway(scans_of(walk))
+    assert np.all(poses[0] == 0.0)
+    assert ate(poses, walk) < 1.0
+
+
+def test_a_swarm_has_particles() -> None:
+    with pytest.raises(ValueError, match="at least 1"):
+        SwarmConfig(num_particles=0)

@@ -1,0 +1,56 @@
+from __future__ import annotations
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from dpmjax.geometry import rigid
+from tests.tolerances import DOUBLE, ROUNDING
+
+
+def random_motions(seed: int, n: int, dim: int) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    T = np.tile(np.eye(dim + 1), (n, 1, 1))
+    axis = np.array([0, 0, 1]) if dim == 2 else rng.normal(size=(n, 3))
+    R = Rotation.from_rotvec(rng.uniform(-2, 2, (n, 1)) * axis).as_matrix()
+    T[:, :dim, :dim], T[:, :dim, dim] = R[:, :dim, :dim], rng.normal(size=(n, dim))
+    return T
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_transform_points_is_the_homogeneous_product(dim: int) -> None:
+    T = random_motions(5, 6, dim)
+    points = np.random.default_rng(6).normal(size=(6, 9, dim)).astype(np.float32)
+    homogeneous = np.concatenate([points, np.ones((6, 9, 1), np.float32)], -1).astype(np.float64)
+    expected = np.einsum("nij,nbj->nbi", T, homogeneous)[..., :dim]
+    np.testing.assert_allclose(rigid.transform_points(T.astype(np.float32), points), expected, **ROUNDING)
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_transform_points_broadcasts_and_keeps_dtype(dim: int) -> None:
+    T = random_motions(7, 4, dim).astype(np.float32)
+    points = jnp.ones((9, dim))
+    moved = rigid.transform_points(T, points)
+    assert moved.shape == (4, 9, dim)
+    assert moved.dtype == jnp.float32
+    assert rigid.transform_points(T[0], points[:0]).shape == (0, dim)
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_inverse_undoes_a_motion(dim: int) -> None:
+    T = random_motions(8, 10, dim)
+    np.testing.assert_allclose(rigid.inverse(T) @ T, np.tile(np.eye(dim + 1), (10, 1, 1)), **DOUBLE)
+    single = jnp.asarray(T, jnp.float32)
+    np.testing.assert_allclose(rigid.inverse(single), np.linalg.inv(T), **ROUNDING)
+
+
+def test_wrong_matrix_size_is_named(as_user) -> None:
+    with pytest.raises(ValueError, match="T_a_b: expected shape"):
+        rigid.transform_points(jnp.eye(4), jnp.ones((5, 2)))
+
+
+def test_second_call_compiles_nothing(assert_compiles_nothing) -> None:
+    rigid.transform_points(np.eye(4, dtype=np.float32), np.ones((5, 3), np.float32))
+    with assert_compiles_nothing():
+        rigid.transform_points(2 * np.eye(4, dtype=np.float32), np.zeros((5, 3), np.float32))

@@ -1,0 +1,133 @@
+"""Laws of the CARMEN reader."""
+
+import gzip
+import logging
+
+import numpy as np
+import pytest
+
+from dpmjax.io import InputError, read_carmen_log
+from dpmjax.io.scans2d.carmen import scan_angles
+
+
+def flaser(ranges, corrected=(0, 0, 0), odometry=(9, 9, 1), time=0.0):
+    numbers = [len(ranges), *ranges, *corrected, *odometry, time]
+    return "FLASER " + " ".join(map(str, numbers)) + f" host {time}"
+
+
+def write(tmp_path, *lines, name="a.log"):
+    path = tmp_path / name
+    text = "\n".join(["# comment", "PARAM laser 1", "ODOM 0 0 0 0 0 0 0 h 0", "RLASER 1 2 0 0 0 0 0 0 0 h 0", *lines])
+    path.write_bytes(gzip.compress(text.encode()) if name.endswith(".gz") else text.encode())
+    return path
+
+
+@pytest.mark.parametrize("name", ["a.log", "a.clf", "a.log.gz"])
+def test_columns_go_where_they_belong(tmp_path, name):
+    path = write(
+        tmp_path,
+        flaser([1, 2, 3], (1, 2, 3), (4, 5, 1.5), 10.5),
+        flaser([1, 1, 1], (2, 2, 3), (4, 6, 1.6), 11),
+        name=name,
+    )
+    log = read_carmen_log(path)
+    np.testing.assert_allclose(log.points[0], [[0, -1], [2, 0], [0, 3]], atol=1e-6)
+    np.testing.assert_array_equal(log.reference_poses, [[1, 2, 3], [2, 2, 3]])
+    np.testing.assert_array_equal(log.odometry_poses, [[4, 5, 1.5], [4, 6, 1.6]])
+    np.testing.assert_array_equal(log.times, [10.5, 11])
+    assert log.unit == "m"
+    assert log.name == "a"
+
+
+@pytest.mark.parametrize(("num_beams", "last_deg"), [(180, 89.0), (181, 90.0), (360, 89.5), (361, 90.0), (1, -90.0)])
+def test_field_of_view_is_half_a_turn_from_right_to_left(num_beams, last_deg):
+    angles = np.rad2deg(scan_angles(num_beams))
+    assert angles[0] == -90
+    np.testing.assert_allclose(angles[-1], last_deg)
+    assert (np.diff(angles) > 0).all()
+
+
+def test_ragged_scans_are_masked(tmp_path):
+    log = read_carmen_log(write(tmp_path, flaser([1, 2, 3]), flaser([4]), flaser([5, 6])))
+    np.testing.assert_array_equal(log.mask.sum(axis=1), [3, 1, 2])
+    assert (log.points[~log.mask] == 0).all()
+
+
+def test_equal_columns_mean_no_odometry_and_equal_stamps_no_times(tmp_path):
+    log = read_carmen_log(write(tmp_path, flaser([1], (1, 2, 3), (1, 2, 3)), flaser([1], (2, 2, 3), (2, 2, 3))))
+    assert log.odometry_poses is None
+    assert log.times is None
+
+
+def test_no_echo_is_masked(tmp_path):
+    path = write(tmp_path, flaser([1.0, 81.91, 0.0, 20.0]), flaser([2.0, 81.87, -1.0, 60.0]))
+    np.testing.assert_array_equal(read_carmen_log(path).mask, [[1, 0, 0, 1], [1, 0, 0, 1]])
+    np.testing.assert_array_equal(read_carmen_log(path, max_range=30).mask, [[1, 0, 0, 1], [1, 0, 0, 0]])
+
+
+def test_short_scale_is_not_taken_for_no_echo(tmp_path):
+    assert read_carmen_log(write(tmp_path, flaser([1.0, 3.0]), flaser([2.0, 3.0]))).mask.all()
+
+
+def test_entries_of_another_moment_are_interpolated(tmp_path, caplog):
+    lines = [flaser([1], (i, 0, 0), (i, 0, 3.1 + 0.1 * i if i < 1 else -3.2 + 0.1 * i), i) for i in range(6)]
+    lines[3] = flaser([1], (3, 0, 0), (700, -3, 1), 99.0)
+    with caplog.at_level(logging.WARNING):
+        log = read_carmen_log(write(tmp_path, *lines))
+    assert "1 of 6 lines" in caplog.text
+    np.testing.assert_allclose(log.times, range(6))
+    np.testing.assert_allclose(log.odometry_poses[:, 0], range(6), atol=1e-12)
+    np.testing.assert_allclose(log.odometry_poses[3, 2], -2.9, atol=1e-12)
+    np.testing.assert_array_equal(log.reference_poses[:, 0], range(6))
+
+
+@pytest.mark.parametrize(
+    ("line", "found"),
+    [
+        ("FLASER", "not a FLASER line"),
+        ("FLASER 3 1 2 3 0 0 0", "at least 9 expected"),
+        ("FLASER 2 1 abc 0 0 0 0 0 0 1 h 1", "not a FLASER line"),
+        ("FLASER 2 1 nan 0 0 0 0 0 0 1 h 1", "NaN"),
+        ("FLASER 2 1 1 0 0 inf 0 0 0 1 h 1", "infinite"),
+        ("FLASER 0 0 0 0 0 0 0 1 h 1", "at least"),
+    ],
+)
+def test_bad_line_is_named_with_its_number(tmp_path, line, found):
+    with pytest.raises(InputError, match=found) as caught:
+        read_carmen_log(write(tmp_path, flaser([1, 2]), line))
+    assert "a.log:6" in str(caught.value)
+
+
+def test_logs_without_front_laser_are_refused(tmp_path):
+    with pytest.raises(InputError, match="no FLASER line"):
+        read_carmen_log(write(tmp_path))
+    with pytest.raises(InputError, match="ROBOTLASER1"):
+        read_carmen_log(write(tmp_path, "ROBOTLASER1 0 1 2"))
+    with pytest.raises(InputError, match="cannot be read"):
+        read_carmen_log(tmp_path / "none.log")
+    (tmp_path / "cut.log.gz").write_bytes(gzip.compress(b"FLASER 1 1" * 99)[:-12])
+    with pytest.raises(InputError, match="cannot be read"):
+        read_carmen_log(tmp_path / "cut.log.gz")
+
+
+@pytest.mark.parametrize(
+    ("name", "shape", "has_odometry"),
+    [
+        ("intel", (910, 180), True),
+        ("aces", (440, 180), True),
+        ("csail", (406, 361), True),
+        ("orebro", (237, 181), False),
+        ("seattle", (241, 361), False),
+        ("edmonton", (340, 180), False),
+    ],
+)
+def test_published_logs_read_as_they_are_known(real_data, name, shape, has_odometry):
+    log = read_carmen_log(real_data / "carmen" / f"{name}.log.gz")
+    assert log.mask.shape == shape
+    assert (log.odometry_poses is not None) == has_odometry
+    assert 0.0 < 1 - log.mask.mean() < 0.06
+    if has_odometry:
+        step = np.linalg.norm(np.diff(log.odometry_poses[:, :2], axis=0), axis=1)
+        true = np.linalg.norm(np.diff(log.reference_poses[:, :2], axis=0), axis=1)
+        assert np.abs(step - true).max() < 1.0  # Entries of another moment were metres off.
+        assert (np.diff(log.times) >= 0).all()

@@ -1,0 +1,348 @@
+"""Tiny drives in each layout, and the real ones."""
+
+import logging
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from dpmjax.geometry import rigid
+from dpmjax.io import (
+    InputError,
+    iterate_scans,
+    list_lidar_sequences,
+    open_lidar_sequence,
+    read_lidar_file,
+    write_pcd,
+    write_ply,
+)
+from dpmjax.io.poses.lidar_poses import interpolate_poses
+
+AXES = np.array([[0.0, -1, 0, 0.1], [0, 0, -1, -0.2], [1, 0, 0, -0.3], [0, 0, 0, 1]])  # T_cam0_lidar
+
+
+@pytest.fixture
+def clouds():
+    rng = np.random.default_rng(0)
+    return [rng.normal(size=(20 + i, 3)).astype(np.float32) * [10, 10, 1] for i in range(12)]
+
+
+@pytest.fixture
+def poses():
+    rng = np.random.default_rng(1)
+    found = np.tile(np.eye(4), (12, 1, 1))
+    found[1:, :3, :3] = Rotation.from_euler("zyx", rng.uniform(-0.5, 0.5, (11, 3))).as_matrix()
+    found[1:, :3, 3] = np.cumsum(rng.uniform(0, 2, (11, 3)), axis=0)
+    return found
+
+
+def write_bin(path, points):
+    path.parent.mkdir(parents=True, exist_ok=True)
+    np.column_stack([points, np.ones(len(points))]).astype("<f4").tofile(path)
+
+
+def rows(poses):
+    return "".join(" ".join(f"{v:.12e}" for v in pose[:3].ravel()) + "\n" for pose in poses)
+
+
+def assert_same(sequence, clouds, poses):
+    assert sequence.num_scans == len(clouds)
+    for index, cloud in enumerate(clouds):
+        np.testing.assert_allclose(sequence.read_scan(index), cloud, rtol=1e-6)
+    if poses is None:
+        assert sequence.T_world_lidar is None
+    else:
+        np.testing.assert_allclose(sequence.T_world_lidar, poses, atol=1e-6)
+
+
+def kitti_odometry(root, clouds, poses, name="00"):
+    folder = root / "sequences" / name
+    for index, cloud in enumerate(clouds):
+        write_bin(folder / "velodyne" / f"{index:06d}.bin", cloud)
+    (root / "poses").mkdir(exist_ok=True)
+    (root / "poses" / f"{name}.txt").write_text(rows(AXES @ poses @ rigid.inverse(AXES)))
+    tr = " ".join(map(str, AXES[:3].ravel()))
+    (folder / "calib.txt").write_text(f"P0: {tr}\nTr: {tr}\n")
+    (folder / "times.txt").write_text("".join(f"{0.1 * i:e}\n" for i in range(len(clouds))))
+    return folder
+
+
+def test_kitti_odometry_poses_come_into_the_lidar_frame(tmp_path, clouds, poses):
+    folder = kitti_odometry(tmp_path, clouds, poses)
+    for sequence in (open_lidar_sequence(folder), open_lidar_sequence(tmp_path)):
+        assert_same(sequence, clouds, poses)
+        assert sequence.name == "00"
+        np.testing.assert_allclose(sequence.times, 0.1 * np.arange(12))
+
+
+def test_semantic_kitti_prefers_the_poses_beside_the_scans(tmp_path, clouds, poses):
+    folder = kitti_odometry(tmp_path, clouds, np.tile(np.eye(4), (12, 1, 1)))
+    (folder / "poses.txt").write_text(rows(AXES @ poses @ rigid.inverse(AXES)))
+    assert_same(open_lidar_sequence(tmp_path, sequence="00"), clouds, poses)
+
+
+def test_camera_poses_without_calibration_are_refused(tmp_path, clouds, poses):
+    folder = kitti_odometry(tmp_path, clouds, poses)
+    (folder / "calib.txt").write_text("P0: 1 2 3\n")
+    with pytest.raises(InputError, match=r"calib.txt.*Tr"):
+        open_lidar_sequence(folder)
+    (folder / "calib.txt").unlink()
+    with pytest.raises(InputError, match=r"calib.txt"):
+        open_lidar_sequence(folder)
+
+
+def test_a_part_of_a_sequence_takes_its_poses_by_number(tmp_path, clouds, poses):
+    folder = kitti_odometry(tmp_path, clouds, poses)
+    for index in (0, 1, 5):
+        (folder / "velodyne" / f"{index:06d}.bin").unlink()
+    kept = [2, 3, 4, 6, 7, 8, 9, 10, 11]
+    assert_same(open_lidar_sequence(folder), [clouds[i] for i in kept], poses[kept])
+
+
+def test_roots_with_several_drives_ask_which(tmp_path, clouds, poses):
+    kitti_odometry(tmp_path, clouds, poses, "00")
+    kitti_odometry(tmp_path, clouds, poses, "10")
+    assert list_lidar_sequences(tmp_path) == ["00", "10"]
+    with pytest.raises(InputError, match=r"2 sequences: 00, 10"):
+        open_lidar_sequence(tmp_path)
+    with pytest.raises(InputError, match=r"no sequence 07"):
+        open_lidar_sequence(tmp_path, sequence="07")
+
+
+def test_kitti_raw_poses_come_from_gps_and_imu(tmp_path, clouds):
+    drive = tmp_path / "2011_09_26" / "2011_09_26_drive_0013_sync"
+    data = drive / "velodyne_points" / "data"
+    (drive / "oxts" / "data").mkdir(parents=True)
+    for index in range(3):
+        write_bin(data / f"{index:010d}.bin", clouds[index])
+        # Ten metres to the east for each scan, heading north.
+        longitude = 8.4 + np.degrees(10 * index / (6378137.0 * np.cos(np.radians(49.0))))
+        record = f"49.0 {longitude:.12f} 110.0 0 0 {np.pi / 2} " + "0 " * 24
+        (drive / "oxts" / "data" / f"{index:010d}.txt").write_text(record)
+    stamps = [f"2011-09-26 13:02:2{i}.951199337" for i in range(3)]
+    (drive / "velodyne_points" / "timestamps.txt").write_text("\n".join(stamps) + "\n")
+    with pytest.raises(InputError, match=r"calib_imu_to_velo"):
+        open_lidar_sequence(drive)
+    (drive.parent / "calib_imu_to_velo.txt").write_text("calib_time: x\nR: 1 0 0 0 1 0 0 0 1\nT: -0.8 0.3 -0.7\n")
+    sequence = open_lidar_sequence(drive)
+    wanted = np.tile(np.eye(4), (3, 1, 1))
+    wanted[:, 1, 3] = [0, -10, -20]  # East is to the right.
+    assert_same(sequence, clouds[:3], wanted)
+    np.testing.assert_allclose(sequence.times, [0, 1, 2], atol=1e-6)
+
+
+def test_kitti_360_interpolates_where_the_car_stands(tmp_path, clouds, poses):
+    name = "2013_05_28_drive_0000_sync"
+    data = tmp_path / "data_3d_raw" / name / "velodyne_points" / "data"
+    for index in range(5):
+        write_bin(data / f"{index:010d}.bin", clouds[index])
+    T_imu_cam0, T_lidar_cam0 = rigid.inverse(AXES), rigid.inverse(AXES) @ poses[3]
+    T_imu_lidar = T_imu_cam0 @ rigid.inverse(T_lidar_cam0)
+    (tmp_path / "calibration").mkdir()
+    (tmp_path / "calibration" / "calib_cam_to_pose.txt").write_text("image_00: " + rows(T_imu_cam0[None]))
+    (tmp_path / "calibration" / "calib_cam_to_velo.txt").write_text(rows(T_lidar_cam0[None]))
+    folder = tmp_path / "data_poses" / name
+    folder.mkdir(parents=True)
+    in_grid = poses.copy()
+    in_grid[:, :3, 3] += [1e3, 5e3, 100]
+    lines = rows(in_grid @ rigid.inverse(T_imu_lidar)).splitlines()
+    (folder / "poses.txt").write_text("".join(f"{i} {lines[i]}\n" for i in (1, 2, 4)))
+    sequence = open_lidar_sequence(tmp_path)
+    middle = interpolate_poses(np.array([2.0, 4.0]), in_grid[[2, 4]], np.array([3.0]))
+    wanted = np.stack([in_grid[1], in_grid[2], middle[0], in_grid[4]])
+    assert_same(sequence, clouds[1:5], rigid.inverse(wanted[0]) @ wanted)
+
+
+@pytest.mark.parametrize("home", ["Ouster", "sensor_data/Ouster"])
+def test_mulran_poses_are_found_by_time(tmp_path, clouds, poses, home):
+    start = 1567410200000000000
+    for index in range(4):
+        with_nothing = np.vstack([clouds[index], np.zeros((5, 3))])
+        write_bin(tmp_path / home / f"{start + index * 100_000_000}.bin", with_nothing)
+    T_car_lidar = np.eye(4)
+    T_car_lidar[:3, :3] = Rotation.from_euler("xyz", [0.0001, 0.0003, 179.6654], degrees=True).as_matrix()
+    T_car_lidar[:3, 3] = [1.7042, -0.021, 1.8047]
+    lines = rows(poses[:4] @ rigid.inverse(T_car_lidar)).splitlines()
+    table = [f"{start + i * 100_000_000}," + ",".join(line.split()) for i, line in enumerate(lines)]
+    (tmp_path / "global_pose.csv").write_text("\n".join(table) + "\n")
+    sequence = open_lidar_sequence(tmp_path)
+    assert_same(sequence, clouds[:4], poses[:4])
+    np.testing.assert_allclose(sequence.times, [0, 0.1, 0.2, 0.3], atol=1e-6)
+
+
+def test_kitti_carla_takes_every_hundredth_pose(tmp_path, clouds, poses):
+    home = tmp_path / "Town01" / "generated"
+    (home / "frames").mkdir(parents=True)
+    for index in range(3):
+        write_ply(home / "frames" / f"frame_{index:04d}.ply", clouds[index])
+    fine = interpolate_poses(np.arange(12.0), poses, np.arange(300) / 100)
+    lines = [f"{line} {0.001 * i:.3f}" for i, line in enumerate(rows(fine).splitlines())]
+    (home / "full_poses_lidar.txt").write_text("# R(0,0) R(0,1) ... timestamp\n" + "\n".join(lines) + "\n")
+    for folder in (tmp_path, tmp_path / "Town01", home):
+        sequence = open_lidar_sequence(folder)
+        assert_same(sequence, clouds[:3], poses[:3])
+        assert sequence.name == "Town01"
+
+
+def test_learned_folders_carry_poses_in_the_scans(tmp_path, clouds, poses):
+    folder = tmp_path / "scene" / "0"
+    folder.mkdir(parents=True)
+    for index, (cloud, pose) in enumerate(zip(clouds, poses, strict=True)):
+        np.savez(folder / f"{index}.npz", lidar_pcd=cloud, ego_rotation=pose[:3, :3], ego_translation=pose[:3, 3:])
+    assert_same(open_lidar_sequence(folder), clouds, poses)
+    assert_same(open_lidar_sequence(tmp_path), clouds, poses)
+
+
+def _save_npz(path, points):
+    np.savez(path, points=points)
+
+
+@pytest.mark.parametrize(
+    ("suffix", "write"),
+    [
+        (".bin", write_bin),
+        (".npy", np.save),
+        (".npz", _save_npz),
+        (".pcd", write_pcd),
+        (".ply", write_ply),
+    ],
+)
+def test_plain_folders_in_natural_order(tmp_path, clouds, poses, suffix, write):
+    for index, cloud in enumerate(clouds):
+        write(tmp_path / f"scan_{index}{suffix}", cloud)
+    (tmp_path / "notes.md").write_text("hello")
+    assert_same(open_lidar_sequence(tmp_path), clouds, None)
+    (tmp_path / "poses.txt").write_text(rows(poses))
+    assert_same(open_lidar_sequence(tmp_path), clouds, poses)
+
+
+def test_a_pose_file_can_be_named(tmp_path, clouds, poses):
+    for index, cloud in enumerate(clouds):
+        write_bin(tmp_path / "data" / f"{index}.bin", cloud)
+    quaternions = Rotation.from_matrix(poses[:, :3, :3]).as_quat()
+    tum = np.column_stack([np.arange(12), poses[:, :3, 3], quaternions])
+    np.savetxt(tmp_path / "mine.tum", tum)
+    assert_same(open_lidar_sequence(tmp_path, poses=tmp_path / "mine.tum"), clouds, poses)
+    np.save(tmp_path / "mine.npy", poses[:5])
+    with pytest.raises(InputError, match=r"5 poses for 12 scans|12 scans"):
+        open_lidar_sequence(tmp_path / "data", poses=tmp_path / "mine.npy")
+
+
+def test_sub_ranges_take_poses_and_times_along(tmp_path, clouds, poses):
+    folder = kitti_odometry(tmp_path, clouds, poses)
+    part = open_lidar_sequence(folder, start=2, stop=9, stride=3)
+    assert_same(part, clouds[2:9:3], poses[2:9:3])
+    np.testing.assert_allclose(part.times, [0.2, 0.5, 0.8])
+    for wrong in ({"start": 20}, {"stride": 0}, {"start": -1}, {"stop": 0}):
+        with pytest.raises(InputError):
+            open_lidar_sequence(folder, **wrong)
+
+
+def bad_nan(path, cloud):
+    cloud = cloud.copy()
+    cloud[3, 1] = np.nan
+    write_bin(path, cloud)
+
+
+BAD = {
+    "cut off": lambda path, cloud: path.write_bytes(cloud.astype("<f4").tobytes()[:-7]),
+    "NaN": bad_nan,
+    "no point": lambda path, cloud: path.write_bytes(b""),
+    "median range": lambda path, cloud: write_bin(path, 1000 * cloud),
+    "out of range": lambda path, cloud: write_bin(path, 1e-3 * cloud / np.abs(cloud).max()),
+}
+
+
+@pytest.mark.parametrize("reason", BAD)
+def test_one_bad_scan_is_named_and_passed_over(tmp_path, clouds, poses, reason, caplog):
+    folder = kitti_odometry(tmp_path, clouds, poses)
+    BAD[reason](folder / "velodyne" / "000004.bin", clouds[4])
+    sequence, bad = open_lidar_sequence(folder), []
+    with caplog.at_level(logging.WARNING):
+        numbers = [scan.number for scan in iterate_scans(sequence, bad)]
+    assert numbers == [0, 1, 2, 3, 5, 6, 7, 8, 9, 10, 11]
+    assert [scan.index for scan in bad] == [4]
+    assert bad[0].file.endswith("000004.bin")
+    assert reason in bad[0].reason
+    assert "000004.bin" in caplog.text
+
+
+def test_a_sequence_of_bad_scans_only_is_refused(tmp_path):
+    for index in range(3):
+        (tmp_path / f"{index}.bin").write_bytes(b"1234567")
+    with pytest.raises(InputError, match=r"all 3 scans are bad"):
+        list(iterate_scans(open_lidar_sequence(tmp_path)))
+
+
+@pytest.mark.parametrize(
+    "content", [np.zeros((5, 2)), np.zeros(7), np.array(["a"]), np.zeros((0, 3)), np.full((4, 3), np.inf)]
+)
+def test_wrong_arrays_are_named(tmp_path, content):
+    np.save(tmp_path / "0.npy", content)
+    with pytest.raises(InputError, match=r"0\.npy"):
+        read_lidar_file(tmp_path / "0.npy")
+
+
+def test_other_columns_can_be_said(tmp_path, clouds):
+    five = np.column_stack([clouds[0][:15], np.ones((15, 2))]).astype("<f4")
+    five.tofile(tmp_path / "0.bin")
+    with pytest.raises(InputError, match=r"3 or 5 columns|5 columns"):
+        read_lidar_file(tmp_path / "0.bin")
+    np.testing.assert_allclose(read_lidar_file(tmp_path / "0.bin", bin_columns=5), clouds[0][:15])
+
+
+def test_organised_clouds_may_hold_nan(tmp_path, clouds):
+    holes = clouds[0].copy()
+    holes[[2, 5]] = np.nan
+    write_pcd(tmp_path / "0.pcd", holes)
+    np.testing.assert_allclose(read_lidar_file(tmp_path / "0.pcd"), np.delete(clouds[0], [2, 5], axis=0))
+
+
+def test_folders_without_scans_are_refused(tmp_path):
+    with pytest.raises(InputError, match=r"without scans"):
+        open_lidar_sequence(tmp_path)
+    with pytest.raises(InputError, match=r"no such folder"):
+        open_lidar_sequence(tmp_path / "nowhere")
+    (tmp_path / "0.bin").write_bytes(b"")
+    with pytest.raises(InputError, match=r"single file"):
+        open_lidar_sequence(tmp_path / "0.bin")
+
+
+def test_poses_that_are_none_are_refused(tmp_path, clouds):
+    for index in range(2):
+        write_bin(tmp_path / f"{index}.bin", clouds[index])
+    (tmp_path / "poses.txt").write_text("1 0 0 0 0 1 0 0 0 0 2 0\n" * 2)
+    with pytest.raises(InputError, match=r"no rigid motion"):
+        open_lidar_sequence(tmp_path)
+
+
+REAL = {"hilti_room": 177, "kitti_00": 4, "kitti_07": 4, "kitti_raw_0013": 144, "mulran_kaist03": 21}
+
+
+@pytest.mark.parametrize("name", REAL)
+def test_real_drives_are_opened(real_data, name):
+    sequence = open_lidar_sequence(real_data / "lidar_3d" / name)
+    assert sequence.num_scans == REAL[name]
+    assert sequence.T_world_lidar is not None
+    assert sequence.times is not None
+    points = sequence.read_scan(sequence.num_scans - 1)
+    assert points.dtype == np.float32
+    assert len(points) > 3000
+
+
+def test_the_real_truncated_scan_is_named(real_data):
+    with pytest.raises(InputError, match=r"truncated\.bin.*cut off"):
+        read_lidar_file(real_data / "bad_input" / "truncated.bin")
+
+
+def test_a_damaged_npz_is_named(tmp_path, clouds, poses):
+    for index, pose in enumerate(poses[:3]):
+        named = {"ego_rotation": pose[:3, :3], "ego_translation": pose[:3, 3:]}
+        np.savez(tmp_path / f"{index}.npz", lidar_pcd=clouds[index], **named)
+    whole = (tmp_path / "1.npz").read_bytes()
+    for content in (whole[:100], b"PK\x03\x04 no archive", b"", b"neither"):
+        (tmp_path / "1.npz").write_bytes(content)
+        bad = []
+        numbers = [scan.number for scan in iterate_scans(open_lidar_sequence(tmp_path), bad)]
+        assert numbers == [0, 2]
+        assert bad[0].file.endswith("1.npz")

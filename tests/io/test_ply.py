@@ -1,0 +1,72 @@
+"""PLY files in and out."""
+
+import numpy as np
+import pytest
+
+from dpmjax.io import InputError, read_ply, write_ply
+
+POINTS = np.array([[1, 2, 3], [-4, 5.5, 6], [0.25, 0, -1]], np.float32)
+HEADER = """ply
+format {} 1.0
+comment made by hand
+element vertex 3
+property uchar tag
+property double y
+property float x
+property float32 z
+element face 1
+property list uchar int vertex_indices
+end_header
+"""
+LAYOUT = [("tag", "u1"), ("y", "f8"), ("x", "f4"), ("z", "f4")]
+
+
+def table(order):
+    rows = np.zeros(3, [(name, order + kind) for name, kind in LAYOUT])
+    rows["x"], rows["y"], rows["z"] = POINTS.T
+    return rows
+
+
+def test_what_is_written_is_read(tmp_path):
+    np.testing.assert_array_equal(read_ply(write_ply(tmp_path / "a.ply", POINTS)), POINTS)
+
+
+@pytest.mark.parametrize(("encoding", "order"), [("binary_little_endian", "<"), ("binary_big_endian", ">")])
+def test_properties_come_in_any_order_and_type(tmp_path, encoding, order):
+    (tmp_path / "a.ply").write_bytes(HEADER.format(encoding).encode() + table(order).tobytes() + b"\3\0\0\0\0")
+    np.testing.assert_array_equal(read_ply(tmp_path / "a.ply"), POINTS)
+
+
+def test_ascii_is_read(tmp_path):
+    rows = "".join(f"7 {y} {x} {z}\n" for x, y, z in POINTS)
+    (tmp_path / "a.ply").write_text(HEADER.format("ascii") + rows + "3 0 1 2\n")
+    np.testing.assert_array_equal(read_ply(tmp_path / "a.ply"), POINTS)
+
+
+@pytest.mark.parametrize(
+    ("content", "found"),
+    [
+        (b"", "no PLY header"),
+        (b"ply\nformat ascii 1.0\nelement vertex 2\n", "no PLY header"),
+        (HEADER.format("binary_little_endian").encode() + b"123", "cut off"),
+        (HEADER.format("ascii").encode() + b"1 2 3 4\n", "cut off"),
+        (HEADER.format("ascii").encode() + b"1 2 3 4\n1 2\n3 4 5 6\n", "no point"),
+        (HEADER.format("morse").encode(), "unknown|morse"),
+        (HEADER.format("ascii").replace("float32 z", "float32 w").encode(), "PLY properties"),
+        (HEADER.format("ascii").replace("double", "quadruple").encode(), "broken PLY header"),
+    ],
+)
+def test_broken_files_are_named(tmp_path, content, found):
+    (tmp_path / "bad.ply").write_bytes(content)
+    with pytest.raises(InputError, match=f"bad.ply.*({found})"):
+        read_ply(tmp_path / "bad.ply")
+
+
+def test_a_missing_file_is_named(tmp_path):
+    with pytest.raises(InputError, match=r"none\.ply"):
+        read_ply(tmp_path / "none.ply")
+
+
+def test_other_shapes_are_not_written(tmp_path):
+    with pytest.raises(ValueError, match="points"):
+        write_ply(tmp_path / "a.ply", POINTS[:, :2])

@@ -1,0 +1,201 @@
+"""Laws of the one door for scans and of NumPy files."""
+
+import gzip
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from dpmjax.io import InputError, ScanSequence, has_angular_order, read_sequence, take_scans, write_deepmapping_folder
+
+ANGLES = np.linspace(-2, 2, 7)
+POINTS = 3.0 * np.tile(np.stack([np.cos(ANGLES), np.sin(ANGLES)], -1), (6, 1, 1)) * np.arange(1, 7)[:, None, None]
+POSES = np.arange(18.0).reshape(6, 3) / 10
+LOG = "".join(f"FLASER 3 1 2 3 {i} 0 0 {i} 1 0 {i} h {i}\n" for i in range(6))
+
+
+def save(tmp_path, name="a.npy", **arrays):
+    path = tmp_path / name
+    if name.endswith(".npy"):
+        np.save(path, arrays["points"])
+    else:
+        np.savez(path, **arrays)
+    return path
+
+
+def test_npy_and_npz_of_points_agree(tmp_path):
+    plain = read_sequence(save(tmp_path, points=POINTS))
+    rich = read_sequence(save(tmp_path, "a.npz", points=POINTS, poses=POSES, odometry=POSES + 1, times=np.arange(6)))
+    np.testing.assert_allclose(plain.points, POINTS, rtol=1e-6)
+    np.testing.assert_array_equal(plain.points, rich.points)
+    assert plain.points.dtype == np.float32
+    assert plain.is_organised
+    assert plain.reference_poses is None
+    assert (rich.reference_poses == POSES).all()
+    assert (rich.odometry_poses == POSES + 1).all()
+    assert (rich.times == np.arange(6)).all()
+
+
+def test_third_coordinate_is_ignored(tmp_path):
+    deep = np.concatenate([POINTS, np.full((6, 7, 1), 9.0)], axis=2)
+    np.testing.assert_allclose(read_sequence(save(tmp_path, points=deep)).points, POINTS, rtol=1e-6)
+
+
+def test_ranges_and_angles_make_the_points(tmp_path):
+    ranges = np.linalg.norm(POINTS, axis=2)
+    ranges[0, 1], ranges[1, 2], ranges[2, 3] = np.inf, 0.0, np.nan
+    scans = read_sequence(save(tmp_path, "a.npz", ranges=ranges, angles=ANGLES))
+    np.testing.assert_allclose(scans.points[3:], POINTS[3:], rtol=1e-6)
+    assert (~scans.mask).sum() == 3
+    assert not scans.mask[[0, 1, 2], [1, 2, 3]].any()
+
+
+def test_matrices_and_triples_are_the_same_poses(tmp_path):
+    matrices = np.tile(np.eye(3), (6, 1, 1))
+    matrices[:, 0, 0] = matrices[:, 1, 1] = np.cos(POSES[:, 2])
+    matrices[:, 1, 0], matrices[:, 0, 1] = np.sin(POSES[:, 2]), -np.sin(POSES[:, 2])
+    matrices[:, :2, 2] = POSES[:, :2]
+    scans = read_sequence(save(tmp_path, "a.npz", points=POINTS, poses=matrices))
+    np.testing.assert_allclose(scans.reference_poses, POSES, atol=1e-12)
+
+
+def test_nan_points_and_the_mask_are_invalid_beams(tmp_path):
+    holed, mask = POINTS.copy(), np.ones((6, 7), bool)
+    holed[0, 1], mask[1, 2] = np.nan, False
+    scans = read_sequence(save(tmp_path, "a.npz", points=holed, mask=mask))
+    assert not scans.mask[[0, 1], [1, 2]].any()
+    assert scans.mask.sum() == 40
+    assert (scans.points[~scans.mask] == 0).all()
+
+
+def with_value(index, value):
+    points = POINTS.copy()
+    points[index] = value
+    return points
+
+
+@pytest.mark.parametrize(
+    ("arrays", "found"),
+    [
+        ({"points": with_value((0, 1, 0), np.nan)}, "scan 0, beam 1"),
+        ({"points": with_value((2, 1), np.inf)}, "infinite"),
+        ({"points": with_value((2,), np.nan)}, "1 of 6 scans .* scan 2"),
+        ({"points": with_value((), np.nan)}, "every beam"),
+        ({"points": POINTS[0]}, r"give \(n, b, 2\)"),
+        ({"points": POINTS[..., :1]}, r"give \(n, b, 2\)"),
+        ({"points": POINTS.astype(str)}, "points are"),
+        ({"points": POINTS[:1]}, "two scans"),
+        ({"points": POINTS[:0]}, "two scans"),
+        ({"points": POINTS * 1000}, "millimetres"),
+        ({"points": POINTS / 1000}, "median range"),
+        ({"points": POINTS, "poses": POSES[:4]}, "poses are"),
+        ({"points": POINTS, "poses": POSES * np.nan}, "NaN"),
+        ({"points": POINTS, "mask": np.ones(3, bool)}, "mask is"),
+        ({"points": POINTS, "mask": np.zeros((6, 7), bool)}, "every beam"),
+        ({"points": POINTS, "times": np.ones(3)}, "times are"),
+        ({"points": POINTS, "unit": "miles"}, "miles"),
+        ({"ranges": np.ones((6, 7)), "angles": np.ones(3)}, "angles"),
+        ({"other": POSES}, "other"),
+    ],
+)
+def test_bad_arrays_are_told_in_one_line(tmp_path, arrays, found):
+    path = save(tmp_path, "bad.npz", **arrays)
+    with pytest.raises(InputError, match=found) as caught:
+        read_sequence(path)
+    assert str(caught.value).startswith(str(path))
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("name", ["a.npy", "a.npz", "a.tar", "a.log", "a.log.gz", "a.clf", "a", "a.csv"])
+@pytest.mark.parametrize("content", [None, b"", b"garbage garbage"])
+def test_missing_empty_and_foreign_files_are_refused(tmp_path, name, content):
+    path = tmp_path / name
+    if content is not None:
+        path.write_bytes(content)
+    with pytest.raises(InputError) as caught:
+        read_sequence(path)
+    assert str(path) in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_damaged_npz_is_refused(tmp_path):
+    path = save(tmp_path, "a.npz", points=POINTS)
+    path.write_bytes(path.read_bytes()[:200])
+    with pytest.raises(InputError, match="NumPy"):
+        read_sequence(path)
+
+
+def test_contents_decide_where_the_ending_does_not(tmp_path, small):
+    (tmp_path / "log").write_text(LOG)
+    assert read_sequence(tmp_path / "log").unit == "m"
+    save(tmp_path, points=POINTS).rename(tmp_path / "array")
+    assert len(read_sequence(tmp_path / "array")) == 6
+    assert len(read_sequence(write_deepmapping_folder(tmp_path / "folder", small))) == 3
+    with pytest.raises(InputError, match="single scan"):
+        read_sequence(tmp_path / "folder" / "000.pcd")
+    with pytest.raises(InputError, match=r"without \.pcd"):
+        read_sequence(tmp_path)
+
+
+def test_sub_range_and_stride_take_poses_and_times_along(tmp_path):
+    path = tmp_path / "a.log.gz"
+    path.write_bytes(gzip.compress(LOG.encode()))
+    part = read_sequence(path, start=1, stop=6, stride=2)
+    for poses in (part.reference_poses, part.odometry_poses):
+        np.testing.assert_array_equal(poses[:, 0], [1, 3, 5])
+    np.testing.assert_array_equal(part.times, [1, 3, 5])
+    assert part.points.shape == (3, 3, 2)
+
+
+@pytest.mark.parametrize("choice", [{"start": 99}, {"stop": 1}, {"stride": 0}, {"start": -1}, {"stride": 6}])
+def test_choices_that_leave_nothing_are_refused(tmp_path, choice):
+    path = tmp_path / "a.log"
+    path.write_text(LOG)
+    with pytest.raises(InputError, match=r"a\.log"):
+        read_sequence(path, **choice)
+
+
+def test_limit_masks_far_beams_of_every_format(tmp_path):
+    (tmp_path / "a.log").write_text(LOG)
+    assert (read_sequence(tmp_path / "a.log", max_range=2.5).mask == [True, True, False]).all()
+    assert read_sequence(save(tmp_path, points=POINTS), start=0, stop=2, max_range=7).mask.all()
+    with pytest.raises(InputError, match="no valid beam"):
+        read_sequence(save(tmp_path, points=POINTS), max_range=7)
+
+
+def test_log_with_every_beam_at_maximum_range_is_refused(tmp_path):
+    (tmp_path / "a.log").write_text(LOG.replace("3 1 2 3", "3 81.91 81.91 81.91"))
+    with pytest.raises(InputError, match="maximum range"):
+        read_sequence(tmp_path / "a.log")
+    with pytest.raises(InputError, match="metres"):
+        read_sequence(tmp_path / "a.log", unit="px")
+
+
+@pytest.mark.parametrize("turn", [1, -1])
+def test_order_of_beams_is_seen(turn):
+    points, mask = POINTS[:, ::turn].astype(np.float32), np.ones((6, 7), bool)
+    shuffled = points[:, np.random.default_rng(0).permutation(7)]
+    assert has_angular_order(points, mask)
+    assert not has_angular_order(shuffled, mask)
+    assert not has_angular_order(points, np.zeros_like(mask))
+    rolled = np.roll(points, 3, axis=1)
+    assert has_angular_order(points, mask) == has_angular_order(rolled, mask)
+
+
+@pytest.mark.parametrize(
+    "change", [{"unit": "mm"}, {"mask": np.ones((6, 6), bool)}, {"points": POSES}, {"times": np.ones(2)}]
+)
+def test_sequence_refuses_shapes_that_do_not_belong_together(change):
+    fields = {"name": "a", "points": POINTS.astype(np.float32), "mask": np.ones((6, 7), bool), "unit": "m"}
+    whole = ScanSequence(**fields)
+    assert len(take_scans(whole, slice(1, 4))) == 3
+    with pytest.raises(ValueError, match=next(iter(change))):
+        ScanSequence(**(fields | change))
+
+
+def test_import_is_light():
+    heavy = "('scipy', 'jax', 'matplotlib')"
+    code = f"import sys, dpmjax.io as d; d.ScanSequence; print(*[m for m in {heavy} if m in sys.modules])"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == ""

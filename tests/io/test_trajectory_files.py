@@ -1,0 +1,126 @@
+"""Laws of trajectory files; evo is the oracle that reads them, where it is installed."""
+
+import os
+
+import numpy as np
+import pytest
+
+from dpmjax.io import (
+    InputError,
+    planar_to_homogeneous,
+    read_initial_poses,
+    write_atomically,
+    write_kitti,
+    write_poses_npy,
+    write_tum,
+)
+
+POSES = np.column_stack([np.random.default_rng(0).uniform(-500, 500, (9, 2)), np.linspace(-3.1, 3.1, 9)])
+WRITTEN = 1e-6  # The files keep nine digits.
+WRITERS = {"tum.txt": write_tum, "kitti.txt": write_kitti, "poses.npy": write_poses_npy}
+
+
+@pytest.mark.parametrize("name", WRITERS)
+@pytest.mark.parametrize("is_spatial", [False, True])
+def test_poses_survive_writing(tmp_path, name, is_spatial):
+    path = WRITERS[name](tmp_path / "sub" / name, planar_to_homogeneous(POSES) if is_spatial else POSES)
+    np.testing.assert_allclose(read_initial_poses(path, 9, "m"), POSES, atol=WRITTEN)
+    assert [file.name for file in path.parent.iterdir()] == [name]
+
+
+def test_evo_reads_what_we_write(tmp_path):
+    file_interface = pytest.importorskip("evo.tools.file_interface")
+    times = np.linspace(1.25, 9, 9)
+    tum = file_interface.read_tum_trajectory_file(str(write_tum(tmp_path / "t.txt", POSES, times=times)))
+    kitti = file_interface.read_kitti_poses_file(str(write_kitti(tmp_path / "k.txt", POSES)))
+    np.testing.assert_allclose(tum.timestamps, times, atol=1e-6)
+    for trajectory in (tum, kitti):
+        np.testing.assert_allclose(trajectory.poses_se3, planar_to_homogeneous(POSES), atol=WRITTEN)
+
+
+def test_tum_tells_its_frame_and_keeps_the_digits(tmp_path):
+    lines = write_tum(tmp_path / "t.txt", POSES, unit="px").read_text().splitlines()
+    assert lines[0].startswith("#")
+    assert "T_world_scan" in lines[0]
+    assert "px" in lines[0]
+    assert all(len(word.split(".")[1]) >= 6 for line in lines[1:] for word in line.split())
+    with pytest.raises(InputError, match="poses in px"):
+        read_initial_poses(tmp_path / "t.txt", 9, "m")
+
+
+def test_kitti_rows_are_twelve_bare_numbers(tmp_path):
+    text = write_kitti(tmp_path / "k.txt", POSES).read_text()
+    assert all(len(line.split(" ")) == 12 for line in text.splitlines())
+    assert text.endswith("\n")
+    assert not text.endswith("\n\n")
+
+
+def test_planar_columns_are_read_with_comments(tmp_path):
+    path = tmp_path / "start.txt"
+    path.write_text("# x_px y_px theta_rad\n\n1 2 0.5\n3, 4, -0.5\n")
+    np.testing.assert_array_equal(read_initial_poses(path, 2, "px"), [[1, 2, 0.5], [3, 4, -0.5]])
+
+
+def test_homogeneous_planar_matrices_are_read(tmp_path):
+    matrices = planar_to_homogeneous(POSES)[:, [0, 1, 3]][:, :, [0, 1, 3]]
+    np.save(tmp_path / "m.npy", matrices)
+    np.testing.assert_allclose(read_initial_poses(tmp_path / "m.npy", 9, "m"), POSES, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("text", "found"),
+    [
+        ("", "no row"),
+        ("1 2 3\n", "1 poses for 2 scans"),
+        ("1 2 3\n1 2 nan\n", "NaN"),
+        ("1 2 3\n1 2\n", "columns"),
+        ("1 2\n1 2\n", "columns"),
+        ("1 2 3\n1 2 x\n", "not a number"),
+        ("0 1 2 3 0 0 0 2\n1 1 2 3 0 0 0 1\n", "quaternions"),
+        ("1 0 0 0 0 0 -1 0 0 1 0 0\n" * 2, "tilted by 90"),
+        ("# x_px y_px theta_rad\n1 2 3\n1 2 3\n", "poses in px"),
+    ],
+)
+def test_bad_start_is_told_in_one_line(tmp_path, text, found):
+    path = tmp_path / "start.txt"
+    path.write_text(text)
+    with pytest.raises(InputError, match=found) as caught:
+        read_initial_poses(path, 2, "m")
+    assert str(path) in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_bad_arrays_are_refused(tmp_path):
+    with pytest.raises(InputError, match="no such file"):
+        read_initial_poses(tmp_path / "none.npy", 2, "m")
+    np.save(tmp_path / "a.npy", np.ones((2, 5)))
+    with pytest.raises(InputError, match=r"\(2, 5\)"):
+        read_initial_poses(tmp_path / "a.npy", 2, "m")
+    (tmp_path / "b.npy").write_bytes(b"cut")
+    with pytest.raises(InputError, match="NumPy"):
+        read_initial_poses(tmp_path / "b.npy", 2, "m")
+
+
+@pytest.mark.parametrize("bad", [np.ones((3, 2)), np.ones((3, 3, 3)), np.full((3, 3), np.nan)])
+def test_writers_refuse_what_is_no_trajectory(tmp_path, bad):
+    for name, write in WRITERS.items():
+        with pytest.raises(ValueError, match="poses must be"):
+            write(tmp_path / name, bad)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_interrupted_writing_leaves_the_old_file(tmp_path, monkeypatch):
+    path = write_atomically(tmp_path / "a.txt", "old")
+
+    def fail(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(os, "replace", fail)
+    with pytest.raises(KeyboardInterrupt):
+        write_atomically(path, "new")
+    assert path.read_text() == "old"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_start_of_the_authors_trajectory_is_read(real_data):
+    assert read_initial_poses(real_data / "deepmapping_2d" / "start_16px.txt", 256, "px").shape == (256, 3)

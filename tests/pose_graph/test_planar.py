@@ -1,0 +1,99 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from dpmjax.geometry import se2
+from dpmjax.pose_graph.planar import join_edges, solve_poses
+from dpmjax.registration import Edges, optimize_planar_graph
+from tests.tolerances import DOUBLE
+
+
+def hat(tangent: np.ndarray) -> np.ndarray:
+    x, y, turn = tangent
+    return np.array([[0.0, -turn, x], [turn, 0.0, y], [0.0, 0.0, 0.0]])
+
+
+def loop_of(num_poses: int = 40) -> np.ndarray:
+    """One and a half rounds on a circle."""
+    angle = np.linspace(0.0, 3 * np.pi, num_poses)
+    return np.stack([50 * np.sin(angle), 50 - 50 * np.cos(angle), se2.wrap_angle(angle)], -1)
+
+
+def edges_of(poses: np.ndarray, source: np.ndarray, target: np.ndarray, weight: float = 1.0) -> Edges:
+    information = np.broadcast_to(weight * np.diag([1.0, 1.0, 100.0]), (len(source), 3, 3))
+    return Edges(source, target, se2.relative(poses[target], poses[source]), information)
+
+
+def steps_of(poses: np.ndarray) -> Edges:
+    later = np.arange(1, len(poses))
+    return edges_of(poses, later, later - 1)
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_sparse_step_is_that_of_the_dense_system(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    count, num_edges = 7, 16
+    source = np.append(np.arange(1, count), rng.integers(1, count, num_edges - count + 1))
+    target = np.append(
+        np.arange(count - 1), (source[count - 1 :] + rng.integers(1, count, num_edges - count + 1)) % count
+    )
+    roots = rng.normal(size=(num_edges, 3, 3))
+    edges = Edges(source, target, rng.normal(size=(num_edges, 3)), roots @ np.swapaxes(roots, 1, 2))
+    residual = rng.normal(size=(num_edges, 3))
+    gradient = np.einsum("eij,ej->ei", edges.information, residual)
+    # Least squares over all edges: J (delta_i - Ad(T_i_j) delta_j) + J r, first pose held.
+    rows = np.zeros((3 * num_edges, 3 * count))
+    right = np.zeros(3 * num_edges)
+    for e, (i, j) in enumerate(zip(source, target, strict=True)):
+        part, root = slice(3 * e, 3 * e + 3), np.linalg.cholesky(edges.information[e]).T
+        rows[part, 3 * i : 3 * i + 3] += root
+        rows[part, 3 * j : 3 * j + 3] -= root @ se2.adjoint(se2.inverse(edges.poses[e]))
+        right[part] = -root @ residual[e]
+    expected = np.linalg.lstsq(rows[:, 3:], right, rcond=None)[0].reshape(-1, 3)
+    step = solve_poses(count, edges, gradient, damping=0.0)
+    np.testing.assert_allclose(step[0], 0.0, atol=1e-6)
+    np.testing.assert_allclose(step[1:], expected, rtol=1e-4, atol=1e-5)
+
+
+def test_poses_move_in_their_own_frames() -> None:
+    pose, step = np.array([[3.0, -2.0, np.pi / 2]]), np.array([[1.0, 0.0, 0.1]])
+    np.testing.assert_allclose(se2.compose(pose, step), [[3.0, -1.0, np.pi / 2 + 0.1]], **DOUBLE)
+
+
+def test_a_torn_loop_is_recovered_although_a_fifth_of_the_loops_lie() -> None:
+    rng = np.random.default_rng(3)
+    true = loop_of()
+    # The second round sees the first one again; the steps drift by a degree each.
+    source, target = np.repeat(np.arange(28, 40), 2), np.tile([0, 1], 12) + np.repeat(np.arange(0, 12), 2)
+    loops = edges_of(true, source, target)
+    is_wrong = np.arange(len(source)) % 5 == 0
+    lies = np.where(is_wrong[:, None], loops.poses + rng.uniform(20, 40, (len(source), 3)) * [1, -1, 0.05], loops.poses)
+    steps = steps_of(true)
+    drifted = steps._replace(poses=steps.poses + np.array([0.0, 0.0, np.radians(1.0)]))
+    start = se2.compose(true[:1], se2.chain(drifted.poses))
+    found, weight = optimize_planar_graph(
+        start, join_edges(drifted, loops._replace(poses=lies)), trust=np.repeat([30.0, 1.0], [39, len(source)])
+    )
+    before = np.hypot(*(start - true)[:, :2].T).max()
+    after = np.hypot(*(found - true)[:, :2].T).max()
+    assert before > 20.0
+    assert after < 5.0
+    assert weight[39:][is_wrong].max() < 0.1
+    assert weight[39:][~is_wrong].min() > 0.5
+    np.testing.assert_allclose(found[0], start[0], atol=1e-5)
+
+
+def test_a_consistent_graph_stays_where_it_is() -> None:
+    true = loop_of()
+    found, weight = optimize_planar_graph(true, steps_of(true))
+    np.testing.assert_allclose(found, true, atol=1e-8)
+    np.testing.assert_allclose(weight, 1.0, atol=1e-8)
+
+
+def test_poses_without_an_edge_stay_finite_and_still() -> None:
+    poses = loop_of(5)
+    none = np.zeros(0, np.int64)
+    found, weight = optimize_planar_graph(poses, Edges(none, none, np.zeros((0, 3)), np.zeros((0, 3, 3))))
+    np.testing.assert_allclose(found, poses, atol=1e-9)
+    assert weight.shape == (0,)

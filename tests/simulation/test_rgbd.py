@@ -1,0 +1,186 @@
+"""Laws of the depth camera, its apartments and the readers."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+from PIL import Image
+from scipy.io import savemat
+
+from dpmjax import io, simulation
+from dpmjax.io import InputError
+from dpmjax.io.depth.camera import Camera
+from tests.tolerances import ROUNDING
+
+CAMERA = Camera(8, 6, 6.0, 6.5, 3.5, 2.5)
+
+
+def box_distance_by_marching(origin, ray, centre, half, yaw):
+    """First depth along the ray inside the box, by small steps."""
+    for depth in np.arange(0.0, 6.0, 0.002):
+        x, y, z = origin + depth * ray - centre
+        u, v = np.cos(yaw) * x - np.sin(yaw) * z, np.sin(yaw) * x + np.cos(yaw) * z
+        if abs(u) <= half[0] and abs(y) <= half[1] and abs(v) <= half[2]:
+            return depth
+    return np.inf
+
+
+def test_depth_is_what_marching_along_the_rays_finds():
+    rng = np.random.default_rng(0)
+    centres, halves = rng.uniform([-1, -1, 1.5], [1, 1, 4], (4, 3)), rng.uniform(0.2, 0.7, (4, 3))
+    yaws = rng.uniform(-1, 1, 4)
+    rays = CAMERA.rays(np.arange(8.0), np.arange(6.0))
+    depth = np.asarray(simulation.cast_depth(np.eye(4), rays, centres, halves, yaws))
+    for row, column in [(0, 0), (2, 3), (3, 4), (5, 7), (1, 6)]:
+        boxes = zip(centres, halves, yaws, strict=True)
+        expected = min(box_distance_by_marching(np.zeros(3), rays[row, column], *box) for box in boxes)
+        assert depth[row, column] == pytest.approx(expected, abs=0.004)
+
+
+def test_from_within_a_box_its_walls_are_seen_and_empty_boxes_are_not():
+    rays = CAMERA.rays(np.arange(8.0), np.arange(6.0))
+    boxes = (np.zeros((2, 3)), np.array([[2.0, 2.0, 3.0], [0.0, 0.0, 0.0]]), np.zeros(2))
+    depth = np.asarray(simulation.cast_depth(np.eye(4), rays, *boxes))
+    expected = np.min(np.array([2.0, 2.0, 3.0]) / np.maximum(np.abs(rays), 1e-12), axis=-1)
+    np.testing.assert_allclose(depth, expected, **ROUNDING)
+
+
+def test_walks_keep_to_the_grid_and_neighbours_differ_by_one_step():
+    sequence = simulation.simulate_depth_sequence(3, 8, seed=5)
+    T = sequence.T_world_camera
+    assert sequence.is_planar
+    assert sequence.mask.mean() > 0.8
+    np.testing.assert_allclose(T[:, 1, 3], 0.0)
+    grid = T[:, [0, 2], 3] / 0.3
+    np.testing.assert_allclose(grid, np.round(grid), atol=1e-9)
+    moved = np.linalg.norm(np.diff(T[:, :3, 3], axis=0), axis=1)
+    turned = np.degrees(np.arccos(np.clip((np.einsum("nij,nij->n", T[:-1, :3, :3], T[1:, :3, :3]) - 1) / 2, -1, 1)))
+    for distance, angle in zip(moved, turned, strict=True):
+        assert (distance, angle) == (pytest.approx(0.3), pytest.approx(0.0, abs=1e-5)) or (
+            distance,
+            angle,
+        ) == (pytest.approx(0.0), pytest.approx(30.0))
+
+
+def test_a_seed_gives_one_walk():
+    one, two, other = (simulation.simulate_depth_sequence(0, 8, seed=seed) for seed in (1, 1, 2))
+    np.testing.assert_array_equal(one.points, two.points)
+    assert not np.array_equal(one.points, other.points)
+
+
+def test_all_images_of_a_walk_see_the_same_walls():
+    sequence = simulation.simulate_depth_sequence(1, 8, seed=0)
+    T = sequence.T_world_camera
+    world = np.einsum("nij,nhwj->nhwi", T[:, :3, :3], sequence.points) + T[:, None, None, :3, 3]
+    home = simulation.make_apartment(1)
+    inside = world[sequence.mask]
+    assert (inside[:, [0, 2]] > -1e-3).all()
+    assert (inside[:, 0] < home.size_x_m + 1e-3).all()
+    np.testing.assert_allclose([inside[:, 1].min(), inside[:, 1].max()], [-1.5, 1.1], atol=1e-3)
+
+
+def write_png(path, depth_mm):
+    path.parent.mkdir(parents=True, exist_ok=True)
+    Image.fromarray(np.asarray(depth_mm, np.uint16)).save(path)
+
+
+@pytest.fixture
+def pose_folder(tmp_path):
+    np.savetxt(tmp_path / "camera-intrinsics.txt", [[6.0, 0, 3.5], [0, 6.5, 2.5], [0, 0, 1]])
+    for index in (2, 10):
+        depth = np.full((6, 8), 1000 * index // 2)
+        depth[0, 0], depth[0, 1] = 0, 65535
+        write_png(tmp_path / f"frame-{index}.depth.png", depth)
+        pose = np.eye(4)
+        pose[0, 3] = index
+        np.savetxt(tmp_path / f"frame-{index}.pose.txt", pose)
+    return tmp_path
+
+
+def test_pose_folders_are_read_in_natural_order(pose_folder):
+    sequence = io.read_pose_folder(pose_folder, height=6, width=8)
+    np.testing.assert_array_equal(sequence.T_world_camera[:, 0, 3], [2, 10])
+    assert not sequence.is_planar
+    assert not sequence.mask[:, 0, :2].any()
+    assert sequence.mask[:, 1:].all()
+    x, y, z = sequence.points[0, 5, 7]
+    np.testing.assert_allclose([x, y, z], [3.5 / 6.0, 2.5 / 6.5, 1.0], **ROUNDING)
+
+
+@pytest.mark.parametrize(
+    ("spoil", "message"),
+    [
+        (lambda path: (path / "frame-2.pose.txt").unlink(), "no frame-2.pose.txt"),
+        (lambda path: (path / "camera-intrinsics.txt").unlink(), "intrinsics"),
+        (lambda path: (path / "frame-2.depth.png").write_bytes(b"no picture"), "not a readable PNG"),
+        (lambda path: (path / "frame-2.depth.png").unlink(), "at least two"),
+        (lambda path: (path / "frame-2.pose.txt").write_text("1 2 3"), "a matrix of"),
+    ],
+)
+def test_damaged_pose_folders_are_told_in_one_line(pose_folder, spoil, message):
+    spoil(pose_folder)
+    with pytest.raises(InputError, match=message) as caught:
+        io.read_pose_folder(pose_folder, height=6, width=8)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.fixture
+def scene(tmp_path):
+    """Four views in the layout of the Active Vision Dataset: two places, two directions."""
+    folder = tmp_path / "Home_999_1"
+    names = [f"0009990000{k}0101.png".replace(".png", ".jpg") for k in range(4)]
+    turn = np.array([[np.cos(0.5), 0, np.sin(0.5)], [0, 1, 0], [-np.sin(0.5), 0, np.cos(0.5)]])
+    structs = np.zeros(4, [("image_name", object), ("R", object), ("t", object)])
+    for k, name in enumerate(names):
+        R, position = (turn if k % 2 else np.eye(3)), np.array([0.1 * (k // 2), 0.0, 0.0])
+        structs[k] = (name, R.T, -R.T @ position)
+        write_png(folder / "high_res_depth" / f"{name[:-6]}03.png", np.full((6, 8), 2000 + k))
+    savemat(folder / "image_structs.mat", {"image_structs": structs, "scale": 3000.0})
+    links = {
+        name: {"forward": "", "rotate_cw": names[k ^ 1], "rotate_ccw": "", "left": names[k ^ 2]}
+        for k, name in enumerate(names)
+    }
+    (folder / "annotations.json").write_text(json.dumps(links))
+    (folder / "cameras.txt").write_text("# cameras\n1 OPENCV 8 6 6.0 6.5 3.5 2.5 0 0 0 0\n")
+    return folder
+
+
+def test_active_vision_scenes_are_walked_along_their_links(scene):
+    sequence = io.read_active_vision(scene, 8, seed=3, height=6, width=8)
+    assert sequence.is_planar
+    assert len(sequence) == 8
+    T = sequence.T_world_camera
+    assert set(np.round(T[:, 0, 3], 6)) == {0.0, 0.3}  # 0.1 units of 3000 mm
+    view = np.round((sequence.points[:, 3, 3, 2] - 2.0) * 1000).astype(int)
+    np.testing.assert_allclose(T[:, 0, 2], np.where(view % 2, np.sin(0.5), 0.0), atol=1e-9)
+    np.testing.assert_allclose(T[:, 0, 3], 0.3 * (view // 2), atol=1e-9)
+    changed = np.abs(np.diff(view))
+    assert set(changed) <= {1, 2}
+    again = io.read_active_vision(scene, 8, seed=3, height=6, width=8)
+    np.testing.assert_array_equal(again.points, sequence.points)
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "message"),
+    [
+        ("annotations.json", "{", "annotations"),
+        ("image_structs.mat", "text", "pose file"),
+        ("cameras.txt", "1 OPENCV 8 six 6 6 3 3\n", "not a camera"),
+        ("cameras.txt", "# nothing\n", "no camera"),
+    ],
+)
+def test_damaged_scenes_are_told_in_one_line(scene, name, content, message):
+    (scene / name).write_text(content)
+    with pytest.raises(InputError, match=message):
+        io.read_active_vision(scene, 8, height=6, width=8)
+
+
+def test_bad_arguments_are_named():
+    with pytest.raises(ValueError, match="num_views"):
+        simulation.simulate_depth_sequence(0, 1)
+    with pytest.raises(ValueError, match="seed"):
+        simulation.make_apartment(-1)
+    with pytest.raises(ValueError, match="depth_m: expected"):
+        io.back_project(np.ones((3, 3)), CAMERA, height=2, width=2, max_depth_m=5.0)

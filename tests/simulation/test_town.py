@@ -1,0 +1,218 @@
+"""Towns, drives through them and what a lidar sees there."""
+
+from dataclasses import replace
+
+import jax
+import numpy as np
+import pytest
+
+from dpmjax.io import iterate_scans, open_lidar_sequence
+from dpmjax.simulation import (
+    HDL64E,
+    DriveConfig,
+    LidarSensor,
+    TownConfig,
+    drive,
+    make_town,
+    range_image,
+    scan_town,
+    simulate_lidar_sequence,
+    write_kitti_sequence,
+)
+from dpmjax.simulation.town import SENSORS
+
+SENSOR = LidarSensor("test", tuple(np.linspace(2.0, -24.0, 16)), 360, max_range_m=80.0)
+SHORT = TownConfig(route_length_m=500)
+
+
+@pytest.fixture(scope="module")
+def town():
+    return make_town(3, SHORT)
+
+
+@pytest.fixture(scope="module")
+def way(town):
+    return drive(town)
+
+
+def scan(town, way, index, seed=0, sensor=SENSOR):
+    pose, time = way.T_world_lidar[index], way.times[index]
+    return scan_town(town.primitives, pose, time, key=jax.random.key(seed), sensor=sensor)
+
+
+def test_a_seed_makes_one_town(town):
+    again, other = make_town(3, SHORT), make_town(4, SHORT)
+    jax.tree.map(np.testing.assert_array_equal, town.primitives, again.primitives)
+    assert not np.array_equal(town.primitives.boxes.centres[:50], other.primitives.boxes.centres[:50])
+
+
+def test_a_key_makes_one_scan(town, way, assert_compiles_nothing):
+    first = scan(town, way, 10)
+    with assert_compiles_nothing():
+        again, other = scan(town, way, 10), scan(town, way, 30, seed=1)
+    np.testing.assert_array_equal(first.points, again.points)
+    np.testing.assert_array_equal(first.mask, again.mask)
+    assert not np.array_equal(first.points, other.points)
+
+
+def test_points_lie_on_beams_within_range(town, way):
+    cloud = scan(town, way, 40)
+    points, mask = np.asarray(cloud.points), np.asarray(cloud.mask)
+    assert points.shape == (SENSOR.num_rays, 3)
+    assert 0.5 < mask.mean() < 1.0
+    ranges = np.linalg.norm(points[mask], axis=1)
+    assert ranges.min() >= SENSOR.min_range_m
+    assert ranges.max() <= SENSOR.max_range_m + 1e-3
+    assert not points[~mask].any()
+    beams = np.repeat(np.radians(SENSOR.elevations_deg), SENSOR.num_azimuths)[mask]
+    np.testing.assert_allclose(np.arcsin(points[mask, 2] / ranges), beams, atol=1e-4)
+
+
+def test_a_range_image_looks_ahead_with_the_sky_on_top(town, way):
+    cloud = scan(town, way, 40)
+    ranges, mask = (np.asarray(x) for x in range_image(cloud, SENSOR))
+    grid = np.asarray(cloud.points).reshape(*ranges.shape, 3)
+    middle = slice(ranges.shape[1] // 2 - 3, ranges.shape[1] // 2 + 3)
+    assert (grid[:, middle, 0][mask[:, middle]] > 0).all()
+    assert (grid[-1, : ranges.shape[1] // 2, 1][mask[-1, : ranges.shape[1] // 2]] > -0.2).all()
+    assert ranges[0][mask[0]].mean() > ranges[-1][mask[-1]].mean()
+
+
+@pytest.mark.parametrize("kind", ["loop", "there_and_back", "wander"])
+def test_routes_close_and_have_the_wanted_length(kind):
+    town = make_town(1, TownConfig(route=kind, route_length_m=1200, block_m=90))
+    poses = drive(town).T_world_lidar
+    steps = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
+    assert np.linalg.norm(poses[-1, :3, 3] - poses[0, :3, 3]) < 1.5
+    assert steps.max() < 1.0
+    assert steps.sum() == pytest.approx(1200, rel=0.35)
+
+
+def test_there_and_back_sees_a_street_from_both_sides():
+    town = make_town(2, TownConfig(route="there_and_back", route_length_m=1000, block_m=90))
+    poses = drive(town).T_world_lidar
+    apart = np.linalg.norm(poses[:, None, :2, 3] - poses[None, :, :2, 3], axis=-1)
+    facing = np.einsum("ni,mi->nm", poses[:, :2, 0], poses[:, :2, 0])
+    assert ((apart < 5) & (facing < -0.9)).any(axis=1).mean() > 0.1
+
+
+def test_reverse_drives_the_other_lane(town, way):
+    back = drive(town, DriveConfig(is_reversed=True)).T_world_lidar
+    apart = np.linalg.norm(back[:, None, :2, 3] - way.T_world_lidar[None, :, :2, 3], axis=-1).min(1)
+    assert np.median(apart) == pytest.approx(3.4, abs=0.6)
+
+
+def test_poses_are_rigid_and_stand_on_the_ground(town, way):
+    poses = way.T_world_lidar
+    np.testing.assert_allclose(
+        poses[:, :3, :3] @ poses[:, :3, :3].transpose(0, 2, 1), np.tile(np.eye(3), (len(poses), 1, 1)), atol=1e-9
+    )
+    np.testing.assert_allclose(poses[:, 2, 3] - town.terrain.height_at(poses[:, :2, 3]), 1.73, atol=1e-9)
+    assert (poses[:, 2, 2] > 0.98).all()
+    assert (np.diff(way.times) > 0).all()
+
+
+def test_nothing_stands_in_the_lane(town):
+    boxes = town.primitives.boxes
+    mask = np.asarray(boxes.mask)
+    lane = drive(town, DriveConfig(sway_m=0.0)).T_world_lidar[:, :2, 3]
+    centres, half, turn = (np.asarray(x, np.float64)[mask] for x in (boxes.centres, boxes.half_sizes, boxes.headings))
+    offset = lane[:, None] - centres[None, :, :2]
+    along = np.abs(offset[..., 0] * turn[:, 0] + offset[..., 1] * turn[:, 1]) - half[:, 0]
+    across = np.abs(offset[..., 1] * turn[:, 0] - offset[..., 0] * turn[:, 1]) - half[:, 1]
+    assert np.maximum(along, across).min() > 1.2
+
+
+def test_a_second_scan_of_a_place_fits_the_first(town, way):
+    """The world stands still: points of one scan, moved by the true poses, lie on those of the next."""
+    from scipy.spatial import KDTree
+
+    clouds = [scan(town, way, index, seed=index) for index in (60, 62)]
+    points = [np.asarray(c.points)[np.asarray(c.mask)] for c in clouds]
+    world = [p @ T[:3, :3].T + T[:3, 3] for p, T in zip(points, way.T_world_lidar[[60, 62]], strict=True)]
+    near = np.linalg.norm(points[1], axis=1) < 12
+    distance = KDTree(world[0]).query(world[1][near])[0]
+    assert np.median(distance) < 0.2
+
+
+def test_traffic_moves(town):
+    from dpmjax.simulation.town.traffic import traffic_boxes
+
+    here = np.array([1e4, 1e4, 0.0], np.float32)
+    start, later = (traffic_boxes(town.primitives.traffic, here, time) for time in (0.0, 0.5))
+    mask = np.asarray(start.mask & later.mask)
+    way = np.linalg.norm(np.asarray(later.centres - start.centres)[mask], axis=1)
+    assert mask.sum() > 5
+    assert np.median(way) > 0.3
+    assert np.percentile(way, 80) < 7.0
+
+
+def test_a_simulated_sequence_is_written_and_read_as_kitti(tmp_path):
+    driving = DriveConfig(length_m=3.0)
+    sequence = simulate_lidar_sequence(3, SHORT, driving=driving, sensor=SENSOR)
+    write_kitti_sequence(tmp_path, "05", sequence)
+    again = open_lidar_sequence(tmp_path, sequence="05")
+    assert again.num_scans == sequence.num_scans > 2
+    np.testing.assert_allclose(again.times, sequence.times, atol=1e-6)
+    relative = np.linalg.inv(sequence.T_world_lidar[0]) @ sequence.T_world_lidar
+    np.testing.assert_allclose(again.T_world_lidar, relative, atol=1e-6)
+    for mine, theirs in zip(iterate_scans(sequence), iterate_scans(again), strict=True):
+        np.testing.assert_array_equal(mine.points, theirs.points)
+
+
+def test_a_street_is_laid_along_a_real_drive(real_data):
+    from dpmjax.io.poses.lidar_poses import lidar_poses_from_camera, read_kitti_calibration, read_poses
+
+    calibration = read_kitti_calibration(real_data / "poses" / "kitti_00_calib.txt")
+    real = lidar_poses_from_camera(read_poses(real_data / "poses" / "kitti_07.txt"), calibration)
+    town = make_town(0, trajectory=real)
+    poses = drive(town).T_world_lidar
+    apart = np.linalg.norm(poses[:, None, :3, 3] - real[None, :, :3, 3], axis=-1).min(1)
+    assert np.percentile(apart, 95) < 1.2
+    length = np.linalg.norm(np.diff(real[:, :3, 3], axis=0), axis=1).sum()
+    assert np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1).sum() == pytest.approx(length, rel=0.05)
+
+
+def describe(points):
+    """Shares of the points by range, and of those near the ground: what a network sees first."""
+    ranges = np.linalg.norm(points, axis=1)
+    shares = np.histogram(ranges, [0, 5, 10, 20, 40, 80])[0] / len(ranges)
+    return np.append(shares, (points[:, 2] < -1.35).mean())
+
+
+def test_a_scan_of_the_town_has_the_statistics_of_a_real_one(town, way, real_data):
+    """Within the scatter of real streets; kitti_00 and kitti_07 differ by 0.12 themselves."""
+    real = [
+        describe(open_lidar_sequence(real_data / "lidar_3d" / name).read_scan(0)) for name in ("kitti_00", "kitti_07")
+    ]
+    sensor = replace(SENSOR, elevations_deg=HDL64E.elevations_deg[::4])
+    made = []
+    for index in range(0, len(way.times), 60):
+        cloud = scan(town, way, index, sensor=sensor)
+        made.append(describe(np.asarray(cloud.points)[np.asarray(cloud.mask)]))
+    np.testing.assert_allclose(np.mean(made, axis=0), np.mean(real, axis=0), atol=0.12)
+
+
+@pytest.mark.parametrize("sensor", SENSORS.values(), ids=lambda sensor: sensor.name)
+def test_beam_tables_go_down(sensor):
+    assert (np.diff(sensor.elevations_deg) < 0).all()
+    assert sensor.num_rays == len(sensor.elevations_deg) * sensor.num_azimuths
+    assert len(sensor.elevations_deg) in (16, 32, 64)
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda: make_town(-1),
+        lambda: TownConfig(route="spiral"),
+        lambda: TownConfig(route_length_m=0),
+        lambda: LidarSensor("none", (), 100),
+        lambda: LidarSensor("near", (0.0,), 100, min_range_m=5, max_range_m=4),
+        lambda: DriveConfig(speed_m_s=0),
+        lambda: make_town(0, trajectory=np.zeros((5, 3))),
+        lambda: make_town(0, trajectory=np.tile(np.eye(4), (5, 1, 1))),
+    ],
+)
+def test_senseless_wishes_are_refused(make):
+    with pytest.raises(ValueError, match=r"must|needs"):
+        make()

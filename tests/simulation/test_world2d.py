@@ -1,0 +1,156 @@
+"""Laws of the worlds, of the walk through them, and of the simulated sequence."""
+
+from functools import lru_cache
+
+import numpy as np
+import pytest
+from scipy.ndimage import label
+from scipy.stats import kstest
+
+from dpmjax.io import InputError
+from dpmjax.simulation import (
+    TrajectoryConfig,
+    World,
+    beam_angles,
+    cast_rays,
+    make_world,
+    read_world_png,
+    simulate_odometry,
+    simulate_sequence,
+    simulate_trajectory,
+    write_world_png,
+)
+
+WORLDS = [0, 1, 2]
+world = lru_cache(make_world)
+
+
+@lru_cache
+def walk(index):
+    return simulate_trajectory(world(index), 256, rng=np.random.default_rng([index, 0]))
+
+
+@pytest.mark.parametrize("index", WORLDS)
+def test_world_is_the_papers_size_and_one_free_space(index):
+    grid = world(index).is_obstacle
+    assert grid.shape == (1024, 1024)
+    assert label(~grid)[1] == 1
+    assert 0.05 < grid.mean() < 0.5
+    np.testing.assert_array_equal(make_world(index).is_obstacle, grid)
+
+
+def test_worlds_differ():
+    grids = [make_world(index).is_obstacle for index in (0, 1, 2, 3)]
+    assert all((a != b).mean() > 0.02 for i, a in enumerate(grids) for b in grids[:i])
+
+
+def test_negative_index_is_refused():
+    with pytest.raises(ValueError, match="index"):
+        make_world(-1)
+
+
+def test_world_survives_its_picture(tmp_path):
+    path = write_world_png(tmp_path / "world.png", world(0))
+    np.testing.assert_array_equal(read_world_png(path).is_obstacle, world(0).is_obstacle)
+
+
+@pytest.mark.parametrize("content", [None, b"", b"no picture"])
+def test_bad_picture_is_refused(tmp_path, content):
+    path = tmp_path / "bad.png"
+    if content is not None:
+        path.write_bytes(content)
+    with pytest.raises(InputError, match=r"bad\.png"):
+        read_world_png(path)
+
+
+@pytest.mark.parametrize("index", WORLDS)
+def test_steps_have_the_papers_statistics(index):
+    poses = walk(index)
+    steps = np.linalg.norm(np.diff(poses[:, :2], axis=0), axis=1)
+    turns = (np.diff(poses[:, 2]) + np.pi) % (2 * np.pi) - np.pi
+    assert abs(steps.mean() - 8.16) < 0.5  # Five standard errors of 255 uniform steps.
+    assert (np.abs(turns) <= np.deg2rad(10) + 1e-12).all()
+    assert kstest(turns, "uniform", args=(-np.deg2rad(10), np.deg2rad(20))).pvalue > 1e-3
+
+
+@pytest.mark.parametrize("index", WORLDS)
+def test_walk_keeps_clear_of_walls_between_poses_too(index):
+    poses = walk(index)
+    step = np.diff(poses[:, :2], axis=0)
+    ahead = cast_rays(world(index).is_obstacle, poses[:-1, :2], np.arctan2(step[:, 1], step[:, 0])).ranges
+    assert (ahead >= np.linalg.norm(step, axis=1) + 8.0).all()
+    between = np.concatenate([poses[:-1, :2] + f * step for f in (0.0, 0.25, 0.5, 0.75)])
+    fan = np.tile(beam_angles(64), len(between))
+    assert cast_rays(world(index).is_obstacle, np.repeat(between, 64, axis=0), fan).ranges.min() >= 8.0
+
+
+@pytest.mark.parametrize("index", WORLDS)
+def test_every_scan_sees_structure_in_two_directions(index):
+    poses = walk(index)
+    angles = (poses[:, 2:] + beam_angles(256)).ravel()
+    hits = cast_rays(world(index).is_obstacle, np.repeat(poses[:, :2], 256, axis=0), angles)
+    axis, is_near = hits.axis.reshape(256, 256), hits.ranges.reshape(256, 256) < 350
+    for normal in (0, 1):
+        assert ((axis == normal) & is_near).sum(axis=1).min() >= 20
+
+
+@pytest.mark.parametrize("index", WORLDS)
+def test_walk_explores_and_comes_back(index):
+    xy = walk(index)[:, :2]
+    assert np.ptp(xy, axis=0).max() > 250
+    seen_again = [np.linalg.norm(xy[: i - 60] - xy[i], axis=1).min() < 60 for i in range(61, 256)]
+    assert np.mean(seen_again) > 0.05
+
+
+def test_walk_is_a_function_of_the_generator():
+    a, b, c = (simulate_trajectory(world(0), 40, rng=np.random.default_rng(s)) for s in (1, 1, 2))
+    np.testing.assert_array_equal(a, b)
+    assert not np.array_equal(a, c)
+    assert simulate_trajectory(world(0), 1, rng=np.random.default_rng(0)).shape == (1, 3)
+
+
+def test_world_too_narrow_is_refused():
+    grid = np.ones((100, 100), bool)
+    grid[50:60, 10:90] = False
+    with pytest.raises(ValueError, match="too narrow"):
+        simulate_trajectory(World("slit", grid), 10, rng=np.random.default_rng(0))
+
+
+@pytest.mark.parametrize("field", ["max_rotation_deg", "mean_step_px", "clearance_px", "leg_px"])
+def test_config_refuses_what_is_not_positive(field):
+    with pytest.raises(ValueError, match=field):
+        TrajectoryConfig(**{field: 0.0})
+
+
+def test_odometry_without_errors_is_the_walk_seen_from_its_first_pose():
+    poses = walk(0)[:50]
+    odometry = simulate_odometry(poses, rng=np.random.default_rng(0), translation_noise=0, rotation_noise_deg=0, bias=0)
+    cos, sin = np.cos(poses[0, 2]), np.sin(poses[0, 2])
+    np.testing.assert_allclose(odometry[:, :2] @ [[cos, sin], [-sin, cos]] + poses[0, :2], poses[:, :2], atol=1e-9)
+    drifting = simulate_odometry(poses, rng=np.random.default_rng(0))
+    assert 0.01 < np.linalg.norm(drifting[-1, :2] - odometry[-1, :2]) < 100
+
+
+def test_sequence_is_deterministic_and_its_walk_knows_nothing_of_noise():
+    clean, again = simulate_sequence(0, 6, seed=3), simulate_sequence(0, 6, seed=3)
+    noisy = simulate_sequence(0, 6, seed=3, range_noise_px=1.0, with_odometry=True)
+    np.testing.assert_array_equal(clean.points, again.points)
+    np.testing.assert_array_equal(clean.reference_poses, noisy.reference_poses)
+    assert not np.array_equal(clean.points, noisy.points)
+    assert clean.points.shape == (6, 256, 2)
+    assert clean.points.dtype == np.float32
+    assert clean.unit == "px"
+    assert clean.odometry_poses is None
+    assert noisy.odometry_poses.shape == (6, 3)
+    assert not np.array_equal(clean.points, simulate_sequence(0, 6, seed=4).points)
+
+
+def test_scans_put_at_their_reference_agree():
+    from scipy.spatial import cKDTree
+
+    scans = simulate_sequence(1, 12)
+    cos, sin = np.cos(scans.reference_poses[:, 2]), np.sin(scans.reference_poses[:, 2])
+    rotation = np.stack([np.stack([cos, -sin], -1), np.stack([sin, cos], -1)], -2)
+    world_points = np.einsum("nij,nbj->nbi", rotation, scans.points) + scans.reference_poses[:, None, :2]
+    distance, _ = cKDTree(world_points[0]).query(world_points[1])
+    assert np.median(distance) < 3.0
