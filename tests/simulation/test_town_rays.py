@@ -7,17 +7,16 @@ import pytest
 
 from dpmjax.simulation import CastConfig, LidarSensor
 from dpmjax.simulation.town import cast
-from dpmjax.simulation.town.ground import cross_ground, ground_height
-from dpmjax.simulation.town.intersect import cross_box, cross_cylinder, cross_spheroid
-from dpmjax.simulation.town.primitives import (
-    Ground,
-    TownPrimitives,
-    Traffic,
-    pack_boxes,
-    pack_cylinders,
-    pack_spheroids,
+from dpmjax.simulation.town.intersect import (
+    Hull,
+    cross_box,
+    cross_cylinder,
+    cross_ground,
+    cross_spheroid,
+    ground_height,
 )
-from dpmjax.simulation.town.scan import cast_rays_3d, ray_directions, ray_shape
+from dpmjax.simulation.town.primitives import Ground, TownPrimitives, Traffic, pack_boxes, pack_round
+from dpmjax.simulation.town.scan import make_rays
 from tests.tolerances import ACCUMULATED
 
 SENSOR = LidarSensor("test", tuple(np.linspace(20.0, -30.0, 9)), 72, max_range_m=60.0)
@@ -73,6 +72,10 @@ def ground_oracle(heights, origin, cell, start, ray, max_range):
     return t[np.argmax(below)] if below.any() else np.inf
 
 
+def hull(centre, half_size, heading):
+    return Hull(*(jnp.asarray(x, jnp.float32) for x in (centre, half_size, heading)))
+
+
 def first_hit(crossing):
     return np.where((crossing.entry > 0) & (crossing.entry <= crossing.exit), crossing.entry, np.inf)
 
@@ -84,7 +87,7 @@ def test_boxes_are_met_where_their_planes_are(seed):
     centre = rays * rng.uniform(4, 40, (200, 1)) + rng.normal(size=(200, 3))
     half, heading = rng.uniform(0.2, 3, (200, 3)), rng.uniform(-np.pi, np.pi, 200)
     turned = np.column_stack([np.cos(heading), np.sin(heading)])
-    found = first_hit(cross_box(*(jnp.asarray(x, jnp.float32) for x in (rays, centre, half, turned))))
+    found = first_hit(cross_box(jnp.asarray(rays, jnp.float32), hull(centre, half, turned)))
     wanted = np.array([box_oracle(*row) for row in zip(rays, centre, half, heading, strict=True)])
     outside = ~np.array([(np.abs(c) < h.max() * 1.8).all() for c, h in zip(centre, half, strict=True)])
     assert np.isfinite(wanted).mean() > 0.5
@@ -99,7 +102,8 @@ def test_round_bodies_are_met_where_their_roots_are(cross, oracle):
     rays = directions(rng, 300)
     centre = rays * rng.uniform(6, 60, (300, 1)) + rng.normal(size=(300, 3))
     radius, half_height = rng.uniform(0.1, 2, 300), rng.uniform(0.3, 3, 300)
-    found = first_hit(cross(*(jnp.asarray(x, jnp.float32) for x in (rays, centre, radius, half_height))))
+    sizes = np.column_stack([radius, radius, half_height])
+    found = first_hit(cross(jnp.asarray(rays, jnp.float32), hull(centre, sizes, np.tile([1.0, 0.0], (300, 1)))))
     wanted = np.array([oracle(*row) for row in zip(rays, centre, radius, half_height, strict=True)])
     both = np.isfinite(found) == np.isfinite(wanted)
     assert np.isfinite(wanted).mean() > 0.3
@@ -134,7 +138,9 @@ def small_town(land, rng):
     place = place[np.linalg.norm(place[:, :2], axis=1) > 5]
     sizes = rng.uniform(0.3, 2.5, (len(place), 3))
     boxes = np.column_stack([place, sizes, rng.uniform(-3, 3, len(place)), np.zeros((len(place), 2))])
-    poles = np.column_stack([place + np.array([3, -2, 0]), rng.uniform(0.05, 0.4, len(place)), sizes[:, 2] + 1])
+    poles = np.column_stack(
+        [place + np.array([3, -2, 0]), rng.uniform(0.05, 0.4, len(place)), sizes[:, 2] + 1, np.zeros(len(place))]
+    )
     tufts = np.column_stack([place + np.array([-2, 3, 1]), sizes[:, :2] * 0.5, np.zeros(len(place))])
     traffic = Traffic(
         lane_points=jnp.zeros((2, 64, 3)),
@@ -148,8 +154,8 @@ def small_town(land, rng):
     )
     town = TownPrimitives(
         pack_boxes(boxes),
-        pack_cylinders(poles),
-        pack_spheroids(tufts),
+        pack_round(poles),
+        pack_round(tufts),
         Ground(jnp.asarray(heights, jnp.float32), jnp.asarray(origin, jnp.float32), jnp.float32(1.0)),
         traffic,
     )
@@ -169,15 +175,13 @@ def tilted_pose():
 def turn(land):
     """A small town and what a turn of the sensor meets there."""
     town, *tables = small_town(land, np.random.default_rng(11))
-    rays = ray_directions(SENSOR, CONFIG, jnp.float32(0.01))
+    rays = make_rays(SENSOR, CONFIG, jnp.float32(0.01))
 
     @jax.jit
     def look(town, pose):
-        depths = jnp.zeros(ray_shape(SENSOR, CONFIG))
-        zero = jnp.float32(0.0)
-        return cast_rays_3d(town, pose, zero, rays, jnp.float32(0.01), depths, sensor=SENSOR, config=CONFIG)
+        return cast.cast_turn(town, pose, jnp.float32(0.0), rays, max_range=SENSOR.max_range_m, config=CONFIG)
 
-    return look, town, tables, np.asarray(rays, np.float64)
+    return look, town, tables, np.asarray(rays.directions, np.float64)
 
 
 def test_a_turn_meets_the_nearest_of_all_bodies(turn, land):
@@ -252,8 +256,7 @@ def test_foliage_is_met_inside_of_it():
     rng = np.random.default_rng(0)
     rays = directions(rng, 500)
     depths = rng.exponential(size=500)
-    tufts = pack_spheroids(np.array([[0.0, 0, 0, 3, 2, 0.8]]))
-    crossing = cross_spheroid(jnp.asarray(rays), tufts.centres[0] + jnp.array([8.0, 0, 0]), 3.0, 2.0)
+    crossing = cross_spheroid(jnp.asarray(rays, jnp.float32), hull([8.0, 0, 0], [3.0, 3, 2], [1.0, 0]))
     inside = np.asarray(crossing.entry + 0.8 * depths)
     is_met = np.isfinite(inside) & (inside <= np.asarray(crossing.exit)) & (np.asarray(crossing.entry) > 0)
     points = inside[is_met, None] * rays[is_met] - [8, 0, 0]

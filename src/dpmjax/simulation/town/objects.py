@@ -1,4 +1,4 @@
-"""What stands in a town, part by part: houses, cars, trees, hedges, poles, people. Rows for the tables of primitives.
+"""Objects of a town as rows of primitives: houses, cars, trees, hedges, poles, people.
 
 Every builder gets a place on the ground and a heading (the street's direction; the street lies to the object's right)
 and appends rows to a `Collection`.
@@ -19,7 +19,7 @@ class Collection:
 
     Attributes:
         boxes: x y z, half sizes, heading, softness, window depth.
-        cylinders: x y z, radius, half height.
+        cylinders: x y z, radius, half height, softness (0).
         spheroids: x y z, radius, half height, softness.
     """
 
@@ -83,7 +83,7 @@ def put_house(
     *,
     is_plain: bool,
 ) -> None:
-    """A house: body with windows, stepped roof, and what sticks out towards the street.
+    """A house: body with windows, stepped roof, and bays, steps and balconies towards the street.
 
     Args:
         into: where to.
@@ -91,7 +91,7 @@ def put_house(
         place: middle of the body; the street lies to the right of its heading.
         size: along and across the street, m.
         height: of the eaves, m.
-        is_plain: nothing sticks out.
+        is_plain: no bays, steps or balconies.
     """
     width, depth = size
     put_box(into, place, size, (-_SUNK_M, height), window_depth=float(rng.uniform(0.1, 0.4)))
@@ -117,16 +117,13 @@ def put_house(
         put_pole(into, pipe, 0.06, height)
 
 
-def put_car(into: Collection, rng: np.random.Generator, place: Place) -> tuple[float, float]:
+def put_car(into: Collection, rng: np.random.Generator, place: Place) -> None:
     """A parked car or van: body, cabin, a gap below.
 
     Args:
         into: where to.
         rng: source of its size.
         place: its middle.
-
-    Returns:
-        Length and width, m.
     """
     if rng.random() < 0.12:
         length, width, top = rng.uniform(4.8, 6.2), rng.uniform(1.9, 2.1), rng.uniform(2.0, 2.7)
@@ -140,7 +137,6 @@ def put_car(into: Collection, rng: np.random.Generator, place: Place) -> tuple[f
         put_box(into, cabin, (rng.uniform(0.5, 0.62) * length, 0.86 * width), (belt, top))
     for along in (-0.32, 0.32):
         put_box(into, place.move(along * length, 0.0), (0.6, 0.98 * width), (0.0, 0.4))
-    return float(length), float(width)
 
 
 def put_pole(into: Collection, place: Place, radius: float, height: float) -> None:
@@ -152,7 +148,7 @@ def put_pole(into: Collection, place: Place, radius: float, height: float) -> No
         radius: m.
         height: m.
     """
-    into.cylinders.append((place.x, place.y, place.ground + 0.5 * height - 0.1, radius, 0.5 * height + 0.1))
+    into.cylinders.append((place.x, place.y, place.ground + 0.5 * height - 0.1, radius, 0.5 * height + 0.1, 0.0))
 
 
 def put_sign(into: Collection, rng: np.random.Generator, place: Place) -> None:
@@ -201,7 +197,7 @@ def put_bush(into: Collection, rng: np.random.Generator, place: Place) -> None:
 
 
 def put_border(into: Collection, rng: np.random.Generator, place: Place, length: float, kind: str) -> None:
-    """A hedge, wall or fence along the street, in pieces, with a gate left open.
+    """A hedge, wall or fence along the street, in pieces, with an open gate.
 
     Args:
         into: where to.
@@ -234,7 +230,7 @@ def put_border(into: Collection, rng: np.random.Generator, place: Place, length:
 
 
 def put_person(into: Collection, rng: np.random.Generator, place: Place) -> None:
-    """Somebody who stands: a body and a head.
+    """A standing person: a body and a head.
 
     Args:
         into: where to.
