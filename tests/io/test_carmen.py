@@ -106,7 +106,7 @@ def test_logs_without_front_laser_are_refused(tmp_path):
     with pytest.raises(InputError, match="no such file"):
         read_carmen_log(tmp_path / "none.log")
     (tmp_path / "cut.log.gz").write_bytes(gzip.compress(b"FLASER 1 1" * 99)[:-12])
-    with pytest.raises(InputError, match="no such file"):
+    with pytest.raises(InputError, match="cannot be unpacked"):
         read_carmen_log(tmp_path / "cut.log.gz")
 
 

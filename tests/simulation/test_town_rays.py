@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from dpmjax.simulation import CastConfig, LidarSensor
-from dpmjax.simulation.town import cast
+from dpmjax.simulation.town.cast import cast_turn
 from dpmjax.simulation.town.intersect import (
     Hull,
     cross_box,
@@ -15,7 +15,17 @@ from dpmjax.simulation.town.intersect import (
     cross_spheroid,
     ground_height,
 )
-from dpmjax.simulation.town.primitives import Ground, TownPrimitives, Traffic, pack_boxes, pack_round
+from dpmjax.simulation.town.primitives import (
+    GROUND,
+    NOTHING,
+    POLE,
+    SOFT,
+    SOLID,
+    Ground,
+    TownPrimitives,
+    Traffic,
+    pack_bodies,
+)
 from dpmjax.simulation.town.scan import make_rays
 from tests.tolerances import ACCUMULATED
 
@@ -138,10 +148,10 @@ def small_town(land, rng):
     place = place[np.linalg.norm(place[:, :2], axis=1) > 5]
     sizes = rng.uniform(0.3, 2.5, (len(place), 3))
     boxes = np.column_stack([place, sizes, rng.uniform(-3, 3, len(place)), np.zeros((len(place), 2))])
-    poles = np.column_stack(
-        [place + np.array([3, -2, 0]), rng.uniform(0.05, 0.4, len(place)), sizes[:, 2] + 1, np.zeros(len(place))]
-    )
-    tufts = np.column_stack([place + np.array([-2, 3, 1]), sizes[:, :2] * 0.5, np.zeros(len(place))])
+    zero = np.zeros((len(place), 3))
+    thickness = rng.uniform(0.05, 0.4, len(place))
+    poles = np.column_stack([place + np.array([3, -2, 0]), thickness, thickness, sizes[:, 2] + 1, zero])
+    tufts = np.column_stack([place + np.array([-2, 3, 1]), sizes[:, [0, 0, 1]] * 0.5, zero])
     traffic = Traffic(
         lane_points=jnp.zeros((2, 64, 3)),
         lane_lengths=jnp.ones(2),
@@ -153,9 +163,9 @@ def small_town(land, rng):
         mask=jnp.zeros(4, bool),
     )
     town = TownPrimitives(
-        pack_boxes(boxes),
-        pack_round(poles),
-        pack_round(tufts),
+        pack_bodies(boxes, SOLID),
+        pack_bodies(poles, POLE),
+        pack_bodies(tufts, SOFT),
         Ground(jnp.asarray(heights, jnp.float32), jnp.asarray(origin, jnp.float32), jnp.float32(1.0)),
         traffic,
     )
@@ -179,7 +189,7 @@ def turn(land):
 
     @jax.jit
     def look(town, pose):
-        return cast.cast_turn(town, pose, jnp.float32(0.0), rays, max_range=SENSOR.max_range_m, config=CONFIG)
+        return cast_turn(town, pose, jnp.float32(0.0), rays, max_range=SENSOR.max_range_m, config=CONFIG)
 
     return look, town, tables, np.asarray(rays.directions, np.float64)
 
@@ -194,19 +204,19 @@ def test_a_turn_meets_the_nearest_of_all_bodies(turn, land):
     wanted, kinds = [], []
     for ray in world:
         options = {
-            cast.SOLID: min(box_oracle(ray, b[:3] - start, b[3:6], b[6]) for b in boxes),
-            cast.POLE: min(cylinder_oracle(ray, p[:3] - start, p[3], p[4]) for p in poles),
-            cast.SOFT: min(spheroid_oracle(ray, s[:3] - start, s[3], s[4]) for s in tufts),
-            cast.GROUND: ground_oracle(land[0], land[1], 1.0, start, ray, SENSOR.max_range_m),
+            SOLID: min(box_oracle(ray, b[:3] - start, b[3:6], b[6]) for b in boxes),
+            POLE: min(cylinder_oracle(ray, p[:3] - start, p[3], p[5]) for p in poles),
+            SOFT: min(spheroid_oracle(ray, s[:3] - start, s[3], s[5]) for s in tufts),
+            GROUND: ground_oracle(land[0], land[1], 1.0, start, ray, SENSOR.max_range_m),
         }
         kind = min(options, key=options.get)
         wanted.append(min(options[kind], np.inf) if options[kind] <= SENSOR.max_range_m else np.inf)
-        kinds.append(kind if np.isfinite(wanted[-1]) else cast.NOTHING)
+        kinds.append(kind if np.isfinite(wanted[-1]) else NOTHING)
     wanted, kinds = np.array(wanted), np.array(kinds)
     same = np.isclose(found, wanted, rtol=0, atol=0.03)
     assert same.mean() > 0.985
     assert (surfaces == kinds)[same].mean() > 0.98
-    assert {cast.SOLID, cast.POLE, cast.SOFT, cast.GROUND} <= set(surfaces.tolist())
+    assert {SOLID, POLE, SOFT, GROUND} <= set(surfaces.tolist())
 
 
 def test_padding_takes_no_part(turn):
@@ -231,8 +241,8 @@ def test_an_empty_town_is_ground_only(turn):
         spheroids=town.spheroids.replace(mask=jnp.zeros_like(town.spheroids.mask)),
     )
     hits = look(empty, jnp.asarray(tilted_pose(), jnp.float32))
-    assert set(np.unique(hits.surfaces)) == {cast.NOTHING, cast.GROUND}
-    assert np.isinf(np.asarray(hits.ranges)[np.asarray(hits.surfaces) == cast.NOTHING]).all()
+    assert set(np.unique(hits.surfaces)) == {NOTHING, GROUND}
+    assert np.isinf(np.asarray(hits.ranges)[np.asarray(hits.surfaces) == NOTHING]).all()
 
 
 def test_windows_lie_behind_their_wall(turn):
@@ -242,7 +252,7 @@ def test_windows_lie_behind_their_wall(turn):
     depth = 0.3
     boxes = town.boxes.replace(window_depth=jnp.full(town.boxes.mask.shape, depth))
     fronts = look(town.replace(boxes=boxes), pose)
-    is_wall = np.asarray(walls.surfaces) == cast.SOLID
+    is_wall = np.asarray(walls.surfaces) == SOLID
     deeper = np.asarray(fronts.ranges)[is_wall] - np.asarray(walls.ranges)[is_wall]
     cosines = np.asarray(walls.cosines)[is_wall]
     assert (deeper >= 0).all()

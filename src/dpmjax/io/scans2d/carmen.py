@@ -104,7 +104,7 @@ def _flaser_lines(path: str | Path) -> list[tuple[int, list[str]]]:
     try:
         text = (gzip.decompress(content) if content[:2] == b"\x1f\x8b" else content).decode("latin-1")
     except (OSError, EOFError, zlib.error) as error:
-        raise InputError(path, f"cannot be read ({error})", "check the path, or copy the file again") from error
+        raise InputError(path, f"cannot be unpacked ({error})", "copy the file again") from error
     lines = text.splitlines()
     found = [(number, line.split()) for number, line in enumerate(lines, 1) if line.startswith("FLASER")]
     if not found:

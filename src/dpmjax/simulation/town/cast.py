@@ -19,12 +19,9 @@ from dpmjax.simulation.town.intersect import (
     cross_ground,
     cross_spheroid,
 )
-from dpmjax.simulation.town.primitives import RoundBodies, TownPrimitives, traffic_boxes
-from dpmjax.simulation.town.sectors import Bodies, bodies_by_sector, nearest_bodies
+from dpmjax.simulation.town.primitives import GROUND, NOTHING, Bodies, TownPrimitives, traffic_boxes
+from dpmjax.simulation.town.sectors import bodies_by_sector, nearest_bodies
 from dpmjax.simulation.town.windows import recess
-
-NOTHING, GROUND, SOLID, SOFT, POLE, MOVING = range(6)
-"""What a ray can meet."""
 
 
 @dataclass(frozen=True)
@@ -121,17 +118,16 @@ def cast_turn(
         directions=jnp.einsum("ij,srj->sri", T_world_lidar[:3, :3], rays.directions, precision=highest)
     )
 
-    def in_sectors(bodies: Bodies, num_nearest: int, capacity: int) -> Bodies:
-        near = nearest_bodies(bodies, num_nearest, max_range)
-        return bodies_by_sector(near, T_lidar_world, rays.azimuths, capacity)
+    def first_hits(bodies: Bodies, num_nearest: int, capacity: int, cross: Callable[[Array, Hull], Crossing]) -> Hits:
+        near = nearest_bodies(replace(bodies, centres=bodies.centres - start), num_nearest, max_range)
+        return _body_hits(bodies_by_sector(near, T_lidar_world, rays.azimuths, capacity), in_world, cross)
 
-    boxes = in_sectors(_boxes(town, start, time), config.num_boxes, config.boxes_per_sector)
-    cylinders = in_sectors(_upright(town.cylinders, start), config.num_cylinders, config.cylinders_per_sector)
-    spheroids = in_sectors(_upright(town.spheroids, start), config.num_spheroids, config.spheroids_per_sector)
-    hits = _box_hits(boxes, in_world, len(town.boxes.mask))
-    hits = _nearer(hits, _round_hits(cylinders, in_world, cross_cylinder, POLE))
-    hits = _nearer(hits, _round_hits(spheroids, in_world, cross_spheroid, SOFT))
-    hits = _nearer(hits, _ground_hits(town, start, in_world, max_range))
+    boxes = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), town.boxes, traffic_boxes(town.traffic, start, time))
+    hits = first_hits(boxes, config.num_boxes, config.boxes_per_sector, cross_box)
+    poles = first_hits(town.cylinders, config.num_cylinders, config.cylinders_per_sector, cross_cylinder)
+    tufts = first_hits(town.spheroids, config.num_spheroids, config.spheroids_per_sector, cross_spheroid)
+    for others in (poles, tufts, _ground_hits(town, start, in_world, max_range)):
+        hits = _nearer(hits, others)
     is_seen = hits.ranges <= max_range
     return replace(
         hits, ranges=jnp.where(is_seen, hits.ranges, jnp.inf), surfaces=jnp.where(is_seen, hits.surfaces, NOTHING)
@@ -141,27 +137,6 @@ def cast_turn(
 def _nearer(a: Hits, b: Hits) -> Hits:
     is_a = a.ranges <= b.ranges
     return jax.tree.map(lambda x, y: jnp.where(is_a, x, y), a, b)
-
-
-def _boxes(town: TownPrimitives, start: Float[Array, " 3"], time: Float[Array, ""]) -> Bodies:
-    """Boxes that stand and boxes that drive, relative to the sensor."""
-    moving = traffic_boxes(town.traffic, start, time)
-    both = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), town.boxes, moving)
-    return Bodies(**{**vars(both), "centres": both.centres - start}, index=jnp.arange(len(both.mask)))
-
-
-def _upright(bodies: RoundBodies, start: Float[Array, " 3"]) -> Bodies:
-    """Round bodies by the boxes round them, relative to the sensor."""
-    zero = jnp.zeros_like(bodies.radii)
-    return Bodies(
-        centres=bodies.centres - start,
-        half_sizes=jnp.stack([bodies.radii, bodies.radii, bodies.half_heights], axis=-1),
-        headings=jnp.stack([zero + 1.0, zero], axis=-1),
-        softness=bodies.softness,
-        window_depth=zero,
-        mask=bodies.mask,
-        index=jnp.arange(len(bodies.mask)),
-    )
 
 
 def _first(bodies: Bodies, rays: Rays, cross: Callable[[Array, Hull], Crossing]) -> _Best:
@@ -181,32 +156,19 @@ def _first(bodies: Bodies, rays: Rays, cross: Callable[[Array, Hull], Crossing])
     return best
 
 
-def _box_hits(bodies: Bodies, rays: Rays, num_standing: int) -> Hits:
-    best = _first(bodies, rays, cross_box)
+def _body_hits(bodies: Bodies, rays: Rays, cross: Callable[[Array, Hull], Crossing]) -> Hits:
+    """The first bodies of all rays; boxes have windows, and the angle of a face counts, unless it is soft."""
+    best = _first(bodies, rays, cross)
     is_met = best.slots >= 0
     # For each ray, the body in the slot of its sector's list.
     sectors = jnp.arange(best.slots.shape[0])[:, None]
     body = jax.tree.map(lambda x: x[sectors, jnp.maximum(best.slots, 0)], bodies)
+    surfaces = jnp.where(is_met, body.surface, NOTHING)
+    if cross is not cross_box:
+        return Hits(best.ranges, jnp.ones_like(best.ranges), surfaces, jnp.zeros(is_met.shape, bool))
     face = recess(jnp.where(is_met, best.ranges, 0.0), rays.directions, body)
-    is_soft = body.softness > 0
-    surfaces = jnp.where(body.index >= num_standing, MOVING, jnp.where(is_soft, SOFT, SOLID))
-    return Hits(
-        ranges=jnp.where(is_met, face.ranges, jnp.inf),
-        cosines=jnp.where(is_soft, 1.0, face.cosines),
-        surfaces=jnp.where(is_met, surfaces, NOTHING),
-        is_glass=face.is_glass & is_met,
-    )
-
-
-def _round_hits(bodies: Bodies, rays: Rays, cross: Callable[[Array, Hull], Crossing], surface: int) -> Hits:
-    """Poles and tufts: small or rough, the angle of the surface does not count."""
-    best = _first(bodies, rays, cross)
-    return Hits(
-        ranges=best.ranges,
-        cosines=jnp.ones_like(best.ranges),
-        surfaces=jnp.where(best.slots >= 0, surface, NOTHING),
-        is_glass=jnp.zeros(best.slots.shape, bool),
-    )
+    ranges = jnp.where(is_met, face.ranges, jnp.inf)
+    return Hits(ranges, jnp.where(body.softness > 0, 1.0, face.cosines), surfaces, face.is_glass & is_met)
 
 
 def _ground_hits(town: TownPrimitives, start: Float[Array, " 3"], rays: Rays, max_range: float) -> Hits:

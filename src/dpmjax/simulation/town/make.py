@@ -12,13 +12,15 @@ from dpmjax.simulation.town.furnish import furnish
 from dpmjax.simulation.town.objects import Collection
 from dpmjax.simulation.town.primitives import (
     LANE_STEP_M,
+    POLE,
+    SOFT,
+    SOLID,
     Ground,
     TownPrimitives,
     Traffic,
     capacity_for,
     mask_of,
-    pack_boxes,
-    pack_round,
+    pack_bodies,
     padded,
 )
 from dpmjax.simulation.town.streets import (
@@ -121,9 +123,9 @@ def make_town(seed: int, config: TownConfig = TownConfig(), *, trajectory: Array
 def _pack_town(standing: Collection, terrain: Terrain, traffic: Traffic) -> TownPrimitives:
     """The town as arrays on the device."""
     return TownPrimitives(
-        boxes=pack_boxes(np.array(standing.boxes, np.float64)),
-        cylinders=pack_round(np.array(standing.cylinders, np.float64)),
-        spheroids=pack_round(np.array(standing.spheroids, np.float64)),
+        boxes=pack_bodies(np.array(standing.boxes, np.float64), SOLID),
+        cylinders=pack_bodies(np.array(standing.cylinders, np.float64), POLE),
+        spheroids=pack_bodies(np.array(standing.spheroids, np.float64), SOFT),
         ground=Ground(
             heights=jnp.asarray(terrain.heights, jnp.float32),
             origin=jnp.asarray(terrain.origin, jnp.float32),

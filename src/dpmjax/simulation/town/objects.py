@@ -19,8 +19,8 @@ class Collection:
 
     Attributes:
         boxes: x y z, half sizes, heading, softness, window depth.
-        cylinders: x y z, radius, half height, softness (0).
-        spheroids: x y z, radius, half height, softness.
+        cylinders: the same of the boxes round them.
+        spheroids: the same.
     """
 
     boxes: list[tuple[float, ...]] = field(default_factory=list)
@@ -148,7 +148,16 @@ def put_pole(into: Collection, place: Place, radius: float, height: float) -> No
         radius: m.
         height: m.
     """
-    into.cylinders.append((place.x, place.y, place.ground + 0.5 * height - 0.1, radius, 0.5 * height + 0.1, 0.0))
+    centre = (place.x, place.y, place.ground + 0.5 * height - 0.1)
+    into.cylinders.append((*centre, radius, radius, 0.5 * height + 0.1, 0.0, 0.0, 0.0))
+
+
+def _put_tuft(
+    into: Collection, place: Place, level: float, radius: float, half_height: float, softness: float = 0.0
+) -> None:
+    """A spheroid with its centre `level` above the ground, m."""
+    size = (radius, radius, half_height)
+    into.spheroids.append((place.x, place.y, place.ground + level, *size, 0.0, softness, 0.0))
 
 
 def put_sign(into: Collection, rng: np.random.Generator, place: Place) -> None:
@@ -178,8 +187,8 @@ def put_tree(into: Collection, rng: np.random.Generator, place: Place) -> None:
         along, left = rng.normal(0.0, 0.5 * radius, 2)
         at = place.move(float(along), float(left))
         size = radius * rng.uniform(0.45, 0.8)
-        centre = place.ground + trunk + radius + rng.uniform(-0.5, 0.7) * radius
-        into.spheroids.append((at.x, at.y, centre, size, size * rng.uniform(0.7, 1.1), float(rng.uniform(0.3, 1.0))))
+        level = trunk + radius + rng.uniform(-0.5, 0.7) * radius
+        _put_tuft(into, at, level, size, size * rng.uniform(0.7, 1.1), float(rng.uniform(0.3, 1.0)))
 
 
 def put_bush(into: Collection, rng: np.random.Generator, place: Place) -> None:
@@ -193,7 +202,7 @@ def put_bush(into: Collection, rng: np.random.Generator, place: Place) -> None:
     for _ in range(rng.integers(2, 4)):
         along, left = rng.normal(0.0, 0.5, 2)
         at, size = place.move(float(along), float(left)), rng.uniform(0.4, 1.1)
-        into.spheroids.append((at.x, at.y, place.ground + 0.6 * size, size, 0.9 * size, float(rng.uniform(0.1, 0.35))))
+        _put_tuft(into, at, 0.6 * size, size, 0.9 * size, float(rng.uniform(0.1, 0.35)))
 
 
 def put_border(into: Collection, rng: np.random.Generator, place: Place, length: float, kind: str) -> None:
@@ -239,4 +248,4 @@ def put_person(into: Collection, rng: np.random.Generator, place: Place) -> None
     """
     height = rng.uniform(1.5, 1.9)
     put_pole(into, place, 0.22, height - 0.25)
-    into.spheroids.append((place.x, place.y, place.ground + height - 0.12, 0.11, 0.14, 0.0))
+    _put_tuft(into, place, height - 0.12, 0.11, 0.14)

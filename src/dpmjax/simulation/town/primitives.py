@@ -21,17 +21,22 @@ _CLEARANCE_M = 4.0
 _CAR_IS_LONGER_THAN_M = 0.5
 
 
+NOTHING, GROUND, SOLID, SOFT, POLE, MOVING = range(6)
+"""What a ray can meet."""
+
+
 @flax.struct.dataclass
-class Boxes:
-    """Upright boxes, turned about z only.
+class Bodies:
+    """Upright boxes, cylinders or ellipsoids of revolution, by the boxes round them, turned about z only.
 
     Attributes:
         centres: in the world, m.
-        half_sizes: along the box's own x, y, z, m.
+        half_sizes: along the box's own x, y, z, m; of a round body: radius, radius, half height.
         headings: cosine and sine of the angle from the world's x to the box's x.
-        softness: mean way, m, that a beam goes into the box before it is reflected (hedges, fences); 0 for a solid one.
-        window_depth: how far windows and doors lie behind the faces, m; 0 for faces without any.
-        mask: which boxes exist.
+        softness: mean way, m, that a beam goes into hedges, fences and foliage before it is reflected; 0 if solid.
+        window_depth: how far windows and doors lie behind the faces of a box, m; 0 for faces without any.
+        surface: SOLID, SOFT, POLE or MOVING.
+        mask: which bodies exist.
     """
 
     centres: Float[Array, "n 3"]
@@ -39,25 +44,7 @@ class Boxes:
     headings: Float[Array, "n 2"]
     softness: Float[Array, " n"]
     window_depth: Float[Array, " n"]
-    mask: Bool[Array, " n"]
-
-
-@flax.struct.dataclass
-class RoundBodies:
-    """Upright cylinders (poles, trunks), or ellipsoids of revolution about z (the tufts of crowns and bushes).
-
-    Attributes:
-        centres: in the world, m.
-        radii: horizontal, m.
-        half_heights: m.
-        softness: mean way, m, that a beam goes into foliage before it is reflected; 0 for a solid body.
-        mask: which bodies exist.
-    """
-
-    centres: Float[Array, "n 3"]
-    radii: Float[Array, " n"]
-    half_heights: Float[Array, " n"]
-    softness: Float[Array, " n"]
+    surface: Int[Array, " n"]
     mask: Bool[Array, " n"]
 
 
@@ -113,9 +100,9 @@ class TownPrimitives:
         traffic: what moves.
     """
 
-    boxes: Boxes
-    cylinders: RoundBodies
-    spheroids: RoundBodies
+    boxes: Bodies
+    cylinders: Bodies
+    spheroids: Bodies
     ground: Ground
     traffic: Traffic
 
@@ -153,45 +140,31 @@ def mask_of(count: int, capacity: int) -> jax.Array:
     return jnp.asarray(np.arange(capacity) < count)
 
 
-def pack_boxes(table: NDArray[np.float64]) -> Boxes:
-    """Boxes out of rows.
+def pack_bodies(table: NDArray[np.float64], surface: int) -> Bodies:
+    """Bodies of one kind out of rows.
 
     Args:
         table: (n, 9) x y z, half sizes, heading in radians, softness, window depth.
-
-    Returns:
-        The boxes, padded.
-    """
-    table = table.reshape(-1, 9)
-    capacity = capacity_for(len(table))
-    rows = padded(table, capacity)
-    headings = np.column_stack([np.cos(table[:, 6]), np.sin(table[:, 6])])
-    return Boxes(
-        centres=rows[:, :3],
-        half_sizes=rows[:, 3:6],
-        headings=padded(headings, capacity),
-        softness=rows[:, 7],
-        window_depth=rows[:, 8],
-        mask=mask_of(len(table), capacity),
-    )
-
-
-def pack_round(table: NDArray[np.float64]) -> RoundBodies:
-    """Cylinders or spheroids out of rows.
-
-    Args:
-        table: (n, 6) x y z, radius, half height, softness.
+        surface: SOLID (soft rows become SOFT), SOFT or POLE.
 
     Returns:
         The bodies, padded.
     """
-    table = table.reshape(-1, 6)
+    table = table.reshape(-1, 9)
     rows = padded(table, capacity_for(len(table)))
-    exists = mask_of(len(table), len(rows))
-    return RoundBodies(rows[:, :3], radii=rows[:, 3], half_heights=rows[:, 4], softness=rows[:, 5], mask=exists)
+    headings = padded(np.column_stack([np.cos(table[:, 6]), np.sin(table[:, 6])]), len(rows))
+    return Bodies(
+        centres=rows[:, :3],
+        half_sizes=rows[:, 3:6],
+        headings=headings,
+        softness=rows[:, 7],
+        window_depth=rows[:, 8],
+        surface=jnp.where((rows[:, 7] > 0) & (surface == SOLID), SOFT, surface),
+        mask=mask_of(len(table), len(rows)),
+    )
 
 
-def traffic_boxes(traffic: Traffic, sensor: Float[Array, " 3"], time: Float[Array, ""]) -> Boxes:
+def traffic_boxes(traffic: Traffic, sensor: Float[Array, " 3"], time: Float[Array, ""]) -> Bodies:
     """The road users at a time.
 
     Args:
@@ -215,12 +188,13 @@ def traffic_boxes(traffic: Traffic, sensor: Float[Array, " 3"], time: Float[Arra
     lift = jnp.where(is_car, 0.25, 0.0)
     up = jnp.array([0.0, 0.0, 1.0], foot.dtype)
     zero = jnp.zeros(len(way), foot.dtype)
-    body = Boxes(
+    body = Bodies(
         centres=foot + (lift + half_body)[:, None] * up,
         half_sizes=traffic.half_sizes.at[:, 2].set(half_body),
         headings=heading,
         softness=zero,
         window_depth=zero,
+        surface=jnp.full(len(way), MOVING),
         mask=traffic.mask & is_free,
     )
     cabin = replace(

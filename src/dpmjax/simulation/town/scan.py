@@ -14,8 +14,8 @@ import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from dpmjax.checks import require_shape
-from dpmjax.simulation.town.cast import NOTHING, CastConfig, Hits, Rays, cast_turn
-from dpmjax.simulation.town.primitives import TownPrimitives
+from dpmjax.simulation.town.cast import CastConfig, Hits, Rays, cast_turn
+from dpmjax.simulation.town.primitives import NOTHING, TownPrimitives
 from dpmjax.types import AnyArray, PointCloud
 
 # Reflectivity of each surface (nothing, ground, solid, soft, pole, moving): asphalt is dark, leaves and paint are not.

@@ -7,28 +7,16 @@ farthest bodies are missing.
 
 from __future__ import annotations
 
-import flax.struct
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float
 
 from dpmjax.geometry import rigid, se2
 from dpmjax.simulation.town.intersect import turn_back
-from dpmjax.simulation.town.primitives import Boxes
+from dpmjax.simulation.town.primitives import Bodies
 
 _CORNERS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], np.float32)
-
-
-@flax.struct.dataclass
-class Bodies(Boxes):
-    """Bodies of one kind by the boxes round them, in axes of the world with the sensor as origin.
-
-    Attributes:
-        index: which body of the town this is.
-    """
-
-    index: Int[Array, " k"]
 
 
 def nearest_bodies(bodies: Bodies, capacity: int, max_range: float) -> Bodies:

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from dpmjax.simulation.town.intersect import turn_back
-from dpmjax.simulation.town.sectors import Bodies
+from dpmjax.simulation.town.primitives import Bodies
 
 _STOREY_M = 2.9
 _SILL_M = 0.9
