@@ -13,8 +13,8 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from dpmjax.io.clouds import parse_pcd, write_pcd
 from dpmjax.io.files import natural_key, read_bytes, write_atomically
-from dpmjax.io.pcd import parse_pcd, write_pcd
 from dpmjax.sequences import InputError, ScanSequence, has_angular_order
 
 _PIXELS_PER_UNIT = 512.0
