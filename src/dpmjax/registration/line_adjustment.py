@@ -21,7 +21,7 @@ import scipy.spatial
 from jaxtyping import Array, Bool, Float, Int
 
 from dpmjax.geometry import se2
-from dpmjax.pose_graph.planar import Floats, Indices
+from dpmjax.pose_graph.graph import Floats, Indices
 from dpmjax.registration.line_fitting import LineScans
 from dpmjax.registration.pair_alignment import rotation_of
 from dpmjax.registration.pairs import length_scale

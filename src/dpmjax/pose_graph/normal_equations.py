@@ -1,0 +1,159 @@
+"""Sparse normal equations made of small dense blocks, assembled fast and solved by SuperLU.
+
+A term of a least-squares problem touches a few nodes (two for an edge of a pose graph). Its share of J^T W J is a dense
+block for every pair of them, its share of J^T W r a vector for each.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.sparse as sp
+import scipy.sparse.linalg
+from jaxtyping import Float
+from numpy.typing import NDArray
+
+from dpmjax.pose_graph.graph import Floats, Indices
+
+
+@dataclass(frozen=True, eq=False)
+class BlockPattern:
+    """The places of all blocks in the sparse matrix, which stay the same while the numbers change.
+
+    Attributes:
+        nodes: (m, s) the nodes of each term.
+        rows: (n,) block row of each free node, -1 for held ones.
+        order: the blocks between free nodes, of m * s * s in all, sorted by their place.
+        starts: where in `order` each place of the matrix begins.
+        columns: block column of each place.
+        row_starts: where in `columns` each block row begins.
+    """
+
+    nodes: Indices
+    rows: Indices
+    order: Indices
+    starts: Indices
+    columns: Indices
+    row_starts: Indices
+
+    @classmethod
+    def create(cls, nodes: Indices, is_held: NDArray[np.bool_]) -> BlockPattern:
+        """Finds the places.
+
+        Args:
+            nodes: (m, s) the nodes of each term.
+            is_held: (n,) nodes that do not move.
+
+        Returns:
+            The pattern.
+        """
+        rows = np.where(is_held, -1, np.cumsum(~is_held) - 1)
+        num_free = int((~is_held).sum())
+        at = rows[nodes]
+        block_row, block_column = (x.ravel() for x in np.broadcast_arrays(at[:, :, None], at[:, None, :]))
+        used = np.flatnonzero((block_row >= 0) & (block_column >= 0))
+        place = block_row[used] * num_free + block_column[used]
+        sorting = np.argsort(place, kind="stable")
+        place = place[sorting]
+        starts = np.flatnonzero(np.diff(place, prepend=-1))
+        columns = place[starts] % max(num_free, 1)
+        row_starts = np.searchsorted(place[starts], num_free * np.arange(num_free + 1))
+        return cls(nodes, rows, used[sorting], starts, columns, row_starts)
+
+    def matrix(self, blocks: Float[np.ndarray, "m s s d d"]) -> sp.csc_matrix:
+        """The sum of all blocks over the free nodes.
+
+        Args:
+            blocks: J^T W J of each term, symmetric as a whole.
+
+        Returns:
+            The sparse matrix, d rows for each free node.
+        """
+        axes, num_free = blocks.shape[-1], len(self.row_starts) - 1
+        ordered = blocks.reshape(-1, axes, axes)[self.order]
+        summed = np.add.reduceat(ordered, self.starts, axis=0) if len(self.starts) else ordered
+        shape = (axes * num_free, axes * num_free)
+        by_rows = sp.bsr_matrix((summed, self.columns, self.row_starts), shape=shape).tocsr()
+        # A symmetric matrix has the same arrays by rows and by columns.
+        return sp.csc_matrix((by_rows.data, by_rows.indices, by_rows.indptr), shape=shape)
+
+    def vector(self, parts: Float[np.ndarray, "m s *k"]) -> Floats:
+        """The sum of all vectors over the free nodes.
+
+        Args:
+            parts: (m, s, d) or (m, s, d, k), J^T W r of each term.
+
+        Returns:
+            (rows of the matrix,) or (rows of the matrix, k).
+        """
+        shape = parts.shape[2:]
+        flat = parts.reshape(self.nodes.size, -1)
+        size = len(self.rows)
+        summed = [np.bincount(self.nodes.ravel(), column, size) for column in flat.T]
+        of_free = np.stack(summed, axis=1)[self.rows >= 0]
+        return of_free.reshape(-1, *shape[1:])
+
+    def to_nodes(self, solution: Floats, axes: int) -> Floats:
+        """Spreads a solution over all nodes.
+
+        Args:
+            solution: (rows of the matrix,) or (rows of the matrix, k).
+            axes: d, rows of each node.
+
+        Returns:
+            (n, d) or (n, d, k), zero for held nodes.
+        """
+        full = np.zeros((len(self.rows), axes, *solution.shape[1:]))
+        full[self.rows >= 0] = solution.reshape(-1, axes, *solution.shape[1:])
+        return full
+
+
+def solve_symmetric(matrix: sp.csc_matrix, right: Floats, extra: Floats | float = 0.0) -> Floats:
+    """Solves a positive definite sparse system by a factorisation that keeps its symmetry.
+
+    Args:
+        matrix: (m, m) symmetric.
+        right: (m,) or (m, k) right sides.
+        extra: (m,) what is added to the diagonal.
+
+    Returns:
+        The solution, with the shape of `right`; NaN where the matrix is singular.
+    """
+    if not len(right):
+        return right
+    damped = (matrix + sp.diags(np.broadcast_to(extra, (len(right),)))).tocsc()
+    try:
+        factors = scipy.sparse.linalg.splu(
+            damped, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True}
+        )
+    except RuntimeError:
+        return np.full_like(right, np.nan)
+    return factors.solve(right)
+
+
+def solve_blocks(
+    nodes: Indices,
+    blocks: Float[np.ndarray, "m s s d d"],
+    gradient: Float[np.ndarray, "m s d"],
+    is_held: NDArray[np.bool_],
+    *,
+    damping: float = 1e-6,
+) -> Floats:
+    """One Gauss-Newton step of all nodes.
+
+    Args:
+        nodes: (m, s) the nodes of each term.
+        blocks: J^T W J of each term.
+        gradient: J^T W r of each term.
+        is_held: (n,) nodes that do not move.
+        damping: share of the diagonal that is added, so that nodes without a sharp term stay where they are.
+
+    Returns:
+        (n, d) steps.
+    """
+    pattern = BlockPattern.create(nodes, is_held)
+    matrix = pattern.matrix(blocks)
+    diagonal = matrix.diagonal()
+    extra = damping * diagonal + 1e-9 * max(diagonal.max(initial=0.0), 1e-300)
+    return pattern.to_nodes(solve_symmetric(matrix, -pattern.vector(gradient), extra), gradient.shape[-1])
