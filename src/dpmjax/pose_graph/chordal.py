@@ -29,7 +29,7 @@ def chordal_poses(graph: PoseGraph, pattern: BlockPattern) -> Floats:
     is_planar = graph.poses.ndim == 2
     poses, measured = (se2.to_matrix(x) if is_planar else x for x in (graph.poses, graph.edges.measurements))
     dim = poses.shape[1] - 1
-    is_free = pattern.rows >= 0
+    is_free = np.isin(np.arange(len(poses)), pattern.free_nodes)
     information = np.einsum("eii->ei", graph.edges.information)
     # Rows of R_source - R_target @ R_measured; transposed, so that the unknowns are columns.
     turn = np.swapaxes(measured[:, :dim, :dim], 1, 2)

@@ -71,7 +71,7 @@ def _round_up(count: int) -> int:
 def _linearise(poses: Array, step: Array, edges: Edges) -> tuple[Array, Array, Array, Array]:
     poses = _retract(poses, step)
     relative = _relative(poses[edges.target], poses[edges.source])
-    residual, of_source = jax.vmap(_residual_and_jacobian)(relative, edges.measurements)
+    residual, of_source = _residuals(relative, edges.measurements)
     adjoint = se2.adjoint(se2.inverse(relative)) if poses.ndim == 2 else se3.adjoint(rigid.inverse(relative))
     with jax.default_matmul_precision("highest"):
         jacobian = jnp.stack([-of_source @ adjoint, of_source], axis=1)
@@ -88,20 +88,16 @@ def _retract(poses: Float[Array, "n *s"], step: Float[Array, "n d"]) -> Float[Ar
     return jnp.matmul(poses, se3.exp(step), precision="highest")
 
 
-def _relative(target: Float[Array, "*n s"], source: Float[Array, "*n s"]) -> Float[Array, "*n s"]:
-    if source.shape[-2:] != (4, 4):
+def _relative(target: Float[Array, "e *s"], source: Float[Array, "e *s"]) -> Float[Array, "e *s"]:
+    if source.ndim == 2:
         return se2.relative(target, source)
     return jnp.matmul(rigid.inverse(target), source, precision="highest")
 
 
-def _residual_and_jacobian(relative: Array, measurement: Array) -> tuple[Float[Array, " d"], Float[Array, "d d"]]:
-    """The residual of one edge, and its derivative by a step of the source pose."""
-
-    def residual(step: Float[Array, " d"]) -> tuple[Array, Array]:
-        difference = _relative(measurement, _retract(relative[None], step[None])[0])
-        value = difference if measurement.ndim == 1 else se3.log(difference)
-        return value, value
-
-    zero = jnp.zeros(3 if measurement.ndim == 1 else 6, relative.dtype)
-    jacobian, value = jax.jacfwd(residual, has_aux=True)(zero)
-    return value, jacobian
+def _residuals(relative: Array, measured: Array) -> tuple[Float[Array, "e d"], Float[Array, "e d d"]]:
+    """Residuals, and their derivatives by steps of the source poses."""
+    difference = _relative(measured, relative)
+    if relative.ndim == 3:
+        return se3.log(difference), se3.log_jacobian(difference)
+    turn = se2.adjoint(difference)
+    return difference, turn.at[:, :2, 2].set(0.0)
