@@ -124,7 +124,7 @@ def _require(is_right: bool, name: str, expected: str, got: Any) -> None:
 
 
 def _require_finite(name: str, array: Floats) -> None:
-    is_finite = np.isfinite(array).reshape(len(array), -1).all(axis=1)
+    is_finite = np.isfinite(array).all(axis=tuple(range(1, array.ndim)))
     if not is_finite.all():
         raise ValueError(f"{name}: expected finite numbers, got NaN or infinity in row {np.argmin(is_finite)}")
 
@@ -149,7 +149,7 @@ def _check_edges(graph: PoseGraph) -> None:
         is_node = (rows >= 0) & (rows < size)
         _require(bool(is_node.all()), name, f"rows of nodes in [0, {size})", rows[~is_node][:1])
     is_loop = edges.source == edges.target
-    _require(not is_loop.any(), "source", "another node than the target", f"the same in edge {np.argmax(is_loop)}")
+    _require(not is_loop.any(), "source", "another node than the target", f"the same in edges {np.flatnonzero(is_loop)[:3]}")
     for name in ("measurements", "information"):
         _require_finite(name, getattr(edges, name))
     information, scale = edges.information, np.abs(edges.information).max(axis=(1, 2), initial=0.0)

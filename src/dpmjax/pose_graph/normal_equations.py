@@ -91,9 +91,9 @@ class BlockPattern:
             (rows of the matrix,) or (rows of the matrix, k).
         """
         shape = parts.shape[2:]
-        flat = parts.reshape(self.nodes.size, -1)
+        flat = parts.reshape(self.nodes.size, int(np.prod(shape)))
         summed = [np.bincount(self.nodes.ravel(), column, self.num_nodes) for column in flat.T]
-        return np.stack(summed, axis=1)[self.free_nodes].reshape(-1, *shape[1:])
+        return np.stack(summed, axis=1).astype(np.float64)[self.free_nodes].reshape(-1, *shape[1:])
 
     def to_nodes(self, solution: Floats, axes: int) -> Floats:
         """Spreads a solution over all nodes.

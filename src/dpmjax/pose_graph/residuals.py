@@ -1,8 +1,7 @@
 """Residuals of the edges and their derivatives on the tangent space, in JAX with 64-bit floats.
 
-Poses move on the right, T_world_node @ exp(delta). The residual of an edge is the difference between measured and
-present relative pose, in the tangent of the source frame. In the plane it is (x, y, heading) of that difference, in
-space its logarithm, translation first; these are also GTSAM's.
+Poses move on the right, T_world_node @ exp(delta). The residual of an edge is the logarithm of the motion from the
+measured to the present relative pose, translation first, in the tangent of the source frame. GTSAM uses the same.
 """
 
 from __future__ import annotations
@@ -64,7 +63,7 @@ def linearise(poses: Floats, step: Floats, edges: Edges) -> Linearisation:
 
 
 def _round_up(count: int) -> int:
-    return 1 << max(count - 1, 7).bit_length()
+    return 1 << max(count - 1, 15).bit_length()
 
 
 @jax.jit
@@ -96,8 +95,6 @@ def _relative(target: Float[Array, "e *s"], source: Float[Array, "e *s"]) -> Flo
 
 def _residuals(relative: Array, measured: Array) -> tuple[Float[Array, "e d"], Float[Array, "e d d"]]:
     """Residuals, and their derivatives by steps of the source poses."""
+    algebra = se2 if relative.ndim == 2 else se3
     difference = _relative(measured, relative)
-    if relative.ndim == 3:
-        return se3.log(difference), se3.log_jacobian(difference)
-    turn = se2.adjoint(difference)
-    return difference, turn.at[:, :2, 2].set(0.0)
+    return algebra.log(difference), algebra.log_jacobian(difference)

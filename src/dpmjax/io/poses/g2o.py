@@ -125,6 +125,8 @@ def _rows(
             values.append([float(word) for word in words[num_nodes:]])
         except ValueError as error:
             raise InputError(f"{path}: line {number}", f"not a number ({error})", "write plain numbers") from error
+        if max(map(abs, nodes[-1])) > np.iinfo(np.int64).max:
+            raise InputError(f"{path}: line {number}", "a node number above 2^63", "number the nodes from 0")
     return np.array(nodes, np.int64).reshape(-1, num_nodes), np.array(values).reshape(-1, num_values)
 
 
