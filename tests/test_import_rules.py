@@ -25,7 +25,7 @@ ALLOWED: dict[str, set[str]] = {
     "deeppointmap": NETWORK_PARTS,
     "slam": {"deeppointmap", "registration", "pose_graph", "geometry", "scans", "deepmapping"},
     "metrics": {"geometry"},
-    "io": {"geometry"},
+    "io": {"geometry", "pose_graph"},
     "simulation": {"geometry"},
     "viz": {"geometry"},
     "weights": {"geometry", "nets", "deeppointmap"},
