@@ -57,7 +57,7 @@ def parse_mat(content: bytes, source: str | Path) -> dict[str, Any]:
 
 def _elements(data: bytes, order: str) -> Iterator[tuple[int, bytes]]:
     """Type and content of each data element, unpacked; a ValueError where one is longer than what holds it."""
-    while len(data) >= 8:
+    while len(data):
         kind, size = struct.unpack(f"{order}II", data[:8])
         start, end = 8, 8 + size + (-size % 8 if kind != _COMPRESSED else 0)
         if kind >> 16:  # The short form: type, size and four bytes of content in eight bytes.
