@@ -16,8 +16,8 @@ from .geometry.normals import estimate_normals as estimate_normals
 from .geometry.rays import sample_free_space as sample_free_space
 from .geometry.sampling import farthest_point_sample as farthest_point_sample
 from .geometry.sampling import voxel_sample as voxel_sample
-from .io.poses.g2o import read_g2o as read_g2o
-from .io.poses.g2o import write_g2o as write_g2o
+from .io.g2o import read_g2o as read_g2o
+from .io.g2o import write_g2o as write_g2o
 from .losses.chamfer import chamfer_distance as chamfer_distance
 from .losses.contrastive import info_nce as info_nce
 from .losses.occupancy import occupancy_loss as occupancy_loss

@@ -9,7 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from dpmjax import PoseGraph, optimize_pose_graph, read_g2o, write_g2o
-from dpmjax.io.errors import InputError
+from dpmjax.io.files import InputError
 
 PLANAR = """# two nodes and a loop
 VERTEX_SE2 7 0 0 0

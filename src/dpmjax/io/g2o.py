@@ -15,8 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from dpmjax.io.errors import InputError
-from dpmjax.io.files import write_atomically
+from dpmjax.io.files import InputError, write_atomically
 from dpmjax.pose_graph.graph import Edges, PoseGraph
 
 
