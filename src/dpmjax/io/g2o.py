@@ -131,7 +131,7 @@ def _poses(numbers: NDArray[np.float64]) -> NDArray[np.float64]:
     if numbers.shape[1] == 3:
         return numbers
     quaternions = numbers[:, 3:]
-    if not np.isfinite(numbers).all() or (np.abs(np.linalg.norm(quaternions, axis=1) - 1) > 0.1).any():
+    if not np.isfinite(numbers).all() or (np.abs(np.linalg.norm(np.clip(quaternions, -2, 2), axis=1) - 1) > 0.1).any():
         raise ValueError("a quaternion that is not of length 1, or a number that is not finite")
     matrices = np.tile(np.eye(4), (len(numbers), 1, 1))
     if len(numbers):

@@ -189,7 +189,7 @@ def _read_stamps(path: Path, files: list[Path]) -> NDArray[np.float64] | None:
     """KITTI raw's timestamps.txt (2011-09-26 13:02:25.951199337) as seconds from the first; None if it does not fit."""
     try:
         lines = [line.strip() for line in read_lines(path) if line.strip()]
-        if not all(re.fullmatch(r"[-\d:. T]+", line) for line in lines):
+        if not all(re.fullmatch(r"\d{4}-\d\d-\d\d[ T]\d\d:\d\d:\d\d(\.\d{1,9})?", line) for line in lines):
             return None
         stamps = np.array([line.replace(" ", "T") for line in lines], "datetime64[ns]")
     except ValueError:
