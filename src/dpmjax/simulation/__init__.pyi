@@ -21,10 +21,10 @@ from .town import range_image as range_image
 from .town import scan_town as scan_town
 from .town import simulate_lidar_sequence as simulate_lidar_sequence
 from .town import write_kitti_sequence as write_kitti_sequence
-from .world2d.position_bound import position_bound as position_bound
 from .world2d.raycast import RayHits as RayHits
 from .world2d.raycast import beam_angles as beam_angles
 from .world2d.raycast import cast_rays as cast_rays
+from .world2d.raycast import cast_scans as cast_scans
 from .world2d.raycast import scan_world as scan_world
 from .world2d.simulate import simulate_sequence as simulate_sequence
 from .world2d.trajectory import TrajectoryConfig as TrajectoryConfig
