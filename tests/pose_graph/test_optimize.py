@@ -162,7 +162,9 @@ def test_chordal_start_solves_a_graph_without_any_first_guess(tangent: int) -> N
 def test_kernel_lets_a_wrong_loop_go(tangent: int) -> None:
     graph = random_graph(4, tangent, noise=0.0, start=0.02)
     measurements = graph.edges.measurements.copy()
-    measurements[-1] = from_matrices([to_matrix(measurements[-1]) @ exponential(np.array([6.0, -5.0, *[0.5] * (tangent - 2)]))])[0]
+    measurements[-1] = from_matrices(
+        [to_matrix(measurements[-1]) @ exponential(np.array([6.0, -5.0, *[0.5] * (tangent - 2)]))]
+    )[0]
     torn = PoseGraph.create(graph.poses, graph.edges._replace(measurements=measurements))
     steps_count_more = np.repeat([30.0, 1.0], [7, 3])
     config = PoseGraphConfig(outlier_chi2=10.0, tolerance=1e-9)

@@ -34,6 +34,10 @@ def align_rigid(estimated: Float[AnyArray, "n d"], reference: Float[AnyArray, "n
     Least squares in closed form (Horn 1987). What the positions leave open (n = 1; in 3-D all on one line) is settled
     by the rotation nearest to the identity.
 
+    Args:
+        estimated: (n, 2) or (n, 3) positions.
+        reference: the same positions in another frame, the same unit.
+
     Returns:
         `T_reference_estimated`, (d+1, d+1) float64.
 
@@ -64,8 +68,11 @@ def absolute_trajectory_error(estimated: Float[AnyArray, "n d"], reference: Floa
         estimated: positions, (n, 2) or (n, 3).
         reference: the same positions in another frame, the same unit.
 
+    Returns:
+        The error, in the unit of the positions.
+
     Raises:
-        ValueError: as `align_rigid`.
+        ValueError: the shapes differ, are not (n, 2) or (n, 3) with n >= 1, or a number is not finite.
     """
     T = align_rigid(estimated, reference)
     aligned = _transform(T, np.asarray(estimated, np.float64))
@@ -79,6 +86,14 @@ def relative_pose_error(
 
     The error of a pair is inv(inv(Q_i) Q_j) inv(P_i) P_j with P estimated, Q the reference and j = i + delta. It does
     not depend on the frame of either trajectory.
+
+    Args:
+        estimated: (n, 3, 3) or (n, 4, 4) `T_world_scan`.
+        reference: the same poses in another frame, the same unit.
+        delta: how many poses apart the two of a pair are.
+
+    Returns:
+        Root mean squares over all pairs.
 
     Raises:
         ValueError: the shapes differ, are not (n, 3, 3) or (n, 4, 4), a number is not finite, or `delta` is not in
@@ -114,6 +129,9 @@ def point_distance(
         mask: False for points that are not there; they may hold anything.
         T_estimated: `T_world_scan` of each scan.
         T_reference: the same, in the reference's world.
+
+    Returns:
+        The distance, in the unit of the points.
 
     Raises:
         ValueError: the shapes do not match, a number is not finite, or no point is valid.
@@ -179,7 +197,7 @@ def _invert(T: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _rotation_angle(R: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The angle of rotation matrices in [0, pi], exact for small angles (an arc cosine is not)."""
+    """Returns the angle of rotation matrices in [0, pi], exact for small angles (an arc cosine is not)."""
     skew = (R - np.swapaxes(R, 1, 2)) / 2
     sin = np.sqrt(np.sum(skew**2, axis=(1, 2)) / 2)
     trace = np.trace(R, axis1=1, axis2=2)

@@ -149,7 +149,9 @@ def _check_edges(graph: PoseGraph) -> None:
         is_node = (rows >= 0) & (rows < size)
         _require(bool(is_node.all()), name, f"rows of nodes in [0, {size})", rows[~is_node][:1])
     is_loop = edges.source == edges.target
-    _require(not is_loop.any(), "source", "another node than the target", f"the same in edges {np.flatnonzero(is_loop)[:3]}")
+    _require(
+        not is_loop.any(), "source", "another node than the target", f"the same in edges {np.flatnonzero(is_loop)[:3]}"
+    )
     for name in ("measurements", "information"):
         _require_finite(name, getattr(edges, name))
     information, scale = edges.information, np.abs(edges.information).max(axis=(1, 2), initial=0.0)
