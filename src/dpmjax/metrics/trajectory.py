@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from numpy.typing import NDArray
 
+from dpmjax.geometry import rigid
 from dpmjax.types import AnyArray
 
 
@@ -104,9 +105,9 @@ def relative_pose_error(
     num_poses = len(estimated)
     if not 1 <= delta < num_poses:
         raise ValueError(f"delta: expected 1 <= delta < {num_poses}, the number of poses, got {delta}")
-    moved_estimated = _invert(estimated[:-delta]) @ estimated[delta:]
-    moved_reference = _invert(reference[:-delta]) @ reference[delta:]
-    error = _invert(moved_reference) @ moved_estimated
+    moved_estimated = rigid.inverse(estimated[:-delta]) @ estimated[delta:]
+    moved_reference = rigid.inverse(reference[:-delta]) @ reference[delta:]
+    error = rigid.inverse(moved_reference) @ moved_estimated
     angles = _rotation_angle(error[:, :-1, :-1])
     squared_lengths = np.sum(error[:, :-1, -1] ** 2, axis=1)
     return RelativePoseError(
@@ -186,14 +187,6 @@ def _require_same_shape(name: str, array: NDArray[np.float64], other: NDArray[np
 def _transform(T: NDArray[np.float64], points: NDArray[np.float64]) -> NDArray[np.float64]:
     dim = points.shape[-1]
     return points @ np.swapaxes(T[..., :dim, :dim], -1, -2) + T[..., None, :dim, dim]
-
-
-def _invert(T: NDArray[np.float64]) -> NDArray[np.float64]:
-    inverse = np.zeros_like(T)
-    inverse[:, :-1, :-1] = np.swapaxes(T[:, :-1, :-1], 1, 2)
-    inverse[:, :-1, -1] = -np.einsum("nij,nj->ni", inverse[:, :-1, :-1], T[:, :-1, -1])
-    inverse[:, -1, -1] = 1
-    return inverse
 
 
 def _rotation_angle(R: NDArray[np.float64]) -> NDArray[np.float64]:
