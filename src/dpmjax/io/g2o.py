@@ -101,7 +101,17 @@ def write_g2o(path: str | Path, graph: PoseGraph) -> Path:
 
 
 def _read_lines(path: Path) -> list[tuple[int, list[str]]]:
-    """The words of each line that is read, and its number."""
+    """Splits the lines that are read.
+
+    Args:
+        path: the file.
+
+    Returns:
+        The number and the words of each line.
+
+    Raises:
+        InputError: the file cannot be read.
+    """
     try:
         text = path.read_text(encoding="utf-8", errors="replace")
     except OSError as error:
@@ -113,7 +123,20 @@ def _read_lines(path: Path) -> list[tuple[int, list[str]]]:
 def _rows(
     path: str | Path, lines: Iterable[tuple[int, list[str]]], num_nodes: int, num_values: int
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Node ids and numbers of all lines of one tag."""
+    """Parses all lines of one tag.
+
+    Args:
+        path: for messages.
+        lines: number and words of each line.
+        num_nodes: how many node ids a line has.
+        num_values: how many numbers come after them.
+
+    Returns:
+        (k, num_nodes) ids and (k, num_values) numbers.
+
+    Raises:
+        InputError: a line has another number of words, or one that is no number.
+    """
     nodes, values = [], []
     for number, (tag, *words) in lines:
         if len(words) != num_nodes + num_values:
@@ -130,7 +153,17 @@ def _rows(
 
 
 def _poses(numbers: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Poses of the graph from numbers of the file: x y heading, or x y z qx qy qz qw to matrices."""
+    """Makes poses of the graph.
+
+    Args:
+        numbers: (k, 3) x y heading, or (k, 7) x y z qx qy qz qw.
+
+    Returns:
+        (k, 3) or (k, 4, 4).
+
+    Raises:
+        ValueError: a quaternion is not of length 1, or a number is not finite.
+    """
     if numbers.shape[1] == 3:
         return numbers
     quaternions = numbers[:, 3:]
@@ -143,7 +176,7 @@ def _poses(numbers: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _numbers(poses: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Numbers of the file from poses of the graph."""
+    """Returns numbers of the file for poses of the graph."""
     if poses.ndim == 2 or not len(poses):
         return poses.reshape(len(poses), -1)
     return np.column_stack([poses[:, :3, 3], Rotation.from_matrix(poses[:, :3, :3]).as_quat()])
