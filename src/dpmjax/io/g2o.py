@@ -15,8 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from dpmjax.io.files import InputError, write_atomically
+from dpmjax.io.files import read_lines, write_atomically
 from dpmjax.pose_graph.graph import Edges, PoseGraph
+from dpmjax.sequences import InputError
 
 
 class _Kind(NamedTuple):
@@ -31,14 +32,14 @@ class _Kind(NamedTuple):
 _PLANAR = _Kind("VERTEX_SE2", "EDGE_SE2", 3, 3)
 _SPATIAL = _Kind("VERTEX_SE3:QUAT", "EDGE_SE3:QUAT", 7, 6)
 _ADVICE = "give VERTEX_SE2 and EDGE_SE2, or VERTEX_SE3:QUAT and EDGE_SE3:QUAT lines"
-_PASSED_OVER = ("PARAMS_SE2OFFSET", "PARAMS_SE3OFFSET")
+_IGNORED = ("PARAMS_SE2OFFSET", "PARAMS_SE3OFFSET")
 
 
 def read_g2o(path: str | Path) -> PoseGraph:
     """Reads a pose graph.
 
     Args:
-        path: the file. Empty lines, lines with # in front and sensor offsets (PARAMS_...) are passed over.
+        path: the file. Empty lines, lines with # in front and sensor offsets (PARAMS_...) are ignored.
 
     Returns:
         The graph; nodes in the order of the file, those after FIX fixed.
@@ -47,7 +48,7 @@ def read_g2o(path: str | Path) -> PoseGraph:
         InputError: no such file, an unknown line, a wrong number of values, both kinds in one file, a node that occurs
             twice or not at all, or numbers that make no poses or information matrices.
     """
-    lines = _read_lines(Path(path))
+    lines = _read_words(path)
     tags = {words[0] for _, words in lines} - {"FIX"}
     kind = _PLANAR if tags <= {_PLANAR.vertex, _PLANAR.edge} else _SPATIAL
     for number, words in lines:
@@ -100,43 +101,16 @@ def write_g2o(path: str | Path, graph: PoseGraph) -> Path:
     return write_atomically(path, "\n".join(lines) + "\n")
 
 
-def _read_lines(path: Path) -> list[tuple[int, list[str]]]:
-    """Splits the lines that are read.
-
-    Args:
-        path: the file.
-
-    Returns:
-        The number and the words of each line.
-
-    Raises:
-        InputError: the file cannot be read.
-    """
-    try:
-        text = path.read_text(encoding="utf-8", errors="replace")
-    except OSError as error:
-        raise InputError(path, f"cannot be read ({error.strerror})", "check the path") from error
-    lines = ((number, line.split()) for number, line in enumerate(text.splitlines(), 1) if line.strip()[:1] != "#")
-    return [(number, words) for number, words in lines if words and words[0] not in _PASSED_OVER]
+def _read_words(path: str | Path) -> list[tuple[int, list[str]]]:
+    """The words of each line that is read, and its number."""
+    lines = ((number, line.split()) for number, line in enumerate(read_lines(path), 1) if line.strip()[:1] != "#")
+    return [(number, words) for number, words in lines if words and words[0] not in _IGNORED]
 
 
 def _rows(
     path: str | Path, lines: Iterable[tuple[int, list[str]]], num_nodes: int, num_values: int
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Parses all lines of one tag.
-
-    Args:
-        path: for messages.
-        lines: number and words of each line.
-        num_nodes: how many node ids a line has.
-        num_values: how many numbers come after them.
-
-    Returns:
-        (k, num_nodes) ids and (k, num_values) numbers.
-
-    Raises:
-        InputError: a line has another number of words, or one that is no number.
-    """
+    """Node ids and numbers of all lines of one tag."""
     nodes, values = [], []
     for number, (tag, *words) in lines:
         if len(words) != num_nodes + num_values:
@@ -153,17 +127,7 @@ def _rows(
 
 
 def _poses(numbers: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Makes poses of the graph.
-
-    Args:
-        numbers: (k, 3) x y heading, or (k, 7) x y z qx qy qz qw.
-
-    Returns:
-        (k, 3) or (k, 4, 4).
-
-    Raises:
-        ValueError: a quaternion is not of length 1, or a number is not finite.
-    """
+    """Poses of the graph from numbers of the file: x y heading, or x y z qx qy qz qw to matrices."""
     if numbers.shape[1] == 3:
         return numbers
     quaternions = numbers[:, 3:]
@@ -176,7 +140,7 @@ def _poses(numbers: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _numbers(poses: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Returns numbers of the file for poses of the graph."""
+    """Numbers of the file from poses of the graph."""
     if poses.ndim == 2 or not len(poses):
         return poses.reshape(len(poses), -1)
     return np.column_stack([poses[:, :3, 3], Rotation.from_matrix(poses[:, :3, :3]).as_quat()])
