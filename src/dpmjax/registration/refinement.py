@@ -185,7 +185,9 @@ def align_all(lines: LineScans, poses: Floats, config: PolishConfig, *, scale: f
         here = se2.relative(poses[steps.target], poses[steps.source])
         pull = np.einsum("eij,ej->ei", steps.information, se2.relative(steps.poses, here))
         gradient = np.concatenate([np.asarray(system.gradient), pull])
-        poses = se2.compose(poses, solve_poses(len(poses), join_edges(edges, steps._replace(measurements=here)), gradient))
+        poses = se2.compose(
+            poses, solve_poses(len(poses), join_edges(edges, steps._replace(measurements=here)), gradient)
+        )
     rmse = float(np.sqrt(np.sum(system.squares) / max(float(np.sum(system.weight)), 1e-9))) if system else 0.0
     return Polished(poses, 0, len(source), rmse)
 

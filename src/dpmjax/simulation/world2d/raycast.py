@@ -52,6 +52,22 @@ def beam_angles(num_beams: int) -> NDArray[np.float64]:
     return np.arange(num_beams, dtype=np.float64) * (2.0 * np.pi / num_beams)
 
 
+def cast_scans(is_obstacle: NDArray[np.bool_], poses: ArrayLike, *, num_beams: int = 256) -> NDArray[np.float64]:
+    """Ranges of noise-free scans of 360 degrees.
+
+    Args:
+        is_obstacle: (h, w), True where a pixel is solid.
+        poses: (n, 3) x, y (px) and heading (radians) in the world, in free pixels.
+        num_beams: beams of a scan.
+
+    Returns:
+        (n, num_beams) px.
+    """
+    at = np.asarray(poses, np.float64).reshape(-1, 3)
+    angles = (at[:, 2:] + beam_angles(num_beams)).ravel()
+    return cast_rays(is_obstacle, np.repeat(at[:, :2], num_beams, axis=0), angles).ranges.reshape(-1, num_beams)
+
+
 def cast_rays(is_obstacle: NDArray[np.bool_], origins: ArrayLike, angles: ArrayLike) -> RayHits:
     """Follows beams through the pixel grid to the first obstacle edge, or to the border of the image.
 
