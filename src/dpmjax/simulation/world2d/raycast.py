@@ -144,8 +144,7 @@ def scan_world(
         raise ValueError("range_noise_px needs an rng")
     pose = np.asarray(poses, np.float64).reshape(-1, 3)
     angles = beam_angles(num_beams)
-    hits = cast_rays(is_obstacle, np.repeat(pose[:, :2], num_beams, axis=0), (pose[:, 2:] + angles).ravel())
-    ranges = hits.ranges.reshape(len(pose), num_beams)
+    ranges = cast_scans(is_obstacle, pose, num_beams=num_beams)
     mask = np.ones(ranges.shape, bool) if max_range is None else ranges <= max_range
     if rng is not None and range_noise_px > 0:
         ranges = np.maximum(ranges + rng.normal(0.0, range_noise_px, ranges.shape), 0.0)
