@@ -8,6 +8,7 @@ levels are switched on one after the other: first the basin of the poses is wide
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from itertools import product
 from typing import Any, Literal
@@ -82,16 +83,20 @@ def interpolate_grid(grid: Float[Array, "*size"], points: Float[Array, "n d"]) -
     Returns:
         The value at each point.
     """
-    cells = grid.shape[0] - 1
-    position = jnp.clip(0.5 * (points + 1.0), 0.0, 1.0) * cells
-    corner = jnp.clip(jnp.floor(position).astype(jnp.int32), 0, cells - 1)
+    num_cells, dimensions = grid.shape[0] - 1, grid.ndim
+    position = jnp.clip(0.5 * (points + 1.0), 0.0, 1.0) * num_cells
+    corner = jnp.clip(jnp.floor(position).astype(jnp.int32), 0, num_cells - 1)
     part = position - corner
-    total = jnp.zeros(points.shape[0], points.dtype)
-    for step in product((0, 1), repeat=grid.ndim):
-        node = tuple(corner[:, axis] + side for axis, side in enumerate(step))
-        weight = jnp.prod(jnp.where(jnp.asarray(step, bool), part, 1.0 - part), axis=-1)
-        total = total + weight * grid[node]
-    return total
+    sides = list(product((0, 1), repeat=dimensions))
+    # The corners of a cell side by side: one read a sample, and on the way back one write instead of four or eight.
+    nodes = jnp.stack([grid[tuple(slice(side, side + num_cells) for side in corners)] for corners in sides], axis=-1)
+    cell = corner @ num_cells ** jnp.arange(dimensions)[::-1]
+    values = nodes.reshape(-1, len(sides)).at[cell].get(mode="promise_in_bounds")
+    weights = [
+        math.prod(part[:, axis] if side else 1.0 - part[:, axis] for axis, side in enumerate(corners))
+        for corners in sides
+    ]
+    return jnp.sum(values * jnp.stack(weights, axis=-1), axis=-1)
 
 
 class MapGrid(nn.Module):
