@@ -8,10 +8,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from dpmjax.deepmapping.stepping import steps_per_call
 
 from dpmjax import deepmapping as dm
 from dpmjax.deepmapping.fit import _draw_batch, run_phases
-from dpmjax.deepmapping.stepping import steps_per_call
 from dpmjax.geometry import se2
 from dpmjax.metrics import absolute_trajectory_error
 from dpmjax.nets.localization import LocalizationConfig

@@ -8,7 +8,6 @@ from typing import Literal, TypeVar
 from dpmjax.nets.localization import LocalizationConfig
 from dpmjax.nets.occupancy import OccupancyConfig
 
-
 ConfigT = TypeVar("ConfigT", bound="DeepMappingConfig")
 
 Motion = Literal["planar", "full"]
@@ -118,9 +117,7 @@ JOINT = PhaseConfig(
 """The paper: 3000 epochs of two batches for 256 scans, all beams, 19 free samples, gamma 0.1, windows of 4 scans."""
 
 
-LOCALIZE_DEPTH = replace(
-    LOCALIZE, num_steps=400, learning_rate=1e-3, beams_per_step=400, num_offsets=2, max_offset=3
-)
+LOCALIZE_DEPTH = replace(LOCALIZE, num_steps=400, learning_rate=1e-3, beams_per_step=400, num_offsets=2, max_offset=3)
 """Cold start of depth images."""
 
 UNROLL_DEPTH = replace(

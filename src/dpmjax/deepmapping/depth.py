@@ -150,18 +150,21 @@ def fit_depth(
     scans = scans if isinstance(scans, DepthScans) else as_depth_scans(scans)
     unit = typical_range(scans.points, scans.mask)
     scaled = replace(scans, points=scans.points / unit)
-    start = None
-    if init is not None:
-        start = np.array(init, np.float64)
-        if start.shape != (scans.mask.shape[0], 4, 4) or not np.isfinite(start).all():
-            raise ValueError(f"init: expected finite numbers of shape ({scans.mask.shape[0]}, 4, 4), got {start.shape}")
-        start[:, :3, 3] /= unit
-        start = jnp.asarray(start, jnp.float32)
+    start = None if init is None else _start_poses(init, len(scaled.points), unit)
     problem = depth_problem(config, is_warm=init is not None)
     fitted = fit(problem, scaled, key=key, start=start, num_starts=num_starts)
     T = np.array(fitted.poses, np.float64)
     T[:, :3, 3] *= unit
     return DepthFitted(T, fitted.state.params, fitted.report, unit)
+
+
+def _start_poses(poses: ArrayLike, num_scans: int, unit: float) -> Float[Array, "n 4 4"]:
+    """Checked poses to start from, in typical ranges."""
+    T = np.array(poses, np.float64)
+    if T.shape != (num_scans, 4, 4) or not np.isfinite(T).all():
+        raise ValueError(f"init: expected finite numbers of shape ({num_scans}, 4, 4), got {T.shape}")
+    T[:, :3, 3] /= unit
+    return jnp.asarray(T, jnp.float32)
 
 
 def _net(config: DepthMappingConfig) -> LocalizationNet:
@@ -237,9 +240,7 @@ def _loss(
     sample = _draw_pixels(scans, phase.beams_per_step, key=batch_key)
     T = _poses(config, phase, params, scans)
     rows = jnp.arange(count)
-    world = WorldBatch(
-        rigid.transform_points(T, sample.points), T[:, :3, 3], sample.mask, rows, jnp.zeros_like(rows)
-    )
+    world = WorldBatch(rigid.transform_points(T, sample.points), T[:, :3, 3], sample.mask, rows, jnp.zeros_like(rows))
     free_key, offset_key = jax.random.split(loss_key)
     progress = step / phase.num_steps
     if phase.projection_tolerance is None:

@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool, Float, Int
 from numpy.typing import ArrayLike, NDArray
 
 from dpmjax.deepmapping.config import DeepMappingConfig, PhaseConfig
-from dpmjax.deepmapping.fit import FitState, Report, fit
+from dpmjax.deepmapping.fit import Report, fit
 from dpmjax.deepmapping.objective import Terms, WorldBatch, chamfer_term, interpolate_log
 from dpmjax.deepmapping.problem import (
     MapFrame,
@@ -257,9 +257,7 @@ def _loss(
     """DeepMapping eq. 6 of a batch of scans and beams."""
     batch_key, loss_key = jax.random.split(key)
     beam_key, row_key = jax.random.split(batch_key)
-    beams = choose_beams(
-        scans.mask.shape[1], phase, jax.random.randint(beam_key, (), 0, scans.mask.shape[1])
-    )
+    beams = choose_beams(scans.mask.shape[1], phase, jax.random.randint(beam_key, (), 0, scans.mask.shape[1]))
     rows, block = draw_rows(phase, scans.mask.shape[0], step, key=row_key)
     points, mask = scans.points[rows][:, beams], scans.mask[rows][:, beams]
     if phase.poses == "network":

@@ -6,14 +6,14 @@ point is compared with the surface between the pixels instead of with the neares
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
+import flax.struct
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 from numpy.typing import NDArray
-from typing import NamedTuple
-
-import flax.struct
 
 from dpmjax.geometry import rigid
 
