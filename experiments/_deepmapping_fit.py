@@ -12,15 +12,15 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from experiments._checkpoint import Checkpoints
 from experiments._history import HistoryFile, read_history
 from experiments._run_folder import CHECKPOINTS, HISTORY, RunFolder
 from experiments._stop import StopFlag
 
 if TYPE_CHECKING:
     from dpmjax.deepmapping import DeepMappingConfig, Fitted
-    from dpmjax.deepmapping.fit import FitState, Progress
+    from dpmjax.deepmapping.fit import Progress
     from dpmjax.io.scans2d.sequence import ScanSequence
+    from experiments._checkpoint import Checkpoints
 
 # Of the table; the error, named with its unit, comes last.
 _COLUMNS = ("step", "phase", "run_s", "loss", "occupancy", "chamfer")
@@ -77,6 +77,7 @@ def run_fit(
     from dpmjax.deepmapping.planar import planar_problem, scale_scans, start_poses
     from dpmjax.geometry import se2
     from dpmjax.types import ScanSet
+    from experiments._checkpoint import Checkpoints
 
     scans, unit = scale_scans(ScanSet(sequence.points, sequence.mask))
     problem = planar_problem(settings, is_warm=start is not None)
@@ -85,14 +86,14 @@ def run_fit(
     checkpoints = Checkpoints(Path(folder.path) / CHECKPOINTS)
     if folder.is_resumed:
         state = checkpoints.restore_latest(state, fallback=state)
-    with _Recorder(folder, sequence, unit, state, seconds) as recorder:
+    with _Recorder(folder, sequence, unit, checkpoints, int(state.step)) as recorder:
         done = fit(
             problem,
             scans,
             key=jax.random.key(seed),
             start=state,
             on_report=recorder.record,
-            stop=lambda: stop.is_requested or recorder.is_time_up,
+            stop=lambda: stop.is_requested or (seconds is not None and recorder.run_s >= seconds),
         )
     checkpoints.save(int(done.state.step), done.state)
     poses = np.asarray(done.poses, np.float64) * [unit, unit, 1.0]
@@ -105,11 +106,10 @@ class _Recorder:
     """Writes what a fit reports to the table, the progress bar and the checkpoints."""
 
     def __init__(
-        self, folder: RunFolder, sequence: ScanSequence, unit: float, state: FitState, seconds: float | None
+        self, folder: RunFolder, sequence: ScanSequence, unit: float, checkpoints: Checkpoints, step: int
     ) -> None:
-        self._checkpoints = Checkpoints(Path(folder.path) / CHECKPOINTS)
-        self._measure, self._length, self._unit, self._seconds = _ate_of(sequence), sequence.unit, unit, seconds
-        step = int(state.step)
+        self._checkpoints = checkpoints
+        self._measure, self._length, self._unit = _ate_of(sequence), sequence.unit, unit
         self._earlier_s = _earlier_seconds(folder, step)
         self.run_s = self._earlier_s
         self._bar = tqdm(total=1.0, bar_format="{desc} {percentage:3.0f}%|{bar}| [{elapsed}{postfix}]", desc="fit")
@@ -124,11 +124,6 @@ class _Recorder:
         self._bar.close()
         self._history.__exit__(None, None, None)
 
-    @property
-    def is_time_up(self) -> bool:
-        """Whether the run time is spent."""
-        return self._seconds is not None and self.run_s >= self._seconds
-
     def record(self, progress: Progress) -> None:
         """One call of the step."""
         report, phase, step = progress.report, progress.phase.name, int(progress.state.step)
@@ -137,9 +132,8 @@ class _Recorder:
         losses = {name: float(np.mean(term)) for name, term in report.terms._asdict().items()}
         row = {"step": step, "phase": phase, "run_s": round(self.run_s, 4), f"ate_{self._length}": ate}
         self._history.append(**row, loss=report.loss, **losses)
-        done = max(progress.share, self.run_s / self._seconds if self._seconds else 0.0)
         ate_text = f", ATE {ate:.3g} {self._length}" if math.isfinite(ate) else ""
-        show_progress(self._bar, f"{phase}, loss {report.loss:.4f}{ate_text}", done, self.run_s)
+        show_progress(self._bar, f"{phase}, loss {report.loss:.4f}{ate_text}", progress.share, self.run_s)
         if time.perf_counter() - self._saved_at > _SAVE_EVERY_S:
             self._checkpoints.save(step, progress.state)
             self._saved_at = time.perf_counter()
