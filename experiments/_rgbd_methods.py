@@ -36,6 +36,9 @@ def run_method(
         settings: of DeepMapping.
         found: results of other methods for this sequence: a start that is there is not computed again.
         seed: of everything random.
+
+    Returns:
+        The poses.
     """
     import jax
 

@@ -133,6 +133,14 @@ def draw(
 def load_fit(run: Path, options: deepmapping_2d.Config, sequence: ScanSequence) -> Fitted:
     """The fit of a run folder; its poses are those that the run kept.
 
+    Args:
+        run: the folder.
+        options: of the run.
+        sequence: its scans.
+
+    Returns:
+        The fit.
+
     Raises:
         ValueError: the folder holds no checkpoint or no trajectory.
     """

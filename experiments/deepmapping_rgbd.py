@@ -161,9 +161,19 @@ def run_one(
     settings: DepthMappingConfig,
     index: int,
 ) -> dict[str, Any]:
-    """All methods on one trajectory; `run_s` of the first of each length contains its compilation.
+    """All methods on one trajectory; a fit from the result of another method is timed without that method.
 
-    A fit from a start that is a column of its own is timed without it.
+    The first `run_s` of each number of images contains its compilation.
+
+    Args:
+        folder: of the run; gets the pictures.
+        config: options.
+        sequence: the trajectory.
+        settings: of DeepMapping.
+        index: of the trajectory.
+
+    Returns:
+        The row of the table.
     """
     found: dict[str, NDArray[np.float64]] = {}
     row: dict[str, Any] = {"name": sequence.name, "views": len(sequence)}

@@ -157,12 +157,17 @@ def run_paper(toy: ToyConfig, config: Config) -> tuple[dict[str, NDArray[np.floa
 
 
 def choose_seed(network_x: NDArray[np.floating], direct_x: NDArray[np.floating]) -> int:
-    """The seed of the picture: the first that the network form brings to the minimum and the direct form does not.
+    """The first seed that the network form brings to the minimum and the direct form does not, as in figure 14.
 
-    As in the paper's picture; inside of what is drawn where there is such a seed.
+    Args:
+        network_x: (seeds, steps) x of the network form.
+        direct_x: (seeds, steps) x of the direct form.
+
+    Returns:
+        The seed; one whose x stays inside of the picture where there is such a seed.
     """
-    is_told = is_at_minimum(network_x[:, -1]) & ~is_at_minimum(direct_x[:, -1])
-    return int(np.argmax(2 * is_told + (np.abs(network_x).max(axis=1) < VIEW)))
+    is_example = is_at_minimum(network_x[:, -1]) & ~is_at_minimum(direct_x[:, -1])
+    return int(np.argmax(2 * is_example + (np.abs(network_x).max(axis=1) < VIEW)))
 
 
 def is_at_minimum(x: NDArray[np.floating]) -> NDArray[np.bool_]:

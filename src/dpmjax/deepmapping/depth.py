@@ -110,17 +110,8 @@ def depth_problem(config: DepthMappingConfig, *, is_warm: bool) -> Problem:
     Returns:
         The problem.
     """
-    return Problem(
-        config,
-        config.phases(is_warm=is_warm),
-        init=_init,
-        optimizer=make_optimizer,
-        loss=_loss,
-        poses=_poses,
-        next_phase=_next_phase,
-        steps_per_call=config.steps_per_call,
-        halve_at=config.halve_at,
-    )
+    phases, functions = config.phases(is_warm=is_warm), (_init, make_optimizer, _loss, _poses, _next_phase)
+    return Problem(config, phases, *functions, config.steps_per_call, config.halve_at)
 
 
 def fit_depth(

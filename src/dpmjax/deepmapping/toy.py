@@ -70,6 +70,9 @@ def global_minimum() -> tuple[float, float]:
     """Where L is smallest, and its value there: (-1.417, -23.757), in float64.
 
     Beyond |x| = 12 the parabola alone is above 47, more than the smallest value plus both amplitudes.
+
+    Returns:
+        x and L(x).
     """
     x = np.linspace(-12.0, 12.0, 240_001)
     loss = 0.5 * x**2 + 5.0 * np.sin(10.0 * x) + 20.0 * np.sin(x)
@@ -91,16 +94,7 @@ def toy_problem(config: ToyConfig) -> Problem:
     Returns:
         The problem; all starts are kept.
     """
-    return Problem(
-        config,
-        (config,),
-        init=_init,
-        optimizer=_optimizer,
-        loss=_loss,
-        poses=_poses,
-        next_phase=_next_phase,
-        steps_per_call=config.num_steps,
-    )
+    return Problem(config, (config,), _init, _optimizer, _loss, _poses, _next_phase, steps_per_call=config.num_steps)
 
 
 def network_value(config: ToyConfig, params: ToyParams) -> Float[Array, ""]:
