@@ -19,7 +19,7 @@ from experiments._stop import StopFlag
 if TYPE_CHECKING:
     from dpmjax.deepmapping import DeepMappingConfig, Fitted
     from dpmjax.deepmapping.fit import Progress
-    from dpmjax.io.scans2d.sequence import ScanSequence
+    from dpmjax.sequences import ScanSequence
     from experiments._checkpoint import Checkpoints
 
 # Of the table; the error, named with its unit, comes last.

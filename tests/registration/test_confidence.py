@@ -6,7 +6,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from dpmjax.io import take_scans
 from dpmjax.registration import judge_trajectory
 from dpmjax.registration.line_fitting import fit_lines
 from dpmjax.simulation import simulate_sequence
@@ -15,7 +14,7 @@ from dpmjax.types import ScanSet
 
 @pytest.fixture(scope="module")
 def walk():
-    return take_scans(simulate_sequence(0, 41, seed=1), slice(0, None, 4))
+    return simulate_sequence(0, 41, seed=1).take(slice(0, None, 4))
 
 
 def lines_of(walk):
@@ -40,7 +39,7 @@ def test_collapsed_poses_are_not(walk) -> None:
 
 
 def test_what_noise_has_drowned_is_not_trusted() -> None:
-    walk = take_scans(simulate_sequence(0, 41, seed=1, range_noise_px=12.0), slice(0, None, 4))
+    walk = simulate_sequence(0, 41, seed=1, range_noise_px=12.0).take(slice(0, None, 4))
     assert not judge_trajectory(lines_of(walk), walk.mask, walk.reference_poses).is_good
 
 

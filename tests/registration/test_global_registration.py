@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from dpmjax.geometry import se2
-from dpmjax.io import ScanSequence, take_scans
+from dpmjax.io import ScanSequence
 from dpmjax.metrics import absolute_trajectory_error
 from dpmjax.registration import (
     AssembleConfig,
@@ -59,7 +59,7 @@ def look(sequence: ScanSequence) -> Views:
 @pytest.fixture(scope="module")
 def views() -> Views:
     """Seven scans of the office, 60 px apart."""
-    return look(take_scans(simulate_sequence(0, 49, seed=1), slice(0, None, 8)))
+    return look(simulate_sequence(0, 49, seed=1).take(slice(0, None, 8)))
 
 
 @pytest.fixture(scope="module")
@@ -279,7 +279,7 @@ def test_scans_that_are_lost_together_do_not_vouch_for_each_other() -> None:
 
 
 def test_a_scan_that_sees_no_keyframe_is_found_by_the_others(monkeypatch: pytest.MonkeyPatch) -> None:
-    there = look(take_scans(simulate_sequence(0, 97, seed=2), slice(0, None, 16)))
+    there = look(simulate_sequence(0, 97, seed=2).take(slice(0, None, 16)))
     truth, keyframes, lost = np.asarray(there.sequence.reference_poses), np.array([0, 1]), 5
 
     def know(profiles: Profiles, source: np.ndarray, target: np.ndarray, *_: object, **__: object) -> Candidates:

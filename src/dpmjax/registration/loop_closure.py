@@ -15,7 +15,8 @@ import numpy as np
 import scipy.spatial
 
 from dpmjax.geometry import se2
-from dpmjax.pose_graph.planar import Edges, Floats, GraphConfig, Indices, join_edges, optimize_planar_graph
+from dpmjax.pose_graph.graph import Edges, Floats, Indices, join_edges
+from dpmjax.pose_graph.planar import GraphConfig, optimize_planar_graph
 from dpmjax.registration.line_fitting import LineScans
 from dpmjax.registration.pair_alignment import StepPrior
 from dpmjax.registration.pairs import PairMatches, Schedule, length_scale, match_pairs, take_scans

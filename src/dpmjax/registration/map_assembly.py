@@ -13,7 +13,8 @@ from typing import NamedTuple
 import numpy as np
 
 from dpmjax.geometry import se2
-from dpmjax.pose_graph.planar import Edges, GraphConfig, optimize_planar_graph
+from dpmjax.pose_graph.graph import Edges
+from dpmjax.pose_graph.planar import GraphConfig, optimize_planar_graph
 from dpmjax.registration.block_moves import move_blocks
 from dpmjax.registration.pair_search import Candidates, Floats, Indices
 from dpmjax.registration.pose_scoring import (

@@ -15,7 +15,8 @@ import numpy as np
 import scipy.spatial
 
 from dpmjax.geometry import se2
-from dpmjax.pose_graph.planar import Edges, Floats, Indices, join_edges, solve_poses
+from dpmjax.pose_graph.graph import Edges, Floats, Indices, join_edges
+from dpmjax.pose_graph.planar import solve_poses
 from dpmjax.registration.incremental import incremental_icp
 from dpmjax.registration.line_adjustment import WallConfig, align_to_walls
 from dpmjax.registration.line_fitting import LineScans
@@ -184,7 +185,9 @@ def align_all(lines: LineScans, poses: Floats, config: PolishConfig, *, scale: f
         here = se2.relative(poses[steps.target], poses[steps.source])
         pull = np.einsum("eij,ej->ei", steps.information, se2.relative(steps.poses, here))
         gradient = np.concatenate([np.asarray(system.gradient), pull])
-        poses = se2.compose(poses, solve_poses(len(poses), join_edges(edges, steps._replace(poses=here)), gradient))
+        poses = se2.compose(
+            poses, solve_poses(len(poses), join_edges(edges, steps._replace(measurements=here)), gradient)
+        )
     rmse = float(np.sqrt(np.sum(system.squares) / max(float(np.sum(system.weight)), 1e-9))) if system else 0.0
     return Polished(poses, 0, len(source), rmse)
 
