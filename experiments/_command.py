@@ -12,6 +12,7 @@ from typing import TypeVar
 
 import tyro
 
+from experiments._machine import enable_compilation_cache
 from experiments._run_folder import RunFailedError, find_run, load_config
 from experiments._stop import Interrupted
 
@@ -51,6 +52,7 @@ def run_command(
     console.setLevel(logging.WARNING)
     logging.basicConfig(format="dpmjax: %(levelname)s: %(message)s", handlers=[console])
     previous = signal.signal(signal.SIGTERM, _interrupt)
+    enable_compilation_cache()
     try:
         main(_parse(config_type, experiment, description, arguments))
     except SystemExit as done:  # tyro, after --help or wrong usage

@@ -17,7 +17,7 @@ from __future__ import annotations
 import logging
 import math
 import time
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -131,7 +131,7 @@ def main(config: Config) -> Result:
         print(f"{sequence.name}: {len(sequence)} scans of {sequence.points.shape[1]} beams, from {config.init}")
         fitted = _fit(folder, sequence, settings, start, config, stop)
         lines = line_scans(sequence)
-        candidates = {"start": start, "fit": fitted.poses}
+        candidates = {"start": start, "fit": fitted.fitted.poses}
         if config.polish and not stop.is_requested:
             candidates |= _polish(lines, candidates, config.init)
         chosen, scores = choose_trajectory(lines, candidates)
@@ -154,7 +154,7 @@ def main(config: Config) -> Result:
         write_trajectories(folder, sequence, poses)
         write_metrics(folder, metrics, seed=config.seed)
         draw(folder, sequence, start, poses, metrics)
-        draw_occupancy(folder, sequence, fitted, settings)
+        draw_occupancy(folder, sequence, fitted)
         tell(folder, sequence, metrics)
     return Result(folder.path, poses, metrics)
 
@@ -168,6 +168,7 @@ def _fit(
     stop: StopFlag,
 ) -> FitRun:
     """DeepMapping; its losses compare each scan with the next ones, so these must be near: in time they are."""
+    from dpmjax.geometry import se2
     from dpmjax.registration import nearest_tour
 
     order = np.arange(len(sequence)) if config.ordered else nearest_tour(start)
@@ -180,7 +181,8 @@ def _fit(
         seconds=config.seconds,
         stop=stop,
     )
-    return replace(fitted, poses=fitted.poses[np.argsort(order)])
+    poses = fitted.fitted.poses[np.argsort(order)]
+    return fitted._replace(fitted=fitted.fitted._replace(poses=poses, T_world_scan=se2.to_matrix(poses)))
 
 
 def _polish(lines: LineScans, candidates: dict[str, NDArray[np.float64]], init: str) -> dict[str, NDArray[np.float64]]:
@@ -285,17 +287,16 @@ def write_trajectories(folder: RunFolder, sequence: ScanSequence, poses: NDArray
     write_kitti(folder / "trajectory_kitti.txt", poses)
 
 
-def draw_occupancy(folder: RunFolder, sequence: ScanSequence, fitted: FitRun, settings: DeepMappingConfig) -> None:
+def draw_occupancy(folder: RunFolder, sequence: ScanSequence, run: FitRun) -> None:
     """occupancy.png: what M-Net learned, black, white, and grey where no beam has been."""
-    if not fitted.has_map:
+    if not run.has_map:
         return
     from dpmjax import viz
     from dpmjax.deepmapping import draw_map
 
-    picture = draw_map(fitted.state, settings, sequence.points, sequence.mask, fitted.poses, reach=fitted.reach)
-    figure = viz.occupancy_figure(
-        picture.probability, picture.explored, picture.extent, fitted.poses[:, :2], sequence.unit
-    )
+    picture = draw_map(run.fitted, sequence.points, sequence.mask)
+    trajectory = run.fitted.poses[:, :2]
+    figure = viz.occupancy_figure(picture.probability, picture.explored, picture.extent, trajectory, sequence.unit)
     viz.save_figure(figure, folder / "occupancy.png")
 
 

@@ -34,11 +34,11 @@ def sample_free_space(
     return origin + factors[..., None] * (points - origin)[:, None, :]
 
 
-def typical_range(points: Float[AnyArray, "n b d"], mask: Bool[AnyArray, "n b"]) -> float:
+def typical_range(points: Float[AnyArray, "n *beams d"], mask: Bool[AnyArray, "n *beams"]) -> float:
     """The range that nine beams in ten of a scan stay below, as the median over the scans.
 
     Args:
-        points: beam end points, each scan in its own sensor frame.
+        points: beam end points or pixels, each scan in its own sensor frame.
         mask: True where a beam measured something; scans without any do not count.
 
     Returns:

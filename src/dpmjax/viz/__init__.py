@@ -4,13 +4,10 @@ Nothing here needs a screen or touches `pyplot`; matplotlib itself is imported w
 """
 
 from dpmjax.viz.comparison import error_boxes_figure, success_grids_figure
+from dpmjax.viz.curves import History, history_figure, size_figure
 from dpmjax.viz.figures import save_figure
-from dpmjax.viz.history import History, history_figure
 from dpmjax.viz.maps import Panel, make_panel, registered_scans_figure
-from dpmjax.viz.occupancy import occupancy_figure
-from dpmjax.viz.relocalization import ErrorMap, error_maps_figure
-from dpmjax.viz.rgbd import box_plots_figure, from_above_figure
-from dpmjax.viz.size import size_figure
+from dpmjax.viz.rasters import ErrorMap, error_maps_figure, from_above_figure, occupancy_figure
 from dpmjax.viz.toy import endings_figure, toy_figure
 from dpmjax.viz.training import curves_figure, matches_figure
 
@@ -18,7 +15,6 @@ __all__ = [
     "ErrorMap",
     "History",
     "Panel",
-    "box_plots_figure",
     "curves_figure",
     "endings_figure",
     "error_boxes_figure",

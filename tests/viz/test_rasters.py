@@ -1,0 +1,113 @@
+"""The world from above: shares of occupied, free and unexplored cells; errors of poses; clouds of depth images."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+
+from dpmjax.viz import ErrorMap, error_maps_figure, from_above_figure, occupancy_figure
+from dpmjax.viz.rasters import UNEXPLORED_GREY
+
+
+def example():
+    probability = np.zeros((30, 50))
+    probability[12:15, 10:40] = 1.0
+    explored = np.zeros((30, 50), bool)
+    explored[5:25, 5:45] = True
+    return probability, explored
+
+
+def rendered_map(figure, dpi=100):
+    figure.set_dpi(dpi)
+    canvas = FigureCanvasAgg(figure)
+    canvas.draw()
+    image = np.asarray(canvas.buffer_rgba())[..., :3].astype(int)
+    box = figure.axes[0].get_window_extent()
+    height = len(image)
+    return image[height - int(box.y1) : height - int(box.y0), int(box.x0) : int(box.x1)]
+
+
+def test_shares_of_black_white_and_grey_are_those_of_the_map():
+    probability, explored = example()
+    image = rendered_map(occupancy_figure(probability, explored, (0, 100, 0, 60), None, "px"))
+    grey = np.abs(image - round(255 * UNEXPLORED_GREY)).max(axis=-1) <= 2
+    white = image.min(axis=-1) > 250
+    black = image.max(axis=-1) < 5
+    assert grey.mean() == pytest.approx((~explored).mean(), abs=0.03)  # frame and scale bar cover up to 3 %
+    assert white.mean() == pytest.approx((explored & (probability < 0.5)).mean(), abs=0.03)
+    assert black.mean() == pytest.approx((explored & (probability > 0.5)).mean(), abs=0.03)
+
+
+def test_row_zero_is_the_smallest_y():
+    probability, explored = np.zeros((20, 20)), np.ones((20, 20), bool)
+    probability[:5] = 1.0
+    image = rendered_map(occupancy_figure(probability, explored, (0, 10, 0, 10), None, "m"))
+    assert image[-20:].mean() < 60
+    assert image[20:100].mean() > 240
+
+
+def test_trajectory_is_drawn_in_world_coordinates():
+    probability, explored = example()
+    path = np.array([[10.0, 10.0], [90.0, 50.0]])
+    figure = occupancy_figure(probability, explored, (0, 100, 0, 60), path, "px")
+    assert any(np.array_equal(line.get_xydata(), path) for line in figure.axes[0].lines)
+    assert figure.axes[0].get_xlim() == (0, 100)
+    assert figure.axes[0].get_ylim() == (0, 60)
+
+
+@pytest.mark.parametrize(
+    ("explored_shape", "extent", "message"), [((3, 3), (0, 1, 0, 1), r"\(3, 3\)"), ((4, 5), (1, 1, 0, 1), "extent")]
+)
+def test_wrong_shapes_are_refused(explored_shape, extent, message):
+    with pytest.raises(ValueError, match=message):
+        occupancy_figure(np.zeros((4, 5)), np.ones(explored_shape, bool), extent, None, "px")
+
+
+def test_errors_are_drawn_on_one_scale_with_titles_trajectory_and_bar():
+    error = np.array([[0.0, 50.0], [np.nan, 500.0]])
+    path = np.array([[1.0, 1.0], [3.0, 2.0]])
+    maps = [ErrorMap("as fitted", "median 50 px", error), ErrorMap("trained", "median 5 px", 0.1 * error)]
+    figure = error_maps_figure(maps, (0.0, 4.0, 0.0, 4.0), path, "px", worst=200.0)
+    *panels, bar = figure.axes
+    assert [axes.get_title(loc="left").strip() for axes in panels] == ["as fitted", "trained"]
+    assert [axes.texts[0].get_text() for axes in panels] == ["median 50 px", "median 5 px"]
+    for axes, panel in zip(panels, maps, strict=True):
+        (image,) = axes.images
+        np.testing.assert_array_equal(image.get_array().filled(np.nan), panel.error)
+        assert image.get_clim() == (0.0, 200.0)
+        np.testing.assert_array_equal(axes.lines[0].get_xydata(), path)
+    assert bar.get_ylabel() == "error, px"
+    # The smaller errors are the darker picture.
+    canvas = FigureCanvasAgg(figure)
+    canvas.draw()
+    drawn = np.asarray(canvas.buffer_rgba())[..., :3].astype(int)
+    assert len(np.unique(drawn.reshape(-1, 3), axis=0)) > 50
+
+
+def test_panels_of_different_shapes_are_refused():
+    maps = [ErrorMap("a", "", np.zeros((2, 2))), ErrorMap("b", "", np.zeros((3, 2)))]
+    with pytest.raises(ValueError, match="panels of one shape"):
+        error_maps_figure(maps, (0.0, 1.0, 0.0, 1.0), np.zeros((2, 2)), "px", worst=1.0)
+
+
+def test_images_from_above_lie_where_their_poses_say_and_the_ceiling_is_left_out():
+    points = np.random.default_rng(0).uniform([-1, -0.5, 1], [1, 0.5, 3], (2, 4, 5, 3))
+    points[0, 0, 0] = [0.0, -1.5, 2.0]
+    mask = np.ones(points.shape[:3], bool)
+    mask[1, 0] = False
+    T = np.tile(np.eye(4), (2, 1, 1))
+    T[1, :3, 3] = [2.0, 0.0, 1.0]
+    # The whole first panel is moved: it is laid onto the reference by its first pose.
+    moved = np.eye(4)
+    moved[:3, 3] = [7.0, 0.0, -3.0]
+    panels = from_above_figure([("found", moved @ T), ("reference", T)], points, mask).axes
+    assert [axes.get_title(loc="left") for axes in panels] == ["found", "reference"]
+    for axes in panels:
+        first, second, path = axes.lines[:3]
+        assert len(first.get_xdata()) == 19
+        assert len(second.get_xdata()) == 15
+        np.testing.assert_allclose(second.get_xydata(), points[1][mask[1]][:, [0, 2]] + [2.0, 1.0])
+        np.testing.assert_allclose(path.get_xydata(), [[0.0, 0.0], [2.0, 1.0]])
+    with pytest.raises(ValueError, match="panels"):
+        from_above_figure([], points, mask)
