@@ -18,7 +18,8 @@ from dpmjax.deeppointmap import (
     predict_offsets,
     similarity_features,
 )
-from dpmjax.nets import DecoderConfig, attention, embed_positions
+from dpmjax.nets import DecoderConfig, attention
+from dpmjax.nets.attention import embed_positions
 from dpmjax.types import DescriptorCloud
 from tests.tolerances import ACCUMULATED, ROUNDING
 

@@ -59,7 +59,7 @@ def test_neighbourhood_maximum_is_that_of_the_whole_formula() -> None:
     features, positions, queries = rng.normal(size=(9, 5)), rng.normal(size=(9, 3)), rng.normal(size=(6, 3))
     neighbours = rng.integers(0, 9, (6, 4))
     inputs = [jnp.asarray(x, jnp.float32) for x in (features, positions, queries)]
-    module = NeighbourhoodMaximum(7, radius=0.3)
+    module = NeighbourhoodMaximum(7, radius=0.3, config=EncoderConfig())
     params = module.init(jax.random.key(0), *inputs, neighbours)["params"]
     params = {name: rng.normal(size=value.shape).astype(np.float32) for name, value in params.items()}
     offsets = (positions[neighbours] - queries[:, None]) / 0.3
