@@ -9,7 +9,7 @@ So the large matrix products run over points, and each neighbour costs one sum, 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal, get_args
 
 import flax.linen as nn
@@ -71,8 +71,8 @@ class NeighbourhoodMaximum(nn.Module):
     def __call__(
         self,
         features: Float[Array, "n c"],
-        positions: Float[Array, "n 3"],
-        queries: Float[Array, "m 3"],
+        positions: Float[AnyArray, "n 3"],
+        queries: Float[AnyArray, "m 3"],
         neighbours: Int[AnyArray, "m k"],
     ) -> Float[Array, "m f"]:
         """Pools the neighbourhood of each query.
@@ -97,7 +97,7 @@ class NeighbourhoodMaximum(nn.Module):
         from_features = jnp.matmul(
             features.astype(dtype), kernel[:-3].astype(dtype), preferred_element_type=jnp.float32
         )
-        offsets = (positions[neighbours] - queries[:, None]) / self.radius
+        offsets = jnp.asarray(positions[neighbours] - queries[:, None]) / self.radius
         if self.config.frame == "bearing":
             offsets = turn_to_bearing(offsets, queries[:, None])
         # relu grows with its argument, so it may follow the maximum.
@@ -105,7 +105,7 @@ class NeighbourhoodMaximum(nn.Module):
         return nn.relu(maximum + norm_bias)
 
 
-def turn_to_bearing(vectors: Float[Array, "... 3"], positions: Float[Array, "... 3"]) -> Float[Array, "... 3"]:
+def turn_to_bearing(vectors: Float[AnyArray, "... 3"], positions: Float[AnyArray, "... 3"]) -> Float[Array, "... 3"]:
     """Rotates vectors into the frame of the ray from the lidar: x away from the lidar, y to the left, z up.
 
     The result is invariant to rotations about the z axis of the lidar. On that axis itself, vectors stay as they are.
@@ -139,7 +139,7 @@ class InvertedResidual(nn.Module):
 
     @nn.compact
     def __call__(
-        self, features: Float[Array, "m f"], positions: Float[Array, "m 3"], neighbours: Int[AnyArray, "m k"]
+        self, features: Float[Array, "m f"], positions: Float[AnyArray, "m 3"], neighbours: Int[AnyArray, "m k"]
     ) -> Float[Array, "m f"]:
         """Refines the features of one level.
 
@@ -250,10 +250,10 @@ class PointEncoder(nn.Module):
         config = self.config
         # Masked points may hold anything; set to zero, they cannot reach a gradient.
         levels = [
-            level.replace(positions=jnp.where(level.mask[:, None], level.positions, 0)) for level in pyramid.levels
+            replace(level, positions=jnp.where(level.mask[:, None], level.positions, 0)) for level in pyramid.levels
         ]
         positions = levels[0].positions
-        seen = turn_to_bearing(positions, positions) if config.frame == "bearing" else positions
+        seen = turn_to_bearing(positions, positions) if config.frame == "bearing" else jnp.asarray(positions)
         features = [linear(config.stem_channels, "float32", "stem")(seen)]
         for stage, radii in enumerate(self.radii):
             module = Stage(config.stem_channels * 2 ** (stage + 1), radii, config, name=f"stage_{stage}")

@@ -15,9 +15,10 @@ import numpy as np
 import pytest
 
 from dpmjax.deeppointmap import Model, ModelConfig, init_model, model_preset
-from dpmjax.weights import load_model, read_card, read_torch_file, save_model
+from dpmjax.weights import load_model, read_card, save_model
 from dpmjax.weights.__main__ import main
-from dpmjax.weights.config_json import config_from_json, config_to_json
+from dpmjax.weights.model_file import config_from_json, config_to_json
+from dpmjax.weights.torch_import import read_torch_file
 from tests.weights.published import published_tensors
 
 needs_torch = pytest.mark.skipif(
