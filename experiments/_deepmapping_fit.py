@@ -78,7 +78,7 @@ def run_fit(
     import jax
 
     from dpmjax import deepmapping as dm
-    from experiments._checkpoint import Checkpoints
+    from dpmjax.checkpoints import Checkpoints
 
     scans, reach = _scaled(sequence)
     unit = np.array([reach, reach, 1.0])

@@ -139,10 +139,10 @@ def load_fit(run: Path, options: deepmapping_2d.Config, sequence: ScanSequence) 
     import jax
 
     from dpmjax import deepmapping as dm
+    from dpmjax.checkpoints import Checkpoints
     from dpmjax.deepmapping import Report
     from dpmjax.geometry import se2
     from dpmjax.types import ScanSet
-    from experiments._checkpoint import Checkpoints
 
     trajectory = run / "trajectory.npy"
     if not trajectory.is_file():

@@ -14,6 +14,7 @@ NETWORK_PARTS = {"geometry", "scans", "nets", "losses", "registration"}
 ALLOWED: dict[str, set[str]] = {
     "types": set(),
     "checks": set(),
+    "checkpoints": set(),
     "geometry": set(),
     "scans": {"geometry"},
     "nets": {"geometry"},
@@ -21,7 +22,7 @@ ALLOWED: dict[str, set[str]] = {
     "pose_graph": {"geometry"},
     "registration": {"geometry", "losses", "pose_graph"},
     "deepmapping": NETWORK_PARTS,
-    "deeppointmap": NETWORK_PARTS,
+    "deeppointmap": NETWORK_PARTS | {"metrics"},
     "slam": {"deeppointmap", "registration", "pose_graph", "geometry", "scans", "deepmapping"},
     "metrics": {"geometry"},
     "io": {"geometry"},

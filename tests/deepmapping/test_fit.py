@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from dpmjax import deepmapping as dm
+from dpmjax.checkpoints import Checkpoints
 from dpmjax.deepmapping.fit import _draw_batch, run_phases
 from dpmjax.deepmapping.stepping import steps_per_call
 from dpmjax.geometry import se2
@@ -17,7 +18,6 @@ from dpmjax.metrics import absolute_trajectory_error
 from dpmjax.nets.localization import LocalizationConfig
 from dpmjax.nets.occupancy import OccupancyConfig
 from dpmjax.types import ScanSet
-from experiments._checkpoint import Checkpoints
 
 KEY = jax.random.key(3)
 # The fast preset in small: fewer levels, beams and steps.

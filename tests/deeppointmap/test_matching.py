@@ -5,8 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from dpmjax.deeppointmap import MatchConfig, match_descriptors, merge_clouds
-from dpmjax.deeppointmap.matching import best_pairs
+from dpmjax.deeppointmap import MatchConfig, merge_clouds
+from dpmjax.deeppointmap.matching import MaskedPositions, best_pairs, match_descriptors
 from dpmjax.geometry import ConsensusConfig, rigid, se3
 from dpmjax.types import DescriptorCloud, Registration
 from tests.tolerances import ACCUMULATED, ROUNDING
@@ -17,6 +17,11 @@ CONFIG = MatchConfig()
 
 def no_offsets(source: jax.Array, target: jax.Array) -> tuple[jax.Array, jax.Array]:
     return jnp.zeros((len(source), 3)), jnp.zeros((len(target), 3))
+
+
+def match_clouds(source, target, similarity, offsets=no_offsets, masks=(None, None), config: MatchConfig = CONFIG):
+    source, target = MaskedPositions(source, masks[0]), MaskedPositions(target, masks[1])
+    return match_descriptors(source, target, similarity, offsets, config=config)
 
 
 def clouds(seed: int, n: int = 80, num_outliers: int = 0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -5,15 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from dpmjax.deeppointmap import (
-    CurriculumStage,
-    SamplingConfig,
-    ScanTable,
-    TrainingConfig,
-    draw_groups,
-    draw_overlap_pairs,
-    training_preset,
-)
+from dpmjax.deeppointmap import CurriculumStage, SamplingConfig, TrainingConfig, training_preset
+from dpmjax.deeppointmap.sampling import ScanTable, draw_groups, draw_overlap_pairs
 
 
 def table(num: int = 60, step_m: float = 2.0) -> ScanTable:

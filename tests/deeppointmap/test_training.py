@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from experiments._dpm_data import SampleMaker, ScanStore
 
 from dpmjax.deeppointmap import (
     RegistrationSample,
@@ -23,7 +24,6 @@ from dpmjax.deeppointmap import (
     make_step,
     stack,
 )
-from experiments._dpm_data import SampleMaker, ScanStore
 from tests.deeppointmap import toy
 from tests.tolerances import ACCUMULATED
 

@@ -12,14 +12,14 @@ from pathlib import Path
 import jax
 import numpy as np
 import pytest
-from optax.tree_utils import tree_get
-
-from dpmjax.deeppointmap import CurriculumStage, init, make_step
 from experiments._checkpoint import Checkpoints
 from experiments._dpm_data import SampleMaker, ScanStore
 from experiments._dpm_progress import begin
-from experiments._history import read_history
 from experiments._processes import join_processes
+from optax.tree_utils import tree_get
+
+from dpmjax.deeppointmap import CurriculumStage, init, make_step
+from experiments._history import read_history
 from experiments._run_folder import CHECKPOINTS, HISTORY
 from tests.deeppointmap import toy
 

@@ -11,14 +11,14 @@ from pathlib import Path
 import jax
 import numpy as np
 import pytest
-
-from dpmjax.deeppointmap import CurriculumStage, init
-from experiments import _dpm_fit
-from experiments._command import run_command
 from experiments._dpm_data import ScanStore, made_ahead
 from experiments._dpm_fit import run_training
 from experiments._dpm_progress import after_measurement, before_step, begin, params_to_use
 from experiments._dpm_recall import draw_pairs
+
+from dpmjax.deeppointmap import CurriculumStage, init
+from experiments import _dpm_fit
+from experiments._command import run_command
 from experiments._history import read_history
 from experiments._run_folder import CHECKPOINTS, HISTORY, RunFolder
 from experiments.dpm_train import EXPERIMENT, Config, main

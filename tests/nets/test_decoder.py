@@ -7,17 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from dpmjax.deeppointmap import (
-    Model,
-    coarse_features,
-    correlate,
-    init_model,
-    model_preset,
-    overlap,
-    overlap_logit,
-    predict_offsets,
-    similarity_features,
-)
+from dpmjax.deeppointmap import Model, correlate, init_model, model_preset, overlap
+from dpmjax.deeppointmap.model import coarse_features, overlap_logit, predict_offsets, similarity_features
 from dpmjax.nets import DecoderConfig, attention
 from dpmjax.nets.attention import embed_positions
 from dpmjax.types import DescriptorCloud

@@ -9,8 +9,7 @@ import pytest
 
 from dpmjax.geometry import rigid
 from dpmjax.scans import AugmentConfig, BoxConfig, SectorConfig, augment_scan
-from dpmjax.scans.augment import random_motion
-from dpmjax.scans.occlusion import is_behind_box, is_behind_boxes, is_behind_sectors
+from dpmjax.scans.augment import is_behind_box, is_behind_boxes, is_behind_sectors, random_motion
 from dpmjax.types import PointCloud
 from tests.tolerances import ACCUMULATED
 

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from dpmjax.scans import PreprocessConfig, preprocess_host, preprocess_scan, preprocess_scan_on_host
+from dpmjax.scans import PreprocessConfig, preprocess, preprocess_scan, preprocess_scan_on_host
 from dpmjax.types import PointCloud
 
 CONFIG = PreprocessConfig(max_range_m=30.0, num_outlier_neighbours=5, capacity=512)
@@ -86,7 +86,7 @@ def test_both_forms_agree_on_real_scans(sequence: str) -> None:
 def test_voxels_too_many_for_a_table_are_sorted_to_the_same(monkeypatch) -> None:
     points = np.random.default_rng(5).uniform(-20, 20, (1000, 3)).astype(np.float32)
     expected = preprocess_scan_on_host(points, None, CONFIG)
-    monkeypatch.setattr(preprocess_host, "MAX_TABLE_ENTRIES", 0)
+    monkeypatch.setattr(preprocess, "MAX_TABLE_ENTRIES", 0)
     jax.tree.map(np.testing.assert_array_equal, preprocess_scan_on_host(points, None, CONFIG), expected)
 
 

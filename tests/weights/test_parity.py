@@ -12,7 +12,8 @@ import jax
 import numpy as np
 import pytest
 
-from dpmjax.deeppointmap import Model, correlate, encode_pyramid, overlap, register, similarity_features
+from dpmjax.deeppointmap import Model, correlate, encode_pyramid, overlap, register
+from dpmjax.deeppointmap.model import similarity_features
 from dpmjax.geometry.pyramid import build_pyramid
 from dpmjax.types import DescriptorCloud
 from dpmjax.weights import load_model

@@ -21,7 +21,7 @@ from dpmjax.deeppointmap.model import (
     similarity_features,
 )
 from dpmjax.geometry.pyramid_host import build_pyramid_on_host
-from dpmjax.scans.preprocess_host import preprocess_scan_on_host
+from dpmjax.scans.preprocess import preprocess_scan_on_host
 from dpmjax.types import AnyArray, DescriptorCloud, PointCloud, PointPyramid, Registration
 
 ScanOrCloud = DescriptorCloud | PointCloud | Float[AnyArray, "n 3"]
@@ -41,15 +41,15 @@ def encode(model: Model, points: PointCloud | Float[AnyArray, "n 3"]) -> Descrip
     Returns:
         `model.config.num_descriptors` descriptors, metres, same frame. The mask of an empty scan is all False.
     """
-    return encode_pyramid(model, pyramid_of_scan(model, points))
+    return encode_pyramid(model, pyramid_of_scan(points, model.config))
 
 
-def pyramid_of_scan(model: Model, points: PointCloud | Float[AnyArray, "n 3"]) -> PointPyramid:
+def pyramid_of_scan(points: PointCloud | Float[AnyArray, "n 3"], config: ModelConfig) -> PointPyramid:
     """Computes the first half of `encode` on the host: preprocessing, normalisation and the point pyramid.
 
     Args:
-        model: its configuration includes the preprocessing.
         points: (n, 3), metres, in the frame of the lidar; points that are not finite are dropped.
+        config: preprocessing, pyramid, and scale of its coordinates.
 
     Returns:
         The pyramid, in normalised coordinates.
@@ -64,29 +64,15 @@ def pyramid_of_scan(model: Model, points: PointCloud | Float[AnyArray, "n 3"]) -
         raise ValueError(f"points: expected shape (n, 3), got {array.shape}{hint}")
     if not (np.issubdtype(array.dtype, np.floating) or np.issubdtype(array.dtype, np.integer)):
         raise ValueError(f"points: expected real numbers, got dtype {array.dtype}")
-    config = model.config
     cloud = preprocess_scan_on_host(array, None if mask is None else np.asarray(mask), config.preprocess)
-    return pyramid_of_cloud(model, cloud)
+    return pyramid_of_cloud(cloud, config)
 
 
-def pyramid_of_cloud(model: Model, cloud: PointCloud) -> PointPyramid:
-    """Builds the pyramid of a preprocessed cloud on the host.
-
-    Args:
-        model: its configuration includes the pyramid and the scale of its coordinates.
-        cloud: metres, in the frame of the lidar.
-
-    Returns:
-        The pyramid, in normalised coordinates.
-    """
-    return build_scaled_pyramid(cloud, model.config)
-
-
-def build_scaled_pyramid(cloud: PointCloud, config: ModelConfig, *, num_threads: int = 2) -> PointPyramid:
+def pyramid_of_cloud(cloud: PointCloud, config: ModelConfig, *, num_threads: int = 2) -> PointPyramid:
     """Converts metres to normalised coordinates and builds the pyramid on the host.
 
     Args:
-        cloud: metres, in the frame of the lidar.
+        cloud: a preprocessed scan, metres, in the frame of the lidar.
         config: pyramid, and scale of its coordinates.
         num_threads: threads of the neighbour search.
 

@@ -12,11 +12,12 @@ from dpmjax.viz.relocalization import ErrorMap, error_maps_figure
 from dpmjax.viz.rgbd import box_plots_figure, from_above_figure
 from dpmjax.viz.size import size_figure
 from dpmjax.viz.toy import endings_figure, toy_figure
-from dpmjax.viz.training import curves_figure, matches_figure
+from dpmjax.viz.training import MatchedScans, curves_figure, matches_figure
 
 __all__ = [
     "ErrorMap",
     "History",
+    "MatchedScans",
     "Panel",
     "box_plots_figure",
     "curves_figure",
