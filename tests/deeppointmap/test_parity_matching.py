@@ -86,7 +86,7 @@ def test_losses_are_the_published_ones(case, decoder) -> None:
     masks = [~case[f"descriptor_padding_{side}"] for side in "ab"]
     correlated = [case[f"correlated_features_{side}"] for side in "ab"]
     T_b_a = case["T_b_a"].astype(np.float32)
-    close = close_pairs(*positions, T_b_a, *masks, config=config)
+    close = close_pairs(*map(MaskedPositions, positions, masks), T_b_a, config=config)
     sides = []
     for here, there in ((0, 1), (1, 0)):
         partners = correlated[there][np.asarray(close[here].indices)]

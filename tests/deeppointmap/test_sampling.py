@@ -87,6 +87,6 @@ def test_presets_double_the_groups(name) -> None:
         (lambda: ScanTable(np.zeros((3, 4, 4)), np.zeros(2, int)), "T_world_lidar"),
     ],
 )
-def test_what_makes_no_sense_is_refused(make, message: str) -> None:
+def test_what_makes_no_sense_is_refused(as_user, make, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         make()

@@ -19,6 +19,7 @@ from dpmjax.weights import load_model, read_card, save_model
 from dpmjax.weights.__main__ import main
 from dpmjax.weights.model_file import config_from_json, config_to_json
 from dpmjax.weights.torch_import import read_torch_file
+from tests.deeppointmap import toy
 from tests.weights.published import published_tensors
 
 needs_torch = pytest.mark.skipif(
@@ -28,7 +29,7 @@ needs_torch = pytest.mark.skipif(
 
 @pytest.fixture(scope="module")
 def model() -> Model:
-    return init_model(jax.random.key(0), model_preset("tiny"))
+    return init_model(jax.random.key(0), toy.MODEL)
 
 
 def assert_same(a: Model, b: Model, rtol: float = 0) -> None:

@@ -29,9 +29,9 @@ class MapOfScans:
         T_map_scan: poses of the scans in the frame of the map, metres.
     """
 
-    rows: Int[AnyArray, "*b g s"]
-    mask: Bool[AnyArray, "*b g s"]
-    T_map_scan: Float[AnyArray, "*b g s 4 4"]
+    rows: Int[AnyArray, "*b s"]
+    mask: Bool[AnyArray, "*b s"]
+    T_map_scan: Float[AnyArray, "*b s 4 4"]
 
 
 @flax.struct.dataclass
@@ -49,8 +49,8 @@ class RegistrationSample:
     pyramids: PointPyramid
     source: MapOfScans
     target: MapOfScans
-    T_target_source: Float[AnyArray, "*b g 4 4"]
-    mask: Bool[AnyArray, "*b g"]
+    T_target_source: Float[AnyArray, "*b 4 4"]
+    mask: Bool[AnyArray, "*b"]
 
 
 @flax.struct.dataclass
@@ -124,7 +124,7 @@ def stack(trees: Sequence[TreeT]) -> TreeT:
 
 
 def _map_of_scans(
-    rows: Sequence[Int[np.ndarray, " s"]], T_world_scan: Float[np.ndarray, "s 4 4"], num_groups: int, capacity: int
+    rows: Sequence[Int[np.ndarray, " k"]], T_world_scan: Float[np.ndarray, "s 4 4"], num_groups: int, capacity: int
 ) -> MapOfScans:
     padded = np.zeros((num_groups, capacity), np.int32)
     mask = np.zeros((num_groups, capacity), bool)

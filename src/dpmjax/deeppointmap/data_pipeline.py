@@ -12,7 +12,7 @@ import os
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
-from typing import NamedTuple, Protocol
+from typing import NamedTuple, Protocol, runtime_checkable
 
 import jax
 import numpy as np
@@ -39,6 +39,7 @@ SAMPLE_STREAM, EPOCH_STREAM = 3101, 3102
 STEPS_AHEAD = 2
 
 
+@runtime_checkable
 class PosedScans(Protocol):
     """One drive with true poses, read scan by scan; a `dpmjax.io.LidarSequence` is one."""
 

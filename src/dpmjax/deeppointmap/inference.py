@@ -24,7 +24,7 @@ from dpmjax.geometry.pyramid_host import build_pyramid_on_host
 from dpmjax.scans.preprocess import preprocess_scan_on_host
 from dpmjax.types import AnyArray, DescriptorCloud, PointCloud, PointPyramid, Registration
 
-ScanOrCloud = DescriptorCloud | PointCloud | Float[AnyArray, "n 3"]
+ScanOrCloud = DescriptorCloud | PointCloud | Float[AnyArray, "_n 3"]
 """A raw scan in metres, in the frame of its lidar; or the descriptors of a scan; or a map of such descriptors."""
 
 

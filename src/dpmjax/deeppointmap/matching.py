@@ -82,6 +82,20 @@ class MaskedPositions(NamedTuple):
     mask: Bool[AnyArray, " m"] | None = None
 
 
+def checked(name: str, cloud: MaskedPositions | DescriptorCloud) -> tuple[Float[Array, "m 3"], Bool[Array, " m"]]:
+    """Checks positions and mask; a `ValueError` names an argument of a wrong shape.
+
+    Args:
+        name: name of the argument.
+        cloud: the argument.
+
+    Returns:
+        Positions and mask as JAX arrays.
+    """
+    positions = as_points(f"{name}.positions", cloud.positions, dimensions=(3,))
+    return positions, as_mask(f"{name}.mask", cloud.mask, positions.shape[:1])
+
+
 def match_descriptors(
     source: MaskedPositions | DescriptorCloud,
     target: MaskedPositions | DescriptorCloud,
@@ -109,13 +123,10 @@ def match_descriptors(
     Returns:
         The motion, its confidence and the pairs; see `Registration`.
     """
-    source_positions = as_points("source.positions", source.positions, dimensions=(3,))
-    target_positions = as_points("target.positions", target.positions, dimensions=(3,))
+    source_positions, source_mask = checked("source", source)
+    target_positions, target_mask = checked("target", target)
     similarity = as_float("similarity", similarity)
-    num_source, num_target = len(source_positions), len(target_positions)
-    require_shape("similarity", similarity, (num_source, num_target))
-    source_mask = as_mask("source.mask", source.mask, (num_source,))
-    target_mask = as_mask("target.mask", target.mask, (num_target,))
+    require_shape("similarity", similarity, (len(source_positions), len(target_positions)))
     best = best_pairs(similarity, source_mask, target_mask, config=config)
     points = source_positions[best.source_indices], target_positions[best.target_indices]
     return _align(*points, predict_offsets(best.source_indices, best.target_indices), best, config=config)

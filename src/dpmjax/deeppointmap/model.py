@@ -256,7 +256,7 @@ def similarity_features(model: Model, correlated: DescriptorCloud) -> Float[Arra
     Returns:
         One row for each descriptor.
     """
-    return _decode(model, correlated.features, method="similarity_features")
+    return _decode(model, correlated.features, method="similarity_head")
 
 
 @jax.jit
@@ -270,7 +270,7 @@ def coarse_features(model: Model, cloud: DescriptorCloud) -> Float[Array, "m c"]
     Returns:
         One row for each descriptor.
     """
-    return _decode(model, cloud.features, method="coarse_features")
+    return _decode(model, cloud.features, method="coarse_head")
 
 
 @jax.jit
@@ -287,7 +287,7 @@ def predict_offsets(
     Returns:
         Offsets in metres, in the frame of the first cloud.
     """
-    return _decode(model, features, partners, method="offsets")
+    return _decode(model, features, partners, method="offset_head")
 
 
 @jax.jit

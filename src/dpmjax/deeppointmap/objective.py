@@ -16,12 +16,13 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from dpmjax.checks import as_float, as_mask, as_points, require_count, require_positive, require_shape
+from dpmjax.checks import as_float, require_count, require_positive, require_shape
+from dpmjax.deeppointmap.matching import MaskedPositions, checked
 from dpmjax.geometry import rigid
 from dpmjax.geometry.neighbours import radius_search
 from dpmjax.losses.contrastive import info_nce
 from dpmjax.losses.offset import offset_loss
-from dpmjax.types import AnyArray
+from dpmjax.types import AnyArray, DescriptorCloud
 
 
 @dataclass(frozen=True)
@@ -66,9 +67,9 @@ class ClosePairs:
         offsets: from the descriptor to its neighbour, metres, in the frame of the descriptor; 0 where `mask` is False.
     """
 
-    indices: Int[Array, "m k"]
-    mask: Bool[Array, "m k"]
-    offsets: Float[Array, "m k 3"]
+    indices: Int[AnyArray, "*b m k"]
+    mask: Bool[AnyArray, "*b m k"]
+    offsets: Float[AnyArray, "*b m k 3"]
 
 
 @flax.struct.dataclass
@@ -84,12 +85,12 @@ class TrainingSide:
         offsets: predicted offsets of the close pairs, metres, in the frame of the cloud.
     """
 
-    positions: Float[Array, "m 3"]
-    mask: Bool[Array, " m"]
-    matched_features: Float[Array, "m c"]
-    coarse_features: Float[Array, "m e"]
+    positions: Float[AnyArray, "*b m 3"]
+    mask: Bool[AnyArray, "*b m"]
+    matched_features: Float[AnyArray, "*b m c"]
+    coarse_features: Float[AnyArray, "*b m e"]
     close: ClosePairs
-    offsets: Float[Array, "m k 3"]
+    offsets: Float[AnyArray, "*b m k 3"]
 
 
 class ObjectiveTerms(NamedTuple):
@@ -111,32 +112,27 @@ class ObjectiveTerms(NamedTuple):
 
 
 def close_pairs(
-    positions_a: Float[AnyArray, "m 3"],
-    positions_b: Float[AnyArray, "n 3"],
+    a: MaskedPositions | DescriptorCloud,
+    b: MaskedPositions | DescriptorCloud,
     T_b_a: Float[AnyArray, "4 4"],
-    mask_a: Bool[AnyArray, " m"] | None = None,
-    mask_b: Bool[AnyArray, " n"] | None = None,
     *,
     config: ObjectiveConfig,
 ) -> tuple[ClosePairs, ClosePairs]:
     """Finds the pairs closer than `offset_radius_m`, and their true offsets. A `ValueError` names a wrong shape.
 
     Args:
-        positions_a: metres, in the frame of a.
-        positions_b: metres, in the frame of b.
+        a: metres, in the frame of a; masked descriptors may hold anything.
+        b: the same in the frame of b.
         T_b_a: the true motion.
-        mask_a: False for descriptors of a that are not there; they may hold anything.
-        mask_b: the same for b.
         config: radius and capacity.
 
     Returns:
         The pairs of each descriptor of a, and those of each descriptor of b.
     """
-    positions_a = as_points("positions_a", positions_a, dimensions=(3,))
-    positions_b = as_points("positions_b", positions_b, dimensions=(3,))
     T_b_a = as_float("T_b_a", T_b_a)
     require_shape("T_b_a", T_b_a, (4, 4))
-    mask_a, mask_b = as_mask("mask_a", mask_a, positions_a.shape[:1]), as_mask("mask_b", mask_b, positions_b.shape[:1])
+    positions_a, mask_a = checked("a", a)
+    positions_b, mask_b = checked("b", b)
     of_a = _close_of(positions_a, rigid.transform_points(rigid.inverse(T_b_a), positions_b), mask_a, mask_b, config)
     of_b = _close_of(positions_b, rigid.transform_points(T_b_a, positions_a), mask_b, mask_a, config)
     return of_a, of_b
@@ -162,8 +158,8 @@ def matching_loss(
     T_b_a = as_float("T_b_a", T_b_a)
     require_shape("T_b_a", T_b_a, (4, 4))
     for name, side in (("a", a), ("b", b)):
-        require_shape(f"{name}.offsets", side.offsets, side.close.offsets.shape)
-        require_shape(f"{name}.mask", side.mask, side.positions.shape[:1])
+        require_shape(f"{name}.offsets", jnp.asarray(side.offsets), side.close.offsets.shape)
+        require_shape(f"{name}.mask", jnp.asarray(side.mask), side.positions.shape[:1])
     return _matching_loss(a, b, T_b_a, config=config)
 
 

@@ -170,7 +170,7 @@ def _map_pair_loss(
 ) -> tuple[Float[Array, ""], ObjectiveTerms]:
     # Applies the networks to two maps, and computes the losses (DeepPointMap eq. 4 to 7).
     correlated_a, correlated_b = correlate(model, a, b)
-    close_a, close_b = close_pairs(a.positions, b.positions, T_b_a, a.mask, b.mask, config=config)
+    close_a, close_b = close_pairs(a, b, T_b_a, config=config)
     sides = (
         _side(model, a, correlated_a, correlated_b, close_a),
         _side(model, b, correlated_b, correlated_a, close_b),

@@ -106,8 +106,8 @@ class PairAttention(nn.Module):
 
     @nn.compact
     def __call__(
-        self, features: Float[Array, "m+n c"], masks: tuple[Bool[Array, " m"], Bool[Array, " n"]]
-    ) -> Float[Array, "m+n c"]:
+        self, features: Float[Array, "rows c"], masks: tuple[Bool[Array, " m"], Bool[Array, " n"]]
+    ) -> Float[Array, "rows c"]:
         """Applies attention to both clouds.
 
         Args:
@@ -150,10 +150,10 @@ class AttentionLayer(nn.Module):
     @nn.compact
     def __call__(
         self,
-        features: Float[Array, "m+n c"],
-        embeddings: Float[Array, "m+n c"],
+        features: Float[Array, "rows c"],
+        embeddings: Float[Array, "rows c"],
         masks: tuple[Bool[Array, " m"], Bool[Array, " n"]],
-    ) -> Float[Array, "m+n c"]:
+    ) -> Float[Array, "rows c"]:
         """Applies the layer to both clouds.
 
         Args:

@@ -1,6 +1,6 @@
 """The decoder: attention correlates two descriptor clouds, and four heads predict what registration needs.
 
-DeepPointMap section 3.2. Call its methods by name: `decoder.apply({"params": params}, a, b, method="correlate")`.
+DeepPointMap section 3.2. Call methods and heads by name: `decoder.apply({"params": params}, a, b, method="correlate")`.
 """
 
 from __future__ import annotations
@@ -152,40 +152,6 @@ class DescriptorDecoder(nn.Module):
         correlated_b = DescriptorCloud(b.positions, features_b, masks[1])
         return _cleared(correlated_a), _cleared(correlated_b)
 
-    def similarity_features(self, features: Float[Array, "m c"]) -> Float[Array, "m c"]:
-        """Maps correlated features to features whose cosine is the similarity of two descriptors.
-
-        Args:
-            features: correlated features.
-
-        Returns:
-            Features of the same width.
-        """
-        return self.similarity_head(features)
-
-    def coarse_features(self, features: Float[Array, "m c"]) -> Float[Array, "m c"]:
-        """Maps uncorrelated features to the features of the coarse pairing loss (DeepPointMap eq. 5).
-
-        Args:
-            features: uncorrelated features.
-
-        Returns:
-            Features of the same width.
-        """
-        return self.coarse_head(features)
-
-    def offsets(self, features: Float[Array, "... c"], partners: Float[Array, "... c"]) -> Float[Array, "... 3"]:
-        """Predicts the offset from each descriptor to its partner.
-
-        Args:
-            features: correlated features of the first cloud, one row for each pair.
-            partners: correlated features of the second cloud, row for row.
-
-        Returns:
-            Offsets in metres, in the frame of the first cloud.
-        """
-        return self.offset_head(features, partners)
-
     def overlap_logit(self, a: DescriptorCloud, b: DescriptorCloud) -> Float[Array, ""]:
         """Predicts the logit of the probability that two clouds overlap.
 
@@ -206,9 +172,9 @@ class DescriptorDecoder(nn.Module):
             b: any descriptor cloud.
         """
         correlated_a, correlated_b = self.correlate(a, b)
-        self.similarity_features(correlated_a.features)
-        self.coarse_features(a.features)
-        self.offsets(correlated_a.features[:1], correlated_b.features[:1])
+        self.similarity_head(correlated_a.features)
+        self.coarse_head(a.features)
+        self.offset_head(correlated_a.features[:1], correlated_b.features[:1])
         self.overlap_logit(correlated_a, correlated_b)
 
 

@@ -17,7 +17,7 @@ from jaxtyping import Array, Bool, Float, PRNGKeyArray
 from dpmjax.checks import require_count
 from dpmjax.geometry import rigid
 from dpmjax.scans.preprocess import farthest_first
-from dpmjax.types import PointCloud
+from dpmjax.types import AnyArray, PointCloud
 
 Interval = tuple[float, float]
 
@@ -192,17 +192,8 @@ def _is_occluded(points: Float[Array, "n 3"], config: AugmentConfig, key: PRNGKe
     return by_sectors | (has_boxes & is_behind_boxes(points, config.boxes, key=box_key))
 
 
-def is_behind_sectors(points: Float[Array, "n 3"], config: SectorConfig, *, key: PRNGKeyArray) -> Bool[Array, " n"]:
-    """Finds the points that lie in a random sector beyond its range.
-
-    Args:
-        points: metres, in the frame of the sensor, z up.
-        config: settings of the sectors.
-        key: used once.
-
-    Returns:
-        True for hidden points.
-    """
+def is_behind_sectors(points: Float[AnyArray, "n 3"], config: SectorConfig, *, key: PRNGKeyArray) -> Bool[Array, " n"]:
+    """Returns True for points in a random sector beyond its range; metres, in the frame of the sensor, z up."""
     draws = jax.random.uniform(key, (4, config.max_count))
     index = jnp.arange(1, config.max_count + 1)
     count = _count(draws[0, 0], config.max_count)
@@ -215,17 +206,8 @@ def is_behind_sectors(points: Float[Array, "n 3"], config: SectorConfig, *, key:
     return jnp.any(is_in_sector & is_far & (index <= count), axis=1)
 
 
-def is_behind_boxes(points: Float[Array, "n 3"], config: BoxConfig, *, key: PRNGKeyArray) -> Bool[Array, " n"]:
-    """Finds the points whose beam from the sensor meets a random box.
-
-    Args:
-        points: metres, in the frame of the sensor, z up.
-        config: settings of the boxes.
-        key: used once.
-
-    Returns:
-        True for hidden points.
-    """
+def is_behind_boxes(points: Float[AnyArray, "n 3"], config: BoxConfig, *, key: PRNGKeyArray) -> Bool[Array, " n"]:
+    """Returns True for points that a random box hides; metres, in the frame of the sensor, z up."""
     draws = jax.random.uniform(key, (8, config.max_count))
     count = _count(draws[0, 0], config.max_count)
     length = _between(config.length_m, draws[1])
@@ -243,7 +225,10 @@ def is_behind_boxes(points: Float[Array, "n 3"], config: BoxConfig, *, key: PRNG
 
 
 def is_behind_box(
-    points: Float[Array, "n 3"], centre: Float[Array, " 3"], size: Float[Array, " 3"], heading: Float[Array, ""]
+    points: Float[AnyArray, "n 3"],
+    centre: Float[AnyArray, " 3"],
+    size: Float[AnyArray, " 3"],
+    heading: Float[Array, ""],
 ) -> Bool[Array, " n"]:
     """Finds the points whose segment to the origin meets one upright box (slab method).
 
@@ -262,7 +247,7 @@ def is_behind_box(
         x, y, z = vectors[..., 0], vectors[..., 1], vectors[..., 2]
         return jnp.stack([cos * x + sin * y, cos * y - sin * x, z], axis=-1)
 
-    direction, origin = turn(points), -turn(centre)
+    direction, origin = turn(jnp.asarray(points)), -turn(jnp.asarray(centre))
     # A beam parallel to a slab never crosses its planes; with a tiny slope, both crossings are far away.
     tiny = jnp.finfo(points.dtype).eps
     slope = jnp.where(jnp.abs(direction) < tiny, tiny, direction)

@@ -191,6 +191,8 @@ def _restored(value: Any, expected: Any, name: str) -> Any:
         if value is None and type(None) in typing.get_args(expected):
             return None
         (expected,) = (choice for choice in typing.get_args(expected) if choice is not type(None))
+    if expected is Path:
+        return Path(value)
     if dataclasses.is_dataclass(expected) and isinstance(expected, type):
         if not isinstance(value, dict):
             raise ValueError(f"{name}: expected an object, got {value!r}")

@@ -66,18 +66,10 @@ DECODER_NAMES = {
     **{rf"{theirs}\.{2 * i}\.": f"{ours}.linear_{i}." for theirs, ours in _SEQUENCES.items() for i in range(3)},
 }
 
-STORAGE_DTYPES: dict[str, np.dtype] = {
-    "DoubleStorage": np.dtype("<f8"),
-    "FloatStorage": np.dtype("<f4"),
-    "HalfStorage": np.dtype("<f2"),
-    "BFloat16Storage": np.dtype(jnp.bfloat16),
-    "LongStorage": np.dtype("<i8"),
-    "IntStorage": np.dtype("<i4"),
-    "ShortStorage": np.dtype("<i2"),
-    "CharStorage": np.dtype("i1"),
-    "ByteStorage": np.dtype("u1"),
-    "BoolStorage": np.dtype("?"),
-}
+_CODES = {"Double": "<f8", "Float": "<f4", "Half": "<f2", "Long": "<i8", "Int": "<i4", "Short": "<i2"}
+_CODES |= {"Char": "i1", "Byte": "u1", "Bool": "?"}
+STORAGE_DTYPES = {f"{name}Storage": np.dtype(code) for name, code in _CODES.items()}
+STORAGE_DTYPES["BFloat16Storage"] = np.dtype(jnp.bfloat16)
 
 
 def import_torch_checkpoint(path: str | Path) -> Model:
