@@ -61,7 +61,7 @@ def test_figures_have_a_case(folder) -> None:
     cases = {row.case.replace("tiny", "paper") for stage in timed for row in stage(folder, quick=True)}
     for case in FIGURES:
         if "overlap" not in case and "process" not in case:
-            assert re.sub(r"\d+ x \d+", "8 x 256", case.replace("small", "paper")) in cases
+            assert re.sub(r"\d+ x \d+", "32 x 256", case.replace("small", "paper")) in cases
 
 
 def test_compile_time_is_told_of_what_is_compiled(folder) -> None:

@@ -143,7 +143,7 @@ def test_paper_size_is_the_published_one() -> None:
     assert ModelConfig().num_descriptors == 256
 
 
-def test_wrong_pyramids_and_widths_are_named(model: Model) -> None:
+def test_wrong_pyramids_and_widths_are_named(as_user, model: Model) -> None:
     pyramid = pyramid_of(points(9))
     with pytest.raises(ValueError, match="^pyramid: expected 3 levels, got 2"):
         encode_pyramid(model, pyramid.replace(levels=pyramid.levels[:-1]))

@@ -242,7 +242,7 @@ def overlap_logit(model: Model, a: DescriptorCloud, b: DescriptorCloud) -> Float
     Returns:
         The logit.
     """
-    return _decode(model, a, b, method="overlap_logit")
+    return _decode(model, a, b, part="overlap_logit")
 
 
 @jax.jit
@@ -256,7 +256,7 @@ def similarity_features(model: Model, correlated: DescriptorCloud) -> Float[Arra
     Returns:
         One row for each descriptor.
     """
-    return _decode(model, correlated.features, method="similarity_head")
+    return _decode(model, correlated.features, part="similarity_head")
 
 
 @jax.jit
@@ -270,7 +270,7 @@ def coarse_features(model: Model, cloud: DescriptorCloud) -> Float[Array, "m c"]
     Returns:
         One row for each descriptor.
     """
-    return _decode(model, cloud.features, method="coarse_head")
+    return _decode(model, cloud.features, part="coarse_head")
 
 
 @jax.jit
@@ -287,7 +287,7 @@ def predict_offsets(
     Returns:
         Offsets in metres, in the frame of the first cloud.
     """
-    return _decode(model, features, partners, method="offset_head")
+    return _decode(model, features, partners, part="offset_head")
 
 
 @jax.jit
@@ -300,15 +300,20 @@ def _encode_pyramid(model: Model, pyramid: PointPyramid) -> DescriptorCloud:
 
 @jax.jit
 def _correlate(model: Model, a: DescriptorCloud, b: DescriptorCloud) -> tuple[DescriptorCloud, DescriptorCloud]:
-    return _decode(model, a, b, method="correlate")
+    return _decode(model, a, b, part="correlate")
 
 
 def _encoder(config: ModelConfig) -> PointEncoder:
     return PointEncoder(config.encoder, tuple(stage.radii for stage in config.pyramid.stages))
 
 
-def _decode(model: Model, *arguments: Any, method: str) -> Any:
-    return DescriptorDecoder(model.config.decoder).apply({"params": model.params["decoder"]}, *arguments, method=method)
+def _decode(model: Model, *arguments: Any, part: str) -> Any:
+    # `part` is a method or a head of the decoder.
+    return DescriptorDecoder(model.config.decoder).apply(
+        {"params": model.params["decoder"]},
+        *arguments,
+        method=lambda decoder, *arguments: getattr(decoder, part)(*arguments),
+    )
 
 
 def _blank_pyramid(config: PyramidConfig) -> PointPyramid:

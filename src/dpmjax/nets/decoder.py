@@ -1,6 +1,6 @@
 """The decoder: attention correlates two descriptor clouds, and four heads predict what registration needs.
 
-DeepPointMap section 3.2. Call methods and heads by name: `decoder.apply({"params": params}, a, b, method="correlate")`.
+DeepPointMap section 3.2. Call a method by its name: `decoder.apply({"params": params}, a, b, method="correlate")`.
 """
 
 from __future__ import annotations
