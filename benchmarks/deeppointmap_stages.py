@@ -20,7 +20,8 @@ from numpy.typing import NDArray
 import dpmjax
 from benchmarks.rows import Row
 from benchmarks.timing import measure
-from dpmjax.deeppointmap import merge_clouds, pyramid_of_cloud
+from dpmjax.deeppointmap import merge_clouds
+from dpmjax.deeppointmap.inference import pyramid_of_cloud
 from dpmjax.geometry import build_pyramid
 from dpmjax.io import open_lidar_sequence
 from dpmjax.scans import preprocess_scan, preprocess_scan_on_host
@@ -62,10 +63,10 @@ def time_encoding(folder: Path, quick: bool, *, preset: str) -> list[Row]:
     rows = []
     for name, points in read_scans(folder).items():
         cloud = preprocess_scan_on_host(points, None, model.config.preprocess)
-        pyramid = pyramid_of_cloud(model, cloud)
+        pyramid = pyramid_of_cloud(cloud, model.config)
         parts: dict[str, Callable[[], object]] = {
             "preprocess": partial(preprocess_scan_on_host, points, None, model.config.preprocess),
-            "pyramid": partial(pyramid_of_cloud, model, cloud),
+            "pyramid": partial(pyramid_of_cloud, cloud, model.config),
             "network": partial(dpmjax.encode_pyramid, model, pyramid),
             "preprocess + encode": partial(dpmjax.encode, model, points),
         }

@@ -72,12 +72,12 @@ def run_fit(
     """
     import jax
 
+    from dpmjax.checkpoints import Checkpoints
     from dpmjax.deepmapping import Fitted
     from dpmjax.deepmapping.fit import fit, init
     from dpmjax.deepmapping.planar import planar_problem, scale_scans, start_poses
     from dpmjax.geometry import se2
     from dpmjax.types import ScanSet
-    from experiments._checkpoint import Checkpoints
 
     scans, unit = scale_scans(ScanSet(sequence.points, sequence.mask))
     problem = planar_problem(settings, is_warm=start is not None)

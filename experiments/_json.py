@@ -6,7 +6,6 @@ import dataclasses
 import json
 import math
 import os
-import typing
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, TypeVar
@@ -62,23 +61,10 @@ def load_dataclass(path: Path, config_type: type[ConfigT], *, ignore: frozenset[
     Raises:
         ValueError: it holds an option that `config_type` does not have, or is no JSON.
     """
-    stored = load_json(path)
-    hints = typing.get_type_hints(config_type)
-    unknown = sorted(set(stored) - set(hints))
-    if unknown:
-        raise ValueError(f"{path} holds options that this version does not know: {', '.join(unknown)}")
-    kept = {name: value for name, value in stored.items() if name not in ignore}
-    return config_type(**{name: _from_json(value, hints[name]) for name, value in kept.items()})
+    from dpmjax.weights.model_file import config_from_json
 
-
-def _from_json(value: Any, hint: Any) -> Any:
-    choices = typing.get_args(hint) or (hint,)
-    if isinstance(value, dict):
-        nested = next(choice for choice in choices if isinstance(choice, type) and dataclasses.is_dataclass(choice))
-        hints = typing.get_type_hints(nested)
-        return nested(**{name: _from_json(entry, hints[name]) for name, entry in value.items()})
-    if isinstance(value, list):
-        return tuple(value)
-    if isinstance(value, str) and Path in choices:
-        return Path(value)
-    return value
+    kept = {name: value for name, value in load_json(path).items() if name not in ignore}
+    try:
+        return config_from_json(kept, config_type)
+    except ValueError as error:
+        raise ValueError(f"{path} holds options that this version does not know: {error}") from error

@@ -146,12 +146,12 @@ def load_fit(run: Path, options: deepmapping_2d.Config, sequence: ScanSequence) 
     """
     import jax
 
+    from dpmjax.checkpoints import Checkpoints
     from dpmjax.deepmapping import Fitted
     from dpmjax.deepmapping.fit import init
     from dpmjax.deepmapping.planar import planar_problem, scale_scans, start_poses
     from dpmjax.geometry import se2
     from dpmjax.types import ScanSet
-    from experiments._checkpoint import Checkpoints
 
     trajectory = run / "trajectory.npy"
     if not trajectory.is_file():

@@ -26,21 +26,21 @@ import numpy as np
 from tyro.conf import FlagCreatePairsOff, arg
 
 from experiments._command import run_command
-from experiments._dpm_fit import TrainRun, run_training
 from experiments._history import read_history
 from experiments._machine import peak_rss_gb, select_device
-from experiments._processes import is_first, join_processes, merged, together
 from experiments._run_folder import HISTORY, METRICS, RunFolder, open_run_folder, recording, write_metrics
 from experiments._stop import StopFlag
 
 if TYPE_CHECKING:
     from dpmjax.deeppointmap import Model, TrainingConfig
-    from experiments._dpm_recall import Examination, Examined
+    from dpmjax.deeppointmap.evaluation import Evaluation, EvaluationPairs
+    from dpmjax.deeppointmap.training_loop import Trained
+    from experiments._dpm_run import Records
 
 EXPERIMENT = "dpm_train"
 MODEL = "model.safetensors"
 # More bad scans than this are counted only.
-MAX_TOLD = 10
+MAX_LISTED = 10
 
 
 @dataclass(frozen=True)
@@ -94,11 +94,11 @@ class Config:
 
 @dataclass(frozen=True)
 class Result:
-    """What a run made.
+    """Result of a run.
 
     Attributes:
-        folder: where it was written; None in all processes but the first.
-        metrics: what `metrics.json` says.
+        folder: folder of the run; None in all processes but the first.
+        metrics: content of `metrics.json`.
     """
 
     folder: Path | None
@@ -106,67 +106,80 @@ class Result:
 
 
 def main(config: Config) -> Result:
-    """Opens the drives, trains, measures, writes."""
-    from experiments._dpm_data import HELD_OUT_SEED, ScanStore, open_drives, town_drive
-    from experiments._dpm_recall import draw_pairs
+    """Opens the drives, trains, evaluates, and writes the results."""
+    from dpmjax.deeppointmap.processes import join_processes, merged, together
 
     started = time.perf_counter()
     join_processes(config.coordinator, config.num_processes, config.process_id)
     select_device(config.device)
+    from dpmjax.deeppointmap import ScanStore
+    from experiments._dpm_run import open_drives, run_training
+
     with together():
         settings = training_settings(config)
         drives = open_drives(
             config.data, num_towns=config.num_towns, town_length_m=config.town_length_m, seed=config.seed
         )
-        store = ScanStore(drives, settings)
+        store = ScanStore(drives, settings.model.preprocess)
         folder = _open_folder(config)
     with recording(folder) if folder is not None else nullcontext(), StopFlag() as stop:
-        paired = None
-        if folder is not None:
-            print(f"{len(drives)} drives of {len(store.table)} scans; {config.preset}: {settings.num_steps} steps")
-            held_out = town_drive(HELD_OUT_SEED, length_m=config.town_length_m)
-            paired = draw_pairs(held_out, config.held_out_pairs, seed=0)
-        run = run_training(
-            folder, store, settings, paired, seed=config.seed, recall_every=config.recall_every, stop=stop
+        with together():
+            records = None if folder is None else _open_records(folder, config, settings, store)
+        trained = run_training(
+            records,
+            store,
+            settings,
+            seed=config.seed,
+            recall_every=config.recall_every,
+            stop=lambda: stop.received or 0,
         )
+        if trained.stopped_by:
+            stop.request(trained.stopped_by)
         bad = merged(store.bad)
-        if folder is None or run is None:
+        if folder is None or records is None:
             return Result(None, {})
-        metrics = measure(run, run.examination) | {
+        evaluation, metrics = measure(trained, records)
+        metrics |= {
             "num_scans": len(store.table),
             "bad_scans": bad,
-            "steps": run.steps,
-            "best_step": run.best_step,
-            "train_s": run.run_s,
-            "compile_s": run.compile_s,
-            "scans_per_s": run.scans_per_s,
             "wall_s": time.perf_counter() - started,
             "peak_rss_gb": peak_rss_gb(),
             "is_interrupted": stop.is_requested,
         }
         # Numbers first: a picture that fails must not cost them.
         write_metrics(folder, metrics, seed=config.seed)
-        write_model(folder, run.model, config, metrics)
-        draw(folder, run)
-        tell(folder, metrics)
+        write_model(folder, trained.model, config, metrics)
+        draw(folder, evaluation, records.pairs)
+        print_summary(folder, metrics)
     return Result(folder.path, metrics)
 
 
 def _open_folder(config: Config) -> RunFolder | None:
-    """The run folder, in the process that writes."""
+    from dpmjax.deeppointmap.processes import is_first
+
     if not is_first():
         return None
     return open_run_folder(config, EXPERIMENT, output=config.output, resume=config.resume, force=config.force)
 
 
-def tell(folder: RunFolder, metrics: dict[str, Any]) -> None:
-    """The last lines on the console: recall, the scans that were left out, and where to look."""
+def _open_records(folder: RunFolder, config: Config, settings: TrainingConfig, store: Any) -> Records:
+    from dpmjax.deeppointmap import draw_evaluation_pairs
+    from experiments._dpm_run import HELD_OUT_SEED, Records, town_drive
+
+    print(f"{len(store.table)} scans; {config.preset}: {settings.num_steps} steps")
+    held_out = town_drive(HELD_OUT_SEED, length_m=config.town_length_m)
+    pairs = draw_evaluation_pairs(held_out, config.held_out_pairs, settings.model)
+    return Records(folder, settings, pairs, seed=config.seed)
+
+
+def print_summary(folder: RunFolder, metrics: dict[str, Any]) -> None:
+    """Prints the recall, the scans that were left out, and the folder."""
     at = "" if metrics["best_step"] is None else f" (best, after step {metrics['best_step']})"
     print(f"recall on the held-out town {metrics['recall_untrained']:.2f} -> {metrics['recall']:.2f}{at}")
     bad = metrics["bad_scans"]
     if bad:
         print(f"{len(bad)} scans left out, all of them in {folder / METRICS}:")
-        for source, reason in list(bad.items())[:MAX_TOLD]:
+        for source, reason in list(bad.items())[:MAX_LISTED]:
             print(f"  {source}: {reason}")
     print(f"results in {folder.path}")
 
@@ -183,27 +196,33 @@ def training_settings(config: Config) -> TrainingConfig:
     return settings if config.steps is None else settings.with_steps(config.steps)
 
 
-def measure(run: TrainRun, examination: Examination) -> dict[str, Any]:
-    """Recall of the trained and of the untrained network, errors, and how well overlap is told."""
-    from experiments._dpm_recall import examine, overlap_accuracy
+def measure(trained: Trained, records: Records) -> tuple[Evaluation, dict[str, Any]]:
+    """Recall, errors and overlap accuracy of the trained and of the untrained network, and times."""
+    from dpmjax.deeppointmap import evaluate_registration, overlap_accuracy
 
-    trained, untrained = run.examined, examine(run.untrained, examination)
-    found = trained.recall
-    return {
-        "recall": found.recall,
-        "recall_untrained": untrained.recall.recall,
-        "num_held_out_pairs": len(found.is_right),
-        "translation_error_median_m": float(np.median(found.translation_errors_m)),
-        "rotation_error_median_deg": float(np.median(found.rotation_errors_deg)),
-        "translation_error_median_untrained_m": float(np.median(untrained.recall.translation_errors_m)),
-        "rotation_error_median_untrained_deg": float(np.median(untrained.recall.rotation_errors_deg)),
-        "overlap_accuracy": overlap_accuracy(run.model, trained, examination),
-        "overlap_accuracy_untrained": overlap_accuracy(run.untrained, untrained, examination),
+    models = {"": trained.model, "_untrained": records.untrained}
+    evaluations = {suffix: evaluate_registration(model, records.pairs) for suffix, model in models.items()}
+    metrics: dict[str, Any] = {
+        "num_held_out_pairs": len(records.pairs.pairs),
+        "steps": int(trained.progress.state.step),
+        "best_step": int(trained.progress.best_step) or None,
+        "train_s": records.earlier_s + trained.run_s,
+        "compile_s": trained.compile_s,
+        "scans_per_s": trained.scans_per_s,
     }
+    for suffix, evaluation in evaluations.items():
+        recall = evaluation.recall
+        metrics |= {
+            f"recall{suffix}": recall.recall,
+            f"translation_error_median{suffix}_m": float(np.median(recall.translation_errors_m)),
+            f"rotation_error_median{suffix}_deg": float(np.median(recall.rotation_errors_deg)),
+            f"overlap_accuracy{suffix}": overlap_accuracy(models[suffix], evaluation, records.pairs),
+        }
+    return evaluations[""], metrics
 
 
 def write_model(folder: RunFolder, model: Model, config: Config, metrics: dict[str, Any]) -> None:
-    """model.safetensors, with a card that says where it comes from."""
+    """Writes model.safetensors with a description of its training."""
     from dpmjax.weights import save_model
 
     best = "" if metrics["best_step"] is None else f" (best recall after {metrics['best_step']})"
@@ -218,8 +237,8 @@ def write_model(folder: RunFolder, model: Model, config: Config, metrics: dict[s
     unfinished.replace(folder / MODEL)
 
 
-def draw(folder: RunFolder, run: TrainRun) -> None:
-    """loss.png and matches.png."""
+def draw(folder: RunFolder, evaluation: Evaluation, pairs: EvaluationPairs) -> None:
+    """Draws loss.png and matches.png."""
     from dpmjax import viz
 
     rows = read_history(folder / HISTORY)
@@ -231,24 +250,18 @@ def draw(folder: RunFolder, run: TrainRun) -> None:
         curves["loss"][[row["stage"] == "overlap" for row in rows]] = np.nan
         steps = [int(row["step"]) for row in rows]
         viz.save_figure(viz.curves_figure(steps, curves), folder / "loss.png")
-    viz.save_figure(matches_picture(run.examined, run.examination), folder / "matches.png")
-
-
-def matches_picture(examined: Examined, examination: Examination) -> Any:
-    """The held-out pair whose error is the median one."""
-    from dpmjax import viz
-
-    errors = examined.recall.translation_errors_m
+    # The held-out pair of median error.
+    errors = evaluation.recall.translation_errors_m
     number = int(np.argsort(errors)[len(errors) // 2])
-    a, b = examination.pairs[number]
-    match, T_true = examined.matches[number], examined.T_true[number]
+    a, b = (int(row) for row in pairs.pairs[number])
+    match, T_true = evaluation.matches[number], evaluation.T_true[number]
     is_inlier = np.asarray(match.is_inlier)
-    p = np.asarray(examined.clouds[a].positions)[np.asarray(match.source_indices)[is_inlier]]
-    q = np.asarray(examined.clouds[b].positions)[np.asarray(match.target_indices)[is_inlier]]
+    p = np.asarray(evaluation.clouds[a].positions)[np.asarray(match.source_indices)[is_inlier]]
+    q = np.asarray(evaluation.clouds[b].positions)[np.asarray(match.target_indices)[is_inlier]]
     distances = np.linalg.norm(p @ T_true[:3, :3].T + T_true[:3, 3] - q, axis=1)
-    source, target = (examination.scan_points(int(row)) for row in (a, b))
     title = f"held-out pair of median error, {errors[number]:.2f} m; green: matches less than 3 m apart"
-    return viz.matches_figure(source, target, match.T_target_source, p, q, distances < 3.0, title)
+    scans = viz.MatchedScans(pairs.scan_points(a), pairs.scan_points(b), p, q, distances < 3.0)
+    viz.save_figure(viz.matches_figure(scans, match.T_target_source, title=title), folder / "matches.png")
 
 
 if __name__ == "__main__":

@@ -23,13 +23,15 @@ import pytest
 # Before the first import of these packages, so that their functions are wrapped.
 jaxtyping.install_import_hook(
     [
+        "dpmjax.deeppointmap",
         "dpmjax.geometry",
         "dpmjax.losses",
         "dpmjax.metrics",
-        "dpmjax.nets.localization",
-        "dpmjax.nets.occupancy",
+        "dpmjax.nets",
         "dpmjax.pose_graph",
         "dpmjax.registration",
+        "dpmjax.scans",
+        "dpmjax.weights",
     ],
     "beartype.beartype",
 )

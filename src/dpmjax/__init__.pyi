@@ -8,7 +8,7 @@ from .deeppointmap.model import ModelConfig as ModelConfig
 from .deeppointmap.model import correlate as correlate
 from .deeppointmap.model import encode_pyramid as encode_pyramid
 from .deeppointmap.model import init_model as init_model
-from .deeppointmap.presets import model_preset as model_preset
+from .deeppointmap.model import model_preset as model_preset
 from .geometry.alignment import weighted_svd as weighted_svd
 from .geometry.neighbours import k_nearest as k_nearest
 from .geometry.neighbours import radius_search as radius_search
@@ -35,7 +35,7 @@ from .types import DescriptorCloud as DescriptorCloud
 from .types import Neighbours as Neighbours
 from .types import PointCloud as PointCloud
 from .types import ScanSet as ScanSet
-from .weights.checkpoint import load_model as load_model
-from .weights.checkpoint import save_model as save_model
+from .weights.model_file import load_model as load_model
+from .weights.model_file import save_model as save_model
 
 __version__: str

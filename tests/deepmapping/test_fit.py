@@ -12,12 +12,12 @@ import optax
 import pytest
 
 from dpmjax import deepmapping as dm
+from dpmjax.checkpoints import Checkpoints
 from dpmjax.deepmapping.fit import Progress, fit, init, is_finished, step, steps_per_call
 from dpmjax.deepmapping.planar import planar_problem
 from dpmjax.deepmapping.problem import Problem, draw_offsets
 from dpmjax.nets.localization import LocalizationConfig
 from dpmjax.nets.occupancy import OccupancyConfig
-from experiments._checkpoint import Checkpoints
 from tests.tolerances import ACCUMULATED, DOUBLE
 
 KEY = jax.random.key(3)

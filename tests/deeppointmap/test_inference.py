@@ -32,10 +32,14 @@ def test_scans_and_their_descriptors_register_alike(model, scans) -> None:
     assert 0 < dpmjax.overlap(model, scans[0], dpmjax.encode(model, scans[1])) < 1
 
 
-def test_a_scan_on_itself_does_not_move(model, scans) -> None:
-    match = dpmjax.register(model, scans[0], scans[0])
-    assert match.T_target_source.shape == (4, 4)
-    assert np.isfinite(match.T_target_source).all()
+def test_a_scan_on_itself_does_not_move_where_offsets_are_zero(model, scans) -> None:
+    decoder = {
+        **model.params["decoder"],
+        "offset_head": jax.tree.map(np.zeros_like, model.params["decoder"]["offset_head"]),
+    }
+    match = dpmjax.register(model.replace(params={**model.params, "decoder": decoder}), scans[0], scans[0])
+    np.testing.assert_allclose(match.T_target_source, np.eye(4), atol=1e-4)
+    assert match.rmse < 1e-3
 
 
 def test_descriptors_are_in_metres_in_the_frame_of_the_scan(model, scans) -> None:
@@ -60,7 +64,18 @@ def test_an_empty_scan_is_a_failure_as_data(model, scans) -> None:
     np.testing.assert_array_equal(match.T_target_source, np.eye(4))
     assert match.confidence == 0
     assert np.isinf(match.rmse)
-    assert np.isfinite(dpmjax.overlap(model, empty, scans[0]))
+    assert dpmjax.overlap(model, empty, scans[0]) == dpmjax.overlap(model, scans[0], empty) == 0
+
+
+def test_overlap_of_features_that_are_not_finite_is_zero(model, scans) -> None:
+    cloud = dpmjax.encode(model, scans[0])
+    broken = cloud.replace(features=cloud.features.at[2].set(np.nan))
+    assert dpmjax.overlap(model, cloud, broken) == dpmjax.overlap(model, broken, cloud) == 0
+
+
+def test_a_scan_in_millimetres_is_warned_of(model, scans) -> None:
+    with pytest.warns(UserWarning, match="is it in metres"):
+        dpmjax.encode(model, 1000 * scans[0])
 
 
 def test_second_call_compiles_nothing(model, scans, assert_compiles_nothing) -> None:
@@ -73,6 +88,6 @@ def test_second_call_compiles_nothing(model, scans, assert_compiles_nothing) -> 
     ("points", "message"),
     [(np.zeros((5, 4)), r"points\[:, :3\]"), (np.zeros(3), "shape"), (np.array([["a", "b", "c"]]), "real numbers")],
 )
-def test_what_is_no_scan_is_refused(model, points, message: str) -> None:
+def test_what_is_no_scan_is_refused(as_user, model, points, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         dpmjax.encode(model, points)

@@ -10,14 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from dpmjax.deeppointmap import (
-    MatchConfig,
-    ObjectiveConfig,
-    TrainingSide,
-    close_pairs,
-    match_descriptors,
-    registration_loss,
-)
+from dpmjax.deeppointmap.matching import MaskedPositions, MatchConfig, match_descriptors
+from dpmjax.deeppointmap.objective import ObjectiveConfig, TrainingSide, close_pairs, matching_loss
 
 FOLDER = Path(os.environ.get("DPMJAX_PARITY", Path(__file__).parents[3] / "shared" / "parity" / "small"))
 PARITY: dict[str, Any] = {"rtol": 1e-4, "atol": 1e-5}
@@ -71,12 +65,10 @@ def test_registration_is_the_published_one(case, decoder) -> None:
         return tuple(jnp.asarray(offset, jnp.float32) for offset in offsets)
 
     match = match_descriptors(
-        case["descriptor_xyz_a"],
-        case["descriptor_xyz_b"],
+        MaskedPositions(case["descriptor_xyz_a"], ~case["descriptor_padding_a"]),
+        MaskedPositions(case["descriptor_xyz_b"], ~case["descriptor_padding_b"]),
         case["similarity"],
         predict_offsets,
-        ~case["descriptor_padding_a"],
-        ~case["descriptor_padding_b"],
         config=MatchConfig(),
     )
     np.testing.assert_allclose(match.T_target_source[:3, :3], case["registration_rotation"], **PARITY)
@@ -94,7 +86,7 @@ def test_losses_are_the_published_ones(case, decoder) -> None:
     masks = [~case[f"descriptor_padding_{side}"] for side in "ab"]
     correlated = [case[f"correlated_features_{side}"] for side in "ab"]
     T_b_a = case["T_b_a"].astype(np.float32)
-    close = close_pairs(*positions, T_b_a, *masks, config=config)
+    close = close_pairs(*map(MaskedPositions, positions, masks), T_b_a, config=config)
     sides = []
     for here, there in ((0, 1), (1, 0)):
         partners = correlated[there][np.asarray(close[here].indices)]
@@ -111,7 +103,7 @@ def test_losses_are_the_published_ones(case, decoder) -> None:
                 offsets=jnp.asarray(offset_head(decoder, own, partners), jnp.float32),
             )
         )
-    total, terms = registration_loss(*sides, T_b_a, config=config)
+    total, terms = matching_loss(*sides, T_b_a, config=config)
     np.testing.assert_allclose(terms.pairing, case["loss_pairing"], **PARITY)
     np.testing.assert_allclose(terms.coarse, case["loss_coarse_pairing"], **PARITY)
     np.testing.assert_allclose(terms.offset, case["loss_offset"], **PARITY)

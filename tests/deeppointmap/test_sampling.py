@@ -5,15 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from dpmjax.deeppointmap import (
-    CurriculumStage,
-    SamplingConfig,
-    ScanTable,
-    TrainingConfig,
-    draw_groups,
-    draw_overlap_pairs,
-    training_preset,
-)
+from dpmjax.deeppointmap import CurriculumStage, SamplingConfig, TrainingConfig, training_preset
+from dpmjax.deeppointmap.sampling import ScanTable, draw_groups, draw_overlap_pairs
 
 
 def table(num: int = 60, step_m: float = 2.0) -> ScanTable:
@@ -94,6 +87,6 @@ def test_presets_double_the_groups(name) -> None:
         (lambda: ScanTable(np.zeros((3, 4, 4)), np.zeros(2, int)), "T_world_lidar"),
     ],
 )
-def test_what_makes_no_sense_is_refused(make, message: str) -> None:
+def test_what_makes_no_sense_is_refused(as_user, make, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         make()

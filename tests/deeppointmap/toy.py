@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import jax
 import numpy as np
 
 from dpmjax.deeppointmap import CurriculumStage, ModelConfig, ObjectiveConfig, SamplingConfig, TrainingConfig
@@ -39,3 +40,9 @@ def drive(seed: int = 0, num_scans: int = 24, step_m: float = 4.0) -> LidarSeque
         return points[np.linalg.norm(points, axis=1) < 30].astype(np.float32)
 
     return LidarSequence(f"toy {seed}", tuple(map(str, range(num_scans))), read_scan, poses)
+
+
+def assert_trees_equal(found: object, expected: object) -> None:
+    """All leaves are the same, bit for bit."""
+    for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
+        np.testing.assert_array_equal(a, b)

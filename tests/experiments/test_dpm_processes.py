@@ -14,51 +14,49 @@ import numpy as np
 import pytest
 from optax.tree_utils import tree_get
 
-from dpmjax.deeppointmap import CurriculumStage, init, make_step
-from experiments._checkpoint import Checkpoints
-from experiments._dpm_data import SampleMaker, ScanStore
-from experiments._dpm_progress import begin
+from dpmjax.checkpoints import Checkpoints
+from dpmjax.deeppointmap import CurriculumStage, SampleMaker, ScanStore, init_training, join_processes, make_step
+from dpmjax.deeppointmap.training_loop import begin_training
 from experiments._history import read_history
-from experiments._processes import join_processes
 from experiments._run_folder import CHECKPOINTS, HISTORY
 from tests.deeppointmap import toy
 
 REPOSITORY = Path(__file__).parents[2]
 TRAINING = replace(toy.TRAINING, curriculum=(CurriculumStage(2, 4),), overlap_steps=0)
 
-# The second process gets a signal in its second step of four.
+# The second process gets a signal before its third step of four.
 PROCESS = """
 import os, signal, sys
-from experiments import _dpm_fit, _processes
-from experiments._dpm_data import ScanStore
-from experiments._dpm_recall import draw_pairs
+from dpmjax.deeppointmap.processes import is_first, join_processes, merged
+coordinator, number, folder = sys.argv[1], int(sys.argv[2]), sys.argv[3]
+join_processes(coordinator, 2, number)
+
+from dpmjax.deeppointmap import ScanStore, draw_evaluation_pairs
+from experiments._dpm_run import Records, run_training
 from experiments._run_folder import RunFolder
 from experiments._stop import Interrupted, StopFlag
 from pathlib import Path
 from tests.deeppointmap import toy
 from tests.experiments.test_dpm_processes import TRAINING
 
-coordinator, number, folder = sys.argv[1], int(sys.argv[2]), Path(sys.argv[3])
-_processes.join_processes(coordinator, 2, number)
-add = _dpm_fit._Clock.add
 calls = []
 
-def add_and_interrupt(self, *args, **options):
-    add(self, *args, **options)
+def stop_requested():
     calls.append(0)
-    if number == 1 and len(calls) == 2:
+    if number == 1 and len(calls) == 3:
         os.kill(os.getpid(), signal.SIGINT)
+    return stop.received or 0
 
-_dpm_fit._Clock.add = add_and_interrupt
-assert _processes.merged({str(number): "bad"}) == {"0": "bad", "1": "bad"}
-is_first = _processes.is_first()
+assert merged({str(number): "bad"}) == {"0": "bad", "1": "bad"}
+assert is_first() == (number == 0)
 try:
     with StopFlag() as stop:
-        paired = draw_pairs(toy.drive(seed=9), 1, seed=0) if is_first else None
-        run = RunFolder(folder, False) if is_first else None
-        store = ScanStore([toy.drive()], TRAINING)
-        done = _dpm_fit.run_training(run, store, TRAINING, paired, seed=0, recall_every=1, stop=stop)
-        assert (done is not None) == is_first
+        pairs = draw_evaluation_pairs(toy.drive(seed=9), 1, toy.MODEL)
+        records = Records(RunFolder(Path(folder), False), TRAINING, pairs, seed=0) if is_first() else None
+        store = ScanStore([toy.drive()], toy.MODEL.preprocess)
+        done = run_training(records, store, TRAINING, seed=0, recall_every=1, stop=stop_requested)
+        assert done.stopped_by == signal.SIGINT
+        stop.request(done.stopped_by)
 except Interrupted as stopped:
     sys.exit(stopped.exit_code)
 """
@@ -98,9 +96,9 @@ def test_two_processes_train_as_one_and_stop_as_one(tmp_path: Path) -> None:
     assert "train:" not in told[1][1]
     assert [row["step"] for row in read_history(tmp_path / HISTORY)] == ["1", "2"]
 
-    state, step = init(jax.random.key(0), TRAINING), make_step(TRAINING)
-    maker = SampleMaker(ScanStore([toy.drive()], TRAINING), TRAINING, seed=0, num_samples=2)
-    progress = Checkpoints(tmp_path / CHECKPOINTS).restore_latest(begin(state), fallback=None)
+    state, step = init_training(jax.random.key(0), TRAINING), make_step(TRAINING)
+    maker = SampleMaker(ScanStore([toy.drive()], toy.MODEL.preprocess), TRAINING, seed=0, num_samples=2)
+    progress = Checkpoints(tmp_path / CHECKPOINTS).restore_latest(begin_training(state), fallback=None)
     for number in range(2):
         state, _ = step(state, maker(number))
     assert progress.state.step == progress.best_step == 2
@@ -113,9 +111,9 @@ def test_two_processes_train_as_one_and_stop_as_one(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ((None, 2, 0), "--coordinator"),
-        (("localhost:1", None, 0), "--num-processes"),
-        (("localhost:1", 2, 2), "--process-id: expected from 0 to 1, got 2"),
+        ((None, 2, 0), "^coordinator"),
+        (("localhost:1", None, 0), "^num_processes"),
+        (("localhost:1", 2, 2), "^process_id: expected from 0 to 1, got 2"),
     ],
 )
 def test_options_that_do_not_go_together_are_refused(options, message: str) -> None:

@@ -5,20 +5,20 @@ from __future__ import annotations
 import errno
 import subprocess
 import sys
-from dataclasses import dataclass, replace
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 
 import jax
 import numpy as np
 import pytest
 
-from dpmjax.deeppointmap import CurriculumStage, init
-from experiments import _dpm_fit
+from dpmjax.deeppointmap import CurriculumStage, SampleMaker, ScanStore, draw_evaluation_pairs, init_training
+from dpmjax.deeppointmap.training_loop import after_evaluation, before_step, begin_training, params_to_use
+from dpmjax.io import InputError
+from experiments import _dpm_run
 from experiments._command import run_command
-from experiments._dpm_data import ScanStore, made_ahead
-from experiments._dpm_fit import run_training
-from experiments._dpm_progress import after_measurement, before_step, begin, params_to_use
-from experiments._dpm_recall import draw_pairs
+from experiments._dpm_run import Records, run_training
 from experiments._history import read_history
 from experiments._run_folder import CHECKPOINTS, HISTORY, RunFolder
 from experiments.dpm_train import EXPERIMENT, Config, main
@@ -29,25 +29,26 @@ TRAINING = replace(toy.TRAINING, curriculum=(CurriculumStage(2, 4),))
 
 
 class StopAfter:
-    """Asks to stop when it was asked so often."""
-
-    received = None
+    """Asks to stop after so many steps."""
 
     def __init__(self, num: int) -> None:
         self._left = num
 
-    @property
-    def is_requested(self) -> bool:
+    def __call__(self) -> int:
         self._left -= 1
-        return self._left < 0
+        return int(self._left < 0)
 
 
 def train(folder: Path, *, stop_after: int = 99, is_resumed: bool = False):
     folder.mkdir(exist_ok=True)
-    store = ScanStore([toy.drive()], TRAINING)
-    paired = draw_pairs(toy.drive(seed=9), 2, seed=0)
-    run_folder, stop = RunFolder(folder, is_resumed), StopAfter(stop_after)
-    return run_training(run_folder, store, TRAINING, paired, seed=0, recall_every=2, stop=stop)
+    store = ScanStore([toy.drive()], toy.MODEL.preprocess)
+    pairs = draw_evaluation_pairs(toy.drive(seed=9), 2, toy.MODEL)
+    records = Records(RunFolder(folder, is_resumed), TRAINING, pairs, seed=0)
+    return run_training(records, store, TRAINING, seed=0, recall_every=2, stop=StopAfter(stop_after))
+
+
+def num_steps(trained) -> int:
+    return int(trained.progress.state.step)
 
 
 @pytest.fixture(scope="module")
@@ -59,8 +60,8 @@ def whole(tmp_path_factory):
 
 def assert_same_run(parts, folder: Path, whole) -> None:
     """Parameters and history bit for bit, but for the seconds."""
-    assert (parts.steps, parts.best_step) == (whole[0].steps, whole[0].best_step)
-    jax.tree.map(np.testing.assert_array_equal, parts.model.params, whole[0].model.params)
+    toy.assert_trees_equal(parts.progress, whole[0].progress)
+    toy.assert_trees_equal(parts.model.params, whole[0].model.params)
     rows = [read_history(where / HISTORY) for where in (whole[1], folder)]
     for one, other in zip(*rows, strict=True):
         assert {**one, "run_s": ""} == {**other, "run_s": ""}
@@ -70,14 +71,14 @@ def assert_same_run(parts, folder: Path, whole) -> None:
 @pytest.mark.parametrize("num_before", [0, 1, 3, 5])
 def test_a_broken_off_run_goes_on_with_the_numbers_of_an_unbroken_one(tmp_path: Path, whole, num_before) -> None:
     # Before the first step, before and after the first recall, in the overlap part.
-    assert whole[0].steps == TRAINING.num_steps
-    assert train(tmp_path, stop_after=num_before).steps == num_before
+    assert num_steps(whole[0]) == TRAINING.num_steps
+    assert num_steps(train(tmp_path, stop_after=num_before)) == num_before
     assert_same_run(train(tmp_path, is_resumed=True), tmp_path, whole)
 
 
 @pytest.mark.slow
 def test_a_cut_off_checkpoint_is_passed_over_for_the_one_before(tmp_path: Path, whole, monkeypatch, caplog) -> None:
-    monkeypatch.setattr(_dpm_fit, "_SAVE_EVERY_S", 0.0)
+    monkeypatch.setattr(_dpm_run, "SAVE_EVERY_S", 0.0)
     train(tmp_path, stop_after=3)
     saved = sorted((tmp_path / CHECKPOINTS).iterdir(), key=lambda path: int(path.name))
     assert [path.name for path in saved] == ["2", "3"]
@@ -89,53 +90,44 @@ def test_a_cut_off_checkpoint_is_passed_over_for_the_one_before(tmp_path: Path, 
 
 
 def test_the_best_of_equal_models_is_the_later_and_the_overlap_part_goes_on_from_it() -> None:
-    state = init(jax.random.key(0), TRAINING)
-    first = after_measurement(begin(state), 0.5)
+    state = init_training(jax.random.key(0), TRAINING)
+    first = after_evaluation(begin_training(state), 0.5)
 
     def after(step: int, scale: float):
         params = jax.tree.map(lambda leaf: scale * leaf, state.params)
-        return replace(state, params=params, step=np.int32(step))
+        return replace(state, params=params, step=jax.numpy.asarray(step, jax.numpy.int32))
 
     last = TRAINING.registration_steps
-    worse = after_measurement(replace(first, state=after(2, 2.0)), 0.4)
-    equal = after_measurement(replace(first, state=after(last, 3.0)), 0.5)
+    worse = after_evaluation(replace(first, state=after(2, 2.0)), 0.4)
+    equal = after_evaluation(replace(first, state=after(last, 3.0)), 0.5)
     assert (int(worse.best_step), int(equal.best_step)) == (0, last)
     assert worse.best_params is first.best_params
-    second = after_measurement(replace(first, state=after(1, 2.0)), 0.6)
+    second = after_evaluation(replace(first, state=after(1, 2.0)), 0.6)
     over = before_step(replace(second, state=after(last, 3.0)), TRAINING)
     assert over.state.params is second.best_params
     assert before_step(replace(second, state=after(last - 1, 3.0)), TRAINING).state.params is not second.best_params
     assert params_to_use(replace(second, state=after(last + 1, 3.0)), TRAINING) is not second.best_params
 
 
-def test_results_made_ahead_come_in_order_and_errors_where_they_belong() -> None:
-    def make(step: int) -> int:
-        if step == 3:
-            raise ValueError("bad batch")
-        return step
-
-    with made_ahead(make, 1, 9) as results:
-        assert [next(results), next(results)] == [1, 2]
-        with pytest.raises(ValueError, match="bad batch"):
-            next(results)
+def test_batches_made_ahead_are_those_made_alone() -> None:
+    with SampleMaker(ScanStore([toy.drive()], toy.MODEL.preprocess), TRAINING, seed=0) as maker:
+        for step, batch in zip(range(1, 6), maker.batches(1, 6), strict=True):
+            toy.assert_trees_equal(batch, maker(step))
 
 
 def test_a_bad_scan_is_empty_and_named() -> None:
-    from dpmjax.io import InputError
-
     drive = toy.drive()
 
-    @dataclass
-    class Reader:
-        def __call__(self, index: int) -> np.ndarray:
-            if index == 2:
-                raise InputError("scan 2", "cut off", "leave it out")
-            return drive.read_scan(index)
+    def read_scan(index: int) -> np.ndarray:
+        if index == 2:
+            raise InputError("2", "cut off", "leave it out")
+        return drive.read_scan(index)
 
-    store = ScanStore([type(drive)(drive.name, drive.sources, Reader(), drive.T_world_lidar)], toy.TRAINING)
-    assert store[1].mask.any()
-    assert not store[2].mask.any()
-    assert list(store.bad) == ["2"]
+    store = ScanStore([replace(drive, read_scan=read_scan)], toy.MODEL.preprocess)
+    with ThreadPoolExecutor(1) as pool:
+        assert len(store.request(1, pool).result()) > 0
+        assert len(store.request(2, pool).result()) == 0
+    assert store.bad == {"2": "cut off; leave it out."}
 
 
 def test_help_needs_no_jax_and_shows_examples() -> None:
@@ -208,7 +200,7 @@ def test_a_full_disk_is_told_and_what_was_written_stays(tmp_path, monkeypatch) -
     def full(*_: object, **__: object) -> None:
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr(_dpm_fit._Records, "save", full)
+    monkeypatch.setattr(Records, "save", full)
     with pytest.raises(OSError, match="No space left"):
         train(tmp_path, stop_after=1)
     assert [row["step"] for row in read_history(tmp_path / HISTORY)] == ["1"]

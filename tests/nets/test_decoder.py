@@ -7,22 +7,19 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from dpmjax.deeppointmap import (
-    Model,
-    coarse_features,
-    correlate,
-    init_model,
-    model_preset,
-    overlap,
-    overlap_logit,
-    predict_offsets,
-    similarity_features,
-)
-from dpmjax.nets import DecoderConfig, attention, embed_positions
+from dpmjax.deeppointmap import Model, correlate, init_model, model_preset, overlap
+from dpmjax.deeppointmap.model import coarse_features, overlap_logit, predict_offsets, similarity_features
+from dpmjax.nets import DecoderConfig, attention
+from dpmjax.nets.attention import embed_positions
 from dpmjax.types import DescriptorCloud
+from tests.deeppointmap import toy
 from tests.tolerances import ACCUMULATED, ROUNDING
 
-CONFIG = replace(model_preset("tiny"), decoder=DecoderConfig(64, model_channels=32, num_layers=2, num_heads=4))
+CONFIG = replace(
+    toy.MODEL,
+    encoder=replace(toy.MODEL.encoder, output_channels=64),
+    decoder=DecoderConfig(64, model_channels=32, num_layers=2, num_heads=4),
+)
 
 
 @pytest.fixture(scope="module")

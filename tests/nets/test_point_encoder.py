@@ -17,9 +17,7 @@ from dpmjax.types import PointPyramid
 from tests.tolerances import ACCUMULATED, ROUNDING
 
 CONFIG = ModelConfig(
-    pyramid=PyramidConfig(
-        (PyramidStage(24, (0.3, 0.5), 6), PyramidStage(12, (0.6, 0.8), 6), PyramidStage(4, (1.0,), 3)), 2
-    ),
+    pyramid=PyramidConfig((PyramidStage(24, (0.3, 0.5), 6), PyramidStage(6, (1.0,), 3)), 1),
     encoder=EncoderConfig(stem_channels=4, expansion=2, output_channels=10),
     decoder=DecoderConfig(input_channels=10, model_channels=16, num_heads=2),
 )
@@ -59,9 +57,9 @@ def test_neighbourhood_maximum_is_that_of_the_whole_formula() -> None:
     features, positions, queries = rng.normal(size=(9, 5)), rng.normal(size=(9, 3)), rng.normal(size=(6, 3))
     neighbours = rng.integers(0, 9, (6, 4))
     inputs = [jnp.asarray(x, jnp.float32) for x in (features, positions, queries)]
-    module = NeighbourhoodMaximum(7, radius=0.3)
+    module = NeighbourhoodMaximum(7, radius=0.3, config=EncoderConfig())
     params = module.init(jax.random.key(0), *inputs, neighbours)["params"]
-    params = {name: rng.normal(size=value.shape).astype(np.float32) for name, value in params.items()}
+    params = {name: jnp.asarray(rng.normal(size=value.shape), jnp.float32) for name, value in params.items()}
     offsets = (positions[neighbours] - queries[:, None]) / 0.3
     rows = np.concatenate([features[neighbours], offsets], axis=-1)
     rows = norm(rows @ params["kernel"] + params["bias"], params["norm_scale"], params["norm_bias"])
@@ -74,7 +72,7 @@ def test_padded_equals_unpadded(model: Model) -> None:
     cloud = points(1, 19)
     found = encode_pyramid(model, poisoned(pyramid_of(cloud, capacity=64)))
     stages = (PyramidStage(19, (0.3, 0.5), 6), *CONFIG.pyramid.stages[1:])
-    unpadded = Model(model.params, ModelConfig(PyramidConfig(stages, 2), CONFIG.encoder, CONFIG.decoder))
+    unpadded = Model(model.params, ModelConfig(PyramidConfig(stages, 1), CONFIG.encoder, CONFIG.decoder))
     expected = encode_pyramid(unpadded, pyramid_of(cloud, config=unpadded.config))
     np.testing.assert_array_equal(found.mask, np.arange(24) < 19)
     np.testing.assert_allclose(found.features[:19], expected.features, **ROUNDING)
@@ -145,9 +143,9 @@ def test_paper_size_is_the_published_one() -> None:
     assert ModelConfig().num_descriptors == 256
 
 
-def test_wrong_pyramids_and_widths_are_named(model: Model) -> None:
+def test_wrong_pyramids_and_widths_are_named(as_user, model: Model) -> None:
     pyramid = pyramid_of(points(9))
-    with pytest.raises(ValueError, match="^pyramid: expected 4 levels, got 3"):
+    with pytest.raises(ValueError, match="^pyramid: expected 3 levels, got 2"):
         encode_pyramid(model, pyramid.replace(levels=pyramid.levels[:-1]))
     short = pyramid.levels[1].replace(neighbours=pyramid.levels[1].neighbours[:1])
     with pytest.raises(ValueError, match="^pyramid.levels.1.: expected 2 neighbourhoods, got 1"):

@@ -1,6 +1,8 @@
 from __future__ import annotations
 
 import os
+import warnings
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 
@@ -9,7 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from dpmjax.scans import PreprocessConfig, preprocess_host, preprocess_scan, preprocess_scan_on_host
+from dpmjax.scans import PreprocessConfig, preprocess_scan, preprocess_scan_on_host
+from dpmjax.scans import preprocess as preprocess_module
 from dpmjax.types import PointCloud
 
 CONFIG = PreprocessConfig(max_range_m=30.0, num_outlier_neighbours=5, capacity=512)
@@ -67,7 +70,9 @@ def test_both_forms_agree(case: str) -> None:
         points = np.stack(np.meshgrid(*[np.arange(1, 11, dtype=np.float32)] * 3), axis=-1).reshape(-1, 3)
     elif case == "too near":
         points = points / 1000
-    device, host = jax.device_get(preprocess_scan(points, mask, CONFIG)), preprocess_scan_on_host(points, mask, CONFIG)
+    with pytest.warns(UserWarning, match="in metres") if case == "too near" else nullcontext():
+        host = preprocess_scan_on_host(points, mask, CONFIG)
+    device = jax.device_get(preprocess_scan(points, mask, CONFIG))
     jax.tree.map(np.testing.assert_array_equal, device, host)
     assert host.mask.sum() == {"one": 1, "none": 0, "too near": 0}.get(case, host.mask.sum())
 
@@ -86,7 +91,7 @@ def test_both_forms_agree_on_real_scans(sequence: str) -> None:
 def test_voxels_too_many_for_a_table_are_sorted_to_the_same(monkeypatch) -> None:
     points = np.random.default_rng(5).uniform(-20, 20, (1000, 3)).astype(np.float32)
     expected = preprocess_scan_on_host(points, None, CONFIG)
-    monkeypatch.setattr(preprocess_host, "MAX_TABLE_ENTRIES", 0)
+    monkeypatch.setattr(preprocess_module, "MAX_TABLE_ENTRIES", 0)
     jax.tree.map(np.testing.assert_array_equal, preprocess_scan_on_host(points, None, CONFIG), expected)
 
 
@@ -98,6 +103,16 @@ def test_capacity_thins_evenly(preprocess) -> None:
     points = np.asarray(preprocess(circle, None, config).points)
     gaps = np.diff(np.sort(np.arctan2(points[:, 1], points[:, 0])))
     assert gaps.max() < 2.1 * 2 * np.pi / 64
+
+
+def test_a_scan_in_millimetres_is_warned_of_once() -> None:
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("default")
+        for seed in (2, 3):
+            assert preprocess_scan_on_host(1000 * scan(seed), None, CONFIG).mask.sum() < 5
+    assert [str(warning.message) for warning in caught] == [
+        "hardly any point of the scan is 1 to 30 m from the lidar: is it in metres?"
+    ]
 
 
 @BUILDERS
@@ -142,7 +157,7 @@ def test_empty_scan_is_an_empty_cloud() -> None:
         assert not np.any(preprocess(np.zeros((0, 3), np.float32), None, CONFIG).mask)
 
 
-def test_wrong_arguments_are_named() -> None:
+def test_wrong_arguments_are_named(as_user) -> None:
     for preprocess in (preprocess_scan, preprocess_scan_on_host):
         with pytest.raises(ValueError, match="^points: expected shape"):
             preprocess(np.ones((5, 4), np.float32), None, CONFIG)

@@ -12,8 +12,9 @@ import jax
 import numpy as np
 import pytest
 
-from dpmjax.deeppointmap import Model, correlate, encode_pyramid, overlap, register, similarity_features
-from dpmjax.geometry.pyramid import build_pyramid
+from dpmjax.deeppointmap import Model, correlate, encode_pyramid, overlap, register
+from dpmjax.deeppointmap.model import similarity_features
+from dpmjax.geometry.pyramid_host import build_pyramid_on_host
 from dpmjax.types import DescriptorCloud
 from dpmjax.weights import load_model
 
@@ -47,14 +48,19 @@ def published_cloud(case: dict[str, np.ndarray], name: str) -> DescriptorCloud:
     return DescriptorCloud(case[f"descriptor_xyz_{name}"], case[f"descriptor_features_{name}"], mask)
 
 
-def encoded(case: dict[str, np.ndarray], model: Model, name: str) -> DescriptorCloud:
-    pyramid = build_pyramid(case[f"points_{name}"], ~case[f"padding_{name}"], model.config.pyramid)
-    return encode_pyramid(model, pyramid)
+@pytest.fixture(scope="module")
+def encoded(case, model) -> dict[str, DescriptorCloud]:
+    return {
+        name: encode_pyramid(
+            model, build_pyramid_on_host(case[f"points_{name}"], ~case[f"padding_{name}"], model.config.pyramid)
+        )
+        for name in "ab"
+    }
 
 
 @pytest.mark.parametrize("name", ["a", "b"])
-def test_descriptors_are_the_published_ones(case, model, name: str) -> None:
-    cloud = encoded(case, model, name)
+def test_descriptors_are_the_published_ones(case, encoded, name: str) -> None:
+    cloud = encoded[name]
     np.testing.assert_array_equal(cloud.mask, ~case[f"descriptor_padding_{name}"])
     assert_close(cloud.positions, case[f"descriptor_xyz_{name}"])
     assert_close(cloud.features, case[f"descriptor_features_{name}"])
@@ -65,20 +71,20 @@ def test_correlated_features_are_the_published_ones(case, model) -> None:
         assert_close(cloud.features, case[f"correlated_features_{name}"])
 
 
-def test_similarity_is_the_published_one_from_the_scans_on(case, model) -> None:
-    correlated = correlate(model, encoded(case, model, "a"), encoded(case, model, "b"))
+def test_similarity_is_the_published_one_from_the_scans_on(case, model, encoded) -> None:
+    correlated = correlate(model, encoded["a"], encoded["b"])
     a, b = (np.asarray(similarity_features(model, cloud), np.float64) for cloud in correlated)
     a, b = (x / np.linalg.norm(x, axis=1, keepdims=True) for x in (a, b))
     assert_close(a @ b.T, case["similarity"])
 
 
-def test_overlap_probability_is_the_published_one(case, model) -> None:
-    probability = overlap(model, encoded(case, model, "a"), encoded(case, model, "b"))
+def test_overlap_probability_is_the_published_one(case, model, encoded) -> None:
+    probability = overlap(model, encoded["a"], encoded["b"])
     assert_close(probability[None], case["overlap_probability"])
 
 
-def test_registration_is_the_published_one_from_the_scans_on(case, model) -> None:
-    match = register(model, encoded(case, model, "a"), encoded(case, model, "b"))
+def test_registration_is_the_published_one_from_the_scans_on(case, model, encoded) -> None:
+    match = register(model, encoded["a"], encoded["b"])
     assert_close(match.T_target_source[:3, :3], case["registration_rotation"])
     assert_close(match.T_target_source[:3, 3], case["registration_translation"].reshape(3))
     assert_close(match.rmse[None], case["registration_rmse"].reshape(-1)[:1])

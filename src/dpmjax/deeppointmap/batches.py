@@ -1,11 +1,12 @@
-"""What a step of training takes: pyramids of augmented scans and how they belong together, in fixed shapes.
+"""Batches: pyramids of augmented scans and the maps that they form, as arrays of fixed shapes. On the host.
 
-A sample is made on the host; a batch is samples stacked along a new first axis, which is spread over devices.
+A batch is samples stacked along a new first axis, which is spread over devices.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import TypeVar
 
 import flax.struct
 import jax
@@ -15,39 +16,41 @@ from jaxtyping import Bool, Float, Int
 from dpmjax.deeppointmap.sampling import Group, SamplingConfig
 from dpmjax.types import AnyArray, PointPyramid
 
+TreeT = TypeVar("TreeT")
+
 
 @flax.struct.dataclass
 class MapOfScans:
     """One map of each group.
 
     Attributes:
-        rows: of its scans among the pyramids of the sample; 0 where `mask` is False.
+        rows: its scans, as rows of the pyramids of the sample; 0 where `mask` is False.
         mask: False where a map has fewer scans.
         T_map_scan: poses of the scans in the frame of the map, metres.
     """
 
-    rows: Int[AnyArray, "*b g s"]
-    mask: Bool[AnyArray, "*b g s"]
-    T_map_scan: Float[AnyArray, "*b g s 4 4"]
+    rows: Int[AnyArray, "*b s"]
+    mask: Bool[AnyArray, "*b s"]
+    T_map_scan: Float[AnyArray, "*b s 4 4"]
 
 
 @flax.struct.dataclass
 class RegistrationSample:
-    """Groups of scans that make two maps each; a batch has one more axis in front.
+    """Groups of scans that form two maps each; a batch has one more axis in front.
 
     Attributes:
-        pyramids: of all scans; spare ones repeat the first.
-        source: the one map.
-        target: the other.
-        T_target_source: the true motion between them, metres.
+        pyramids: pyramids of all scans; unused rows repeat the first.
+        source: first map of each group.
+        target: second map of each group.
+        T_target_source: true motion between both maps, metres.
         mask: False where there are fewer groups.
     """
 
     pyramids: PointPyramid
     source: MapOfScans
     target: MapOfScans
-    T_target_source: Float[AnyArray, "*b g 4 4"]
-    mask: Bool[AnyArray, "*b g"]
+    T_target_source: Float[AnyArray, "*b 4 4"]
+    mask: Bool[AnyArray, "*b"]
 
 
 @flax.struct.dataclass
@@ -55,14 +58,18 @@ class OverlapSample:
     """Pairs of scans; a batch has one more axis in front.
 
     Attributes:
-        first: pyramids of the one scan of each pair.
-        second: those of the other.
-        is_overlap: the truth.
+        first: pyramid of the first scan of each pair.
+        second: pyramid of the second scan of each pair.
+        is_overlap: whether the two overlap in truth.
     """
 
     first: PointPyramid
     second: PointPyramid
     is_overlap: Bool[AnyArray, "*b p"]
+
+
+Sample = RegistrationSample | OverlapSample
+"""What a step trains on; a batch has one more axis in front, which is spread over devices."""
 
 
 def arrange_groups(
@@ -72,17 +79,20 @@ def arrange_groups(
     max_group: int,
     config: SamplingConfig,
 ) -> RegistrationSample:
-    """A sample from groups, with arrays of NumPy; its shapes depend on `max_group` and `config` only.
+    """Arranges groups as a sample of NumPy arrays; its shapes depend on `max_group` and `config` only.
 
     Args:
         groups: from `draw_groups`.
-        pyramids: of the scans of the groups: the source of the first group, its target, the source of the second, ...
-        T_world_scan: float64 poses of the frames that the pyramids are in, in the same order.
-        max_group: of the stage of the curriculum.
+        pyramids: one for each scan: the source of the first group, its target, the source of the second, ...
+        T_world_scan: float64 poses of the frames of the pyramids, in the same order.
+        max_group: scans in both maps of a group together, at most.
         config: sizes.
 
+    Returns:
+        The sample.
+
     Raises:
-        ValueError: not as many pyramids and poses as the groups have scans, or more than fit.
+        ValueError: if there are not as many pyramids and poses as scans in the groups, or more than fit.
     """
     sizes = [len(side) for group in groups for side in group]
     if not len(pyramids) == len(T_world_scan) == sum(sizes) <= config.num_scans:
@@ -101,13 +111,20 @@ def arrange_groups(
     return RegistrationSample(stack([*pyramids, *spare]), source, target, T.astype(np.float32), mask)
 
 
-def stack(trees: Sequence[PointPyramid]) -> PointPyramid:
-    """Pytrees of NumPy arrays stacked along a new first axis; samples too."""
+def stack(trees: Sequence[TreeT]) -> TreeT:
+    """Stacks pytrees of NumPy arrays along a new first axis.
+
+    Args:
+        trees: pyramids or samples of the same shapes.
+
+    Returns:
+        One tree of NumPy arrays.
+    """
     return jax.tree.map(lambda *leaves: np.stack(leaves), *trees)
 
 
 def _map_of_scans(
-    rows: Sequence[Int[np.ndarray, " s"]], T_world_scan: Float[np.ndarray, "s 4 4"], num_groups: int, capacity: int
+    rows: Sequence[Int[np.ndarray, " k"]], T_world_scan: Float[np.ndarray, "s 4 4"], num_groups: int, capacity: int
 ) -> MapOfScans:
     padded = np.zeros((num_groups, capacity), np.int32)
     mask = np.zeros((num_groups, capacity), bool)

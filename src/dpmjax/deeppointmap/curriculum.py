@@ -1,24 +1,24 @@
-"""From pairs of scans to pairs of maps: how training is divided into stages, and its numbers."""
+"""The training configuration: a curriculum from pairs of scans to pairs of maps, and all other settings."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 
 from dpmjax.checks import require_count, require_positive
-from dpmjax.deeppointmap.model import ModelConfig
+from dpmjax.deeppointmap.model import ModelConfig, Preset, model_preset
 from dpmjax.deeppointmap.objective import ObjectiveConfig
-from dpmjax.deeppointmap.presets import Preset, model_preset
 from dpmjax.deeppointmap.sampling import SamplingConfig
 from dpmjax.scans.augment import AugmentConfig
 
 
 @dataclass(frozen=True)
 class CurriculumStage:
-    """A part of training in which groups have up to so many scans. Each compiles one step.
+    """A part of training with one size of groups. Each stage compiles one step.
 
     Attributes:
-        max_group: scans in both maps of a group together; the published curriculum doubles it from 2 to 32.
-        num_steps: how long.
+        max_group: largest number of scans in both maps of a group together; the published curriculum doubles it from 2
+            to 32.
+        num_steps: number of steps.
     """
 
     max_group: int
@@ -32,23 +32,23 @@ class CurriculumStage:
 
 @dataclass(frozen=True)
 class TrainingConfig:
-    """Everything that training depends on but the scans (DeepPointMap section 3.3 and its published configuration).
+    """All settings of training except the scans (DeepPointMap section 3.3 and its published configuration).
 
     Attributes:
-        model: what is trained.
-        curriculum: the stages of the registration part.
-        overlap_steps: steps of the part after it, in which only the overlap head learns; may be 0.
-        sampling: which scans make a sample.
-        augment: what is done to each scan.
-        objective: the losses of the registration part.
-        learning_rate: at the start of the cosine.
-        final_learning_rate: at its end.
-        weight_decay: of AdamW.
-        warmup_steps: the learning rate rises from 0 for so long.
-        max_gradient_norm: longer gradients are shortened to this.
+        model: configuration of the model.
+        curriculum: stages of the registration part.
+        overlap_steps: steps of the second part, in which only the overlap head learns; may be 0.
+        sampling: choice of the scans of a sample.
+        augment: augmentation of each scan.
+        objective: losses of the registration part.
+        learning_rate: learning rate at the start of the cosine.
+        final_learning_rate: learning rate at the end of the cosine.
+        weight_decay: weight decay of AdamW.
+        warmup_steps: number of steps in which the learning rate rises from 0.
+        max_gradient_norm: longer gradients are scaled down to this norm.
         overlap_ratio: learning rates and weight decay of the overlap part, relative to those above.
-        scans_at_once: about so many scans of a sample are worked on at a time, for the rest waits: more need more
-            memory and keep a large device busy. It changes nothing but rounding.
+        scans_at_once: about this many scans of a sample are processed at the same time. More scans need more memory and
+            keep a large device busy; the results change by rounding only.
     """
 
     model: ModelConfig = field(default_factory=ModelConfig)
@@ -84,19 +84,25 @@ class TrainingConfig:
 
     @property
     def registration_steps(self) -> int:
-        """Steps of all stages of the curriculum."""
+        """Number of steps of all stages of the curriculum."""
         return sum(stage.num_steps for stage in self.curriculum)
 
     @property
     def num_steps(self) -> int:
-        """Steps of both parts."""
+        """Number of steps of both parts."""
         return self.registration_steps + self.overlap_steps
 
     def stage_at(self, step: int) -> CurriculumStage | None:
-        """The stage of a step, counted from 0; None in the overlap part.
+        """Finds the stage of a step.
+
+        Args:
+            step: number of the step, from 0.
+
+        Returns:
+            The stage; None in the overlap part.
 
         Raises:
-            ValueError: training does not last so long.
+            ValueError: if training has fewer steps.
         """
         if not 0 <= step < self.num_steps:
             raise ValueError(f"step: expected from 0 to {self.num_steps - 1}, got {step}")
@@ -107,7 +113,14 @@ class TrainingConfig:
         return None
 
     def with_steps(self, num_steps: int) -> TrainingConfig:
-        """The same in about so many steps, each part shortened or stretched alike, none to less than one."""
+        """Shortens or stretches all parts in proportion, none to less than one step.
+
+        Args:
+            num_steps: about this many steps in all.
+
+        Returns:
+            A new configuration.
+        """
         ratio = num_steps / self.num_steps
         stages = tuple(replace(stage, num_steps=max(1, round(stage.num_steps * ratio))) for stage in self.curriculum)
         overlap = max(1, round(self.overlap_steps * ratio)) if self.overlap_steps > 0 else 0
@@ -116,10 +129,13 @@ class TrainingConfig:
 
 
 def training_preset(name: Preset) -> TrainingConfig:
-    """How each model preset is trained: minutes on two cores, hours on one GPU, days on several.
+    """Returns the training configuration of a preset. A `ValueError` says if no preset has this name.
 
-    Raises:
-        ValueError: no preset has this name.
+    Args:
+        name: "tiny" (minutes on two cores), "small" (hours on one GPU) or "paper" (days on several GPUs).
+
+    Returns:
+        The configuration.
     """
     model = model_preset(name)
     if name == "tiny":
@@ -128,7 +144,7 @@ def training_preset(name: Preset) -> TrainingConfig:
             curriculum=(CurriculumStage(2, 700), CurriculumStage(4, 40)),
             overlap_steps=60,
             sampling=SamplingConfig(num_scans=16, max_side=2, num_overlap_pairs=8),
-            # In so few steps: less disturbance, more positives, and the encoder is told directly.
+            # So few steps need weaker augmentation, more positives, and a direct loss on the encoder.
             augment=AugmentConfig(max_drop_ratio=0.3, max_tilt_rad=0.05, translation_sigma_m=0.3),
             objective=ObjectiveConfig(coarse_weight=1.0, positive_radius_m=1.5, max_close=4),
             learning_rate=2e-3,

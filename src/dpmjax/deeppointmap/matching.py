@@ -1,6 +1,6 @@
-"""Two descriptor clouds to one motion: mutual matches, moved by their offsets, aligned in rounds of inliers.
+"""Matching estimates the motion between two descriptor clouds: best pairs, their offsets, alignment of the inliers.
 
-Scan to scan and map to map are the same here: a map is the union of descriptor clouds (`merge_clouds`).
+A map is the union of descriptor clouds (`merge_clouds`), so scans and maps are matched alike.
 """
 
 from __future__ import annotations
@@ -19,32 +19,35 @@ from dpmjax.checks import as_float, as_mask, as_points, require_count, require_p
 from dpmjax.geometry import rigid
 from dpmjax.geometry.alignment import weighted_svd
 from dpmjax.geometry.consensus import ConsensusConfig, find_consensus
-from dpmjax.types import AnyArray, Registration
+from dpmjax.types import AnyArray, DescriptorCloud, Registration
 
 PredictOffsets = Callable[[Int[Array, " k"], Int[Array, " k"]], tuple[Float[Array, "k 3"], Float[Array, "k 3"]]]
-"""Of rows in the source and in the target: the offsets of eq. 1 (source frame) and of eq. 2 (target frame), metres."""
+"""Maps rows of the source and of the target to the offsets of eq. 1 (source frame) and eq. 2 (target frame), metres."""
 
 
 ERROR_SLACK = 1 + 1e-5
-"""Relative: where all errors are equal, rounding must not drop them."""
+"""Relative tolerance: rounding must not drop pairs whose errors are all equal."""
+
+MIN_NUM_POINTS = 3
+"""A rigid motion needs three distinct points on both sides."""
 
 
 @dataclass(frozen=True)
 class MatchConfig:
-    """How pairs are chosen and which are believed (the numbers of DeepPointMap's published configuration).
+    """Choice of pairs and of inliers (defaults: DeepPointMap's published configuration).
 
     Attributes:
-        temperature: of both softmaxes.
-        pair_ratio: pairs per direction, as a share of the mean size of the two clouds.
+        temperature: temperature of both softmaxes.
+        pair_ratio: number of pairs per direction, as a share of the mean size of the two clouds.
         max_offset_m: pairs with longer offsets are dropped.
         min_inlier_score: pairs with higher scores are the first inliers ...
-        min_num_first: ... or so many of the best, where those are fewer.
-        num_rounds: how often inliers are chosen anew.
-        inlier_sigmas: inliers are no farther than mean + so many standard deviations of those before.
-        min_num_inliers: a choice of fewer is not taken.
-        num_confident: the confidence is the mean score of so many first inliers.
-        consensus: where given, the first inliers are instead the pairs that agree on one motion. Right pairs may
-            then be few: networks of little training, or places that look alike.
+        min_num_first: ... or this many of the best pairs, where those are fewer.
+        num_rounds: number of times that the inliers are chosen again.
+        inlier_sigmas: an inlier's error is at most the mean plus this many standard deviations of the inliers before.
+        min_num_inliers: a choice of fewer inliers is rejected.
+        num_confident: the confidence is the mean score of this many first inliers.
+        consensus: if given, the first inliers are the pairs that support one common motion. This tolerates many wrong
+            pairs, as from networks with little training or in repetitive places.
     """
 
     temperature: float = 0.1
@@ -67,62 +70,74 @@ class MatchConfig:
             raise ValueError(f"pair_ratio: expected at most 1, got {self.pair_ratio}")
 
 
+class MaskedPositions(NamedTuple):
+    """Positions of descriptors, or of anything else that is matched.
+
+    Attributes:
+        positions: metres.
+        mask: False for descriptors that are not there; None if all are.
+    """
+
+    positions: Float[AnyArray, "m 3"]
+    mask: Bool[AnyArray, " m"] | None = None
+
+
+def checked(name: str, cloud: MaskedPositions | DescriptorCloud) -> tuple[Float[Array, "m 3"], Bool[Array, " m"]]:
+    """Checks positions and mask; a `ValueError` names an argument of a wrong shape.
+
+    Args:
+        name: name of the argument.
+        cloud: the argument.
+
+    Returns:
+        Positions and mask as JAX arrays.
+    """
+    positions = as_points(f"{name}.positions", cloud.positions, dimensions=(3,))
+    return positions, as_mask(f"{name}.mask", cloud.mask, positions.shape[:1])
+
+
 def match_descriptors(
-    source_positions: Float[AnyArray, "m 3"],
-    target_positions: Float[AnyArray, "n 3"],
+    source: MaskedPositions | DescriptorCloud,
+    target: MaskedPositions | DescriptorCloud,
     similarity: Float[AnyArray, "m n"],
     predict_offsets: PredictOffsets,
-    source_mask: Bool[AnyArray, " m"] | None = None,
-    target_mask: Bool[AnyArray, " n"] | None = None,
     *,
     config: MatchConfig,
 ) -> Registration:
-    """The motion between two clouds of descriptors (DeepPointMap section 3.2, eq. 1 to 3).
+    """Estimates the motion between two descriptor clouds (DeepPointMap section 3.2, eq. 1 to 3).
 
-    Pairs with the highest products of both softmaxes of the similarity count twice: as T (p + offset) = q and as
-    T p = q + offset. One weighted SVD over both sets solves eq. 3, scores being the weights; then errors decide anew
-    who is an inlier, in rounds. How many pairs there are depends on the number of valid descriptors, so that padded
-    clouds give what unpadded ones do.
+    The pairs with the highest products of both softmaxes of the similarity count twice: as T (p + offset) = q and as
+    T p = q + offset. A weighted SVD over both sets solves eq. 3 with the scores as weights; then the errors decide
+    about the inliers again, in rounds. The number of pairs depends on the number of valid descriptors, so padded clouds
+    give the same result as unpadded ones.
 
-    Traced into the jitted step of the caller, for one pair of clouds; `vmap` for more.
+    Use `vmap` for several pairs of clouds. A `ValueError` names an argument of a wrong shape.
 
     Args:
-        source_positions: metres, source frame.
-        target_positions: metres, target frame.
+        source: positions in metres, source frame, and their mask; masked descriptors may hold anything.
+        target: the same in the target frame.
         similarity: cosine of each pair of descriptors, in [-1, 1].
-        predict_offsets: the offset head on pairs of rows; called once, with static shapes.
-        source_mask: False for descriptors that are not there; they may hold anything.
-        target_mask: the same.
+        predict_offsets: the offset head on pairs of rows; it is called once, with static shapes.
         config: thresholds.
 
-    Raises:
-        ValueError: the shapes do not match.
+    Returns:
+        The motion, its confidence and the pairs; see `Registration`.
     """
-    source_positions = as_points("source_positions", source_positions, dimensions=(3,))
-    target_positions = as_points("target_positions", target_positions, dimensions=(3,))
+    source_positions, source_mask = checked("source", source)
+    target_positions, target_mask = checked("target", target)
     similarity = as_float("similarity", similarity)
-    num_source, num_target = len(source_positions), len(target_positions)
-    require_shape("similarity", similarity, (num_source, num_target))
-    source_mask = as_mask("source_mask", source_mask, (num_source,))
-    target_mask = as_mask("target_mask", target_mask, (num_target,))
+    require_shape("similarity", similarity, (len(source_positions), len(target_positions)))
     best = best_pairs(similarity, source_mask, target_mask, config=config)
-    source_offsets, target_offsets = predict_offsets(best.source_indices, best.target_indices)
-    return align_pairs(
-        source_positions[best.source_indices],
-        target_positions[best.target_indices],
-        source_offsets,
-        target_offsets,
-        best,
-        config=config,
-    )
+    points = source_positions[best.source_indices], target_positions[best.target_indices]
+    return _align(*points, predict_offsets(best.source_indices, best.target_indices), best, config=config)
 
 
 class BestPairs(NamedTuple):
-    """The best matches of two clouds, best first.
+    """The best pairs of two clouds, best first.
 
     Attributes:
-        source_indices: row of each in the source.
-        target_indices: row of each in the target.
+        source_indices: row of each pair in the source.
+        target_indices: row of each pair in the target.
         scores: product of both softmaxes, in [0, 1]; 0 where `mask` is False.
         mask: False where there are fewer pairs.
     """
@@ -141,7 +156,17 @@ def best_pairs(
     *,
     config: MatchConfig,
 ) -> BestPairs:
-    """The pairs with the highest dual softmax; a descriptor may be in several."""
+    """Selects the pairs with the highest dual softmax; a descriptor may be in several pairs.
+
+    Args:
+        similarity: cosine of each pair of descriptors.
+        source_mask: False for descriptors that are not there.
+        target_mask: the same.
+        config: temperature and number of pairs.
+
+    Returns:
+        The pairs, best first.
+    """
     num_source, num_target = similarity.shape
     # floor(floor(ratio * (m + n)) / 2): the count of the published configuration.
     capacity = min(int(config.pair_ratio * (num_source + num_target)) // 2, num_source * num_target)
@@ -157,21 +182,20 @@ def best_pairs(
 
 
 @functools.partial(jax.jit, static_argnames="config")
-def align_pairs(
+def _align(
     source_points: Float[Array, "k 3"],
     target_points: Float[Array, "k 3"],
-    source_offsets: Float[Array, "k 3"],
-    target_offsets: Float[Array, "k 3"],
+    both_offsets: tuple[Float[Array, "k 3"], Float[Array, "k 3"]],
     pairs: BestPairs,
     *,
     config: MatchConfig,
 ) -> Registration:
-    """Weighted SVD with rounds of inliers over both directions of the pairs (DeepPointMap eq. 3)."""
-    offsets = jnp.concatenate([source_offsets, target_offsets])
+    # Weighted SVD with rounds of inliers over both directions of the pairs (DeepPointMap eq. 3).
+    offsets = jnp.concatenate(both_offsets)
     scores = jnp.tile(pairs.scores, 2)
     is_used = jnp.tile(pairs.mask, 2) & (jnp.sum(offsets**2, axis=1) <= config.max_offset_m**2)
     offsets = jnp.where(is_used[:, None], offsets, 0)
-    # Metres in, metres out, whatever the heads compute in.
+    # Metres keep the type of the points, whatever type the heads compute in.
     offsets = offsets.astype(source_points.dtype)
     num_pairs = len(source_points)
     source = jnp.tile(source_points, (2, 1)).at[:num_pairs].add(offsets[:num_pairs])
@@ -181,17 +205,29 @@ def align_pairs(
     T_target_source, errors = _solve(source, target, scores, is_inlier)
     num_inliers = jnp.sum(is_inlier)
     squared = jnp.sum(jnp.where(is_inlier, errors**2, 0)) / jnp.maximum(num_inliers, 1)
+    rows = jnp.tile(pairs.source_indices, 2), jnp.tile(pairs.target_indices, 2)
+    is_determined = jnp.minimum(*(_num_distinct(some, is_inlier) for some in rows)) >= MIN_NUM_POINTS
     is_confident = is_inlier & (jnp.cumsum(is_inlier) <= config.num_confident)
     return Registration(
         T_target_source=T_target_source,
         confidence=jnp.sum(jnp.where(is_confident, scores, 0)) / jnp.maximum(jnp.sum(is_confident), 1),
-        rmse_m=jnp.where(num_inliers > 0, jnp.sqrt(squared), jnp.inf),
+        rmse_m=jnp.where(is_determined, _sqrt(squared), jnp.inf),
         num_inliers=num_inliers,
-        source_indices=jnp.tile(pairs.source_indices, 2),
-        target_indices=jnp.tile(pairs.target_indices, 2),
+        source_indices=rows[0],
+        target_indices=rows[1],
         scores=jnp.where(is_used, scores, 0),
         is_inlier=is_inlier,
     )
+
+
+def _num_distinct(rows: Int[Array, " p"], mask: Bool[Array, " p"]) -> Int[Array, ""]:
+    ordered = jnp.sort(jnp.where(mask, rows, -1))
+    return jnp.sum(jnp.diff(ordered, prepend=-1) > 0)
+
+
+def _sqrt(squared: Float[Array, "*p"]) -> Float[Array, "*p"]:
+    # The derivative at 0 is 0 instead of infinite.
+    return jnp.where(squared > 0, jnp.sqrt(jnp.where(squared > 0, squared, 1)), 0)
 
 
 def _softmax(logits: Float[Array, "m n"], is_pair: Bool[Array, "m n"], axis: int) -> Float[Array, "m n"]:
@@ -212,7 +248,7 @@ def _first_inliers(scores: Float[Array, " p"], is_used: Bool[Array, " p"], confi
 def _agreeing(
     source: Float[Array, "p 3"], target: Float[Array, "p 3"], is_used: Bool[Array, " p"], config: ConsensusConfig
 ) -> Bool[Array, " p"]:
-    """Pairs of both directions that the consensus supports; it is sought in the first alone, a quarter of the work."""
+    # The consensus is found in the first direction alone, at a quarter of the work, and then applied to both.
     half = len(source) // 2
     T_target_source = find_consensus(source[:half], target[:half], is_used[:half], config=config).T_target_source
     squared = jnp.sum((rigid.transform_points(T_target_source, source) - target) ** 2, axis=1)
@@ -226,13 +262,12 @@ def _choose_inliers(
     is_used: Bool[Array, " p"],
     config: MatchConfig,
 ) -> Bool[Array, " p"]:
-    """Which pairs the motion rests on; the choice has no derivative."""
+    # The choice has no derivative.
     source, target, scores = lax.stop_gradient((source, target, scores))
 
     def choose(_: Int[Array, ""], is_inlier: Bool[Array, " p"]) -> Bool[Array, " p"]:
         _, errors = _solve(source, target, scores, is_inlier)
         chosen = is_used & (errors <= _error_limit(errors, is_inlier, config))
-        # Taken where they are enough; a choice that does not change any more stays as it is.
         return jnp.where(jnp.sum(chosen) >= config.min_num_inliers, chosen, is_inlier)
 
     if config.consensus is None:
@@ -247,8 +282,7 @@ def _solve(
 ) -> tuple[Float[Array, "4 4"], Float[Array, " p"]]:
     T_target_source = weighted_svd(source, target, jnp.where(is_inlier, scores, 0))
     squared = jnp.sum((rigid.transform_points(T_target_source, source) - target) ** 2, axis=1)
-    is_apart = squared > 0
-    return T_target_source, jnp.where(is_apart, jnp.sqrt(jnp.where(is_apart, squared, 1)), 0)
+    return T_target_source, _sqrt(squared)
 
 
 def _error_limit(errors: Float[Array, " p"], is_inlier: Bool[Array, " p"], config: MatchConfig) -> Float[Array, ""]:
@@ -256,3 +290,36 @@ def _error_limit(errors: Float[Array, " p"], is_inlier: Bool[Array, " p"], confi
     mean = jnp.sum(jnp.where(is_inlier, errors, 0)) / count
     variance = jnp.sum(jnp.where(is_inlier, (errors - mean) ** 2, 0)) / count
     return (mean + config.inlier_sigmas * jnp.sqrt(variance)) * ERROR_SLACK
+
+
+def merge_clouds(clouds: DescriptorCloud, T_map_cloud: Float[AnyArray, "s 4 4"]) -> DescriptorCloud:
+    """Merges several descriptor clouds into one frame: a map, without new extraction (DeepPointMap section 3.1).
+
+    Args:
+        clouds: s clouds of equal capacity, stacked: positions (s, m, 3), features (s, m, c), mask (s, m).
+        T_map_cloud: pose of each cloud in the frame of the map, metres. The pose of a cloud without a valid descriptor
+            may be anything.
+
+    Returns:
+        One cloud of capacity s * m; positions are 0 where the mask is False.
+
+    Raises:
+        ValueError: if the shapes do not match.
+    """
+    if clouds.positions.ndim != 3:
+        raise ValueError(f"clouds: expected stacked clouds, positions (s, m, 3), got {clouds.positions.shape}")
+    T_map_cloud = as_float("T_map_cloud", T_map_cloud)
+    require_shape("T_map_cloud", T_map_cloud, (len(clouds.positions), 4, 4))
+    return _merge_clouds(clouds, T_map_cloud)
+
+
+@jax.jit
+def _merge_clouds(clouds: DescriptorCloud, T_map_cloud: jax.Array) -> DescriptorCloud:
+    positions_cloud = jnp.where(clouds.mask[..., None], clouds.positions, 0)
+    T_map_cloud = jnp.where(jnp.any(clouds.mask, axis=1)[:, None, None], T_map_cloud, 0)
+    positions_map = jnp.where(clouds.mask[..., None], rigid.transform_points(T_map_cloud, positions_cloud), 0)
+    return DescriptorCloud(
+        positions=positions_map.reshape(-1, 3),
+        features=clouds.features.reshape(-1, clouds.features.shape[-1]),
+        mask=clouds.mask.reshape(-1),
+    )

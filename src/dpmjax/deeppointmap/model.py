@@ -1,12 +1,12 @@
-"""The model: its configuration and its parameters, and what it says of point pyramids and descriptor clouds.
+"""The model: its configuration, three presets, its parameters, and the functions that apply its networks.
 
-All functions are for one scan or one pair; `vmap` over the clouds batches them.
+All functions take one scan or one pair; `vmap` over the clouds batches them.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, Literal
 
 import flax.struct
 import jax
@@ -16,25 +16,28 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from dpmjax.checks import require_positive, require_shape
 from dpmjax.deeppointmap.matching import MatchConfig
-from dpmjax.geometry.pyramid import PyramidConfig
+from dpmjax.geometry.consensus import ConsensusConfig
+from dpmjax.geometry.pyramid import PyramidConfig, PyramidStage
 from dpmjax.nets.decoder import DecoderConfig, DescriptorDecoder
 from dpmjax.nets.layers import ComputeDtype
 from dpmjax.nets.point_encoder import EncoderConfig, PointEncoder
 from dpmjax.scans.preprocess import PreprocessConfig
 from dpmjax.types import DescriptorCloud, Interpolation, PointPyramid, PyramidLevel
 
+Preset = Literal["tiny", "small", "paper"]
+
 
 @dataclass(frozen=True)
 class ModelConfig:
-    """What a model is made of; the defaults are the published configuration.
+    """Configuration of a model (defaults: DeepPointMap's published configuration).
 
     Attributes:
-        pyramid: which points are kept and which are neighbours.
-        encoder: its widths.
-        decoder: its widths.
+        pyramid: sampled points and neighbourhoods.
+        encoder: widths of the encoder.
+        decoder: widths of the decoder.
         scale_m: metres in one unit of the pyramid's normalised coordinates.
-        preprocess: what is kept of a raw scan, in training and in use alike.
-        matching: which pairs of descriptors are chosen and believed.
+        preprocess: filters of raw scans, in training and inference alike.
+        matching: choice of descriptor pairs and inliers.
     """
 
     pyramid: PyramidConfig = field(default_factory=PyramidConfig)
@@ -52,11 +55,18 @@ class ModelConfig:
 
     @property
     def num_descriptors(self) -> int:
-        """How many descriptors the encoder makes of a scan."""
+        """Number of descriptors of a scan."""
         return self.pyramid.stages[-1 - self.pyramid.num_interpolations].num_points
 
     def with_compute_dtype(self, compute_dtype: ComputeDtype) -> ModelConfig:
-        """The same with other matrix products: "float32" or "bfloat16". Geometry stays in float32."""
+        """Changes the type of the matrix products; geometry stays in float32.
+
+        Args:
+            compute_dtype: "float32" or "bfloat16".
+
+        Returns:
+            A new configuration.
+        """
         return replace(
             self,
             encoder=replace(self.encoder, compute_dtype=compute_dtype),
@@ -64,13 +74,55 @@ class ModelConfig:
         )
 
 
+def model_preset(name: str) -> ModelConfig:
+    """Returns the configuration of a preset.
+
+    Args:
+        name: "tiny" for trials on a CPU, "small" for real time, or "paper".
+
+    Returns:
+        The configuration.
+
+    Raises:
+        ValueError: if no preset has this name.
+    """
+    if name not in PRESETS:
+        raise ValueError(f"name: expected one of {', '.join(PRESETS)}, got {name!r}")
+    return PRESETS[name]
+
+
+def _pyramid(
+    num_points: tuple[int, ...], num_neighbours: tuple[int, ...], last_radii: tuple[float, ...]
+) -> PyramidConfig:
+    radii = ((0.05, 0.1), (0.1, 0.2), (0.2, 0.4), (0.4, 0.8), last_radii)
+    return PyramidConfig(tuple(map(PyramidStage, num_points, radii, num_neighbours)))
+
+
+PRESETS: dict[str, ModelConfig] = {
+    "tiny": ModelConfig(
+        pyramid=_pyramid((1024, 512, 256, 64, 16), (16, 16, 16, 16, 8), (0.8,)),
+        encoder=EncoderConfig(stem_channels=8, expansion=2, output_channels=64, frame="bearing"),
+        decoder=DecoderConfig(input_channels=64, model_channels=64, num_heads=2),
+        preprocess=PreprocessConfig(capacity=4096),
+        matching=MatchConfig(consensus=ConsensusConfig()),
+    ),
+    "small": ModelConfig(
+        pyramid=_pyramid((2048, 768, 256, 64, 16), (24, 24, 24, 24, 16), (0.8, 1.6)),
+        encoder=EncoderConfig(stem_channels=16, expansion=2, output_channels=128, frame="bearing"),
+        decoder=DecoderConfig(input_channels=128, model_channels=128),
+        matching=MatchConfig(consensus=ConsensusConfig()),
+    ),
+    "paper": ModelConfig(),
+}
+
+
 @flax.struct.dataclass
 class Model:
-    """A configuration and its parameters.
+    """Parameters and their configuration.
 
     Attributes:
-        params: {"encoder": ..., "decoder": ...}, each as Flax holds parameters.
-        config: static.
+        params: {"encoder": ..., "decoder": ...}, each a tree of Flax parameters.
+        config: the configuration; static under jit.
     """
 
     params: dict[str, Any]
@@ -78,9 +130,17 @@ class Model:
 
 
 def init_model(key: PRNGKeyArray, config: ModelConfig) -> Model:
-    """A model with random parameters: matrices N(0, 1 / rows), scales one, all else zero; float32."""
+    """Makes a model with random parameters: matrices N(0, 1 / rows), scales one, biases zero; float32.
+
+    Args:
+        key: used once.
+        config: configuration of the model.
+
+    Returns:
+        The model.
+    """
     shapes = model_shapes(config)
-    # One long draw, cut up on the host: a draw for each of the 200 arrays would take ten seconds to compile.
+    # One long draw is cut up on the host; a draw for each of the 200 arrays would take ten seconds to compile.
     num_numbers = sum(leaf.size for leaf in jax.tree.leaves(shapes))
     draw = np.asarray(jax.random.normal(key, (num_numbers,)))
     ends = iter(np.cumsum([leaf.size for leaf in jax.tree.leaves(shapes)]))
@@ -95,7 +155,14 @@ def init_model(key: PRNGKeyArray, config: ModelConfig) -> Model:
 
 
 def model_shapes(config: ModelConfig) -> dict[str, Any]:
-    """The parameters of a model as shapes and dtypes, without numbers."""
+    """Returns the parameters of a model as shapes and dtypes.
+
+    Args:
+        config: configuration of the model.
+
+    Returns:
+        {"encoder": ..., "decoder": ...}, with `jax.ShapeDtypeStruct` leaves.
+    """
     key = jax.random.key(0)
     num, channels = config.num_descriptors, config.decoder.input_channels
     cloud = DescriptorCloud(jnp.zeros((num, 3)), jnp.zeros((num, channels)), jnp.ones(num, bool))
@@ -105,18 +172,17 @@ def model_shapes(config: ModelConfig) -> dict[str, Any]:
 
 
 def encode_pyramid(model: Model, pyramid: PointPyramid) -> DescriptorCloud:
-    """One scan to descriptors in metres, in the frame of the lidar (DeepPointMap section 3.1).
+    """Encodes one scan to descriptors in metres, in the frame of the lidar (DeepPointMap section 3.1).
 
     Args:
-        model: its `config.pyramid` is what the pyramid was built with.
-        pyramid: in normalised coordinates, of one scan.
+        model: a model whose `config.pyramid` built the pyramid.
+        pyramid: one scan in normalised coordinates; masked points may hold anything.
 
     Returns:
-        `config.num_descriptors` descriptors. Those that are not there have zero position and features; what the
-        masked points of the pyramid hold changes nothing.
+        `config.num_descriptors` descriptors; zero where the mask is False.
 
     Raises:
-        ValueError: the pyramid has other stages than the model.
+        ValueError: if the pyramid has other stages than the model.
     """
     stages = model.config.pyramid.stages
     if len(pyramid.levels) != len(stages) + 1:
@@ -129,12 +195,17 @@ def encode_pyramid(model: Model, pyramid: PointPyramid) -> DescriptorCloud:
 
 
 def correlate(model: Model, a: DescriptorCloud, b: DescriptorCloud) -> tuple[DescriptorCloud, DescriptorCloud]:
-    """Both clouds with features that know of each other (DeepPointMap section 3.2, figure 2b).
+    """Correlates two descriptor clouds by attention (DeepPointMap section 3.2, figure 2b).
 
-    Positions and masks stay as they are (zero where masked). Clouds of scans and of maps are treated alike.
+    A `ValueError` says if the features have another width than the model.
 
-    Raises:
-        ValueError: features have another number of channels than the model takes.
+    Args:
+        model: encoder and decoder.
+        a: uncorrelated descriptors of a scan or a map.
+        b: the same.
+
+    Returns:
+        Both clouds with correlated features; positions and masks stay as they are (zero where masked).
     """
     _require_features("a", a, model.config.decoder.input_channels)
     _require_features("b", b, model.config.decoder.input_channels)
@@ -142,49 +213,81 @@ def correlate(model: Model, a: DescriptorCloud, b: DescriptorCloud) -> tuple[Des
 
 
 def overlap_probability(model: Model, a: DescriptorCloud, b: DescriptorCloud) -> Float[Array, ""]:
-    """Probability that two clouds see the same place, less than 20 m apart (DeepPointMap section 3.2).
+    """Predicts the probability that two clouds overlap: less than 20 m apart (DeepPointMap section 3.2).
+
+    A `ValueError` says if the features have another width than the model.
 
     Args:
         model: encoder and decoder.
         a: uncorrelated descriptors.
         b: the same; the order matters a little.
 
-    Raises:
-        ValueError: features have another number of channels than the model takes.
+    Returns:
+        The probability. It is 0 where a cloud is empty or holds a feature that is not finite.
     """
-    return jax.nn.sigmoid(overlap_logit(model, *correlate(model, a, b)))
+    logit = overlap_logit(model, *correlate(model, a, b))
+    is_known = jnp.any(a.mask) & jnp.any(b.mask) & jnp.isfinite(logit)
+    return jnp.where(is_known, jax.nn.sigmoid(jnp.where(is_known, logit, 0)), 0)
 
 
 @jax.jit
 def overlap_logit(model: Model, a: DescriptorCloud, b: DescriptorCloud) -> Float[Array, ""]:
-    """Logit of the overlap probability, from correlated clouds."""
-    return _decode(model, a, b, method="overlap_logit")
+    """Predicts the logit of the overlap probability.
+
+    Args:
+        model: encoder and decoder.
+        a: a correlated cloud.
+        b: the other correlated cloud.
+
+    Returns:
+        The logit.
+    """
+    return _decode(model, a, b, part="overlap_logit")
 
 
 @jax.jit
 def similarity_features(model: Model, correlated: DescriptorCloud) -> Float[Array, "m c"]:
-    """Features whose cosine tells how likely descriptors of two correlated clouds are partners."""
-    return _decode(model, correlated.features, method="similarity_features")
+    """Computes features whose cosine is the similarity of two descriptors.
+
+    Args:
+        model: encoder and decoder.
+        correlated: a correlated cloud.
+
+    Returns:
+        One row for each descriptor.
+    """
+    return _decode(model, correlated.features, part="similarity_head")
 
 
 @jax.jit
 def coarse_features(model: Model, cloud: DescriptorCloud) -> Float[Array, "m c"]:
-    """Features of an uncorrelated cloud that the coarse pairing loss compares (DeepPointMap eq. 5)."""
-    return _decode(model, cloud.features, method="coarse_features")
+    """Computes the features of the coarse pairing loss (DeepPointMap eq. 5).
+
+    Args:
+        model: encoder and decoder.
+        cloud: an uncorrelated cloud.
+
+    Returns:
+        One row for each descriptor.
+    """
+    return _decode(model, cloud.features, part="coarse_head")
 
 
 @jax.jit
 def predict_offsets(
     model: Model, features: Float[Array, "... c"], partners: Float[Array, "... c"]
 ) -> Float[Array, "... 3"]:
-    """Metres from each descriptor to its partner, in the frame of the first cloud (DeepPointMap section 3.2).
+    """Predicts the offset from each descriptor to its partner (DeepPointMap section 3.2).
 
     Args:
         model: encoder and decoder.
         features: correlated features of the first cloud, one row for each pair.
-        partners: correlated features of the other, row for row.
+        partners: correlated features of the second cloud, row for row.
+
+    Returns:
+        Offsets in metres, in the frame of the first cloud.
     """
-    return _decode(model, features, partners, method="offsets")
+    return _decode(model, features, partners, part="offset_head")
 
 
 @jax.jit
@@ -197,19 +300,24 @@ def _encode_pyramid(model: Model, pyramid: PointPyramid) -> DescriptorCloud:
 
 @jax.jit
 def _correlate(model: Model, a: DescriptorCloud, b: DescriptorCloud) -> tuple[DescriptorCloud, DescriptorCloud]:
-    return _decode(model, a, b, method="correlate")
+    return _decode(model, a, b, part="correlate")
 
 
 def _encoder(config: ModelConfig) -> PointEncoder:
     return PointEncoder(config.encoder, tuple(stage.radii for stage in config.pyramid.stages))
 
 
-def _decode(model: Model, *arguments: Any, method: str) -> Any:
-    return DescriptorDecoder(model.config.decoder).apply({"params": model.params["decoder"]}, *arguments, method=method)
+def _decode(model: Model, *arguments: Any, part: str) -> Any:
+    # `part` is a method or a head of the decoder.
+    return DescriptorDecoder(model.config.decoder).apply(
+        {"params": model.params["decoder"]},
+        *arguments,
+        method=lambda decoder, *arguments: getattr(decoder, part)(*arguments),
+    )
 
 
 def _blank_pyramid(config: PyramidConfig) -> PointPyramid:
-    """One of the right structure: the sizes of parameters depend on nothing else."""
+    # A pyramid of the right structure: the shapes of the parameters depend on nothing else.
 
     def level(num: int, num_blocks: int) -> PyramidLevel:
         indices = jnp.zeros(num, jnp.int32)

@@ -1,7 +1,7 @@
-"""What the networks of DeepPointMap are trained for: descriptors of one place alike, offsets right.
+"""The training objective of DeepPointMap: similar descriptors at the same place, and correct offsets.
 
-The order of use: `close_pairs` finds, from true poses, which descriptors lie close to each other; the offset head is
-asked about those; `registration_loss` puts the three losses together. Everything here takes arrays, not networks.
+`close_pairs` finds, from true poses, the descriptors that lie close to each other. The offset head predicts their
+offsets. `matching_loss` combines the three losses. All functions take arrays, not networks.
 """
 
 from __future__ import annotations
@@ -16,12 +16,13 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from dpmjax.checks import as_float, as_mask, as_points, require_count, require_positive, require_shape
+from dpmjax.checks import as_float, require_count, require_positive, require_shape
+from dpmjax.deeppointmap.matching import MaskedPositions, checked
 from dpmjax.geometry import rigid
 from dpmjax.geometry.neighbours import radius_search
 from dpmjax.losses.contrastive import info_nce
 from dpmjax.losses.offset import offset_loss
-from dpmjax.types import AnyArray
+from dpmjax.types import AnyArray, DescriptorCloud
 
 
 @dataclass(frozen=True)
@@ -29,13 +30,14 @@ class ObjectiveConfig:
     """Weights and distances (DeepPointMap section 3.3).
 
     Attributes:
-        pairing_weight: of the pairing loss.
-        coarse_weight: of the coarse pairing loss.
-        offset_weight: of the offset loss.
-        temperature: of both pairing losses.
-        positive_radius_m: the nearest descriptor is the positive one if it is this close; others this close neutral.
-        offset_radius_m: offsets are learned for all pairs this close.
-        max_close: of those, so many of each descriptor, the nearest. Two scans need 4; maps of many scans more.
+        pairing_weight: weight of the pairing loss.
+        coarse_weight: weight of the coarse pairing loss.
+        offset_weight: weight of the offset loss.
+        temperature: temperature of both pairing losses.
+        positive_radius_m: the nearest descriptor within this radius is the positive; the others within it are neutral.
+        offset_radius_m: offsets are learned for all pairs within this radius.
+        max_close: largest number of such pairs for each descriptor, the nearest first. Two scans need 4, maps of many
+            scans need more.
     """
 
     pairing_weight: float = 1.0
@@ -57,49 +59,49 @@ class ObjectiveConfig:
 
 @flax.struct.dataclass
 class ClosePairs:
-    """For each descriptor of one cloud, those of the other that lie close to it, nearest first.
+    """The descriptors of the other cloud that lie close to each descriptor of one cloud, nearest first.
 
     Attributes:
         indices: row in the other cloud; 0 where `mask` is False.
-        mask: True where there is one.
-        offsets: from the descriptor to that one, metres, in the frame of the descriptor; 0 where `mask` is False.
+        mask: False where there are fewer.
+        offsets: from the descriptor to its neighbour, metres, in the frame of the descriptor; 0 where `mask` is False.
     """
 
-    indices: Int[Array, "m k"]
-    mask: Bool[Array, "m k"]
-    offsets: Float[Array, "m k 3"]
+    indices: Int[AnyArray, "*b m k"]
+    mask: Bool[AnyArray, "*b m k"]
+    offsets: Float[AnyArray, "*b m k 3"]
 
 
 @flax.struct.dataclass
 class TrainingSide:
-    """All that the losses need of one of two clouds.
+    """Input of the losses from one of two clouds.
 
     Attributes:
         positions: metres, in the frame of the cloud.
         mask: True for descriptors that are there; others may hold anything.
         matched_features: correlated descriptors after the similarity head.
-        coarse_features: unified descriptors after the coarse head.
+        coarse_features: uncorrelated descriptors after the coarse head.
         close: from `close_pairs`.
-        offsets: what the offset head says of the close pairs, metres, in the frame of the cloud.
+        offsets: predicted offsets of the close pairs, metres, in the frame of the cloud.
     """
 
-    positions: Float[Array, "m 3"]
-    mask: Bool[Array, " m"]
-    matched_features: Float[Array, "m c"]
-    coarse_features: Float[Array, "m e"]
+    positions: Float[AnyArray, "*b m 3"]
+    mask: Bool[AnyArray, "*b m"]
+    matched_features: Float[AnyArray, "*b m c"]
+    coarse_features: Float[AnyArray, "*b m e"]
     close: ClosePairs
-    offsets: Float[Array, "m k 3"]
+    offsets: Float[AnyArray, "*b m k 3"]
 
 
 class ObjectiveTerms(NamedTuple):
-    """The parts of the loss, not weighted, each the mean of both directions.
+    """Unweighted parts of the loss, each the mean of both directions.
 
     Attributes:
         pairing: eq. 4, on correlated descriptors.
-        coarse: eq. 5, on unified descriptors.
+        coarse: eq. 5, on uncorrelated descriptors.
         offset: eq. 6.
-        top1_accuracy: share of the descriptors with a positive that are most similar to it.
-        num_positives: how many descriptors have one, in both clouds together.
+        top1_accuracy: share of the descriptors with a positive that are most similar to this positive.
+        num_positives: number of descriptors with a positive, in both clouds together.
     """
 
     pairing: Float[Array, ""]
@@ -110,66 +112,59 @@ class ObjectiveTerms(NamedTuple):
 
 
 def close_pairs(
-    positions_a: Float[AnyArray, "m 3"],
-    positions_b: Float[AnyArray, "n 3"],
+    a: MaskedPositions | DescriptorCloud,
+    b: MaskedPositions | DescriptorCloud,
     T_b_a: Float[AnyArray, "4 4"],
-    mask_a: Bool[AnyArray, " m"] | None = None,
-    mask_b: Bool[AnyArray, " n"] | None = None,
     *,
     config: ObjectiveConfig,
 ) -> tuple[ClosePairs, ClosePairs]:
-    """Which pairs are closer than `offset_radius_m`, and their true offsets: of a (to b), and of b (to a).
+    """Finds the pairs closer than `offset_radius_m`, and their true offsets. A `ValueError` names a wrong shape.
 
     Args:
-        positions_a: metres, in the frame of a.
-        positions_b: metres, in the frame of b.
+        a: metres, in the frame of a; masked descriptors may hold anything.
+        b: the same in the frame of b.
         T_b_a: the true motion.
-        mask_a: False for descriptors of a that are not there; they may hold anything.
-        mask_b: the same for b.
         config: radius and capacity.
 
-    Raises:
-        ValueError: the shapes do not match.
+    Returns:
+        The pairs of each descriptor of a, and those of each descriptor of b.
     """
-    positions_a = as_points("positions_a", positions_a, dimensions=(3,))
-    positions_b = as_points("positions_b", positions_b, dimensions=(3,))
     T_b_a = as_float("T_b_a", T_b_a)
     require_shape("T_b_a", T_b_a, (4, 4))
-    mask_a, mask_b = as_mask("mask_a", mask_a, positions_a.shape[:1]), as_mask("mask_b", mask_b, positions_b.shape[:1])
+    positions_a, mask_a = checked("a", a)
+    positions_b, mask_b = checked("b", b)
     of_a = _close_of(positions_a, rigid.transform_points(rigid.inverse(T_b_a), positions_b), mask_a, mask_b, config)
     of_b = _close_of(positions_b, rigid.transform_points(T_b_a, positions_a), mask_b, mask_a, config)
     return of_a, of_b
 
 
-def registration_loss(
+def matching_loss(
     a: TrainingSide, b: TrainingSide, T_b_a: Float[AnyArray, "4 4"], *, config: ObjectiveConfig
 ) -> tuple[Float[Array, ""], ObjectiveTerms]:
-    """Pairing, coarse pairing and offset loss of two clouds, both directions averaged (DeepPointMap eq. 4 to 7).
+    """Combines pairing, coarse pairing and offset loss, the mean of both directions (DeepPointMap eq. 4 to 7).
 
-    For one pair of clouds; `vmap` for more. Without any close pair the loss and its gradient are 0.
+    Use `vmap` for several pairs of clouds. Without any close pair, the loss and its gradient are 0. A `ValueError`
+    names an argument of a wrong shape.
 
     Args:
-        a: one cloud, with what the networks say of it.
-        b: the other.
+        a: one cloud, with the predictions of the networks.
+        b: the other cloud.
         T_b_a: the true motion, metres.
         config: weights and distances.
 
     Returns:
         The weighted sum, and its parts.
-
-    Raises:
-        ValueError: the shapes do not match.
     """
     T_b_a = as_float("T_b_a", T_b_a)
     require_shape("T_b_a", T_b_a, (4, 4))
     for name, side in (("a", a), ("b", b)):
-        require_shape(f"{name}.offsets", side.offsets, side.close.offsets.shape)
-        require_shape(f"{name}.mask", side.mask, side.positions.shape[:1])
-    return _registration_loss(a, b, T_b_a, config=config)
+        require_shape(f"{name}.offsets", jnp.asarray(side.offsets), side.close.offsets.shape)
+        require_shape(f"{name}.mask", jnp.asarray(side.mask), side.positions.shape[:1])
+    return _matching_loss(a, b, T_b_a, config=config)
 
 
 @functools.partial(jax.jit, static_argnames="config")
-def _registration_loss(
+def _matching_loss(
     a: TrainingSide, b: TrainingSide, T_b_a: jax.Array, *, config: ObjectiveConfig
 ) -> tuple[jax.Array, ObjectiveTerms]:
     positions_b = jnp.where(

@@ -1,7 +1,7 @@
-"""Which scans are trained on together: groups that make two maps, and pairs that overlap or not. On the host.
+"""Sampling for training: which scans form two maps, and which pairs of scans overlap. On the host.
 
-Everything is drawn from true poses, before augmentation, and from the generator that is given, so that the sample of a
-step does not depend on how training came to it.
+Scans are drawn by their true poses, before augmentation, and from the given generator only, so that the sample of a
+step does not depend on the steps before.
 """
 
 from __future__ import annotations
@@ -21,17 +21,19 @@ NUM_ATTEMPTS = 100
 
 @dataclass(frozen=True)
 class SamplingConfig:
-    """Sizes and distances (DeepPointMap's published configuration).
+    """Sizes and distances of samples (defaults: DeepPointMap's published configuration).
 
     Attributes:
-        num_scans: scans of one sample, all groups together.
-        min_distance_m: scans nearer to the anchor are as good as the same.
-        max_distance_m: scans farther from it do not belong to its group.
-        pair_probability: of a group being one pair of scans, whatever the stage.
-        max_side: scans of one map; groups up to this are split one to all others half the time.
+        num_scans: capacity of one sample, all groups together.
+        min_distance_m: scans nearer to the anchor are too similar to it.
+        max_distance_m: scans farther from the anchor do not belong to its group.
+        pair_probability: probability that a group is one pair of scans, in every stage.
+        max_side: largest number of scans of one map. Half of the groups up to this size are split into one scan
+            against all others.
         num_overlap_pairs: pairs of one sample of the overlap part.
-        overlap_distance_m: nearer scans overlap.
-        far_distance_m: a quarter of the pairs is farther apart than this, a quarter between the two.
+        overlap_distance_m: scans nearer to each other than this overlap.
+        far_distance_m: a quarter of the overlap pairs is farther apart than this, a quarter lies between the two
+            distances.
     """
 
     num_scans: int = 32
@@ -56,25 +58,36 @@ class SamplingConfig:
             raise ValueError(f"pair_probability: expected from 0 to 1, got {self.pair_probability}")
 
     def side_capacity(self, max_group: int) -> int:
-        """Scans that one map of a group can have."""
+        """Returns the capacity of one map of a group.
+
+        Args:
+            max_group: scans in both maps of a group together, at most.
+
+        Returns:
+            The largest number of scans in one map.
+        """
         return min(max_group - 1, self.max_side)
 
     def num_groups(self, max_group: int) -> int:
-        """Groups of one sample: about as many as fill it."""
+        """Returns the number of groups in a sample.
+
+        Args:
+            max_group: scans in both maps of a group together, at most.
+
+        Returns:
+            About as many groups as fill the sample.
+        """
         mean = 2 * self.pair_probability + (1 - self.pair_probability) * (2 + max_group) / 2
         return max(1, round(self.num_scans / mean))
 
 
 @dataclass(frozen=True)
 class ScanTable:
-    """Where the scans of all drives were taken.
+    """True poses of the scans of all drives; a `ValueError` says if there are fewer than two, or one is not finite.
 
     Attributes:
         T_world_lidar: (n, 4, 4) float64 true poses, metres.
-        scene: (n,) which world each pose is in; poses of different worlds have nothing to do with each other.
-
-    Raises:
-        ValueError: the shapes do not match, a pose is not finite, or no two scans.
+        scene: (n,) number of the world of each pose; poses of different worlds are unrelated.
     """
 
     T_world_lidar: Float[np.ndarray, "n 4 4"]
@@ -92,32 +105,40 @@ class ScanTable:
 
     @functools.cached_property
     def positions(self) -> Float[np.ndarray, "n 3"]:
-        """Of the lidar, metres."""
+        """Positions of the lidar, metres."""
         return self.T_world_lidar[:, :3, 3]
 
     @functools.cached_property
     def trees(self) -> tuple[cKDTree, ...]:
-        """One a scene."""
+        """One search tree for each scene."""
         return tuple(cKDTree(self.positions[rows]) for rows in self.rows)
 
     @functools.cached_property
     def rows(self) -> tuple[Int[np.ndarray, " s"], ...]:
-        """The scans of each scene."""
+        """Numbers of the scans of each scene."""
         return tuple(np.flatnonzero(self.scene == scene) for scene in range(int(self.scene.max()) + 1))
 
     def within(self, row: int, max_distance_m: float) -> Int[np.ndarray, " k"]:
-        """Scans of the same scene up to a distance from scan `row`, itself among them, in order."""
+        """Finds the scans of the same scene up to a distance.
+
+        Args:
+            row: number of the scan in the middle.
+            max_distance_m: the distance.
+
+        Returns:
+            Numbers of the scans in order, `row` among them.
+        """
         scene = int(self.scene[row])
         near = self.trees[scene].query_ball_point(self.positions[row], max_distance_m)
         return self.rows[scene][np.sort(np.asarray(near, int))]
 
 
 class Group(NamedTuple):
-    """Rows of the scans that make two maps of one place.
+    """Numbers of the scans that form two maps of one place.
 
     Attributes:
-        source: of the one; the first scan is the frame of the map.
-        target: of the other.
+        source: scans of the first map; its first scan is the frame of the map.
+        target: scans of the second map; its first scan is the frame of the map.
     """
 
     source: Int[np.ndarray, " a"]
@@ -125,7 +146,7 @@ class Group(NamedTuple):
 
 
 class OverlapPairs(NamedTuple):
-    """Pairs of scans, and whether they are closer than `overlap_distance_m`."""
+    """Numbers of the scans of each pair, and whether they are closer than `overlap_distance_m`."""
 
     first: Int[np.ndarray, " p"]
     second: Int[np.ndarray, " p"]
@@ -135,21 +156,24 @@ class OverlapPairs(NamedTuple):
 def draw_groups(
     table: ScanTable, first_anchor: int, max_group: int, config: SamplingConfig, rng: np.random.Generator
 ) -> tuple[Group, ...]:
-    """Groups for one sample, at most `config.num_groups` with `config.num_scans` scans together.
+    """Draws the groups of one sample: at most `config.num_groups`, with at most `config.num_scans` scans together.
 
-    A group is an anchor and random scans about it: two with `pair_probability`, else 2 to `max_group`, each number
-    equally likely. Unlike in the published program every group draws its own size, so that all steps of a stage have
-    one shape.
+    A group is an anchor and random scans around it: two scans with `pair_probability`, else 2 to `max_group`, each
+    number equally likely. Every group draws its own size, so that all steps of a stage have the same shapes (the
+    published program draws one size for each step).
 
     Args:
         table: the scans.
-        first_anchor: of the first group; the others have random ones.
-        max_group: of the stage of the curriculum.
+        first_anchor: anchor of the first group; the other anchors are random.
+        max_group: scans in both maps of a group together, at most.
         config: sizes and distances.
-        rng: what the draws come from.
+        rng: source of the draws.
+
+    Returns:
+        At least one group.
 
     Raises:
-        ValueError: no scan has another one near it.
+        ValueError: if no scan has another one near it.
     """
     groups: list[Group] = []
     num_left, anchor = config.num_scans, first_anchor
@@ -169,10 +193,17 @@ def draw_groups(
 
 
 def draw_overlap_pairs(table: ScanTable, config: SamplingConfig, rng: np.random.Generator) -> OverlapPairs:
-    """Pairs for the overlap part: half of them overlap, a quarter just not, a quarter is far apart.
+    """Draws the pairs of the overlap part: half overlap, a quarter lies just beyond that, a quarter is far apart.
 
-    A quarter that a scene does not have (a short drive) is made up of scans of other scenes, or of the next nearer
-    band.
+    Where a scene has no pair of one kind (a short drive), scans of other scenes replace it, or the next nearer kind.
+
+    Args:
+        table: the scans.
+        config: number of pairs, and distances.
+        rng: source of the draws.
+
+    Returns:
+        `config.num_overlap_pairs` pairs.
     """
     bands = ((0.0, config.overlap_distance_m), (config.overlap_distance_m, config.far_distance_m))
     first, second = [], []
@@ -203,7 +234,7 @@ def _members(
 
 
 def _split(members: Int[np.ndarray, " s"], config: SamplingConfig, rng: np.random.Generator) -> Group:
-    """One scan against all others half the time, else anywhere; neither side longer than `max_side`."""
+    # Half of the groups are split into one scan and all others, the rest anywhere; no side exceeds `max_side`.
     num = len(members)
     least, most = max(1, num - config.max_side), min(num - 1, config.max_side)
     is_one_to_all = least == 1 and num <= config.max_side and rng.random() < 0.5

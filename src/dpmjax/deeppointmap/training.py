@@ -1,12 +1,11 @@
-"""The step of training: descriptors, maps, losses, AdamW; on one device or many.
+"""The training step: descriptors, maps, losses and AdamW, on one device or many.
 
-    state = init(key, config)
+    state = init_training(key, config)
     step = make_step(config)
     state, report = step(state, batch)
 
-Nothing in the step is random: what is, the samples and their augmentation, is drawn when a batch is made. A batch of
-`RegistrationSample` trains everything but the overlap head, which the losses do not reach; one of `OverlapSample` the
-overlap head alone.
+The step is deterministic: samples and their augmentation are drawn when a batch is made. A batch of
+`RegistrationSample` trains all parts except the overlap head; a batch of `OverlapSample` trains the overlap head only.
 """
 
 from __future__ import annotations
@@ -14,19 +13,18 @@ from __future__ import annotations
 import functools
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple
 
 import flax.struct
 import jax
 import jax.numpy as jnp
-import numpy as np
 import optax
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
-from dpmjax.deeppointmap.batches import MapOfScans, OverlapSample, RegistrationSample
+from dpmjax.deeppointmap.batches import MapOfScans, OverlapSample, RegistrationSample, Sample
 from dpmjax.deeppointmap.curriculum import TrainingConfig
-from dpmjax.deeppointmap.merging import merge_clouds
+from dpmjax.deeppointmap.matching import merge_clouds
 from dpmjax.deeppointmap.model import (
     Model,
     coarse_features,
@@ -43,25 +41,21 @@ from dpmjax.deeppointmap.objective import (
     ObjectiveTerms,
     TrainingSide,
     close_pairs,
-    registration_loss,
+    matching_loss,
 )
 from dpmjax.losses.overlap import overlap_loss
 from dpmjax.types import AnyArray, DescriptorCloud, PointPyramid
 
-Sample = RegistrationSample | OverlapSample
-BATCH_AXIS = "batch"
-TreeT = TypeVar("TreeT")
-
 
 @flax.struct.dataclass
 class TrainingState:
-    """What a step changes, and a checkpoint holds.
+    """State of training: a step changes it, a checkpoint holds it.
 
     Attributes:
-        params: of the model.
-        registration_optimizer: of all parameters.
-        overlap_optimizer: of those of the overlap head.
-        step: how many steps are done, both parts together.
+        params: parameters of the model.
+        registration_optimizer: state of the optimiser of all parameters.
+        overlap_optimizer: state of the optimiser of the overlap head.
+        step: number of steps done, both parts together.
     """
 
     params: dict[str, Any]
@@ -71,14 +65,14 @@ class TrainingState:
 
 
 class TrainingReport(NamedTuple):
-    """What a step says of itself; the parameters are those before it. NaN for what the part does not have.
+    """Measures of one step, at the parameters before it; NaN for those that its part does not have.
 
     Attributes:
-        loss: that the step made smaller.
-        terms: of the registration loss, means over all groups; `num_positives` of both maps of one group.
-        overlap_accuracy: share of pairs on the right side of one half.
-        gradient_norm: before it is shortened.
-        learning_rate: of this step.
+        loss: loss of the batch.
+        terms: terms of the matching loss, means over all groups.
+        overlap_accuracy: share of the overlap pairs that are classified correctly.
+        gradient_norm: norm of the gradient before it is scaled down.
+        learning_rate: learning rate of the step.
     """
 
     loss: Float[Array, ""]
@@ -91,8 +85,16 @@ class TrainingReport(NamedTuple):
 Step = Callable[[TrainingState, Sample], tuple[TrainingState, TrainingReport]]
 
 
-def init(key: PRNGKeyArray, config: TrainingConfig) -> TrainingState:
-    """An untrained model, and optimisers that have seen nothing."""
+def init_training(key: PRNGKeyArray, config: TrainingConfig) -> TrainingState:
+    """Makes the state before the first step.
+
+    Args:
+        key: used once, for the parameters.
+        config: settings of training.
+
+    Returns:
+        The state.
+    """
     params = init_model(key, config.model).params
     return TrainingState(
         params=params,
@@ -102,17 +104,18 @@ def init(key: PRNGKeyArray, config: TrainingConfig) -> TrainingState:
     )
 
 
-def model_of(state: TrainingState, config: TrainingConfig) -> Model:
-    """The model as it is now."""
-    return Model(state.params, config.model)
-
-
 def make_step(config: TrainingConfig, mesh: Mesh | None = None) -> Step:
-    """The jitted step. It compiles once for each shape of batch: once a stage of the curriculum, once for the overlap.
+    """Makes the jitted step, which compiles once for each stage of the curriculum and once for the overlap part.
 
-    Batches carry samples along their first axis and may be spread over devices by `shard_batch`; the loss is the mean
-    over all groups of all samples, so that the number of devices changes nothing but the speed. With a mesh, each of
-    its devices gets the whole state and the whole report, so that every process can read them.
+    Batches carry samples along their first axis and may be spread over devices by `shard_batch`. The loss is the mean
+    over all groups of all samples, so the number of devices changes the speed only.
+
+    Args:
+        config: settings of training.
+        mesh: if given, each of its devices gets the whole state and report, so that every process can read them.
+
+    Returns:
+        A function of state and batch that returns the new state and the report.
     """
     if mesh is None:
         return functools.partial(_step, config=config)
@@ -131,7 +134,16 @@ _step = jax.jit(_one_step, static_argnames="config")
 def batch_loss(
     params: dict[str, Any], batch: RegistrationSample, config: TrainingConfig
 ) -> tuple[Float[Array, ""], ObjectiveTerms]:
-    """Mean of the registration loss over all groups of all samples, and of its terms."""
+    """Computes the mean of the matching loss and of its terms over all groups of all samples.
+
+    Args:
+        params: parameters of the model.
+        batch: samples along the first axis.
+        config: settings of training.
+
+    Returns:
+        The loss and its terms; 0 without any group.
+    """
     model = Model(params, config.model)
 
     def of_sample(sample: RegistrationSample) -> tuple[Array, ObjectiveTerms]:
@@ -139,7 +151,7 @@ def batch_loss(
 
         def of_group(group: tuple[MapOfScans, MapOfScans, AnyArray]) -> tuple[Array, ObjectiveTerms]:
             source, target, T_target_source = group
-            return map_pair_loss(
+            return _map_pair_loss(
                 model, _merged(clouds, source), _merged(clouds, target), T_target_source, config.objective
             )
 
@@ -153,27 +165,24 @@ def batch_loss(
     return loss, terms
 
 
-def map_pair_loss(
+def _map_pair_loss(
     model: Model, a: DescriptorCloud, b: DescriptorCloud, T_b_a: Float[AnyArray, "4 4"], config: ObjectiveConfig
 ) -> tuple[Float[Array, ""], ObjectiveTerms]:
-    """What the networks say of two maps, and the losses of it (DeepPointMap eq. 4 to 7)."""
+    # Applies the networks to two maps, and computes the losses (DeepPointMap eq. 4 to 7).
     correlated_a, correlated_b = correlate(model, a, b)
-    close_a, close_b = close_pairs(a.positions, b.positions, T_b_a, a.mask, b.mask, config=config)
+    close_a, close_b = close_pairs(a, b, T_b_a, config=config)
     sides = (
         _side(model, a, correlated_a, correlated_b, close_a),
         _side(model, b, correlated_b, correlated_a, close_b),
     )
-    return registration_loss(*sides, T_b_a, config=config)
+    return matching_loss(*sides, T_b_a, config=config)
 
 
 def _in_parts(function: Callable[[Any], Any], trees: Any, at_once: int) -> Any:
-    """The function of each entry along the first axis, about so many at a time, at least one.
-
-    What happens inside is computed again for the gradient instead of being kept: a tenth of the memory, and on a CPU
-    no time is lost, for what stays small stays in the cache.
-    """
+    # Maps the function over the first axis, about `at_once` entries at a time. The gradient computes the inside again
+    # instead of keeping it: this takes a tenth of the memory, and no more time on a CPU, where small parts stay cached.
     num = len(jax.tree.leaves(trees)[0])
-    # A divisor: a last part of another size would be compiled apart.
+    # A divisor, because a last part of another size would be compiled separately.
     size = max(size for size in range(1, max(1, min(at_once, num)) + 1) if num % size == 0)
     return jax.lax.map(jax.checkpoint(function), trees, batch_size=size)
 
@@ -249,7 +258,7 @@ def _overlap_step(
 def _correlated_pairs(
     model: Model, batch: OverlapSample, pairs_at_once: int
 ) -> tuple[DescriptorCloud, DescriptorCloud]:
-    """Of all pairs of all samples, one after the other; no gradient is asked of it."""
+    # All pairs of all samples along one axis; they need no gradient.
 
     def of_pair(pair: tuple[PointPyramid, PointPyramid]) -> tuple[DescriptorCloud, DescriptorCloud]:
         first, second = pair
@@ -271,7 +280,7 @@ def _with_head(params: dict[str, Any], head: Any) -> dict[str, Any]:
 
 
 def _schedule(config: TrainingConfig, *, is_overlap: bool) -> optax.Schedule:
-    """A cosine from the first learning rate to the last, after the warm-up."""
+    # A cosine from the first learning rate to the last, after the warm-up.
     ratio = config.overlap_ratio if is_overlap else 1.0
     return optax.warmup_cosine_decay_schedule(
         init_value=0.0 if config.warmup_steps > 0 and not is_overlap else ratio * config.learning_rate,
@@ -288,25 +297,3 @@ def _optimizer(config: TrainingConfig, *, is_overlap: bool) -> optax.GradientTra
         optax.clip_by_global_norm(config.max_gradient_norm),
         optax.adamw(_schedule(config, is_overlap=is_overlap), weight_decay=ratio * config.weight_decay),
     )
-
-
-def device_mesh() -> Mesh:
-    """All devices of all processes in a row."""
-    return Mesh(np.array(jax.devices()), (BATCH_AXIS,))
-
-
-def shard_batch(samples: TreeT, mesh: Mesh) -> TreeT:
-    """The samples of this process, stacked along the first axis, as its part of the batch of all devices.
-
-    Args:
-        samples: as many as this process has devices in the mesh, or a multiple.
-        mesh: from `device_mesh`.
-    """
-    sharding = NamedSharding(mesh, PartitionSpec(BATCH_AXIS))
-    return jax.tree.map(lambda x: jax.make_array_from_process_local_data(sharding, np.asarray(x)), samples)
-
-
-def replicate(tree: TreeT, mesh: Mesh) -> TreeT:
-    """The same on every device of the mesh; every process has to give the same."""
-    sharding = NamedSharding(mesh, PartitionSpec())
-    return jax.tree.map(lambda x: jax.make_array_from_process_local_data(sharding, np.asarray(x)), tree)

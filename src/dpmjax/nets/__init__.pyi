@@ -1,10 +1,5 @@
-from .attention import AttentionLayer as AttentionLayer
-from .attention import PairAttention as PairAttention
-from .attention import embed_positions as embed_positions
 from .decoder import DecoderConfig as DecoderConfig
 from .decoder import DescriptorDecoder as DescriptorDecoder
-from .heads import OffsetHead as OffsetHead
-from .heads import OverlapHead as OverlapHead
 from .point_encoder import EncoderConfig as EncoderConfig
 from .point_encoder import PointEncoder as PointEncoder
 from .scalar import ScalarNet as ScalarNet

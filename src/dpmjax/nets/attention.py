@@ -1,4 +1,4 @@
-"""Attention between descriptors, masked, and the embedding of where they are (DeepPointMap section 3.2)."""
+"""Masked attention between descriptors, and the embedding of their positions (DeepPointMap section 3.2)."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ from dpmjax.nets.layers import ComputeDtype, TwoLayers, layer_norm, linear
 EMBEDDING_TEMPERATURE = 10_000.0
 
 MAX_LIVE_LOGITS = 1 << 20
-"""How many logits a CPU holds at once: 4 MB."""
+"""Largest number of logits that a CPU holds at once: 4 MB."""
 
 
 def embed_positions(positions: Float[Array, "n 3"], num_channels: int) -> Float[Array, "n c"]:
-    """Sines and cosines of pi times metric coordinates, at wavelengths from 2 m to about 20 km (Vaswani et al. 2017).
+    """Embeds positions by sines and cosines at wavelengths from 2 m to about 20 km (Vaswani et al. 2017).
 
     Each axis has the largest even number of channels that fits three times: sine and cosine by turns, from the
-    shortest wavelength to the longest. What is left over is zero.
+    shortest wavelength to the longest. The remaining channels are zero.
 
     Args:
         positions: metres.
-        num_channels: c, at least 6.
+        num_channels: channels of the result, at least 6.
 
     Returns:
         (n, c), in the dtype of the positions.
@@ -39,7 +39,17 @@ def embed_positions(positions: Float[Array, "n 3"], num_channels: int) -> Float[
 def attend(
     queries: Float[Array, "m h c"], keys: Float[Array, "n h c"], values: Float[Array, "n h c"], mask: Bool[Array, " n"]
 ) -> Float[Array, "m h c"]:
-    """Softmax of scaled products, in float32, over the keys that are there; zero where none is."""
+    """Applies masked scaled dot-product attention; the softmax is computed in float32.
+
+    Args:
+        queries: m rows of h heads.
+        keys: n rows of h heads.
+        values: row for row with the keys.
+        mask: False for keys that are not there; they may hold any finite number.
+
+    Returns:
+        A weighted mean of the values for each query; zero without any key.
+    """
     per_head = [jnp.swapaxes(x, 0, 1) for x in (queries / queries.shape[-1] ** 0.5, keys, values)]
 
     def all_heads(*heads: jax.Array) -> jax.Array:
@@ -52,7 +62,7 @@ def attend(
     if num_logits <= MAX_LIVE_LOGITS:
         mixed = all_heads(*per_head)
     else:
-        # What does not fit the cache of a CPU takes three times as long there.
+        # Logits that do not fit the cache of a CPU take three times as long there.
         mixed = lax.platform_dependent(*per_head, cpu=head_by_head, default=all_heads)
     return jnp.swapaxes(mixed, 0, 1)
 
@@ -71,7 +81,7 @@ def _attend_with_one_head(
     queries: Float[Array, "m c"], keys: Float[Array, "n c"], values: Float[Array, "n c"], mask: Bool[Array, " n"]
 ) -> Float[Array, "m c"]:
     logits = jnp.matmul(queries, keys.T, preferred_element_type=jnp.float32) + jnp.where(mask, 0, -jnp.inf)
-    # Finite even where there is no key, so that what is masked has a share of exactly zero.
+    # Finite even without any key, so that masked keys have a share of exactly zero.
     lowest = jnp.finfo(jnp.float32).min
     largest = lax.stop_gradient(jnp.max(logits, axis=-1, keepdims=True, initial=lowest))
     shares = jnp.exp(logits - largest)
@@ -82,12 +92,12 @@ def _attend_with_one_head(
 
 
 class PairAttention(nn.Module):
-    """Attention with several heads on a pair of clouds, from each into itself or into the other.
+    """Attention with several heads on a pair of clouds: self-attention or cross-attention.
 
     Attributes:
         num_heads: divides the number of channels.
-        is_crossed: whether each cloud looks into the other one.
-        compute_dtype: of the matrix products.
+        is_crossed: whether each cloud attends to the other one instead of to itself.
+        compute_dtype: type of the matrix products.
     """
 
     num_heads: int
@@ -96,9 +106,17 @@ class PairAttention(nn.Module):
 
     @nn.compact
     def __call__(
-        self, features: Float[Array, "m+n c"], masks: tuple[Bool[Array, " m"], Bool[Array, " n"]]
-    ) -> Float[Array, "m+n c"]:
-        """The rows of both clouds, one below the other: so each matrix is multiplied once."""
+        self, features: Float[Array, "rows c"], masks: tuple[Bool[Array, " m"], Bool[Array, " n"]]
+    ) -> Float[Array, "rows c"]:
+        """Applies attention to both clouds.
+
+        Args:
+            features: the rows of both clouds, one below the other, so that each matrix is multiplied once.
+            masks: masks of both clouds.
+
+        Returns:
+            Mixed features, row for row.
+        """
         num_rows, num_channels = features.shape
         dtype = jnp.dtype(self.compute_dtype)
         # One matrix for queries, keys and values, side by side.
@@ -118,12 +136,12 @@ class PairAttention(nn.Module):
 class AttentionLayer(nn.Module):
     """Self-attention, cross-attention and a two-layer network on a pair of clouds, each added and then normalised.
 
-    The position embedding is added to the features before both attentions, so it is in queries, keys, values and in
-    what is carried on (the published networks; the paper leaves it open). Both clouds pass the same weights.
+    The position embedding is added to the features before both attentions. It is therefore in the queries, keys,
+    values and in the residual path (the published networks; the paper leaves it open). Both clouds share the weights.
 
     Attributes:
-        num_heads: of both attentions.
-        compute_dtype: of the matrix products.
+        num_heads: heads of both attentions.
+        compute_dtype: type of the matrix products.
     """
 
     num_heads: int
@@ -132,11 +150,20 @@ class AttentionLayer(nn.Module):
     @nn.compact
     def __call__(
         self,
-        features: Float[Array, "m+n c"],
-        embeddings: Float[Array, "m+n c"],
+        features: Float[Array, "rows c"],
+        embeddings: Float[Array, "rows c"],
         masks: tuple[Bool[Array, " m"], Bool[Array, " n"]],
-    ) -> Float[Array, "m+n c"]:
-        """The rows of both clouds, one below the other, and which of each are there."""
+    ) -> Float[Array, "rows c"]:
+        """Applies the layer to both clouds.
+
+        Args:
+            features: the rows of both clouds, one below the other.
+            embeddings: of the positions, row for row.
+            masks: masks of both clouds.
+
+        Returns:
+            New features, row for row.
+        """
         num_channels = features.shape[1]
         x = features + embeddings
         x += PairAttention(self.num_heads, False, self.compute_dtype, name="self_attention")(x, masks)

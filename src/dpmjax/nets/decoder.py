@@ -1,6 +1,6 @@
-"""The decoder: two descriptor clouds look at each other, and heads read off what registration needs.
+"""The decoder: attention correlates two descriptor clouds, and four heads predict what registration needs.
 
-DeepPointMap section 3.2. Its methods are called by name: `decoder.apply({"params": params}, a, b, method="correlate")`.
+DeepPointMap section 3.2. Call a method by its name: `decoder.apply({"params": params}, a, b, method="correlate")`.
 """
 
 from __future__ import annotations
@@ -9,11 +9,10 @@ from dataclasses import dataclass
 
 import flax.linen as nn
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from dpmjax.checks import require_count
 from dpmjax.nets.attention import AttentionLayer, embed_positions
-from dpmjax.nets.heads import OffsetHead, OverlapHead
 from dpmjax.nets.layers import ComputeDtype, TwoLayers, linear, require_compute_dtype
 from dpmjax.types import DescriptorCloud
 
@@ -23,12 +22,12 @@ class DecoderConfig:
     """Widths of the decoder (defaults: DeepPointMap's published configuration).
 
     Attributes:
-        input_channels: of a descriptor.
-        model_channels: of a correlated descriptor; at least 6.
-        num_layers: of attention.
-        num_heads: of each attention; divides `model_channels`.
+        input_channels: channels of a descriptor.
+        model_channels: channels of a correlated descriptor; at least 6.
+        num_layers: number of attention layers.
+        num_heads: heads of each attention; divides `model_channels`.
         shares_layers: whether all layers have the same weights, as the paper says; the published networks do not.
-        compute_dtype: of the matrix products.
+        compute_dtype: type of the matrix products.
     """
 
     input_channels: int = 128
@@ -47,17 +46,81 @@ class DecoderConfig:
         require_compute_dtype(self.compute_dtype)
 
 
-class DescriptorDecoder(nn.Module):
-    """Descriptor clouds to correlated ones, and the four heads.
+class OffsetHead(nn.Module):
+    """Predicts the offset from a descriptor to its partner (DeepPointMap section 3.2, figure 2d).
+
+    Three linear layers of halving width run beside a linear short cut; a linear map to three coordinates follows.
 
     Attributes:
-        config: the widths.
+        num_channels: channels of one descriptor.
+        compute_dtype: type of the matrix products.
+    """
+
+    num_channels: int
+    compute_dtype: ComputeDtype = "float32"
+
+    @nn.compact
+    def __call__(self, features: Float[Array, "... c"], partners: Float[Array, "... c"]) -> Float[Array, "... 3"]:
+        """Predicts offsets, row for row.
+
+        Args:
+            features: correlated features of the first cloud.
+            partners: correlated features of their partners.
+
+        Returns:
+            Offsets in metres, in the frame of the first cloud.
+        """
+        pair = jnp.concatenate([features, partners], axis=-1)
+        x = nn.relu(linear(self.num_channels, self.compute_dtype, "linear_0")(pair))
+        x = nn.relu(linear(self.num_channels // 2, self.compute_dtype, "linear_1")(x))
+        x = linear(self.num_channels // 4, self.compute_dtype, "linear_2")(x)
+        short_cut = linear(self.num_channels // 4, self.compute_dtype, "short_cut")(pair)
+        return linear(3, "float32", "output")(nn.relu(x + short_cut).astype(jnp.float32))
+
+
+class OverlapHead(nn.Module):
+    """Predicts whether two clouds overlap (DeepPointMap section 3.2, figure 2e).
+
+    Attributes:
+        num_channels: channels of one descriptor.
+        compute_dtype: type of the matrix products.
+    """
+
+    num_channels: int
+    compute_dtype: ComputeDtype = "float32"
+
+    @nn.compact
+    def __call__(
+        self,
+        features: tuple[Float[Array, "m c"], Float[Array, "n c"]],
+        masks: tuple[Bool[Array, " m"], Bool[Array, " n"]],
+    ) -> Float[Array, ""]:
+        """Predicts the logit of the overlap probability.
+
+        Args:
+            features: correlated features of both clouds.
+            masks: masks of both clouds.
+
+        Returns:
+            The logit.
+        """
+        network = TwoLayers(self.num_channels, self.num_channels, self.compute_dtype, name="network")
+        means = [_masked_mean(network(x), mask) for x, mask in zip(features, masks, strict=True)]
+        classifier = TwoLayers(2 * self.num_channels, 1, "float32", name="classifier")
+        return classifier(jnp.concatenate(means))[0]
+
+
+class DescriptorDecoder(nn.Module):
+    """Correlates two descriptor clouds, and holds the four heads.
+
+    Attributes:
+        config: widths of the layers.
     """
 
     config: DecoderConfig
 
     def setup(self) -> None:
-        """All parts, so that every method finds its own."""
+        """Makes all parts, so that each method finds its own."""
         config = self.config
         channels, dtype = config.model_channels, config.compute_dtype
         self.projection = linear(channels, dtype, "projection")
@@ -69,7 +132,15 @@ class DescriptorDecoder(nn.Module):
         self.coarse_head = TwoLayers(config.input_channels, config.input_channels, dtype)
 
     def correlate(self, a: DescriptorCloud, b: DescriptorCloud) -> tuple[DescriptorCloud, DescriptorCloud]:
-        """Both clouds with features that know of each other, `model_channels` wide; zero where the mask is False."""
+        """Exchanges information between two clouds by attention.
+
+        Args:
+            a: descriptors with `input_channels` channels.
+            b: the same.
+
+        Returns:
+            Both clouds with features of `model_channels` channels; zero where the mask is False.
+        """
         masks = (a.mask, b.mask)
         a, b = _cleared(a), _cleared(b)
         embeddings = embed_positions(jnp.concatenate([a.positions, b.positions]), self.config.model_channels)
@@ -81,33 +152,39 @@ class DescriptorDecoder(nn.Module):
         correlated_b = DescriptorCloud(b.positions, features_b, masks[1])
         return _cleared(correlated_a), _cleared(correlated_b)
 
-    def similarity_features(self, features: Float[Array, "m c"]) -> Float[Array, "m c"]:
-        """Correlated features to those whose cosine tells how likely two descriptors are partners."""
-        return self.similarity_head(features)
-
-    def coarse_features(self, features: Float[Array, "m c"]) -> Float[Array, "m c"]:
-        """Uncorrelated features to those that the coarse pairing loss compares (DeepPointMap eq. 5)."""
-        return self.coarse_head(features)
-
-    def offsets(self, features: Float[Array, "... c"], partners: Float[Array, "... c"]) -> Float[Array, "... 3"]:
-        """Metres from each descriptor to its partner in the frame of the first, from their correlated features."""
-        return self.offset_head(features, partners)
-
     def overlap_logit(self, a: DescriptorCloud, b: DescriptorCloud) -> Float[Array, ""]:
-        """Logit of the probability that two correlated clouds see the same place."""
+        """Predicts the logit of the probability that two clouds overlap.
+
+        Args:
+            a: a correlated cloud.
+            b: the other correlated cloud.
+
+        Returns:
+            The logit.
+        """
         return self.overlap_head((_cleared(a).features, _cleared(b).features), (a.mask, b.mask))
 
     def __call__(self, a: DescriptorCloud, b: DescriptorCloud) -> None:
-        """Touches every part once, so that `init` makes all parameters."""
+        """Calls every part once, so that `init` makes all parameters.
+
+        Args:
+            a: any descriptor cloud.
+            b: any descriptor cloud.
+        """
         correlated_a, correlated_b = self.correlate(a, b)
-        self.similarity_features(correlated_a.features)
-        self.coarse_features(a.features)
-        self.offsets(correlated_a.features[:1], correlated_b.features[:1])
+        self.similarity_head(correlated_a.features)
+        self.coarse_head(a.features)
+        self.offset_head(correlated_a.features[:1], correlated_b.features[:1])
         self.overlap_logit(correlated_a, correlated_b)
 
 
 def _cleared(cloud: DescriptorCloud) -> DescriptorCloud:
-    """Zero where nothing is: what stands there may be anything, and must not reach a gradient."""
+    # Masked entries may hold anything, and must not reach a gradient.
     mask = cloud.mask[:, None]
     positions, features = jnp.where(mask, cloud.positions, 0), jnp.where(mask, cloud.features, 0)
     return DescriptorCloud(positions, features, cloud.mask)
+
+
+def _masked_mean(features: Float[Array, "m c"], mask: Bool[Array, " m"]) -> Float[Array, " c"]:
+    total = jnp.sum(jnp.where(mask[:, None], features, 0), axis=0)
+    return total / jnp.maximum(jnp.sum(mask), 1)

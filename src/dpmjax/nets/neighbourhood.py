@@ -1,7 +1,7 @@
-"""The maximum over neighbours of normalised differences, the inner loop of the encoder, with its own backward pass.
+"""The maximum over neighbours of normalised differences: the inner loop of the encoder, with its own backward pass.
 
-Left to itself, the derivative of gather, norm and maximum over (m, k, f) numbers takes fifteen times as long as the
-value on a CPU. Here one neighbour after the other is done, forward and back, on (m, f) numbers that stay in the cache.
+The automatic derivative of gather, norm and maximum over (m, k, f) numbers takes fifteen times as long as the value on
+a CPU. Both passes here visit one neighbour after the other, on (m, f) numbers that stay in the cache.
 """
 
 from __future__ import annotations
@@ -27,16 +27,19 @@ def maximum_of_normalised(
     neighbours: Int[AnyArray, "m k"],
     scale: Float[Array, " f"],
 ) -> Float[Array, "m f"]:
-    """max_j scale * x_ij / |x_ij| with x_ij = of_points_j + offset_ij kernel, its mean over channels being zero.
+    """Computes max_j scale * x_ij / |x_ij| with x_ij = of_points_j + offset_ij kernel, of zero mean over channels.
 
     |x| is the root of the mean square. Where several neighbours are equal, the derivative is that of the first.
 
     Args:
-        of_points: a row for each point that may be a neighbour.
+        of_points: one row for each point that may be a neighbour.
         offsets: from each query to its neighbours, in units of the radius.
-        kernel: what an offset adds.
+        kernel: linear map of the offsets.
         neighbours: rows of `of_points`, at least one for each query.
-        scale: of each channel, after the norm.
+        scale: factor of each channel, after the norm.
+
+    Returns:
+        The maximum over the neighbours, for each query and channel.
     """
     x = _with_offsets(of_points[neighbours], offsets, kernel)
     return jnp.max(x * _inverse_length(x) * scale, axis=1)
@@ -70,7 +73,7 @@ def _backward(residuals: Residuals, gradient: jax.Array) -> tuple[jax.Array, jax
         normalised = x * inverse
         has_won = winner == j
         won = jnp.where(has_won, weighted, 0)
-        # What lies along x only changes its length, which the norm takes away.
+        # The component along x only changes its length, which the norm removes.
         along = jnp.mean(won * normalised, axis=-1, keepdims=True)
         share = inverse * (won - normalised * along)
         return (
@@ -89,7 +92,7 @@ def _backward(residuals: Residuals, gradient: jax.Array) -> tuple[jax.Array, jax
 def _with_offsets(
     of_points: Float[Array, "... f"], offsets: Float[Array, "... 3"], kernel: Float[Array, "3 f"]
 ) -> Float[Array, "... f"]:
-    # Three products of their own stay in one loop with what follows; a matrix product would be written out first.
+    # Three separate products fuse with the operations after them; a matrix product would be written out first.
     for axis in range(3):
         of_points = of_points + offsets[..., axis, None] * kernel[axis]
     return of_points

@@ -1,15 +1,15 @@
-"""The encoder: a point pyramid to a few hundred descriptors (DeepPointMap section 3.1, after PointNeXt).
+"""The encoder maps a point pyramid to a few hundred descriptors (DeepPointMap section 3.1, after PointNeXt).
 
-Down the pyramid each stage gathers what lies around its points (set abstraction) and refines it (inverted residual
-blocks); then the features of the coarse levels are carried up again (feature propagation).
+Down the pyramid, each stage pools the neighbourhoods of its points (set abstraction) and refines them (inverted
+residual blocks). Then feature propagation carries the features of the coarse levels up again.
 
-A linear map of [feature_j, (position_j - position_i) / r] is a map of j's features and one of three numbers. So the
-large matrix products run over points, and what is done for each neighbour is one sum, norm and maximum.
+A linear map of [feature_j, (position_j - position_i) / r] is a map of the features of j plus a map of three numbers.
+So the large matrix products run over points, and each neighbour costs one sum, norm and maximum only.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal, get_args
 
 import flax.linen as nn
@@ -20,7 +20,7 @@ from jaxtyping import Array, Float, Int
 from dpmjax.checks import require_count
 from dpmjax.nets.layers import ComputeDtype, layer_norm, linear, require_compute_dtype
 from dpmjax.nets.neighbourhood import maximum_of_normalised
-from dpmjax.types import AnyArray, Interpolation, PointPyramid
+from dpmjax.types import AnyArray, Interpolation, PointPyramid, PyramidLevel
 
 Frame = Literal["lidar", "bearing"]
 
@@ -30,13 +30,13 @@ class EncoderConfig:
     """Widths of the encoder (defaults: DeepPointMap's published configuration).
 
     Attributes:
-        stem_channels: of the input level; each stage down doubles them.
-        expansion: of the hidden layer in inverted residual blocks.
-        output_channels: of a descriptor.
-        frame: in which directions are seen: "lidar", its axes (the published networks, which have to learn that a
-            scan may be turned), or "bearing", along and across the ray from the lidar to each point; descriptors then
-            do not change when the scan is turned about the vertical.
-        compute_dtype: of the matrix products over features.
+        stem_channels: channels of the input level; each stage down doubles them.
+        expansion: width of the hidden layer in inverted residual blocks, relative to its input.
+        output_channels: channels of a descriptor.
+        frame: frame of the offsets between points. "lidar": the axes of the lidar (the published networks, which have
+            to learn that a scan may be rotated). "bearing": along and across the ray from the lidar to each point;
+            descriptors are then invariant to rotations of the scan about the vertical.
+        compute_dtype: type of the matrix products over features.
     """
 
     stem_channels: int = 16
@@ -55,52 +55,67 @@ class EncoderConfig:
 
 
 class NeighbourhoodMaximum(nn.Module):
-    """For each query the maximum over its neighbours j of relu(norm(linear([feature_j, offset_j / radius]))).
+    """The maximum over the neighbours j of each query of relu(norm(linear([feature_j, offset_j / radius]))).
 
     Attributes:
         num_features: channels of the result.
-        radius: of the neighbourhood, normalised.
-        frame: in which offsets are seen.
-        compute_dtype: of the matrix product over features; the part of the positions is float32.
+        radius: radius of the neighbourhood, normalised coordinates.
+        config: frame of the offsets, and type of the product over features; the product over offsets is float32.
     """
 
     num_features: int
     radius: float
-    frame: Frame = "lidar"
-    compute_dtype: ComputeDtype = "float32"
+    config: EncoderConfig
 
     @nn.compact
     def __call__(
         self,
         features: Float[Array, "n c"],
-        positions: Float[Array, "n 3"],
-        queries: Float[Array, "m 3"],
+        positions: Float[AnyArray, "n 3"],
+        queries: Float[AnyArray, "m 3"],
         neighbours: Int[AnyArray, "m k"],
     ) -> Float[Array, "m f"]:
-        """Features (n, c) and positions (n, 3) of the level searched; queries (m, 3); rows of neighbours (m, k)."""
+        """Pools the neighbourhood of each query.
+
+        Args:
+            features: features of the level that holds the neighbours.
+            positions: positions of that level.
+            queries: positions of the queries.
+            neighbours: rows of the neighbours of each query.
+
+        Returns:
+            Features of the queries.
+        """
         num_channels, num_features = features.shape[1], self.num_features
         kernel = self.param("kernel", nn.initializers.lecun_normal(), (num_channels + 3, num_features))
         bias = self.param("bias", nn.initializers.zeros_init(), (num_features,))
         scale = self.param("norm_scale", nn.initializers.ones_init(), (num_features,))
         norm_bias = self.param("norm_bias", nn.initializers.zeros_init(), (num_features,))
-        # The norm removes the mean over channels: removed from the weights, there is none left to compute.
+        # The norm removes the mean over channels; removing it from the weights is cheaper.
         kernel, bias = kernel - kernel.mean(axis=1, keepdims=True), bias - bias.mean()
-        dtype = jnp.dtype(self.compute_dtype)
+        dtype = jnp.dtype(self.config.compute_dtype)
         from_features = jnp.matmul(
             features.astype(dtype), kernel[:-3].astype(dtype), preferred_element_type=jnp.float32
         )
-        offsets = (positions[neighbours] - queries[:, None]) / self.radius
-        if self.frame == "bearing":
+        offsets = jnp.asarray(positions[neighbours] - queries[:, None]) / self.radius
+        if self.config.frame == "bearing":
             offsets = turn_to_bearing(offsets, queries[:, None])
         # relu grows with its argument, so it may follow the maximum.
         maximum = maximum_of_normalised(from_features + bias, offsets, kernel[-3:], neighbours, scale)
         return nn.relu(maximum + norm_bias)
 
 
-def turn_to_bearing(vectors: Float[Array, "... 3"], positions: Float[Array, "... 3"]) -> Float[Array, "... 3"]:
-    """Vectors at positions as seen along the ray from the lidar: x away from it, y to the left, z up.
+def turn_to_bearing(vectors: Float[AnyArray, "... 3"], positions: Float[AnyArray, "... 3"]) -> Float[Array, "... 3"]:
+    """Rotates vectors into the frame of the ray from the lidar: x away from the lidar, y to the left, z up.
 
-    A turn of the lidar about its z axis changes nothing in them. On the axis itself x stays x.
+    The result is invariant to rotations about the z axis of the lidar. On that axis itself, vectors stay as they are.
+
+    Args:
+        vectors: one for each position, in the frame of the lidar.
+        positions: in the frame of the lidar.
+
+    Returns:
+        The rotated vectors.
     """
     squared = jnp.sum(positions[..., :2] ** 2, axis=-1)
     is_off_axis = squared > 0
@@ -115,29 +130,33 @@ class InvertedResidual(nn.Module):
     """Neighbourhood maximum, then a narrow-wide-narrow network of two layers, added to the input.
 
     Attributes:
-        radius: of the neighbourhood, normalised.
-        expansion: how much wider the hidden layer is.
-        frame: in which offsets are seen.
-        compute_dtype: of the matrix products.
+        radius: radius of the neighbourhood, normalised coordinates.
+        config: expansion, frame of the offsets and type of the matrix products.
     """
 
     radius: float
-    expansion: int
-    frame: Frame = "lidar"
-    compute_dtype: ComputeDtype = "float32"
+    config: EncoderConfig
 
     @nn.compact
     def __call__(
-        self, features: Float[Array, "m f"], positions: Float[Array, "m 3"], neighbours: Int[AnyArray, "m k"]
+        self, features: Float[Array, "m f"], positions: Float[AnyArray, "m 3"], neighbours: Int[AnyArray, "m k"]
     ) -> Float[Array, "m f"]:
-        """Features (m, f) and positions (m, 3) of one level, and neighbours (m, k) in it."""
+        """Refines the features of one level.
+
+        Args:
+            features: features of the level.
+            positions: positions of the level.
+            neighbours: rows of the neighbours in the same level.
+
+        Returns:
+            New features of the level.
+        """
         num_features = features.shape[1]
-        x = NeighbourhoodMaximum(num_features, self.radius, self.frame, self.compute_dtype, name="neighbourhood")(
-            features, positions, positions, neighbours
-        )
-        x = linear(num_features * self.expansion, self.compute_dtype, "expand")(x)
+        pool = NeighbourhoodMaximum(num_features, self.radius, self.config, name="neighbourhood")
+        x = pool(features, positions, positions, neighbours)
+        x = linear(num_features * self.config.expansion, self.config.compute_dtype, "expand")(x)
         x = nn.relu(layer_norm("expand_norm")(x))
-        x = linear(num_features, self.compute_dtype, "contract")(x)
+        x = linear(num_features, self.config.compute_dtype, "contract")(x)
         return nn.relu(layer_norm("contract_norm")(x) + features)
 
 
@@ -146,43 +165,40 @@ class Stage(nn.Module):
 
     Attributes:
         num_features: channels of the result.
-        radii: of the set abstraction, and of each block after it.
-        expansion: of the blocks.
-        frame: in which offsets are seen.
-        compute_dtype: of the matrix products.
+        radii: radius of the set abstraction, then the radius of each block after it.
+        config: expansion, frame of the offsets and type of the matrix products.
     """
 
     num_features: int
     radii: tuple[float, ...]
-    expansion: int
-    frame: Frame = "lidar"
-    compute_dtype: ComputeDtype = "float32"
+    config: EncoderConfig
 
     @nn.compact
-    def __call__(
-        self,
-        features: Float[Array, "n c"],
-        positions: Float[Array, "n 3"],
-        queries: Float[Array, "m 3"],
-        neighbours: tuple[Int[AnyArray, "m k"], ...],
-    ) -> Float[Array, "m f"]:
-        """Features and positions of the level before, positions of this one, and the neighbours of each block."""
-        first_radius, *radii = self.radii
-        rest = (self.frame, self.compute_dtype)
-        abstraction = NeighbourhoodMaximum(self.num_features, first_radius, *rest, name="set_abstraction")
-        x = abstraction(features, positions, queries, neighbours[0])
-        for block, radius in enumerate(radii):
-            residual = InvertedResidual(radius, self.expansion, *rest, name=f"inverted_residual_{block}")
-            x = residual(x, queries, neighbours[block + 1])
+    def __call__(self, features: Float[Array, "n c"], finer: PyramidLevel, level: PyramidLevel) -> Float[Array, "m f"]:
+        """Computes the features of one level from those of the finer level before it.
+
+        Args:
+            features: features of the finer level.
+            finer: the level before; positions are 0 where its mask is False.
+            level: this level; positions are 0 where its mask is False.
+
+        Returns:
+            Features of this level.
+        """
+        abstraction = NeighbourhoodMaximum(self.num_features, self.radii[0], self.config, name="set_abstraction")
+        x = abstraction(features, finer.positions, level.positions, level.neighbours[0])
+        for block, radius in enumerate(self.radii[1:]):
+            residual = InvertedResidual(radius, self.config, name=f"inverted_residual_{block}")
+            x = residual(x, level.positions, level.neighbours[block + 1])
         return x
 
 
 class FeaturePropagation(nn.Module):
-    """One step up the pyramid: what the finer level knows, and the coarser one's features interpolated to it.
+    """One step up the pyramid: features of the finer level, joined with interpolated features of the coarser one.
 
     Attributes:
         num_features: channels of the result.
-        compute_dtype: of the matrix products.
+        compute_dtype: type of the matrix products.
     """
 
     num_features: int
@@ -192,7 +208,16 @@ class FeaturePropagation(nn.Module):
     def __call__(
         self, fine: Float[Array, "n c"], coarse: Float[Array, "m d"], interpolation: Interpolation
     ) -> Float[Array, "n f"]:
-        """Features of both levels, (n, c) and (m, d)."""
+        """Joins the features of two levels.
+
+        Args:
+            fine: features of the finer level.
+            coarse: features of the coarser level.
+            interpolation: from the coarser to the finer level.
+
+        Returns:
+            New features of the finer level.
+        """
         interpolated = jnp.einsum("nk,nkd->nd", interpolation.weights, coarse[interpolation.indices])
         x = jnp.concatenate([fine, interpolated], axis=-1)
         for layer in range(2):
@@ -202,11 +227,11 @@ class FeaturePropagation(nn.Module):
 
 
 class PointEncoder(nn.Module):
-    """A point pyramid to the features of the level that its last interpolation reaches.
+    """Maps a point pyramid to features of the level that its last interpolation reaches.
 
     Attributes:
-        config: the widths.
-        radii: of each stage's neighbourhoods, normalised; those the pyramid was built with.
+        config: widths of the layers.
+        radii: radii of the neighbourhoods of each stage, normalised coordinates, as the pyramid was built with.
     """
 
     config: EncoderConfig
@@ -214,19 +239,25 @@ class PointEncoder(nn.Module):
 
     @nn.compact
     def __call__(self, pyramid: PointPyramid) -> Float[Array, "m c"]:
-        """Features in float32, one row for each point of that level; zero where its mask is False."""
+        """Encodes one pyramid.
+
+        Args:
+            pyramid: in normalised coordinates; masked points may hold anything.
+
+        Returns:
+            float32 features, one row for each point of that level; zero where its mask is False.
+        """
         config = self.config
-        # What is not there may hold anything; cleared here, it cannot reach a gradient.
-        positions = [jnp.where(level.mask[:, None], level.positions, 0) for level in pyramid.levels]
-        is_turned = config.frame == "bearing"
-        seen = turn_to_bearing(positions[0], positions[0]) if is_turned else positions[0]
+        # Masked points may hold anything; set to zero, they cannot reach a gradient.
+        levels = [
+            replace(level, positions=jnp.where(level.mask[:, None], level.positions, 0)) for level in pyramid.levels
+        ]
+        positions = levels[0].positions
+        seen = turn_to_bearing(positions, positions) if config.frame == "bearing" else jnp.asarray(positions)
         features = [linear(config.stem_channels, "float32", "stem")(seen)]
         for stage, radii in enumerate(self.radii):
-            num_features = config.stem_channels * 2 ** (stage + 1)
-            rest = (config.expansion, config.frame, config.compute_dtype)
-            module = Stage(num_features, radii, *rest, name=f"stage_{stage}")
-            level = pyramid.levels[stage + 1]
-            features.append(module(features[-1], positions[stage], positions[stage + 1], level.neighbours))
+            module = Stage(config.stem_channels * 2 ** (stage + 1), radii, config, name=f"stage_{stage}")
+            features.append(module(features[-1], levels[stage], levels[stage + 1]))
         x = features.pop()
         num_steps = len(pyramid.interpolation)
         for step, interpolation in enumerate(pyramid.interpolation):

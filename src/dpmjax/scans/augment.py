@@ -1,4 +1,8 @@
-"""What training does to a scan, so that the network meets what it will meet: gaps, shadows, any attitude, noise."""
+"""Augmentation for training: random gaps, shadows of near objects, any attitude, noise (DeepPointMap section 3.3).
+
+A vehicle nearby empties a large part of a scan ("Random Occlusion"). The paper describes boxes, its published
+configuration uses azimuth sectors; both are here.
+"""
 
 from __future__ import annotations
 
@@ -10,27 +14,84 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
+from dpmjax.checks import require_count
 from dpmjax.geometry import rigid
-from dpmjax.scans.occlusion import BoxConfig, SectorConfig, is_behind_boxes, is_behind_sectors
 from dpmjax.scans.preprocess import farthest_first
-from dpmjax.types import PointCloud
+from dpmjax.types import AnyArray, PointCloud
+
+Interval = tuple[float, float]
+
+
+@dataclass(frozen=True)
+class SectorConfig:
+    """Azimuth sectors that are empty from some range on (defaults: DeepPointMap's published configuration).
+
+    Attributes:
+        max_count: largest number of sectors; each number from 1 to it is equally likely.
+        width_deg: bounds of the width of the first sector; the width of the i-th sector is divided by i.
+        min_range_m: bounds of the range beyond which a sector hides its points.
+    """
+
+    max_count: int = 3
+    width_deg: Interval = (10.0, 150.0)
+    min_range_m: Interval = (2.0, 10.0)
+
+    def __post_init__(self) -> None:
+        require_count("max_count", self.max_count)
+        _require_interval("width_deg", self.width_deg)
+        _require_interval("min_range_m", self.min_range_m)
+
+
+@dataclass(frozen=True)
+class BoxConfig:
+    """Upright boxes around the sensor, from the size of a car to that of a truck (the paper gives no numbers).
+
+    All intervals are lower and upper bounds of uniform draws.
+
+    Attributes:
+        max_count: largest number of boxes; each number from 1 to it is equally likely.
+        length_m: longer side on the ground.
+        width_m: shorter side on the ground.
+        height_m: height of the box.
+        gap_m: free space between the sensor and the circle around the box.
+        centre_z_m: height of the centre of the box, in the frame of the lidar.
+    """
+
+    max_count: int = 3
+    length_m: Interval = (2.0, 10.0)
+    width_m: Interval = (0.5, 2.5)
+    height_m: Interval = (1.0, 3.5)
+    gap_m: Interval = (1.0, 10.0)
+    centre_z_m: Interval = (-1.5, 0.5)
+
+    def __post_init__(self) -> None:
+        require_count("max_count", self.max_count)
+        for name in ("length_m", "width_m", "height_m", "gap_m"):
+            _require_interval(name, getattr(self, name))
+        if self.centre_z_m[0] > self.centre_z_m[1]:
+            raise ValueError(f"centre_z_m: expected lower and upper bound, got {self.centre_z_m}")
+
+
+def _require_interval(name: str, interval: Interval) -> None:
+    if not 0 <= interval[0] <= interval[1]:
+        raise ValueError(f"{name}: expected 0 <= lower <= upper bound, got {interval}")
 
 
 @dataclass(frozen=True)
 class AugmentConfig:
-    """How much is done (defaults: DeepPointMap's published configuration, the boxes aside).
+    """Strength of the augmentation (defaults: DeepPointMap's published configuration, the boxes excepted).
 
     Attributes:
-        max_drop_ratio: each scan loses a share of its points between 0 and this.
-        sector_probability: of a scan being occluded by sectors.
-        sectors: which ones.
-        box_probability: of a scan being occluded by boxes.
-        boxes: which ones.
-        max_yaw_rad: rotation about z, to either side.
-        max_tilt_rad: rotation about x and about y, to either side.
-        translation_sigma_m: of x and y; half of it for z.
-        jitter_sigma_m: noise of each coordinate.
-        jitter_clip_sigmas: no noise is larger than this.
+        max_drop_ratio: each scan loses a share of its points, uniform between 0 and this.
+        sector_probability: probability that sectors occlude a scan.
+        sectors: settings of the sectors.
+        box_probability: probability that boxes occlude a scan.
+        boxes: settings of the boxes.
+        max_yaw_rad: largest rotation about z, to either side.
+        max_tilt_rad: largest rotation about x and about y, to either side.
+        translation_sigma_m: standard deviation of the translation in x and y; half of it in z.
+        jitter_sigma_m: standard deviation of the noise of each coordinate.
+        jitter_clip_sigmas: the noise is clipped at this many standard deviations.
     """
 
     max_drop_ratio: float = 0.5
@@ -57,9 +118,9 @@ class AugmentedScan(NamedTuple):
     """A scan after augmentation.
 
     Attributes:
-        cloud: in a frame of its own, metres; the valid point farthest from its origin stands first.
-        T_augmented_lidar: the motion that was applied, (4, 4). So the pose of the new frame is
-            `T_world_augmented = T_world_lidar @ rigid.inverse(T_augmented_lidar)`, and that of b in a is
+        cloud: the points in a new frame, metres; the valid point farthest from the origin stands first.
+        T_augmented_lidar: the motion that was applied, (4, 4). The pose of the new frame is
+            `T_world_augmented = T_world_lidar @ rigid.inverse(T_augmented_lidar)`, and the pose of b in a is
             `T_augmented_lidar_a @ T_a_b @ rigid.inverse(T_augmented_lidar_b)`.
     """
 
@@ -68,15 +129,18 @@ class AugmentedScan(NamedTuple):
 
 
 def augment_scan(cloud: PointCloud, config: AugmentConfig, *, key: PRNGKeyArray) -> AugmentedScan:
-    """Random drop, random occlusion, random rigid motion and jitter, in this order (DeepPointMap section 3.3).
+    """Drops points, occludes, moves and jitters one scan, in this order (DeepPointMap section 3.3).
 
-    For one scan; use `vmap` over clouds and keys for more, each of which then moves on its own. Whether two scans see
-    the same place is to be asked of the true poses, before augmentation.
+    Use `vmap` over clouds and keys for several scans; each then gets a motion of its own. Whether two scans overlap
+    follows from their true poses before augmentation.
 
     Args:
         cloud: a preprocessed scan, metres, in the frame of the lidar.
-        config: how much is done.
+        config: strength of the augmentation.
         key: used once.
+
+    Returns:
+        The scan and the motion that was applied to it.
     """
     drop_key, occlusion_key, motion_key, jitter_key = jax.random.split(key, 4)
     points = jnp.where(cloud.mask[:, None], cloud.points, 0)
@@ -91,7 +155,15 @@ def augment_scan(cloud: PointCloud, config: AugmentConfig, *, key: PRNGKeyArray)
 
 
 def random_motion(config: AugmentConfig, *, key: PRNGKeyArray) -> Float[Array, "4 4"]:
-    """A rotation Rx Ry Rz by uniform angles, and a normal translation."""
+    """Draws a rotation Rx Ry Rz by uniform angles, and a normal translation.
+
+    Args:
+        config: bounds of the angles and sigma of the translation.
+        key: used once.
+
+    Returns:
+        A homogeneous matrix (4, 4), metres.
+    """
     angle_key, translation_key = jax.random.split(key)
     bounds = jnp.array([config.max_tilt_rad, config.max_tilt_rad, config.max_yaw_rad])
     roll, pitch, yaw = bounds * jax.random.uniform(angle_key, (3,), minval=-1, maxval=1)
@@ -118,3 +190,76 @@ def _is_occluded(points: Float[Array, "n 3"], config: AugmentConfig, key: PRNGKe
     has_sectors, has_boxes = jax.random.uniform(coin_key, (2,)) < probabilities
     by_sectors = has_sectors & is_behind_sectors(points, config.sectors, key=sector_key)
     return by_sectors | (has_boxes & is_behind_boxes(points, config.boxes, key=box_key))
+
+
+def is_behind_sectors(points: Float[AnyArray, "n 3"], config: SectorConfig, *, key: PRNGKeyArray) -> Bool[Array, " n"]:
+    """Returns True for points in a random sector beyond its range; metres, in the frame of the sensor, z up."""
+    draws = jax.random.uniform(key, (4, config.max_count))
+    index = jnp.arange(1, config.max_count + 1)
+    count = _count(draws[0, 0], config.max_count)
+    width = jnp.deg2rad(_between(config.width_deg, draws[1])) / index
+    start = _between((-jnp.pi, jnp.pi), draws[2])
+    min_range = _between(config.min_range_m, draws[3])
+    azimuth = jnp.arctan2(points[:, 1], points[:, 0])[:, None]
+    is_in_sector = jnp.mod(azimuth - start, 2 * jnp.pi) <= width
+    is_far = jnp.sum(points**2, axis=1)[:, None] > min_range**2
+    return jnp.any(is_in_sector & is_far & (index <= count), axis=1)
+
+
+def is_behind_boxes(points: Float[AnyArray, "n 3"], config: BoxConfig, *, key: PRNGKeyArray) -> Bool[Array, " n"]:
+    """Returns True for points that a random box hides; metres, in the frame of the sensor, z up."""
+    draws = jax.random.uniform(key, (8, config.max_count))
+    count = _count(draws[0, 0], config.max_count)
+    length = _between(config.length_m, draws[1])
+    width = _between(config.width_m, draws[2])
+    height = _between(config.height_m, draws[3])
+    z = _between(config.centre_z_m, draws[4])
+    azimuth = _between((-jnp.pi, jnp.pi), draws[5])
+    heading = _between((-jnp.pi, jnp.pi), draws[6])
+    # The gap keeps the sensor outside of the box: inside, everything would be hidden.
+    distance = _between(config.gap_m, draws[7]) + jnp.hypot(length, width) / 2
+    centres = jnp.stack([distance * jnp.cos(azimuth), distance * jnp.sin(azimuth), z], axis=1)
+    sizes = jnp.stack([length, width, height], axis=1)
+    is_hidden = jax.vmap(is_behind_box, (None, 0, 0, 0))(points, centres, sizes, heading)
+    return jnp.any(is_hidden & (jnp.arange(config.max_count) < count)[:, None], axis=0)
+
+
+def is_behind_box(
+    points: Float[AnyArray, "n 3"],
+    centre: Float[AnyArray, " 3"],
+    size: Float[AnyArray, " 3"],
+    heading: Float[Array, ""],
+) -> Bool[Array, " n"]:
+    """Finds the points whose segment to the origin meets one upright box (slab method).
+
+    Args:
+        points: metres, in the frame of the sensor.
+        centre: centre of the box, same frame.
+        size: length, width and height of the box.
+        heading: direction of the length, radians about z.
+
+    Returns:
+        True for hidden points.
+    """
+    cos, sin = jnp.cos(heading), jnp.sin(heading)
+
+    def turn(vectors: Float[Array, "... 3"]) -> Float[Array, "... 3"]:
+        x, y, z = vectors[..., 0], vectors[..., 1], vectors[..., 2]
+        return jnp.stack([cos * x + sin * y, cos * y - sin * x, z], axis=-1)
+
+    direction, origin = turn(jnp.asarray(points)), -turn(jnp.asarray(centre))
+    # A beam parallel to a slab never crosses its planes; with a tiny slope, both crossings are far away.
+    tiny = jnp.finfo(points.dtype).eps
+    slope = jnp.where(jnp.abs(direction) < tiny, tiny, direction)
+    crossings = jnp.stack([(-size / 2 - origin) / slope, (size / 2 - origin) / slope])
+    enters = jnp.max(jnp.min(crossings, axis=0), axis=1)
+    leaves = jnp.min(jnp.max(crossings, axis=0), axis=1)
+    return (enters <= leaves) & (leaves >= 0) & (enters <= 1)
+
+
+def _between(bounds: Interval, draws: Float[Array, " c"]) -> Float[Array, " c"]:
+    return bounds[0] + (bounds[1] - bounds[0]) * draws
+
+
+def _count(draw: Float[Array, ""], max_count: int) -> Array:
+    return 1 + jnp.floor(draw * max_count).astype(jnp.int32)

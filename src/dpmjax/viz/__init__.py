@@ -9,11 +9,12 @@ from dpmjax.viz.figures import save_figure
 from dpmjax.viz.maps import Panel, make_panel, registered_scans_figure
 from dpmjax.viz.rasters import ErrorMap, error_maps_figure, from_above_figure, occupancy_figure
 from dpmjax.viz.toy import endings_figure, toy_figure
-from dpmjax.viz.training import curves_figure, matches_figure
+from dpmjax.viz.training import MatchedScans, curves_figure, matches_figure
 
 __all__ = [
     "ErrorMap",
     "History",
+    "MatchedScans",
     "Panel",
     "curves_figure",
     "endings_figure",

@@ -1,9 +1,9 @@
-"""The course of a training, and what a model matches: curves over steps, and two clouds with lines between them."""
+"""Pictures of a training: curves over steps, and two scans with lines between their matches."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -19,10 +19,17 @@ SMOOTHED_PART = 0.03
 
 
 def curves_figure(steps: ArrayLike, curves: Mapping[str, ArrayLike]) -> Figure:
-    """Draws each curve over the steps in a row of its own; what was not measured (NaN) is left out.
+    """Draws each curve over the steps in a row of its own; NaN is left out.
+
+    Args:
+        steps: numbers of the steps.
+        curves: one value for each step, by name.
+
+    Returns:
+        The figure.
 
     Raises:
-        ValueError: no step, no curve, or a curve of another length.
+        ValueError: if there is no step, no curve, or a curve of another length.
     """
     x = np.asarray(steps, np.float64)
     values = {name: np.asarray(curve, np.float64) for name, curve in curves.items()}
@@ -53,34 +60,43 @@ def curves_figure(steps: ArrayLike, curves: Mapping[str, ArrayLike]) -> Figure:
     return figure
 
 
-def matches_figure(
-    source: ArrayLike,
-    target: ArrayLike,
-    T_target_source: ArrayLike,
-    source_matched: ArrayLike,
-    target_matched: ArrayLike,
-    is_right: ArrayLike,
-    title: str,
-) -> Figure:
-    """Draws two scans side by side from above with lines between matches, and laid over each other by the motion.
+class MatchedScans(NamedTuple):
+    """Two scans and the matches between them, metres.
+
+    Attributes:
+        source: (n, 3) points in the source frame.
+        target: (m, 3) points in the target frame.
+        source_matched: (k, 3) matched points of the source.
+        target_matched: (k, 3) matched points of the target, row for row.
+        is_right: (k,) whether the true motion brings the two points of a match together.
+    """
+
+    source: ArrayLike
+    target: ArrayLike
+    source_matched: ArrayLike
+    target_matched: ArrayLike
+    is_right: ArrayLike
+
+
+def matches_figure(scans: MatchedScans, T_target_source: ArrayLike, *, title: str) -> Figure:
+    """Draws two scans side by side from above with lines between matches, and overlaid by the estimated motion.
 
     Args:
-        source: (n, 3) points, metres.
-        target: (m, 3) points.
-        T_target_source: (4, 4) the motion that was found.
-        source_matched: (k, 3) points of the source that were matched,
-        target_matched: (k, 3) and those of the target, row for row.
-        is_right: (k,) whether the true motion brings the two close to each other.
-        title: of the picture.
+        scans: both scans and their matches.
+        T_target_source: (4, 4) the estimated motion, metres.
+        title: title of the picture.
+
+    Returns:
+        The figure.
     """
-    a, b, T = (np.asarray(x, np.float64) for x in (source, target, T_target_source))
-    pa, pb = np.asarray(source_matched, np.float64), np.asarray(target_matched, np.float64)
+    a, b, T = (np.asarray(x, np.float64) for x in (scans.source, scans.target, T_target_source))
+    pa, pb = np.asarray(scans.source_matched, np.float64), np.asarray(scans.target_matched, np.float64)
     figure = new_figure(12.0, 4.6)
     left, right = figure.subplots(1, 2, width_ratios=(2, 1))
     shift = np.array([a[:, 0].max(initial=0) - b[:, 0].min(initial=0) + 5.0, 0.0])
     _dots(left, a[:, :2], CURVE_COLOR)
     _dots(left, b[:, :2] + shift, MUTED)
-    for start, end, fits in zip(pa[:, :2], pb[:, :2] + shift, np.asarray(is_right, bool), strict=True):
+    for start, end, fits in zip(pa[:, :2], pb[:, :2] + shift, np.asarray(scans.is_right, bool), strict=True):
         left.plot(*zip(start, end, strict=True), color=RIGHT_COLOR if fits else ACCENT, lw=0.6, alpha=0.7)
     left.set_title(title, fontsize=10, color=INK)
     _dots(right, b[:, :2], MUTED)
@@ -98,7 +114,7 @@ def _dots(axes: Axes, points: NDArray[np.float64], color: str) -> None:
 
 
 def _smoothed(values: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Running mean over a small part of the curve, of what there is at its ends."""
+    # Running mean over a small part of the curve; at the ends, of the values that are there.
     width = max(3, int(SMOOTHED_PART * len(values)))
     ones = np.ones(width)
     return np.convolve(values, ones, "same") / np.convolve(np.ones_like(values), ones, "same")

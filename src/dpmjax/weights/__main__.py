@@ -6,18 +6,25 @@ import argparse
 import sys
 from collections.abc import Sequence
 
-from dpmjax.weights.checkpoint import load_model, save_model
+from dpmjax.weights.model_file import load_model, save_model
 
 EXIT_OK, EXIT_BAD_INPUT = 0, 2
 
 
 def main(args: Sequence[str] | None = None) -> int:
-    """Converts, and returns the exit code: 0, or 2 after one line on stderr where the input is bad."""
+    """Converts a checkpoint; bad input ends in one line on stderr.
+
+    Args:
+        args: the command line; None takes that of the process.
+
+    Returns:
+        The exit code: 0, or 2 for bad input.
+    """
     parser = argparse.ArgumentParser(prog="python -m dpmjax.weights", description=__doc__)
     parser.add_argument("source", help="a published .pth checkpoint, a .safetensors file, or a shipped model's name")
     parser.add_argument("target", help="the .safetensors file to write")
     parser.add_argument("--dtype", choices=["float32", "float16"], default="float32", help="how numbers are stored")
-    parser.add_argument("--card", default="", help="what people should know of these weights")
+    parser.add_argument("--card", default="", help="a description of these weights")
     options = parser.parse_args(args)
     try:
         save_model(load_model(options.source), options.target, card=options.card, dtype=options.dtype)

@@ -1,75 +1,93 @@
-"""The published PyTorch checkpoints of DeepPointMap: their names to ours, and their sizes to a configuration."""
+"""The published PyTorch checkpoints of DeepPointMap, read without PyTorch and without running what is in the file.
+
+A file that PyTorch saved is a ZIP archive of raw storages and one pickle that maps tensors to parts of storages. The
+pickle may name only tensors and dictionaries; anything else is refused. Files from before PyTorch 1.6 are no archives;
+those need PyTorch itself. Names of the tensors are mapped to ours, and their shapes give the configuration.
+"""
 
 from __future__ import annotations
 
+import io
 import json
+import math
+import pickle
 import re
+import zipfile
+from collections import OrderedDict
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
-import flax.traverse_util
 import jax.numpy as jnp
 import numpy as np
 
-from dpmjax.deeppointmap.model import Model, ModelConfig, model_shapes
+from dpmjax.deeppointmap.model import Model, ModelConfig
 from dpmjax.geometry.pyramid import PyramidConfig, PyramidStage
 from dpmjax.nets.decoder import DecoderConfig
 from dpmjax.nets.point_encoder import EncoderConfig
-from dpmjax.weights.torch_file import read_torch_file
+from dpmjax.weights.model_file import model_from_arrays
 
 Tensors = dict[str, np.ndarray]
 
-# Each of their names is one of these patterns and then `weight` or `bias`; `(\d+)` is carried over.
+# Each published name is one of these patterns and then `weight` or `bias`; `(\d+)` is carried over.
+_RESIDUAL, _OUR_RESIDUAL = r"downsampler\.(\d+)\.irm\.(\d+)", r"stage_\1.inverted_residual_\2"
 ENCODER_NAMES = {
     r"point_mlp0\.": "stem.",
     r"downsampler\.(\d+)\.sa\.mlp\.0\.": r"stage_\1.set_abstraction.",
     r"downsampler\.(\d+)\.sa\.mlp\.1\.ln\.": r"stage_\1.set_abstraction.norm_",
-    r"downsampler\.(\d+)\.irm\.(\d+)\.la\.mlp\.0\.": r"stage_\1.inverted_residual_\2.neighbourhood.",
-    r"downsampler\.(\d+)\.irm\.(\d+)\.la\.mlp\.1\.ln\.": r"stage_\1.inverted_residual_\2.neighbourhood.norm_",
-    r"downsampler\.(\d+)\.irm\.(\d+)\.pw_conv\.0\.": r"stage_\1.inverted_residual_\2.expand.",
-    r"downsampler\.(\d+)\.irm\.(\d+)\.pw_conv\.1\.ln\.": r"stage_\1.inverted_residual_\2.expand_norm.",
-    r"downsampler\.(\d+)\.irm\.(\d+)\.pw_conv\.3\.": r"stage_\1.inverted_residual_\2.contract.",
-    r"downsampler\.(\d+)\.irm\.(\d+)\.pw_conv\.4\.ln\.": r"stage_\1.inverted_residual_\2.contract_norm.",
-    r"upsampler\.(\d+)\.mlp\.0\.": r"propagation_\1.linear_0.",
-    r"upsampler\.(\d+)\.mlp\.1\.ln\.": r"propagation_\1.norm_0.",
-    r"upsampler\.(\d+)\.mlp\.3\.": r"propagation_\1.linear_1.",
-    r"upsampler\.(\d+)\.mlp\.4\.ln\.": r"propagation_\1.norm_1.",
+    rf"{_RESIDUAL}\.la\.mlp\.0\.": rf"{_OUR_RESIDUAL}.neighbourhood.",
+    rf"{_RESIDUAL}\.la\.mlp\.1\.ln\.": rf"{_OUR_RESIDUAL}.neighbourhood.norm_",
+    rf"{_RESIDUAL}\.pw_conv\.0\.": rf"{_OUR_RESIDUAL}.expand.",
+    rf"{_RESIDUAL}\.pw_conv\.1\.ln\.": rf"{_OUR_RESIDUAL}.expand_norm.",
+    rf"{_RESIDUAL}\.pw_conv\.3\.": rf"{_OUR_RESIDUAL}.contract.",
+    rf"{_RESIDUAL}\.pw_conv\.4\.ln\.": rf"{_OUR_RESIDUAL}.contract_norm.",
+}
+for _layer in range(2):
+    ENCODER_NAMES[rf"upsampler\.(\d+)\.mlp\.{3 * _layer}\."] = rf"propagation_\1.linear_{_layer}."
+    ENCODER_NAMES[rf"upsampler\.(\d+)\.mlp\.{3 * _layer + 1}\.ln\."] = rf"propagation_\1.norm_{_layer}."
+
+# Networks whose linear layers have the numbers 0, 2, 4 there, and 0, 1, 2 here.
+_SEQUENCES = {
+    r"descriptor_attention\.(\d+)\.mlp": r"layer_\1.network",
+    "similarity_head": "similarity_head",
+    "coarse_pairing_head": "coarse_head",
+    r"offset_head\.mlp": "offset_head",
+    r"loop_head\.mlp": "overlap_head.network",
+    r"loop_head\.projection": "overlap_head.classifier",
 }
 DECODER_NAMES = {
     r"projection\.": "projection.",
     r"descriptor_attention\.(\d+)\.(self|cross)_attn\.in_proj_": r"layer_\1.\2_attention.in_",
     r"descriptor_attention\.(\d+)\.(self|cross)_attn\.out_proj\.": r"layer_\1.\2_attention.out.",
-    r"descriptor_attention\.(\d+)\.mlp\.0\.": r"layer_\1.network.linear_0.",
-    r"descriptor_attention\.(\d+)\.mlp\.2\.": r"layer_\1.network.linear_1.",
     r"descriptor_attention\.(\d+)\.norm1\.": r"layer_\1.self_norm.",
     r"descriptor_attention\.(\d+)\.norm2\.": r"layer_\1.cross_norm.",
     r"descriptor_attention\.(\d+)\.norm3\.": r"layer_\1.network_norm.",
-    r"similarity_head\.0\.": "similarity_head.linear_0.",
-    r"similarity_head\.2\.": "similarity_head.linear_1.",
-    r"coarse_pairing_head\.0\.": "coarse_head.linear_0.",
-    r"coarse_pairing_head\.2\.": "coarse_head.linear_1.",
-    r"offset_head\.mlp\.0\.": "offset_head.linear_0.",
-    r"offset_head\.mlp\.2\.": "offset_head.linear_1.",
-    r"offset_head\.mlp\.4\.": "offset_head.linear_2.",
     r"offset_head\.downsample\.": "offset_head.short_cut.",
     r"offset_head\.head\.": "offset_head.output.",
-    r"loop_head\.mlp\.0\.": "overlap_head.network.linear_0.",
-    r"loop_head\.mlp\.2\.": "overlap_head.network.linear_1.",
-    r"loop_head\.projection\.0\.": "overlap_head.classifier.linear_0.",
-    r"loop_head\.projection\.2\.": "overlap_head.classifier.linear_1.",
+    **{rf"{theirs}\.{2 * i}\.": f"{ours}.linear_{i}." for theirs, ours in _SEQUENCES.items() for i in range(3)},
 }
+
+_CODES = {"Double": "<f8", "Float": "<f4", "Half": "<f2", "Long": "<i8", "Int": "<i4", "Short": "<i2"}
+_CODES |= {"Char": "i1", "Byte": "u1", "Bool": "?"}
+STORAGE_DTYPES = {f"{name}Storage": np.dtype(code) for name, code in _CODES.items()}
+STORAGE_DTYPES["BFloat16Storage"] = np.dtype(jnp.bfloat16)
 
 
 def import_torch_checkpoint(path: str | Path) -> Model:
-    """A model from a published checkpoint: `{"encoder": state_dict, "decoder": state_dict}`.
+    """Reads a model from a published checkpoint: `{"encoder": state_dict, "decoder": state_dict}`.
 
-    Widths, depths and numbers of blocks are derived from the tensors. Radii, numbers of points and of neighbours are
-    not in there: they come from a `config.json` beside the file where there is one (keys `npoint`, `radius_list`,
-    `nsample_list`, `upsample_layers` under `encoder`, and `coordinate_scale`), and are the paper's otherwise. Attention
+    The shapes of the tensors give widths, depths and numbers of blocks. Radii, numbers of points and numbers of
+    neighbours come from a `config.json` beside the file (keys `npoint`, `radius_list`, `nsample_list`,
+    `upsample_layers` under `encoder`, and `coordinate_scale`), or are those of the paper where there is none. Attention
     has eight heads.
 
+    Args:
+        path: the `.pth` file.
+
+    Returns:
+        The model, parameters in float32.
+
     Raises:
-        ValueError: the file cannot be read, or is of another layout.
+        ValueError: if the file cannot be read, or has another layout.
     """
     path = Path(path)
     content = read_torch_file(path)
@@ -86,14 +104,7 @@ def import_torch_checkpoint(path: str | Path) -> Model:
         raise ValueError(f"{path}: lacks the tensor that becomes {error}") from error
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from error
-    shapes = flax.traverse_util.flatten_dict(model_shapes(config), sep=".")
-    for name in sorted(shapes.keys() | arrays.keys()):
-        wanted = shapes[name].shape if name in shapes else "none"
-        found = arrays[name].shape if name in arrays else "none"
-        if wanted != found:
-            raise ValueError(f"{path}: the tensor that becomes {name} should have shape {wanted}, and has {found}")
-    params = {name: jnp.asarray(array, jnp.float32) for name, array in arrays.items()}
-    return Model(flax.traverse_util.unflatten_dict(params, sep="."), config)
+    return model_from_arrays(arrays, config, str(path))
 
 
 def _renamed(tensors: Any, names: dict[str, str], where: str) -> Tensors:
@@ -118,7 +129,7 @@ def _converted(name: str, tensor: np.ndarray, names: dict[str, str], where: str)
 
 
 def _sampling(path: Path) -> tuple[tuple[PyramidStage, ...], float]:
-    """The stages and the scale in metres that a published configuration tells; the paper's without one."""
+    # The stages, and the scale in metres, of a published configuration; those of the paper without one.
     if not path.is_file():
         return PyramidConfig().stages, ModelConfig().scale_m
     try:
@@ -159,3 +170,108 @@ def _derived_config(arrays: Tensors, stages: tuple[PyramidStage, ...], scale_m: 
         input_channels=input_channels, model_channels=model_channels, num_layers=count(r"decoder\.layer_\d+")
     )
     return ModelConfig(PyramidConfig(stages, num_steps), encoder, decoder, scale_m)
+
+
+def read_torch_file(path: str | Path) -> Any:
+    """Reads what `torch.save` wrote.
+
+    Args:
+        path: the file.
+
+    Returns:
+        Dictionaries, lists and numbers, with NumPy arrays for tensors.
+
+    Raises:
+        ValueError: if the file is missing, broken, or holds other objects; or if it has the format before PyTorch 1.6
+            and PyTorch is not installed.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise ValueError(f"{path}: no such file")
+    if not zipfile.is_zipfile(path):
+        return _read_with_torch(path)
+    try:
+        with zipfile.ZipFile(path) as archive:
+            return _read_archive(archive)
+    except Exception as error:  # a broken pickle raises anything at all
+        raise ValueError(f"{path}: not a PyTorch checkpoint that can be read ({error})") from error
+
+
+def _read_archive(archive: zipfile.ZipFile) -> Any:
+    pickles = [name for name in archive.namelist() if name.endswith("/data.pkl")]
+    if len(pickles) != 1:
+        raise ValueError("no data.pkl in the archive")
+    root = pickles[0].removesuffix("data.pkl")
+    if f"{root}byteorder" in archive.namelist() and archive.read(f"{root}byteorder") != b"little":
+        raise ValueError("numbers are stored in big-endian order")
+    return _TensorUnpickler(archive, root).load()
+
+
+class _TensorUnpickler(pickle.Unpickler):
+    """Loads tensors and dictionaries, and refuses every other class or function."""
+
+    def __init__(self, archive: zipfile.ZipFile, root: str) -> None:
+        super().__init__(io.BytesIO(archive.read(f"{root}data.pkl")))
+        self._archive, self._root = archive, root
+
+    def find_class(self, module: str, name: str) -> Any:
+        if module == "torch" and name in STORAGE_DTYPES:
+            return name
+        known = {
+            ("collections", "OrderedDict"): OrderedDict,
+            ("torch._utils", "_rebuild_tensor_v2"): _tensor,
+            ("torch._utils", "_rebuild_parameter"): _parameter,
+        }
+        if (module, name) not in known:
+            raise pickle.UnpicklingError(f"it holds a {module}.{name}, which is no tensor")
+        return known[module, name]
+
+    def persistent_load(self, pid: Any) -> _Storage:
+        kind, storage_class, key, _, num_numbers = pid
+        if kind != "storage" or storage_class not in STORAGE_DTYPES or not str(key).isalnum():
+            raise pickle.UnpicklingError("a storage of an unknown kind")
+        dtype = STORAGE_DTYPES[storage_class]
+        content = self._archive.read(f"{self._root}data/{key}")
+        if len(content) != num_numbers * dtype.itemsize:
+            raise pickle.UnpicklingError(f"storage {key} has {len(content)} bytes for {num_numbers} numbers")
+        return _Storage(np.frombuffer(content, dtype))
+
+
+class _Storage(NamedTuple):
+    numbers: np.ndarray
+
+
+def _tensor(storage: Any, offset: int, shape: tuple[int, ...], strides: tuple[int, ...], *_: Any) -> np.ndarray:
+    # A tensor is a strided part of a storage, and must lie within it.
+    if not isinstance(storage, _Storage) or len(shape) != len(strides) or min((offset, *shape, *strides)) < 0:
+        raise pickle.UnpicklingError("a tensor that is not part of a storage")
+    last = offset + sum((size - 1) * stride for size, stride in zip(shape, strides, strict=True))
+    if math.prod(shape) == 0:
+        return np.zeros(shape, storage.numbers.dtype)
+    if last >= storage.numbers.size:
+        raise pickle.UnpicklingError("a tensor that reaches beyond its storage")
+    byte_strides = tuple(stride * storage.numbers.itemsize for stride in strides)
+    return np.lib.stride_tricks.as_strided(storage.numbers[offset:], shape, byte_strides).copy()
+
+
+def _parameter(tensor: Any, *_: Any) -> Any:
+    return tensor
+
+
+def _read_with_torch(path: Path) -> Any:
+    try:
+        import torch
+    except ImportError:
+        needed = "PyTorch is needed to read it: pip install dpmjax[torch]"
+        raise ValueError(f"{path}: no ZIP archive, so at best a checkpoint of PyTorch before 1.6; {needed}") from None
+    try:
+        return _as_numpy(torch.load(path, map_location="cpu", weights_only=True))
+    except Exception as error:  # whatever a broken file makes of it
+        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise ValueError(f"{path}: not a PyTorch checkpoint that can be read ({reason})") from error
+
+
+def _as_numpy(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _as_numpy(item) for key, item in value.items()}
+    return value.detach().float().numpy() if hasattr(value, "detach") else value

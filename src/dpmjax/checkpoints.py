@@ -1,4 +1,4 @@
-"""Checkpoints of a training state, by orbax: the last two are kept, and one that was cut off is passed over."""
+"""Checkpoints of any training state, written by orbax: the last two are kept, and a broken one is skipped."""
 
 from __future__ import annotations
 
@@ -15,18 +15,17 @@ LOGGER = logging.getLogger("dpmjax.checkpoint")
 
 
 class Checkpoints:
-    """The checkpoints in a folder, one a step.
-
-    Of several processes one alone uses it, without the others.
-
-    Args:
-        folder: is made when the first one is saved.
-        num_kept: older ones are removed.
-    """
+    """The checkpoints in a folder, one for each saved step. With several processes, only one may use a folder."""
 
     def __init__(self, folder: Path, *, num_kept: int = 2) -> None:
+        """Prepares the folder; the first `save` makes it.
+
+        Args:
+            folder: where the checkpoints are.
+            num_kept: number of checkpoints to keep; older ones are removed.
+        """
         alone = None
-        if jax.process_count() > 1:  # orbax would wait for the others
+        if jax.process_count() > 1:  # without this, orbax waits for the other processes
             this = jax.process_index()
             alone = ocp.options.MultiprocessingOptions(this, {this}, barrier_sync_key_prefix=f"process_{this}")
         self._options = ocp.CheckpointManagerOptions(
@@ -38,7 +37,12 @@ class Checkpoints:
         self._folder = folder.resolve()
 
     def save(self, step: int, state: object) -> None:
-        """Writes the state; the same step is not written twice."""
+        """Writes a state; the same step is not written twice.
+
+        Args:
+            step: number of steps done.
+            state: any pytree of arrays.
+        """
         logging.getLogger("absl").setLevel(logging.ERROR)
         self._folder.mkdir(parents=True, exist_ok=True)
         with ocp.CheckpointManager(self._folder, options=self._options) as manager:
@@ -47,11 +51,11 @@ class Checkpoints:
                 manager.wait_until_finished()
 
     def restore_latest(self, like: StateT, *, fallback: StateT) -> StateT:
-        """The newest state that can be read.
+        """Reads the newest state that is not broken.
 
         Args:
             like: a state of the same structure, shapes and types.
-            fallback: what to return where there is none.
+            fallback: the result without a readable checkpoint.
 
         Returns:
             The state.
@@ -64,7 +68,7 @@ class Checkpoints:
             for step in sorted(manager.all_steps(), reverse=True):
                 try:
                     restored = manager.restore(step, args=ocp.args.StandardRestore(target))
-                except (ValueError, OSError, KeyError, FileNotFoundError) as error:
+                except (ValueError, OSError, KeyError) as error:
                     LOGGER.warning("checkpoint %d cannot be read (%s); the one before is taken", step, error)
                     continue
                 return jax.tree.map(jax.numpy.asarray, restored)

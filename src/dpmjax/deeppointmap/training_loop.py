@@ -1,0 +1,270 @@
+"""The training loop: batches, steps, evaluation, reports, and the best parameters so far.
+
+    store = ScanStore(drives, config.model.preprocess)
+    trained = train(store, config, hooks=TrainingHooks(evaluate=..., on_report=...))
+
+A run that continues from the `TrainingProgress` of any report gives the numbers of an unbroken run.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
+
+import flax.struct
+import jax
+import numpy as np
+from jaxtyping import Float, Int
+
+from dpmjax.checks import require_count
+from dpmjax.deeppointmap.curriculum import CurriculumStage, TrainingConfig
+from dpmjax.deeppointmap.data_pipeline import SampleMaker, ScanStore
+from dpmjax.deeppointmap.model import Model
+from dpmjax.deeppointmap.processes import device_mesh, from_first, is_first, largest, replicate, shard_batch, together
+from dpmjax.deeppointmap.training import TrainingReport, TrainingState, init_training, make_step
+from dpmjax.types import AnyArray
+
+
+class TrainingLostError(ArithmeticError):
+    """The loss is not finite."""
+
+
+@flax.struct.dataclass
+class TrainingProgress:
+    """The state of training and the best parameters so far; a checkpoint of it resumes the run exactly.
+
+    Attributes:
+        state: state after the last step.
+        best_params: parameters with the best score; the initial ones before the first evaluation.
+        best_score: the best score; -1 before the first evaluation.
+        best_step: number of steps before the best evaluation; 0 before the first.
+    """
+
+    state: TrainingState
+    best_params: dict[str, Any]
+    best_score: Float[AnyArray, ""]
+    best_step: Int[AnyArray, ""]
+
+
+class StepRecord(NamedTuple):
+    """What the loop reports after a step.
+
+    Attributes:
+        step: number of steps done.
+        stage: stage of the step; None in the overlap part.
+        report: measures of the step.
+        score: score of an evaluation after this step; NaN without one.
+        run_s: seconds of all steps of this call, without compilation.
+        compile_s: seconds of the first step of each stage.
+        scans_per_s: scans that a second of steps processes.
+    """
+
+    step: int
+    stage: CurriculumStage | None
+    report: TrainingReport
+    score: float
+    run_s: float
+    compile_s: float
+    scans_per_s: float
+
+
+@dataclass(frozen=True)
+class TrainingHooks:
+    """Functions that the loop calls. `evaluate` and `on_report` are called in process 0 only.
+
+    Attributes:
+        evaluate: scores a model, larger is better; the model with the best score is kept.
+        evaluate_every: number of steps from one evaluation to the next.
+        on_report: gets the record and the progress after each step.
+        stop: called before each step; any number but 0 ends training in all processes.
+    """
+
+    evaluate: Callable[[Model], float] | None = None
+    evaluate_every: int = 100
+    on_report: Callable[[StepRecord, TrainingProgress], None] | None = None
+    stop: Callable[[], int] = int
+
+    def __post_init__(self) -> None:
+        require_count("evaluate_every", self.evaluate_every)
+
+
+class Trained(NamedTuple):
+    """Result of training.
+
+    Attributes:
+        model: the model with the best score, with the trained overlap head; the last one without an evaluation.
+        progress: progress after the last step.
+        stopped_by: the number that `stop` returned; 0 after the last step.
+        run_s: seconds of the steps of this call, without compilation.
+        compile_s: seconds of the first step of each stage.
+        scans_per_s: scans that a second of steps processed.
+    """
+
+    model: Model
+    progress: TrainingProgress
+    stopped_by: int
+    run_s: float
+    compile_s: float
+    scans_per_s: float
+
+
+def train(
+    store: ScanStore,
+    config: TrainingConfig,
+    *,
+    seed: int = 0,
+    start: TrainingProgress | None = None,
+    hooks: TrainingHooks = TrainingHooks(),
+) -> Trained:
+    """Trains a model on all devices, or continues a training.
+
+    With several processes (`join_processes`), each calls this function with the same settings.
+
+    Args:
+        store: the scans.
+        config: settings of training.
+        seed: seed of parameters, samples and augmentation.
+        start: progress to continue from; that of process 0 counts.
+        hooks: evaluation, reports and stopping.
+
+    Returns:
+        The model and the progress.
+
+    Raises:
+        TrainingLostError: if the loss is not finite.
+    """
+    if start is None:
+        start = begin_training(init_training(jax.random.key(seed), config))
+    mesh, num_local = device_mesh(), jax.local_device_count()
+    progress = replicate(from_first(start), mesh)
+    step = make_step(config, mesh if jax.device_count() > 1 else None)
+    clock, stopped_by = _Clock(config.sampling.num_scans * jax.device_count()), 0
+    first_sample = jax.process_index() * num_local
+    with SampleMaker(store, config, seed=seed, num_samples=num_local, first_sample=first_sample) as maker:
+        batches = maker.batches(int(progress.state.step), config.num_steps)
+        with together():
+            batch = next(batches, None)
+        while batch is not None and not (stopped_by := largest(int(hooks.stop()))):
+            progress = before_step(progress, config)
+            stage = config.stage_at(int(progress.state.step))
+            with clock.step(stage):
+                state, report = step(progress.state, shard_batch(batch, mesh))
+                with together():  # the next batch is prepared while the device computes
+                    batch = next(batches, None)
+                report = jax.device_get(report)
+            progress = replace(progress, state=state)
+            number = int(state.step)
+            if not math.isfinite(report.loss):
+                raise TrainingLostError(
+                    f"the loss of step {number} is {report.loss}; resume from a checkpoint before it"
+                )
+            progress, score = _evaluate_when_due(progress, stage, config, hooks)
+            with together():
+                if hooks.on_report is not None and is_first():
+                    hooks.on_report(StepRecord(number, stage, report, score, *clock.seconds), progress)
+    model = _local(Model(params_to_use(progress, config), config.model))
+    return Trained(model, progress, stopped_by, *clock.seconds)
+
+
+def begin_training(state: TrainingState) -> TrainingProgress:
+    """Makes the progress before the first step.
+
+    Args:
+        state: from `init_training`.
+
+    Returns:
+        Progress without an evaluation.
+    """
+    return TrainingProgress(state, state.params, np.asarray(-1, np.float32), np.asarray(0, np.int32))
+
+
+def after_evaluation(progress: TrainingProgress, score: float) -> TrainingProgress:
+    """Keeps the parameters of the state if no score was better; of equal scores, the later one counts.
+
+    Args:
+        progress: progress before the evaluation.
+        score: score of the parameters of the state.
+
+    Returns:
+        The new progress.
+    """
+    if not score >= float(progress.best_score):
+        return progress
+    state = progress.state
+    return TrainingProgress(state, state.params, np.asarray(score, np.float32), np.asarray(state.step, np.int32))
+
+
+def before_step(progress: TrainingProgress, config: TrainingConfig) -> TrainingProgress:
+    """Restores the best parameters at the beginning of the overlap part, whose head is trained on them.
+
+    Args:
+        progress: progress before a step.
+        config: settings of training.
+
+    Returns:
+        The progress to take the step from.
+    """
+    if int(progress.state.step) != config.registration_steps or int(progress.best_step) == 0:
+        return progress
+    return replace(progress, state=replace(progress.state, params=progress.best_params))
+
+
+def params_to_use(progress: TrainingProgress, config: TrainingConfig) -> dict[str, Any]:
+    """Selects the parameters of the result.
+
+    Args:
+        progress: progress after any step.
+        config: settings of training.
+
+    Returns:
+        The best parameters. In the overlap part these are the parameters of the state, with a new head.
+    """
+    is_over = int(progress.state.step) > config.registration_steps
+    return progress.state.params if is_over or int(progress.best_step) == 0 else progress.best_params
+
+
+def _evaluate_when_due(
+    progress: TrainingProgress, stage: CurriculumStage | None, config: TrainingConfig, hooks: TrainingHooks
+) -> tuple[TrainingProgress, float]:
+    done = int(progress.state.step)
+    if stage is None or (done % hooks.evaluate_every and done != config.registration_steps):
+        return progress, math.nan
+    score = math.nan
+    with together():
+        if hooks.evaluate is not None and is_first():
+            score = hooks.evaluate(_local(Model(progress.state.params, config.model)))
+    return after_evaluation(progress, float(from_first(np.asarray(score, np.float32)))), score
+
+
+def _local(tree: Any) -> Any:
+    # Every device holds the same; the arrays of one device are enough.
+    return jax.tree.map(lambda x: jax.numpy.asarray(np.asarray(x)), tree)
+
+
+class _Clock:
+    """Measures steps; the first step of each stage counts as compilation."""
+
+    def __init__(self, scans_per_step: int) -> None:
+        self._scans_per_step, self._num, self._run_s, self._compile_s = scans_per_step, 0, 0.0, 0.0
+        self._seen: set[CurriculumStage | None] = set()
+
+    @contextmanager
+    def step(self, stage: CurriculumStage | None) -> Iterator[None]:
+        begun = time.perf_counter()
+        yield
+        seconds = time.perf_counter() - begun
+        if stage in self._seen:
+            self._run_s, self._num = self._run_s + seconds, self._num + 1
+        else:
+            self._compile_s += seconds
+            self._seen.add(stage)
+
+    @property
+    def seconds(self) -> tuple[float, float, float]:
+        """Seconds of running and of compiling, and scans a second."""
+        rate = self._num / self._run_s if self._run_s > 0 else 0.0
+        return self._run_s, self._compile_s, rate * self._scans_per_step

@@ -1,0 +1,211 @@
+"""One model in one `.safetensors` file: arrays by name; the header holds its configuration and a description."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import types
+import typing
+from pathlib import Path
+from typing import Any, Literal, TypeVar
+
+import flax.traverse_util
+import jax
+import jax.numpy as jnp
+import numpy as np
+from safetensors import SafetensorError, safe_open
+from safetensors.numpy import save_file
+
+from dpmjax.deeppointmap.model import Model, ModelConfig, model_shapes
+
+ConfigT = TypeVar("ConfigT")
+
+SHIPPED = Path(__file__).parent
+FORMAT, FORMAT_VERSION = "dpmjax model", "1"
+TORCH_SUFFIXES = (".pth", ".pt")
+SUFFIX = ".safetensors"
+
+
+def load_model(path_or_name: str | Path) -> Model:
+    """Loads a trained model.
+
+    Args:
+        path_or_name: the name of a shipped model; or a `.safetensors` file that `save_model` wrote; or a `.pth` file of
+            the published PyTorch programs (see `import_torch_checkpoint`).
+
+    Returns:
+        The model, parameters in float32.
+
+    Raises:
+        ValueError: if no shipped model has this name, or the file is missing, broken, or of another layout.
+    """
+    from dpmjax.weights.torch_import import import_torch_checkpoint
+
+    path = Path(path_or_name)
+    if path.suffix in TORCH_SUFFIXES:
+        return import_torch_checkpoint(_existing(path))
+    if path.suffix == SUFFIX:
+        return _load_safetensors(_existing(path))
+    if path.name in shipped_models() and path == Path(path.name):
+        return _load_safetensors(SHIPPED / (path.name + SUFFIX))
+    shipped = ", ".join(shipped_models()) or "none yet"
+    expected = f"expected a {SUFFIX} or .pth file, or the name of a shipped model ({shipped})"
+    raise ValueError(f"path_or_name: {expected}, got {str(path_or_name)!r}")
+
+
+def shipped_models() -> tuple[str, ...]:
+    """Lists the names of the models that come with this package.
+
+    Returns:
+        The names, sorted.
+    """
+    return tuple(sorted(path.stem for path in SHIPPED.glob(f"*{SUFFIX}")))
+
+
+def save_model(
+    model: Model, path: str | Path, *, card: str = "", dtype: Literal["float16", "float32"] = "float32"
+) -> None:
+    """Writes a model to a `.safetensors` file.
+
+    Args:
+        model: the model.
+        path: must end in `.safetensors`.
+        card: a description for users: data, steps, seed, results.
+        dtype: type of the stored numbers; float16 halves the file and keeps three digits of each parameter.
+
+    Raises:
+        ValueError: if the path has another ending, or a parameter is not finite in that type.
+    """
+    path = Path(path)
+    if path.suffix != SUFFIX:
+        raise ValueError(f"path: expected a file that ends in {SUFFIX}, got {str(path)!r}")
+    params = flax.traverse_util.flatten_dict(jax.device_get(model.params), sep=".")
+    with np.errstate(over="ignore"):  # overflow is reported below
+        arrays = {name: np.ascontiguousarray(array, dtype) for name, array in params.items()}
+    for name, array in arrays.items():
+        if not np.isfinite(array).all():
+            raise ValueError(f"model: {name} holds numbers that are not finite in {dtype}")
+    header = {
+        "format": FORMAT,
+        "format_version": FORMAT_VERSION,
+        "config": json.dumps(config_to_json(model.config)),
+        "card": card,
+    }
+    save_file(arrays, path, metadata=header)
+
+
+def read_card(path: str | Path) -> str:
+    """Reads the description of a model; a `ValueError` says if the file is missing or no such model.
+
+    Args:
+        path: a `.safetensors` file that `save_model` wrote.
+
+    Returns:
+        The description that was given to `save_model`.
+    """
+    return _read(_existing(Path(path)))[0].get("card", "")
+
+
+def _load_safetensors(path: Path) -> Model:
+    header, arrays = _read(path)
+    try:
+        config = config_from_json(json.loads(header["config"]), ModelConfig)
+    except (KeyError, TypeError, ValueError) as error:
+        raise ValueError(f"{path}: its configuration cannot be read ({error})") from error
+    return model_from_arrays(arrays, config, str(path))
+
+
+def model_from_arrays(arrays: dict[str, np.ndarray], config: ModelConfig, source: str) -> Model:
+    """Makes a model from arrays by name.
+
+    Args:
+        arrays: one array for each parameter, names joined by points.
+        config: configuration of the model.
+        source: name of the file, for errors.
+
+    Returns:
+        The model, parameters in float32.
+
+    Raises:
+        ValueError: if a parameter is missing, unknown, or has another shape.
+    """
+    shapes = flax.traverse_util.flatten_dict(model_shapes(config), sep=".")
+    for name in sorted(shapes.keys() | arrays.keys()):
+        expected = shapes[name].shape if name in shapes else "none"
+        found = arrays[name].shape if name in arrays else "none"
+        if expected != found:
+            raise ValueError(f"{source}: parameter {name}: expected shape {expected}, got {found}")
+    params = {name: jnp.asarray(array, jnp.float32) for name, array in arrays.items()}
+    return Model(flax.traverse_util.unflatten_dict(params, sep="."), config)
+
+
+def _read(path: Path) -> tuple[dict[str, str], dict[str, Any]]:
+    try:
+        with safe_open(path, framework="numpy") as file:
+            header = file.metadata() or {}
+            arrays = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (no mapping)
+    except (SafetensorError, OSError) as error:
+        raise ValueError(f"{path}: not a whole safetensors file ({error})") from error
+    if header.get("format") != FORMAT:
+        raise ValueError(f"{path}: a safetensors file, but not one of a dpmjax model")
+    if header.get("format_version") != FORMAT_VERSION:
+        raise ValueError(f"{path}: format version {header.get('format_version')}, this dpmjax reads {FORMAT_VERSION}")
+    return header, arrays
+
+
+def _existing(path: Path) -> Path:
+    if not path.is_file():
+        raise ValueError(f"{path}: no such file")
+    return path
+
+
+def config_to_json(config: Any) -> dict[str, Any]:
+    """Converts a configuration to JSON values, field by field.
+
+    Args:
+        config: a frozen dataclass; nested dataclasses become nested objects, tuples become lists.
+
+    Returns:
+        The values by the names of their fields.
+    """
+    return dataclasses.asdict(config)
+
+
+def config_from_json(value: Any, config_type: type[ConfigT]) -> ConfigT:
+    """Reads a configuration back from what `config_to_json` returned.
+
+    A `ValueError` names a field that is unknown or has a value of another type.
+
+    Args:
+        value: the JSON value; missing fields get their defaults.
+        config_type: the dataclass.
+
+    Returns:
+        The configuration.
+    """
+    return _restored(value, config_type, config_type.__name__)
+
+
+def _restored(value: Any, expected: Any, name: str) -> Any:
+    if typing.get_origin(expected) in (types.UnionType, typing.Union):
+        if value is None and type(None) in typing.get_args(expected):
+            return None
+        (expected,) = (choice for choice in typing.get_args(expected) if choice is not type(None))
+    if expected is Path:
+        return Path(value)
+    if dataclasses.is_dataclass(expected) and isinstance(expected, type):
+        if not isinstance(value, dict):
+            raise ValueError(f"{name}: expected an object, got {value!r}")
+        fields = typing.get_type_hints(expected)
+        if unknown := value.keys() - fields.keys():
+            raise ValueError(f"{name}: unknown field {min(unknown)!r}")
+        return expected(**{key: _restored(item, fields[key], f"{name}.{key}") for key, item in value.items()})
+    if typing.get_origin(expected) is tuple:
+        if not isinstance(value, list | tuple):
+            raise ValueError(f"{name}: expected a list, got {value!r}")
+        (item_type, _) = typing.get_args(expected)
+        return tuple(_restored(item, item_type, f"{name}[{i}]") for i, item in enumerate(value))
+    is_number = expected is float and isinstance(value, int) and not isinstance(value, bool)
+    if isinstance(expected, type) and (type(value) is not expected) and not is_number:
+        raise ValueError(f"{name}: expected {expected.__name__}, got {value!r}")
+    return float(value) if is_number else value
