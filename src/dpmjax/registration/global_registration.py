@@ -74,12 +74,10 @@ class GlobalRegistration(NamedTuple):
     Attributes:
         poses: (n, 3) T_world_scan, the first one zero.
         keyframes: rows of the scans that were searched all against all.
-        num_edges: pairs that agree with the map.
     """
 
     poses: Floats
     keyframes: Indices
-    num_edges: int
 
 
 class ViewSimilarity(NamedTuple):
@@ -132,16 +130,15 @@ def register_globally(scans: PlanarScans, config: GlobalConfig | None = None) ->
     first, second = lower_pairs(len(keyframes))
     found = task.search(keyframes[first], keyframes[second])
     inside = found._replace(source=first, target=second)
-    assembly = assemble(profiles.take(keyframes), inside, config.assembly, is_ordered=scans.is_ordered)
     poses = np.zeros((len(scans), 3))
-    poses[keyframes] = assembly.poses
-    edges = agreeing_edges(poses, found, config.assembly, profiles.typical_range)
+    poses[keyframes] = assemble(profiles.take(keyframes), inside, config.assembly, is_ordered=scans.is_ordered)
     if len(keyframes) < len(scans):
+        key_edges = agreeing_edges(poses, found, config.assembly, profiles.typical_range)
         poses, more = place_others(task, poses, found, _search_others(task, poses))
-        edges = join_edges(edges, agreeing_edges(poses, more, config.assembly, profiles.typical_range))
+        edges = join_edges(key_edges, agreeing_edges(poses, more, config.assembly, profiles.typical_range))
         if len(edges.source):
             poses, _ = optimize_planar_graph(poses, edges)
-    return GlobalRegistration(se2.relative(poses[0], poses), keyframes, len(edges.source))
+    return GlobalRegistration(se2.relative(poses[0], poses), keyframes)
 
 
 def compare_profiles(profiles: RangeProfiles) -> ViewSimilarity:

@@ -11,8 +11,6 @@ to the best of the poses that any pair across the cut supports.
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
 import scipy.sparse
 import scipy.sparse.csgraph
@@ -35,21 +33,9 @@ from dpmjax.registration.pose_scoring import (
 from dpmjax.registration.range_profiles import RangeProfiles
 
 
-class Assembly(NamedTuple):
-    """A map of all scans.
-
-    Attributes:
-        poses: (n, 3) T_world_scan.
-        edges: pairs that agree with it.
-    """
-
-    poses: Floats
-    edges: Edges
-
-
 def assemble(
     profiles: RangeProfiles, candidates: Candidates, config: AssemblyConfig | None = None, *, is_ordered: bool = False
-) -> Assembly:
+) -> Floats:
     """Poses of all scans from candidates of their pairs, without a first guess.
 
     Args:
@@ -59,7 +45,7 @@ def assemble(
         is_ordered: neighbours in the array are neighbours in time, so likely to overlap.
 
     Returns:
-        Assembly; the first pose is zero.
+        (n, 3) T_world_scan; the first pose is zero.
     """
     config = config or AssemblyConfig()
     scorer = PoseScorer(profiles, config, chance_level(candidates), noisy_share(profiles, candidates), is_ordered)
@@ -75,7 +61,7 @@ def assemble(
     edges = agreeing_edges(poses, candidates, config, profiles.typical_range)
     if len(edges.source):
         poses, _ = optimize_planar_graph(poses, edges)
-    return Assembly(se2.relative(poses[0], poses), edges)
+    return np.asarray(se2.relative(poses[0], poses))
 
 
 def place_in_map(poses: Floats, placed: Indices, hypotheses: Hypotheses, scorer: PoseScorer) -> Floats:

@@ -99,13 +99,11 @@ class PairSystem(NamedTuple):
         information: J^T W J in the tangent (dx, dy, dheading) of the source frame.
         gradient: J^T W r.
         weight: sum of the robust weights, at most the number of source beams.
-        squares: weighted sum of squared residuals.
     """
 
     information: Float[Array, "3 3"]
     gradient: Float[Array, " 3"]
     weight: Float[Array, ""]
-    squares: Float[Array, ""]
 
 
 def linearise_pair(
@@ -154,7 +152,6 @@ def linearise_pair(
         information=jnp.einsum("bki,bkj->ij", weighted, jacobian, precision="highest"),
         gradient=jnp.einsum("bki,bk->i", weighted, residual, precision="highest"),
         weight=weight.sum(),
-        squares=(weight * squared).sum(),
     )
 
 

@@ -91,8 +91,9 @@ class PlanarScans(flax.struct.PyTreeNode):
         return Tolerances(match=max(0.006 * reach, 0.5 * noise), contradict=max(0.018 * reach, 5.0 * noise))
 
     def take(self, rows: Any) -> PlanarScans:
-        """The scans of these rows (an index, a slice, or an array of them); a selection has no order in time."""
-        return jax.tree.map(lambda x: x[rows], self).replace(is_ordered=False)
+        """The scans of these rows (an index, a slice, a list or an array); a selection has no order in time."""
+        index = np.array(rows) if isinstance(rows, list) else rows
+        return jax.tree.map(lambda x: x[index], self).replace(is_ordered=False)
 
     def thin(self, stride: int) -> PlanarScans:
         """The same scans with every `stride`-th beam."""

@@ -26,6 +26,8 @@ _MIN_COSINE = 0.3
 _UNKNOWN_COSINE = 0.7
 # Surfaces that are turned away from the viewer by more than this sine are not the ones it sees.
 _MAX_AVERTED = 0.1
+# Odd minimax polynomial of the arctangent on [0, 1], the highest power first.
+_ARCTANGENT = (-0.01171913, 0.05264734, -0.11642647, 0.19354037, -0.33262283, 0.99997722)
 # Pairs that are compared at a time, all batches of one shape; many calls have but a few hundred.
 _BATCH = 256
 
@@ -142,13 +144,22 @@ def _profile(scan: PlanarScans, *, num_bearings: int) -> RangeProfiles:
     )
 
 
+def _bearing(points: Float[Array, "b 2"]) -> Float[Array, " b"]:
+    """Bearing in [0, 2 pi] to 2e-6 radians; an exact arctangent would take two thirds of a global registration."""
+    x, y = jnp.abs(points[:, 0]), jnp.abs(points[:, 1])
+    slope = jnp.minimum(x, y) / jnp.maximum(jnp.maximum(x, y), 1e-12)
+    octant = slope * jnp.polyval(jnp.asarray(_ARCTANGENT, slope.dtype), slope**2)
+    quadrant = jnp.where(y > x, 0.5 * jnp.pi - octant, octant)
+    half = jnp.where(points[:, 0] < 0, jnp.pi - quadrant, quadrant)
+    return jnp.where(points[:, 1] < 0, 2 * jnp.pi - half, half)
+
+
 def _view(scan: PlanarScans, pose: Float[Array, " 3"], viewer: RangeProfiles, tolerances: Tolerances) -> ViewComparison:
     """Hits of a scan against the profile of a viewer; `pose` is T_viewer_scan."""
     points = se2.transform_points(pose, scan.points)
     normals = jnp.matmul(scan.normals, se2.rotation(pose[2]).T, precision="highest")
     count = viewer.surface.shape[-1]
-    bearing = jnp.mod(jnp.arctan2(points[:, 1], points[:, 0]), 2 * jnp.pi) * (count / (2 * jnp.pi))
-    k = jnp.minimum(bearing.astype(jnp.int32), count - 1)
+    k = jnp.minimum((_bearing(points) * (count / (2 * jnp.pi))).astype(jnp.int32), count - 1)
     distance = jnp.linalg.norm(points, axis=-1)
     near, far, slant = viewer.near[k], viewer.far[k], viewer.slant[k]
     is_jump = far - near > 10.0 * tolerances.match

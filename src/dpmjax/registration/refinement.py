@@ -70,13 +70,11 @@ class Refined(NamedTuple):
         poses: (n, 3) x, y, heading.
         num_loops: loops that were found and kept; 0 where none was needed.
         num_pairs: pairs of scans in the last round.
-        rmse: robust root mean square of the distances to the lines, unit of the points.
     """
 
     poses: Floats
     num_loops: int
     num_pairs: int
-    rmse: float
 
 
 def refine(scans: PlanarScans, poses: Floats, config: RefinementConfig | None = None) -> Refined:
@@ -114,7 +112,7 @@ def _align_all(scans: PlanarScans, poses: Floats, config: RefinementConfig) -> R
     # In units of one beam's information, as the systems of the pairs are.
     trust = max(scans.noise, 0.00075 * scans.typical_range) ** 2 if scans.is_ordered else 1e-9
     steps = steps._replace(information=steps.information * trust)
-    source, target, rmse = np.zeros(0, np.int64), np.zeros(0, np.int64), 0.0
+    source, target = np.zeros(0, np.int64), np.zeros(0, np.int64)
     for round_number, (gate, kernel) in enumerate(zip(gates, kernels, strict=True)):
         if round_number % config.refresh == 0:
             source, target = choose_pairs(scans, poses, config)
@@ -123,8 +121,7 @@ def _align_all(scans: PlanarScans, poses: Floats, config: RefinementConfig) -> R
         pull = np.einsum("eij,ej->ei", steps.information, se2.relative(steps.poses, here))
         gradient = np.concatenate([np.asarray(system.gradient), pull])
         poses = se2.compose(poses, solve_poses(len(poses), join_edges(edges, steps._replace(poses=here)), gradient))
-        rmse = float(np.sqrt(np.sum(system.squares) / max(float(np.sum(system.weight)), 1e-9)))
-    return Refined(poses, 0, len(source), rmse)
+    return Refined(poses, 0, len(source))
 
 
 def choose_pairs(scans: PlanarScans, poses: Floats, config: RefinementConfig) -> tuple[Indices, Indices]:
