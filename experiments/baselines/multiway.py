@@ -37,7 +37,7 @@ class MultiwayConfig:
 
 
 def multiway(scans: ScanSet, config: MultiwayConfig | None = None) -> Floats:
-    """Poses of planar scans by Open3D's multiway registration.
+    """Poses of planar scans by Open3D's multiway registration; a ModuleNotFoundError without Open3D.
 
     Args:
         scans: n scans in order of time.
@@ -45,9 +45,6 @@ def multiway(scans: ScanSet, config: MultiwayConfig | None = None) -> Floats:
 
     Returns:
         (n, 3) T_world_scan, x, y, heading; the first one zero.
-
-    Raises:
-        ModuleNotFoundError: Open3D is not installed.
     """
     import open3d
 

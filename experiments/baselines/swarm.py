@@ -49,7 +49,8 @@ class SwarmConfig:
 def swarm_chain(scans: ScanSet, config: SwarmConfig | None = None, *, key: jax.Array) -> NDArray[np.float64]:
     """Poses of planar scans, each onto the one before by a swarm that minimises their Chamfer distance (eq. 5).
 
-    A swarm over all poses at once does not converge; over one relative pose of three numbers it does.
+    A swarm over all poses at once does not converge; over one relative pose of three numbers it does. Without evosax it
+    ends in a ModuleNotFoundError.
 
     Args:
         scans: n scans in order of time.
@@ -58,9 +59,6 @@ def swarm_chain(scans: ScanSet, config: SwarmConfig | None = None, *, key: jax.A
 
     Returns:
         (n, 3) T_world_scan, x, y, heading; the first one zero.
-
-    Raises:
-        ModuleNotFoundError: evosax is not installed.
     """
     config = config or SwarmConfig()
     points, mask = jnp.asarray(scans.points), jnp.asarray(scans.mask)

@@ -231,5 +231,5 @@ def test_a_scan_that_sees_no_keyframe_is_found_by_the_others(monkeypatch: pytest
 
 
 def test_a_tour_goes_from_each_pose_to_the_nearest_left() -> None:
-    poses = np.array([[0.0, 0.0, 0.0], [5.0, 0.0, 0.0], [1.0, 0.0, 3.0], [-3.0, 0.0, 0.0]])
+    poses = np.array([[0.0, 0.0, 0.0], [5.0, 0.0, 0.0], [1.0, 0.0, 3.0], [-2.5, 0.0, 0.0]])
     np.testing.assert_array_equal(nearest_tour(poses), [0, 2, 3, 1])

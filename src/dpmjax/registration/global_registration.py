@@ -270,6 +270,14 @@ def find_unregistered(profiles: RangeProfiles, poses: Floats, config: GlobalConf
 
     A small cluster of scans that match each other and no other scan is unregistered too: its scans must not support
     each other.
+
+    Args:
+        profiles: n scans.
+        poses: (n, 3) T_world_scan.
+        config: settings.
+
+    Returns:
+        Rows of the unregistered scans.
     """
     num_scans = len(poses)
     near = scipy.spatial.cKDTree(poses[:, :2]).query(poses[:, :2], k=min(7, num_scans))[1]

@@ -147,6 +147,9 @@ def _predict_open_steps(matches: PairMatches, config: IncrementalConfig, typical
 
     In a corridor two scans fit at every shift along it; a robot that has made straight steps of one metre elsewhere
     will have made another one there.
+
+    Returns:
+        PosePrior of the translations; without five clear steps it is no belief.
     """
     eigenvalue = matches.weakest_eigenvalue()
     is_clear = (eigenvalue >= np.median(eigenvalue)) & (matches.fitness >= np.median(matches.fitness))
@@ -188,6 +191,9 @@ def _bridge_bad_scans(scans: PlanarScans, steps: PairMatches, config: Incrementa
 
     Where a step is poor, the scans on either side are matched across it, two and three apart. The poses then follow the
     spanning tree of the most trustworthy matches instead of the plain chain, so that a bad scan is a leaf.
+
+    Returns:
+        (n, 3) poses, the first one zero.
     """
     later, profiles = np.arange(1, len(scans)), make_profiles(scans)
     links = [_link(profiles, later, later - 1, steps)]

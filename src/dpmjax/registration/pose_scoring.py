@@ -166,6 +166,14 @@ def add_up(row: Indices, value: Floats, count: int) -> Floats:
 
     A pose needs a few scans that match it well. Were all counted alike, rooms that look alike would be stacked: the
     more scans overlap, the more beams match.
+
+    Args:
+        row: (k,) the row of each score.
+        value: (k,) scores.
+        count: rows in all.
+
+    Returns:
+        (count,) totals.
     """
     order = np.lexsort((-value, row))
     row, value = row[order], value[order]
