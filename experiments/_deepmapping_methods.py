@@ -12,9 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 if TYPE_CHECKING:
-    from dpmjax.deepmapping import Confidence
-    from dpmjax.registration.line_fitting import LineScans
     from dpmjax.sequences import ScanSequence
+    from dpmjax.registration import Assessment, PlanarScans
     from dpmjax.types import ScanSet
 
 Floats = NDArray[np.float64]
@@ -38,14 +37,14 @@ class Problem:
 
     Attributes:
         sequence: the scans; methods do not look at its reference.
-        lines: the same with lines.
+        planar: the same with lines.
         is_ordered: the scans lie in the order of time.
         steps: of Adam, for what optimises.
         seed: of everything random.
     """
 
     sequence: ScanSequence
-    lines: LineScans
+    planar: PlanarScans
     is_ordered: bool
     steps: int
     seed: int
@@ -70,13 +69,13 @@ def split_by_extras(methods: tuple[str, ...]) -> tuple[tuple[str, ...], dict[str
 
 def make_problem(sequence: ScanSequence, *, is_ordered: bool, steps: int, seed: int) -> Problem:
     """The scans as methods want them; without an order they are shuffled."""
-    from dpmjax.registration.line_fitting import fit_lines
-    from dpmjax.types import ScanSet
+    from dpmjax.registration import planar_scans
 
     if not is_ordered:
         order = np.random.default_rng([seed, 77]).permutation(len(sequence))
         sequence = replace(sequence.take(order), odometry_poses=None)
-    return Problem(sequence, fit_lines(ScanSet(sequence.points, sequence.mask)), is_ordered, steps, seed)
+    planar = planar_scans(sequence.points, sequence.mask, is_ordered=is_ordered)
+    return Problem(sequence, planar, is_ordered, steps, seed)
 
 
 def icp_point(problem: Problem) -> Floats:
@@ -91,9 +90,9 @@ def icp_plane(problem: Problem) -> Floats:
 
 def multiview(problem: Problem) -> Floats:
     """Incremental ICP, loops, and all scans aligned together."""
-    from dpmjax.registration import polish
+    from dpmjax.registration import refine
 
-    return polish(problem.lines, icp_plane(problem)).poses
+    return refine(problem.planar, icp_plane(problem)).poses
 
 
 def multiway(problem: Problem) -> Floats:
@@ -137,35 +136,35 @@ def cold(problem: Problem) -> Floats:
 
     start = _global(problem)
     candidates = {"start": start, "fit": _fit_in_order(problem, start)}
-    return candidates[choose_trajectory(problem.lines, candidates)[0]]
+    return candidates[choose_trajectory(problem.planar, candidates)[0]]
 
 
 def warm(problem: Problem) -> Floats:
     """DeepMapping from ICP, or from the global search where that holds better; the sharpest result is kept."""
-    from dpmjax.registration import PolishConfig, choose_trajectory, polish
+    from dpmjax.registration import choose_trajectory, refine
 
     best = _best_start(problem)
     fitted = _fit_in_order(problem, best)
-    polished = polish(problem.lines, fitted, PolishConfig(is_ordered=False)).poses
+    polished = refine(problem.planar.replace(is_ordered=False), fitted).poses
     candidates = {"start": best, "fit": fitted, "polished fit": polished}
-    return candidates[choose_trajectory(problem.lines, candidates)[0]]
+    return candidates[choose_trajectory(problem.planar, candidates)[0]]
 
 
 def _best_start(problem: Problem) -> Floats:
-    """ICP if it can be trusted; else the one of ICP and search whose weakest joint is the stronger."""
-    from dpmjax.registration import PolishConfig, judge_trajectory, polish
+    """ICP if it can be trusted; else the one of ICP and search whose weakest connection is the stronger."""
+    from dpmjax.registration import assess_trajectory, refine
 
-    starts: list[tuple[Confidence, Floats]] = []
+    starts: list[tuple[Assessment, Floats]] = []
 
     def add(poses: Floats) -> None:
-        starts.append((judge_trajectory(problem.lines, problem.sequence.mask, poses), poses))
+        starts.append((assess_trajectory(problem.planar, poses), poses))
 
     if problem.is_ordered:
-        add(polish(problem.lines, icp_plane(problem)).poses)
-    if not starts or not starts[0][0].is_good:
-        add(polish(problem.lines, _global(problem), PolishConfig(is_ordered=False)).poses)
+        add(refine(problem.planar, icp_plane(problem)).poses)
+    if not starts or not starts[0][0].is_trusted:
+        add(refine(problem.planar.replace(is_ordered=False), _global(problem)).poses)
     # Other than between fits of one map, the sharper of two maps may be the wrong one.
-    return max(starts, key=lambda start: start[0].weakest_joint)[1]
+    return max(starts, key=lambda start: start[0].weakest_connection)[1]
 
 
 METHODS: dict[str, Callable[[Problem], Floats]] = {
@@ -185,7 +184,7 @@ def run_method(name: str, problem: Problem) -> dict[str, Any]:
     """Errors, time and confidence of one method on one problem."""
     from dpmjax.geometry import se2
     from dpmjax.metrics import absolute_trajectory_error, point_distance
-    from dpmjax.registration import judge_trajectory
+    from dpmjax.registration import assess_trajectory
 
     sequence = problem.sequence
     reference = sequence.reference_poses
@@ -195,27 +194,27 @@ def run_method(name: str, problem: Problem) -> dict[str, Any]:
     seconds, cpu_seconds = time.perf_counter() - begun, time.process_time() - begun_cpu
     ate = absolute_trajectory_error(poses[:, :2], reference[:, :2])
     distance = point_distance(sequence.points, sequence.mask, se2.to_matrix(poses), se2.to_matrix(reference))
-    confidence = judge_trajectory(problem.lines, sequence.mask, poses)
+    assessment = assess_trajectory(problem.planar, poses)
     return {
         "ate_px": ate,
         "point_distance_px": distance,
         "success": ate < SUCCESS_PX,
         "seconds": seconds,
         "cpu_s": cpu_seconds,
-        **confidence._asdict(),
+        **assessment._asdict(),
     }
 
 
 def _incremental(problem: Problem, metric: Literal["point", "plane"]) -> Floats:
     from dpmjax.registration import IncrementalConfig, incremental_icp
 
-    return incremental_icp(problem.lines, IncrementalConfig(metric=metric))[0]
+    return incremental_icp(problem.planar, IncrementalConfig(metric=metric)).poses
 
 
 def _global(problem: Problem) -> Floats:
-    from dpmjax.registration import global_start
+    from dpmjax.registration import register_globally
 
-    return global_start(problem.lines, problem.sequence.mask, is_ordered=problem.is_ordered).poses
+    return register_globally(problem.planar).poses
 
 
 def _fit(problem: Problem, start: Floats | None, config: Any) -> Floats:
@@ -230,6 +229,7 @@ def _fit(problem: Problem, start: Floats | None, config: Any) -> Floats:
 def _fit_in_order(problem: Problem, start: Floats) -> Floats:
     """The fit of scans in an order in which neighbours are near each other: that of time, or a tour of the start."""
     from dpmjax.deepmapping import preset
+    from dpmjax.registration import nearest_tour
 
     if problem.is_ordered:
         return _fit(problem, start, preset("fast"))

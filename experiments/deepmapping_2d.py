@@ -34,8 +34,8 @@ from experiments._stop import StopFlag
 
 if TYPE_CHECKING:
     from dpmjax.deepmapping import DeepMappingConfig
-    from dpmjax.registration.line_fitting import LineScans
     from dpmjax.sequences import ScanSequence
+    from dpmjax.registration import PlanarScans
 
 EXPERIMENT = "deepmapping_2d"
 LOGGER = logging.getLogger("dpmjax.deepmapping_2d")
@@ -112,7 +112,7 @@ class Result:
 
 def main(config: Config) -> Result:
     """Reads, starts warm, fits, polishes, keeps the best, writes."""
-    from dpmjax.registration import choose_trajectory, judge_trajectory
+    from dpmjax.registration import assess_trajectory, choose_trajectory
 
     started = time.perf_counter()
     select_device(config.device)
@@ -136,7 +136,7 @@ def main(config: Config) -> Result:
             candidates |= _polish(lines, candidates, config.init)
         chosen, scores = choose_trajectory(lines, candidates)
         poses = candidates[chosen]
-        confidence = judge_trajectory(lines, sequence.mask, poses)
+        confidence = assess_trajectory(lines, poses)
         metrics = {
             "num_scans": len(sequence),
             "steps": fitted.steps,
@@ -185,13 +185,15 @@ def _fit(
     return fitted._replace(fitted=fitted.fitted._replace(poses=poses, T_world_scan=se2.to_matrix(poses)))
 
 
-def _polish(lines: LineScans, candidates: dict[str, NDArray[np.float64]], init: str) -> dict[str, NDArray[np.float64]]:
+def _polish(
+    lines: PlanarScans, candidates: dict[str, NDArray[np.float64]], init: str
+) -> dict[str, NDArray[np.float64]]:
     """Both polished: the fit is sharper near a good start, the start keeps what a robot's odometry knows."""
-    from dpmjax.registration import PolishConfig, polish
+    from dpmjax.registration import refine
 
     polished = {}
     for name in ("fit",) if init == "zero" else ("start", "fit"):
-        result = polish(lines, candidates[name], PolishConfig(is_ordered=init != "global"))
+        result = refine(lines.replace(is_ordered=init != "global"), candidates[name])
         LOGGER.info("polished the %s: %d pairs, %d loops", name, result.num_pairs, result.num_loops)
         polished[f"polished {name}"] = result.poses
     return polished
@@ -216,9 +218,9 @@ def warm_start(config: Config, sequence: ScanSequence) -> NDArray[np.float64]:
     if config.init == "zero":
         return np.zeros((len(sequence), 3))
     if config.init == "global":
-        from dpmjax.registration import global_start
+        from dpmjax.registration import register_globally
 
-        return global_start(line_scans(sequence), sequence.mask, is_ordered=config.ordered).poses
+        return register_globally(line_scans(sequence).replace(is_ordered=config.ordered)).poses
     if config.init == "odometry":
         if sequence.odometry_poses is None:
             raise ValueError(
@@ -236,17 +238,14 @@ def warm_start(config: Config, sequence: ScanSequence) -> NDArray[np.float64]:
     from dpmjax.registration import IncrementalConfig, incremental_icp
 
     metric: Literal["point", "plane"] = "point" if config.init == "icp-point" else "plane"
-    poses, _ = incremental_icp(line_scans(sequence), IncrementalConfig(metric=metric))
-    return poses
+    return incremental_icp(line_scans(sequence), IncrementalConfig(metric=metric)).poses
 
 
-def line_scans(sequence: ScanSequence) -> LineScans:
+def line_scans(sequence: ScanSequence) -> PlanarScans:
     """The scans with a line at every beam; beams without an order are sorted by angle first."""
-    from dpmjax.registration.line_fitting import fit_lines, sort_by_angle
-    from dpmjax.types import ScanSet
+    from dpmjax.registration import planar_scans
 
-    scans = ScanSet(sequence.points, sequence.mask)
-    return fit_lines(scans if sequence.is_organised else sort_by_angle(scans))
+    return planar_scans(sequence.points, sequence.mask)
 
 
 def fit_settings(config: Config, sequence: ScanSequence) -> DeepMappingConfig:
@@ -339,9 +338,9 @@ def tell(folder: RunFolder, sequence: ScanSequence, metrics: dict[str, Any]) -> 
     print(f"kept: the {metrics['chosen']} (judged by the scans alone)")
     print(f"results in {folder.path}")
     confidence = metrics["confidence"]
-    verdict = "can be trusted" if confidence["is_good"] else "DO NOT TRUST this map"
+    verdict = "can be trusted" if confidence["is_trusted"] else "DO NOT TRUST this map"
     print(
-        f"{verdict}: weakest joint {confidence['weakest_joint']:.0%} of the beams, "
+        f"{verdict}: weakest connection {confidence['weakest_connection']:.0%} of the beams, "
         f"{confidence['contradiction']:.1%} contradict others"
     )
 

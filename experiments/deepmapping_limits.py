@@ -158,7 +158,7 @@ def _write(folder: Any, rows: list[dict[str, Any]], config: Config) -> None:
     """metrics.json and one picture an order."""
     from dpmjax import viz
 
-    good = [row for row in rows if row["is_good"]]
+    good = [row for row in rows if row["is_trusted"]]
     metrics = {
         "success_threshold_px": SUCCESS_PX,
         "summary": summary(rows, config),

@@ -148,7 +148,7 @@ def _bound(world: int, sequence: ScanSequence, range_noise_px: float) -> dict[st
 
 def summarise(rows: list[dict[str, Any]]) -> dict[str, Any]:
     """Medians, success and how right the confidence was, of the rows of one method."""
-    good = [row for row in rows if row["is_good"]]
+    good = [row for row in rows if row["is_trusted"]]
     return {
         "num_trajectories": len(rows),
         "median_ate_px": float(np.median([row["ate_px"] for row in rows])),

@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
-import jax.numpy as jnp
+import numpy as np
 import pytest
 
 from dpmjax.io import ScanSequence
-from dpmjax.registration.line_fitting import LineScans, fit_lines
+from dpmjax.metrics import absolute_trajectory_error
+from dpmjax.registration import PlanarScans, planar_scans
 from dpmjax.simulation import simulate_sequence
-from dpmjax.types import ScanSet
 
 NUM_SCANS, NUM_BEAMS = 24, 128
 
 
-def lines_of(sequence: ScanSequence) -> LineScans:
-    return fit_lines(ScanSet(jnp.asarray(sequence.points), jnp.asarray(sequence.mask)))
+def scans_of(sequence: ScanSequence) -> PlanarScans:
+    return planar_scans(sequence.points, sequence.mask)
+
+
+def ate(poses: np.ndarray, reference: np.ndarray) -> float:
+    return absolute_trajectory_error(poses[:, :2], reference[:, :2])
 
 
 @pytest.fixture(scope="session")
@@ -23,8 +27,8 @@ def walk() -> ScanSequence:
 
 
 @pytest.fixture(scope="session")
-def walk_lines(walk: ScanSequence) -> LineScans:
-    return lines_of(walk)
+def walk_scans(walk: ScanSequence) -> PlanarScans:
+    return scans_of(walk)
 
 
 @pytest.fixture(scope="session")
@@ -33,5 +37,5 @@ def noisy_walk() -> ScanSequence:
 
 
 @pytest.fixture(scope="session")
-def noisy_walk_lines(noisy_walk: ScanSequence) -> LineScans:
-    return lines_of(noisy_walk)
+def noisy_walk_scans(noisy_walk: ScanSequence) -> PlanarScans:
+    return scans_of(noisy_walk)

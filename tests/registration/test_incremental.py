@@ -6,8 +6,8 @@ import pytest
 
 from dpmjax.geometry import se2
 from dpmjax.metrics import absolute_trajectory_error
-from dpmjax.registration import IncrementalConfig, incremental_icp
-from dpmjax.registration.pairs import Schedule, length_scale
+from dpmjax.registration import IncrementalConfig, incremental_icp, planar_scans
+from dpmjax.registration.pair_alignment import Schedule
 
 
 def ate(poses: np.ndarray, reference: np.ndarray) -> float:
@@ -15,8 +15,8 @@ def ate(poses: np.ndarray, reference: np.ndarray) -> float:
 
 
 @pytest.fixture(scope="module")
-def chained(walk_lines) -> np.ndarray:
-    return incremental_icp(walk_lines)[0]
+def chained(walk_scans) -> np.ndarray:
+    return incremental_icp(walk_scans).poses
 
 
 def test_chain_recovers_a_noise_free_walk(walk, chained) -> None:
@@ -26,39 +26,47 @@ def test_chain_recovers_a_noise_free_walk(walk, chained) -> None:
     np.testing.assert_array_equal(chained[0], np.zeros(3))
 
 
-def test_same_scans_give_the_same_numbers(walk_lines, chained) -> None:
-    np.testing.assert_array_equal(incremental_icp(walk_lines)[0], chained)
+def test_same_scans_give_the_same_numbers(walk_scans, chained) -> None:
+    np.testing.assert_array_equal(incremental_icp(walk_scans).poses, chained)
 
 
-def test_chain_is_bounded_under_noise(noisy_walk, noisy_walk_lines) -> None:
-    assert ate(incremental_icp(noisy_walk_lines)[0], noisy_walk.reference_poses) < 1.5
+def test_chain_is_bounded_under_noise(noisy_walk, noisy_walk_scans) -> None:
+    assert ate(incremental_icp(noisy_walk_scans).poses, noisy_walk.reference_poses) < 1.5
 
 
-def test_point_metric_recovers_the_walk_roughly(walk, walk_lines) -> None:
-    poses, steps = incremental_icp(walk_lines, IncrementalConfig(metric="point"))
+def test_point_metric_recovers_the_walk_roughly(walk, walk_scans) -> None:
+    poses, steps = incremental_icp(walk_scans, IncrementalConfig(metric="point"))
     assert ate(poses, walk.reference_poses) < 3.0
     assert len(steps.poses) == len(poses) - 1
 
 
-def test_odometry_is_the_guess(walk, walk_lines) -> None:
+def test_odometry_is_the_guess(walk, walk_scans) -> None:
     # Without it, a scan turned by half a turn against the one before would not be found.
     turned = walk.reference_poses.copy()
     turned[12:, 2] += np.pi
     sign = jnp.where(jnp.arange(24) < 12, 1.0, -1.0)[:, None, None]
-    lines = walk_lines.replace(
-        points=sign * walk_lines.points, normals=sign * walk_lines.normals, centroids=sign * walk_lines.centroids
+    scans = walk_scans.replace(
+        points=sign * walk_scans.points, normals=sign * walk_scans.normals, centroids=sign * walk_scans.centroids
     )
     rng = np.random.default_rng(0)
     steps = se2.relative(turned[:-1], turned[1:]) + rng.normal(size=(23, 3)) * [2.0, 2.0, 0.03]
-    poses, _ = incremental_icp(lines, odometry=se2.chain(steps))
+    poses, _ = incremental_icp(scans, odometry=se2.chain(steps))
     assert ate(poses, turned) < 0.1
     assert abs(se2.wrap_angle(poses[12:13, 2] - poses[11, 2])[0]) > 2.5
 
 
-def test_length_scale_grows_with_the_scans_and_survives_empty_ones(walk_lines) -> None:
-    scale = length_scale(walk_lines)
-    assert length_scale(walk_lines.replace(points=3 * walk_lines.points)) == pytest.approx(3 * scale, rel=1e-5)
-    assert length_scale(walk_lines.replace(mask=jnp.zeros_like(walk_lines.mask))) == 1.0
+def test_a_scan_that_fits_nowhere_is_bridged(walk, chained) -> None:
+    points = np.array(walk.points)
+    # Someone stands around the sensor: short ranges all round.
+    points[11] *= 4.0 / np.linalg.norm(points[11], axis=-1, keepdims=True)
+    points[11] *= np.random.default_rng(0).uniform(0.7, 1.3, (len(points[11]), 1)).astype(np.float32)
+    poses = incremental_icp(planar_scans(points, walk.mask)).poses
+    others = np.delete(np.arange(len(poses)), 11)
+    assert ate(poses[others], walk.reference_poses[others]) < 0.1
+
+
+def test_one_scan_is_a_trajectory(walk_scans) -> None:
+    np.testing.assert_array_equal(incremental_icp(walk_scans.take(slice(1))).poses, np.zeros((1, 3)))
 
 
 def test_schedule_refuses_what_never_shrinks() -> None:
