@@ -12,10 +12,10 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 from tqdm import tqdm
 
+from experiments._command import StopFlag
 from experiments._history import HistoryFile, read_history
 from experiments._processes import from_first, together
 from experiments._run_folder import CHECKPOINTS, HISTORY, RunFolder
-from experiments._stop import StopFlag
 
 if TYPE_CHECKING:
     from dpmjax.deeppointmap import Model, TrainingConfig, TrainingState

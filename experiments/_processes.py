@@ -12,7 +12,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from experiments._stop import StopFlag
+from experiments._command import StopFlag
 
 TreeT = TypeVar("TreeT")
 # Above all numbers of signals.

@@ -2,7 +2,7 @@
 
     python -m experiments.deepmapping_logs path/to/logs -o out
 
-Each run keeps its own folder below OUT, with its pictures; a run that is there already is not done again.
+Each run keeps its own folder below OUT, with its pictures; a run that is finished already is not done again.
 """
 
 from __future__ import annotations
@@ -18,11 +18,24 @@ from tyro.conf import Positional, arg
 from experiments._command import run_command
 from experiments._json import load_json, write_json
 from experiments._machine import environment
-from experiments._run_folder import METRICS
+from experiments._run_folder import METRICS, commits_note
 
 EXPERIMENT = "deepmapping_logs"
 _BAD_INPUT = 2
-COLUMNS = ("num_scans", "ate_initial_m", "ate_m", "chosen", "fit_s", "wall_s", "peak_rss_gb")
+# Each row carries the commit of its own run: earlier runs are kept.
+COLUMNS = (
+    "num_scans",
+    "ate_initial_m",
+    "ate_m",
+    "kept",
+    "fit_s",
+    "wall_s",
+    "peak_rss_gb",
+    "candidates",
+    "seed",
+    "git_hash",
+    "versions",
+)
 
 
 @dataclass(frozen=True)
@@ -53,13 +66,15 @@ def main(config: Config) -> list[dict[str, Any]]:
             if metrics is not None:
                 name = log.name.split(".")[0]
                 rows.append({"log": name, "init": init, **{key: metrics.get(key) for key in COLUMNS}})
-                write_json(config.output / "table.json", {"rows": rows, "seed": config.seed, **environment()})
+                made_by = environment()
+                table = {"seed": config.seed, **made_by, "note": commits_note(rows, made_by["git_hash"]), "rows": rows}
+                write_json(config.output / "table.json", table)
     print(markdown(rows))
     return rows
 
 
 def _run(log: Path, init: str, config: Config) -> dict[str, Any] | None:
-    """Metrics of one run in a process (so a peak memory) of its own; None where the log cannot do it."""
+    """Metrics of one run in a process of its own, whose peak memory is its own; None where the log lacks odometry."""
     folder = config.output / f"{log.name.split('.')[0]}_{init}"
     if not (folder / METRICS).exists():
         command = [sys.executable, "-m", "experiments.deepmapping_2d", str(log), "-o", str(folder), "--force"]
@@ -79,7 +94,7 @@ def markdown(rows: list[dict[str, Any]]) -> str:
     for row in rows:
         before, after = row["ate_initial_m"], row["ate_m"]
         lines.append(
-            f"| {row['log']} | {row['num_scans']} | {row['init']} | {before:.2f} | {after:.2f} | {row['chosen']} |"
+            f"| {row['log']} | {row['num_scans']} | {row['init']} | {before:.2f} | {after:.2f} | {row['kept']} |"
         )
     return "\n".join(lines)
 

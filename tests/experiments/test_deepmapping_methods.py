@@ -6,10 +6,10 @@ from collections import Counter
 
 import numpy as np
 import pytest
+from experiments._resumable_rows import do_row, row_path
 
 from experiments import deepmapping_limits, deepmapping_suite
 from experiments._deepmapping_methods import make_problem
-from experiments._resumable_rows import do_row, row_path
 
 
 def test_suite_is_that_of_the_paper() -> None:

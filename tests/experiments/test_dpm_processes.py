@@ -33,7 +33,7 @@ from experiments import _dpm_fit, _processes
 from experiments._dpm_data import ScanStore
 from experiments._dpm_recall import draw_pairs
 from experiments._run_folder import RunFolder
-from experiments._stop import Interrupted, StopFlag
+from experiments._command import Interrupted, StopFlag
 from pathlib import Path
 from tests.deeppointmap import toy
 from tests.experiments.test_dpm_processes import TRAINING

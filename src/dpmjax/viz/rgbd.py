@@ -76,7 +76,8 @@ def box_plots_figure(
     """
     if not groups or any(not len(values) for group in groups.values() for values in group.values()):
         raise ValueError("groups: expected one or more, each with values")
-    figure = new_figure(max(5.0, 2.9 * len(groups)), 3.9)
+    widths = [max(2.9, 0.5 * len(group)) for group in groups.values()]
+    figure = new_figure(max(5.0, sum(widths)), 3.9)
     axes_row = figure.subplots(1, len(groups), sharey=True, squeeze=False)[0]
     for axes, (title, group) in zip(axes_row, groups.items(), strict=True):
         axes.boxplot(

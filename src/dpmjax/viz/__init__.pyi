@@ -1,0 +1,17 @@
+from .comparison import success_grids_figure as success_grids_figure
+from .figures import Limits as Limits
+from .figures import save_figure as save_figure
+from .history import History as History
+from .history import history_figure as history_figure
+from .maps import Panel as Panel
+from .maps import registered_scans_figure as registered_scans_figure
+from .occupancy import occupancy_figure as occupancy_figure
+from .relocalization import ErrorMap as ErrorMap
+from .relocalization import error_maps_figure as error_maps_figure
+from .rgbd import box_plots_figure as box_plots_figure
+from .rgbd import from_above_figure as from_above_figure
+from .size import size_figure as size_figure
+from .toy import endings_figure as endings_figure
+from .toy import toy_figure as toy_figure
+from .training import curves_figure as curves_figure
+from .training import matches_figure as matches_figure
