@@ -253,7 +253,7 @@ def write_trajectories(folder: RunFolder, sequence: ScanSequence, poses: Floats)
     io.write_kitti(folder / "trajectory_kitti.txt", poses)
 
 
-def draw_map(folder: RunFolder, sequence: ScanSequence, candidates: Candidates, metrics: Mapping[str, Any]) -> Limits:
+def draw_map(folder: RunFolder, task: Task, candidates: Candidates, metrics: Mapping[str, Any]) -> viz.Limits:
     """map.png: the start, DeepMapping, the candidate that was kept, and the reference; returns what it shows."""
     scans, unit, kept = task.scans, task.sequence.unit, metrics["kept"]
     panels = []

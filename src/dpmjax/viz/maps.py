@@ -193,7 +193,9 @@ def _draw_panel(axes: Axes, panel: Panel, limits: Limits, unit: str, colormap: C
     if panel.point_distance is not None:
         numbers.append(f"point distance {format_length(panel.point_distance, unit)}")
     style: dict[str, Any] = {"xycoords": "axes fraction", "textcoords": "offset points", "va": "baseline"}
-    axes.annotate(panel.title, (0, 1), xytext=(1, 21), fontsize=12.5, fontweight="bold", color=INK, **style)
+    # A long title is drawn smaller, so that it does not run into the next panel.
+    title_size = min(12.5, 480.0 / max(1, len(panel.title)))
+    axes.annotate(panel.title, (0, 1), xytext=(1, 21), fontsize=title_size, fontweight="bold", color=INK, **style)
     axes.annotate("   ".join(numbers), (0, 1), xytext=(1, 7), fontsize=9.5, color=MUTED, **style)
 
 
