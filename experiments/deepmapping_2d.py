@@ -28,23 +28,10 @@ from tyro.conf import Positional, arg
 
 from dpmjax import deepmapping, io, simulation, viz
 from dpmjax import metrics as trajectory_metrics
+from experiments import _deepmapping_methods as shared
 from experiments._command import StopFlag, run_command
 from experiments._deepmapping_fit import FitRun, run_fit
-from experiments._deepmapping_methods import (
-    DEEPMAPPING,
-    START_NAMES,
-    Candidates,
-    Floats,
-    Task,
-    assess,
-    choose,
-    errors,
-    in_fitting_order,
-    incremental,
-    line_scans,
-    refined,
-    search,
-)
+from experiments._deepmapping_methods import Candidates, Floats, Task
 from experiments._history import read_history
 from experiments._machine import peak_rss_gb
 from experiments._run_folder import HISTORY, RunFolder, RunOptions, open_run_folder, recording, write_metrics
@@ -122,14 +109,14 @@ def main(config: Config) -> Result:
     """Reads, starts, fits, refines, keeps the best candidate, writes."""
     started = time.perf_counter()
     sequence = read_scans(config)
-    task = Task(sequence, line_scans(sequence), is_ordered=config.ordered, seed=config.seed)
+    task = Task(sequence, shared.line_scans(sequence), is_ordered=config.ordered, seed=config.seed)
     start_name, start = starting_poses(config, task)
     settings = fit_settings(config, sequence)
     folder = open_run_folder(config, EXPERIMENT)
     with recording(folder), StopFlag() as stop:
         print(f"{sequence.name}: {len(sequence)} scans of {sequence.points.shape[1]} beams, from {start_name}")
         fitted = _fit(folder, task, settings, start, config, stop)
-        candidates = {start_name: start, DEEPMAPPING: fitted.poses}
+        candidates = {start_name: start, shared.DEEPMAPPING: fitted.poses}
         if config.refine and not stop.is_requested:
             candidates |= _refine(task, candidates, config.init)
         kept, compared = compare(task, candidates)
@@ -140,7 +127,7 @@ def main(config: Config) -> Result:
             "start": start_name,
             "kept": kept,
             "candidates": compared,
-            "assessment": assess(task, candidates[kept]),
+            "assessment": shared.assess(task, candidates[kept]),
             "fit_s": fitted.run_s,
             "compile_s": fitted.compile_s,
             "wall_s": time.perf_counter() - started,
@@ -166,7 +153,7 @@ def _fit(
     folder: RunFolder, task: Task, settings: DeepMappingConfig, start: Floats, config: Config, stop: StopFlag
 ) -> FitRun:
     """DeepMapping, of the scans in an order in which neighbours are near each other."""
-    order = in_fitting_order(task, start)
+    order = shared.in_fitting_order(task, start)
     fitted = run_fit(
         folder,
         io.take_scans(task.sequence, order),
@@ -182,13 +169,13 @@ def _fit(
 def _refine(task: Task, candidates: Candidates, init: str) -> Candidates:
     """Both refined: the fit is sharper near a good start, the start keeps what a robot's odometry knows."""
     names = list(candidates)[init == "zero" :]
-    return {f"{name}, refined": refined(task, candidates[name], is_ordered=init != "global") for name in names}
+    return {f"{name}, refined": shared.refined(task, candidates[name], is_ordered=init != "global") for name in names}
 
 
 def compare(task: Task, candidates: Candidates) -> tuple[str, dict[str, dict[str, float]]]:
     """The name of the candidate to keep, chosen without ground truth; and the errors and scores of all."""
-    kept, scores = choose(task, candidates)
-    return kept, {name: errors(task.sequence, poses) | scores[name] for name, poses in candidates.items()}
+    kept, scores = shared.choose(task, candidates)
+    return kept, {name: shared.errors(task.sequence, poses) | scores[name] for name, poses in candidates.items()}
 
 
 def read_scans(config: Config) -> ScanSequence:
@@ -204,13 +191,13 @@ def read_scans(config: Config) -> ScanSequence:
 
 def starting_poses(config: Config, task: Task) -> tuple[str, Floats]:
     """The name of the start and its (n, 3) poses; what is no word of `START_NAMES` names a trajectory file."""
-    sequence, name = task.sequence, START_NAMES.get(config.init, f"poses of {Path(config.init).name}")
+    sequence, name = task.sequence, shared.START_NAMES.get(config.init, f"poses of {Path(config.init).name}")
     if config.init == "zero":
         return name, np.zeros((len(sequence), 3))
     if config.init == "global":
-        return name, search(task)
+        return name, shared.search(task)
     if config.init in ("icp-plane", "icp-point"):
-        return name, incremental(task, "plane" if config.init == "icp-plane" else "point")
+        return name, shared.incremental(task, "plane" if config.init == "icp-plane" else "point")
     if config.init == "odometry":
         if sequence.odometry_poses is None:
             raise ValueError(
@@ -220,7 +207,7 @@ def starting_poses(config: Config, task: Task) -> tuple[str, Floats]:
         return name, sequence.odometry_poses
 
     if not Path(config.init).exists():
-        raise ValueError(f"--init {config.init}: no such file, and none of {', '.join(START_NAMES)}")
+        raise ValueError(f"--init {config.init}: no such file, and none of {', '.join(shared.START_NAMES)}")
     return name, io.read_initial_poses(config.init, len(sequence), sequence.unit)
 
 
@@ -235,7 +222,7 @@ def before_and_after(sequence: ScanSequence, start: Floats, poses: Floats) -> di
     reference, unit = sequence.reference_poses, sequence.unit
     if reference is None:
         return {"success": None}
-    after, before = errors(sequence, poses), errors(sequence, start)
+    after, before = shared.errors(sequence, poses), shared.errors(sequence, start)
     # The paper's threshold is 20 pixels, 2 % of its world; of a real place, 2 % of what its trajectory spans.
     threshold = 20.0 if unit == "px" else 0.02 * float(np.linalg.norm(np.ptp(reference[:, :2], axis=0)))
     return {
@@ -257,7 +244,7 @@ def draw_map(folder: RunFolder, task: Task, candidates: Candidates, metrics: Map
     """map.png: the start, DeepMapping, the candidate that was kept, and the reference; returns what it shows."""
     scans, unit, kept = task.scans, task.sequence.unit, metrics["kept"]
     panels = []
-    for name in dict.fromkeys((metrics["start"], DEEPMAPPING, kept)):
+    for name in dict.fromkeys((metrics["start"], shared.DEEPMAPPING, kept)):
         numbers = metrics["candidates"][name]
         ate, distance = numbers.get(f"ate_{unit}"), numbers.get(f"point_distance_{unit}")
         title = name[0].upper() + name[1:] + (" (kept)" if name == kept else "")

@@ -19,15 +19,9 @@ from numpy.typing import NDArray
 from tyro.conf import arg
 
 from dpmjax import io, simulation, viz
+from experiments import _deepmapping_methods as shared
 from experiments._command import run_command
-from experiments._deepmapping_methods import (
-    SUCCESS_PX,
-    Task,
-    check_methods,
-    make_task,
-    run_cells,
-    split_by_extras,
-)
+from experiments._deepmapping_methods import Task
 from experiments._run_folder import RunFolder, RunOptions, open_run_folder, write_metrics
 
 EXPERIMENT = "deepmapping_limits"
@@ -57,7 +51,7 @@ class Config(RunOptions):
 
     def __post_init__(self) -> None:
         """Checks names and ranges."""
-        check_methods(self.methods)
+        shared.check_methods(self.methods)
         if not self.orders or any(order not in ORDERS for order in self.orders):
             raise ValueError(f"--orders: expected some of {', '.join(ORDERS)}, got {', '.join(self.orders) or 'none'}")
         if self.limit < 1 or self.steps < 2 or any(s < 1 or s > NUM_SCANS // 4 for s in self.strides):
@@ -69,7 +63,7 @@ class Config(RunOptions):
 def main(config: Config) -> list[dict[str, Any]]:
     """Runs what is missing, cell by cell."""
     folder = open_run_folder(config, EXPERIMENT)
-    methods, missing = split_by_extras(config.methods)
+    names, missing = shared.split_by_extras(config.methods)
     cells = [
         {"stride": stride, "noise_px": noise, "order": order, "walk": walk}
         for stride in config.strides
@@ -78,7 +72,7 @@ def main(config: Config) -> list[dict[str, Any]]:
         for order in config.orders
     ]
     write = partial(_write, folder, config)
-    rows = run_cells(folder, cells, methods, partial(_prepare, config), write, seed=config.seed)
+    rows = shared.run_cells(folder, cells, names, partial(_prepare, config), write, seed=config.seed)
     for line in summary(rows):
         print(line)
     for name, reason in missing.items():
@@ -93,7 +87,7 @@ def _prepare(config: Config, cell: dict[str, Any]) -> tuple[Task, dict[str, Any]
         walk % NUM_WORLDS, NUM_SCANS, seed=200 + walk, range_noise_px=cell["noise_px"]
     )
     scans = io.take_scans(sequence, slice(None, None, cell["stride"]))
-    return make_task(scans, is_ordered=cell["order"] == "ordered", steps=config.steps, seed=config.seed), {}
+    return shared.make_task(scans, is_ordered=cell["order"] == "ordered", steps=config.steps, seed=config.seed), {}
 
 
 def success_grid(rows: list[dict[str, Any]], method: str, order: str, config: Config) -> NDArray[np.float64]:
@@ -122,7 +116,7 @@ def _write(folder: RunFolder, config: Config, rows: list[dict[str, Any]]) -> Non
     """metrics.json and one picture an order."""
     trusted = [row["success"] for row in rows if row["is_trusted"]]
     metrics = {
-        "success_threshold_px": SUCCESS_PX,
+        "success_threshold_px": shared.SUCCESS_PX,
         "summary": summary(rows),
         "num_trusted": len(trusted),
         "success_of_trusted": float(np.mean(trusted)) if trusted else None,

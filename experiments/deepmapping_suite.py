@@ -21,17 +21,9 @@ import numpy as np
 from tyro.conf import arg
 
 from dpmjax import simulation, viz
+from experiments import _deepmapping_methods as shared
 from experiments._command import run_command
-from experiments._deepmapping_methods import (
-    METHODS,
-    NOT_RUN,
-    SUCCESS_PX,
-    Task,
-    check_methods,
-    make_task,
-    run_cells,
-    split_by_extras,
-)
+from experiments._deepmapping_methods import Task
 from experiments._run_folder import RunFolder, RunOptions, open_run_folder, write_metrics
 
 if TYPE_CHECKING:
@@ -49,7 +41,7 @@ class Config(RunOptions):
 
     limit: Annotated[int | None, arg(metavar="N")] = None
     """Only the first N trajectories; they go through worlds and lengths in turn."""
-    methods: tuple[str, ...] = tuple(METHODS)
+    methods: tuple[str, ...] = tuple(shared.METHODS)
     """Columns."""
     steps: int = 600
     """Steps of the fit."""
@@ -58,7 +50,7 @@ class Config(RunOptions):
 
     def __post_init__(self) -> None:
         """Checks names and ranges."""
-        check_methods(self.methods)
+        shared.check_methods(self.methods)
         if self.steps < 2 or (self.limit is not None and self.limit < 1) or self.range_noise_px < 0:
             raise ValueError("--steps, --limit and --range-noise-px: expected at least 2, 1 and 0")
 
@@ -74,11 +66,11 @@ def list_trajectories() -> list[dict[str, int]]:
 def main(config: Config) -> list[dict[str, Any]]:
     """Runs what is missing, writes the table after every trajectory."""
     folder = open_run_folder(config, EXPERIMENT)
-    methods, missing = split_by_extras(config.methods)
-    not_run = NOT_RUN | missing
+    names, missing = shared.split_by_extras(config.methods)
+    not_run = shared.NOT_RUN | missing
     write = partial(_write, folder, not_run=not_run, seed=config.seed)
     cells = list_trajectories()[: config.limit]
-    rows = run_cells(folder, cells, methods, partial(_prepare, config), write, seed=config.seed)
+    rows = shared.run_cells(folder, cells, names, partial(_prepare, config), write, seed=config.seed)
     print(table(rows))
     if config.range_noise_px and rows:
         bound = float(np.median([row["bound_px"] for row in rows]))
@@ -94,7 +86,7 @@ def _prepare(config: Config, cell: dict[str, Any]) -> tuple[Task, dict[str, Any]
     sequence = simulation.simulate_sequence(
         cell["world"], cell["num_scans"], seed=cell["walk"], range_noise_px=config.range_noise_px
     )
-    return make_task(sequence, steps=config.steps, seed=config.seed), _bound(
+    return shared.make_task(sequence, steps=config.steps, seed=config.seed), _bound(
         cell["world"], sequence, config.range_noise_px
     )
 
@@ -142,7 +134,7 @@ def _medians(numbers: Sequence[dict[str, Any]]) -> dict[str, Any]:
         "num_trajectories": len(numbers),
         "median_ate_px": float(np.median(ates)),
         "median_point_distance_px": float(np.median([row["point_distance_px"] for row in numbers])),
-        "success": float(np.mean(ates < SUCCESS_PX)),
+        "success": float(np.mean(ates < shared.SUCCESS_PX)),
     }
 
 
@@ -169,7 +161,7 @@ def table(rows: Sequence[dict[str, Any]]) -> str:
     for method, mine in by_method(rows).items():
         s = summarise(mine)
         right = "-" if s["success_of_trusted"] is None else f"{s['success_of_trusted']:.1%}"
-        lines.append(line(METHODS[method].title, s, f"{s['median_s']:.1f} | {s['num_trusted']} | {right}"))
+        lines.append(line(shared.METHODS[method].title, s, f"{s['median_s']:.1f} | {s['num_trusted']} | {right}"))
         if len(s["candidates"]) > 1:
             lines += [
                 line(f"- of it: {name}", c, f"kept {c['num_kept']} times | |") for name, c in s["candidates"].items()
@@ -181,8 +173,10 @@ def _write(folder: RunFolder, rows: list[dict[str, Any]], *, not_run: dict[str, 
     """table.md, metrics.json, boxes.png."""
     groups = by_method(rows)
     metrics = {
-        "success_threshold_px": SUCCESS_PX,
-        "methods": {method: {"title": METHODS[method].title, **summarise(mine)} for method, mine in groups.items()},
+        "success_threshold_px": shared.SUCCESS_PX,
+        "methods": {
+            method: {"title": shared.METHODS[method].title, **summarise(mine)} for method, mine in groups.items()
+        },
         "not_run": not_run,
     }
     note = write_metrics(folder, metrics, seed=seed, rows=rows)
@@ -191,7 +185,7 @@ def _write(folder: RunFolder, rows: list[dict[str, Any]], *, not_run: dict[str, 
         label: {method: [row[key] for row in mine] for method, mine in groups.items()}
         for label, key in (("ATE", "ate_px"), ("point distance", "point_distance_px"))
     }
-    viz.save_figure(viz.box_plots_figure(panels, "px", SUCCESS_PX), folder / "boxes.png")
+    viz.save_figure(viz.box_plots_figure(panels, "px", shared.SUCCESS_PX), folder / "boxes.png")
 
 
 if __name__ == "__main__":

@@ -126,7 +126,7 @@ def test_limits_are_resumed_without_doing_a_row_twice(tmp_path, monkeypatch, cap
 
     def simulate(world: int, num_scans: int, **options):
         simulated.append((world, options["seed"]))
-        return simulate_sequence(world, 8, num_beams=16)
+        return simulate_sequence(world, 8, num_beams=64)
 
     def run(*options: str) -> dict:
         arguments = ["-o", str(tmp_path / "out"), "--strides", "2", "--noises-px", "0", "--orders", "ordered", *options]

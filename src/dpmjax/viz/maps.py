@@ -49,7 +49,11 @@ class Panel:
     is_reference: bool = False
 
     def __post_init__(self) -> None:
-        """Raises a ValueError where the shapes do not fit."""
+        """Checks the shapes.
+
+        Raises:
+            ValueError: they do not fit each other.
+        """
         points, mask, poses = (np.shape(x) for x in (self.scans.points, self.scans.mask, self.poses))
         if len(points) != 3 or points[-1] != 2 or mask != points[:2] or poses != (points[0], 3):
             raise ValueError(
@@ -68,7 +72,7 @@ class Panel:
         return np.asarray(se2.transform_points(poses, points))
 
     def visible_points(self) -> tuple[NDArray[np.float64], NDArray[np.intp]]:
-        """The points (m, 2) that can be drawn, and the scan (m,) that each comes from."""
+        """Returns the points (m, 2) that can be drawn, and the scan (m,) that each comes from."""
         points = self.points_world
         is_drawable = np.asarray(self.scans.mask, bool) & np.isfinite(points).all(axis=-1)
         return points[is_drawable], np.nonzero(is_drawable)[0]
@@ -117,7 +121,7 @@ def registered_scans_figure(panels: Sequence[Panel], unit: str) -> Figure:
 
 
 def time_colormap() -> Colormap:
-    """Violet over red to amber: even in lightness, and nowhere too pale for a white ground."""
+    """Returns violet over red to amber: even in lightness, and nowhere too pale for a white ground."""
     import matplotlib
     from matplotlib.colors import LinearSegmentedColormap
 
@@ -126,7 +130,7 @@ def time_colormap() -> Colormap:
 
 
 def _laid_onto(panel: Panel, anchor: Panel) -> Panel:
-    """Moves the panel rigidly so that its trajectory is as close as possible to the anchor's (least squares)."""
+    """Returns the panel moved rigidly, its trajectory as close as possible to the anchor's (least squares)."""
     # A position as one complex number: a turn is then a product with a number of length one.
     source, target = (one.trajectory_world @ np.array([1.0, 1.0j]) for one in (panel, anchor))
     is_used = np.isfinite(source) & np.isfinite(target)
@@ -140,7 +144,7 @@ def _laid_onto(panel: Panel, anchor: Panel) -> Panel:
 
 
 def _shared_limits(panels: Sequence[Panel], anchor: Panel) -> Limits:
-    """Limits that show every panel; a panel that flies apart is cut at half the anchor's size beyond the anchor."""
+    """Returns limits that show every panel; a diverged panel is cut at half the anchor's size beyond the anchor."""
     low, high = _extent(anchor)
     size = np.max(high - low)
     lows, highs = zip(*(_extent(panel) for panel in panels), strict=True)
@@ -155,7 +159,7 @@ def _shared_limits(panels: Sequence[Panel], anchor: Panel) -> Limits:
 
 
 def _extent(panel: Panel) -> tuple[NDArray[np.floating], NDArray[np.floating]]:
-    """Corners of the box around the trajectory and nearly all points; a unit box where there is nothing."""
+    """Returns the corners of the box around trajectory and nearly all points; a unit box where there is nothing."""
     points, _ = panel.visible_points()
     trajectory = panel.trajectory_world[np.isfinite(panel.trajectory_world).all(axis=-1)]
     corners = [trajectory]
