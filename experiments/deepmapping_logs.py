@@ -16,26 +16,11 @@ from typing import Annotated, Any
 from tyro.conf import Positional, arg
 
 from experiments._command import run_command
-from experiments._json import load_json, write_json
-from experiments._machine import environment
-from experiments._run_folder import METRICS, commits_note
+from experiments._json import load_json
+from experiments._run_folder import METRICS, RunFolder, write_metrics
 
 EXPERIMENT = "deepmapping_logs"
 _BAD_INPUT = 2
-# Each row carries the commit of its own run: earlier runs are kept.
-COLUMNS = (
-    "num_scans",
-    "ate_initial_m",
-    "ate_m",
-    "kept",
-    "fit_s",
-    "wall_s",
-    "peak_rss_gb",
-    "candidates",
-    "seed",
-    "git_hash",
-    "versions",
-)
 
 
 @dataclass(frozen=True)
@@ -45,7 +30,7 @@ class Config:
     logs: Positional[Path]
     """Folder of .log, .log.gz or .clf files."""
     output: Annotated[Path, arg(aliases=["-o"], metavar="OUT")] = Path("results/deepmapping_logs")
-    """Folder for the runs and table.json."""
+    """Folder for the runs and metrics.json."""
     inits: tuple[str, ...] = ("icp-plane", "odometry")
     """Starts to try."""
     steps: int | None = None
@@ -64,11 +49,9 @@ def main(config: Config) -> list[dict[str, Any]]:
         for init in config.inits:
             metrics = _run(log, init, config)
             if metrics is not None:
-                name = log.name.split(".")[0]
-                rows.append({"log": name, "init": init, **{key: metrics.get(key) for key in COLUMNS}})
-                made_by = environment()
-                table = {"seed": config.seed, **made_by, "note": commits_note(rows, made_by["git_hash"]), "rows": rows}
-                write_json(config.output / "table.json", table)
+                # A row has the commit of its own run, which may be an earlier one.
+                rows.append({"log": log.name.split(".")[0], "init": init, **metrics})
+                write_metrics(RunFolder(config.output, is_resumed=True), {}, seed=config.seed, rows=rows)
     print(markdown(rows))
     return rows
 

@@ -27,7 +27,7 @@ from experiments._deepmapping_methods import Task
 from experiments._run_folder import RunFolder, RunOptions, open_run_folder, write_metrics
 
 if TYPE_CHECKING:
-    from dpmjax.io.scans2d.sequence import ScanSequence
+    pass
 
 EXPERIMENT = "deepmapping_suite"
 NUM_WORLDS, NUM_SHORT, NUM_LONG = 3, 50, 25
@@ -82,27 +82,16 @@ def main(config: Config) -> list[dict[str, Any]]:
 
 
 def _prepare(config: Config, cell: dict[str, Any]) -> tuple[Task, dict[str, Any]]:
-    """The scans of a trajectory, and the bound on their ATE."""
-    sequence = simulation.simulate_sequence(
-        cell["world"], cell["num_scans"], seed=cell["walk"], range_noise_px=config.range_noise_px
-    )
-    return shared.make_task(sequence, steps=config.steps, seed=config.seed), _bound(
-        cell["world"], sequence, config.range_noise_px
-    )
-
-
-def _bound(world: int, sequence: ScanSequence, range_noise_px: float) -> dict[str, float]:
-    """The Cramer-Rao bound on the ATE, px; nothing without noise."""
-    if not range_noise_px:
-        return {}
+    """The scans of a trajectory, and with noise the Cramer-Rao bound on their ATE."""
+    world, noise = cell["world"], config.range_noise_px
+    sequence = simulation.simulate_sequence(world, cell["num_scans"], seed=cell["walk"], range_noise_px=noise)
+    task = shared.make_task(sequence, steps=config.steps, seed=config.seed)
+    if not noise:
+        return task, {}
     assert sequence.reference_poses is not None
-    bound = simulation.position_bound(
-        simulation.make_world(world).is_obstacle,
-        sequence.reference_poses,
-        range_noise_px=range_noise_px,
-        num_beams=sequence.mask.shape[1],
-    )
-    return {"bound_px": float(np.sqrt(np.mean(bound**2)))}
+    is_obstacle, num_beams = simulation.make_world(world).is_obstacle, sequence.mask.shape[1]
+    bound = simulation.position_bound(is_obstacle, sequence.reference_poses, range_noise_px=noise, num_beams=num_beams)
+    return task, {"bound_px": float(np.sqrt(np.mean(bound**2)))}
 
 
 def summarise(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
