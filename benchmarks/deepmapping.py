@@ -21,8 +21,7 @@ from benchmarks.rows import Row
 from dpmjax import deepmapping as dm
 from dpmjax.io import ScanSequence, read_sequence
 from dpmjax.metrics import absolute_trajectory_error
-from dpmjax.registration import PolishConfig, incremental_icp, polish
-from dpmjax.registration.line_fitting import LineScans, fit_lines
+from dpmjax.registration import PlanarScans, incremental_icp, planar_scans, refine
 from dpmjax.simulation import simulate_sequence
 from dpmjax.types import ScanSet
 
@@ -67,8 +66,8 @@ def _with_noise(sequence: ScanSequence, noise_px: float) -> ScanSequence:
     return replace(sequence, points=points.astype(np.float32))
 
 
-def _lines(sequence: ScanSequence) -> LineScans:
-    return fit_lines(ScanSet(sequence.points, sequence.mask))
+def _lines(sequence: ScanSequence) -> PlanarScans:
+    return planar_scans(sequence.points, sequence.mask)
 
 
 def _ate(sequence: ScanSequence, poses: NDArray[np.float64]) -> float:
@@ -94,10 +93,10 @@ def _classical(sequence: ScanSequence, case: str, quick: bool) -> list[Row]:
     lines = _lines(sequence)
     poses, _ = timed("icp-plane", lambda: incremental_icp(_lines(sequence)))
     rows.append(Row(f"{case}: icp-plane", "ate", _ate(sequence, poses), "px"))
-    polished = timed("icp-plane + polish", lambda: polish(lines, poses, PolishConfig()))
+    polished = timed("icp-plane + polish", lambda: refine(lines, poses))
     rows.append(Row(f"{case}: icp-plane + polish", "ate", _ate(sequence, polished.poses), "px"))
     if not quick:
-        polished = polish(lines, _poor_start(sequence), PolishConfig())
+        polished = refine(lines, _poor_start(sequence))
         rows.append(Row(f"{case}: poor start + polish", "ate", _ate(sequence, polished.poses), "px"))
     return rows
 
@@ -136,7 +135,7 @@ def _fit(sequence: ScanSequence, start: NDArray[np.float64] | None, case: str, q
         Row(case, "steps", float(state.step), ""),
         Row(case, "compile", compile_s, "s"),
     ]
-    polished = polish(_lines(sequence), poses, PolishConfig())
+    polished = refine(_lines(sequence), poses)
     return [*rows, Row(f"{case}: + polish", "ate", _ate(sequence, polished.poses), "px")]
 
 

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dpmjax.geometry import se2
-from dpmjax.registration.pairs import length_scale
+from dpmjax.geometry.rays import typical_range
 from dpmjax.types import ScanSet
 
 Floats = NDArray[np.float64]
@@ -21,7 +21,7 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class MultiwayConfig:
-    """Settings. Lengths are in length scales of the scans.
+    """Settings. Lengths are in typical ranges of the scans.
 
     Attributes:
         coarse: largest distance of matched points, first round.
@@ -30,9 +30,9 @@ class MultiwayConfig:
         prune: doubtful edges below this confidence are taken out.
     """
 
-    coarse: float = 0.6
-    fine: float = 0.15
-    radius: float = 2.0
+    coarse: float = 0.09
+    fine: float = 0.0225
+    radius: float = 0.3
     prune: float = 0.25
 
 
@@ -52,9 +52,9 @@ def multiway(scans: ScanSet, config: MultiwayConfig | None = None) -> Floats:
     import open3d
 
     config = config or MultiwayConfig()
-    scale = length_scale(scans)
+    unit = typical_range(scans.points, scans.mask)
     clouds = [_cloud(p[m]) for p, m in zip(np.asarray(scans.points), np.asarray(scans.mask), strict=True)]
-    coarse, fine = config.coarse * scale, config.fine * scale
+    coarse, fine = config.coarse * unit, config.fine * unit
     graph = open3d.pipelines.registration.PoseGraph()
     T_world = [np.eye(4)]
     graph.nodes.append(_node(T_world[0]))
@@ -65,7 +65,7 @@ def multiway(scans: ScanSet, config: MultiwayConfig | None = None) -> Floats:
         graph.nodes.append(_node(T_world[-1]))
     chain = np.stack(T_world)
     apart = np.linalg.norm(chain[:, None, :3, 3] - chain[None, :, :3, 3], axis=-1)
-    for source, target in np.argwhere(np.triu(apart < config.radius * scale, k=2)).tolist():
+    for source, target in np.argwhere(np.triu(apart < config.radius * unit, k=2)).tolist():
         guess = np.linalg.inv(chain[target]) @ chain[source]
         graph.edges.append(_edge(clouds, source, target, guess, (coarse, fine), is_doubtful=True))
     registration = open3d.pipelines.registration

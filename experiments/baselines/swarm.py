@@ -16,20 +16,20 @@ from jaxtyping import Array, Bool, Float
 from numpy.typing import NDArray
 
 from dpmjax.geometry import se2
+from dpmjax.geometry.rays import typical_range
 from dpmjax.losses import chamfer_distance
-from dpmjax.registration.pairs import length_scale
 from dpmjax.types import ScanSet
 
 
 @dataclass(frozen=True)
 class SwarmConfig:
-    """Settings. Lengths are in length scales of the scans.
+    """Settings. Lengths are in typical ranges of the scans.
 
     Attributes:
         num_particles: relative poses that are tried at a time.
         num_iterations: of a swarm.
         num_rounds: swarms from fresh particles; the best round of each pair is kept.
-        reach: particles start within this: translation along each axis, radians.
+        spread: particles start within this: translation along each axis, radians.
         num_beams: beams of each scan that are compared.
         pairs_at_once: pairs that are worked on together.
     """
@@ -37,7 +37,7 @@ class SwarmConfig:
     num_particles: int = 32
     num_iterations: int = 60
     num_rounds: int = 3
-    reach: tuple[float, float] = (1.0, 0.5)
+    spread: tuple[float, float] = (0.15, 0.5)
     num_beams: int = 86
     pairs_at_once: int = 32
 
@@ -65,13 +65,10 @@ def swarm_chain(scans: ScanSet, config: SwarmConfig | None = None, *, key: jax.A
     config = config or SwarmConfig()
     points, mask = jnp.asarray(scans.points), jnp.asarray(scans.mask)
     stride = max(1, -(-mask.shape[1] // config.num_beams))
-    scale = length_scale(scans)
-    widths = jnp.array([config.reach[0] * scale, config.reach[0] * scale, config.reach[1]])
+    unit = typical_range(scans.points, scans.mask)
+    widths = jnp.array([config.spread[0] * unit, config.spread[0] * unit, config.spread[1]])
     steps = _swarm_pairs(points[:, ::stride], mask[:, ::stride], widths, key, config=config)
-    poses = np.zeros((len(mask), 3))
-    for scan, step in enumerate(np.asarray(steps, np.float64), start=1):
-        poses[scan] = se2.compose(poses[scan - 1], step)
-    return poses
+    return se2.chain(np.asarray(steps, np.float64))
 
 
 @partial(jax.jit, static_argnames="config")
@@ -89,10 +86,7 @@ def _swarm_pairs(
         before, before_mask, after, after_mask, pair_key = pair
 
         def misfit(pose: Float[Array, " 3"]) -> Array:
-            c, s = jnp.cos(pose[2]), jnp.sin(pose[2])
-            rotation = jnp.stack([jnp.stack([c, -s]), jnp.stack([s, c])])
-            moved = jnp.matmul(after, rotation.T, precision=jax.lax.Precision.HIGHEST) + pose[:2]
-            return chamfer_distance(moved, before, after_mask, before_mask)
+            return chamfer_distance(se2.transform_points(pose, after), before, after_mask, before_mask)
 
         swarm = partial(_swarm, lambda x: jax.vmap(misfit)(x * widths), config=config)
         found, values = jax.lax.map(swarm, jax.random.split(pair_key, config.num_rounds))

@@ -1,8 +1,9 @@
-"""Samples on the rays between the sensor and what it hit: where nothing stands."""
+"""Rays between the sensor and what it hit: samples of free space on them, and their typical length."""
 
 from __future__ import annotations
 
-from jaxtyping import Array, Float
+import numpy as np
+from jaxtyping import Array, Bool, Float
 
 from dpmjax.checks import as_float, as_points, require_shape
 from dpmjax.types import AnyArray
@@ -31,3 +32,18 @@ def sample_free_space(
     if factors.ndim not in (1, 2) or (factors.ndim == 2 and factors.shape[0] != num_beams):
         raise ValueError(f"factors: expected shape (s,) or ({num_beams}, s), got {factors.shape}")
     return origin + factors[..., None] * (points - origin)[:, None, :]
+
+
+def typical_range(points: Float[AnyArray, "n *beams d"], mask: Bool[AnyArray, "n *beams"]) -> float:
+    """The range that nine beams in ten of a scan stay below, median over the scans: the unit of length of a fit.
+
+    Args:
+        points: beam end points of n scans in their sensor frames, any unit; planar scans or depth images.
+        mask: False for beams that measured nothing; they may hold anything.
+
+    Returns:
+        The range, in the unit of the points. Scans without a valid beam are left out; 1 if no scan has one.
+    """
+    ranges = np.linalg.norm(np.asarray(points, np.float32), axis=-1)
+    far = [np.percentile(r[m], 90) for r, m in zip(ranges, np.asarray(mask), strict=True) if m.any()]
+    return float(np.median(far)) if far else 1.0

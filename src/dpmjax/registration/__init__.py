@@ -1,4 +1,4 @@
-"""Classical registration: ICP, the incremental warm start, loop closure and the multi-view polish."""
+"""Classical registration of planar scans: ICP, chains of it, loop closure, refinement, global search, and trust."""
 
 import lazy_loader as _lazy
 

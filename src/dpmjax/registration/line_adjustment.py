@@ -1,9 +1,8 @@
-"""Walls fitted to all scans together: the last step of the polish where there is range noise.
+"""Line adjustment: all poses against lines that all scans make together, as in a bundle adjustment.
 
-A line of one scan is as noisy as its beams. Here every beam is compared with the wall that all scans around it see: a
-straight line through the beams nearby, weighted by what range noise says of them (a grazing beam knows its wall well,
-because its noise runs along the wall). The line is eliminated: its weights make the residual a difference of poses, so
-that all poses move together, as in a bundle adjustment.
+The line of one scan is as noisy as its beams. Here every beam is compared with a straight line through the beams of all
+scans nearby, weighted by their range noise (a grazing beam knows its wall well, because its noise runs along the wall).
+The lines are eliminated: their weights make each residual a function of poses alone.
 """
 
 from __future__ import annotations
@@ -21,35 +20,32 @@ import scipy.spatial
 from jaxtyping import Array, Bool, Float, Int
 
 from dpmjax.geometry import se2
-from dpmjax.pose_graph.planar import Floats, Indices
-from dpmjax.registration.line_fitting import LineScans
-from dpmjax.registration.pair_alignment import rotation_of
-from dpmjax.registration.pairs import length_scale
+from dpmjax.registration.planar_scans import Floats, Indices, PlanarScans
 
 _einsum = partial(jnp.einsum, precision="highest")
 
 
 @dataclass(frozen=True)
-class WallConfig:
-    """Settings of the alignment to walls. Lengths are in standard deviations of the range noise, but for `reach`.
+class LineAdjustmentConfig:
+    """Settings of the line adjustment. Lengths are in standard deviations of the range noise, but for `radius`.
 
     Attributes:
-        num_neighbours: walls are made of the scan itself and so many others, evenly by nearness out of all in reach.
-        reach: within which scans share walls, in length scales of the scans.
-        beams_aside: of a neighbour the beams up to so many beside the nearest one may be part of the wall.
-        window: half the length of wall that a beam is compared with.
-        gate: beams farther than this off a wall are not part of it.
-        roughness: standard deviation of what is no straight wall; grazing beams are trusted no further.
-        outlier: residuals of this many of their standard deviations lose most of their say.
-        max_chi2: a wall bends if its points stray by more than this, as a mean square in standard deviations.
-        min_slenderness: a wall is one if its points spread so many times more along than across (variances).
-        num_rounds: the beams of a wall are chosen anew so many times.
+        num_neighbours: lines are made of the scan itself and so many others, evenly by nearness within `radius`.
+        radius: within which scans share lines, in typical ranges of the scans.
+        num_beside: of a neighbour the nearest beam and so many to either side may be part of the line.
+        window: half the length of line that a beam is compared with.
+        gate: beams farther than this off a line are not part of it.
+        roughness: standard deviation of walls about a straight line; grazing beams are trusted no further.
+        outlier: residuals of this many of their standard deviations lose most of their weight.
+        max_chi2: a wall is bent if its points stray by more than this, as a mean square in standard deviations.
+        min_slenderness: points are a line if they spread so many times more along than across (variances).
+        num_rounds: times that the beams of a line are chosen.
         num_iterations: Gauss-Newton steps of each round.
     """
 
     num_neighbours: int = 48
-    reach: float = 8.0
-    beams_aside: int = 2
+    radius: float = 1.2
+    num_beside: int = 2
     window: float = 6.0
     gate: float = 4.0
     roughness: float = 0.2
@@ -61,7 +57,7 @@ class WallConfig:
 
 
 class _Beams(NamedTuple):
-    """Beams of the neighbours that may lie on the wall of each beam of a scan, in its frame: (b, s, k)."""
+    """Beams of the neighbours that may lie on the line of each beam of a scan, in its frame: (b, s, k)."""
 
     offsets: Float[Array, "b s k 2"]
     slant: Float[Array, "b s k 2"]
@@ -69,24 +65,24 @@ class _Beams(NamedTuple):
     mask: Bool[Array, "b s k"]
 
 
-class _Walls(NamedTuple):
-    """The wall of each beam (b): what it is and where the beam should end by it.
+class _Lines(NamedTuple):
+    """The line of each beam (b).
 
     Attributes:
         normals: turned as those of the beams.
-        shares: weights of the beams around, whose mean is the wall where the beam meets it.
-        variance: of the wall there.
-        is_wall: straight, and seen by enough beams.
+        shares: weights of the beams around, whose mean is the point of the line where the beam meets it.
+        variance: of the line there.
+        is_line: straight, and seen by enough beams.
     """
 
     normals: Float[Array, "b 2"]
     shares: Float[Array, "b s k"]
     variance: Float[Array, " b"]
-    is_wall: Bool[Array, " b"]
+    is_line: Bool[Array, " b"]
 
 
-class WallSystem(NamedTuple):
-    """Gauss-Newton system of one scan against the walls around it, over it and its neighbours (s scans)."""
+class _LineSystem(NamedTuple):
+    """Gauss-Newton system of one scan against the lines around it, over it and its neighbours (s scans)."""
 
     information: Float[Array, "s 3 s 3"]
     gradient: Float[Array, "s 3"]
@@ -98,18 +94,15 @@ def _levers(points: Float[Array, "... 2"]) -> Float[Array, "... 2"]:
 
 
 def _gather_beams(
-    own: LineScans,
-    others: LineScans,
-    nearest: Int[Array, "b s"],
-    poses: Float[Array, "s 3"],
-    config: WallConfig,
-) -> _Beams:
-    """For each beam those of the scans around it, beside the nearest one, that see the same side of a wall nearby."""
-    noise = own.noise
-    rotation = jax.vmap(rotation_of)(poses[:, 2])
+    own: PlanarScans, others: PlanarScans, nearest: Int[Array, "b s"], poses: Float[Array, "s 3"],
+    config: LineAdjustmentConfig,
+) -> _Beams:  # fmt: skip
+    """For each beam those of the scans around, beside the nearest one, that see the same side of a surface nearby."""
+    noise = own.noises
+    rotation = se2.rotation(poses[:, 2])
     turn = partial(_einsum, "sij,skj->ski", rotation)
-    points = turn(others.points) + poses[:, None, :2]
-    index = nearest[..., None] + jnp.arange(-config.beams_aside, config.beams_aside + 1)
+    points = se2.transform_points(poses, others.points)
+    index = nearest[..., None] + jnp.arange(-config.num_beside, config.num_beside + 1)
     is_inside = (index >= 0) & (index < points.shape[1])
     index = jnp.clip(index, 0, points.shape[1] - 1)
     scan = jnp.arange(points.shape[0])[:, None]
@@ -123,11 +116,13 @@ def _gather_beams(
         offsets=offsets,
         slant=turn(others.points / reach)[scan, index],
         levers=turn(_levers(others.points))[scan, index],
-        mask=others.mask[scan, index] & is_inside & is_near & faces_same_way,
+        mask=others.is_on_line[scan, index] & is_inside & is_near & faces_same_way,
     )
 
 
-def _fit_walls(beams: _Beams, normals: Float[Array, "b 2"], noise: Float[Array, ""], config: WallConfig) -> _Walls:
+def _fit_lines(
+    beams: _Beams, normals: Float[Array, "b 2"], noise: Float[Array, ""], config: LineAdjustmentConfig
+) -> _Lines:
     """Weighted straight lines, each from the beams around one beam; `normals` are where to start."""
     floor = (config.roughness * noise) ** 2
     taper = jnp.maximum(1.0 - (beams.offsets**2).sum(-1) / (config.window * noise) ** 2, 0.0) ** 2
@@ -154,90 +149,82 @@ def _fit_walls(beams: _Beams, normals: Float[Array, "b 2"], noise: Float[Array, 
     along = _einsum("bi,bski->bsk", _levers(normals), centred)
     here = -(_levers(normals) * mean).sum(-1)
     length = jnp.maximum((weight * along**2).sum((1, 2)), 1e-12)
-    return _Walls(
+    return _Lines(
         normals=normals,
         shares=weight * (1.0 / total[:, None, None] + along * (here / length)[:, None, None]),
         variance=1.0 / total + here**2 / length,
-        is_wall=is_slender & (chi2 < config.max_chi2) & (counts.sum((1, 2)) > 5),
+        is_line=is_slender & (chi2 < config.max_chi2) & (counts.sum((1, 2)) > 5),
     )
 
 
 def _linearise(
-    own: LineScans,
-    others: LineScans,
-    nearest: Int[Array, "b s"],
-    poses: Float[Array, "s 3"],
-    config: WallConfig,
-) -> WallSystem:
+    own: PlanarScans, others: PlanarScans, nearest: Int[Array, "b s"], poses: Float[Array, "s 3"],
+    config: LineAdjustmentConfig,
+) -> _LineSystem:  # fmt: skip
     """The system of one scan; the first of `others` is the scan itself, at pose zero."""
-    noise = own.noise
+    noise = own.noises
     beams = _gather_beams(own, others, nearest, poses, config)
-    walls = _fit_walls(beams, own.normals, noise, config)
-    normals = walls.normals
-    residual = -_einsum("bsk,bski,bi->b", walls.shares, beams.offsets, normals)
+    lines = _fit_lines(beams, own.normals, noise, config)
+    normals = lines.normals
+    residual = -_einsum("bsk,bski,bi->b", lines.shares, beams.offsets, normals)
     squared_slant = (normals * own.points).sum(-1) ** 2 / jnp.maximum((own.points**2).sum(-1), 1e-12)
-    variance = noise**2 * (squared_slant + config.roughness**2) + walls.variance
+    variance = noise**2 * (squared_slant + config.roughness**2) + lines.variance
     robust = 1.0 / (1.0 + residual**2 / (config.outlier**2 * variance)) ** 2
-    weight = jnp.where(own.mask & walls.is_wall, robust / variance, 0.0)
-    rotation = jax.vmap(rotation_of)(poses[:, 2])
-    shift = walls.shares.sum(2)[..., None] * _einsum("bi,sij->bsj", normals, rotation)
-    turn = _einsum("bsk,bski,bi->bs", walls.shares, beams.levers, normals)
+    weight = jnp.where(own.is_on_line & lines.is_line, robust / variance, 0.0)
+    rotation = se2.rotation(poses[:, 2])
+    shift = lines.shares.sum(2)[..., None] * _einsum("bi,sij->bsj", normals, rotation)
+    turn = _einsum("bsk,bski,bi->bs", lines.shares, beams.levers, normals)
     own_part = jnp.concatenate([normals, (normals * _levers(own.points)).sum(-1, keepdims=True)], -1)
     jacobian = (-jnp.concatenate([shift, turn[..., None]], -1)).at[:, 0].add(own_part)
-    return WallSystem(
+    return _LineSystem(
         information=_einsum("b,bsi,btj->sitj", weight, jacobian, jacobian),
         gradient=_einsum("b,b,bsi->si", weight, residual, jacobian),
     )
 
 
 @jax.jit
-def _find_nearest(lines: LineScans, around: Int[Array, "n s"], poses: Float[Array, "n s 3"]) -> Int[Array, "n b s"]:
+def _find_nearest(scans: PlanarScans, around: Int[Array, "n s"], poses: Float[Array, "n s 3"]) -> Int[Array, "n b s"]:
     """The beam of each scan around that ends nearest to each beam."""
 
     def find(one: tuple[Array, Array]) -> Array:
         rows, relative = one
-        own, others = lines.points[rows[0]], lines.points[rows]
-        points = _einsum("sij,skj->ski", jax.vmap(rotation_of)(relative[:, 2]), others) + relative[:, None, :2]
+        own, others = scans.points[rows[0]], scans.points[rows]
+        points = se2.transform_points(relative, others)
         # The square of a beam's own range is the same for all others.
         squared = (points**2).sum(-1) - 2.0 * _einsum("bi,ski->bsk", own, points)
-        return jnp.argmin(jnp.where(lines.mask[rows], squared, jnp.inf), axis=2)
+        return jnp.argmin(jnp.where(scans.is_on_line[rows], squared, jnp.inf), axis=2)
 
     return jax.lax.map(find, (around, poses))
 
 
 @partial(jax.jit, static_argnames="config")
 def _linearise_all(
-    lines: LineScans,
-    around: Int[Array, "n s"],
-    nearest: Int[Array, "n b s"],
-    poses: Float[Array, "n s 3"],
-    *,
-    config: WallConfig,
-) -> WallSystem:
-    def linearise(one: tuple[Array, Array, Array]) -> WallSystem:
+    scans: PlanarScans, around: Int[Array, "n s"], nearest: Int[Array, "n b s"], poses: Float[Array, "n s 3"],
+    *, config: LineAdjustmentConfig,
+) -> _LineSystem:  # fmt: skip
+    def linearise(one: tuple[Array, Array, Array]) -> _LineSystem:
         rows, nearest, relative = one
-        own, others = jax.tree.map(lambda x: x[rows[0]], lines), jax.tree.map(lambda x: x[rows], lines)
-        return _linearise(own, others, nearest, relative, config)
+        return _linearise(scans.take(rows[0]), scans.take(rows), nearest, relative, config)
 
     return jax.lax.map(linearise, (around, nearest, poses))
 
 
-def _choose_around(poses: Floats, num_neighbours: int, reach: float) -> Indices:
-    """Rows of each scan, itself first, and of others: evenly by nearness out of those in reach."""
+def _choose_around(poses: Floats, num_neighbours: int, radius: float) -> Indices:
+    """Rows of each scan, itself first, and of others: evenly by nearness out of those within the radius."""
     num_scans = len(poses)
     count = min(num_neighbours, num_scans - 1)
     tree = scipy.spatial.cKDTree(poses[:, :2])
     around = np.empty((num_scans, count + 1), np.int64)
     for scan, pose in enumerate(poses):
-        in_reach = tree.query_ball_point(pose[:2], reach, return_length=True)
-        near = np.atleast_1d(tree.query(pose[:2], k=min(num_scans, max(in_reach, count + 1)))[1])
+        num_within = tree.query_ball_point(pose[:2], radius, return_length=True)
+        near = np.atleast_1d(tree.query(pose[:2], k=min(num_scans, max(num_within, count + 1)))[1])
         # Of scans at one place any may come first.
         near = near[near != scan]
         around[scan] = [scan, *near[np.linspace(0, len(near) - 1, count).astype(np.int64)]]
     return around
 
 
-def _solve(num_poses: int, around: Indices, system: WallSystem) -> Floats:
+def _solve(num_poses: int, around: Indices, system: _LineSystem) -> Floats:
     """Steps of all poses in their own frames; the first one is held."""
     entry = 3 * around[:, :, None] + np.arange(3)
     size = entry.shape[1] * 3
@@ -254,30 +241,31 @@ def _solve(num_poses: int, around: Indices, system: WallSystem) -> Floats:
     return scipy.sparse.linalg.splu((matrix + sp.diags(extra)).tocsc()).solve(right).reshape(num_poses, 3)
 
 
-def align_to_walls(lines: LineScans, poses: Floats, config: WallConfig | None = None) -> Floats:
-    """Gauss-Newton of all poses against walls that all scans make together.
+def adjust_to_lines(scans: PlanarScans, poses: Floats, config: LineAdjustmentConfig | None = None) -> Floats:
+    """Gauss-Newton of all poses against lines that all scans make together.
 
     Args:
-        lines: n scans with lines and a range noise above zero.
+        scans: n scans with a range noise above zero.
         poses: (n, 3) start, T_world_scan, within a few deviations of the noise.
         config: settings.
 
     Returns:
-        (n, 3) poses; the first is that of the start. Without noise the start itself: there is no scale to weigh by.
+        (n, 3) poses; the first is that of the start. Without noise the start itself: nothing tells what to weigh by.
     """
-    config = config or WallConfig()
+    config = config or LineAdjustmentConfig()
     poses = np.asarray(poses, np.float64)
-    if len(poses) < 2 or float(lines.noise[0]) <= 0:
+    if len(poses) < 2 or scans.noise <= 0:
         return poses
-    reach = config.reach * length_scale(lines)
+    radius, scans = config.radius * scans.typical_range, scans.replace(is_ordered=False)
     for _ in range(config.num_rounds):
-        around = _choose_around(poses, config.num_neighbours, reach)
-        nearest = _find_nearest(lines, around, _relative_to_own(poses, around))
+        around = _choose_around(poses, config.num_neighbours, radius)
+        nearest = _find_nearest(scans, around, _relative_to_own(poses, around))
         for _ in range(config.num_iterations):
-            system = _linearise_all(lines, around, nearest, _relative_to_own(poses, around), config=config)
+            system = _linearise_all(scans, around, nearest, _relative_to_own(poses, around), config=config)
             poses = se2.compose(poses, _solve(len(poses), around, system))
     return poses
 
 
 def _relative_to_own(poses: Floats, around: Indices) -> Float[np.ndarray, "n s 3"]:
+    """Poses of the scans around each scan in its frame."""
     return se2.relative(poses[around[:, 0]][:, None], poses[around]).astype(np.float32)

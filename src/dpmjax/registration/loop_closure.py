@@ -1,137 +1,227 @@
-"""Places that were seen before: pairs of scans far apart in time, matched without trust in the drifted poses.
+"""Loop closure: pairs of scans far apart in time are matched without trust in the drifted poses, then optimised.
 
 A single pair of half-circle scans in a corridor fits in many wrong ways. Three things make a loop believable: the
-target is a small map of several scans, neighbouring loops say the same (a wrong match has no company), and the robust
-graph lets go of what still contradicts the rest.
+target is a small submap of several scans, neighbouring loops agree with it, and the robust graph rejects what still
+contradicts the rest.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy.spatial
+from jaxtyping import Array, Bool, Float, Int
 
 from dpmjax.geometry import se2
-from dpmjax.pose_graph.planar import Edges, Floats, GraphConfig, Indices, join_edges, optimize_planar_graph
-from dpmjax.registration.line_fitting import LineScans
-from dpmjax.registration.pair_alignment import StepPrior
-from dpmjax.registration.pairs import PairMatches, Schedule, length_scale, match_pairs, take_scans
-from dpmjax.registration.visibility import compare_views
-from dpmjax.types import ScanSet
+from dpmjax.pose_graph.planar import Edges, join_edges, optimize_planar_graph
+from dpmjax.registration.incremental import contradicted_share
+from dpmjax.registration.pair_alignment import PairMatches, PosePrior, Schedule, match_pairs
+from dpmjax.registration.planar_scans import Floats, Indices, PlanarScans, batches
+from dpmjax.registration.range_profiles import make_profiles
 
-_SEARCH = Schedule(gate=(1.2, 0.3), kernel=(0.6, 0.15), num_iterations=7, source_stride=5, target_stride=3)
-_REFINE = Schedule(gate=(0.5, 0.15), kernel=(0.15, 0.03), num_iterations=10, target_stride=2)
-
-
+_SEARCH = Schedule(gate=(0.18, 0.045), kernel=(0.09, 0.0225), num_iterations=7, source_stride=5, target_stride=3)
+_REFINE = Schedule(gate=(0.075, 0.0225), kernel=(0.0225, 0.0045), num_iterations=10, target_stride=2)
 # Candidates are matched so many at a time, all batches of one shape.
 _BATCH = 512
+# Two views that overlap well are nearer than twice this, in typical ranges, whatever the drift.
+_NEARBY = 0.15
 
 
 @dataclass(frozen=True)
 class LoopConfig:
-    """Settings of the loop search.
+    """Settings of the loop search. Lengths are in typical ranges of the scans.
 
     Attributes:
         num_rounds: searches, each from the poses that the one before has corrected.
-        drift: how far a pose may have gone astray, as a share of the way since; sets where loops are looked for.
-        max_radius: largest distance of a candidate, in length scales.
-        min_way: way between the two scans of a loop, in length scales.
+        drift: error of a pose as a share of the way since; it sets where loops are looked for.
+        max_radius: largest distance of a candidate.
+        min_way: way between the two scans of a loop.
         max_candidates: at most so many pairs a round.
-        submap_width: the target is a map of so many scans to either side.
+        submap_width: the target is a submap of so many scans to either side.
         min_fitness: robust share of the beams that must find their partner.
-        max_crossed: share of the points that may be crossed by a beam of the other scan.
-        min_grip: share of the beams that must hold the pair in its softest direction.
+        max_contradicted: share of the beams that may contradict the other scan.
+        min_eigenvalue: share of the beams that the weakest eigenvalue of a pair must reach.
         min_support: so many neighbouring loops must agree.
-        agreement: within which they agree: translation in length scales, turn in radians.
+        agreement: within which they agree: translation, turn in radians.
         neighbourhood: scans within which loops are neighbours.
-        sigma: accuracy of a fitted beam in length scales; gives edges their information.
-        step_sigma: trust in a step of the start: translation in length scales, turn in radians.
+        sigma: accuracy of a fitted beam; it gives edges their information.
+        step_sigma: standard deviation of a step of the start: translation, turn in radians.
         step_trust: so many loops must contradict a step before the trajectory is torn there.
     """
 
     num_rounds: int = 3
     drift: float = 0.05
-    max_radius: float = 15.0
-    min_way: float = 15.0
+    max_radius: float = 2.25
+    min_way: float = 2.25
     max_candidates: int = 2000
     submap_width: int = 2
     min_fitness: float = 0.4
-    max_crossed: float = 0.08
-    min_grip: float = 0.03
+    max_contradicted: float = 0.08
+    min_eigenvalue: float = 0.03
     min_support: int = 2
-    agreement: tuple[float, float] = (0.3, 0.08)
+    agreement: tuple[float, float] = (0.045, 0.08)
     neighbourhood: int = 6
-    sigma: float = 0.2
-    step_sigma: tuple[float, float] = (0.3, 0.15)
+    sigma: float = 0.03
+    step_sigma: tuple[float, float] = (0.045, 0.15)
     step_trust: float = 30.0
 
 
-def find_candidates(poses: Floats, config: LoopConfig, scale: float, seed: int = 0) -> tuple[Indices, Indices]:
+class LoopResult(NamedTuple):
+    """Result of `close_loops`.
+
+    Attributes:
+        poses: (n, 3) corrected T_world_scan.
+        loops: edges of the last round.
+        weights: their final weights, 0 (rejected) to 1.
+    """
+
+    poses: Floats
+    loops: Edges
+    weights: Floats
+
+
+def close_loops(
+    scans: PlanarScans, poses: Floats, config: LoopConfig | None = None, *, steps: Edges | None = None
+) -> LoopResult:
+    """Corrects a drifted trajectory by the loops found in it.
+
+    Args:
+        scans: n scans in time order.
+        poses: (n, 3) start, T_world_scan: locally right, globally drifted.
+        config: settings.
+        steps: edges between neighbours in time; None: those of `poses`.
+
+    Returns:
+        LoopResult; the poses are those of the start where there is no loop.
+    """
+    config = config or LoopConfig()
+    steps = steps or pose_steps(poses, config.step_sigma, scans.typical_range)
+    loops, weights = _find_loops(scans, poses, config), np.zeros(0)
+    for round_number in range(config.num_rounds):
+        loops = _find_loops(scans, poses, config) if round_number else loops
+        if not len(loops.source):
+            break
+        trust = np.repeat([config.step_trust, 1.0], [len(steps.source), len(loops.source)])
+        poses, weights = optimize_planar_graph(poses, join_edges(steps, loops), trust=trust)
+        weights = weights[len(steps.source) :]
+    return LoopResult(poses, loops, weights)
+
+
+def pose_steps(poses: Floats, sigma: tuple[float, float], typical_range: float) -> Edges:
+    """Edges between neighbours in time of these poses, with standard deviations in typical ranges and radians."""
+    relative, later = se2.relative(poses[:-1], poses[1:]), np.arange(1, len(poses))
+    information = np.diag([(typical_range * sigma[0]) ** -2.0] * 2 + [sigma[1] ** -2.0])
+    return Edges(later, later - 1, relative, np.broadcast_to(information, (len(later), 3, 3)))
+
+
+def matched_steps(matches: PairMatches, config: LoopConfig, typical_range: float) -> Edges:
+    """Edges between neighbours in time from their matches; the trust in a step is the least that they have."""
+    least = pose_steps(np.zeros((len(matches.poses) + 1, 3)), config.step_sigma, typical_range)
+    information = matches.information / (config.sigma * typical_range) ** 2 + least.information
+    return least._replace(poses=matches.poses, information=information)
+
+
+def _find_loops(scans: PlanarScans, poses: Floats, config: LoopConfig) -> Edges:
+    """Loops between scans of one trajectory, each supported by its neighbours; perhaps none."""
+    unit = scans.typical_range
+    source, target = find_candidates(poses, config, unit)
+    found = [
+        PairMatches(*(x[: part.stop - part.start] for x in _match(scans, poses, source[rows], target[rows], config)))
+        for part, rows in batches(len(source), _BATCH)
+    ]
+    if not found:
+        return Edges(source, target, np.zeros((0, 3)), np.zeros((0, 3, 3)))
+    matches = PairMatches(*(np.concatenate(x) for x in zip(*found, strict=True)))
+    contradicted = contradicted_share(make_profiles(scans), source, target, matches.poses)
+    num_beams = np.maximum(np.asarray(scans.is_on_line.sum(1))[source], 1)
+    is_held = matches.weakest_eigenvalue() / num_beams > config.min_eigenvalue
+    fits = (matches.fitness > config.min_fitness) & (contradicted < config.max_contradicted) & is_held
+    information = matches.information[fits] / (config.sigma * unit) ** 2
+    edges = Edges(source[fits], target[fits], matches.poses[fits], information)
+    is_supported = count_support(edges, poses, config, unit) >= config.min_support
+    return jax.tree.map(lambda x: x[is_supported], edges)
+
+
+def find_candidates(poses: Floats, config: LoopConfig, typical_range: float) -> tuple[Indices, Indices]:
     """Pairs of scans that may see the same place: later one (source) and earlier one (target)."""
-    way = np.append(0.0, np.cumsum(np.hypot(*np.diff(poses[:, :2], axis=0).T)))
-    tree = scipy.spatial.cKDTree(poses[:, :2])
-    first, second = tree.query_pairs(
-        min(config.max_radius * scale, 2 * scale + config.drift * way[-1]), output_type="ndarray"
-    ).T
+    way, nearby = _way_along(poses), 2.0 * _NEARBY * typical_range
+    radius = min(config.max_radius * typical_range, nearby + config.drift * way[-1])
+    first, second = scipy.spatial.cKDTree(poses[:, :2]).query_pairs(radius, output_type="ndarray").T
     apart = way[second] - way[first]
     distance = np.hypot(*(poses[second, :2] - poses[first, :2]).T)
-    keep = (apart > config.min_way * scale) & (distance < 2 * scale + config.drift * apart) & (second - first > 5)
+    keep = (apart > config.min_way * typical_range) & (distance < nearby + config.drift * apart) & (second - first > 5)
     source, target = second[keep], first[keep]
     if len(source) > config.max_candidates:
         # Nearer pairs are likelier to overlap; the rest is drawn so that far ones get their chance.
-        rng = np.random.default_rng(seed)
+        rng = np.random.default_rng(0)
         order = np.argsort(distance[keep] * rng.uniform(0.1, 1.0, len(source)))[: config.max_candidates]
         source, target = source[np.sort(order)], target[np.sort(order)]
     return source.astype(np.int64), target.astype(np.int64)
 
 
-@jax.jit
-def _merge_scans(lines: LineScans, rows: jax.Array, present: jax.Array, poses: jax.Array) -> LineScans:
-    """Submaps of (p, w) scans each, poses (p, w, 3) T_target_scan."""
-    c, s = jnp.cos(poses[..., 2]), jnp.sin(poses[..., 2])
-    rotation = jnp.stack([jnp.stack([c, -s], -1), jnp.stack([s, c], -1)], -2)
+def _way_along(poses: Floats) -> Floats:
+    """(n,) length of the trajectory up to each pose."""
+    return np.append(0.0, np.cumsum(np.hypot(*np.diff(poses[:, :2], axis=0).T)))
 
-    def turn(vectors: jax.Array) -> jax.Array:
-        return jnp.einsum("pwij,pwbj->pwbi", rotation, vectors[rows], precision="highest")
 
-    shift = poses[:, :, None, :2]
-    flat = (rows.shape[0], -1)
-    return LineScans(
-        points=(turn(lines.points) + shift).reshape(*flat, 2),
-        normals=turn(lines.normals).reshape(*flat, 2),
-        centroids=(turn(lines.centroids) + shift).reshape(*flat, 2),
-        mask=(lines.mask[rows] & present[..., None]).reshape(flat),
-        noise=lines.noise[rows[:, 0]],
+def _match(scans: PlanarScans, poses: Floats, source: Indices, target: Indices, config: LoopConfig) -> PairMatches:
+    """Matches scans to submaps around their targets, one batch of candidates."""
+    unit, way = scans.typical_range, _way_along(poses)
+    submaps, ones = _build_submaps(scans, poses, target, config.submap_width), scans.take(source)
+    predicted = se2.relative(poses[target], poses[source])
+    # The prediction is believed as far as the drift allows: it decides along a corridor, where scans cannot.
+    sigma = 0.045 * unit + 0.5 * config.drift * (way[source] - way[target])
+    belief = np.stack([sigma, sigma, np.full_like(sigma, np.inf)], axis=-1) ** -2.0
+    prior = PosePrior(predicted, (0.015 * unit) ** 2 * belief)
+    rough = match_pairs(ones, submaps, _guesses(predicted, unit), _SEARCH, prior)
+    prior = PosePrior(predicted, (3.0 * scans.noise) ** 2 * belief)
+    return match_pairs(ones, submaps, rough.poses[:, None], _REFINE, prior)
+
+
+def _guesses(predicted: Floats, typical_range: float) -> Floats:
+    """Guesses of each pair (p, h, 3): scans that overlap are near each other; only the heading is trusted a little."""
+    shifts = 1.5 * _NEARBY * typical_range * np.array([(0, 0), (1, 0), (-1, 0), (0, 1), (0, -1)])
+    fan = np.array([(x, y, turn) for turn in np.radians([0.0, -12.0, 12.0]) for x, y in shifts])
+    guesses = fan + predicted[:, None] * [0.0, 0.0, 1.0]
+    return np.concatenate([guesses, predicted[:, None]], axis=1)
+
+
+def _build_submaps(scans: PlanarScans, poses: Floats, centres: Indices, width: int) -> PlanarScans:
+    """A submap around each centre scan, in its frame: the scans up to `width` before and after it."""
+    rows = centres[:, None] + np.array(sorted(range(-width, width + 1), key=abs))
+    is_there = (rows >= 0) & (rows < len(poses))
+    rows = np.clip(rows, 0, len(poses) - 1)
+    relative = se2.relative(poses[centres][:, None], poses[rows])
+    return _merge_scans(
+        scans.replace(is_ordered=False), jnp.asarray(rows), jnp.asarray(is_there), jnp.asarray(relative, jnp.float32)
     )
 
 
-def build_submaps(lines: LineScans, poses: Floats, centres: Indices, width: int) -> LineScans:
-    """One small map around each centre scan, in that scan's frame: the scans up to `width` before and after it."""
-    offsets = np.array(sorted(range(-width, width + 1), key=abs))
-    rows = centres[:, None] + offsets
-    present = (rows >= 0) & (rows < len(poses))
-    rows = np.clip(rows, 0, len(poses) - 1)
-    relative = se2.relative(poses[centres][:, None], poses[rows])
-    return _merge_scans(lines, jnp.asarray(rows), jnp.asarray(present), jnp.asarray(relative, jnp.float32))
+@jax.jit
+def _merge_scans(
+    scans: PlanarScans, rows: Int[Array, "p w"], is_there: Bool[Array, "p w"], poses: Float[Array, "p w 3"]
+) -> PlanarScans:
+    """Submaps of w scans each; poses are T_submap_scan."""
+    some, rotation = scans.take(rows), se2.rotation(poses[..., 2])
+    flat = (rows.shape[0], -1)
+    return PlanarScans(
+        points=se2.transform_points(poses, some.points).reshape(*flat, 2),
+        mask=(some.mask & is_there[..., None]).reshape(flat),
+        normals=jnp.einsum("pwij,pwbj->pwbi", rotation, some.normals, precision="highest").reshape(*flat, 2),
+        centroids=se2.transform_points(poses, some.centroids).reshape(*flat, 2),
+        is_on_line=(some.is_on_line & is_there[..., None]).reshape(flat),
+        noises=some.noises[:, 0],
+        typical_ranges=some.typical_ranges[:, 0],
+        is_ordered=False,
+    )
 
 
-def _guesses(predicted: Floats, scale: float) -> Floats:
-    """Scans that overlap well are near each other, whatever the drift says; only the heading is trusted a little."""
-    shifts = 1.5 * scale * np.array([(0, 0), (1, 0), (-1, 0), (0, 1), (0, -1)])
-    turns = np.radians([0.0, -12.0, 12.0])
-    fan = [
-        np.stack([x + 0 * predicted[:, 0], y + 0 * predicted[:, 1], predicted[:, 2] + t], -1)
-        for t in turns
-        for x, y in shifts
-    ]
-    return np.stack([*fan, predicted], axis=1)
-
-
-def count_support(edges: Edges, poses: Floats, config: LoopConfig, scale: float) -> Indices:
-    """How many neighbouring loops say the same as each loop, through the steps of the trajectory between them."""
+def count_support(edges: Edges, poses: Floats, config: LoopConfig, typical_range: float) -> Indices:
+    """Number of neighbouring loops that agree with each loop, through the steps of the trajectory between them."""
     near = np.abs(edges.source[:, None] - edges.source) <= config.neighbourhood
     near &= np.abs(edges.target[:, None] - edges.target) <= config.neighbourhood
     near &= (edges.source[:, None] != edges.source) | (edges.target[:, None] != edges.target)
@@ -140,104 +230,6 @@ def count_support(edges: Edges, poses: Floats, config: LoopConfig, scale: float)
     step_source = se2.relative(poses[edges.source[other]], poses[edges.source[one]])
     through = se2.compose(se2.compose(step_target, edges.poses[other]), step_source)
     error = se2.relative(edges.poses[one], through)
-    agrees = np.hypot(error[:, 0], error[:, 1]) < config.agreement[0] * scale
+    agrees = np.hypot(error[:, 0], error[:, 1]) < config.agreement[0] * typical_range
     agrees &= np.abs(error[:, 2]) < config.agreement[1]
     return np.bincount(one[agrees], minlength=len(edges.source))
-
-
-def _match_batch(
-    lines: LineScans, poses: Floats, source: Indices, target: Indices, way: Floats, config: LoopConfig, scale: float
-) -> tuple[PairMatches, Floats]:
-    """Matches of one batch of candidates, and the share of points that contradict each."""
-    maps, scans = build_submaps(lines, poses, target, config.submap_width), take_scans(lines, source)
-    predicted = se2.relative(poses[target], poses[source])
-    # The prediction is believed as far as the drift allows: it decides along a corridor, where scans cannot.
-    sigma = 0.3 * scale + 0.5 * config.drift * (way[source] - way[target])
-    belief = np.stack([sigma, sigma, np.full_like(sigma, np.inf)], axis=-1) ** -2.0
-    rough = match_pairs(
-        scans, maps, _guesses(predicted, scale), _SEARCH, StepPrior(predicted, (0.1 * scale) ** 2 * belief), scale=scale
-    )
-    prior = StepPrior(predicted, (3.0 * float(lines.noise[0])) ** 2 * belief)
-    fine = match_pairs(scans, maps, rough.poses[:, None], _REFINE, prior, scale=scale)
-    centres = take_scans(lines, target)
-    views = compare_views(
-        ScanSet(scans.points, scans.mask),
-        ScanSet(centres.points, centres.mask),
-        jnp.asarray(fine.poses, jnp.float32),
-        jnp.asarray(max(0.1 * scale, 3.0 * float(lines.noise[0])), jnp.float32),
-    )
-    crossed = np.asarray(views.num_crossed, np.float64) / np.maximum(np.asarray(views.num_seen, np.float64), 20.0)
-    return fine, crossed
-
-
-def find_loops(lines: LineScans, poses: Floats, config: LoopConfig, *, scale: float) -> Edges:
-    """Loops between scans of one trajectory, each supported by its neighbours.
-
-    Args:
-        lines: n scans with lines.
-        poses: (n, 3) T_world_scan, locally right, globally drifted.
-        config: settings.
-        scale: `length_scale` of the scans.
-
-    Returns:
-        Edges with information in the unit of the points; perhaps none.
-    """
-    source, target = find_candidates(poses, config, scale)
-    way = np.append(0.0, np.cumsum(np.hypot(*np.diff(poses[:, :2], axis=0).T)))
-    found = []
-    for start in range(0, len(source), _BATCH):
-        rows = np.resize(np.arange(start, min(start + _BATCH, len(source))), _BATCH)
-        found.append(_match_batch(lines, poses, source[rows], target[rows], way, config, scale))
-    if not found:
-        return Edges(source, target, np.zeros((0, 3)), np.zeros((0, 3, 3)))
-    matches, crossed = (
-        PairMatches(*(np.concatenate(x)[: len(source)] for x in zip(*[m for m, _ in found], strict=True))),
-        np.concatenate([c for _, c in found])[: len(source)],
-    )
-    num_beams = np.maximum(np.asarray(lines.mask.sum(1))[source], 1)
-    grip = np.linalg.eigvalsh(matches.information[:, :2, :2])[:, 0] / num_beams
-    fits = (matches.fitness > config.min_fitness) & (crossed < config.max_crossed) & (grip > config.min_grip)
-    information = matches.information[fits] / (config.sigma * scale) ** 2
-    edges = Edges(source[fits], target[fits], matches.poses[fits], information)
-    supported = count_support(edges, poses, config, scale) >= config.min_support
-    return jax.tree.map(lambda x: x[supported], edges)
-
-
-def close_loops(
-    lines: LineScans, poses: Floats, steps: Edges, config: LoopConfig | None = None
-) -> tuple[Floats, Edges, Floats]:
-    """Corrects a drifted trajectory by the loops found in it.
-
-    Args:
-        lines: n scans with lines.
-        poses: (n, 3) start.
-        steps: edges between neighbours in time.
-        config: settings.
-
-    Returns:
-        The corrected poses, the loops of the last round and their final weights (0: let go).
-    """
-    config = config or LoopConfig()
-    scale = length_scale(lines)
-    loops, weight = find_loops(lines, poses, config, scale=scale), np.zeros(0)
-    for round_number in range(config.num_rounds):
-        if round_number:
-            loops = find_loops(lines, poses, config, scale=scale)
-        if not len(loops.source):
-            return poses, loops, weight
-        trust = np.repeat([config.step_trust, 1.0], [len(steps.source), len(loops.source)])
-        poses, weights = optimize_planar_graph(poses, join_edges(steps, loops), GraphConfig(), trust=trust)
-        weight = weights[len(steps.source) :]
-    return poses, loops, weight
-
-
-def step_edges(poses: Floats, matches: PairMatches | None, config: LoopConfig, scale: float) -> Edges:
-    """Edges between neighbours in time: from matched steps where there are any, else from the poses themselves."""
-    sigma = np.array([scale, scale, 1.0]) * np.array(config.step_sigma)[[0, 0, 1]]
-    floor = np.diag(1.0 / sigma**2)
-    source = np.arange(1, len(poses))
-    if matches is None:
-        relative = se2.relative(poses[:-1], poses[1:])
-        return Edges(source, source - 1, relative, np.broadcast_to(floor, (len(source), 3, 3)))
-    information = matches.information / (config.sigma * scale) ** 2 + floor
-    return Edges(source, source - 1, matches.poses, information)

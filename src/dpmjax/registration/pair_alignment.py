@@ -1,26 +1,95 @@
-"""Robust alignment of pairs of planar scans, many at once: the kernel under the warm start, loop search and polish.
+"""Robust alignment of pairs of planar scans, many at once: the kernel under the chain, the loop search and refinement.
 
 A pose is a vector (x, y, heading). Errors of a pair are linearised in the tangent space of T_target_source on the
-right, T_target_source @ exp(delta), so that a pair costs a 3 x 3 matrix and a 3-vector whoever asks.
+right, T_target_source @ exp(delta), so that every pair costs a 3 x 3 matrix and a 3-vector.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import partial
 from typing import Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
+from dpmjax.geometry import se2
 from dpmjax.geometry.neighbours import k_nearest
-from dpmjax.registration.line_fitting import LineScans
+from dpmjax.registration.planar_scans import Floats, PlanarScans, batches
 from dpmjax.types import AnyArray
 
 # GPUs multiply in TF32 unless told otherwise: centimetres at a hundred metres.
 _matmul = partial(jnp.matmul, precision="highest")
+# How many distances one batch of pairs may hold at once: 128 MB of float32 with what XLA keeps beside them.
+_LIVE_DISTANCES = 1 << 24
 
 Metric = Literal["point", "plane"]
+
+
+@dataclass(frozen=True)
+class Schedule:
+    """How the search distance of a matching shrinks from iteration to iteration, in typical ranges of the scans.
+
+    Attributes:
+        gate: largest distance of matched points, first and last iteration.
+        kernel: scale of the robust weight, first and last iteration; never below twice the range noise.
+        num_iterations: iterations of Gauss-Newton.
+        source_stride: every `source_stride`-th beam of the source is used.
+        target_stride: every `target_stride`-th beam of the target is used.
+    """
+
+    gate: tuple[float, float]
+    kernel: tuple[float, float]
+    num_iterations: int
+    source_stride: int = 1
+    target_stride: int = 1
+
+    def __post_init__(self) -> None:
+        if min(*self.gate, *self.kernel) <= 0 or self.num_iterations < 1:
+            raise ValueError(f"schedule: gates, kernels and iterations must be positive, got {self}")
+
+    def gates_and_kernels(self, typical_range: float, noise: float) -> tuple[jax.Array, jax.Array]:
+        """Gate and kernel of each iteration in the unit of the points, bounded below by the range noise."""
+        gates = typical_range * np.geomspace(*self.gate, self.num_iterations)
+        kernels = typical_range * np.geomspace(*self.kernel, self.num_iterations)
+        widest = np.maximum(gates, 4.0 * noise), np.maximum(kernels, 2.0 * noise)
+        return jnp.asarray(widest[0], jnp.float32), jnp.asarray(widest[1], jnp.float32)
+
+
+COARSE = Schedule(gate=(0.18, 0.045), kernel=(0.09, 0.0225), num_iterations=8, source_stride=3)
+FINE = Schedule(gate=(0.075, 0.0225), kernel=(0.0225, 0.00225), num_iterations=12)
+
+
+class PairMatches(NamedTuple):
+    """Aligned pairs (p) on the host.
+
+    Attributes:
+        poses: (p, 3) x, y, heading of T_target_source.
+        fitness: (p,) robust share of beams that found their partner, 0 to 1.
+        information: (p, 3, 3) J^T W J in the source frame, one unit a beam.
+    """
+
+    poses: Floats
+    fitness: Floats
+    information: Floats
+
+    def weakest_eigenvalue(self) -> Floats:
+        """(p,) information in the direction of the translation that the scans hold least, in beams."""
+        return np.asarray(np.linalg.eigvalsh(self.information[:, :2, :2])[:, 0], np.float64)
+
+
+class PosePrior(NamedTuple):
+    """Belief in relative poses before a beam is compared; it decides directions that the scans leave open.
+
+    Attributes:
+        mean: expected relative pose (x, y, heading).
+        information: inverse variances of its three parts, in units of one beam's information; zero: no belief.
+    """
+
+    mean: Float[AnyArray, "... 3"]
+    information: Float[AnyArray, "... 3"]
 
 
 class PairSystem(NamedTuple):
@@ -39,15 +108,9 @@ class PairSystem(NamedTuple):
     squares: Float[Array, ""]
 
 
-def rotation_of(heading: Float[Array, ""]) -> Float[Array, "2 2"]:
-    """Matrix of a heading."""
-    c, s = jnp.cos(heading), jnp.sin(heading)
-    return jnp.stack([jnp.stack([c, -s]), jnp.stack([s, c])])
-
-
 def linearise_pair(
-    source: LineScans,
-    target: LineScans,
+    source: PlanarScans,
+    target: PlanarScans,
     pose_target_source: Float[Array, " 3"],
     gate: Float[Array, ""],
     kernel: Float[Array, ""],
@@ -67,13 +130,13 @@ def linearise_pair(
     Returns:
         PairSystem at this pose.
     """
-    rotation = rotation_of(pose_target_source[2])
-    points = _matmul(source.points, rotation.T) + pose_target_source[:2]
-    nearest = k_nearest(points, target.points, 1, mask=target.mask).indices[:, 0]
+    rotation = se2.rotation(pose_target_source[2])
+    points = se2.transform_points(pose_target_source, source.points)
+    nearest = k_nearest(points, target.points, 1, mask=target.is_on_line).indices[:, 0]
     matched, normals = target.points[nearest], target.normals[nearest]
     faces_same_way = (_matmul(source.normals, rotation.T) * normals).sum(-1) > 0.7
     near = ((points - matched) ** 2).sum(-1) < gate**2
-    counts = source.mask & target.mask[nearest] & near & faces_same_way
+    counts = source.is_on_line & target.is_on_line[nearest] & near & faces_same_way
     lever = _matmul(jnp.stack([-source.points[:, 1], source.points[:, 0]], -1), rotation.T)
     if metric == "plane":
         residual = (normals * (points - target.centroids[nearest])).sum(-1)
@@ -95,30 +158,17 @@ def linearise_pair(
     )
 
 
-def move(pose: Float[Array, " 3"], delta: Float[Array, " 3"]) -> Float[Array, " 3"]:
+def _move(pose: Float[Array, " 3"], delta: Float[Array, " 3"]) -> Float[Array, " 3"]:
     """The pose after a small step in its own frame (first order: the step is a few percent of the pose)."""
-    c, s = jnp.cos(pose[2]), jnp.sin(pose[2])
-    return pose + jnp.stack([c * delta[0] - s * delta[1], s * delta[0] + c * delta[1], delta[2]])
+    return pose + jnp.append(_matmul(se2.rotation(pose[2]), delta[:2]), delta[2])
 
 
-class StepPrior(NamedTuple):
-    """What is believed of relative poses before a beam is compared; it decides where the scans leave a direction open.
-
-    Attributes:
-        mean: expected relative pose (x, y, heading).
-        information: inverse variances of its three parts, in units of one beam's information; zero: no belief.
-    """
-
-    mean: Float[AnyArray, "... 3"]
-    information: Float[AnyArray, "... 3"]
-
-
-def _solve(system: PairSystem, pose: Float[Array, " 3"], prior: StepPrior) -> Float[Array, " 3"]:
-    """The step that the scans and the belief ask for together."""
+def _solve(system: PairSystem, pose: Float[Array, " 3"], prior: PosePrior) -> Float[Array, " 3"]:
+    """The Gauss-Newton step of the scans and the prior together."""
     offset = pose - prior.mean
-    turn = offset.at[2].set(jnp.arctan2(jnp.sin(offset[2]), jnp.cos(offset[2])))
-    rotation = jnp.eye(3).at[:2, :2].set(rotation_of(pose[2]))
-    pull = _matmul(rotation.T, prior.information * turn)
+    offset = offset.at[2].set(se2.wrap_angle(offset[2]))
+    rotation = jnp.eye(3).at[:2, :2].set(se2.rotation(pose[2]))
+    pull = _matmul(rotation.T, prior.information * offset)
     belief = _matmul(rotation.T, prior.information[:, None] * rotation)
     # Damping in proportion to each axis: a pair that fixes one direction only (a corridor) moves in that one alone.
     diagonal = jnp.diagonal(system.information)
@@ -126,41 +176,76 @@ def _solve(system: PairSystem, pose: Float[Array, " 3"], prior: StepPrior) -> Fl
     return jnp.linalg.solve(system.information + belief + jnp.diag(damping), -system.gradient - pull)
 
 
-@partial(jax.jit, static_argnames=("metric",))
-def align_pairs(
-    source: LineScans,
-    target: LineScans,
-    guesses: Float[Array, "p 3"],
-    gates: Float[Array, " t"],
-    kernels: Float[Array, " t"],
-    prior: StepPrior,
-    *,
-    metric: Metric = "plane",
-) -> tuple[Float[Array, "p 3"], PairSystem]:
-    """Iterated closest point for many pairs at once.
-
-    Args:
-        source: scans (p, b, 2), one for each pair.
-        target: scans (p, c, 2).
-        guesses: where to start, x, y, heading of T_target_source.
-        gates: largest distance of matched points in each iteration.
-        kernels: scale of the robust weight in each iteration.
-        prior: belief in each relative pose (p, 3).
-        metric: "point" or "plane".
-
-    Returns:
-        The aligned relative poses and each pair's system there; its `information` and `weight` tell how well it is
-        fixed.
-    """
+@partial(jax.jit, static_argnames="metric")
+def _align(
+    source: PlanarScans, target: PlanarScans, guesses: Float[Array, "p 3"],
+    scales: tuple[Float[Array, " t"], Float[Array, " t"]], prior: PosePrior, *, metric: Metric,
+) -> tuple[Float[Array, "p 3"], PairSystem]:  # fmt: skip
+    """Iterated closest point of p pairs; `scales` are gate and kernel of each iteration."""
 
     def align(
-        source: LineScans, target: LineScans, guess: Float[Array, " 3"], prior: StepPrior
+        source: PlanarScans, target: PlanarScans, guess: Float[Array, " 3"], prior: PosePrior
     ) -> tuple[Array, PairSystem]:
-        def iterate(pose: Array, scales: tuple[Array, Array]) -> tuple[Array, None]:
-            system = linearise_pair(source, target, pose, *scales, metric=metric)
-            return move(pose, _solve(system, pose, prior)), None
+        def iterate(pose: Array, scale: tuple[Array, Array]) -> tuple[Array, None]:
+            system = linearise_pair(source, target, pose, *scale, metric=metric)
+            return _move(pose, _solve(system, pose, prior)), None
 
-        pose, _ = jax.lax.scan(iterate, guess, (gates, kernels))
-        return pose, linearise_pair(source, target, pose, gates[-1], kernels[-1], metric=metric)
+        pose, _ = jax.lax.scan(iterate, guess, scales)
+        return pose, linearise_pair(source, target, pose, scales[0][-1], scales[1][-1], metric=metric)
 
     return jax.vmap(align)(source, target, guesses, prior)
+
+
+def match_pairs(
+    source: PlanarScans,
+    target: PlanarScans,
+    guesses: Floats,
+    schedule: Schedule,
+    prior: PosePrior | None = None,
+    *,
+    metric: Metric = "plane",
+) -> PairMatches:
+    """Aligns source scan p to target scan p from each of its guesses and keeps the best.
+
+    Args:
+        source: p scans.
+        target: p scans, or submaps of as many points as wanted.
+        guesses: (p, h, 3) relative poses T_target_source to start from.
+        schedule: how the search distance shrinks.
+        prior: belief in the relative poses, (p, 3) each; None: none.
+        metric: distance to the target's lines ("plane") or points.
+
+    Returns:
+        PairMatches of the guess with the best fitness for each pair.
+    """
+    num_pairs, num_guesses = guesses.shape[:2]
+    if not num_pairs:
+        return PairMatches(np.zeros((0, 3)), np.zeros(0), np.zeros((0, 3, 3)))
+    prior = prior or PosePrior(np.zeros((num_pairs, 3)), np.zeros((num_pairs, 3)))
+    scales = schedule.gates_and_kernels(source.typical_range, source.noise)
+    source, target = source.thin(schedule.source_stride), target.thin(schedule.target_stride)
+    distances = num_guesses * source.mask.shape[1] * target.mask.shape[1]
+    # A power of two whatever the number of pairs: calls of about the same size share one compiled program.
+    batch = 1 << int(np.log2(np.clip(_LIVE_DISTANCES // distances, 1, max(2 * num_pairs - 1, 1))))
+    poses, weight = np.zeros((num_pairs, num_guesses, 3)), np.zeros((num_pairs, num_guesses))
+    information = np.zeros((num_pairs, num_guesses, 3, 3))
+    for part, rows in batches(num_pairs, batch):
+        repeated = np.repeat(rows, num_guesses)
+        aligned, system = _align(
+            source.take(repeated),
+            target.take(repeated),
+            jnp.asarray(guesses[rows].reshape(-1, 3), jnp.float32),
+            scales,
+            PosePrior(*(jnp.asarray(np.asarray(x)[repeated], jnp.float32) for x in prior)),
+            metric=metric,
+        )
+        pairs = ((poses, aligned), (weight, system.weight), (information, system.information))
+        for kept, found in pairs:
+            kept[part] = np.asarray(found).reshape(batch, *kept.shape[1:])[: part.stop - part.start]
+    row, best = np.arange(num_pairs), weight.argmax(axis=1)
+    num_beams = np.minimum(np.asarray(source.is_on_line.sum(1)), np.asarray(target.is_on_line.sum(1)))
+    return PairMatches(
+        poses=poses[row, best],
+        fitness=weight[row, best] / np.maximum(num_beams, 1),
+        information=information[row, best],
+    )

@@ -1,0 +1,310 @@
+"""The scan record of this room: planar scans with a line at every beam, and the lengths that settings refer to.
+
+All lengths in settings are in typical ranges of the scans (`dpmjax.geometry.rays.typical_range`: the range that nine
+beams in ten stay below), so pixels, rooms and streets need no settings of their own.
+
+A line with a normal is fitted at every beam and is honest under range noise. Two neighbouring beams give the exact
+normal of a noise-free wall, but nonsense as soon as the noise is as large as the distance between the beams. So several
+windows of neighbouring beams compete for each beam, centred on it and to either side (a beam beside a corner sees only
+one of the two walls). The widest window that is straight up to the noise wins; the noise is measured from the scans.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator
+from typing import Any, NamedTuple
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+from numpy.typing import NDArray
+
+from dpmjax.geometry.rays import typical_range
+from dpmjax.types import AnyArray, ScanSet
+
+Floats = NDArray[np.float64]
+Indices = NDArray[np.int64]
+
+# A run of beams counts as straight if it bends by less than this part of its length (0.03 degrees).
+_BEND = 5e-4
+# The noise is a median over at most so many beams: a sort of millions would take longer than all the rest.
+_NOISE_SAMPLES = 65536
+# The widest run of beams that competes has 2 ** (this + 1) beams.
+_NUM_DOUBLINGS = 4
+
+
+class Tolerances(NamedTuple):
+    """How exactly hits of two scans are compared, in the unit of the points.
+
+    Attributes:
+        match: standard deviation of a hit about the surface that it belongs to.
+        contradict: a hit farther than this in front of a surface contradicts it.
+    """
+
+    match: float | Float[Array, ""]
+    contradict: float | Float[Array, ""]
+
+
+class PlanarScans(flax.struct.PyTreeNode):
+    """Planar scans with a line fitted at every beam, each in its own sensor frame. Made by `planar_scans`.
+
+    Attributes:
+        points: measured beam end points, in the order of their angles; zero where `mask` is False.
+        mask: True where the beam measured something.
+        normals: unit normals of the fitted lines, turned towards the sensor; zero without a line.
+        centroids: a point on each fitted line: the mean of the beams that it was fitted to.
+        is_on_line: True where the beam lies on a straight piece (valid, not a corner, not alone).
+        noises: `noise`, repeated for each scan, so that rows can be taken in traced code.
+        typical_ranges: `typical_range`, repeated likewise.
+        is_ordered: neighbours in the array are neighbours in time.
+    """
+
+    points: Float[Array, "*n b 2"]
+    mask: Bool[Array, "*n b"]
+    normals: Float[Array, "*n b 2"]
+    centroids: Float[Array, "*n b 2"]
+    is_on_line: Bool[Array, "*n b"]
+    noises: Float[Array, "*n"]
+    typical_ranges: Float[Array, "*n"]
+    is_ordered: bool = flax.struct.field(pytree_node=False, default=True)
+
+    def __len__(self) -> int:
+        return self.mask.shape[0]
+
+    @property
+    def noise(self) -> float:
+        """Standard deviation of the range noise of all scans together, in the unit of the points."""
+        return float(self.noises.reshape(-1)[0])
+
+    @property
+    def typical_range(self) -> float:
+        """The range that nine beams in ten stay below, median over the scans: the unit of all settings."""
+        return float(self.typical_ranges.reshape(-1)[0])
+
+    @property
+    def tolerances(self) -> Tolerances:
+        """How exactly hits of these scans can be compared: by the typical range, or by the noise if that is more."""
+        reach, noise = self.typical_range, self.noise
+        return Tolerances(match=max(0.006 * reach, 0.5 * noise), contradict=max(0.018 * reach, 5.0 * noise))
+
+    def take(self, rows: Any) -> PlanarScans:
+        """The scans of these rows (an index, a slice, or an array of them); a selection has no order in time."""
+        return jax.tree.map(lambda x: x[rows], self).replace(is_ordered=False)
+
+    def thin(self, stride: int) -> PlanarScans:
+        """The same scans with every `stride`-th beam."""
+        return self.replace(
+            points=self.points[..., ::stride, :],
+            mask=self.mask[..., ::stride],
+            normals=self.normals[..., ::stride, :],
+            centroids=self.centroids[..., ::stride, :],
+            is_on_line=self.is_on_line[..., ::stride],
+        )
+
+
+def planar_scans(points: AnyArray | ScanSet, mask: AnyArray | None = None, *, is_ordered: bool = True) -> PlanarScans:
+    """Prepares planar scans for registration: fits lines, measures noise and typical range.
+
+    Args:
+        points: (n, b, 2) beam end points in the frame of their sensor, any unit; or a ScanSet. Beams that are not in
+            the order of their angles are sorted, each scan with its invalid beams last.
+        mask: (n, b) True where the beam measured something; None: everywhere, or the mask of the ScanSet.
+        is_ordered: neighbours in the array are neighbours in time.
+
+    Returns:
+        PlanarScans.
+
+    Raises:
+        ValueError: wrong shapes, no scan, or coordinates that are not finite where the mask is True.
+    """
+    if isinstance(points, ScanSet):
+        mask, points = points.mask if mask is None else mask, points.points
+    values = np.asarray(points, np.float32)
+    if values.ndim != 3 or values.shape[-1] != 2 or 0 in values.shape:
+        raise ValueError(f"points: expected shape (n, b, 2) with at least one scan and beam, got {values.shape}")
+    valid = np.ones(values.shape[:2], bool) if mask is None else np.asarray(mask)
+    if valid.dtype != bool or valid.shape != values.shape[:2]:
+        raise ValueError(f"mask: expected bool of shape {values.shape[:2]}, got {valid.dtype} of {valid.shape}")
+    if not np.isfinite(values[valid]).all():
+        raise ValueError("points: expected finite coordinates where the mask is True")
+    # What is masked may hold anything; zero times NaN would be NaN later on.
+    scans = ScanSet(points=jnp.asarray(np.where(valid[..., None], values, 0.0)), mask=jnp.asarray(valid))
+    scans = scans if _has_angular_order(values, valid) else _sort_by_angle(scans)
+    length = jnp.full(len(values), typical_range(values, valid), jnp.float32)
+    return _fit_lines(scans).replace(typical_ranges=length, is_ordered=is_ordered)
+
+
+def batches(count: int, size: int) -> Iterator[tuple[slice, Indices]]:
+    """Splits rows 0 to `count` into batches of one shape; the last one is filled up with repetitions.
+
+    Args:
+        count: rows in all.
+        size: rows of a batch.
+
+    Yields:
+        The slice of a batch, and its rows (size,), of which as many are new as the slice is long.
+    """
+    for start in range(0, count, size):
+        stop = min(start + size, count)
+        yield slice(start, stop), np.resize(np.arange(start, stop), size)
+
+
+def _has_angular_order(points: NDArray[np.float32], mask: NDArray[np.bool_]) -> bool:
+    """Whether nearly all valid beams of nearly all scans go one way round, in one turn at most."""
+    in_order = []
+    for scan, valid in zip(points, mask, strict=True):
+        angle = np.unwrap(np.arctan2(scan[valid, 1], scan[valid, 0]).astype(np.float64))
+        if len(angle) >= 3:
+            turn = np.diff(angle)
+            one_way = max(np.mean(turn > 0), np.mean(turn < 0))
+            in_order.append(one_way >= 0.95 and np.abs(turn).sum() <= 1.05 * 2 * np.pi)
+    return bool(in_order) and float(np.mean(in_order)) >= 0.9
+
+
+@jax.jit
+def _sort_by_angle(scans: ScanSet) -> ScanSet:
+    """The same scans with their beams in the order of their angles; masked ones last."""
+    angle = jnp.where(scans.mask, jnp.arctan2(scans.points[..., 1], scans.points[..., 0]), jnp.inf)
+    order = jnp.argsort(angle, axis=-1)
+    return ScanSet(
+        points=jnp.take_along_axis(scans.points, order[..., None], axis=1),
+        mask=jnp.take_along_axis(scans.mask, order, axis=1),
+    )
+
+
+def _cross(a: Float[Array, "... 2"], b: Float[Array, "... 2"]) -> Float[Array, "..."]:
+    return a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
+
+
+@jax.jit
+def range_noise(scans: ScanSet) -> Float[Array, ""]:
+    """Standard deviation of the range noise, measured from the scans alone.
+
+    The beam between two others that hit the same straight wall must end on their chord. The median over all beams of
+    the distance along the beam to that chord is not disturbed by corners and depth jumps, which are few.
+
+    Args:
+        scans: organised planar scans (n, b, 2).
+
+    Returns:
+        The noise in the unit of the points; about rounding error for noise-free scans, 0 when no beam has two
+        neighbours.
+    """
+    before, here, after = scans.points[:, :-2], scans.points[:, 1:-1], scans.points[:, 2:]
+    usable = scans.mask[:, :-2] & scans.mask[:, 1:-1] & scans.mask[:, 2:]
+    reach = jnp.linalg.norm(here, axis=-1)
+    direction = here / jnp.where(usable, reach, 1.0)[..., None]
+    chord = after - before
+    slope = _cross(direction, chord)
+    along = _cross(before, chord) / jnp.where(jnp.abs(slope) > 1e-9, slope, 1.0)
+    usable &= (jnp.abs(slope) > 1e-9) & (along > 0)
+    deviation = jnp.where(usable, jnp.abs(reach - along), jnp.nan).reshape(-1)
+    deviation = jnp.nanmedian(deviation[:: max(1, deviation.size // _NOISE_SAMPLES)])
+    # A mean of two ends has variance 1/2, so the deviation has 3/2 of that of one beam; 1.4826: median to sigma.
+    return jnp.nan_to_num(1.4826 * deviation / jnp.sqrt(1.5))
+
+
+@flax.struct.dataclass
+class _Moments:
+    """First and second moments of a run of beams: (..., b) arrays, one run for each beam that it starts at."""
+
+    count: float = flax.struct.field(pytree_node=False)
+    mean: Float[Array, "... b 2"]
+    xx: Float[Array, "... b"]
+    xy: Float[Array, "... b"]
+    yy: Float[Array, "... b"]
+    is_complete: Bool[Array, "... b"]
+
+
+def _shift(values: Array, offset: int, axis: int) -> Array:
+    """Entry i becomes entry i + offset; what would come from outside repeats the border."""
+    size = values.shape[axis]
+    kept = jax.lax.slice_in_dim(values, max(offset, 0), size + min(offset, 0), axis=axis)
+    border = jax.lax.slice_in_dim(values, size - 1 if offset > 0 else 0, size if offset > 0 else 1, axis=axis)
+    filling = jnp.repeat(border, abs(offset), axis=axis)
+    return jnp.concatenate([kept, filling] if offset > 0 else [filling, kept], axis=axis)
+
+
+def _start_at(run: _Moments, offset: int) -> _Moments:
+    """The runs that start `offset` beams later; incomplete where that is outside the scan."""
+    size = run.xx.shape[-1]
+    start = np.arange(size) + offset
+    moved = jax.tree.map(lambda x: _shift(x, offset, axis=run.xx.ndim - 1), run)
+    return dataclasses.replace(moved, is_complete=moved.is_complete & ((start >= 0) & (start < size)))
+
+
+def _join(first: _Moments, second: _Moments) -> _Moments:
+    """Moments of two disjoint runs together; stable, because only the difference of their means enters."""
+    count = first.count + second.count
+    step = second.mean - first.mean
+    weight = first.count * second.count / count
+    return _Moments(
+        count=count,
+        mean=first.mean + step * (second.count / count),
+        xx=first.xx + second.xx + weight * step[..., 0] ** 2,
+        xy=first.xy + second.xy + weight * step[..., 0] * step[..., 1],
+        yy=first.yy + second.yy + weight * step[..., 1] ** 2,
+        is_complete=first.is_complete & second.is_complete,
+    )
+
+
+def _runs(scans: ScanSet) -> list[_Moments]:
+    """Runs of 3, 4, 8, 16 ... beams, each run joined from two shorter ones."""
+    nothing = jnp.zeros(scans.mask.shape, scans.points.dtype)
+    one = _Moments(count=1.0, mean=scans.points, xx=nothing, xy=nothing, yy=nothing, is_complete=scans.mask)
+    two = _join(one, _start_at(one, 1))
+    runs = [_join(two, _start_at(one, 2))]
+    for k in range(1, _NUM_DOUBLINGS + 1):
+        two = _join(two, _start_at(two, 2**k))
+        runs.append(two)
+    return runs
+
+
+def _line_of(run: _Moments, noise: Float[Array, ""]) -> tuple[Float[Array, "... b 2"], Float[Array, "... b"]]:
+    """Direction of the line through each run, and the error of that direction in radians: infinite if not straight."""
+    half_difference, half_sum = 0.5 * (run.xx - run.yy), 0.5 * (run.xx + run.yy)
+    radius = jnp.sqrt(half_difference**2 + run.xy**2)
+    along, across = half_sum + radius, jnp.maximum(half_sum - radius, 0.0)
+    angle = 0.5 * jnp.arctan2(run.xy, half_difference)
+    deviation = jnp.sqrt(across / (run.count - 2.0))
+    length = jnp.sqrt(along / run.count)
+    allowed = noise * (1.0 + 2.0 / run.count**0.5) + _BEND * length
+    is_straight = run.is_complete & (deviation <= allowed) & (along > 4.0 * across)
+    error = jnp.maximum(deviation, noise) / jnp.sqrt(jnp.maximum(along, 1e-20))
+    return jnp.stack([jnp.cos(angle), jnp.sin(angle)], -1), jnp.where(is_straight, error, jnp.inf)
+
+
+@jax.jit
+def _fit_lines(scans: ScanSet) -> PlanarScans:
+    """Fits a line at every beam; a beam without any straight run of its own has none. Typical ranges are left at 1."""
+    # Rounding of float32 coordinates looks like noise of this size; below it "straight" would mean nothing.
+    reach = jnp.max(jnp.where(scans.mask, jnp.linalg.norm(scans.points, axis=-1), 0.0))
+    noise = jnp.maximum(range_noise(scans), 1e-6 * reach)
+    tangent, centroid = jnp.zeros_like(scans.points), scans.points
+    error = jnp.full(scans.mask.shape, jnp.inf, scans.points.dtype)
+    for run in _runs(scans):
+        run_tangent, run_error = _line_of(run, noise)
+        width = int(run.count)
+        for start in (0, 1 - width, -(width // 2)):
+            here = _shift(run_error, start, axis=1)
+            index = np.arange(scans.mask.shape[1]) + start
+            here = jnp.where((index >= 0) & (index < scans.mask.shape[1]), here, jnp.inf)
+            better = here < error
+            error = jnp.where(better, here, error)
+            tangent = jnp.where(better[..., None], _shift(run_tangent, start, axis=1), tangent)
+            centroid = jnp.where(better[..., None], _shift(run.mean, start, axis=1), centroid)
+    is_on_line = jnp.isfinite(error)
+    normal = jnp.stack([-tangent[..., 1], tangent[..., 0]], -1)
+    towards_sensor = jnp.where((normal * centroid).sum(-1, keepdims=True) > 0, -normal, normal)
+    return PlanarScans(
+        points=scans.points,
+        mask=scans.mask,
+        normals=towards_sensor,
+        centroids=centroid,
+        is_on_line=is_on_line,
+        noises=jnp.broadcast_to(noise, is_on_line.shape[:1]),
+        typical_ranges=jnp.ones(is_on_line.shape[:1], noise.dtype),
+    )
