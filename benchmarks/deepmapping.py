@@ -19,6 +19,8 @@ from numpy.typing import NDArray
 
 from benchmarks.rows import Row
 from dpmjax import deepmapping as dm
+from dpmjax.deepmapping.fit import Progress, fit
+from dpmjax.deepmapping.planar import planar_problem, scale_scans, start_poses
 from dpmjax.io import ScanSequence, read_sequence
 from dpmjax.metrics import absolute_trajectory_error
 from dpmjax.registration import PlanarScans, incremental_icp, planar_scans, refine
@@ -102,38 +104,31 @@ def _classical(sequence: ScanSequence, case: str, quick: bool) -> list[Row]:
 
 
 def _fit(sequence: ScanSequence, start: NDArray[np.float64] | None, case: str, quick: bool) -> list[Row]:
-    """Neural losses alone, ATE at the marks and at the end; then the polish of the result."""
+    """Neural losses alone, ATE at the marks and at the end; then the refinement of the result."""
     config = dm.with_steps(dm.preset("fast"), 100) if quick else dm.preset("fast")
-    is_warm = start is not None
-    scans = dm.as_scan_set(ScanSet(sequence.points, sequence.mask))
-    reach = dm.measure_reach(scans)
-    scans = scans.replace(points=scans.points / reach)
-    unit = np.array([reach, reach, 1.0])
-    key = jax.random.key(0)
-    state = dm.init(key, scans, config, start_poses=None if start is None else start / unit)
-    compile_s = run_s = 0.0
-    poses = np.zeros((len(sequence), 3)) if start is None else start
-    rows = [Row(case, "ate at start", _ate(sequence, poses), "px")]
+    scans, length = scale_scans(ScanSet(sequence.points, sequence.mask))
+    unit = np.array([length, length, 1.0])
     marks = list(_MARKS_S)
-    phases = config.phases(is_warm=is_warm)
-    for index, phase in enumerate(phases):
-        begun = time.perf_counter()
-        step = dm.make_step(scans, config, phase).lower(state, key=key).compile()
-        compile_s += time.perf_counter() - begun
-        while int(state.phase_step) < phase.num_steps:
-            begun = time.perf_counter()
-            state, report = step(state, key=key)
-            poses = np.asarray(report.poses, np.float64) * unit
-            run_s += time.perf_counter() - begun
-            if marks and run_s >= marks[0]:
-                rows.append(Row(case, f"ate after {marks.pop(0):.0f} s", _ate(sequence, poses), "px"))
-        if index + 1 < len(phases):
-            state = dm.next_phase(state, scans, config, is_warm=is_warm)
+    rows = [Row(case, "ate at start", _ate(sequence, np.zeros((len(sequence), 3)) if start is None else start), "px")]
+
+    def at_mark(progress: Progress) -> None:
+        while marks and progress.run_s >= marks[0]:
+            ate = _ate(sequence, np.asarray(progress.report.poses, np.float64) * unit)
+            rows.append(Row(case, f"ate after {marks.pop(0):.0f} s", ate, "px"))
+
+    done = fit(
+        planar_problem(config, is_warm=start is not None),
+        scans,
+        key=jax.random.key(0),
+        start=None if start is None else start_poses(start, len(sequence), length),
+        on_report=at_mark,
+    )
+    poses = np.asarray(done.poses, np.float64) * unit
     rows += [
         Row(case, "ate at the end", _ate(sequence, poses), "px"),
-        Row(case, "run", run_s, "s"),
-        Row(case, "steps", float(state.step), ""),
-        Row(case, "compile", compile_s, "s"),
+        Row(case, "run", done.run_s, "s"),
+        Row(case, "steps", float(done.state.step), ""),
+        Row(case, "compile", done.compile_s, "s"),
     ]
     polished = refine(_lines(sequence), poses)
     return [*rows, Row(f"{case}: + polish", "ate", _ate(sequence, polished.poses), "px")]
@@ -141,19 +136,15 @@ def _fit(sequence: ScanSequence, start: NDArray[np.float64] | None, case: str, q
 
 def _paper_step(sequence: ScanSequence) -> list[Row]:
     """One step of the paper's architecture, losses and sampling: a batch of 128 scans, as published."""
-    config = dm.preset("paper")
-    scans = dm.as_scan_set(ScanSet(sequence.points, sequence.mask))
-    scans = scans.replace(points=scans.points / dm.measure_reach(scans))
-    key = jax.random.key(0)
-    state = dm.init(key, scans, config)
-    phase = config.cold_phases[0]
-    begun = time.perf_counter()
-    step = dm.make_step(scans, config, phase).lower(state, key=key).compile()
-    compile_s = time.perf_counter() - begun
-    seconds = []
-    for _ in range(2):
-        begun = time.perf_counter()
-        state, _ = jax.block_until_ready(step(state, key=key))
-        seconds.append(time.perf_counter() - begun)
+    scans, _ = scale_scans(ScanSet(sequence.points, sequence.mask))
+    run_s = [0.0]
+    done = fit(
+        planar_problem(dm.preset("paper"), is_warm=False),
+        scans,
+        key=jax.random.key(0),
+        on_report=lambda progress: run_s.append(progress.run_s),
+        stop=lambda: len(run_s) > 2,
+    )
     case = f"{sequence.name}, paper preset"
-    return [Row(case, "compile", compile_s, "s"), Row(case, "one step of 128 scans", min(seconds), "s")]
+    step_s = float(np.diff(run_s).min())
+    return [Row(case, "compile", done.compile_s, "s"), Row(case, "one step of 128 scans", step_s, "s")]

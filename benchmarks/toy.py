@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import importlib.util
+from dataclasses import replace
 
 import jax
 
 from benchmarks.rows import Row
 from benchmarks.timing import measure
-from dpmjax.deepmapping import ToyConfig, descend_direct, descend_network, init_toy, network_value
-from experiments.toy_1d import share_at_minimum, torch_seconds
+from dpmjax.deepmapping.fit import fit
+from dpmjax.deepmapping.toy import ToyConfig, toy_problem
+from experiments.toy_1d import FORMS, share_at_minimum, torch_seconds
 
 NAME = "toy"
 
@@ -19,15 +21,16 @@ def run(quick: bool) -> list[Row]:
     toy = ToyConfig(num_steps=100 if quick else 1000)
     rows: list[Row] = []
     for num_seeds in (1, 100) if quick else (1, 1000):
-        keys = jax.random.split(jax.random.key(0), num_seeds)
-        starts = jax.vmap(lambda key: init_toy(key, toy))(keys)
-        network = jax.jit(jax.vmap(lambda start: descend_network(start, toy).x[-1]))
-        direct = jax.jit(jax.vmap(lambda start: descend_direct(network_value(start, toy), toy).x[-1]))
-        for form, function in (("network", network), ("direct", direct)):
+        for form in FORMS:
+
+            def ends(form: str = form, num_seeds: int = num_seeds) -> jax.Array:
+                problem = toy_problem(replace(toy, form=form))
+                return fit(problem, None, key=jax.random.key(0), num_starts=num_seeds).poses
+
             case = f"{form} form, {num_seeds} seeds x {toy.num_steps} steps"
-            rows += measure(function, starts, repeats=3).rows(f"{case}: dpmjax")
+            rows += measure(ends, repeats=3).rows(f"{case}: dpmjax")
             if num_seeds > 1:
-                rows.append(Row(f"{case}: dpmjax", "share at global minimum", share_at_minimum(function(starts)), ""))
+                rows.append(Row(f"{case}: dpmjax", "share at global minimum", share_at_minimum(ends()), ""))
     if importlib.util.find_spec("torch") is not None:
         seconds = min(torch_seconds(toy, seed) for seed in range(3))
         rows.append(Row(f"network form, 1 seeds x {toy.num_steps} steps: PyTorch", "min", 1e3 * seconds, "ms"))

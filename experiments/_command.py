@@ -13,7 +13,7 @@ from typing import Self, TypeVar
 
 import tyro
 
-from experiments._machine import select_device
+from experiments._machine import enable_compilation_cache, select_device
 from experiments._run_folder import FolderOptions, RunFailedError, check_run_folder, find_run, load_config
 
 EXIT_OK, EXIT_FAILED, EXIT_BAD_INPUT = 0, 1, 2
@@ -120,6 +120,7 @@ def run_command(
     console.setLevel(logging.WARNING)
     logging.basicConfig(format="dpmjax: %(levelname)s: %(message)s", handlers=[console])
     previous = signal.signal(signal.SIGTERM, _interrupt)
+    enable_compilation_cache()
     try:
         config = _parse(config_type, experiment, description, arguments)
         if isinstance(config, FolderOptions):

@@ -1,13 +1,12 @@
-"""The loop around DeepMapping's step: compile, run, tell, record, save, stop, resume."""
+"""One fit of planar scans in a run folder: history, checkpoints, progress bar, Ctrl-C, resume."""
 
 from __future__ import annotations
 
 import math
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,33 +17,29 @@ from experiments._history import HistoryFile, read_history
 from experiments._run_folder import CHECKPOINTS, HISTORY, RunFolder
 
 if TYPE_CHECKING:
-    from dpmjax.deepmapping import DeepMappingConfig
+    from dpmjax.deepmapping import DeepMappingConfig, Fitted
+    from dpmjax.deepmapping.fit import Progress
     from dpmjax.io.scans2d.sequence import ScanSequence
-    from dpmjax.types import ScanSet
+    from experiments._checkpoint import Checkpoints
 
 # Of the table; the error, named with its unit, comes last.
 _COLUMNS = ("step", "phase", "run_s", "loss", "occupancy", "chamfer")
-# A checkpoint so often; Ctrl-C and the end write one too.
+# Seconds between checkpoints; Ctrl-C and the end write one too.
 _SAVE_EVERY_S = 20.0
 
 
-@dataclass(frozen=True)
-class FitRun:
-    """What the fit hands on.
+class FitRun(NamedTuple):
+    """A fit in a run folder.
 
     Attributes:
-        poses: (n, 3) poses of the last step, unit of the scans.
-        state: of DeepMapping, to draw the map from.
-        reach: the length that the state counts in.
+        fitted: the fit; poses in the unit of the scans.
         steps: steps done in all.
         run_s: seconds of stepping, compile time apart.
         compile_s: seconds of compiling.
         has_map: M-Net has been trained.
     """
 
-    poses: NDArray[np.float64]
-    state: Any
-    reach: float
+    fitted: Fitted
     steps: int
     run_s: float
     compile_s: float
@@ -64,7 +59,7 @@ def run_fit(
     """Fits, or continues where the checkpoints of the folder end.
 
     Args:
-        folder: of the run; gets `history.csv` and checkpoints.
+        folder: of the run; gets `metrics.csv` and checkpoints.
         sequence: the scans.
         settings: of DeepMapping.
         start: (n, 3) poses, or None for a cold start.
@@ -77,74 +72,71 @@ def run_fit(
     """
     import jax
 
-    from dpmjax import deepmapping as dm
+    from dpmjax.deepmapping import Fitted
+    from dpmjax.deepmapping.fit import fit, init
+    from dpmjax.deepmapping.planar import planar_problem, scale_scans, start_poses
+    from dpmjax.geometry import se2
+    from dpmjax.types import ScanSet
     from experiments._checkpoint import Checkpoints
 
-    scans, reach = _scaled(sequence)
-    unit = np.array([reach, reach, 1.0])
-    is_warm = start is not None
-    phases = settings.phases(is_warm=is_warm)
-    key = jax.random.key(seed)
-    state = dm.init(key, scans, settings, start_poses=None if start is None else start / unit)
+    scans, unit = scale_scans(ScanSet(sequence.points, sequence.mask))
+    problem = planar_problem(settings, is_warm=start is not None)
+    first = None if start is None else start_poses(start, len(sequence), unit)
+    state = init(problem, scans, key=jax.random.key(seed), start=first)
     checkpoints = Checkpoints(Path(folder.path) / CHECKPOINTS)
     if folder.is_resumed:
         state = checkpoints.restore_latest(state, fallback=state)
-    ate_column = f"ate_{sequence.unit}"
-    run_s, compile_s = _earlier_seconds(folder, int(state.step)), 0.0
-    measure = _ate_of(sequence)
-    poses = np.asarray(dm.current_poses(state, scans, settings, phases[int(state.phase)]), np.float64) * unit
-    total = sum(phase.num_steps for phase in phases)
-    progress = tqdm(total=1.0, bar_format="{desc} {percentage:3.0f}%|{bar}| [{elapsed}{postfix}]", desc="fit")
-    last_saved = time.perf_counter()
-    keep_until = int(state.step) if folder.is_resumed else None
-    with HistoryFile(folder / HISTORY, (*_COLUMNS, ate_column), keep_until=keep_until) as history:
-        while True:
-            phase = phases[int(state.phase)]
-            begun = time.perf_counter()
-            progress.set_postfix_str(f"compiling {phase.name}")
-            step = dm.make_step(scans, settings, phase).lower(state, key=key).compile()
-            compile_s += time.perf_counter() - begun
-            while int(state.phase_step) < phase.num_steps and not _is_over(stop, seconds, run_s):
-                begun = time.perf_counter()
-                state, report = step(state, key=key)
-                poses = np.asarray(report.poses, np.float64) * unit
-                run_s += time.perf_counter() - begun
-                ate = measure(poses)
-                row = {"step": int(state.step), "phase": phase.name, "run_s": round(run_s, 4), ate_column: ate}
-                history.append(**row, **_losses(report))
-                done = max(int(state.step) / total, run_s / seconds if seconds else 0.0)
-                show_progress(progress, phase.name, done, run_s, float(report.loss), ate, sequence.unit)
-                if time.perf_counter() - last_saved > _SAVE_EVERY_S:
-                    checkpoints.save(int(state.step), state)
-                    last_saved = time.perf_counter()
-            if _is_over(stop, seconds, run_s) or int(state.phase) + 1 == len(phases):
-                break
-            state = dm.next_phase(state, scans, settings, is_warm=is_warm)
-    progress.close()
-    checkpoints.save(int(state.step), state)
-    return FitRun(
-        poses, state, reach, int(state.step), run_s, compile_s, phases[int(state.phase)].occupancy_weight > 0.0
-    )
+    with _Recorder(folder, sequence, unit, checkpoints, int(state.step)) as recorder:
+        done = fit(
+            problem,
+            scans,
+            key=jax.random.key(seed),
+            start=state,
+            on_report=recorder.record,
+            stop=lambda: stop.is_requested or (seconds is not None and recorder.run_s >= seconds),
+        )
+    checkpoints.save(int(done.state.step), done.state)
+    poses = np.asarray(done.poses, np.float64) * [unit, unit, 1.0]
+    fitted = Fitted(se2.to_matrix(poses), poses, done.state.params, done.report, unit, settings)
+    has_map = problem.phases[int(done.state.phase)].occupancy_weight > 0.0
+    return FitRun(fitted, int(done.state.step), recorder.run_s, done.compile_s, has_map)
 
 
-def _scaled(sequence: ScanSequence) -> tuple[ScanSet, float]:
-    """The scans with their reach as unit, and the reach."""
-    from dpmjax import deepmapping as dm
-    from dpmjax.types import ScanSet
+class _Recorder:
+    """Writes what a fit reports to the table, the progress bar and the checkpoints."""
 
-    scans = dm.as_scan_set(ScanSet(sequence.points, sequence.mask))
-    reach = dm.measure_reach(scans)
-    return replace(scans, points=scans.points / reach), reach
+    def __init__(
+        self, folder: RunFolder, sequence: ScanSequence, unit: float, checkpoints: Checkpoints, step: int
+    ) -> None:
+        self._checkpoints = checkpoints
+        self._measure, self._length, self._unit = _ate_of(sequence), sequence.unit, unit
+        self._earlier_s = _earlier_seconds(folder, step)
+        self.run_s = self._earlier_s
+        self._bar = tqdm(total=1.0, bar_format="{desc} {percentage:3.0f}%|{bar}| [{elapsed}{postfix}]", desc="fit")
+        columns = (*_COLUMNS, f"ate_{sequence.unit}")
+        self._history = HistoryFile(folder / HISTORY, columns, keep_until=step if folder.is_resumed else None)
+        self._saved_at = time.perf_counter()
 
+    def __enter__(self) -> _Recorder:
+        return self
 
-def _losses(report: Any) -> dict[str, float]:
-    """The loss of a step and its terms, by the names of the table."""
-    terms = report.terms
-    return {"loss": float(report.loss), "occupancy": float(terms.occupancy), "chamfer": float(terms.chamfer)}
+    def __exit__(self, *error: object) -> None:
+        self._bar.close()
+        self._history.__exit__(None, None, None)
 
-
-def _is_over(stop: StopFlag, seconds: float | None, run_s: float) -> bool:
-    return stop.is_requested or (seconds is not None and run_s >= seconds)
+    def record(self, progress: Progress) -> None:
+        """One call of the step."""
+        report, phase, step = progress.report, progress.phase.name, int(progress.state.step)
+        self.run_s = self._earlier_s + progress.run_s
+        ate = self._measure(np.asarray(report.poses, np.float64) * [self._unit, self._unit, 1.0])
+        losses = {name: float(np.mean(term)) for name, term in report.terms._asdict().items()}
+        row = {"step": step, "phase": phase, "run_s": round(self.run_s, 4), f"ate_{self._length}": ate}
+        self._history.append(**row, loss=report.loss, **losses)
+        ate_text = f", ATE {ate:.3g} {self._length}" if math.isfinite(ate) else ""
+        show_progress(self._bar, f"{phase}, loss {report.loss:.4f}{ate_text}", progress.share, self.run_s)
+        if time.perf_counter() - self._saved_at > _SAVE_EVERY_S:
+            self._checkpoints.save(step, progress.state)
+            self._saved_at = time.perf_counter()
 
 
 def _earlier_seconds(folder: RunFolder, step: int) -> float:
@@ -163,10 +155,9 @@ def _ate_of(sequence: ScanSequence) -> Callable[[NDArray[np.float64]], float]:
     return lambda poses: absolute_trajectory_error(poses[:, :2], reference[:, :2])
 
 
-def show_progress(progress: tqdm, phase: str, done: float, run_s: float, loss: float, ate: float, unit: str) -> None:
-    """Moves the bar to the share that is done and tells phase, loss, error and seconds left."""
+def show_progress(bar: tqdm, text: str, done: float, run_s: float) -> None:
+    """Moves the bar to the share that is done, and writes the text and the seconds left."""
     done = min(1.0, done)
-    ate_text = f", ATE {ate:.3g} {unit}" if math.isfinite(ate) else ""
     left = run_s * (1.0 - done) / max(done, 1e-9)
-    progress.set_postfix_str(f"{phase}, loss {loss:.4f}{ate_text}, {left:.0f} s left", refresh=False)
-    progress.update(done - progress.n)
+    bar.set_postfix_str(f"{text}, {left:.0f} s left", refresh=False)
+    bar.update(done - bar.n)

@@ -24,7 +24,7 @@ from experiments._run_folder import RunFolder, do_row, recording
 if TYPE_CHECKING:
     from dpmjax.deepmapping import DeepMappingConfig
     from dpmjax.io.scans2d.sequence import ScanSequence
-    from dpmjax.registration.line_fitting import LineScans
+    from dpmjax.registration import PlanarScans
     from dpmjax.types import ScanSet
 
 Floats = NDArray[np.float64]
@@ -56,14 +56,14 @@ class Task:
 
     Attributes:
         sequence: the scans; methods do not look at its reference.
-        lines: the same scans with a line at every beam.
+        planar: the same scans with a line at every beam.
         is_ordered: the scans lie in the order of time.
         steps: steps of an optimiser.
         seed: seed of everything random.
     """
 
     sequence: ScanSequence
-    lines: LineScans
+    planar: PlanarScans
     is_ordered: bool = True
     steps: int = 600
     seed: int = 0
@@ -81,47 +81,34 @@ def make_task(sequence: ScanSequence, *, is_ordered: bool = True, steps: int = 6
     if not is_ordered:
         order = np.random.default_rng([seed, 77]).permutation(len(sequence))
         sequence = replace(io.take_scans(sequence, order), odometry_poses=None)
-    return Task(sequence, line_scans(sequence), is_ordered, steps, seed)
-
-
-def line_scans(sequence: ScanSequence) -> LineScans:
-    """Fits a line at every beam; beams without an order are sorted by angle first."""
-    from dpmjax.registration.line_fitting import fit_lines, sort_by_angle
-    from dpmjax.types import ScanSet
-
-    scans = ScanSet(sequence.points, sequence.mask)
-    return fit_lines(scans if sequence.is_organised else sort_by_angle(scans))
+    planar = registration.planar_scans(sequence.points, sequence.mask, is_ordered=is_ordered)
+    return Task(sequence, planar, is_ordered, steps, seed)
 
 
 def incremental(task: Task, metric: Literal["point", "plane"] = "plane") -> Floats:
     """Poses by incremental ICP."""
-    return registration.incremental_icp(task.lines, registration.IncrementalConfig(metric=metric))[0]
+    return registration.incremental_icp(task.planar, registration.IncrementalConfig(metric=metric)).poses
 
 
 def search(task: Task) -> Floats:
     """Poses by global registration: an exhaustive search of scan pairs, without a first guess."""
-    return registration.global_start(task.lines, task.sequence.mask, is_ordered=task.is_ordered).poses
+    return registration.register_globally(task.planar).poses
 
 
 def refined(task: Task, poses: Floats, *, is_ordered: bool) -> Floats:
     """Poses after the alignment of all scans together."""
-    return registration.polish(task.lines, poses, registration.PolishConfig(is_ordered=is_ordered)).poses
+    return registration.refine(task.planar.replace(is_ordered=is_ordered), poses).poses
 
 
 def choose(task: Task, candidates: Mapping[str, Floats]) -> tuple[str, dict[str, dict[str, float]]]:
     """The name of the best candidate, judged by the scans alone, and the scores of all."""
-    kept, scores = registration.choose_trajectory(task.lines, candidates)
+    kept, scores = registration.choose_trajectory(task.planar, candidates)
     return kept, {name: score._asdict() for name, score in scores.items()}
 
 
 def assess(task: Task, poses: Floats) -> dict[str, Any]:
     """Whether the poses can be trusted, from the scans alone, by the names of the result files."""
-    found = registration.judge_trajectory(task.lines, task.sequence.mask, poses)
-    return {
-        "is_trusted": found.is_good,
-        "weakest_connection": found.weakest_joint,
-        "contradiction": found.contradiction,
-    }
+    return registration.assess_trajectory(task.planar, poses)._asdict()
 
 
 def errors(sequence: ScanSequence, poses: Floats) -> dict[str, float]:
@@ -158,8 +145,7 @@ def _fit(task: Task, start: Floats | None, config: DeepMappingConfig | None = No
 
 def _direct_adam(task: Task) -> Floats:
     """DeepMapping's loss without L-Net: poses from zero by Adam."""
-    config = deepmapping.preset("fast")
-    return _fit(task, None, replace(config, cold_phases=config.warm_phases))
+    return _fit(task, None, deepmapping.as_direct(deepmapping.preset("fast")))
 
 
 def _direct_lbfgs(task: Task) -> Floats:

@@ -8,6 +8,7 @@ import platform
 import resource
 import subprocess
 import sys
+import zlib
 from pathlib import Path
 from typing import Any, Literal
 
@@ -32,6 +33,33 @@ def select_device(device: Literal["cpu", "gpu"] | None) -> None:
         raise ValueError(
             f"--device {device}: JAX finds no such device here; leave the option out or install its plugin"
         ) from error
+
+
+def enable_compilation_cache() -> None:
+    """Keeps compiled programs between runs, in `$XDG_CACHE_HOME/dpmjax`, or in the platform's folder for caches.
+
+    Call it before the first import of JAX. `DPMJAX_COMPILATION_CACHE=off` turns it off, another value names the folder;
+    `JAX_COMPILATION_CACHE_DIR`, where it is set, is kept.
+    """
+    chosen = os.environ.get("DPMJAX_COMPILATION_CACHE", "")
+    if chosen == "off" or "JAX_COMPILATION_CACHE_DIR" in os.environ:
+        return
+    # A program belongs to a processor: a home directory may be shared by several kinds.
+    folder = Path(chosen) if chosen else _cache_home() / "dpmjax" / f"{zlib.crc32(cpu_model().encode()):08x}"
+    os.environ["JAX_COMPILATION_CACHE_DIR"] = str(folder)
+    # Also the hundreds of small programs, which take seconds together.
+    os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
+    os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES", "-1")
+
+
+def _cache_home() -> Path:
+    if named := os.environ.get("XDG_CACHE_HOME"):
+        return Path(named)
+    if sys.platform == "darwin":
+        return Path.home() / "Library" / "Caches"
+    if sys.platform == "win32":
+        return Path(os.environ.get("LOCALAPPDATA", Path.home() / "AppData" / "Local"))
+    return Path.home() / ".cache"
 
 
 def environment() -> dict[str, Any]:

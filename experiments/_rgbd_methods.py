@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,20 +24,18 @@ def run_method(
     found: Mapping[str, NDArray[np.float64]],
     *,
     seed: int,
-    cache: dict[str, Any],
 ) -> NDArray[np.float64]:
     """(n, 4, 4) T_world_camera by one method.
 
     Args:
-        name: one of `METHODS`. "zero": all cameras at one place. "placed": the start that contradicts itself least.
-            "deepmapping": from there. "deepmapping-cold": L-Net from zero. "direct": its losses without L-Net, from
-            L-Net's first forward pass, as in the paper. "icp": each image onto the one before; "deepmapping-icp": from
-            there. Of a start and the fit from it that is kept of which the images agree better.
+        name: one of `METHODS`. "zero": all cameras at one place. "placed": the search for first poses. "deepmapping":
+            from there. "deepmapping-cold": L-Net from zero. "direct": its losses without L-Net, from L-Net's first
+            forward pass, as in the paper. "icp": each image onto the one before; "deepmapping-icp": from there. Of a
+            start and the fit from it, the one of the larger projective consistency is kept.
         sequence: depth images.
         settings: of DeepMapping.
-        found: what other methods have found for this sequence: a start that is there is not computed again.
+        found: results of other methods for this sequence: a start that is there is not computed again.
         seed: of everything random.
-        cache: compiled steps, kept between calls.
     """
     import jax
 
@@ -47,17 +45,16 @@ def run_method(
     if name == "zero":
         return np.tile(np.eye(4), (len(sequence), 1, 1))
     if name == "placed":
-        return dm.place_images(scans, motion=settings.motion, key=key)
+        return dm.initialize_depth(scans, motion=settings.motion, key=key)
     if name == "icp":
         return chain_icp(sequence, seed=seed)
     used = dm.as_direct(settings) if name == "direct" else settings
     start = {"deepmapping": "placed", "deepmapping-icp": "icp"}.get(name)
-    steps = cache.setdefault(f"{name == 'direct'}, {start is None}", {})
     if start is None:
-        return dm.fit_depth(scans, used, key=key, steps=steps).T_world_camera
-    init = found[start] if start in found else run_method(start, sequence, settings, found, seed=seed, cache=cache)
-    fitted = dm.fit_depth(scans, used, key=key, init=init, steps=steps).T_world_camera
-    return max(fitted, init, key=lambda T: float(dm.mean_agreement(scans, T)))
+        return dm.fit_depth(scans, used, key=key).T_world_camera
+    init = found[start] if start in found else run_method(start, sequence, settings, found, seed=seed)
+    fitted = dm.fit_depth(scans, used, key=key, init=init).T_world_camera
+    return max(fitted, init, key=lambda T: float(dm.projective_consistency(scans, T)))
 
 
 def chain_icp(sequence: DepthSequence, *, seed: int) -> NDArray[np.float64]:

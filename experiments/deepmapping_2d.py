@@ -26,7 +26,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 import numpy as np
 from tyro.conf import Positional, arg
 
-from dpmjax import deepmapping, io, simulation, viz
+from dpmjax import deepmapping, io, registration, simulation, viz
 from dpmjax import metrics as trajectory_metrics
 from experiments import _deepmapping_methods as shared
 from experiments._command import StopFlag, run_command
@@ -109,27 +109,28 @@ def main(config: Config) -> Result:
     """Reads, starts, fits, refines, keeps the best candidate, writes."""
     started = time.perf_counter()
     sequence = read_scans(config)
-    task = Task(sequence, shared.line_scans(sequence), is_ordered=config.ordered, seed=config.seed)
+    planar = registration.planar_scans(sequence.points, sequence.mask, is_ordered=config.ordered)
+    task = Task(sequence, planar, is_ordered=config.ordered, seed=config.seed)
     start_name, start = starting_poses(config, task)
     settings = fit_settings(config, sequence)
     folder = open_run_folder(config, EXPERIMENT)
     with recording(folder), StopFlag() as stop:
         print(f"{sequence.name}: {len(sequence)} scans of {sequence.points.shape[1]} beams, from {start_name}")
-        fitted = _fit(folder, task, settings, start, config, stop)
-        candidates = {start_name: start, shared.DEEPMAPPING: fitted.poses}
+        run = _fit(folder, task, settings, start, config, stop)
+        candidates = {start_name: start, shared.DEEPMAPPING: run.fitted.poses}
         if config.refine and not stop.is_requested:
             candidates |= _refine(task, candidates, config.init)
         kept, compared = compare(task, candidates)
         metrics = {
             "num_scans": len(sequence),
-            "steps": fitted.steps,
+            "steps": run.steps,
             **before_and_after(sequence, start, candidates[kept]),
             "start": start_name,
             "kept": kept,
             "candidates": compared,
             "assessment": shared.assess(task, candidates[kept]),
-            "fit_s": fitted.run_s,
-            "compile_s": fitted.compile_s,
+            "fit_s": run.run_s,
+            "compile_s": run.compile_s,
             "wall_s": time.perf_counter() - started,
             "peak_rss_gb": peak_rss_gb(),
             "is_interrupted": stop.is_requested,
@@ -138,7 +139,7 @@ def main(config: Config) -> Result:
         write_trajectories(folder, sequence, candidates[kept])
         write_metrics(folder, metrics, seed=config.seed)
         limits = draw_map(folder, task, candidates, metrics)
-        draw_occupancy(folder, sequence, fitted, settings, candidates[kept], limits)
+        draw_occupancy(folder, sequence, run, candidates[kept], limits)
         draw_loss(folder, sequence.unit)
         metrics["wall_s"] = time.perf_counter() - started
         write_metrics(folder, metrics, seed=config.seed)
@@ -153,8 +154,10 @@ def _fit(
     folder: RunFolder, task: Task, settings: DeepMappingConfig, start: Floats, config: Config, stop: StopFlag
 ) -> FitRun:
     """DeepMapping, of the scans in an order in which neighbours are near each other."""
+    from dpmjax.geometry import se2
+
     order = shared.in_fitting_order(task, start)
-    fitted = run_fit(
+    run = run_fit(
         folder,
         io.take_scans(task.sequence, order),
         settings,
@@ -163,7 +166,8 @@ def _fit(
         seconds=config.seconds,
         stop=stop,
     )
-    return replace(fitted, poses=fitted.poses[np.argsort(order)])
+    poses = run.fitted.poses[np.argsort(order)]
+    return run._replace(fitted=run.fitted._replace(poses=poses, T_world_scan=se2.to_matrix(poses)))
 
 
 def _refine(task: Task, candidates: Candidates, init: str) -> Candidates:
@@ -258,23 +262,15 @@ def draw_map(folder: RunFolder, task: Task, candidates: Candidates, metrics: Map
     return viz.Limits(*figure.axes[0].get_xlim(), *figure.axes[0].get_ylim())
 
 
-def draw_occupancy(
-    folder: RunFolder,
-    sequence: ScanSequence,
-    fitted: FitRun,
-    settings: DeepMappingConfig,
-    kept: Floats,
-    limits: viz.Limits,
-) -> None:
+def draw_occupancy(folder: RunFolder, sequence: ScanSequence, run: FitRun, kept: Floats, limits: viz.Limits) -> None:
     """occupancy.png: what M-Net learned, in the frame and within the limits of map.png."""
-    if not fitted.has_map:
+    if not run.has_map:
         return
-    picture = deepmapping.draw_map(
-        fitted.state, settings, sequence.points, sequence.mask, fitted.poses, reach=fitted.reach
-    )
+    picture = deepmapping.draw_map(run.fitted, sequence.points, sequence.mask)
     anchor = kept if sequence.reference_poses is None else sequence.reference_poses
-    T_view_fit = trajectory_metrics.align_rigid(fitted.poses[:, :2], anchor[:, :2])
-    figure = viz.occupancy_figure(picture, fitted.poses[:, :2], sequence.unit, T_view_world=T_view_fit, limits=limits)
+    trajectory = run.fitted.poses[:, :2]
+    T_view_fit = trajectory_metrics.align_rigid(trajectory, anchor[:, :2])
+    figure = viz.occupancy_figure(picture, trajectory, sequence.unit, T_view_world=T_view_fit, limits=limits)
     viz.save_figure(figure, folder / "occupancy.png")
 
 

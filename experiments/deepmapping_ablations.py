@@ -82,12 +82,12 @@ def main(config: Config) -> dict[str, Any]:
             for trajectory in range(config.limit)
             if (ablation, variant, trajectory) not in done
         ]
-        steps: dict[DepthMappingConfig, dict[Any, Any]] = {}
         for ablation, variant, trajectory in tqdm(missing, unit=" runs"):
             if stop.is_requested:
                 break
             settings = settings_of(ablation, variant, config)
-            rows.append(run_one(ablation, variant, trajectory, settings, config, steps.setdefault(settings, {})))
+            case = {"ablation": ablation, "variant": variant, "trajectory": trajectory}
+            rows.append({**case, **run_one(trajectory, settings, config)})
             write_json(folder / RUNS, {"rows": rows, "seed": config.seed})
         if rows:
             table = summarise(rows)
@@ -105,8 +105,7 @@ def main(config: Config) -> dict[str, Any]:
 
 def settings_of(ablation: str, variant: str, config: Config) -> DepthMappingConfig:
     """The basis with one thing changed."""
-    from dpmjax.deepmapping import depth_preset
-    from dpmjax.deepmapping.depth_config import JOINT_DEPTH, DepthMappingConfig
+    from dpmjax.deepmapping.config import JOINT_DEPTH, DepthMappingConfig, depth_preset
     from dpmjax.nets.occupancy import OccupancyConfig
 
     phase = replace(
@@ -139,18 +138,11 @@ def settings_of(ablation: str, variant: str, config: Config) -> DepthMappingConf
     elif ablation == "free":
         phase = replace(phase, num_free=int(variant))
     per_call = min(50, config.steps)
-    return DepthMappingConfig("planar", (phase,), (phase,), localization, occupancy, steps_per_call=per_call)
+    return DepthMappingConfig((phase,), (phase,), localization, occupancy, steps_per_call=per_call)
 
 
-def run_one(
-    ablation: str,
-    variant: str,
-    trajectory: int,
-    settings: DepthMappingConfig,
-    config: Config,
-    steps: dict[Any, Any],
-) -> dict[str, Any]:
-    """One fit; the first of a variant compiles, and its `run_s` contains that."""
+def run_one(trajectory: int, settings: DepthMappingConfig, config: Config) -> dict[str, Any]:
+    """Errors of one fit; the first of a variant compiles, and its `run_s` contains that."""
     import jax
 
     from dpmjax import deepmapping as dm
@@ -160,15 +152,8 @@ def run_one(
     sequence = simulation.simulate_depth_sequence(seed % 15, config.views, seed=seed)
     begun = time.perf_counter()
     scans = dm.as_depth_scans(sequence.points, sequence.mask)
-    fitted = dm.fit_depth(scans, settings, key=jax.random.key(config.seed), steps=steps)
-    errors = errors_of(fitted.T_world_camera, sequence)
-    return {
-        "ablation": ablation,
-        "variant": variant,
-        "trajectory": trajectory,
-        **errors,
-        "run_s": time.perf_counter() - begun,
-    }
+    fitted = dm.fit_depth(scans, settings, key=jax.random.key(config.seed))
+    return {**errors_of(fitted.T_world_camera, sequence), "run_s": time.perf_counter() - begun}
 
 
 def summarise(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
@@ -201,7 +186,8 @@ def draw(folder: RunFolder, rows: list[dict[str, Any]]) -> None:
     groups: dict[str, dict[str, list[float]]] = {}
     for row in rows:
         groups.setdefault(row["ablation"], {}).setdefault(row["variant"], []).append(row["ate_mm"])
-    viz.save_figure(viz.box_plots_figure(groups, "ATE, mm", _SUCCESS_MM), folder / "ablations.png")
+    panels = {f"{ablation}: ATE, mm": variants for ablation, variants in groups.items()}
+    viz.save_figure(viz.error_boxes_figure(panels, threshold=_SUCCESS_MM), folder / "ablations.png")
 
 
 if __name__ == "__main__":

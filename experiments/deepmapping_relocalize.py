@@ -5,14 +5,14 @@
 
 RUN is a folder of deepmapping_2d on a built-in world. Written beside its results: relocalization.png and
 relocalization.json, for L-Net as the fit left it (cold starts only; after a warm start it knows corrections only) and
-for L-Net taught the poses that the run found.
+for L-Net trained on the poses that the run found.
 """
 
 from __future__ import annotations
 
 import itertools
 import time
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -47,9 +47,9 @@ class Config:
     heading: Literal["nearest", "east"] = "nearest"
     """Orientation of these scans: that of the nearest scan of the fit, or along x everywhere."""
     steps: Annotated[int, arg(metavar="N")] = 5000
-    """Steps in which L-Net is taught the poses of the run."""
+    """Training steps of L-Net on the poses of the run."""
     seed: int = 0
-    """Seed of the teaching."""
+    """Seed of the training."""
 
     def __post_init__(self) -> None:
         """Checks ranges."""
@@ -59,10 +59,10 @@ class Config:
 
 
 def main(config: Config) -> dict[str, Any]:
-    """Loads the run, asks both L-Nets everywhere, draws, writes."""
+    """Loads the run, re-localises scans everywhere with both L-Nets, draws, writes."""
     import jax
 
-    from dpmjax import deepmapping as dm
+    from dpmjax.deepmapping import LocalizationTrainingConfig, relocalize, train_localization
     from dpmjax.simulation import make_world, scan_world
     from dpmjax.types import ScanSet
 
@@ -75,16 +75,16 @@ def main(config: Config) -> dict[str, Any]:
     truth = free_poses(grid, sequence, config)
     points, mask = scan_world(grid, truth, num_beams=sequence.points.shape[1])
     nets: dict[str, Fitted] = {}
-    if not np.any(np.asarray(fitted.state.start_poses)):
+    if not np.any(np.asarray(fitted.params.start)):
         nets["L-Net as fitted"] = fitted
     begun = time.perf_counter()
     scans = ScanSet(sequence.points, sequence.mask)
-    teach = dm.TeachConfig(num_steps=config.steps)
-    nets["L-Net taught"] = dm.teach_localization(fitted, scans, teach, key=jax.random.key(config.seed))
-    jax.block_until_ready(nets["L-Net taught"].params)
-    teach_s = time.perf_counter() - begun
+    training = LocalizationTrainingConfig(num_steps=config.steps)
+    nets["L-Net trained"] = train_localization(fitted, scans, training, key=jax.random.key(config.seed))
+    jax.block_until_ready(nets["L-Net trained"].params)
+    training_s = time.perf_counter() - begun
     errors = {
-        name: errors_at(dm.relocalize(net, ScanSet(points, mask)).pose, truth, fitted, sequence)
+        name: errors_at(relocalize(net, ScanSet(points, mask)).pose, truth, fitted, sequence)
         for name, net in nets.items()
     }
     results = {name: summarise(far, turns, truth, sequence) for name, (far, turns) in errors.items()}
@@ -92,10 +92,10 @@ def main(config: Config) -> dict[str, Any]:
     report = {
         "world": sequence.name,
         "num_scans": len(sequence),
-        "num_places": len(truth),
+        "num_poses": len(truth),
         "heading": config.heading,
         "nets": results,
-        "teach_s": teach_s,
+        "training_s": training_s,
         "seed": config.seed,
         **environment(),
     }
@@ -138,8 +138,9 @@ def load_fit(run: Path, options: deepmapping_2d.Config, sequence: ScanSequence) 
     """
     import jax
 
-    from dpmjax import deepmapping as dm
-    from dpmjax.deepmapping import Report
+    from dpmjax.deepmapping import Fitted
+    from dpmjax.deepmapping.fit import init
+    from dpmjax.deepmapping.planar import planar_problem, scale_scans, start_poses
     from dpmjax.geometry import se2
     from dpmjax.types import ScanSet
     from experiments._checkpoint import Checkpoints
@@ -148,25 +149,15 @@ def load_fit(run: Path, options: deepmapping_2d.Config, sequence: ScanSequence) 
     if not trajectory.is_file():
         raise ValueError(f"{run} holds no trajectory.npy: let the run end, or resume it")
     settings = deepmapping_2d.fit_settings(options, sequence)
-    scans = dm.as_scan_set(ScanSet(sequence.points, sequence.mask))
-    reach = dm.measure_reach(scans)
-    scaled = replace(scans, points=scans.points / reach)
-    is_warm = options.init != "zero"
-    start = np.zeros((len(sequence), 3)) if is_warm else None
-    like = dm.init(jax.random.key(0), scaled, settings, start_poses=start)
-    # The optimiser's state changes its shape from phase to phase; what is asked of L-Net does not need it.
-    for phase in range(len(settings.phases(is_warm=is_warm)))[::-1]:
-        at_phase = like
-        for _ in range(phase):
-            at_phase = dm.next_phase(at_phase, scaled, settings, is_warm=is_warm)
-        state = Checkpoints((run / CHECKPOINTS).resolve()).restore_latest(at_phase, fallback=None)
-        if state is not None:
-            break
-    else:
-        raise ValueError(f"{run} holds no checkpoint that can be read")
+    scans, unit = scale_scans(ScanSet(sequence.points, sequence.mask))
     poses = np.load(trajectory)
-    report = Report(np.nan, None, state.params.poses)  # type: ignore[arg-type]
-    return dm.Fitted(se2.to_matrix(poses), poses, state.params, report, state, reach, settings)
+    is_warm = options.init != "zero"
+    start = start_poses(poses, len(sequence), unit) if is_warm else None
+    like = init(planar_problem(settings, is_warm=is_warm), scans, key=jax.random.key(0), start=start)
+    state = Checkpoints((run / CHECKPOINTS).resolve()).restore_latest(like, fallback=None)
+    if state is None:
+        raise ValueError(f"{run} holds no checkpoint that can be read")
+    return Fitted(se2.to_matrix(poses), poses, state.params, None, unit, settings)
 
 
 def free_poses(grid: NDArray[np.bool_], sequence: ScanSequence, config: Config) -> NDArray[np.float64]:
@@ -206,7 +197,7 @@ def summarise(
     for low, high in itertools.pairwise(_BINS_PX):
         inside = (distance >= low) & (distance < high)
         if inside.any():
-            row = {"from_px": low, "to_px": high, "num_places": int(inside.sum())}
+            row = {"from_px": low, "to_px": high, "num_poses": int(inside.sum())}
             row |= {"median_px": float(np.median(errors[inside])), "median_deg": float(np.median(turns[inside]))}
             bins.append({**row, "share_below_20_px": float((errors[inside] < _RIGHT_PX).mean())})
     return {

@@ -84,12 +84,11 @@ def main(config: Config) -> dict[str, Any]:
     with recording(folder), StopFlag() as stop:
         begun = time.perf_counter()
         rows = load_json(folder / RUNS)["rows"] if folder.is_resumed and (folder / RUNS).exists() else []
-        cache: dict[str, Any] = {}
         for index in tqdm(range(len(rows), num_trajectories(config)), unit=" trajectories"):
             if stop.is_requested:
                 break
             sequence = first if index == 0 else read_trajectory(config, index)
-            rows.append(run_one(folder, config, sequence, settings, index, cache))
+            rows.append(run_one(folder, config, sequence, settings, index))
             write_json(folder / RUNS, {"rows": rows, "seed": config.seed})
         if rows:
             metrics = summarise(rows, config.methods)
@@ -144,7 +143,6 @@ def run_one(
     sequence: DepthSequence,
     settings: DepthMappingConfig,
     index: int,
-    cache: dict[str, Any],
 ) -> dict[str, Any]:
     """All methods on one trajectory; `run_s` of the first of each length contains its compilation.
 
@@ -154,7 +152,7 @@ def run_one(
     row: dict[str, Any] = {"name": sequence.name, "views": len(sequence)}
     for name in config.methods:
         begun = time.perf_counter()
-        found[name] = run_method(name, sequence, settings, found, seed=config.seed, cache=cache)
+        found[name] = run_method(name, sequence, settings, found, seed=config.seed)
         row[name] = {**errors_of(found[name], sequence), "run_s": time.perf_counter() - begun}
     if index < config.pictures:
         from dpmjax import viz
@@ -186,11 +184,11 @@ def draw_errors(folder: RunFolder, rows: list[dict[str, Any]], methods: tuple[st
     """errors.png."""
     from dpmjax import viz
 
-    groups = {
+    panels = {
         title: {name: [row[name][key] for row in rows] for name in methods}
-        for title, key in (("ATE", "ate_mm"), ("point distance", "point_distance_mm"))
+        for title, key in (("ATE, mm", "ate_mm"), ("point distance, mm", "point_distance_mm"))
     }
-    viz.save_figure(viz.box_plots_figure(groups, "mm", _SUCCESS_MM), folder / "errors.png")
+    viz.save_figure(viz.error_boxes_figure(panels, threshold=_SUCCESS_MM), folder / "errors.png")
 
 
 def tell(folder: RunFolder, metrics: dict[str, Any]) -> None:

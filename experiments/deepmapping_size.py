@@ -20,7 +20,8 @@ import numpy as np
 from tyro.conf import arg
 
 from experiments._command import run_command
-from experiments._json import load_json
+from experiments._json import load_json, write_json
+from experiments._machine import environment, peak_rss_gb
 from experiments._run_folder import FolderOptions, open_run_folder, recording, write_metrics
 
 EXPERIMENT = "deepmapping_size"
@@ -55,8 +56,11 @@ def main(config: Config) -> dict[str, Any]:
         for size in sorted(config.sizes):
             file = folder / f"size_{size}.json"
             if not (folder.is_resumed and file.exists()):
-                command = [sys.executable, "-m", "experiments._size_child", str(size), str(config.calls)]
-                subprocess.run([*command, str(config.seed), str(file)], check=True, cwd=Path(__file__).parents[1])
+                code = (
+                    f"from experiments.deepmapping_size import measure; measure({size}, {config.calls}, {config.seed},"
+                )
+                command = [sys.executable, "-c", f"{code} {str(file.resolve())!r})"]
+                subprocess.run(command, check=True, cwd=Path(__file__).parents[1])
             rows.append(load_json(file))
             tell(rows[-1])
         metrics = {"rows": [{key: row[key] for key in _KEYS} for row in rows], "exponents": exponents(rows)}
@@ -95,6 +99,42 @@ def exponents(rows: list[dict[str, Any]]) -> dict[str, float | None]:
         name: float(np.polyfit(np.log(sizes[is_full]), np.log(values[is_full]), 1)[0])
         for name, values in columns.items()
     }
+
+
+def measure(num_scans: int, num_calls: int, seed: int, output: str) -> None:
+    """Seconds a step of both phases, and the peak of memory of this process, as JSON."""
+    import jax
+
+    from dpmjax.deepmapping import preset
+    from dpmjax.deepmapping.fit import fit, steps_per_call
+    from dpmjax.deepmapping.planar import planar_problem, scale_scans, start_poses
+    from dpmjax.simulation import simulate_sequence
+    from dpmjax.types import ScanSet
+
+    sequence = simulate_sequence(0, num_scans, seed=seed, with_odometry=True)
+    before_gb = peak_rss_gb()
+    scans, unit = scale_scans(ScanSet(sequence.points, sequence.mask))
+    assert sequence.odometry_poses is not None
+    phases: dict[str, Any] = {}
+    for name, odometry in (("network", None), ("free", sequence.odometry_poses)):
+        problem = planar_problem(preset("fast"), is_warm=odometry is not None)
+        run_s = [0.0]
+        done = fit(
+            problem,
+            scans,
+            key=jax.random.key(seed),
+            start=None if odometry is None else start_poses(odometry, len(sequence), unit),
+            on_report=lambda progress, run_s=run_s: run_s.append(progress.run_s),
+            stop=lambda run_s=run_s: len(run_s) > num_calls,
+        )
+        if not np.isfinite(np.asarray(done.poses)).all():
+            raise RuntimeError(f"poses of {num_scans} scans are not finite")
+        phase = problem.phases[0]
+        step_s = float(np.diff(run_s).min()) / steps_per_call(problem, phase)
+        epoch_s = step_s * len(sequence) / min(len(sequence), phase.scans_per_step)
+        phases[name] = {"compile_s": done.compile_s, "step_s": step_s, "epoch_s": epoch_s}
+    result = {"num_scans": len(sequence), **phases, "data_gb": before_gb, "peak_rss_gb": peak_rss_gb(), **environment()}
+    write_json(Path(output), result)
 
 
 def tell(row: dict[str, Any]) -> None:

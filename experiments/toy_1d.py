@@ -27,7 +27,8 @@ from experiments._machine import peak_rss_gb, select_device
 from experiments._run_folder import RunFolder, open_run_folder, recording, write_metrics
 
 if TYPE_CHECKING:
-    from dpmjax.deepmapping import Descent, ToyConfig
+    from dpmjax.deepmapping.fit import Fit
+    from dpmjax.deepmapping.toy import ToyConfig
 
 EXPERIMENT = "toy_1d"
 FORMS = ("network", "direct")
@@ -70,7 +71,7 @@ class Config:
 
 def main(config: Config) -> dict[str, Any]:
     """Runs all seeds, then all variants, draws, measures, writes."""
-    from dpmjax.deepmapping import ToyConfig, global_minimum
+    from dpmjax.deepmapping.toy import ToyConfig, global_minimum
     from dpmjax.nets.scalar import Initialization
 
     select_device(config.device)  # type: ignore[arg-type]
@@ -84,7 +85,7 @@ def main(config: Config) -> dict[str, Any]:
             for rate in sorted({paper.learning_rate, *config.learning_rates}):
                 net = replace(paper.net, initialization=initialization)
                 runs = descend_both(replace(paper, net=net, learning_rate=rate), config)
-                row = {form: share_at_minimum(np.asarray(run.x[:, -1])) for form, run in zip(FORMS, runs, strict=True)}
+                row = {form: share_at_minimum(run.poses) for form, run in zip(FORMS, runs, strict=True)}
                 variants.append({"initialization": initialization, "learning_rate": rate, **row})
         x_best, loss_best = global_minimum()
         metrics = {
@@ -103,25 +104,26 @@ def main(config: Config) -> dict[str, Any]:
     return metrics
 
 
-def starts(toy: ToyConfig, config: Config) -> Any:
-    """The starts of all seeds."""
+def descend(toy: ToyConfig, config: Config) -> Fit:
+    """All seeds as starts of one fit."""
     import jax
 
-    from dpmjax.deepmapping import init_toy
+    from dpmjax.deepmapping.fit import fit
+    from dpmjax.deepmapping.toy import toy_problem
 
-    return jax.vmap(lambda key: init_toy(key, toy))(jax.random.split(jax.random.key(config.seed), config.seeds))
+    return fit(toy_problem(toy), None, key=jax.random.key(config.seed), num_starts=config.seeds)
 
 
-def descend_both(toy: ToyConfig, config: Config) -> tuple[Descent, Descent]:
+def descend_both(toy: ToyConfig, config: Config) -> tuple[Fit, Fit]:
     """All seeds in the network form, and in the direct form from the same starts."""
-    import jax
+    return descend(replace(toy, form="network"), config), descend(replace(toy, form="direct"), config)
 
-    from dpmjax.deepmapping import descend_direct, descend_network, network_value
 
-    def both(start: Any) -> tuple[Descent, Descent]:
-        return descend_network(start, toy), descend_direct(network_value(start, toy), toy)
-
-    return jax.jit(jax.vmap(both))(starts(toy, config))
+def path(run: Fit) -> NDArray[np.floating]:
+    """(seeds, steps + 1) x of every seed from the start to the end."""
+    assert run.report is not None
+    x = np.atleast_2d(np.asarray(run.report.terms))
+    return np.concatenate([x, np.reshape(run.poses, (-1, 1))], axis=1)
 
 
 def run_paper(toy: ToyConfig, config: Config) -> tuple[dict[str, NDArray[np.floating]], dict[str, Any]]:
@@ -129,31 +131,28 @@ def run_paper(toy: ToyConfig, config: Config) -> tuple[dict[str, NDArray[np.floa
     import jax
     import jax.numpy as jnp
 
-    from dpmjax.deepmapping import minimize_direct, network_value, toy_loss
-    from dpmjax.nets.scalar import ScalarNet
+    from dpmjax.deepmapping.toy import network_value, toy_loss
+    from experiments.baselines.direct import minimize_toy
 
-    network, direct = descend_both(toy, config)
-    ends = {
-        f"{name} form, gradient descent": np.asarray(run.x[:, -1])
-        for name, run in zip(FORMS, (network, direct), strict=True)
-    }
-    x0 = jax.vmap(lambda start: network_value(start, toy))(starts(toy, config))
+    runs = descend_both(toy, config)
+    network, direct = map(path, runs)
+    ends = {f"{name} form, gradient descent": x[:, -1] for name, x in zip(FORMS, (network, direct), strict=True)}
     for solver in SOLVERS:
-        solve = jax.jit(jax.vmap(lambda x, solver=solver: minimize_direct(x, solver, max_iterations=config.steps)))
-        ends[f"direct form, jaxopt {solver}"] = np.asarray(solve(x0))
+        solve = jax.jit(jax.vmap(lambda x, solver=solver: minimize_toy(x, solver, max_iterations=config.steps)))
+        ends[f"direct form, jaxopt {solver}"] = np.asarray(solve(jnp.asarray(direct[:, 0])))
     # Out of the same vmap as the shares: the descent is chaotic, and one seed compiled alone rounds its way elsewhere.
-    chosen = choose_seed(np.asarray(network.x), np.asarray(direct.x))
+    chosen = choose_seed(network, direct)
     z = jnp.linspace(-VIEW, VIEW, 1201)
-    params = jax.tree.map(lambda leaf: leaf[chosen], network.params)
-    converted = toy_loss(jax.vmap(lambda one: ScalarNet(toy.net).apply(params, one))(z))
-    x_direct, visited = float(direct.x[chosen, -1]), np.asarray(network.x[chosen])
+    params = runs[0].state.params if config.seeds == 1 else jax.tree.map(lambda x: x[chosen], runs[0].state.params)
+    converted = toy_loss(jax.vmap(lambda one: network_value(toy, params.replace(z=one)))(z))
+    x_direct, visited = float(direct[chosen, -1]), network[chosen]
     return ends, {
         "z": np.asarray(z),
         "converted_loss": np.asarray(converted),
         "visited": (visited, np.asarray(toy_loss(visited))),
         "direct_end": (x_direct, float(toy_loss(x_direct))),
         "network_end": (float(visited[-1]), float(toy_loss(visited[-1]))),
-        "network_end_z": float(network.z[chosen]),
+        "network_end_z": float(params.z),
     }
 
 
@@ -168,7 +167,7 @@ def choose_seed(network_x: NDArray[np.floating], direct_x: NDArray[np.floating])
 
 def is_at_minimum(x: NDArray[np.floating]) -> NDArray[np.bool_]:
     """Which ends are at the global minimum."""
-    from dpmjax.deepmapping import global_minimum
+    from dpmjax.deepmapping.toy import global_minimum
 
     return np.abs(np.asarray(x, np.float64) - global_minimum()[0]) < _SAME_PLACE
 
@@ -180,20 +179,10 @@ def share_at_minimum(x: NDArray[np.floating]) -> float:
 
 def measure_seconds(toy: ToyConfig, config: Config) -> dict[str, Any]:
     """Seconds of the network form: all seeds in one vmap, one seed, and one seed in a plain PyTorch loop."""
-    import jax
-
-    from dpmjax.deepmapping import descend_network
-
-    all_starts = starts(toy, config)
     seconds: dict[str, Any] = {}
-    run = jax.jit(jax.vmap(lambda start: descend_network(start, toy).x[-1]))
-    for name, some in (("all_seeds", all_starts), ("one_seed", jax.tree.map(lambda leaf: leaf[:1], all_starts))):
-        begun = time.perf_counter()
-        compiled = run.lower(some).compile()
-        seconds[f"{name}_compile_s"] = time.perf_counter() - begun
-        begun = time.perf_counter()
-        jax.block_until_ready(compiled(some))
-        seconds[f"{name}_run_s"] = time.perf_counter() - begun
+    for name, seeds in (("all_seeds", config.seeds), ("one_seed", 1)):
+        run = descend(toy, replace(config, seeds=seeds))
+        seconds |= {f"{name}_compile_s": run.compile_s, f"{name}_run_s": run.run_s}
     if importlib.util.find_spec("torch") is None:
         print("PyTorch is not installed: its loop is not timed (pip install torch)")
     else:
@@ -228,7 +217,7 @@ def draw(
 ) -> None:
     """toy.png and endings.png."""
     from dpmjax import viz
-    from dpmjax.deepmapping import toy_loss
+    from dpmjax.deepmapping.toy import toy_loss
 
     x = np.linspace(-VIEW, VIEW, 2401)
     loss = np.asarray(toy_loss(x))

@@ -1,28 +1,31 @@
-"""Direct optimisation of the poses: DeepMapping's loss without L-Net, from zero, by L-BFGS (a baseline of the paper).
+"""Direct optimisation without L-Net by jaxopt: of DeepMapping's loss (a baseline of the paper), and of the toy.
 
-By Adam it is `fit_deepmapping` with a single phase of free poses.
+By Adam the direct form is `fit_deepmapping` with the settings of `as_direct`.
 """
 
 from __future__ import annotations
 
-from typing import Any
+from dataclasses import replace
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
+import jaxopt
 import numpy as np
 from jaxtyping import Array, Float
 from numpy.typing import NDArray
 
 from dpmjax.deepmapping.config import DeepMappingConfig
-from dpmjax.deepmapping.fit import as_scan_set, init, map_logits, measure_reach
-from dpmjax.deepmapping.objective import Batch, registration_loss
+from dpmjax.deepmapping.fit import init
+from dpmjax.deepmapping.planar import planar_problem, scale_scans
+from dpmjax.deepmapping.toy import toy_loss
 from dpmjax.types import ScanSet
 
 
 def optimize_directly(
     scans: ScanSet, config: DeepMappingConfig, *, num_iterations: int, key: jax.Array
 ) -> NDArray[np.float64]:
-    """Poses and map from zero by L-BFGS on the loss of the config's last warm phase, its random samples held.
+    """Poses and map from zero by L-BFGS on the loss at the end of the last warm phase, its random samples held.
 
     Args:
         scans: n planar scans.
@@ -33,23 +36,38 @@ def optimize_directly(
     Returns:
         (n, 3) poses, unit of the scans.
     """
-    import jaxopt
-
-    scans = as_scan_set(scans)
-    reach = measure_reach(scans)
-    scans = ScanSet(points=scans.points / reach, mask=scans.mask)
-    phase = config.warm_phases[-1]
-    start = init(key, scans, config, start_poses=jnp.zeros((scans.mask.shape[0], 3)))
-    stride = max(1, -(-scans.mask.shape[1] // phase.beams_per_step))
-    rows = jnp.arange(scans.mask.shape[0])
-    batch = Batch(scans.points[:, ::stride], scans.mask[:, ::stride], rows, jnp.zeros_like(rows))
+    scaled, unit = scale_scans(scans)
+    num_scans = len(scaled.points)
+    phase = replace(config.warm_phases[-1], scans_per_step=num_scans)
+    problem = planar_problem(replace(config, warm_phases=(phase,)), is_warm=True)
+    start = init(problem, scaled, key=key, start=jnp.zeros((num_scans, 3))).params
 
     def loss(moving: tuple[Array, Any]) -> Float[Array, ""]:
-        poses, occupancy = moving
-        state = start.replace(params=start.params.replace(occupancy=occupancy))  # type: ignore[attr-defined]
-        value, _ = registration_loss(poses, batch, map_logits(state, config), phase, jnp.ones(()), key=key)
-        return value
+        params = replace(start, poses=moving[0], occupancy=moving[1])
+        return problem.loss(problem.config, phase, params, scaled, jnp.asarray(phase.num_steps), key)[0]
 
     solver = jaxopt.LBFGS(loss, maxiter=num_iterations, history_size=10, linesearch="backtracking", maxls=20)
-    solution, _ = solver.run((start.params.poses, start.params.occupancy))
-    return np.asarray(solution[0], np.float64) * [reach, reach, 1.0]
+    solution, _ = solver.run((start.poses, start.occupancy))
+    return np.asarray(solution[0], np.float64) * [unit, unit, 1.0]
+
+
+def minimize_toy(
+    x0: Float[Array, ""], method: Literal["gradient-descent", "lbfgs", "bfgs"], *, max_iterations: int = 1000
+) -> Float[Array, ""]:
+    """The direct form of the toy by a solver of jaxopt with its own line search.
+
+    Args:
+        x0: where to start.
+        method: "gradient-descent" (with line search and momentum), "lbfgs" or "bfgs".
+        max_iterations: the largest number of iterations.
+
+    Returns:
+        Where the solver ends.
+
+    Raises:
+        ValueError: the method is unknown.
+    """
+    solvers = {"gradient-descent": jaxopt.GradientDescent, "lbfgs": jaxopt.LBFGS, "bfgs": jaxopt.BFGS}
+    if method not in solvers:
+        raise ValueError(f"method: expected one of {', '.join(solvers)}, got {method!r}")
+    return solvers[method](fun=toy_loss, maxiter=max_iterations).run(x0).params

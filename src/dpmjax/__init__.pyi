@@ -1,5 +1,5 @@
-from .deepmapping.fit import fit_deepmapping as fit_deepmapping
-from .deepmapping.relocalize import relocalize as relocalize
+from .deepmapping.planar import fit_deepmapping as fit_deepmapping
+from .deepmapping.relocalization import relocalize as relocalize
 from .deeppointmap.inference import encode as encode
 from .deeppointmap.inference import overlap as overlap
 from .deeppointmap.inference import register as register

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from dpmjax import deepmapping as dm
+from dpmjax.deepmapping.planar import scale_scans
 from dpmjax.io import ScanSequence
 from dpmjax.simulation import simulate_sequence
 from dpmjax.types import ScanSet
@@ -20,9 +20,8 @@ def tiny_walk() -> ScanSequence:
 
 @pytest.fixture(scope="session")
 def tiny_scans(tiny_walk: ScanSequence) -> ScanSet:
-    """In reaches."""
-    scans = dm.as_scan_set(ScanSet(tiny_walk.points, tiny_walk.mask))
-    return ScanSet(scans.points / dm.measure_reach(scans), scans.mask)
+    """In typical ranges."""
+    return scale_scans(ScanSet(tiny_walk.points, tiny_walk.mask))[0]
 
 
 @pytest.fixture(scope="session")

@@ -8,14 +8,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-
-from dpmjax import deepmapping as dm
-from dpmjax import io, simulation
 from dpmjax.deepmapping.depth_agreement import agreement
 from dpmjax.deepmapping.depth_scans import fit_pinhole
 from dpmjax.deepmapping.depth_start import DepthStartConfig
-from dpmjax.metrics import absolute_trajectory_error
 from dpmjax.nets.depth_localization import DepthLocalizationConfig
+
+from dpmjax import deepmapping as dm
+from dpmjax import io, simulation
+from dpmjax.metrics import absolute_trajectory_error
 from dpmjax.nets.occupancy import OccupancyConfig
 from tests.tolerances import ROUNDING
 

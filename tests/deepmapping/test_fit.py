@@ -1,129 +1,217 @@
+"""Laws of the engine, on problems whose answer is known and on the smallest planar fit."""
+
 from __future__ import annotations
 
-import importlib
-from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optax
 import pytest
 
 from dpmjax import deepmapping as dm
-from dpmjax.deepmapping.fit import _draw_batch, run_phases
-from dpmjax.deepmapping.stepping import steps_per_call
-from dpmjax.geometry import se2
-from dpmjax.metrics import absolute_trajectory_error
+from dpmjax.deepmapping.fit import Progress, fit, init, is_finished, step, steps_per_call
+from dpmjax.deepmapping.planar import planar_problem
+from dpmjax.deepmapping.problem import Problem, draw_offsets
 from dpmjax.nets.localization import LocalizationConfig
 from dpmjax.nets.occupancy import OccupancyConfig
-from dpmjax.types import ScanSet
 from experiments._checkpoint import Checkpoints
+from tests.tolerances import ACCUMULATED, DOUBLE
 
 KEY = jax.random.key(3)
-# The fast preset in small: fewer levels, beams and steps.
-SMALL = dm.with_steps(
-    replace(
-        dm.preset("fast"),
-        occupancy=OccupancyConfig(kind="grid", resolutions=(16, 32, 64, 128)),
-        localization=LocalizationConfig(features=(16, 32), strides=(1, 2), is_circular=True, hidden=(32,)),
-    ),
-    150,
-)
-BRIEF = replace(dm.with_steps(SMALL, 6), steps_per_call=2)
 
 
-def ate(poses: np.ndarray, reference: np.ndarray) -> float:
-    return absolute_trajectory_error(poses[:, :2], reference[:, :2])
+@dataclass(frozen=True)
+class Valley:
+    """Settings of a problem with two minima: gradient descent on (x^2 - 1)^2 + x / 4 + data."""
+
+    name: str = "valley"
+    num_steps: int = 60
 
 
-def assert_same(a, b) -> None:
-    jax.tree.map(np.testing.assert_array_equal, a, b)
+def height(x):
+    return (x**2 - 1.0) ** 2 + 0.25 * x
 
 
-@pytest.fixture(scope="module")
-def warm(tiny_walk, shaken) -> dm.Fitted:
-    return dm.fit_deepmapping(ScanSet(tiny_walk.points, tiny_walk.mask), SMALL, key=KEY, init=shaken)
-
-
-def test_a_perturbed_start_is_improved(tiny_walk, shaken, warm) -> None:
-    assert ate(warm.poses, tiny_walk.reference_poses) < 0.4 * ate(shaken, tiny_walk.reference_poses)
-    np.testing.assert_allclose(se2.to_matrix(warm.poses), warm.T_world_scan)
-    assert int(warm.state.step) == 150
-
-
-@pytest.mark.slow
-def test_a_cold_start_finds_the_walk_roughly(tiny_walk) -> None:
-    cold = dm.fit_deepmapping(ScanSet(tiny_walk.points, tiny_walk.mask), dm.with_steps(SMALL, 300), key=KEY)
-    # All poses at one place are off by the spread of the walk.
-    spread = ate(np.zeros((20, 3)), tiny_walk.reference_poses)
-    assert ate(cold.poses, tiny_walk.reference_poses) < 0.5 * spread
-
-
-def test_picture_is_dark_at_walls_and_light_in_free_space(tiny_walk, warm) -> None:
-    picture = dm.draw_map(
-        warm.state, SMALL, tiny_walk.points, tiny_walk.mask, warm.poses, reach=warm.reach, num_cells=200
+def valley(halve_at: tuple[float, ...] = (0.25, 0.5, 0.75)) -> Problem:
+    return Problem(
+        Valley(),
+        (Valley(), Valley(name="again", num_steps=20)),
+        init=draw_start,
+        optimizer=descent,
+        loss=valley_loss,
+        poses=valley_pose,
+        next_phase=stay,
+        steps_per_call=5,
+        halve_at=halve_at,
     )
-    world = se2.transform_points(warm.poses, tiny_walk.points)
-    sensors = np.broadcast_to(warm.poses[:, None, :2], world.shape)
-    x_min, x_max, y_min, y_max = picture.extent
-    height, width = picture.probability.shape
-
-    def at(places: np.ndarray) -> np.ndarray:
-        column = ((places[:, 0] - x_min) / (x_max - x_min) * width).astype(int)
-        row = ((places[:, 1] - y_min) / (y_max - y_min) * height).astype(int)
-        assert picture.explored[row, column].mean() > 0.99
-        return picture.probability[row, column]
-
-    walls, free = at(world[tiny_walk.mask]), at((0.5 * (world + sensors))[tiny_walk.mask])
-    assert np.median(walls) > 0.5
-    assert np.median(free) < 0.2
-    assert not picture.explored.all()
 
 
-@pytest.fixture(scope="module")
-def brief_steps(tiny_scans) -> dict[str, Callable]:
-    """The compiled steps of the brief cold start, one a phase."""
-    return {phase.name: dm.make_step(tiny_scans, BRIEF, phase) for phase in BRIEF.cold_phases}
+def draw_start(config, key, data, start):
+    return 2.0 * jax.random.normal(key) if start is None else start
 
 
-def test_same_key_same_numbers_and_another_key_others(tiny_scans, brief_steps) -> None:
-    step = brief_steps[BRIEF.cold_phases[0].name]
-
-    def run(key: jax.Array) -> dm.State:
-        return step(dm.init(key, tiny_scans, BRIEF), key=key)[0]
-
-    one = run(KEY)
-    assert_same(one, run(KEY))
-    assert not np.array_equal(*(jax.tree.leaves(s.params.localization)[-1] for s in (one, run(jax.random.key(4)))))
+def descent(config, phase):
+    return optax.sgd(0.02)
 
 
-def test_second_step_compiles_nothing(tiny_scans, brief_steps, assert_compiles_nothing) -> None:
-    step = brief_steps[BRIEF.cold_phases[0].name]
-    state, _ = step(dm.init(KEY, tiny_scans, BRIEF), key=KEY)
+def valley_loss(config, phase, params, data, step, key):
+    return height(params) + data, (params,)
+
+
+def valley_pose(config, phase, params, data):
+    return params
+
+
+def stay(config, phase, params, data):
+    return params
+
+
+def descend(x: float, num_steps: int) -> float:
+    """The oracle: plain gradient descent in float64."""
+    for _ in range(num_steps):
+        x -= 0.02 * (4.0 * x * (x**2 - 1.0) + 0.25)
+    return x
+
+
+def test_a_fit_is_plain_gradient_descent_through_all_phases() -> None:
+    done = fit(valley(), jnp.zeros(()), key=KEY, start=jnp.asarray(0.9))
+    assert float(done.poses) == pytest.approx(descend(0.9, 80), abs=1e-4)
+    assert (int(done.state.step), int(done.state.phase), int(done.state.phase_step)) == (80, 1, 20)
+    np.testing.assert_allclose(np.asarray(done.report.terms[0]), [descend(0.9, 75 + k) for k in range(5)], **ACCUMULATED)
+
+
+def test_the_best_start_survives() -> None:
+    starts = np.asarray(jax.vmap(lambda key: 2.0 * jax.random.normal(key))(jax.random.split(KEY, 8)))
+    ends = np.array([descend(x, 80) for x in starts])
+    # Both minima attract some of the starts, so that the law is not empty.
+    assert len(np.unique(np.sign(ends))) == 2
+    done = fit(valley(), jnp.zeros(()), key=KEY, num_starts=8)
+    assert done.state.step.shape == ()
+    assert float(done.poses) == pytest.approx(ends[np.argmin(height(ends))], abs=1e-3)
+
+
+def test_starts_are_halved_at_the_given_shares_of_the_first_phase() -> None:
+    num_starts: list[int] = []
+    fit(valley((0.25, 0.5)), jnp.zeros(()), key=KEY, num_starts=6, on_report=lambda p: num_starts.append(p.state.step.size))
+    # Calls of 5 steps: halved after steps 15 and 30, and the best one alone is kept at the end.
+    assert num_starts == [6] * 3 + [3] * 3 + [2] * 10
+
+
+def test_without_halving_all_starts_are_kept_and_each_is_a_fit_of_its_own() -> None:
+    keys = jax.random.split(KEY, 3)
+    together = fit(valley(()), jnp.zeros(()), key=KEY, num_starts=3)
+    alone = [fit(valley(()), jnp.zeros(()), key=key) for key in keys]
+    np.testing.assert_allclose(together.poses, [one.poses for one in alone], **ACCUMULATED)
+    assert together.state.step.tolist() == [80, 80, 80]
+
+
+def test_diverged_starts_are_dropped_first() -> None:
+    def nan_or_zero(config, key, data, start):
+        return jnp.where(jax.random.uniform(key) < 0.5, jnp.nan, 0.5)
+
+    problem = replace(valley(), init=nan_or_zero)
+    assert np.isfinite(fit(problem, jnp.zeros(()), key=KEY, num_starts=8).poses)
+
+
+def test_stop_ends_the_fit_and_a_state_goes_on_to_the_same_numbers() -> None:
+    problem, calls = valley(), []
+    unbroken = fit(problem, jnp.zeros(()), key=KEY)
+    stopped = fit(problem, jnp.zeros(()), key=KEY, on_report=calls.append, stop=lambda: len(calls) == 12)
+    # The first phase has 12 calls: the stop falls on the border of the phases.
+    assert int(stopped.state.step) == 60
+    assert not is_finished(problem, stopped.state)
+    resumed = fit(problem, jnp.zeros(()), key=jax.random.key(9), start=stopped.state)
+    jax.tree.map(np.testing.assert_array_equal, resumed.state, unbroken.state)
+    assert fit(problem, jnp.zeros(()), key=KEY, start=unbroken.state).report is None
+
+
+def test_step_by_step_is_the_fit() -> None:
+    problem, data = valley(), jnp.zeros(())
+    state = init(problem, data, key=KEY)
+    while not is_finished(problem, state):
+        state, report = step(problem, state, data)
+    done = fit(problem, data, key=KEY)
+    jax.tree.map(np.testing.assert_array_equal, state, done.state)
+    assert report.loss == pytest.approx(float(np.mean(done.report.losses)))
+
+
+def test_progress_tells_shares_phases_and_seconds() -> None:
+    seen: list[Progress] = []
+    fit(valley(), jnp.zeros(()), key=KEY, on_report=seen.append)
+    np.testing.assert_allclose([p.share for p in seen], np.arange(5, 81, 5) / 80, **DOUBLE)
+    assert [p.phase.name for p in seen] == ["valley"] * 12 + ["again"] * 4
+    assert all(later.run_s > earlier.run_s > 0.0 for earlier, later in zip(seen, seen[1:], strict=False))
+
+
+def test_no_start_is_refused() -> None:
+    with pytest.raises(ValueError, match="num_starts"):
+        fit(valley(), jnp.zeros(()), key=KEY, num_starts=0)
+
+
+@pytest.mark.parametrize(("num_steps", "expected"), [(60, 60), (20, 20), (61, 63), (25, 25)])
+def test_calls_of_a_step_share_the_steps_of_the_phase(num_steps: int, expected: int) -> None:
+    problem = planar_problem(dm.with_steps(dm.preset("fast"), num_steps), is_warm=True)
+    length = steps_per_call(problem, problem.phases[0])
+    assert length * -(-num_steps // length) == expected
+
+
+# The fast preset in small: few levels, channels and steps; two phases.
+BRIEF = replace(
+    dm.with_steps(
+        replace(
+            dm.preset("fast"),
+            occupancy=OccupancyConfig(kind="grid", resolutions=(8, 16)),
+            localization=LocalizationConfig(features=(8, 16), strides=(1, 2), is_circular=True, hidden=(16,)),
+        ),
+        6,
+    ),
+    steps_per_call=2,
+)
+COLD = planar_problem(BRIEF, is_warm=False)
+
+
+def test_other_data_of_the_same_shape_compile_nothing_in_any_phase(tiny_scans, assert_compiles_nothing) -> None:
+    first = fit(COLD, tiny_scans, key=KEY)
+    # Another random key and other scans; the problem is made anew from equal settings.
+    other = replace(tiny_scans, points=0.9 * tiny_scans.points)
     with assert_compiles_nothing():
-        state, report = step(state, key=KEY)
-    assert np.isfinite(report.loss)
+        second = fit(planar_problem(replace(BRIEF), is_warm=False), other, key=jax.random.key(4))
+    assert int(first.state.phase) == int(second.state.phase) == len(COLD.phases) - 1
+    assert not np.array_equal(first.poses, second.poses)
 
 
-def test_interrupted_and_restored_equals_unbroken(tiny_scans, brief_steps, tmp_path, monkeypatch) -> None:
-    module = importlib.import_module("dpmjax.deepmapping.fit")
-    monkeypatch.setattr(module, "make_step", lambda scans, config, phase: brief_steps[phase.name])
-    start = dm.init(KEY, tiny_scans, BRIEF)
-    states = [state for _, state, _ in run_phases(tiny_scans, BRIEF, start, key=KEY, is_warm=False)]
-    checkpoints = Checkpoints(tmp_path / "checkpoints")
-    # The first call ends inside the first phase.
-    checkpoints.save(2, states[0])
-    restored = Checkpoints(tmp_path / "checkpoints").restore_latest(start, fallback=start)
-    assert_same(restored, states[0])
-    *_, (_, resumed, _) = run_phases(tiny_scans, BRIEF, restored, key=KEY, is_warm=False)
-    assert_same(resumed, states[-1])
+def test_same_key_same_numbers_and_another_key_others(tiny_scans) -> None:
+    one, same, other = (fit(COLD, tiny_scans, key=key).state for key in (KEY, KEY, jax.random.key(4)))
+    jax.tree.map(np.testing.assert_array_equal, one, same)
+    assert not np.array_equal(*(jax.tree.leaves(s.params.localization)[-1] for s in (one, other)))
+
+
+def test_restored_from_disk_in_any_phase_equals_unbroken(tiny_scans, tmp_path) -> None:
+    states = []
+    fit(COLD, tiny_scans, key=KEY, on_report=lambda progress: states.append(progress.state))
+    like = init(COLD, tiny_scans, key=jax.random.key(0))
+    for number, state in enumerate(states[:-1]):
+        folder = tmp_path / str(number)
+        Checkpoints(folder).save(int(state.step), state)
+        restored = Checkpoints(folder).restore_latest(like, fallback=None)
+        jax.tree.map(np.testing.assert_array_equal, restored, state)
+    resumed = fit(COLD, tiny_scans, key=KEY, start=restored)
+    jax.tree.map(np.testing.assert_array_equal, resumed.state, states[-1])
+
+
+def test_several_planar_starts_end_as_one(tiny_scans) -> None:
+    done = fit(COLD, tiny_scans, key=KEY, num_starts=2)
+    assert done.poses.shape == (20, 3)
+    assert np.isfinite(done.report.loss)
 
 
 def test_a_checkpoint_that_was_cut_off_is_passed_over(tmp_path, caplog) -> None:
     checkpoints, fallback = Checkpoints(tmp_path / "checkpoints"), {"x": jnp.zeros(3)}
     assert checkpoints.restore_latest(fallback, fallback=fallback) is fallback
-    for step in (1, 2, 3):
-        checkpoints.save(step, {"x": jnp.full(3, float(step))})
+    for number in (1, 2, 3):
+        checkpoints.save(number, {"x": jnp.full(3, float(number))})
     kept = sorted(path.name for path in (tmp_path / "checkpoints").iterdir() if path.name.isdigit())
     assert kept == ["2", "3"]
     np.testing.assert_array_equal(checkpoints.restore_latest(fallback, fallback=fallback)["x"], 3.0)
@@ -134,85 +222,9 @@ def test_a_checkpoint_that_was_cut_off_is_passed_over(tmp_path, caplog) -> None:
     assert "checkpoint 3 cannot be read" in caplog.text
 
 
-def test_the_paper_preset_steps_on_a_tiny_set(tiny_scans) -> None:
-    config = dm.with_steps(dm.preset("paper"), 1)
-    (phase,) = config.cold_phases
-    assert (phase.num_free, phase.is_free_factor_shared, phase.occupancy_weight, phase.num_offsets) == (
-        19,
-        True,
-        0.1,
-        3,
-    )
-    few = ScanSet(tiny_scans.points[:4, ::4], tiny_scans.mask[:4, ::4])
-    state = dm.init(KEY, few, config)
-    after, report = dm.make_step(few, config, phase)(state, key=KEY)
-    assert float(report.loss) > 0.0
-    for name in ("localization", "occupancy"):
-        moved = [
-            not np.array_equal(a, b)
-            for a, b in zip(*(jax.tree.leaves(getattr(s.params, name)) for s in (state, after)), strict=True)
-        ]
-        assert any(moved)
-    np.testing.assert_array_equal(state.params.poses, after.params.poses)
-
-
-def test_every_scan_is_in_some_batch_of_the_published_order() -> None:
-    scans = ScanSet(jnp.zeros((11, 4, 2)), jnp.ones((11, 4), bool))
-    phase = replace(dm.preset("paper").cold_phases[0], scans_per_step=4)
-    rows = [np.asarray(_draw_batch(scans, phase, jnp.int32(k), key=KEY).rows) for k in range(3)]
-    assert set(np.concatenate(rows).tolist()) == set(range(11))
-    assert all((np.diff(r) == 1).all() for r in rows)
-
-
-def test_masked_beams_never_matter(tiny_scans) -> None:
-    mask = tiny_scans.mask & (jax.random.uniform(KEY, tiny_scans.mask.shape) < 0.8)
-    scans = [
-        dm.as_scan_set(ScanSet(jnp.where(mask[..., None], tiny_scans.points, filling), mask))
-        for filling in (0.0, 1e6, np.nan)
-    ]
-    assert_same(scans[0], scans[1])
-    assert_same(scans[0], scans[2])
-    assert dm.measure_reach(scans[0]) == pytest.approx(1.0, rel=0.1)
-
-
-def test_beams_that_are_zero_or_not_finite_are_masked() -> None:
-    points = np.ones((3, 5, 2))
-    points[0, 1], points[1, 2] = 0.0, [np.nan, 1.0]
-    scans = dm.as_scan_set(points)
-    assert np.argwhere(~np.asarray(scans.mask)).tolist() == [[0, 1], [1, 2]]
-    assert np.isfinite(scans.points).all()
-
-
-@pytest.mark.parametrize(
-    ("scans", "options", "message"),
-    [
-        (np.ones((4, 5)), {}, "scans: expected shape"),
-        (np.ones((4, 5, 3)), {}, "scans: expected shape"),
-        (np.ones((1, 5, 2)), {}, "scans: expected at least 2"),
-        (np.stack([np.ones((5, 2)), np.zeros((5, 2))]), {}, "scan 1 has no valid beam"),
-        (ScanSet(jnp.full((2, 5, 2), jnp.nan), jnp.ones((2, 5), bool)), {}, "scans: expected finite"),
-        (np.ones((2, 5, 2)), {"init": np.zeros((3, 3))}, "init: expected shape"),
-        (np.ones((2, 5, 2)), {"init": np.full((2, 3), np.nan)}, "init: expected finite"),
-    ],
-)
-def test_bad_input_is_named(as_user, scans, options, message) -> None:
-    with pytest.raises(ValueError, match=message):
-        dm.fit_deepmapping(scans, BRIEF, key=KEY, **options)
-
-
-def test_unknown_presets_and_too_few_steps_are_refused() -> None:
-    with pytest.raises(ValueError, match="preset: expected 'fast' or 'paper'"):
-        dm.preset("quick")
-    with pytest.raises(ValueError, match="steps: expected at least one"):
-        dm.with_steps(dm.preset("fast"), 1)
-
-
-@pytest.mark.parametrize(("num_steps", "expected"), [(60, 60), (20, 20), (61, 63), (25, 25)])
-def test_calls_of_a_step_share_the_steps_of_the_phase(num_steps: int, expected: int) -> None:
-    config = dm.with_steps(dm.preset("fast"), num_steps)
-    length = steps_per_call(config, config.warm_phases[0])
-    assert length * -(-num_steps // length) == expected
-
-
-def test_scans_without_an_order_get_a_pointnet() -> None:
-    assert dm.preset("fast", is_organised=False).localization.kind == "point"
+@pytest.mark.parametrize(("furthest", "expected"), [(1, {1}), (2, {1, 2}), (5, {1, 2, 3, 4, 5})])
+def test_drawn_offsets_are_clamped_to_what_there_is(furthest: int, expected: set[int]) -> None:
+    phase = replace(BRIEF.cold_phases[0], num_offsets=3, max_offset=8)
+    drawn = [np.asarray(draw_offsets(phase, furthest, key=jax.random.key(k))).tolist() for k in range(20)]
+    assert all(len(set(one)) == len(one) == min(3, furthest) and one[0] == 1 for one in drawn)
+    assert set(np.concatenate(drawn).tolist()) == expected

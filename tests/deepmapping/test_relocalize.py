@@ -8,10 +8,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from dpmjax.deepmapping.relocalize import shift_scan, turn_scan
 
 import dpmjax
 from dpmjax import deepmapping as dm
-from dpmjax.deepmapping.relocalize import shift_scan, turn_scan
 from dpmjax.geometry import se2
 from dpmjax.nets.localization import LocalizationConfig
 from dpmjax.nets.occupancy import OccupancyConfig

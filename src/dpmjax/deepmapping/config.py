@@ -1,17 +1,22 @@
-"""Settings of DeepMapping: what a phase of the fit optimises, with which losses, and the two presets."""
+"""Settings of DeepMapping for planar scans and depth images: the phases of a fit, the networks, the presets."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import Literal
+from typing import Literal, TypeVar
 
 from dpmjax.nets.localization import LocalizationConfig
 from dpmjax.nets.occupancy import OccupancyConfig
 
+ConfigT = TypeVar("ConfigT", bound="DeepMappingConfig")
+
+Motion = Literal["planar", "full"]
+"""Motion of a depth camera: x, z and the angle about y, as in the paper; or a twist in SE(3)."""
+
 
 @dataclass(frozen=True)
 class PhaseConfig:
-    """One phase of the fit. Lengths are in reaches: the range that nine beams in ten stay below.
+    """One phase of the fit. Lengths are in typical ranges: the range that nine beams in ten stay below.
 
     Attributes:
         name: shown in logs and pictures.
@@ -23,17 +28,20 @@ class PhaseConfig:
         map_learning_rate: of M-Net.
         adam_decay: Adam's decay rates of both moments, for poses or L-Net.
         scans_per_step: scans in a step, in blocks of neighbours in time.
-        beams_per_step: beams of each scan in a step.
-        num_offsets: each scan is compared to so many later ones.
-        max_offset: which are drawn among the next so many; the next one is always among them.
+        beams_per_step: beams, or pixels of a depth image, of each scan in a step.
+        num_offsets: number of later scans that each scan is compared to.
+        max_offset: the largest distance in time to a scan that it is compared to; the next one is always compared.
         num_free: free samples a beam, drawn between sensor and hit.
         is_free_factor_shared: one factor a sample for all beams and scans (the published program), else one each.
-        surface_distance: a further free sample in front of the hit, at about this distance at the start and at the
-            end of the phase; None: none.
+        surface_distance: distance of one more free sample from the hit, at the start and at the end of the phase;
+            None: no such sample.
         anneal_until: share of the phase after which all levels of the map are on.
         map_decay: weight of the mean square of a grid's nodes.
         chamfer_limit: larger distances count as this one in the Chamfer term, at the start and at the end of the phase,
             so that what only one scan has seen does not pull; None: no limit.
+        projection_tolerance: for depth images. Images are compared by projection instead of by the Chamfer distance:
+            share of the depth by which matching points may differ, at the start and at the end of the phase. The
+            images after the last are then the first ones, so that any two can meet. None: Chamfer distance.
     """
 
     name: str
@@ -54,6 +62,7 @@ class PhaseConfig:
     anneal_until: float = 0.0
     map_decay: float = 0.0
     chamfer_limit: tuple[float, float] | None = None
+    projection_tolerance: tuple[float, float] | None = None
 
     def __post_init__(self) -> None:
         if not 0.0 <= self.occupancy_weight <= 1.0:
@@ -108,17 +117,59 @@ JOINT = PhaseConfig(
 """The paper: 3000 epochs of two batches for 256 scans, all beams, 19 free samples, gamma 0.1, windows of 4 scans."""
 
 
+LOCALIZE_DEPTH = replace(LOCALIZE, num_steps=400, learning_rate=1e-3, beams_per_step=400, num_offsets=2, max_offset=3)
+"""Cold start of depth images."""
+
+UNROLL_DEPTH = replace(
+    LOCALIZE_DEPTH,
+    name="free poses, Chamfer",
+    poses="free",
+    num_steps=300,
+    learning_rate=1e-2,
+    final_learning_rate=0.02,
+    chamfer_limit=(0.5, 0.05),
+)
+"""The Chamfer distance pulls views of low overlap onto each other; with its falling limit, that pull vanishes."""
+
+REFINE_DEPTH = replace(
+    REFINE,
+    name="free poses and map",
+    num_steps=150,
+    occupancy_weight=0.1,
+    learning_rate=2e-3,
+    beams_per_step=200,
+    num_offsets=3,
+    max_offset=1 << 30,
+    surface_distance=(0.05, 0.01),
+    projection_tolerance=(0.05, 0.005),
+)
+"""Free poses and a map that sharpens from coarse to fine. The nearest point of another image is some centimetres beside
+the surface between its pixels, and it pulls where only one image has seen; a projection does neither."""
+
+JOINT_DEPTH = replace(
+    JOINT,
+    num_steps=3000,
+    occupancy_weight=0.9,
+    scans_per_step=256,
+    num_offsets=1,
+    max_offset=1,
+    num_free=35,
+)
+"""The paper: all pixels, 35 free samples a ray, gamma 0.9, windows of 2."""
+
+
 @dataclass(frozen=True)
 class DeepMappingConfig:
-    """Settings of the whole fit.
+    """Settings of the fit of planar scans.
 
     Attributes:
         cold_phases: phases from zero poses.
         warm_phases: phases from given poses.
         localization: shape of L-Net.
         occupancy: shape of M-Net.
-        steps_per_call: at most so many steps are compiled into one call.
-        map_margin: the map's square is so many times larger than what the scans cover at the start of a phase.
+        steps_per_call: the largest number of steps that are compiled into one call.
+        map_margin: side of the map over the extent of the scans at the start of a phase.
+        halve_at: shares of the first phase at which the worse half of several starts is dropped.
     """
 
     cold_phases: tuple[PhaseConfig, ...] = (LOCALIZE, REFINE)
@@ -131,17 +182,46 @@ class DeepMappingConfig:
     occupancy: OccupancyConfig = field(default_factory=lambda: OccupancyConfig(kind="grid"))
     steps_per_call: int = 25
     map_margin: float = 1.15
+    halve_at: tuple[float, ...] = (0.25, 0.5, 0.75)
 
     def phases(self, *, is_warm: bool) -> tuple[PhaseConfig, ...]:
-        """The phases of a start."""
+        """The phases of a fit.
+
+        Args:
+            is_warm: the fit starts from given poses.
+
+        Returns:
+            The phases in order.
+        """
         return self.warm_phases if is_warm else self.cold_phases
+
+
+@dataclass(frozen=True)
+class DepthMappingConfig(DeepMappingConfig):
+    """Settings of the fit of depth images; attributes as in DeepMappingConfig.
+
+    Attributes:
+        motion: degrees of freedom of the camera.
+    """
+
+    cold_phases: tuple[PhaseConfig, ...] = (LOCALIZE_DEPTH, UNROLL_DEPTH, REFINE_DEPTH)
+    warm_phases: tuple[PhaseConfig, ...] = (REFINE_DEPTH,)
+    localization: LocalizationConfig = field(
+        default_factory=lambda: LocalizationConfig(features=(32, 64, 128), strides=(2, 2, 1), hidden=(128, 64))
+    )
+    occupancy: OccupancyConfig = field(
+        default_factory=lambda: OccupancyConfig(kind="grid", resolutions=(8, 16, 32, 64))
+    )
+    steps_per_call: int = 50
+    map_margin: float = 1.2
+    motion: Motion = "planar"
 
 
 def preset(name: Literal["fast", "paper"], *, is_organised: bool = True) -> DeepMappingConfig:
     """The settings of a preset.
 
     Args:
-        name: "fast" (minutes on two cores) or "paper" (its architecture, losses and sampling).
+        name: "fast" (a minute on two cores) or "paper" (its architecture, losses and sampling).
         is_organised: the beams are in order; else L-Net is a PointNet.
 
     Returns:
@@ -150,25 +230,77 @@ def preset(name: Literal["fast", "paper"], *, is_organised: bool = True) -> Deep
     Raises:
         ValueError: the name is unknown.
     """
-    if name == "fast":
-        config = DeepMappingConfig()
-    elif name == "paper":
-        config = DeepMappingConfig(
-            cold_phases=(JOINT,),
-            warm_phases=(JOINT,),
-            localization=LocalizationConfig(),
-            occupancy=OccupancyConfig(),
-            steps_per_call=1,
+    _check_preset(name)
+    config = DeepMappingConfig()
+    if name == "paper":
+        config = replace(
+            _with_phase(config, JOINT), localization=LocalizationConfig(), occupancy=OccupancyConfig(), steps_per_call=1
         )
-    else:
-        raise ValueError(f"preset: expected 'fast' or 'paper', got {name!r}")
     if not is_organised:
         config = replace(config, localization=replace(config.localization, kind="point"))
     return config
 
 
-def with_steps(config: DeepMappingConfig, num_steps: int) -> DeepMappingConfig:
-    """The same settings with so many steps in all, divided among the phases as before.
+def depth_preset(name: Literal["fast", "paper"], *, motion: Motion = "planar") -> DepthMappingConfig:
+    """The settings of a preset for depth images.
+
+    Args:
+        name: "fast" (seconds to a minute on two cores) or "paper" (its networks and sampling).
+        motion: degrees of freedom of the camera.
+
+    Returns:
+        The settings.
+
+    Raises:
+        ValueError: the name is unknown.
+    """
+    _check_preset(name)
+    config = DepthMappingConfig(motion=motion)
+    if name == "paper":
+        localization = LocalizationConfig(features=(64, 128, 256, 1024), strides=(1, 1, 1, 1))
+        config = _with_phase(config, JOINT_DEPTH)
+        return replace(config, localization=localization, occupancy=OccupancyConfig(), steps_per_call=1)
+    if motion == "planar":
+        return config
+    # Real depth images in SE(3) do not agree to half a percent of the depth, and their first poses are rougher.
+    refine = replace(REFINE_DEPTH, projection_tolerance=(0.1, 0.02))
+    return replace(config, cold_phases=(*config.cold_phases[:-1], refine), warm_phases=(refine,))
+
+
+def _with_phase(config: ConfigT, phase: PhaseConfig) -> ConfigT:
+    return replace(config, cold_phases=(phase,), warm_phases=(phase,))
+
+
+def _check_preset(name: str) -> None:
+    if name not in ("fast", "paper"):
+        raise ValueError(f"preset: expected 'fast' or 'paper', got {name!r}")
+
+
+def as_direct(config: ConfigT) -> ConfigT:
+    """The paper's baseline: the same losses and steps, but the poses themselves are optimised, never L-Net.
+
+    Args:
+        config: settings of a fit.
+
+    Returns:
+        The settings with free poses in every phase.
+    """
+
+    def free(phases: tuple[PhaseConfig, ...]) -> tuple[PhaseConfig, ...]:
+        return tuple(replace(phase, poses="free") for phase in phases)
+
+    return replace(config, cold_phases=free(config.cold_phases), warm_phases=free(config.warm_phases))
+
+
+def with_steps(config: ConfigT, num_steps: int) -> ConfigT:
+    """The same settings with another number of steps, divided among the phases as before.
+
+    Args:
+        config: settings of a fit.
+        num_steps: steps of all phases together.
+
+    Returns:
+        The settings.
 
     Raises:
         ValueError: there are fewer steps than phases.

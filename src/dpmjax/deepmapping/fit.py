@@ -1,13 +1,15 @@
-"""Training as registration: `init` a state, `step` it through a phase, go to the next; `fit_deepmapping` does it all.
+"""The engine: `init` a state, `step` it, `fit` to the end. Training a problem's parameters is the registration.
 
-The state is one pytree of arrays, so that a run can be written to disk after any call and go on exactly.
+A state is one pytree of arrays: written to disk after any call, it goes on exactly. The data are arguments of the
+compiled step, so that another set of the same shape compiles nothing. Several starts are one more leading axis.
 """
 
 from __future__ import annotations
 
-from collections import deque
-from collections.abc import Callable, Iterator
+import time
+from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from typing import Any, NamedTuple
 
 import flax.struct
@@ -16,327 +18,297 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 from jaxtyping import Array, Float, Int
-from numpy.typing import ArrayLike, NDArray
 
-from dpmjax.deepmapping.config import DeepMappingConfig, PhaseConfig
-from dpmjax.deepmapping.objective import Batch, MapLogits, Terms, registration_loss, to_world
-from dpmjax.deepmapping.stepping import MapFrame, Params, bind_map, level_weights, make_optimizer, steps_per_call
-from dpmjax.geometry import se2
-from dpmjax.nets.localization import LocalizationNet
-from dpmjax.nets.occupancy import init_map_net
-from dpmjax.types import ScanSet
-
-# Scans that are drawn together where a set is too large for one step.
-_BLOCK = 32
+from dpmjax.deepmapping.problem import Problem
 
 
 @flax.struct.dataclass
-class State:
-    """Everything that a fit needs to go on.
+class FitState:
+    """Everything that a fit needs to go on; of several starts every leaf has a leading axis.
 
     Attributes:
-        params: networks and poses.
-        optimizer: Adam's moments.
-        start_poses: (n, 3) poses that L-Net's outputs are relative to.
-        frame: of the map.
+        params: what the problem trains.
+        optimizer: state of the optimiser.
+        key: of the start; step k uses `fold_in(key, k)`, so that a resumed run equals an unbroken one.
         phase: index of the phase.
         phase_step: steps done in it.
         step: steps done in all.
     """
 
-    params: Params
+    params: Any
     optimizer: Any
-    start_poses: Float[Array, "n 3"]
-    frame: MapFrame
-    phase: Int[Array, ""]
-    phase_step: Int[Array, ""]
-    step: Int[Array, ""]
+    key: Array
+    phase: Int[Array, "*starts"]
+    phase_step: Int[Array, "*starts"]
+    step: Int[Array, "*starts"]
 
 
 class Report(NamedTuple):
-    """What one call of `step` says.
+    """Result of one call of the step; of several starts every leaf has a leading axis.
 
     Attributes:
-        loss: mean over the steps of the call.
-        terms: its parts before weighting, likewise.
-        poses: (n, 3) poses after the call, in reaches and radians.
+        losses: of each step of the call.
+        terms: parts of the loss before weighting, of each step.
+        poses: of the whole data set after the call.
     """
 
-    loss: Float[Array, ""]
-    terms: Terms
-    poses: Float[Array, "n 3"]
+    losses: Float[Array, "... t"]
+    terms: Any
+    poses: Any
+
+    @property
+    def loss(self) -> float:
+        """Mean loss of the call, of the best start."""
+        return float(np.asarray(self.losses).mean(axis=-1).min())
 
 
-class Fitted(NamedTuple):
-    """Result of `fit_deepmapping`.
+class Progress(NamedTuple):
+    """A call of the step, as `on_report` gets it.
 
     Attributes:
-        T_world_scan: (n, 3, 3) float64.
-        poses: the same as (n, 3) x, y, heading.
-        params: of L-Net and M-Net.
-        report: of the last step.
-        state: to continue or to draw the map from.
-        reach: the length that the state counts in, unit of the points.
-        config: settings of the fit.
+        phase: settings of the phase.
+        state: after the call.
+        report: of the call.
+        share: steps done of all steps, 0 to 1.
+        run_s: seconds of stepping so far, of this `fit`.
+        compile_s: seconds of compiling so far.
     """
 
-    T_world_scan: NDArray[np.float64]
-    poses: NDArray[np.float64]
-    params: Params
+    phase: Any
+    state: FitState
     report: Report
-    state: State
-    reach: float
-    config: DeepMappingConfig
+    share: float
+    run_s: float
+    compile_s: float
 
 
-def as_scan_set(scans: ScanSet | ArrayLike) -> ScanSet:
-    """Scans from an array (n, b, 2); beams with coordinates that are not finite, or both zero, measured nothing.
+class Fit(NamedTuple):
+    """Result of `fit`.
+
+    Attributes:
+        state: at the end, or where it was stopped.
+        poses: of the whole data set, as the state has them.
+        report: of the last call; None if no step was done.
+        run_s: seconds of stepping.
+        compile_s: seconds of compiling.
+    """
+
+    state: FitState
+    poses: Any
+    report: Report | None
+    run_s: float
+    compile_s: float
+
+
+def init(problem: Problem, data: Any, *, key: jax.Array, start: Any = None, num_starts: int = 1) -> FitState:
+    """A fresh state at the start of the first phase.
+
+    Args:
+        problem: what to fit.
+        data: of the problem.
+        key: of the run.
+        start: poses to start from, as the problem takes them; None: cold start.
+        num_starts: number of starts that differ in their keys; with 1, there is no leading axis.
+
+    Returns:
+        The state.
 
     Raises:
-        ValueError: the shape is not (n, b, 2), there are fewer than two scans, a scan has no valid beam, or what the
-            mask of a ScanSet calls valid is not finite.
+        ValueError: there is no start.
     """
-    if not isinstance(scans, ScanSet):
-        points = np.asarray(scans, np.float32)
-        if points.ndim != 3 or points.shape[-1] != 2:
-            raise ValueError(f"scans: expected shape (n, b, 2), got {points.shape}")
-        mask = np.isfinite(points).all(-1) & (np.abs(points).sum(-1) > 0)
-        scans = ScanSet(points=jnp.asarray(np.where(mask[..., None], points, 0.0)), mask=jnp.asarray(mask))
-    if scans.points.shape[0] < 2:
-        raise ValueError(f"scans: expected at least 2, got {scans.points.shape[0]}")
-    empty = np.flatnonzero(~np.asarray(scans.mask).any(-1))
-    if len(empty):
-        raise ValueError(f"scans: scan {empty[0]} has no valid beam; leave it out ({len(empty)} such scans)")
-    mask = jnp.asarray(scans.mask, bool)
-    clean = jnp.where(mask[..., None], jnp.asarray(scans.points, jnp.float32), 0.0)
-    if not bool(jnp.isfinite(clean).all()):
-        raise ValueError("scans: expected finite coordinates where the mask is True")
-    return ScanSet(points=clean, mask=mask)
+    if num_starts < 1:
+        raise ValueError(f"num_starts: expected at least 1, got {num_starts}")
+    if num_starts == 1:
+        return _init(problem, data, key, start)
+    return _init_all(problem, data, jax.random.split(key, num_starts), start)
 
 
-def measure_reach(scans: ScanSet) -> float:
-    """The unit of length of the fit: the range that nine beams in ten stay below, median over the scans."""
-    ranges = np.linalg.norm(np.asarray(scans.points), axis=-1)
-    return float(np.median([np.percentile(r[m], 90) for r, m in zip(ranges, np.asarray(scans.mask), strict=True)]))
-
-
-def _choose_frame(scans: ScanSet, poses: Float[Array, "n 3"], config: DeepMappingConfig) -> MapFrame:
-    """The square that the scans cover at these poses, with a margin."""
-    if config.occupancy.kind == "mlp":
-        return MapFrame(centre=jnp.zeros(2), half_side=jnp.ones(()))
-    world = to_world(poses, scans.points)
-    low = jnp.min(jnp.where(scans.mask[..., None], world, jnp.inf), axis=(0, 1))
-    high = jnp.max(jnp.where(scans.mask[..., None], world, -jnp.inf), axis=(0, 1))
-    return MapFrame(centre=0.5 * (low + high), half_side=0.5 * config.map_margin * jnp.max(high - low))
-
-
-def init(
-    key: jax.Array, scans: ScanSet, config: DeepMappingConfig, *, start_poses: Float[Array, "n 3"] | None = None
-) -> State:
-    """A fresh state.
+def step(problem: Problem, state: FitState, data: Any) -> tuple[FitState, Report]:
+    """Does one call of steps, and enters the next phase first where one is over.
 
     Args:
-        key: for the weights of both networks.
-        scans: in reaches.
-        config: settings; a start from given poses runs `config.warm_phases`.
-        start_poses: (n, 3) in reaches and radians; None: cold start from zero.
+        problem: what to fit.
+        state: from `init` or from an earlier call.
+        data: of the problem.
 
     Returns:
-        The state at the start of the first phase.
+        The state after the call, and its report.
     """
-    net_key, map_key = jax.random.split(key)
-    net = LocalizationNet(config.localization)
-    num_scans = scans.mask.shape[0]
-    poses = jnp.zeros((num_scans, 3)) if start_poses is None else jnp.asarray(start_poses, jnp.float32)
-    phase = config.phases(is_warm=start_poses is not None)[0]
-    params = Params(
-        localization=net.init(net_key, scans.points[0], scans.mask[0]),
-        poses=poses,
-        occupancy=init_map_net(config.occupancy, key=map_key),
-    )
-    zero = jnp.zeros((), jnp.int32)
-    frame = _choose_frame(scans, poses, config)
-    return State(params, make_optimizer(phase).init(params), poses, frame, zero, zero, zero)
+    state = _enter_phase(problem, state, data)
+    return _advance(problem, _scalar(state.phase), state, data)
 
 
-# `fit_deepmapping` has an argument of the name `init`, as `icp` has: the start of a registration.
-_init_state = init
-
-
-def next_phase(state: State, scans: ScanSet, config: DeepMappingConfig, *, is_warm: bool) -> State:
-    """The state at the start of the next phase: free poses take over where L-Net is, in a map frame around them."""
-    phases = config.phases(is_warm=is_warm)
-    poses = current_poses(state, scans, config, phases[int(state.phase)])
-    params = replace(state.params, poses=poses)
-    optimizer = make_optimizer(phases[int(state.phase) + 1]).init(params)
-    frame = _choose_frame(scans, poses, config)
-    zero = jnp.zeros((), jnp.int32)
-    return State(params, optimizer, state.start_poses, frame, state.phase + 1, zero, state.step)
-
-
-def _network_poses(params: Params, start: Float[Array, "m 3"], batch: Batch, config: DeepMappingConfig) -> Array:
-    net = LocalizationNet(config.localization)
-    outputs = jax.vmap(net.apply, in_axes=(None, 0, 0))(params.localization, batch.points, batch.mask)
-    return se2.compose(start, outputs)
-
-
-def current_poses(state: State, scans: ScanSet, config: DeepMappingConfig, phase: PhaseConfig) -> Float[Array, "n 3"]:
-    """Poses of all scans as the state has them; L-Net sees the same number of beams as in training."""
-    if phase.poses == "free":
-        return state.params.poses
-    beams = _choose_beams(scans.mask.shape[1], phase, jnp.zeros((), jnp.int32))
-    rows = jnp.arange(scans.mask.shape[0])
-    batch = Batch(scans.points[:, beams], scans.mask[:, beams], rows, jnp.zeros_like(rows))
-    return _network_poses(state.params, state.start_poses, batch, config)
-
-
-def _choose_beams(num_beams: int, phase: PhaseConfig, offset: Int[Array, ""]) -> Int[Array, " c"]:
-    stride = max(1, -(-num_beams // phase.beams_per_step))
-    return offset % stride + stride * jnp.arange(num_beams // stride)
-
-
-def _draw_batch(scans: ScanSet, phase: PhaseConfig, step: Int[Array, ""], *, key: jax.Array) -> Batch:
-    """All scans where they are few enough, else blocks of neighbours in time; beams from a random first one on."""
-    beam_key, scan_key = jax.random.split(key)
-    num_scans, num_beams = scans.mask.shape
-    beams = _choose_beams(num_beams, phase, jax.random.randint(beam_key, (), 0, num_beams))
-    if num_scans <= phase.scans_per_step:
-        rows, block = jnp.arange(num_scans), jnp.zeros(num_scans, jnp.int32)
-    elif phase.is_free_factor_shared:
-        # The published order: batches follow each other in time, none is mixed.
-        # The last one reaches back, so that it is as long as the others and no scan is left out.
-        first = step % -(-num_scans // phase.scans_per_step) * phase.scans_per_step
-        first = jnp.minimum(first, num_scans - phase.scans_per_step)
-        rows, block = first + jnp.arange(phase.scans_per_step), jnp.zeros(phase.scans_per_step, jnp.int32)
-    else:
-        num_blocks = phase.scans_per_step // _BLOCK
-        first = jax.random.randint(scan_key, (num_blocks, 1), 0, num_scans - _BLOCK + 1)
-        rows, block = (first + jnp.arange(_BLOCK)).reshape(-1), jnp.repeat(jnp.arange(num_blocks), _BLOCK)
-    return Batch(scans.points[rows][:, beams], scans.mask[rows][:, beams], rows, block)
-
-
-def map_logits(state: State, config: DeepMappingConfig) -> MapLogits:
-    """M-Net of a state with all its levels on, as a function of points in the world, in reaches."""
-    return bind_map(state.params.occupancy, config.occupancy, state.frame, jnp.ones(config.occupancy.num_levels))
-
-
-def make_step(scans: ScanSet, config: DeepMappingConfig, phase: PhaseConfig) -> Callable[..., tuple[State, Report]]:
-    """The compiled step of one phase: `state, report = step(state, key=key)` does `steps_per_call` steps.
+def is_finished(problem: Problem, state: FitState) -> bool:
+    """Whether all steps of the last phase are done.
 
     Args:
-        scans: all scans, in reaches.
-        config: settings of the fit.
-        phase: the phase that the state is in.
+        problem: what is fitted.
+        state: of the fit.
 
     Returns:
-        The function. The key is that of the whole run: step k uses `fold_in(key, k)`, so that a resumed run equals an
-        unbroken one.
+        True if no step is left.
     """
-    optimizer = make_optimizer(phase)
-    length = steps_per_call(config, phase)
-
-    def loss_of(params: Params, state: State, key: jax.Array) -> tuple[Float[Array, ""], Terms]:
-        batch_key, loss_key = jax.random.split(key)
-        batch = _draw_batch(scans, phase, state.phase_step, key=batch_key)
-        progress = state.phase_step / phase.num_steps
-        if phase.poses == "network":
-            poses = _network_poses(params, state.start_poses[batch.rows], batch, config)
-        else:
-            poses = params.poses[batch.rows]
-        logits = bind_map(params.occupancy, config.occupancy, state.frame, level_weights(phase, config, progress))
-        loss, terms = registration_loss(poses, batch, logits, phase, progress, key=loss_key)
-        if phase.map_decay > 0.0:
-            squares = sum(jnp.sum(x**2) for x in jax.tree.leaves(params.occupancy))
-            loss += phase.map_decay * squares / batch.mask.size
-        return loss, terms
-
-    def one_step(state: State, key: jax.Array) -> tuple[State, tuple[Array, Terms]]:
-        (loss, terms), gradient = jax.value_and_grad(loss_of, has_aux=True)(
-            state.params, state, jax.random.fold_in(key, state.step)
-        )
-        updates, optimizer_state = optimizer.update(gradient, state.optimizer, state.params)
-        params = optax.apply_updates(state.params, updates)
-        state = replace(
-            state, params=params, optimizer=optimizer_state, phase_step=state.phase_step + 1, step=state.step + 1
-        )
-        return state, (loss, terms)
-
-    @jax.jit
-    def step(state: State, *, key: jax.Array) -> tuple[State, Report]:
-        state, (losses, terms) = jax.lax.scan(lambda s, _: one_step(s, key), state, None, length=length)
-        poses = current_poses(state, scans, config, phase)
-        return state, Report(losses.mean(), jax.tree.map(jnp.mean, terms), poses)
-
-    return step
+    phase = _scalar(state.phase)
+    return phase == len(problem.phases) - 1 and _scalar(state.phase_step) >= problem.phases[phase].num_steps
 
 
-def run_phases(
-    scans: ScanSet, config: DeepMappingConfig, state: State, *, key: jax.Array, is_warm: bool
-) -> Iterator[tuple[PhaseConfig, State, Report]]:
-    """Steps a state through all phases that are left, and hands out every report.
-
-    Args:
-        scans: in reaches.
-        config: settings.
-        state: from `init`, or from where an earlier run stopped.
-        key: of the run.
-        is_warm: the run began from given poses.
-
-    Yields:
-        The phase, the state and the report after each call of the step.
-    """
-    phases = config.phases(is_warm=is_warm)
-    while True:
-        phase = phases[int(state.phase)]
-        step = make_step(scans, config, phase)
-        while int(state.phase_step) < phase.num_steps:
-            state, report = step(state, key=key)
-            yield phase, state, report
-        if int(state.phase) + 1 == len(phases):
-            return
-        state = next_phase(state, scans, config, is_warm=is_warm)
-
-
-def fit_deepmapping(
-    scans: ScanSet | ArrayLike,
-    config: DeepMappingConfig | None = None,
+def fit(
+    problem: Problem,
+    data: Any,
     *,
     key: jax.Array,
-    init: NDArray[np.float64] | None = None,
-) -> Fitted:
-    """Registers planar scans by optimising L-Net and M-Net on them alone (DeepMapping eq. 6).
+    start: Any = None,
+    num_starts: int = 1,
+    on_report: Callable[[Progress], None] | None = None,
+    stop: Callable[[], bool] | None = None,
+) -> Fit:
+    """Steps a state through all phases that are left.
+
+    Of several starts, the worse half by the loss is dropped at `problem.halve_at`, and the best one is kept at the end
+    of the fit. A problem without `halve_at` keeps all of them to the end.
 
     Args:
-        scans: (n, b, 2) in the sensor frames, any unit; all-zero or non-finite beams are left out. Or a ScanSet.
-        config: settings; None: `preset("fast")`.
-        key: of the whole run.
-        init: (n, 3) x, y, heading or (n, 3, 3) matrices to start from; None: cold start from zero.
+        problem: what to fit.
+        data: of the problem.
+        key: of the run.
+        start: poses to start from, None for a cold start, or a FitState to go on from.
+        num_starts: number of starts that advance side by side.
+        on_report: called after each call of the step.
+        stop: called before each call of the step; the fit ends where it returns True.
 
     Returns:
-        Fitted, poses in the unit of the points. The world is that of `init`, or arbitrary after a cold start.
-
-    Raises:
-        ValueError: the scans or the poses have a wrong shape or are not finite, or a scan has no valid beam.
+        Fit.
     """
-    config = config or DeepMappingConfig()
-    scans = as_scan_set(scans)
-    reach = measure_reach(scans)
-    scaled = replace(scans, points=scans.points / reach)
-    unit = np.array([reach, reach, 1.0])
-    start = None if init is None else _as_planar(init, scans.mask.shape[0]) / unit
-    state = _init_state(key, scaled, config, start_poses=start)
-    # One at a time: a list of all states would hold every map that there ever was.
-    ((_, state, report),) = deque(run_phases(scaled, config, state, key=key, is_warm=start is not None), maxlen=1)
-    poses = np.asarray(report.poses, np.float64) * unit
-    return Fitted(se2.to_matrix(poses), poses, state.params, report, state, reach, config)
+    state = start if isinstance(start, FitState) else init(problem, data, key=key, start=start, num_starts=num_starts)
+    total = sum(phase.num_steps for phase in problem.phases)
+    run_s = compile_s = 0.0
+    report = program = None
+    while not is_finished(problem, state) and not (stop is not None and stop()):
+        begun = time.perf_counter()
+        if program is None or _is_phase_over(problem, state):
+            state = _enter_phase(problem, state, data)
+            program = _advance.lower(problem, _scalar(state.phase), state, data).compile()
+            compile_s += time.perf_counter() - begun
+            begun = time.perf_counter()
+        before = _scalar(state.step)
+        state, report = jax.block_until_ready(program(state, data))
+        run_s += time.perf_counter() - begun
+        if on_report is not None:
+            share = min(1.0, _scalar(state.step) / total)
+            phase = problem.phases[_scalar(state.phase)]
+            on_report(Progress(phase, state, report, share, run_s, compile_s))
+        if num_kept := _num_kept(problem, state, before):
+            state, report = _keep_best(state, report, num_kept)
+            program = None
+    return Fit(state, _current_poses(problem, _scalar(state.phase), state, data), report, run_s, compile_s)
 
 
-def _as_planar(poses: NDArray[np.float64], num_scans: int) -> NDArray[np.float64]:
-    poses = np.asarray(poses, np.float64)
-    if not np.isfinite(poses).all():
-        raise ValueError("init: expected finite poses")
-    if poses.shape == (num_scans, 3, 3):
-        return np.stack([poses[:, 0, 2], poses[:, 1, 2], np.arctan2(poses[:, 1, 0], poses[:, 0, 0])], axis=-1)
-    if poses.shape != (num_scans, 3):
-        raise ValueError(f"init: expected shape ({num_scans}, 3) or ({num_scans}, 3, 3), got {poses.shape}")
-    return poses
+def _scalar(count: Array) -> int:
+    """A counter, which is the same for all starts."""
+    return int(np.asarray(count).reshape(-1)[0])
+
+
+def steps_per_call(problem: Problem, phase: Any) -> int:
+    """Steps of one call: the calls share those of the phase evenly, so that the last one hardly goes beyond.
+
+    Args:
+        problem: what is fitted.
+        phase: of the fit.
+
+    Returns:
+        The number of steps.
+    """
+    num_calls = -(-phase.num_steps // problem.steps_per_call)
+    return -(-phase.num_steps // num_calls)
+
+
+@partial(jax.jit, static_argnums=0)
+def _init(problem: Problem, data: Any, key: Array, start: Any) -> FitState:
+    params = problem.init(problem.config, key, data, start)
+    moments = problem.optimizer(problem.config, problem.phases[0]).init(params)
+    zero = jnp.zeros((), jnp.int32)
+    return FitState(params, moments, jax.random.key_data(key), zero, zero, zero)
+
+
+@partial(jax.jit, static_argnums=0)
+def _init_all(problem: Problem, data: Any, keys: Array, start: Any) -> FitState:
+    return jax.vmap(lambda key: _init(problem, data, key, start))(keys)
+
+
+def _is_phase_over(problem: Problem, state: FitState) -> bool:
+    return _scalar(state.phase_step) >= problem.phases[_scalar(state.phase)].num_steps
+
+
+def _enter_phase(problem: Problem, state: FitState, data: Any) -> FitState:
+    """The state at the start of the next phase if its phase is over and not the last; else the same state."""
+    phase = _scalar(state.phase)
+    if phase + 1 == len(problem.phases) or not _is_phase_over(problem, state):
+        return state
+    return _begin_next_phase(problem, phase, state, data)
+
+
+def _over_starts(function: Callable[..., Any], state: FitState, data: Any) -> Any:
+    """The function of one state, or of all starts side by side."""
+    return jax.vmap(function, in_axes=(0, None))(state, data) if state.step.ndim else function(state, data)
+
+
+@partial(jax.jit, static_argnums=(0, 1))
+def _begin_next_phase(problem: Problem, phase: int, state: FitState, data: Any) -> FitState:
+    def begin(state: FitState, data: Any) -> FitState:
+        params = problem.next_phase(problem.config, problem.phases[phase], state.params, data)
+        moments = problem.optimizer(problem.config, problem.phases[phase + 1]).init(params)
+        return replace(
+            state, params=params, optimizer=moments, phase=state.phase + 1, phase_step=jnp.zeros_like(state.phase_step)
+        )
+
+    return _over_starts(begin, state, data)
+
+
+@partial(jax.jit, static_argnums=(0, 1))
+def _current_poses(problem: Problem, phase: int, state: FitState, data: Any) -> Any:
+    return _over_starts(lambda s, d: problem.poses(problem.config, problem.phases[phase], s.params, d), state, data)
+
+
+@partial(jax.jit, static_argnums=(0, 1))
+def _advance(problem: Problem, phase_index: int, state: FitState, data: Any) -> tuple[FitState, Report]:
+    """One call of steps of a phase."""
+    phase = problem.phases[phase_index]
+    optimizer = problem.optimizer(problem.config, phase)
+
+    def one_step(state: FitState, data: Any) -> tuple[FitState, tuple[Array, Any]]:
+        key = jax.random.fold_in(jax.random.wrap_key_data(state.key), state.step)
+
+        def loss_of(params: Any) -> tuple[Array, Any]:
+            return problem.loss(problem.config, phase, params, data, state.phase_step, key)
+
+        (loss, terms), gradient = jax.value_and_grad(loss_of, has_aux=True)(state.params)
+        updates, moments = optimizer.update(gradient, state.optimizer, state.params)
+        params = optax.apply_updates(state.params, updates)
+        state = replace(state, params=params, optimizer=moments, phase_step=state.phase_step + 1, step=state.step + 1)
+        return state, (loss, terms)
+
+    def call(state: FitState, data: Any) -> tuple[FitState, Report]:
+        length = steps_per_call(problem, phase)
+        state, (losses, terms) = jax.lax.scan(lambda s, _: one_step(s, data), state, None, length=length)
+        return state, Report(losses, terms, problem.poses(problem.config, phase, state.params, data))
+
+    return _over_starts(call, state, data)
+
+
+def _num_kept(problem: Problem, state: FitState, steps_before: int) -> int:
+    """Number of starts to go on with where some are to be dropped; else 0."""
+    num_starts = state.step.size
+    if num_starts == 1 or not problem.halve_at:
+        return 0
+    if is_finished(problem, state):
+        return 1
+    steps, first = _scalar(state.step), problem.phases[0].num_steps
+    is_due = any(steps_before < share * first <= steps for share in problem.halve_at)
+    return -(-num_starts // 2) if is_due else 0
+
+
+def _keep_best(state: FitState, report: Report, num_kept: int) -> tuple[FitState, Report]:
+    """The starts of the smallest mean loss of the last call; a single one loses its leading axis."""
+    losses = np.nan_to_num(np.asarray(report.losses).mean(axis=-1), nan=np.inf)
+    best = np.sort(np.argsort(losses, kind="stable")[:num_kept])
+    return jax.tree.map(lambda leaf: leaf[best[0]] if num_kept == 1 else leaf[best], (state, report))

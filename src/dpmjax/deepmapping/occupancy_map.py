@@ -8,8 +8,8 @@ import jax
 import numpy as np
 from numpy.typing import NDArray
 
-from dpmjax.deepmapping.config import DeepMappingConfig
-from dpmjax.deepmapping.fit import State, map_logits
+from dpmjax.deepmapping.planar import Fitted
+from dpmjax.deepmapping.problem import bind_map
 from dpmjax.geometry import se2
 
 # Samples on a beam for what counts as explored.
@@ -31,29 +31,20 @@ class MapPicture(NamedTuple):
 
 
 def draw_map(
-    state: State,
-    config: DeepMappingConfig,
-    points: NDArray[np.floating],
-    mask: NDArray[np.bool_],
-    poses: NDArray[np.float64],
-    *,
-    reach: float,
-    num_cells: int = 500,
+    fitted: Fitted, points: NDArray[np.floating], mask: NDArray[np.bool_], *, num_cells: int = 500
 ) -> MapPicture:
-    """Asks M-Net everywhere that a beam has been.
+    """Evaluates M-Net wherever a beam has been.
 
     Args:
-        state: fitted.
-        config: of the fit.
-        points: (n, b, 2) in the sensor frames, any unit.
-        mask: (n, b).
-        poses: (n, 3) poses of the fit in the same unit.
-        reach: the length that the state counts in.
+        fitted: the fit.
+        points: (n, b, 2) its scans in the sensor frames, unit of the poses.
+        mask: (n, b) False for beams that measured nothing.
         num_cells: along the longer side.
 
     Returns:
-        MapPicture.
+        MapPicture in the frame of `fitted.poses`.
     """
+    poses = fitted.poses
     world = se2.transform_points(poses, points)
     hits = world[mask]
     low, high = hits.min(axis=0), hits.max(axis=0)
@@ -67,8 +58,8 @@ def draw_map(
         column, row = ((sensors + share * (hits - sensors) - low) / cell).astype(int).T
         explored[np.clip(row, 0, height - 1), np.clip(column, 0, width - 1)] = True
     x, y = low[0] + cell * (np.arange(width) + 0.5), low[1] + cell * (np.arange(height) + 0.5)
-    places = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2) / reach
-    logits = map_logits(state, config)(jax.numpy.asarray(places, jax.numpy.float32))
+    centres = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2) / fitted.unit
+    logits = bind_map(fitted.params, fitted.config)(jax.numpy.asarray(centres, jax.numpy.float32))
     probability = np.asarray(jax.nn.sigmoid(logits)).reshape(height, width)
     extent = (float(low[0]), float(low[0] + cell * width), float(low[1]), float(low[1] + cell * height))
     return MapPicture(probability, _close_gaps(explored), extent)

@@ -1,34 +1,39 @@
 """Why DeepMapping optimises a network instead of the poses, in one dimension (DeepMapping supplement D, figure 14).
 
 The same function is minimised twice by plain gradient descent from the same start: over x, and over the weights and
-the input of a network whose output is x. Everything is for one seed; `vmap` over keys.
+the input of a network whose output is x. Both are problems of the engine; many seeds are many starts.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
+import flax.struct
 import jax
 import jax.numpy as jnp
-import jaxopt
 import numpy as np
+import optax
 from jaxtyping import Array, Float
 
+from dpmjax.deepmapping.problem import Problem
 from dpmjax.nets.scalar import ScalarNet, ScalarNetConfig
 from dpmjax.types import AnyArray
 
 
 @dataclass(frozen=True)
 class ToyConfig:
-    """Settings of the example; the defaults are the paper's.
+    """Settings of the example; the defaults are the paper's. It is its own only phase.
 
     Attributes:
+        form: "network": weights and input of the network are optimised; "direct": x itself, from the network's first
+            output, so that both forms start alike.
         net: the network.
-        learning_rate: of gradient descent, in both forms.
-        num_steps: of both forms.
+        learning_rate: of gradient descent.
+        num_steps: of gradient descent.
     """
 
+    form: Literal["network", "direct"] = "network"
     net: ScalarNetConfig = field(default_factory=ScalarNetConfig)
     learning_rate: float = 2e-4
     num_steps: int = 1000
@@ -40,30 +45,19 @@ class ToyConfig:
             raise ValueError(f"num_steps: expected at least 1, got {self.num_steps}")
 
 
-class NetworkStart(NamedTuple):
-    """Where the network form starts.
+@flax.struct.dataclass
+class ToyParams:
+    """Parameters of the example.
 
     Attributes:
-        params: weights of the network.
-        z: its input, drawn from a standard normal distribution.
+        x: of the direct form.
+        net: weights of the network.
+        z: input of the network, drawn from a standard normal distribution.
     """
 
-    params: Any
+    x: Float[Array, ""]
+    net: Any
     z: Float[Array, ""]
-
-
-class Descent(NamedTuple):
-    """One descent.
-
-    Attributes:
-        x: values of x from the start to the end, num_steps + 1.
-        params: weights at the end; None in the direct form.
-        z: input of the network at the end; None in the direct form.
-    """
-
-    x: Float[Array, " t"]
-    params: Any = None
-    z: Float[Array, ""] | None = None
 
 
 def toy_loss(x: Float[AnyArray, "..."]) -> Float[Array, "..."]:
@@ -86,60 +80,72 @@ def global_minimum() -> tuple[float, float]:
     return float(best), float(0.5 * best**2 + 5.0 * np.sin(10.0 * best) + 20.0 * np.sin(best))
 
 
-def init_toy(key: jax.Array, config: ToyConfig) -> NetworkStart:
-    """Fresh weights and input."""
-    params_key, z_key = jax.random.split(key)
-    z = jax.random.normal(z_key)
-    return NetworkStart(ScalarNet(config.net).init(params_key, z), z)
+def toy_problem(config: ToyConfig) -> Problem:
+    """The example as a problem of the engine: no data (None), no start, one phase in one call.
 
-
-def network_value(start: NetworkStart, config: ToyConfig) -> Float[Array, ""]:
-    """The output f(z) = x: where the direct form starts, so that both start alike."""
-    return ScalarNet(config.net).apply(start.params, start.z)  # type: ignore[return-value]
-
-
-def descend_network(start: NetworkStart, config: ToyConfig) -> Descent:
-    """Gradient descent on weights and input of the network together."""
-
-    def loss_of(at: NetworkStart) -> tuple[Array, Array]:
-        x = network_value(at, config)
-        return toy_loss(x), x
-
-    def step(at: NetworkStart, _: None) -> tuple[NetworkStart, Array]:
-        gradient, x = jax.grad(loss_of, has_aux=True)(at)
-        return jax.tree.map(lambda value, slope: value - config.learning_rate * slope, at, gradient), x
-
-    end, x = jax.lax.scan(step, start, None, length=config.num_steps)
-    return Descent(jnp.append(x, network_value(end, config)), end.params, end.z)
-
-
-def descend_direct(x0: Float[Array, ""], config: ToyConfig) -> Descent:
-    """Gradient descent on x itself."""
-
-    def step(x: Array, _: None) -> tuple[Array, Array]:
-        return x - config.learning_rate * jax.grad(toy_loss)(x), x
-
-    end, x = jax.lax.scan(step, x0, None, length=config.num_steps)
-    return Descent(jnp.append(x, end))
-
-
-def minimize_direct(
-    x0: Float[Array, ""], method: Literal["gradient-descent", "lbfgs", "bfgs"], *, max_iterations: int = 1000
-) -> Float[Array, ""]:
-    """The direct form by a solver of jaxopt with its own line search.
+    The terms of a report are x before each step of the call; the poses are x after the call.
 
     Args:
-        x0: where to start.
-        method: "gradient-descent" (with line search and momentum), "lbfgs" or "bfgs".
-        max_iterations: at most so many.
+        config: settings.
 
     Returns:
-        Where the solver ends.
-
-    Raises:
-        ValueError: the method is unknown.
+        The problem; all starts are kept.
     """
-    solvers = {"gradient-descent": jaxopt.GradientDescent, "lbfgs": jaxopt.LBFGS, "bfgs": jaxopt.BFGS}
-    if method not in solvers:
-        raise ValueError(f"method: expected one of {', '.join(solvers)}, got {method!r}")
-    return solvers[method](fun=toy_loss, maxiter=max_iterations).run(x0).params
+    return Problem(
+        config,
+        (config,),
+        init=_init,
+        optimizer=_optimizer,
+        loss=_loss,
+        poses=_poses,
+        next_phase=_next_phase,
+        steps_per_call=config.num_steps,
+    )
+
+
+def network_value(config: ToyConfig, params: ToyParams) -> Float[Array, ""]:
+    """The output of the network f(z).
+
+    Args:
+        config: settings.
+        params: with the weights and the input of the network.
+
+    Returns:
+        x = f(z).
+    """
+    return ScalarNet(config.net).apply(params.net, params.z)  # type: ignore[return-value]
+
+
+def _init(config: ToyConfig, key: jax.Array, data: None, start: None) -> ToyParams:
+    del data, start
+    net_key, z_key = jax.random.split(key)
+    z = jax.random.normal(z_key)
+    params = ToyParams(jnp.zeros(()), ScalarNet(config.net).init(net_key, z), z)
+    return params.replace(x=network_value(config, params))  # type: ignore[attr-defined]
+
+
+def _optimizer(config: ToyConfig, phase: ToyConfig) -> optax.GradientTransformation:
+    del phase
+    return optax.sgd(config.learning_rate)
+
+
+def _value(config: ToyConfig, params: ToyParams) -> Float[Array, ""]:
+    return params.x if config.form == "direct" else network_value(config, params)
+
+
+def _loss(
+    config: ToyConfig, phase: ToyConfig, params: ToyParams, data: None, step: Array, key: jax.Array
+) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    del phase, data, step, key
+    x = _value(config, params)
+    return toy_loss(x), x
+
+
+def _poses(config: ToyConfig, phase: ToyConfig, params: ToyParams, data: None) -> Float[Array, ""]:
+    del phase, data
+    return _value(config, params)
+
+
+def _next_phase(config: ToyConfig, phase: ToyConfig, params: ToyParams, data: None) -> ToyParams:
+    del config, phase, data
+    return params

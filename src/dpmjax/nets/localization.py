@@ -1,7 +1,8 @@
-"""L-Net: a scan goes in, the pose of its sensor comes out (DeepMapping section 3.3)."""
+"""L-Net: a scan or a depth image goes in, the pose of its sensor comes out (DeepMapping sections 3.3 and 4.2)."""
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
 from typing import Literal
 
@@ -9,8 +10,8 @@ import flax.linen as nn
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-_HE_LIKE = nn.initializers.variance_scaling(2.0, "fan_avg", "uniform")
-"""Xavier-uniform with the gain of ReLU."""
+HE_LIKE = nn.initializers.variance_scaling(2.0, "fan_avg", "uniform")
+"""Xavier-uniform with the gain of ReLU, as in the published networks."""
 
 
 @dataclass(frozen=True)
@@ -18,10 +19,10 @@ class LocalizationConfig:
     """Shape of L-Net. The defaults are the paper's (section 4.1) with the dilation of the published program.
 
     Attributes:
-        kind: "conv" for scans whose beams are in order, "point" (PointNet) for any set of points.
+        kind: "conv" for beams or pixels in order, "point" (PointNet, supplement A) for any set of points.
         features: channels of the layers before the maximum over the beams.
         strides: of the same layers; "point" ignores them.
-        dilation: distance of the three taps of a convolution, in beams.
+        dilation: distance of the three taps of a convolution along each axis, in beams or pixels.
         is_circular: the last beam is the neighbour of the first (a full turn); else zeros follow.
         hidden: channels of the layers after the maximum.
     """
@@ -38,8 +39,8 @@ class LocalizationConfig:
             raise ValueError(f"strides: expected one for each of {len(self.features)} layers, got {self.strides}")
 
 
-class BeamConvolution(nn.Module):
-    """A dilated convolution of three taps along the beams.
+class DilatedConvolution(nn.Module):
+    """A dilated convolution of three taps along each axis: 3 for beams, 3 x 3 for an image.
 
     It is one matrix product: XLA's own convolution is ten times slower on CPUs.
     """
@@ -50,45 +51,57 @@ class BeamConvolution(nn.Module):
     is_circular: bool
 
     @nn.compact
-    def __call__(self, x: Float[Array, "b c"]) -> Float[Array, "b_out f"]:
-        """Same length as the input, divided by the stride."""
-        num_beams = x.shape[0]
-        pad = (self.dilation, self.dilation)
-        padded = jnp.pad(x, (pad, (0, 0)), mode="wrap" if self.is_circular else "constant")
-        taps = [padded[k * self.dilation : k * self.dilation + num_beams : self.stride] for k in range(3)]
-        return nn.Dense(self.features, kernel_init=_HE_LIKE)(jnp.concatenate(taps, axis=-1))
+    def __call__(self, x: Float[Array, "*size c"]) -> Float[Array, "*size_out f"]:
+        """Same size as the input, divided by the stride.
+
+        Args:
+            x: channels of the beams (b, c) or of the pixels (h, w, c).
+
+        Returns:
+            Channels of every `stride`-th beam or pixel.
+        """
+        *size, _ = x.shape
+        gap = self.dilation
+        padded = jnp.pad(x, [(gap, gap)] * len(size) + [(0, 0)], mode="wrap" if self.is_circular else "constant")
+        taps = [
+            padded[tuple(slice(k * gap, k * gap + n, self.stride) for k, n in zip(tap, size, strict=True))]
+            for tap in itertools.product(range(3), repeat=len(size))
+        ]
+        return nn.Dense(self.features, kernel_init=HE_LIKE)(jnp.concatenate(taps, axis=-1))
 
 
 class LocalizationNet(nn.Module):
-    """L-Net for one scan; `vmap` over the set."""
+    """L-Net for one scan or depth image; `vmap` over the set."""
 
     config: LocalizationConfig
     num_outputs: int = 3
 
     @nn.compact
-    def __call__(self, points: Float[Array, "b d"], mask: Bool[Array, " b"]) -> Float[Array, " o"]:
+    def __call__(self, points: Float[Array, "*size d"], mask: Bool[Array, "*size"]) -> Float[Array, " o"]:
         """Pose of the sensor.
 
         Args:
-            points: in the sensor frame, about -1 to 1.
+            points: (b, 2) or (h, w, 3) in the sensor frame, about -1 to 1.
             mask: False for beams that measured nothing.
 
         Returns:
-            For planar scans x, y, heading in radians.
+            For planar scans x, y, heading in radians; for depth images the numbers of a motion.
         """
         config = self.config
-        x = jnp.where(mask[:, None], points, 0.0)
+        x = jnp.where(mask[..., None], points, 0.0)
         for layer, features in enumerate(config.features):
             if config.kind == "conv":
                 stride = config.strides[layer]
-                x = BeamConvolution(features, stride, config.dilation, config.is_circular)(x)
-                mask = mask[::stride]
+                x = DilatedConvolution(features, stride, config.dilation, config.is_circular)(x)
+                mask = mask[(slice(None, None, stride),) * mask.ndim]
             else:
-                x = nn.Dense(features, kernel_init=_HE_LIKE)(x)
+                x = nn.Dense(features, kernel_init=HE_LIKE)(x)
             if layer < len(config.features) - 1:
                 x = nn.relu(x)
         # The published network has no activation before the maximum.
-        x = jnp.where(mask.any(), jnp.max(jnp.where(mask[:, None], x, -jnp.inf), axis=0, initial=-1e30), 0.0)
+        axes = tuple(range(mask.ndim))
+        x = jnp.max(jnp.where(mask[..., None], x, -jnp.inf), axis=axes, initial=-1e30)
+        x = jnp.where(mask.any(), x, 0.0)
         for features in config.hidden:
-            x = nn.relu(nn.Dense(features, kernel_init=_HE_LIKE)(x))
-        return nn.Dense(self.num_outputs, kernel_init=_HE_LIKE)(x)
+            x = nn.relu(nn.Dense(features, kernel_init=HE_LIKE)(x))
+        return nn.Dense(self.num_outputs, kernel_init=HE_LIKE)(x)

@@ -1,14 +1,14 @@
 """M-Net: a place goes in, the log odds of its being occupied come out (DeepMapping sections 3.2 and 3.3).
 
-`MapMLP` is the paper's, `MapResMLP` the residual one that it is compared to (supplement A). `MapGrid` is a network of
-one layer over multi-resolution hat functions: a sum of learned grids from coarse to fine, each interpolated between its
-nodes. It is as continuous as the MLP, a sample costs four reads (in 3-D eight) a level instead of half a million
-multiplications, a step changes the map only where the sample is, and switching the levels on one after the other widens
-the basin of the poses first and sharpens it later.
+`MapMLP` is the paper's. `MapGrid` is a network of one layer over multi-resolution hat functions: a sum of learned grids
+from coarse to fine, each interpolated between its nodes. It is as continuous as the MLP. A sample costs four reads a
+level (in 3-D eight) instead of half a million multiplications, and a step changes the map only near the samples. The
+levels are switched on one after the other: first the basin of the poses is wide, later the map is sharp.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from itertools import product
 from typing import Any, Literal
@@ -18,7 +18,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-_HE_LIKE = nn.initializers.variance_scaling(2.0, "fan_avg", "uniform")
+from dpmjax.nets.localization import HE_LIKE
 
 
 @dataclass(frozen=True)
@@ -42,63 +42,61 @@ class OccupancyConfig:
 
 
 class MapMLP(nn.Module):
-    """The paper's M-Net."""
+    """The paper's M-Net, or residual blocks of two layers each (supplement A).
+
+    Where the width changes, the way around a residual block is a linear map.
+    """
 
     features: tuple[int, ...]
+    is_residual: bool = False
 
     @nn.compact
     def __call__(self, points: Float[Array, "n d"], level_weights: Float[Array, " l"]) -> Float[Array, " n"]:
-        """Logits at points of the world, about -1 to 1; `level_weights` has no meaning here."""
+        """Logits at points of the world, about -1 to 1; `level_weights` has no meaning here.
+
+        Args:
+            points: (n, 2) or (n, 3).
+            level_weights: ignored.
+
+        Returns:
+            Logits.
+        """
         del level_weights
         x = points
         for features in self.features:
-            x = nn.relu(nn.Dense(features, kernel_init=_HE_LIKE)(x))
-        return nn.Dense(1, kernel_init=_HE_LIKE)(x)[:, 0]
+            y = nn.relu(nn.Dense(features, kernel_init=HE_LIKE)(x))
+            if self.is_residual:
+                y = nn.Dense(features, kernel_init=HE_LIKE)(y)
+                around = x if x.shape[-1] == features else nn.Dense(features, kernel_init=HE_LIKE)(x)
+                y = nn.relu(y + around)
+            x = y
+        return nn.Dense(1, kernel_init=HE_LIKE)(x)[:, 0]
 
 
-class MapResMLP(nn.Module):
-    """M-Net of residual blocks of two layers each; where the width changes, the way around is a linear map."""
+def interpolate_grid(grid: Float[Array, "*size"], points: Float[Array, "n d"]) -> Float[Array, " n"]:
+    """Interpolates linearly along each axis; points outside of [-1, 1] continue the border.
 
-    features: tuple[int, ...]
+    Args:
+        grid: values at the nodes, r + 1 along each of d axes.
+        points: (n, d), d = 2 or 3.
 
-    @nn.compact
-    def __call__(self, points: Float[Array, "n d"], level_weights: Float[Array, " l"]) -> Float[Array, " n"]:
-        """Logits at points of the world, about -1 to 1; `level_weights` has no meaning here."""
-        del level_weights
-        x = points
-        for features in self.features:
-            y = nn.relu(nn.Dense(features, kernel_init=_HE_LIKE)(x))
-            y = nn.Dense(features, kernel_init=_HE_LIKE)(y)
-            around = x if x.shape[-1] == features else nn.Dense(features, kernel_init=_HE_LIKE)(x)
-            x = nn.relu(y + around)
-        return nn.Dense(1, kernel_init=_HE_LIKE)(x)[:, 0]
-
-
-def interpolate_volume(grid: Float[Array, "r r r"], points: Float[Array, "n 3"]) -> Float[Array, " n"]:
-    """Trilinear interpolation; points outside of [-1, 1] continue the border."""
-    cells = grid.shape[0] - 1
-    position = jnp.clip(0.5 * (points + 1.0), 0.0, 1.0) * cells
-    corner = jnp.clip(jnp.floor(position).astype(jnp.int32), 0, cells - 1)
+    Returns:
+        The value at each point.
+    """
+    num_cells, dimensions = grid.shape[0] - 1, grid.ndim
+    position = jnp.clip(0.5 * (points + 1.0), 0.0, 1.0) * num_cells
+    corner = jnp.clip(jnp.floor(position).astype(jnp.int32), 0, num_cells - 1)
     part = position - corner
-    total = jnp.zeros(points.shape[0], points.dtype)
-    for step in product((0, 1), repeat=3):
-        at = corner + jnp.asarray(step)
-        weight = jnp.prod(jnp.where(jnp.asarray(step, bool), part, 1.0 - part), axis=-1)
-        total = total + weight * grid[at[:, 0], at[:, 1], at[:, 2]]
-    return total
-
-
-def interpolate_grid(grid: Float[Array, "r r"], points: Float[Array, "n 2"]) -> Float[Array, " n"]:
-    """Bilinear interpolation; points outside of [-1, 1] continue the border."""
-    cells = grid.shape[0] - 1
-    position = jnp.clip(0.5 * (points + 1.0), 0.0, 1.0) * cells
-    corner = jnp.clip(jnp.floor(position).astype(jnp.int32), 0, cells - 1)
-    part = position - corner
-    row, column = corner[:, 0], corner[:, 1]
-    x, y = part[:, 0], part[:, 1]
-    low = (1.0 - y) * grid[row, column] + y * grid[row, column + 1]
-    high = (1.0 - y) * grid[row + 1, column] + y * grid[row + 1, column + 1]
-    return (1.0 - x) * low + x * high
+    sides = list(product((0, 1), repeat=dimensions))
+    # The corners of a cell side by side: one read a sample, and on the way back one write instead of four or eight.
+    nodes = jnp.stack([grid[tuple(slice(side, side + num_cells) for side in corners)] for corners in sides], axis=-1)
+    cell = corner @ num_cells ** jnp.arange(dimensions)[::-1]
+    values = nodes.reshape(-1, len(sides)).at[cell].get(mode="promise_in_bounds")
+    weights = [
+        math.prod(part[:, axis] if side else 1.0 - part[:, axis] for axis, side in enumerate(corners))
+        for corners in sides
+    ]
+    return jnp.sum(values * jnp.stack(weights, axis=-1), axis=-1)
 
 
 class MapGrid(nn.Module):
@@ -118,21 +116,36 @@ class MapGrid(nn.Module):
             Logits; 0 (unknown) where no sample has ever been.
         """
         dimensions = points.shape[1]
-        interpolate = interpolate_grid if dimensions == 2 else interpolate_volume
         logits = jnp.zeros(points.shape[0], points.dtype)
         for level, cells in enumerate(self.resolutions):
             grid = self.param(f"level_{cells}", nn.initializers.zeros, (cells + 1,) * dimensions)
-            logits = logits + level_weights[level] * interpolate(grid, points)
+            logits = logits + level_weights[level] * interpolate_grid(grid, points)
         return logits
 
 
-def make_map_net(config: OccupancyConfig) -> MapMLP | MapResMLP | MapGrid:
-    """The M-Net of a configuration."""
+def make_map_net(config: OccupancyConfig) -> MapMLP | MapGrid:
+    """The M-Net of a configuration.
+
+    Args:
+        config: shape of M-Net.
+
+    Returns:
+        The module: `apply(params, points, level_weights)`.
+    """
     if config.kind == "grid":
         return MapGrid(config.resolutions)
-    return (MapMLP if config.kind == "mlp" else MapResMLP)(config.features)
+    return MapMLP(config.features, is_residual=config.kind == "resmlp")
 
 
 def init_map_net(config: OccupancyConfig, *, key: jax.Array, num_dimensions: int = 2) -> Any:
-    """Fresh parameters."""
+    """Fresh parameters.
+
+    Args:
+        config: shape of M-Net.
+        key: for the weights.
+        num_dimensions: of the world, 2 or 3.
+
+    Returns:
+        Parameters for `make_map_net(config).apply`.
+    """
     return make_map_net(config).init(key, jnp.zeros((1, num_dimensions)), jnp.ones(config.num_levels))

@@ -1,8 +1,7 @@
-"""Where was a new scan taken? What L-Net has learned beyond the scans that it was fitted to (DeepMapping figure 7)."""
+"""Re-localisation: L-Net estimates the poses of scans that it was not fitted to (DeepMapping figure 7)."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, NamedTuple
@@ -15,9 +14,8 @@ from jaxtyping import Array, Bool, Float
 from numpy.typing import ArrayLike, NDArray
 
 from dpmjax.deepmapping.config import DeepMappingConfig
-from dpmjax.deepmapping.fit import Fitted, as_scan_set
+from dpmjax.deepmapping.planar import Fitted, as_scan_set, choose_beams, localize_scans
 from dpmjax.geometry import se2
-from dpmjax.nets.localization import LocalizationConfig, LocalizationNet
 from dpmjax.types import ScanSet
 
 # Scans that L-Net sees at once where there are many.
@@ -37,18 +35,18 @@ class Relocalized(NamedTuple):
 
 
 @dataclass(frozen=True)
-class TeachConfig:
-    """How L-Net learns the poses that a fit has found.
+class LocalizationTrainingConfig:
+    """Settings of the training of L-Net on the poses of a fit.
 
     Attributes:
         num_steps: steps of Adam.
         learning_rate: at the start; it falls to a hundredth (cosine).
         scans_per_step: drawn with replacement.
-        max_turn_deg: scans are turned by a random angle up to this, heading with them: L-Net becomes so much less
-            dependent on the orientations that the sensor happened to have.
-        max_shift: scans are taken again from places around their own (`shift_scan`), up to so far off, in parts of the
-            reach of the scans: L-Net learns the surroundings of the trajectory.
-        drop: share of the beams that is hidden from L-Net, at most; how many differs from scan to scan.
+        max_turn_deg: scans are turned by a random angle up to this, heading with them, so that L-Net depends less on
+            the orientations that the sensor happened to have.
+        max_shift: scans are re-projected to points around their own (`shift_scan`), up to this distance in typical
+            ranges, so that L-Net learns the surroundings of the trajectory.
+        drop: largest share of the beams that is hidden from L-Net; the share differs from scan to scan.
     """
 
     num_steps: int = 5000
@@ -70,14 +68,14 @@ class TeachConfig:
 
 
 def relocalize(fitted: Fitted, scan: ScanSet | ArrayLike) -> Relocalized:
-    """Estimates where new scans were taken, by one forward pass of L-Net (DeepMapping section 4.1, figure 7).
+    """Estimates poses of new scans by one forward pass of L-Net (DeepMapping section 4.1, figure 7).
 
-    It is a coarse guess: right near the trajectory of the fit and at similar orientations, wrong elsewhere, and it does
-    not say which. After the free poses of the fast preset L-Net lags behind the poses; `teach_localization` brings it
-    back to them.
+    The estimate is coarse: right near the trajectory of the fit and at similar orientations, wrong elsewhere, without
+    a sign of which. After the free poses of the fast preset L-Net lags behind the poses; `train_localization` brings
+    it back to them.
 
     Args:
-        fitted: result of `fit_deepmapping` from zero poses, or of `teach_localization`.
+        fitted: result of `fit_deepmapping` from zero poses, or of `train_localization`.
         scan: (b, 2) one scan, or (m, b, 2), in the sensor frame, unit and order of the beams as in the fit; beams with
             coordinates that are not finite, or both zero, measured nothing.
 
@@ -85,35 +83,32 @@ def relocalize(fitted: Fitted, scan: ScanSet | ArrayLike) -> Relocalized:
         Relocalized, in the world of `fitted.poses`.
 
     Raises:
-        ValueError: the shape is another one, a scan has no valid beam, or L-Net tells corrections of given start
-            poses.
+        ValueError: the shape is another one, a scan has no valid beam, or L-Net's outputs are corrections of given
+            start poses.
     """
-    if np.any(np.asarray(fitted.state.start_poses) != 0.0):
+    if np.any(np.asarray(fitted.params.start) != 0.0):
         raise ValueError(
-            "fitted: its L-Net corrects given start poses, which a new scan has not; call teach_localization first"
+            "fitted: its L-Net corrects given start poses, which a new scan has not; call train_localization first"
         )
     is_one = not isinstance(scan, ScanSet) and np.ndim(scan) == 2
     scans = _as_scans(np.asarray(scan)[None] if is_one else scan)
-    beams = _beams_of_fit(scans.mask.shape[1], fitted.config)
-    points, mask = scans.points[:, beams] / fitted.reach, scans.mask[:, beams]
-    parts = [
-        _apply(fitted.params.localization, points[k : k + _CHUNK], mask[k : k + _CHUNK], fitted.config.localization)
-        for k in range(0, len(points), _CHUNK)
-    ]
+    beams = choose_beams(scans.mask.shape[1], fitted.config.cold_phases[0])
+    points, mask = scans.points[:, beams] / fitted.unit, scans.mask[:, beams]
+    chunks = [slice(k, k + _CHUNK) for k in range(0, len(points), _CHUNK)]
+    parts = [_localize(fitted.params.localization, points[c], mask[c], config=fitted.config) for c in chunks]
     poses = np.concatenate([np.asarray(part, np.float64) for part in parts])
-    poses[:, :2] *= fitted.reach
+    poses[:, :2] *= fitted.unit
     poses[:, 2] = se2.wrap_angle(poses[:, 2])
     T_world_scan = se2.to_matrix(poses)
     return Relocalized(T_world_scan[0], poses[0]) if is_one else Relocalized(T_world_scan, poses)
 
 
-def teach_localization(
-    fitted: Fitted, scans: ScanSet | ArrayLike, config: TeachConfig | None = None, *, key: jax.Array
+def train_localization(
+    fitted: Fitted, scans: ScanSet | ArrayLike, config: LocalizationTrainingConfig | None = None, *, key: jax.Array
 ) -> Fitted:
-    """Fits L-Net to the poses that the fit has found, so that `relocalize` speaks of the same world.
+    """Trains L-Net on the poses that the fit has found, so that `relocalize` answers in the same world.
 
-    The labels are the fit's own: no ground truth enters. Scans are seen from turned and shifted sensors, with beams
-    hidden.
+    The labels are the fit's own: no ground truth enters. Scans are turned, shifted and partly hidden.
 
     Args:
         fitted: any fit, also from given poses.
@@ -127,52 +122,33 @@ def teach_localization(
     Raises:
         ValueError: the number of scans is not that of the fit.
     """
-    config = config or TeachConfig()
+    config = config or LocalizationTrainingConfig()
     scans = as_scan_set(scans)
     if len(scans.points) != len(fitted.poses):
         raise ValueError(f"scans: expected the {len(fitted.poses)} scans of the fit, got {len(scans.points)}")
-    poses = jnp.asarray(fitted.poses / [fitted.reach, fitted.reach, 1.0], jnp.float32)
-    scaled = replace(scans, points=scans.points / fitted.reach)
-    params = _teach(fitted.params.localization, scaled, poses, fitted.config, config, key=key)
-    new_params = replace(fitted.params, localization=params)
-    state = replace(fitted.state, params=new_params, start_poses=jnp.zeros_like(fitted.state.start_poses))
-    return fitted._replace(params=new_params, state=state)
+    poses = jnp.asarray(fitted.poses / [fitted.unit, fitted.unit, 1.0], jnp.float32)
+    scaled = replace(scans, points=scans.points / fitted.unit)
+    net = _train(fitted.params.localization, scaled, poses, key, fit_config=fitted.config, config=config)
+    params = replace(fitted.params, localization=net, start=jnp.zeros_like(fitted.params.start))
+    return fitted._replace(params=params)
 
 
-def _teach(
+@partial(jax.jit, static_argnames=("fit_config", "config"))
+def _train(
     params: Any,
     scans: ScanSet,
     poses: Float[Array, "n 3"],
-    fit_config: DeepMappingConfig,
-    config: TeachConfig,
-    *,
     key: jax.Array,
+    *,
+    fit_config: DeepMappingConfig,
+    config: LocalizationTrainingConfig,
 ) -> Any:
     optimizer = optax.adam(optax.cosine_decay_schedule(config.learning_rate, config.num_steps, 0.01))
-    num_scans, num_beams = scans.mask.shape
-    stride = max(1, -(-num_beams // fit_config.cold_phases[0].beams_per_step))
-    net: Callable[..., Array] = jax.vmap(LocalizationNet(fit_config.localization).apply, in_axes=(None, 0, 0))  # type: ignore[assignment]
 
     def loss_of(params: Any, step_key: jax.Array) -> Array:
-        row_key, first_key, turn_key, share_key, drop_key, shift_key = jax.random.split(step_key, 6)
-        rows = jax.random.randint(row_key, (config.scans_per_step,), 0, num_scans)
-        first = jax.random.randint(first_key, (), 0, stride)
-        beams = first + stride * jnp.arange(num_beams // stride)
-        points, mask = scans.points[rows][:, beams], scans.mask[rows][:, beams]
-        limit = np.deg2rad(config.max_turn_deg)
-        turn = jax.random.uniform(turn_key, rows.shape, minval=-limit, maxval=limit)
-        shift = _draw_shifts(shift_key, len(rows), config.max_shift)
-        points = jax.vmap(shift_scan)(points, mask, shift)
-        moved = jax.vmap(turn_scan)(shift[:, None], -poses[rows, 2])[:, 0]
-        points = jax.vmap(turn_scan)(points, turn)
-        hidden = jax.random.uniform(drop_key, mask.shape) < config.drop * jax.random.uniform(
-            share_key, (*rows.shape, 1)
-        )
-        # A scan of one beam must keep it.
-        seen = jnp.where((mask & ~hidden).any(-1, keepdims=True), mask & ~hidden, mask)
-        error = net(params, points, seen) - poses[rows] - jnp.concatenate([moved, turn[:, None]], axis=-1)
-        place, heading = error[:, :2], se2.wrap_angle(error[:, 2])
-        return jnp.mean(jnp.sum(jnp.abs(place), -1) + jnp.abs(heading))
+        batch, labels = _draw_training_batch(scans, poses, fit_config, config, key=step_key)
+        error = localize_scans(params, batch.points, batch.mask, fit_config) - labels
+        return jnp.mean(jnp.sum(jnp.abs(error[:, :2]), -1) + jnp.abs(se2.wrap_angle(error[:, 2])))
 
     def one_step(carry: tuple[Any, Any], step: Array) -> tuple[tuple[Any, Any], None]:
         params, state = carry
@@ -180,11 +156,34 @@ def _teach(
         updates, state = optimizer.update(gradient, state, params)
         return (optax.apply_updates(params, updates), state), None
 
-    @jax.jit
-    def run(params: Any) -> Any:
-        return jax.lax.scan(one_step, (params, optimizer.init(params)), jnp.arange(config.num_steps))[0][0]
+    return jax.lax.scan(one_step, (params, optimizer.init(params)), jnp.arange(config.num_steps))[0][0]
 
-    return run(params)
+
+def _draw_training_batch(
+    scans: ScanSet,
+    poses: Float[Array, "n 3"],
+    fit_config: DeepMappingConfig,
+    config: LocalizationTrainingConfig,
+    *,
+    key: jax.Array,
+) -> tuple[ScanSet, Float[Array, "m 3"]]:
+    """Scans turned, shifted and partly hidden, and their poses."""
+    row_key, first_key, turn_key, share_key, drop_key, shift_key = jax.random.split(key, 6)
+    num_scans, num_beams = scans.mask.shape
+    rows = jax.random.randint(row_key, (config.scans_per_step,), 0, num_scans)
+    beams = choose_beams(num_beams, fit_config.cold_phases[0], jax.random.randint(first_key, (), 0, num_beams))
+    points, mask = scans.points[rows][:, beams], scans.mask[rows][:, beams]
+    limit = np.deg2rad(config.max_turn_deg)
+    turn = jax.random.uniform(turn_key, rows.shape, minval=-limit, maxval=limit)
+    shift = _draw_shifts(shift_key, len(rows), config.max_shift)
+    points = jax.vmap(shift_scan)(points, mask, shift)
+    moved = jax.vmap(turn_scan)(shift[:, None], -poses[rows, 2])[:, 0]
+    points = jax.vmap(turn_scan)(points, turn)
+    share = config.drop * jax.random.uniform(share_key, (*rows.shape, 1))
+    hidden = jax.random.uniform(drop_key, mask.shape) < share
+    # A scan of one beam must keep it.
+    seen = jnp.where((mask & ~hidden).any(-1, keepdims=True), mask & ~hidden, mask)
+    return ScanSet(points, seen), poses[rows] + jnp.concatenate([moved, turn[:, None]], axis=-1)
 
 
 def _draw_shifts(key: jax.Array, count: int, largest: float) -> Float[Array, "n 2"]:
@@ -196,29 +195,37 @@ def _draw_shifts(key: jax.Array, count: int, largest: float) -> Float[Array, "n 
 
 
 def turn_scan(points: Float[Array, "b 2"], turn: Float[Array, ""]) -> Float[Array, "b 2"]:
-    """What the sensor would have seen with its heading larger by `turn`: every point turned back by it."""
+    """The scan of a sensor whose heading is larger by `turn`: every point turned back by it.
+
+    Args:
+        points: in the sensor frame.
+        turn: radians.
+
+    Returns:
+        Points in the frame of the turned sensor.
+    """
     cos, sin = jnp.cos(turn), jnp.sin(turn)
     return jnp.stack([cos * points[:, 0] + sin * points[:, 1], cos * points[:, 1] - sin * points[:, 0]], axis=-1)
 
 
 def shift_scan(points: Float[Array, "b 2"], mask: Bool[Array, " b"], shift: Float[Array, " 2"]) -> Float[Array, "b 2"]:
-    """About what the sensor would have seen from a place nearby, at the same angles.
+    """An approximate scan of a sensor nearby, at the same angles.
 
-    What hides behind what is not asked: the points are sorted by their new angles, and ranges are interpolated.
+    Occlusion is ignored: the points are sorted by their new angles, and ranges are interpolated between them.
 
     Args:
-        points: in the sensor frame; beams without a measurement keep none.
-        mask: beams that measured something.
-        shift: the new place in the sensor frame.
+        points: in the sensor frame.
+        mask: beams that measured something; the others keep their points.
+        shift: position of the new sensor in the frame of the old one.
 
     Returns:
-        Points in the frame of the sensor at the new place; without a shift the points themselves.
+        Points in the frame of the new sensor; without a shift the points themselves.
     """
     safe = jnp.where(mask[:, None], points, 1.0)
     moved = safe - shift
     angle = jnp.where(mask, jnp.arctan2(moved[:, 1], moved[:, 0]), jnp.inf)
     order = jnp.argsort(angle)
-    # Walls are straight in the inverse range, nearly.
+    # The inverse range along a straight wall is nearly linear in the angle.
     inverse = 1.0 / jnp.maximum(jnp.linalg.norm(moved, axis=-1), 1e-6)
     target = jnp.arctan2(safe[:, 1], safe[:, 0])
     last = jnp.maximum(mask.sum() - 1, 0)
@@ -246,14 +253,4 @@ def _first(scans: ScanSet) -> ScanSet:
     return jax.tree.map(lambda leaf: leaf[:1], scans)
 
 
-def _beams_of_fit(num_beams: int, config: DeepMappingConfig) -> slice:
-    """The beams of a scan that L-Net sees: as many as in the fit."""
-    stride = max(1, -(-num_beams // config.cold_phases[0].beams_per_step))
-    return slice(0, stride * (num_beams // stride), stride)
-
-
-@partial(jax.jit, static_argnames="config")
-def _apply(
-    params: Any, points: Float[Array, "m b 2"], mask: Bool[Array, "m b"], config: LocalizationConfig
-) -> Float[Array, "m 3"]:
-    return jax.vmap(LocalizationNet(config).apply, in_axes=(None, 0, 0))(params, points, mask)  # type: ignore[return-value]
+_localize = jax.jit(localize_scans, static_argnames="config")

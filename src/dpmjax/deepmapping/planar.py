@@ -1,0 +1,307 @@
+"""DeepMapping of planar scans: the problem, and `fit_deepmapping` around the engine."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+from numpy.typing import ArrayLike, NDArray
+
+from dpmjax.deepmapping.config import DeepMappingConfig, PhaseConfig
+from dpmjax.deepmapping.fit import Report, fit
+from dpmjax.deepmapping.objective import Terms, WorldBatch, chamfer_term, interpolate_log
+from dpmjax.deepmapping.problem import (
+    MapFrame,
+    Params,
+    Problem,
+    choose_frame,
+    draw_offsets,
+    make_optimizer,
+    mapping_loss,
+)
+from dpmjax.geometry import se2
+from dpmjax.geometry.rays import typical_range
+from dpmjax.nets.localization import LocalizationNet
+from dpmjax.nets.occupancy import init_map_net
+from dpmjax.types import ScanSet
+
+# Scans that are drawn together where a set is too large for one step.
+_BLOCK = 32
+
+
+class Fitted(NamedTuple):
+    """Result of `fit_deepmapping`.
+
+    Attributes:
+        T_world_scan: (n, 3, 3) float64.
+        poses: the same as (n, 3) x, y, heading.
+        params: of L-Net and M-Net.
+        report: of the last call of the step.
+        unit: the length that the parameters count in, unit of the points.
+        config: settings of the fit.
+    """
+
+    T_world_scan: NDArray[np.float64]
+    poses: NDArray[np.float64]
+    params: Params
+    report: Report | None
+    unit: float
+    config: DeepMappingConfig
+
+
+def as_scan_set(scans: ScanSet | ArrayLike) -> ScanSet:
+    """Checked scans; beams with coordinates that are not finite, or both zero, measured nothing.
+
+    Args:
+        scans: (n, b, 2) in the sensor frames, any unit; or a ScanSet.
+
+    Returns:
+        The scans, zeros where nothing was measured.
+
+    Raises:
+        ValueError: the shape is not (n, b, 2), there are fewer than two scans, a scan has no valid beam, or what the
+            mask of a ScanSet calls valid is not finite.
+    """
+    if not isinstance(scans, ScanSet):
+        points = np.asarray(scans, np.float32)
+        if points.ndim != 3 or points.shape[-1] != 2:
+            raise ValueError(f"scans: expected shape (n, b, 2), got {points.shape}")
+        mask = np.isfinite(points).all(-1) & (np.abs(points).sum(-1) > 0)
+        scans = ScanSet(points=jnp.asarray(np.where(mask[..., None], points, 0.0)), mask=jnp.asarray(mask))
+    if scans.points.shape[0] < 2:
+        raise ValueError(f"scans: expected at least 2, got {scans.points.shape[0]}")
+    empty = np.flatnonzero(~np.asarray(scans.mask).any(-1))
+    if len(empty):
+        raise ValueError(f"scans: scan {empty[0]} has no valid beam; leave it out ({len(empty)} such scans)")
+    mask = jnp.asarray(scans.mask, bool)
+    clean = jnp.where(mask[..., None], jnp.asarray(scans.points, jnp.float32), 0.0)
+    if not bool(jnp.isfinite(clean).all()):
+        raise ValueError("scans: expected finite coordinates where the mask is True")
+    return ScanSet(points=clean, mask=mask)
+
+
+def scale_scans(scans: ScanSet | ArrayLike) -> tuple[ScanSet, float]:
+    """Checked scans with their typical range as the unit of length, as the problem takes them.
+
+    Args:
+        scans: as `as_scan_set`.
+
+    Returns:
+        The scans, and the typical range in their unit.
+    """
+    checked = as_scan_set(scans)
+    unit = typical_range(checked.points, checked.mask)
+    return replace(checked, points=checked.points / unit), unit
+
+
+def planar_problem(config: DeepMappingConfig, *, is_warm: bool) -> Problem:
+    """DeepMapping of planar scans: data are a ScanSet in typical ranges, poses are (n, 3) x, y, heading.
+
+    Args:
+        config: settings of the fit.
+        is_warm: the fit starts from given poses.
+
+    Returns:
+        The problem.
+    """
+    return Problem(
+        config,
+        config.phases(is_warm=is_warm),
+        init=_init,
+        optimizer=make_optimizer,
+        loss=_loss,
+        poses=_poses,
+        next_phase=_next_phase,
+        steps_per_call=config.steps_per_call,
+        halve_at=config.halve_at,
+    )
+
+
+def fit_deepmapping(
+    scans: ScanSet | ArrayLike,
+    config: DeepMappingConfig | None = None,
+    *,
+    key: jax.Array,
+    init: ArrayLike | None = None,
+    num_starts: int = 1,
+) -> Fitted:
+    """Registers planar scans by optimising L-Net and M-Net on them alone (DeepMapping eq. 6).
+
+    Args:
+        scans: (n, b, 2) in the sensor frames, any unit; all-zero or non-finite beams are left out. Or a ScanSet.
+        config: settings; None: `preset("fast")`.
+        key: of the whole run.
+        init: (n, 3) x, y, heading or (n, 3, 3) matrices to start from; None: cold start from zero.
+        num_starts: starts with other weights, side by side; the worse half by the loss is dropped again and again.
+
+    Returns:
+        Fitted, poses in the unit of the points. The world is that of `init`, or arbitrary after a cold start.
+
+    Raises:
+        ValueError: the scans or the poses have a wrong shape or are not finite, a scan has no valid beam, or there is
+            no start.
+    """
+    config = config or DeepMappingConfig()
+    scaled, unit = scale_scans(scans)
+    start = None if init is None else start_poses(init, len(scaled.points), unit)
+    problem = planar_problem(config, is_warm=init is not None)
+    fitted = fit(problem, scaled, key=key, start=start, num_starts=num_starts)
+    poses = np.asarray(fitted.poses, np.float64) * [unit, unit, 1.0]
+    return Fitted(se2.to_matrix(poses), poses, fitted.state.params, fitted.report, unit, config)
+
+
+def start_poses(poses: ArrayLike, num_scans: int, unit: float) -> Float[Array, "n 3"]:
+    """Checked poses to start from, as the problem takes them.
+
+    Args:
+        poses: (n, 3) x, y, heading or (n, 3, 3) matrices, unit of the points.
+        num_scans: n.
+        unit: the typical range.
+
+    Returns:
+        (n, 3) in typical ranges and radians.
+
+    Raises:
+        ValueError: the poses have a wrong shape or are not finite.
+    """
+    given = np.asarray(poses, np.float64)
+    if not np.isfinite(given).all():
+        raise ValueError("init: expected finite poses")
+    if given.shape == (num_scans, 3, 3):
+        given = se2.from_matrix(given)
+    if given.shape != (num_scans, 3):
+        raise ValueError(f"init: expected shape ({num_scans}, 3) or ({num_scans}, 3, 3), got {given.shape}")
+    return jnp.asarray(given / [unit, unit, 1.0], jnp.float32)
+
+
+def localize_scans(
+    params: Any, points: Float[Array, "m b 2"], mask: Bool[Array, "m b"], config: DeepMappingConfig
+) -> Float[Array, "m 3"]:
+    """L-Net's outputs for scans.
+
+    Args:
+        params: weights of L-Net.
+        points: in the sensor frames, in typical ranges, beams thinned as in the fit.
+        mask: False for beams that measured nothing.
+        config: settings of the fit.
+
+    Returns:
+        x, y, heading in typical ranges and radians.
+    """
+    return jax.vmap(LocalizationNet(config.localization).apply, in_axes=(None, 0, 0))(params, points, mask)  # type: ignore[return-value]
+
+
+def choose_beams(num_beams: int, phase: PhaseConfig, first: Int[Array, ""] | int = 0) -> Int[Array, " c"]:
+    """Indices of evenly spaced beams, about `beams_per_step` of them.
+
+    Args:
+        num_beams: of a scan.
+        phase: of the fit.
+        first: shifts all beams, by less than their spacing.
+
+    Returns:
+        The indices.
+    """
+    stride = max(1, -(-num_beams // phase.beams_per_step))
+    return first % stride + stride * jnp.arange(num_beams // stride)
+
+
+def _init(config: DeepMappingConfig, key: jax.Array, scans: ScanSet, start: Array | None) -> Params:
+    net_key, map_key = jax.random.split(key)
+    net = LocalizationNet(config.localization)
+    poses = jnp.zeros((scans.mask.shape[0], 3)) if start is None else jnp.asarray(start, jnp.float32)
+    return Params(
+        localization=net.init(net_key, scans.points[0], scans.mask[0]),
+        poses=poses,
+        occupancy=init_map_net(config.occupancy, key=map_key),
+        start=poses,
+        frame=_choose_frame(config, scans, poses),
+    )
+
+
+def _choose_frame(config: DeepMappingConfig, scans: ScanSet, poses: Float[Array, "n 3"]) -> MapFrame:
+    """The square that the scans cover at these poses."""
+    if config.occupancy.kind == "mlp":
+        return MapFrame(centre=jnp.zeros(2), half_side=jnp.ones(()))
+    return choose_frame(se2.transform_points(poses, scans.points), scans.mask, config.map_margin)
+
+
+def _next_phase(config: DeepMappingConfig, phase: PhaseConfig, params: Params, scans: ScanSet) -> Params:
+    """Free poses take over where L-Net is, in a map frame around them."""
+    poses = _poses(config, phase, params, scans)
+    return replace(params, poses=poses, frame=_choose_frame(config, scans, poses))
+
+
+def _poses(config: DeepMappingConfig, phase: PhaseConfig, params: Params, scans: ScanSet) -> Float[Array, "n 3"]:
+    """Poses of all scans; L-Net sees the same number of beams as in training."""
+    if phase.poses == "free":
+        return params.poses
+    beams = choose_beams(scans.mask.shape[1], phase)
+    return se2.compose(
+        params.start, localize_scans(params.localization, scans.points[:, beams], scans.mask[:, beams], config)
+    )
+
+
+def _loss(
+    config: DeepMappingConfig,
+    phase: PhaseConfig,
+    params: Params,
+    scans: ScanSet,
+    step: Int[Array, ""],
+    key: jax.Array,
+) -> tuple[Float[Array, ""], Terms]:
+    """DeepMapping eq. 6 of a batch of scans and beams."""
+    batch_key, loss_key = jax.random.split(key)
+    beam_key, row_key = jax.random.split(batch_key)
+    beams = choose_beams(scans.mask.shape[1], phase, jax.random.randint(beam_key, (), 0, scans.mask.shape[1]))
+    rows, block = draw_rows(phase, scans.mask.shape[0], step, key=row_key)
+    points, mask = scans.points[rows][:, beams], scans.mask[rows][:, beams]
+    if phase.poses == "network":
+        poses = se2.compose(params.start[rows], localize_scans(params.localization, points, mask, config))
+    else:
+        poses = params.poses[rows]
+    world = WorldBatch(se2.transform_points(poses, points), poses[:, :2], mask, rows, block)
+    free_key, offset_key = jax.random.split(loss_key)
+    progress = step / phase.num_steps
+    limit = None if phase.chamfer_limit is None else interpolate_log(phase.chamfer_limit, progress)
+    offsets = draw_offsets(phase, _scans_in_block(phase, scans.mask.shape[0]) - 1, key=offset_key)
+    chamfer = chamfer_term(world, offsets, limit)
+    return mapping_loss(config, phase, params, world, chamfer, progress, key=free_key)
+
+
+def _scans_in_block(phase: PhaseConfig, num_scans: int) -> int:
+    """Neighbours in time that a step sees together."""
+    if num_scans <= phase.scans_per_step:
+        return num_scans
+    return phase.scans_per_step if phase.is_free_factor_shared else _BLOCK
+
+
+def draw_rows(
+    phase: PhaseConfig, num_scans: int, step: Int[Array, ""], *, key: jax.Array
+) -> tuple[Int[Array, " m"], Int[Array, " m"]]:
+    """Scans of a step: all where they are few enough, else blocks of neighbours in time.
+
+    Args:
+        phase: of the fit.
+        num_scans: of the set.
+        step: steps done in the phase.
+        key: of the step.
+
+    Returns:
+        Index of each scan in the set, and the block it belongs to.
+    """
+    if num_scans <= phase.scans_per_step:
+        return jnp.arange(num_scans), jnp.zeros(num_scans, jnp.int32)
+    if phase.is_free_factor_shared:
+        # The published order: batches follow each other in time, none is mixed.
+        # The last one reaches back, so that it is as long as the others and no scan is left out.
+        first = step % -(-num_scans // phase.scans_per_step) * phase.scans_per_step
+        first = jnp.minimum(first, num_scans - phase.scans_per_step)
+        return first + jnp.arange(phase.scans_per_step), jnp.zeros(phase.scans_per_step, jnp.int32)
+    num_blocks = phase.scans_per_step // _BLOCK
+    first = jax.random.randint(key, (num_blocks, 1), 0, num_scans - _BLOCK + 1)
+    return (first + jnp.arange(_BLOCK)).reshape(-1), jnp.repeat(jnp.arange(num_blocks), _BLOCK)

@@ -1,0 +1,235 @@
+"""What the engine fits: a record of pure functions, and the parts that problems with an L-Net and an M-Net share."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+import optax
+from jaxtyping import Array, Float, Int
+
+from dpmjax.deepmapping.config import DeepMappingConfig, PhaseConfig
+from dpmjax.deepmapping.objective import (
+    MapLogits,
+    Terms,
+    WorldBatch,
+    free_factors,
+    interpolate_log,
+    occupancy_term,
+)
+from dpmjax.nets.occupancy import make_map_net
+
+# Points that M-Net's hidden layers hold at once when it is an MLP: 16 MB a layer of 512.
+_MLP_CHUNK = 1 << 13
+
+
+@dataclass(frozen=True)
+class Problem:
+    """A problem whose parameters are trained on one data set; training them is the registration.
+
+    The functions are pure and belong to a module, so that problems of equal settings are equal: a Problem is a static
+    argument of the compiled step, and the data are not part of it.
+
+    Attributes:
+        config: settings, given to every function as its first argument; hashable.
+        phases: settings of each phase; each has a `name` and `num_steps`. A function of a phase gets them second.
+        init: (config, key, data, start) -> Params; `start` are given poses or None.
+        optimizer: (config, phase) -> what changes the parameters; its state has the same structure in all phases.
+        loss: (config, phase, params, data, step, key) -> (scalar, terms); `step` counts from 0 within the phase.
+        poses: (config, phase, params, data) -> poses of the whole data set.
+        next_phase: (config, phase, params, data) -> Params at the start of the phase after `phase`.
+        steps_per_call: the largest number of steps that are compiled into one call.
+        halve_at: shares of the first phase at which the worse half of several starts is dropped; empty: all are kept.
+    """
+
+    config: Any
+    phases: tuple[Any, ...]
+    init: Callable[..., Any]
+    optimizer: Callable[..., optax.GradientTransformation]
+    loss: Callable[..., tuple[Float[Array, ""], Any]]
+    poses: Callable[..., Any]
+    next_phase: Callable[..., Any]
+    steps_per_call: int
+    halve_at: tuple[float, ...] = ()
+
+
+@flax.struct.dataclass
+class MapFrame:
+    """The square of the world, or the cube, that M-Net sees as [-1, 1]^d; in typical ranges."""
+
+    centre: Float[Array, " d"]
+    half_side: Float[Array, ""]
+
+
+@flax.struct.dataclass
+class Params:
+    """Parameters of a fit; lengths in typical ranges, angles in radians.
+
+    Attributes:
+        localization: weights of L-Net.
+        poses: free poses, or free motions after `start`.
+        occupancy: weights of M-Net.
+        start: poses that L-Net's outputs are relative to; not trained.
+        frame: of the map; not trained.
+    """
+
+    localization: Any
+    poses: Float[Array, "n k"]
+    occupancy: Any
+    start: Float[Array, "n ..."]
+    frame: MapFrame
+
+
+def make_optimizer(config: DeepMappingConfig, phase: PhaseConfig) -> optax.GradientTransformation:
+    """Adam for what a phase optimises; the rest stands still, and its moments are kept.
+
+    Args:
+        config: settings of the fit.
+        phase: of the fit.
+
+    Returns:
+        The optimiser of Params.
+    """
+    del config
+    decay = optax.cosine_decay_schedule(phase.learning_rate, phase.num_steps, phase.final_learning_rate)
+    moving = optax.adam(decay, *phase.adam_decay)
+    map_adam = optax.adam(phase.map_learning_rate, 0.8 if phase.poses == "free" else 0.9, phase.adam_decay[1])
+    labels: Any = Params(localization="network", poses="free", occupancy="map", start="fixed", frame="fixed")  # type: ignore[arg-type]
+    return optax.multi_transform(
+        {
+            "network": moving if phase.poses == "network" else _frozen(moving),
+            "free": moving if phase.poses == "free" else _frozen(moving),
+            "map": map_adam if phase.occupancy_weight > 0.0 else _frozen(map_adam),
+            "fixed": optax.set_to_zero(),
+        },
+        labels,
+    )
+
+
+def _frozen(optimizer: optax.GradientTransformation) -> optax.GradientTransformation:
+    """The same state, but nothing moves: so that the states of all phases have one structure."""
+
+    def update(updates: Any, state: Any, params: Any = None) -> tuple[Any, Any]:
+        del params
+        return jax.tree.map(jnp.zeros_like, updates), state
+
+    return optax.GradientTransformation(optimizer.init, update)
+
+
+def choose_frame(points_world: Float[Array, "... d"], mask: Array, margin: float) -> MapFrame:
+    """The square or cube around points, with a margin.
+
+    Args:
+        points_world: (..., d).
+        mask: (...) False for points that are not there.
+        margin: side of the frame over the largest extent of the points.
+
+    Returns:
+        MapFrame.
+    """
+    axes = tuple(range(mask.ndim))
+    low = jnp.where(mask[..., None], points_world, jnp.inf).min(axes)
+    high = jnp.where(mask[..., None], points_world, -jnp.inf).max(axes)
+    return MapFrame(centre=0.5 * (low + high), half_side=0.5 * margin * jnp.max(high - low))
+
+
+def bind_map(params: Params, config: DeepMappingConfig, level_weights: Float[Array, " l"] | None = None) -> MapLogits:
+    """M-Net as a function of points in the world, in typical ranges.
+
+    Args:
+        params: of the fit.
+        config: settings of the fit.
+        level_weights: 0 (off) to 1 for each level of a grid; None: all on.
+
+    Returns:
+        The function: points (n, d) -> logits (n,).
+    """
+    occupancy = config.occupancy
+    apply: Callable[..., Any] = make_map_net(occupancy).apply
+    weights = jnp.ones(occupancy.num_levels) if level_weights is None else level_weights
+
+    def logits(points: Float[Array, "n d"]) -> Float[Array, " n"]:
+        local = (points - params.frame.centre) / params.frame.half_side
+        if occupancy.kind == "grid" or len(points) <= _MLP_CHUNK:
+            return apply(params.occupancy, local, weights)
+        # The hidden layers of all samples at once would take gigabytes: a part at a time, again on the way back.
+        count = -(-len(points) // _MLP_CHUNK)
+        parts = jnp.pad(local, ((0, count * _MLP_CHUNK - len(points)), (0, 0))).reshape(count, _MLP_CHUNK, -1)
+        logits_of_parts = jax.lax.map(jax.checkpoint(lambda part: apply(params.occupancy, part, weights)), parts)
+        return logits_of_parts.reshape(-1)[: len(points)]
+
+    return logits
+
+
+def level_weights(phase: PhaseConfig, num_levels: int, progress: Float[Array, ""]) -> Float[Array, " l"]:
+    """Weights of the levels of the map: coarse ones first, all of them from `anneal_until` on.
+
+    Args:
+        phase: of the fit.
+        num_levels: of the map.
+        progress: 0 at the start of the phase, 1 at its end.
+
+    Returns:
+        0 (off) to 1 for each level.
+    """
+    if phase.anneal_until == 0.0:
+        return jnp.ones(num_levels)
+    return jnp.clip(progress / phase.anneal_until * num_levels - jnp.arange(num_levels) + 1.5, 0.0, 1.0)
+
+
+def draw_offsets(phase: PhaseConfig, furthest: int, *, key: jax.Array) -> Int[Array, " o"]:
+    """Distances in time of the scans that are compared: 1, so that neighbours always meet, and others at random.
+
+    Args:
+        phase: of the fit; `num_offsets` and `max_offset` are clamped to what there is.
+        furthest: the largest distance that there is.
+        key: of this step.
+
+    Returns:
+        Different whole numbers, 1 to `furthest`.
+    """
+    largest = max(1, min(phase.max_offset, furthest))
+    count = min(phase.num_offsets, largest) - 1
+    others = jax.random.choice(key, jnp.arange(2, max(largest, 2) + 1), (count,), replace=False)
+    return jnp.concatenate([jnp.ones(1, others.dtype), others])
+
+
+def mapping_loss(
+    config: DeepMappingConfig,
+    phase: PhaseConfig,
+    params: Params,
+    world: WorldBatch,
+    pair_term: Float[Array, ""],
+    progress: Float[Array, ""],
+    *,
+    key: jax.Array,
+) -> tuple[Float[Array, ""], Terms]:
+    """DeepMapping eq. 6 in the convex form gamma BCE + (1 - gamma) * (comparison of pairs).
+
+    Args:
+        config: settings of the fit.
+        phase: of the fit.
+        params: with M-Net and its frame.
+        world: the scans of the batch in the world.
+        pair_term: eq. 7, or another comparison of pairs of scans.
+        progress: 0 at the start of the phase, 1 at its end.
+        key: of the free samples.
+
+    Returns:
+        The loss with the decay of the map, and its terms before weighting.
+    """
+    gamma, loss, occupancy = phase.occupancy_weight, pair_term, jnp.zeros(())
+    if gamma > 0.0:
+        logits = bind_map(params, config, level_weights(phase, config.occupancy.num_levels, progress))
+        distance = None if phase.surface_distance is None else interpolate_log(phase.surface_distance, progress)
+        factors = free_factors(world, phase, distance, key=key)
+        occupancy = occupancy_term(world, logits, factors)
+        loss = gamma * occupancy + (1.0 - gamma) * pair_term
+    if phase.map_decay > 0.0:
+        squares = sum(jnp.sum(x**2) for x in jax.tree.leaves(params.occupancy))
+        loss += phase.map_decay * squares / world.mask.size
+    return loss, Terms(occupancy, pair_term)

@@ -1,0 +1,224 @@
+"""Projective consistency of depth images at given poses: the share of matching pixels less that of contradictions.
+
+An organised image is its own nearest-neighbour structure. Two images are compared by one projection each way, and a
+point is compared with the surface between the pixels instead of with the nearest of them.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+from numpy.typing import NDArray
+
+from dpmjax.geometry import rigid
+
+# Four pixels whose inverse depths differ by less than this share lie on one surface; else an edge runs between them.
+_EDGE = 0.15
+# Cost of a contradiction in matches: along a bare wall a wrong pose matches nearly everywhere, and overlaps more.
+_CONTRADICTION = 3.0
+# Matches count as a share of the visible points, not of all points, or else every image would be pulled onto the
+# others. This share of all points is added to the visible ones, so that a little overlap that matches is worth little.
+_UNSEEN = 0.1
+
+
+class Pinhole(NamedTuple):
+    """A camera: column = fx x/z + cx, row = fy y/z + cy, in pixels."""
+
+    fx: Array
+    fy: Array
+    cx: Array
+    cy: Array
+
+
+@flax.struct.dataclass
+class DepthScans:
+    """Organised depth images as clouds in their camera frames (x right, y down, z forward).
+
+    Attributes:
+        points: metres, or typical ranges inside of the fit.
+        mask: True where something was measured.
+        pinhole: of the camera that took all of them.
+    """
+
+    points: Float[Array, "n h w 3"]
+    mask: Bool[Array, "n h w"]
+    pinhole: Pinhole
+
+    @property
+    def depth(self) -> Float[Array, "n h w"]:
+        """Depth along z, 0 where nothing was measured."""
+        return jnp.where(self.mask, self.points[..., 2], 0.0)
+
+
+class PixelSample(NamedTuple):
+    """Some points of each image, in its camera frame.
+
+    Attributes:
+        points: (n, p, 3), or (p, 3) of one image.
+        mask: False for points that are not there.
+    """
+
+    points: Float[Array, "... p 3"]
+    mask: Bool[Array, "... p"]
+
+
+def fit_pinhole(points: NDArray[np.floating], mask: NDArray[np.bool_]) -> Pinhole:
+    """The camera of organised clouds, by least squares.
+
+    Args:
+        points: (n, h, w, 3) in the camera frames.
+        mask: (n, h, w) True where something was measured, with z above 0.
+
+    Returns:
+        Pinhole.
+    """
+    _, row, column = np.nonzero(mask)
+    valid = np.asarray(points, np.float64)[mask]
+
+    def line(ratio: NDArray[np.float64], pixel: NDArray[np.intp]) -> NDArray[np.float64]:
+        return np.linalg.lstsq(np.stack([ratio, np.ones_like(ratio)], axis=-1), pixel, rcond=None)[0]
+
+    (fx, cx), (fy, cy) = line(valid[:, 0] / valid[:, 2], column), line(valid[:, 1] / valid[:, 2], row)
+    return Pinhole(*(jnp.asarray(value, jnp.float32) for value in (fx, fy, cx, cy)))
+
+
+def image_consistency(
+    T_other_camera: Float[Array, "4 4"],
+    sample: PixelSample,
+    depth_other: Float[Array, "h w"],
+    pinhole: Pinhole,
+    tolerance: Float[Array, ""],
+) -> Float[Array, ""]:
+    """Matches less contradictions of points with the depth image of another camera, per visible point, in [-3, 1].
+
+    A point that lands on the surface that the other camera sees matches it. A point in front of that surface
+    contradicts it, because the other camera looked through it (the self-contradictory occupancy of DeepMapping
+    figure 3, tested on the image instead of the map). A point behind the surface is hidden and counts 0.
+
+    Args:
+        T_other_camera: maps the points into the frame of the other camera.
+        sample: points of one image.
+        depth_other: depth image of the other camera, 0 where nothing was measured.
+        pinhole: of the other camera.
+        tolerance: share of the depth by which matching points may differ.
+
+    Returns:
+        The consistency; 0 where no point is visible.
+    """
+    seen = rigid.transform_points(T_other_camera, sample.points)
+    depth = seen[:, 2]
+    safe = jnp.maximum(depth, 1e-3)
+    column = pinhole.fx * seen[:, 0] / safe + pinhole.cx
+    row = pinhole.fy * seen[:, 1] / safe + pinhole.cy
+    inverse, is_smooth = _inverse_depth_at(depth_other, row, column)
+    is_visible = sample.mask & (depth > 1e-3) & is_smooth
+    # Distance of the point in front of the surface, in shares of the surface's depth, over the tolerance.
+    gap = jnp.where(is_visible, 1.0 - depth * inverse, 0.0) / tolerance
+    contradicted = jax.nn.sigmoid(3.0 * (gap - 2.0))
+    score = jnp.where(is_visible, jnp.exp(-(gap**2)) - _CONTRADICTION * contradicted, 0.0)
+    return score.sum() / jnp.maximum(is_visible.sum() + _UNSEEN * sample.mask.sum(), 1.0)
+
+
+def _inverse_depth_at(
+    depth: Float[Array, "h w"], row: Float[Array, " p"], column: Float[Array, " p"]
+) -> tuple[Float[Array, " p"], Bool[Array, " p"]]:
+    """One over the depth between four pixels, which is linear on a plane; and whether they lie on one surface."""
+    height, width = depth.shape
+    top = jnp.clip(jnp.floor(row).astype(jnp.int32), 0, height - 2)
+    left = jnp.clip(jnp.floor(column).astype(jnp.int32), 0, width - 2)
+    inverse = jnp.where(depth > 0.0, 1.0 / jnp.where(depth > 0.0, depth, 1.0), 0.0)
+    corners = jnp.stack([inverse[top + i, left + j] for i in (0, 1) for j in (0, 1)], axis=-1)
+    v, u = row - top, column - left
+    shares = jnp.stack([(1 - v) * (1 - u), (1 - v) * u, v * (1 - u), v * u], axis=-1)
+    is_inside = (row >= 0.0) & (row <= height - 1) & (column >= 0.0) & (column <= width - 1)
+    low, high = corners.min(-1), corners.max(-1)
+    is_smooth = is_inside & (low > 0.0) & (high - low < _EDGE * high)
+    return jnp.sum(jnp.where(is_inside[:, None], shares, 0.0) * corners, axis=-1), is_smooth
+
+
+def both_ways(
+    T_other_camera: Float[Array, "4 4"],
+    samples: tuple[PixelSample, PixelSample],
+    depths: tuple[Float[Array, "h w"], Float[Array, "h w"]],
+    pinhole: Pinhole,
+    tolerance: Float[Array, ""],
+) -> Float[Array, ""]:
+    """Mean consistency of a pair of images: the first seen by the other, and the other by the first.
+
+    Args:
+        T_other_camera: maps points of the first image into the frame of the other camera.
+        samples: points of the first and of the other image.
+        depths: depth images of the first and of the other camera.
+        pinhole: of both cameras.
+        tolerance: share of the depth by which matching points may differ.
+
+    Returns:
+        The consistency, -3 to 1.
+    """
+    there = image_consistency(T_other_camera, samples[0], depths[1], pinhole, tolerance)
+    back = image_consistency(rigid.inverse(T_other_camera), samples[1], depths[0], pinhole, tolerance)
+    return 0.5 * (there + back)
+
+
+def consistency_of_pairs(
+    T_world_camera: Float[Array, "n 4 4"],
+    sample: PixelSample,
+    scans: DepthScans,
+    offsets: Int[Array, " o"],
+    tolerance: Float[Array, ""],
+) -> Float[Array, ""]:
+    """Mean consistency of each image with those `offsets` later, the last followed by the first; each pair once.
+
+    Args:
+        T_world_camera: poses.
+        sample: some points of each image.
+        scans: depth images, unit of the poses.
+        offsets: different numbers, 1 to n // 2; half the circle of offsets has every pair.
+        tolerance: share of the depth by which matching points may differ.
+
+    Returns:
+        The mean over all pairs, -3 to 1.
+    """
+    count, depth = T_world_camera.shape[0], scans.depth
+
+    def compare(offset: Int[Array, ""]) -> tuple[Float[Array, ""], Int[Array, ""]]:
+        other = (jnp.arange(count) + offset) % count
+        T_other_camera = jnp.matmul(
+            rigid.inverse(T_world_camera[other]), T_world_camera, precision=jax.lax.Precision.HIGHEST
+        )
+        others = PixelSample(sample.points[other], sample.mask[other])
+        scores = jax.vmap(both_ways, in_axes=(0, 0, 0, None, None))(
+            T_other_camera, (sample, others), (depth, depth[other]), scans.pinhole, tolerance
+        )
+        # At half the circle the second half of the images repeats the pairs of the first.
+        is_new = (2 * offset != count) | (jnp.arange(count) < offset)
+        return jnp.sum(jnp.where(is_new, scores, 0.0)), is_new.sum()
+
+    totals, counts = jax.lax.map(compare, offsets)
+    return totals.sum() / counts.sum()
+
+
+@jax.jit
+def projective_consistency(
+    scans: DepthScans, T_world_camera: Float[Array, "n 4 4"], tolerance: Float[Array, ""] | float = 0.02
+) -> Float[Array, ""]:
+    """Mean consistency of all pairs of images, all their pixels: compares trajectories without a ground truth.
+
+    Args:
+        scans: depth images.
+        T_world_camera: their poses, unit of the points.
+        tolerance: share of the depth by which matching points may differ.
+
+    Returns:
+        -3 (every point contradicts an image) to 1; images that see nothing of each other count 0.
+    """
+    count = scans.mask.shape[0]
+    sample = PixelSample(scans.points.reshape(count, -1, 3), scans.mask.reshape(count, -1))
+    offsets = jnp.arange(1, count // 2 + 1)
+    T = jnp.asarray(T_world_camera, sample.points.dtype)
+    return consistency_of_pairs(T, sample, scans, offsets, jnp.asarray(tolerance))
