@@ -172,9 +172,9 @@ def _write(folder: RunFolder, rows: list[dict[str, Any]], *, not_run: dict[str, 
     (folder / "table.md").write_text(table(rows) + (f"\n\n{note}.\n" if note else "\n"), encoding="utf-8")
     panels = {
         label: {method: [row[key] for row in mine] for method, mine in groups.items()}
-        for label, key in (("ATE", "ate_px"), ("point distance", "point_distance_px"))
+        for label, key in (("ATE, px", "ate_px"), ("point distance, px", "point_distance_px"))
     }
-    viz.save_figure(viz.box_plots_figure(panels, "px", shared.SUCCESS_PX), folder / "boxes.png")
+    viz.save_figure(viz.error_boxes_figure(panels, threshold=shared.SUCCESS_PX), folder / "boxes.png")
 
 
 if __name__ == "__main__":

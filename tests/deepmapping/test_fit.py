@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass, replace
 
 import jax
@@ -79,7 +80,9 @@ def test_a_fit_is_plain_gradient_descent_through_all_phases() -> None:
     done = fit(valley(), jnp.zeros(()), key=KEY, start=jnp.asarray(0.9))
     assert float(done.poses) == pytest.approx(descend(0.9, 80), abs=1e-4)
     assert (int(done.state.step), int(done.state.phase), int(done.state.phase_step)) == (80, 1, 20)
-    np.testing.assert_allclose(np.asarray(done.report.terms[0]), [descend(0.9, 75 + k) for k in range(5)], **ACCUMULATED)
+    np.testing.assert_allclose(
+        np.asarray(done.report.terms[0]), [descend(0.9, 75 + k) for k in range(5)], **ACCUMULATED
+    )
 
 
 def test_the_best_start_survives() -> None:
@@ -94,7 +97,13 @@ def test_the_best_start_survives() -> None:
 
 def test_starts_are_halved_at_the_given_shares_of_the_first_phase() -> None:
     num_starts: list[int] = []
-    fit(valley((0.25, 0.5)), jnp.zeros(()), key=KEY, num_starts=6, on_report=lambda p: num_starts.append(p.state.step.size))
+    fit(
+        valley((0.25, 0.5)),
+        jnp.zeros(()),
+        key=KEY,
+        num_starts=6,
+        on_report=lambda p: num_starts.append(p.state.step.size),
+    )
     # Calls of 5 steps: halved after steps 15 and 30, and the best one alone is kept at the end.
     assert num_starts == [6] * 3 + [3] * 3 + [2] * 10
 
@@ -142,7 +151,7 @@ def test_progress_tells_shares_phases_and_seconds() -> None:
     fit(valley(), jnp.zeros(()), key=KEY, on_report=seen.append)
     np.testing.assert_allclose([p.share for p in seen], np.arange(5, 81, 5) / 80, **DOUBLE)
     assert [p.phase.name for p in seen] == ["valley"] * 12 + ["again"] * 4
-    assert all(later.run_s > earlier.run_s > 0.0 for earlier, later in zip(seen, seen[1:], strict=False))
+    assert all(later.run_s > earlier.run_s > 0.0 for earlier, later in itertools.pairwise(seen))
 
 
 def test_no_start_is_refused() -> None:

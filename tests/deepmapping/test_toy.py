@@ -7,11 +7,15 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from dpmjax import deepmapping as dm
+from dpmjax.deepmapping.fit import fit
+from dpmjax.deepmapping.toy import ToyConfig, global_minimum, network_value, toy_loss, toy_problem
 from dpmjax.nets.scalar import ScalarNet, ScalarNetConfig
-from tests.tolerances import ROUNDING
+from experiments.baselines.direct import minimize_toy
+from tests.tolerances import ACCUMULATED, ROUNDING
 
-SHORT = dm.ToyConfig(num_steps=20)
+SHORT = ToyConfig(num_steps=20)
+DIRECT = ToyConfig("direct", num_steps=20)
+KEY = jax.random.key(0)
 
 
 def loss64(x):
@@ -20,40 +24,49 @@ def loss64(x):
 
 def test_global_minimum_is_where_brute_force_finds_it() -> None:
     x = np.linspace(-30.0, 30.0, 2_000_001)
-    x_best, loss_best = dm.global_minimum()
+    x_best, loss_best = global_minimum()
     assert x_best == pytest.approx(x[np.argmin(loss64(x))], abs=1e-4)
     assert loss_best == pytest.approx(loss64(x).min(), abs=1e-6)
     assert (round(x_best, 3), round(loss_best, 3)) == (-1.417, -23.757)
 
 
 def test_direct_form_is_plain_gradient_descent() -> None:
-    x = expected = 0.7
-    for _ in range(SHORT.num_steps):
-        expected -= SHORT.learning_rate * (expected + 50.0 * np.cos(10.0 * expected) + 20.0 * np.cos(expected))
-    run = dm.descend_direct(jnp.float32(x), SHORT)
-    assert run.x.shape == (SHORT.num_steps + 1,)
-    np.testing.assert_allclose(run.x[-1], expected, **ROUNDING)
+    run = fit(toy_problem(DIRECT), None, key=KEY)
+    path = [float(run.report.terms[0])]
+    for _ in range(DIRECT.num_steps):
+        x = path[-1]
+        path.append(x - DIRECT.learning_rate * (x + 50.0 * np.cos(10.0 * x) + 20.0 * np.cos(x)))
+    np.testing.assert_allclose(run.report.terms, path[:-1], **ACCUMULATED)
+    np.testing.assert_allclose(run.poses, path[-1], **ACCUMULATED)
 
 
 def test_both_forms_start_alike_and_the_first_network_step_is_descent_on_all_of_it() -> None:
-    start = dm.init_toy(jax.random.key(0), SHORT)
-    x0 = dm.network_value(start, SHORT)
-    run = dm.descend_network(start, SHORT)
-    assert run.x[0] == x0 == dm.descend_direct(x0, SHORT).x[0]
-    gradient = jax.grad(lambda at: dm.toy_loss(dm.network_value(at, SHORT)))(start)
+    problem = toy_problem(SHORT)
+    start = problem.init(SHORT, KEY, None, None)
+    run, direct = fit(problem, None, key=KEY), fit(toy_problem(DIRECT), None, key=KEY)
+    np.testing.assert_allclose(run.report.terms[0], direct.report.terms[0], **ROUNDING)
+    gradient = jax.grad(lambda params: toy_loss(network_value(SHORT, params)))(start)
     moved = jax.tree.map(lambda value, slope: value - SHORT.learning_rate * slope, start, gradient)
-    np.testing.assert_allclose(run.x[1], dm.network_value(moved, SHORT), **ROUNDING)
-    assert run.z != start.z
+    np.testing.assert_allclose(run.report.terms[1], network_value(SHORT, moved), **ROUNDING)
+    assert run.state.params.z != start.z
+
+
+def test_seeds_are_starts_and_none_is_dropped() -> None:
+    run = fit(toy_problem(DIRECT), None, key=KEY, num_starts=5)
+    assert run.poses.shape == (5,)
+    assert run.report.terms.shape == (5, 20)
+    alone = fit(toy_problem(DIRECT), None, key=jax.random.split(KEY, 5)[3])
+    np.testing.assert_allclose(run.poses[3], alone.poses, **ACCUMULATED)
 
 
 def test_network_is_a_chain_of_linear_maps_and_elus() -> None:
-    start = dm.init_toy(jax.random.key(1), SHORT)
-    layers = [start.params["params"][f"Dense_{k}"] for k in range(5)]
+    start = toy_problem(SHORT).init(SHORT, jax.random.key(1), None, None)
+    layers = [start.net["params"][f"Dense_{k}"] for k in range(5)]
     x = np.array([start.z], np.float64)
     for k, layer in enumerate(layers):
         x = x @ np.asarray(layer["kernel"], np.float64) + np.asarray(layer["bias"], np.float64)
         x = np.where(x > 0, x, np.expm1(x)) if k < 4 else x
-    np.testing.assert_allclose(dm.network_value(start, SHORT), x[0], **ROUNDING)
+    np.testing.assert_allclose(network_value(SHORT, start), x[0], **ROUNDING)
     assert [layer["kernel"].shape[1] for layer in layers] == [10, 20, 30, 40, 1]
 
 
@@ -68,17 +81,17 @@ def test_initialisations_have_their_spread(name: str) -> None:
 
 @pytest.mark.parametrize("method", ["gradient-descent", "lbfgs", "bfgs"])
 def test_solvers_end_at_the_minimum_of_their_valley(method: str) -> None:
-    x_best, _ = dm.global_minimum()
-    x = dm.minimize_direct(jnp.float32(x_best + 0.05), method, max_iterations=50)
+    x_best, _ = global_minimum()
+    x = minimize_toy(jnp.float32(x_best + 0.05), method, max_iterations=50)
     assert float(x) == pytest.approx(x_best, abs=1e-3)
 
 
 @pytest.mark.parametrize(
     ("call", "message"),
     [
-        (lambda: dm.minimize_direct(jnp.zeros(()), "newton"), "method: expected one of"),
-        (lambda: dm.ToyConfig(learning_rate=0.0), "learning_rate"),
-        (lambda: dm.ToyConfig(num_steps=0), "num_steps"),
+        (lambda: minimize_toy(jnp.zeros(()), "newton"), "method: expected one of"),
+        (lambda: ToyConfig(learning_rate=0.0), "learning_rate"),
+        (lambda: ToyConfig(num_steps=0), "num_steps"),
         (lambda: ScalarNetConfig(initialization="zeros"), "initialization"),
     ],
 )

@@ -182,3 +182,21 @@ def test_resumed_run_keeps_the_options_that_are_not_given(toy):
     code, _, errors = finish(toy("-o", "out", "--resume", "--seed", "6"))
     assert code == 2
     assert "--seed was 5" in errors
+
+
+@pytest.mark.parametrize(
+    ("variables", "expected"),
+    [
+        ({"XDG_CACHE_HOME": "/caches"}, "/caches/dpmjax"),
+        ({"DPMJAX_COMPILATION_CACHE": "/here"}, "/here"),
+        ({"DPMJAX_COMPILATION_CACHE": "off"}, None),
+        ({"JAX_COMPILATION_CACHE_DIR": "/mine"}, "/mine"),
+    ],
+)
+def test_compiled_programs_are_kept_where_the_user_says(variables, expected, monkeypatch):
+    from experiments._machine import enable_compilation_cache
+
+    monkeypatch.setattr(os, "environ", {"HOME": "/home/somebody", **variables})
+    enable_compilation_cache()
+    found = os.environ.get("JAX_COMPILATION_CACHE_DIR")
+    assert found == expected or found.startswith(f"{expected}/")

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import jax
 import jax.numpy as jnp
+import jax.test_util
 import numpy as np
 import pytest
 
@@ -42,7 +43,7 @@ def test_convolution_is_that_of_the_textbook() -> None:
     config = LocalizationConfig(features=(5,), strides=(2,), hidden=())
     net, points = LocalizationNet(config), jax.random.normal(KEY, (20, 2))
     params = net.init(KEY, points, jnp.ones(20, bool))["params"]
-    weight = np.asarray(params["BeamConvolution_0"]["Dense_0"]["kernel"], np.float64).reshape(3, 2, 5)
+    weight = np.asarray(params["DilatedConvolution_0"]["Dense_0"]["kernel"], np.float64).reshape(3, 2, 5)
     padded = np.pad(np.asarray(points, np.float64), ((3, 3), (0, 0)))
     features = np.array([sum(padded[b + 3 * k] @ weight[k] for k in range(3)) for b in range(0, 20, 2)])
     expected = features.max(0) @ np.asarray(params["Dense_0"]["kernel"], np.float64)
@@ -80,15 +81,44 @@ def test_circular_convolution_does_not_see_where_the_turn_begins() -> None:
     )
 
 
-def test_grid_is_exact_at_its_nodes_and_linear_between() -> None:
-    grid = jnp.asarray(np.random.default_rng(0).normal(size=(5, 5)), jnp.float32)
-    x, y = np.meshgrid(np.linspace(-1, 1, 5), np.linspace(-1, 1, 5), indexing="ij")
-    nodes = jnp.asarray(np.stack([x, y], -1).reshape(-1, 2), jnp.float32)
-    np.testing.assert_allclose(interpolate_grid(grid, nodes), grid.reshape(-1), **ACCUMULATED)
-    middle = interpolate_grid(grid, jnp.array([[-0.75, -0.75]]))[0]
-    np.testing.assert_allclose(middle, grid[:2, :2].mean(), **ACCUMULATED)
-    outside = interpolate_grid(grid, jnp.array([[-3.0, 9.0]]))[0]
-    np.testing.assert_allclose(outside, grid[0, -1], **ACCUMULATED)
+def test_image_convolution_is_that_of_the_textbook() -> None:
+    config = LocalizationConfig(features=(4,), strides=(2,), dilation=2, hidden=())
+    net, points, mask = LocalizationNet(config), jax.random.normal(KEY, (6, 8, 3)), jnp.ones((6, 8), bool)
+    params = net.init(KEY, points, mask)["params"]
+    weight = np.asarray(params["DilatedConvolution_0"]["Dense_0"]["kernel"], np.float64).reshape(3, 3, 3, 4)
+    padded = np.pad(np.asarray(points, np.float64), ((2, 2), (2, 2), (0, 0)))
+    features = np.array(
+        [
+            sum(padded[r + 2 * i, c + 2 * j] @ weight[i, j] for i in range(3) for j in range(3))
+            for r in range(0, 6, 2)
+            for c in range(0, 8, 2)
+        ]
+    )
+    expected = features.max(0) @ np.asarray(params["Dense_0"]["kernel"], np.float64)
+    np.testing.assert_allclose(net.apply({"params": params}, points, mask), expected, **ACCUMULATED)
+
+
+@pytest.mark.parametrize("dimensions", [2, 3])
+def test_grid_is_exact_at_its_nodes_and_linear_between(dimensions: int) -> None:
+    grid = jnp.asarray(np.random.default_rng(0).normal(size=(5,) * dimensions), jnp.float32)
+    nodes = np.stack(np.meshgrid(*[np.linspace(-1, 1, 5)] * dimensions, indexing="ij"), -1).reshape(-1, dimensions)
+    np.testing.assert_allclose(interpolate_grid(grid, jnp.asarray(nodes, jnp.float32)), grid.reshape(-1), **ACCUMULATED)
+    middle = interpolate_grid(grid, jnp.full((1, dimensions), -0.75))[0]
+    np.testing.assert_allclose(middle, grid[(slice(2),) * dimensions].mean(), **ACCUMULATED)
+    outside = interpolate_grid(grid, jnp.array([[-3.0, 9.0, 9.0][:dimensions]]))[0]
+    np.testing.assert_allclose(outside, grid[(0, -1, -1)[:dimensions]], **ACCUMULATED)
+
+
+@pytest.mark.parametrize("dimensions", [2, 3])
+def test_gradient_of_the_grid_is_that_of_finite_differences(dimensions: int) -> None:
+    rng = np.random.default_rng(1)
+    grid = jnp.asarray(rng.normal(size=(4,) * dimensions), jnp.float32)
+    points = jnp.asarray(rng.uniform(-0.95, 0.95, size=(30, dimensions)), jnp.float32)
+
+    def total(grid, points):
+        return jnp.sum(jnp.sin(interpolate_grid(jnp.asarray(grid), jnp.asarray(points))))
+
+    jax.test_util.check_grads(total, (grid, points), order=1, modes=("rev",), eps=1e-3, rtol=0.02, atol=0.02)
 
 
 def test_levels_that_are_off_do_not_count() -> None:

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from dpmjax.viz import box_plots_figure, save_figure, success_grids_figure
+from dpmjax.viz import error_boxes_figure, save_figure, success_grids_figure
+from dpmjax.viz.figures import ACCENT
 
 ROWS, COLUMNS = {"scans used": ["1/2", "1/4", "1/8"]}, {"range noise, px": ["0", "10"]}
 
@@ -35,14 +36,19 @@ def test_a_grid_of_another_shape_is_refused():
 
 
 def test_boxes_show_the_median_of_each_method_and_the_threshold(tmp_path):
-    groups = {"ATE": {"icp": [1.0, 2.0, 30.0], "search": [0.1, 0.2, 0.3]}, "point distance": {"icp": [5.0]}}
-    figure = box_plots_figure(groups, "px", 20.0)
+    panels = {"ATE, px": {"icp": [1.0, 2.0, 30.0], "search": [0.1, 0.2, 0.3]}, "point distance, px": {"icp": [5.0]}}
+    figure = error_boxes_figure(panels, threshold=20.0)
     first, second = figure.axes
-    assert [first.get_title(), second.get_title()] == list(groups)
+    assert [first.get_ylabel(), second.get_ylabel()] == list(panels)
     assert [label.get_text() for label in first.get_xticklabels()] == ["icp", "search"]
-    medians = sorted({line.get_ydata()[0] for line in first.lines if line.get_color() == "#d1495b"})
-    np.testing.assert_allclose(medians, [0.2, 2.0])
-    assert any(np.allclose(line.get_ydata(), 20.0) for line in first.lines)
+    medians = {
+        line.get_ydata()[0] for line in first.lines if line.get_color() == ACCENT and line.get_linestyle() == "-"
+    }
+    np.testing.assert_allclose(sorted(medians), [0.2, 2.0])
+    assert [line.get_ydata()[0] for line in first.lines if line.get_linestyle() == "--"] == [20.0]
+    # Every error is a dot.
+    dots = [sorted(line.get_ydata()) for line in first.lines if line.get_marker() == "."]
+    assert dots == [[1.0, 2.0, 30.0], [0.1, 0.2, 0.3]]
     assert first.get_yscale() == "log"
     save_figure(figure, tmp_path / "boxes.png", dpi=50)
     assert (tmp_path / "boxes.png").stat().st_size > 1000

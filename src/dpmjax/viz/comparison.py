@@ -1,4 +1,4 @@
-"""Methods side by side: grids of their success over two settings."""
+"""Methods side by side: boxes of their errors (DeepMapping figure 6) and grids of their success."""
 
 from __future__ import annotations
 
@@ -8,10 +8,40 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from dpmjax.viz.figures import INK, new_figure
+from dpmjax.viz.figures import ACCENT, INK, MUTED, new_figure
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+
+
+def error_boxes_figure(
+    panels: Mapping[str, Mapping[str, Sequence[float]]], *, threshold: float | None = None
+) -> Figure:
+    """Draws box plots of errors on a logarithmic axis: one panel for each measure, one box for each method.
+
+    Args:
+        panels: errors by measure (with its unit) and by method.
+        threshold: drawn as a line in the first panel: what counts as success.
+
+    Returns:
+        The figure.
+    """
+    figure = new_figure(1.6 + 0.75 * max(len(methods) for methods in panels.values()) * len(panels), 4.4)
+    axes = np.atleast_1d(figure.subplots(1, len(panels)))
+    for number, (ax, (measure, methods)) in enumerate(zip(axes, panels.items(), strict=True)):
+        values = [np.maximum(np.asarray(errors, float), 1e-4) for errors in methods.values()]
+        ax.boxplot(values, widths=0.55, medianprops={"color": ACCENT}, showfliers=False, whis=(5, 95))
+        for place, errors in enumerate(values, start=1):
+            spread = np.linspace(-0.18, 0.18, len(errors)) if len(errors) > 1 else np.zeros(len(errors))
+            ax.plot(place + spread, errors, ".", color=MUTED, markersize=3, alpha=0.6)
+        ax.set_xticks(range(1, len(methods) + 1), list(methods), rotation=30, ha="right", fontsize=8)
+        ax.set_yscale("log")
+        ax.set_ylabel(measure, color=INK)
+        ax.grid(axis="y", alpha=0.25)
+        if threshold is not None and number == 0:
+            ax.axhline(threshold, color=ACCENT, linewidth=0.8, linestyle="--")
+    figure.tight_layout()
+    return figure
 
 
 def success_grids_figure(

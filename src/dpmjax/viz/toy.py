@@ -31,14 +31,17 @@ def toy_figure(
     """Draws DeepMapping figure 14.
 
     Args:
-        x: (k,) places,
-        loss: (k,) and L there.
-        z: (m,) inputs of the fitted network,
-        converted_loss: (m,) and L of its output there.
+        x: (k,) values of x.
+        loss: (k,) L there.
+        z: (m,) inputs of the fitted network.
+        converted_loss: (m,) L of its output there.
         visited: x and L of the descent of the network form.
         direct_end: x and L where the direct form ends.
         network_end: x and L where the network form ends.
         network_end_z: the input of the network there.
+
+    Returns:
+        The figure.
     """
     figure = new_figure(8.0, 4.6)
     axes = figure.add_subplot()
@@ -66,23 +69,26 @@ def endings_figure(
     """Draws where the seeds end: L on top, then a histogram a method with the share that found the global minimum.
 
     Args:
-        x: (k,) places; their range is what is shown,
-        loss: (k,) and L there.
+        x: (k,) values of x; their range is shown.
+        loss: (k,) L there.
         ends: x at the end of each seed, by method.
         shares: share of the seeds at the global minimum, by method.
+
+    Returns:
+        The figure.
 
     Raises:
         ValueError: no method, or a share is missing.
     """
     if not ends or set(ends) != set(shares):
         raise ValueError(f"expected shares of the same methods as ends; got {sorted(ends)} and {sorted(shares)}")
-    places = np.asarray(x, np.float64)
+    shown = np.asarray(x, np.float64)
     figure = new_figure(8.0, 1.8 + 0.95 * len(ends))
     top, *rows = figure.subplots(1 + len(ends), 1, sharex=True, height_ratios=(1.8, *([1.0] * len(ends))))
-    top.plot(places, np.asarray(loss), color=CURVE, lw=1.2)
+    top.plot(shown, np.asarray(loss), color=CURVE, lw=1.2)
     top.set_ylabel("L(x)", fontsize=9, color=INK)
     _plain(top)
-    edges = np.linspace(places.min(), places.max(), 241)
+    edges = np.linspace(shown.min(), shown.max(), 241)
     for axes, (name, values) in zip(rows, ends.items(), strict=True):
         finite = values[np.isfinite(values)]
         axes.hist(np.clip(finite, edges[0], edges[-1]), edges, color=NETWORK if "network" in name else DIRECT)

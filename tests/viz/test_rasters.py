@@ -1,4 +1,4 @@
-"""The occupancy picture: black, white and grey in the shares of occupied, free and unexplored cells."""
+"""The world from above: shares of occupied, free and unexplored cells; errors of poses; clouds of depth images."""
 
 from __future__ import annotations
 
@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 
-from dpmjax.viz import Limits, occupancy_figure
-from dpmjax.viz.occupancy import UNEXPLORED_GREY
+from dpmjax.viz import ErrorMap, Limits, error_maps_figure, from_above_figure, occupancy_figure
+from dpmjax.viz.rasters import UNEXPLORED_GREY
 
 
 def example():
@@ -82,3 +82,52 @@ def test_a_quarter_turn_of_the_world_turns_the_picture():
 def test_wrong_shapes_are_refused(explored_shape, extent, message):
     with pytest.raises(ValueError, match=message):
         occupancy_figure((np.zeros((4, 5)), np.ones(explored_shape, bool), extent), None, "px")
+
+
+def test_errors_are_drawn_on_one_scale_with_titles_trajectory_and_bar():
+    error = np.array([[0.0, 50.0], [np.nan, 500.0]])
+    path = np.array([[1.0, 1.0], [3.0, 2.0]])
+    maps = [ErrorMap("as fitted", "median 50 px", error), ErrorMap("trained", "median 5 px", 0.1 * error)]
+    figure = error_maps_figure(maps, (0.0, 4.0, 0.0, 4.0), path, "px", worst=200.0)
+    *panels, bar = figure.axes
+    assert [axes.get_title(loc="left").strip() for axes in panels] == ["as fitted", "trained"]
+    assert [axes.texts[0].get_text() for axes in panels] == ["median 50 px", "median 5 px"]
+    for axes, panel in zip(panels, maps, strict=True):
+        (image,) = axes.images
+        np.testing.assert_array_equal(image.get_array().filled(np.nan), panel.error)
+        assert image.get_clim() == (0.0, 200.0)
+        np.testing.assert_array_equal(axes.lines[0].get_xydata(), path)
+    assert bar.get_ylabel() == "error, px"
+    # The smaller errors are the darker picture.
+    canvas = FigureCanvasAgg(figure)
+    canvas.draw()
+    drawn = np.asarray(canvas.buffer_rgba())[..., :3].astype(int)
+    assert len(np.unique(drawn.reshape(-1, 3), axis=0)) > 50
+
+
+def test_panels_of_different_shapes_are_refused():
+    maps = [ErrorMap("a", "", np.zeros((2, 2))), ErrorMap("b", "", np.zeros((3, 2)))]
+    with pytest.raises(ValueError, match="panels of one shape"):
+        error_maps_figure(maps, (0.0, 1.0, 0.0, 1.0), np.zeros((2, 2)), "px", worst=1.0)
+
+
+def test_images_from_above_lie_where_their_poses_say_and_the_ceiling_is_left_out():
+    points = np.random.default_rng(0).uniform([-1, -0.5, 1], [1, 0.5, 3], (2, 4, 5, 3))
+    points[0, 0, 0] = [0.0, -1.5, 2.0]
+    mask = np.ones(points.shape[:3], bool)
+    mask[1, 0] = False
+    T = np.tile(np.eye(4), (2, 1, 1))
+    T[1, :3, 3] = [2.0, 0.0, 1.0]
+    # The whole first panel is moved: it is laid onto the reference by its first pose.
+    moved = np.eye(4)
+    moved[:3, 3] = [7.0, 0.0, -3.0]
+    panels = from_above_figure([("found", moved @ T), ("reference", T)], points, mask).axes
+    assert [axes.get_title(loc="left") for axes in panels] == ["found", "reference"]
+    for axes in panels:
+        first, second, path = axes.lines[:3]
+        assert len(first.get_xdata()) == 19
+        assert len(second.get_xdata()) == 15
+        np.testing.assert_allclose(second.get_xydata(), points[1][mask[1]][:, [0, 2]] + [2.0, 1.0])
+        np.testing.assert_allclose(path.get_xydata(), [[0.0, 0.0], [2.0, 1.0]])
+    with pytest.raises(ValueError, match="panels"):
+        from_above_figure([], points, mask)

@@ -1,13 +1,13 @@
-"""The course of a fit over time: the loss, and the trajectory error where a reference exists."""
+"""Curves: loss and trajectory error of a fit over time; time and memory against the number of scans."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from dpmjax.viz.figures import ACCENT, FRAME, INK, MUTED, format_length, new_figure
 
@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 PHASE_COLORS = ("#eef2f7", "#fbf3e6", "#ecf5ee", "#f6eef6")
 LOSS_COLOR = "#30638e"
 RATIO_FOR_LOG_AXIS = 10.0
+SIZE_COLORS = (LOSS_COLOR, ACCENT, "#2a9d6f", "#e09f3e")
 
 
 @dataclass(frozen=True)
@@ -49,6 +50,13 @@ def history_figure(history: History, unit: str) -> Figure:
     The loss line breaks between phases, because each phase has an objective of its own. A value axis is logarithmic
     where all its values are positive and span more than a factor of ten.
 
+    Args:
+        history: of the fit.
+        unit: of the ATE.
+
+    Returns:
+        The figure.
+
     Raises:
         ValueError: no record, or columns of different lengths.
     """
@@ -72,16 +80,9 @@ def history_figure(history: History, unit: str) -> Figure:
         is_known = np.isfinite(ate)
         _draw_line(rows[1], seconds[is_known], ate[is_known], ACCENT)
         _finish_value_axis(rows[1], ate, f"ATE ({unit})")
-        rows[1].annotate(
-            format_length(ate[is_known][-1], unit),
-            (seconds[is_known][-1], ate[is_known][-1]),
-            xytext=(7, 0),
-            textcoords="offset points",
-            va="center",
-            fontsize=9,
-            color=ACCENT,
-            annotation_clip=False,
-        )
+        last = seconds[is_known][-1], ate[is_known][-1]
+        style: Any = {"va": "center", "fontsize": 9, "color": ACCENT, "annotation_clip": False}
+        rows[1].annotate(format_length(last[1], unit), last, xytext=(7, 0), textcoords="offset points", **style)
     _name_phases(rows[0], phases, seconds)
     rows[-1].set_xlabel("run time (s)", color=INK)
     first, last = seconds[0], seconds[-1]
@@ -145,3 +146,43 @@ def _finish_value_axis(axes: Axes, values: NDArray[np.floating], label: str) -> 
     for side, spine in axes.spines.items():
         spine.set_visible(side in ("left", "bottom"))
         spine.set_color(FRAME)
+
+
+def size_figure(curves: Mapping[str, ArrayLike], *, memory_limit_gb: float) -> Figure:
+    """Draws seconds on the left and memory on the right.
+
+    Args:
+        curves: "num_scans" (k,), and by name other (k,) values: in GB where the name ends so, else in seconds.
+        memory_limit_gb: a line on the right.
+
+    Returns:
+        The figure.
+
+    Raises:
+        ValueError: no size, or a curve of another length.
+    """
+    sizes = np.asarray(curves["num_scans"], np.float64)
+    others = {name: np.asarray(values, np.float64) for name, values in curves.items() if name != "num_scans"}
+    if len(sizes) == 0 or any(values.shape != sizes.shape for values in others.values()):
+        raise ValueError(f"curves: expected one or more sizes and curves as long; got {len(sizes)} sizes")
+    figure = new_figure(9.0, 3.9)
+    left, right = figure.subplots(1, 2)
+    times = [name for name in others if not name.endswith("(GB)")]
+    for name, color in zip(times, SIZE_COLORS * len(times), strict=False):
+        left.plot(sizes, others[name], "-o", ms=4, lw=1.4, color=color, label=name)
+    for name in (name for name in others if name.endswith("(GB)")):
+        right.plot(sizes, others[name], "-o", ms=4, lw=1.4, color=SIZE_COLORS[0], label=name)
+    right.axhline(memory_limit_gb, color=MUTED, ls=":", lw=1.0)
+    right.set_ylim(bottom=0.0, top=1.15 * memory_limit_gb)
+    left.set_yscale("log")
+    for axes in (left, right):
+        axes.set_xscale("log", base=2)
+        axes.set_xlabel("scans", fontsize=9, color=INK)
+        axes.set_xticks(sizes, [f"{int(size)}" for size in sizes])
+        axes.grid(color=FRAME, lw=0.6)
+        axes.tick_params(colors=MUTED, labelsize=8)
+        axes.legend(fontsize=8, frameon=False)
+        for spine in axes.spines.values():
+            spine.set_color(FRAME)
+    figure.tight_layout()
+    return figure

@@ -8,10 +8,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from dpmjax.deepmapping.relocalize import shift_scan, turn_scan
 
 import dpmjax
 from dpmjax import deepmapping as dm
+from dpmjax.deepmapping.fit import init
+from dpmjax.deepmapping.planar import planar_problem, scale_scans
+from dpmjax.deepmapping.relocalization import shift_scan, turn_scan
 from dpmjax.geometry import se2
 from dpmjax.nets.localization import LocalizationConfig
 from dpmjax.nets.occupancy import OccupancyConfig
@@ -30,39 +32,40 @@ def fitted(tiny_walk) -> dm.Fitted:
         occupancy=OccupancyConfig(kind="grid", resolutions=(4,)),
         localization=LocalizationConfig(features=(16, 32), strides=(1, 2), is_circular=True, hidden=(32,)),
     )
-    scans = dm.as_scan_set(ScanSet(tiny_walk.points, tiny_walk.mask))
-    reach = dm.measure_reach(scans)
-    state = dm.init(KEY, ScanSet(scans.points / reach, scans.mask), config)
+    scans, unit = scale_scans(ScanSet(tiny_walk.points, tiny_walk.mask))
+    params = init(planar_problem(config, is_warm=False), scans, key=KEY).params
     poses = tiny_walk.reference_poses - tiny_walk.reference_poses.mean(axis=0)
     T = se2.to_matrix(poses)
-    return dm.Fitted(T, poses, state.params, None, state, reach, config)  # type: ignore[arg-type]
+    return dm.Fitted(T, poses, params, None, unit, config)
 
 
 @pytest.fixture(scope="module")
-def taught(fitted, tiny_walk) -> dm.Fitted:
+def trained(fitted, tiny_walk) -> dm.Fitted:
     scans = ScanSet(tiny_walk.points, tiny_walk.mask)
-    return dm.teach_localization(fitted, scans, dm.TeachConfig(num_steps=300, scans_per_step=20), key=KEY)
+    return dm.train_localization(
+        fitted, scans, dm.LocalizationTrainingConfig(num_steps=300, scans_per_step=20), key=KEY
+    )
 
 
-def test_taught_scans_come_back_near_their_poses(taught, tiny_walk) -> None:
-    found = dpmjax.relocalize(taught, ScanSet(tiny_walk.points, tiny_walk.mask))
-    spread = np.linalg.norm(taught.poses[:, :2], axis=1)
-    error = np.linalg.norm(found.pose[:, :2] - taught.poses[:, :2], axis=1)
+def test_trained_scans_come_back_near_their_poses(trained, tiny_walk) -> None:
+    found = dpmjax.relocalize(trained, ScanSet(tiny_walk.points, tiny_walk.mask))
+    spread = np.linalg.norm(trained.poses[:, :2], axis=1)
+    error = np.linalg.norm(found.pose[:, :2] - trained.poses[:, :2], axis=1)
     assert np.median(error) < 0.4 * np.median(spread)
     np.testing.assert_allclose(found.T_world_scan, se2.to_matrix(found.pose))
 
 
-def test_one_scan_is_one_row_of_many(taught, tiny_walk) -> None:
+def test_one_scan_is_one_row_of_many(trained, tiny_walk) -> None:
     scans = np.where(tiny_walk.mask[..., None], tiny_walk.points, 0.0)
-    many = dpmjax.relocalize(taught, scans)
-    one = dpmjax.relocalize(taught, scans[3])
+    many = dpmjax.relocalize(trained, scans)
+    one = dpmjax.relocalize(trained, scans[3])
     assert one.pose.shape == (3,)
     np.testing.assert_allclose(one.pose, many.pose[3], rtol=1e-4, atol=1e-3)
 
 
-def test_teaching_keeps_poses_and_map(fitted, taught) -> None:
-    np.testing.assert_array_equal(fitted.poses, taught.poses)
-    jax.tree.map(np.testing.assert_array_equal, fitted.params.occupancy, taught.params.occupancy)
+def test_teaching_keeps_poses_and_map(fitted, trained) -> None:
+    np.testing.assert_array_equal(fitted.poses, trained.poses)
+    jax.tree.map(np.testing.assert_array_equal, fitted.params.occupancy, trained.params.occupancy)
 
 
 def test_a_turned_sensor_sees_points_turned_back() -> None:
@@ -97,11 +100,11 @@ def test_a_shifted_scan_of_no_or_few_beams_stays_finite() -> None:
         np.testing.assert_array_equal(np.asarray(seen)[valid:], np.asarray(points)[valid:])
 
 
-def test_a_second_call_compiles_nothing(taught, tiny_walk, assert_compiles_nothing) -> None:
+def test_a_second_call_compiles_nothing(trained, tiny_walk, assert_compiles_nothing) -> None:
     scans = ScanSet(tiny_walk.points, tiny_walk.mask)
-    dpmjax.relocalize(taught, scans)
+    dpmjax.relocalize(trained, scans)
     with assert_compiles_nothing():
-        dpmjax.relocalize(taught, scans)
+        dpmjax.relocalize(trained, scans)
 
 
 def test_bad_input_is_named(fitted, tiny_walk) -> None:
@@ -109,10 +112,10 @@ def test_bad_input_is_named(fitted, tiny_walk) -> None:
         dpmjax.relocalize(fitted, np.ones((4, 3, 3)))
     with pytest.raises(ValueError, match="no valid beam"):
         dpmjax.relocalize(fitted, np.zeros((64, 2)))
-    warm = fitted._replace(state=replace(fitted.state, start_poses=jnp.ones((20, 3))))
-    with pytest.raises(ValueError, match="teach_localization"):
+    warm = fitted._replace(params=replace(fitted.params, start=jnp.ones((20, 3))))
+    with pytest.raises(ValueError, match="train_localization"):
         dpmjax.relocalize(warm, tiny_walk.points)
     with pytest.raises(ValueError, match="the 20 scans of the fit"):
-        dm.teach_localization(fitted, tiny_walk.points[:5], key=KEY)
+        dm.train_localization(fitted, tiny_walk.points[:5], key=KEY)
     with pytest.raises(ValueError, match="drop"):
-        dm.TeachConfig(drop=1.0)
+        dm.LocalizationTrainingConfig(drop=1.0)

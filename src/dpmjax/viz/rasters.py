@@ -1,0 +1,192 @@
+"""The world from above: the map that M-Net learned, errors of re-localisation, and clouds of depth images."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from dpmjax.viz.figures import ACCENT, INK, MUTED, Limits, add_scale_bar, draw_trajectory, frame_map, new_figure
+from dpmjax.viz.maps import time_colormap
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+UNEXPLORED_GREY = 0.74
+LONGER_SIDE_IN = 6.4
+GAP_IN = 0.12
+OBSTACLE = "#e4e6e9"
+TRAJECTORY = "#16c7d9"
+
+
+def occupancy_figure(
+    picture: tuple[ArrayLike, ArrayLike, tuple[float, float, float, float]],
+    trajectory_world: ArrayLike | None,
+    unit: str,
+    *,
+    T_view_world: ArrayLike | None = None,
+    limits: Limits | None = None,
+) -> Figure:
+    """Draws an occupancy map in the manner of DeepMapping, Figure 5.
+
+    Args:
+        picture: (h, w) probability that a cell is occupied, row 0 at the smallest y; (h, w) True where a beam passed or
+            ended; and x_min, x_max, y_min, y_max of the grid's outer edges in the world, in `unit`.
+        trajectory_world: (n, 2) sensor positions, or None.
+        unit: unit of lengths, "px" or "m".
+        T_view_world: (3, 3) rigid motion into the frame of the picture; None draws the world as it is.
+        limits: what is shown of that frame; None shows the grid.
+
+    Returns:
+        The figure.
+
+    Raises:
+        ValueError: where the shapes do not fit, or the extent is empty.
+    """
+    from matplotlib.transforms import Affine2D
+
+    probability, explored = np.asarray(picture[0], np.float64), np.asarray(picture[1], bool)
+    if probability.ndim != 2 or explored.shape != probability.shape:
+        raise ValueError(f"expected two arrays (h, w); got probability {probability.shape}, explored {explored.shape}")
+    extent = Limits(*(float(edge) for edge in picture[2]))
+    if not (extent.width > 0.0 and extent.height > 0.0):
+        raise ValueError(f"expected an extent (x_min, x_max, y_min, y_max) with min < max; got {tuple(extent)}")
+    T = np.eye(3) if T_view_world is None else np.asarray(T_view_world, np.float64)
+    limits = limits or extent
+
+    scale_in = LONGER_SIDE_IN / max(limits.width, limits.height)
+    width_in, height_in = limits.width * scale_in, limits.height * scale_in
+    total_width_in, total_height_in = width_in + 2.0 * GAP_IN, height_in + 2.0 * GAP_IN
+    figure = new_figure(total_width_in, total_height_in)
+    axes = figure.add_axes(
+        (GAP_IN / total_width_in, GAP_IN / total_height_in, width_in / total_width_in, height_in / total_height_in)
+    )
+    brightness = np.where(explored, 1.0 - np.clip(probability, 0.0, 1.0), UNEXPLORED_GREY)
+    axes.set_facecolor(str(UNEXPLORED_GREY))
+    image = axes.imshow(brightness, cmap="gray", vmin=0.0, vmax=1.0, origin="lower", extent=extent)
+    image.set_interpolation("nearest")
+    image.set_transform(Affine2D(T) + axes.transData)
+    if trajectory_world is not None:
+        draw_trajectory(axes, np.asarray(trajectory_world, np.float64) @ T[:2, :2].T + T[:2, 2], ACCENT)
+    frame_map(axes, limits)
+    add_scale_bar(axes, limits, unit)
+    return figure
+
+
+class ErrorMap(NamedTuple):
+    """One panel.
+
+    Attributes:
+        title: of the network.
+        subtitle: its numbers.
+        error: (h, w) distance to the truth; NaN where no scan was taken. Row 0 has the smallest y.
+    """
+
+    title: str
+    subtitle: str
+    error: NDArray[np.floating]
+
+
+def error_maps_figure(
+    maps: Sequence[ErrorMap],
+    extent: tuple[float, float, float, float],
+    trajectory_world: NDArray[np.floating],
+    unit: str,
+    *,
+    worst: float,
+) -> Figure:
+    """Draws errors of re-localisation in the manner of DeepMapping figure 7: black is right, the lighter the worse.
+
+    Args:
+        maps: at least one, all of one shape.
+        extent: x_min, x_max, y_min, y_max of the grids' outer edges, in `unit`.
+        trajectory_world: (n, 2) where the scans of the fit were taken.
+        unit: unit of lengths.
+        worst: errors from here on have the last colour.
+
+    Returns:
+        The figure; the trajectory of the fit is cyan.
+
+    Raises:
+        ValueError: no panel, panels of different shapes, or `worst` is not positive.
+    """
+    if not maps or len({panel.error.shape for panel in maps}) != 1 or not worst > 0.0:
+        raise ValueError(f"expected panels of one shape and worst > 0; got {len(maps)} panels, worst {worst}")
+    import matplotlib
+
+    limits = Limits(*map(float, extent))
+    colormap = matplotlib.colormaps["inferno"].with_extremes(bad=OBSTACLE)
+    figure = new_figure(4.6 * len(maps) + 0.9, 5.0)
+    axes_row = figure.subplots(1, len(maps), squeeze=False)[0]
+    for axes, panel in zip(axes_row, maps, strict=True):
+        image = axes.imshow(
+            panel.error, cmap=colormap, vmin=0.0, vmax=worst, origin="lower", extent=limits, interpolation="nearest"
+        )
+        axes.plot(*np.asarray(trajectory_world).T, ".", color=TRAJECTORY, ms=1.8)
+        frame_map(axes, limits)
+        axes.set_title(f"{panel.title}\n", fontsize=11, color=INK, loc="left", fontweight="bold")
+        axes.annotate(
+            panel.subtitle,
+            (0, 1),
+            xytext=(0, 6),
+            xycoords="axes fraction",
+            textcoords="offset points",
+            fontsize=8.5,
+            color=MUTED,
+        )
+    add_scale_bar(axes_row[0], limits, unit)
+    # The bar and its label need about 0.9 inches at the right, whatever the number of maps.
+    right = 1.0 - 0.9 / figure.get_figwidth()
+    figure.tight_layout(rect=(0.0, 0.0, right, 1.0))
+    bar = figure.add_axes((right + 0.005, 0.1, 0.15 / figure.get_figwidth(), 0.75))
+    figure.colorbar(image, cax=bar, label=f"error, {unit}", extend="max")
+    return figure
+
+
+def from_above_figure(
+    panels: Sequence[tuple[str, ArrayLike]], points: ArrayLike, mask: ArrayLike, *, below_m: float = -0.9
+) -> Figure:
+    """Draws depth images from above, without the ceiling, one colour an image, for several sets of poses.
+
+    Args:
+        panels: title and (n, 4, 4) T_world_camera in metres; the last is the frame that the others are laid onto.
+        points: (n, h, w, 3) in the camera frames (y down).
+        mask: (n, h, w).
+        below_m: points with a smaller y than this are the ceiling.
+
+    Returns:
+        The figure.
+
+    Raises:
+        ValueError: no panel.
+    """
+    if not panels:
+        raise ValueError("panels: expected at least one")
+    clouds, sensors = [], []
+    cloud, valid = np.asarray(points, np.float64), np.asarray(mask, bool)
+    # The first camera is level in every panel: laying the first poses onto each other is enough to compare.
+    anchor = np.asarray(panels[-1][1], np.float64)[0]
+    for _, poses in panels:
+        T = anchor @ np.linalg.inv(np.asarray(poses, np.float64)[0]) @ np.asarray(poses, np.float64)
+        clouds.append(np.einsum("nij,nhwj->nhwi", T[:, :3, :3], cloud) + T[:, None, None, :3, 3])
+        sensors.append(T[:, :3, 3])
+    low, high = np.quantile(clouds[-1][valid][:, [0, 2]], [0.002, 0.998], axis=0)
+    centres = sensors[-1][:, [0, 2]]
+    low, high = np.minimum(low, centres.min(0)), np.maximum(high, centres.max(0))
+    margin = 0.12 * float((high - low).max())
+    limits = Limits(low[0] - margin, high[0] + margin, low[1] - margin, high[1] + margin)
+    figure = new_figure(4.4 * len(panels), 4.4 * limits.height / limits.width + 0.5)
+    colors = time_colormap()(np.linspace(0.0, 1.0, len(cloud)))
+    axes_row = figure.subplots(1, len(panels), squeeze=False)[0]
+    for axes, (title, _), world, centres in zip(axes_row, panels, clouds, sensors, strict=True):
+        for image, color in enumerate(colors):
+            shown = world[image][valid[image] & (world[image][..., 1] > below_m)]
+            axes.plot(shown[:, 0], shown[:, 2], ".", ms=1.2, mew=0, color=color)
+        axes.plot(centres[:, 0], centres[:, 2], "-o", color=INK, ms=3, lw=1)
+        frame_map(axes, limits)
+        axes.set_title(title, fontsize=10, color=INK, loc="left")
+    add_scale_bar(axes_row[0], limits, "m")
+    figure.tight_layout()
+    return figure
