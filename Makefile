@@ -1,6 +1,12 @@
 # Every target does its own set-up; Python >= 3.11 and make are all it needs.
-PYTHON ?= python3
-VENV   := .venv
+# With PYTHON given, a .venv of another version stays as it is, and this version gets .venv-X.Y beside it.
+VERSION_OF = $(shell $(1) -c 'import sys; print("%d.%d" % sys.version_info[:2])' 2>/dev/null)
+ifeq ($(origin PYTHON),undefined)
+  PYTHON := python3
+  VENV   := .venv
+else
+  VENV   := .venv$(if $(filter-out $(call VERSION_OF,$(PYTHON)),$(call VERSION_OF,.venv/bin/python)),-$(call VERSION_OF,$(PYTHON)))
+endif
 BIN    := $(VENV)/bin
 STAMP  := $(VENV)/.installed
 
@@ -17,10 +23,11 @@ $(STAMP): pyproject.toml
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[dev]'
 	@touch $@
 
-venv: $(STAMP)  ## make .venv and install dpmjax with its development tools
+venv: $(STAMP)  ## make the environment and install dpmjax with its development tools
 
-check: $(STAMP)  ## lint, format, types, import rules
+check: $(STAMP)  ## lint, docstrings, format, types, import rules
 	$(BIN)/ruff check .
+	$(BIN)/ruff check --preview --select DOC,D417 src
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/python -m pytest -q tests/test_import_rules.py
@@ -38,6 +45,6 @@ demo: $(STAMP)  ## register the built-in 2-D world; pictures in results/demo
 bench: $(STAMP)  ## speed and accuracy of everything that is measured
 	$(BIN)/python -m benchmarks
 
-clean:  ## remove .venv and the caches (results/ stays)
-	rm -rf $(VENV) build dist .pytest_cache .ruff_cache .mypy_cache src/*.egg-info
+clean:  ## remove the environments and the caches (results/ stays)
+	rm -rf .venv .venv-* build dist .pytest_cache .ruff_cache .mypy_cache src/*.egg-info
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -1,24 +1,89 @@
-"""From a frozen dataclass of options and a `main` to a command: parsing, one-line errors, exit codes."""
+"""From a frozen dataclass of options and a `main` to a command: parsing, one-line errors, signals, exit codes."""
 
 from __future__ import annotations
 
 import logging
 import signal
 import sys
+import threading
 import traceback
 from collections.abc import Callable, Sequence
-from types import FrameType
-from typing import TypeVar
+from types import FrameType, TracebackType
+from typing import Self, TypeVar
 
 import tyro
 
-from experiments._machine import enable_compilation_cache
-from experiments._run_folder import RunFailedError, find_run, load_config
-from experiments._stop import Interrupted
+from experiments._machine import enable_compilation_cache, select_device
+from experiments._run_folder import FolderOptions, RunFailedError, check_run_folder, find_run, load_config
 
 EXIT_OK, EXIT_FAILED, EXIT_BAD_INPUT = 0, 1, 2
 
+SIGNALS = (signal.SIGINT, signal.SIGTERM)
 ConfigT = TypeVar("ConfigT")
+
+
+class Interrupted(KeyboardInterrupt):
+    """A signal has stopped the run."""
+
+    def __init__(self, signal_number: int) -> None:
+        super().__init__(signal.Signals(signal_number).name)
+        self.signal_number = signal_number
+
+    @property
+    def exit_code(self) -> int:
+        """What a shell reports for a program ended by this signal: 130 for Ctrl-C, 143 for SIGTERM."""
+        return 128 + self.signal_number
+
+
+class StopFlag:
+    """Turns the first signal into a flag; a second one interrupts at once.
+
+        with StopFlag() as stop:
+            while not stop.is_requested and step < num_steps:
+                ...
+            write_results()
+
+    At the end of the block, after everything in it was written, a requested stop is raised as `Interrupted`. The
+    command then ends with the exit code of the signal. Outside the main thread, where Python delivers no signals, the
+    flag is never set.
+    """
+
+    def __init__(self) -> None:
+        self._received: int | None = None
+        self._previous: dict[int, object] = {}
+
+    @property
+    def is_requested(self) -> bool:
+        """Whether a signal came."""
+        return self._received is not None
+
+    @property
+    def received(self) -> int | None:
+        """The number of the signal, None where none came."""
+        return self._received
+
+    def request(self, signal_number: int) -> None:
+        """Sets the flag where another process of the same run has received the signal."""
+        if self._received is None:
+            self._received = signal_number
+
+    def __enter__(self) -> Self:
+        if threading.current_thread() is threading.main_thread():
+            self._previous = {number: signal.signal(number, self._on_signal) for number in SIGNALS}
+        return self
+
+    def __exit__(
+        self, error_type: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        for number, handler in self._previous.items():
+            signal.signal(number, handler)  # type: ignore[arg-type]
+        if self._received is not None and error_type is None:
+            raise Interrupted(self._received)
+
+    def _on_signal(self, number: int, frame: FrameType | None) -> None:
+        if self._received is not None:
+            raise Interrupted(number)
+        self._received = number
 
 
 def run_command(
@@ -37,10 +102,13 @@ def run_command(
 
     Args:
         main: takes the options. Errors of the user are raised as `ValueError` before the run folder is opened.
-        config_type: frozen dataclass; the fields `output` and `resume`, where it has them, steer `--resume`.
+        config_type: frozen dataclass. Of `FolderOptions`, the folder is checked and the device selected before `main`.
         experiment: name of the module in `experiments` and of the folder in `results`.
         description: the module's docstring; `--help` begins with it.
         args: the command line; None takes that of the process.
+
+    Returns:
+        The exit code.
     """
     arguments = list(sys.argv[1:] if args is None else args)
     if "--version" in arguments:
@@ -54,7 +122,11 @@ def run_command(
     previous = signal.signal(signal.SIGTERM, _interrupt)
     enable_compilation_cache()
     try:
-        main(_parse(config_type, experiment, description, arguments))
+        config = _parse(config_type, experiment, description, arguments)
+        if isinstance(config, FolderOptions):
+            check_run_folder(config, experiment)
+            select_device(getattr(config, "device", None))
+        main(config)
     except SystemExit as done:  # tyro, after --help or wrong usage
         return EXIT_OK if done.code is None else int(done.code)
     except Interrupted as stop:
@@ -76,6 +148,8 @@ def run_command(
 
 def _parse(config_type: type[ConfigT], experiment: str, description: str | None, arguments: list[str]) -> ConfigT:
     prog = f"python -m experiments.{experiment}"
+    old_names = getattr(config_type, "old_names", {})
+    arguments = [old_names.get(argument, argument) for argument in arguments]
     config = tyro.cli(config_type, prog=prog, description=description, args=arguments)
     if not getattr(config, "resume", False):
         return config

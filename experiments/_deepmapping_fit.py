@@ -12,15 +12,15 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
+from experiments._command import StopFlag
 from experiments._history import HistoryFile, read_history
 from experiments._run_folder import CHECKPOINTS, HISTORY, RunFolder
-from experiments._stop import StopFlag
 
 if TYPE_CHECKING:
     from dpmjax.deepmapping import DeepMappingConfig, Fitted
     from dpmjax.deepmapping.fit import Progress
     from dpmjax.sequences import ScanSequence
-    from experiments._checkpoint import Checkpoints
+    from dpmjax.checkpoints import Checkpoints
 
 # Of the table; the error, named with its unit, comes last.
 _COLUMNS = ("step", "phase", "run_s", "loss", "occupancy", "chamfer")

@@ -94,19 +94,12 @@ def device_name() -> str | None:
 
 def git_hash() -> str | None:
     """Commit of the checkout that this file lies in, with `+changes` where it is not clean; None without git."""
-    command = ["git", "-C", str(Path(__file__).parent)]
+    command = ["git", "-C", str(Path(__file__).parent), "describe", "--always", "--abbrev=40", "--exclude=*"]
     try:
-        commit = subprocess.run([*command, "rev-parse", "HEAD"], capture_output=True, text=True, check=True, timeout=5)
-        changes = subprocess.run(
-            [*command, "status", "--porcelain", "--untracked-files=no"],
-            capture_output=True,
-            text=True,
-            check=True,
-            timeout=5,
-        )
+        found = subprocess.run([*command, "--dirty=+changes"], capture_output=True, text=True, check=True, timeout=5)
     except (OSError, subprocess.SubprocessError):
         return None
-    return commit.stdout.strip() + ("+changes" if changes.stdout.strip() else "")
+    return found.stdout.strip()
 
 
 def cpu_model() -> str:

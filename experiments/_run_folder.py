@@ -1,30 +1,68 @@
-"""The folder of one run: where it lies, what may be overwritten, and files that appear whole or not at all."""
+"""The folder of one run: its options, what may be overwritten, and result files that tell which commit made them."""
 
 from __future__ import annotations
 
+import hashlib
 import logging
 import os
 import shutil
-from collections.abc import Iterator, Mapping
+from collections import defaultdict
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
 from types import TracebackType
-from typing import Any, TypeVar
+from typing import Annotated, Any, ClassVar, Literal, TypeVar
+
+from tyro.conf import FlagCreatePairsOff, arg
 
 from experiments._json import as_json, load_dataclass, load_json, write_json
-from experiments._machine import environment
+from experiments._machine import environment, git_hash, versions
 
 CONFIG, METRICS, HISTORY, LOG = "config.json", "metrics.json", "metrics.csv", "log.txt"
 CHECKPOINTS = "checkpoints"
-# --force removes these kinds of files only: a mistyped -o must not cost a user anything else.
+# --force removes these folders and kinds of files only: a mistyped -o must not cost a user anything else.
+RESULT_FOLDERS = (CHECKPOINTS, "rows")
 RESULT_SUFFIXES = (".json", ".csv", ".txt", ".npy", ".npz", ".png", ".ply", ".g2o")
 LOGGERS = ("dpmjax", "experiments", "__main__")
 # Options that do not change what is computed.
 FREE_OPTIONS = frozenset({"output", "resume", "force", "device", "coordinator", "num_processes", "process_id"})
 
+UNKNOWN = "unknown"
+RESULTS = Path("results")
+
 ConfigT = TypeVar("ConfigT")
+
+
+@dataclass(frozen=True, kw_only=True)
+class FolderOptions:
+    """Options of every command that can be interrupted and resumed.
+
+    Attributes:
+        may_change: options that a resumed run may change, besides those that do not change what is computed.
+        old_names: earlier spellings of options on the command line, with today's.
+    """
+
+    may_change: ClassVar[frozenset[str]] = frozenset()
+    old_names: ClassVar[Mapping[str, str]] = {}
+
+    output: Annotated[Path | None, arg(aliases=["-o"], metavar="OUT")] = None
+    """Folder for the results, instead of results/<experiment>/<time>."""
+    seed: int = 0
+    """Seed of everything random."""
+    resume: FlagCreatePairsOff[bool] = False
+    """Continue an interrupted run, the latest or that in OUT; options not given are the same as then."""
+    force: FlagCreatePairsOff[bool] = False
+    """Replace an earlier run in OUT."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunOptions(FolderOptions):
+    """The same of a command that computes in this process."""
+
+    device: Annotated[Literal["cpu", "gpu"] | None, arg(metavar="cpu|gpu")] = None
+    """Where to compute; without it, JAX chooses."""
 
 
 class RunFailedError(RuntimeError):
@@ -51,53 +89,74 @@ class RunFolder:
         return self.path / name
 
 
-def open_run_folder(
-    config: Any,
-    experiment: str,
-    *,
-    output: Path | None,
-    resume: bool = False,
-    force: bool = False,
-    root: Path = Path("results"),
-    may_change: frozenset[str] = frozenset(),
-) -> RunFolder:
+def open_run_folder(config: Any, experiment: str, *, root: Path = RESULTS) -> RunFolder:
     """Makes the folder of a run, or finds the one to continue, and writes `config.json`.
 
     Call it after the input was read, so that bad input leaves no folder behind.
 
     Args:
-        config: the resolved options, a dataclass.
+        config: the resolved options, a dataclass such as `FolderOptions`. Its `output` None makes
+            `root/<experiment>/<timestamp>` and lets `latest` beside it point there; `resume` continues the run in
+            `output`, or the latest one; `force` empties `output` first where it holds an earlier run.
         experiment: name of the experiment.
-        output: the folder; None makes `root/<experiment>/<timestamp>` and lets `latest` beside it point there.
-        resume: continue the run in `output`, or the latest one.
-        force: empty `output` first where it holds an earlier run.
         root: folder of all results.
-        may_change: options that a resumed run may change, besides those that do not change what is computed.
+
+    Returns:
+        The open folder.
+
+    Raises:
+        ValueError: as `check_run_folder`; or the folder cannot be made.
+    """
+    check_run_folder(config, experiment, root=root)
+    is_resumed = getattr(config, "resume", False)
+    try:
+        if is_resumed:
+            path = find_run(experiment, config.output, root)
+        elif config.output is None:
+            path = _make_timestamped(root / experiment)
+        else:
+            path = config.output
+            path.mkdir(parents=True, exist_ok=True)
+            _clear(path)
+        write_json(path / CONFIG, config)
+    except OSError as error:
+        where = root / experiment if config.output is None else config.output
+        raise _cannot_write(where, error.strerror or str(error)) from error
+    return RunFolder(path, is_resumed=is_resumed)
+
+
+def check_run_folder(config: Any, experiment: str, *, root: Path = RESULTS) -> None:
+    """Refuses what `open_run_folder` would refuse and changes nothing, so that a command can ask before any work.
+
+    Args:
+        config: the resolved options.
+        experiment: name of the experiment.
+        root: folder of all results.
 
     Raises:
         ValueError: `output` holds something and neither `resume` nor `force` is given; there is nothing to resume; the
-            resumed run had other options; the folder cannot be made.
+            resumed run had other options; nothing can be written there.
     """
-    if resume and force:
-        raise ValueError("--resume continues a run and --force starts it over: give one of them")
-    try:
-        if resume:
-            path = find_run(experiment, output, root)
-            _check_same_options(load_json(path / CONFIG), as_json(config), path, FREE_OPTIONS | may_change)
-        elif output is None:
-            path = _make_timestamped(root / experiment)
-        else:
-            path = output
-            _make_empty(path, force)
-        write_json(path / CONFIG, config)
-    except OSError as error:
-        where = output if output is not None else root / experiment
-        raise ValueError(f"cannot write to {where}: {error.strerror or error}; name another folder with -o") from error
-    return RunFolder(path, is_resumed=resume)
+    if getattr(config, "resume", False):
+        if config.force:
+            raise ValueError("--resume continues a run and --force starts it over: give one of them")
+        path = find_run(experiment, config.output, root)
+        may_change = FREE_OPTIONS | getattr(config, "may_change", frozenset())
+        _check_same_options(load_json(path / CONFIG), as_json(config), path, may_change)
+    elif config.output is not None:
+        _check_replaceable(config.output, config.force)
 
 
-def find_run(experiment: str, output: Path | None, root: Path = Path("results")) -> Path:
-    """The folder of an earlier run: `output`, or the latest of this experiment.
+def find_run(experiment: str, output: Path | None, root: Path = RESULTS) -> Path:
+    """Finds the folder of an earlier run.
+
+    Args:
+        experiment: name of the experiment.
+        output: the folder, or None for the latest run of this experiment.
+        root: folder of all results.
+
+    Returns:
+        The folder.
 
     Raises:
         ValueError: there is none.
@@ -109,7 +168,14 @@ def find_run(experiment: str, output: Path | None, root: Path = Path("results"))
 
 
 def load_config(path: Path, config_type: type[ConfigT]) -> ConfigT:
-    """Reads the options of the run in folder `path`; where it writes and the like gets its defaults.
+    """Reads the options of an earlier run; options such as `output` get their defaults.
+
+    Args:
+        path: folder of the run.
+        config_type: dataclass of the options.
+
+    Returns:
+        The options.
 
     Raises:
         ValueError: its `config.json` holds an option that `config_type` does not have, or is no JSON.
@@ -117,14 +183,103 @@ def load_config(path: Path, config_type: type[ConfigT]) -> ConfigT:
     return load_dataclass(path / CONFIG, config_type, ignore=FREE_OPTIONS)
 
 
-def write_metrics(folder: RunFolder, metrics: Mapping[str, Any], *, seed: int) -> None:
-    """Writes `metrics.json`: plain names with units, then the seed, the versions, the device and the machine."""
-    write_json(folder / METRICS, {**metrics, "seed": seed, **environment()})
+def write_metrics(
+    folder: RunFolder, metrics: Mapping[str, Any], *, seed: int, rows: Sequence[Mapping[str, Any]] | None = None
+) -> str | None:
+    """Writes `metrics.json`: plain names with units, then the seed, the versions, the device and the machine.
+
+    Args:
+        folder: of the run.
+        metrics: numbers by name.
+        seed: of the run.
+        rows: rows made by `do_row`; the file names those of another commit than its own.
+
+    Returns:
+        That note, or None where all rows are of this commit.
+    """
+    made_by = environment()
+    note = commits_note(rows or (), made_by["git_hash"])
+    table = {} if rows is None else {"note": note, "rows": rows}
+    write_json(folder / METRICS, {**metrics, "seed": seed, **made_by, **table})
+    return note
+
+
+def do_row(
+    folder: RunFolder, case: Mapping[str, Any], work: Callable[[], Mapping[str, Any]], *, seed: int
+) -> dict[str, Any]:
+    """Makes one row of results, or reads it where an earlier, perhaps killed, run has made it.
+
+    Each row is a file of its own below `rows/`, written whole, and carries the commit, the versions and the seed that
+    made it.
+
+    Args:
+        folder: of the run.
+        case: identifies the row and becomes part of it.
+        work: makes the rest of the row.
+        seed: of the run.
+
+    Returns:
+        The row. The commit of a row that carries none is "unknown".
+    """
+    path = row_path(folder.path, case)
+    if path.exists():
+        return {"git_hash": UNKNOWN, **load_json(path)}
+    made_by = {
+        "git_hash": git_hash() or UNKNOWN,
+        "versions": ", ".join(f"{name} {version}" for name, version in versions().items()),
+        "seed": seed,
+    }
+    row = {**case, **work(), **made_by}
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_json(path, row)
+    return row
+
+
+def row_path(folder: Path, case: Mapping[str, Any]) -> Path:
+    """The file of a row: a readable name that no other case has."""
+    text = "_".join(f"{key}-{value}" for key, value in case.items())
+    digest = hashlib.sha256(text.encode()).hexdigest()[:6]
+    return folder / "rows" / f"{text.replace('.', 'p').replace('/', '-')[:120]}_{digest}.json"
+
+
+def commits_note(rows: Sequence[Mapping[str, Any]], commit: str | None) -> str | None:
+    """Names the rows that another commit has made than the one that writes the file.
+
+    Args:
+        rows: with `git_hash`, and `method` where there are several.
+        commit: of the program that writes the file, None where it is not known.
+
+    Returns:
+        One sentence, or None where all rows are of `commit`.
+    """
+    methods: dict[str, list[str]] = defaultdict(list)
+    for row in rows:
+        if row.get("git_hash", UNKNOWN) != commit:
+            methods[row.get("git_hash", UNKNOWN)].append(str(row.get("method", "")))
+    if not methods:
+        return None
+
+    def short(name: str) -> str:
+        return name[:10] + ("+changes" if name.endswith("+changes") else "")
+
+    parts = [
+        f"{len(names)} of {short(made_by)}" + (f" ({', '.join(sorted(set(names)))})" if any(names) else "")
+        for made_by, names in methods.items()
+    ]
+    count = sum(map(len, methods.values()))
+    own = short(commit or UNKNOWN)
+    return f"{count} of {len(rows)} rows were made by another commit than this file ({own}): {'; '.join(parts)}"
 
 
 @contextmanager
 def recording(folder: RunFolder) -> Iterator[None]:
     """Logs to `log.txt` what happens in the block, and the traceback if it fails.
+
+    Args:
+        folder: of the run.
+
+    Yields:
+        Nothing.
 
     Raises:
         RunFailedError: from the error that ended the block. Interrupts pass through.
@@ -142,7 +297,7 @@ def recording(folder: RunFolder) -> Iterator[None]:
         loggers[-1].info("stopped by %s", stop or "SIGINT")
         raise
     except Exception as error:
-        # The console tells it too: here only the file must not miss it.
+        # The console shows the error too; this handler makes sure that the file has it.
         handler.handle(logging.LogRecord("dpmjax", logging.ERROR, __file__, 0, "failed", (), _exc_info(error)))
         raise RunFailedError(folder.path, error) from error
     finally:
@@ -187,17 +342,29 @@ def _link_latest(path: Path) -> None:
         logging.getLogger(__name__).warning("cannot link %s to the newest run: %s", link, error)
 
 
-def _make_empty(path: Path, force: bool) -> None:
-    path.mkdir(parents=True, exist_ok=True)
-    entries = list(path.iterdir())
-    if not entries:
+def _check_replaceable(path: Path, force: bool) -> None:
+    """Raises a ValueError where `path` is no folder, cannot be written, or holds what must not be replaced."""
+    existing = next(folder for folder in (path, *path.absolute().parents) if folder.exists())
+    if not existing.is_dir():
+        raise _cannot_write(path, f"{existing} is a file")
+    if not os.access(existing, os.W_OK):
+        raise _cannot_write(path, "permission denied")
+    if existing != path or not any(path.iterdir()):
         return
     if not (path / CONFIG).is_file():
         raise ValueError(f"{path} is not empty and holds no earlier run: name another folder with -o")
     if not force:
         raise ValueError(f"{path} holds an earlier run: --resume continues it, --force replaces it, -o names another")
-    for entry in entries:
-        if entry.name == CHECKPOINTS and entry.is_dir():
+
+
+def _cannot_write(path: Path, reason: str) -> ValueError:
+    return ValueError(f"cannot write to {path}: {reason}; name another folder with -o")
+
+
+def _clear(path: Path) -> None:
+    """Removes the results of an earlier run."""
+    for entry in path.iterdir():
+        if entry.name in RESULT_FOLDERS and entry.is_dir():
             shutil.rmtree(entry)
         elif entry.is_file() and entry.suffix in RESULT_SUFFIXES:
             entry.unlink()

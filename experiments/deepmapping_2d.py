@@ -8,8 +8,9 @@
     python -m experiments.deepmapping_2d --resume                     continue the latest run
 
 Results go to results/deepmapping_2d/<time>/ (latest links to the newest): metrics.json, trajectories as TUM, KITTI and
-npy, and pictures: map.png, occupancy.png, loss.png. Without --init the start is incremental point-to-line ICP; the
-result is the one of start, fit and polish whose map describes the beams best, so it does not get worse.
+npy, and pictures: map.png, occupancy.png, loss.png. Without --init the start is incremental point-to-line ICP. Of the
+start, DeepMapping and both after refinement, the candidate is kept whose map describes the beams best, judged without
+ground truth; metrics.json and map.png name it.
 """
 
 from __future__ import annotations
@@ -17,47 +18,49 @@ from __future__ import annotations
 import logging
 import math
 import time
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 import numpy as np
-from numpy.typing import NDArray
-from tyro.conf import FlagCreatePairsOff, Positional, arg
+from tyro.conf import Positional, arg
 
-from experiments._command import run_command
+from dpmjax import deepmapping, io, registration, simulation, viz
+from dpmjax import metrics as trajectory_metrics
+from experiments import _deepmapping_methods as shared
+from experiments._command import StopFlag, run_command
 from experiments._deepmapping_fit import FitRun, run_fit
+from experiments._deepmapping_methods import Candidates, Floats, Task
 from experiments._history import read_history
-from experiments._machine import peak_rss_gb, select_device
-from experiments._run_folder import HISTORY, RunFolder, open_run_folder, recording, write_metrics
-from experiments._stop import StopFlag
+from experiments._machine import peak_rss_gb
+from experiments._run_folder import HISTORY, RunFolder, RunOptions, open_run_folder, recording, write_metrics
 
 if TYPE_CHECKING:
     from dpmjax.deepmapping import DeepMappingConfig
     from dpmjax.sequences import ScanSequence
-    from dpmjax.registration import PlanarScans
 
 EXPERIMENT = "deepmapping_2d"
 LOGGER = logging.getLogger("dpmjax.deepmapping_2d")
-INITS = ("icp-plane", "icp-point", "global", "odometry", "zero")
 
 
-@dataclass(frozen=True)
-class Config:
+@dataclass(frozen=True, kw_only=True)
+class Config(RunOptions):
     """Options of the run."""
+
+    may_change: ClassVar[frozenset[str]] = frozenset({"seconds"})
+    old_names: ClassVar[Mapping[str, str]] = {"--polish": "--refine", "--no-polish": "--no-refine"}
 
     data: Annotated[Positional[Path | None], arg(metavar="[DATA]")] = None
     """Scans: a folder or .tar of .pcd, a CARMEN log, .npy or .npz. Without it: the built-in world."""
-    output: Annotated[Path | None, arg(aliases=["-o"], metavar="OUT")] = None
-    """Folder for the results, instead of results/deepmapping_2d/<time>."""
     preset: Literal["fast", "paper"] = "fast"
     """fast: minutes on two cores; paper: architecture, losses and sampling of the paper."""
     init: Annotated[str, arg(metavar="icp-plane|icp-point|global|odometry|zero|FILE")] = "icp-plane"
     """Where the poses start; global: an exhaustive search of scan pairs, needs no guess; FILE is a trajectory."""
     ordered: bool = True
     """Scans lie in the order of time; --no-ordered makes no use of it, and needs --init global."""
-    polish: bool = True
-    """Finish with a multi-view point-to-line alignment."""
+    refine: bool = True
+    """Also align all scans together, point to line, from the start and from the fit (--polish is the same)."""
     steps: Annotated[int | None, arg(metavar="N")] = None
     """Stop after N steps; without it, the preset decides."""
     seconds: Annotated[float | None, arg(metavar="S")] = None
@@ -72,14 +75,6 @@ class Config:
     """Which built-in world, where no DATA is given."""
     range_noise_px: Annotated[float, arg(metavar="PX")] = 0.0
     """Standard deviation of the range noise in the built-in world."""
-    seed: int = 0
-    """Seed of everything random."""
-    device: Annotated[Literal["cpu", "gpu"] | None, arg(metavar="cpu|gpu")] = None
-    """Where to compute; without it, JAX chooses."""
-    resume: FlagCreatePairsOff[bool] = False
-    """Continue an interrupted run, the latest or that in OUT; options not given are the same as then."""
-    force: FlagCreatePairsOff[bool] = False
-    """Replace an earlier run in OUT."""
 
     def __post_init__(self) -> None:
         """Checks ranges."""
@@ -101,248 +96,211 @@ class Result:
 
     Attributes:
         folder: where it was written.
-        poses: (n, 3) float64 x, y, heading of each scan in the world.
-        metrics: what `metrics.json` says.
+        poses: (n, 3) float64 x, y, heading of each scan in the world: the candidate that was kept.
+        metrics: the content of `metrics.json`.
     """
 
     folder: Path
-    poses: NDArray[np.float64]
+    poses: Floats
     metrics: dict[str, Any]
 
 
 def main(config: Config) -> Result:
-    """Reads, starts warm, fits, polishes, keeps the best, writes."""
-    from dpmjax.registration import assess_trajectory, choose_trajectory
-
+    """Reads, starts, fits, refines, keeps the best candidate, writes."""
     started = time.perf_counter()
-    select_device(config.device)
     sequence = read_scans(config)
-    start = warm_start(config, sequence)
+    planar = registration.planar_scans(sequence.points, sequence.mask, is_ordered=config.ordered)
+    task = Task(sequence, planar, is_ordered=config.ordered, seed=config.seed)
+    start_name, start = starting_poses(config, task)
     settings = fit_settings(config, sequence)
-    folder = open_run_folder(
-        config,
-        EXPERIMENT,
-        output=config.output,
-        resume=config.resume,
-        force=config.force,
-        may_change=frozenset({"seconds"}),
-    )
+    folder = open_run_folder(config, EXPERIMENT)
     with recording(folder), StopFlag() as stop:
-        print(f"{sequence.name}: {len(sequence)} scans of {sequence.points.shape[1]} beams, from {config.init}")
-        fitted = _fit(folder, sequence, settings, start, config, stop)
-        lines = line_scans(sequence)
-        candidates = {"start": start, "fit": fitted.fitted.poses}
-        if config.polish and not stop.is_requested:
-            candidates |= _polish(lines, candidates, config.init)
-        chosen, scores = choose_trajectory(lines, candidates)
-        poses = candidates[chosen]
-        confidence = assess_trajectory(lines, poses)
+        print(f"{sequence.name}: {len(sequence)} scans of {sequence.points.shape[1]} beams, from {start_name}")
+        run = _fit(folder, task, settings, start, config, stop)
+        candidates = {start_name: start, shared.DEEPMAPPING: run.fitted.poses}
+        if config.refine and not stop.is_requested:
+            candidates |= _refine(task, candidates, config.init)
+        kept, compared = compare(task, candidates)
         metrics = {
             "num_scans": len(sequence),
-            "steps": fitted.steps,
-            **compare_to_reference(sequence, start, poses),
-            "chosen": chosen,
-            "scores": {name: score._asdict() for name, score in scores.items()},
-            "confidence": confidence._asdict(),
-            "fit_s": fitted.run_s,
-            "compile_s": fitted.compile_s,
+            "steps": run.steps,
+            **before_and_after(sequence, start, candidates[kept]),
+            "start": start_name,
+            "kept": kept,
+            "candidates": compared,
+            "assessment": shared.assess(task, candidates[kept]),
+            "fit_s": run.run_s,
+            "compile_s": run.compile_s,
             "wall_s": time.perf_counter() - started,
             "peak_rss_gb": peak_rss_gb(),
             "is_interrupted": stop.is_requested,
         }
         # Numbers first: a picture that fails must not cost them.
-        write_trajectories(folder, sequence, poses)
+        write_trajectories(folder, sequence, candidates[kept])
         write_metrics(folder, metrics, seed=config.seed)
-        draw(folder, sequence, start, poses, metrics)
-        draw_occupancy(folder, sequence, fitted)
-        tell(folder, sequence, metrics)
-    return Result(folder.path, poses, metrics)
+        limits = draw_map(folder, task, candidates, metrics)
+        draw_occupancy(folder, sequence, run, candidates[kept], limits)
+        draw_loss(folder, sequence.unit)
+        metrics["wall_s"] = time.perf_counter() - started
+        write_metrics(folder, metrics, seed=config.seed)
+        for line in report(sequence.unit, metrics):
+            print(line)
+            LOGGER.info(line)
+        print(f"results in {folder.path}")
+    return Result(folder.path, candidates[kept], metrics)
 
 
 def _fit(
-    folder: RunFolder,
-    sequence: ScanSequence,
-    settings: DeepMappingConfig,
-    start: NDArray[np.float64],
-    config: Config,
-    stop: StopFlag,
+    folder: RunFolder, task: Task, settings: DeepMappingConfig, start: Floats, config: Config, stop: StopFlag
 ) -> FitRun:
-    """DeepMapping; its losses compare each scan with the next ones, so these must be near: in time they are."""
+    """DeepMapping, of the scans in an order in which neighbours are near each other."""
     from dpmjax.geometry import se2
-    from dpmjax.registration import nearest_tour
 
-    order = np.arange(len(sequence)) if config.ordered else nearest_tour(start)
-    fitted = run_fit(
+    order = shared.in_fitting_order(task, start)
+    run = run_fit(
         folder,
-        sequence.take(order),
+        task.sequence.take(order),
         settings,
         start=None if config.init == "zero" else start[order],
         seed=config.seed,
         seconds=config.seconds,
         stop=stop,
     )
-    poses = fitted.fitted.poses[np.argsort(order)]
-    return fitted._replace(fitted=fitted.fitted._replace(poses=poses, T_world_scan=se2.to_matrix(poses)))
+    poses = run.fitted.poses[np.argsort(order)]
+    return run._replace(fitted=run.fitted._replace(poses=poses, T_world_scan=se2.to_matrix(poses)))
 
 
-def _polish(
-    lines: PlanarScans, candidates: dict[str, NDArray[np.float64]], init: str
-) -> dict[str, NDArray[np.float64]]:
-    """Both polished: the fit is sharper near a good start, the start keeps what a robot's odometry knows."""
-    from dpmjax.registration import refine
+def _refine(task: Task, candidates: Candidates, init: str) -> Candidates:
+    """Both refined: the fit is sharper near a good start, the start keeps what a robot's odometry knows."""
+    names = list(candidates)[init == "zero" :]
+    return {f"{name}, refined": shared.refined(task, candidates[name], is_ordered=init != "global") for name in names}
 
-    polished = {}
-    for name in ("fit",) if init == "zero" else ("start", "fit"):
-        result = refine(lines.replace(is_ordered=init != "global"), candidates[name])
-        LOGGER.info("polished the %s: %d pairs, %d loops", name, result.num_pairs, result.num_loops)
-        polished[f"polished {name}"] = result.poses
-    return polished
+
+def compare(task: Task, candidates: Candidates) -> tuple[str, dict[str, dict[str, float]]]:
+    """The name of the candidate to keep, chosen without ground truth; and the errors and scores of all."""
+    kept, scores = shared.choose(task, candidates)
+    return kept, {name: shared.errors(task.sequence, poses) | scores[name] for name, poses in candidates.items()}
 
 
 def read_scans(config: Config) -> ScanSequence:
     """The scans of DATA or of the built-in world, sub-range and stride applied."""
-    from dpmjax.io import read_sequence
-    from dpmjax.simulation import simulate_sequence
-
     stop = None if config.n_scans is None else config.start + config.n_scans * config.jump
     if config.data is not None:
-        return read_sequence(config.data, start=config.start, stop=stop, stride=config.jump)
-    sequence = simulate_sequence(
+        return io.read_sequence(config.data, start=config.start, stop=stop, stride=config.jump)
+    sequence = simulation.simulate_sequence(
         config.world, stop or 256, range_noise_px=config.range_noise_px, seed=config.seed, with_odometry=True
     )
     return sequence.take(slice(config.start, stop, config.jump))
 
 
-def warm_start(config: Config, sequence: ScanSequence) -> NDArray[np.float64]:
-    """(n, 3) poses to start from; what is no word of `INITS` names a trajectory file."""
+def starting_poses(config: Config, task: Task) -> tuple[str, Floats]:
+    """The name of the start and its (n, 3) poses; what is no word of `START_NAMES` names a trajectory file."""
+    sequence, name = task.sequence, shared.START_NAMES.get(config.init, f"poses of {Path(config.init).name}")
     if config.init == "zero":
-        return np.zeros((len(sequence), 3))
+        return name, np.zeros((len(sequence), 3))
     if config.init == "global":
-        from dpmjax.registration import register_globally
-
-        return register_globally(line_scans(sequence).replace(is_ordered=config.ordered)).poses
+        return name, shared.search(task)
+    if config.init in ("icp-plane", "icp-point"):
+        return name, shared.incremental(task, "plane" if config.init == "icp-plane" else "point")
     if config.init == "odometry":
         if sequence.odometry_poses is None:
             raise ValueError(
                 f"{sequence.name}: has no odometry of its own (its odometry column repeats the corrected pose, or is "
                 "missing); use --init icp-plane"
             )
-        return sequence.odometry_poses
-    if config.init not in INITS:
-        from dpmjax.io import read_planar_poses
+        return name, sequence.odometry_poses
 
-        if not Path(config.init).exists():
-            raise ValueError(f"--init {config.init}: no such file, and none of {', '.join(INITS)}")
-        return read_planar_poses(config.init, len(sequence), sequence.unit)
-
-    from dpmjax.registration import IncrementalConfig, incremental_icp
-
-    metric: Literal["point", "plane"] = "point" if config.init == "icp-point" else "plane"
-    return incremental_icp(line_scans(sequence), IncrementalConfig(metric=metric)).poses
-
-
-def line_scans(sequence: ScanSequence) -> PlanarScans:
-    """The scans with a line at every beam; beams without an order are sorted by angle first."""
-    from dpmjax.registration import planar_scans
-
-    return planar_scans(sequence.points, sequence.mask)
+    if not Path(config.init).exists():
+        raise ValueError(f"--init {config.init}: no such file, and none of {', '.join(shared.START_NAMES)}")
+    return name, io.read_planar_poses(config.init, len(sequence), sequence.unit)
 
 
 def fit_settings(config: Config, sequence: ScanSequence) -> DeepMappingConfig:
     """The preset, with the number of steps asked for in its last phase."""
-    from dpmjax.deepmapping import preset, with_steps
-
-    settings = preset(config.preset, is_organised=sequence.is_organised)
-    return settings if config.steps is None else with_steps(settings, config.steps)
+    settings = deepmapping.preset(config.preset, is_organised=sequence.is_organised)
+    return settings if config.steps is None else deepmapping.with_steps(settings, config.steps)
 
 
-def compare_to_reference(
-    sequence: ScanSequence, start: NDArray[np.float64], poses: NDArray[np.float64]
-) -> dict[str, Any]:
-    """Errors before and after, in the unit of the scans; `success` is unknown where there is no reference."""
-    from dpmjax.geometry import se2
-    from dpmjax.metrics import absolute_trajectory_error, point_distance
-
+def before_and_after(sequence: ScanSequence, start: Floats, poses: Floats) -> dict[str, Any]:
+    """Errors of the kept poses and of the start; `success` is unknown where there is no reference."""
     reference, unit = sequence.reference_poses, sequence.unit
     if reference is None:
         return {"success": None}
-    T_reference = se2.to_matrix(reference)
-    errors: dict[str, Any] = {}
-    for which, some in (("", poses), ("initial_", start)):
-        errors[f"ate_{which}{unit}"] = absolute_trajectory_error(some[:, :2], reference[:, :2])
-        distance = point_distance(sequence.points, sequence.mask, se2.to_matrix(some), T_reference)
-        errors[f"point_distance_{which}{unit}"] = distance
+    after, before = shared.errors(sequence, poses), shared.errors(sequence, start)
     # The paper's threshold is 20 pixels, 2 % of its world; of a real place, 2 % of what its trajectory spans.
     threshold = 20.0 if unit == "px" else 0.02 * float(np.linalg.norm(np.ptp(reference[:, :2], axis=0)))
-    return {**errors, f"success_threshold_{unit}": threshold, "success": errors[f"ate_{unit}"] < threshold}
+    return {
+        **after,
+        **{name.replace(f"_{unit}", f"_initial_{unit}"): value for name, value in before.items()},
+        f"success_threshold_{unit}": threshold,
+        "success": after[f"ate_{unit}"] < threshold,
+    }
 
 
-def write_trajectories(folder: RunFolder, sequence: ScanSequence, poses: NDArray[np.float64]) -> None:
+def write_trajectories(folder: RunFolder, sequence: ScanSequence, poses: Floats) -> None:
     """trajectory.npy, trajectory_tum.txt, trajectory_kitti.txt: T_world_scan of every scan."""
-    from dpmjax.io import write_kitti, write_poses_npy, write_tum
-
-    write_poses_npy(folder / "trajectory.npy", poses)
-    write_tum(folder / "trajectory_tum.txt", poses, times=sequence.times, unit=sequence.unit)
-    write_kitti(folder / "trajectory_kitti.txt", poses)
+    io.write_poses_npy(folder / "trajectory.npy", poses)
+    io.write_tum(folder / "trajectory_tum.txt", poses, times=sequence.times, unit=sequence.unit)
+    io.write_kitti(folder / "trajectory_kitti.txt", poses)
 
 
-def draw_occupancy(folder: RunFolder, sequence: ScanSequence, run: FitRun) -> None:
-    """occupancy.png: what M-Net learned, black, white, and grey where no beam has been."""
+def draw_map(folder: RunFolder, task: Task, candidates: Candidates, metrics: Mapping[str, Any]) -> viz.Limits:
+    """map.png: the start, DeepMapping, the candidate that was kept, and the reference; returns what it shows."""
+    scans, unit, kept = task.scans, task.sequence.unit, metrics["kept"]
+    panels = []
+    for name in dict.fromkeys((metrics["start"], shared.DEEPMAPPING, kept)):
+        numbers = metrics["candidates"][name]
+        ate, distance = numbers.get(f"ate_{unit}"), numbers.get(f"point_distance_{unit}")
+        title = name[0].upper() + name[1:] + (" (kept)" if name == kept else "")
+        panels.append(viz.Panel(title, scans, candidates[name], ate=ate, point_distance=distance))
+    if task.sequence.reference_poses is None:
+        panels = [replace(panel, is_reference=panel.title.endswith(" (kept)")) for panel in panels]
+    else:
+        panels.append(viz.Panel("Reference", scans, task.sequence.reference_poses, is_reference=True))
+    figure = viz.registered_scans_figure(panels, unit)
+    viz.save_figure(figure, folder / "map.png")
+    return viz.Limits(*figure.axes[0].get_xlim(), *figure.axes[0].get_ylim())
+
+
+def draw_occupancy(folder: RunFolder, sequence: ScanSequence, run: FitRun, kept: Floats, limits: viz.Limits) -> None:
+    """occupancy.png: what M-Net learned, in the frame and within the limits of map.png."""
     if not run.has_map:
         return
-    from dpmjax import viz
-    from dpmjax.deepmapping import draw_map
-
-    picture = draw_map(run.fitted, sequence.points, sequence.mask)
+    picture = deepmapping.draw_map(run.fitted, sequence.points, sequence.mask)
+    anchor = kept if sequence.reference_poses is None else sequence.reference_poses
     trajectory = run.fitted.poses[:, :2]
-    figure = viz.occupancy_figure(picture.probability, picture.explored, picture.extent, trajectory, sequence.unit)
+    T_view_fit = trajectory_metrics.align_rigid(trajectory, anchor[:, :2])
+    figure = viz.occupancy_figure(picture, trajectory, sequence.unit, T_view_world=T_view_fit, limits=limits)
     viz.save_figure(figure, folder / "occupancy.png")
 
 
-def draw(
-    folder: RunFolder,
-    sequence: ScanSequence,
-    start: NDArray[np.float64],
-    poses: NDArray[np.float64],
-    metrics: dict[str, Any],
-) -> None:
-    """map.png and loss.png."""
-    from dpmjax import viz
-
-    unit = sequence.unit
-    scans = sequence.points, sequence.mask
-
-    def panel(title: str, of_poses: NDArray[np.float64], which: str) -> viz.Panel:
-        ate, distance = metrics.get(f"ate_{which}{unit}"), metrics.get(f"point_distance_{which}{unit}")
-        return viz.make_panel(title, *scans, of_poses, ate=ate, point_distance=distance)
-
-    panels = [panel(f"Start: {sequence.name}", start, "initial_"), panel("DeepMapping", poses, "")]
-    if sequence.reference_poses is not None:
-        panels.append(viz.make_panel("Reference", *scans, sequence.reference_poses, is_reference=True))
-    viz.save_figure(viz.registered_scans_figure(panels, unit), folder / "map.png")
+def draw_loss(folder: RunFolder, unit: str) -> None:
+    """loss.png: loss and error of the fit over its run time."""
     rows = read_history(folder / HISTORY)
     if rows:
-        columns = {
-            name: np.array([float(row[name] or "nan") for row in rows]) for name in ("run_s", "loss", f"ate_{unit}")
-        }
-        phases = [row["phase"] for row in rows]
-        history = viz.History(columns["run_s"], columns["loss"], phases, columns[f"ate_{unit}"])
+        seconds, loss, ate = (
+            np.array([float(row[name] or "nan") for row in rows]) for name in ("run_s", "loss", f"ate_{unit}")
+        )
+        history = viz.History(seconds, loss, [row["phase"] for row in rows], ate)
         viz.save_figure(viz.history_figure(history, unit), folder / "loss.png")
 
 
-def tell(folder: RunFolder, sequence: ScanSequence, metrics: dict[str, Any]) -> None:
-    """The last lines on the console: the error before and after, and where to look."""
-    unit = sequence.unit
-    if f"ate_{unit}" in metrics:
-        print(f"ATE {metrics[f'ate_initial_{unit}']:.3g} {unit} -> {metrics[f'ate_{unit}']:.3g} {unit}")
-    print(f"kept: the {metrics['chosen']} (judged by the scans alone)")
-    print(f"results in {folder.path}")
-    confidence = metrics["confidence"]
-    verdict = "can be trusted" if confidence["is_trusted"] else "DO NOT TRUST this map"
-    print(
-        f"{verdict}: weakest connection {confidence['weakest_connection']:.0%} of the beams, "
-        f"{confidence['contradiction']:.1%} contradict others"
-    )
+def report(unit: str, metrics: Mapping[str, Any]) -> list[str]:
+    """The last lines on the console: every candidate with its error and scores, and whether to trust the kept one."""
+    candidates = metrics["candidates"]
+    width = max(map(len, candidates))
+    lines = [f"  {'candidate':{width}}  {'ATE, ' + unit:>10}  nats a beam  beams off a surface"]
+    for name, numbers in candidates.items():
+        mark, ate = "*" if name == metrics["kept"] else " ", numbers.get(f"ate_{unit}", math.nan)
+        lines.append(f"{mark} {name:{width}}  {ate:10.3g}  {numbers['code_length']:11.3f}  {numbers['misfit']:19.1%}")
+    assessment = metrics["assessment"]
+    trust = "can be trusted" if assessment["is_trusted"] else "DO NOT TRUST this map"
+    return [
+        *lines,
+        f"kept: {metrics['kept']} (chosen by the scans alone)",
+        f"{trust}: weakest connection {assessment['weakest_connection']:.0%} of the beams, "
+        f"{assessment['contradiction']:.1%} contradict others",
+    ]
 
 
 if __name__ == "__main__":

@@ -15,19 +15,16 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass, replace
-from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 import numpy as np
 from tqdm import tqdm
-from tyro.conf import FlagCreatePairsOff, arg
+from tyro.conf import arg
 
-from experiments._command import run_command
+from experiments._command import StopFlag, run_command
 from experiments._json import load_json, write_json
-from experiments._machine import select_device
 from experiments._rgbd_methods import errors_of
-from experiments._run_folder import RunFolder, open_run_folder, recording, write_metrics
-from experiments._stop import StopFlag
+from experiments._run_folder import RunFolder, RunOptions, open_run_folder, recording, write_metrics
 
 if TYPE_CHECKING:
     from dpmjax.deepmapping import DepthMappingConfig
@@ -45,12 +42,12 @@ VARIANTS: dict[str, tuple[str, ...]] = {
 }
 
 
-@dataclass(frozen=True)
-class Config:
+@dataclass(frozen=True, kw_only=True)
+class Config(RunOptions):
     """Options of the ablations."""
 
-    output: Annotated[Path | None, arg(aliases=["-o"], metavar="OUT")] = None
-    """Folder for the results, instead of results/deepmapping_ablations/<time>."""
+    may_change: ClassVar[frozenset[str]] = frozenset({"limit", "only"})
+
     limit: Annotated[int, arg(metavar="N")] = 10
     """Trajectories a variant."""
     steps: Annotated[int, arg(metavar="N")] = 600
@@ -61,14 +58,6 @@ class Config:
     """Images a trajectory."""
     points: Annotated[int, arg(metavar="N")] = 200
     """Pixels of each image in a step."""
-    seed: int = 0
-    """Seed of walks and fits."""
-    device: Annotated[Literal["cpu", "gpu"] | None, arg(metavar="cpu|gpu")] = None
-    """Where to compute; without it, JAX chooses."""
-    resume: FlagCreatePairsOff[bool] = False
-    """Continue an interrupted run, the latest or that in OUT."""
-    force: FlagCreatePairsOff[bool] = False
-    """Replace an earlier run in OUT."""
 
     def __post_init__(self) -> None:
         """Checks ranges."""
@@ -82,15 +71,7 @@ class Config:
 
 def main(config: Config) -> dict[str, Any]:
     """Runs what is missing, variant by variant, then writes the table and the box plots."""
-    select_device(config.device)
-    folder = open_run_folder(
-        config,
-        EXPERIMENT,
-        output=config.output,
-        resume=config.resume,
-        force=config.force,
-        may_change=frozenset({"limit", "only"}),
-    )
+    folder = open_run_folder(config, EXPERIMENT)
     with recording(folder), StopFlag() as stop:
         rows = load_json(folder / RUNS)["rows"] if folder.is_resumed and (folder / RUNS).exists() else []
         done = {(row["ablation"], row["variant"], row["trajectory"]) for row in rows}

@@ -2,7 +2,7 @@
 
     python -m experiments.deepmapping_logs path/to/logs -o out
 
-Each run keeps its own folder below OUT, with its pictures; a run that is there already is not done again.
+Each run keeps its own folder below OUT, with its pictures; a run that is finished already is not done again.
 """
 
 from __future__ import annotations
@@ -16,13 +16,11 @@ from typing import Annotated, Any
 from tyro.conf import Positional, arg
 
 from experiments._command import run_command
-from experiments._json import load_json, write_json
-from experiments._machine import environment
-from experiments._run_folder import METRICS
+from experiments._json import load_json
+from experiments._run_folder import METRICS, RunFolder, write_metrics
 
 EXPERIMENT = "deepmapping_logs"
 _BAD_INPUT = 2
-COLUMNS = ("num_scans", "ate_initial_m", "ate_m", "chosen", "fit_s", "wall_s", "peak_rss_gb")
 
 
 @dataclass(frozen=True)
@@ -32,7 +30,7 @@ class Config:
     logs: Positional[Path]
     """Folder of .log, .log.gz or .clf files."""
     output: Annotated[Path, arg(aliases=["-o"], metavar="OUT")] = Path("results/deepmapping_logs")
-    """Folder for the runs and table.json."""
+    """Folder for the runs and metrics.json."""
     inits: tuple[str, ...] = ("icp-plane", "odometry")
     """Starts to try."""
     steps: int | None = None
@@ -51,15 +49,15 @@ def main(config: Config) -> list[dict[str, Any]]:
         for init in config.inits:
             metrics = _run(log, init, config)
             if metrics is not None:
-                name = log.name.split(".")[0]
-                rows.append({"log": name, "init": init, **{key: metrics.get(key) for key in COLUMNS}})
-                write_json(config.output / "table.json", {"rows": rows, "seed": config.seed, **environment()})
+                # A row has the commit of its own run, which may be an earlier one.
+                rows.append({"log": log.name.split(".")[0], "init": init, **metrics})
+                write_metrics(RunFolder(config.output, is_resumed=True), {}, seed=config.seed, rows=rows)
     print(markdown(rows))
     return rows
 
 
 def _run(log: Path, init: str, config: Config) -> dict[str, Any] | None:
-    """Metrics of one run in a process (so a peak memory) of its own; None where the log cannot do it."""
+    """Metrics of one run in a process of its own, whose peak memory is its own; None where the log lacks odometry."""
     folder = config.output / f"{log.name.split('.')[0]}_{init}"
     if not (folder / METRICS).exists():
         command = [sys.executable, "-m", "experiments.deepmapping_2d", str(log), "-o", str(folder), "--force"]
@@ -79,7 +77,7 @@ def markdown(rows: list[dict[str, Any]]) -> str:
     for row in rows:
         before, after = row["ate_initial_m"], row["ate_m"]
         lines.append(
-            f"| {row['log']} | {row['num_scans']} | {row['init']} | {before:.2f} | {after:.2f} | {row['chosen']} |"
+            f"| {row['log']} | {row['num_scans']} | {row['init']} | {before:.2f} | {after:.2f} | {row['kept']} |"
         )
     return "\n".join(lines)
 

@@ -17,19 +17,18 @@ from __future__ import annotations
 import time
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
-from tyro.conf import FlagCreatePairsOff, Positional, arg
+from tyro.conf import Positional, arg
 
-from experiments._command import run_command
+from experiments._command import StopFlag, run_command
 from experiments._json import load_json, write_json
-from experiments._machine import peak_rss_gb, select_device
+from experiments._machine import peak_rss_gb
 from experiments._rgbd_methods import METHODS, errors_of, run_method
-from experiments._run_folder import RunFolder, open_run_folder, recording, write_metrics
-from experiments._stop import StopFlag
+from experiments._run_folder import RunFolder, RunOptions, open_run_folder, recording, write_metrics
 
 if TYPE_CHECKING:
     from dpmjax.deepmapping import DepthMappingConfig
@@ -41,14 +40,14 @@ _SUCCESS_MM = 450.0
 _CLOSE_MM = 100.0
 
 
-@dataclass(frozen=True)
-class Config:
+@dataclass(frozen=True, kw_only=True)
+class Config(RunOptions):
     """Options of the comparison."""
+
+    may_change: ClassVar[frozenset[str]] = frozenset({"limit", "pictures"})
 
     data: Annotated[Positional[Path | None], arg(metavar="[DATA]")] = None
     """A scene of the Active Vision Dataset, or a folder of NAME.depth.png; without it, simulated apartments."""
-    output: Annotated[Path | None, arg(aliases=["-o"], metavar="OUT")] = None
-    """Folder for the results, instead of results/deepmapping_rgbd/<time>."""
     limit: Annotated[int, arg(metavar="N")] = 105
     """Trajectories."""
     methods: tuple[str, ...] = ("zero", "placed", "deepmapping", "deepmapping-cold", "direct")
@@ -63,14 +62,6 @@ class Config:
     """Depth noise of the simulated camera at one metre."""
     pictures: Annotated[int, arg(metavar="N")] = 4
     """Trajectories to draw from above."""
-    seed: int = 0
-    """Seed of walks and fits."""
-    device: Annotated[Literal["cpu", "gpu"] | None, arg(metavar="cpu|gpu")] = None
-    """Where to compute; without it, JAX chooses."""
-    resume: FlagCreatePairsOff[bool] = False
-    """Continue an interrupted run, the latest or that in OUT."""
-    force: FlagCreatePairsOff[bool] = False
-    """Replace an earlier run in OUT."""
 
     def __post_init__(self) -> None:
         """Checks ranges."""
@@ -87,17 +78,9 @@ class Config:
 
 def main(config: Config) -> dict[str, Any]:
     """Runs what is missing, then writes the table and the pictures."""
-    select_device(config.device)
     first = read_trajectory(config, 0)
     settings = fit_settings(config, first)
-    folder = open_run_folder(
-        config,
-        EXPERIMENT,
-        output=config.output,
-        resume=config.resume,
-        force=config.force,
-        may_change=frozenset({"limit", "pictures"}),
-    )
+    folder = open_run_folder(config, EXPERIMENT)
     with recording(folder), StopFlag() as stop:
         begun = time.perf_counter()
         rows = load_json(folder / RUNS)["rows"] if folder.is_resumed and (folder / RUNS).exists() else []

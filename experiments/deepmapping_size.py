@@ -14,37 +14,31 @@ import subprocess
 import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, ClassVar
 
 import numpy as np
-from tyro.conf import FlagCreatePairsOff, arg
+from tyro.conf import arg
 
 from experiments._command import run_command
 from experiments._json import load_json, write_json
 from experiments._machine import environment, peak_rss_gb
-from experiments._run_folder import open_run_folder, recording, write_metrics
+from experiments._run_folder import FolderOptions, open_run_folder, recording, write_metrics
 
 EXPERIMENT = "deepmapping_size"
 # The exponent is that of large sizes: below, a step does not hold its full number of scans.
 _FULL_STEP = 256
 
 
-@dataclass(frozen=True)
-class Config:
+@dataclass(frozen=True, kw_only=True)
+class Config(FolderOptions):
     """Options of the measurement."""
 
-    output: Annotated[Path | None, arg(aliases=["-o"], metavar="OUT")] = None
-    """Folder for the results, instead of results/deepmapping_size/<time>."""
+    may_change: ClassVar[frozenset[str]] = frozenset({"sizes"})
+
     sizes: tuple[int, ...] = (64, 128, 256, 512, 1024, 2048, 4096)
     """Numbers of scans."""
     calls: Annotated[int, arg(metavar="N")] = 3
     """Calls of 25 steps of each phase; the quickest counts."""
-    seed: int = 0
-    """Seed of walks and fits."""
-    resume: FlagCreatePairsOff[bool] = False
-    """Measure only the sizes that are missing in OUT."""
-    force: FlagCreatePairsOff[bool] = False
-    """Replace an earlier run in OUT."""
 
     def __post_init__(self) -> None:
         """Checks ranges."""
@@ -56,14 +50,7 @@ class Config:
 
 def main(config: Config) -> dict[str, Any]:
     """Measures what is missing, fits the exponents, draws."""
-    folder = open_run_folder(
-        config,
-        EXPERIMENT,
-        output=config.output,
-        resume=config.resume,
-        force=config.force,
-        may_change=frozenset({"sizes"}),
-    )
+    folder = open_run_folder(config, EXPERIMENT)
     with recording(folder):
         rows = []
         for size in sorted(config.sizes):

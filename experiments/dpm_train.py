@@ -25,11 +25,10 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import numpy as np
 from tyro.conf import FlagCreatePairsOff, arg
 
-from experiments._command import run_command
+from experiments._command import StopFlag, run_command
 from experiments._history import read_history
 from experiments._machine import peak_rss_gb, select_device
 from experiments._run_folder import HISTORY, METRICS, RunFolder, open_run_folder, recording, write_metrics
-from experiments._stop import StopFlag
 
 if TYPE_CHECKING:
     from dpmjax.deeppointmap import Model, TrainingConfig
@@ -159,7 +158,7 @@ def _open_folder(config: Config) -> RunFolder | None:
 
     if not is_first():
         return None
-    return open_run_folder(config, EXPERIMENT, output=config.output, resume=config.resume, force=config.force)
+    return open_run_folder(config, EXPERIMENT)
 
 
 def _open_records(folder: RunFolder, config: Config, settings: TrainingConfig, store: Any) -> Records:

@@ -75,7 +75,7 @@ def main(config: Config) -> dict[str, Any]:
     from dpmjax.nets.scalar import Initialization
 
     select_device(config.device)  # type: ignore[arg-type]
-    folder = open_run_folder(config, EXPERIMENT, output=config.output, force=config.force)
+    folder = open_run_folder(config, EXPERIMENT)
     with recording(folder):
         paper = ToyConfig(num_steps=config.steps)
         ends, figure = run_paper(paper, config)

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import re
 import subprocess
 import sys
 import tomllib
@@ -42,3 +43,18 @@ def test_compile_counter_counts(count_compilations) -> None:
     before = count_compilations()
     jax.jit(lambda x: x * 3 + 1)(jnp.ones(7)).block_until_ready()
     assert count_compilations() > before
+
+
+def test_api_page_lists_exactly_the_root_names() -> None:
+    page = (Path(__file__).parents[1] / "docs" / "api.md").read_text(encoding="utf-8")
+    listed = re.findall(r"^\* `(\w+)`: .+\.$", page, re.MULTILINE)
+    assert len(listed) == page.count("\n* "), "one line each: * `name`: what it is."
+    assert sorted(listed) == sorted(set(dpmjax.__all__) - {"__version__"})
+    assert page.count("\n## ") == 11, "ten groups, and the packages"
+
+
+def test_links_of_the_pages_lead_somewhere() -> None:
+    root = Path(__file__).parents[1]
+    for page in (root / "README.md", root / "CONTRIBUTING.md", *(root / "docs").glob("*.md")):
+        for target in re.findall(r"\]\((?!https?:)([^)#]+)", page.read_text(encoding="utf-8")):
+            assert (page.parent / target).exists(), f"{page.name} links to {target}"

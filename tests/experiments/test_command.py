@@ -22,29 +22,26 @@ from __future__ import annotations
 import sys, time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import ClassVar
 import tyro
-from experiments._command import run_command
+from experiments._command import StopFlag, run_command
 from experiments._history import HistoryFile, read_history
-from experiments._run_folder import open_run_folder, recording, write_metrics
-from experiments._stop import StopFlag
+from experiments._run_folder import FolderOptions, open_run_folder, recording, write_metrics
 
-@dataclass(frozen=True)
-class Config:
+@dataclass(frozen=True, kw_only=True)
+class Config(FolderOptions):
+    may_change: ClassVar[frozenset[str]] = frozenset({"steps"})
+    old_names: ClassVar[dict[str, str]] = {"--iterations": "--steps"}
+
     data: tyro.conf.Positional[Path | None] = None
     """Scans."""
-    output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"])] = None
-    seed: int = 0
     steps: int = 3
     fail: bool = False
-    resume: tyro.conf.FlagCreatePairsOff[bool] = False
-    force: tyro.conf.FlagCreatePairsOff[bool] = False
 
 def main(config):
     if config.data is not None and not config.data.exists():
         raise ValueError(f"{config.data}: no such file\\n  name a file of scans")
-    folder = open_run_folder(config, "toy", output=config.output, resume=config.resume, force=config.force,
-                             may_change=frozenset({"steps"}))
+    folder = open_run_folder(config, "toy")
     with recording(folder), StopFlag() as stop:
         start = len(read_history(folder / "metrics.csv")) if folder.is_resumed else 0
         step = start - 1
@@ -132,6 +129,17 @@ def test_bad_input_is_one_line_and_leaves_no_folder(toy, tmp_path):
     assert errors == "dpmjax: error: missing.pcd: no such file name a file of scans\n"
     assert not (tmp_path / "out").exists()
     assert not (tmp_path / "results").exists()
+
+
+def test_a_folder_that_is_taken_is_refused_before_the_input_is_read(toy, tmp_path):
+    (tmp_path / "notes.txt").write_text("mine")
+    code, output, errors = finish(toy("missing.pcd", "-o", "."))
+    assert (code, output) == (2, "")
+    assert errors == "dpmjax: error: . is not empty and holds no earlier run: name another folder with -o\n"
+
+
+def test_old_names_of_options_still_work(toy):
+    assert finish(toy("-o", "out", "--iterations", "2"))[:2] == (0, "0\n1\n")
 
 
 def test_wrong_usage_exits_with_two(toy):

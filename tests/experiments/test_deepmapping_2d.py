@@ -1,16 +1,197 @@
-"""The main command as a newcomer meets it."""
+"""Whole runs of the main command on tiny scans, what its help says, and what it says to bad input."""
 
 from __future__ import annotations
 
+import json
+import os
 import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
+from evo.tools import file_interface
 
-from experiments.deepmapping_2d import Config
+from dpmjax.io import ScanSequence, write_deepmapping_folder, write_pcd
+from dpmjax.simulation import simulate_sequence
+from experiments._command import run_command
+from experiments.deepmapping_2d import EXPERIMENT, Config, main
 
 REPOSITORY = Path(__file__).parents[2]
+NUM_SCANS = 16
+SCALE_M = 0.05
+METRICS = (
+    "ate_px", "ate_initial_px", "point_distance_px", "point_distance_initial_px", "num_scans", "steps", "wall_s",
+    "compile_s", "peak_rss_gb", "success", "seed",
+)  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def walk() -> ScanSequence:
+    return simulate_sequence(0, NUM_SCANS, num_beams=64)
+
+
+@pytest.fixture(scope="module")
+def scans_npz(walk, tmp_path_factory) -> Path:
+    path = tmp_path_factory.mktemp("scans") / "scans.npz"
+    np.savez(path, points=np.where(walk.mask[..., None], walk.points, 0.0), poses=walk.reference_poses)
+    return path
+
+
+@pytest.fixture(scope="module")
+def environment(tmp_path_factory) -> dict[str, str]:
+    """One cache of compiled programs for all runs."""
+    return os.environ | {
+        "JAX_COMPILATION_CACHE_DIR": str(tmp_path_factory.mktemp("compiled")),
+        "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
+        "JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES": "-1",
+    }
+
+
+def run(environment: dict[str, str], *options: object, interrupt: bool = False) -> subprocess.CompletedProcess[str]:
+    """The command in a process of its own; interrupted after the first call of the step where asked."""
+    command = ["-m", "experiments.deepmapping_2d"]
+    if interrupt:
+        code = (
+            "import os, signal; from experiments import _deepmapping_fit as fit, deepmapping_2d as m;"
+            "from experiments._command import run_command;"
+            "fit.show_progress = lambda *_: os.kill(os.getpid(), signal.SIGINT);"
+            "raise SystemExit(run_command(m.main, m.Config, experiment=m.EXPERIMENT, description=None))"
+        )
+        command = ["-c", code]
+    return subprocess.run(
+        [sys.executable, *command, *map(str, options)],
+        cwd=REPOSITORY,
+        env=environment,
+        capture_output=True,
+        text=True,
+        timeout=300,
+    )
+
+
+def metrics_of(folder: Path) -> dict:
+    return json.loads((folder / "metrics.json").read_text())
+
+
+def test_a_run_on_the_authors_folder_writes_everything_it_promises(environment, walk, tmp_path) -> None:
+    folder = write_deepmapping_folder(tmp_path / "scans", walk)
+    np.save(tmp_path / "start.npy", walk.reference_poses + np.array([3.0, -2.0, 0.0]))
+    done = run(environment, folder, "-o", tmp_path / "out", "--steps", 20, "--init", tmp_path / "start.npy")
+    assert done.returncode == 0, done.stderr
+    metrics = metrics_of(tmp_path / "out")
+    assert not [name for name in METRICS if metrics.get(name) is None]
+    assert (metrics["num_scans"], metrics["steps"], metrics["success"]) == (NUM_SCANS, 20, True)
+    # From a good start it never gets worse.
+    assert metrics["ate_initial_px"] < 1e-3
+    assert metrics["ate_px"] < 0.1
+    assert json.loads((tmp_path / "out" / "config.json").read_text())["steps"] == 20
+    candidates = metrics["candidates"]
+    assert list(candidates) == [
+        "poses of start.npy", "DeepMapping", "poses of start.npy, refined", "DeepMapping, refined",
+    ]  # fmt: skip
+    assert candidates[metrics["kept"]]["ate_px"] == metrics["ate_px"]
+    assert candidates["poses of start.npy"]["ate_px"] == metrics["ate_initial_px"]
+    assert min(numbers["misfit"] for numbers in candidates.values()) == candidates[metrics["kept"]]["misfit"]
+    assert f"kept: {metrics['kept']}" in done.stdout
+    for name in ("map.png", "occupancy.png", "loss.png"):
+        assert (tmp_path / "out" / name).read_bytes().startswith(b"\x89PNG"), name
+    assert len(np.load(tmp_path / "out" / "trajectory.npy")) == NUM_SCANS
+    tum = file_interface.read_tum_trajectory_file(tmp_path / "out" / "trajectory_tum.txt")
+    kitti = file_interface.read_kitti_poses_file(tmp_path / "out" / "trajectory_kitti.txt")
+    np.testing.assert_allclose(tum.positions_xyz, kitti.positions_xyz, atol=1e-4)
+    assert tum.num_poses == NUM_SCANS
+
+
+@pytest.mark.slow
+def test_an_interrupted_run_is_resumed_to_the_same_numbers(environment, scans_npz, tmp_path) -> None:
+    options = (scans_npz, "--steps", 60, "--no-polish", "--init", "zero")  # the old name of --no-refine
+    broken = run(environment, *options, "-o", tmp_path / "broken", interrupt=True)
+    assert broken.returncode == 130, broken.stderr
+    stopped = metrics_of(tmp_path / "broken")
+    assert stopped["is_interrupted"]
+    assert 0 < stopped["steps"] < 60
+    assert list(stopped["candidates"]) == ["zero poses", "DeepMapping"]
+    resumed = run(environment, "--resume", "-o", tmp_path / "broken")
+    assert resumed.returncode == 0, resumed.stderr
+    unbroken = run(environment, *options, "-o", tmp_path / "unbroken")
+    assert unbroken.returncode == 0, unbroken.stderr
+    assert metrics_of(tmp_path / "broken")["steps"] == metrics_of(tmp_path / "unbroken")["steps"]
+    one, other = (np.load(tmp_path / name / "trajectory.npy") for name in ("broken", "unbroken"))
+    np.testing.assert_array_equal(one, other)
+    steps = [line.split(",")[0] for line in (tmp_path / "broken" / "metrics.csv").read_text().splitlines()[1:]]
+    assert steps == [
+        line.split(",")[0] for line in (tmp_path / "unbroken" / "metrics.csv").read_text().splitlines()[1:]
+    ]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("is_ordered", "noise_px"), [(True, 0.0), (False, 2.0)])
+def test_a_global_start_finds_the_map_from_half_a_turn_of_view(environment, tmp_path, is_ordered, noise_px) -> None:
+    """In metres, with 180 degrees of view: in order and without noise, and shuffled with 0.1 m of range noise."""
+    walk = simulate_sequence(0, 24, num_beams=180, seed=3, range_noise_px=noise_px)
+    order = np.arange(0, 24, 2) if is_ordered else np.random.default_rng(0).permutation(np.arange(0, 24, 2))
+    bearing_deg = (2 * np.arange(180) + 180) % 360 - 180
+    ahead = [beam for beam in np.argsort(bearing_deg) if abs(bearing_deg[beam]) <= 90]
+    points = np.where(walk.mask[..., None], walk.points, 0.0)[order][:, ahead] * SCALE_M
+    poses = walk.reference_poses[order] * [SCALE_M, SCALE_M, 1.0]
+    np.savez(tmp_path / "half.npz", points=points, poses=poses, unit="m")
+    assert points[..., 0].min() > -1e-3  # nothing from behind
+    options = [] if is_ordered else ["--no-ordered"]
+    done = run(environment, tmp_path / "half.npz", "-o", tmp_path / "out", "--init", "global", "--steps", 20, *options)
+    assert done.returncode == 0, done.stderr
+    metrics = metrics_of(tmp_path / "out")
+    candidates = metrics["candidates"]
+    # The walk spans some metres: a tenth of a metre is right, and no wall is doubled.
+    assert candidates["global registration"]["ate_m"] < 0.1
+    assert metrics["ate_m"] < (0.01 if is_ordered else 0.1)
+    assert metrics["assessment"]["is_trusted"]
+
+
+def refused(tmp_path: Path, capsys, *options: object) -> str:
+    """What stderr says to bad input; there must be one line, exit code 2, and nothing written."""
+    out = tmp_path / "out"
+    arguments = [*map(str, options), "-o", str(out)]
+    code = run_command(main, Config, experiment=EXPERIMENT, description=None, args=arguments)
+    error = capsys.readouterr().err.strip()
+    assert code == 2, error
+    assert not out.exists()
+    assert len(error.splitlines()) == 1, error
+    return error
+
+
+def test_a_missing_file_is_named(as_user, tmp_path, capsys) -> None:
+    assert "nowhere.npz" in refused(tmp_path, capsys, tmp_path / "nowhere.npz")
+
+
+def test_a_truncated_cloud_is_named(as_user, walk, tmp_path, capsys) -> None:
+    folder = write_deepmapping_folder(tmp_path / "scans", walk)
+    path = folder / "003.pcd"
+    write_pcd(path, np.ones((40, 3), np.float32))
+    path.write_bytes(path.read_bytes()[:-30])
+    error = refused(tmp_path, capsys, folder)
+    assert "003.pcd" in error
+    assert "truncated" in error
+
+
+@pytest.mark.parametrize(
+    ("spoil", "found"),
+    [("all_zero", "scans.npy"), ("all_nan", "scans.npy"), ("one_scan", "scan")],
+)
+def test_scans_without_a_valid_beam_are_refused(as_user, walk, tmp_path, capsys, spoil, found) -> None:
+    points = np.where(walk.mask[..., None], walk.points, 0.0)
+    if spoil == "one_scan":
+        points = points[:1]
+    else:
+        points[:] = np.nan if spoil == "all_nan" else 0.0
+    np.save(tmp_path / "scans.npy", points)
+    assert found in refused(tmp_path, capsys, tmp_path / "scans.npy")
+
+
+@pytest.mark.parametrize(
+    ("init", "found"), [("odometry", "no odometry"), ("guess", "--init guess"), ("x.npy", "x.npy")]
+)
+def test_a_start_that_is_not_there_is_named(as_user, scans_npz, tmp_path, capsys, init, found) -> None:
+    assert found in refused(tmp_path, capsys, scans_npz, "--init", init)
 
 
 def test_help_needs_no_jax_and_shows_examples():
@@ -22,7 +203,7 @@ def test_help_needs_no_jax_and_shows_examples():
     done = subprocess.run([sys.executable, "-c", code], cwd=REPOSITORY, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     assert "    python -m experiments.deepmapping_2d --resume " in done.stdout
-    for option in ("-o OUT", "-n N", "-j N", "--preset {fast,paper}", "--init", "--no-polish", "--seed", "--resume"):
+    for option in ("-o OUT", "-n N", "-j N", "--preset {fast,paper}", "--init", "--no-refine", "--seed", "--resume"):
         assert option in done.stdout
 
 
@@ -33,6 +214,7 @@ def test_help_needs_no_jax_and_shows_examples():
         ({"n_scans": 0}, "--n-scans"),
         ({"seconds": -1.0}, "--seconds"),
         ({"steps": 0}, "--steps"),
+        ({"ordered": False, "init": "icp-plane"}, "--no-ordered"),
     ],
 )
 def test_options_out_of_range_are_refused(options, message):

@@ -34,7 +34,7 @@ join_processes(coordinator, 2, number)
 from dpmjax.deeppointmap import ScanStore, draw_evaluation_pairs
 from experiments._dpm_run import Records, run_training
 from experiments._run_folder import RunFolder
-from experiments._stop import Interrupted, StopFlag
+from experiments._command import Interrupted, StopFlag
 from pathlib import Path
 from tests.deeppointmap import toy
 from tests.experiments.test_dpm_processes import TRAINING

@@ -6,6 +6,7 @@ import json
 import logging
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import ClassVar
 
 import numpy as np
 import pytest
@@ -13,7 +14,18 @@ import pytest
 from experiments import _run_folder
 from experiments._history import HistoryFile, read_history
 from experiments._json import write_json
-from experiments._run_folder import RunFailedError, load_config, open_run_folder, recording, write_metrics
+from experiments._run_folder import (
+    FolderOptions,
+    RunFailedError,
+    check_run_folder,
+    commits_note,
+    do_row,
+    load_config,
+    open_run_folder,
+    recording,
+    row_path,
+    write_metrics,
+)
 
 
 @dataclass(frozen=True)
@@ -21,15 +33,12 @@ class Nested:
     rates: tuple[float, ...] = (1.0, 2.0)
 
 
-@dataclass(frozen=True)
-class Config:
+@dataclass(frozen=True, kw_only=True)
+class Config(FolderOptions):
+    may_change: ClassVar[frozenset[str]] = frozenset({"seconds"})
+
     data: Path | None = None
-    output: Path | None = None
-    init: str = "icp-plane"
-    seed: int = 0
     seconds: float | None = None
-    resume: bool = False
-    force: bool = False
     nested: Nested = Nested()
 
 
@@ -38,8 +47,8 @@ def _in_empty_folder(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
 
 
-def open_run(config=None, **options):
-    return open_run_folder(config or Config(), "toy", output=options.pop("output", None), **options)
+def open_run(**options):
+    return open_run_folder(Config(**options), "toy")
 
 
 def test_every_run_gets_a_folder_of_its_own_and_latest_is_the_newest():
@@ -66,6 +75,7 @@ def test_earlier_run_is_refused_resumed_or_replaced(tmp_path):
         open_run(output=run.path)
     assert open_run(output=run.path, resume=True).is_resumed
     assert (run / "metrics.json").exists()
+    (run / "rows").mkdir()
     open_run(output=run.path, force=True)
     assert sorted(path.name for path in run.path.iterdir()) == ["config.json", "notes.md"]
 
@@ -80,12 +90,11 @@ def test_force_never_touches_a_folder_that_is_no_run(tmp_path):
 def test_resume_takes_the_latest_run_and_refuses_other_options():
     with pytest.raises(ValueError, match="nothing to resume"):
         open_run(resume=True)
-    first = open_run(Config(seed=1))
-    assert open_run(Config(seed=1, resume=True), resume=True).path.resolve() == first.path.resolve()
+    first = open_run(seed=1)
+    assert open_run(seed=1, resume=True).path.resolve() == first.path.resolve()
     with pytest.raises(ValueError, match=r"--seed was 1 in .* and is 2 now"):
-        open_run(Config(seed=2), resume=True)
-    longer = Config(seed=1, seconds=60.0)
-    assert open_run(longer, resume=True, may_change=frozenset({"seconds"})).is_resumed
+        open_run(seed=2, resume=True)
+    assert open_run(seed=1, seconds=60.0, resume=True).is_resumed
 
 
 def test_folder_that_cannot_be_made_is_an_input_error(tmp_path):
@@ -94,10 +103,19 @@ def test_folder_that_cannot_be_made_is_an_input_error(tmp_path):
         open_run(output=tmp_path / "file" / "out")
 
 
+def test_check_refuses_without_touching_anything(tmp_path):
+    (tmp_path / "thesis.txt").write_text("years")
+    for options in ({"output": tmp_path}, {"resume": True}, {"resume": True, "force": True}):
+        with pytest.raises(ValueError, match="-o|give one"):
+            check_run_folder(Config(**options), "toy")
+    check_run_folder(Config(output=tmp_path / "new"), "toy")
+    assert [path.name for path in tmp_path.iterdir()] == ["thesis.txt"]
+
+
 def test_options_survive_the_way_through_the_file():
-    config = Config(data=Path("a/b"), seconds=2.5, nested=Nested((3.0,)), resume=True)
-    run = open_run(config)
-    assert load_config(run.path, Config) == replace(config, resume=False)
+    config = Config(data=Path("a/b"), seconds=2.5, nested=Nested((3.0,)), force=True)
+    run = open_run_folder(config, "toy")
+    assert load_config(run.path, Config) == replace(config, force=False)
     write_json(run / "config.json", {"sead": 1})
     with pytest.raises(ValueError, match="sead"):
         load_config(run.path, Config)
@@ -115,6 +133,51 @@ def test_metrics_are_valid_json_with_seed_and_versions():
     assert metrics["seed"] == 7
     assert {"python", "dpmjax", "jax", "jaxlib", "flax", "optax", "numpy"} <= set(metrics["versions"])
     assert {"device", "git_hash", "platform", "cpu", "num_cores"} <= set(metrics)
+
+
+def run_rows(folder, commit, monkeypatch, methods):
+    monkeypatch.setattr(_run_folder, "git_hash", lambda: commit)
+    return [do_row(folder, {"method": method}, lambda: {"ate_px": 1.5}, seed=3) for method in methods]
+
+
+def test_each_row_carries_its_own_commit_seed_and_versions(monkeypatch):
+    run = open_run()
+    (row,) = run_rows(run, "abc", monkeypatch, ["icp"])
+    assert row == run_rows(run, "def", monkeypatch, ["icp"])[0]
+    assert (row["git_hash"], row["seed"], row["ate_px"]) == ("abc", 3, 1.5)
+    assert "jax " in row["versions"]
+
+
+def test_the_file_names_the_rows_of_other_commits(monkeypatch):
+    run = open_run()
+    first = run_rows(run, "a" * 40, monkeypatch, ["icp", "swarm"])
+    path = next((run.path / "rows").glob("*swarm*"))
+    stored = json.loads(path.read_text())
+    del stored["git_hash"]
+    path.write_text(json.dumps(stored))
+    rows = run_rows(run, "b" * 40 + "+changes", monkeypatch, ["icp", "swarm", "fit"])
+    assert [row["git_hash"] for row in rows] == ["a" * 40, "unknown", "b" * 40 + "+changes"]
+    monkeypatch.setattr(_run_folder, "environment", lambda: {"git_hash": "b" * 40 + "+changes"})
+    note = write_metrics(run, {}, seed=0, rows=rows)
+    assert json.loads((run / "metrics.json").read_text())["note"] == note
+    assert note == (
+        "2 of 3 rows were made by another commit than this file (bbbbbbbbbb+changes): "
+        "1 of aaaaaaaaaa (icp); 1 of unknown (swarm)"
+    )
+    assert commits_note(first, "a" * 40) is None
+
+
+def test_a_failed_row_leaves_no_file_and_no_two_cases_share_one():
+    run = open_run()
+
+    def work():
+        raise RuntimeError("no")
+
+    with pytest.raises(RuntimeError):
+        do_row(run, {"method": "x"}, work, seed=0)
+    assert not list((run.path).glob("rows/*"))
+    case = {"method": "icp", "walk": 3, "noise_px": 0.5}
+    assert row_path(run.path, case) != row_path(run.path, {**case, "noise_px": 5})
 
 
 def test_failed_write_keeps_the_old_file(tmp_path):

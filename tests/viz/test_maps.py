@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 
-from dpmjax.viz import make_panel, registered_scans_figure, save_figure
+from dpmjax.types import ScanSet
+from dpmjax.viz import Panel, registered_scans_figure, save_figure
 from dpmjax.viz.maps import MAX_POINTS_PER_PANEL, time_colormap
 
 
@@ -44,15 +45,15 @@ def map_axes(figure):
 
 def test_panel_puts_points_where_the_poses_say():
     points, mask, poses, walls = scans_of_a_room()
-    np.testing.assert_allclose(make_panel("result", points, mask, poses).points_world, walls, atol=1e-9)
+    np.testing.assert_allclose(Panel("result", ScanSet(points, mask), poses).points_world, walls, atol=1e-9)
 
 
 def test_panels_share_limits_and_lie_on_the_reference():
     points, mask, poses, walls = scans_of_a_room()
     figure = registered_scans_figure(
         [
-            make_panel("result", points, mask, moved(poses)),
-            make_panel("reference", points, mask, poses, is_reference=True),
+            Panel("result", ScanSet(points, mask), moved(poses)),
+            Panel("reference", ScanSet(points, mask), poses, is_reference=True),
         ],
         "px",
     )
@@ -66,7 +67,7 @@ def test_panels_share_limits_and_lie_on_the_reference():
 
 def test_trajectory_is_black_and_scans_have_the_colours_of_time():
     points, mask, poses, _ = scans_of_a_room(num_beams=200)
-    image = pixels(registered_scans_figure([make_panel("result", points, mask, poses)], "m"))
+    image = pixels(registered_scans_figure([Panel("result", ScanSet(points, mask), poses)], "m"))
     assert (image.sum(axis=-1) == 0).sum() > 100
     for fraction in (0.0, 1.0):
         color = np.round(255 * np.array(time_colormap()(fraction)[:3])).astype(int)
@@ -76,7 +77,7 @@ def test_trajectory_is_black_and_scans_have_the_colours_of_time():
 def test_title_carries_the_numbers_with_their_unit():
     points, mask, poses, _ = scans_of_a_room()
     figure = registered_scans_figure(
-        [make_panel("warm start", points, mask, poses, ate=16.13, point_distance=0.0004)], "px"
+        [Panel("warm start", ScanSet(points, mask), poses, ate=16.13, point_distance=0.0004)], "px"
     )
     texts = [text.get_text() for axes in figure.axes for text in axes.texts]
     assert "warm start" in texts
@@ -88,7 +89,7 @@ def test_masked_and_diverged_points_are_not_drawn():
     mask[:, ::2] = False
     points[:, ::2] = 1e9
     poses[-1] = np.nan
-    (axes,) = map_axes(registered_scans_figure([make_panel("result", points, mask, poses)], "px"))
+    (axes,) = map_axes(registered_scans_figure([Panel("result", ScanSet(points, mask), poses)], "px"))
     offsets = axes.collections[0].get_offsets()
     assert len(offsets) == (len(poses) - 1) * mask.shape[1] // 2
     assert np.abs(offsets).max() < 1e3
@@ -98,7 +99,11 @@ def test_a_panel_that_flew_apart_does_not_shrink_the_others():
     points, mask, poses, _ = scans_of_a_room()
     wild = poses * [1000.0, 1000.0, 1.0]
     figure = registered_scans_figure(
-        [make_panel("start", points, mask, wild), make_panel("reference", points, mask, poses, is_reference=True)], "px"
+        [
+            Panel("start", ScanSet(points, mask), wild),
+            Panel("reference", ScanSet(points, mask), poses, is_reference=True),
+        ],
+        "px",
     )
     assert np.ptp(map_axes(figure)[0].get_xlim()) < 4 * 80
 
@@ -111,7 +116,9 @@ def test_degenerate_scans_still_give_a_picture(is_standing, tmp_path):
     else:
         points[:] = 0.0
         poses[:] = 0.0
-    save_figure(registered_scans_figure([make_panel("result", points, mask, poses)], "m"), tmp_path / "map.png", dpi=60)
+    save_figure(
+        registered_scans_figure([Panel("result", ScanSet(points, mask), poses)], "m"), tmp_path / "map.png", dpi=60
+    )
     assert (tmp_path / "map.png").read_bytes().startswith(b"\x89PNG")
     assert [path.name for path in tmp_path.iterdir()] == ["map.png"]
 
@@ -119,23 +126,26 @@ def test_degenerate_scans_still_give_a_picture(is_standing, tmp_path):
 def test_many_points_are_thinned_to_the_budget():
     points = np.random.default_rng(0).uniform(0, 50, (4, MAX_POINTS_PER_PANEL // 2, 2))
     poses = np.zeros((4, 3))
-    (axes,) = map_axes(registered_scans_figure([make_panel("result", points, np.ones(points.shape[:2]), poses)], "m"))
+    (axes,) = map_axes(
+        registered_scans_figure([Panel("result", ScanSet(points, np.ones(points.shape[:2])), poses)], "m")
+    )
     assert len(axes.collections[0].get_offsets()) == MAX_POINTS_PER_PANEL
 
 
 def test_panels_of_other_scans_are_refused():
     points, mask, poses, _ = scans_of_a_room()
-    panels = [make_panel("a", points, mask, poses), make_panel("b", points[:2], mask[:2], poses[:2])]
+    panels = [Panel("a", ScanSet(points, mask), poses), Panel("b", ScanSet(points[:2], mask[:2]), poses[:2])]
     with pytest.raises(ValueError, match=r"\[6, 2\]"):
         registered_scans_figure(panels, "px")
     with pytest.raises(ValueError, match="poses"):
-        make_panel("a", points, mask, poses[:, :2])
+        Panel("a", ScanSet(points, mask), poses[:, :2])
 
 
 def test_drawing_leaves_no_global_state_and_no_early_matplotlib():
     code = (
-        "import sys, numpy as np, dpmjax.viz as viz; assert 'matplotlib' not in sys.modules;"
-        "panel = viz.make_panel('a', np.ones((2, 3, 2)), np.ones((2, 3)), np.zeros((2, 3)));"
+        "import sys, numpy as np, dpmjax.viz as viz; assert not {'jax', 'matplotlib'} & set(sys.modules);"
+        "from dpmjax.types import ScanSet;"
+        "panel = viz.Panel('a', ScanSet(np.ones((2, 3, 2)), np.ones((2, 3))), np.zeros((2, 3)));"
         "viz.registered_scans_figure([panel], 'm');"
         "assert 'matplotlib.pyplot' not in sys.modules"
     )

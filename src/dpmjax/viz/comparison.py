@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 def error_boxes_figure(
     panels: Mapping[str, Mapping[str, Sequence[float]]], *, threshold: float | None = None
 ) -> Figure:
-    """Box plots of errors on a logarithmic axis, one panel a measure, one box a method.
+    """Draws box plots of errors on a logarithmic axis: one panel for each measure, one box for each method.
 
     Args:
         panels: errors by measure (with its unit) and by method.
@@ -45,34 +45,40 @@ def error_boxes_figure(
 
 
 def success_grids_figure(
-    grids: Mapping[str, NDArray[np.float64]], rows: Sequence[str], columns: Sequence[str], *, row_label: str,
-    column_label: str,
-) -> Figure:  # fmt: skip
-    """One grid of success rates a method; cells that were not run are empty.
+    grids: Mapping[str, NDArray[np.float64]], rows: Mapping[str, Sequence[str]], columns: Mapping[str, Sequence[str]]
+) -> Figure:
+    """Draws one grid of success rates for each method; cells that were not run are empty.
 
     Args:
         grids: (r, c) rates from 0 to 1 by method; NaN: not run.
-        rows: names of the rows.
-        columns: names of the columns.
-        row_label: what the rows are.
-        column_label: what the columns are.
+        rows: what the rows are, with the name of each.
+        columns: what the columns are, with the name of each.
 
     Returns:
         The figure.
+
+    Raises:
+        ValueError: a grid has another shape than its names.
     """
-    figure = new_figure(1.2 + 2.1 * len(grids), 1.3 + 0.42 * len(rows))
-    axes = np.atleast_1d(figure.subplots(1, len(grids), sharey=True))
-    for number, (ax, (method, rates)) in enumerate(zip(axes, grids.items(), strict=True)):
+    ((row_label, row_names),) = rows.items()
+    ((column_label, column_names),) = columns.items()
+    for method, rates in grids.items():
+        if rates.shape != (len(row_names), len(column_names)):
+            raise ValueError(
+                f"{method}: expected {len(row_names)} rows and {len(column_names)} columns, got {rates.shape}"
+            )
+    figure = new_figure(1.2 + 2.1 * len(grids), 1.3 + 0.42 * len(row_names))
+    axes = figure.subplots(1, len(grids), sharey=True, squeeze=False)[0]
+    for ax, (method, rates) in zip(axes, grids.items(), strict=True):
         ax.imshow(rates, vmin=0.0, vmax=1.0, cmap="cividis", aspect="auto")
         for (i, j), rate in np.ndenumerate(rates):
             if np.isfinite(rate):
                 ink = INK if rate > 0.5 else "white"
                 ax.text(j, i, f"{100 * rate:.0f}", ha="center", va="center", fontsize=8, color=ink)
         ax.set_title(method, fontsize=9, color=INK)
-        ax.set_xticks(range(len(columns)), list(columns), fontsize=8)
-        ax.set_yticks(range(len(rows)), list(rows), fontsize=8)
+        ax.set_xticks(range(len(column_names)), list(column_names), fontsize=8)
+        ax.set_yticks(range(len(row_names)), list(row_names), fontsize=8)
         ax.set_xlabel(column_label, fontsize=8)
-        if number == 0:
-            ax.set_ylabel(row_label, fontsize=8)
+    axes[0].set_ylabel(row_label, fontsize=8)
     figure.tight_layout()
     return figure

@@ -38,7 +38,7 @@ class Limits(NamedTuple):
 
 
 def new_figure(width_in: float, height_in: float) -> Figure:
-    """Makes a white figure that belongs to no window and to no global state."""
+    """Returns a white figure that belongs to no window and to no global state."""
     from matplotlib.figure import Figure
 
     return Figure(figsize=(width_in, height_in), facecolor="white")
@@ -89,7 +89,7 @@ def add_scale_bar(axes: Axes, limits: Limits, unit: str) -> None:
 
 
 def round_length(length: float) -> float:
-    """The largest of 1, 2, 5 times a power of ten that is not longer than `length`."""
+    """Returns the largest of 1, 2, 5 times a power of ten that is not longer than `length`."""
     power = 10.0 ** np.floor(np.log10(length))
     return float(max(step * power for step in (1.0, 2.0, 5.0) if step * power <= length * (1.0 + 1e-9)))
 
@@ -102,7 +102,7 @@ def draw_trajectory(axes: Axes, trajectory_world: np.ndarray, color: str) -> Non
 
 
 def format_length(length: float, unit: str) -> str:
-    """At most three significant digits and three decimals, without exponents: `16.1 px`, `0.012 m`, `< 0.001 px`."""
+    """Returns a length with three significant digits and three decimals at most: `16.1 px`, `0.012 m`, `< 0.001 px`."""
     if not np.isfinite(length):
         return f"{length} {unit}"
     if abs(length) < 1e-3:

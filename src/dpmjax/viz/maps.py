@@ -7,14 +7,17 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
+from dpmjax.geometry import se2
 from dpmjax.viz.figures import INK, MUTED, Limits, add_scale_bar, draw_trajectory, format_length, frame_map, new_figure
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.colors import Colormap
     from matplotlib.figure import Figure
+
+    from dpmjax.types import ScanSet
 
 PANEL_WIDTH_IN = 4.2
 HEADER_IN = 0.62
@@ -27,63 +30,52 @@ MARGIN = 0.04
 
 @dataclass(frozen=True)
 class Panel:
-    """One set of poses, and where it puts the points.
+    """One set of poses of the scans.
 
     Attributes:
-        title: what these poses are ("warm start").
-        points_world: (n, b, 2) all scans in this panel's own world frame.
-        mask: (n, b) True where there is a point.
-        trajectory_world: (n, 2) sensor positions in the same frame.
+        title: what produced these poses.
+        scans: points (n, b, 2) in the sensor frames, and mask (n, b), True where there is a point.
+        poses: (n, 3) x, y, heading (radians) of the sensor in the world of this panel.
         ate: absolute trajectory error in the unit of the figure, or None.
         point_distance: mean point distance in the unit of the figure, or None.
         is_reference: the other panels are laid onto this one.
     """
 
     title: str
-    points_world: NDArray[np.floating]
-    mask: NDArray[np.bool_]
-    trajectory_world: NDArray[np.floating]
+    scans: ScanSet
+    poses: NDArray[np.floating]
     ate: float | None = None
     point_distance: float | None = None
     is_reference: bool = False
 
+    def __post_init__(self) -> None:
+        """Checks the shapes.
 
-def make_panel(
-    title: str,
-    points: ArrayLike,
-    mask: ArrayLike,
-    poses: ArrayLike,
-    *,
-    ate: float | None = None,
-    point_distance: float | None = None,
-    is_reference: bool = False,
-) -> Panel:
-    """Makes a panel from scans in their sensor frames and planar poses.
+        Raises:
+            ValueError: they do not fit each other.
+        """
+        points, mask, poses = (np.shape(x) for x in (self.scans.points, self.scans.mask, self.poses))
+        if len(points) != 3 or points[-1] != 2 or mask != points[:2] or poses != (points[0], 3):
+            raise ValueError(
+                f"expected points (n, b, 2), mask (n, b), poses (n, 3); got points {points}, mask {mask}, poses {poses}"
+            )
 
-    Args:
-        title: what these poses are.
-        points: (n, b, 2) in the sensor frames.
-        mask: (n, b) True where there is a point.
-        poses: (n, 3) x, y, heading (radians) of the sensor in the world.
-        ate: absolute trajectory error, if known.
-        point_distance: mean point distance, if known.
-        is_reference: whether the other panels are laid onto this one.
+    @property
+    def trajectory_world(self) -> NDArray[np.float64]:
+        """(n, 2) sensor positions."""
+        return np.asarray(self.poses, np.float64)[:, :2]
 
-    Raises:
-        ValueError: where the shapes do not fit.
-    """
-    points = np.asarray(points, np.float64)
-    mask = np.asarray(mask, bool)
-    poses = np.asarray(poses, np.float64)
-    if points.ndim != 3 or points.shape[-1] != 2 or mask.shape != points.shape[:2] or poses.shape != (len(points), 3):
-        raise ValueError(
-            "expected points (n, b, 2), mask (n, b), poses (n, 3); "
-            f"got points {points.shape}, mask {mask.shape}, poses {poses.shape}"
-        )
-    cos, sin = np.cos(poses[:, 2, None]), np.sin(poses[:, 2, None])
-    x, y = points[..., 0], points[..., 1]
-    points_world = np.stack([cos * x - sin * y, sin * x + cos * y], axis=-1) + poses[:, None, :2]
-    return Panel(title, points_world, mask, poses[:, :2], ate, point_distance, is_reference)
+    @property
+    def points_world(self) -> NDArray[np.float64]:
+        """(n, b, 2) the points where the poses put them."""
+        poses, points = np.asarray(self.poses, np.float64), np.asarray(self.scans.points, np.float64)
+        return np.asarray(se2.transform_points(poses, points))
+
+    def visible_points(self) -> tuple[NDArray[np.float64], NDArray[np.intp]]:
+        """Returns the points (m, 2) that can be drawn, and the scan (m,) that each comes from."""
+        points = self.points_world
+        is_drawable = np.asarray(self.scans.mask, bool) & np.isfinite(points).all(axis=-1)
+        return points[is_drawable], np.nonzero(is_drawable)[0]
 
 
 def registered_scans_figure(panels: Sequence[Panel], unit: str) -> Figure:
@@ -98,14 +90,15 @@ def registered_scans_figure(panels: Sequence[Panel], unit: str) -> Figure:
         panels: at least one; all of the same scans.
         unit: unit of lengths, "px" or "m".
 
+    Returns:
+        The figure; its first axes have the limits of all panels.
+
     Raises:
         ValueError: no panel, or panels of different numbers of scans.
     """
-    if not panels or len({len(panel.trajectory_world) for panel in panels}) != 1:
-        raise ValueError(
-            "expected one or more panels of the same scans; "
-            f"got panels of {[len(panel.trajectory_world) for panel in panels]} scans"
-        )
+    sizes = [len(panel.poses) for panel in panels]
+    if len(set(sizes)) != 1:
+        raise ValueError(f"expected one or more panels of the same scans; got panels of {sizes} scans")
     anchor = next((panel for panel in panels if panel.is_reference), panels[-1])
     aligned = [panel if panel is anchor else _laid_onto(panel, anchor) for panel in panels]
     limits = _shared_limits(aligned, aligned[panels.index(anchor)])
@@ -123,12 +116,12 @@ def registered_scans_figure(panels: Sequence[Panel], unit: str) -> Figure:
         _draw_panel(axes, panel, limits, unit, colormap)
         if column == 0:
             add_scale_bar(axes, limits, unit)
-    _add_time_bar(figure, len(anchor.trajectory_world), width_in, total_in, colormap)
+    _add_time_bar(figure, len(anchor.poses), width_in, total_in, colormap)
     return figure
 
 
 def time_colormap() -> Colormap:
-    """Violet over red to amber: even in lightness, and nowhere too pale for a white ground."""
+    """Returns violet over red to amber: even in lightness, and nowhere too pale for a white ground."""
     import matplotlib
     from matplotlib.colors import LinearSegmentedColormap
 
@@ -137,31 +130,21 @@ def time_colormap() -> Colormap:
 
 
 def _laid_onto(panel: Panel, anchor: Panel) -> Panel:
-    """Moves the panel rigidly so that its trajectory is as close as possible to the anchor's (least squares)."""
-    source = panel.trajectory_world @ np.array([1.0, 1.0j])
-    target = anchor.trajectory_world @ np.array([1.0, 1.0j])
+    """Returns the panel moved rigidly, its trajectory as close as possible to the anchor's (least squares)."""
+    # A position as one complex number: a turn is then a product with a number of length one.
+    source, target = (one.trajectory_world @ np.array([1.0, 1.0j]) for one in (panel, anchor))
     is_used = np.isfinite(source) & np.isfinite(target)
     if not is_used.any():
         return panel
-    source_centre, target_centre = source[is_used].mean(), target[is_used].mean()
-    correlation = np.vdot(source[is_used] - source_centre, target[is_used] - target_centre)
-    turn = correlation / abs(correlation) if abs(correlation) > 0.0 else 1.0 + 0.0j
-
-    def move(points: NDArray[np.floating]) -> NDArray[np.floating]:
-        moved = turn * (points @ np.array([1.0, 1.0j]) - source_centre) + target_centre
-        return np.stack([moved.real, moved.imag], axis=-1)
-
-    return replace(panel, points_world=move(panel.points_world), trajectory_world=move(panel.trajectory_world))
-
-
-def _visible_points(panel: Panel) -> tuple[NDArray[np.floating], NDArray[np.intp]]:
-    """The points (m, 2) that are drawable, and the scan (m,) that each comes from."""
-    is_drawable = panel.mask & np.isfinite(panel.points_world).all(axis=-1)
-    return panel.points_world[is_drawable], np.nonzero(is_drawable)[0]
+    source, target = source[is_used], target[is_used]
+    turn = np.angle(np.vdot(source - source.mean(), target - target.mean()))
+    shift = target.mean() - np.exp(1.0j * turn) * source.mean()
+    motion = np.array([shift.real, shift.imag, turn])
+    return replace(panel, poses=se2.compose(motion, np.asarray(panel.poses, np.float64)))
 
 
 def _shared_limits(panels: Sequence[Panel], anchor: Panel) -> Limits:
-    """Limits that show every panel; a panel that flies apart is cut at half the anchor's size beyond the anchor."""
+    """Returns limits that show every panel; a diverged panel is cut at half the anchor's size beyond the anchor."""
     low, high = _extent(anchor)
     size = np.max(high - low)
     lows, highs = zip(*(_extent(panel) for panel in panels), strict=True)
@@ -176,8 +159,8 @@ def _shared_limits(panels: Sequence[Panel], anchor: Panel) -> Limits:
 
 
 def _extent(panel: Panel) -> tuple[NDArray[np.floating], NDArray[np.floating]]:
-    """Corners of the box around the trajectory and nearly all points; a unit box where there is nothing."""
-    points, _ = _visible_points(panel)
+    """Returns the corners of the box around trajectory and nearly all points; a unit box where there is nothing."""
+    points, _ = panel.visible_points()
     trajectory = panel.trajectory_world[np.isfinite(panel.trajectory_world).all(axis=-1)]
     corners = [trajectory]
     if len(points):
@@ -192,7 +175,7 @@ def _extent(panel: Panel) -> tuple[NDArray[np.floating], NDArray[np.floating]]:
 
 
 def _draw_panel(axes: Axes, panel: Panel, limits: Limits, unit: str, colormap: Colormap) -> None:
-    points, scans = _visible_points(panel)
+    points, scans = panel.visible_points()
     order = np.random.default_rng(0).permutation(len(points))[:MAX_POINTS_PER_PANEL]
     axes.scatter(
         points[order, 0],
@@ -200,7 +183,7 @@ def _draw_panel(axes: Axes, panel: Panel, limits: Limits, unit: str, colormap: C
         c=scans[order],
         cmap=colormap,
         vmin=0,
-        vmax=max(1, len(panel.trajectory_world) - 1),
+        vmax=max(1, len(panel.poses) - 1),
         s=np.clip(50_000.0 / max(1, len(order)), 0.45, 4.0),
         linewidths=0,
         rasterized=True,
@@ -214,7 +197,9 @@ def _draw_panel(axes: Axes, panel: Panel, limits: Limits, unit: str, colormap: C
     if panel.point_distance is not None:
         numbers.append(f"point distance {format_length(panel.point_distance, unit)}")
     style: dict[str, Any] = {"xycoords": "axes fraction", "textcoords": "offset points", "va": "baseline"}
-    axes.annotate(panel.title, (0, 1), xytext=(1, 21), fontsize=12.5, fontweight="bold", color=INK, **style)
+    # A long title is drawn smaller, so that it does not run into the next panel.
+    title_size = min(12.5, 480.0 / max(1, len(panel.title)))
+    axes.annotate(panel.title, (0, 1), xytext=(1, 21), fontsize=title_size, fontweight="bold", color=INK, **style)
     axes.annotate("   ".join(numbers), (0, 1), xytext=(1, 7), fontsize=9.5, color=MUTED, **style)
 
 
