@@ -24,7 +24,7 @@ from dpmjax.deeppointmap import merge_clouds, pyramid_of_cloud
 from dpmjax.geometry import build_pyramid
 from dpmjax.io import open_lidar_sequence
 from dpmjax.scans import preprocess_scan, preprocess_scan_on_host
-from dpmjax.simulation.town import HDL64E, simulate_lidar_sequence
+from dpmjax.simulation import HDL64E, simulate_lidar_sequence
 from dpmjax.types import DescriptorCloud
 from experiments._machine import peak_rss_gb
 

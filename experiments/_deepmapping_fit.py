@@ -19,7 +19,7 @@ from experiments._stop import StopFlag
 
 if TYPE_CHECKING:
     from dpmjax.deepmapping import DeepMappingConfig
-    from dpmjax.io.scans2d.sequence import ScanSequence
+    from dpmjax.sequences import ScanSequence
     from dpmjax.types import ScanSet
 
 # Of the table; the error, named with its unit, comes last.

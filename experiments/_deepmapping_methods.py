@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 if TYPE_CHECKING:
-    from dpmjax.io.scans2d.sequence import ScanSequence
     from dpmjax.registration import Assessment, PlanarScans
+    from dpmjax.sequences import ScanSequence
     from dpmjax.types import ScanSet
 
 Floats = NDArray[np.float64]
@@ -69,12 +69,11 @@ def split_by_extras(methods: tuple[str, ...]) -> tuple[tuple[str, ...], dict[str
 
 def make_problem(sequence: ScanSequence, *, is_ordered: bool, steps: int, seed: int) -> Problem:
     """The scans as methods want them; without an order they are shuffled."""
-    from dpmjax.io import take_scans
     from dpmjax.registration import planar_scans
 
     if not is_ordered:
         order = np.random.default_rng([seed, 77]).permutation(len(sequence))
-        sequence = replace(take_scans(sequence, order), odometry_poses=None)
+        sequence = replace(sequence.take(order), odometry_poses=None)
     planar = planar_scans(sequence.points, sequence.mask, is_ordered=is_ordered)
     return Problem(sequence, planar, is_ordered, steps, seed)
 
@@ -230,13 +229,12 @@ def _fit(problem: Problem, start: Floats | None, config: Any) -> Floats:
 def _fit_in_order(problem: Problem, start: Floats) -> Floats:
     """The fit of scans in an order in which neighbours are near each other: that of time, or a tour of the start."""
     from dpmjax.deepmapping import preset
-    from dpmjax.io import take_scans
     from dpmjax.registration import nearest_tour
 
     if problem.is_ordered:
         return _fit(problem, start, preset("fast"))
     tour = nearest_tour(start)
-    ordered = replace(problem, sequence=take_scans(problem.sequence, tour))
+    ordered = replace(problem, sequence=problem.sequence.take(tour))
     poses = np.empty_like(start)
     poses[tour] = _fit(ordered, start[tour], preset("fast"))
     return poses

@@ -34,8 +34,8 @@ from experiments._stop import StopFlag
 
 if TYPE_CHECKING:
     from dpmjax.deepmapping import DeepMappingConfig
-    from dpmjax.io.scans2d.sequence import ScanSequence
     from dpmjax.registration import PlanarScans
+    from dpmjax.sequences import ScanSequence
 
 EXPERIMENT = "deepmapping_2d"
 LOGGER = logging.getLogger("dpmjax.deepmapping_2d")
@@ -168,13 +168,12 @@ def _fit(
     stop: StopFlag,
 ) -> FitRun:
     """DeepMapping; its losses compare each scan with the next ones, so these must be near: in time they are."""
-    from dpmjax.io import take_scans
     from dpmjax.registration import nearest_tour
 
     order = np.arange(len(sequence)) if config.ordered else nearest_tour(start)
     fitted = run_fit(
         folder,
-        take_scans(sequence, order),
+        sequence.take(order),
         settings,
         start=None if config.init == "zero" else start[order],
         seed=config.seed,
@@ -200,7 +199,7 @@ def _polish(
 
 def read_scans(config: Config) -> ScanSequence:
     """The scans of DATA or of the built-in world, sub-range and stride applied."""
-    from dpmjax.io import read_sequence, take_scans
+    from dpmjax.io import read_sequence
     from dpmjax.simulation import simulate_sequence
 
     stop = None if config.n_scans is None else config.start + config.n_scans * config.jump
@@ -209,7 +208,7 @@ def read_scans(config: Config) -> ScanSequence:
     sequence = simulate_sequence(
         config.world, stop or 256, range_noise_px=config.range_noise_px, seed=config.seed, with_odometry=True
     )
-    return take_scans(sequence, slice(config.start, stop, config.jump))
+    return sequence.take(slice(config.start, stop, config.jump))
 
 
 def warm_start(config: Config, sequence: ScanSequence) -> NDArray[np.float64]:
@@ -228,11 +227,11 @@ def warm_start(config: Config, sequence: ScanSequence) -> NDArray[np.float64]:
             )
         return sequence.odometry_poses
     if config.init not in INITS:
-        from dpmjax.io import read_initial_poses
+        from dpmjax.io import read_planar_poses
 
         if not Path(config.init).exists():
             raise ValueError(f"--init {config.init}: no such file, and none of {', '.join(INITS)}")
-        return read_initial_poses(config.init, len(sequence), sequence.unit)
+        return read_planar_poses(config.init, len(sequence), sequence.unit)
 
     from dpmjax.registration import IncrementalConfig, incremental_icp
 

@@ -116,13 +116,12 @@ def _run_cell(folder: Path, cell: tuple[int, int, float, str], config: Config) -
 
 
 def _make_cell_problem(cell: tuple[int, int, float, str], config: Config) -> Problem:
-    from dpmjax.io import take_scans
     from dpmjax.simulation import simulate_sequence
 
     walk, stride, noise, order = cell
     sequence = simulate_sequence(walk % NUM_WORLDS, NUM_SCANS, seed=200 + walk, range_noise_px=noise)
     return make_problem(
-        take_scans(sequence, slice(None, None, stride)),
+        sequence.take(slice(None, None, stride)),
         is_ordered=order == "ordered",
         steps=config.steps,
         seed=config.seed,

@@ -28,7 +28,7 @@ from experiments._run_folder import CHECKPOINTS, find_run, load_config
 
 if TYPE_CHECKING:
     from dpmjax.deepmapping import Fitted
-    from dpmjax.io.scans2d.sequence import ScanSequence
+    from dpmjax.sequences import ScanSequence
 
 EXPERIMENT = "deepmapping_relocalize"
 # A fit counts as a success below this error (section 4.1); so does a re-localisation.

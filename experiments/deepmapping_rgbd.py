@@ -143,7 +143,7 @@ def read_trajectory(config: Config, index: int) -> DepthSequence:
     if sequence.T_world_camera is None:
         raise ValueError(f"{config.data}: has no pose files, so nothing to compare to")
     begin = index * (views // 2)
-    window = io.take_frames(sequence, slice(begin, begin + views))
+    window = sequence.take(slice(begin, begin + views))
     return replace(window, name=f"{sequence.name}, images {begin} to {begin + len(window) - 1}")
 
 

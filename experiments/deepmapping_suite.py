@@ -36,7 +36,7 @@ from experiments._run_folder import RunFolder, open_run_folder, recording, write
 from experiments._stop import StopFlag
 
 if TYPE_CHECKING:
-    from dpmjax.io.scans2d.sequence import ScanSequence
+    from dpmjax.sequences import ScanSequence
 
 EXPERIMENT = "deepmapping_suite"
 NUM_WORLDS, NUM_SHORT, NUM_LONG = 3, 50, 25

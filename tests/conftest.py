@@ -79,3 +79,12 @@ def as_user() -> Iterator[None]:
     jaxtyping.config.update("jaxtyping_disable", True)
     yield
     jaxtyping.config.update("jaxtyping_disable", False)
+
+
+@pytest.fixture
+def real_data() -> Path:
+    """Folder of the real data; the test is skipped where there is none."""
+    folder = Path(os.environ.get("DPMJAX_DATA", Path(__file__).parents[2] / "shared" / "data"))
+    if not folder.is_dir():
+        pytest.skip(f"no real data in {folder} (set DPMJAX_DATA)")
+    return folder

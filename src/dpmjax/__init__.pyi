@@ -16,6 +16,8 @@ from .geometry.normals import estimate_normals as estimate_normals
 from .geometry.rays import sample_free_space as sample_free_space
 from .geometry.sampling import farthest_point_sample as farthest_point_sample
 from .geometry.sampling import voxel_sample as voxel_sample
+from .io.g2o import read_g2o as read_g2o
+from .io.g2o import write_g2o as write_g2o
 from .losses.chamfer import chamfer_distance as chamfer_distance
 from .losses.contrastive import info_nce as info_nce
 from .losses.occupancy import occupancy_loss as occupancy_loss
@@ -24,6 +26,10 @@ from .metrics.trajectory import absolute_trajectory_error as absolute_trajectory
 from .metrics.trajectory import align_rigid as align_rigid
 from .metrics.trajectory import point_distance as point_distance
 from .metrics.trajectory import relative_pose_error as relative_pose_error
+from .pose_graph.graph import Edges as Edges
+from .pose_graph.graph import PoseGraph as PoseGraph
+from .pose_graph.optimize import PoseGraphConfig as PoseGraphConfig
+from .pose_graph.optimize import optimize_pose_graph as optimize_pose_graph
 from .registration.icp import icp as icp
 from .types import DescriptorCloud as DescriptorCloud
 from .types import Neighbours as Neighbours

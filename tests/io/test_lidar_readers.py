@@ -16,7 +16,7 @@ from dpmjax.io import (
     write_pcd,
     write_ply,
 )
-from dpmjax.io.poses.lidar_poses import interpolate_poses
+from dpmjax.io.poses import interpolate_poses
 
 AXES = np.array([[0.0, -1, 0, 0.1], [0, 0, -1, -0.2], [1, 0, 0, -0.3], [0, 0, 0, 1]])  # T_cam0_lidar
 
@@ -230,12 +230,11 @@ def test_a_pose_file_can_be_named(tmp_path, clouds, poses):
 
 def test_sub_ranges_take_poses_and_times_along(tmp_path, clouds, poses):
     folder = kitti_odometry(tmp_path, clouds, poses)
-    part = open_lidar_sequence(folder, start=2, stop=9, stride=3)
+    part = open_lidar_sequence(folder, selection=slice(2, 9, 3))
     assert_same(part, clouds[2:9:3], poses[2:9:3])
     np.testing.assert_allclose(part.times, [0.2, 0.5, 0.8])
-    for wrong in ({"start": 20}, {"stride": 0}, {"start": -1}, {"stop": 0}):
-        with pytest.raises(InputError):
-            open_lidar_sequence(folder, **wrong)
+    with pytest.raises(InputError, match="0 of 12 scans"):
+        open_lidar_sequence(folder, selection=slice(20, None))
 
 
 def bad_nan(path, cloud):
@@ -245,7 +244,7 @@ def bad_nan(path, cloud):
 
 
 BAD = {
-    "cut off": lambda path, cloud: path.write_bytes(cloud.astype("<f4").tobytes()[:-7]),
+    "truncated": lambda path, cloud: path.write_bytes(cloud.astype("<f4").tobytes()[:-7]),
     "NaN": bad_nan,
     "no point": lambda path, cloud: path.write_bytes(b""),
     "median range": lambda path, cloud: write_bin(path, 1000 * cloud),
@@ -281,6 +280,16 @@ def test_wrong_arrays_are_named(tmp_path, content):
     np.save(tmp_path / "0.npy", content)
     with pytest.raises(InputError, match=r"0\.npy"):
         read_lidar_file(tmp_path / "0.npy")
+
+
+def test_a_scan_in_millimetres_is_warned_of(tmp_path, clouds, caplog):
+    for index in range(3):
+        write_bin(tmp_path / f"{index}.bin", clouds[index] / np.linalg.norm(clouds[index], axis=1)[:, None] * 300)
+    with caplog.at_level(logging.WARNING):
+        assert len(list(iterate_scans(open_lidar_sequence(tmp_path)))) == 3
+    assert [record.message.count("are these millimetres?") for record in caplog.records] == [1]
+    read_lidar_file(tmp_path / "1.bin")
+    assert "1.bin" in caplog.text
 
 
 def test_other_columns_can_be_said(tmp_path, clouds):
@@ -331,7 +340,7 @@ def test_real_drives_are_opened(real_data, name):
 
 
 def test_the_real_truncated_scan_is_named(real_data):
-    with pytest.raises(InputError, match=r"truncated\.bin.*cut off"):
+    with pytest.raises(InputError, match=r"truncated\.bin.*truncated"):
         read_lidar_file(real_data / "bad_input" / "truncated.bin")
 
 

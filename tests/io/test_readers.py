@@ -1,18 +1,22 @@
 """Laws of the one door for scans and of NumPy files."""
 
 import gzip
+import logging
 import subprocess
 import sys
 
 import numpy as np
 import pytest
 
-from dpmjax.io import InputError, ScanSequence, has_angular_order, read_sequence, take_scans, write_deepmapping_folder
+from dpmjax.io import InputError, ScanSequence, read_sequence, write_deepmapping_folder
+from dpmjax.sequences import has_angular_order
 
-ANGLES = np.linspace(-2, 2, 7)
+NUM_BEAMS = 20
+ANGLES = np.linspace(-2, 2, NUM_BEAMS)
 POINTS = 3.0 * np.tile(np.stack([np.cos(ANGLES), np.sin(ANGLES)], -1), (6, 1, 1)) * np.arange(1, 7)[:, None, None]
 POSES = np.arange(18.0).reshape(6, 3) / 10
-LOG = "".join(f"FLASER 3 1 2 3 {i} 0 0 {i} 1 0 {i} h {i}\n" for i in range(6))
+RANGES = "1 2 3" + 17 * " 1"
+LOG = "".join(f"FLASER 20 {RANGES} {i} 0 0 {i} 1 0 {i} h {i}\n" for i in range(6))
 
 
 def save(tmp_path, name="a.npy", **arrays):
@@ -38,7 +42,7 @@ def test_npy_and_npz_of_points_agree(tmp_path):
 
 
 def test_third_coordinate_is_ignored(tmp_path):
-    deep = np.concatenate([POINTS, np.full((6, 7, 1), 9.0)], axis=2)
+    deep = np.concatenate([POINTS, np.full((6, NUM_BEAMS, 1), 9.0)], axis=2)
     np.testing.assert_allclose(read_sequence(save(tmp_path, points=deep)).points, POINTS, rtol=1e-6)
 
 
@@ -61,11 +65,11 @@ def test_matrices_and_triples_are_the_same_poses(tmp_path):
 
 
 def test_nan_points_and_the_mask_are_invalid_beams(tmp_path):
-    holed, mask = POINTS.copy(), np.ones((6, 7), bool)
+    holed, mask = POINTS.copy(), np.ones((6, NUM_BEAMS), bool)
     holed[0, 1], mask[1, 2] = np.nan, False
     scans = read_sequence(save(tmp_path, "a.npz", points=holed, mask=mask))
     assert not scans.mask[[0, 1], [1, 2]].any()
-    assert scans.mask.sum() == 40
+    assert scans.mask.sum() == 6 * NUM_BEAMS - 2
     assert (scans.points[~scans.mask] == 0).all()
 
 
@@ -85,6 +89,8 @@ def with_value(index, value):
         ({"points": POINTS[0]}, r"give \(n, b, 2\)"),
         ({"points": POINTS[..., :1]}, r"give \(n, b, 2\)"),
         ({"points": POINTS.astype(str)}, "points are"),
+        ({"points": np.ones((5, 10, 3))}, "scans of 10 beams"),
+        ({"points": np.ones((5, 40, 2))}, "one and the same"),
         ({"points": POINTS[:1]}, "two scans"),
         ({"points": POINTS[:0]}, "two scans"),
         ({"points": POINTS * 1000}, "millimetres"),
@@ -92,10 +98,10 @@ def with_value(index, value):
         ({"points": POINTS, "poses": POSES[:4]}, "poses are"),
         ({"points": POINTS, "poses": POSES * np.nan}, "NaN"),
         ({"points": POINTS, "mask": np.ones(3, bool)}, "mask is"),
-        ({"points": POINTS, "mask": np.zeros((6, 7), bool)}, "every beam"),
+        ({"points": POINTS, "mask": np.zeros((6, NUM_BEAMS), bool)}, "every beam"),
         ({"points": POINTS, "times": np.ones(3)}, "times are"),
         ({"points": POINTS, "unit": "miles"}, "miles"),
-        ({"ranges": np.ones((6, 7)), "angles": np.ones(3)}, "angles"),
+        ({"ranges": np.ones((6, NUM_BEAMS)), "angles": np.ones(3)}, "angles"),
         ({"other": POSES}, "other"),
     ],
 )
@@ -145,7 +151,7 @@ def test_sub_range_and_stride_take_poses_and_times_along(tmp_path):
     for poses in (part.reference_poses, part.odometry_poses):
         np.testing.assert_array_equal(poses[:, 0], [1, 3, 5])
     np.testing.assert_array_equal(part.times, [1, 3, 5])
-    assert part.points.shape == (3, 3, 2)
+    assert part.points.shape == (3, NUM_BEAMS, 2)
 
 
 @pytest.mark.parametrize("choice", [{"start": 99}, {"stop": 1}, {"stride": 0}, {"start": -1}, {"stride": 6}])
@@ -158,14 +164,14 @@ def test_choices_that_leave_nothing_are_refused(tmp_path, choice):
 
 def test_limit_masks_far_beams_of_every_format(tmp_path):
     (tmp_path / "a.log").write_text(LOG)
-    assert (read_sequence(tmp_path / "a.log", max_range=2.5).mask == [True, True, False]).all()
+    assert (read_sequence(tmp_path / "a.log", max_range=2.5).mask == (np.arange(NUM_BEAMS) != 2)).all()
     assert read_sequence(save(tmp_path, points=POINTS), start=0, stop=2, max_range=7).mask.all()
     with pytest.raises(InputError, match="no valid beam"):
         read_sequence(save(tmp_path, points=POINTS), max_range=7)
 
 
 def test_log_with_every_beam_at_maximum_range_is_refused(tmp_path):
-    (tmp_path / "a.log").write_text(LOG.replace("3 1 2 3", "3 81.91 81.91 81.91"))
+    (tmp_path / "a.log").write_text(LOG.replace(RANGES, 20 * " 81.91"))
     with pytest.raises(InputError, match="maximum range"):
         read_sequence(tmp_path / "a.log")
     with pytest.raises(InputError, match="metres"):
@@ -174,8 +180,8 @@ def test_log_with_every_beam_at_maximum_range_is_refused(tmp_path):
 
 @pytest.mark.parametrize("turn", [1, -1])
 def test_order_of_beams_is_seen(turn):
-    points, mask = POINTS[:, ::turn].astype(np.float32), np.ones((6, 7), bool)
-    shuffled = points[:, np.random.default_rng(0).permutation(7)]
+    points, mask = POINTS[:, ::turn].astype(np.float32), np.ones((6, NUM_BEAMS), bool)
+    shuffled = points[:, np.random.default_rng(0).permutation(NUM_BEAMS)]
     assert has_angular_order(points, mask)
     assert not has_angular_order(shuffled, mask)
     assert not has_angular_order(points, np.zeros_like(mask))
@@ -187,11 +193,19 @@ def test_order_of_beams_is_seen(turn):
     "change", [{"unit": "mm"}, {"mask": np.ones((6, 6), bool)}, {"points": POSES}, {"times": np.ones(2)}]
 )
 def test_sequence_refuses_shapes_that_do_not_belong_together(change):
-    fields = {"name": "a", "points": POINTS.astype(np.float32), "mask": np.ones((6, 7), bool), "unit": "m"}
+    fields = {"name": "a", "points": POINTS.astype(np.float32), "mask": np.ones((6, NUM_BEAMS), bool), "unit": "m"}
     whole = ScanSequence(**fields)
-    assert len(take_scans(whole, slice(1, 4))) == 3
+    assert len(whole.take(slice(1, 4))) == 3
     with pytest.raises(ValueError, match=next(iter(change))):
         ScanSequence(**(fields | change))
+
+
+def test_a_scan_in_millimetres_is_warned_of(tmp_path, caplog):
+    with caplog.at_level(logging.WARNING):
+        read_sequence(save(tmp_path, points=POINTS))
+        assert not caplog.records
+        read_sequence(save(tmp_path, points=POINTS * 40))
+    assert "are these millimetres?" in caplog.text
 
 
 def test_import_is_light():

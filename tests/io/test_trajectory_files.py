@@ -7,13 +7,14 @@ import pytest
 
 from dpmjax.io import (
     InputError,
-    planar_to_homogeneous,
-    read_initial_poses,
+    read_planar_poses,
+    read_poses,
     write_atomically,
     write_kitti,
     write_poses_npy,
     write_tum,
 )
+from dpmjax.io.poses import planar_to_homogeneous
 
 POSES = np.column_stack([np.random.default_rng(0).uniform(-500, 500, (9, 2)), np.linspace(-3.1, 3.1, 9)])
 WRITTEN = 1e-6  # The files keep nine digits.
@@ -24,8 +25,14 @@ WRITERS = {"tum.txt": write_tum, "kitti.txt": write_kitti, "poses.npy": write_po
 @pytest.mark.parametrize("is_spatial", [False, True])
 def test_poses_survive_writing(tmp_path, name, is_spatial):
     path = WRITERS[name](tmp_path / "sub" / name, planar_to_homogeneous(POSES) if is_spatial else POSES)
-    np.testing.assert_allclose(read_initial_poses(path, 9, "m"), POSES, atol=WRITTEN)
+    np.testing.assert_allclose(read_planar_poses(path, 9, "m"), POSES, atol=WRITTEN)
     assert [file.name for file in path.parent.iterdir()] == [name]
+
+
+@pytest.mark.parametrize("name", WRITERS)
+def test_planar_and_spatial_readers_agree(tmp_path, name):
+    path = WRITERS[name](tmp_path / name, POSES)
+    np.testing.assert_allclose(read_poses(path), planar_to_homogeneous(POSES), atol=WRITTEN)
 
 
 def test_evo_reads_what_we_write(tmp_path):
@@ -45,7 +52,7 @@ def test_tum_tells_its_frame_and_keeps_the_digits(tmp_path):
     assert "px" in lines[0]
     assert all(len(word.split(".")[1]) >= 6 for line in lines[1:] for word in line.split())
     with pytest.raises(InputError, match="poses in px"):
-        read_initial_poses(tmp_path / "t.txt", 9, "m")
+        read_planar_poses(tmp_path / "t.txt", 9, "m")
 
 
 def test_kitti_rows_are_twelve_bare_numbers(tmp_path):
@@ -58,13 +65,13 @@ def test_kitti_rows_are_twelve_bare_numbers(tmp_path):
 def test_planar_columns_are_read_with_comments(tmp_path):
     path = tmp_path / "start.txt"
     path.write_text("# x_px y_px theta_rad\n\n1 2 0.5\n3, 4, -0.5\n")
-    np.testing.assert_array_equal(read_initial_poses(path, 2, "px"), [[1, 2, 0.5], [3, 4, -0.5]])
+    np.testing.assert_array_equal(read_planar_poses(path, 2, "px"), [[1, 2, 0.5], [3, 4, -0.5]])
 
 
 def test_homogeneous_planar_matrices_are_read(tmp_path):
     matrices = planar_to_homogeneous(POSES)[:, [0, 1, 3]][:, :, [0, 1, 3]]
     np.save(tmp_path / "m.npy", matrices)
-    np.testing.assert_allclose(read_initial_poses(tmp_path / "m.npy", 9, "m"), POSES, atol=1e-12)
+    np.testing.assert_allclose(read_planar_poses(tmp_path / "m.npy", 9, "m"), POSES, atol=1e-12)
 
 
 @pytest.mark.parametrize(
@@ -85,20 +92,20 @@ def test_bad_start_is_told_in_one_line(tmp_path, text, found):
     path = tmp_path / "start.txt"
     path.write_text(text)
     with pytest.raises(InputError, match=found) as caught:
-        read_initial_poses(path, 2, "m")
+        read_planar_poses(path, 2, "m")
     assert str(path) in str(caught.value)
     assert "\n" not in str(caught.value)
 
 
 def test_bad_arrays_are_refused(tmp_path):
     with pytest.raises(InputError, match="no such file"):
-        read_initial_poses(tmp_path / "none.npy", 2, "m")
+        read_planar_poses(tmp_path / "none.npy", 2, "m")
     np.save(tmp_path / "a.npy", np.ones((2, 5)))
-    with pytest.raises(InputError, match=r"\(2, 5\)"):
-        read_initial_poses(tmp_path / "a.npy", 2, "m")
+    with pytest.raises(InputError, match="rows of 5 columns"):
+        read_planar_poses(tmp_path / "a.npy", 2, "m")
     (tmp_path / "b.npy").write_bytes(b"cut")
     with pytest.raises(InputError, match="NumPy"):
-        read_initial_poses(tmp_path / "b.npy", 2, "m")
+        read_planar_poses(tmp_path / "b.npy", 2, "m")
 
 
 @pytest.mark.parametrize("bad", [np.ones((3, 2)), np.ones((3, 3, 3)), np.full((3, 3), np.nan)])
@@ -123,4 +130,4 @@ def test_interrupted_writing_leaves_the_old_file(tmp_path, monkeypatch):
 
 
 def test_start_of_the_authors_trajectory_is_read(real_data):
-    assert read_initial_poses(real_data / "deepmapping_2d" / "start_16px.txt", 256, "px").shape == (256, 3)
+    assert read_planar_poses(real_data / "deepmapping_2d" / "start_16px.txt", 256, "px").shape == (256, 3)

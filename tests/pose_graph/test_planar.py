@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from dpmjax.geometry import se2
-from dpmjax.pose_graph.planar import join_edges, solve_poses
-from dpmjax.registration import Edges, optimize_planar_graph
+from dpmjax.pose_graph.graph import Edges, join_edges
+from dpmjax.pose_graph.planar import optimize_planar_graph, solve_poses
 from tests.tolerances import DOUBLE
 
 
@@ -70,10 +70,10 @@ def test_a_torn_loop_is_recovered_although_a_fifth_of_the_loops_lie() -> None:
     is_wrong = np.arange(len(source)) % 5 == 0
     lies = np.where(is_wrong[:, None], loops.poses + rng.uniform(20, 40, (len(source), 3)) * [1, -1, 0.05], loops.poses)
     steps = steps_of(true)
-    drifted = steps._replace(poses=steps.poses + np.array([0.0, 0.0, np.radians(1.0)]))
+    drifted = steps._replace(measurements=steps.poses + np.array([0.0, 0.0, np.radians(1.0)]))
     start = se2.compose(true[:1], se2.chain(drifted.poses))
     found, weight = optimize_planar_graph(
-        start, join_edges(drifted, loops._replace(poses=lies)), trust=np.repeat([30.0, 1.0], [39, len(source)])
+        start, join_edges(drifted, loops._replace(measurements=lies)), trust=np.repeat([30.0, 1.0], [39, len(source)])
     )
     before = np.hypot(*(start - true)[:, :2].T).max()
     after = np.hypot(*(found - true)[:, :2].T).max()

@@ -11,7 +11,8 @@ from scipy.io import savemat
 
 from dpmjax import io, simulation
 from dpmjax.io import InputError
-from dpmjax.io.depth.camera import Camera
+from dpmjax.io.depth import Camera, back_project
+from dpmjax.simulation.apartment import cast_depth
 from tests.tolerances import ROUNDING
 
 CAMERA = Camera(8, 6, 6.0, 6.5, 3.5, 2.5)
@@ -32,7 +33,7 @@ def test_depth_is_what_marching_along_the_rays_finds():
     centres, halves = rng.uniform([-1, -1, 1.5], [1, 1, 4], (4, 3)), rng.uniform(0.2, 0.7, (4, 3))
     yaws = rng.uniform(-1, 1, 4)
     rays = CAMERA.rays(np.arange(8.0), np.arange(6.0))
-    depth = np.asarray(simulation.cast_depth(np.eye(4), rays, centres, halves, yaws))
+    depth = np.asarray(cast_depth(np.eye(4), rays, centres, halves, yaws))
     for row, column in [(0, 0), (2, 3), (3, 4), (5, 7), (1, 6)]:
         boxes = zip(centres, halves, yaws, strict=True)
         expected = min(box_distance_by_marching(np.zeros(3), rays[row, column], *box) for box in boxes)
@@ -42,7 +43,7 @@ def test_depth_is_what_marching_along_the_rays_finds():
 def test_from_within_a_box_its_walls_are_seen_and_empty_boxes_are_not():
     rays = CAMERA.rays(np.arange(8.0), np.arange(6.0))
     boxes = (np.zeros((2, 3)), np.array([[2.0, 2.0, 3.0], [0.0, 0.0, 0.0]]), np.zeros(2))
-    depth = np.asarray(simulation.cast_depth(np.eye(4), rays, *boxes))
+    depth = np.asarray(cast_depth(np.eye(4), rays, *boxes))
     expected = np.min(np.array([2.0, 2.0, 3.0]) / np.maximum(np.abs(rays), 1e-12), axis=-1)
     np.testing.assert_allclose(depth, expected, **ROUNDING)
 
@@ -183,4 +184,4 @@ def test_bad_arguments_are_named():
     with pytest.raises(ValueError, match="seed"):
         simulation.make_apartment(-1)
     with pytest.raises(ValueError, match="depth_m: expected"):
-        io.back_project(np.ones((3, 3)), CAMERA, height=2, width=2, max_depth_m=5.0)
+        back_project(np.ones((3, 3)), CAMERA, height=2, width=2, max_depth_m=5.0)

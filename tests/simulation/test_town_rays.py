@@ -6,18 +6,27 @@ import numpy as np
 import pytest
 
 from dpmjax.simulation import CastConfig, LidarSensor
-from dpmjax.simulation.town import cast
-from dpmjax.simulation.town.ground import cross_ground, ground_height
-from dpmjax.simulation.town.intersect import cross_box, cross_cylinder, cross_spheroid
+from dpmjax.simulation.town.cast import cast_turn
+from dpmjax.simulation.town.intersect import (
+    Hull,
+    cross_box,
+    cross_cylinder,
+    cross_ground,
+    cross_spheroid,
+    ground_height,
+)
 from dpmjax.simulation.town.primitives import (
+    GROUND,
+    NOTHING,
+    POLE,
+    SOFT,
+    SOLID,
     Ground,
     TownPrimitives,
     Traffic,
-    pack_boxes,
-    pack_cylinders,
-    pack_spheroids,
+    pack_bodies,
 )
-from dpmjax.simulation.town.scan import cast_rays_3d, ray_directions, ray_shape
+from dpmjax.simulation.town.scan import make_rays
 from tests.tolerances import ACCUMULATED
 
 SENSOR = LidarSensor("test", tuple(np.linspace(20.0, -30.0, 9)), 72, max_range_m=60.0)
@@ -73,6 +82,10 @@ def ground_oracle(heights, origin, cell, start, ray, max_range):
     return t[np.argmax(below)] if below.any() else np.inf
 
 
+def hull(centre, half_size, heading):
+    return Hull(*(jnp.asarray(x, jnp.float32) for x in (centre, half_size, heading)))
+
+
 def first_hit(crossing):
     return np.where((crossing.entry > 0) & (crossing.entry <= crossing.exit), crossing.entry, np.inf)
 
@@ -84,7 +97,7 @@ def test_boxes_are_met_where_their_planes_are(seed):
     centre = rays * rng.uniform(4, 40, (200, 1)) + rng.normal(size=(200, 3))
     half, heading = rng.uniform(0.2, 3, (200, 3)), rng.uniform(-np.pi, np.pi, 200)
     turned = np.column_stack([np.cos(heading), np.sin(heading)])
-    found = first_hit(cross_box(*(jnp.asarray(x, jnp.float32) for x in (rays, centre, half, turned))))
+    found = first_hit(cross_box(jnp.asarray(rays, jnp.float32), hull(centre, half, turned)))
     wanted = np.array([box_oracle(*row) for row in zip(rays, centre, half, heading, strict=True)])
     outside = ~np.array([(np.abs(c) < h.max() * 1.8).all() for c, h in zip(centre, half, strict=True)])
     assert np.isfinite(wanted).mean() > 0.5
@@ -99,7 +112,8 @@ def test_round_bodies_are_met_where_their_roots_are(cross, oracle):
     rays = directions(rng, 300)
     centre = rays * rng.uniform(6, 60, (300, 1)) + rng.normal(size=(300, 3))
     radius, half_height = rng.uniform(0.1, 2, 300), rng.uniform(0.3, 3, 300)
-    found = first_hit(cross(*(jnp.asarray(x, jnp.float32) for x in (rays, centre, radius, half_height))))
+    sizes = np.column_stack([radius, radius, half_height])
+    found = first_hit(cross(jnp.asarray(rays, jnp.float32), hull(centre, sizes, np.tile([1.0, 0.0], (300, 1)))))
     wanted = np.array([oracle(*row) for row in zip(rays, centre, radius, half_height, strict=True)])
     both = np.isfinite(found) == np.isfinite(wanted)
     assert np.isfinite(wanted).mean() > 0.3
@@ -134,8 +148,10 @@ def small_town(land, rng):
     place = place[np.linalg.norm(place[:, :2], axis=1) > 5]
     sizes = rng.uniform(0.3, 2.5, (len(place), 3))
     boxes = np.column_stack([place, sizes, rng.uniform(-3, 3, len(place)), np.zeros((len(place), 2))])
-    poles = np.column_stack([place + np.array([3, -2, 0]), rng.uniform(0.05, 0.4, len(place)), sizes[:, 2] + 1])
-    tufts = np.column_stack([place + np.array([-2, 3, 1]), sizes[:, :2] * 0.5, np.zeros(len(place))])
+    zero = np.zeros((len(place), 3))
+    thickness = rng.uniform(0.05, 0.4, len(place))
+    poles = np.column_stack([place + np.array([3, -2, 0]), thickness, thickness, sizes[:, 2] + 1, zero])
+    tufts = np.column_stack([place + np.array([-2, 3, 1]), sizes[:, [0, 0, 1]] * 0.5, zero])
     traffic = Traffic(
         lane_points=jnp.zeros((2, 64, 3)),
         lane_lengths=jnp.ones(2),
@@ -147,9 +163,9 @@ def small_town(land, rng):
         mask=jnp.zeros(4, bool),
     )
     town = TownPrimitives(
-        pack_boxes(boxes),
-        pack_cylinders(poles),
-        pack_spheroids(tufts),
+        pack_bodies(boxes, SOLID),
+        pack_bodies(poles, POLE),
+        pack_bodies(tufts, SOFT),
         Ground(jnp.asarray(heights, jnp.float32), jnp.asarray(origin, jnp.float32), jnp.float32(1.0)),
         traffic,
     )
@@ -169,15 +185,13 @@ def tilted_pose():
 def turn(land):
     """A small town and what a turn of the sensor meets there."""
     town, *tables = small_town(land, np.random.default_rng(11))
-    rays = ray_directions(SENSOR, CONFIG, jnp.float32(0.01))
+    rays = make_rays(SENSOR, CONFIG, jnp.float32(0.01))
 
     @jax.jit
     def look(town, pose):
-        depths = jnp.zeros(ray_shape(SENSOR, CONFIG))
-        zero = jnp.float32(0.0)
-        return cast_rays_3d(town, pose, zero, rays, jnp.float32(0.01), depths, sensor=SENSOR, config=CONFIG)
+        return cast_turn(town, pose, jnp.float32(0.0), rays, max_range=SENSOR.max_range_m, config=CONFIG)
 
-    return look, town, tables, np.asarray(rays, np.float64)
+    return look, town, tables, np.asarray(rays.directions, np.float64)
 
 
 def test_a_turn_meets_the_nearest_of_all_bodies(turn, land):
@@ -190,19 +204,19 @@ def test_a_turn_meets_the_nearest_of_all_bodies(turn, land):
     wanted, kinds = [], []
     for ray in world:
         options = {
-            cast.SOLID: min(box_oracle(ray, b[:3] - start, b[3:6], b[6]) for b in boxes),
-            cast.POLE: min(cylinder_oracle(ray, p[:3] - start, p[3], p[4]) for p in poles),
-            cast.SOFT: min(spheroid_oracle(ray, s[:3] - start, s[3], s[4]) for s in tufts),
-            cast.GROUND: ground_oracle(land[0], land[1], 1.0, start, ray, SENSOR.max_range_m),
+            SOLID: min(box_oracle(ray, b[:3] - start, b[3:6], b[6]) for b in boxes),
+            POLE: min(cylinder_oracle(ray, p[:3] - start, p[3], p[5]) for p in poles),
+            SOFT: min(spheroid_oracle(ray, s[:3] - start, s[3], s[5]) for s in tufts),
+            GROUND: ground_oracle(land[0], land[1], 1.0, start, ray, SENSOR.max_range_m),
         }
         kind = min(options, key=options.get)
         wanted.append(min(options[kind], np.inf) if options[kind] <= SENSOR.max_range_m else np.inf)
-        kinds.append(kind if np.isfinite(wanted[-1]) else cast.NOTHING)
+        kinds.append(kind if np.isfinite(wanted[-1]) else NOTHING)
     wanted, kinds = np.array(wanted), np.array(kinds)
     same = np.isclose(found, wanted, rtol=0, atol=0.03)
     assert same.mean() > 0.985
     assert (surfaces == kinds)[same].mean() > 0.98
-    assert {cast.SOLID, cast.POLE, cast.SOFT, cast.GROUND} <= set(surfaces.tolist())
+    assert {SOLID, POLE, SOFT, GROUND} <= set(surfaces.tolist())
 
 
 def test_padding_takes_no_part(turn):
@@ -227,8 +241,8 @@ def test_an_empty_town_is_ground_only(turn):
         spheroids=town.spheroids.replace(mask=jnp.zeros_like(town.spheroids.mask)),
     )
     hits = look(empty, jnp.asarray(tilted_pose(), jnp.float32))
-    assert set(np.unique(hits.surfaces)) == {cast.NOTHING, cast.GROUND}
-    assert np.isinf(np.asarray(hits.ranges)[np.asarray(hits.surfaces) == cast.NOTHING]).all()
+    assert set(np.unique(hits.surfaces)) == {NOTHING, GROUND}
+    assert np.isinf(np.asarray(hits.ranges)[np.asarray(hits.surfaces) == NOTHING]).all()
 
 
 def test_windows_lie_behind_their_wall(turn):
@@ -238,7 +252,7 @@ def test_windows_lie_behind_their_wall(turn):
     depth = 0.3
     boxes = town.boxes.replace(window_depth=jnp.full(town.boxes.mask.shape, depth))
     fronts = look(town.replace(boxes=boxes), pose)
-    is_wall = np.asarray(walls.surfaces) == cast.SOLID
+    is_wall = np.asarray(walls.surfaces) == SOLID
     deeper = np.asarray(fronts.ranges)[is_wall] - np.asarray(walls.ranges)[is_wall]
     cosines = np.asarray(walls.cosines)[is_wall]
     assert (deeper >= 0).all()
@@ -252,8 +266,7 @@ def test_foliage_is_met_inside_of_it():
     rng = np.random.default_rng(0)
     rays = directions(rng, 500)
     depths = rng.exponential(size=500)
-    tufts = pack_spheroids(np.array([[0.0, 0, 0, 3, 2, 0.8]]))
-    crossing = cross_spheroid(jnp.asarray(rays), tufts.centres[0] + jnp.array([8.0, 0, 0]), 3.0, 2.0)
+    crossing = cross_spheroid(jnp.asarray(rays, jnp.float32), hull([8.0, 0, 0], [3.0, 3, 2], [1.0, 0]))
     inside = np.asarray(crossing.entry + 0.8 * depths)
     is_met = np.isfinite(inside) & (inside <= np.asarray(crossing.exit)) & (np.asarray(crossing.entry) > 0)
     points = inside[is_met, None] * rays[is_met] - [8, 0, 0]

@@ -7,19 +7,17 @@ import pytest
 from scipy.ndimage import label
 from scipy.stats import kstest
 
-from dpmjax.io import InputError
+from dpmjax.io import InputError, read_world_png, write_world_png
 from dpmjax.simulation import (
     TrajectoryConfig,
     World,
-    beam_angles,
     cast_rays,
     make_world,
-    read_world_png,
-    simulate_odometry,
     simulate_sequence,
     simulate_trajectory,
-    write_world_png,
 )
+from dpmjax.simulation.world2d.raycast import beam_angles
+from dpmjax.simulation.world2d.trajectory import simulate_odometry
 
 WORLDS = [0, 1, 2]
 world = lru_cache(make_world)

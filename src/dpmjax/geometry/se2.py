@@ -119,3 +119,36 @@ def exp(tangent: Float[AnyArray, "... 3"]) -> Float[Array, "... 3 3"]:
     """The matrix of a planar twist (vx, vy, angle); the gradient is right at zero too."""
     with jax.default_matmul_precision("highest"):
         return jaxlie.SE2.exp(jnp.asarray(tangent)).as_matrix()
+
+
+@jax.jit
+def log(pose_a_b: Float[AnyArray, "... 3"]) -> Float[Array, "... 3"]:
+    """The planar twist (vx, vy, angle) of a pose (x, y, heading), the inverse of `exp`.
+
+    Args:
+        pose_a_b: (..., 3).
+
+    Returns:
+        (..., 3), the angle in [-pi, pi].
+    """
+    with jax.default_matmul_precision("highest"):
+        return _motion(pose_a_b).log()
+
+
+@jax.jit
+def log_jacobian(pose_a_b: Float[AnyArray, "... 3"]) -> Float[Array, "... 3 3"]:
+    """The derivative of log(T_a_b @ exp(step)) by the step, at zero: the inverse right Jacobian.
+
+    Args:
+        pose_a_b: (..., 3), heading below half a turn.
+
+    Returns:
+        (..., 3, 3).
+    """
+    with jax.default_matmul_precision("highest"):
+        return _motion(pose_a_b).jlog()
+
+
+def _motion(pose_a_b: AnyArray) -> jaxlie.SE2:
+    pose_a_b = jnp.asarray(pose_a_b)
+    return jaxlie.SE2.from_xy_theta(pose_a_b[..., 0], pose_a_b[..., 1], pose_a_b[..., 2])

@@ -27,6 +27,32 @@ def log(T: Float[AnyArray, "... 4 4"]) -> Float[Array, "... 6"]:
         return jaxlie.SE3.from_matrix(jnp.asarray(T)).log()
 
 
+def log_jacobian(T: Float[AnyArray, "... 4 4"]) -> Float[Array, "... 6 6"]:
+    """The derivative of log(T @ exp(step)) by the step, at zero: the inverse right Jacobian.
+
+    Args:
+        T: (..., 4, 4), of angle below pi.
+
+    Returns:
+        (..., 6, 6) for tangents (translation, rotation).
+    """
+    with jax.default_matmul_precision("highest"):
+        return jaxlie.SE3.from_matrix(jnp.asarray(T)).jlog()
+
+
+def adjoint(T_a_b: Float[AnyArray, "... 4 4"]) -> Float[Array, "... 6 6"]:
+    """The adjoint of a motion, which moves tangents from b to a.
+
+    Args:
+        T_a_b: (..., 4, 4).
+
+    Returns:
+        (..., 6, 6) for tangents (translation, rotation).
+    """
+    with jax.default_matmul_precision("highest"):
+        return jaxlie.SE3.from_matrix(jnp.asarray(T_a_b)).adjoint()
+
+
 @jax.jit
 def rotation_from_quaternion_xyzw(quaternion: Float[AnyArray, "... 4"]) -> Float[Array, "... 3 3"]:
     """The rotation matrix of a quaternion in file order x, y, z, w, of any length; of zero, the identity."""

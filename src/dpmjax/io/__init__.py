@@ -1,6 +1,6 @@
-"""Readers and writers of scans, depth images, poses; NumPy only, and no algorithm imports them.
+"""Readers and writers of scans, depth images, poses and floor plans; NumPy only, and no algorithm imports them.
 
-Bad input ends in an `InputError` of one line.
+Bad input raises an `InputError` of one line.
 """
 
 import lazy_loader

@@ -1,11 +1,24 @@
-"""Files as a whole: written completely or not at all, listed in the order in which a human counts."""
+"""Files as a whole: read with one-line errors, written completely or not at all, sorted by their numbers."""
 
 from __future__ import annotations
 
+import io
+import math
 import os
 import re
 import tempfile
+import zipfile
+from collections.abc import Sequence
 from pathlib import Path
+
+import numpy as np
+from numpy.lib import format as npy_format
+from numpy.typing import ArrayLike, NDArray
+
+from dpmjax.sequences import InputError
+
+# A member of an archive that unpacks to more than this many times its size has a wrong header: deflate reaches 1032.
+_LARGEST_COMPRESSION = 1100
 
 
 def write_atomically(path: str | Path, content: bytes | str) -> Path:
@@ -21,7 +34,7 @@ def write_atomically(path: str | Path, content: bytes | str) -> Path:
         The path.
 
     Raises:
-        OSError: the folder cannot be written; an existing file is then untouched.
+        BaseException: what stopped the writing, such as an OSError; an existing file is then untouched.
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -55,4 +68,180 @@ def natural_key(name: str) -> tuple[tuple[int, int, str], ...]:
         The name cut into numbers and text; numbers compare as numbers and come before text.
     """
     pieces = [piece for piece in re.split(r"(\d+)", name) if piece]
-    return tuple((0, int(p), "") if p.isdecimal() else (1, 0, p) for p in pieces)
+    return tuple((0, int(p), "") if p.isdecimal() and len(p) < 100 else (1, 0, p) for p in pieces)
+
+
+def read_bytes(path: str | Path) -> bytes:
+    """Reads a whole file.
+
+    Args:
+        path: the file.
+
+    Returns:
+        Its bytes.
+
+    Raises:
+        InputError: there is no such file, or it cannot be read.
+    """
+    try:
+        return Path(path).read_bytes()
+    except FileNotFoundError as error:
+        raise InputError(path, "no such file", "check the path") from error
+    except OSError as error:
+        raise InputError(path, f"cannot be read ({error.strerror})", "check the path and its permissions") from error
+
+
+def read_lines(path: str | Path) -> list[str]:
+    """Reads the lines of a text file; bytes that are no UTF-8 are replaced.
+
+    Args:
+        path: the file.
+
+    Returns:
+        The lines without their ends.
+
+    Raises:
+        InputError: there is no such file, or it cannot be read.
+    """
+    return read_bytes(path).decode("utf-8", errors="replace").splitlines()
+
+
+def to_numbers(rows: Sequence[Sequence[str]], source: str | Path) -> NDArray[np.float64]:
+    """Converts words to numbers.
+
+    Args:
+        rows: n rows of k words each.
+        source: name of the file, for messages.
+
+    Returns:
+        (n, k).
+
+    Raises:
+        InputError: there is no row, rows differ in length, or a word is no number.
+    """
+    widths = sorted({len(row) for row in rows})
+    if len(widths) != 1:
+        found = f"rows of {' and '.join(map(str, widths))} columns" if rows else "no row"
+        raise InputError(source, found, "give rows of equal length")
+    try:
+        return np.array(rows, np.float64)
+    except ValueError as error:
+        raise InputError(source, f"not a number ({error})", "write plain decimal numbers") from error
+
+
+def read_table(path: str | Path) -> NDArray[np.float64]:
+    """Reads rows of numbers, separated by blanks or commas; empty lines and lines with # in front are left out.
+
+    Args:
+        path: the file.
+
+    Returns:
+        (n, k).
+
+    Raises:
+        InputError: there is no such file, no row, rows differ in length, or a word is no number.
+    """
+    lines = [line for line in read_lines(path) if line.strip()[:1] not in ("", "#")]
+    return to_numbers([line.replace(",", " ").split() for line in lines], path)
+
+
+def unpack_rows(body: bytes, layout: np.dtype[np.void], count: int, source: str | Path) -> NDArray[np.void]:
+    """Reads binary records.
+
+    Args:
+        body: the bytes.
+        layout: of one record.
+        count: number of records that the header promises.
+        source: name of the file, for messages.
+
+    Returns:
+        (count,) records, read-only.
+
+    Raises:
+        InputError: there are fewer bytes.
+    """
+    expected = count * layout.itemsize
+    if len(body) < expected:
+        found = f"truncated: {count} points need {expected} bytes, {len(body)} are there"
+        raise InputError(source, found, "copy the file again")
+    return np.frombuffer(body, layout, count=count)
+
+
+def split_rows(body: bytes, width: int, count: int, source: str | Path) -> NDArray[np.float64]:
+    """Reads rows of numbers as text.
+
+    Args:
+        body: the bytes.
+        width: numbers in a row.
+        count: number of rows that the header promises; further rows are ignored.
+        source: name of the file, for messages.
+
+    Returns:
+        (count, width).
+
+    Raises:
+        InputError: there are fewer rows, a row of another width, or a word that is no number.
+    """
+    rows = [line.split() for line in body.decode("latin-1").splitlines() if line.strip()]
+    if len(rows) < count:
+        found = f"truncated: the header promises {count} points, {len(rows)} are there"
+        raise InputError(source, found, "copy the file again")
+    wrong = next((i for i, row in enumerate(rows[:count]) if len(row) != width), None)
+    if wrong is not None:
+        found = f"row {wrong} has {len(rows[wrong])} columns, the header promises {width}"
+        raise InputError(source, found, "write one number per field in each row")
+    return to_numbers(rows[:count], source) if count else np.zeros((0, width))
+
+
+def to_float32(values: ArrayLike) -> NDArray[np.float32]:
+    """The values as float32; those beyond its range become infinite, without a warning."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        return np.asarray(values).astype(np.float32)
+
+
+def load_arrays(path: str | Path, keys: Sequence[str] | None = None) -> dict[str, NDArray[np.generic]]:
+    """Reads a NumPy file; never allocates more than the file can hold, whatever its header says.
+
+    Args:
+        path: `.npy` or `.npz`; the first bytes decide.
+        keys: names of the arrays to read from an `.npz`; None reads all.
+
+    Returns:
+        The arrays by name; the one of an `.npy` is called "points". Arrays may be read-only.
+
+    Raises:
+        InputError: no such file, no NumPy file, a damaged one, or one of Python objects.
+    """
+    try:
+        with Path(path).open("rb") as file:
+            if file.read(6) == npy_format.MAGIC_PREFIX:
+                file.seek(0)
+                return {"points": _parse_npy(file.read())}
+        with zipfile.ZipFile(path) as archive:
+            members = {entry.filename.removesuffix(".npy"): entry for entry in archive.infolist()}
+            chosen = {key: members[key] for key in (members if keys is None else keys) if key in members}
+            if any(m.file_size > _LARGEST_COMPRESSION * (m.compress_size + 64) for m in chosen.values()):
+                raise ValueError("a member claims more bytes than its packed size can hold")
+            return {key: _parse_npy(archive.read(member)) for key, member in chosen.items()}
+    except FileNotFoundError as error:
+        raise InputError(path, "no such file", "check the path") from error
+    except Exception as error:  # The parsers of zip, zlib and NumPy headers raise many kinds.
+        found = f"not a readable NumPy file ({error})"
+        raise InputError(path, found, "save it again with numpy.save or numpy.savez") from error
+
+
+def _parse_npy(content: bytes) -> NDArray[np.generic]:
+    """The array of the bytes of an `.npy`."""
+    stream = io.BytesIO(content)
+    version = npy_format.read_magic(stream)
+    read_header = npy_format.read_array_header_1_0 if version == (1, 0) else npy_format.read_array_header_2_0
+    shape, is_fortran, dtype = read_header(stream)
+    if dtype.hasobject or min(shape, default=0) < 0:
+        raise ValueError(f"an array of {shape} {dtype}")
+    needed, present = math.prod(shape) * dtype.itemsize, len(content) - stream.tell()
+    if needed > present or (needed == 0 and max(shape, default=0) > present + 65536):
+        raise ValueError(f"truncated: an array of {shape} {dtype} needs {needed} bytes, {present} are there")
+    if needed == 0:
+        return np.zeros(shape, dtype)
+    values = np.frombuffer(content, dtype, math.prod(shape), stream.tell())
+    return values.reshape(shape, order="F" if is_fortran else "C")

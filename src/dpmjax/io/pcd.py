@@ -1,4 +1,4 @@
-"""Point Cloud Data files (PCD 0.7): what planar scans need of the format."""
+"""Point Cloud Data files (PCD 0.7): the coordinates of their points, ascii or binary."""
 
 from __future__ import annotations
 
@@ -8,16 +8,17 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from dpmjax.io.errors import InputError
-from dpmjax.io.files import write_atomically
+from dpmjax.io.files import read_bytes, split_rows, to_float32, unpack_rows, write_atomically
+from dpmjax.sequences import InputError
+
+_TYPES = {"F": "f", "I": "i", "U": "u"}
 
 
 class _Header(NamedTuple):
-    """What a PCD header says: names, NumPy types and counts of the fields, points, encoding; and its own length."""
+    """Names of the fields, their layout as one NumPy type, number of points, encoding, and the header's length."""
 
     fields: list[str]
-    types: list[str]
-    counts: list[int]
+    layout: np.dtype[np.void]
     num_points: int
     encoding: str
     size: int
@@ -34,13 +35,9 @@ def read_pcd(path: str | Path, *, drop_nan: bool = False) -> NDArray[np.float32]
         (m, 3) float32 x, y, z in the file's unit; z is zero where the file has none.
 
     Raises:
-        InputError: the file is missing, or `parse_pcd` finds fault with it.
+        InputError: the file is missing, or `parse_pcd` refuses it.
     """
-    try:
-        content = Path(path).read_bytes()
-    except OSError as error:
-        raise InputError(path, f"cannot be read ({error.strerror})", "check the path") from error
-    return parse_pcd(content, str(path), drop_nan=drop_nan)
+    return parse_pcd(read_bytes(path), str(path), drop_nan=drop_nan)
 
 
 def parse_pcd(content: bytes, source: str, *, drop_nan: bool = False) -> NDArray[np.float32]:
@@ -68,7 +65,7 @@ def parse_pcd(content: bytes, source: str, *, drop_nan: bool = False) -> NDArray
         raise InputError(source, f"DATA {header.encoding} is not supported", "save the cloud as ascii or binary PCD")
     columns = read(body, header, source)
     zeros = np.zeros(header.num_points, np.float32)
-    points = np.stack([np.asarray(columns.get(name, zeros), np.float32) for name in "xyz"], axis=1)
+    points = np.stack([to_float32(columns.get(name, zeros)) for name in "xyz"], axis=1)
     if drop_nan:
         points = points[~np.isnan(points).all(axis=1)]
     bad = ~np.isfinite(points).all(axis=1)
@@ -117,46 +114,25 @@ def _parse_header(content: bytes, source: str) -> _Header:
     try:
         fields = entries["FIELDS"]
         types = ["<" + _TYPES[t] + s for t, s in zip(entries["TYPE"], entries["SIZE"], strict=True)]
-        counts = [int(c) for c in entries.get("COUNT", ["1"] * len(fields))]
-        num_points = (
-            int(entries["POINTS"][0]) if "POINTS" in entries else int(entries["WIDTH"][0]) * int(entries["HEIGHT"][0])
-        )
-        if not len(fields) == len(types) == len(counts) or num_points < 0 or not entries["DATA"]:
-            raise ValueError("lengths differ")
-        np.dtype(",".join(types))
-    except (KeyError, ValueError, IndexError, TypeError) as error:
+        counts = [int(count) for count in entries.get("COUNT", ["1"] * len(fields))]
+        sizes = entries.get("POINTS") or [entries["WIDTH"][0], entries["HEIGHT"][0]]
+        num_points = int(sizes[0]) * int(sizes[1] if len(sizes) > 1 else 1)
+        if not len(fields) == len(types) == len(counts) or min(counts) < 1 or num_points < 0:
+            raise ValueError("lengths differ, or a number is below one")
+        layout = np.dtype([(f"{i}", t, (c,)) for i, (t, c) in enumerate(zip(types, counts, strict=True))])
+        return _Header(fields, layout, num_points, entries["DATA"][0].lower(), size)
+    except (KeyError, ValueError, IndexError, TypeError, OverflowError) as error:
         found = f"broken PCD header ({type(error).__name__}: {error})"
         raise InputError(source, found, "write FIELDS, SIZE, TYPE, COUNT of one length, POINTS and DATA") from error
-    return _Header(fields, types, counts, num_points, entries["DATA"][0].lower(), size)
-
-
-_TYPES = {"F": "f", "I": "i", "U": "u"}
 
 
 def _read_binary(body: bytes, header: _Header, source: str) -> dict[str, NDArray[np.generic]]:
-    layout = np.dtype([(f"{i}", t, (c,)) for i, (t, c) in enumerate(zip(header.types, header.counts, strict=True))])
-    expected = header.num_points * layout.itemsize
-    if len(body) < expected:
-        found = f"truncated: {header.num_points} points need {expected} bytes, {len(body)} are there"
-        raise InputError(source, found, "copy the file again")
-    table = np.frombuffer(body, layout, count=header.num_points)
-    return {name: table[f"{i}"][:, 0] for i, name in enumerate(header.fields) if header.counts[i]}
+    table = unpack_rows(body, header.layout, header.num_points, source)
+    return {name: table[f"{i}"][:, 0] for i, name in enumerate(header.fields)}
 
 
 def _read_ascii(body: bytes, header: _Header, source: str) -> dict[str, NDArray[np.generic]]:
-    rows = [line.split() for line in body.decode("latin-1").splitlines() if line.strip()]
-    if len(rows) < header.num_points:
-        found = f"truncated: the header tells of {header.num_points} points, {len(rows)} are there"
-        raise InputError(source, found, "copy the file again")
-    rows = rows[: header.num_points]
-    width = sum(header.counts)
-    wrong = next((i for i, row in enumerate(rows) if len(row) != width), None)
-    if wrong is not None:
-        found = f"row {wrong} has {len(rows[wrong])} columns, the header tells of {width}"
-        raise InputError(source, found, "write one value per field in each row")
-    try:
-        table = np.array(rows, np.float64).reshape(len(rows), width)
-    except ValueError as error:
-        raise InputError(source, f"not a number ({error})", "write plain decimal numbers") from error
-    first = np.cumsum([0, *header.counts[:-1]])
-    return {name: table[:, first[i]] for i, name in enumerate(header.fields) if header.counts[i]}
+    counts = [header.layout[i].shape[0] for i in range(len(header.fields))]
+    table = split_rows(body, sum(counts), header.num_points, source)
+    first = np.cumsum([0, *counts[:-1]])
+    return {name: table[:, first[i]] for i, name in enumerate(header.fields)}

@@ -8,8 +8,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from dpmjax.io.errors import InputError
-from dpmjax.io.files import write_atomically
+from dpmjax.io.files import read_bytes, split_rows, to_float32, unpack_rows, write_atomically
+from dpmjax.sequences import InputError
 
 _TYPES = {
     "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2", "ushort": "u2",
@@ -20,11 +20,11 @@ _ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
 
 
 class _Header(NamedTuple):
-    """Encoding, number of vertices, their properties as (name, NumPy type), and the header's length in bytes."""
+    """Encoding, number of vertices, their properties as one NumPy type, and the header's length in bytes."""
 
     encoding: str
     num_vertices: int
-    properties: list[tuple[str, str]]
+    layout: np.dtype[np.void]
     size: int
 
 
@@ -32,22 +32,22 @@ def read_ply(path: str | Path) -> NDArray[np.float32]:
     """Reads the points of a PLY file.
 
     Args:
-        path: the file; the vertex element must come first, other elements and properties are passed over.
+        path: the file; the vertex element must come first, other elements and properties are ignored.
 
     Returns:
         (n, 3) float32 x, y, z in the file's unit; NaN is left as it is.
 
     Raises:
-        InputError: the file is missing, has a broken header or no x, y, z, or is cut off.
+        InputError: the file is missing, has a broken header or no x, y, z, or is truncated.
     """
-    try:
-        content = Path(path).read_bytes()
-    except OSError as error:
-        raise InputError(path, f"cannot be read ({error.strerror})", "check the path") from error
+    content = read_bytes(path)
     header = _parse_header(content, str(path))
-    body = content[header.size :]
-    read = _read_ascii if header.encoding == "ascii" else _read_binary
-    return read(body, header, str(path))
+    body, names = content[header.size :], list(header.layout.names or ())
+    if header.encoding == "ascii":
+        columns = [names.index(axis) for axis in "xyz"]
+        return to_float32(split_rows(body, len(names), header.num_vertices, path)[:, columns])
+    table = unpack_rows(body, header.layout, header.num_vertices, path)
+    return np.stack([to_float32(table[axis]) for axis in "xyz"], axis=1)
 
 
 def write_ply(path: str | Path, points: ArrayLike) -> Path:
@@ -89,31 +89,9 @@ def _parse_header(content: bytes, source: str) -> _Header:
         properties = [
             (name, _ORDERS[encoding] + _TYPES[kind]) for word, kind, name in rows[first:stop] if word == "property"
         ]
-    except (KeyError, ValueError, IndexError) as error:
+        layout = np.dtype(properties)
+    except (KeyError, ValueError, IndexError, TypeError) as error:
         raise InputError(source, f"broken PLY header ({type(error).__name__}: {error})", advice) from error
     if num_vertices < 0 or not {"x", "y", "z"} <= {name for name, _ in properties}:
         raise InputError(source, f"PLY properties {' '.join(name for name, _ in properties)}", advice)
-    return _Header(encoding, num_vertices, properties, size)
-
-
-def _read_binary(body: bytes, header: _Header, source: str) -> NDArray[np.float32]:
-    layout = np.dtype(header.properties)
-    expected = header.num_vertices * layout.itemsize
-    if len(body) < expected:
-        found = f"cut off: {header.num_vertices} points need {expected} bytes, {len(body)} are there"
-        raise InputError(source, found, "copy the file again")
-    table = np.frombuffer(body, layout, count=header.num_vertices)
-    return np.stack([table[name] for name in "xyz"], axis=1).astype(np.float32)
-
-
-def _read_ascii(body: bytes, header: _Header, source: str) -> NDArray[np.float32]:
-    rows = [line.split() for line in body.decode("latin-1").splitlines() if line.strip()][: header.num_vertices]
-    if len(rows) < header.num_vertices:
-        found = f"cut off: the header tells of {header.num_vertices} points, {len(rows)} are there"
-        raise InputError(source, found, "copy the file again")
-    columns = [[name for name, _ in header.properties].index(axis) for axis in "xyz"]
-    try:
-        values = [[float(row[column]) for column in columns] for row in rows]
-    except (ValueError, IndexError) as error:
-        raise InputError(source, f"a row is no point ({error})", "write one number per property") from error
-    return np.array(values, np.float32).reshape(-1, 3)
+    return _Header(encoding, num_vertices, layout, size)

@@ -1,1 +1,5 @@
 """Pose graphs: relative poses in, poses that agree with most of them out."""
+
+import lazy_loader as _lazy
+
+__getattr__, __dir__, __all__ = _lazy.attach_stub(__name__, __file__)

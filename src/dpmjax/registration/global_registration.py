@@ -16,7 +16,8 @@ import scipy.spatial
 from numpy.typing import NDArray
 
 from dpmjax.geometry import se2
-from dpmjax.pose_graph.planar import join_edges, optimize_planar_graph
+from dpmjax.pose_graph.graph import join_edges
+from dpmjax.pose_graph.planar import optimize_planar_graph
 from dpmjax.registration.map_assembly import agreeing_edges, assemble, place_in_map
 from dpmjax.registration.pair_search import Candidates, CorrelativeConfig, join_candidates, search_pairs
 from dpmjax.registration.planar_scans import Floats, Indices, PlanarScans

@@ -14,12 +14,11 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-import scipy.sparse as sp
-import scipy.sparse.linalg
 import scipy.spatial
 from jaxtyping import Array, Bool, Float, Int
 
 from dpmjax.geometry import se2
+from dpmjax.pose_graph.normal_equations import solve_blocks
 from dpmjax.registration.planar_scans import Floats, Indices, PlanarScans
 
 _einsum = partial(jnp.einsum, precision="highest")
@@ -84,7 +83,7 @@ class _Lines(NamedTuple):
 class _LineSystem(NamedTuple):
     """Gauss-Newton system of one scan against the lines around it, over it and its neighbours (s scans)."""
 
-    information: Float[Array, "s 3 s 3"]
+    information: Float[Array, "s s 3 3"]
     gradient: Float[Array, "s 3"]
 
 
@@ -177,7 +176,7 @@ def _linearise(
     own_part = jnp.concatenate([normals, (normals * _levers(own.points)).sum(-1, keepdims=True)], -1)
     jacobian = (-jnp.concatenate([shift, turn[..., None]], -1)).at[:, 0].add(own_part)
     return _LineSystem(
-        information=_einsum("b,bsi,btj->sitj", weight, jacobian, jacobian),
+        information=_einsum("b,bsi,btj->stij", weight, jacobian, jacobian),
         gradient=_einsum("b,b,bsi->si", weight, residual, jacobian),
     )
 
@@ -224,23 +223,6 @@ def _choose_around(poses: Floats, num_neighbours: int, radius: float) -> Indices
     return around
 
 
-def _solve(num_poses: int, around: Indices, system: _LineSystem) -> Floats:
-    """Steps of all poses in their own frames; the first one is held."""
-    entry = 3 * around[:, :, None] + np.arange(3)
-    size = entry.shape[1] * 3
-    entry = entry.reshape(num_poses, size)
-    rows, cols = np.repeat(entry, size, axis=1), np.tile(entry, (1, size))
-    values = np.asarray(system.information, np.float64).ravel()
-    matrix = sp.csc_matrix((values, (rows.ravel(), cols.ravel())), shape=(3 * num_poses,) * 2)
-    right = np.zeros(3 * num_poses)
-    np.add.at(right, entry, -np.asarray(system.gradient, np.float64).reshape(num_poses, size))
-    diagonal = matrix.diagonal()
-    largest = max(diagonal.max(initial=0.0), 1e-300)
-    extra = 1e-6 * diagonal + 1e-9 * largest
-    extra[:3] += 1e9 * largest
-    return scipy.sparse.linalg.splu((matrix + sp.diags(extra)).tocsc()).solve(right).reshape(num_poses, 3)
-
-
 def adjust_to_lines(scans: PlanarScans, poses: Floats, config: LineAdjustmentConfig | None = None) -> Floats:
     """Gauss-Newton of all poses against lines that all scans make together.
 
@@ -262,7 +244,8 @@ def adjust_to_lines(scans: PlanarScans, poses: Floats, config: LineAdjustmentCon
         nearest = _find_nearest(scans, around, _relative_to_own(poses, around))
         for _ in range(config.num_iterations):
             system = _linearise_all(scans, around, nearest, _relative_to_own(poses, around), config=config)
-            poses = se2.compose(poses, _solve(len(poses), around, system))
+            blocks, gradient = (np.asarray(x, np.float64) for x in system)
+            poses = se2.compose(poses, solve_blocks(around, blocks, gradient, np.arange(len(poses)) == 0))
     return poses
 
 

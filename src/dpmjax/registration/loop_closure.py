@@ -17,7 +17,8 @@ import scipy.spatial
 from jaxtyping import Array, Bool, Float, Int
 
 from dpmjax.geometry import se2
-from dpmjax.pose_graph.planar import Edges, join_edges, optimize_planar_graph
+from dpmjax.pose_graph.graph import Edges, join_edges
+from dpmjax.pose_graph.planar import optimize_planar_graph
 from dpmjax.registration.incremental import contradicted_share
 from dpmjax.registration.pair_alignment import PairMatches, PosePrior, Schedule, match_pairs
 from dpmjax.registration.planar_scans import Floats, Indices, PlanarScans, batches
@@ -122,7 +123,7 @@ def matched_steps(matches: PairMatches, config: LoopConfig, typical_range: float
     """Edges between neighbours in time from their matches; the trust in a step is the least that they have."""
     least = pose_steps(np.zeros((len(matches.poses) + 1, 3)), config.step_sigma, typical_range)
     information = matches.information / (config.sigma * typical_range) ** 2 + least.information
-    return least._replace(poses=matches.poses, information=information)
+    return least._replace(measurements=matches.poses, information=information)
 
 
 def _find_loops(scans: PlanarScans, poses: Floats, config: LoopConfig) -> Edges:
@@ -228,8 +229,8 @@ def count_support(edges: Edges, poses: Floats, config: LoopConfig, typical_range
     one, other = np.nonzero(near)
     step_target = se2.relative(poses[edges.target[one]], poses[edges.target[other]])
     step_source = se2.relative(poses[edges.source[other]], poses[edges.source[one]])
-    through = se2.compose(se2.compose(step_target, edges.poses[other]), step_source)
-    error = se2.relative(edges.poses[one], through)
+    through = se2.compose(se2.compose(step_target, edges.measurements[other]), step_source)
+    error = se2.relative(edges.measurements[one], through)
     agrees = np.hypot(error[:, 0], error[:, 1]) < config.agreement[0] * typical_range
     agrees &= np.abs(error[:, 2]) < config.agreement[1]
     return np.bincount(one[agrees], minlength=len(edges.source))

@@ -17,7 +17,8 @@ import scipy.sparse.csgraph
 from numpy.typing import NDArray
 
 from dpmjax.geometry import se2
-from dpmjax.pose_graph.planar import Edges, optimize_planar_graph
+from dpmjax.pose_graph.graph import Edges
+from dpmjax.pose_graph.planar import optimize_planar_graph
 from dpmjax.registration.pair_search import Candidates
 from dpmjax.registration.planar_scans import Floats, Indices
 from dpmjax.registration.pose_scoring import (

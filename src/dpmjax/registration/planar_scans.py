@@ -23,6 +23,7 @@ from jaxtyping import Array, Bool, Float
 from numpy.typing import NDArray
 
 from dpmjax.geometry.rays import typical_range
+from dpmjax.sequences import has_angular_order
 from dpmjax.types import AnyArray, ScanSet
 
 Floats = NDArray[np.float64]
@@ -133,7 +134,7 @@ def planar_scans(points: AnyArray | ScanSet, mask: AnyArray | None = None, *, is
         raise ValueError("points: expected finite coordinates where the mask is True")
     # What is masked may hold anything; zero times NaN would be NaN later on.
     scans = ScanSet(points=jnp.asarray(np.where(valid[..., None], values, 0.0)), mask=jnp.asarray(valid))
-    scans = scans if _has_angular_order(values, valid) else _sort_by_angle(scans)
+    scans = scans if has_angular_order(values, valid) else _sort_by_angle(scans)
     length = jnp.full(len(values), typical_range(values, valid), jnp.float32)
     return _fit_lines(scans).replace(typical_ranges=length, is_ordered=is_ordered)
 
@@ -151,18 +152,6 @@ def batches(count: int, size: int) -> Iterator[tuple[slice, Indices]]:
     for start in range(0, count, size):
         stop = min(start + size, count)
         yield slice(start, stop), np.resize(np.arange(start, stop), size)
-
-
-def _has_angular_order(points: NDArray[np.float32], mask: NDArray[np.bool_]) -> bool:
-    """Whether nearly all valid beams of nearly all scans go one way round, in one turn at most."""
-    in_order = []
-    for scan, valid in zip(points, mask, strict=True):
-        angle = np.unwrap(np.arctan2(scan[valid, 1], scan[valid, 0]).astype(np.float64))
-        if len(angle) >= 3:
-            turn = np.diff(angle)
-            one_way = max(np.mean(turn > 0), np.mean(turn < 0))
-            in_order.append(one_way >= 0.95 and np.abs(turn).sum() <= 1.05 * 2 * np.pi)
-    return bool(in_order) and float(np.mean(in_order)) >= 0.9
 
 
 @jax.jit

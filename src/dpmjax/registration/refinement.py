@@ -16,7 +16,8 @@ import scipy.spatial
 from jaxtyping import Array, Float, Int
 
 from dpmjax.geometry import se2
-from dpmjax.pose_graph.planar import Edges, join_edges, solve_poses
+from dpmjax.pose_graph.graph import Edges, join_edges
+from dpmjax.pose_graph.planar import solve_poses
 from dpmjax.registration.incremental import incremental_icp
 from dpmjax.registration.line_adjustment import LineAdjustmentConfig, adjust_to_lines
 from dpmjax.registration.loop_closure import LoopConfig, close_loops, matched_steps, pose_steps
@@ -118,9 +119,10 @@ def _align_all(scans: PlanarScans, poses: Floats, config: RefinementConfig) -> R
             source, target = choose_pairs(scans, poses, config)
         edges, system = _linearise(scans, source, target, poses, (gate, kernel))
         here = se2.relative(poses[steps.target], poses[steps.source])
-        pull = np.einsum("eij,ej->ei", steps.information, se2.relative(steps.poses, here))
+        pull = np.einsum("eij,ej->ei", steps.information, se2.relative(steps.measurements, here))
         gradient = np.concatenate([np.asarray(system.gradient), pull])
-        poses = se2.compose(poses, solve_poses(len(poses), join_edges(edges, steps._replace(poses=here)), gradient))
+        edges = join_edges(edges, steps._replace(measurements=here))
+        poses = se2.compose(poses, solve_poses(len(poses), edges, gradient))
     return Refined(poses, 0, len(source))
 
 

@@ -1,4 +1,4 @@
-"""One door for 3-D scans: finds out what a folder holds, and opens it as a sequence that reads lazily."""
+"""The entrance for 3-D scans: finds out what a folder holds, and opens it as a sequence that reads lazily."""
 
 from __future__ import annotations
 
@@ -8,13 +8,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from dpmjax.io.errors import InputError
 from dpmjax.io.files import natural_key
-from dpmjax.io.lidar.drive import Drive3D, scan_files
-from dpmjax.io.lidar.files import read_lidar_file
-from dpmjax.io.lidar.folders import read_learned_folder, read_mulran, read_plain_folder
-from dpmjax.io.lidar.kitti import read_kitti_360, read_kitti_carla, read_kitti_odometry, read_kitti_raw
-from dpmjax.io.lidar.sequence import LidarSequence, take_lidar_scans
+from dpmjax.io.lidar.datasets import read_kitti_360, read_kitti_carla, read_kitti_raw, read_mulran
+from dpmjax.io.lidar.drive import Drive3D, read_learned_folder, read_plain_folder, scan_files
+from dpmjax.io.lidar.files import read_points, warn_of_unit
+from dpmjax.io.lidar.kitti import read_kitti_odometry
+from dpmjax.sequences import InputError, LidarSequence
 
 _FORMATS = (
     "a KITTI sequence (velodyne/, calib.txt), a KITTI raw or KITTI-360 drive (velodyne_points/data), a MulRan folder "
@@ -27,9 +26,7 @@ def open_lidar_sequence(
     *,
     sequence: str | None = None,
     poses: str | Path | None = None,
-    start: int = 0,
-    stop: int | None = None,
-    stride: int = 1,
+    selection: slice = slice(None),
     bin_columns: int = 4,
 ) -> LidarSequence:
     """Opens a drive of 3-D scans, whatever of the known layouts it is in; no scan is read yet.
@@ -38,9 +35,7 @@ def open_lidar_sequence(
         path: the folder of a drive, or the root of a data set that holds several.
         sequence: which drive of a root, like "00"; may be left out where there is only one.
         poses: a pose file in the lidar's frame (KITTI or TUM rows, `.npy`) instead of the data set's own.
-        start: first scan to keep.
-        stop: scan to stop before; None for the end.
-        stride: keep every so many-th scan.
+        selection: start, stop and stride in scans.
         bin_columns: numbers a point has in `.bin` files.
 
     Returns:
@@ -48,13 +43,9 @@ def open_lidar_sequence(
 
     Raises:
         InputError: one line with the file, what was found and what to do: no such folder, an unknown layout, no scan,
-            poses that cannot be brought into the lidar's frame, or arguments out of range.
+            poses that cannot be brought into the lidar's frame, or a selection of no scan.
     """
     path = Path(path)
-    if start < 0 or stride < 1 or (stop is not None and stop < 0):
-        raise InputError(
-            path, f"start {start}, stop {stop}, stride {stride}", "start and stop count from 0, stride from 1"
-        )
     if bin_columns < 3:
         raise InputError(path, f"bin_columns is {bin_columns}", "a point has x, y and z at least")
     drive = _read(_choose(path, sequence), None if poses is None else Path(poses))
@@ -67,10 +58,9 @@ def open_lidar_sequence(
         T_world_lidar=drive.T_world_lidar,
         times=drive.times,
     )
-    part = take_lidar_scans(whole, slice(start, stop, stride))
+    part = whole.take(selection)
     if not part.num_scans:
-        found = f"0 of {whole.num_scans} scans chosen (start {start}, stop {stop}, stride {stride})"
-        raise InputError(path, found, "choose others")
+        raise InputError(path, f"{selection} chooses 0 of {whole.num_scans} scans", "choose others")
     return part
 
 
@@ -88,7 +78,11 @@ def list_lidar_sequences(path: str | Path) -> list[str]:
 
 
 def _read_scan(files: list[Path], bin_columns: int, index: int) -> NDArray[np.float32]:
-    return read_lidar_file(files[index], bin_columns=bin_columns)
+    """Scan `index`; the first one stands for all in the warning of a wrong unit."""
+    points = read_points(files[index], bin_columns=bin_columns)
+    if index == 0:
+        warn_of_unit(points, files[index])
+    return points
 
 
 def _choose(path: Path, sequence: str | None) -> Path:
@@ -132,6 +126,24 @@ def _drives(path: Path) -> dict[str, Path]:
     return found
 
 
+_READERS = {
+    "kitti_carla": read_kitti_carla,
+    "mulran": read_mulran,
+    "kitti_360": read_kitti_360,
+    "kitti_raw": read_kitti_raw,
+    "kitti_odometry": read_kitti_odometry,
+    "learned": read_learned_folder,
+}
+_SCAN_FOLDERS = {
+    "kitti_carla": "generated/frames",
+    "mulran": "Ouster",
+    "kitti_360": "velodyne_points/data",
+    "kitti_raw": "velodyne_points/data",
+    "kitti_odometry": "velodyne",
+    "plain_data": "data",
+}
+
+
 def _kind(path: Path) -> str | None:
     """Which layout a folder has, judged by what lies in it; None for none."""
     if (path / "generated" / "frames").is_dir() or (path / "full_poses_lidar.txt").is_file():
@@ -150,26 +162,9 @@ def _kind(path: Path) -> str | None:
 
 
 def _read(path: Path, poses: Path | None) -> Drive3D:
-    kind = _kind(path)
-    if poses is not None:
-        homes = {
-            "kitti_carla": "generated/frames",
-            "mulran": "Ouster",
-            "kitti_360": "velodyne_points/data",
-            "kitti_raw": "velodyne_points/data",
-            "kitti_odometry": "velodyne",
-            "plain_data": "data",
-        }
-        drive = read_plain_folder(path / homes.get(kind or "", ""), poses=poses)
-        return drive._replace(name=path.resolve().name)
-    read = {
-        "kitti_carla": read_kitti_carla,
-        "mulran": read_mulran,
-        "kitti_360": read_kitti_360,
-        "kitti_raw": read_kitti_raw,
-        "kitti_odometry": read_kitti_odometry,
-        "learned": read_learned_folder,
-    }.get(kind or "")
-    if read is not None:
-        return read(path)
-    return read_plain_folder(path / "data" if kind == "plain_data" else path)._replace(name=path.resolve().name)
+    """The drive in a folder; a given pose file replaces that of the data set."""
+    kind = _kind(path) or "plain"
+    if poses is None and kind in _READERS:
+        return _READERS[kind](path)
+    drive = read_plain_folder(path / _SCAN_FOLDERS.get(kind, ""), poses=poses)
+    return drive._replace(name=path.resolve().name)

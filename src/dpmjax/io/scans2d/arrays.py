@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import zipfile
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Literal
@@ -10,22 +9,25 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from dpmjax.io.errors import InputError
-from dpmjax.io.scans2d.sequence import ScanSequence, has_angular_order
+from dpmjax.geometry import se2
+from dpmjax.io.files import load_arrays, to_float32
+from dpmjax.io.poses import check_poses
+from dpmjax.sequences import InputError, ScanSequence, has_angular_order
 
+Table = Mapping[str, NDArray[np.generic]]
 _KEYS = "points (n, b, 2), or ranges (n, b) and angles (b,); optional mask, poses, odometry, times, unit"
 
 
 def read_arrays(path: str | Path, *, unit: Literal["px", "m"] | None = None) -> ScanSequence:
     """Reads scans from `.npy` or `.npz`.
 
-    A `.npy` holds points (n, b, 2) in the sensor frame; of (n, b, 3) the third coordinate is ignored. A `.npz` holds
+    A `.npy` holds points (n, b, 2) in the sensor frame; the third coordinate of (n, b, 3) is ignored. A `.npz` holds
     `points` like that, or `ranges` (n, b) with `angles` (b,) or (n, b) in radians counter-clockwise from straight
     ahead; and optionally `mask` (n, b), `poses` (the reference) and `odometry` as (n, 3) x, y, heading or (n, 3, 3)
     `T_world_scan`, `times` (n,) in seconds, and `unit`, "px" or "m".
 
-    A beam is invalid where `mask` says so, where both coordinates are NaN, or where its range is NaN, infinite or not
-    positive (as scanner drivers write what has no echo). A beam with one NaN coordinate is an error.
+    A beam is invalid where `mask` is False, where both coordinates are NaN, or where its range is NaN, infinite or not
+    positive (as scanner drivers write a beam without echo). A beam with one NaN coordinate is an error.
 
     Args:
         path: the file.
@@ -38,22 +40,24 @@ def read_arrays(path: str | Path, *, unit: Literal["px", "m"] | None = None) -> 
         InputError: the file is missing or damaged, lacks an array, has wrong shapes, or holds NaN or infinite values
             other than for invalid beams.
     """
-    table = _load(Path(path))
+    table = load_arrays(path)
     points, mask = _points(table, path) if "points" in table else _from_ranges(table, path)
     if "mask" in table:
         given = table["mask"]
         if given.shape != mask.shape or given.dtype.kind not in "biu":
             raise InputError(path, f"mask is {given.shape} {given.dtype}", f"give {mask.shape} booleans")
         mask &= given.astype(bool)
-    bad = mask & ~np.isfinite(points).all(axis=2)
+    stored = np.where(mask[..., None], to_float32(points), np.float32(0))
+    bad = ~np.isfinite(stored).all(axis=2)
     if bad.any():
         scan, beam = np.argwhere(bad)[0]
         advice = "mark an invalid beam by NaN in both coordinates"
         raise InputError(path, f"{bad.sum()} NaN or infinite points, the first in scan {scan}, beam {beam}", advice)
-    stored = np.where(mask[..., None], points, 0.0).astype(np.float32)
     times = table.get("times")
-    if times is not None and (times.shape != (len(points),) or times.dtype.kind not in "fiu"):
-        raise InputError(path, f"times are {times.shape} {times.dtype}", f"give ({len(points)},) seconds")
+    if times is not None and (
+        times.shape != (len(points),) or times.dtype.kind not in "fiu" or not np.isfinite(times).all()
+    ):
+        raise InputError(path, f"times are {times.shape} {times.dtype}", f"give ({len(points)},) finite seconds")
     return ScanSequence(
         name=Path(path).stem,
         points=stored,
@@ -66,25 +70,7 @@ def read_arrays(path: str | Path, *, unit: Literal["px", "m"] | None = None) -> 
     )
 
 
-def _load(path: Path) -> Mapping[str, NDArray[np.generic]]:
-    """The arrays of the file by key; a `.npy` is `points`."""
-    try:
-        # An opened file, for numpy.load leaves one open that is no zip archive.
-        with path.open("rb") as file:
-            loaded = np.load(file, allow_pickle=False)
-            if isinstance(loaded, np.ndarray):
-                return {"points": loaded}
-            with loaded:
-                return {key: loaded[key] for key in loaded.files}
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
-        raise InputError(
-            path, f"not a readable NumPy file ({error})", "save it again with numpy.save or numpy.savez"
-        ) from error
-
-
-def _points(
-    table: Mapping[str, NDArray[np.generic]], path: str | Path
-) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+def _points(table: Table, path: str | Path) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
     points = table["points"]
     if points.ndim != 3 or points.shape[2] not in (2, 3) or points.dtype.kind not in "fiu":
         raise InputError(path, f"points are {points.shape} {points.dtype}", "give (n, b, 2): scans, beams, x and y")
@@ -92,9 +78,7 @@ def _points(
     return planar, np.isnan(planar).sum(axis=2) < 2
 
 
-def _from_ranges(
-    table: Mapping[str, NDArray[np.generic]], path: str | Path
-) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+def _from_ranges(table: Table, path: str | Path) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
     if "ranges" not in table or "angles" not in table:
         raise InputError(path, f"keys are {', '.join(table) or 'none'}", f"give {_KEYS}")
     ranges, angles = table["ranges"], table["angles"]
@@ -102,36 +86,27 @@ def _from_ranges(
     if not fits or ranges.dtype.kind not in "fiu" or angles.dtype.kind not in "fiu":
         raise InputError(path, f"ranges are {ranges.shape}, angles {angles.shape}", "give (n, b) and (b,) or (n, b)")
     distance, theta = ranges.astype(np.float64), angles.astype(np.float64)
-    if not np.isfinite(theta).all():
-        raise InputError(path, "angles hold NaN or infinite values", "give a direction to every beam, in radians")
+    if not (np.abs(theta) < 1e6).all():
+        raise InputError(path, "angles hold NaN, infinite or huge values", "give a direction to every beam, in radians")
     mask = np.isfinite(distance) & (distance > 0)
     distance = np.where(mask, distance, 0.0)
     return distance[..., None] * np.stack([np.cos(theta), np.sin(theta)], axis=-1), mask
 
 
-def _unit(table: Mapping[str, NDArray[np.generic]], path: str | Path) -> Literal["px", "m"]:
+def _unit(table: Table, path: str | Path) -> Literal["px", "m"]:
     unit = str(table["unit"]) if "unit" in table else "m"
     if unit not in ("px", "m"):
         raise InputError(path, f"unit is {unit!r}", "say 'px' or 'm'")
     return "px" if unit == "px" else "m"
 
 
-def _planar(
-    table: Mapping[str, NDArray[np.generic]], key: str, num_scans: int, path: str | Path
-) -> NDArray[np.float64] | None:
+def _planar(table: Table, key: str, num_scans: int, path: str | Path) -> NDArray[np.float64] | None:
     """Poses (n, 3) x, y, heading out of (n, 3) or homogeneous (n, 3, 3)."""
     if key not in table:
         return None
     poses = table[key]
     if poses.shape not in ((num_scans, 3), (num_scans, 3, 3)) or poses.dtype.kind not in "fiu":
-        raise InputError(
-            path, f"{key} are {poses.shape} for {num_scans} scans", "give (n, 3) x, y, heading or (n, 3, 3)"
-        )
-    values = poses.astype(np.float64)
-    if not np.isfinite(values).all():
-        raise InputError(
-            path, f"{key} hold NaN or infinite values", "give a pose to every scan, or leave the array out"
-        )
-    if values.ndim == 2:
-        return values
-    return np.column_stack([values[:, :2, 2], np.arctan2(values[:, 1, 0], values[:, 0, 0])])
+        found = f"{key} are {poses.shape} for {num_scans} scans"
+        raise InputError(path, found, "give (n, 3) x, y, heading or (n, 3, 3)")
+    values = check_poses(poses.astype(np.float64), f"{path}: {key}")
+    return values if values.ndim == 2 else se2.from_matrix(values)

@@ -1,11 +1,11 @@
 """CARMEN logs: planar scans of a front laser with the pose a SLAM program gave them and the robot's odometry.
 
 A line is `FLASER n r1 .. rn x y theta odom_x odom_y odom_theta ipc_timestamp host timestamp`: ranges in metres over 180
-degrees from right to left, the corrected pose, the raw odometry. Every other line is passed over.
+degrees from right to left, the corrected pose, the raw odometry. Other lines are ignored.
 
-Two traps of the published logs are met here. Some lines carry time stamp and odometry of another moment (they break the
-order of the time stamps, and the odometry jumps by metres there and back): those entries are interpolated. And where
-odometry equals the corrected pose throughout, the raw odometry is lost: there is none.
+Published logs have two faults. Some lines carry the time stamp and odometry of another moment: the time stamps are out
+of order there, and the odometry jumps by metres there and back. Those entries are interpolated. And where odometry
+equals the corrected pose throughout, the raw odometry is lost: the sequence has none.
 """
 
 from __future__ import annotations
@@ -20,11 +20,12 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from dpmjax.io.errors import InputError
-from dpmjax.io.scans2d.sequence import ScanSequence
+from dpmjax.io.files import read_bytes
+from dpmjax.sequences import InputError, ScanSequence
 
 _log = logging.getLogger(__name__)
 _SHORTEST_SCALE_M = 7.9  # No laser of these logs has a shorter scale: a log that ends before has no code for "no echo".
+_LONGEST_RANGE_M, _LARGEST_NUMBER = 1e6, 1e18
 _CODE_BAND_M = 0.1  # Codes for "no echo" scatter by a few centimetres (81.87 to 81.91 m on a SICK LMS).
 
 
@@ -42,17 +43,17 @@ def read_carmen_log(path: str | Path, *, max_range: float | None = None) -> Scan
 
     Args:
         path: `.log`, `.clf` or their `.gz`.
-        max_range: readings of this many metres or more are no echo and become masked. None takes the largest reading of
-            the log, less 0.1 m, if that reading is beyond 7.9 m, and masks nothing for length otherwise. Readings of
-            zero and below are always masked.
+        max_range: readings of this many metres or more are masked as no echo. None takes the largest reading of the
+            log, less 0.1 m, if that reading is beyond 7.9 m, and masks no long reading otherwise. Readings of zero and
+            below are always masked.
 
     Returns:
         The scans in metres; scans with fewer beams than the longest are padded with masked beams. The corrected poses
         are the reference. No times where the log's stand still.
 
     Raises:
-        InputError: the file cannot be read, has no FLASER line, or a FLASER line lacks values or holds what is no
-            number.
+        InputError: the file cannot be read, has no FLASER line, or a FLASER line lacks values or holds words that
+            are no numbers.
     """
     lines = [_parse_line(words, f"{path}:{number}") for number, words in _flaser_lines(path)]
     capacity = max(len(line.ranges) for line in lines)
@@ -62,9 +63,10 @@ def read_carmen_log(path: str | Path, *, max_range: float | None = None) -> Scan
     for row, valid, line in zip(points, mask, lines, strict=True):
         count = len(line.ranges)
         angles = scan_angles(count)
-        row[:count] = line.ranges[:, None] * np.column_stack([np.cos(angles), np.sin(angles)])
-        valid[:count] = (line.ranges > 0) & (line.ranges < limit)
-    points[~mask] = 0
+        valid[:count] = (line.ranges > 0) & (line.ranges < min(limit, _LONGEST_RANGE_M))
+        ranges = np.where(valid[:count], line.ranges, 0.0)
+        row[:count] = ranges[:, None] * np.column_stack([np.cos(angles), np.sin(angles)])
+    points[~mask] = 0  # no -0.0
     corrected, odometry = np.array([line.corrected for line in lines]), np.array([line.odometry for line in lines])
     has_odometry = not np.allclose(corrected, odometry, atol=1e-6)
     times, odometry = _repair(np.array([line.time for line in lines]), odometry, path)
@@ -98,17 +100,17 @@ def scan_angles(num_beams: int) -> NDArray[np.float64]:
 
 def _flaser_lines(path: str | Path) -> list[tuple[int, list[str]]]:
     """Line numbers and words of the FLASER lines."""
+    content = read_bytes(path)
     try:
-        content = Path(path).read_bytes()
         text = (gzip.decompress(content) if content[:2] == b"\x1f\x8b" else content).decode("latin-1")
     except (OSError, EOFError, zlib.error) as error:
-        raise InputError(path, f"cannot be read ({error})", "check the path, or copy the file again") from error
+        raise InputError(path, f"cannot be unpacked ({error})", "copy the file again") from error
     lines = text.splitlines()
     found = [(number, line.split()) for number, line in enumerate(lines, 1) if line.startswith("FLASER")]
     if not found:
         newer = any(line.startswith("ROBOTLASER1") for line in lines)
-        told = "ROBOTLASER1 lines but no FLASER line" if newer else "no FLASER line"
-        raise InputError(path, told, "give a CARMEN log with FLASER lines")
+        what = "ROBOTLASER1 lines but no FLASER line" if newer else "no FLASER line"
+        raise InputError(path, what, "give a CARMEN log with FLASER lines")
     return found
 
 
@@ -118,13 +120,13 @@ def _parse_line(words: list[str], source: str) -> _Line:
         count = int(words[1])
         values = np.array(words[2 : 2 + count + 6], np.float64)
         time = float(words[count + 8]) if len(words) > count + 8 else 0.0
-    except (ValueError, IndexError) as error:
+    except (ValueError, IndexError, OverflowError) as error:
         raise InputError(source, f"not a FLASER line ({error})", advice) from error
     if count < 1 or len(values) < count + 6:
         raise InputError(source, f"{len(words) - 2} values after n = {count}, at least {count + 6} expected", advice)
     ranges, corrected, odometry = values[:count], values[count : count + 3], values[count + 3 :]
-    if np.isnan(values).any() or not np.isfinite(values[count:]).all() or not np.isfinite(time):
-        raise InputError(source, "NaN or infinite values", "remove the line")
+    if np.isnan(values).any() or not (np.abs([*values[count:], time]) < _LARGEST_NUMBER).all():
+        raise InputError(source, "NaN, infinite or huge values", "remove the line")
     return _Line(ranges, corrected, odometry, time)
 
 

@@ -13,13 +13,13 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from dpmjax.io.errors import InputError
-from dpmjax.io.files import natural_key, write_atomically
+from dpmjax.io.files import natural_key, read_bytes, write_atomically
 from dpmjax.io.pcd import parse_pcd, write_pcd
-from dpmjax.io.scans2d.sequence import ScanSequence, has_angular_order
+from dpmjax.sequences import InputError, ScanSequence, has_angular_order
 
-PIXELS_PER_UNIT = 512.0
+_PIXELS_PER_UNIT = 512.0
 _LARGEST_STORED = 8.0  # A picture of 2048 pixels has a diagonal of 5.7 stored units.
+_LARGEST_LENGTH = 1e7
 _POSE_FILE = "gt_pose.mat"
 
 
@@ -36,24 +36,28 @@ def read_deepmapping_folder(path: str | Path, *, unit: Literal["px", "m"] | None
         beams; reference poses where there is a `gt_pose.mat`.
 
     Raises:
-        InputError: no such path, no PCD file, a file `parse_pcd` finds fault with, a pose file that does not fit, or
-            (unit None) coordinates too large to be pixels / 512.
+        InputError: no such path, no PCD file, a damaged PCD file, a pose file that does not fit, or
+            coordinates too large for their unit.
     """
     files = _list_files(Path(path))
     names = sorted((name for name in files if name.lower().endswith(".pcd")), key=natural_key)
     if not names:
         raise InputError(path, "no .pcd file in it", "give the authors' folder or .tar of .pcd files")
     scans = [parse_pcd(files[name], f"{path}/{name}")[:, :2] for name in names]
-    points, mask = _pad(scans)
+    points = np.zeros((len(scans), max(len(scan) for scan in scans), 2), np.float32)
+    for row, scan in zip(points, scans, strict=True):
+        row[: len(scan)] = scan
+    mask = (points != 0).any(axis=2)
     if not mask.any():
-        raise InputError(
-            path, "every point of every scan is zero (an invalid beam)", "give scans that measured something"
-        )
+        found = "every point of every scan is zero (an invalid beam)"
+        raise InputError(path, found, "give scans that measured something")
+    if np.abs(points).max() > _LARGEST_LENGTH:
+        raise InputError(path, f"coordinates up to {np.abs(points).max():g}", "give metres, or pixels / 512")
     if unit is None and np.abs(points).max() > _LARGEST_STORED:
         found = f"coordinates up to {np.abs(points).max():g}, too large for pixels / 512"
         raise InputError(path, found, "say --unit m if they are metres")
     if unit != "m":
-        points *= np.float32(PIXELS_PER_UNIT)
+        points *= np.float32(_PIXELS_PER_UNIT)
     pose_name = next((name for name in files if PurePosixPath(name).name == _POSE_FILE), None)
     return ScanSequence(
         name=Path(path).stem,
@@ -83,10 +87,10 @@ def write_deepmapping_folder(path: str | Path, sequence: ScanSequence) -> Path:
     folder = Path(path)
     digits = max(3, len(str(len(sequence) - 1)))
     names = [f"{index:0{digits}d}.pcd" for index in range(len(sequence))]
-    strangers = sorted({file.name for file in folder.glob("*.pcd")} - set(names)) if folder.is_dir() else []
-    if strangers:
-        raise InputError(folder, f"{len(strangers)} other .pcd files, such as {strangers[0]}", "give an empty folder")
-    scale = PIXELS_PER_UNIT if sequence.unit == "px" else 1.0
+    others = sorted({file.name for file in folder.glob("*.pcd")} - set(names)) if folder.is_dir() else []
+    if others:
+        raise InputError(folder, f"{len(others)} other .pcd files, such as {others[0]}", "give an empty folder")
+    scale = _PIXELS_PER_UNIT if sequence.unit == "px" else 1.0
     stored = np.where(sequence.mask[..., None], sequence.points, 0.0) / scale
     for name, points in zip(names, stored, strict=True):
         write_pcd(folder / name, points)
@@ -101,24 +105,17 @@ def _list_files(path: Path) -> dict[str, bytes]:
     """The PCD and MAT files by name; archives are read in memory and never unpacked."""
     if path.is_dir():
         chosen = [file for file in path.iterdir() if file.suffix.lower() in (".pcd", ".mat")]
-        return {file.name: file.read_bytes() for file in chosen if file.is_file()}
+        return {file.name: read_bytes(file) for file in chosen if file.is_file()}
     if not path.exists():
         raise InputError(path, "no such file or folder", "check the path")
     try:
         with tarfile.open(path) as archive:
-            members = [m for m in archive if m.isfile() and m.name.lower().endswith((".pcd", ".mat"))]
+            members = [m for m in archive if m.isfile() and not m.issparse()]
+            members = [m for m in members if m.name.lower().endswith((".pcd", ".mat"))]
             members = [m for m in members if not PurePosixPath(m.name).name.startswith("._")]
             return {m.name: file.read() for m in members if (file := archive.extractfile(m)) is not None}
-    except (tarfile.TarError, EOFError, OSError) as error:
+    except Exception as error:  # The parsers of tar, gzip, bzip2 and xz raise many kinds.
         raise InputError(path, f"not a readable tar archive ({error})", "copy the archive again") from error
-
-
-def _pad(scans: list[NDArray[np.float32]]) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-    """Ragged scans as points (n, b, 2) and mask (n, b); a point of zeros is an invalid beam."""
-    points = np.zeros((len(scans), max(len(scan) for scan in scans), 2), np.float32)
-    for row, scan in zip(points, scans, strict=True):
-        row[: len(scan)] = scan
-    return points, (points != 0).any(axis=2)
 
 
 def _read_poses(content: bytes, source: str, num_scans: int) -> NDArray[np.float64]:

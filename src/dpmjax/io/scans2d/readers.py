@@ -1,4 +1,4 @@
-"""One door for 2-D scans: finds out what a path holds, reads it, and refuses what cannot be registered."""
+"""The entrance for 2-D scans: finds out what a path holds, reads it, and refuses what cannot be registered."""
 
 from __future__ import annotations
 
@@ -9,16 +9,18 @@ from typing import Literal
 
 import numpy as np
 
-from dpmjax.io.errors import InputError
 from dpmjax.io.scans2d.arrays import read_arrays
 from dpmjax.io.scans2d.carmen import read_carmen_log
 from dpmjax.io.scans2d.deepmapping_folder import read_deepmapping_folder
-from dpmjax.io.scans2d.sequence import ScanSequence, take_scans
+from dpmjax.sequences import InputError, ScanSequence
 
 _log = logging.getLogger(__name__)
 _FORMATS = "a folder or .tar of .pcd files, a CARMEN .log, .clf or .log.gz, or .npy / .npz arrays"
 # Median ranges outside of these are a mistaken unit: millimetres, or pixels / 512.
 _PLAUSIBLE_RANGE = {"m": (0.05, 500.0), "px": (2.0, 20000.0)}
+# Few planar lidars measure farther; a sequence with hardly any shorter beam may be in millimetres.
+_USUAL_M, _LEAST_USUAL_SHARE = 100.0, 0.05
+_LEAST_BEAMS = 17  # Lines are fitted to up to 17 neighbouring beams.
 
 
 def read_sequence(
@@ -37,17 +39,18 @@ def read_sequence(
             NumPy file (`read_arrays`). The ending decides, else the first bytes.
         start: first scan to keep.
         stop: scan to stop before; None for the end.
-        stride: keep every so many-th scan.
-        unit: unit of the file's lengths where the file does not tell: PCD files are pixels / 512 and arrays are metres
-            unless this says otherwise. CARMEN logs are in metres.
+        stride: keep every `stride`-th scan.
+        unit: unit of the file's lengths where the file does not state it; None takes PCD files as pixels / 512 and
+            arrays as metres. CARMEN logs are in metres.
         max_range: beams of this length or more (in the sequence's unit) are masked; None leaves it to the reader.
 
     Returns:
-        The sequence: two scans at least, each with one valid beam at least.
+        The sequence: two scans at least of 17 beams at least, each with one valid beam at least.
 
     Raises:
         InputError: one line with the file, what was found and what to do: no such file, an unknown format, damage, too
-            few scans, a scan without a valid beam, lengths that no such unit explains, or arguments out of range.
+            few scans or beams, a scan without a valid beam, scans of a single point, lengths that no such unit
+            explains, or arguments out of range.
     """
     path = Path(path)
     if start < 0 or stride < 1 or (stop is not None and stop < 0):
@@ -59,7 +62,7 @@ def read_sequence(
     whole = _read_any(path, unit, max_range)
     if max_range is not None:
         whole = _limit(whole, max_range)
-    sequence = take_scans(whole, slice(start, stop, stride))
+    sequence = whole.take(slice(start, stop, stride))
     if len(sequence) < 2:
         found = f"{len(sequence)} of {len(whole)} scans chosen (start {start}, stop {stop}, stride {stride})"
         raise InputError(path, found, "a registration needs two scans at least")
@@ -119,26 +122,33 @@ def _limit(sequence: ScanSequence, max_range: float) -> ScanSequence:
 
 
 def _check_beams(sequence: ScanSequence, path: Path, start: int, stride: int) -> None:
+    num_beams = sequence.mask.shape[1]
+    if num_beams < _LEAST_BEAMS:
+        found = f"scans of {num_beams} beams"
+        raise InputError(path, found, f"give {_LEAST_BEAMS} beams or more; arrays are (scans, beams, 2)")
     empty = np.flatnonzero(~sequence.mask.any(axis=1))
     if len(empty) == len(sequence):
-        raise InputError(
-            path, "every beam of every scan is invalid or at maximum range", "check ranges and --max-range"
-        )
+        found = "every beam of every scan is invalid or at maximum range"
+        raise InputError(path, found, "check ranges and --max-range")
     if len(empty):
         found = (
             f"{len(empty)} of {len(sequence)} scans have no valid beam, the first is scan {start + stride * empty[0]}"
         )
         raise InputError(path, found, "remove such scans, or choose others by start, stop and stride")
+    first = sequence.points[np.arange(len(sequence)), sequence.mask.argmax(axis=1)]
+    if not ((sequence.points != first[:, None]).any(axis=2) & sequence.mask).any():
+        raise InputError(path, "all points of each scan are one and the same", "give scans that see some surroundings")
 
 
 def _check_unit(sequence: ScanSequence, path: Path) -> None:
-    median = float(np.median(np.linalg.norm(sequence.points[sequence.mask], axis=1)))
+    ranges = np.linalg.norm(sequence.points[sequence.mask].astype(np.float64), axis=1)
+    median = float(np.median(ranges))
     low, high = _PLAUSIBLE_RANGE[sequence.unit]
     if not low <= median <= high:
         found = f"the median range is {median:.4g} {sequence.unit}"
-        advice = (
-            "convert millimetres to metres, or name the unit"
-            if sequence.unit == "m"
-            else "name the unit, or give pixels"
-        )
+        is_metric = sequence.unit == "m"
+        advice = "convert millimetres to metres, or name the unit" if is_metric else "name the unit, or give pixels"
         raise InputError(path, found, advice)
+    share = float((ranges < _USUAL_M).mean())
+    if sequence.unit == "m" and share < _LEAST_USUAL_SHARE:
+        _log.warning("%s: %.1f %% of the beams are below %g m; are these millimetres?", path, 100 * share, _USUAL_M)

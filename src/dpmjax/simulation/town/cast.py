@@ -1,4 +1,4 @@
-"""The ray caster: what each ray of a turn meets first, among the bodies of its sector and the ground."""
+"""The ray caster: finds what each ray of a turn meets first, among the bodies of its sector and the ground."""
 
 from __future__ import annotations
 
@@ -11,15 +11,17 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from dpmjax.simulation.town.ground import cross_ground
-from dpmjax.simulation.town.intersect import Crossing, cross_box, cross_cylinder, cross_spheroid
-from dpmjax.simulation.town.primitives import TownPrimitives
-from dpmjax.simulation.town.sectors import Bodies, bodies_by_sector, nearest_bodies
-from dpmjax.simulation.town.traffic import traffic_boxes
+from dpmjax.simulation.town.intersect import (
+    Crossing,
+    Hull,
+    cross_box,
+    cross_cylinder,
+    cross_ground,
+    cross_spheroid,
+)
+from dpmjax.simulation.town.primitives import GROUND, NOTHING, Bodies, TownPrimitives, traffic_boxes
+from dpmjax.simulation.town.sectors import bodies_by_sector, nearest_bodies
 from dpmjax.simulation.town.windows import recess
-
-NOTHING, GROUND, SOLID, SOFT, POLE, MOVING = range(6)
-"""What a ray can meet."""
 
 
 @dataclass(frozen=True)
@@ -33,7 +35,7 @@ class CastConfig:
         boxes_per_sector: boxes that one sector of the turn holds.
         cylinders_per_sector: cylinders of a sector.
         spheroids_per_sector: spheroids of a sector.
-        max_sectors: the turn is cut into so many sectors at most.
+        max_sectors: largest number of sectors of a turn.
     """
 
     num_boxes: int = 1024
@@ -51,7 +53,7 @@ class CastConfig:
 
 @flax.struct.dataclass
 class Hits:
-    """What the rays meet, (s, r): r rays in each of s sectors.
+    """First hits of r rays in each of s sectors.
 
     Attributes:
         ranges: m; infinite for nothing.
@@ -66,6 +68,20 @@ class Hits:
     is_glass: Float[Array, "s r"]
 
 
+class Rays(NamedTuple):
+    """The rays of a turn: r rays in each of s equal sectors.
+
+    Attributes:
+        directions: unit directions in the sensor frame.
+        azimuths: middle of each sector, radians.
+        depths: how many mean ways each ray goes into foliage.
+    """
+
+    directions: Float[Array, "s r 3"]
+    azimuths: Float[Array, " s"]
+    depths: Float[Array, "s r"]
+
+
 class _Best(NamedTuple):
     """The nearest meeting so far: range, and slot in the sector's list (-1: none)."""
 
@@ -73,61 +89,45 @@ class _Best(NamedTuple):
     slots: Int[Array, "s r"]
 
 
-def num_sectors(num_azimuths: int, max_sectors: int) -> int:
-    """The largest number of equal sectors of whole columns.
-
-    Args:
-        num_azimuths: columns in a turn.
-        max_sectors: upper limit.
-
-    Returns:
-        A divisor of `num_azimuths`.
-    """
-    return max(count for count in range(1, max_sectors + 1) if num_azimuths % count == 0)
-
-
 def cast_turn(
     town: TownPrimitives,
     T_world_lidar: Float[Array, "4 4"],
     time: Float[Array, ""],
-    directions: Float[Array, "s r 3"],
-    sector_azimuths: Float[Array, " s"],
-    sector_half_width: float,
-    depths: Float[Array, "s r"],
+    rays: Rays,
     *,
     max_range: float,
     config: CastConfig,
 ) -> Hits:
-    """Follows all rays of a turn.
+    """Follows all rays of a turn to what they meet first, without noise and loss.
 
     Args:
         town: the world.
         T_world_lidar: pose of the sensor.
         time: s, for the traffic.
-        directions: unit directions in axes of the world, by sector.
-        sector_azimuths: middle of each sector in the sensor frame, radians.
-        sector_half_width: radians.
-        depths: for each ray, how many mean ways it goes into what is soft.
+        rays: by sector.
         max_range: m.
         config: capacities.
 
     Returns:
-        The hits.
+        The hits, by sector.
     """
     start = T_world_lidar[:3, 3]
     T_lidar_world = jnp.zeros((4, 4), T_world_lidar.dtype).at[:3, :3].set(T_world_lidar[:3, :3].T).at[3, 3].set(1.0)
+    highest = jax.lax.Precision.HIGHEST
+    in_world = rays._replace(
+        directions=jnp.einsum("ij,srj->sri", T_world_lidar[:3, :3], rays.directions, precision=highest)
+    )
 
-    def in_sectors(bodies: Bodies, num_nearest: int, capacity: int) -> Bodies:
-        near = nearest_bodies(bodies, num_nearest, max_range)
-        return bodies_by_sector(near, T_lidar_world, sector_azimuths, sector_half_width, capacity)
+    def first_hits(bodies: Bodies, num_nearest: int, capacity: int, cross: Callable[[Array, Hull], Crossing]) -> Hits:
+        near = nearest_bodies(replace(bodies, centres=bodies.centres - start), num_nearest, max_range)
+        return _body_hits(bodies_by_sector(near, T_lidar_world, rays.azimuths, capacity), in_world, cross)
 
-    boxes = in_sectors(_boxes(town, start, time), config.num_boxes, config.boxes_per_sector)
-    cylinders = in_sectors(_cylinders(town, start), config.num_cylinders, config.cylinders_per_sector)
-    spheroids = in_sectors(_spheroids(town, start), config.num_spheroids, config.spheroids_per_sector)
-    hits = _box_hits(boxes, directions, depths, len(town.boxes.mask))
-    hits = _nearer(hits, _round_hits(cylinders, directions, depths, _cross_cylinder, POLE))
-    hits = _nearer(hits, _round_hits(spheroids, directions, depths, _cross_spheroid, SOFT))
-    hits = _nearer(hits, _ground_hits(town, start, directions, max_range))
+    boxes = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), town.boxes, traffic_boxes(town.traffic, start, time))
+    hits = first_hits(boxes, config.num_boxes, config.boxes_per_sector, cross_box)
+    poles = first_hits(town.cylinders, config.num_cylinders, config.cylinders_per_sector, cross_cylinder)
+    tufts = first_hits(town.spheroids, config.num_spheroids, config.spheroids_per_sector, cross_spheroid)
+    for others in (poles, tufts, _ground_hits(town, start, in_world, max_range)):
+        hits = _nearer(hits, others)
     is_seen = hits.ranges <= max_range
     return replace(
         hits, ranges=jnp.where(is_seen, hits.ranges, jnp.inf), surfaces=jnp.where(is_seen, hits.surfaces, NOTHING)
@@ -139,129 +139,43 @@ def _nearer(a: Hits, b: Hits) -> Hits:
     return jax.tree.map(lambda x, y: jnp.where(is_a, x, y), a, b)
 
 
-def _boxes(town: TownPrimitives, start: Float[Array, " 3"], time: Float[Array, ""]) -> Bodies:
-    """Boxes that stand and boxes that drive, relative to the sensor."""
-    moving = traffic_boxes(town.traffic, start, time)
-    both = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), town.boxes, moving)
-    return Bodies(
-        centres=both.centres - start,
-        half_sizes=both.half_sizes,
-        headings=both.headings,
-        softness=both.softness,
-        window_depth=both.window_depth,
-        index=jnp.arange(len(both.mask)),
-        mask=both.mask,
-    )
-
-
-def _upright(
-    centres: Float[Array, "n 3"],
-    radii: Float[Array, " n"],
-    half_heights: Float[Array, " n"],
-    softness: Array,
-    mask: Array,
-) -> Bodies:
-    """Round bodies by the boxes round them."""
-    zero = jnp.zeros_like(radii)
-    return Bodies(
-        centres=centres,
-        half_sizes=jnp.stack([radii, radii, half_heights], axis=-1),
-        headings=jnp.stack([zero + 1.0, zero], axis=-1),
-        softness=softness,
-        window_depth=zero,
-        index=jnp.arange(len(mask)),
-        mask=mask,
-    )
-
-
-def _cylinders(town: TownPrimitives, start: Float[Array, " 3"]) -> Bodies:
-    poles = town.cylinders
-    return _upright(poles.centres - start, poles.radii, poles.half_heights, jnp.zeros_like(poles.radii), poles.mask)
-
-
-def _spheroids(town: TownPrimitives, start: Float[Array, " 3"]) -> Bodies:
-    tufts = town.spheroids
-    return _upright(tufts.centres - start, tufts.radii, tufts.half_heights, tufts.softness, tufts.mask)
-
-
-def _cross_box(direction: Array, body: Bodies) -> Crossing:
-    return cross_box(direction, body.centres, body.half_sizes, body.headings)
-
-
-def _cross_cylinder(direction: Array, body: Bodies) -> Crossing:
-    return cross_cylinder(direction, body.centres, body.half_sizes[..., 0], body.half_sizes[..., 2])
-
-
-def _cross_spheroid(direction: Array, body: Bodies) -> Crossing:
-    return cross_spheroid(direction, body.centres, body.half_sizes[..., 0], body.half_sizes[..., 2])
-
-
-def _first(
-    bodies: Bodies, directions: Float[Array, "s r 3"], depths: Float[Array, "s r"], cross: Callable[..., Crossing]
-) -> _Best:
+def _first(bodies: Bodies, rays: Rays, cross: Callable[[Array, Hull], Crossing]) -> _Best:
     """The first body of each ray: one slot of the lists after the other, all rays at once."""
 
     def meet(best: _Best, entry: tuple[Array, Bodies]) -> tuple[_Best, None]:
         slot, column = entry
         body = jax.tree.map(lambda x: x[:, None], column)
-        crossing = cross(directions, body)
-        distance = crossing.entry + body.softness * depths
+        crossing = cross(rays.directions, Hull(body.centres, body.half_sizes, body.headings))
+        distance = crossing.entry + body.softness * rays.depths
         is_met = body.mask & (crossing.entry > 0) & (distance <= crossing.exit) & (distance < best.ranges)
         return _Best(jnp.where(is_met, distance, best.ranges), jnp.where(is_met, slot, best.slots)), None
 
     columns = jax.tree.map(lambda x: jnp.moveaxis(x, 1, 0), bodies)
-    nothing = _Best(jnp.full(depths.shape, jnp.inf, depths.dtype), jnp.full(depths.shape, -1))
+    nothing = _Best(jnp.full(rays.depths.shape, jnp.inf, rays.depths.dtype), jnp.full(rays.depths.shape, -1))
     best, _ = jax.lax.scan(meet, nothing, (jnp.arange(bodies.mask.shape[1]), columns))
     return best
 
 
-def _met(bodies: Bodies, slots: Int[Array, "s r"]) -> Bodies:
-    """For each ray, the body in the slot of its sector's list."""
-    sectors = jnp.arange(slots.shape[0])[:, None]
-    return jax.tree.map(lambda x: x[sectors, jnp.maximum(slots, 0)], bodies)
-
-
-def _box_hits(
-    bodies: Bodies, directions: Float[Array, "s r 3"], depths: Float[Array, "s r"], num_standing: int
-) -> Hits:
-    best = _first(bodies, directions, depths, _cross_box)
-    body = _met(bodies, best.slots)
+def _body_hits(bodies: Bodies, rays: Rays, cross: Callable[[Array, Hull], Crossing]) -> Hits:
+    """The first bodies of all rays; boxes have windows, and the angle of a face counts, unless it is soft."""
+    best = _first(bodies, rays, cross)
     is_met = best.slots >= 0
-    face = recess(jnp.where(is_met, best.ranges, 0.0), directions, body)
-    is_soft = body.softness > 0
-    surfaces = jnp.where(body.index >= num_standing, MOVING, jnp.where(is_soft, SOFT, SOLID))
-    return Hits(
-        ranges=jnp.where(is_met, face.ranges, jnp.inf),
-        cosines=jnp.where(is_soft, 1.0, face.cosines),
-        surfaces=jnp.where(is_met, surfaces, NOTHING),
-        is_glass=face.is_glass & is_met,
-    )
+    # For each ray, the body in the slot of its sector's list.
+    sectors = jnp.arange(best.slots.shape[0])[:, None]
+    body = jax.tree.map(lambda x: x[sectors, jnp.maximum(best.slots, 0)], bodies)
+    surfaces = jnp.where(is_met, body.surface, NOTHING)
+    if cross is not cross_box:
+        return Hits(best.ranges, jnp.ones_like(best.ranges), surfaces, jnp.zeros(is_met.shape, bool))
+    face = recess(jnp.where(is_met, best.ranges, 0.0), rays.directions, body)
+    ranges = jnp.where(is_met, face.ranges, jnp.inf)
+    return Hits(ranges, jnp.where(body.softness > 0, 1.0, face.cosines), surfaces, face.is_glass & is_met)
 
 
-def _round_hits(
-    bodies: Bodies,
-    directions: Float[Array, "s r 3"],
-    depths: Float[Array, "s r"],
-    cross: Callable[..., Crossing],
-    surface: int,
-) -> Hits:
-    """Poles and tufts: small or rough, the angle of the surface does not count."""
-    best = _first(bodies, directions, depths, cross)
-    return Hits(
-        ranges=best.ranges,
-        cosines=jnp.ones_like(best.ranges),
-        surfaces=jnp.where(best.slots >= 0, surface, NOTHING),
-        is_glass=jnp.zeros(best.slots.shape, bool),
-    )
-
-
-def _ground_hits(
-    town: TownPrimitives, start: Float[Array, " 3"], directions: Float[Array, "s r 3"], max_range: float
-) -> Hits:
-    ranges = cross_ground(town.ground, start, directions, max_range)
+def _ground_hits(town: TownPrimitives, start: Float[Array, " 3"], rays: Rays, max_range: float) -> Hits:
+    ranges = cross_ground(town.ground, start, rays.directions, max_range)
     return Hits(
         ranges=ranges,
-        cosines=jnp.abs(directions[..., 2]),
+        cosines=jnp.abs(rays.directions[..., 2]),
         surfaces=jnp.where(jnp.isfinite(ranges), GROUND, NOTHING),
         is_glass=jnp.zeros(ranges.shape, bool),
     )

@@ -1,15 +1,19 @@
-"""A drive along the route of a town: where the sensor is, and when."""
+"""Drives along the route of a town: poses and times of the sensor, and the scans that it takes."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from typing import NamedTuple
 
+import jax
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from dpmjax.simulation.town.make import Town, lane_of
-from dpmjax.simulation.town.paths import arc_lengths, at_way, tangents
+from dpmjax.sequences import LidarSequence
+from dpmjax.simulation.town.cast import CastConfig
+from dpmjax.simulation.town.make import Town, TownConfig, make_town
+from dpmjax.simulation.town.scan import HDL64E, LidarSensor, scan_town
+from dpmjax.simulation.town.streets import arc_lengths, at_way, lane_of, tangents
 
 _WHEELBASE_M = 2.7
 _TRACK_M = 1.6
@@ -58,6 +62,50 @@ class Drive(NamedTuple):
 
     T_world_lidar: NDArray[np.float64]
     times: NDArray[np.float64]
+
+
+def simulate_lidar_sequence(
+    seed: int,
+    config: TownConfig = TownConfig(),  # noqa: B008 (frozen)
+    *,
+    driving: DriveConfig | None = None,
+    sensor: LidarSensor = HDL64E,
+    trajectory: ArrayLike | None = None,
+    casting: CastConfig = CastConfig(),  # noqa: B008
+) -> LidarSequence:
+    """A drive through a town of its own; a scan is simulated when it is read.
+
+    Args:
+        seed: of the town, the drive and the noise: the same sequence every time.
+        config: what the town is like.
+        driving: how the car drives; None takes the default with the sensor's own height.
+        sensor: the lidar.
+        trajectory: (n, 4, 4) `T_world_lidar` of a real drive to lay the street along, see `make_town`.
+        casting: capacities of the ray caster.
+
+    Returns:
+        The sequence, with exact poses and times. The world is the town's.
+
+    Raises:
+        ValueError: see `make_town`.
+    """
+    town = make_town(seed, config, trajectory=trajectory)
+    driving = driving or DriveConfig(sensor_height_m=sensor.height_m)
+    way = drive(town, driving, seed=seed)
+
+    def read_scan(index: int) -> NDArray[np.float32]:
+        key = jax.random.fold_in(jax.random.key(seed), index)
+        pose, time = way.T_world_lidar[index], way.times[index]
+        cloud = scan_town(town.primitives, pose, time, key=key, sensor=sensor, config=casting)
+        return np.asarray(cloud.points)[np.asarray(cloud.mask)]
+
+    return LidarSequence(
+        name=town.name,
+        sources=tuple(f"{town.name}, scan {index}" for index in range(len(way.times))),
+        read_scan=read_scan,
+        T_world_lidar=way.T_world_lidar,
+        times=way.times,
+    )
 
 
 def drive(town: Town, config: DriveConfig = DriveConfig(), *, seed: int = 0) -> Drive:

@@ -9,9 +9,8 @@ from numpy.typing import NDArray
 
 from dpmjax.simulation.town import objects
 from dpmjax.simulation.town.objects import Collection, Place
-from dpmjax.simulation.town.paths import arc_lengths, at_way, tangents
-from dpmjax.simulation.town.plots import Plots
-from dpmjax.simulation.town.streets import Streets
+from dpmjax.simulation.town.streets import Streets, arc_lengths, at_way, tangents
+from dpmjax.simulation.town.terrain import Plots
 
 
 @dataclass(frozen=True)

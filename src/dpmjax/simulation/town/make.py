@@ -10,22 +10,29 @@ from numpy.typing import ArrayLike, NDArray
 
 from dpmjax.simulation.town.furnish import furnish
 from dpmjax.simulation.town.objects import Collection
-from dpmjax.simulation.town.paths import arc_lengths, resample, shift_left
-from dpmjax.simulation.town.plots import Plots
 from dpmjax.simulation.town.primitives import (
     LANE_STEP_M,
+    POLE,
+    SOFT,
+    SOLID,
     Ground,
     TownPrimitives,
     Traffic,
     capacity_for,
     mask_of,
-    pack_boxes,
-    pack_cylinders,
-    pack_spheroids,
+    pack_bodies,
     padded,
 )
-from dpmjax.simulation.town.streets import LANE_M, RouteKind, Streets, make_streets, streets_along
-from dpmjax.simulation.town.terrain import CELL_M, Terrain, make_terrain
+from dpmjax.simulation.town.streets import (
+    LANE_M,
+    RouteKind,
+    Streets,
+    arc_lengths,
+    make_streets,
+    resample,
+    streets_along,
+)
+from dpmjax.simulation.town.terrain import CELL_M, Plots, Terrain, make_terrain
 
 _SENSOR_HEIGHT_M = 1.73
 _TOWN_STREAM = 8150
@@ -110,24 +117,15 @@ def make_town(seed: int, config: TownConfig = TownConfig(), *, trajectory: Array
     terrain = make_terrain(rng, streets, steepness=config.steepness, support=support)
     standing = furnish(rng, streets, Plots(terrain))
     traffic = _make_traffic(rng, streets, terrain, config)
-    return Town(f"town-{seed}", streets, terrain, pack_town(standing, terrain, traffic))
+    return Town(f"town-{seed}", streets, terrain, _pack_town(standing, terrain, traffic))
 
 
-def pack_town(standing: Collection, terrain: Terrain, traffic: Traffic) -> TownPrimitives:
-    """Brings a town to the device.
-
-    Args:
-        standing: rows of primitives.
-        terrain: the ground.
-        traffic: what moves.
-
-    Returns:
-        The primitives.
-    """
+def _pack_town(standing: Collection, terrain: Terrain, traffic: Traffic) -> TownPrimitives:
+    """The town as arrays on the device."""
     return TownPrimitives(
-        boxes=pack_boxes(np.array(standing.boxes, np.float64)),
-        cylinders=pack_cylinders(np.array(standing.cylinders, np.float64)),
-        spheroids=pack_spheroids(np.array(standing.spheroids, np.float64)),
+        boxes=pack_bodies(np.array(standing.boxes, np.float64), SOLID),
+        cylinders=pack_bodies(np.array(standing.cylinders, np.float64), POLE),
+        spheroids=pack_bodies(np.array(standing.spheroids, np.float64), SOFT),
         ground=Ground(
             heights=jnp.asarray(terrain.heights, jnp.float32),
             origin=jnp.asarray(terrain.origin, jnp.float32),
@@ -179,17 +177,3 @@ def _make_traffic(rng: np.random.Generator, streets: Streets, terrain: Terrain, 
 def _fill(points: NDArray[np.float64], count: int) -> NDArray[np.float64]:
     """Repeats the last row up to `count` rows."""
     return np.vstack([points, np.repeat(points[-1:], count - len(points), axis=0)])
-
-
-def lane_of(streets: Streets, *, is_reversed: bool) -> NDArray[np.float64]:
-    """The right lane of the route.
-
-    Args:
-        streets: with the route.
-        is_reversed: drive the route the other way round, on the other side of the street.
-
-    Returns:
-        (k, 2) points at steps of about half a metre.
-    """
-    line = streets.route[::-1] if is_reversed else streets.route
-    return resample(shift_left(line, -LANE_M), 0.5)

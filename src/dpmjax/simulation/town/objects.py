@@ -1,4 +1,4 @@
-"""What stands in a town, part by part: houses, cars, trees, hedges, poles, people. Rows for the tables of primitives.
+"""Objects of a town as rows of primitives: houses, cars, trees, hedges, poles, people.
 
 Every builder gets a place on the ground and a heading (the street's direction; the street lies to the object's right)
 and appends rows to a `Collection`.
@@ -19,8 +19,8 @@ class Collection:
 
     Attributes:
         boxes: x y z, half sizes, heading, softness, window depth.
-        cylinders: x y z, radius, half height.
-        spheroids: x y z, radius, half height, softness.
+        cylinders: the same of the boxes round them.
+        spheroids: the same.
     """
 
     boxes: list[tuple[float, ...]] = field(default_factory=list)
@@ -83,7 +83,7 @@ def put_house(
     *,
     is_plain: bool,
 ) -> None:
-    """A house: body with windows, stepped roof, and what sticks out towards the street.
+    """A house: body with windows, stepped roof, and bays, steps and balconies towards the street.
 
     Args:
         into: where to.
@@ -91,7 +91,7 @@ def put_house(
         place: middle of the body; the street lies to the right of its heading.
         size: along and across the street, m.
         height: of the eaves, m.
-        is_plain: nothing sticks out.
+        is_plain: no bays, steps or balconies.
     """
     width, depth = size
     put_box(into, place, size, (-_SUNK_M, height), window_depth=float(rng.uniform(0.1, 0.4)))
@@ -117,16 +117,13 @@ def put_house(
         put_pole(into, pipe, 0.06, height)
 
 
-def put_car(into: Collection, rng: np.random.Generator, place: Place) -> tuple[float, float]:
+def put_car(into: Collection, rng: np.random.Generator, place: Place) -> None:
     """A parked car or van: body, cabin, a gap below.
 
     Args:
         into: where to.
         rng: source of its size.
         place: its middle.
-
-    Returns:
-        Length and width, m.
     """
     if rng.random() < 0.12:
         length, width, top = rng.uniform(4.8, 6.2), rng.uniform(1.9, 2.1), rng.uniform(2.0, 2.7)
@@ -140,7 +137,6 @@ def put_car(into: Collection, rng: np.random.Generator, place: Place) -> tuple[f
         put_box(into, cabin, (rng.uniform(0.5, 0.62) * length, 0.86 * width), (belt, top))
     for along in (-0.32, 0.32):
         put_box(into, place.move(along * length, 0.0), (0.6, 0.98 * width), (0.0, 0.4))
-    return float(length), float(width)
 
 
 def put_pole(into: Collection, place: Place, radius: float, height: float) -> None:
@@ -152,7 +148,16 @@ def put_pole(into: Collection, place: Place, radius: float, height: float) -> No
         radius: m.
         height: m.
     """
-    into.cylinders.append((place.x, place.y, place.ground + 0.5 * height - 0.1, radius, 0.5 * height + 0.1))
+    centre = (place.x, place.y, place.ground + 0.5 * height - 0.1)
+    into.cylinders.append((*centre, radius, radius, 0.5 * height + 0.1, 0.0, 0.0, 0.0))
+
+
+def _put_tuft(
+    into: Collection, place: Place, level: float, radius: float, half_height: float, softness: float = 0.0
+) -> None:
+    """A spheroid with its centre `level` above the ground, m."""
+    size = (radius, radius, half_height)
+    into.spheroids.append((place.x, place.y, place.ground + level, *size, 0.0, softness, 0.0))
 
 
 def put_sign(into: Collection, rng: np.random.Generator, place: Place) -> None:
@@ -182,8 +187,8 @@ def put_tree(into: Collection, rng: np.random.Generator, place: Place) -> None:
         along, left = rng.normal(0.0, 0.5 * radius, 2)
         at = place.move(float(along), float(left))
         size = radius * rng.uniform(0.45, 0.8)
-        centre = place.ground + trunk + radius + rng.uniform(-0.5, 0.7) * radius
-        into.spheroids.append((at.x, at.y, centre, size, size * rng.uniform(0.7, 1.1), float(rng.uniform(0.3, 1.0))))
+        level = trunk + radius + rng.uniform(-0.5, 0.7) * radius
+        _put_tuft(into, at, level, size, size * rng.uniform(0.7, 1.1), float(rng.uniform(0.3, 1.0)))
 
 
 def put_bush(into: Collection, rng: np.random.Generator, place: Place) -> None:
@@ -197,11 +202,11 @@ def put_bush(into: Collection, rng: np.random.Generator, place: Place) -> None:
     for _ in range(rng.integers(2, 4)):
         along, left = rng.normal(0.0, 0.5, 2)
         at, size = place.move(float(along), float(left)), rng.uniform(0.4, 1.1)
-        into.spheroids.append((at.x, at.y, place.ground + 0.6 * size, size, 0.9 * size, float(rng.uniform(0.1, 0.35))))
+        _put_tuft(into, at, 0.6 * size, size, 0.9 * size, float(rng.uniform(0.1, 0.35)))
 
 
 def put_border(into: Collection, rng: np.random.Generator, place: Place, length: float, kind: str) -> None:
-    """A hedge, wall or fence along the street, in pieces, with a gate left open.
+    """A hedge, wall or fence along the street, in pieces, with an open gate.
 
     Args:
         into: where to.
@@ -234,7 +239,7 @@ def put_border(into: Collection, rng: np.random.Generator, place: Place, length:
 
 
 def put_person(into: Collection, rng: np.random.Generator, place: Place) -> None:
-    """Somebody who stands: a body and a head.
+    """A standing person: a body and a head.
 
     Args:
         into: where to.
@@ -243,4 +248,4 @@ def put_person(into: Collection, rng: np.random.Generator, place: Place) -> None
     """
     height = rng.uniform(1.5, 1.9)
     put_pole(into, place, 0.22, height - 0.25)
-    into.spheroids.append((place.x, place.y, place.ground + height - 0.12, 0.11, 0.14, 0.0))
+    _put_tuft(into, place, height - 0.12, 0.11, 0.14)

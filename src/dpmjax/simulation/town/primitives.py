@@ -6,6 +6,8 @@ coordinates are in the world frame: metres, z up.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import flax.struct
 import jax
 import jax.numpy as jnp
@@ -13,18 +15,28 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 from numpy.typing import NDArray
 
+LANE_STEP_M = 2.0
+# Road users nearer to the sensor than this are left out: the sensor's own car is there.
+_CLEARANCE_M = 4.0
+_CAR_IS_LONGER_THAN_M = 0.5
+
+
+NOTHING, GROUND, SOLID, SOFT, POLE, MOVING = range(6)
+"""What a ray can meet."""
+
 
 @flax.struct.dataclass
-class Boxes:
-    """Upright boxes, turned about z only.
+class Bodies:
+    """Upright boxes, cylinders or ellipsoids of revolution, by the boxes round them, turned about z only.
 
     Attributes:
         centres: in the world, m.
-        half_sizes: along the box's own x, y, z, m.
+        half_sizes: along the box's own x, y, z, m; of a round body: radius, radius, half height.
         headings: cosine and sine of the angle from the world's x to the box's x.
-        softness: mean way, m, that a beam goes into the box before it is reflected (hedges, fences); 0 for a solid one.
-        window_depth: how far windows and doors lie behind the faces, m; 0 for faces without any.
-        mask: which boxes exist.
+        softness: mean way, m, that a beam goes into hedges, fences and foliage before it is reflected; 0 if solid.
+        window_depth: how far windows and doors lie behind the faces of a box, m; 0 for faces without any.
+        surface: SOLID, SOFT, POLE or MOVING.
+        mask: which bodies exist.
     """
 
     centres: Float[Array, "n 3"]
@@ -32,42 +44,7 @@ class Boxes:
     headings: Float[Array, "n 2"]
     softness: Float[Array, " n"]
     window_depth: Float[Array, " n"]
-    mask: Bool[Array, " n"]
-
-
-@flax.struct.dataclass
-class Cylinders:
-    """Upright solid cylinders: poles, trunks.
-
-    Attributes:
-        centres: in the world, m.
-        radii: m.
-        half_heights: m.
-        mask: which cylinders exist.
-    """
-
-    centres: Float[Array, "n 3"]
-    radii: Float[Array, " n"]
-    half_heights: Float[Array, " n"]
-    mask: Bool[Array, " n"]
-
-
-@flax.struct.dataclass
-class Spheroids:
-    """Ellipsoids of revolution about z: the tufts that crowns and bushes are made of.
-
-    Attributes:
-        centres: in the world, m.
-        radii: horizontal, m.
-        half_heights: vertical semi-axes, m.
-        softness: mean way, m, that a beam goes into the foliage before it is reflected; 0 for a solid one.
-        mask: which spheroids exist.
-    """
-
-    centres: Float[Array, "n 3"]
-    radii: Float[Array, " n"]
-    half_heights: Float[Array, " n"]
-    softness: Float[Array, " n"]
+    surface: Int[Array, " n"]
     mask: Bool[Array, " n"]
 
 
@@ -95,7 +72,7 @@ class Traffic:
         lane_lengths: length of each lane, m.
         lanes: lane of each road user.
         starts: way along the lane at time 0, m.
-        speeds: m/s, positive; who reaches the end of the lane starts again.
+        speeds: m/s, positive; at the end of the lane a road user starts again.
         sides: distance to the left of the lane, m.
         half_sizes: of the box around the road user, m; cars (longer than 1 m) get a cabin on top.
         mask: which road users exist.
@@ -123,14 +100,11 @@ class TownPrimitives:
         traffic: what moves.
     """
 
-    boxes: Boxes
-    cylinders: Cylinders
-    spheroids: Spheroids
+    boxes: Bodies
+    cylinders: Bodies
+    spheroids: Bodies
     ground: Ground
     traffic: Traffic
-
-
-LANE_STEP_M = 2.0
 
 
 def capacity_for(count: int, *, least: int = 64) -> int:
@@ -166,60 +140,81 @@ def mask_of(count: int, capacity: int) -> jax.Array:
     return jnp.asarray(np.arange(capacity) < count)
 
 
-def pack_boxes(table: NDArray[np.float64]) -> Boxes:
-    """Boxes out of rows.
+def pack_bodies(table: NDArray[np.float64], surface: int) -> Bodies:
+    """Bodies of one kind out of rows.
 
     Args:
         table: (n, 9) x y z, half sizes, heading in radians, softness, window depth.
+        surface: SOLID (soft rows become SOFT), SOFT or POLE.
 
     Returns:
-        The boxes, padded.
+        The bodies, padded.
     """
     table = table.reshape(-1, 9)
-    capacity = capacity_for(len(table))
-    rows = padded(table, capacity)
-    headings = np.column_stack([np.cos(table[:, 6]), np.sin(table[:, 6])])
-    return Boxes(
+    rows = padded(table, capacity_for(len(table)))
+    headings = padded(np.column_stack([np.cos(table[:, 6]), np.sin(table[:, 6])]), len(rows))
+    return Bodies(
         centres=rows[:, :3],
         half_sizes=rows[:, 3:6],
-        headings=padded(headings, capacity),
+        headings=headings,
         softness=rows[:, 7],
         window_depth=rows[:, 8],
-        mask=mask_of(len(table), capacity),
-    )
-
-
-def pack_cylinders(table: NDArray[np.float64]) -> Cylinders:
-    """Cylinders out of rows.
-
-    Args:
-        table: (n, 5) x y z, radius, half height.
-
-    Returns:
-        The cylinders, padded.
-    """
-    table = table.reshape(-1, 5)
-    rows = padded(table, capacity_for(len(table)))
-    return Cylinders(
-        centres=rows[:, :3], radii=rows[:, 3], half_heights=rows[:, 4], mask=mask_of(len(table), len(rows))
-    )
-
-
-def pack_spheroids(table: NDArray[np.float64]) -> Spheroids:
-    """Spheroids out of rows.
-
-    Args:
-        table: (n, 6) x y z, radius, half height, softness.
-
-    Returns:
-        The spheroids, padded.
-    """
-    table = table.reshape(-1, 6)
-    rows = padded(table, capacity_for(len(table)))
-    return Spheroids(
-        centres=rows[:, :3],
-        radii=rows[:, 3],
-        half_heights=rows[:, 4],
-        softness=rows[:, 5],
+        surface=jnp.where((rows[:, 7] > 0) & (surface == SOLID), SOFT, surface),
         mask=mask_of(len(table), len(rows)),
     )
+
+
+def traffic_boxes(traffic: Traffic, sensor: Float[Array, " 3"], time: Float[Array, ""]) -> Bodies:
+    """The road users at a time.
+
+    Args:
+        traffic: lanes and users.
+        sensor: position of the sensor in the world, m; road users within 4 m of it are left out.
+        time: s.
+
+    Returns:
+        Two boxes for each: body and cabin (masked for people).
+    """
+    way = jnp.mod(traffic.starts + traffic.speeds * time, traffic.lane_lengths[traffic.lanes])
+    here, ahead = _on_lane(traffic, way), _on_lane(traffic, way + 0.5 * LANE_STEP_M)
+    heading = ahead[:, :2] - here[:, :2]
+    heading = heading / jnp.maximum(jnp.linalg.norm(heading, axis=-1, keepdims=True), 1e-6)
+    left = jnp.stack([-heading[:, 1], heading[:, 0], jnp.zeros(len(heading))], axis=-1)
+    foot = here + traffic.sides[:, None] * left
+    is_free = ((foot[:, :2] - sensor[:2]) ** 2).sum(-1) > _CLEARANCE_M**2
+    is_car = traffic.half_sizes[:, 0] > _CAR_IS_LONGER_THAN_M
+    body_z, cabin_z = _car_levels(traffic.half_sizes[:, 2])
+    half_body = jnp.where(is_car, body_z, traffic.half_sizes[:, 2])
+    lift = jnp.where(is_car, 0.25, 0.0)
+    up = jnp.array([0.0, 0.0, 1.0], foot.dtype)
+    zero = jnp.zeros(len(way), foot.dtype)
+    body = Bodies(
+        centres=foot + (lift + half_body)[:, None] * up,
+        half_sizes=traffic.half_sizes.at[:, 2].set(half_body),
+        headings=heading,
+        softness=zero,
+        window_depth=zero,
+        surface=jnp.full(len(way), MOVING),
+        mask=traffic.mask & is_free,
+    )
+    cabin = replace(
+        body,
+        centres=foot + (lift + 2 * half_body + cabin_z)[:, None] * up,
+        half_sizes=traffic.half_sizes * jnp.array([0.55, 0.85, 0.0], foot.dtype) + cabin_z[:, None] * up,
+        mask=body.mask & is_car,
+    )
+    return jax.tree.map(lambda a, b: jnp.concatenate([a, b]), body, cabin)
+
+
+def _car_levels(half_height: Float[Array, "..."]) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
+    """Half heights of body and cabin of a car, m: they share its height above 0.25 m as 3 : 2."""
+    room = half_height - 0.125
+    return 0.6 * room, 0.4 * room
+
+
+def _on_lane(traffic: Traffic, way: Float[Array, " n"]) -> Float[Array, "n 3"]:
+    """Points of the lanes, linear between their samples."""
+    at = jnp.clip(way / LANE_STEP_M, 0.0, traffic.lane_points.shape[1] - 1.001)
+    low = jnp.floor(at).astype(jnp.int32)
+    part = (at - low)[:, None]
+    return traffic.lane_points[traffic.lanes, low] * (1 - part) + traffic.lane_points[traffic.lanes, low + 1] * part

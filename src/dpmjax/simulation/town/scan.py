@@ -1,27 +1,105 @@
-"""One turn of a lidar in the town: rays, hits, noise and lost returns. Pure and jitted; `vmap` it over poses."""
+"""Spinning lidars, and one turn of a lidar in the town: rays, hits, noise and lost returns.
+
+A scan is pure and jitted; `vmap` it over poses.
+"""
 
 from __future__ import annotations
 
+from dataclasses import dataclass, replace
 from functools import partial
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, PRNGKeyArray
+from jaxtyping import Array, Float, PRNGKeyArray
 
 from dpmjax.checks import require_shape
-from dpmjax.simulation.town import cast
-from dpmjax.simulation.town.cast import CastConfig, Hits, cast_turn, num_sectors
-from dpmjax.simulation.town.primitives import TownPrimitives
-from dpmjax.simulation.town.sensors import LidarSensor
+from dpmjax.simulation.town.cast import CastConfig, Hits, Rays, cast_turn
+from dpmjax.simulation.town.primitives import NOTHING, TownPrimitives
 from dpmjax.types import AnyArray, PointCloud
 
-_HIGHEST = jax.lax.Precision.HIGHEST
 # Reflectivity of each surface (nothing, ground, solid, soft, pole, moving): asphalt is dark, leaves and paint are not.
 _REFLECTIVITY = np.array([0.0, 0.17, 0.35, 0.4, 0.35, 0.3], np.float32)
 _GLASS_RETURNS = 0.35
-# How sharply returns end at the sensor's reach, in natural logarithms of range.
+# How sharply returns end at that range, in natural logarithms of range.
 _FADE = 0.18
+
+
+@dataclass(frozen=True)
+class LidarSensor:
+    """A spinning lidar: one column of beams that turns about z.
+
+    Hashable, so that it can be a static argument of a kernel.
+
+    Attributes:
+        name: for titles and files.
+        elevations_deg: angle of each beam above the horizontal, highest first.
+        num_azimuths: columns in a turn; they go clockwise from straight behind, as a range image is looked at.
+        min_range_m: nearer surfaces return nothing.
+        max_range_m: farther surfaces return nothing.
+        range_noise_m: standard deviation of a range.
+        drop_rate: share of the returns that is lost at any range.
+        half_loss_m: range at which half of the returns of a surface of 20 % reflectivity, met head-on, are lost.
+        height_m: mounting height above the ground, for drives.
+
+    Raises:
+        ValueError: no beams, fewer than 8 columns, or ranges that are not 0 <= min < max.
+    """
+
+    name: str
+    elevations_deg: tuple[float, ...]
+    num_azimuths: int
+    min_range_m: float = 1.0
+    max_range_m: float = 100.0
+    range_noise_m: float = 0.02
+    drop_rate: float = 0.03
+    half_loss_m: float = 75.0
+    height_m: float = 1.73
+
+    def __post_init__(self) -> None:
+        if not self.elevations_deg or self.num_azimuths < 8:
+            raise ValueError(
+                f"a sensor needs beams and at least 8 azimuths, got {len(self.elevations_deg)} and {self.num_azimuths}"
+            )
+        if not 0 <= self.min_range_m < self.max_range_m:
+            raise ValueError(f"ranges must be 0 <= min < max, got {self.min_range_m} and {self.max_range_m}")
+
+    @property
+    def num_rays(self) -> int:
+        """Rays in a turn."""
+        return len(self.elevations_deg) * self.num_azimuths
+
+    def with_azimuths(self, num_azimuths: int) -> LidarSensor:
+        """The same sensor with fewer or more columns: cheaper scans for training."""
+        return replace(self, num_azimuths=num_azimuths)
+
+
+def _spread(top_deg: float, bottom_deg: float, count: int) -> tuple[float, ...]:
+    return tuple(float(v) for v in np.linspace(top_deg, bottom_deg, count))
+
+
+HDL64E = LidarSensor(
+    # Velodyne's manual: 32 lasers a third of a degree apart, and 32 below them half a degree apart (as on KITTI's car).
+    name="hdl64e",
+    elevations_deg=_spread(2.0, -8.33, 32) + _spread(-8.83, -24.33, 32),
+    num_azimuths=1800,
+    max_range_m=80.0,
+)
+OS1_64 = LidarSensor(
+    # Ouster OS1-64 of the first generation, as on MulRan's car.
+    name="os1_64",
+    elevations_deg=_spread(16.6, -16.6, 64),
+    num_azimuths=1024,
+    range_noise_m=0.03,
+    half_loss_m=60.0,
+    height_m=1.85,
+)
+HDL32E = LidarSensor(
+    name="hdl32e", elevations_deg=_spread(10.67, -30.67, 32), num_azimuths=1080, max_range_m=80.0, height_m=1.84
+)
+VLP16 = LidarSensor(name="vlp16", elevations_deg=_spread(15.0, -15.0, 16), num_azimuths=1800, range_noise_m=0.03)
+
+SENSORS = {sensor.name: sensor for sensor in (HDL64E, OS1_64, HDL32E, VLP16)}
 
 
 def scan_town(
@@ -70,34 +148,20 @@ def _scan(
 ) -> PointCloud:
     """The kernel of `scan_town`."""
     key_phase, key_depth, key_noise, key_loss = jax.random.split(key, 4)
-    shape = ray_shape(sensor, config)
+    shape = _ray_shape(sensor, config)
     phase = jax.random.uniform(key_phase, (), minval=0.0, maxval=2 * np.pi / sensor.num_azimuths)
-    rays = ray_directions(sensor, config, phase)
     depths = -jnp.log(jax.random.uniform(key_depth, shape, minval=1e-6, maxval=1.0))
-    hits = cast_rays_3d(town, pose, time, rays, phase, depths, sensor=sensor, config=config)
+    rays = make_rays(sensor, config, phase)._replace(depths=depths)
+    hits = cast_turn(town, pose, time, rays, max_range=sensor.max_range_m, config=config)
     ranges = hits.ranges + sensor.range_noise_m * jax.random.normal(key_noise, shape)
-    is_back = jax.random.uniform(key_loss, shape) < return_probability(hits, sensor)
+    is_back = jax.random.uniform(key_loss, shape) < _return_probability(hits, sensor)
     mask = is_back & (ranges >= sensor.min_range_m) & (ranges <= sensor.max_range_m)
-    points = jnp.where(mask[..., None], ranges[..., None] * rays, 0.0)
-    return PointCloud(points=by_beam(points, sensor), mask=by_beam(mask, sensor))
+    points = jnp.where(mask[..., None], ranges[..., None] * rays.directions, 0.0)
+    return PointCloud(points=_by_beam(points, sensor), mask=_by_beam(mask, sensor))
 
 
-def ray_shape(sensor: LidarSensor, config: CastConfig) -> tuple[int, int]:
-    """Sectors, and rays of a sector.
-
-    Args:
-        sensor: the lidar.
-        config: capacities.
-
-    Returns:
-        The shape in which rays are followed.
-    """
-    count = num_sectors(sensor.num_azimuths, config.max_sectors)
-    return count, sensor.num_rays // count
-
-
-def ray_directions(sensor: LidarSensor, config: CastConfig, phase: Float[Array, ""]) -> Float[Array, "s r 3"]:
-    """Unit directions of the rays in the sensor frame, by sector.
+def make_rays(sensor: LidarSensor, config: CastConfig, phase: Float[Array, ""]) -> Rays:
+    """The rays of a turn, by sectors of whole columns; foliage is met at its surface.
 
     Args:
         sensor: the lidar.
@@ -105,111 +169,43 @@ def ray_directions(sensor: LidarSensor, config: CastConfig, phase: Float[Array, 
         phase: by how much the turn is turned to the left, radians.
 
     Returns:
-        The directions; a sector holds whole columns.
+        The rays, in the sensor frame.
     """
-    count = ray_shape(sensor, config)[0]
-    azimuth = phase + jnp.asarray(_azimuths(sensor).reshape(count, -1, 1))
+    shape = _ray_shape(sensor, config)
+    step = 2 * np.pi / sensor.num_azimuths
+    # Clockwise from straight behind.
+    columns = (np.pi - step * (np.arange(sensor.num_azimuths) + 0.5)).astype(np.float32).reshape(shape[0], -1)
     elevation = np.radians(np.array(sensor.elevations_deg, np.float32))
     flat, up = jnp.cos(elevation), jnp.sin(elevation)
-    columns = jnp.broadcast_to(azimuth, (*azimuth.shape[:2], len(elevation)))
-    rays = jnp.stack([flat * jnp.cos(columns), flat * jnp.sin(columns), jnp.broadcast_to(up, columns.shape)], axis=-1)
-    return rays.reshape(count, -1, 3)
+    azimuth = phase + jnp.asarray(columns[..., None])
+    azimuth = jnp.broadcast_to(azimuth, (*azimuth.shape[:2], len(elevation)))
+    rays = jnp.stack([flat * jnp.cos(azimuth), flat * jnp.sin(azimuth), jnp.broadcast_to(up, azimuth.shape)], axis=-1)
+    return Rays(rays.reshape(*shape, 3), phase + jnp.asarray(columns.mean(axis=1)), jnp.zeros(shape))
 
 
-def cast_rays_3d(
-    town: TownPrimitives,
-    T_world_lidar: Float[Array, "4 4"],
-    time: Float[Array, ""],
-    rays: Float[Array, "s r 3"],
-    phase: Float[Array, ""],
-    depths: Float[Array, "s r"],
-    *,
-    sensor: LidarSensor,
-    config: CastConfig,
-) -> Hits:
-    """What the rays of a turn meet, without noise and loss.
-
-    Args:
-        town: the world.
-        T_world_lidar: pose of the sensor.
-        time: s.
-        rays: from `ray_directions`.
-        phase: the same as there.
-        depths: for each ray, how many mean ways it goes into foliage.
-        sensor: the lidar.
-        config: capacities.
-
-    Returns:
-        The hits, by sector.
-    """
-    count = rays.shape[0]
-    middles = phase + jnp.asarray(_azimuths(sensor).reshape(count, -1).mean(axis=1))
-    directions = jnp.einsum("ij,srj->sri", T_world_lidar[:3, :3], rays, precision=_HIGHEST)
-    return cast_turn(
-        town,
-        T_world_lidar,
-        time,
-        directions,
-        middles,
-        np.pi / count,
-        depths,
-        max_range=sensor.max_range_m,
-        config=config,
-    )
+def _ray_shape(sensor: LidarSensor, config: CastConfig) -> tuple[int, int]:
+    """Number of sectors, the largest of whole columns, and rays of a sector."""
+    count = max(count for count in range(1, config.max_sectors + 1) if sensor.num_azimuths % count == 0)
+    return count, sensor.num_rays // count
 
 
-def return_probability(hits: Hits, sensor: LidarSensor) -> Float[Array, "s r"]:
+def _return_probability(hits: Hits, sensor: LidarSensor) -> Float[Array, "s r"]:
     """Probability that a ray comes back.
 
-    Half of the returns are lost at `reach_m`, scaled by the root of the reflectivity (the energy falls with the square
-    of the range) and by the fourth root of the cosine: real surfaces are rough, and asphalt is seen farther than a
-    smooth one would be.
-
-    Args:
-        hits: what the rays meet.
-        sensor: the lidar.
-
-    Returns:
-        Probabilities; 0 for nothing.
+    Half of the returns are lost at `half_loss_m`, scaled by the root of the reflectivity (the energy falls with the
+    square of the range) and by the fourth root of the cosine: real surfaces are rough, and asphalt is seen farther than
+    a smooth one would be. Nothing has probability 0.
     """
     reflectivity = jnp.asarray(_REFLECTIVITY)[hits.surfaces]
-    reach = sensor.reach_m * jnp.sqrt(reflectivity / 0.2) * jnp.maximum(hits.cosines, 1e-4) ** 0.25
-    excess = jnp.log(jnp.maximum(reach, 1e-3)) - jnp.log(jnp.minimum(hits.ranges, 1e6))
-    is_hit = hits.surfaces != cast.NOTHING
+    half_loss = sensor.half_loss_m * jnp.sqrt(reflectivity / 0.2) * jnp.maximum(hits.cosines, 1e-4) ** 0.25
+    excess = jnp.log(jnp.maximum(half_loss, 1e-3)) - jnp.log(jnp.minimum(hits.ranges, 1e6))
+    is_hit = hits.surfaces != NOTHING
     base = (1.0 - sensor.drop_rate) * jnp.where(hits.is_glass, _GLASS_RETURNS, 1.0)
     return jnp.where(is_hit, base * jax.nn.sigmoid(excess / _FADE), 0.0)
 
 
-def by_beam(values: Array, sensor: LidarSensor) -> Array:
-    """Rays by sector (s, r, ...) brought into the order of points: beam by beam.
-
-    Args:
-        values: anything by ray.
-        sensor: the lidar.
-
-    Returns:
-        (beams * azimuths, ...).
-    """
+def _by_beam(values: Array, sensor: LidarSensor) -> Array:
+    """Values (s, r, ...) by sector in the order of points, (beams * azimuths, ...): beam by beam."""
     tail = values.shape[2:]
     grid = values.reshape(sensor.num_azimuths, len(sensor.elevations_deg), *tail)
     return jnp.swapaxes(grid, 0, 1).reshape(sensor.num_rays, *tail)
-
-
-def range_image(cloud: PointCloud, sensor: LidarSensor) -> tuple[Float[Array, "beams a"], Bool[Array, "beams a"]]:
-    """Ranges of a simulated scan as a picture: highest beam on top, straight ahead in the middle.
-
-    Args:
-        cloud: from `scan_town`.
-        sensor: the lidar that took it.
-
-    Returns:
-        Ranges in m (0 where nothing came back), and where something did.
-    """
-    shape = (len(sensor.elevations_deg), sensor.num_azimuths)
-    return jnp.linalg.norm(cloud.points, axis=-1).reshape(shape), jnp.asarray(cloud.mask).reshape(shape)
-
-
-def _azimuths(sensor: LidarSensor) -> np.ndarray:
-    """Middle of each column, radians: clockwise from straight behind."""
-    step = 2 * np.pi / sensor.num_azimuths
-    return (np.pi - step * (np.arange(sensor.num_azimuths) + 0.5)).astype(np.float32)

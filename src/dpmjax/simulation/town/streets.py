@@ -1,4 +1,7 @@
-"""Streets of a town and routes along them: a shaken, bent lattice of blocks, or one street laid along a trajectory."""
+"""Streets of a town and routes along them: a shaken, bent lattice of blocks, or one street laid along a trajectory.
+
+Curves are dense polylines; the lower half of this file resamples, smooths and shifts them.
+"""
 
 from __future__ import annotations
 
@@ -9,8 +12,6 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
-
-from dpmjax.simulation.town.paths import arc_lengths, resample, shift_left, smooth
 
 RouteKind = Literal["loop", "there_and_back", "wander"]
 LANE_M = 1.7
@@ -158,3 +159,107 @@ def _neighbours(route: list[tuple[int, int]], side: int) -> list[tuple[int, int]
     i, j = route[-1]
     steps = [(i + 1, j), (i - 1, j), (i, j + 1), (i, j - 1)]
     return [s for s in steps if s != route[-2] and 0 <= s[0] < side and 0 <= s[1] < side]
+
+
+def lane_of(streets: Streets, *, is_reversed: bool) -> NDArray[np.float64]:
+    """The right lane of the route.
+
+    Args:
+        streets: with the route.
+        is_reversed: drive the route the other way round, on the other side of the street.
+
+    Returns:
+        (k, 2) points at steps of about half a metre.
+    """
+    line = streets.route[::-1] if is_reversed else streets.route
+    return resample(shift_left(line, -LANE_M), 0.5)
+
+
+def arc_lengths(path: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Way from the start to each point.
+
+    Args:
+        path: (k, 2) points, m.
+
+    Returns:
+        (k,) m.
+    """
+    return np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(path[:, :2], axis=0), axis=1))])
+
+
+def at_way(path: NDArray[np.float64], way: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Points at given ways along the path, linear between its points.
+
+    Args:
+        path: (k, d) points; the way counts x and y only.
+        way: (m,) m, clipped to the path.
+
+    Returns:
+        (m, d).
+    """
+    lengths = arc_lengths(path)
+    return np.column_stack([np.interp(way, lengths, column) for column in path.T])
+
+
+def resample(path: NDArray[np.float64], step: float) -> NDArray[np.float64]:
+    """The path at (nearly) equal steps, both ends kept.
+
+    Args:
+        path: (k, d) points.
+        step: m.
+
+    Returns:
+        (m, d), m at least 2.
+    """
+    length = arc_lengths(path)[-1]
+    return at_way(path, np.linspace(0.0, length, max(round(length / step), 1) + 1))
+
+
+def tangents(path: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Unit directions along the path.
+
+    Args:
+        path: (k, 2) points, none of them twice in a row.
+
+    Returns:
+        (k, 2).
+    """
+    slope = np.gradient(path[:, :2], axis=0)
+    return slope / np.maximum(np.linalg.norm(slope, axis=1, keepdims=True), 1e-9)
+
+
+def shift_left(path: NDArray[np.float64], distance: float | NDArray[np.float64]) -> NDArray[np.float64]:
+    """The path moved to its left.
+
+    Args:
+        path: (k, 2) points.
+        distance: m, one for all or one each; negative for the right.
+
+    Returns:
+        (k, 2).
+    """
+    along = tangents(path)
+    return path[:, :2] + np.broadcast_to(distance, len(path))[:, None] * np.column_stack([-along[:, 1], along[:, 0]])
+
+
+def smooth(path: NDArray[np.float64], sigma: float, *, is_closed: bool) -> NDArray[np.float64]:
+    """Rounds corners with a Gaussian along the path.
+
+    Args:
+        path: (k, d) points at equal steps of `sigma / 6` or less.
+        sigma: in steps.
+        is_closed: the last point is the first one again.
+
+    Returns:
+        (k, d); ends stay where they are, unless the path is closed.
+    """
+    from scipy.ndimage import gaussian_filter1d
+
+    if is_closed:
+        ring = gaussian_filter1d(path[:-1], sigma, axis=0, mode="wrap")
+        return np.vstack([ring, ring[:1]])
+    line = np.linspace(0.0, 1.0, len(path))[:, None] * (path[-1] - path[0]) + path[0]
+    # The difference to the straight line vanishes at both ends; mirrored with a change of sign, it stays zero there.
+    padded = np.concatenate([-(path - line)[::-1][:-1], path - line, -(path - line)[::-1][1:]])
+    rounded = gaussian_filter1d(padded, sigma, axis=0)
+    return line + rounded[len(path) - 1 : 2 * len(path) - 1]

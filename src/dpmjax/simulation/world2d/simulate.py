@@ -1,4 +1,4 @@
-"""The built-in world of the demo: worlds, a walk and an ideal lidar put together into one sequence of scans."""
+"""A walk through a planar world with an ideal lidar, as one sequence of scans."""
 
 from __future__ import annotations
 
@@ -6,10 +6,10 @@ import zlib
 
 import numpy as np
 
-from dpmjax.io.scans2d.sequence import ScanSequence
+from dpmjax.sequences import ScanSequence, World
 from dpmjax.simulation.world2d.raycast import scan_world
-from dpmjax.simulation.world2d.trajectory import TrajectoryConfig, simulate_odometry, simulate_trajectory
-from dpmjax.simulation.world2d.world import World, make_world
+from dpmjax.simulation.world2d.trajectory import simulate_odometry, simulate_trajectory
+from dpmjax.simulation.world2d.world import make_world
 
 
 def simulate_sequence(
@@ -17,24 +17,20 @@ def simulate_sequence(
     num_scans: int = 256,
     *,
     num_beams: int = 256,
-    max_range: float | None = None,
     range_noise_px: float = 0.0,
     seed: int = 0,
-    trajectory: TrajectoryConfig | None = None,
     with_odometry: bool = False,
 ) -> ScanSequence:
     """Simulates a drive through a planar world (DeepMapping section 4.1).
 
-    Walk, noise and odometry have random streams of their own: a seed gives one walk, with and without noise.
+    Walk, noise and odometry have separate random streams: a seed gives the same walk with and without noise.
 
     Args:
         world: index for `make_world`, or a world.
         num_scans: number of scans; the paper has 128 and 256.
         num_beams: beams per scan over 360 degrees.
-        max_range: beams longer than this (px) are masked; None for the paper's unlimited sensor.
         range_noise_px: standard deviation of Gaussian noise on the ranges, px.
         seed: seed of walk and noise.
-        trajectory: step statistics; the paper's where None.
         with_odometry: whether to simulate wheel odometry too.
 
     Returns:
@@ -45,16 +41,16 @@ def simulate_sequence(
     """
     if num_scans < 2:
         raise ValueError(f"num_scans must be at least 2, got {num_scans}")
-    place = world if isinstance(world, World) else make_world(world)
+    scene = world if isinstance(world, World) else make_world(world)
     # The name takes part, so that walks through two worlds are two walks and not one bent by other walls.
-    streams = ([seed, zlib.crc32(place.name.encode()), stream] for stream in range(3))
+    streams = ([seed, zlib.crc32(scene.name.encode()), stream] for stream in range(3))
     walk_rng, noise_rng, odometry_rng = map(np.random.default_rng, streams)
-    poses = simulate_trajectory(place, num_scans, rng=walk_rng, config=trajectory)
+    poses = simulate_trajectory(scene, num_scans, rng=walk_rng)
     points, mask = scan_world(
-        place.is_obstacle, poses, num_beams=num_beams, max_range=max_range, range_noise_px=range_noise_px, rng=noise_rng
+        scene.is_obstacle, poses, num_beams=num_beams, range_noise_px=range_noise_px, rng=noise_rng
     )
     return ScanSequence(
-        name=place.name,
+        name=scene.name,
         points=points,
         mask=mask,
         unit="px",

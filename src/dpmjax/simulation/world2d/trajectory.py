@@ -11,7 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from dpmjax.simulation.world2d.world import World
+from dpmjax.geometry import se2
+from dpmjax.sequences import World
 
 
 @dataclass(frozen=True)
@@ -24,7 +25,7 @@ class TrajectoryConfig:
         mean_step_px: mean translation between consecutive scans (section 4.1); steps are uniform between 0.6 and 1.4 of
             it.
         clearance_px: no point of the path comes closer to an obstacle or to the border of the image.
-        leg_px: wish for the length of a leg to a new place; after two legs the robot comes home by another way.
+        leg_px: wanted length of a leg to a new place; after two legs the robot comes home by another way.
     """
 
     max_rotation_deg: float = 10.0
@@ -80,7 +81,7 @@ def simulate_odometry(
     rotation_noise_deg: float = 1.0,
     bias: float = 0.01,
 ) -> NDArray[np.float64]:
-    """What wheel encoders would have told: each relative motion with a fixed scale error and white noise, chained up.
+    """Simulates wheel odometry: each relative motion gets a fixed scale error and white noise; the motions are chained.
 
     Args:
         poses: (n, 3) true x, y, heading (radians).
@@ -93,22 +94,13 @@ def simulate_odometry(
         (n, 3) float64 poses in the odometry's own world: the first is zero.
     """
     pose = np.asarray(poses, np.float64).reshape(-1, 3)
-    step, turn = np.diff(pose[:, :2], axis=0), np.diff(pose[:, 2])
-    turn = (turn + np.pi) % (2 * np.pi) - np.pi
-    cos, sin = np.cos(pose[:-1, 2]), np.sin(pose[:-1, 2])
-    forward, left = cos * step[:, 0] + sin * step[:, 1], cos * step[:, 1] - sin * step[:, 0]
+    forward, left, turn = se2.relative(pose[:-1], pose[1:]).T
     length = np.hypot(forward, left)
-
     scale, scale_turn = 1.0 + bias * rng.normal(size=2)
-    forward = scale * forward + translation_noise * length * rng.normal(size=len(step))
-    left = scale * left + translation_noise * length * rng.normal(size=len(step))
-    turn = scale_turn * turn + np.deg2rad(rotation_noise_deg) * rng.normal(size=len(step))
-
-    heading = np.concatenate([[0.0], np.cumsum(turn)])
-    cos, sin = np.cos(heading[:-1]), np.sin(heading[:-1])
-    moves = np.column_stack([cos * forward - sin * left, sin * forward + cos * left])
-    positions = np.concatenate([np.zeros((1, 2)), np.cumsum(moves, axis=0)])
-    return np.column_stack([positions, heading])[: len(pose)]
+    forward = scale * forward + translation_noise * length * rng.normal(size=len(turn))
+    left = scale * left + translation_noise * length * rng.normal(size=len(turn))
+    turn = scale_turn * turn + np.deg2rad(rotation_noise_deg) * rng.normal(size=len(turn))
+    return se2.chain(np.column_stack([forward, left, turn]))[: len(pose)]
 
 
 def _clearance(is_obstacle: NDArray[np.bool_]) -> NDArray[np.float64]:
@@ -159,7 +151,7 @@ def _largest_region(is_open: NDArray[np.bool_]) -> NDArray[np.int64]:
 def _shortest_paths(
     cells: NDArray[np.int64], coarse: NDArray[np.float64], visits: NDArray[np.float64], start: int
 ) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
-    """Costs (k,) from the start cell and predecessors (k,); walls and trodden ways cost more than open new ground."""
+    """Costs (k,) from the start cell and predecessors (k,); walls and used ways cost more than open new ground."""
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import dijkstra
 
@@ -185,8 +177,8 @@ def _choose_goal(
     """The least visited of a handful of places about a leg away."""
     off = np.abs(cost / (1.5 * config.leg_px) - 1.0)
     near_enough = np.flatnonzero((off <= max(0.4, float(np.partition(off, 1)[1]))) & (cost > 0))
-    wishes = rng.choice(near_enough, size=min(8, len(near_enough)), replace=False)
-    return int(wishes[np.argmin(visits[wishes])])
+    options = rng.choice(near_enough, size=min(8, len(near_enough)), replace=False)
+    return int(options[np.argmin(visits[options])])
 
 
 def _trace(before: NDArray[np.int32], start: int, goal: int) -> list[int]:
@@ -212,7 +204,7 @@ def _walk(
         here = positions[-1]
         along = _aim(route, along, here, clearance, config)
         bearing = np.arctan2(*(route[along] - here)[::-1])
-        # The swing is given up, then the straight line, before a wall is touched.
+        # Smaller swings, then other directions, are tried before a step would touch a wall.
         spread = np.concatenate(
             [[swing, 0.5 * swing, 0.0], np.deg2rad(np.arange(5, 180, 5).repeat(2)) * np.tile([1, -1], 35)]
         )

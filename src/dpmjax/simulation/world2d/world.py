@@ -2,45 +2,22 @@
 
 Three kinds, one after the other as the index grows: 0 an office (rooms cut out of rooms), 1 a yard (free-standing
 blocks, open to the border of the image), 2 a clinic (a corridor between two rows of rooms). All are furnished with
-round, square and three-cornered obstacles, so that no two places look alike. The frame is that of `raycast2d`: row 0 is
+round, square and three-cornered obstacles, so that no two places look alike. The frame is that of `raycast`: row 0 is
 the lowest.
 """
 
 from __future__ import annotations
 
-import io
-from dataclasses import dataclass, field
 from itertools import pairwise
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from dpmjax.io.errors import InputError
-from dpmjax.io.files import write_atomically
+from dpmjax.sequences import World
 
 SIZE_PX = 1024
 _WALL_PX = 10
 _DOOR_PX = 72
-
-
-@dataclass(frozen=True)
-class World:
-    """A planar world.
-
-    Attributes:
-        name: kind and index, for titles.
-        is_obstacle: (h, w) bool, True where a pixel is solid; row 0 is the lowest; one connected free space.
-    """
-
-    name: str
-    is_obstacle: NDArray[np.bool_] = field(repr=False)
-
-    def __post_init__(self) -> None:
-        if self.is_obstacle.ndim != 2 or self.is_obstacle.dtype != np.bool_:
-            raise ValueError(f"is_obstacle must be (h, w) bool, got {self.is_obstacle.shape} {self.is_obstacle.dtype}")
-        if self.is_obstacle.all():
-            raise ValueError("is_obstacle must leave free space, got a solid world")
 
 
 def make_world(index: int) -> World:
@@ -62,59 +39,7 @@ def make_world(index: int) -> World:
     rng = np.random.default_rng([2024, index])
     grid = np.zeros((SIZE_PX, SIZE_PX), bool)
     build(grid, rng)
-    return World(f"{kind}-{index}", _fill_enclosed(grid))
-
-
-def write_world_png(path: str | Path, world: World) -> Path:
-    """Saves the world as a picture: white is free, black is solid, y up as in a plot.
-
-    Args:
-        path: file to write, atomically.
-        world: the world.
-
-    Returns:
-        The path.
-    """
-    from matplotlib.image import imsave
-
-    buffer = io.BytesIO()
-    imsave(buffer, ~world.is_obstacle[::-1], cmap="gray", vmin=0, vmax=1, format="png")
-    return write_atomically(path, buffer.getvalue())
-
-
-def read_world_png(path: str | Path) -> World:
-    """Reads a floor plan: pixels darker than half are solid, the lowest picture row is row 0.
-
-    Args:
-        path: a PNG picture.
-
-    Returns:
-        The world, with free pockets that cannot be reached from the largest free space filled in.
-
-    Raises:
-        InputError: the file is missing, no picture, or solid everywhere.
-    """
-    from matplotlib.image import imread
-
-    try:
-        image = np.asarray(imread(path), np.float64)
-    except (OSError, SyntaxError, ValueError) as error:
-        raise InputError(path, f"not a readable picture ({error})", "give a black and white PNG") from error
-    gray = image if image.ndim == 2 else image[..., : 1 if image.shape[2] < 3 else 3].mean(axis=2)
-    is_obstacle = gray[::-1] < 0.5 * max(1.0, gray.max())
-    if is_obstacle.all():
-        raise InputError(path, "no white pixel", "free space must be white, obstacles black")
-    return World(Path(path).stem, _fill_enclosed(is_obstacle))
-
-
-def _fill_enclosed(grid: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Keeps the largest free space and makes every other free pixel solid."""
-    from scipy.ndimage import label
-
-    labels, _ = label(~grid)
-    sizes = np.bincount(labels.ravel())
-    sizes[0] = 0
-    return labels != sizes.argmax()
+    return World(f"{kind}-{index}", grid).fill_pockets()
 
 
 def _build_office(grid: NDArray[np.bool_], rng: np.random.Generator) -> None:
@@ -140,7 +65,7 @@ def _build_clinic(grid: NDArray[np.bool_], rng: np.random.Generator) -> None:
         widths = rng.dirichlet(np.full(4, 12.0)) * SIZE_PX
         edges = np.concatenate([[0.0], np.cumsum(widths)])
         for left, right in pairwise(edges):
-            # Each room stands forward or back by its own amount: the corridor has corners to hold on to.
+            # Each room stands forward or back: along a straight corridor no scan would fix the position.
             y = wall_y + sign * rng.uniform(-15, 45)
             door = rng.uniform(left + 0.2 * (right - left), left + 0.8 * (right - left) - _DOOR_PX)
             _paint_span(grid, 0, y, (left, right), [door])

@@ -1,0 +1,244 @@
+"""Depth images as organised clouds: folders with a pose file each (7-Scenes), scenes of the Active Vision Dataset.
+
+The Active Vision Dataset (Ammirato et al. 2017) has one folder a scene:
+
+    Home_001_1/high_res_depth/000110000010103.png   16 bit, millimetres, 0 for nothing
+    Home_001_1/image_structs.mat                    poses: image_name, R, t (world to camera) of each image; scale, mm
+    Home_001_1/annotations.json                     for each image the next one forward, backward, left, right, turned
+    Home_001_1/cameras.txt                          intrinsics as COLMAP writes them; optional
+
+A scene is a grid of places with twelve views each; a trajectory is a random walk along the links of annotations.json.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dpmjax.io.files import natural_key, read_bytes, read_lines, read_table
+from dpmjax.io.pictures import read_depth_png
+from dpmjax.sequences import ACTIVE_VISION, Camera, DepthSequence, InputError
+
+_NOTHING_MM = 65535  # besides 0
+_MOVES, _TURNS = ("forward", "backward", "left", "right"), ("rotate_cw", "rotate_ccw")
+
+
+def read_pose_folder(path: str | Path, *, height: int = 30, width: int = 40, max_depth_m: float = 5.0) -> DepthSequence:
+    """Reads NAME.depth.png, NAME.pose.txt and one *intrinsics.txt.
+
+    Args:
+        path: the folder. Depth is 16 bit, millimetres, 0 or 65535 for nothing; poses are 4 x 4 camera to world, metres;
+            intrinsics 3 x 3.
+        height: rows of a cloud.
+        width: columns of a cloud.
+        max_depth_m: deeper pixels are masked.
+
+    Returns:
+        The sequence in natural order of the names, moving in SE(3); without a reference where no pose file is there.
+
+    Raises:
+        InputError: no such folder, no depth image, no intrinsics, poses for some images only, or a damaged file.
+    """
+    folder = Path(path)
+    if not folder.is_dir():
+        raise InputError(folder, "no such folder", "give a folder of NAME.depth.png files")
+    images = sorted(folder.glob("*.depth.png"), key=lambda file: natural_key(file.name))
+    if len(images) < 2:
+        raise InputError(folder, f"{len(images)} .depth.png files", "give at least two")
+    intrinsics = next(iter(sorted(folder.glob("*intrinsics*.txt"))), None)
+    if intrinsics is None:
+        raise InputError(folder, "no *intrinsics*.txt", "add the 3 x 3 matrix of the depth camera")
+    matrix = _read_matrix(intrinsics, (3, 3))
+    poses = [image.with_name(image.name.replace(".depth.png", ".pose.txt")) for image in images]
+    missing = [pose.name for pose in poses if not pose.is_file()]
+    if missing and len(missing) < len(poses):
+        raise InputError(folder, f"no {missing[0]} ({len(missing)} missing)", "give a pose to every image or to none")
+    rows, columns = read_depth_png(images[0]).shape
+    camera = _make_camera(intrinsics, columns, rows, matrix[[0, 1, 0, 1], [0, 1, 2, 2]])
+    points, mask = _read_clouds(images, camera, (height, width), max_depth_m)
+    T_world_camera = None if missing else np.stack([_read_matrix(pose, (4, 4)) for pose in poses])
+    return DepthSequence(folder.name, points, mask, False, T_world_camera)
+
+
+def read_active_vision(
+    path: str | Path,
+    num_views: int = 16,
+    *,
+    seed: int = 0,
+    height: int = 27,
+    width: int = 48,
+    max_depth_m: float = 7.0,
+) -> DepthSequence:
+    """Reads one random trajectory through a scene (DeepMapping section 4.2); every second step moves, the others turn.
+
+    Args:
+        path: folder of the scene.
+        num_views: 8 or 16 in the paper.
+        seed: of the walk.
+        height: rows of a cloud.
+        width: columns of a cloud.
+        max_depth_m: deeper pixels are masked; the published program drops 7 m and more.
+
+    Returns:
+        The sequence; its motion is planar, its reference that of the dataset, in metres.
+
+    Raises:
+        InputError: a file is missing or damaged, or no image has a depth image and a pose.
+        ValueError: fewer than two views.
+    """
+    if num_views < 2:
+        raise ValueError(f"num_views: expected at least 2, got {num_views}")
+    scene = Path(path)
+    if not scene.is_dir():
+        raise InputError(scene, "no such folder", "give the folder of a scene, such as Home_001_1")
+    poses = _read_scene_poses(scene / "image_structs.mat")
+    links = _read_links(scene / "annotations.json")
+    depth_of = {name: scene / "high_res_depth" / f"{Path(name).stem[:-2]}03.png" for name in poses}
+    known = sorted(name for name in poses if name in links and depth_of[name].is_file())
+    if not known:
+        raise InputError(scene, "no image with links, pose and depth", "unpack the scene's high_res_depth folder too")
+    names = _walk(known, links, num_views, np.random.default_rng([seed, 13]))
+    camera = _read_colmap_camera(scene / "cameras.txt")
+    points, mask = _read_clouds([depth_of[name] for name in names], camera, (height, width), max_depth_m)
+    return DepthSequence(f"{scene.name}, walk {seed}", points, mask, True, np.stack([poses[name] for name in names]))
+
+
+def is_active_vision(path: Path) -> bool:
+    """Whether a folder is a scene of the Active Vision Dataset.
+
+    Args:
+        path: the folder.
+
+    Returns:
+        True where it holds image_structs.mat.
+    """
+    return (path / "image_structs.mat").is_file()
+
+
+def back_project(
+    depth_m: NDArray[np.floating], camera: Camera, *, height: int, width: int, max_depth_m: float
+) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+    """An organised cloud out of a depth image, thinned to `height` x `width` of its pixels.
+
+    Args:
+        depth_m: (rows, columns) depth along z, metres; zero, negative or not finite: nothing measured.
+        camera: that took it; its size is that of the image.
+        height: rows of the cloud.
+        width: columns of the cloud.
+        max_depth_m: deeper pixels are masked.
+
+    Returns:
+        points: (height, width, 3) in the camera frame, zero where masked.
+        mask: (height, width) True where something was measured.
+
+    Raises:
+        ValueError: the image has another size than the camera, or is smaller than the cloud.
+    """
+    if depth_m.shape != (camera.height, camera.width):
+        raise ValueError(f"depth_m: expected {(camera.height, camera.width)} as the camera, got {depth_m.shape}")
+    if height > camera.height or width > camera.width:
+        raise ValueError(f"height, width: expected at most {depth_m.shape}, got {(height, width)}")
+    rows, columns = camera.sample_pixels(height, width)
+    depth = np.asarray(depth_m, np.float64)[np.ix_(rows, columns)]
+    mask = np.isfinite(depth) & (depth > 0.0) & (depth <= max_depth_m)
+    points = camera.rays(columns.astype(np.float64), rows.astype(np.float64)) * np.where(mask, depth, 0.0)[..., None]
+    return points.astype(np.float32), mask
+
+
+def _read_clouds(
+    images: Iterable[Path], camera: Camera, shape: tuple[int, int], max_depth_m: float
+) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+    """Points (n, h, w, 3) and mask (n, h, w) of depth images in millimetres."""
+    clouds = []
+    for image in images:
+        depth_mm = read_depth_png(image)
+        depth_m = np.where(depth_mm == _NOTHING_MM, 0, depth_mm) / 1000.0
+        try:
+            clouds.append(back_project(depth_m, camera, height=shape[0], width=shape[1], max_depth_m=max_depth_m))
+        except ValueError as error:
+            raise InputError(image, str(error), "give images of the camera's size, not smaller than a cloud") from error
+    points, mask = zip(*clouds, strict=True)
+    return np.stack(points), np.stack(mask)
+
+
+def _read_matrix(path: Path, shape: tuple[int, int]) -> NDArray[np.float64]:
+    matrix = read_table(path)
+    if matrix.shape != shape or not np.isfinite(matrix).all():
+        raise InputError(path, f"a matrix of {matrix.shape}", f"give {shape[0]} x {shape[1]} finite numbers")
+    return matrix
+
+
+def _make_camera(path: Path, width: int, height: int, intrinsics: Iterable[float]) -> Camera:
+    """The camera of fx, fy, cx, cy."""
+    try:
+        return Camera(width, height, *(float(value) for value in intrinsics))
+    except ValueError as error:
+        raise InputError(path, f"not a camera ({error})", "give focal lengths above 0") from error
+
+
+def _walk(known: list[str], links: dict[str, Any], num_views: int, rng: np.random.Generator) -> list[str]:
+    """Names of the images; where no step of one kind is known, one of the other kind is taken."""
+    is_known = set(known)
+
+    def reachable(name: str, kinds: tuple[str, ...]) -> list[str]:
+        return [links[name][kind] for kind in kinds if links[name].get(kind) in is_known]
+
+    name = known[rng.integers(len(known))]
+    names = [name]
+    while len(names) < num_views:
+        moves, turns = reachable(name, _MOVES), reachable(name, _TURNS)
+        options = moves if (rng.random() < 0.5 and moves) or not turns else turns
+        if not options:
+            raise InputError(name, "no neighbour with a depth image and a pose", "unpack the whole scene")
+        name = options[rng.integers(len(options))]
+        names.append(name)
+    return names
+
+
+def _read_scene_poses(path: Path) -> dict[str, NDArray[np.float64]]:
+    """T_world_camera of every image that the reconstruction has placed, metres."""
+    from scipy.io import loadmat
+
+    poses = {}
+    try:
+        content = loadmat(path, squeeze_me=True, struct_as_record=False)
+        scale_m = float(content["scale"]) / 1000.0
+        for entry in np.atleast_1d(content["image_structs"]):
+            R, t = np.asarray(entry.R, np.float64), np.asarray(entry.t, np.float64).reshape(-1)
+            if R.shape != (3, 3) or t.shape != (3,) or not (np.isfinite(R).all() and np.isfinite(t).all()):
+                continue  # not placed by the reconstruction
+            T = np.eye(4)
+            T[:3, :3], T[:3, 3] = R.T, -R.T @ t * scale_m
+            poses[str(entry.image_name)] = T
+    except Exception as error:  # SciPy raises whatever its parser trips over.
+        found = f"not the dataset's pose file ({type(error).__name__})"
+        raise InputError(path, found, "copy image_structs.mat of the scene") from error
+    return poses
+
+
+def _read_links(path: Path) -> dict[str, dict[str, str]]:
+    try:
+        links = json.loads(read_bytes(path))
+        return {name: {kind: str(other) for kind, other in entry.items()} for name, entry in links.items()}
+    except (UnicodeDecodeError, json.JSONDecodeError, AttributeError, RecursionError) as error:
+        raise InputError(path, f"not readable ({error})", "copy annotations.json of the scene") from error
+
+
+def _read_colmap_camera(path: Path) -> Camera:
+    """Size and pinhole part of a COLMAP camera; the dataset's usual one where the file is missing."""
+    if not path.is_file():
+        return ACTIVE_VISION
+    for line in read_lines(path):
+        words = line.split()
+        if len(words) >= 8 and not line.startswith("#"):
+            try:
+                return Camera(int(words[2]), int(words[3]), *(float(word) for word in words[4:8]))
+            except ValueError as error:
+                found = f"not a camera: {line.strip()} ({error})"
+                raise InputError(path, found, "give COLMAP's cameras.txt") from error
+    raise InputError(path, "no camera in it", "give COLMAP's cameras.txt")

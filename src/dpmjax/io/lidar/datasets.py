@@ -1,0 +1,231 @@
+"""Drives of other data sets as they lie on disk: KITTI raw, KITTI-360, KITTI-CARLA, MulRan."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dpmjax.geometry import rigid
+from dpmjax.io.files import natural_key, read_lines, read_table
+from dpmjax.io.lidar.drive import Drive3D, from_first, match_poses, numbers_of, scan_files
+from dpmjax.io.lidar.kitti import read_labelled_numbers
+from dpmjax.io.poses import check_poses, interpolate_poses, to_homogeneous
+from dpmjax.sequences import InputError
+
+_CARLA_POSES_PER_FRAME = 100  # KITTI-CARLA writes poses at 1000 Hz and frames at 10 Hz.
+_EARTH_RADIUS_M = 6378137.0
+# MulRan's published calibration: the Ouster in the car's frame; rotation about z by 179.6654 degrees.
+_MULRAN_OUSTER_XYZ = (1.7042, -0.021, 1.8047)
+_MULRAN_OUSTER_RPY_DEG = (0.0001, 0.0003, 179.6654)
+
+
+def read_kitti_raw(folder: Path) -> Drive3D:
+    """KITTI raw: velodyne_points/data, oxts/data, and calib_imu_to_velo.txt in the folder of the day.
+
+    Args:
+        folder: DAY_drive_NNNN_sync.
+
+    Returns:
+        The drive; the world is the first lidar frame.
+
+    Raises:
+        InputError: GPS/IMU records without calibration, or broken files.
+    """
+    files = scan_files(folder / "velodyne_points" / "data")
+    stamps = _read_stamps(folder / "velodyne_points" / "timestamps.txt", files)
+    home = folder / "oxts" / "data"
+    records = sorted(home.glob("*.txt"), key=lambda f: natural_key(f.name))
+    if not records or not files:
+        return Drive3D(folder.resolve().name, files, None, stamps)
+    candidates = [parent / "calib_imu_to_velo.txt" for parent in (folder, folder.resolve().parent)]
+    calibration = next((path for path in candidates if path.is_file()), None)
+    if calibration is None:
+        advice = "put the calibration of the day (calib_imu_to_velo.txt) into the folder above"
+        raise InputError(folder, "GPS/IMU records but no calib_imu_to_velo.txt", advice)
+    table = np.vstack([_first_row(record, 6) for record in records])
+    T_world_lidar = _poses_from_oxts(table, home) @ rigid.inverse(_read_imu_calibration(calibration))
+    # A drive may lack scans that have a record: poses are matched by number.
+    return Drive3D(folder.resolve().name, files, from_first(match_poses(T_world_lidar, files, home)), stamps)
+
+
+def read_kitti_360(folder: Path) -> Drive3D:
+    """KITTI-360: data_3d_raw/DRIVE/velodyne_points/data, data_poses/DRIVE/poses.txt and calibration/.
+
+    The car has no pose where it stands: such scans are interpolated; scans before the first and after the last pose are
+    left out.
+
+    Args:
+        folder: the drive's folder in data_3d_raw.
+
+    Returns:
+        The drive; the world is the first lidar frame.
+
+    Raises:
+        InputError: poses without calibration, or broken files.
+    """
+    files = scan_files(folder / "velodyne_points" / "data")
+    stamps = _read_stamps(folder / "velodyne_points" / "timestamps.txt", files)
+    name, root = folder.resolve().name, folder.resolve().parents[1]
+    path = root / "data_poses" / name / "poses.txt"
+    if not path.is_file():
+        return Drive3D(name, files, None, stamps)
+    rows = _read_rows(path, "KITTI-360's poses.txt: frame and 12 numbers")
+    calibration = root / "calibration" / "calib_cam_to_pose.txt"
+    numbers = read_labelled_numbers(calibration).get("image_00", np.zeros(0))
+    if len(numbers) != 12:
+        raise InputError(calibration, "no line 'image_00:' of 12 numbers", "take KITTI-360's calibration folder")
+    T_imu_cam0 = check_poses(to_homogeneous(numbers[None]), calibration)
+    calibration = root / "calibration" / "calib_cam_to_velo.txt"
+    T_lidar_cam0 = check_poses(to_homogeneous(_first_row(calibration, 12)), calibration)
+    T_world_lidar = check_poses(to_homogeneous(rows[:, 1:]), path) @ T_imu_cam0 @ rigid.inverse(T_lidar_cam0)
+    frames = np.array(_require_numbers(files), np.float64)
+    return _interpolate(Drive3D(name, files, None, stamps), frames, rows[:, 0], T_world_lidar, path)
+
+
+def read_kitti_carla(folder: Path) -> Drive3D:
+    """KITTI-CARLA: TownNN/generated with frames/frame_NNNN.ply and full_poses_lidar.txt (12 numbers and a time).
+
+    Args:
+        folder: TownNN, or its generated/.
+
+    Returns:
+        The drive. Frame i has pose 100 i. Frames keep the motion of the car during a turn.
+
+    Raises:
+        InputError: broken files, or fewer poses than frames.
+    """
+    home = folder / "generated" if (folder / "generated").is_dir() else folder
+    files = scan_files(home / "frames", (".ply",))
+    name = home.resolve().parent.name if home.resolve().name == "generated" else home.resolve().name
+    path = home / "full_poses_lidar.txt"
+    if not path.is_file():
+        return Drive3D(name, files, None, None)
+    rows = _read_rows(path, "KITTI-CARLA's full_poses_lidar.txt: 12 numbers and a time")
+    endings = [(re.findall(r"\d+", file.stem) or [str(index)])[-1] for index, file in enumerate(files)]
+    at = [_CARLA_POSES_PER_FRAME * int(ending[-9:]) for ending in endings]
+    if max(at, default=0) >= len(rows):
+        raise InputError(path, f"{len(rows)} rows for {len(files)} frames", "give 100 rows a frame")
+    return Drive3D(name, files, check_poses(to_homogeneous(rows[at, :12]), path), rows[at, 12])
+
+
+def read_mulran(folder: Path) -> Drive3D:
+    """MulRan: Ouster/STAMP.bin (nanoseconds) and global_pose.csv of the car at 100 Hz.
+
+    Args:
+        folder: the folder that holds Ouster/ or sensor_data/Ouster/.
+
+    Returns:
+        The drive; the world is the first lidar frame. Scans half a second or more outside of the poses are left out.
+
+    Raises:
+        InputError: broken files.
+    """
+    from scipy.spatial.transform import Rotation
+
+    home = folder / "Ouster" if (folder / "Ouster").is_dir() else folder / "sensor_data" / "Ouster"
+    files = scan_files(home, (".bin",))
+    stamps = np.array(_require_numbers(files), np.int64)
+    times = (stamps - stamps[:1]).astype(np.float64) * 1e-9
+    drive = Drive3D(folder.resolve().name, files, None, times)
+    path = folder / "global_pose.csv"
+    if not path.is_file() or not len(files):
+        return drive
+    rows = _read_rows(path, "MulRan's global_pose.csv: stamp and 12 numbers")
+    # In float64 a stamp of 1.5e18 ns is good to 256 ns.
+    pose_times = (rows[:, 0] - float(stamps[0])) * 1e-9
+    T_car_lidar = np.eye(4)
+    T_car_lidar[:3, 3] = _MULRAN_OUSTER_XYZ
+    T_car_lidar[:3, :3] = Rotation.from_euler("xyz", _MULRAN_OUSTER_RPY_DEG, degrees=True).as_matrix()
+    T_world_lidar = check_poses(to_homogeneous(rows[:, 1:]), path) @ T_car_lidar
+    return _interpolate(drive, times, pose_times, T_world_lidar, path, slack=0.5)
+
+
+def _interpolate(
+    drive: Drive3D,
+    wanted: NDArray[np.float64],
+    times: NDArray[np.float64],
+    poses: NDArray[np.float64],
+    path: Path,
+    *,
+    slack: float = 0.0,
+) -> Drive3D:
+    """The scans less than `slack` beyond the times of the poses, with interpolated poses from the first on."""
+    times, first = np.unique(times, return_index=True)
+    kept = np.flatnonzero((wanted >= times[0] - slack) & (wanted <= times[-1] + slack))
+    if not len(kept):
+        raise InputError(path, "no scan lies within the times of the poses", "give scans and poses of one drive")
+    found = from_first(interpolate_poses(times, poses[first], wanted[kept]))
+    stamps = None if drive.times is None else drive.times[kept]
+    return Drive3D(drive.name, [drive.files[i] for i in kept], found, stamps)
+
+
+def _require_numbers(files: list[Path]) -> list[int]:
+    numbers = numbers_of(files)
+    if numbers is None:
+        raise InputError(files[0].parent, "a file name that is no number", "keep the names of the data set")
+    return numbers
+
+
+def _first_row(path: Path, width: int) -> NDArray[np.float64]:
+    """(1, width) first numbers of a file."""
+    rows = read_table(path)
+    if rows.shape[1] < width:
+        raise InputError(path, f"rows of {rows.shape[1]} numbers", f"give {width} numbers or more")
+    return rows[:1, :width]
+
+
+def _read_rows(path: Path, layout: str) -> NDArray[np.float64]:
+    """(n, 13) numbers of a pose file, all finite."""
+    rows = read_table(path)
+    if rows.shape[1] != 13 or not np.isfinite(rows).all():
+        raise InputError(path, f"rows of {rows.shape[1]} numbers, or some not finite", f"give {layout}")
+    return rows
+
+
+def _read_stamps(path: Path, files: list[Path]) -> NDArray[np.float64] | None:
+    """KITTI raw's timestamps.txt (2011-09-26 13:02:25.951199337) as seconds from the first; None if it does not fit."""
+    try:
+        lines = [line.strip() for line in read_lines(path) if line.strip()]
+        if not all(re.fullmatch(r"[-\d:. T]+", line) for line in lines):
+            return None
+        stamps = np.array([line.replace(" ", "T") for line in lines], "datetime64[ns]")
+    except ValueError:
+        return None
+    if len(stamps) != len(files):
+        numbers = numbers_of(files, len(stamps) - 1)
+        if numbers is None:
+            return None
+        stamps = stamps[numbers]
+    return (stamps - stamps[0]).astype(np.float64) * 1e-9 if len(stamps) else None
+
+
+def _read_imu_calibration(path: Path) -> NDArray[np.float64]:
+    """(4, 4) out of KITTI raw's `R:` and `T:` lines."""
+    entries = read_labelled_numbers(path)
+    turn, shift = entries.get("R", np.zeros(0)), entries.get("T", np.zeros(0))
+    if len(turn) != 9 or len(shift) != 3:
+        raise InputError(path, "no lines 'R:' of 9 and 'T:' of 3 numbers", "take KITTI's calibration file")
+    return check_poses(to_homogeneous(np.column_stack([turn.reshape(3, 3), shift]).reshape(1, 12)), path)[0]
+
+
+def _poses_from_oxts(records: NDArray[np.float64], source: Path) -> NDArray[np.float64]:
+    """GPS/IMU records as poses, by the Mercator projection (Geiger et al. 2013, section III).
+
+    Records are (n, 6) latitude, longitude (degrees), altitude (m), roll, pitch, yaw (radians). Returns (n, 4, 4)
+    `T_world_imu`, world in metres, x east, y north, z up.
+    """
+    from scipy.spatial.transform import Rotation
+
+    if not (np.isfinite(records).all() and (np.abs(records[:, 0]) < 89.0).all()):
+        raise InputError(source, "records that are not finite, or a latitude beyond 89 degrees", "copy them again")
+    latitude, longitude = np.radians(records[:, 0]), np.radians(records[:, 1])
+    scale = np.cos(latitude[0]) * _EARTH_RADIUS_M
+    poses = np.tile(np.eye(4), (len(records), 1, 1))
+    poses[:, 0, 3] = scale * longitude
+    poses[:, 1, 3] = scale * np.log(np.tan(0.25 * np.pi + 0.5 * latitude))
+    poses[:, 2, 3] = records[:, 2]
+    poses[:, :3, :3] = Rotation.from_euler("ZYX", records[:, [5, 4, 3]]).as_matrix()
+    return poses

@@ -1,0 +1,5 @@
+from .graph import Edges as Edges
+from .graph import PoseGraph as PoseGraph
+from .optimize import OptimizedPoseGraph as OptimizedPoseGraph
+from .optimize import PoseGraphConfig as PoseGraphConfig
+from .optimize import optimize_pose_graph as optimize_pose_graph

@@ -1,0 +1,158 @@
+"""The nouns of pose graphs: edges are measured relative poses, a graph is poses and edges."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+import scipy.sparse as sp
+from numpy.typing import ArrayLike, NDArray
+
+Floats = NDArray[np.float64]
+Indices = NDArray[np.int64]
+
+_TANGENT_SIZE = {(3,): 3, (4, 4): 6}
+"""Degrees of freedom of a pose by its shape: x, y, heading in the plane; a homogeneous matrix in space."""
+
+
+class Edges(NamedTuple):
+    """Measured relative poses (e edges).
+
+    Attributes:
+        source: (e,) row of the pose that was measured.
+        target: (e,) row of the pose in whose frame it was measured.
+        measurements: `T_target_source`; (e, 3) x, y, heading in the plane, (e, 4, 4) in space.
+        information: inverse covariance in the tangent of the source frame, translation first; (e, 3, 3) or (e, 6, 6).
+    """
+
+    source: Indices
+    target: Indices
+    measurements: Floats
+    information: Floats
+
+    @property
+    def poses(self) -> Floats:
+        """`measurements`, under the name that registration uses."""
+        return self.measurements
+
+
+def join_edges(*edges: Edges) -> Edges:
+    """Joins lists of edges into one list.
+
+    Args:
+        *edges: the lists, in the order of the result.
+
+    Returns:
+        All edges.
+    """
+    return Edges(*(np.concatenate(parts) for parts in zip(*edges, strict=True)))
+
+
+@dataclass(frozen=True, eq=False)
+class PoseGraph:
+    """Poses (n nodes) and the relative poses measured between them. `PoseGraph.create` makes and checks one.
+
+    Attributes:
+        poses: `T_world_node`; (n, 3) x, y, heading in the plane, (n, 4, 4) in space; metres and radians.
+        edges: measured relative poses.
+        is_fixed: (n,) True for nodes that the optimisation does not move.
+        ids: (n,) names of the nodes in files.
+    """
+
+    poses: Floats
+    edges: Edges
+    is_fixed: NDArray[np.bool_]
+    ids: Indices
+
+    @classmethod
+    def create(
+        cls, poses: ArrayLike, edges: Edges, *, is_fixed: ArrayLike | None = None, ids: ArrayLike | None = None
+    ) -> PoseGraph:
+        """Makes a graph out of anything that NumPy takes for arrays.
+
+        Args:
+            poses: (n, 3) or (n, 4, 4) `T_world_node`.
+            edges: measured relative poses, as in `Edges`.
+            is_fixed: (n,) nodes that stay; none by default.
+            ids: (n,) names of the nodes; their rows by default.
+
+        Returns:
+            The graph, in float64.
+
+        Raises:
+            ValueError: the shapes do not match, a number is not finite, an edge joins no two nodes of the graph, or an
+                information matrix is not symmetric and positive semidefinite.
+        """
+        poses = np.asarray(poses, np.float64)
+        source, target = (np.asarray(index, np.int64) for index in (edges.source, edges.target))
+        measurements, information = (np.asarray(x, np.float64) for x in (edges.measurements, edges.information))
+        graph = cls(
+            poses,
+            Edges(source, target, measurements, information),
+            np.zeros(len(poses), bool) if is_fixed is None else np.asarray(is_fixed, bool),
+            np.arange(len(poses)) if ids is None else np.asarray(ids, np.int64),
+        )
+        _check_nodes(graph)
+        _check_edges(graph)
+        return graph
+
+    @property
+    def tangent_size(self) -> int:
+        """Degrees of freedom of a pose: 3 in the plane, 6 in space."""
+        return _TANGENT_SIZE[self.poses.shape[1:]]
+
+    def held_nodes(self) -> NDArray[np.bool_]:
+        """The nodes that an optimisation holds.
+
+        Returns:
+            (n,) True for fixed nodes, and for the first node of each connected part without any.
+        """
+        edges, size = self.edges, len(self.poses)
+        joined = sp.coo_matrix((np.ones(len(edges.source)), (edges.source, edges.target)), (size, size))
+        num_parts, part = sp.csgraph.connected_components(joined, directed=False)
+        has_fixed = np.bincount(part[self.is_fixed], minlength=num_parts) > 0
+        first = np.unique(part, return_index=True)[1]
+        held = self.is_fixed.copy()
+        held[first[~has_fixed]] = True
+        return held
+
+
+def _require(is_right: bool, name: str, expected: str, got: Any) -> None:
+    if not is_right:
+        raise ValueError(f"{name}: expected {expected}, got {got}")
+
+
+def _require_finite(name: str, array: Floats) -> None:
+    is_finite = np.isfinite(array).all(axis=tuple(range(1, array.ndim)))
+    if not is_finite.all():
+        raise ValueError(f"{name}: expected finite numbers, got NaN or infinity in row {np.argmin(is_finite)}")
+
+
+def _check_nodes(graph: PoseGraph) -> None:
+    shape, size = graph.poses.shape, len(graph.poses)
+    _require(shape[1:] in _TANGENT_SIZE and size > 0, "poses", "shape (n, 3) or (n, 4, 4), n >= 1", shape)
+    for name in ("is_fixed", "ids"):
+        _require(getattr(graph, name).shape == (size,), name, f"shape ({size},)", getattr(graph, name).shape)
+    _require(len(np.unique(graph.ids)) == size, "ids", "every id once", "an id twice")
+    _require_finite("poses", graph.poses)
+
+
+def _check_edges(graph: PoseGraph) -> None:
+    edges, size, tangent = graph.edges, len(graph.poses), graph.tangent_size
+    count = len(edges.source)
+    shapes = {"source": (count,), "target": (count,), "measurements": (count, *graph.poses.shape[1:])}
+    for name, shape in (shapes | {"information": (count, tangent, tangent)}).items():
+        _require(getattr(edges, name).shape == shape, name, f"shape {shape}", getattr(edges, name).shape)
+    for name in ("source", "target"):
+        rows = getattr(edges, name)
+        is_node = (rows >= 0) & (rows < size)
+        _require(bool(is_node.all()), name, f"rows of nodes in [0, {size})", rows[~is_node][:1])
+    is_loop = edges.source == edges.target
+    _require(not is_loop.any(), "source", "another node than the target", f"the same in edges {np.flatnonzero(is_loop)[:3]}")
+    for name in ("measurements", "information"):
+        _require_finite(name, getattr(edges, name))
+    information, scale = edges.information, np.abs(edges.information).max(axis=(1, 2), initial=0.0)
+    is_symmetric = (np.abs(information - np.swapaxes(information, 1, 2)).max(axis=(1, 2)) <= 1e-9 * scale).all()
+    is_positive = (np.linalg.eigvalsh(information)[:, 0] >= -1e-6 * scale).all()
+    _require(bool(is_symmetric and is_positive), "information", "symmetric, positive semidefinite matrices", "others")

@@ -1,0 +1,179 @@
+"""Sparse normal equations made of small dense blocks, assembled fast and solved by SuperLU.
+
+A term of a least-squares problem touches a few nodes (two for an edge of a pose graph). Its share of J^T W J is a dense
+block for every pair of them, its share of J^T W r a vector for each.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.sparse as sp
+import scipy.sparse.linalg
+from jaxtyping import Float
+from numpy.typing import NDArray
+
+from dpmjax.pose_graph.graph import Floats, Indices
+
+
+@dataclass(frozen=True, eq=False)
+class BlockPattern:
+    """The places of all blocks in the sparse matrix, which stay the same while the numbers change.
+
+    Attributes:
+        nodes: (m, s) the nodes of each term.
+        num_nodes: n.
+        free_nodes: (f,) the free node of each block row, in the order of elimination.
+        order: the blocks between free nodes, of m * s * s in all, sorted by their place.
+        starts: where in `order` each place of the matrix begins.
+        columns: block column of each place.
+        row_starts: where in `columns` each block row begins.
+    """
+
+    nodes: Indices
+    num_nodes: int
+    free_nodes: Indices
+    order: Indices
+    starts: Indices
+    columns: Indices
+    row_starts: Indices
+
+    @classmethod
+    def create(cls, nodes: Indices, is_held: NDArray[np.bool_]) -> BlockPattern:
+        """Finds the places.
+
+        Args:
+            nodes: (m, s) the nodes of each term.
+            is_held: (n,) nodes that do not move.
+
+        Returns:
+            The pattern.
+        """
+        free = np.flatnonzero(~is_held)
+        num_free, rows = len(free), np.full(len(is_held), -1)
+        rows[free] = np.arange(num_free)
+        rank = _elimination_order(*_free_blocks(rows[nodes])[1:], num_free)
+        rows[free] = rank
+        used, block_row, block_column = _free_blocks(rows[nodes])
+        place = block_row * num_free + block_column
+        sorting = np.argsort(place, kind="stable")
+        place = place[sorting]
+        starts = np.flatnonzero(np.diff(place, prepend=-1))
+        columns = place[starts] % max(num_free, 1)
+        row_starts = np.searchsorted(place[starts], num_free * np.arange(num_free + 1))
+        return cls(nodes, len(is_held), free[np.argsort(rank)], used[sorting], starts, columns, row_starts)
+
+    def matrix(self, blocks: Float[np.ndarray, "m s s d d"]) -> sp.csc_matrix:
+        """The sum of all blocks over the free nodes.
+
+        Args:
+            blocks: J^T W J of each term, symmetric as a whole.
+
+        Returns:
+            The sparse matrix, d rows for each free node.
+        """
+        axes, num_free = blocks.shape[-1], len(self.row_starts) - 1
+        ordered = blocks.reshape(-1, axes, axes)[self.order]
+        summed = np.add.reduceat(ordered, self.starts, axis=0) if len(self.starts) else ordered
+        shape = (axes * num_free, axes * num_free)
+        by_rows = sp.bsr_matrix((summed, self.columns, self.row_starts), shape=shape).tocsr()
+        # A symmetric matrix has the same arrays by rows and by columns.
+        return sp.csc_matrix((by_rows.data, by_rows.indices, by_rows.indptr), shape=shape)
+
+    def vector(self, parts: Float[np.ndarray, "m s *k"]) -> Floats:
+        """The sum of all vectors over the free nodes.
+
+        Args:
+            parts: (m, s, d) or (m, s, d, k), J^T W r of each term.
+
+        Returns:
+            (rows of the matrix,) or (rows of the matrix, k).
+        """
+        shape = parts.shape[2:]
+        flat = parts.reshape(self.nodes.size, int(np.prod(shape)))
+        summed = [np.bincount(self.nodes.ravel(), column, self.num_nodes) for column in flat.T]
+        return np.stack(summed, axis=1).astype(np.float64)[self.free_nodes].reshape(-1, *shape[1:])
+
+    def to_nodes(self, solution: Floats, axes: int) -> Floats:
+        """Spreads a solution over all nodes.
+
+        Args:
+            solution: (rows of the matrix,) or (rows of the matrix, k).
+            axes: d, rows of each node.
+
+        Returns:
+            (n, d) or (n, d, k), zero for held nodes.
+        """
+        full = np.zeros((self.num_nodes, axes, *solution.shape[1:]))
+        full[self.free_nodes] = solution.reshape(-1, axes, *solution.shape[1:])
+        return full
+
+
+def _free_blocks(rows: Indices) -> tuple[Indices, Indices, Indices]:
+    """The blocks (m * s * s in all) between free nodes, and their block rows and columns."""
+    block_row, block_column = (x.ravel() for x in np.broadcast_arrays(rows[:, :, None], rows[:, None, :]))
+    used = np.flatnonzero((block_row >= 0) & (block_column >= 0))
+    return used, block_row[used], block_column[used]
+
+
+def _elimination_order(block_row: Indices, block_column: Indices, num_free: int) -> Indices:
+    """The rank of each free node by minimum degree: few new entries in the factors."""
+    if num_free == 0:
+        return np.zeros(0, np.int64)
+    ones = np.ones(len(block_row))
+    joined = sp.csc_matrix((ones, (block_row, block_column)), (num_free, num_free))
+    # The numbers only have to make a matrix that needs no pivots.
+    return _factorise(joined + sp.diags(2.0 * joined.sum(axis=0).A1 + 1.0), "MMD_AT_PLUS_A").perm_c.astype(np.int64)
+
+
+def _factorise(matrix: sp.spmatrix, order: str) -> scipy.sparse.linalg.SuperLU:
+    options = {"SymmetricMode": True}
+    return scipy.sparse.linalg.splu(matrix.tocsc(), permc_spec=order, diag_pivot_thresh=0.0, options=options)
+
+
+def solve_symmetric(matrix: sp.csc_matrix, right: Floats, extra: Floats | float = 0.0) -> Floats:
+    """Solves a positive definite sparse system by a factorisation that keeps its symmetry.
+
+    Args:
+        matrix: (m, m) symmetric, rows in the order of elimination.
+        right: (m,) or (m, k) right sides.
+        extra: (m,) what is added to the diagonal.
+
+    Returns:
+        The solution, with the shape of `right`; NaN where the matrix is singular.
+    """
+    if not len(right):
+        return right
+    try:
+        factors = _factorise(matrix + sp.diags(np.broadcast_to(extra, (len(right),))), "NATURAL")
+    except RuntimeError:
+        return np.full_like(right, np.nan)
+    return factors.solve(right)
+
+
+def solve_blocks(
+    nodes: Indices,
+    blocks: Float[np.ndarray, "m s s d d"],
+    gradient: Float[np.ndarray, "m s d"],
+    is_held: NDArray[np.bool_],
+    *,
+    damping: float = 1e-6,
+) -> Floats:
+    """One Gauss-Newton step of all nodes.
+
+    Args:
+        nodes: (m, s) the nodes of each term.
+        blocks: J^T W J of each term.
+        gradient: J^T W r of each term.
+        is_held: (n,) nodes that do not move.
+        damping: share of the diagonal that is added, so that nodes without a sharp term stay where they are.
+
+    Returns:
+        (n, d) steps.
+    """
+    pattern = BlockPattern.create(nodes, is_held)
+    matrix = pattern.matrix(blocks)
+    diagonal = matrix.diagonal()
+    extra = damping * diagonal + 1e-9 * max(diagonal.max(initial=0.0), 1e-300)
+    return pattern.to_nodes(solve_symmetric(matrix, -pattern.vector(gradient), extra), gradient.shape[-1])

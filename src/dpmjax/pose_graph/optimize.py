@@ -1,0 +1,167 @@
+"""Robust Levenberg-Marquardt over all poses of a graph, in the plane and in space.
+
+Without a kernel this is plain least squares. With one, every edge has a Geman-McClure kernel that is narrowed step by
+step (graduated non-convexity): all edges count at first, then wrong ones are let go.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+
+from dpmjax.checks import require_count, require_positive
+from dpmjax.pose_graph.chordal import chordal_poses
+from dpmjax.pose_graph.graph import Floats, PoseGraph
+from dpmjax.pose_graph.normal_equations import BlockPattern, solve_symmetric
+from dpmjax.pose_graph.residuals import Linearisation, linearise
+
+_NARROWING = 1.6
+_LEAST_DAMPING, _MOST_DAMPING = 1e-12, 1e6
+# Below this share of the stiffest diagonal entry, damping goes by the stiffest entry.
+_LEAST_STIFFNESS = 1e-6
+
+
+@dataclass(frozen=True)
+class PoseGraphConfig:
+    """Settings of the optimisation.
+
+    Attributes:
+        outlier_chi2: the most that a contradicted edge costs (squared Mahalanobis distance; 10 is about the 98 %
+            quantile in the plane). None for plain least squares.
+        max_iterations: at most so many linear solves.
+        tolerance: the optimisation ends when a step lowers the cost by less than this share.
+        widening: the kernel starts so many times wider.
+        is_chordal_start: also try the chordal relaxation as a start; it is taken where its cost is lower.
+        damping: Levenberg-Marquardt damping at the start, as a share of the diagonal.
+    """
+
+    outlier_chi2: float | None = None
+    max_iterations: int = 100
+    tolerance: float = 1e-5
+    widening: float = 1000.0
+    is_chordal_start: bool = True
+    damping: float = 1e-6
+
+    def __post_init__(self) -> None:
+        """Checks the numbers."""
+        require_count("max_iterations", self.max_iterations)
+        for name in ("tolerance", "damping", "widening"):
+            require_positive(name, getattr(self, name))
+        if self.outlier_chi2 is not None:
+            require_positive("outlier_chi2", self.outlier_chi2)
+
+
+class OptimizedPoseGraph(NamedTuple):
+    """An optimised graph.
+
+    Attributes:
+        graph: the graph at the new poses.
+        chi2: sum of r^T W r over all edges, each times its weight.
+        chi2_initial: the same at the poses that were given, all weights one.
+        iterations: linear solves, rejected ones included.
+        weights: (e,) of each edge in the end, 0 (let go) to 1; all one without a kernel.
+        is_converged: False where the iterations ran out, or no step lowered the cost.
+    """
+
+    graph: PoseGraph
+    chi2: float
+    chi2_initial: float
+    iterations: int
+    weights: Floats
+    is_converged: bool
+
+
+class _State(NamedTuple):
+    """The optimisation between two solves; `widening` is how many times the kernel is wider than in the end."""
+
+    at: Linearisation
+    damping: float
+    widening: float
+    is_converged: bool = False
+
+
+def optimize_pose_graph(
+    graph: PoseGraph, config: PoseGraphConfig | None = None, *, trust: Floats | float = 1.0
+) -> OptimizedPoseGraph:
+    """Moves all free poses so that the relative poses agree with the measured ones.
+
+    Fixed nodes stay. In each connected part without a fixed node the first node stays, so that a graph of several
+    parts is no singular system.
+
+    Args:
+        graph: poses and measurements, in the plane or in space.
+        config: settings; plain least squares by default.
+        trust: (e,) how many ordinary edges must contradict an edge before the kernel lets it go.
+
+    Returns:
+        The optimised graph and its cost; the graph itself where no step lowers the cost.
+
+    Raises:
+        ValueError: the cost of the given poses is not a finite number, or `trust` is not positive.
+    """
+    config = config or PoseGraphConfig()
+    if not (np.asarray(trust) > 0).all():
+        raise ValueError("trust: expected numbers above 0, got others")
+    width = np.full(len(graph.edges.source), config.outlier_chi2 or np.inf) * trust
+    nodes = np.stack([graph.edges.target, graph.edges.source], axis=1)
+    pattern = BlockPattern.create(nodes, graph.held_nodes())
+    still = np.zeros((len(graph.poses), graph.tangent_size))
+    at = linearise(graph.poses, still, graph.edges)
+    chi2_initial = float(at.chi2.sum())
+    if not np.isfinite(chi2_initial):
+        raise ValueError("graph: expected residuals of finite length, got NaN or infinity")
+    if config.is_chordal_start and len(graph.edges.source):
+        chordal = linearise(chordal_poses(graph, pattern), still, graph.edges)
+        at = chordal if _cost(chordal.chi2, width) < _cost(at.chi2, width) else at
+    state = _State(at, config.damping, 1.0 if config.outlier_chi2 is None else config.widening)
+    iterations = 0
+    while iterations < config.max_iterations and not state.is_converged and state.damping < _MOST_DAMPING:
+        state = _iterate(state, graph, pattern, width, config)
+        iterations += 1
+    weights = _weights(state.at.chi2, width)
+    return OptimizedPoseGraph(
+        graph=replace(graph, poses=state.at.poses),
+        chi2=float((weights * state.at.chi2).sum()),
+        chi2_initial=chi2_initial,
+        iterations=iterations,
+        weights=weights,
+        is_converged=state.is_converged,
+    )
+
+
+def _iterate(
+    state: _State, graph: PoseGraph, pattern: BlockPattern, width: Floats, config: PoseGraphConfig
+) -> _State:
+    """One damped solve; its step is taken where it lowers the cost."""
+    at, is_narrow = state.at, state.widening <= 1.0
+    width = width * state.widening
+    weights = _weights(at.chi2, width)
+    matrix = pattern.matrix(at.blocks * weights[:, None, None, None, None])
+    right = -pattern.vector(at.gradient * weights[:, None, None])
+    diagonal = matrix.diagonal()
+    extra = state.damping * np.maximum(diagonal, max(_LEAST_STIFFNESS * diagonal.max(initial=0.0), 1e-300))
+    step = solve_symmetric(matrix, right, extra)
+    cost = _cost(at.chi2, width)
+    small = config.tolerance * cost + 1e-12
+    widening = max(1.0, state.widening / _NARROWING)
+    trial, decrease = at, -np.inf
+    if np.isfinite(step).all():
+        if is_narrow and step @ right + step @ (extra * step) <= small:
+            return state._replace(is_converged=True)
+        trial = linearise(at.poses, pattern.to_nodes(step, graph.tangent_size), graph.edges)
+        decrease = cost - _cost(trial.chi2, width)
+    if not decrease >= 0:
+        return state._replace(damping=10.0 * state.damping, widening=widening)
+    return _State(trial, max(0.1 * state.damping, _LEAST_DAMPING), widening, is_narrow and decrease <= small)
+
+
+def _weights(chi2: Floats, width: Floats) -> Floats:
+    """Weights of the edges under a Geman-McClure kernel of this width; one where the width is infinite."""
+    return 1.0 / (1.0 + chi2 / width) ** 2
+
+
+def _cost(chi2: Floats, width: Floats) -> float:
+    """The sum of what all edges cost: chi2 of small residuals, at most the width of the kernel."""
+    return float((chi2 / (1.0 + chi2 / width)).sum())

@@ -1,0 +1,330 @@
+"""What readers and simulators return: scans, depth images, worlds and drives, with the poses that belong to them.
+
+NumPy only, on the host. `dpmjax.io` and `dpmjax.simulation` make these records.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+_log = logging.getLogger(__name__)
+Selection = slice | NDArray[np.integer]
+"""Start, stop and stride in scans, or the rows to keep, in the order wanted."""
+
+
+class InputError(ValueError):
+    """The user's input is not usable: one line that names the file, what was found there and what to do.
+
+    The command line prints the line and ends with exit code 2; nothing has been written by then.
+
+    Args:
+        source: the file or folder at fault.
+        found: what was found, without a final full stop.
+        advice: what to do about it, without a final full stop.
+    """
+
+    def __init__(self, source: str | Path, found: str, advice: str) -> None:
+        self.source, self.found, self.advice = str(source), found, advice
+        super().__init__(" ".join(f"{source}: {found}; {advice}.".split()))
+
+
+def _require_shapes(record: Any, shapes: dict[str, tuple[int, ...]]) -> None:
+    """Raises a ValueError for the first field that is present and has another shape."""
+    for name, shape in shapes.items():
+        value = getattr(record, name)
+        if value is not None and value.shape != shape:
+            raise ValueError(f"{name} must be {shape}, got {value.shape}")
+
+
+def _select(record: Any, names: tuple[str, ...], selection: Selection) -> dict[str, Any]:
+    """The selected rows of each field that is present."""
+    values = {name: getattr(record, name) for name in names}
+    return {name: None if value is None else value[selection] for name, value in values.items()}
+
+
+@dataclass(frozen=True)
+class ScanSequence:
+    """A sequence of planar scans.
+
+    Attributes:
+        name: short name of the source, for titles and folders.
+        points: (n, b, 2) float32 beam end points in the sensor frame (x forward, y left), in `unit`; zero where masked.
+        mask: (n, b) bool, True where the beam measured something.
+        unit: unit of lengths.
+        is_organised: beams of a scan are ordered by angle, neighbours in the array are neighbours in the world.
+        reference_poses: (n, 3) float64 x, y, heading of the sensor in the world (`unit`, radians), or None.
+        odometry_poses: (n, 3) float64, raw odometry in its own world, or None where the source has none.
+        times: (n,) float64 seconds, or None.
+
+    Raises:
+        ValueError: shapes that do not belong together, or a unit other than "px" and "m".
+    """
+
+    name: str
+    points: NDArray[np.float32]
+    mask: NDArray[np.bool_]
+    unit: Literal["px", "m"]
+    is_organised: bool = True
+    reference_poses: NDArray[np.float64] | None = None
+    odometry_poses: NDArray[np.float64] | None = None
+    times: NDArray[np.float64] | None = None
+
+    def __post_init__(self) -> None:
+        if self.unit not in ("px", "m"):
+            raise ValueError(f"unit must be 'px' or 'm', got {self.unit!r}")
+        if self.points.ndim != 3 or self.points.shape[2] != 2:
+            raise ValueError(f"points must be (n, b, 2), got {self.points.shape}")
+        n = len(self.points)
+        shapes = {"mask": self.points.shape[:2], "reference_poses": (n, 3), "odometry_poses": (n, 3), "times": (n,)}
+        _require_shapes(self, shapes)
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+    def take(self, selection: Selection) -> ScanSequence:
+        """The selected scans with their poses and times; arrays are views where `selection` is a slice."""
+        names = ("points", "mask", "reference_poses", "odometry_poses", "times")
+        return replace(self, **_select(self, names, selection))
+
+
+def has_angular_order(points: NDArray[np.float32], mask: NDArray[np.bool_]) -> bool:
+    """Whether the beams of scans are ordered by angle, as 1-D convolutions and neighbour normals need it.
+
+    A scan is in order when at least 95 % of the turns from one valid beam to the next go the same way round and
+    together they make one turn at most (with 5 % to spare, for noise). The sequence is in order when at least 90 % of
+    its scans are. Scans with fewer than three valid beams do not count.
+
+    Args:
+        points: (n, b, 2) in the sensor frame.
+        mask: (n, b).
+
+    Returns:
+        True for ordered beams; False where no scan has three valid beams.
+    """
+    is_ordered = []
+    for scan, valid in zip(points, mask, strict=True):
+        if valid.sum() < 3:
+            continue
+        angle = np.arctan2(scan[valid, 1], scan[valid, 0])
+        turn = (np.diff(angle.astype(np.float64)) + np.pi) % (2 * np.pi) - np.pi
+        same_way = max((turn > 0).mean(), (turn < 0).mean())
+        is_ordered.append(same_way >= 0.95 and np.abs(turn).sum() <= 1.05 * 2 * np.pi)
+    return bool(is_ordered) and float(np.mean(is_ordered)) >= 0.9
+
+
+@dataclass(frozen=True)
+class World:
+    """A planar world of unit pixels.
+
+    Attributes:
+        name: for titles.
+        is_obstacle: (h, w) bool, True where a pixel is solid; row 0 is the lowest.
+
+    Raises:
+        ValueError: another shape or dtype, or no free space.
+    """
+
+    name: str
+    is_obstacle: NDArray[np.bool_] = field(repr=False)
+
+    def __post_init__(self) -> None:
+        if self.is_obstacle.ndim != 2 or self.is_obstacle.dtype != np.bool_:
+            raise ValueError(f"is_obstacle must be (h, w) bool, got {self.is_obstacle.shape} {self.is_obstacle.dtype}")
+        if self.is_obstacle.all():
+            raise ValueError("is_obstacle must leave free space, got a solid world")
+
+    def fill_pockets(self) -> World:
+        """The same world with every free pixel solid that cannot be reached from the largest free space."""
+        from scipy.ndimage import label
+
+        labels, _ = label(~self.is_obstacle)
+        sizes = np.bincount(labels.ravel())
+        sizes[0] = 0
+        return replace(self, is_obstacle=labels != sizes.argmax())
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A pinhole camera without distortion; its frame is x to the right, y down, z forward.
+
+    Attributes:
+        width: of the image, pixels.
+        height: of the image, pixels.
+        fx: focal length along x, pixels.
+        fy: focal length along y, pixels.
+        cx: column of the optical axis, pixels from the centre of the first.
+        cy: row of the optical axis.
+
+    Raises:
+        ValueError: a size or a focal length that is not positive and finite.
+    """
+
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+
+    def __post_init__(self) -> None:
+        numbers = (self.fx, self.fy, self.cx, self.cy)
+        if min(self.width, self.height) < 1 or not min(self.fx, self.fy) > 0.0 or not np.isfinite(numbers).all():
+            raise ValueError(f"camera: expected a size and focal lengths above 0, got {self}")
+
+    def rays(self, columns: NDArray[np.float64], rows: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Directions (h, w, 3) with z = 1 of the pixels at rows (h,) and columns (w,)."""
+        x, y = np.meshgrid((columns - self.cx) / self.fx, (rows - self.cy) / self.fy)
+        return np.stack([x, y, np.ones_like(x)], axis=-1)
+
+    def sample_pixels(self, height: int, width: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Rows (height,) and columns (width,) spread evenly over the image, in the middles of their cells."""
+        rows = ((np.arange(height) + 0.5) * self.height / height).astype(np.int64)
+        return rows, ((np.arange(width) + 0.5) * self.width / width).astype(np.int64)
+
+
+ACTIVE_VISION = Camera(1920, 1080, 1070.0, 1069.126, 927.268, 545.76)
+"""The camera of the Active Vision Dataset."""
+
+
+@dataclass(frozen=True)
+class DepthSequence:
+    """Depth images as organised clouds, in the order in which they were taken.
+
+    Attributes:
+        name: for titles and messages.
+        points: (n, h, w, 3) float32 metres in the camera frame (x right, y down, z forward); zero where masked.
+        mask: (n, h, w) bool.
+        is_planar: the camera moved on a plane: x, z and the angle about y.
+        T_world_camera: (n, 4, 4) float64 reference poses, or None.
+
+    Raises:
+        ValueError: shapes that do not belong together.
+    """
+
+    name: str
+    points: NDArray[np.float32]
+    mask: NDArray[np.bool_]
+    is_planar: bool
+    T_world_camera: NDArray[np.float64] | None = None
+
+    def __post_init__(self) -> None:
+        if self.points.ndim != 4 or self.points.shape[3] != 3:
+            raise ValueError(f"points must be (n, h, w, 3), got {self.points.shape}")
+        _require_shapes(self, {"mask": self.points.shape[:3], "T_world_camera": (len(self.points), 4, 4)})
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+    def take(self, selection: Selection) -> DepthSequence:
+        """The selected images with their poses."""
+        return replace(self, **_select(self, ("points", "mask", "T_world_camera"), selection))
+
+
+@dataclass(frozen=True)
+class LidarSequence:
+    """Scans of one drive, read lazily.
+
+    Attributes:
+        name: short name of the source, for titles and folders.
+        sources: where each scan comes from: a file, in general.
+        read_scan: read_scan(i) gives scan i as (n, 3) float32 points in the lidar's frame (x forward, y left, z up), m;
+            raises an InputError that names the file where the scan is bad.
+        T_world_lidar: (num_scans, 4, 4) float64 reference poses, or None.
+        times: (num_scans,) float64 s, or None.
+
+    Raises:
+        ValueError: poses or times that are not one a scan.
+    """
+
+    name: str
+    sources: tuple[str, ...] = field(repr=False)
+    read_scan: Callable[[int], NDArray[np.float32]] = field(repr=False)
+    T_world_lidar: NDArray[np.float64] | None = field(default=None, repr=False)
+    times: NDArray[np.float64] | None = field(default=None, repr=False)
+
+    def __post_init__(self) -> None:
+        _require_shapes(self, {"T_world_lidar": (self.num_scans, 4, 4), "times": (self.num_scans,)})
+
+    @property
+    def num_scans(self) -> int:
+        """Number of scans, the bad ones too."""
+        return len(self.sources)
+
+    def __len__(self) -> int:
+        return len(self.sources)
+
+    def take(self, selection: Selection) -> LidarSequence:
+        """The selected scans with their poses and times, in the same world; nothing is read."""
+        numbers = [int(i) for i in np.arange(self.num_scans)[selection]]
+
+        def read_scan(index: int) -> NDArray[np.float32]:
+            return self.read_scan(numbers[index])
+
+        sources = tuple(self.sources[i] for i in numbers)
+        return replace(
+            self, sources=sources, read_scan=read_scan, **_select(self, ("T_world_lidar", "times"), selection)
+        )
+
+
+@dataclass(frozen=True)
+class BadScan:
+    """A scan that could not be used.
+
+    Attributes:
+        index: its number in the sequence.
+        file: where it came from.
+        reason: what was found there.
+    """
+
+    index: int
+    file: str
+    reason: str
+
+
+class IndexedScan(NamedTuple):
+    """A scan and its number in the sequence.
+
+    Attributes:
+        number: of the scan in the sequence.
+        points: (n, 3) float32, lidar frame, m.
+    """
+
+    number: int
+    points: NDArray[np.float32]
+
+
+def iterate_scans(sequence: LidarSequence, bad: list[BadScan] | None = None) -> Iterator[IndexedScan]:
+    """Reads scan after scan and leaves out the bad ones; a warning names them at the end.
+
+    Args:
+        sequence: the scans.
+        bad: gets an entry for each scan that was left out.
+
+    Yields:
+        The good scans with their numbers.
+
+    Raises:
+        InputError: not one scan is good.
+    """
+    found = [] if bad is None else bad
+    for index, source in enumerate(sequence.sources):
+        try:
+            points = sequence.read_scan(index)
+        except InputError as error:
+            found.append(BadScan(index, source, error.found))
+            continue
+        yield IndexedScan(index, points)
+    if not found:
+        return
+    listed = "; ".join(f"scan {scan.index}, {scan.file}: {scan.reason}" for scan in found[:10])
+    listed += f"; and {len(found) - 10} more" if len(found) > 10 else ""
+    if len(found) == sequence.num_scans:
+        raise InputError(sequence.name, f"all {len(found)} scans are bad: {listed}", "check the files")
+    _log.warning("%s: %d of %d scans left out: %s", sequence.name, len(found), sequence.num_scans, listed)

@@ -1,0 +1,295 @@
+"""Furnished apartments of boxes, made by seed, and depth images of a random walk through them.
+
+World frame: x and z span the floor, y points down; the camera travels in the plane y = 0. Views follow the protocol of
+the Active Vision Dataset: a grid of places, views in steps of 30 degrees (DeepMapping section 4.2).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+from numpy.typing import NDArray
+
+from dpmjax.sequences import ACTIVE_VISION, Camera, DepthSequence
+from dpmjax.types import AnyArray
+
+_CAMERA_HEIGHT_M, _ROOM_HEIGHT_M, _WALL_M, _DOOR_M = 1.1, 2.6, 0.12, 0.95
+_PARALLEL = 1e-9
+_Box = tuple[list[float], list[float], float]  # centre, half sizes, yaw
+
+
+@dataclass(frozen=True)
+class Apartment:
+    """Boxes that stand in a rectangle.
+
+    Attributes:
+        name: for titles.
+        centres: (b, 3) metres.
+        half_sizes: (b, 3) metres.
+        yaws: (b,) radians about y.
+        size_x_m: the rectangle is [0, size_x_m] x [0, size_z_m].
+        size_z_m: the same along z.
+        is_seen_through: (b,) True for the shell, which is seen from within.
+    """
+
+    name: str
+    centres: NDArray[np.float64]
+    half_sizes: NDArray[np.float64]
+    yaws: NDArray[np.float64]
+    size_x_m: float
+    size_z_m: float
+    is_seen_through: NDArray[np.bool_]
+
+    def is_free(self, places: NDArray[np.float64], clearance_m: float) -> NDArray[np.bool_]:
+        """Which (m, 2) places x, z keep `clearance_m` from walls and from what stands at the camera's height.
+
+        Lower furniture counts too: the robot below the camera has to pass.
+        """
+        far = np.array([self.size_x_m, self.size_z_m]) - clearance_m
+        inside: NDArray[np.bool_] = np.all((places > clearance_m) & (places < far), axis=1)
+        for centre, half, yaw in zip(
+            self.centres[~self.is_seen_through],
+            self.half_sizes[~self.is_seen_through],
+            self.yaws[~self.is_seen_through],
+            strict=True,
+        ):
+            if centre[1] + half[1] < -0.9:  # hangs above the robot
+                continue
+            dx, dz = (places - centre[[0, 2]]).T
+            u, v = np.cos(yaw) * dx - np.sin(yaw) * dz, np.sin(yaw) * dx + np.cos(yaw) * dz
+            inside &= (np.abs(u) > half[0] + clearance_m) | (np.abs(v) > half[2] + clearance_m)
+        return inside
+
+
+@dataclass(frozen=True)
+class GridWalkConfig:
+    """How the camera travels (DeepMapping section 4.2).
+
+    Attributes:
+        grid_m: distance of neighbouring places.
+        turn_deg: angle between neighbouring views.
+        move_share: share of the steps that go to a neighbouring place; the others turn.
+        clearance_m: places keep this distance from walls and furniture.
+        height: rows of a cloud.
+        width: columns of a cloud.
+        max_depth_m: deeper pixels are masked.
+        depth_noise_m: standard deviation of the depth at one metre; it grows with the square of the depth, as a
+            structured-light camera's does.
+    """
+
+    grid_m: float = 0.3
+    turn_deg: float = 30.0
+    move_share: float = 0.5
+    clearance_m: float = 0.2
+    height: int = 27
+    width: int = 48
+    max_depth_m: float = 6.0
+    depth_noise_m: float = 0.0
+
+    def __post_init__(self) -> None:
+        if not 0.0 <= self.move_share <= 1.0 or not min(self.grid_m, self.turn_deg) > 0.0 or self.depth_noise_m < 0.0:
+            raise ValueError(f"expected a grid, a turn above 0, a share of 0 to 1 and noise of 0 or more, got {self}")
+
+
+def simulate_depth_sequence(
+    apartment: int | Apartment = 0,
+    num_views: int = 16,
+    *,
+    seed: int = 0,
+    config: GridWalkConfig | None = None,
+    camera: Camera = ACTIVE_VISION,
+) -> DepthSequence:
+    """A random walk over the grid of an apartment, seen by a depth camera that looks level.
+
+    Args:
+        apartment: seed for `make_apartment`, or an apartment.
+        num_views: 8 or 16 in the paper.
+        seed: of walk and noise.
+        config: of the walk; the paper's protocol where None.
+        camera: whose rays are cast.
+
+    Returns:
+        The sequence; its motion is planar.
+
+    Raises:
+        ValueError: fewer than two views, or an apartment without free places.
+    """
+    if num_views < 2:
+        raise ValueError(f"num_views: expected at least 2, got {num_views}")
+    config = config or GridWalkConfig()
+    home = apartment if isinstance(apartment, Apartment) else make_apartment(apartment)
+    rng = np.random.default_rng([seed, 11])
+    T_world_camera = _planar_to_matrices(_walk(home, num_views, config, rng))
+    rows, columns = camera.sample_pixels(config.height, config.width)
+    rays = camera.rays(columns.astype(np.float64), rows.astype(np.float64))
+    # One capacity for all apartments, so that the caster compiles once.
+    spare = -len(home.centres) % 32
+    boxes = (np.pad(home.centres, ((0, spare), (0, 0))), np.pad(home.half_sizes, ((0, spare), (0, 0))))
+    cast = jax.vmap(cast_depth, in_axes=(0, None, None, None, None))
+    depth = np.asarray(cast(T_world_camera, rays, *boxes, np.pad(home.yaws, (0, spare))), np.float64)
+    mask = np.isfinite(depth) & (depth <= config.max_depth_m) & (depth > 0.05)
+    depth = np.where(mask, depth, 0.0)
+    depth += config.depth_noise_m * depth**2 * rng.standard_normal(depth.shape)
+    points = np.where(mask[..., None], rays * depth[..., None], 0.0).astype(np.float32)
+    return DepthSequence(f"{home.name}, walk {seed}", points, mask, is_planar=True, T_world_camera=T_world_camera)
+
+
+def make_apartment(seed: int) -> Apartment:
+    """Builds the apartment of a seed, the same one every time.
+
+    Raises:
+        ValueError: a negative seed.
+    """
+    if seed < 0:
+        raise ValueError(f"seed: expected zero or more, got {seed}")
+    rng = np.random.default_rng([7, seed])
+    size_x, size_z = rng.uniform(5.5, 7.5), rng.uniform(5.0, 6.5)
+    floor, ceiling = _CAMERA_HEIGHT_M, _CAMERA_HEIGHT_M - _ROOM_HEIGHT_M
+    middle_y, half_y = (floor + ceiling) / 2, _ROOM_HEIGHT_M / 2
+    boxes: list[_Box] = [([size_x / 2, middle_y, size_z / 2], [size_x / 2, half_y, size_z / 2], 0.0)]
+    cut = size_x * rng.uniform(0.42, 0.58)
+    door = rng.uniform(0.25, 0.75) * size_z
+    for low, high in ((0.0, door - _DOOR_M / 2), (door + _DOOR_M / 2, size_z)):
+        boxes.append(([cut, middle_y, (low + high) / 2], [_WALL_M / 2, half_y, (high - low) / 2], 0.0))
+    boxes.append(([cut, ceiling + 0.2, door], [_WALL_M / 2, 0.2, _DOOR_M / 2], 0.0))
+    for _ in range(26):
+        boxes += _place_furniture(rng, _Rooms(size_x, size_z, cut, door))
+    centres, halves, yaws = zip(*boxes, strict=True)
+    is_shell = np.arange(len(boxes)) == 0
+    return Apartment(f"apartment-{seed}", np.array(centres), np.array(halves), np.array(yaws), size_x, size_z, is_shell)
+
+
+class _Rooms(NamedTuple):
+    """Two rooms: size of the floor, x of the wall between them, z of its door, m."""
+
+    size_x: float
+    size_z: float
+    wall_x: float
+    door_z: float
+
+
+def _place_furniture(rng: np.random.Generator, rooms: _Rooms) -> list[_Box]:
+    """One piece at a wall, on a wall, or in the room; nothing where it would block the doorway."""
+    size_x, size_z, wall_x, door_z = rooms
+    kind = rng.choice(["cupboard", "table", "picture", "shelf", "bench"], p=[0.26, 0.16, 0.26, 0.16, 0.16])
+    width, depth = rng.uniform(0.3, 1.1), rng.uniform(0.25, 0.6)
+    wall = int(rng.integers(6))
+    along = rng.uniform(0.15, 0.85)
+    if kind == "picture":
+        depth = rng.uniform(0.06, 0.3)
+    if kind == "table":
+        place = rng.uniform(0.8, np.array([size_x, size_z]) - 0.8)
+        yaw = rng.uniform(0, np.pi)
+        if abs(place[0] - wall_x) < 0.9:
+            return []
+    elif wall < 4:  # the outer walls
+        at = [depth / 2, size_x - depth / 2, depth / 2, size_z - depth / 2][wall]
+        place = np.array([at, along * size_z]) if wall < 2 else np.array([along * size_x, at])
+        yaw = np.pi / 2 if wall < 2 else 0.0
+    else:  # the inner wall, either side
+        place = np.array([wall_x + (depth + _WALL_M) / 2 * (1 if wall == 4 else -1), along * size_z])
+        yaw = np.pi / 2
+    if np.linalg.norm(place - [wall_x, door_z]) < _DOOR_M + 0.3 and kind != "picture":
+        return []
+    return _build_furniture(rng, kind, place, (width, depth, yaw))
+
+
+def _build_furniture(
+    rng: np.random.Generator, kind: str, place: NDArray[np.float64], footprint: tuple[float, float, float]
+) -> list[_Box]:
+    """The boxes of a piece; the footprint is width, depth and yaw."""
+    floor, ceiling = _CAMERA_HEIGHT_M, _CAMERA_HEIGHT_M - _ROOM_HEIGHT_M
+    width, depth, yaw = footprint
+    x, z = place
+    if kind == "cupboard":
+        height = rng.uniform(0.7, 2.1)
+        return [([x, floor - height / 2, z], [width / 2, height / 2, depth / 2], yaw)]
+    if kind == "picture":
+        y = rng.uniform(ceiling + 0.3, ceiling + 0.6)
+        return [([x, y, z], [width / 2, rng.uniform(0.15, 0.3), depth / 2], yaw)]
+    if kind == "shelf":
+        levels = np.arange(1, 4) * rng.uniform(0.4, 0.6)
+        return [([x, floor - level, z], [width / 2, 0.04, depth / 2], yaw) for level in levels]
+    if kind == "bench":
+        back = rng.uniform(0.4, 1.2)
+        return [
+            ([x, floor - 0.22, z], [width / 2, 0.22, depth / 2], yaw),
+            ([x, floor - back / 2, z], [width / 2, back / 2, 0.05], yaw),
+        ]
+    top = [([x, floor - 0.74, z], [width / 2 + 0.2, 0.03, depth / 2 + 0.15], yaw)]
+    return [*top, ([x, floor - 0.37, z], [0.1, 0.37, 0.1], yaw)]
+
+
+@jax.jit
+def cast_depth(
+    T_world_camera: Float[AnyArray, "4 4"],
+    rays: Float[AnyArray, "h w 3"],
+    centres: Float[AnyArray, "b 3"],
+    half_sizes: Float[AnyArray, "b 3"],
+    yaws: Float[AnyArray, " b"],
+) -> Float[Array, "h w"]:
+    """Depth along z of the first surface that each ray meets; `vmap` over cameras.
+
+    Args:
+        T_world_camera: pose of the camera.
+        rays: directions in the camera frame with z = 1, so that a length along a ray is a depth.
+        centres: of the boxes in the world, metres.
+        half_sizes: of the boxes; a box of size 0 is never met.
+        yaws: turn of each box about y, radians.
+
+    Returns:
+        (h, w) metres; infinite where a ray meets nothing. From within a box its inside is seen.
+    """
+    T, rays = jnp.asarray(T_world_camera), jnp.asarray(rays)
+    directions_world = jnp.einsum("ij,hwj->hwi", T[:3, :3], rays, precision=jax.lax.Precision.HIGHEST)
+
+    def meet(centre: Array, half: Array, yaw: Array) -> Array:
+        cos, sin = jnp.cos(yaw), jnp.sin(yaw)
+        R_box_world = jnp.stack([jnp.stack([cos, 0.0, -sin]), jnp.array([0.0, 1.0, 0.0]), jnp.stack([sin, 0.0, cos])])
+        origin = jnp.sum(R_box_world * (T[:3, 3] - centre), axis=-1)
+        direction = jnp.einsum("ij,hwj->hwi", R_box_world, directions_world, precision=jax.lax.Precision.HIGHEST)
+        safe = jnp.where(jnp.abs(direction) < _PARALLEL, _PARALLEL, direction)
+        first, second = (-half - origin) / safe, (half - origin) / safe
+        enter, leave = jnp.minimum(first, second).max(-1), jnp.maximum(first, second).min(-1)
+        depth = jnp.where(enter > 0.0, enter, leave)
+        return jnp.where((leave > jnp.maximum(enter, 0.0)) & (half > 0.0).all(), depth, jnp.inf)
+
+    return jax.vmap(meet)(jnp.asarray(centres), jnp.asarray(half_sizes), jnp.asarray(yaws)).min(0)
+
+
+def _walk(home: Apartment, num_views: int, config: GridWalkConfig, rng: np.random.Generator) -> NDArray[np.float64]:
+    """(n, 3) x, z and angle about y: one step to a neighbouring place, or one turn, from view to view."""
+    x, z = np.arange(0.0, home.size_x_m, config.grid_m), np.arange(0.0, home.size_z_m, config.grid_m)
+    places = np.stack(np.meshgrid(x, z, indexing="ij"), axis=-1)
+    is_free = home.is_free(places.reshape(-1, 2), config.clearance_m).reshape(places.shape[:2])
+    free = np.argwhere(is_free)
+    if len(free) == 0:
+        raise ValueError(f"{home.name} has no free place with {config.clearance_m} m of clearance")
+    at, view = free[rng.integers(len(free))], int(rng.integers(round(360.0 / config.turn_deg)))
+    turn_sign = int(rng.choice([-1, 1]))
+    poses = []
+    for _ in range(num_views):
+        poses.append([*places[tuple(at)], np.deg2rad(view * config.turn_deg)])
+        neighbours = at + np.array([[1, 0], [-1, 0], [0, 1], [0, -1]])
+        inside = ((neighbours >= 0) & (neighbours < is_free.shape)).all(1)
+        reachable = [n for n, ok in zip(neighbours, inside, strict=True) if ok and is_free[tuple(n)]]
+        if reachable and rng.random() < config.move_share:
+            at = reachable[rng.integers(len(reachable))]
+        else:
+            turn_sign = -turn_sign if rng.random() < 0.2 else turn_sign
+            view += turn_sign
+    return np.array(poses)
+
+
+def _planar_to_matrices(poses: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(n, 4, 4) T_world_camera of x, z and the angle about y."""
+    cos, sin = np.cos(poses[:, 2]), np.sin(poses[:, 2])
+    T = np.tile(np.eye(4), (len(poses), 1, 1))
+    T[:, 0, 0], T[:, 0, 2], T[:, 2, 0], T[:, 2, 2] = cos, sin, -sin, cos
+    T[:, 0, 3], T[:, 2, 3] = poses[:, 0], poses[:, 1]
+    return T

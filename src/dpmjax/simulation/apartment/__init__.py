@@ -1,1 +1,0 @@
-"""Simulated apartments seen by a depth camera."""

@@ -1,0 +1,424 @@
+"""Made-up inputs: every reader ends in a good result or in an `InputError` of one line, and so does the command."""
+
+from __future__ import annotations
+
+import gzip
+import json
+import os
+import re
+import tarfile
+import warnings
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+from scipy.io import savemat
+
+from dpmjax import io
+from dpmjax.sequences import InputError, LidarSequence, ScanSequence, World
+
+NUM_FUZZED = int(os.environ.get("DPMJAX_NUM_FUZZED", "2000"))
+MOST_VALUES = 10**7  # A result that is larger than this comes from a header, for no file here has 100 kB.
+
+Write = Callable[[Path, np.random.Generator], Path]
+Read = Callable[[Path], object]
+
+
+def points_2d(rng):
+    angles = np.linspace(0, 6, 24)
+    return rng.uniform(2, 9, (4, 24, 1)) * np.stack([np.cos(angles), np.sin(angles)], -1)
+
+
+def cloud(rng):
+    return rng.normal(size=(40, 3)).astype(np.float32) * [10, 10, 1]
+
+
+def write_npy_2d(folder, rng):
+    np.save(folder / "a.npy", points_2d(rng))
+    return folder / "a.npy"
+
+
+def write_npz_2d(folder, rng, *, is_packed=False):
+    save = np.savez_compressed if is_packed else np.savez
+    save(folder / "a.npz", points=points_2d(rng), poses=rng.normal(size=(4, 3)), times=np.arange(4.0), unit="m")
+    return folder / "a.npz"
+
+
+def write_ranges(folder, rng):
+    np.savez(folder / "a.npz", ranges=rng.uniform(1, 9, (4, 24)), angles=np.linspace(0, 6, 24))
+    return folder / "a.npz"
+
+
+def write_log(folder, rng, *, is_packed=False):
+    lines = [
+        f"FLASER 20 {' '.join(f'{r:.2f}' for r in rng.uniform(1, 9, 20))} {i} 0 0 {i} 1 0 {i} h {i}" for i in range(4)
+    ]
+    text = ("# log\n" + "\n".join(lines) + "\n").encode()
+    path = folder / ("a.log.gz" if is_packed else "a.log")
+    path.write_bytes(gzip.compress(text) if is_packed else text)
+    return path
+
+
+def write_pcd_folder(folder, rng):
+    mask = np.ones((4, 24), bool)
+    scans = ScanSequence(
+        "s", 30 * points_2d(rng).astype(np.float32), mask, "px", reference_poses=rng.normal(size=(4, 3))
+    )
+    return io.write_deepmapping_folder(folder / "scans", scans)
+
+
+def write_pcd_tar(folder, rng):
+    home = write_pcd_folder(folder, rng)
+    with tarfile.open(folder / "a.tar", "w") as archive:
+        archive.add(home, "scans")
+    return folder / "a.tar"
+
+
+def write_ascii_pcd(folder, rng):
+    header = "VERSION 0.7\nFIELDS x y z i\nSIZE 4 4 4 4\nTYPE F F F U\nCOUNT 1 1 1 1\nWIDTH 40\nHEIGHT 1\nPOINTS 40\n"
+    rows = "".join(f"{x} {y} {z} 7\n" for x, y, z in cloud(rng))
+    (folder / "0.pcd").write_text(header + "DATA ascii\n" + rows)
+    return folder / "0.pcd"
+
+
+def write_ascii_ply(folder, rng):
+    properties = "".join(f"property float {name}\n" for name in "xyz")
+    rows = "".join(f"{x} {y} {z}\n" for x, y, z in cloud(rng))
+    (folder / "0.ply").write_text(f"ply\nformat ascii 1.0\nelement vertex 40\n{properties}end_header\n{rows}")
+    return folder / "0.ply"
+
+
+def write_bin(folder, rng):
+    np.column_stack([cloud(rng), np.ones(40)]).astype("<f4").tofile(folder / "0.bin")
+    return folder / "0.bin"
+
+
+def write_npy_3d(folder, rng):
+    np.save(folder / "0.npy", cloud(rng))
+    return folder / "0.npy"
+
+
+def write_learned(folder, rng):
+    for index in range(3):
+        np.savez(
+            folder / f"{index}.npz", lidar_pcd=cloud(rng), ego_rotation=np.eye(3), ego_translation=np.zeros((3, 1))
+        )
+    return folder
+
+
+def trajectory(rng):
+    return np.column_stack([rng.uniform(-9, 9, (5, 2)), rng.uniform(-3, 3, 5)])
+
+
+def write_trajectory(folder, rng, *, name, write):
+    return write(folder / name, trajectory(rng))
+
+
+def write_columns(folder, rng):
+    np.savetxt(folder / "a.txt", trajectory(rng), header="x_m y_m theta_rad")
+    return folder / "a.txt"
+
+
+def write_drive(folder, rng, *, kind):
+    """The layout of a data set with all its side files."""
+    T = "1 0 0 0.5 0 1 0 0 0 0 1 0"
+    rows = [T.replace("0.5", str(i)) for i in range(3)]
+    homes = {
+        "kitti": "velodyne",
+        "raw": "velodyne_points/data",
+        "360": "data_3d_raw/d/velodyne_points/data",
+        "mulran": "Ouster",
+        "carla": "generated/frames",
+    }
+    home = folder / homes[kind]
+    home.mkdir(parents=True)
+    files = {"times.txt": "0\n0.1\n0.2\n", f"{homes[kind]}/../timestamps.txt": "2011-09-26 13:02:25.95\n" * 3}
+    if kind == "kitti":
+        files |= {"calib.txt": f"P0: {T}\nTr: {T}\n", "poses.txt": "\n".join(rows)}
+    if kind == "raw":
+        files |= {f"oxts/data/{i}.txt": f"49 {8 + 1e-5 * i} 100 0 0 {i}" for i in range(3)}
+        files |= {"calib_imu_to_velo.txt": "R: 1 0 0 0 1 0 0 0 1\nT: 0 0 0\n"}
+    if kind == "360":
+        files |= {"data_poses/d/poses.txt": "\n".join(f"{i} {row}" for i, row in enumerate(rows))}
+        files |= {"calibration/calib_cam_to_pose.txt": f"image_00: {T}", "calibration/calib_cam_to_velo.txt": T}
+    if kind == "mulran":
+        files |= {"global_pose.csv": "\n".join(f"{i},{row.replace(' ', ',')}" for i, row in enumerate(rows))}
+    if kind == "carla":
+        files |= {"generated/full_poses_lidar.txt": "\n".join(f"{rows[i // 100]} {0.01 * i}" for i in range(300))}
+    for name, text in files.items():
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_text(text)
+    for index in range(3):
+        if kind == "carla":
+            io.write_ply(home / f"frame_{index}.ply", cloud(rng))
+        else:
+            np.column_stack([cloud(rng), np.ones(40)]).astype("<f4").tofile(home / f"{index}.bin")
+    return folder
+
+
+def write_png(path, rng):
+    path.parent.mkdir(parents=True, exist_ok=True)
+    Image.fromarray(rng.integers(500, 3000, (6, 8)).astype(np.uint16)).save(path)
+
+
+def write_pose_folder(folder, rng):
+    np.savetxt(folder / "intrinsics.txt", [[6.0, 0, 3.5], [0, 6.5, 2.5], [0, 0, 1]])
+    for index in range(2):
+        write_png(folder / f"{index}.depth.png", rng)
+        np.savetxt(folder / f"{index}.pose.txt", np.eye(4))
+    return folder
+
+
+def write_scene(folder, rng):
+    names = [f"00{k}0101.jpg" for k in range(2)]
+    structs = np.zeros(2, [("image_name", object), ("R", object), ("t", object)])
+    for k, name in enumerate(names):
+        structs[k] = (name, np.eye(3), np.zeros(3))
+        write_png(folder / "high_res_depth" / f"{name[:-6]}03.png", rng)
+    savemat(folder / "image_structs.mat", {"image_structs": structs, "scale": 3000.0})
+    (folder / "annotations.json").write_text(json.dumps({n: {"rotate_cw": names[1 - k]} for k, n in enumerate(names)}))
+    (folder / "cameras.txt").write_text("1 OPENCV 8 6 6.0 6.5 3.5 2.5 0 0 0 0\n")
+    return folder
+
+
+def write_plan(folder, rng):
+    return io.write_world_png(folder / "a.png", World("w", rng.random((20, 30)) < 0.3))
+
+
+def read_drive(path):
+    sequence = io.open_lidar_sequence(path)
+    return [sequence, list(io.iterate_scans(sequence))]
+
+
+SCANS = {
+    "npy": write_npy_2d,
+    "npz": write_npz_2d,
+    "packed npz": partial(write_npz_2d, is_packed=True),
+    "ranges": write_ranges,
+    "log": write_log,
+    "packed log": partial(write_log, is_packed=True),
+    "pcd folder": write_pcd_folder,
+    "pcd tar": write_pcd_tar,
+}
+LIDAR_FILES = {
+    "bin": write_bin,
+    "npy": write_npy_3d,
+    "pcd": lambda folder, rng: io.write_pcd(folder / "0.pcd", cloud(rng)),
+    "ascii pcd": write_ascii_pcd,
+    "ply": lambda folder, rng: io.write_ply(folder / "0.ply", cloud(rng)),
+    "ascii ply": write_ascii_ply,
+}
+POSES = {
+    "tum": partial(write_trajectory, name="t.txt", write=io.write_tum),
+    "kitti": partial(write_trajectory, name="k.txt", write=io.write_kitti),
+    "npy": partial(write_trajectory, name="p.npy", write=io.write_poses_npy),
+    "columns": write_columns,
+}
+CASES: dict[str, tuple[Write, Read]] = {
+    **{f"scans, {name}": (write, io.read_sequence) for name, write in SCANS.items()},
+    **{f"lidar file, {name}": (write, io.read_lidar_file) for name, write in LIDAR_FILES.items()},
+    **{f"poses, {name}": (write, io.read_poses) for name, write in POSES.items()},
+    **{f"planar, {name}": (write, lambda path: io.read_planar_poses(path, 5, "m")) for name, write in POSES.items()},
+    **{
+        f"drive, {kind}": (partial(write_drive, kind=kind), read_drive)
+        for kind in ("kitti", "raw", "360", "mulran", "carla")
+    },
+    "drive, learned": (write_learned, read_drive),
+    "depth folder": (write_pose_folder, lambda path: io.read_pose_folder(path, height=6, width=8)),
+    "depth scene": (write_scene, lambda path: io.read_active_vision(path, 3, height=6, width=8)),
+    "floor plan": (write_plan, io.read_world_png),
+}
+
+HUGE = (b"99999999999", b"-1", b"1e308", b"nan", b"inf", b"0", b"", b"x", b"4294967297", b"1e999", b"\xff", b"-nan")
+
+
+def spoil_bytes(content: bytes, rng: np.random.Generator) -> bytes:
+    """One of: bits turned, bytes cut out or repeated, the end cut off, a number replaced by an odd one."""
+    data = bytearray(content)
+    kind = rng.integers(7)
+    if kind == 0:
+        for at in rng.integers(len(data), size=rng.integers(1, 9)):
+            data[at] ^= 1 << rng.integers(8)
+    elif kind == 1:
+        data = data[: rng.integers(len(data))]
+    elif kind == 2:
+        at = rng.integers(len(data))
+        del data[at : at + rng.integers(1, 64)]
+    elif kind == 3:
+        at = rng.integers(len(data))
+        data[at:at] = data[at : at + rng.integers(1, 64)]
+    elif kind == 4:
+        at = rng.integers(len(data))
+        size = rng.integers(1, 9)
+        data[at : at + size] = bytes([int(rng.choice([0, 255, 127, 32, 48, 10]))]) * size
+    else:  # in front, where headers are, or anywhere
+        numbers = list(re.finditer(rb"-?\d+(\.\d+)?", bytes(data[:400] if kind == 5 else data)))
+        if numbers:
+            number = numbers[rng.integers(len(numbers))]
+            data[number.start() : number.end()] = HUGE[rng.integers(len(HUGE))]
+    return bytes(data)
+
+
+def spoil(path: Path, rng: np.random.Generator) -> None:
+    """Damages one or two files of an input; now and then one is emptied, removed, or replaced by another."""
+    files = sorted(file for file in path.rglob("*") if file.is_file()) if path.is_dir() else [path]
+    for file in rng.permutation(len(files))[: rng.integers(1, 3)]:
+        chosen, kind = files[file], rng.integers(12)
+        if kind == 0:
+            chosen.write_bytes(b"")
+        elif kind == 1 and len(files) > 1:
+            chosen.unlink()
+        elif kind == 2:
+            chosen.write_bytes(rng.bytes(rng.integers(1, 3000)))
+        else:
+            chosen.write_bytes(spoil_bytes(chosen.read_bytes() or b"0", rng))
+
+
+def spoil_arrays(path: Path, rng: np.random.Generator) -> None:
+    """Writes valid NumPy files of wrong shapes, dtypes and values."""
+    shape = tuple(int(n) for n in rng.choice([0, 1, 2, 3, 4, 5, 20], size=rng.integers(0, 5)))
+    values = rng.normal(size=shape) * 10.0 ** rng.integers(-40, 41)
+    values = np.where(rng.random(shape) < rng.choice([0, 0.1, 1]), rng.choice([np.nan, np.inf, 0.0, -np.inf]), values)
+    dtype = rng.choice(["f8", "f4", "f2", "i8", "u1", "?", "c8", "U3", "S2", "M8[s]"])
+    with np.errstate(all="ignore"), warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        values = (
+            np.nan_to_num(values, posinf=1, neginf=0).astype(dtype)
+            if dtype in ("i8", "u1", "M8[s]")
+            else values.astype(dtype)
+        )
+    if path.suffix == ".npy":
+        np.save(path, values)
+        return
+    with np.load(path) as table:
+        arrays = dict(table)
+    arrays[str(rng.choice([*arrays, "mask", "odometry"]))] = values
+    np.savez(path, **arrays)
+
+
+def total_size(result: object) -> int:
+    if isinstance(result, list):
+        return sum(total_size(entry) for entry in result)
+    arrays = (
+        [result] if isinstance(result, np.ndarray) else vars(result).values() if hasattr(result, "__dict__") else []
+    )
+    return sum(array.size for array in arrays if isinstance(array, np.ndarray))
+
+
+def assert_good(result: object) -> None:
+    assert total_size(result) < MOST_VALUES
+    if isinstance(result, ScanSequence):
+        assert np.isfinite(result.points).all()
+        assert result.mask.any(axis=1).all()
+    if isinstance(result, np.ndarray):
+        assert np.isfinite(result).all()
+    if isinstance(result, list):
+        sequence, scans = result
+        assert isinstance(sequence, LidarSequence)
+        assert all(np.isfinite(scan.points).all() and len(scan.points) for scan in scans)
+        assert sequence.T_world_lidar is None or np.isfinite(sequence.T_world_lidar).all()
+
+
+def make_input(name: str, seed: int, folder: Path) -> Path:
+    rng = np.random.default_rng(seed)
+    folder.mkdir()
+    path = CASES[name][0](folder, rng)
+    if path.suffix in (".npy", ".npz") and rng.random() < 0.4:
+        spoil_arrays(path, rng)
+    else:
+        spoil(path, rng)
+    return path
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_unspoilt_inputs_are_read(tmp_path, name):
+    write, read = CASES[name]
+    assert_good(read(write(tmp_path, np.random.default_rng(0))))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", CASES)
+def test_spoilt_inputs_end_in_one_line(tmp_path, name):
+    count = -(-NUM_FUZZED // len(CASES))
+    for seed in range(count):
+        path = make_input(name, seed, tmp_path / str(seed))
+        try:
+            result = CASES[name][1](path)
+        except InputError as error:
+            message = str(error)
+        except Exception as error:
+            raise AssertionError(f"{name}, seed {seed}: {type(error).__name__}: {error}") from error
+        else:
+            message = ""
+            assert_good(result)
+        assert "\n" not in message
+
+
+@pytest.mark.parametrize("claim", ["(99999999999,)", "(2147483647, 2)", "(0, 99999999999)", "(-4, 2)"])
+def test_a_header_that_lies_allocates_nothing(tmp_path, claim):
+    np.save(tmp_path / "a.npy", np.zeros((4, 2)))
+    content = (tmp_path / "a.npy").read_bytes()
+    header = f"{{'descr': '<f8', 'fortran_order': False, 'shape': {claim}, }}"
+    (tmp_path / "a.npy").write_bytes(content[:10] + header.ljust(117).encode() + b"\n" + content[128:])
+    with pytest.raises(InputError, match="NumPy"):
+        io.read_sequence(tmp_path / "a.npy")
+
+
+COMMAND_SEEDS = range(8)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", SCANS)
+def test_the_command_refuses_spoilt_scans_in_one_line(tmp_path, name, capsys, monkeypatch):
+    """Every refusal has exit code 2 and one line; work begins only with scans that were read."""
+    from experiments import deepmapping_2d as command
+    from experiments._command import run_command
+
+    class BegunError(Exception):
+        pass
+
+    def begin(*_):
+        raise BegunError
+
+    monkeypatch.setattr(command, "warm_start", begin)
+    num_refused = 0
+    for seed in COMMAND_SEEDS:
+        path = make_input(f"scans, {name}", seed, tmp_path / str(seed))
+        output = tmp_path / f"out {seed}"
+        arguments = [str(path), "-o", str(output)]
+        code = run_command(command.main, command.Config, experiment="deepmapping_2d", description="", args=arguments)
+        told = capsys.readouterr().err
+        assert not output.exists()
+        if "BegunError" in told:
+            continue
+        num_refused += 1
+        lines = [line for line in told.splitlines() if "WARNING" not in line]
+        assert code == 2, told
+        assert len(lines) == 1, told
+        assert "Traceback" not in told
+    assert num_refused > 0
+
+
+@pytest.mark.parametrize(
+    ("points", "found"),
+    [
+        (np.ones((5, 10, 3)), "scans of 10 beams"),
+        (np.ones((5, 40, 2)), "one and the same"),
+        (np.ones((5, 40, 2)) * 1e5, "m"),
+    ],
+)
+def test_the_command_refuses_what_cannot_be_registered(tmp_path, capsys, points, found):
+    from experiments import deepmapping_2d as command
+    from experiments._command import run_command
+
+    np.save(tmp_path / "a.npy", points)
+    arguments = [str(tmp_path / "a.npy"), "-o", str(tmp_path / "out")]
+    code = run_command(command.main, command.Config, experiment="deepmapping_2d", description="", args=arguments)
+    (line,) = capsys.readouterr().err.splitlines()
+    assert code == 2
+    assert line.startswith(f"dpmjax: error: {tmp_path / 'a.npy'}: ")
+    assert found in line
+    assert not (tmp_path / "out").exists()
