@@ -5,7 +5,7 @@
 
 Three built-in worlds, 50 trajectories of 128 poses and 25 of 256, made by seed. Every trajectory of every method is a
 file of its own, so that a killed run goes on. With --range-noise-px the rows also say the least error that one scan
-allows where the world is known (`dpmjax.simulation.position_bound`). Results: table.md, metrics.json (with all rows),
+allows where the world is known (`dpmjax.metrics.position_bound`). Results: table.md, metrics.json (with all rows),
 boxes.png.
 """
 
@@ -135,17 +135,14 @@ def _measure(method: str, prepare: Callable[[], tuple[Problem, dict[str, float]]
 
 def _bound(world: int, sequence: ScanSequence, range_noise_px: float) -> dict[str, float]:
     """The bound on the ATE, px; nothing without noise."""
-    from dpmjax.simulation import make_world, position_bound
+    from dpmjax.metrics import position_bound
+    from dpmjax.simulation import cast_scans, make_world
 
     if not range_noise_px:
         return {}
     assert sequence.reference_poses is not None
-    bound = position_bound(
-        make_world(world).is_obstacle,
-        sequence.reference_poses,
-        range_noise_px=range_noise_px,
-        num_beams=sequence.mask.shape[1],
-    )
+    cast = partial(cast_scans, make_world(world).is_obstacle, num_beams=sequence.mask.shape[1])
+    bound = position_bound(cast, sequence.reference_poses, range_noise=range_noise_px)
     return {"bound_px": float(np.sqrt(np.mean(bound**2)))}
 
 

@@ -9,7 +9,14 @@ from dpmjax.types import AnyArray
 
 
 def as_float(name: str, value: AnyArray) -> jax.Array:
-    """The array as a JAX float array; floating dtypes are kept, integers become the default float.
+    """Makes a JAX float array; floating dtypes are kept, integers become the default float.
+
+    Args:
+        name: of the argument, for messages.
+        value: the array.
+
+    Returns:
+        The array.
 
     Raises:
         ValueError: `value` is no array of real numbers.
@@ -23,7 +30,15 @@ def as_float(name: str, value: AnyArray) -> jax.Array:
 
 
 def as_points(name: str, value: AnyArray, dimensions: tuple[int, ...] | None = None) -> jax.Array:
-    """The array as float points (n, d), with d one of `dimensions` where given.
+    """Makes float points.
+
+    Args:
+        name: of the argument, for messages.
+        value: the array.
+        dimensions: what d may be; anything above 0 for None.
+
+    Returns:
+        (n, d) points.
 
     Raises:
         ValueError: the shape is another one.
@@ -37,7 +52,15 @@ def as_points(name: str, value: AnyArray, dimensions: tuple[int, ...] | None = N
 
 
 def as_mask(name: str, value: AnyArray | None, shape: tuple[int, ...]) -> jax.Array:
-    """The array as a boolean mask of `shape`; all True for None.
+    """Makes a boolean mask.
+
+    Args:
+        name: of the argument, for messages.
+        value: the array; None stands for all True.
+        shape: of the mask.
+
+    Returns:
+        The mask.
 
     Raises:
         ValueError: the shape is another one, or the dtype is not bool.
@@ -52,18 +75,43 @@ def as_mask(name: str, value: AnyArray | None, shape: tuple[int, ...]) -> jax.Ar
 
 
 def require_shape(name: str, array: jax.Array, shape: tuple[int, ...]) -> None:
-    """Raises a ValueError that names the argument where the shape is not `shape`."""
+    """Checks a shape.
+
+    Args:
+        name: of the argument, for the message.
+        array: the argument.
+        shape: the shape it must have.
+
+    Raises:
+        ValueError: the shape is another one.
+    """
     if array.shape != shape:
         raise ValueError(f"{name}: expected shape {shape}, got {array.shape}")
 
 
 def require_positive(name: str, value: float | AnyArray) -> None:
-    """Raises a ValueError where a number is not above zero; a traced number is let through."""
+    """Checks that a number is above zero; a traced number is let through.
+
+    Args:
+        name: of the argument, for the message.
+        value: the argument.
+
+    Raises:
+        ValueError: the number is zero, negative or NaN.
+    """
     if not isinstance(value, jax.core.Tracer) and not value > 0:
         raise ValueError(f"{name}: expected a number above 0, got {value}")
 
 
 def require_count(name: str, value: int) -> None:
-    """Raises a ValueError where an integer is below one."""
+    """Checks that an integer is at least one.
+
+    Args:
+        name: of the argument, for the message.
+        value: the argument.
+
+    Raises:
+        ValueError: the integer is below one.
+    """
     if value < 1:
         raise ValueError(f"{name}: expected at least 1, got {value}")

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 from dpmjax import sample_free_space
+from dpmjax.geometry.rays import typical_range
 from tests.tolerances import ROUNDING
 
 
@@ -38,3 +39,15 @@ def test_wrong_shapes_are_named(as_user) -> None:
         sample_free_space(jnp.zeros(3), jnp.zeros((4, 2)), jnp.ones(3))
     with pytest.raises(ValueError, match="^factors: expected shape"):
         sample_free_space(jnp.zeros(2), jnp.zeros((4, 2)), jnp.ones((5, 3)))
+
+
+def test_typical_range_is_what_nine_beams_in_ten_stay_below() -> None:
+    # Beam k of scan s ends at range s * k, k from 0 to 100; what is masked does not count, nor does an empty scan.
+    ranges = np.arange(101.0) * np.array([[1], [2], [7], [0]])
+    points = ranges[..., None] * np.array([0.6, 0.8])
+    mask = np.broadcast_to(np.array([[True]] * 3 + [[False]]), ranges.shape)
+    assert typical_range(points, mask) == pytest.approx(180.0)
+    hidden = np.where(np.arange(101) > 50, np.nan, 1.0)[:, None] * points
+    assert typical_range(hidden, mask & (np.arange(101) <= 50)) == pytest.approx(90.0)
+    with pytest.raises(ValueError, match="^mask: expected at least one valid beam"):
+        typical_range(points, np.zeros_like(mask))

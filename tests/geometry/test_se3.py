@@ -8,7 +8,7 @@ from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 
 from dpmjax.geometry import se3
-from tests.tolerances import ACCUMULATED, ROUNDING
+from tests.tolerances import ACCUMULATED, DOUBLE, ROUNDING
 
 
 @pytest.mark.parametrize("scale", [0.0, 1e-6, 1e-3, 0.5, 2.0])
@@ -29,18 +29,27 @@ def test_derivative_of_exp_and_log_at_zero_is_right() -> None:
     np.testing.assert_allclose(round_trip(jnp.zeros(6)), np.eye(6), **ROUNDING)
 
 
-def test_quaternions_are_those_of_scipy_in_file_order() -> None:
-    rotation = Rotation.from_quat(np.random.default_rng(12).normal(size=(50, 4)))
-    xyzw = rotation.as_quat(canonical=True).astype(np.float32)
-    R = rotation.as_matrix().astype(np.float32)
-    np.testing.assert_allclose(se3.rotation_from_quaternion_xyzw(xyzw), R, **ROUNDING)
-    np.testing.assert_allclose(se3.rotation_from_quaternion_xyzw(-3 * xyzw), R, **ROUNDING)
-    np.testing.assert_allclose(se3.quaternion_xyzw_from_rotation(R), xyzw, **ACCUMULATED)
+def random_motions(seed: int, count: int, scale: float = 1.0) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    T = np.tile(np.eye(4), (count, 1, 1))
+    T[:, :3, :3] = Rotation.from_rotvec(scale * rng.uniform(-1.5, 1.5, (count, 3))).as_matrix()
+    T[:, :3, 3] = scale * rng.normal(size=(count, 3))
+    return T
 
 
-def test_zero_quaternion_is_the_identity_with_finite_gradient() -> None:
-    np.testing.assert_array_equal(se3.rotation_from_quaternion_xyzw(jnp.zeros(4)), np.eye(3))
-    assert np.isfinite(jax.jit(jax.jacobian(se3.rotation_from_quaternion_xyzw))(jnp.zeros(4))).all()
+def test_adjoint_moves_steps_to_the_other_side(float64) -> None:
+    T, step = random_motions(3, 10), 0.1 * np.random.default_rng(4).normal(size=(10, 6))
+    moved = np.einsum("nij,nj->ni", se3.adjoint(T), step)
+    np.testing.assert_allclose(se3.exp(moved) @ T, T @ np.asarray(se3.exp(step)), **DOUBLE)
+
+
+@pytest.mark.parametrize("scale", [0.0, 1e-6, 1e-2, 1.0])
+def test_derivative_of_log_is_that_of_finite_differences(scale: float, float64) -> None:
+    T, h = random_motions(5, 4, scale), 1e-6
+    steps = h * np.eye(6)
+    forward, backward = (np.asarray(se3.log(T[:, None] @ np.asarray(se3.exp(sign * steps)))) for sign in (1, -1))
+    expected = np.swapaxes(forward - backward, 1, 2) / (2 * h)
+    np.testing.assert_allclose(se3.log_jacobian(T), expected, rtol=1e-6, atol=1e-6)
 
 
 def test_second_call_compiles_nothing(assert_compiles_nothing) -> None:

@@ -17,6 +17,7 @@ import pytest
 from PIL import Image
 from scipy.io import savemat
 
+import dpmjax
 from dpmjax import io
 from dpmjax.sequences import InputError, LidarSequence, ScanSequence, World
 
@@ -184,6 +185,22 @@ def write_scene(folder, rng):
     return folder
 
 
+PLANAR_GRAPH = """VERTEX_SE2 7 0 0 0
+VERTEX_SE2 3 1 2 0.5
+FIX 3
+EDGE_SE2 7 3 1.1 2.1 0.4 11 12 13 22 23 99
+"""
+SPATIAL_GRAPH = """VERTEX_SE3:QUAT 0 0 0 0 0 0 0 1
+VERTEX_SE3:QUAT 1 1 2 3 0 0 0.6 0.8
+EDGE_SE3:QUAT 0 1 1 2 3 0 0.6 0 0.8 9 0 0 0 0 0 8 0 0 0 0 7 0 0 0 6 0 0 5 0 4
+"""
+
+
+def write_graph(folder, _, *, text):
+    (folder / "a.g2o").write_text(text)
+    return folder / "a.g2o"
+
+
 def write_plan(folder, rng):
     return io.write_world_png(folder / "a.png", World("w", rng.random((20, 30)) < 0.3))
 
@@ -227,6 +244,8 @@ CASES: dict[str, tuple[Write, Read]] = {
         for kind in ("kitti", "raw", "360", "mulran", "carla")
     },
     "drive, learned": (write_learned, read_drive),
+    "graph, planar": (partial(write_graph, text=PLANAR_GRAPH), dpmjax.read_g2o),
+    "graph, spatial": (partial(write_graph, text=SPATIAL_GRAPH), dpmjax.read_g2o),
     "depth folder": (write_pose_folder, lambda path: io.read_pose_folder(path, height=6, width=8)),
     "depth scene": (write_scene, lambda path: io.read_active_vision(path, 3, height=6, width=8)),
     "floor plan": (write_plan, io.read_world_png),

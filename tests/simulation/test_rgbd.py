@@ -167,7 +167,7 @@ def test_active_vision_scenes_are_walked_along_their_links(scene):
     ("name", "content", "message"),
     [
         ("annotations.json", "{", "annotations"),
-        ("image_structs.mat", "text", "pose file"),
+        ("image_structs.mat", "text", "MATLAB"),
         ("cameras.txt", "1 OPENCV 8 six 6 6 3 3\n", "not a camera"),
         ("cameras.txt", "# nothing\n", "no camera"),
     ],

@@ -77,7 +77,7 @@ def _weighted_mean(points: Float[Array, "n d"], weights: Float[Array, " n"]) -> 
 
 
 def _scaled(covariance: Float[Array, "d d"]) -> Float[Array, "d d"]:
-    """The matrix with its largest entry at one: the rotation does not depend on the scale."""
+    """Returns the matrix with its largest entry at one: the rotation does not depend on the scale."""
     largest = lax.stop_gradient(jnp.max(jnp.abs(covariance)))
     return covariance / jnp.where(largest > 0, largest, 1)
 
@@ -108,7 +108,7 @@ def _best_rotation_3d(covariance: Float[Array, "3 3"]) -> Float[Array, "3 3"]:
 
 @jax.custom_jvp
 def _nearest_rotation(H: Float[Array, "3 3"]) -> Float[Array, "3 3"]:
-    """The rotation R that maximises trace(R H)."""
+    """Returns the rotation R that maximises trace(R H)."""
     U, singular_values, V = _signed_svd(H)
     del singular_values
     return jnp.matmul(V, U.T, precision=lax.Precision.HIGHEST)
@@ -129,7 +129,7 @@ def _nearest_rotation_jvp(primals: tuple[jax.Array], tangents: tuple[jax.Array])
 
 
 def _signed_svd(H: Float[Array, "3 3"]) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """U, s, V with H = U diag(s) V^T and V U^T a rotation: the last singular value takes the sign of det H."""
+    """Returns U, s, V with H = U diag(s) V^T and V U^T a rotation: the last singular value takes the sign of det H."""
     U, singular_values, Vt = jnp.linalg.svd(H)
     is_mirrored = jnp.linalg.det(U) * jnp.linalg.det(Vt) < 0
     sign = jnp.where(is_mirrored, -1, 1).astype(H.dtype) * jnp.array([0, 0, 1], H.dtype) + jnp.array([1, 1, 0], H.dtype)

@@ -1,4 +1,4 @@
-"""The motion that most point pairs agree on, where most of the pairs are wrong.
+"""The motion that most point pairs agree on, even if most pairs are wrong.
 
 A rigid motion keeps distances: two right pairs have the same distance between their points on both sides. So right
 pairs agree with each other, and wrong ones only by chance (spectral matching, Leordeanu and Hebert 2005). Two pairs
@@ -26,11 +26,11 @@ from dpmjax.types import AnyArray
 
 @dataclass(frozen=True)
 class ConsensusConfig:
-    """How near is near, and how many motions are tried.
+    """Tolerances, and how many motions are tried.
 
     Attributes:
-        agreement_m: the distances between the points of two pairs may differ by this. Points of two pairs that are
-            nearer to each other than this, on either side, tell nothing.
+        agreement_m: two pairs agree if the distances between their points differ by less than this on the two sides.
+            Points nearer to each other than this, on either side, are not compared.
         inlier_m: a pair farther apart than this under a motion does not support it.
         num_seeds: how many pairs propose a motion.
         num_partners: from how many other pairs each.
@@ -52,13 +52,13 @@ class ConsensusConfig:
 
 @flax.struct.dataclass
 class Consensus:
-    """A motion and who supports it.
+    """A motion and the pairs that support it.
 
     Attributes:
         T_target_source: the motion.
         is_inlier: which pairs are nearer than `inlier_m` under it.
-        support: sum of 1 - error / inlier_m over them, those that say the same counting as one. How much chance gives
-            is for the caller to know.
+        support: sum of 1 - error / inlier_m over the inliers; pairs of nearly the same points count as one. The caller
+            knows how much support arises by chance.
     """
 
     T_target_source: Float[Array, "*b 4 4"]
@@ -124,8 +124,10 @@ def _find_consensus(source: jax.Array, target: jax.Array, mask: jax.Array, *, co
 def _second_order(
     source: Float[Array, "k 3"], target: Float[Array, "k 3"], mask: Bool[Array, " k"], config: ConsensusConfig
 ) -> tuple[Float[Array, "k k"], Float[Array, " k"]]:
-    """For two pairs that agree, how many others agree with both, else 0; and what each pair is worth: those that say
-    the same, their points being nearer than `agreement_m` on both sides, share one vote.
+    """Returns second-order compatibility and votes.
+
+    The compatibility of two pairs that agree is the number of other pairs that agree with both, else 0. Pairs whose
+    points are nearer to each other than `agreement_m` on both sides share one vote.
     """
     lengths, other_lengths = _distances(source), _distances(target)
     is_pair = mask[:, None] & mask[None, :]
@@ -145,7 +147,7 @@ def _distances(points: Float[Array, "k 3"]) -> Float[Array, "k k"]:
 def _closeness(
     T: Float[Array, "4 4"], source: Float[Array, "k 3"], target: Float[Array, "k 3"], config: ConsensusConfig
 ) -> Float[Array, " k"]:
-    """1 for a pair that meets under the motion, falling to 0 at `inlier_m`."""
+    """Returns 1 for a pair that meets under the motion, falling to 0 at `inlier_m`."""
     errors = jnp.sqrt(jnp.sum((rigid.transform_points(T, source) - target) ** 2, axis=1))
     return jnp.maximum(1 - errors / config.inlier_m, 0)
 

@@ -27,7 +27,7 @@ def k_nearest(
 
     Args:
         queries: where to search, in the frame and unit of `points`.
-        points: what is searched.
+        points: the searched points.
         k: how many neighbours; may exceed the number of points.
         mask: False for points that are not there; they may hold anything.
 
@@ -53,6 +53,16 @@ def radius_search(
     """The nearest points within a radius of each query, at most `max_neighbours`; otherwise as `k_nearest`.
 
     A point at exactly `radius` is within it. Changing the radius does not compile again.
+
+    Args:
+        queries: where to search, in the frame and unit of `points`.
+        points: the searched points.
+        radius: largest distance of a neighbour.
+        max_neighbours: how many neighbours are kept.
+        mask: False for points that are not there; they may hold anything.
+
+    Returns:
+        Neighbours (m, max_neighbours), nearest first; masked where there are fewer.
 
     Raises:
         ValueError: the shapes do not match, `max_neighbours` is below 1, or `radius` is not above 0.

@@ -44,6 +44,9 @@ def estimate_normals(
         mask: False for points that are not there; they may hold anything.
         radius: neighbours farther away than this do not count; unlimited by default.
 
+    Returns:
+        A unit normal for each point, how flat its neighbourhood is, and where there is one.
+
     Raises:
         ValueError: the shapes do not match, k is below d, or `radius` is not above 0.
     """
@@ -78,7 +81,7 @@ def _estimate_normals(points: jax.Array, mask: jax.Array, radius: jax.Array, *, 
 def _covariance(
     points: Float[Array, "n d"], near: Neighbours, weights: Float[Array, "n k"]
 ) -> tuple[Float[Array, "n d d"], Float[Array, " n"]]:
-    """The scatter of each neighbourhood about its mean, and its trace."""
+    """Returns the scatter of each neighbourhood about its mean, and its trace."""
     difference = jnp.where(weights[..., None] > 0, points[near.indices] - points[:, None], 0)
     count = jnp.maximum(jnp.sum(weights, axis=1), 1)
     centred = difference - (jnp.sum(difference, axis=1) / count[:, None])[:, None]

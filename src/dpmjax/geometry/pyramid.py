@@ -88,6 +88,9 @@ def build_pyramid(
         mask: False for points that are not there; they may hold anything. All are there for None.
         config: sizes and radii; hashable, so that a second call with it compiles nothing.
 
+    Returns:
+        The levels from fine to coarse, and the interpolations from coarse to fine.
+
     Raises:
         ValueError: there are no points, or the shapes do not match.
     """

@@ -32,7 +32,7 @@ def build_pyramid_on_host(
     *,
     num_threads: int = 2,
 ) -> PointPyramid:
-    """What `build_pyramid` returns, as arrays of NumPy, the same up to rounding.
+    """Builds the pyramid of `build_pyramid` as arrays of NumPy; the two are the same up to rounding.
 
     Neighbours are measured in float64. So two that are equally near up to the rounding of float32 may come in the other
     order; points that coincide come in that of the array, here as there.
@@ -42,6 +42,9 @@ def build_pyramid_on_host(
         mask: False for points that are not there; they may hold anything. All are there for None.
         config: sizes and radii.
         num_threads: of the neighbour search.
+
+    Returns:
+        The pyramid.
 
     Raises:
         ValueError: there are no points, the shapes do not match, or `num_threads` is below 1.
@@ -86,6 +89,14 @@ def farthest_points_on_host(
 
     Where the first valid point is also the one farthest from the origin (`preprocess_scan` sees to that), points are
     kept in buckets of a tree (QuickFPS, Han et al. 2023): four times faster, with the same result.
+
+    Args:
+        points: candidates.
+        mask: False for points that are not there.
+        num_samples: how many to choose.
+
+    Returns:
+        Rows of the points.
     """
     rows = np.flatnonzero(mask)
     num_samples = min(num_samples, len(rows))
@@ -98,7 +109,7 @@ def farthest_points_on_host(
 
 
 def _sample_by_buckets(points: Float[np.ndarray, "n 3"], num_samples: int) -> Int[np.ndarray, " s"] | None:
-    """The samples, starting at point 0; None where that is not to be had."""
+    """Returns the samples, starting at point 0; None where buckets cannot give them."""
     if len(points) < MIN_BUCKETED_POINTS or num_samples < 2:
         return None
     ranges = np.sqrt(np.sum(points.astype(np.float64) ** 2, axis=1))
@@ -131,7 +142,7 @@ class _Searchable:
         self.tree = cKDTree(self.points, leafsize=16, balanced_tree=False, compact_nodes=False)
 
     def nearest(self, queries: Float[np.ndarray, "m 3"], k: int) -> _Found:
-        """The min(k, n) nearest of each query, nearest first; of equally near ones the lower index first."""
+        """Returns the min(k, n) nearest of each query, nearest first; of equally near ones the lower index first."""
         num_points = len(self.points)
         num_found = min(k, num_points)
         if num_found == 0:

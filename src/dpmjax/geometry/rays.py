@@ -1,4 +1,4 @@
-"""Rays between the sensor and what it hit: samples of free space on them, and their typical length."""
+"""Beams of a range sensor: samples of the free space on them, and how far they typically reach."""
 
 from __future__ import annotations
 
@@ -34,16 +34,23 @@ def sample_free_space(
     return origin + factors[..., None] * (points - origin)[:, None, :]
 
 
-def typical_range(points: Float[AnyArray, "n *beams d"], mask: Bool[AnyArray, "n *beams"]) -> float:
-    """The range that nine beams in ten of a scan stay below, median over the scans: the unit of length of a fit.
+def typical_range(points: Float[AnyArray, "n b d"], mask: Bool[AnyArray, "n b"]) -> float:
+    """The range that nine beams in ten of a scan stay below, as the median over the scans.
 
     Args:
-        points: beam end points of n scans in their sensor frames, any unit; planar scans or depth images.
-        mask: False for beams that measured nothing; they may hold anything.
+        points: beam end points, each scan in its own sensor frame.
+        mask: True where a beam measured something; scans without any do not count.
 
     Returns:
-        The range, in the unit of the points. Scans without a valid beam are left out; 1 if no scan has one.
+        The range, in the unit of the points.
+
+    Raises:
+        ValueError: no beam measured anything.
     """
-    ranges = np.linalg.norm(np.asarray(points, np.float32), axis=-1)
-    far = [np.percentile(r[m], 90) for r, m in zip(ranges, np.asarray(mask), strict=True) if m.any()]
-    return float(np.median(far)) if far else 1.0
+    ranges, mask = np.linalg.norm(np.asarray(points), axis=-1), np.asarray(mask)
+    of_scans = [
+        np.percentile(beams[is_valid], 90) for beams, is_valid in zip(ranges, mask, strict=True) if is_valid.any()
+    ]
+    if not of_scans:
+        raise ValueError("mask: expected at least one valid beam, got none")
+    return float(np.median(of_scans))

@@ -13,7 +13,14 @@ from dpmjax.types import AnyArray
 
 
 def inverse(T_a_b: Any) -> Any:
-    """`T_b_a` of a rigid motion (..., d+1, d+1), exact in the rotation; NumPy arrays stay NumPy's, float64."""
+    """Inverts a rigid motion, exactly in its rotation.
+
+    Args:
+        T_a_b: (..., d+1, d+1), of NumPy or of JAX.
+
+    Returns:
+        `T_b_a`, of the same kind and shape.
+    """
     xp = jnp if isinstance(T_a_b, jax.Array) else np
     dim = T_a_b.shape[-1] - 1
     R_b_a = xp.swapaxes(T_a_b[..., :dim, :dim], -1, -2)
@@ -26,7 +33,14 @@ def inverse(T_a_b: Any) -> Any:
 def transform_points(
     T_a_b: Float[AnyArray, "... d1 d1"], points_b: Float[AnyArray, "... n d"]
 ) -> Float[Array, "... n d"]:
-    """Points in a, from points in b; d = 2 or 3, and the leading axes of both broadcast.
+    """Moves points from b to a.
+
+    Args:
+        T_a_b: homogeneous matrices; their leading axes broadcast with those of the points.
+        points_b: points in b, d = 2 or 3.
+
+    Returns:
+        (..., n, d) points in a.
 
     Raises:
         ValueError: the matrix is not (d+1, d+1).

@@ -27,6 +27,9 @@ def farthest_point_sample(
         num_samples: how many to choose.
         mask: False for points that are not there; they may hold anything.
 
+    Returns:
+        (num_samples,) int32 rows of the points.
+
     Raises:
         ValueError: there are no points, the shapes do not match, or `num_samples` is below 1.
     """
@@ -44,6 +47,14 @@ def voxel_sample(
 
     The voxel of a point is `floor(point / voxel_size)`, computed in the dtype of the points and exact for up to 2^31
     voxels an axis. The shape is that of the input; changing the voxel size does not compile again.
+
+    Args:
+        points: the points.
+        voxel_size: edge of a voxel, in the unit of the points.
+        mask: False for points that are not there; they may hold anything.
+
+    Returns:
+        (n,) True for the points that are kept.
 
     Raises:
         ValueError: the shapes do not match, or `voxel_size` is not above 0.

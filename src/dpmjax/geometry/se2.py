@@ -22,17 +22,32 @@ Poses = NDArray[np.float64]
 
 
 def _namespace(*arrays: Any) -> ModuleType:
-    """`jax.numpy` as soon as one array is JAX's, else `numpy`."""
+    """Returns `jax.numpy` as soon as one array is JAX's, else `numpy`."""
     return jnp if any(isinstance(array, jax.Array) for array in arrays) else np
 
 
 def wrap_angle(angle: Any) -> Any:
-    """The same angle in [-pi, pi]; small angles come back unchanged, and the derivative is 1 everywhere."""
+    """Wraps angles; small angles come back unchanged, and the derivative is 1 everywhere.
+
+    Args:
+        angle: radians, any shape.
+
+    Returns:
+        The same angles in [-pi, pi].
+    """
     return angle - 2 * np.pi * _namespace(angle).round(angle / (2 * np.pi))
 
 
 def compose(pose_a_b: Any, pose_b_c: Any) -> Any:
-    """The pose of c in a: `T_a_c = T_a_b @ T_b_c`, (..., 3) each."""
+    """Composes two motions: `T_a_c = T_a_b @ T_b_c`.
+
+    Args:
+        pose_a_b: (..., 3) pose of b in a.
+        pose_b_c: (..., 3) pose of c in b; leading axes broadcast.
+
+    Returns:
+        (..., 3) pose of c in a.
+    """
     xp = _namespace(pose_a_b, pose_b_c)
     cos, sin = xp.cos(pose_a_b[..., 2]), xp.sin(pose_a_b[..., 2])
     x = pose_a_b[..., 0] + cos * pose_b_c[..., 0] - sin * pose_b_c[..., 1]
@@ -41,7 +56,14 @@ def compose(pose_a_b: Any, pose_b_c: Any) -> Any:
 
 
 def inverse(pose_a_b: Any) -> Any:
-    """The pose of a in b, (..., 3)."""
+    """Inverts a motion.
+
+    Args:
+        pose_a_b: (..., 3) pose of b in a.
+
+    Returns:
+        (..., 3) pose of a in b.
+    """
     xp = _namespace(pose_a_b)
     x, y, heading = pose_a_b[..., 0], pose_a_b[..., 1], pose_a_b[..., 2]
     cos, sin = xp.cos(heading), xp.sin(heading)
@@ -49,7 +71,15 @@ def inverse(pose_a_b: Any) -> Any:
 
 
 def relative(pose_w_a: Any, pose_w_b: Any) -> Any:
-    """The pose of b in a: `T_a_b = inverse(T_w_a) @ T_w_b`, (..., 3) each."""
+    """Finds the motion between two poses: `T_a_b = inverse(T_w_a) @ T_w_b`.
+
+    Args:
+        pose_w_a: (..., 3) pose of a in any frame w.
+        pose_w_b: (..., 3) pose of b in w; leading axes broadcast.
+
+    Returns:
+        (..., 3) pose of b in a.
+    """
     xp = _namespace(pose_w_a, pose_w_b)
     cos, sin = xp.cos(pose_w_a[..., 2]), xp.sin(pose_w_a[..., 2])
     # The difference first: poses far from the origin lose no digits to each other.
@@ -74,14 +104,28 @@ def chain(steps: Poses) -> Poses:
 
 
 def rotation(heading: Any) -> Any:
-    """Rotation matrices (..., 2, 2) of headings (...)."""
+    """Makes rotation matrices.
+
+    Args:
+        heading: (...) radians.
+
+    Returns:
+        (..., 2, 2).
+    """
     xp = _namespace(heading)
     cos, sin = xp.cos(heading), xp.sin(heading)
     return xp.stack([xp.stack([cos, -sin], axis=-1), xp.stack([sin, cos], axis=-1)], axis=-2)
 
 
 def to_matrix(pose_a_b: Any) -> Any:
-    """The homogeneous matrix `T_a_b` (..., 3, 3) of a pose (..., 3)."""
+    """Makes homogeneous matrices.
+
+    Args:
+        pose_a_b: (..., 3).
+
+    Returns:
+        `T_a_b` (..., 3, 3).
+    """
     xp = _namespace(pose_a_b)
     x, y = pose_a_b[..., 0], pose_a_b[..., 1]
     cos, sin = xp.cos(pose_a_b[..., 2]), xp.sin(pose_a_b[..., 2])
@@ -91,13 +135,28 @@ def to_matrix(pose_a_b: Any) -> Any:
 
 
 def from_matrix(T_a_b: Any) -> Any:
-    """The pose (..., 3), heading in [-pi, pi], of a homogeneous matrix (..., 3, 3)."""
+    """Reads poses off homogeneous matrices.
+
+    Args:
+        T_a_b: (..., 3, 3).
+
+    Returns:
+        (..., 3) poses, heading in [-pi, pi].
+    """
     xp = _namespace(T_a_b)
     return xp.stack([T_a_b[..., 0, 2], T_a_b[..., 1, 2], xp.arctan2(T_a_b[..., 1, 0], T_a_b[..., 0, 0])], axis=-1)
 
 
 def transform_points(pose_a_b: Any, points_b: Any) -> Any:
-    """Points in a: poses (..., 3) and points (..., n, 2) of one scan each -> (..., n, 2)."""
+    """Moves the points of each scan by its pose.
+
+    Args:
+        pose_a_b: (..., 3).
+        points_b: (..., n, 2) points in b.
+
+    Returns:
+        (..., n, 2) points in a.
+    """
     xp = _namespace(pose_a_b, points_b)
     cos, sin = xp.cos(pose_a_b[..., 2, None]), xp.sin(pose_a_b[..., 2, None])
     x = cos * points_b[..., 0] - sin * points_b[..., 1] + pose_a_b[..., 0, None]
@@ -106,7 +165,14 @@ def transform_points(pose_a_b: Any, points_b: Any) -> Any:
 
 
 def adjoint(pose_a_b: Any) -> Any:
-    """The adjoint (..., 3, 3) of T_a_b on tangents (dx, dy, dheading): moves them from b to a."""
+    """Makes the adjoint, which moves tangents (dx, dy, dheading) from b to a.
+
+    Args:
+        pose_a_b: (..., 3).
+
+    Returns:
+        (..., 3, 3).
+    """
     xp = _namespace(pose_a_b)
     cos, sin = xp.cos(pose_a_b[..., 2]), xp.sin(pose_a_b[..., 2])
     zero, one = xp.zeros_like(cos), xp.ones_like(cos)
@@ -116,7 +182,14 @@ def adjoint(pose_a_b: Any) -> Any:
 
 @jax.jit
 def exp(tangent: Float[AnyArray, "... 3"]) -> Float[Array, "... 3 3"]:
-    """The matrix of a planar twist (vx, vy, angle); the gradient is right at zero too."""
+    """Makes the motion of a planar twist; the gradient is right at zero too.
+
+    Args:
+        tangent: (..., 3) vx, vy, angle.
+
+    Returns:
+        (..., 3, 3) homogeneous matrices.
+    """
     with jax.default_matmul_precision("highest"):
         return jaxlie.SE2.exp(jnp.asarray(tangent)).as_matrix()
 

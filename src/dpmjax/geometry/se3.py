@@ -15,14 +15,28 @@ from dpmjax.types import AnyArray
 
 @jax.jit
 def exp(tangent: Float[AnyArray, "... 6"]) -> Float[Array, "... 4 4"]:
-    """The motion of a twist (vx, vy, vz, wx, wy, wz); the gradient is right at zero too."""
+    """Makes the motion of a twist; the gradient is right at zero too.
+
+    Args:
+        tangent: (..., 6) vx, vy, vz, wx, wy, wz.
+
+    Returns:
+        (..., 4, 4) homogeneous matrices.
+    """
     with jax.default_matmul_precision("highest"):
         return jaxlie.SE3.exp(jnp.asarray(tangent)).as_matrix()
 
 
 @jax.jit
 def log(T: Float[AnyArray, "... 4 4"]) -> Float[Array, "... 6"]:
-    """The twist (vx, vy, vz, wx, wy, wz) of a motion, of angle at most pi; not smooth at half a turn."""
+    """Finds the twist of a motion; not smooth at half a turn.
+
+    Args:
+        T: (..., 4, 4) homogeneous matrices.
+
+    Returns:
+        (..., 6) vx, vy, vz, wx, wy, wz, of angle at most pi.
+    """
     with jax.default_matmul_precision("highest"):
         return jaxlie.SE3.from_matrix(jnp.asarray(T)).log()
 
@@ -51,20 +65,3 @@ def adjoint(T_a_b: Float[AnyArray, "... 4 4"]) -> Float[Array, "... 6 6"]:
     """
     with jax.default_matmul_precision("highest"):
         return jaxlie.SE3.from_matrix(jnp.asarray(T_a_b)).adjoint()
-
-
-@jax.jit
-def rotation_from_quaternion_xyzw(quaternion: Float[AnyArray, "... 4"]) -> Float[Array, "... 3 3"]:
-    """The rotation matrix of a quaternion in file order x, y, z, w, of any length; of zero, the identity."""
-    xyzw = jnp.asarray(quaternion)
-    is_zero = jnp.sum(xyzw**2, axis=-1, keepdims=True) == 0
-    xyzw = jnp.where(is_zero, jnp.array([0, 0, 0, 1], xyzw.dtype), xyzw)
-    unit = xyzw / jnp.sqrt(jnp.sum(xyzw**2, axis=-1, keepdims=True))
-    return jaxlie.SO3.from_quaternion_xyzw(unit).as_matrix()
-
-
-@jax.jit
-def quaternion_xyzw_from_rotation(R: Float[AnyArray, "... 3 3"]) -> Float[Array, "... 4"]:
-    """The unit quaternion of a rotation matrix in file order x, y, z, w, with w >= 0."""
-    xyzw = jaxlie.SO3.from_matrix(jnp.asarray(R)).as_quaternion_xyzw()
-    return jnp.where(xyzw[..., 3:] < 0, -xyzw, xyzw)

@@ -1,3 +1,7 @@
+from .clouds import read_pcd as read_pcd
+from .clouds import read_ply as read_ply
+from .clouds import write_pcd as write_pcd
+from .clouds import write_ply as write_ply
 from .depth import Camera as Camera
 from .depth import DepthSequence as DepthSequence
 from .depth import is_active_vision as is_active_vision
@@ -11,12 +15,8 @@ from .lidar.kitti import write_kitti_sequence as write_kitti_sequence
 from .lidar.readers import LidarSequence as LidarSequence
 from .lidar.readers import list_lidar_sequences as list_lidar_sequences
 from .lidar.readers import open_lidar_sequence as open_lidar_sequence
-from .pcd import read_pcd as read_pcd
-from .pcd import write_pcd as write_pcd
 from .pictures import read_world_png as read_world_png
 from .pictures import write_world_png as write_world_png
-from .ply import read_ply as read_ply
-from .ply import write_ply as write_ply
 from .poses import read_planar_poses as read_planar_poses
 from .poses import read_poses as read_poses
 from .poses import write_kitti as write_kitti

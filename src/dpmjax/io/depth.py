@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dpmjax.io.files import natural_key, read_bytes, read_lines, read_table
+from dpmjax.io.mat import parse_mat
 from dpmjax.io.pictures import read_depth_png
 from dpmjax.sequences import ACTIVE_VISION, Camera, DepthSequence, InputError
 
@@ -202,20 +203,18 @@ def _walk(known: list[str], links: dict[str, Any], num_views: int, rng: np.rando
 
 def _read_scene_poses(path: Path) -> dict[str, NDArray[np.float64]]:
     """T_world_camera of every image that the reconstruction has placed, metres."""
-    from scipy.io import loadmat
-
     poses = {}
+    variables = parse_mat(read_bytes(path), path)
     try:
-        content = loadmat(path, squeeze_me=True, struct_as_record=False)
-        scale_m = float(content["scale"]) / 1000.0
-        for entry in np.atleast_1d(content["image_structs"]):
-            R, t = np.asarray(entry.R, np.float64), np.asarray(entry.t, np.float64).reshape(-1)
+        scale_m = float(variables["scale"].item()) / 1000.0
+        for entry in variables["image_structs"]:
+            R, t = np.asarray(entry["R"], np.float64), np.asarray(entry["t"], np.float64).reshape(-1)
             if R.shape != (3, 3) or t.shape != (3,) or not (np.isfinite(R).all() and np.isfinite(t).all()):
                 continue  # not placed by the reconstruction
             T = np.eye(4)
             T[:3, :3], T[:3, 3] = R.T, -R.T @ t * scale_m
-            poses[str(entry.image_name)] = T
-    except Exception as error:  # SciPy raises whatever its parser trips over.
+            poses[str(entry["image_name"])] = T
+    except (KeyError, ValueError, TypeError, AttributeError) as error:
         found = f"not the dataset's pose file ({type(error).__name__})"
         raise InputError(path, found, "copy image_structs.mat of the scene") from error
     return poses

@@ -220,14 +220,19 @@ def load_arrays(path: str | Path, keys: Sequence[str] | None = None) -> dict[str
         with zipfile.ZipFile(path) as archive:
             members = {entry.filename.removesuffix(".npy"): entry for entry in archive.infolist()}
             chosen = {key: members[key] for key in (members if keys is None else keys) if key in members}
-            if any(m.file_size > _LARGEST_COMPRESSION * (m.compress_size + 64) for m in chosen.values()):
-                raise ValueError("a member claims more bytes than its packed size can hold")
-            return {key: _parse_npy(archive.read(member)) for key, member in chosen.items()}
+            return {key: _parse_npy(_unpack(archive, member)) for key, member in chosen.items()}
     except FileNotFoundError as error:
         raise InputError(path, "no such file", "check the path") from error
     except Exception as error:  # The parsers of zip, zlib and NumPy headers raise many kinds.
         found = f"not a readable NumPy file ({error})"
         raise InputError(path, found, "save it again with numpy.save or numpy.savez") from error
+
+
+def _unpack(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> bytes:
+    """The bytes of a member; a ValueError where it claims more than its packed size can hold."""
+    if member.file_size > _LARGEST_COMPRESSION * (member.compress_size + 64):
+        raise ValueError(f"{member.filename} claims {member.file_size} bytes, packed into {member.compress_size}")
+    return archive.read(member)
 
 
 def _parse_npy(content: bytes) -> NDArray[np.generic]:

@@ -15,8 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from dpmjax.io.files import InputError, write_atomically
+from dpmjax.io.files import read_lines, write_atomically
 from dpmjax.pose_graph.graph import Edges, PoseGraph
+from dpmjax.sequences import InputError
 
 
 class _Kind(NamedTuple):
@@ -31,14 +32,14 @@ class _Kind(NamedTuple):
 _PLANAR = _Kind("VERTEX_SE2", "EDGE_SE2", 3, 3)
 _SPATIAL = _Kind("VERTEX_SE3:QUAT", "EDGE_SE3:QUAT", 7, 6)
 _ADVICE = "give VERTEX_SE2 and EDGE_SE2, or VERTEX_SE3:QUAT and EDGE_SE3:QUAT lines"
-_PASSED_OVER = ("PARAMS_SE2OFFSET", "PARAMS_SE3OFFSET")
+_IGNORED = ("PARAMS_SE2OFFSET", "PARAMS_SE3OFFSET")
 
 
 def read_g2o(path: str | Path) -> PoseGraph:
     """Reads a pose graph.
 
     Args:
-        path: the file. Empty lines, lines with # in front and sensor offsets (PARAMS_...) are passed over.
+        path: the file. Empty lines, lines with # in front and sensor offsets (PARAMS_...) are ignored.
 
     Returns:
         The graph; nodes in the order of the file, those after FIX fixed.
@@ -47,7 +48,7 @@ def read_g2o(path: str | Path) -> PoseGraph:
         InputError: no such file, an unknown line, a wrong number of values, both kinds in one file, a node that occurs
             twice or not at all, or numbers that make no poses or information matrices.
     """
-    lines = _read_lines(Path(path))
+    lines = _read_words(path)
     tags = {words[0] for _, words in lines} - {"FIX"}
     kind = _PLANAR if tags <= {_PLANAR.vertex, _PLANAR.edge} else _SPATIAL
     for number, words in lines:
@@ -100,14 +101,10 @@ def write_g2o(path: str | Path, graph: PoseGraph) -> Path:
     return write_atomically(path, "\n".join(lines) + "\n")
 
 
-def _read_lines(path: Path) -> list[tuple[int, list[str]]]:
+def _read_words(path: str | Path) -> list[tuple[int, list[str]]]:
     """The words of each line that is read, and its number."""
-    try:
-        text = path.read_text(encoding="utf-8", errors="replace")
-    except OSError as error:
-        raise InputError(path, f"cannot be read ({error.strerror})", "check the path") from error
-    lines = ((number, line.split()) for number, line in enumerate(text.splitlines(), 1) if line.strip()[:1] != "#")
-    return [(number, words) for number, words in lines if words and words[0] not in _PASSED_OVER]
+    lines = ((number, line.split()) for number, line in enumerate(read_lines(path), 1) if line.strip()[:1] != "#")
+    return [(number, words) for number, words in lines if words and words[0] not in _IGNORED]
 
 
 def _rows(

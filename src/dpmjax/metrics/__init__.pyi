@@ -1,3 +1,4 @@
+from .position_bound import position_bound as position_bound
 from .recall import RegistrationRecall as RegistrationRecall
 from .recall import registration_recall as registration_recall
 from .trajectory import RelativePoseError as RelativePoseError

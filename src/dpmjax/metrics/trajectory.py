@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from numpy.typing import NDArray
 
+from dpmjax.geometry import rigid
 from dpmjax.types import AnyArray
 
 
@@ -33,6 +34,10 @@ def align_rigid(estimated: Float[AnyArray, "n d"], reference: Float[AnyArray, "n
 
     Least squares in closed form (Horn 1987). What the positions leave open (n = 1; in 3-D all on one line) is settled
     by the rotation nearest to the identity.
+
+    Args:
+        estimated: (n, 2) or (n, 3) positions.
+        reference: the same positions in another frame, the same unit.
 
     Returns:
         `T_reference_estimated`, (d+1, d+1) float64.
@@ -64,8 +69,11 @@ def absolute_trajectory_error(estimated: Float[AnyArray, "n d"], reference: Floa
         estimated: positions, (n, 2) or (n, 3).
         reference: the same positions in another frame, the same unit.
 
+    Returns:
+        The error, in the unit of the positions.
+
     Raises:
-        ValueError: as `align_rigid`.
+        ValueError: the shapes differ, are not (n, 2) or (n, 3) with n >= 1, or a number is not finite.
     """
     T = align_rigid(estimated, reference)
     aligned = _transform(T, np.asarray(estimated, np.float64))
@@ -80,6 +88,14 @@ def relative_pose_error(
     The error of a pair is inv(inv(Q_i) Q_j) inv(P_i) P_j with P estimated, Q the reference and j = i + delta. It does
     not depend on the frame of either trajectory.
 
+    Args:
+        estimated: (n, 3, 3) or (n, 4, 4) `T_world_scan`.
+        reference: the same poses in another frame, the same unit.
+        delta: how many poses apart the two of a pair are.
+
+    Returns:
+        Root mean squares over all pairs.
+
     Raises:
         ValueError: the shapes differ, are not (n, 3, 3) or (n, 4, 4), a number is not finite, or `delta` is not in
             [1, n - 1].
@@ -89,9 +105,9 @@ def relative_pose_error(
     num_poses = len(estimated)
     if not 1 <= delta < num_poses:
         raise ValueError(f"delta: expected 1 <= delta < {num_poses}, the number of poses, got {delta}")
-    moved_estimated = _invert(estimated[:-delta]) @ estimated[delta:]
-    moved_reference = _invert(reference[:-delta]) @ reference[delta:]
-    error = _invert(moved_reference) @ moved_estimated
+    moved_estimated = rigid.inverse(estimated[:-delta]) @ estimated[delta:]
+    moved_reference = rigid.inverse(reference[:-delta]) @ reference[delta:]
+    error = rigid.inverse(moved_reference) @ moved_estimated
     angles = _rotation_angle(error[:, :-1, :-1])
     squared_lengths = np.sum(error[:, :-1, -1] ** 2, axis=1)
     return RelativePoseError(
@@ -114,6 +130,9 @@ def point_distance(
         mask: False for points that are not there; they may hold anything.
         T_estimated: `T_world_scan` of each scan.
         T_reference: the same, in the reference's world.
+
+    Returns:
+        The distance, in the unit of the points.
 
     Raises:
         ValueError: the shapes do not match, a number is not finite, or no point is valid.
@@ -170,16 +189,8 @@ def _transform(T: NDArray[np.float64], points: NDArray[np.float64]) -> NDArray[n
     return points @ np.swapaxes(T[..., :dim, :dim], -1, -2) + T[..., None, :dim, dim]
 
 
-def _invert(T: NDArray[np.float64]) -> NDArray[np.float64]:
-    inverse = np.zeros_like(T)
-    inverse[:, :-1, :-1] = np.swapaxes(T[:, :-1, :-1], 1, 2)
-    inverse[:, :-1, -1] = -np.einsum("nij,nj->ni", inverse[:, :-1, :-1], T[:, :-1, -1])
-    inverse[:, -1, -1] = 1
-    return inverse
-
-
 def _rotation_angle(R: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The angle of rotation matrices in [0, pi], exact for small angles (an arc cosine is not)."""
+    """Returns the angle of rotation matrices in [0, pi], exact for small angles (an arc cosine is not)."""
     skew = (R - np.swapaxes(R, 1, 2)) / 2
     sin = np.sqrt(np.sum(skew**2, axis=(1, 2)) / 2)
     trace = np.trace(R, axis1=1, axis2=2)

@@ -57,7 +57,7 @@ def _solve_linear(
     weight: NDArray[np.float64],
     constant: Float[np.ndarray, "e d k"] | float = 0.0,
 ) -> Float[np.ndarray, "n d k"]:
-    """Least squares of jacobian @ unknowns - constant, the values of held nodes given; k right sides at once."""
+    """Returns what minimises |jacobian @ unknowns - constant|, zero for held nodes; k right sides at once."""
     weighted = weight[:, None, None, None] * np.swapaxes(jacobian, 2, 3)
     blocks = weighted[:, :, None] @ jacobian[:, None]
     residual = (jacobian @ held[pattern.nodes]).sum(axis=1) - constant

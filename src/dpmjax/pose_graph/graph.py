@@ -14,6 +14,8 @@ Indices = NDArray[np.int64]
 
 _TANGENT_SIZE = {(3,): 3, (4, 4): 6}
 """Degrees of freedom of a pose by its shape: x, y, heading in the plane; a homogeneous matrix in space."""
+_ROUNDING = 1e-5
+"""How far, relative to the largest entry, an information matrix may be off for having been computed in float32."""
 
 
 class Edges(NamedTuple):
@@ -149,10 +151,12 @@ def _check_edges(graph: PoseGraph) -> None:
         is_node = (rows >= 0) & (rows < size)
         _require(bool(is_node.all()), name, f"rows of nodes in [0, {size})", rows[~is_node][:1])
     is_loop = edges.source == edges.target
-    _require(not is_loop.any(), "source", "another node than the target", f"the same in edges {np.flatnonzero(is_loop)[:3]}")
+    _require(
+        not is_loop.any(), "source", "another node than the target", f"the same in edges {np.flatnonzero(is_loop)[:3]}"
+    )
     for name in ("measurements", "information"):
         _require_finite(name, getattr(edges, name))
     information, scale = edges.information, np.abs(edges.information).max(axis=(1, 2), initial=0.0)
-    is_symmetric = (np.abs(information - np.swapaxes(information, 1, 2)).max(axis=(1, 2)) <= 1e-9 * scale).all()
-    is_positive = (np.linalg.eigvalsh(information)[:, 0] >= -1e-6 * scale).all()
+    is_symmetric = (np.abs(information - np.swapaxes(information, 1, 2)).max(axis=(1, 2)) <= _ROUNDING * scale).all()
+    is_positive = (np.linalg.eigvalsh(information)[:, 0] >= -_ROUNDING * scale).all()
     _require(bool(is_symmetric and is_positive), "information", "symmetric, positive semidefinite matrices", "others")

@@ -7,6 +7,7 @@ block for every pair of them, its share of J^T W r a vector for each.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 import scipy.sparse as sp
@@ -111,25 +112,28 @@ class BlockPattern:
 
 
 def _free_blocks(rows: Indices) -> tuple[Indices, Indices, Indices]:
-    """The blocks (m * s * s in all) between free nodes, and their block rows and columns."""
+    """Returns which of the m * s * s blocks are between free nodes, and their block rows and columns."""
     block_row, block_column = (x.ravel() for x in np.broadcast_arrays(rows[:, :, None], rows[:, None, :]))
     used = np.flatnonzero((block_row >= 0) & (block_column >= 0))
     return used, block_row[used], block_column[used]
 
 
 def _elimination_order(block_row: Indices, block_column: Indices, num_free: int) -> Indices:
-    """The rank of each free node by minimum degree: few new entries in the factors."""
+    """Returns the rank of each free node by minimum degree, which keeps the factors sparse."""
     if num_free == 0:
         return np.zeros(0, np.int64)
     ones = np.ones(len(block_row))
     joined = sp.csc_matrix((ones, (block_row, block_column)), (num_free, num_free))
     # The numbers only have to make a matrix that needs no pivots.
-    return _factorise(joined + sp.diags(2.0 * joined.sum(axis=0).A1 + 1.0), "MMD_AT_PLUS_A").perm_c.astype(np.int64)
+    return _factorise(joined, 2.0 * joined.sum(axis=0).A1 + 1.0, "MMD_AT_PLUS_A").perm_c.astype(np.int64)
 
 
-def _factorise(matrix: sp.spmatrix, order: str) -> scipy.sparse.linalg.SuperLU:
+def _factorise(
+    matrix: sp.csc_matrix, diagonal: Floats, order: Literal["NATURAL", "MMD_AT_PLUS_A"]
+) -> scipy.sparse.linalg.SuperLU:
     options = {"SymmetricMode": True}
-    return scipy.sparse.linalg.splu(matrix.tocsc(), permc_spec=order, diag_pivot_thresh=0.0, options=options)
+    damped = (matrix + sp.diags(diagonal)).tocsc()
+    return scipy.sparse.linalg.splu(damped, permc_spec=order, diag_pivot_thresh=0.0, options=options)
 
 
 def solve_symmetric(matrix: sp.csc_matrix, right: Floats, extra: Floats | float = 0.0) -> Floats:
@@ -146,7 +150,7 @@ def solve_symmetric(matrix: sp.csc_matrix, right: Floats, extra: Floats | float 
     if not len(right):
         return right
     try:
-        factors = _factorise(matrix + sp.diags(np.broadcast_to(extra, (len(right),))), "NATURAL")
+        factors = _factorise(matrix, np.broadcast_to(extra, (len(right),)), "NATURAL")
     except RuntimeError:
         return np.full_like(right, np.nan)
     return factors.solve(right)

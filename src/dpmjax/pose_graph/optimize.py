@@ -131,10 +131,8 @@ def optimize_pose_graph(
     )
 
 
-def _iterate(
-    state: _State, graph: PoseGraph, pattern: BlockPattern, width: Floats, config: PoseGraphConfig
-) -> _State:
-    """One damped solve; its step is taken where it lowers the cost."""
+def _iterate(state: _State, graph: PoseGraph, pattern: BlockPattern, width: Floats, config: PoseGraphConfig) -> _State:
+    """Returns the state after one damped solve, whose step is taken where it lowers the cost."""
     at, is_narrow = state.at, state.widening <= 1.0
     width = width * state.widening
     weights = _weights(at.chi2, width)
@@ -158,10 +156,10 @@ def _iterate(
 
 
 def _weights(chi2: Floats, width: Floats) -> Floats:
-    """Weights of the edges under a Geman-McClure kernel of this width; one where the width is infinite."""
+    """Returns weights of the edges under a Geman-McClure kernel of this width; one where the width is infinite."""
     return 1.0 / (1.0 + chi2 / width) ** 2
 
 
 def _cost(chi2: Floats, width: Floats) -> float:
-    """The sum of what all edges cost: chi2 of small residuals, at most the width of the kernel."""
+    """Returns the cost of all edges; of each one chi2 if it is small, at most the width of the kernel."""
     return float((chi2 / (1.0 + chi2 / width)).sum())

@@ -70,7 +70,7 @@ def _round_up(count: int) -> int:
 def _linearise(poses: Array, step: Array, edges: Edges) -> tuple[Array, Array, Array, Array]:
     poses = _retract(poses, step)
     relative = _relative(poses[edges.target], poses[edges.source])
-    residual, of_source = _residuals(relative, edges.measurements)
+    residual, of_source = _residuals(relative, jnp.asarray(edges.measurements))
     adjoint = se2.adjoint(se2.inverse(relative)) if poses.ndim == 2 else se3.adjoint(rigid.inverse(relative))
     with jax.default_matmul_precision("highest"):
         jacobian = jnp.stack([-of_source @ adjoint, of_source], axis=1)
@@ -94,7 +94,7 @@ def _relative(target: Float[Array, "e *s"], source: Float[Array, "e *s"]) -> Flo
 
 
 def _residuals(relative: Array, measured: Array) -> tuple[Float[Array, "e d"], Float[Array, "e d d"]]:
-    """Residuals, and their derivatives by steps of the source poses."""
+    """Returns residuals, and their derivatives by steps of the source poses."""
     algebra = se2 if relative.ndim == 2 else se3
     difference = _relative(measured, relative)
     return algebra.log(difference), algebra.log_jacobian(difference)

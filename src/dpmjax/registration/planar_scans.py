@@ -120,7 +120,7 @@ def planar_scans(points: AnyArray | ScanSet, mask: AnyArray | None = None, *, is
         PlanarScans.
 
     Raises:
-        ValueError: wrong shapes, no scan, or coordinates that are not finite where the mask is True.
+        ValueError: wrong shapes, no scan, no valid beam, or coordinates that are not finite where the mask is True.
     """
     if isinstance(points, ScanSet):
         mask, points = points.mask if mask is None else mask, points.points
@@ -130,6 +130,8 @@ def planar_scans(points: AnyArray | ScanSet, mask: AnyArray | None = None, *, is
     valid = np.ones(values.shape[:2], bool) if mask is None else np.asarray(mask)
     if valid.dtype != bool or valid.shape != values.shape[:2]:
         raise ValueError(f"mask: expected bool of shape {values.shape[:2]}, got {valid.dtype} of {valid.shape}")
+    if not valid.any():
+        raise ValueError("mask: expected at least one valid beam, got none")
     if not np.isfinite(values[valid]).all():
         raise ValueError("points: expected finite coordinates where the mask is True")
     # What is masked may hold anything; zero times NaN would be NaN later on.

@@ -16,10 +16,10 @@ from .town.scan import OS1_64 as OS1_64
 from .town.scan import VLP16 as VLP16
 from .town.scan import LidarSensor as LidarSensor
 from .town.scan import scan_town as scan_town
-from .world2d.position_bound import position_bound as position_bound
 from .world2d.raycast import cast_rays as cast_rays
+from .world2d.raycast import cast_scans as cast_scans
 from .world2d.raycast import scan_world as scan_world
-from .world2d.simulate import simulate_sequence as simulate_sequence
+from .world2d.raycast import simulate_sequence as simulate_sequence
 from .world2d.trajectory import TrajectoryConfig as TrajectoryConfig
 from .world2d.trajectory import simulate_trajectory as simulate_trajectory
 from .world2d.world import World as World

@@ -46,9 +46,14 @@ class Apartment:
     is_seen_through: NDArray[np.bool_]
 
     def is_free(self, places: NDArray[np.float64], clearance_m: float) -> NDArray[np.bool_]:
-        """Which (m, 2) places x, z keep `clearance_m` from walls and from what stands at the camera's height.
+        """Which places are free for the robot below the camera; lower furniture counts too.
 
-        Lower furniture counts too: the robot below the camera has to pass.
+        Args:
+            places: (m, 2) x, z, m.
+            clearance_m: distance to keep from walls and furniture.
+
+        Returns:
+            (m,) True where the place is free.
         """
         far = np.array([self.size_x_m, self.size_z_m]) - clearance_m
         inside: NDArray[np.bool_] = np.all((places > clearance_m) & (places < far), axis=1)
@@ -141,6 +146,12 @@ def simulate_depth_sequence(
 
 def make_apartment(seed: int) -> Apartment:
     """Builds the apartment of a seed, the same one every time.
+
+    Args:
+        seed: zero or more.
+
+    Returns:
+        The apartment.
 
     Raises:
         ValueError: a negative seed.

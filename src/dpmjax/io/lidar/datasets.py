@@ -214,8 +214,15 @@ def _read_imu_calibration(path: Path) -> NDArray[np.float64]:
 def _poses_from_oxts(records: NDArray[np.float64], source: Path) -> NDArray[np.float64]:
     """GPS/IMU records as poses, by the Mercator projection (Geiger et al. 2013, section III).
 
-    Records are (n, 6) latitude, longitude (degrees), altitude (m), roll, pitch, yaw (radians). Returns (n, 4, 4)
-    `T_world_imu`, world in metres, x east, y north, z up.
+    Args:
+        records: (n, 6) latitude, longitude (degrees), altitude (m), roll, pitch, yaw (radians).
+        source: for messages.
+
+    Returns:
+        (n, 4, 4) `T_world_imu`, world in metres, x east, y north, z up.
+
+    Raises:
+        InputError: records that are not finite, or too near to a pole.
     """
     from scipy.spatial.transform import Rotation
 

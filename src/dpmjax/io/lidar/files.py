@@ -8,9 +8,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from dpmjax.io.clouds import read_pcd, read_ply
 from dpmjax.io.files import load_arrays, read_bytes, to_float32
-from dpmjax.io.pcd import read_pcd
-from dpmjax.io.ply import read_ply
 from dpmjax.sequences import InputError
 
 _log = logging.getLogger(__name__)

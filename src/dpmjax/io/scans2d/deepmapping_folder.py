@@ -13,8 +13,9 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from dpmjax.io.clouds import parse_pcd, write_pcd
 from dpmjax.io.files import natural_key, read_bytes, write_atomically
-from dpmjax.io.pcd import parse_pcd, write_pcd
+from dpmjax.io.mat import parse_mat
 from dpmjax.sequences import InputError, ScanSequence, has_angular_order
 
 _PIXELS_PER_UNIT = 512.0
@@ -120,18 +121,10 @@ def _list_files(path: Path) -> dict[str, bytes]:
 
 def _read_poses(content: bytes, source: str, num_scans: int) -> NDArray[np.float64]:
     """The (n, 3) array `pose` of a MATLAB file."""
-    from scipy.io import loadmat
-
-    try:
-        variables = loadmat(io.BytesIO(content))  # type: ignore[arg-type]  # Streams are fine.
-    except Exception as error:  # SciPy raises whatever its parser trips over.
-        raise InputError(
-            source, f"not a readable MATLAB file ({type(error).__name__})", "save it again, or remove it"
-        ) from error
+    variables = parse_mat(content, source)
     if "pose" not in variables:
-        names = [name for name in variables if not name.startswith("__")]
-        raise InputError(source, f"variables are {', '.join(names) or 'none'}", "the file needs a variable 'pose'")
-    pose = variables["pose"]
+        raise InputError(source, f"variables are {', '.join(variables) or 'none'}", "the file needs a variable 'pose'")
+    pose = np.asarray(variables["pose"])
     if pose.shape != (num_scans, 3) or pose.dtype.kind not in "fiu":
         raise InputError(source, f"pose is {pose.shape} for {num_scans} scans", "give (n, 3) x px, y px, theta rad")
     if not np.isfinite(pose).all():

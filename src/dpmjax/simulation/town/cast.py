@@ -18,10 +18,10 @@ from dpmjax.simulation.town.intersect import (
     cross_cylinder,
     cross_ground,
     cross_spheroid,
+    recess,
 )
 from dpmjax.simulation.town.primitives import GROUND, NOTHING, Bodies, TownPrimitives, traffic_boxes
 from dpmjax.simulation.town.sectors import bodies_by_sector, nearest_bodies
-from dpmjax.simulation.town.windows import recess
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""Where rays meet boxes, cylinders, spheroids and the ground.
+"""Where rays meet boxes, their windows, cylinders, spheroids and the ground.
 
 Bodies are relative to the rays' common start. Solid and soft bodies share one rule: the way that is gone inside. A ray
 that starts inside a body enters it at a negative distance, which the caller treats as a miss: the sensor's own car is
@@ -12,9 +12,9 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
-from dpmjax.simulation.town.primitives import Ground
+from dpmjax.simulation.town.primitives import Bodies, Ground
 
 # Directions along an axis are nudged off zero by this: a thousandth of a millimetre at 100 m.
 _TINY = 1e-8
@@ -22,6 +22,9 @@ _TINY = 1e-8
 _NUM_STEPS = 14
 _NUM_REFINEMENTS = 5
 _NEAREST_M = 1.0
+# Facades: windows and doors lie behind the wall, so that scans fix the position along a front.
+_STOREY_M, _SILL_M, _LINTEL_M = 2.9, 0.9, 2.2
+_THIN_M = 1e-6
 
 
 class Crossing(NamedTuple):
@@ -107,6 +110,62 @@ def cross_spheroid(direction: Float[Array, "... 3"], spheroid: Hull) -> Crossing
     inside = (1.0 - miss) / squared
     half_chord = jnp.sqrt(jnp.maximum(inside, 0.0))
     return Crossing(jnp.where(inside > 0, nearest - half_chord, jnp.inf), nearest + half_chord)
+
+
+class FaceHits(NamedTuple):
+    """Where rays end at faces of boxes.
+
+    Attributes:
+        ranges: m, behind the face where the ray goes into a window.
+        cosines: of the angle between the ray and the normal.
+        is_glass: True in windows and doors.
+    """
+
+    ranges: Float[Array, "..."]
+    cosines: Float[Array, "..."]
+    is_glass: Bool[Array, "..."]
+
+
+def recess(ranges: Float[Array, "..."], directions: Float[Array, "... 3"], body: Bodies) -> FaceHits:
+    """Takes rays that have reached a face on to the window pane behind it, or to the side of the opening.
+
+    Each side face of a box with windows is divided into bays of 2 to 4 m (a width of its own) and storeys of 2.9 m. The
+    middle of a bay is open; on the ground floor every third opening is a door.
+
+    Args:
+        ranges: distance at which the ray meets the box, m.
+        directions: unit directions in axes of the world.
+        body: the box of each ray, relative to the sensor.
+
+    Returns:
+        The hits.
+    """
+    offset = turn_back(ranges[..., None] * directions - body.centres, body.headings)
+    along = turn_back(directions, body.headings)
+    half = jnp.maximum(body.half_sizes, _THIN_M)
+    slack = jnp.stack([half[..., 0] - jnp.abs(offset[..., 0]), half[..., 1] - jnp.abs(offset[..., 1])], -1)
+    is_x = slack[..., 0] < slack[..., 1]
+    is_side = jnp.minimum(slack[..., 0], slack[..., 1]) < half[..., 2] - jnp.abs(offset[..., 2])
+    across = jnp.abs(jnp.where(is_x, along[..., 0], along[..., 1]))
+    cosines = jnp.where(is_side, across, jnp.abs(directions[..., 2]))
+
+    length = jnp.where(is_x, half[..., 1], half[..., 0])
+    bay = 2.0 * length / jnp.maximum(jnp.floor(2.0 * length / (2.2 + jnp.mod(7.3 * half[..., 2], 1.6))), 1.0)
+    place = jnp.where(is_x, offset[..., 1], offset[..., 0]) + length
+    height = offset[..., 2] + half[..., 2]
+    storey = jnp.floor(height / _STOREY_M)
+    is_door = (storey == 0) & (jnp.mod(jnp.floor(place / bay), 3) == 1)
+    beside, above = jnp.mod(place, bay), height - storey * _STOREY_M
+    left, right = 0.3 * bay, 0.7 * bay
+    low, high = jnp.where(is_door, 0.1, _SILL_M), _LINTEL_M
+    is_open = (beside > left) & (beside < right) & (above > low) & (above < high) & is_side & (body.window_depth > 0)
+
+    speed, climb = jnp.where(is_x, along[..., 1], along[..., 0]), directions[..., 2]
+    to_jamb = jnp.where(speed > 0, right - beside, beside - left) / jnp.maximum(jnp.abs(speed), _THIN_M)
+    to_sill = jnp.where(climb > 0, high - above, above - low) / jnp.maximum(jnp.abs(climb), _THIN_M)
+    to_pane = body.window_depth / jnp.maximum(across, _THIN_M)
+    deeper = jnp.minimum(jnp.minimum(to_jamb, to_sill), to_pane)
+    return FaceHits(ranges + jnp.where(is_open, deeper, 0.0), cosines, is_open & (deeper >= to_pane))
 
 
 def turn_back(vectors: Float[Array, "... 3"], heading: Float[Array, "... 2"]) -> Float[Array, "... 3"]:
@@ -206,10 +265,8 @@ def cross_ground(
 def _narrow(
     bracket: tuple[Array, Array, Array, Array], middle: Float[Array, "..."], here: Float[Array, "..."]
 ) -> tuple[Array, Array, Array, Array]:
-    """The part of (near, far, height at near, height at far) that holds the crossing (Illinois).
-
-    The end that stays counts half the next time, or it would stay for ever.
-    """
+    """The part of the bracket that holds the crossing: (near, far, height at near, height at far)."""
+    # Illinois: the end that stays counts half the next time, or it would stay for ever.
     near, far, above, below = bracket
     is_above = here > 0
     return (

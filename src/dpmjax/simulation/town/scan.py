@@ -190,12 +190,10 @@ def _ray_shape(sensor: LidarSensor, config: CastConfig) -> tuple[int, int]:
 
 
 def _return_probability(hits: Hits, sensor: LidarSensor) -> Float[Array, "s r"]:
-    """Probability that a ray comes back.
-
-    Half of the returns are lost at `half_loss_m`, scaled by the root of the reflectivity (the energy falls with the
-    square of the range) and by the fourth root of the cosine: real surfaces are rough, and asphalt is seen farther than
-    a smooth one would be. Nothing has probability 0.
-    """
+    """Probability that a ray comes back; 0 for nothing."""
+    # Half of the returns are lost at `half_loss_m`, scaled by the root of the reflectivity (the energy falls with the
+    # square of the range) and by the fourth root of the cosine: real surfaces are rough, and asphalt is seen farther
+    # than a smooth one would be.
     reflectivity = jnp.asarray(_REFLECTIVITY)[hits.surfaces]
     half_loss = sensor.half_loss_m * jnp.sqrt(reflectivity / 0.2) * jnp.maximum(hits.cosines, 1e-4) ** 0.25
     excess = jnp.log(jnp.maximum(half_loss, 1e-3)) - jnp.log(jnp.minimum(hits.ranges, 1e6))

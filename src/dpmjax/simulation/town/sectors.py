@@ -42,9 +42,14 @@ def _azimuth_intervals(
 ) -> tuple[Float[Array, " k"], Float[Array, " k"]]:
     """Middle and half-width, radians, of the azimuths under which the boxes are seen in the sensor frame.
 
-    A box is the hull of its corners, and so is its shadow on the sensor's x-y plane. Where that shadow contains the
-    sensor, the interval is the whole turn: its half-width is pi. Of T_lidar_world only the rotation counts.
+    Args:
+        bodies: relative to the sensor, in axes of the world.
+        T_lidar_world: only its rotation counts.
+
+    Returns:
+        Middles and half-widths; half-width pi, the whole turn, where the box lies over or under the sensor.
     """
+    # A box is the hull of its corners, and so is its shadow on the sensor's x-y plane.
     turn = T_lidar_world.at[:3, 3].set(0.0)
     local = jnp.asarray(_CORNERS)[None] * bodies.half_sizes[:, None]
     turned = turn_back(local, bodies.headings[:, None] * jnp.array([1.0, -1.0]))

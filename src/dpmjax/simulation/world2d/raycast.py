@@ -1,4 +1,4 @@
-"""The ideal planar lidar: exact meeting points of beams with a world of unit pixel squares.
+"""The ideal planar lidar: exact meeting points of beams with a world of unit pixel squares, and scans of a walk.
 
 Frame: pixel `is_obstacle[row, col]` fills the square [col, col + 1) x [row, row + 1); x points right along the columns,
 y points up along the rows (row 0 is the lowest), so that the world is right-handed and a plot with the origin below
@@ -7,10 +7,15 @@ shows it as it is. Angles are counter-clockwise from x.
 
 from __future__ import annotations
 
+import zlib
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+
+from dpmjax.sequences import ScanSequence, World
+from dpmjax.simulation.world2d.trajectory import simulate_odometry, simulate_trajectory
+from dpmjax.simulation.world2d.world import make_world
 
 
 class RayHits(NamedTuple):
@@ -38,10 +43,29 @@ def beam_angles(num_beams: int) -> NDArray[np.float64]:
 
     Returns:
         (num_beams,) radians in the sensor frame, from 0 (straight ahead) counter-clockwise, 2 pi excluded.
+
+    Raises:
+        ValueError: fewer than one beam.
     """
     if num_beams < 1:
         raise ValueError(f"num_beams must be at least 1, got {num_beams}")
     return np.arange(num_beams, dtype=np.float64) * (2.0 * np.pi / num_beams)
+
+
+def cast_scans(is_obstacle: NDArray[np.bool_], poses: ArrayLike, *, num_beams: int = 256) -> NDArray[np.float64]:
+    """Ranges of noise-free scans of 360 degrees.
+
+    Args:
+        is_obstacle: (h, w), True where a pixel is solid.
+        poses: (n, 3) x, y (px) and heading (radians) in the world, in free pixels.
+        num_beams: beams of a scan.
+
+    Returns:
+        (n, num_beams) px.
+    """
+    at = np.asarray(poses, np.float64).reshape(-1, 3)
+    angles = (at[:, 2:] + beam_angles(num_beams)).ravel()
+    return cast_rays(is_obstacle, np.repeat(at[:, :2], num_beams, axis=0), angles).ranges.reshape(-1, num_beams)
 
 
 def cast_rays(is_obstacle: NDArray[np.bool_], origins: ArrayLike, angles: ArrayLike) -> RayHits:
@@ -129,6 +153,53 @@ def scan_world(
     return np.where(mask[..., None], points, 0.0).astype(np.float32), mask
 
 
+def simulate_sequence(
+    world: int | World = 0,
+    num_scans: int = 256,
+    *,
+    num_beams: int = 256,
+    range_noise_px: float = 0.0,
+    seed: int = 0,
+    with_odometry: bool = False,
+) -> ScanSequence:
+    """Simulates a drive through a planar world (DeepMapping section 4.1).
+
+    Walk, noise and odometry have separate random streams: a seed gives the same walk with and without noise.
+
+    Args:
+        world: index for `make_world`, or a world.
+        num_scans: number of scans; the paper has 128 and 256.
+        num_beams: beams per scan over 360 degrees.
+        range_noise_px: standard deviation of Gaussian noise on the ranges, px.
+        seed: seed of walk and noise.
+        with_odometry: whether to simulate wheel odometry too.
+
+    Returns:
+        The sequence in px, organised, with the true poses in the world's frame as reference.
+
+    Raises:
+        ValueError: an argument out of its range, or a world too narrow to move in.
+    """
+    if num_scans < 2:
+        raise ValueError(f"num_scans must be at least 2, got {num_scans}")
+    scene = world if isinstance(world, World) else make_world(world)
+    # The name takes part, so that walks through two worlds are two walks and not one bent by other walls.
+    streams = ([seed, zlib.crc32(scene.name.encode()), stream] for stream in range(3))
+    walk_rng, noise_rng, odometry_rng = map(np.random.default_rng, streams)
+    poses = simulate_trajectory(scene, num_scans, rng=walk_rng)
+    points, mask = scan_world(
+        scene.is_obstacle, poses, num_beams=num_beams, range_noise_px=range_noise_px, rng=noise_rng
+    )
+    return ScanSequence(
+        name=scene.name,
+        points=points,
+        mask=mask,
+        unit="px",
+        reference_poses=poses,
+        odometry_poses=simulate_odometry(poses, rng=odometry_rng) if with_odometry else None,
+    )
+
+
 def _check_origins(is_obstacle: NDArray[np.bool_], origins: NDArray[np.float64]) -> None:
     height, width = is_obstacle.shape
     is_inside = ((origins >= 0) & (origins < [width, height])).all(axis=1)
@@ -157,8 +228,17 @@ def _leap(
 ) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.int64]]:
     """Moves each beam into the first pixel outside of the free square of half-width `reach` round its pixel.
 
-    With reach 1 this is one step of the plain grid traversal. The beams are at length `reached`. Returns the new
-    cells (m, 2), the lengths (m,) at which they are entered, and the axes (m,) across whose edge.
+    With reach 1 this is one step of the plain grid traversal.
+
+    Args:
+        start: (m, 2) origins.
+        direction: (m, 2) unit directions.
+        cell: (m, 2) pixels that the beams are in.
+        reach: (m,) half-widths of the free squares.
+        reached: (m,) lengths at which the beams are.
+
+    Returns:
+        The new cells (m, 2), the lengths (m,) at which they are entered, and the axes (m,) of the crossed edges.
     """
     ahead = np.where(direction > 0, reach[:, None], -reach[:, None])
     edge = cell + ahead + (direction < 0)

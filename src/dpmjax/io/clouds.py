@@ -1,4 +1,4 @@
-"""Point Cloud Data files (PCD 0.7): the coordinates of their points, ascii or binary."""
+"""Point cloud files: PCD 0.7 and PLY, ascii or binary."""
 
 from __future__ import annotations
 
@@ -11,10 +11,16 @@ from numpy.typing import ArrayLike, NDArray
 from dpmjax.io.files import read_bytes, split_rows, to_float32, unpack_rows, write_atomically
 from dpmjax.sequences import InputError
 
-_TYPES = {"F": "f", "I": "i", "U": "u"}
+_PCD_TYPES = {"F": "f", "I": "i", "U": "u"}
+_PLY_TYPES = {
+    "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2", "ushort": "u2",
+    "uint16": "u2", "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4", "float": "f4", "float32": "f4",
+    "double": "f8", "float64": "f8",
+}  # fmt: skip
+_PLY_ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
 
 
-class _Header(NamedTuple):
+class _PcdHeader(NamedTuple):
     """Names of the fields, their layout as one NumPy type, number of points, encoding, and the header's length."""
 
     fields: list[str]
@@ -55,12 +61,12 @@ def parse_pcd(content: bytes, source: str, *, drop_nan: bool = False) -> NDArray
         InputError: a broken header, no x or y column, a truncated body, NaN or infinite coordinates, or the compressed
             encoding, which is not supported.
     """
-    header = _parse_header(content, source)
+    header = _parse_pcd_header(content, source)
     for name in ("x", "y"):
         if name not in header.fields:
             raise InputError(source, f"fields are {' '.join(header.fields)}", f"the file needs a column {name}")
     body = content[header.size :]
-    read = {"ascii": _read_ascii, "binary": _read_binary}.get(header.encoding)
+    read = {"ascii": _read_ascii_pcd, "binary": _read_binary_pcd}.get(header.encoding)
     if read is None:
         raise InputError(source, f"DATA {header.encoding} is not supported", "save the cloud as ascii or binary PCD")
     columns = read(body, header, source)
@@ -100,7 +106,7 @@ def write_pcd(path: str | Path, points: ArrayLike) -> Path:
     return write_atomically(path, header.encode("ascii") + cloud.tobytes())
 
 
-def _parse_header(content: bytes, source: str) -> _Header:
+def _parse_pcd_header(content: bytes, source: str) -> _PcdHeader:
     entries: dict[str, list[str]] = {}
     size = 0
     while "DATA" not in entries:
@@ -113,26 +119,103 @@ def _parse_header(content: bytes, source: str) -> _Header:
             entries[words[0].upper()] = words[1:]
     try:
         fields = entries["FIELDS"]
-        types = ["<" + _TYPES[t] + s for t, s in zip(entries["TYPE"], entries["SIZE"], strict=True)]
+        types = ["<" + _PCD_TYPES[t] + s for t, s in zip(entries["TYPE"], entries["SIZE"], strict=True)]
         counts = [int(count) for count in entries.get("COUNT", ["1"] * len(fields))]
         sizes = entries.get("POINTS") or [entries["WIDTH"][0], entries["HEIGHT"][0]]
         num_points = int(sizes[0]) * int(sizes[1] if len(sizes) > 1 else 1)
         if not len(fields) == len(types) == len(counts) or min(counts) < 1 or num_points < 0:
             raise ValueError("lengths differ, or a number is below one")
         layout = np.dtype([(f"{i}", t, (c,)) for i, (t, c) in enumerate(zip(types, counts, strict=True))])
-        return _Header(fields, layout, num_points, entries["DATA"][0].lower(), size)
+        return _PcdHeader(fields, layout, num_points, entries["DATA"][0].lower(), size)
     except (KeyError, ValueError, IndexError, TypeError, OverflowError) as error:
         found = f"broken PCD header ({type(error).__name__}: {error})"
         raise InputError(source, found, "write FIELDS, SIZE, TYPE, COUNT of one length, POINTS and DATA") from error
 
 
-def _read_binary(body: bytes, header: _Header, source: str) -> dict[str, NDArray[np.generic]]:
+def _read_binary_pcd(body: bytes, header: _PcdHeader, source: str) -> dict[str, NDArray[np.generic]]:
     table = unpack_rows(body, header.layout, header.num_points, source)
     return {name: table[f"{i}"][:, 0] for i, name in enumerate(header.fields)}
 
 
-def _read_ascii(body: bytes, header: _Header, source: str) -> dict[str, NDArray[np.generic]]:
+def _read_ascii_pcd(body: bytes, header: _PcdHeader, source: str) -> dict[str, NDArray[np.generic]]:
     counts = [header.layout[i].shape[0] for i in range(len(header.fields))]
     table = split_rows(body, sum(counts), header.num_points, source)
     first = np.cumsum([0, *counts[:-1]])
     return {name: table[:, first[i]] for i, name in enumerate(header.fields)}
+
+
+class _PlyHeader(NamedTuple):
+    """Encoding, number of vertices, their properties as one NumPy type, and the header's length in bytes."""
+
+    encoding: str
+    num_vertices: int
+    layout: np.dtype[np.void]
+    size: int
+
+
+def read_ply(path: str | Path) -> NDArray[np.float32]:
+    """Reads the points of a PLY file.
+
+    Args:
+        path: the file; the vertex element must come first, other elements and properties are ignored.
+
+    Returns:
+        (n, 3) float32 x, y, z in the file's unit; NaN is left as it is.
+
+    Raises:
+        InputError: the file is missing, has a broken header or no x, y, z, or is truncated.
+    """
+    content = read_bytes(path)
+    header = _parse_ply_header(content, str(path))
+    body, names = content[header.size :], list(header.layout.names or ())
+    if header.encoding == "ascii":
+        columns = [names.index(axis) for axis in "xyz"]
+        return to_float32(split_rows(body, len(names), header.num_vertices, path)[:, columns])
+    table = unpack_rows(body, header.layout, header.num_vertices, path)
+    return np.stack([to_float32(table[axis]) for axis in "xyz"], axis=1)
+
+
+def write_ply(path: str | Path, points: ArrayLike) -> Path:
+    """Writes points as binary little-endian PLY with float x, y, z.
+
+    Args:
+        path: file to write, atomically.
+        points: (n, 3).
+
+    Returns:
+        The path.
+
+    Raises:
+        ValueError: another shape.
+    """
+    values = np.asarray(points, "<f4")
+    if values.ndim != 2 or values.shape[1] != 3:
+        raise ValueError(f"points must be (n, 3), got {values.shape}")
+    properties = "".join(f"property float {name}\n" for name in "xyz")
+    header = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(values)}\n{properties}end_header\n"
+    return write_atomically(path, header.encode("ascii") + values.tobytes())
+
+
+def _parse_ply_header(content: bytes, source: str) -> _PlyHeader:
+    advice = "give a PLY file with float x, y, z in its first element, vertex"
+    end = content.find(b"end_header")
+    if not content.startswith(b"ply") or end < 0 or end > 65536:
+        raise InputError(source, "no PLY header", advice)
+    size = content.find(b"\n", end) + 1 or len(content)
+    rows = [line.split() for line in content[:end].decode("latin-1").splitlines() if line.strip()]
+    encoding = next((row[1] for row in rows if row[0] == "format" and len(row) > 1), "")
+    elements = [row for row in rows if row[0] == "element"]
+    if encoding not in _PLY_ORDERS or not elements or elements[0][1:2] != ["vertex"]:
+        raise InputError(source, f"PLY format {encoding or 'unknown'}, or no vertex element in front", advice)
+    first = rows.index(elements[0]) + 1
+    stop = rows.index(elements[1]) if len(elements) > 1 else len(rows)
+    try:
+        num_vertices = int(elements[0][2])
+        order, entries = _PLY_ORDERS[encoding], [row for row in rows[first:stop] if row[0] == "property"]
+        properties = [(name, order + _PLY_TYPES[kind]) for _, kind, name in entries]
+        layout = np.dtype(properties)
+    except (KeyError, ValueError, IndexError, TypeError) as error:
+        raise InputError(source, f"broken PLY header ({type(error).__name__}: {error})", advice) from error
+    if num_vertices < 0 or not {"x", "y", "z"} <= {name for name, _ in properties}:
+        raise InputError(source, f"PLY properties {' '.join(name for name, _ in properties)}", advice)
+    return _PlyHeader(encoding, num_vertices, layout, size)

@@ -1,0 +1,74 @@
+"""Pose graphs beside GTSAM's Levenberg-Marquardt on four public graphs: time and final cost in the same run.
+
+The graphs are g2o files in `$DPMJAX_DATA/g2o` (default `../shared/data`). Reading is not timed, compilation is a row of
+its own. GTSAM gets a tight prior on the first node, which adds nothing to the cost.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import sys
+from pathlib import Path
+from typing import Any
+
+import dpmjax
+from benchmarks.rows import Row
+from benchmarks.timing import Timing, measure
+
+NAME = "pose_graph"
+DATA = Path(os.environ.get("DPMJAX_DATA", "../shared/data")) / "g2o"
+GRAPHS = ("intel", "M3500", "parking-garage", "sphere2500")
+
+
+def run(quick: bool) -> list[Row]:
+    """Optimises each graph with both programs."""
+    repeats = 2 if quick else 5
+    rows: list[Row] = []
+    if importlib.util.find_spec("gtsam") is None:
+        print("gtsam is not installed (pip install dpmjax[gtsam]): no peer", file=sys.stderr)
+    for name in GRAPHS[:2] if quick else GRAPHS:
+        path = DATA / f"{name}.g2o"
+        if not path.exists():
+            print(f"{path} is not there: skipped; set DPMJAX_DATA", file=sys.stderr)
+            continue
+        rows += compare(path, repeats)
+    return rows
+
+
+def compare(path: Path, repeats: int) -> list[Row]:
+    """The rows of one graph."""
+    graph = dpmjax.read_g2o(path)
+    case = f"{path.stem} {len(graph.poses)} poses, {len(graph.edges.source)} edges"
+    ours = measure(lambda: dpmjax.optimize_pose_graph(graph).chi2, repeats=repeats)
+    solved = dpmjax.optimize_pose_graph(graph)
+    rows = ours.rows(f"{case}: dpmjax")
+    rows += [Row(f"{case}: dpmjax", metric, getattr(solved, metric), "") for metric in ("chi2_initial", "chi2")]
+    rows.append(Row(f"{case}: dpmjax", "iterations", solved.iterations, ""))
+    if importlib.util.find_spec("gtsam") is None:
+        return rows
+    theirs, chi2 = gtsam_timing(path, graph.tangent_size == 6, repeats)
+    rows += [row for row in theirs.rows(f"{case}: GTSAM") if row.metric != "compile"]
+    rows.append(Row(f"{case}: GTSAM", "chi2", chi2, ""))
+    rows.append(Row(f"{case}: dpmjax / GTSAM", "median", ours.median_s / theirs.median_s, ""))
+    rows.append(Row(f"{case}: dpmjax / GTSAM", "chi2", solved.chi2 / chi2, ""))
+    return rows
+
+
+def gtsam_timing(path: Path, is_spatial: bool, repeats: int) -> tuple[Timing, float]:
+    """Time and final cost of GTSAM, its settings as they come."""
+    import gtsam
+
+    factors, start = gtsam.readG2o(str(path), is_spatial)
+    first = start.keys()[0]
+    sigma = gtsam.noiseModel.Isotropic.Sigma(6 if is_spatial else 3, 1e-6)
+    held = gtsam.NonlinearFactorGraph(factors)
+    pose = start.atPose3(first) if is_spatial else start.atPose2(first)
+    held.add((gtsam.PriorFactorPose3 if is_spatial else gtsam.PriorFactorPose2)(first, pose, sigma))
+
+    def optimize() -> Any:
+        return gtsam.LevenbergMarquardtOptimizer(held, start, gtsam.LevenbergMarquardtParams()).optimize()
+
+    # The optimised values are no arrays: measured for their time, then computed once more for their cost.
+    timing = measure(lambda: optimize().size(), repeats=repeats)
+    return timing, 2 * factors.error(optimize())

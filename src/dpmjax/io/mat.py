@@ -1,0 +1,105 @@
+"""MATLAB files of level 5 (-v6, -v7): numbers, text, structs, cells. SciPy's reader crashes on damaged files."""
+
+from __future__ import annotations
+
+import math
+import struct
+import zlib
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dpmjax.sequences import InputError
+
+_MATRIX, _COMPRESSED = 14, 15
+_CELL, _STRUCT, _OBJECT, _CHAR, _SPARSE = range(1, 6)
+_STORAGE = {
+    1: "i1",
+    2: "u1",
+    3: "i2",
+    4: "u2",
+    5: "i4",
+    6: "u4",
+    7: "f4",
+    9: "f8",
+    12: "i8",
+    13: "u8",
+    16: "u1",
+    17: "u2",
+}
+_LARGEST_COMPRESSION = 1100
+
+
+def parse_mat(content: bytes, source: str | Path) -> dict[str, Any]:
+    """Reads the variables of a MATLAB file.
+
+    Args:
+        content: the whole file.
+        source: its name, for messages.
+
+    Returns:
+        Arrays and text by name; a struct array is a list of dictionaries, a cell array a list.
+
+    Raises:
+        InputError: no such file format, or a damaged file.
+    """
+    try:
+        order = {b"IM": "<", b"MI": ">"}[content[126:128]]
+        bodies = [body for kind, body in _elements(content[128:], order) if kind == _MATRIX]
+        return dict(_parse_matrix(body, order) for body in bodies)
+    except Exception as error:  # Damage shows as one of many kinds.
+        found = f"not a readable MATLAB file ({type(error).__name__})"
+        raise InputError(source, found, "save it again with -v7, or remove it") from error
+
+
+def _elements(data: bytes, order: str) -> Iterator[tuple[int, bytes]]:
+    """Type and content of each data element, unpacked; a ValueError where one is longer than what holds it."""
+    while len(data):
+        kind, size = struct.unpack(f"{order}II", data[:8])
+        start, end = 8, 8 + size + (-size % 8 if kind != _COMPRESSED else 0)
+        if kind >> 16:  # The short form: type, size and four bytes of content in eight bytes.
+            kind, size, start, end = kind & 0xFFFF, kind >> 16, 4, 8
+        if start + size > len(data) or (end == 8 and size > 4):
+            raise ValueError("an element is longer than the file")
+        if kind == _COMPRESSED:
+            limit = _LARGEST_COMPRESSION * (size + 64)
+            yield from _elements(zlib.decompressobj().decompress(data[start : start + size], limit), order)
+        else:
+            yield kind, data[start : start + size]
+        data = data[end:]
+
+
+def _parse_matrix(data: bytes, order: str) -> tuple[str, Any]:
+    """Name and value of a matrix element."""
+    if not data:
+        return "", np.zeros(0)
+    (_, flags), (_, size), (_, name), *parts = _elements(data, order)
+    shape = tuple(np.frombuffer(size, f"{order}i4").tolist())
+    category, count = struct.unpack(f"{order}I", flags[:4])[0] & 0xFF, math.prod(shape)
+    return name.decode("latin-1"), _parse_value(category, parts, shape, count, order)
+
+
+def _parse_value(category: int, parts: list[tuple[int, bytes]], shape: tuple[int, ...], count: int, order: str) -> Any:
+    if category == _CELL:
+        return [_parse_matrix(body, order)[1] for _, body in parts]
+    if category == _STRUCT:
+        width = int(_numbers(parts[0], order)[0])
+        words = [parts[1][1][i : i + width] for i in range(0, len(parts[1][1]), width)]
+        names = [word.partition(b"\0")[0].decode("latin-1") for word in words]
+        values = [_parse_matrix(body, order)[1] for _, body in parts[2:]]
+        if len(values) != count * len(names):
+            raise ValueError("fields are missing")
+        return [dict(zip(names, values[i : i + len(names)], strict=True)) for i in range(0, len(values), len(names))]
+    if category in (_OBJECT, _SPARSE) or min(shape) < 0:
+        raise ValueError("neither numbers nor text")
+    numbers = _numbers(parts[0], order) if parts else np.zeros(0)
+    if category == _CHAR:
+        return "".join(map(chr, numbers.tolist()))
+    return numbers[:count].reshape(shape, order="F")
+
+
+def _numbers(element: tuple[int, bytes], order: str) -> NDArray[Any]:
+    return np.frombuffer(element[1], order + _STORAGE[element[0]])
