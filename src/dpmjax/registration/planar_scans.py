@@ -1,7 +1,7 @@
 """The scan record of this room: planar scans with a line at every beam, and the lengths that settings refer to.
 
 All lengths in settings are in typical ranges of the scans (`dpmjax.geometry.rays.typical_range`: the range that nine
-beams in ten stay below), so pixels, rooms and streets need no settings of their own.
+in ten beams on a line stay below), so pixels, rooms and streets need no settings of their own.
 
 A line with a normal is fitted at every beam and is honest under range noise. Two neighbouring beams give the exact
 normal of a noise-free wall, but nonsense as soon as the noise is as large as the distance between the beams. So several
@@ -82,7 +82,7 @@ class PlanarScans(flax.struct.PyTreeNode):
 
     @property
     def typical_range(self) -> float:
-        """The range that nine beams in ten stay below, median over the scans: the unit of all settings."""
+        """The range that nine in ten beams on a line stay below, median over the scans: the unit of all settings."""
         return float(self.typical_ranges.reshape(-1)[0])
 
     @property
@@ -137,8 +137,11 @@ def planar_scans(points: AnyArray | ScanSet, mask: AnyArray | None = None, *, is
     # What is masked may hold anything; zero times NaN would be NaN later on.
     scans = ScanSet(points=jnp.asarray(np.where(valid[..., None], values, 0.0)), mask=jnp.asarray(valid))
     scans = scans if has_angular_order(values, valid) else _sort_by_angle(scans)
-    length = jnp.full(len(values), typical_range(values, valid), jnp.float32)
-    return _fit_lines(scans).replace(typical_ranges=length, is_ordered=is_ordered)
+    fitted = _fit_lines(scans)
+    # Beams on lines end on walls; the others would let people and clutter decide on the unit.
+    is_used = np.asarray(fitted.is_on_line if fitted.is_on_line.any() else fitted.mask)
+    length = jnp.full(len(values), typical_range(np.asarray(fitted.points), is_used), jnp.float32)
+    return fitted.replace(typical_ranges=length, is_ordered=is_ordered)
 
 
 def batches(count: int, size: int) -> Iterator[tuple[slice, Indices]]:
