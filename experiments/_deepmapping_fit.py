@@ -17,10 +17,10 @@ from experiments._history import HistoryFile, read_history
 from experiments._run_folder import CHECKPOINTS, HISTORY, RunFolder
 
 if TYPE_CHECKING:
+    from dpmjax.checkpoints import Checkpoints
     from dpmjax.deepmapping import DeepMappingConfig, Fitted
     from dpmjax.deepmapping.fit import Progress
     from dpmjax.sequences import ScanSequence
-    from dpmjax.checkpoints import Checkpoints
 
 # Of the table; the error, named with its unit, comes last.
 _COLUMNS = ("step", "phase", "run_s", "loss", "occupancy", "chamfer")

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from dpmjax.geometry import se2
-from dpmjax.io import ScanSequence, take_scans
+from dpmjax.io import ScanSequence
 from dpmjax.metrics import absolute_trajectory_error
 from dpmjax.registration import GlobalConfig, PlanarScans, nearest_tour, planar_scans, refine, register_globally
 from dpmjax.registration.global_registration import (
@@ -41,7 +41,7 @@ def ate(poses: np.ndarray, sequence: ScanSequence) -> float:
 @pytest.fixture(scope="module")
 def sequence() -> ScanSequence:
     """Seven scans of the office, 60 px apart."""
-    return take_scans(simulate_sequence(0, 49, seed=1), slice(0, None, 8))
+    return simulate_sequence(0, 49, seed=1).take(slice(0, None, 8))
 
 
 @pytest.fixture(scope="module")
@@ -156,7 +156,7 @@ def half_circle(sequence: ScanSequence) -> ScanSequence:
 @pytest.mark.parametrize("is_ordered", [True, False])
 def test_scans_are_registered_at_180_degrees_and_with_noise(is_ordered: bool, noise: float) -> None:
     # 30 px apart, so that half circles overlap; the world is 1024 px wide.
-    walk = half_circle(take_scans(simulate_sequence(0, 37, seed=1, range_noise_px=noise), slice(0, None, 4)))
+    walk = half_circle(simulate_sequence(0, 37, seed=1, range_noise_px=noise).take(slice(0, None, 4)))
     assert walk.mask.mean() < 0.6
     found = register_globally(scans_of(walk, is_ordered=is_ordered), CONFIG)
     assert ate(found.poses, walk) < 4.0
@@ -206,7 +206,7 @@ def test_unregistered_scans_do_not_support_each_other(walk, walk_scans) -> None:
 
 
 def test_a_scan_that_sees_no_keyframe_is_found_by_the_others(monkeypatch: pytest.MonkeyPatch) -> None:
-    there = take_scans(simulate_sequence(0, 97, seed=2), slice(0, None, 16))
+    there = simulate_sequence(0, 97, seed=2).take(slice(0, None, 16))
     truth, lost, profiles = np.asarray(there.reference_poses), 5, make_profiles(scans_of(there))
 
     def know(profiles: RangeProfiles, source: np.ndarray, target: np.ndarray, *_: object, **__: object) -> Candidates:

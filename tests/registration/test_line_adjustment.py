@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from dpmjax.geometry import se2
-from dpmjax.metrics import absolute_trajectory_error
+from dpmjax.metrics import absolute_trajectory_error, position_bound
 from dpmjax.registration import LineAdjustmentConfig, adjust_to_lines, planar_scans
-from dpmjax.simulation import make_world, position_bound
+from dpmjax.simulation import cast_scans, make_world
 
 CONFIG = LineAdjustmentConfig(num_neighbours=12, num_rounds=3)
 
@@ -32,9 +34,8 @@ def aligned(noisy_walk_scans, start) -> np.ndarray:
 
 def test_lines_bring_poses_near_the_bound(noisy_walk, start, aligned) -> None:
     # The bound is for a world that is known; 24 scans make a world that is 1.6 times worse, at most.
-    bound = position_bound(
-        make_world(0).is_obstacle, noisy_walk.reference_poses, range_noise_px=1.0, num_beams=noisy_walk.mask.shape[1]
-    )
+    cast = partial(cast_scans, make_world(0).is_obstacle, num_beams=noisy_walk.mask.shape[1])
+    bound = position_bound(cast, noisy_walk.reference_poses, range_noise=1.0)
     best = float(np.sqrt((bound**2).mean()))
     assert ate(start, noisy_walk.reference_poses) > 4 * best
     assert 0.8 * best < ate(aligned, noisy_walk.reference_poses) < 1.6 * best

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from dpmjax.geometry import se2
-from dpmjax.io import take_scans
 from dpmjax.registration import assess_trajectory, choose_trajectory, planar_scans
 from dpmjax.registration.quality import map_code_length
 from dpmjax.simulation import simulate_sequence
@@ -67,7 +66,7 @@ def test_a_choice_needs_a_candidate(walk_scans) -> None:
 @pytest.fixture(scope="module")
 def sparse():
     """Eleven scans, 40 px apart, and their sequence."""
-    sequence = take_scans(simulate_sequence(0, 41, seed=1), slice(0, None, 4))
+    sequence = simulate_sequence(0, 41, seed=1).take(slice(0, None, 4))
     return sequence, planar_scans(sequence.points, sequence.mask)
 
 
@@ -92,7 +91,7 @@ def test_collapsed_poses_are_not_trusted(sparse) -> None:
 
 
 def test_a_map_drowned_in_noise_is_not_trusted() -> None:
-    sequence = take_scans(simulate_sequence(0, 41, seed=1, range_noise_px=12.0), slice(0, None, 4))
+    sequence = simulate_sequence(0, 41, seed=1, range_noise_px=12.0).take(slice(0, None, 4))
     scans = planar_scans(sequence.points, sequence.mask)
     assert not assess_trajectory(scans, sequence.reference_poses).is_trusted
 

@@ -94,7 +94,7 @@ def test_a_drifted_trajectory_is_closed(revisit, monkeypatch) -> None:
     assert len(loops.source) == len(weight) > 10
     assert (loops.source > loops.target).all()
     kept = se2.relative(true[loops.target], true[loops.source])[weight > 0.5]
-    assert np.median(np.abs(loops.poses[weight > 0.5] - kept)[:, :2]) < 1.0
+    assert np.median(np.abs(loops.measurements[weight > 0.5] - kept)[:, :2]) < 1.0
     assert ate(closed, true) < 0.5 * ate(drifted, true)
 
 

@@ -229,8 +229,8 @@ def count_support(edges: Edges, poses: Floats, config: LoopConfig, typical_range
     one, other = np.nonzero(near)
     step_target = se2.relative(poses[edges.target[one]], poses[edges.target[other]])
     step_source = se2.relative(poses[edges.source[other]], poses[edges.source[one]])
-    through = se2.compose(se2.compose(step_target, edges.poses[other]), step_source)
-    error = se2.relative(edges.poses[one], through)
+    through = se2.compose(se2.compose(step_target, edges.measurements[other]), step_source)
+    error = se2.relative(edges.measurements[one], through)
     agrees = np.hypot(error[:, 0], error[:, 1]) < config.agreement[0] * typical_range
     agrees &= np.abs(error[:, 2]) < config.agreement[1]
     return np.bincount(one[agrees], minlength=len(edges.source))

@@ -1,7 +1,7 @@
 """The scan record of this room: planar scans with a line at every beam, and the lengths that settings refer to.
 
 All lengths in settings are in typical ranges of the scans (`dpmjax.geometry.rays.typical_range`: the range that nine
-beams in ten stay below), so pixels, rooms and streets need no settings of their own.
+in ten beams on a line stay below), so pixels, rooms and streets need no settings of their own.
 
 A line with a normal is fitted at every beam and is honest under range noise. Two neighbouring beams give the exact
 normal of a noise-free wall, but nonsense as soon as the noise is as large as the distance between the beams. So several
@@ -23,6 +23,7 @@ from jaxtyping import Array, Bool, Float
 from numpy.typing import NDArray
 
 from dpmjax.geometry.rays import typical_range
+from dpmjax.sequences import has_angular_order
 from dpmjax.types import AnyArray, ScanSet
 
 Floats = NDArray[np.float64]
@@ -81,7 +82,7 @@ class PlanarScans(flax.struct.PyTreeNode):
 
     @property
     def typical_range(self) -> float:
-        """The range that nine beams in ten stay below, median over the scans: the unit of all settings."""
+        """The range that nine in ten beams on a line stay below, median over the scans: the unit of all settings."""
         return float(self.typical_ranges.reshape(-1)[0])
 
     @property
@@ -119,7 +120,7 @@ def planar_scans(points: AnyArray | ScanSet, mask: AnyArray | None = None, *, is
         PlanarScans.
 
     Raises:
-        ValueError: wrong shapes, no scan, or coordinates that are not finite where the mask is True.
+        ValueError: wrong shapes, no scan, no valid beam, or coordinates that are not finite where the mask is True.
     """
     if isinstance(points, ScanSet):
         mask, points = points.mask if mask is None else mask, points.points
@@ -129,13 +130,18 @@ def planar_scans(points: AnyArray | ScanSet, mask: AnyArray | None = None, *, is
     valid = np.ones(values.shape[:2], bool) if mask is None else np.asarray(mask)
     if valid.dtype != bool or valid.shape != values.shape[:2]:
         raise ValueError(f"mask: expected bool of shape {values.shape[:2]}, got {valid.dtype} of {valid.shape}")
+    if not valid.any():
+        raise ValueError("mask: expected at least one valid beam, got none")
     if not np.isfinite(values[valid]).all():
         raise ValueError("points: expected finite coordinates where the mask is True")
     # What is masked may hold anything; zero times NaN would be NaN later on.
     scans = ScanSet(points=jnp.asarray(np.where(valid[..., None], values, 0.0)), mask=jnp.asarray(valid))
-    scans = scans if _has_angular_order(values, valid) else _sort_by_angle(scans)
-    length = jnp.full(len(values), typical_range(values, valid), jnp.float32)
-    return _fit_lines(scans).replace(typical_ranges=length, is_ordered=is_ordered)
+    scans = scans if has_angular_order(values, valid) else _sort_by_angle(scans)
+    fitted = _fit_lines(scans)
+    # Beams on lines end on walls; the others would let people and clutter decide on the unit.
+    is_used = np.asarray(fitted.is_on_line if fitted.is_on_line.any() else fitted.mask)
+    length = jnp.full(len(values), typical_range(np.asarray(fitted.points), is_used), jnp.float32)
+    return fitted.replace(typical_ranges=length, is_ordered=is_ordered)
 
 
 def batches(count: int, size: int) -> Iterator[tuple[slice, Indices]]:
@@ -151,18 +157,6 @@ def batches(count: int, size: int) -> Iterator[tuple[slice, Indices]]:
     for start in range(0, count, size):
         stop = min(start + size, count)
         yield slice(start, stop), np.resize(np.arange(start, stop), size)
-
-
-def _has_angular_order(points: NDArray[np.float32], mask: NDArray[np.bool_]) -> bool:
-    """Whether nearly all valid beams of nearly all scans go one way round, in one turn at most."""
-    in_order = []
-    for scan, valid in zip(points, mask, strict=True):
-        angle = np.unwrap(np.arctan2(scan[valid, 1], scan[valid, 0]).astype(np.float64))
-        if len(angle) >= 3:
-            turn = np.diff(angle)
-            one_way = max(np.mean(turn > 0), np.mean(turn < 0))
-            in_order.append(one_way >= 0.95 and np.abs(turn).sum() <= 1.05 * 2 * np.pi)
-    return bool(in_order) and float(np.mean(in_order)) >= 0.9
 
 
 @jax.jit

@@ -119,9 +119,10 @@ def _align_all(scans: PlanarScans, poses: Floats, config: RefinementConfig) -> R
             source, target = choose_pairs(scans, poses, config)
         edges, system = _linearise(scans, source, target, poses, (gate, kernel))
         here = se2.relative(poses[steps.target], poses[steps.source])
-        pull = np.einsum("eij,ej->ei", steps.information, se2.relative(steps.poses, here))
+        pull = np.einsum("eij,ej->ei", steps.information, se2.relative(steps.measurements, here))
         gradient = np.concatenate([np.asarray(system.gradient), pull])
-        poses = se2.compose(poses, solve_poses(len(poses), join_edges(edges, steps._replace(measurements=here)), gradient))
+        edges = join_edges(edges, steps._replace(measurements=here))
+        poses = se2.compose(poses, solve_poses(len(poses), edges, gradient))
     return Refined(poses, 0, len(source))
 
 
