@@ -15,6 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 _log = logging.getLogger(__name__)
+FloatArray = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
 Selection = slice | NDArray[np.integer]
 """Start, stop and stride in scans, or the rows to keep, in the order wanted."""
 
@@ -69,12 +71,12 @@ class ScanSequence:
 
     name: str
     points: NDArray[np.float32]
-    mask: NDArray[np.bool_]
+    mask: BoolArray
     unit: Literal["px", "m"]
     is_organised: bool = True
-    reference_poses: NDArray[np.float64] | None = None
-    odometry_poses: NDArray[np.float64] | None = None
-    times: NDArray[np.float64] | None = None
+    reference_poses: FloatArray | None = None
+    odometry_poses: FloatArray | None = None
+    times: FloatArray | None = None
 
     def __post_init__(self) -> None:
         if self.unit not in ("px", "m"):
@@ -94,7 +96,7 @@ class ScanSequence:
         return replace(self, **_select(self, names, selection))
 
 
-def has_angular_order(points: NDArray[np.float32], mask: NDArray[np.bool_]) -> bool:
+def has_angular_order(points: NDArray[np.float32], mask: BoolArray) -> bool:
     """Whether the beams of scans are ordered by angle, as 1-D convolutions and neighbour normals need it.
 
     A scan is in order when at least 95 % of the turns from one valid beam to the next go the same way round and
@@ -132,7 +134,7 @@ class World:
     """
 
     name: str
-    is_obstacle: NDArray[np.bool_] = field(repr=False)
+    is_obstacle: BoolArray = field(repr=False)
 
     def __post_init__(self) -> None:
         if self.is_obstacle.ndim != 2 or self.is_obstacle.dtype != np.bool_:
@@ -178,7 +180,7 @@ class Camera:
         if min(self.width, self.height) < 1 or not min(self.fx, self.fy) > 0.0 or not np.isfinite(numbers).all():
             raise ValueError(f"camera: expected a size and focal lengths above 0, got {self}")
 
-    def rays(self, columns: NDArray[np.float64], rows: NDArray[np.float64]) -> NDArray[np.float64]:
+    def rays(self, columns: FloatArray, rows: FloatArray) -> FloatArray:
         """Directions (h, w, 3) with z = 1 of the pixels at rows (h,) and columns (w,)."""
         x, y = np.meshgrid((columns - self.cx) / self.fx, (rows - self.cy) / self.fy)
         return np.stack([x, y, np.ones_like(x)], axis=-1)
@@ -210,9 +212,9 @@ class DepthSequence:
 
     name: str
     points: NDArray[np.float32]
-    mask: NDArray[np.bool_]
+    mask: BoolArray
     is_planar: bool
-    T_world_camera: NDArray[np.float64] | None = None
+    T_world_camera: FloatArray | None = None
 
     def __post_init__(self) -> None:
         if self.points.ndim != 4 or self.points.shape[3] != 3:
@@ -246,8 +248,8 @@ class LidarSequence:
     name: str
     sources: tuple[str, ...] = field(repr=False)
     read_scan: Callable[[int], NDArray[np.float32]] = field(repr=False)
-    T_world_lidar: NDArray[np.float64] | None = field(default=None, repr=False)
-    times: NDArray[np.float64] | None = field(default=None, repr=False)
+    T_world_lidar: FloatArray | None = field(default=None, repr=False)
+    times: FloatArray | None = field(default=None, repr=False)
 
     def __post_init__(self) -> None:
         _require_shapes(self, {"T_world_lidar": (self.num_scans, 4, 4), "times": (self.num_scans,)})

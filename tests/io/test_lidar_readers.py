@@ -199,13 +199,7 @@ def _save_npz(path, points):
 
 @pytest.mark.parametrize(
     ("suffix", "write"),
-    [
-        (".bin", write_bin),
-        (".npy", np.save),
-        (".npz", _save_npz),
-        (".pcd", write_pcd),
-        (".ply", write_ply),
-    ],
+    [(".bin", write_bin), (".npy", np.save), (".npz", _save_npz), (".pcd", write_pcd), (".ply", write_ply)],
 )
 def test_plain_folders_in_natural_order(tmp_path, clouds, poses, suffix, write):
     for index, cloud in enumerate(clouds):

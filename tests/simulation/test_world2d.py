@@ -8,14 +8,7 @@ from scipy.ndimage import label
 from scipy.stats import kstest
 
 from dpmjax.io import InputError, read_world_png, write_world_png
-from dpmjax.simulation import (
-    TrajectoryConfig,
-    World,
-    cast_rays,
-    make_world,
-    simulate_sequence,
-    simulate_trajectory,
-)
+from dpmjax.simulation import TrajectoryConfig, World, cast_rays, make_world, simulate_sequence, simulate_trajectory
 from dpmjax.simulation.world2d.raycast import beam_angles
 from dpmjax.simulation.world2d.trajectory import simulate_odometry
 

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from dpmjax.io.files import natural_key, read_bytes, read_lines, read_table
 from dpmjax.io.mat import parse_mat
 from dpmjax.io.pictures import read_depth_png
-from dpmjax.sequences import ACTIVE_VISION, Camera, DepthSequence, InputError
+from dpmjax.sequences import ACTIVE_VISION, BoolArray, Camera, DepthSequence, FloatArray, InputError
 
 _NOTHING_MM = 65535  # besides 0
 _MOVES, _TURNS = ("forward", "backward", "left", "right"), ("rotate_cw", "rotate_ccw")
@@ -67,13 +67,7 @@ def read_pose_folder(path: str | Path, *, height: int = 30, width: int = 40, max
 
 
 def read_active_vision(
-    path: str | Path,
-    num_views: int = 16,
-    *,
-    seed: int = 0,
-    height: int = 27,
-    width: int = 48,
-    max_depth_m: float = 7.0,
+    path: str | Path, num_views: int = 16, *, seed: int = 0, height: int = 27, width: int = 48, max_depth_m: float = 7.0
 ) -> DepthSequence:
     """Reads one random trajectory through a scene (DeepMapping section 4.2); every second step moves, the others turn.
 
@@ -123,7 +117,7 @@ def is_active_vision(path: Path) -> bool:
 
 def back_project(
     depth_m: NDArray[np.floating], camera: Camera, *, height: int, width: int, max_depth_m: float
-) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+) -> tuple[NDArray[np.float32], BoolArray]:
     """An organised cloud out of a depth image, thinned to `height` x `width` of its pixels.
 
     Args:
@@ -153,7 +147,7 @@ def back_project(
 
 def _read_clouds(
     images: Iterable[Path], camera: Camera, shape: tuple[int, int], max_depth_m: float
-) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+) -> tuple[NDArray[np.float32], BoolArray]:
     """Points (n, h, w, 3) and mask (n, h, w) of depth images in millimetres."""
     clouds = []
     for image in images:
@@ -167,7 +161,7 @@ def _read_clouds(
     return np.stack(points), np.stack(mask)
 
 
-def _read_matrix(path: Path, shape: tuple[int, int]) -> NDArray[np.float64]:
+def _read_matrix(path: Path, shape: tuple[int, int]) -> FloatArray:
     matrix = read_table(path)
     if matrix.shape != shape or not np.isfinite(matrix).all():
         raise InputError(path, f"a matrix of {matrix.shape}", f"give {shape[0]} x {shape[1]} finite numbers")
@@ -201,7 +195,7 @@ def _walk(known: list[str], links: dict[str, Any], num_views: int, rng: np.rando
     return names
 
 
-def _read_scene_poses(path: Path) -> dict[str, NDArray[np.float64]]:
+def _read_scene_poses(path: Path) -> dict[str, FloatArray]:
     """T_world_camera of every image that the reconstruction has placed, metres."""
     poses = {}
     variables = parse_mat(read_bytes(path), path)

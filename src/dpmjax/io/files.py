@@ -15,7 +15,7 @@ import numpy as np
 from numpy.lib import format as npy_format
 from numpy.typing import ArrayLike, NDArray
 
-from dpmjax.sequences import InputError
+from dpmjax.sequences import FloatArray, InputError
 
 # A member of an archive that unpacks to more than this many times its size has a wrong header: deflate reaches 1032.
 _LARGEST_COMPRESSION = 1100
@@ -106,7 +106,7 @@ def read_lines(path: str | Path) -> list[str]:
     return read_bytes(path).decode("utf-8", errors="replace").splitlines()
 
 
-def to_numbers(rows: Sequence[Sequence[str]], source: str | Path) -> NDArray[np.float64]:
+def to_numbers(rows: Sequence[Sequence[str]], source: str | Path) -> FloatArray:
     """Converts words to numbers.
 
     Args:
@@ -129,7 +129,7 @@ def to_numbers(rows: Sequence[Sequence[str]], source: str | Path) -> NDArray[np.
         raise InputError(source, f"not a number ({error})", "write plain decimal numbers") from error
 
 
-def read_table(path: str | Path) -> NDArray[np.float64]:
+def read_table(path: str | Path) -> FloatArray:
     """Reads rows of numbers, separated by blanks or commas; empty lines and lines with # in front are left out.
 
     Args:
@@ -167,7 +167,7 @@ def unpack_rows(body: bytes, layout: np.dtype[np.void], count: int, source: str 
     return np.frombuffer(body, layout, count=count)
 
 
-def split_rows(body: bytes, width: int, count: int, source: str | Path) -> NDArray[np.float64]:
+def split_rows(body: bytes, width: int, count: int, source: str | Path) -> FloatArray:
     """Reads rows of numbers as text.
 
     Args:

@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from dpmjax.io.files import read_lines, write_atomically
 from dpmjax.pose_graph.graph import Edges, PoseGraph
-from dpmjax.sequences import InputError
+from dpmjax.sequences import FloatArray, InputError
 
 
 class _Kind(NamedTuple):
@@ -109,7 +109,7 @@ def _read_words(path: str | Path) -> list[tuple[int, list[str]]]:
 
 def _rows(
     path: str | Path, lines: Iterable[tuple[int, list[str]]], num_nodes: int, num_values: int
-) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+) -> tuple[NDArray[np.int64], FloatArray]:
     """Node ids and numbers of all lines of one tag."""
     nodes, values = [], []
     for number, (tag, *words) in lines:
@@ -126,7 +126,7 @@ def _rows(
     return np.array(nodes, np.int64).reshape(-1, num_nodes), np.array(values).reshape(-1, num_values)
 
 
-def _poses(numbers: NDArray[np.float64]) -> NDArray[np.float64]:
+def _poses(numbers: FloatArray) -> FloatArray:
     """Poses of the graph from numbers of the file: x y heading, or x y z qx qy qz qw to matrices."""
     if numbers.shape[1] == 3:
         return numbers
@@ -139,12 +139,12 @@ def _poses(numbers: NDArray[np.float64]) -> NDArray[np.float64]:
     return matrices
 
 
-def _numbers(poses: NDArray[np.float64]) -> NDArray[np.float64]:
+def _numbers(poses: FloatArray) -> FloatArray:
     """Numbers of the file from poses of the graph."""
     if poses.ndim == 2 or not len(poses):
         return poses.reshape(len(poses), -1)
     return np.column_stack([poses[:, :3, 3], Rotation.from_matrix(poses[:, :3, :3]).as_quat()])
 
 
-def _line(tag: str, nodes: Iterable[int], values: NDArray[np.float64]) -> str:
+def _line(tag: str, nodes: Iterable[int], values: FloatArray) -> str:
     return " ".join([tag, *map(str, nodes), *(f"{value:.17g}" for value in values.tolist())])

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dpmjax.io.files import read_bytes, write_atomically
-from dpmjax.sequences import InputError, World
+from dpmjax.sequences import FloatArray, InputError, World
 
 _MOST_PIXELS = 1 << 26
 
@@ -71,7 +71,7 @@ def write_world_png(path: str | Path, world: World) -> Path:
     return write_atomically(path, buffer.getvalue())
 
 
-def _read_png(path: str | Path) -> tuple[NDArray[np.float64], int]:
+def _read_png(path: str | Path) -> tuple[FloatArray, int]:
     """The picture with values in [0, 1], and the bits of a channel."""
     from matplotlib.image import imread
 

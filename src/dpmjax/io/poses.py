@@ -11,11 +11,11 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from dpmjax.geometry import se2
 from dpmjax.io.files import load_arrays, read_lines, read_table, write_atomically
-from dpmjax.sequences import InputError
+from dpmjax.sequences import FloatArray, InputError
 
 _LAYOUTS = (
     "x y theta, TUM (stamp tx ty tz qx qy qz qw), KITTI (12 numbers a row), or .npy of (n, 3), (n, 3, 3) or (n, 4, 4)"
@@ -23,7 +23,7 @@ _LAYOUTS = (
 _LARGEST_TILT_DEG = 10.0
 
 
-def read_poses(path: str | Path) -> NDArray[np.float64]:
+def read_poses(path: str | Path) -> FloatArray:
     """Reads poses as they stand in the file, whatever frame they are in.
 
     Args:
@@ -39,7 +39,7 @@ def read_poses(path: str | Path) -> NDArray[np.float64]:
     return planar_to_homogeneous(poses) if poses.ndim == 2 else poses
 
 
-def read_planar_poses(path: str | Path, num_scans: int, unit: Literal["px", "m"]) -> NDArray[np.float64]:
+def read_planar_poses(path: str | Path, num_scans: int, unit: Literal["px", "m"]) -> FloatArray:
     """Reads the planar trajectory of a set of scans.
 
     Args:
@@ -138,7 +138,7 @@ def write_poses_npy(path: str | Path, poses: ArrayLike) -> Path:
     return write_atomically(path, buffer.getvalue())
 
 
-def planar_to_homogeneous(poses: NDArray[np.float64]) -> NDArray[np.float64]:
+def planar_to_homogeneous(poses: FloatArray) -> FloatArray:
     """Puts planar poses into space.
 
     Args:
@@ -152,7 +152,7 @@ def planar_to_homogeneous(poses: NDArray[np.float64]) -> NDArray[np.float64]:
     return matrices
 
 
-def to_homogeneous(rows: NDArray[np.float64]) -> NDArray[np.float64]:
+def to_homogeneous(rows: FloatArray) -> FloatArray:
     """Matrices of KITTI rows.
 
     Args:
@@ -166,7 +166,7 @@ def to_homogeneous(rows: NDArray[np.float64]) -> NDArray[np.float64]:
     return matrices
 
 
-def check_poses(poses: NDArray[np.float64], source: str | Path) -> NDArray[np.float64]:
+def check_poses(poses: FloatArray, source: str | Path) -> FloatArray:
     """Refuses poses that are not finite or no rigid motions.
 
     Args:
@@ -193,9 +193,7 @@ def check_poses(poses: NDArray[np.float64], source: str | Path) -> NDArray[np.fl
     return poses
 
 
-def interpolate_poses(
-    times: NDArray[np.float64], poses: NDArray[np.float64], wanted: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def interpolate_poses(times: FloatArray, poses: FloatArray, wanted: FloatArray) -> FloatArray:
     """Poses at other times: positions linear, rotations on the shortest arc.
 
     Args:
@@ -216,7 +214,7 @@ def interpolate_poses(
     return found
 
 
-def _read(path: Path) -> NDArray[np.float64]:
+def _read(path: Path) -> FloatArray:
     """Checked poses of a file: planar (n, 3), or (n, 4, 4)."""
     if path.suffix.lower() == ".npy":
         array = load_arrays(path).get("points", np.zeros(0))
@@ -238,7 +236,7 @@ def _read(path: Path) -> NDArray[np.float64]:
     return check_poses(_from_tum(values, path) if width == 8 else to_homogeneous(values[:, :12]), path)
 
 
-def _from_tum(rows: NDArray[np.float64], path: Path) -> NDArray[np.float64]:
+def _from_tum(rows: FloatArray, path: Path) -> FloatArray:
     from scipy.spatial.transform import Rotation
 
     if not np.isfinite(rows).all():
@@ -250,7 +248,7 @@ def _from_tum(rows: NDArray[np.float64], path: Path) -> NDArray[np.float64]:
     return poses
 
 
-def _to_quaternions(rotations: NDArray[np.float64]) -> NDArray[np.float64]:
+def _to_quaternions(rotations: FloatArray) -> FloatArray:
     """(n, 4) x y z w with w >= 0."""
     from scipy.spatial.transform import Rotation
 
@@ -260,7 +258,7 @@ def _to_quaternions(rotations: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.where(quaternions[:, 3:] < 0, -quaternions, quaternions)
 
 
-def _as_matrices(poses: ArrayLike) -> NDArray[np.float64]:
+def _as_matrices(poses: ArrayLike) -> FloatArray:
     """(n, 4, 4) out of (n, 3) or (n, 4, 4)."""
     values = np.asarray(poses, np.float64)
     if not (values.ndim == 2 and values.shape[1] == 3) and values.shape[1:] != (4, 4):

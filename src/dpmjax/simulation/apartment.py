@@ -13,9 +13,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
-from numpy.typing import NDArray
 
-from dpmjax.sequences import ACTIVE_VISION, Camera, DepthSequence
+from dpmjax.sequences import ACTIVE_VISION, BoolArray, Camera, DepthSequence, FloatArray
 from dpmjax.types import AnyArray
 
 _CAMERA_HEIGHT_M, _ROOM_HEIGHT_M, _WALL_M, _DOOR_M = 1.1, 2.6, 0.12, 0.95
@@ -38,14 +37,14 @@ class Apartment:
     """
 
     name: str
-    centres: NDArray[np.float64]
-    half_sizes: NDArray[np.float64]
-    yaws: NDArray[np.float64]
+    centres: FloatArray
+    half_sizes: FloatArray
+    yaws: FloatArray
     size_x_m: float
     size_z_m: float
-    is_seen_through: NDArray[np.bool_]
+    is_seen_through: BoolArray
 
-    def is_free(self, places: NDArray[np.float64], clearance_m: float) -> NDArray[np.bool_]:
+    def is_free(self, places: FloatArray, clearance_m: float) -> BoolArray:
         """Which places are free for the robot below the camera; lower furniture counts too.
 
         Args:
@@ -56,7 +55,7 @@ class Apartment:
             (m,) True where the place is free.
         """
         far = np.array([self.size_x_m, self.size_z_m]) - clearance_m
-        inside: NDArray[np.bool_] = np.all((places > clearance_m) & (places < far), axis=1)
+        inside: BoolArray = np.all((places > clearance_m) & (places < far), axis=1)
         for centre, half, yaw in zip(
             self.centres[~self.is_seen_through],
             self.half_sizes[~self.is_seen_through],
@@ -211,7 +210,7 @@ def _place_furniture(rng: np.random.Generator, rooms: _Rooms) -> list[_Box]:
 
 
 def _build_furniture(
-    rng: np.random.Generator, kind: str, place: NDArray[np.float64], footprint: tuple[float, float, float]
+    rng: np.random.Generator, kind: str, place: FloatArray, footprint: tuple[float, float, float]
 ) -> list[_Box]:
     """The boxes of a piece; the footprint is width, depth and yaw."""
     floor, ceiling = _CAMERA_HEIGHT_M, _CAMERA_HEIGHT_M - _ROOM_HEIGHT_M
@@ -273,7 +272,7 @@ def cast_depth(
     return jax.vmap(meet)(jnp.asarray(centres), jnp.asarray(half_sizes), jnp.asarray(yaws)).min(0)
 
 
-def _walk(home: Apartment, num_views: int, config: GridWalkConfig, rng: np.random.Generator) -> NDArray[np.float64]:
+def _walk(home: Apartment, num_views: int, config: GridWalkConfig, rng: np.random.Generator) -> FloatArray:
     """(n, 3) x, z and angle about y: one step to a neighbouring place, or one turn, from view to view."""
     x, z = np.arange(0.0, home.size_x_m, config.grid_m), np.arange(0.0, home.size_z_m, config.grid_m)
     places = np.stack(np.meshgrid(x, z, indexing="ij"), axis=-1)
@@ -297,7 +296,7 @@ def _walk(home: Apartment, num_views: int, config: GridWalkConfig, rng: np.rando
     return np.array(poses)
 
 
-def _planar_to_matrices(poses: NDArray[np.float64]) -> NDArray[np.float64]:
+def _planar_to_matrices(poses: FloatArray) -> FloatArray:
     """(n, 4, 4) T_world_camera of x, z and the angle about y."""
     cos, sin = np.cos(poses[:, 2]), np.sin(poses[:, 2])
     T = np.tile(np.eye(4), (len(poses), 1, 1))

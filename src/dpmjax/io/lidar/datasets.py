@@ -6,14 +6,13 @@ import re
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from dpmjax.geometry import rigid
 from dpmjax.io.files import natural_key, read_lines, read_table
 from dpmjax.io.lidar.drive import Drive3D, from_first, match_poses, numbers_of, scan_files
 from dpmjax.io.lidar.kitti import read_labelled_numbers
 from dpmjax.io.poses import check_poses, interpolate_poses, to_homogeneous
-from dpmjax.sequences import InputError
+from dpmjax.sequences import FloatArray, InputError
 
 _CARLA_POSES_PER_FRAME = 100  # KITTI-CARLA writes poses at 1000 Hz and frames at 10 Hz.
 _EARTH_RADIUS_M = 6378137.0
@@ -144,13 +143,7 @@ def read_mulran(folder: Path) -> Drive3D:
 
 
 def _interpolate(
-    drive: Drive3D,
-    wanted: NDArray[np.float64],
-    times: NDArray[np.float64],
-    poses: NDArray[np.float64],
-    path: Path,
-    *,
-    slack: float = 0.0,
+    drive: Drive3D, wanted: FloatArray, times: FloatArray, poses: FloatArray, path: Path, *, slack: float = 0.0
 ) -> Drive3D:
     """The scans less than `slack` beyond the times of the poses, with interpolated poses from the first on."""
     times, first = np.unique(times, return_index=True)
@@ -169,7 +162,7 @@ def _require_numbers(files: list[Path]) -> list[int]:
     return numbers
 
 
-def _first_row(path: Path, width: int) -> NDArray[np.float64]:
+def _first_row(path: Path, width: int) -> FloatArray:
     """(1, width) first numbers of a file."""
     rows = read_table(path)
     if rows.shape[1] < width:
@@ -177,7 +170,7 @@ def _first_row(path: Path, width: int) -> NDArray[np.float64]:
     return rows[:1, :width]
 
 
-def _read_rows(path: Path, layout: str) -> NDArray[np.float64]:
+def _read_rows(path: Path, layout: str) -> FloatArray:
     """(n, 13) numbers of a pose file, all finite."""
     rows = read_table(path)
     if rows.shape[1] != 13 or not np.isfinite(rows).all():
@@ -185,7 +178,7 @@ def _read_rows(path: Path, layout: str) -> NDArray[np.float64]:
     return rows
 
 
-def _read_stamps(path: Path, files: list[Path]) -> NDArray[np.float64] | None:
+def _read_stamps(path: Path, files: list[Path]) -> FloatArray | None:
     """KITTI raw's timestamps.txt (2011-09-26 13:02:25.951199337) as seconds from the first; None if it does not fit."""
     try:
         lines = [line.strip() for line in read_lines(path) if line.strip()]
@@ -202,7 +195,7 @@ def _read_stamps(path: Path, files: list[Path]) -> NDArray[np.float64] | None:
     return (stamps - stamps[0]).astype(np.float64) * 1e-9 if len(stamps) else None
 
 
-def _read_imu_calibration(path: Path) -> NDArray[np.float64]:
+def _read_imu_calibration(path: Path) -> FloatArray:
     """(4, 4) out of KITTI raw's `R:` and `T:` lines."""
     entries = read_labelled_numbers(path)
     turn, shift = entries.get("R", np.zeros(0)), entries.get("T", np.zeros(0))
@@ -211,7 +204,7 @@ def _read_imu_calibration(path: Path) -> NDArray[np.float64]:
     return check_poses(to_homogeneous(np.column_stack([turn.reshape(3, 3), shift]).reshape(1, 12)), path)[0]
 
 
-def _poses_from_oxts(records: NDArray[np.float64], source: Path) -> NDArray[np.float64]:
+def _poses_from_oxts(records: FloatArray, source: Path) -> FloatArray:
     """GPS/IMU records as poses, by the Mercator projection (Geiger et al. 2013, section III).
 
     Args:

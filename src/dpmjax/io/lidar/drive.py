@@ -7,13 +7,12 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from dpmjax.geometry import rigid
 from dpmjax.io.files import load_arrays, natural_key, read_table
 from dpmjax.io.lidar.files import SCAN_SUFFIXES
 from dpmjax.io.poses import check_poses, read_poses, to_homogeneous
-from dpmjax.sequences import InputError
+from dpmjax.sequences import FloatArray, InputError
 
 _POSE_FILES = ("poses_lidar.txt", "poses_lidar.npy", "poses.txt", "poses.npy", "trajectory.txt", "trajectory_tum.txt",
                "trajectory.npy", "gt_poses.txt", "groundtruth.txt")  # fmt: skip
@@ -31,8 +30,8 @@ class Drive3D(NamedTuple):
 
     name: str
     files: list[Path]
-    T_world_lidar: NDArray[np.float64] | None
-    times: NDArray[np.float64] | None
+    T_world_lidar: FloatArray | None
+    times: FloatArray | None
 
 
 def scan_files(folder: Path, suffixes: tuple[str, ...] = SCAN_SUFFIXES) -> list[Path]:
@@ -70,7 +69,7 @@ def numbers_of(files: Sequence[Path], largest: float = 2.0**62) -> list[int] | N
     return [int(name) for name in names]
 
 
-def match_poses(poses: NDArray[np.float64], files: list[Path], path: Path) -> NDArray[np.float64]:
+def match_poses(poses: FloatArray, files: list[Path], path: Path) -> FloatArray:
     """The pose of each scan: in order if there are as many, else by the number that is the file's name.
 
     Args:
@@ -93,7 +92,7 @@ def match_poses(poses: NDArray[np.float64], files: list[Path], path: Path) -> ND
     return poses[numbers]
 
 
-def match_times(path: Path, files: list[Path]) -> NDArray[np.float64] | None:
+def match_times(path: Path, files: list[Path]) -> FloatArray | None:
     """The times of the scans out of times.txt; a file that does not fit is ignored.
 
     Args:
@@ -115,7 +114,7 @@ def match_times(path: Path, files: list[Path]) -> NDArray[np.float64] | None:
     return times if np.isfinite(times).all() else None
 
 
-def from_first(poses: NDArray[np.float64]) -> NDArray[np.float64]:
+def from_first(poses: FloatArray) -> FloatArray:
     """Poses in the frame of the first one, without the 1e6 m of national grids.
 
     Args:
@@ -162,7 +161,7 @@ def read_learned_folder(folder: Path) -> Drive3D:
         InputError: a pose that is no rigid motion.
     """
     files = scan_files(folder, (".npz",))
-    poses: list[NDArray[np.float64] | None] = []
+    poses: list[FloatArray | None] = []
     for file in files:
         try:
             table = load_arrays(file, ("ego_rotation", "ego_translation"))

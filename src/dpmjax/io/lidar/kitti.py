@@ -5,13 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from dpmjax.geometry import rigid
 from dpmjax.io.files import read_lines, write_atomically
 from dpmjax.io.lidar.drive import Drive3D, match_poses, match_times, scan_files
 from dpmjax.io.poses import check_poses, read_poses, to_homogeneous, write_kitti
-from dpmjax.sequences import InputError, LidarSequence, iterate_scans
+from dpmjax.sequences import FloatArray, InputError, LidarSequence, iterate_scans
 
 # Axes of a camera that looks along x of the lidar: x right, y down, z forward. Written sequences have it in the lidar.
 _T_CAM0_LIDAR = np.array([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]])
@@ -81,7 +80,7 @@ def write_kitti_sequence(root: str | Path, name: str, sequence: LidarSequence) -
     return folder
 
 
-def read_labelled_numbers(path: Path) -> dict[str, NDArray[np.float64]]:
+def read_labelled_numbers(path: Path) -> dict[str, FloatArray]:
     """Reads the lines `key: numbers` of a calibration file; other lines are ignored.
 
     Args:
@@ -102,7 +101,7 @@ def read_labelled_numbers(path: Path) -> dict[str, NDArray[np.float64]]:
     return found
 
 
-def _read_camera_calibration(path: Path) -> NDArray[np.float64]:
+def _read_camera_calibration(path: Path) -> FloatArray:
     """(4, 4) `T_cam0_lidar`: `Tr`, the lidar's frame to the left grey camera's, out of KITTI's calib.txt."""
     entries = read_labelled_numbers(path)
     for key in ("Tr", "Tr_velo_to_cam", "Tr_velo_cam"):

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from dpmjax.geometry import se2
 from dpmjax.io.files import load_arrays, to_float32
 from dpmjax.io.poses import check_poses
-from dpmjax.sequences import InputError, ScanSequence, has_angular_order
+from dpmjax.sequences import BoolArray, FloatArray, InputError, ScanSequence, has_angular_order
 
 Table = Mapping[str, NDArray[np.generic]]
 _KEYS = "points (n, b, 2), or ranges (n, b) and angles (b,); optional mask, poses, odometry, times, unit"
@@ -70,7 +70,7 @@ def read_arrays(path: str | Path, *, unit: Literal["px", "m"] | None = None) -> 
     )
 
 
-def _points(table: Table, path: str | Path) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+def _points(table: Table, path: str | Path) -> tuple[FloatArray, BoolArray]:
     points = table["points"]
     if points.ndim != 3 or points.shape[2] not in (2, 3) or points.dtype.kind not in "fiu":
         raise InputError(path, f"points are {points.shape} {points.dtype}", "give (n, b, 2): scans, beams, x and y")
@@ -78,7 +78,7 @@ def _points(table: Table, path: str | Path) -> tuple[NDArray[np.float64], NDArra
     return planar, np.isnan(planar).sum(axis=2) < 2
 
 
-def _from_ranges(table: Table, path: str | Path) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+def _from_ranges(table: Table, path: str | Path) -> tuple[FloatArray, BoolArray]:
     if "ranges" not in table or "angles" not in table:
         raise InputError(path, f"keys are {', '.join(table) or 'none'}", f"give {_KEYS}")
     ranges, angles = table["ranges"], table["angles"]
@@ -100,7 +100,7 @@ def _unit(table: Table, path: str | Path) -> Literal["px", "m"]:
     return "px" if unit == "px" else "m"
 
 
-def _planar(table: Table, key: str, num_scans: int, path: str | Path) -> NDArray[np.float64] | None:
+def _planar(table: Table, key: str, num_scans: int, path: str | Path) -> FloatArray | None:
     """Poses (n, 3) x, y, heading out of (n, 3) or homogeneous (n, 3, 3)."""
     if key not in table:
         return None

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dpmjax.io.files import read_bytes
-from dpmjax.sequences import InputError, ScanSequence
+from dpmjax.sequences import FloatArray, InputError, ScanSequence
 
 _log = logging.getLogger(__name__)
 _SHORTEST_SCALE_M = 7.9  # No laser of these logs has a shorter scale: a log that ends before has no code for "no echo".
@@ -32,9 +32,9 @@ _CODE_BAND_M = 0.1  # Codes for "no echo" scatter by a few centimetres (81.87 to
 class _Line(NamedTuple):
     """One FLASER line: ranges, m; corrected pose, odometry (x, y, theta); time stamp, s."""
 
-    ranges: NDArray[np.float64]
-    corrected: NDArray[np.float64]
-    odometry: NDArray[np.float64]
+    ranges: FloatArray
+    corrected: FloatArray
+    odometry: FloatArray
     time: float
 
 
@@ -82,7 +82,7 @@ def read_carmen_log(path: str | Path, *, max_range: float | None = None) -> Scan
     )
 
 
-def scan_angles(num_beams: int) -> NDArray[np.float64]:
+def scan_angles(num_beams: int) -> FloatArray:
     """Directions of the beams of a scan over 180 degrees, from right to left.
 
     An odd number of beams (181, 361) includes both ends; an even one (180, 360) has the step 180 / n and leaves out the
@@ -137,9 +137,7 @@ def _no_echo_limit(lines: list[_Line]) -> float:
     return largest - _CODE_BAND_M if largest >= _SHORTEST_SCALE_M else np.inf
 
 
-def _repair(
-    times: NDArray[np.float64], odometry: NDArray[np.float64], path: str | Path
-) -> tuple[NDArray[np.float64] | None, NDArray[np.float64]]:
+def _repair(times: FloatArray, odometry: FloatArray, path: str | Path) -> tuple[FloatArray | None, FloatArray]:
     """Interpolates time and odometry where the time stamp is out of order; no times where they stand still."""
     if np.ptp(times) == 0:
         return None, odometry
@@ -164,7 +162,7 @@ def _repair(
     return np.interp(index, trusted, times[trusted]), repaired
 
 
-def _longest_increasing(values: NDArray[np.float64]) -> NDArray[np.int64]:
+def _longest_increasing(values: FloatArray) -> NDArray[np.int64]:
     """Indices of the longest subsequence that strictly increases (patience sorting)."""
     tails: list[float] = []
     ends: list[int] = []

@@ -11,12 +11,11 @@ from pathlib import Path, PurePosixPath
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from dpmjax.io.clouds import parse_pcd, write_pcd
 from dpmjax.io.files import natural_key, read_bytes, write_atomically
 from dpmjax.io.mat import parse_mat
-from dpmjax.sequences import InputError, ScanSequence, has_angular_order
+from dpmjax.sequences import FloatArray, InputError, ScanSequence, has_angular_order
 
 _PIXELS_PER_UNIT = 512.0
 _LARGEST_STORED = 8.0  # A picture of 2048 pixels has a diagonal of 5.7 stored units.
@@ -119,7 +118,7 @@ def _list_files(path: Path) -> dict[str, bytes]:
         raise InputError(path, f"not a readable tar archive ({error})", "copy the archive again") from error
 
 
-def _read_poses(content: bytes, source: str, num_scans: int) -> NDArray[np.float64]:
+def _read_poses(content: bytes, source: str, num_scans: int) -> FloatArray:
     """The (n, 3) array `pose` of a MATLAB file."""
     variables = parse_mat(content, source)
     if "pose" not in variables:

@@ -9,7 +9,7 @@ import jax
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from dpmjax.sequences import LidarSequence
+from dpmjax.sequences import FloatArray, LidarSequence
 from dpmjax.simulation.town.cast import CastConfig
 from dpmjax.simulation.town.make import Town, TownConfig, make_town
 from dpmjax.simulation.town.scan import HDL64E, LidarSensor, scan_town
@@ -60,8 +60,8 @@ class Drive(NamedTuple):
         times: (n,) s, from 0.
     """
 
-    T_world_lidar: NDArray[np.float64]
-    times: NDArray[np.float64]
+    T_world_lidar: FloatArray
+    times: FloatArray
 
 
 def simulate_lidar_sequence(
@@ -135,8 +135,8 @@ def drive(town: Town, config: DriveConfig = DriveConfig(), *, seed: int = 0) -> 
 
 
 def _timetable(
-    lane: NDArray[np.float64], length: float, config: DriveConfig, *, is_closed: bool
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    lane: FloatArray, length: float, config: DriveConfig, *, is_closed: bool
+) -> tuple[FloatArray, FloatArray]:
     """Ways along the lane and times of the scans."""
     way = np.arange(0.0, length, 0.5)
     whole = arc_lengths(lane)[-1]
@@ -149,14 +149,14 @@ def _timetable(
     return config.start_m + np.interp(times, clock, way), times
 
 
-def _directions(lane: NDArray[np.float64], way: NDArray[np.float64]) -> NDArray[np.float64]:
+def _directions(lane: FloatArray, way: FloatArray) -> FloatArray:
     lengths = arc_lengths(lane)
     slope = tangents(lane)
     found = np.column_stack([np.interp(way, lengths, column) for column in slope.T])
     return found / np.maximum(np.linalg.norm(found, axis=1, keepdims=True), 1e-9)
 
 
-def _slow_noise(rng: np.random.Generator, way: NDArray[np.float64]) -> NDArray[np.float64]:
+def _slow_noise(rng: np.random.Generator, way: FloatArray) -> FloatArray:
     """Unit noise that changes over tens of metres."""
     phases = rng.uniform(0, 2 * np.pi, 3)
     waves = 2 * np.pi / np.array([31.0, 53.0, 97.0])
@@ -164,13 +164,8 @@ def _slow_noise(rng: np.random.Generator, way: NDArray[np.float64]) -> NDArray[n
 
 
 def _poses(
-    town: Town,
-    places: NDArray[np.float64],
-    along: NDArray[np.float64],
-    left: NDArray[np.float64],
-    config: DriveConfig,
-    rng: np.random.Generator,
-) -> NDArray[np.float64]:
+    town: Town, places: FloatArray, along: FloatArray, left: FloatArray, config: DriveConfig, rng: np.random.Generator
+) -> FloatArray:
     """Stands the car on its wheels: pitch and roll from the ground under the axles, and a little shaking."""
     height = town.terrain.height_at
     shake = np.radians(config.shake_deg) * rng.normal(size=(2, len(places)))

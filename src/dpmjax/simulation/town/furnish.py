@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from dpmjax.sequences import FloatArray
 from dpmjax.simulation.town import objects
 from dpmjax.simulation.town.objects import Collection, Place
 from dpmjax.simulation.town.streets import Streets, arc_lengths, at_way, tangents
@@ -63,8 +63,8 @@ _BORDERS = ("hedge", "wall", "fence")
 class _Side:
     """One side of one street: its kerb-to-kerb geometry and the direction of "away from the street"."""
 
-    path: NDArray[np.float64]
-    along: NDArray[np.float64]
+    path: FloatArray
+    along: FloatArray
     length: float
     half_width: float
     quarter: Quarter

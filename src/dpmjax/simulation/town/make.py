@@ -6,8 +6,9 @@ from dataclasses import dataclass, field
 
 import jax.numpy as jnp
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from dpmjax.sequences import FloatArray
 from dpmjax.simulation.town.furnish import furnish
 from dpmjax.simulation.town.objects import Collection
 from dpmjax.simulation.town.primitives import (
@@ -135,7 +136,7 @@ def _pack_town(standing: Collection, terrain: Terrain, traffic: Traffic) -> Town
     )
 
 
-def _positions(trajectory: ArrayLike) -> NDArray[np.float64]:
+def _positions(trajectory: ArrayLike) -> FloatArray:
     poses = np.asarray(trajectory, np.float64)
     if poses.ndim != 3 or poses.shape[1:] != (4, 4) or not np.isfinite(poses).all():
         raise ValueError(f"trajectory must be finite (n, 4, 4) poses, got {poses.shape}")
@@ -174,6 +175,6 @@ def _make_traffic(rng: np.random.Generator, streets: Streets, terrain: Terrain, 
     )
 
 
-def _fill(points: NDArray[np.float64], count: int) -> NDArray[np.float64]:
+def _fill(points: FloatArray, count: int) -> FloatArray:
     """Repeats the last row up to `count` rows."""
     return np.vstack([points, np.repeat(points[-1:], count - len(points), axis=0)])

@@ -13,7 +13,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
-from numpy.typing import NDArray
+
+from dpmjax.sequences import FloatArray
 
 LANE_STEP_M = 2.0
 # Road users nearer to the sensor than this are left out: the sensor's own car is there.
@@ -120,7 +121,7 @@ def capacity_for(count: int, *, least: int = 64) -> int:
     return max(least, 1 << max(count - 1, 0).bit_length())
 
 
-def padded(rows: NDArray[np.float64], capacity: int) -> jax.Array:
+def padded(rows: FloatArray, capacity: int) -> jax.Array:
     """The rows as float32, followed by zeros up to the capacity.
 
     Args:
@@ -140,7 +141,7 @@ def mask_of(count: int, capacity: int) -> jax.Array:
     return jnp.asarray(np.arange(capacity) < count)
 
 
-def pack_bodies(table: NDArray[np.float64], surface: int) -> Bodies:
+def pack_bodies(table: FloatArray, surface: int) -> Bodies:
     """Bodies of one kind out of rows.
 
     Args:

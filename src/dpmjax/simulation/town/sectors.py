@@ -63,10 +63,7 @@ def _azimuth_intervals(
 
 
 def bodies_by_sector(
-    bodies: Bodies,
-    T_lidar_world: Float[Array, "4 4"],
-    sector_azimuths: Float[Array, " s"],
-    capacity: int,
+    bodies: Bodies, T_lidar_world: Float[Array, "4 4"], sector_azimuths: Float[Array, " s"], capacity: int
 ) -> Bodies:
     """Gives each sector its own list of bodies, in the order of the bodies.
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from dpmjax.sequences import FloatArray
 from dpmjax.simulation.town.streets import Streets
 
 CELL_M = 0.5
@@ -26,11 +27,11 @@ class Terrain:
         street_distance: (h, w) from the nearest kerb, m; negative on a street.
     """
 
-    origin: NDArray[np.float64]
-    heights: NDArray[np.float64] = field(repr=False)
-    street_distance: NDArray[np.float64] = field(repr=False)
+    origin: FloatArray
+    heights: FloatArray = field(repr=False)
+    street_distance: FloatArray = field(repr=False)
 
-    def height_at(self, positions: NDArray[np.float64]) -> NDArray[np.float64]:
+    def height_at(self, positions: FloatArray) -> FloatArray:
         """Ground heights (m,) at (m, 2) places, bilinear."""
         from scipy.ndimage import map_coordinates
 
@@ -39,7 +40,7 @@ class Terrain:
 
 
 def make_terrain(
-    rng: np.random.Generator, streets: Streets, *, steepness: float, support: NDArray[np.float64] | None = None
+    rng: np.random.Generator, streets: Streets, *, steepness: float, support: FloatArray | None = None
 ) -> Terrain:
     """Shapes the ground.
 
@@ -62,7 +63,7 @@ def make_terrain(
     return Terrain(low, land + _cross_section(distance) + _roughness(rng, distance), distance)
 
 
-def _street_distance(streets: Streets, origin: NDArray[np.float64], shape: tuple[int, int]) -> NDArray[np.float64]:
+def _street_distance(streets: Streets, origin: FloatArray, shape: tuple[int, int]) -> FloatArray:
     """Distance from the nearest kerb; streets of different width count by their own."""
     from scipy.ndimage import distance_transform_edt
 
@@ -78,9 +79,7 @@ def _street_distance(streets: Streets, origin: NDArray[np.float64], shape: tuple
     return nearest
 
 
-def _rolling(
-    rng: np.random.Generator, x: NDArray[np.float64], y: NDArray[np.float64], steepness: float
-) -> NDArray[np.float64]:
+def _rolling(rng: np.random.Generator, x: FloatArray, y: FloatArray, steepness: float) -> FloatArray:
     land = np.zeros_like(x)
     for wavelength in (900.0, 600.0, 400.0, 250.0):
         angle, phase = rng.uniform(0, 2 * np.pi, 2)
@@ -89,7 +88,7 @@ def _rolling(
     return land
 
 
-def _through(support: NDArray[np.float64], origin: NDArray[np.float64], shape: tuple[int, int]) -> NDArray[np.float64]:
+def _through(support: FloatArray, origin: FloatArray, shape: tuple[int, int]) -> FloatArray:
     """Land through given points: inverse distances on a coarse grid, smoothed, then brought to the fine one."""
     from scipy.ndimage import gaussian_filter, map_coordinates
     from scipy.spatial import KDTree
@@ -107,14 +106,14 @@ def _through(support: NDArray[np.float64], origin: NDArray[np.float64], shape: t
     return map_coordinates(land, at, order=1, mode="nearest")
 
 
-def _cross_section(distance: NDArray[np.float64]) -> NDArray[np.float64]:
+def _cross_section(distance: FloatArray) -> FloatArray:
     """A cambered street, a kerb, a pavement, and gardens a little higher."""
     camber = 0.02 * np.clip(-distance, 0, 5)
     kerb = _KERB_M * np.clip((distance + 0.25) / 0.5, 0, 1)
     return camber + kerb + 0.15 * np.clip((distance - _PAVEMENT_M) / 2.0, 0, 1)
 
 
-def _roughness(rng: np.random.Generator, distance: NDArray[np.float64]) -> NDArray[np.float64]:
+def _roughness(rng: np.random.Generator, distance: FloatArray) -> FloatArray:
     """Millimetres on streets, centimetres and gentle mounds in gardens."""
     from scipy.ndimage import gaussian_filter
 
@@ -138,12 +137,7 @@ class Plots:
         self._is_taken = np.zeros(terrain.heights.shape, bool)
 
     def claim(
-        self,
-        centre: NDArray[np.float64],
-        half_size: tuple[float, float],
-        heading: float,
-        *,
-        kerb_distance: float = 0.5,
+        self, centre: FloatArray, half_size: tuple[float, float], heading: float, *, kerb_distance: float = 0.5
     ) -> bool:
         """Takes a rectangle if all of it is free.
 
@@ -165,7 +159,7 @@ class Plots:
         self._is_taken[at] = True
         return True
 
-    def _cells(self, centre: NDArray[np.float64], half_size: tuple[float, float], heading: float) -> NDArray[np.int64]:
+    def _cells(self, centre: FloatArray, half_size: tuple[float, float], heading: float) -> NDArray[np.int64]:
         axes = [np.linspace(-half, half, max(int(np.ceil(2 * half / CELL_M)) + 1, 2)) for half in half_size]
         u, v = (grid.ravel() for grid in np.meshgrid(*axes))
         cos, sin = np.cos(heading), np.sin(heading)

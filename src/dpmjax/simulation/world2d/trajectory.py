@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dpmjax.geometry import se2
-from dpmjax.sequences import World
+from dpmjax.sequences import BoolArray, FloatArray, World
 
 
 @dataclass(frozen=True)
@@ -46,7 +46,7 @@ _LOOKAHEAD_PX = 36.0
 
 def simulate_trajectory(
     world: World, num_poses: int, *, rng: np.random.Generator, config: TrajectoryConfig | None = None
-) -> NDArray[np.float64]:
+) -> FloatArray:
     """Walks through a world: out to new places, home again by another way, and so on.
 
     Args:
@@ -74,13 +74,13 @@ def simulate_trajectory(
 
 
 def simulate_odometry(
-    poses: NDArray[np.float64],
+    poses: FloatArray,
     *,
     rng: np.random.Generator,
     translation_noise: float = 0.05,
     rotation_noise_deg: float = 1.0,
     bias: float = 0.01,
-) -> NDArray[np.float64]:
+) -> FloatArray:
     """Simulates wheel odometry: each relative motion gets a fixed scale error and white noise; the motions are chained.
 
     Args:
@@ -103,7 +103,7 @@ def simulate_odometry(
     return se2.chain(np.column_stack([forward, left, turn]))[: len(pose)]
 
 
-def _clearance(is_obstacle: NDArray[np.bool_]) -> NDArray[np.float64]:
+def _clearance(is_obstacle: BoolArray) -> FloatArray:
     """(h, w) lower bound of the distance (px) of any point of a pixel to the next obstacle or to the border."""
     from scipy.ndimage import distance_transform_edt
 
@@ -112,8 +112,8 @@ def _clearance(is_obstacle: NDArray[np.bool_]) -> NDArray[np.float64]:
 
 
 def _plan_route(
-    clearance: NDArray[np.float64], length_px: float, rng: np.random.Generator, config: TrajectoryConfig
-) -> NDArray[np.float64]:
+    clearance: FloatArray, length_px: float, rng: np.random.Generator, config: TrajectoryConfig
+) -> FloatArray:
     """(k, 2) raster points of a route of at least the wanted length, every third leg back to where it began."""
     coarse = clearance[_CELL_PX // 2 :: _CELL_PX, _CELL_PX // 2 :: _CELL_PX]
     cells = _largest_region(coarse >= config.clearance_px + _PLAN_MARGIN_PX)
@@ -138,7 +138,7 @@ def _plan_route(
     return centres[route]
 
 
-def _largest_region(is_open: NDArray[np.bool_]) -> NDArray[np.int64]:
+def _largest_region(is_open: BoolArray) -> NDArray[np.int64]:
     """(k, 2) rows and columns of the largest connected open region."""
     from scipy.ndimage import label
 
@@ -149,8 +149,8 @@ def _largest_region(is_open: NDArray[np.bool_]) -> NDArray[np.int64]:
 
 
 def _shortest_paths(
-    cells: NDArray[np.int64], coarse: NDArray[np.float64], visits: NDArray[np.float64], start: int
-) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
+    cells: NDArray[np.int64], coarse: FloatArray, visits: FloatArray, start: int
+) -> tuple[FloatArray, NDArray[np.int32]]:
     """Costs (k,) from the start cell and predecessors (k,); walls and used ways cost more than open new ground."""
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import dijkstra
@@ -171,9 +171,7 @@ def _shortest_paths(
     return cost[0], before[0]
 
 
-def _choose_goal(
-    cost: NDArray[np.float64], visits: NDArray[np.float64], rng: np.random.Generator, config: TrajectoryConfig
-) -> int:
+def _choose_goal(cost: FloatArray, visits: FloatArray, rng: np.random.Generator, config: TrajectoryConfig) -> int:
     """The least visited of a handful of places about a leg away."""
     off = np.abs(cost / (1.5 * config.leg_px) - 1.0)
     near_enough = np.flatnonzero((off <= max(0.4, float(np.partition(off, 1)[1]))) & (cost > 0))
@@ -190,12 +188,8 @@ def _trace(before: NDArray[np.int32], start: int, goal: int) -> list[int]:
 
 
 def _walk(
-    route: NDArray[np.float64],
-    clearance: NDArray[np.float64],
-    num_poses: int,
-    rng: np.random.Generator,
-    config: TrajectoryConfig,
-) -> NDArray[np.float64]:
+    route: FloatArray, clearance: FloatArray, num_poses: int, rng: np.random.Generator, config: TrajectoryConfig
+) -> FloatArray:
     """(num_poses, 2) positions: steps of random length towards the farthest visible point of the route, unsteadily."""
     positions, along = [route[0]], 0
     lengths = config.mean_step_px * rng.uniform(0.6, 1.4, num_poses - 1)
@@ -217,13 +211,7 @@ def _walk(
     return np.array(positions)
 
 
-def _aim(
-    route: NDArray[np.float64],
-    along: int,
-    here: NDArray[np.float64],
-    clearance: NDArray[np.float64],
-    config: TrajectoryConfig,
-) -> int:
+def _aim(route: FloatArray, along: int, here: FloatArray, clearance: FloatArray, config: TrajectoryConfig) -> int:
     """Index of the route point to walk to: the farthest one ahead that is within sight and not far off."""
     last = min(along + int(2 * _LOOKAHEAD_PX / _CELL_PX), len(route) - 1)
     for index in range(last, along, -1):
@@ -233,9 +221,7 @@ def _aim(
     return along if np.linalg.norm(route[along] - here) > _CELL_PX else min(along + 1, len(route) - 1)
 
 
-def _is_clear(
-    start: NDArray[np.float64], end: NDArray[np.float64], clearance: NDArray[np.float64], margin: float
-) -> bool:
+def _is_clear(start: FloatArray, end: FloatArray, clearance: FloatArray, margin: float) -> bool:
     """Whether a straight step keeps the margin, sampled every half pixel (a quarter is lost at most)."""
     count = int(np.linalg.norm(end - start) * 2) + 2
     samples = np.floor(np.linspace(start, end, count)).astype(np.int64)
