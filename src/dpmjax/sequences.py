@@ -37,6 +37,22 @@ class InputError(ValueError):
         super().__init__(" ".join(f"{source}: {found}; {advice}.".split()))
 
 
+def require(is_good: bool | np.bool_, source: str | Path, found: str, advice: str) -> None:
+    """Raises an `InputError` unless the input is good.
+
+    Args:
+        is_good: the check.
+        source: see `InputError`.
+        found: what was found where the check fails.
+        advice: what to do then.
+
+    Raises:
+        InputError: the check fails.
+    """
+    if not is_good:
+        raise InputError(source, found, advice)
+
+
 def _require_shapes(record: Any, shapes: dict[str, tuple[int, ...]]) -> None:
     """Raises a ValueError for the first field that is present and has another shape."""
     for name, shape in shapes.items():

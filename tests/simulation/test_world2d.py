@@ -9,8 +9,8 @@ from scipy.stats import kstest
 
 from dpmjax.io import InputError, read_world_png, write_world_png
 from dpmjax.simulation import TrajectoryConfig, World, cast_rays, make_world, simulate_sequence, simulate_trajectory
-from dpmjax.simulation.world2d.raycast import beam_angles
-from dpmjax.simulation.world2d.trajectory import simulate_odometry
+from dpmjax.simulation.raycast2d import beam_angles
+from dpmjax.simulation.trajectory2d import simulate_odometry
 
 WORLDS = [0, 1, 2]
 world = lru_cache(make_world)

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from dpmjax.io.files import read_bytes, split_rows, to_float32, unpack_rows, write_atomically
-from dpmjax.sequences import InputError
+from dpmjax.sequences import InputError, require
 
 _PCD_TYPES = {"F": "f", "I": "i", "U": "u"}
 _PLY_TYPES = {
@@ -63,8 +63,8 @@ def parse_pcd(content: bytes, source: str, *, drop_nan: bool = False) -> NDArray
     """
     header = _parse_pcd_header(content, source)
     for name in ("x", "y"):
-        if name not in header.fields:
-            raise InputError(source, f"fields are {' '.join(header.fields)}", f"the file needs a column {name}")
+        found = f"fields are {' '.join(header.fields)}"
+        require(name in header.fields, source, found, f"the file needs a column {name}")
     body = content[header.size :]
     read = {"ascii": _read_ascii_pcd, "binary": _read_binary_pcd}.get(header.encoding)
     if read is None:
@@ -199,14 +199,13 @@ def write_ply(path: str | Path, points: ArrayLike) -> Path:
 def _parse_ply_header(content: bytes, source: str) -> _PlyHeader:
     advice = "give a PLY file with float x, y, z in its first element, vertex"
     end = content.find(b"end_header")
-    if not content.startswith(b"ply") or end < 0 or end > 65536:
-        raise InputError(source, "no PLY header", advice)
+    require(content.startswith(b"ply") and 0 <= end <= 65536, source, "no PLY header", advice)
     size = content.find(b"\n", end) + 1 or len(content)
     rows = [line.split() for line in content[:end].decode("latin-1").splitlines() if line.strip()]
     encoding = next((row[1] for row in rows if row[0] == "format" and len(row) > 1), "")
     elements = [row for row in rows if row[0] == "element"]
-    if encoding not in _PLY_ORDERS or not elements or elements[0][1:2] != ["vertex"]:
-        raise InputError(source, f"PLY format {encoding or 'unknown'}, or no vertex element in front", advice)
+    is_good = encoding in _PLY_ORDERS and elements[:1] and elements[0][1:2] == ["vertex"]
+    require(bool(is_good), source, f"PLY format {encoding or 'unknown'}, or no vertex element in front", advice)
     first = rows.index(elements[0]) + 1
     stop = rows.index(elements[1]) if len(elements) > 1 else len(rows)
     try:
@@ -216,6 +215,6 @@ def _parse_ply_header(content: bytes, source: str) -> _PlyHeader:
         layout = np.dtype(properties)
     except (KeyError, ValueError, IndexError, TypeError) as error:
         raise InputError(source, f"broken PLY header ({type(error).__name__}: {error})", advice) from error
-    if num_vertices < 0 or not {"x", "y", "z"} <= {name for name, _ in properties}:
-        raise InputError(source, f"PLY properties {' '.join(name for name, _ in properties)}", advice)
+    names = [name for name, _ in properties]
+    require(num_vertices >= 0 and {"x", "y", "z"} <= set(names), source, f"PLY properties {' '.join(names)}", advice)
     return _PlyHeader(encoding, num_vertices, layout, size)

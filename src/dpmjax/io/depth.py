@@ -23,7 +23,8 @@ from numpy.typing import NDArray
 from dpmjax.io.files import natural_key, read_bytes, read_lines, read_table
 from dpmjax.io.mat import parse_mat
 from dpmjax.io.pictures import read_depth_png
-from dpmjax.sequences import ACTIVE_VISION, BoolArray, Camera, DepthSequence, FloatArray, InputError
+from dpmjax.io.poses import homogeneous
+from dpmjax.sequences import ACTIVE_VISION, BoolArray, Camera, DepthSequence, FloatArray, InputError, require
 
 _NOTHING_MM = 65535  # besides 0
 _MOVES, _TURNS = ("forward", "backward", "left", "right"), ("rotate_cw", "rotate_ccw")
@@ -46,19 +47,17 @@ def read_pose_folder(path: str | Path, *, height: int = 30, width: int = 40, max
         InputError: no such folder, no depth image, no intrinsics, poses for some images only, or a damaged file.
     """
     folder = Path(path)
-    if not folder.is_dir():
-        raise InputError(folder, "no such folder", "give a folder of NAME.depth.png files")
+    require(folder.is_dir(), folder, "no such folder", "give a folder of NAME.depth.png files")
     images = sorted(folder.glob("*.depth.png"), key=lambda file: natural_key(file.name))
-    if len(images) < 2:
-        raise InputError(folder, f"{len(images)} .depth.png files", "give at least two")
+    require(len(images) >= 2, folder, f"{len(images)} .depth.png files", "give at least two")
     intrinsics = next(iter(sorted(folder.glob("*intrinsics*.txt"))), None)
     if intrinsics is None:
         raise InputError(folder, "no *intrinsics*.txt", "add the 3 x 3 matrix of the depth camera")
     matrix = _read_matrix(intrinsics, (3, 3))
     poses = [image.with_name(image.name.replace(".depth.png", ".pose.txt")) for image in images]
     missing = [pose.name for pose in poses if not pose.is_file()]
-    if missing and len(missing) < len(poses):
-        raise InputError(folder, f"no {missing[0]} ({len(missing)} missing)", "give a pose to every image or to none")
+    found = f"no {next(iter(missing), None)} ({len(missing)} missing)"
+    require(len(missing) in (0, len(poses)), folder, found, "give a pose to every image or to none")
     rows, columns = read_depth_png(images[0]).shape
     camera = _make_camera(intrinsics, columns, rows, matrix[[0, 1, 0, 1], [0, 1, 2, 2]])
     points, mask = _read_clouds(images, camera, (height, width), max_depth_m)
@@ -89,14 +88,13 @@ def read_active_vision(
     if num_views < 2:
         raise ValueError(f"num_views: expected at least 2, got {num_views}")
     scene = Path(path)
-    if not scene.is_dir():
-        raise InputError(scene, "no such folder", "give the folder of a scene, such as Home_001_1")
+    require(scene.is_dir(), scene, "no such folder", "give the folder of a scene, such as Home_001_1")
     poses = _read_scene_poses(scene / "image_structs.mat")
     links = _read_links(scene / "annotations.json")
     depth_of = {name: scene / "high_res_depth" / f"{Path(name).stem[:-2]}03.png" for name in poses}
     known = sorted(name for name in poses if name in links and depth_of[name].is_file())
-    if not known:
-        raise InputError(scene, "no image with links, pose and depth", "unpack the scene's high_res_depth folder too")
+    found = "no image with links, pose and depth"
+    require(len(known) > 0, scene, found, "unpack the scene's high_res_depth folder too")
     names = _walk(known, links, num_views, np.random.default_rng([seed, 13]))
     camera = _read_colmap_camera(scene / "cameras.txt")
     points, mask = _read_clouds([depth_of[name] for name in names], camera, (height, width), max_depth_m)
@@ -163,8 +161,8 @@ def _read_clouds(
 
 def _read_matrix(path: Path, shape: tuple[int, int]) -> FloatArray:
     matrix = read_table(path)
-    if matrix.shape != shape or not np.isfinite(matrix).all():
-        raise InputError(path, f"a matrix of {matrix.shape}", f"give {shape[0]} x {shape[1]} finite numbers")
+    is_good = matrix.shape == shape and np.isfinite(matrix).all()
+    require(is_good, path, f"a matrix of {matrix.shape}", f"give {shape[0]} x {shape[1]} finite numbers")
     return matrix
 
 
@@ -188,8 +186,7 @@ def _walk(known: list[str], links: dict[str, Any], num_views: int, rng: np.rando
     while len(names) < num_views:
         moves, turns = reachable(name, _MOVES), reachable(name, _TURNS)
         options = moves if (rng.random() < 0.5 and moves) or not turns else turns
-        if not options:
-            raise InputError(name, "no neighbour with a depth image and a pose", "unpack the whole scene")
+        require(len(options) > 0, name, "no neighbour with a depth image and a pose", "unpack the whole scene")
         name = options[rng.integers(len(options))]
         names.append(name)
     return names
@@ -205,9 +202,7 @@ def _read_scene_poses(path: Path) -> dict[str, FloatArray]:
             R, t = np.asarray(entry["R"], np.float64), np.asarray(entry["t"], np.float64).reshape(-1)
             if R.shape != (3, 3) or t.shape != (3,) or not (np.isfinite(R).all() and np.isfinite(t).all()):
                 continue  # not placed by the reconstruction
-            T = np.eye(4)
-            T[:3, :3], T[:3, 3] = R.T, -R.T @ t * scale_m
-            poses[str(entry["image_name"])] = T
+            poses[str(entry["image_name"])] = homogeneous(R.T, -R.T @ t * scale_m)
     except (KeyError, ValueError, TypeError, AttributeError) as error:
         found = f"not the dataset's pose file ({type(error).__name__})"
         raise InputError(path, found, "copy image_structs.mat of the scene") from error

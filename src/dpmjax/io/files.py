@@ -15,7 +15,7 @@ import numpy as np
 from numpy.lib import format as npy_format
 from numpy.typing import ArrayLike, NDArray
 
-from dpmjax.sequences import FloatArray, InputError
+from dpmjax.sequences import FloatArray, InputError, require
 
 # A member of an archive that unpacks to more than this many times its size has a wrong header: deflate reaches 1032.
 _LARGEST_COMPRESSION = 1100
@@ -120,9 +120,8 @@ def to_numbers(rows: Sequence[Sequence[str]], source: str | Path) -> FloatArray:
         InputError: there is no row, rows differ in length, or a word is no number.
     """
     widths = sorted({len(row) for row in rows})
-    if len(widths) != 1:
-        found = f"rows of {' and '.join(map(str, widths))} columns" if rows else "no row"
-        raise InputError(source, found, "give rows of equal length")
+    found = f"rows of {' and '.join(map(str, widths))} columns" if rows else "no row"
+    require(len(widths) == 1, source, found, "give rows of equal length")
     try:
         return np.array(rows, np.float64)
     except ValueError as error:
@@ -161,9 +160,8 @@ def unpack_rows(body: bytes, layout: np.dtype[np.void], count: int, source: str 
         InputError: there are fewer bytes.
     """
     expected = count * layout.itemsize
-    if len(body) < expected:
-        found = f"truncated: {count} points need {expected} bytes, {len(body)} are there"
-        raise InputError(source, found, "copy the file again")
+    found = f"truncated: {count} points need {expected} bytes, {len(body)} are there"
+    require(len(body) >= expected, source, found, "copy the file again")
     return np.frombuffer(body, layout, count=count)
 
 
@@ -183,9 +181,8 @@ def split_rows(body: bytes, width: int, count: int, source: str | Path) -> Float
         InputError: there are fewer rows, a row of another width, or a word that is no number.
     """
     rows = [line.split() for line in body.decode("latin-1").splitlines() if line.strip()]
-    if len(rows) < count:
-        found = f"truncated: the header promises {count} points, {len(rows)} are there"
-        raise InputError(source, found, "copy the file again")
+    found = f"truncated: the header promises {count} points, {len(rows)} are there"
+    require(len(rows) >= count, source, found, "copy the file again")
     wrong = next((i for i, row in enumerate(rows[:count]) if len(row) != width), None)
     if wrong is not None:
         found = f"row {wrong} has {len(rows[wrong])} columns, the header promises {width}"

@@ -16,20 +16,9 @@ from dpmjax.sequences import InputError
 
 _MATRIX, _COMPRESSED = 14, 15
 _CELL, _STRUCT, _OBJECT, _CHAR, _SPARSE = range(1, 6)
-_STORAGE = {
-    1: "i1",
-    2: "u1",
-    3: "i2",
-    4: "u2",
-    5: "i4",
-    6: "u4",
-    7: "f4",
-    9: "f8",
-    12: "i8",
-    13: "u8",
-    16: "u1",
-    17: "u2",
-}
+_STORAGE = dict(
+    zip((1, 2, 3, 4, 5, 6, 7, 9, 12, 13, 16, 17), ["i1", "u1", "i2", "u2", "i4", "u4", "f4", "f8", "i8", "u8", "u1", "u2"], strict=True)
+)
 _LARGEST_COMPRESSION = 1100
 
 

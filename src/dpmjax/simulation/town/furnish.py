@@ -9,8 +9,8 @@ import numpy as np
 from dpmjax.sequences import FloatArray
 from dpmjax.simulation.town import objects
 from dpmjax.simulation.town.objects import Collection, Place
+from dpmjax.simulation.town.primitives import CELL_M, Terrain
 from dpmjax.simulation.town.streets import Streets, arc_lengths, at_way, tangents
-from dpmjax.simulation.town.terrain import Plots
 
 
 @dataclass(frozen=True)
@@ -57,6 +57,50 @@ QUARTERS = (
 _QUARTER_SHARES = (0.42, 0.32, 0.12, 0.14)
 _PAVEMENT_M = 2.2
 _BORDERS = ("hedge", "wall", "fence")
+
+
+class Plots:
+    """The ground that is taken, so that no house stands in a street or in another house.
+
+    It changes while a town is made.
+
+    Args:
+        terrain: ground heights and distances from the streets.
+    """
+
+    def __init__(self, terrain: Terrain) -> None:
+        self.terrain = terrain
+        self._is_taken = np.zeros(terrain.heights.shape, bool)
+
+    def claim(
+        self, centre: FloatArray, half_size: tuple[float, float], heading: float, *, kerb_distance: float = 0.5
+    ) -> bool:
+        """Takes a rectangle if all of it is free.
+
+        Args:
+            centre: (2,) m.
+            half_size: along its own x and y, m.
+            heading: of its x, radians.
+            kerb_distance: no part may be nearer than this to a kerb, m; negative allows to stand on the street.
+
+        Returns:
+            Whether it was free.
+        """
+        cells = self._cells(centre, half_size, heading)
+        if (cells < 0).any() or (cells >= np.array(self._is_taken.shape)[::-1]).any():
+            return False
+        at = (cells[:, 1], cells[:, 0])
+        if self._is_taken[at].any() or (self.terrain.street_distance[at] < kerb_distance).any():
+            return False
+        self._is_taken[at] = True
+        return True
+
+    def _cells(self, centre: FloatArray, half_size: tuple[float, float], heading: float) -> NDArray[np.int64]:
+        axes = [np.linspace(-half, half, max(int(np.ceil(2 * half / CELL_M)) + 1, 2)) for half in half_size]
+        u, v = (grid.ravel() for grid in np.meshgrid(*axes))
+        cos, sin = np.cos(heading), np.sin(heading)
+        x, y = centre[0] + cos * u - sin * v, centre[1] + sin * u + cos * v
+        return np.round((np.column_stack([x, y]) - self.terrain.origin) / CELL_M).astype(np.int64)
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""Makes towns by seed."""
+"""Makes towns by seed: the ground with its slopes, kerbs and meadows, what stands on it, and the traffic."""
 
 from __future__ import annotations
 
@@ -12,11 +12,13 @@ from dpmjax.sequences import FloatArray
 from dpmjax.simulation.town.furnish import furnish
 from dpmjax.simulation.town.objects import Collection
 from dpmjax.simulation.town.primitives import (
+    CELL_M,
     LANE_STEP_M,
     POLE,
     SOFT,
     SOLID,
     Ground,
+    Terrain,
     TownPrimitives,
     Traffic,
     capacity_for,
@@ -33,8 +35,11 @@ from dpmjax.simulation.town.streets import (
     resample,
     streets_along,
 )
-from dpmjax.simulation.town.terrain import CELL_M, Plots, Terrain, make_terrain
 
+_MARGIN_M = 50.0
+_TILE = 256
+_KERB_M = 0.12
+_PAVEMENT_M = 2.2
 _SENSOR_HEIGHT_M = 1.73
 _TOWN_STREAM = 8150
 
@@ -178,3 +183,87 @@ def _make_traffic(rng: np.random.Generator, streets: Streets, terrain: Terrain, 
 def _fill(points: FloatArray, count: int) -> FloatArray:
     """Repeats the last row up to `count` rows."""
     return np.vstack([points, np.repeat(points[-1:], count - len(points), axis=0)])
+
+
+def make_terrain(
+    rng: np.random.Generator, streets: Streets, *, steepness: float, support: FloatArray | None = None
+) -> Terrain:
+    """Shapes the ground.
+
+    Args:
+        rng: source of all choices.
+        streets: where the streets are.
+        steepness: typical slope of the land, rise over run.
+        support: (n, 3) points that the streets must go through, m; None lets the land roll at random.
+
+    Returns:
+        The terrain; its grid is a whole number of tiles of 128 m, so that kernels see few shapes.
+    """
+    lines = np.vstack(streets.paths)
+    low = lines.min(0) - _MARGIN_M
+    cells = np.ceil((lines.max(0) + _MARGIN_M - low) / CELL_M).astype(int)
+    columns, rows = (int(-(-count // _TILE) * _TILE) for count in cells)
+    distance = _street_distance(streets, low, (rows, columns))
+    x, y = np.meshgrid(low[0] + CELL_M * np.arange(columns), low[1] + CELL_M * np.arange(rows))
+    land = _rolling(rng, x, y, steepness) if support is None else _through(support, low, (rows, columns))
+    return Terrain(low, land + _cross_section(distance) + _roughness(rng, distance), distance)
+
+
+def _street_distance(streets: Streets, origin: FloatArray, shape: tuple[int, int]) -> FloatArray:
+    """Distance from the nearest kerb; streets of different width count by their own."""
+    from scipy.ndimage import distance_transform_edt
+
+    widths = np.round(np.array(streets.half_widths), 1)
+    nearest = np.full(shape, np.inf)
+    for width in np.unique(np.round(widths * 2) / 2):
+        is_far = np.ones(shape, bool)
+        for path, own in zip(streets.paths, widths, strict=True):
+            if round(own * 2) / 2 == width:
+                cell = np.round((path - origin) / CELL_M).astype(int)
+                is_far[cell[:, 1], cell[:, 0]] = False
+        nearest = np.minimum(nearest, distance_transform_edt(is_far) * CELL_M - width)
+    return nearest
+
+
+def _rolling(rng: np.random.Generator, x: FloatArray, y: FloatArray, steepness: float) -> FloatArray:
+    land = np.zeros_like(x)
+    for wavelength in (900.0, 600.0, 400.0, 250.0):
+        angle, phase = rng.uniform(0, 2 * np.pi, 2)
+        wave = 2 * np.pi / wavelength
+        land += steepness * 0.7 / wave * np.sin(wave * (np.cos(angle) * x + np.sin(angle) * y) + phase)
+    return land
+
+
+def _through(support: FloatArray, origin: FloatArray, shape: tuple[int, int]) -> FloatArray:
+    """Land through given points: inverse distances on a coarse grid, smoothed, then brought to the fine one."""
+    from scipy.ndimage import gaussian_filter, map_coordinates
+    from scipy.spatial import KDTree
+
+    coarse = 8
+    rows, columns = (count // coarse + 2 for count in shape)
+    step = CELL_M * coarse
+    x, y = np.meshgrid(origin[0] + step * np.arange(columns), origin[1] + step * np.arange(rows))
+    places = np.stack([x, y], axis=-1)
+    distance, index = KDTree(support[:, :2]).query(places, k=list(range(1, min(8, len(support)) + 1)))
+    weight = 1.0 / np.maximum(distance, 1.0) ** 2
+    values = support[:, 2][index]
+    land = gaussian_filter((weight * values).sum(-1) / weight.sum(-1), 2.0)
+    at = np.stack(np.meshgrid(np.arange(shape[0]) / coarse, np.arange(shape[1]) / coarse, indexing="ij"))
+    return map_coordinates(land, at, order=1, mode="nearest")
+
+
+def _cross_section(distance: FloatArray) -> FloatArray:
+    """A cambered street, a kerb, a pavement, and gardens a little higher."""
+    camber = 0.02 * np.clip(-distance, 0, 5)
+    kerb = _KERB_M * np.clip((distance + 0.25) / 0.5, 0, 1)
+    return camber + kerb + 0.15 * np.clip((distance - _PAVEMENT_M) / 2.0, 0, 1)
+
+
+def _roughness(rng: np.random.Generator, distance: FloatArray) -> FloatArray:
+    """Millimetres on streets, centimetres and gentle mounds in gardens."""
+    from scipy.ndimage import gaussian_filter
+
+    fine = rng.normal(size=distance.shape)
+    mounds = gaussian_filter(rng.normal(size=distance.shape), 8.0) * 28.0
+    is_garden = np.clip((distance - _PAVEMENT_M) / 2.0, 0, 1)
+    return (0.004 + 0.03 * is_garden) * fine + 0.12 * is_garden * mounds

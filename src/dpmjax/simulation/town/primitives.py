@@ -6,7 +6,7 @@ coordinates are in the world frame: metres, z up.
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 
 import flax.struct
 import jax
@@ -17,6 +17,8 @@ from jaxtyping import Array, Bool, Float, Int
 from dpmjax.sequences import FloatArray
 
 LANE_STEP_M = 2.0
+CELL_M = 0.5
+"""Distance of the nodes of the ground."""
 # Road users nearer to the sensor than this are left out: the sensor's own car is there.
 _CLEARANCE_M = 4.0
 _CAR_IS_LONGER_THAN_M = 0.5
@@ -62,6 +64,28 @@ class Ground:
     heights: Float[Array, "h w"]
     origin: Float[Array, " 2"]
     cell: Float[Array, ""]
+
+
+@dataclass(frozen=True)
+class Terrain:
+    """Ground heights and distances from the streets on one grid.
+
+    Attributes:
+        origin: (2,) x and y of entry [0, 0], m.
+        heights: (h, w) z, m; the column follows x.
+        street_distance: (h, w) from the nearest kerb, m; negative on a street.
+    """
+
+    origin: FloatArray
+    heights: FloatArray = field(repr=False)
+    street_distance: FloatArray = field(repr=False)
+
+    def height_at(self, positions: FloatArray) -> FloatArray:
+        """Ground heights (m,) at (m, 2) places, bilinear."""
+        from scipy.ndimage import map_coordinates
+
+        at = (np.atleast_2d(positions)[:, :2] - self.origin) / CELL_M
+        return map_coordinates(self.heights, at[:, ::-1].T, order=1, mode="nearest")
 
 
 @flax.struct.dataclass

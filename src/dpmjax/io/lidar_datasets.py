@@ -8,11 +8,10 @@ from pathlib import Path
 import numpy as np
 
 from dpmjax.geometry import rigid
+from dpmjax.io.drives import Drive3D, from_first, match_poses, match_rows, numbers_of, read_labelled_numbers, scan_files
 from dpmjax.io.files import natural_key, read_lines, read_table
-from dpmjax.io.lidar.drive import Drive3D, from_first, match_poses, numbers_of, scan_files
-from dpmjax.io.lidar.kitti import read_labelled_numbers
-from dpmjax.io.poses import check_poses, interpolate_poses, to_homogeneous
-from dpmjax.sequences import FloatArray, InputError
+from dpmjax.io.poses import check_poses, from_rows, homogeneous, interpolate_poses
+from dpmjax.sequences import FloatArray, InputError, require
 
 _CARLA_POSES_PER_FRAME = 100  # KITTI-CARLA writes poses at 1000 Hz and frames at 10 Hz.
 _EARTH_RADIUS_M = 6378137.0
@@ -36,9 +35,9 @@ def read_kitti_raw(folder: Path) -> Drive3D:
     files = scan_files(folder / "velodyne_points" / "data")
     stamps = _read_stamps(folder / "velodyne_points" / "timestamps.txt", files)
     home = folder / "oxts" / "data"
-    records = sorted(home.glob("*.txt"), key=lambda f: natural_key(f.name))
+    records = sorted(home.glob("*.txt"), key=lambda record: natural_key(record.name))
     if not records or not files:
-        return Drive3D(folder.resolve().name, files, None, stamps)
+        return Drive3D(folder.resolve().name, files, times=stamps)
     candidates = [parent / "calib_imu_to_velo.txt" for parent in (folder, folder.resolve().parent)]
     calibration = next((path for path in candidates if path.is_file()), None)
     if calibration is None:
@@ -70,18 +69,17 @@ def read_kitti_360(folder: Path) -> Drive3D:
     name, root = folder.resolve().name, folder.resolve().parents[1]
     path = root / "data_poses" / name / "poses.txt"
     if not path.is_file():
-        return Drive3D(name, files, None, stamps)
+        return Drive3D(name, files, times=stamps)
     rows = _read_rows(path, "KITTI-360's poses.txt: frame and 12 numbers")
     calibration = root / "calibration" / "calib_cam_to_pose.txt"
     numbers = read_labelled_numbers(calibration).get("image_00", np.zeros(0))
-    if len(numbers) != 12:
-        raise InputError(calibration, "no line 'image_00:' of 12 numbers", "take KITTI-360's calibration folder")
-    T_imu_cam0 = check_poses(to_homogeneous(numbers[None]), calibration)
+    require(len(numbers) == 12, calibration, "no line 'image_00:' of 12 numbers", "take KITTI-360's calibration folder")
+    T_imu_cam0 = from_rows(numbers, calibration)
     calibration = root / "calibration" / "calib_cam_to_velo.txt"
-    T_lidar_cam0 = check_poses(to_homogeneous(_first_row(calibration, 12)), calibration)
-    T_world_lidar = check_poses(to_homogeneous(rows[:, 1:]), path) @ T_imu_cam0 @ rigid.inverse(T_lidar_cam0)
+    T_lidar_cam0 = from_rows(_first_row(calibration, 12), calibration)
+    T_world_lidar = from_rows(rows[:, 1:], path) @ T_imu_cam0 @ rigid.inverse(T_lidar_cam0)
     frames = np.array(_require_numbers(files), np.float64)
-    return _interpolate(Drive3D(name, files, None, stamps), frames, rows[:, 0], T_world_lidar, path)
+    return _interpolate(Drive3D(name, files, times=stamps), frames, rows[:, 0], T_world_lidar, path)
 
 
 def read_kitti_carla(folder: Path) -> Drive3D:
@@ -101,13 +99,12 @@ def read_kitti_carla(folder: Path) -> Drive3D:
     name = home.resolve().parent.name if home.resolve().name == "generated" else home.resolve().name
     path = home / "full_poses_lidar.txt"
     if not path.is_file():
-        return Drive3D(name, files, None, None)
+        return Drive3D(name, files)
     rows = _read_rows(path, "KITTI-CARLA's full_poses_lidar.txt: 12 numbers and a time")
     endings = [(re.findall(r"\d+", file.stem) or [str(index)])[-1] for index, file in enumerate(files)]
     at = [_CARLA_POSES_PER_FRAME * int(ending[-9:]) for ending in endings]
-    if max(at, default=0) >= len(rows):
-        raise InputError(path, f"{len(rows)} rows for {len(files)} frames", "give 100 rows a frame")
-    return Drive3D(name, files, check_poses(to_homogeneous(rows[at, :12]), path), rows[at, 12])
+    require(max(at, default=0) < len(rows), path, f"{len(rows)} rows for {len(files)} frames", "give 100 rows a frame")
+    return Drive3D(name, files, from_rows(rows[at, :12], path), rows[at, 12])
 
 
 def read_mulran(folder: Path) -> Drive3D:
@@ -128,17 +125,16 @@ def read_mulran(folder: Path) -> Drive3D:
     files = scan_files(home, (".bin",))
     stamps = np.array(_require_numbers(files), np.int64)
     times = (stamps - stamps[:1]).astype(np.float64) * 1e-9
-    drive = Drive3D(folder.resolve().name, files, None, times)
+    drive = Drive3D(folder.resolve().name, files, times=times)
     path = folder / "global_pose.csv"
     if not path.is_file() or not len(files):
         return drive
     rows = _read_rows(path, "MulRan's global_pose.csv: stamp and 12 numbers")
     # In float64 a stamp of 1.5e18 ns is good to 256 ns.
     pose_times = (rows[:, 0] - float(stamps[0])) * 1e-9
-    T_car_lidar = np.eye(4)
-    T_car_lidar[:3, 3] = _MULRAN_OUSTER_XYZ
-    T_car_lidar[:3, :3] = Rotation.from_euler("xyz", _MULRAN_OUSTER_RPY_DEG, degrees=True).as_matrix()
-    T_world_lidar = check_poses(to_homogeneous(rows[:, 1:]), path) @ T_car_lidar
+    R_car_lidar = Rotation.from_euler("xyz", _MULRAN_OUSTER_RPY_DEG, degrees=True).as_matrix()
+    T_car_lidar = homogeneous(R_car_lidar, np.array(_MULRAN_OUSTER_XYZ))
+    T_world_lidar = from_rows(rows[:, 1:], path) @ T_car_lidar
     return _interpolate(drive, times, pose_times, T_world_lidar, path, slack=0.5)
 
 
@@ -148,8 +144,7 @@ def _interpolate(
     """The scans less than `slack` beyond the times of the poses, with interpolated poses from the first on."""
     times, first = np.unique(times, return_index=True)
     kept = np.flatnonzero((wanted >= times[0] - slack) & (wanted <= times[-1] + slack))
-    if not len(kept):
-        raise InputError(path, "no scan lies within the times of the poses", "give scans and poses of one drive")
+    require(len(kept) > 0, path, "no scan lies within the times of the poses", "give scans and poses of one drive")
     found = from_first(interpolate_poses(times, poses[first], wanted[kept]))
     stamps = None if drive.times is None else drive.times[kept]
     return Drive3D(drive.name, [drive.files[i] for i in kept], found, stamps)
@@ -165,16 +160,15 @@ def _require_numbers(files: list[Path]) -> list[int]:
 def _first_row(path: Path, width: int) -> FloatArray:
     """(1, width) first numbers of a file."""
     rows = read_table(path)
-    if rows.shape[1] < width:
-        raise InputError(path, f"rows of {rows.shape[1]} numbers", f"give {width} numbers or more")
+    require(rows.shape[1] >= width, path, f"rows of {rows.shape[1]} numbers", f"give {width} numbers or more")
     return rows[:1, :width]
 
 
 def _read_rows(path: Path, layout: str) -> FloatArray:
     """(n, 13) numbers of a pose file, all finite."""
     rows = read_table(path)
-    if rows.shape[1] != 13 or not np.isfinite(rows).all():
-        raise InputError(path, f"rows of {rows.shape[1]} numbers, or some not finite", f"give {layout}")
+    is_good = rows.shape[1] == 13 and np.isfinite(rows).all()
+    require(is_good, path, f"rows of {rows.shape[1]} numbers, or some not finite", f"give {layout}")
     return rows
 
 
@@ -187,21 +181,17 @@ def _read_stamps(path: Path, files: list[Path]) -> FloatArray | None:
         stamps = np.array([line.replace(" ", "T") for line in lines], "datetime64[ns]")
     except ValueError:
         return None
-    if len(stamps) != len(files):
-        numbers = numbers_of(files, len(stamps) - 1)
-        if numbers is None:
-            return None
-        stamps = stamps[numbers]
-    return (stamps - stamps[0]).astype(np.float64) * 1e-9 if len(stamps) else None
+    matched = match_rows(stamps, files)
+    return None if matched is None or not len(matched) else (matched - matched[0]).astype(np.float64) * 1e-9
 
 
 def _read_imu_calibration(path: Path) -> FloatArray:
     """(4, 4) out of KITTI raw's `R:` and `T:` lines."""
     entries = read_labelled_numbers(path)
     turn, shift = entries.get("R", np.zeros(0)), entries.get("T", np.zeros(0))
-    if len(turn) != 9 or len(shift) != 3:
-        raise InputError(path, "no lines 'R:' of 9 and 'T:' of 3 numbers", "take KITTI's calibration file")
-    return check_poses(to_homogeneous(np.column_stack([turn.reshape(3, 3), shift]).reshape(1, 12)), path)[0]
+    is_good = len(turn) == 9 and len(shift) == 3
+    require(is_good, path, "no lines 'R:' of 9 and 'T:' of 3 numbers", "take KITTI's calibration file")
+    return check_poses(homogeneous(turn.reshape(1, 3, 3), shift[None]), path)[0]
 
 
 def _poses_from_oxts(records: FloatArray, source: Path) -> FloatArray:
@@ -219,13 +209,10 @@ def _poses_from_oxts(records: FloatArray, source: Path) -> FloatArray:
     """
     from scipy.spatial.transform import Rotation
 
-    if not (np.isfinite(records).all() and (np.abs(records[:, 0]) < 89.0).all()):
-        raise InputError(source, "records that are not finite, or a latitude beyond 89 degrees", "copy them again")
+    is_good = np.isfinite(records).all() and (np.abs(records[:, 0]) < 89.0).all()
+    require(is_good, source, "records that are not finite, or a latitude beyond 89 degrees", "copy them again")
     latitude, longitude = np.radians(records[:, 0]), np.radians(records[:, 1])
     scale = np.cos(latitude[0]) * _EARTH_RADIUS_M
-    poses = np.tile(np.eye(4), (len(records), 1, 1))
-    poses[:, 0, 3] = scale * longitude
-    poses[:, 1, 3] = scale * np.log(np.tan(0.25 * np.pi + 0.5 * latitude))
-    poses[:, 2, 3] = records[:, 2]
-    poses[:, :3, :3] = Rotation.from_euler("ZYX", records[:, [5, 4, 3]]).as_matrix()
-    return poses
+    east, north = scale * longitude, scale * np.log(np.tan(0.25 * np.pi + 0.5 * latitude))
+    rotations = Rotation.from_euler("ZYX", records[:, [5, 4, 3]]).as_matrix()
+    return homogeneous(rotations, np.column_stack([east, north, records[:, 2]]))

@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from dpmjax.sequences import BoolArray, FloatArray, ScanSequence, World
-from dpmjax.simulation.world2d.trajectory import simulate_odometry, simulate_trajectory
-from dpmjax.simulation.world2d.world import make_world
+from dpmjax.simulation.trajectory2d import simulate_odometry, simulate_trajectory
+from dpmjax.simulation.world2d import make_world
 
 
 class RayHits(NamedTuple):

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dpmjax.io.files import read_bytes
-from dpmjax.sequences import FloatArray, InputError, ScanSequence
+from dpmjax.sequences import FloatArray, InputError, ScanSequence, require
 
 _log = logging.getLogger(__name__)
 _SHORTEST_SCALE_M = 7.9  # No laser of these logs has a shorter scale: a log that ends before has no code for "no echo".
@@ -122,18 +122,15 @@ def _parse_line(words: list[str], source: str) -> _Line:
         time = float(words[count + 8]) if len(words) > count + 8 else 0.0
     except (ValueError, IndexError, OverflowError) as error:
         raise InputError(source, f"not a FLASER line ({error})", advice) from error
-    if count < 1 or len(values) < count + 6:
-        raise InputError(source, f"{len(words) - 2} values after n = {count}, at least {count + 6} expected", advice)
-    ranges, corrected, odometry = values[:count], values[count : count + 3], values[count + 3 :]
-    if np.isnan(values).any() or not (np.abs([*values[count:], time]) < _LARGEST_NUMBER).all():
-        raise InputError(source, "NaN, infinite or huge values", "remove the line")
-    return _Line(ranges, corrected, odometry, time)
+    found = f"{len(words) - 2} values after n = {count}, at least {count + 6} expected"
+    require(count >= 1 and len(values) >= count + 6, source, found, advice)
+    is_good = not np.isnan(values).any() and (np.abs([*values[count:], time]) < _LARGEST_NUMBER).all()
+    require(is_good, source, "NaN, infinite or huge values", "remove the line")
+    return _Line(values[:count], values[count : count + 3], values[count + 3 :], time)
 
 
 def _no_echo_limit(lines: list[_Line]) -> float:
     largest = max(float(line.ranges.max()) for line in lines)
-    if np.isinf(largest):
-        return np.inf
     return largest - _CODE_BAND_M if largest >= _SHORTEST_SCALE_M else np.inf
 
 
@@ -147,12 +144,8 @@ def _repair(times: FloatArray, odometry: FloatArray, path: str | Path) -> tuple[
         _log.warning("%s: time stamps are in no order; odometry is taken as it stands, times are dropped", path)
         return None, odometry
     if num_wrong:
-        _log.warning(
-            "%s: %d of %d lines carry time and odometry of another moment; both are interpolated",
-            path,
-            num_wrong,
-            len(times),
-        )
+        message = "%s: %d of %d lines carry time and odometry of another moment; both are interpolated"
+        _log.warning(message, path, num_wrong, len(times))
     index = np.arange(len(times))
     pose = odometry[trusted].copy()
     pose[:, 2] = np.unwrap(pose[:, 2])
