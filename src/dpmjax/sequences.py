@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 _log = logging.getLogger(__name__)
 FloatArray = NDArray[np.float64]
+Unit = Literal["px", "m"]
 BoolArray = NDArray[np.bool_]
 Selection = slice | NDArray[np.integer]
 """Start, stop and stride in scans, or the rows to keep, in the order wanted."""
@@ -88,7 +89,7 @@ class ScanSequence:
     name: str
     points: NDArray[np.float32]
     mask: BoolArray
-    unit: Literal["px", "m"]
+    unit: Unit
     is_organised: bool = True
     reference_poses: FloatArray | None = None
     odometry_poses: FloatArray | None = None

@@ -20,8 +20,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from dpmjax.io.files import read_bytes
-from dpmjax.sequences import FloatArray, InputError, ScanSequence, require
+from dpmjax.io.files import read_bytes, refusing
+from dpmjax.sequences import FloatArray, ScanSequence, require
 
 _log = logging.getLogger(__name__)
 _SHORTEST_SCALE_M = 7.9  # No laser of these logs has a shorter scale: a log that ends before has no code for "no echo".
@@ -70,16 +70,9 @@ def read_carmen_log(path: str | Path, *, max_range: float | None = None) -> Scan
     corrected, odometry = np.array([line.corrected for line in lines]), np.array([line.odometry for line in lines])
     has_odometry = not np.allclose(corrected, odometry, atol=1e-6)
     times, odometry = _repair(np.array([line.time for line in lines]), odometry, path)
-    return ScanSequence(
-        name=Path(path).name.split(".")[0],
-        points=points,
-        mask=mask,
-        unit="m",
-        is_organised=True,
-        reference_poses=corrected,
-        odometry_poses=odometry if has_odometry else None,
-        times=times,
-    )
+    name, is_organised = Path(path).name.split(".")[0], True
+    raw = odometry if has_odometry else None
+    return ScanSequence(name, points, mask, "m", is_organised, corrected, raw, times)
 
 
 def scan_angles(num_beams: int) -> FloatArray:
@@ -101,27 +94,22 @@ def scan_angles(num_beams: int) -> FloatArray:
 def _flaser_lines(path: str | Path) -> list[tuple[int, list[str]]]:
     """Line numbers and words of the FLASER lines."""
     content = read_bytes(path)
-    try:
+    with refusing(path, "cannot be unpacked ({error})", "copy the file again", (OSError, EOFError, zlib.error)):
         text = (gzip.decompress(content) if content[:2] == b"\x1f\x8b" else content).decode("latin-1")
-    except (OSError, EOFError, zlib.error) as error:
-        raise InputError(path, f"cannot be unpacked ({error})", "copy the file again") from error
     lines = text.splitlines()
     found = [(number, line.split()) for number, line in enumerate(lines, 1) if line.startswith("FLASER")]
-    if not found:
-        newer = any(line.startswith("ROBOTLASER1") for line in lines)
-        what = "ROBOTLASER1 lines but no FLASER line" if newer else "no FLASER line"
-        raise InputError(path, what, "give a CARMEN log with FLASER lines")
+    is_newer = any(line.startswith("ROBOTLASER1") for line in lines)
+    what = "ROBOTLASER1 lines but no FLASER line" if is_newer else "no FLASER line"
+    require(len(found) > 0, path, what, "give a CARMEN log with FLASER lines")
     return found
 
 
 def _parse_line(words: list[str], source: str) -> _Line:
     advice = "a line reads FLASER n r1..rn x y theta odom_x odom_y odom_theta timestamp host timestamp"
-    try:
+    with refusing(source, "not a FLASER line ({error})", advice, (ValueError, IndexError, OverflowError)):
         count = int(words[1])
         values = np.array(words[2 : 2 + count + 6], np.float64)
         time = float(words[count + 8]) if len(words) > count + 8 else 0.0
-    except (ValueError, IndexError, OverflowError) as error:
-        raise InputError(source, f"not a FLASER line ({error})", advice) from error
     found = f"{len(words) - 2} values after n = {count}, at least {count + 6} expected"
     require(count >= 1 and len(values) >= count + 6, source, found, advice)
     is_good = not np.isnan(values).any() and (np.abs([*values[count:], time]) < _LARGEST_NUMBER).all()

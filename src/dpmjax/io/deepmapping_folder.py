@@ -8,22 +8,22 @@ from __future__ import annotations
 import io
 import tarfile
 from pathlib import Path, PurePosixPath
-from typing import Literal
 
 import numpy as np
 
 from dpmjax.io.clouds import parse_pcd, write_pcd
-from dpmjax.io.files import natural_key, read_bytes, write_atomically
+from dpmjax.io.files import natural_key, read_bytes, refusing, write_atomically
 from dpmjax.io.mat import parse_mat
-from dpmjax.sequences import FloatArray, InputError, ScanSequence, has_angular_order, require
+from dpmjax.sequences import FloatArray, ScanSequence, Unit, has_angular_order, require
 
 _PIXELS_PER_UNIT = 512.0
 _LARGEST_STORED = 8.0  # A picture of 2048 pixels has a diagonal of 5.7 stored units.
 _LARGEST_LENGTH = 1e7
+_SUFFIXES = (".pcd", ".mat")
 _POSE_FILE = "gt_pose.mat"
 
 
-def read_deepmapping_folder(path: str | Path, *, unit: Literal["px", "m"] | None = None) -> ScanSequence:
+def read_deepmapping_folder(path: str | Path, *, unit: Unit | None = None) -> ScanSequence:
     """Reads a folder or an uncompressed or compressed tar archive of `*.pcd` and `gt_pose.mat`.
 
     Args:
@@ -57,14 +57,9 @@ def read_deepmapping_folder(path: str | Path, *, unit: Literal["px", "m"] | None
     if unit != "m":
         points *= np.float32(_PIXELS_PER_UNIT)
     pose_name = next((name for name in files if PurePosixPath(name).name == _POSE_FILE), None)
-    return ScanSequence(
-        name=Path(path).stem,
-        points=points,
-        mask=mask,
-        unit="m" if unit == "m" else "px",
-        is_organised=has_angular_order(points, mask),
-        reference_poses=None if pose_name is None else _read_poses(files[pose_name], f"{path}/{pose_name}", len(names)),
-    )
+    reference = None if pose_name is None else _read_poses(files[pose_name], f"{path}/{pose_name}", len(names))
+    is_organised = has_angular_order(points, mask)
+    return ScanSequence(Path(path).stem, points, mask, unit or "px", is_organised, reference)
 
 
 def write_deepmapping_folder(path: str | Path, sequence: ScanSequence) -> Path:
@@ -102,18 +97,15 @@ def write_deepmapping_folder(path: str | Path, sequence: ScanSequence) -> Path:
 def _list_files(path: Path) -> dict[str, bytes]:
     """The PCD and MAT files by name; archives are read in memory and never unpacked."""
     if path.is_dir():
-        chosen = [file for file in path.iterdir() if file.suffix.lower() in (".pcd", ".mat")]
+        chosen = [file for file in path.iterdir() if file.suffix.lower() in _SUFFIXES]
         return {file.name: read_bytes(file) for file in chosen if file.is_file()}
     require(path.exists(), path, "no such file or folder", "check the path")
-    try:
-        with tarfile.open(path) as archive:
-            members = [
-                m for m in archive if m.isfile() and not m.issparse() and m.name.lower().endswith((".pcd", ".mat"))
-            ]
-            members = [m for m in members if not PurePosixPath(m.name).name.startswith("._")]
-            return {m.name: file.read() for m in members if (file := archive.extractfile(m)) is not None}
-    except Exception as error:  # The parsers of tar, gzip, bzip2 and xz raise many kinds.
-        raise InputError(path, f"not a readable tar archive ({error})", "copy the archive again") from error
+    # The parsers of tar, gzip, bzip2 and xz raise many kinds of errors.
+    found, advice = "not a readable tar archive ({error})", "copy the archive again"
+    with refusing(path, found, advice, (Exception,)), tarfile.open(path) as archive:
+        members = [m for m in archive if m.isfile() and not m.issparse() and m.name.lower().endswith(_SUFFIXES)]
+        members = [m for m in members if not PurePosixPath(m.name).name.startswith("._")]
+        return {m.name: file.read() for m in members if (file := archive.extractfile(m)) is not None}
 
 
 def _read_poses(content: bytes, source: str, num_scans: int) -> FloatArray:

@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dpmjax.io.files import natural_key, read_bytes, read_lines, read_table
+from dpmjax.io.files import natural_key, read_bytes, read_lines, read_table, refusing
 from dpmjax.io.mat import parse_mat
 from dpmjax.io.pictures import read_depth_png
 from dpmjax.io.poses import homogeneous
@@ -151,10 +151,8 @@ def _read_clouds(
     for image in images:
         depth_mm = read_depth_png(image)
         depth_m = np.where(depth_mm == _NOTHING_MM, 0, depth_mm) / 1000.0
-        try:
+        with refusing(image, "{error}", "give images of the camera's size, not smaller than a cloud", (ValueError,)):
             clouds.append(back_project(depth_m, camera, height=shape[0], width=shape[1], max_depth_m=max_depth_m))
-        except ValueError as error:
-            raise InputError(image, str(error), "give images of the camera's size, not smaller than a cloud") from error
     points, mask = zip(*clouds, strict=True)
     return np.stack(points), np.stack(mask)
 
@@ -168,10 +166,8 @@ def _read_matrix(path: Path, shape: tuple[int, int]) -> FloatArray:
 
 def _make_camera(path: Path, width: int, height: int, intrinsics: Iterable[float]) -> Camera:
     """The camera of fx, fy, cx, cy."""
-    try:
+    with refusing(path, "not a camera ({error})", "give focal lengths above 0", (ValueError,)):
         return Camera(width, height, *(float(value) for value in intrinsics))
-    except ValueError as error:
-        raise InputError(path, f"not a camera ({error})", "give focal lengths above 0") from error
 
 
 def _walk(known: list[str], links: dict[str, Any], num_views: int, rng: np.random.Generator) -> list[str]:
@@ -196,25 +192,22 @@ def _read_scene_poses(path: Path) -> dict[str, FloatArray]:
     """T_world_camera of every image that the reconstruction has placed, metres."""
     poses = {}
     variables = parse_mat(read_bytes(path), path)
-    try:
+    found, advice = "not the dataset's pose file ({kind})", "copy image_structs.mat of the scene"
+    with refusing(path, found, advice, (KeyError, ValueError, TypeError, AttributeError)):
         scale_m = float(variables["scale"].item()) / 1000.0
         for entry in variables["image_structs"]:
             R, t = np.asarray(entry["R"], np.float64), np.asarray(entry["t"], np.float64).reshape(-1)
             if R.shape != (3, 3) or t.shape != (3,) or not (np.isfinite(R).all() and np.isfinite(t).all()):
                 continue  # not placed by the reconstruction
             poses[str(entry["image_name"])] = homogeneous(R.T, -R.T @ t * scale_m)
-    except (KeyError, ValueError, TypeError, AttributeError) as error:
-        found = f"not the dataset's pose file ({type(error).__name__})"
-        raise InputError(path, found, "copy image_structs.mat of the scene") from error
     return poses
 
 
 def _read_links(path: Path) -> dict[str, dict[str, str]]:
-    try:
-        links = json.loads(read_bytes(path))
+    content, kinds = read_bytes(path), (UnicodeDecodeError, json.JSONDecodeError, AttributeError, RecursionError)
+    with refusing(path, "not readable ({error})", "copy annotations.json of the scene", kinds):
+        links = json.loads(content)
         return {name: {kind: str(other) for kind, other in entry.items()} for name, entry in links.items()}
-    except (UnicodeDecodeError, json.JSONDecodeError, AttributeError, RecursionError) as error:
-        raise InputError(path, f"not readable ({error})", "copy annotations.json of the scene") from error
 
 
 def _read_colmap_camera(path: Path) -> Camera:
@@ -224,9 +217,7 @@ def _read_colmap_camera(path: Path) -> Camera:
     for line in read_lines(path):
         words = line.split()
         if len(words) >= 8 and not line.startswith("#"):
-            try:
+            found = f"not a camera: {line.strip()} ({{error}})"
+            with refusing(path, found, "give COLMAP's cameras.txt", (ValueError,)):
                 return Camera(int(words[2]), int(words[3]), *(float(word) for word in words[4:8]))
-            except ValueError as error:
-                found = f"not a camera: {line.strip()} ({error})"
-                raise InputError(path, found, "give COLMAP's cameras.txt") from error
     raise InputError(path, "no camera in it", "give COLMAP's cameras.txt")

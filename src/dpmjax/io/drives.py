@@ -49,10 +49,8 @@ def scan_files(folder: Path, suffixes: tuple[str, ...] = SCAN_SUFFIXES) -> list[
     """
     if not folder.is_dir():
         return []
-    files = [
-        file for file in folder.iterdir() if file.is_file() and file.name[0] != "." and file.name not in _POSE_FILES
-    ]
-    of_suffix = [[file for file in files if file.suffix.lower() == suffix] for suffix in suffixes]
+    files = [f for f in folder.iterdir() if f.is_file() and f.name[0] != "." and f.name not in _POSE_FILES]
+    of_suffix: list[list[Path]] = [[f for f in files if f.suffix.lower() == suffix] for suffix in suffixes]
     return sorted(max(of_suffix, key=len), key=lambda file: natural_key(file.name))
 
 
@@ -120,18 +118,6 @@ def match_times(path: Path, files: list[Path]) -> FloatArray | None:
     except InputError:
         return None
     return times if times is not None and np.isfinite(times).all() else None
-
-
-def from_first(poses: FloatArray) -> FloatArray:
-    """Poses in the frame of the first one, without the 1e6 m of national grids.
-
-    Args:
-        poses: (n, 4, 4).
-
-    Returns:
-        (n, 4, 4), the first the identity.
-    """
-    return rigid.inverse(poses[0]) @ poses
 
 
 def read_plain_folder(folder: Path, *, poses: Path | None = None) -> Drive3D:

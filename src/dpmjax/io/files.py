@@ -8,7 +8,8 @@ import os
 import re
 import tempfile
 import zipfile
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +19,30 @@ from numpy.typing import ArrayLike, NDArray
 from dpmjax.sequences import FloatArray, InputError, require
 
 # A member of an archive that unpacks to more than this many times its size has a wrong header: deflate reaches 1032.
-_LARGEST_COMPRESSION = 1100
+LARGEST_COMPRESSION = 1100
+
+
+@contextmanager
+def refusing(source: str | Path, found: str, advice: str, kinds: tuple[type[Exception], ...]) -> Iterator[None]:
+    """Turns errors of a parser into an `InputError`.
+
+    Args:
+        source: see `InputError`.
+        found: what was found; "{error}" in it becomes the parser's message, and "{kind}" the class of its error.
+        advice: see `InputError`.
+        kinds: the errors that damaged input can raise.
+
+    Yields:
+        Nothing.
+
+    Raises:
+        InputError: an error of one of these kinds was raised within.
+    """
+    try:
+        yield
+    except kinds as error:
+        found = found.replace("{kind}", type(error).__name__).replace("{error}", str(error))
+        raise InputError(source, found, advice) from error
 
 
 def write_atomically(path: str | Path, content: bytes | str) -> Path:
@@ -122,10 +146,8 @@ def to_numbers(rows: Sequence[Sequence[str]], source: str | Path) -> FloatArray:
     widths = sorted({len(row) for row in rows})
     found = f"rows of {' and '.join(map(str, widths))} columns" if rows else "no row"
     require(len(widths) == 1, source, found, "give rows of equal length")
-    try:
+    with refusing(source, "not a number ({error})", "write plain decimal numbers", (ValueError,)):
         return np.array(rows, np.float64)
-    except ValueError as error:
-        raise InputError(source, f"not a number ({error})", "write plain decimal numbers") from error
 
 
 def read_table(path: str | Path) -> FloatArray:
@@ -209,25 +231,22 @@ def load_arrays(path: str | Path, keys: Sequence[str] | None = None) -> dict[str
     Raises:
         InputError: no such file, no NumPy file, a damaged one, or one of Python objects.
     """
-    try:
-        with Path(path).open("rb") as file:
-            if file.read(6) == npy_format.MAGIC_PREFIX:
-                file.seek(0)
-                return {"points": _parse_npy(file.read())}
-        with zipfile.ZipFile(path) as archive:
+    require(Path(path).exists(), path, "no such file", "check the path")
+    found, advice = "not a readable NumPy file ({error})", "save it again with numpy.save or numpy.savez"
+    # The parsers of zip, zlib and NumPy headers raise many kinds of errors.
+    with refusing(path, found, advice, (Exception,)), Path(path).open("rb") as file:
+        if file.read(6) == npy_format.MAGIC_PREFIX:
+            file.seek(0)
+            return {"points": _parse_npy(file.read())}
+        with zipfile.ZipFile(file) as archive:
             members = {entry.filename.removesuffix(".npy"): entry for entry in archive.infolist()}
             chosen = {key: members[key] for key in (members if keys is None else keys) if key in members}
             return {key: _parse_npy(_unpack(archive, member)) for key, member in chosen.items()}
-    except FileNotFoundError as error:
-        raise InputError(path, "no such file", "check the path") from error
-    except Exception as error:  # The parsers of zip, zlib and NumPy headers raise many kinds.
-        found = f"not a readable NumPy file ({error})"
-        raise InputError(path, found, "save it again with numpy.save or numpy.savez") from error
 
 
 def _unpack(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> bytes:
     """The bytes of a member; a ValueError where it claims more than its packed size can hold."""
-    if member.file_size > _LARGEST_COMPRESSION * (member.compress_size + 64):
+    if member.file_size > LARGEST_COMPRESSION * (member.compress_size + 64):
         raise ValueError(f"{member.filename} claims {member.file_size} bytes, packed into {member.compress_size}")
     return archive.read(member)
 

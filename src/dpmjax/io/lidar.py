@@ -155,13 +155,8 @@ def open_lidar_sequence(
     require(bin_columns >= 3, path, f"bin_columns is {bin_columns}", "a point has x, y and z at least")
     drive = _read(_choose(path, sequence), None if poses is None else Path(poses))
     require(len(drive.files) > 0, path, "a folder without scans", f"give {_FORMATS}")
-    whole = LidarSequence(
-        name=drive.name,
-        sources=tuple(str(file) for file in drive.files),
-        read_scan=partial(_read_scan, drive.files, bin_columns),
-        T_world_lidar=drive.T_world_lidar,
-        times=drive.times,
-    )
+    sources, read_scan = tuple(map(str, drive.files)), partial(_read_scan, drive.files, bin_columns)
+    whole = LidarSequence(drive.name, sources, read_scan, drive.T_world_lidar, drive.times)
     part = whole.take(selection)
     require(part.num_scans > 0, path, f"{selection} chooses 0 of {whole.num_scans} scans", "choose others")
     return part

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from dpmjax.geometry import rigid
-from dpmjax.io.drives import Drive3D, from_first, match_poses, match_rows, numbers_of, read_labelled_numbers, scan_files
+from dpmjax.io.drives import Drive3D, match_poses, match_rows, numbers_of, read_labelled_numbers, scan_files
 from dpmjax.io.files import natural_key, read_lines, read_table
 from dpmjax.io.poses import check_poses, from_rows, homogeneous, interpolate_poses
 from dpmjax.sequences import FloatArray, InputError, require
@@ -46,7 +46,8 @@ def read_kitti_raw(folder: Path) -> Drive3D:
     table = np.vstack([_first_row(record, 6) for record in records])
     T_world_lidar = _poses_from_oxts(table, home) @ rigid.inverse(_read_imu_calibration(calibration))
     # A drive may lack scans that have a record: poses are matched by number.
-    return Drive3D(folder.resolve().name, files, from_first(match_poses(T_world_lidar, files, home)), stamps)
+    poses = match_poses(T_world_lidar, files, home)
+    return Drive3D(folder.resolve().name, files, rigid.inverse(poses[0]) @ poses, stamps)
 
 
 def read_kitti_360(folder: Path) -> Drive3D:
@@ -145,9 +146,10 @@ def _interpolate(
     times, first = np.unique(times, return_index=True)
     kept = np.flatnonzero((wanted >= times[0] - slack) & (wanted <= times[-1] + slack))
     require(len(kept) > 0, path, "no scan lies within the times of the poses", "give scans and poses of one drive")
-    found = from_first(interpolate_poses(times, poses[first], wanted[kept]))
+    found = interpolate_poses(times, poses[first], wanted[kept])
     stamps = None if drive.times is None else drive.times[kept]
-    return Drive3D(drive.name, [drive.files[i] for i in kept], found, stamps)
+    # In the frame of the first, without the 1e6 m of national grids.
+    return Drive3D(drive.name, [drive.files[i] for i in kept], rigid.inverse(found[0]) @ found, stamps)
 
 
 def _require_numbers(files: list[Path]) -> list[int]:

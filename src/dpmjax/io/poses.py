@@ -8,14 +8,13 @@ from __future__ import annotations
 import io
 import re
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from dpmjax.geometry import se2
 from dpmjax.io.files import load_arrays, read_lines, read_table, write_atomically
-from dpmjax.sequences import FloatArray, InputError, require
+from dpmjax.sequences import FloatArray, InputError, Unit, require
 
 _LAYOUTS = (
     "x y theta, TUM (stamp tx ty tz qx qy qz qw), KITTI (12 numbers a row), or .npy of (n, 3), (n, 3, 3) or (n, 4, 4)"
@@ -39,7 +38,7 @@ def read_poses(path: str | Path) -> FloatArray:
     return planar_to_homogeneous(poses) if poses.ndim == 2 else poses
 
 
-def read_planar_poses(path: str | Path, num_scans: int, unit: Literal["px", "m"]) -> FloatArray:
+def read_planar_poses(path: str | Path, num_scans: int, unit: Unit) -> FloatArray:
     """Reads the planar trajectory of a set of scans.
 
     Args:
@@ -194,14 +193,16 @@ def check_poses(poses: FloatArray, source: str | Path) -> FloatArray:
         InputError: names the first bad pose.
     """
     bad = ~np.isfinite(poses.reshape(len(poses), -1)).all(axis=1)
-    require(not bad.any(), source, f"NaN or infinite values in pose {bad.argmax()}", "give a pose to every scan")
+    if bad.any():
+        raise InputError(source, f"NaN or infinite values in pose {bad.argmax()}", "give a pose to every scan")
     if poses.ndim == 3:
         dim = poses.shape[2] - 1
         turn = poses[:, :dim, :dim]
         with np.errstate(over="ignore", invalid="ignore"):
             off = np.abs(turn @ turn.transpose(0, 2, 1) - np.eye(dim)).max(axis=(1, 2))
             bad = ~(off <= 1e-2) | ~(np.linalg.det(turn) > 0)
-        require(not bad.any(), source, f"pose {bad.argmax()} is no rigid motion", "give rotation matrices")
+        if bad.any():
+            raise InputError(source, f"pose {bad.argmax()} is no rigid motion", "give rotation matrices")
     return poses
 
 
@@ -264,10 +265,7 @@ def _to_quaternions(rotations: FloatArray) -> FloatArray:
     """(n, 4) x y z w with w >= 0."""
     from scipy.spatial.transform import Rotation
 
-    if not len(rotations):
-        return np.zeros((0, 4))
-    quaternions = Rotation.from_matrix(rotations).as_quat()
-    return np.where(quaternions[:, 3:] < 0, -quaternions, quaternions)
+    return Rotation.from_matrix(rotations).as_quat(canonical=True) if len(rotations) else np.zeros((0, 4))
 
 
 def _as_matrices(poses: ArrayLike) -> FloatArray:

@@ -6,7 +6,6 @@ import logging
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,19 +13,16 @@ from numpy.typing import NDArray
 from dpmjax.geometry import se2
 from dpmjax.io.carmen import read_carmen_log
 from dpmjax.io.deepmapping_folder import read_deepmapping_folder
-from dpmjax.io.files import load_arrays, to_float32
+from dpmjax.io.files import load_arrays, read_bytes, to_float32
 from dpmjax.io.poses import check_poses
-from dpmjax.sequences import BoolArray, FloatArray, InputError, ScanSequence, has_angular_order, require
+from dpmjax.sequences import BoolArray, FloatArray, InputError, ScanSequence, Unit, has_angular_order, require
 
 Table = Mapping[str, NDArray[np.generic]]
 _log = logging.getLogger(__name__)
 _FORMATS = "a folder or .tar of .pcd files, a CARMEN .log, .clf or .log.gz, or .npy / .npz arrays"
 _KEYS = "points (n, b, 2), or ranges (n, b) and angles (b,); optional mask, poses, odometry, times, unit"
-_ENDINGS = {
-    "folder": (".tar", ".tar.gz", ".tgz"),
-    "arrays": (".npy", ".npz"),
-    "carmen": (".log", ".clf", ".log.gz", ".clf.gz"),
-}
+_ENDINGS = {"folder": (".tar", ".tar.gz", ".tgz"), "arrays": (".npy", ".npz")}
+_ENDINGS |= {"carmen": (".log", ".clf", ".log.gz", ".clf.gz")}
 # Median ranges outside of these are a mistaken unit: millimetres, or pixels / 512.
 _PLAUSIBLE_RANGE = {"m": (0.05, 500.0), "px": (2.0, 20000.0)}
 # Few planar lidars measure farther; a sequence with hardly any shorter beam may be in millimetres.
@@ -40,7 +36,7 @@ def read_sequence(
     start: int = 0,
     stop: int | None = None,
     stride: int = 1,
-    unit: Literal["px", "m"] | None = None,
+    unit: Unit | None = None,
     max_range: float | None = None,
 ) -> ScanSequence:
     """Reads a sequence of planar scans, whatever of the known formats it is in.
@@ -81,7 +77,7 @@ def read_sequence(
     return sequence
 
 
-def _read_any(path: Path, unit: Literal["px", "m"] | None, max_range: float | None) -> ScanSequence:
+def _read_any(path: Path, unit: Unit | None, max_range: float | None) -> ScanSequence:
     require(path.exists(), path, "no such file or folder", "check the path")
     kind = _detect(path)
     if kind == "folder":
@@ -103,11 +99,7 @@ def _detect(path: Path) -> str:
         if name.endswith(endings):
             return kind
     require(not name.endswith(".pcd"), path, "a single scan", "give the folder that holds all of its .pcd files")
-    try:
-        with path.open("rb") as file:
-            head = file.read(65536)
-    except OSError as error:
-        raise InputError(path, f"cannot be read ({error.strerror})", "check the path and its permissions") from error
+    head = read_bytes(path)[:65536]
     if head[257:262] == b"ustar":
         return "folder"
     if head[:6] == b"\x93NUMPY" or head[:2] == b"PK":
@@ -151,7 +143,7 @@ def _check_unit(sequence: ScanSequence, path: Path) -> None:
         _log.warning("%s: %.1f %% of the beams are below %g m; are these millimetres?", path, 100 * share, _USUAL_M)
 
 
-def read_arrays(path: str | Path, *, unit: Literal["px", "m"] | None = None) -> ScanSequence:
+def read_arrays(path: str | Path, *, unit: Unit | None = None) -> ScanSequence:
     """Reads scans from `.npy` or `.npz`.
 
     A `.npy` holds points (n, b, 2) in the sensor frame; the third coordinate of (n, b, 3) is ignored. A `.npz` holds
@@ -188,16 +180,10 @@ def read_arrays(path: str | Path, *, unit: Literal["px", "m"] | None = None) -> 
     times = table.get("times", np.zeros(len(points)))
     is_good = _is_numeric(times, (len(points),)) and np.isfinite(times).all()
     require(is_good, path, f"times are {times.shape} {times.dtype}", f"give ({len(points)},) finite seconds")
-    return ScanSequence(
-        name=Path(path).stem,
-        points=stored,
-        mask=mask,
-        unit=unit or _unit(table, path),
-        is_organised=has_angular_order(stored, mask),
-        reference_poses=_planar(table, "poses", len(points), path),
-        odometry_poses=_planar(table, "odometry", len(points), path),
-        times=times.astype(np.float64) if "times" in table else None,
-    )
+    poses, odometry = (_planar(table, key, len(points), path) for key in ("poses", "odometry"))
+    stamps = times.astype(np.float64) if "times" in table else None
+    is_organised, unit = has_angular_order(stored, mask), unit or _unit(table, path)
+    return ScanSequence(Path(path).stem, stored, mask, unit, is_organised, poses, odometry, stamps)
 
 
 def _is_numeric(array: NDArray[np.generic], *shapes: tuple[int, ...]) -> bool:
@@ -229,7 +215,7 @@ def _from_ranges(table: Table, path: str | Path) -> tuple[FloatArray, BoolArray]
     return distance[..., None] * np.stack([np.cos(theta), np.sin(theta)], axis=-1), mask
 
 
-def _unit(table: Table, path: str | Path) -> Literal["px", "m"]:
+def _unit(table: Table, path: str | Path) -> Unit:
     unit = str(table.get("unit", "m"))
     require(unit in ("px", "m"), path, f"unit is {unit!r}", "say 'px' or 'm'")
     return "px" if unit == "px" else "m"

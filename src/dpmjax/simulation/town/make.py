@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from dpmjax.sequences import FloatArray
-from dpmjax.simulation.town.furnish import furnish
+from dpmjax.simulation.town.furnish import Plots, furnish
 from dpmjax.simulation.town.objects import Collection
 from dpmjax.simulation.town.primitives import (
     CELL_M,
