@@ -5,16 +5,14 @@ NumPy only, on the host. `dpmjax.io` and `dpmjax.simulation` make these records.
 
 from __future__ import annotations
 
-import logging
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-_log = logging.getLogger(__name__)
 FloatArray = NDArray[np.float64]
 Unit = Literal["px", "m"]
 BoolArray = NDArray[np.bool_]
@@ -161,12 +159,24 @@ class World:
 
     def fill_pockets(self) -> World:
         """The same world with every free pixel solid that cannot be reached from the largest free space."""
-        from scipy.ndimage import label
+        return replace(self, is_obstacle=~largest_region(~self.is_obstacle))
 
-        labels, _ = label(~self.is_obstacle)
-        sizes = np.bincount(labels.ravel())
-        sizes[0] = 0
-        return replace(self, is_obstacle=labels != sizes.argmax())
+
+def largest_region(is_free: BoolArray) -> BoolArray:
+    """The largest connected region of a raster.
+
+    Args:
+        is_free: (h, w).
+
+    Returns:
+        (h, w) True where a pixel is free and of the largest region.
+    """
+    from scipy.ndimage import label
+
+    labels, _ = label(is_free)
+    sizes = np.bincount(labels.ravel())
+    sizes[0] = 0
+    return is_free & (labels == sizes.argmax())
 
 
 @dataclass(frozen=True)
@@ -282,68 +292,5 @@ class LidarSequence:
     def take(self, selection: Selection) -> LidarSequence:
         """The selected scans with their poses and times, in the same world; nothing is read."""
         numbers = [int(i) for i in np.arange(self.num_scans)[selection]]
-
-        def read_scan(index: int) -> NDArray[np.float32]:
-            return self.read_scan(numbers[index])
-
-        sources = tuple(self.sources[i] for i in numbers)
-        return replace(
-            self, sources=sources, read_scan=read_scan, **_select(self, ("T_world_lidar", "times"), selection)
-        )
-
-
-@dataclass(frozen=True)
-class BadScan:
-    """A scan that could not be used.
-
-    Attributes:
-        index: its number in the sequence.
-        file: where it came from.
-        reason: what was found there.
-    """
-
-    index: int
-    file: str
-    reason: str
-
-
-class IndexedScan(NamedTuple):
-    """A scan and its number in the sequence.
-
-    Attributes:
-        number: of the scan in the sequence.
-        points: (n, 3) float32, lidar frame, m.
-    """
-
-    number: int
-    points: NDArray[np.float32]
-
-
-def iterate_scans(sequence: LidarSequence, bad: list[BadScan] | None = None) -> Iterator[IndexedScan]:
-    """Reads scan after scan and leaves out the bad ones; a warning names them at the end.
-
-    Args:
-        sequence: the scans.
-        bad: gets an entry for each scan that was left out.
-
-    Yields:
-        The good scans with their numbers.
-
-    Raises:
-        InputError: not one scan is good.
-    """
-    found = [] if bad is None else bad
-    for index, source in enumerate(sequence.sources):
-        try:
-            points = sequence.read_scan(index)
-        except InputError as error:
-            found.append(BadScan(index, source, error.found))
-            continue
-        yield IndexedScan(index, points)
-    if not found:
-        return
-    listed = "; ".join(f"scan {scan.index}, {scan.file}: {scan.reason}" for scan in found[:10])
-    listed += f"; and {len(found) - 10} more" if len(found) > 10 else ""
-    if len(found) == sequence.num_scans:
-        raise InputError(sequence.name, f"all {len(found)} scans are bad: {listed}", "check the files")
-    _log.warning("%s: %d of %d scans left out: %s", sequence.name, len(found), sequence.num_scans, listed)
+        sources, chosen = tuple(self.sources[i] for i in numbers), _select(self, ("T_world_lidar", "times"), selection)
+        return replace(self, sources=sources, read_scan=lambda index: self.read_scan(numbers[index]), **chosen)

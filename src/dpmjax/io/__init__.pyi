@@ -4,7 +4,6 @@ from .clouds import read_ply as read_ply
 from .clouds import write_pcd as write_pcd
 from .clouds import write_ply as write_ply
 from .deepmapping_folder import write_deepmapping_folder as write_deepmapping_folder
-from .depth import Camera as Camera
 from .depth import DepthSequence as DepthSequence
 from .depth import is_active_vision as is_active_vision
 from .depth import read_active_vision as read_active_vision

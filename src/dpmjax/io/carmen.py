@@ -70,9 +70,8 @@ def read_carmen_log(path: str | Path, *, max_range: float | None = None) -> Scan
     corrected, odometry = np.array([line.corrected for line in lines]), np.array([line.odometry for line in lines])
     has_odometry = not np.allclose(corrected, odometry, atol=1e-6)
     times, odometry = _repair(np.array([line.time for line in lines]), odometry, path)
-    name, is_organised = Path(path).name.split(".")[0], True
-    raw = odometry if has_odometry else None
-    return ScanSequence(name, points, mask, "m", is_organised, corrected, raw, times)
+    name, raw = Path(path).name.split(".")[0], odometry if has_odometry else None
+    return ScanSequence(name, points, mask, "m", True, corrected, raw, times)
 
 
 def scan_angles(num_beams: int) -> FloatArray:

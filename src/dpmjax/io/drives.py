@@ -1,8 +1,9 @@
-"""The files of a drive of 3-D scans with their poses and times: plain folders of scans, KITTI odometry in and out."""
+"""The files of a drive of 3-D scans with their poses and times; plain folders; reading on; writing as KITTI."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import logging
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -10,10 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dpmjax.geometry import rigid
-from dpmjax.io.files import load_arrays, natural_key, read_lines, read_table, write_atomically
-from dpmjax.io.poses import check_poses, from_rows, homogeneous, read_poses, write_kitti
-from dpmjax.sequences import FloatArray, InputError, LidarSequence, iterate_scans
+from dpmjax.io.files import load_arrays, natural_key, read_table, write_atomically
+from dpmjax.io.poses import check_poses, homogeneous, read_poses, write_kitti
+from dpmjax.sequences import FloatArray, InputError, LidarSequence, require
 
+_log = logging.getLogger(__name__)
 SCAN_SUFFIXES = (".bin", ".npy", ".npz", ".pcd", ".ply")
 _POSE_FILES = ("poses_lidar.txt", "poses_lidar.npy", "poses.txt", "poses.npy", "trajectory.txt", "trajectory_tum.txt",
                "trajectory.npy", "gt_poses.txt", "groundtruth.txt")  # fmt: skip
@@ -50,8 +52,8 @@ def scan_files(folder: Path, suffixes: tuple[str, ...] = SCAN_SUFFIXES) -> list[
     if not folder.is_dir():
         return []
     files = [f for f in folder.iterdir() if f.is_file() and f.name[0] != "." and f.name not in _POSE_FILES]
-    of_suffix: list[list[Path]] = [[f for f in files if f.suffix.lower() == suffix] for suffix in suffixes]
-    return sorted(max(of_suffix, key=len), key=lambda file: natural_key(file.name))
+    most = max(([f for f in files if f.suffix.lower() == suffix] for suffix in suffixes), key=len)
+    return sorted(most, key=lambda file: natural_key(file.name))
 
 
 def numbers_of(files: Sequence[Path], largest: float = 2.0**62) -> list[int] | None:
@@ -174,33 +176,43 @@ def read_learned_folder(folder: Path) -> Drive3D:
     return Drive3D(folder.resolve().name, files, check_poses(stacked, folder))
 
 
-def read_kitti_odometry(folder: Path) -> Drive3D:
-    """Lists a sequence of KITTI odometry.
+class IndexedScan(NamedTuple):
+    """A scan and its number in the sequence.
 
-    Poses are looked for in poses_lidar.txt (already in the lidar's frame), poses.txt beside velodyne/ (SemanticKITTI's)
-    and poses/NN.txt two folders up, both in the left camera's frame.
+    Attributes:
+        number: of the scan in the sequence.
+        points: (n, 3) float32, lidar frame, m.
+    """
+
+    number: int
+    points: NDArray[np.float32]
+
+
+def iterate_scans(sequence: LidarSequence) -> Iterator[IndexedScan]:
+    """Reads scan after scan and leaves out the bad ones; a warning names them at the end.
 
     Args:
-        folder: the folder that holds velodyne/.
+        sequence: the scans.
 
-    Returns:
-        The drive; poses in the lidar's frame, world = first lidar frame where the first camera pose is the identity.
+    Yields:
+        The good scans with their numbers.
 
     Raises:
-        InputError: camera poses without `Tr` in calib.txt, or broken files.
+        InputError: not one scan is good.
     """
-    files = scan_files(folder / "velodyne")
-    in_lidar, name = folder / "poses_lidar.txt", folder.resolve().name
-    in_camera = [folder / "poses.txt", folder.resolve().parents[1] / "poses" / f"{name}.txt"]
-    drive = Drive3D(name, files, times=match_times(folder / "times.txt", files))
-    path = next((p for p in (in_lidar, *in_camera) if p.is_file()), None)
-    if path is None:
-        return drive
-    poses = read_poses(path)
-    if path != in_lidar:
-        T_cam0_lidar = _read_camera_calibration(folder / "calib.txt")
-        poses = rigid.inverse(T_cam0_lidar) @ poses @ T_cam0_lidar
-    return drive._replace(T_world_lidar=match_poses(poses, files, path))
+    bad: list[str] = []
+    for index, source in enumerate(sequence.sources):
+        try:
+            points = sequence.read_scan(index)
+        except InputError as error:
+            bad.append(f"scan {index}, {source}: {error.found}")
+            continue
+        yield IndexedScan(index, points)
+    listed = "; ".join(bad[:10]) + (f"; and {len(bad) - 10} more" if len(bad) > 10 else "")
+    is_usable = not bad or len(bad) < sequence.num_scans
+    require(is_usable, sequence.name, f"all {len(bad)} scans are bad: {listed}", "check the files")
+    if bad:
+        _log.warning("%s: %d of %d scans left out: %s", sequence.name, len(bad), sequence.num_scans, listed)
 
 
 def write_kitti_sequence(root: str | Path, name: str, sequence: LidarSequence) -> Path:
@@ -236,34 +248,3 @@ def write_kitti_sequence(root: str | Path, name: str, sequence: LidarSequence) -
     times = np.arange(len(kept)) / 10.0 if sequence.times is None else sequence.times[kept]
     write_atomically(folder / "times.txt", "".join(f"{time:.6f}\n" for time in times))
     return folder
-
-
-def read_labelled_numbers(path: Path) -> dict[str, FloatArray]:
-    """Reads the lines `key: numbers` of a calibration file; other lines are ignored.
-
-    Args:
-        path: the file.
-
-    Returns:
-        The numbers by key.
-
-    Raises:
-        InputError: there is no such file.
-    """
-    found = {}
-    for key, _, numbers in (line.partition(":") for line in read_lines(path)):
-        try:
-            found[key.strip()] = np.array(numbers.split(), np.float64)
-        except ValueError:
-            continue
-    return found
-
-
-def _read_camera_calibration(path: Path) -> FloatArray:
-    """(4, 4) `T_cam0_lidar`: `Tr`, the lidar's frame to the left grey camera's, out of KITTI's calib.txt."""
-    entries = read_labelled_numbers(path)
-    for key in ("Tr", "Tr_velo_to_cam", "Tr_velo_cam"):
-        if key in entries and len(entries[key]) == 12:
-            return from_rows(entries[key], path)[0]
-    advice = "take the calib.txt with a line 'Tr:' of 12 numbers (data_odometry_calib); camera poses need it"
-    raise InputError(path, "no line 'Tr:' of 12 numbers", advice)

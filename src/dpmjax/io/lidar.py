@@ -11,16 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dpmjax.io.clouds import read_pcd, read_ply
-from dpmjax.io.drives import (
-    SCAN_SUFFIXES,
-    Drive3D,
-    read_kitti_odometry,
-    read_learned_folder,
-    read_plain_folder,
-    scan_files,
-)
+from dpmjax.io.drives import SCAN_SUFFIXES, Drive3D, read_learned_folder, read_plain_folder, scan_files
 from dpmjax.io.files import load_arrays, natural_key, read_bytes, to_float32
-from dpmjax.io.lidar_datasets import read_kitti_360, read_kitti_carla, read_kitti_raw, read_mulran
+from dpmjax.io.lidar_datasets import read_kitti_360, read_kitti_carla, read_kitti_odometry, read_kitti_raw, read_mulran
 from dpmjax.sequences import InputError, LidarSequence, require
 
 _log = logging.getLogger(__name__)

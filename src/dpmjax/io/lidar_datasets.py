@@ -1,4 +1,4 @@
-"""Drives of other data sets as they lie on disk: KITTI raw, KITTI-360, KITTI-CARLA, MulRan."""
+"""Drives of the data sets as they lie on disk: KITTI odometry, KITTI raw, KITTI-360, KITTI-CARLA, MulRan."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 
 from dpmjax.geometry import rigid
-from dpmjax.io.drives import Drive3D, match_poses, match_rows, numbers_of, read_labelled_numbers, scan_files
+from dpmjax.io.drives import Drive3D, match_poses, match_rows, match_times, numbers_of, scan_files
 from dpmjax.io.files import natural_key, read_lines, read_table
-from dpmjax.io.poses import check_poses, from_rows, homogeneous, interpolate_poses
+from dpmjax.io.poses import check_poses, from_rows, homogeneous, interpolate_poses, read_poses
 from dpmjax.sequences import FloatArray, InputError, require
 
 _CARLA_POSES_PER_FRAME = 100  # KITTI-CARLA writes poses at 1000 Hz and frames at 10 Hz.
@@ -18,6 +18,35 @@ _EARTH_RADIUS_M = 6378137.0
 # MulRan's published calibration: the Ouster in the car's frame; rotation about z by 179.6654 degrees.
 _MULRAN_OUSTER_XYZ = (1.7042, -0.021, 1.8047)
 _MULRAN_OUSTER_RPY_DEG = (0.0001, 0.0003, 179.6654)
+
+
+def read_kitti_odometry(folder: Path) -> Drive3D:
+    """Lists a sequence of KITTI odometry.
+
+    Poses are looked for in poses_lidar.txt (already in the lidar's frame), poses.txt beside velodyne/ (SemanticKITTI's)
+    and poses/NN.txt two folders up, both in the left camera's frame.
+
+    Args:
+        folder: the folder that holds velodyne/.
+
+    Returns:
+        The drive; poses in the lidar's frame, world = first lidar frame where the first camera pose is the identity.
+
+    Raises:
+        InputError: camera poses without `Tr` in calib.txt, or broken files.
+    """
+    files = scan_files(folder / "velodyne")
+    in_lidar, name = folder / "poses_lidar.txt", folder.resolve().name
+    in_camera = [folder / "poses.txt", folder.resolve().parents[1] / "poses" / f"{name}.txt"]
+    drive = Drive3D(name, files, times=match_times(folder / "times.txt", files))
+    path = next((p for p in (in_lidar, *in_camera) if p.is_file()), None)
+    if path is None:
+        return drive
+    poses = read_poses(path)
+    if path != in_lidar:
+        T_cam0_lidar = _read_camera_calibration(folder / "calib.txt")
+        poses = rigid.inverse(T_cam0_lidar) @ poses @ T_cam0_lidar
+    return drive._replace(T_world_lidar=match_poses(poses, files, path))
 
 
 def read_kitti_raw(folder: Path) -> Drive3D:
@@ -185,6 +214,37 @@ def _read_stamps(path: Path, files: list[Path]) -> FloatArray | None:
         return None
     matched = match_rows(stamps, files)
     return None if matched is None or not len(matched) else (matched - matched[0]).astype(np.float64) * 1e-9
+
+
+def read_labelled_numbers(path: Path) -> dict[str, FloatArray]:
+    """Reads the lines `key: numbers` of a calibration file; other lines are ignored.
+
+    Args:
+        path: the file.
+
+    Returns:
+        The numbers by key.
+
+    Raises:
+        InputError: there is no such file.
+    """
+    found = {}
+    for key, _, numbers in (line.partition(":") for line in read_lines(path)):
+        try:
+            found[key.strip()] = np.array(numbers.split(), np.float64)
+        except ValueError:
+            continue
+    return found
+
+
+def _read_camera_calibration(path: Path) -> FloatArray:
+    """(4, 4) `T_cam0_lidar`: `Tr`, the lidar's frame to the left grey camera's, out of KITTI's calib.txt."""
+    entries = read_labelled_numbers(path)
+    for key in ("Tr", "Tr_velo_to_cam", "Tr_velo_cam"):
+        if key in entries and len(entries[key]) == 12:
+            return from_rows(entries[key], path)[0]
+    advice = "take the calib.txt with a line 'Tr:' of 12 numbers (data_odometry_calib); camera poses need it"
+    raise InputError(path, "no line 'Tr:' of 12 numbers", advice)
 
 
 def _read_imu_calibration(path: Path) -> FloatArray:

@@ -20,7 +20,6 @@ from .town.scan import OS1_64 as OS1_64
 from .town.scan import VLP16 as VLP16
 from .town.scan import LidarSensor as LidarSensor
 from .town.scan import scan_town as scan_town
-from .trajectory2d import TrajectoryConfig as TrajectoryConfig
 from .trajectory2d import simulate_trajectory as simulate_trajectory
 from .world2d import World as World
 from .world2d import make_world as make_world

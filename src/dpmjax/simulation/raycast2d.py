@@ -189,14 +189,8 @@ def simulate_sequence(
     points, mask = scan_world(
         scene.is_obstacle, poses, num_beams=num_beams, range_noise_px=range_noise_px, rng=noise_rng
     )
-    return ScanSequence(
-        name=scene.name,
-        points=points,
-        mask=mask,
-        unit="px",
-        reference_poses=poses,
-        odometry_poses=simulate_odometry(poses, rng=odometry_rng) if with_odometry else None,
-    )
+    odometry = simulate_odometry(poses, rng=odometry_rng) if with_odometry else None
+    return ScanSequence(scene.name, points, mask, "px", reference_poses=poses, odometry_poses=odometry)
 
 
 def _check_origins(is_obstacle: BoolArray, origins: FloatArray) -> None:

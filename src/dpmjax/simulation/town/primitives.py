@@ -178,15 +178,25 @@ def pack_bodies(table: FloatArray, surface: int) -> Bodies:
     table = table.reshape(-1, 9)
     rows = padded(table, capacity_for(len(table)))
     headings = padded(np.column_stack([np.cos(table[:, 6]), np.sin(table[:, 6])]), len(rows))
-    return Bodies(
-        centres=rows[:, :3],
-        half_sizes=rows[:, 3:6],
-        headings=headings,
-        softness=rows[:, 7],
-        window_depth=rows[:, 8],
-        surface=jnp.where((rows[:, 7] > 0) & (surface == SOLID), SOFT, surface),
-        mask=mask_of(len(table), len(rows)),
-    )
+    surfaces = jnp.where((rows[:, 7] > 0) & (surface == SOLID), SOFT, surface)
+    mask = mask_of(len(table), len(rows))
+    return Bodies(rows[:, :3], rows[:, 3:6], headings, rows[:, 7], rows[:, 8], surfaces, mask)
+
+
+def turn_back(vectors: Float[Array, "... 3"], heading: Float[Array, "... 2"]) -> Float[Array, "... 3"]:
+    """Vectors in the axes of a box that is turned about z.
+
+    Args:
+        vectors: in axes of the world.
+        heading: cosine and sine of the turn.
+
+    Returns:
+        The same vectors along the box's own x, y, z.
+    """
+    x, y, z = jnp.moveaxis(vectors, -1, 0)
+    cos, sin = heading[..., 0], heading[..., 1]
+    along, across = cos * x + sin * y, cos * y - sin * x
+    return jnp.stack([along, across, jnp.broadcast_to(z, along.shape)], axis=-1)
 
 
 def traffic_boxes(traffic: Traffic, sensor: Float[Array, " 3"], time: Float[Array, ""]) -> Bodies:
@@ -213,15 +223,9 @@ def traffic_boxes(traffic: Traffic, sensor: Float[Array, " 3"], time: Float[Arra
     lift = jnp.where(is_car, 0.25, 0.0)
     up = jnp.array([0.0, 0.0, 1.0], foot.dtype)
     zero = jnp.zeros(len(way), foot.dtype)
-    body = Bodies(
-        centres=foot + (lift + half_body)[:, None] * up,
-        half_sizes=traffic.half_sizes.at[:, 2].set(half_body),
-        headings=heading,
-        softness=zero,
-        window_depth=zero,
-        surface=jnp.full(len(way), MOVING),
-        mask=traffic.mask & is_free,
-    )
+    middle, half_sizes = foot + (lift + half_body)[:, None] * up, traffic.half_sizes.at[:, 2].set(half_body)
+    surface, mask = jnp.full(len(way), MOVING), traffic.mask & is_free
+    body = Bodies(middle, half_sizes, heading, zero, zero, surface, mask)
     cabin = replace(
         body,
         centres=foot + (lift + 2 * half_body + cabin_z)[:, None] * up,
