@@ -17,7 +17,7 @@ from tqdm import tqdm
 from dpmjax.checkpoints import Checkpoints
 from dpmjax.deeppointmap import Model, SamplingConfig, ScanStore, TrainingConfig, TrainingHooks, init_training, train
 from dpmjax.deeppointmap.curriculum import CurriculumStage
-from dpmjax.deeppointmap.evaluation import EvaluationPairs, evaluate_registration
+from dpmjax.deeppointmap.inference import EvaluationPairs, evaluate_registration
 from dpmjax.deeppointmap.training_loop import StepRecord, Trained, TrainingProgress, begin_training
 from dpmjax.io import LidarSequence, list_lidar_sequences, open_lidar_sequence
 from dpmjax.simulation import HDL64E, DriveConfig, TownConfig, simulate_lidar_sequence

@@ -32,7 +32,7 @@ from experiments._run_folder import HISTORY, METRICS, RunFolder, open_run_folder
 
 if TYPE_CHECKING:
     from dpmjax.deeppointmap import Model, TrainingConfig
-    from dpmjax.deeppointmap.evaluation import Evaluation, EvaluationPairs
+    from dpmjax.deeppointmap.inference import Evaluation, EvaluationPairs
     from dpmjax.deeppointmap.training_loop import Trained
     from experiments._dpm_run import Records
 

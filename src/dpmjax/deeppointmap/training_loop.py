@@ -24,7 +24,7 @@ from dpmjax.checks import require_count
 from dpmjax.deeppointmap.curriculum import CurriculumStage, TrainingConfig
 from dpmjax.deeppointmap.data_pipeline import SampleMaker, ScanStore
 from dpmjax.deeppointmap.model import Model
-from dpmjax.deeppointmap.processes import device_mesh, from_first, is_first, largest, replicate, shard_batch, together
+from dpmjax.deeppointmap.processes import BATCH_AXIS, device_mesh, from_first, is_first, largest, place, together
 from dpmjax.deeppointmap.training import TrainingReport, TrainingState, init_training, make_step
 from dpmjax.types import AnyArray
 
@@ -140,7 +140,7 @@ def train(
     if start is None:
         start = begin_training(init_training(jax.random.key(seed), config))
     mesh, num_local = device_mesh(), jax.local_device_count()
-    progress = replicate(from_first(start), mesh)
+    progress = place(from_first(start), mesh)
     step = make_step(config, mesh if jax.device_count() > 1 else None)
     clock, stopped_by = _Clock(config.sampling.num_scans * jax.device_count()), 0
     first_sample = jax.process_index() * num_local
@@ -152,16 +152,14 @@ def train(
             progress = before_step(progress, config)
             stage = config.stage_at(int(progress.state.step))
             with clock.step(stage):
-                state, report = step(progress.state, shard_batch(batch, mesh))
+                state, report = step(progress.state, place(batch, mesh, BATCH_AXIS))
                 with together():  # the next batch is prepared while the device computes
                     batch = next(batches, None)
                 report = jax.device_get(report)
             progress = replace(progress, state=state)
             number = int(state.step)
             if not math.isfinite(report.loss):
-                raise TrainingLostError(
-                    f"the loss of step {number} is {report.loss}; resume from a checkpoint before it"
-                )
+                raise TrainingLostError(f"the loss of step {number} is {report.loss}; resume from an older checkpoint")
             progress, score = _evaluate_when_due(progress, stage, config, hooks)
             with together():
                 if hooks.on_report is not None and is_first():
