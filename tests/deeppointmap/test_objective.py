@@ -162,6 +162,6 @@ def test_second_call_compiles_nothing(assert_compiles_nothing) -> None:
         sides(9)
 
 
-def test_a_negative_weight_is_refused() -> None:
+def test_a_negative_weight_is_refused(as_user) -> None:
     with pytest.raises(ValueError, match="^offset_weight: expected"):
         ObjectiveConfig(offset_weight=-1)

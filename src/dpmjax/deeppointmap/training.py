@@ -190,10 +190,7 @@ def _map_pair_loss(
     # Applies the networks to two maps, and computes the losses (DeepPointMap eq. 4 to 7).
     correlated_a, correlated_b = correlate(model, a, b)
     close_a, close_b = close_pairs(a, b, T_b_a, config=config)
-    sides = (
-        _side(model, a, correlated_a, correlated_b, close_a),
-        _side(model, b, correlated_b, correlated_a, close_b),
-    )
+    sides = (_side(model, a, correlated_a, correlated_b, close_a), _side(model, b, correlated_b, correlated_a, close_b))
     return matching_loss(*sides, T_b_a, config=config)
 
 
@@ -207,11 +204,7 @@ def _in_parts(function: Callable[[Any], Any], trees: Any, at_once: int) -> Any:
 
 
 def _side(
-    model: Model,
-    cloud: DescriptorCloud,
-    correlated: DescriptorCloud,
-    other: DescriptorCloud,
-    close: ClosePairs,
+    model: Model, cloud: DescriptorCloud, correlated: DescriptorCloud, other: DescriptorCloud, close: ClosePairs
 ) -> TrainingSide:
     partners = other.features[close.indices]
     own = jnp.broadcast_to(correlated.features[:, None], partners.shape)

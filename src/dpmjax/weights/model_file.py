@@ -85,12 +85,8 @@ def save_model(
     for name, array in arrays.items():
         if not np.isfinite(array).all():
             raise ValueError(f"model: {name} holds numbers that are not finite in {dtype}")
-    header = {
-        "format": FORMAT,
-        "format_version": FORMAT_VERSION,
-        "config": json.dumps(config_to_json(model.config)),
-        "card": card,
-    }
+    config = json.dumps(dataclasses.asdict(model.config))
+    header = {"format": FORMAT, "format_version": FORMAT_VERSION, "config": config, "card": card}
     save_file(arrays, path, metadata=header)
 
 
@@ -159,20 +155,8 @@ def _existing(path: Path) -> Path:
     return path
 
 
-def config_to_json(config: Any) -> dict[str, Any]:
-    """Converts a configuration to JSON values, field by field.
-
-    Args:
-        config: a frozen dataclass; nested dataclasses become nested objects, tuples become lists.
-
-    Returns:
-        The values by the names of their fields.
-    """
-    return dataclasses.asdict(config)
-
-
 def config_from_json(value: Any, config_type: type[ConfigT]) -> ConfigT:
-    """Reads a configuration back from what `config_to_json` returned.
+    """Reads a configuration back from the JSON of `dataclasses.asdict`.
 
     A `ValueError` names a field that is unknown or has a value of another type.
 
