@@ -24,6 +24,7 @@ from dpmjax.deeppointmap.model import (
     predict_offsets,
     similarity_features,
 )
+from dpmjax.geometry import se2
 from dpmjax.geometry.pyramid_host import build_pyramid_on_host
 from dpmjax.metrics.recall import RegistrationRecall, registration_recall
 from dpmjax.scans.preprocess import preprocess_scan_on_host
@@ -31,6 +32,9 @@ from dpmjax.sequences import LidarSequence
 from dpmjax.types import AnyArray, DescriptorCloud, PointCloud, PointPyramid, Registration
 
 PAIR_STREAM = 3103
+NEAR_M = (2.0, 10.0)
+"""Least and largest distance between the scans of an evaluation pair."""
+
 FAR_M = 40.0
 """Scans farther apart than this do not overlap."""
 
@@ -176,21 +180,15 @@ class Evaluation(NamedTuple):
 
 
 def draw_evaluation_pairs(
-    drive: LidarSequence,
-    num_pairs: int,
-    config: ModelConfig,
-    *,
-    seed: int = 0,
-    distance_m: tuple[float, float] = (2.0, 10.0),
+    drive: LidarSequence, num_pairs: int, config: ModelConfig, *, seed: int = 0
 ) -> EvaluationPairs:
-    """Draws random pairs of one drive; each scan is rotated by a random yaw.
+    """Draws random pairs of one drive; each scan is rotated by a random yaw. The two are 2 to 10 m apart.
 
     Args:
         drive: scans with true poses.
         num_pairs: number of pairs; fewer where the drive has fewer.
         config: preprocessing and pyramid.
         seed: seed of the draws.
-        distance_m: least and largest distance between the scans of a pair.
 
     Returns:
         The pairs.
@@ -203,15 +201,15 @@ def draw_evaluation_pairs(
     if poses is None:
         raise ValueError("drive: expected a true pose for each scan, got none")
     distances = np.linalg.norm(poses[:, None, :3, 3] - poses[None, :, :3, 3], axis=2)
-    sources, targets = np.nonzero((distances >= distance_m[0]) & (distances <= distance_m[1]))
+    sources, targets = np.nonzero((distances >= NEAR_M[0]) & (distances <= NEAR_M[1]))
     if len(sources) == 0:
-        raise ValueError(f"drive: expected scans {distance_m[0]} to {distance_m[1]} m apart, got none")
+        raise ValueError(f"drive: expected scans {NEAR_M[0]} to {NEAR_M[1]} m apart, got none")
     chosen = rng.choice(len(sources), min(num_pairs, len(sources)), replace=False)
     rows = np.stack([sources[chosen], targets[chosen]], axis=1)
     pyramids, rotated = [], []
     for row, yaw in zip(rows.ravel(), rng.uniform(-np.pi, np.pi, rows.size), strict=True):
         T = np.eye(4)
-        T[:2, :2] = [[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]]
+        T[:2, :2] = se2.rotation(np.asarray(yaw))
         points = (drive.read_scan(int(row)) @ T[:3, :3].T).astype(np.float32)
         pyramids.append(pyramid_of_scan(points, config))
         rotated.append(poses[row] @ np.linalg.inv(T))
