@@ -216,9 +216,6 @@ def is_behind_boxes(points: Float[AnyArray, "n 3"], config: BoxConfig, *, key: P
 
 def is_behind_box(
     points: Float[AnyArray, "n 3"], centre: Float[AnyArray, " 3"], size: Float[AnyArray, " 3"], heading: jax.Array
-    centre: Float[AnyArray, " 3"],
-    size: Float[AnyArray, " 3"],
-    heading: Float[Array, ""],
 ) -> Bool[Array, " n"]:
     """Finds the points whose segment to the origin meets one upright box (slab method).
 
