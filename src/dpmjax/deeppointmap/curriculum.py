@@ -182,13 +182,16 @@ class TrainingConfig:
 
 
 def training_preset(name: Preset) -> TrainingConfig:
-    """Returns the training configuration of a preset. A `ValueError` says if no preset has this name.
+    """Returns the training configuration of a preset.
 
     Args:
         name: "tiny" (minutes on two cores), "small" (hours on one GPU) or "paper" (days on several GPUs).
 
     Returns:
         The configuration.
+
+    Raises:
+        ValueError: if no preset has this name.
     """
     if name not in PRESETS:
         raise ValueError(f"name: expected one of {', '.join(PRESETS)}, got {name!r}")

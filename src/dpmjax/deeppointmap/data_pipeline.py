@@ -49,11 +49,14 @@ class ScanStore:
     """
 
     def __init__(self, drives: Sequence[LidarSequence], config: PreprocessConfig) -> None:
-        """Collects the poses; a `ValueError` says if a drive has none.
+        """Collects the poses.
 
         Args:
             drives: with poses.
             config: filters of the scans.
+
+        Raises:
+            ValueError: if a drive has no poses.
         """
         poses = [drive.T_world_lidar for drive in drives if drive.T_world_lidar is not None]
         if len(poses) < len(drives):
@@ -190,15 +193,17 @@ class SampleMaker:
 
     def _start(self, sample: _Drawn) -> Callable[[], Sample]:
         model = self._config.model
-        points = np.zeros((len(sample.points), model.preprocess.capacity, 3), np.float32)
+        num = len(sample.points)
+        # Always room for as many scans as there can be: another number would be compiled again.
+        points = np.zeros((max(num, self._config.sampling.num_scans), model.preprocess.capacity, 3), np.float32)
         mask = np.zeros(points.shape[:2], bool)
         for row, future in enumerate(sample.points):
             kept = future.result()
             points[row, : len(kept)], mask[row, : len(kept)] = kept, True
         clouds, motions = augment_on_host(PointCloud(points, mask), self._config.augment, sample.seeds)
         build = functools.partial(pyramid_of_cloud, config=model, num_threads=1)
-        pyramids = [self._pool.submit(build, PointCloud(p, m)) for p, m in zip(clouds.points, clouds.mask, strict=True)]
-        return lambda: sample.arrange([pyramid.result() for pyramid in pyramids], motions)
+        pyramids = [self._pool.submit(build, PointCloud(clouds.points[i], clouds.mask[i])) for i in range(num)]
+        return lambda: sample.arrange([pyramid.result() for pyramid in pyramids], motions[:num])
 
     def _anchor(self, step: int) -> int:
         # Every scan is the first anchor once in an epoch.

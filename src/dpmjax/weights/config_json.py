@@ -1,4 +1,4 @@
-"""Configurations from the JSON of their fields (`dataclasses.asdict`). The commands use it too, before they load JAX."""
+"""Configurations from the JSON of `dataclasses.asdict`; the commands use it too, before they load JAX."""
 
 from __future__ import annotations
 
