@@ -20,8 +20,13 @@ import jax
 import jaxtyping
 import pytest
 
-# Before the first import of the package, so that its functions are wrapped.
-jaxtyping.install_import_hook("dpmjax", "beartype.beartype")
+# Before the first import of the package, so that the functions of all rooms are wrapped. Only the records of `types`
+# are not: stacked by `vmap`, they have one axis more than their annotations. An integer is a float, as for mypy.
+ROOMS = {path.stem for path in (Path(__file__).parents[1] / "src" / "dpmjax").iterdir()} - {"__init__", "types"}
+jaxtyping.install_import_hook(
+    [f"dpmjax.{room}" for room in sorted(ROOMS)],
+    "beartype.beartype(conf=beartype.BeartypeConf(is_pep484_tower=True))",
+)
 
 _COMPILE_EVENT = "/jax/core/compile/backend_compile_duration"
 _num_compiled = _num_kept = 0
