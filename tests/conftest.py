@@ -20,11 +20,14 @@ import jax
 import jaxtyping
 import pytest
 
-# Before the first import of the package, so that the functions of all rooms are wrapped. Only the records of `types`
-# are not: stacked by `vmap`, they have one axis more than their annotations. An integer is a float, as for mypy.
-ROOMS = {path.stem for path in (Path(__file__).parents[1] / "src" / "dpmjax").iterdir()} - {"__init__", "types"}
+# Before the first import of the package, so that the functions of its rooms are wrapped. The records of `types` and
+# of most of `deepmapping` are not: `vmap` and optimisers make more of them than their annotations say. An integer is
+# a float, as for mypy.
+PACKAGE = Path(__file__).parents[1] / "src" / "dpmjax"
+ROOMS = {path.stem for path in PACKAGE.iterdir()} - {"__init__", "types", "deepmapping"}
+CHECKED_OF_DEEPMAPPING = ("objective", "occupancy_map", "depth_initialization")
 jaxtyping.install_import_hook(
-    [f"dpmjax.{room}" for room in sorted(ROOMS)],
+    [f"dpmjax.{room}" for room in (*sorted(ROOMS), *(f"deepmapping.{name}" for name in CHECKED_OF_DEEPMAPPING))],
     "beartype.beartype(conf=beartype.BeartypeConf(is_pep484_tower=True))",
 )
 

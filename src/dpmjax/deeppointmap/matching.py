@@ -197,13 +197,6 @@ def _sqrt(squared: Float[Array, "*p"]) -> Float[Array, "*p"]:
     return jnp.where(squared > 0, jnp.sqrt(jnp.where(squared > 0, squared, 1)), 0)
 
 
-def _first_inliers(scores: Float[Array, " p"], is_used: Bool[Array, " p"], config: MatchConfig) -> Bool[Array, " p"]:
-    is_good = is_used & (scores > config.min_inlier_score)
-    ranks = jnp.argsort(jnp.argsort(jnp.where(is_used, -scores, jnp.inf)))
-    is_best = is_used & (ranks < config.min_num_first)
-    return is_good | is_best
-
-
 def _agreeing(
     source: Float[Array, "p 3"], target: Float[Array, "p 3"], is_used: Bool[Array, " p"], config: ConsensusConfig
 ) -> Bool[Array, " p"]:
@@ -232,7 +225,8 @@ def _choose_inliers(
         return jnp.where(jnp.sum(chosen) >= config.min_num_inliers, chosen, is_inlier)
 
     if config.consensus is None:
-        first = _first_inliers(scores, is_used, config)
+        ranks = jnp.argsort(jnp.argsort(jnp.where(is_used, -scores, jnp.inf)))
+        first = is_used & ((scores > config.min_inlier_score) | (ranks < config.min_num_first))
     else:
         first = _agreeing(source, target, is_used, config.consensus)
     return lax.fori_loop(0, config.num_rounds, choose, first)
