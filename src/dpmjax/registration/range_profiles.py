@@ -54,16 +54,6 @@ class RangeProfiles(flax.struct.PyTreeNode):
     def __len__(self) -> int:
         return len(self.scans)
 
-    @property
-    def typical_range(self) -> float:
-        """That of the scans."""
-        return self.scans.typical_range
-
-    @property
-    def tolerances(self) -> Tolerances:
-        """Those of the scans."""
-        return self.scans.tolerances
-
     def take(self, rows: Any) -> RangeProfiles:
         """The profiles of these rows."""
         return jax.tree.map(lambda x: x[rows], self)
@@ -134,14 +124,9 @@ def _profile(scan: PlanarScans, *, num_bearings: int) -> RangeProfiles:
     along = one[:, 0] * chord[:, 1] - one[:, 1] * chord[:, 0]
     ends = jnp.linalg.norm(jnp.stack([one, other]), axis=-1)
     near, far = ends.min(0), ends.max(0)
-    return RangeProfiles(
-        scans=scan,
-        surface=jnp.clip(along / jnp.where(jnp.abs(across) > 1e-9, across, 1.0), near, far),
-        near=near,
-        far=far,
-        slant=jnp.minimum(sorted_slant[before], sorted_slant[after]),
-        is_seen=(gap < _MAX_GAP * 2 * jnp.pi / points.shape[0]) & (count > 1),
-    )
+    surface = jnp.clip(along / jnp.where(jnp.abs(across) > 1e-9, across, 1.0), near, far)
+    is_seen = (gap < _MAX_GAP * 2 * jnp.pi / points.shape[0]) & (count > 1)
+    return RangeProfiles(scan, surface, near, far, jnp.minimum(sorted_slant[before], sorted_slant[after]), is_seen)
 
 
 def _bearing(points: Float[Array, "b 2"]) -> Float[Array, " b"]:
@@ -185,14 +170,14 @@ def compare_pair(
 
 @partial(jax.jit, static_argnames="stride")
 def _compare(
-    profiles: RangeProfiles, source: Int[Array, " p"], target: Int[Array, " p"], poses: Float[Array, "p 3"],
-    tolerances: Tolerances, *, stride: int,
-) -> ViewComparison:  # fmt: skip
-    def compare(pair: tuple[Array, Array, Array]) -> ViewComparison:
-        i, j, pose = pair
-        return compare_pair(profiles.take(i), profiles.take(j), pose, tolerances, stride=stride)
+    profiles: RangeProfiles, pairs: tuple[Array, Array, Array], tolerances: Tolerances, *, stride: int
+) -> ViewComparison:
+    """Compares pairs, each a source, a target and a pose."""
 
-    return jax.lax.map(compare, (source, target, poses), batch_size=64)
+    def compare(pair: tuple[Array, Array, Array]) -> ViewComparison:
+        return compare_pair(profiles.take(pair[0]), profiles.take(pair[1]), pair[2], tolerances, stride=stride)
+
+    return jax.lax.map(compare, pairs, batch_size=64)
 
 
 def compare_pairs(
@@ -210,11 +195,9 @@ def compare_pairs(
     Returns:
         ViewComparison with float64 arrays (p,) on the host.
     """
-    tolerances, result = profiles.tolerances, np.zeros((3, len(source)))
+    tolerances, result = profiles.scans.tolerances, np.zeros((3, len(source)))
     for part, rows in batches(len(source), _BATCH):
-        found = _compare(
-            profiles, jnp.asarray(source[rows]), jnp.asarray(target[rows]), jnp.asarray(poses[rows], jnp.float32),
-            tolerances, stride=stride,
-        )  # fmt: skip
+        pairs = source[rows], target[rows], poses[rows].astype(np.float32)
+        found = _compare(profiles, pairs, tolerances, stride=stride)
         result[:, part] = stride * np.stack(found).astype(np.float64)[:, : part.stop - part.start]
     return ViewComparison(*result)
