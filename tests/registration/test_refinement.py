@@ -122,7 +122,7 @@ def test_a_wrong_loop_has_no_support() -> None:
     measured = np.zeros((4, 3))
     measured[2] = [50.0, 0.0, 0.0]
     edges = Edges(source, target, measured, np.zeros((4, 3, 3)))
-    assert count_support(edges, poses, LoopConfig(), 10.0).tolist() == [2, 2, 0, 2]
+    assert count_support(edges, poses, 10.0).tolist() == [2, 2, 0, 2]
 
 
 def test_steps_are_matched_where_they_are(walk, walk_scans) -> None:

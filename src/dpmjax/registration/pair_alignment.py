@@ -165,18 +165,20 @@ def _solve(system: PairSystem, pose: Float[Array, " 3"], prior: PosePrior) -> Fl
 
 
 @partial(jax.jit, static_argnames="metric")
-@partial(jax.vmap, in_axes=(0, 0, 0, None, 0))
 def _align(
-    source: PlanarScans, target: PlanarScans, guess: Array, scales: tuple[Array, Array], prior: PosePrior, metric: Metric
+    pairs: tuple[PlanarScans, PlanarScans, Array, PosePrior], scales: tuple[Array, Array], *, metric: Metric
 ) -> tuple[Float[Array, "p 3"], PairSystem]:
-    """Iterated closest point of p pairs; `scales` are gate and kernel of each iteration."""
+    """Iterated closest point of (source, target, guess, prior); `scales` are gate and kernel of each iteration."""
 
-    def iterate(pose: Array, scale: tuple[Array, Array]) -> tuple[Array, None]:
-        system = linearise_pair(source, target, pose, scale, metric=metric)
-        return _move(pose, _solve(system, pose, prior)), None
+    def align(source: PlanarScans, target: PlanarScans, guess: Array, prior: PosePrior) -> tuple[Array, PairSystem]:
+        def iterate(pose: Array, scale: tuple[Array, Array]) -> tuple[Array, None]:
+            system = linearise_pair(source, target, pose, scale, metric=metric)
+            return _move(pose, _solve(system, pose, prior)), None
 
-    pose, _ = jax.lax.scan(iterate, guess, scales)
-    return pose, linearise_pair(source, target, pose, (scales[0][-1], scales[1][-1]), metric=metric)
+        pose, _ = jax.lax.scan(iterate, guess, scales)
+        return pose, linearise_pair(source, target, pose, (scales[0][-1], scales[1][-1]), metric=metric)
+
+    return jax.vmap(align)(*pairs)
 
 
 def match_pairs(
@@ -211,7 +213,8 @@ def match_pairs(
         repeated = np.repeat(rows, num_guesses)
         belief = PosePrior(*(np.asarray(x, np.float32)[repeated] for x in prior))
         start = guesses[rows].reshape(-1, 3).astype(np.float32)
-        aligned, system = _align(source.take(repeated), target.take(repeated), start, scales, belief, metric=metric)
+        pairs = source.take(repeated), target.take(repeated), start, belief
+        aligned, system = _align(pairs, scales, metric=metric)
         for kept, found in ((poses, aligned), (weight, system.weight), (information, system.information)):
             kept[part] = np.asarray(found).reshape(batch, *kept.shape[1:])[: part.stop - part.start]
     row, best = np.arange(num_pairs), weight.argmax(axis=1)

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from dpmjax.geometry import se2
 from dpmjax.registration.planar_scans import Floats, Indices, Tolerances, batches
-from dpmjax.registration.range_profiles import RangeProfiles, compare_pair
+from dpmjax.registration.range_profiles import RangeProfiles, compare_pair, compare_pairs
 
 # Pairs of one turn are filled up to a power of two, at least this, so that few shapes are compiled.
 _SMALLEST = 64
@@ -78,6 +78,49 @@ class Candidates(NamedTuple):
 def join_candidates(*candidates: Candidates) -> Candidates:
     """Joins candidates of different pairs, of as many poses each."""
     return Candidates(*(np.concatenate(parts) for parts in zip(*candidates, strict=True)))
+
+
+def chance_level(candidates: Candidates) -> float:
+    """Score of a wrong pose of a pair, the median: second candidates are mostly wrong."""
+    second = candidates.scores[:, 1]
+    second = second[np.isfinite(second)]
+    return max(0.0, float(np.median(second))) if len(second) else 0.0
+
+
+def noisy_share(profiles: RangeProfiles, candidates: Candidates) -> float:
+    """Share of visible beams that seem to contradict in pairs that are right: what noise alone does."""
+    best = np.argsort(-candidates.scores[:, 0])[: len(profiles)]
+    views = compare_pairs(profiles, candidates.source[best], candidates.target[best], candidates.poses[best, 0])
+    share = views.contradicted / np.maximum(views.visible, 1.0)
+    return 3.0 * float(np.percentile(share, 90)) if len(share) else 0.0
+
+
+class Hypotheses(NamedTuple):
+    """Pose hypotheses: every candidate in both directions, the pose of `scan` in the frame of `anchor`."""
+
+    scan: Indices
+    anchor: Indices
+    poses: Floats
+    scores: Floats
+
+    @classmethod
+    def of(cls, candidates: Candidates) -> Hypotheses:
+        """Hypotheses of all candidates with a positive score."""
+        count = candidates.scores.shape[1]
+        source, target = np.repeat(candidates.source, count), np.repeat(candidates.target, count)
+        poses, scores = candidates.poses.reshape(-1, 3), candidates.scores.reshape(-1)
+        keep = np.isfinite(scores) & (scores > 0.0)
+        source, target, poses, scores = source[keep], target[keep], poses[keep], scores[keep]
+        both = (source, target), (target, source), (poses, se2.inverse(poses)), (scores, scores)
+        return cls(*(np.concatenate(x) for x in both))
+
+    def take(self, rows: NDArray[np.integer]) -> Hypotheses:
+        """The hypotheses of these rows."""
+        return Hypotheses(*(x[rows] for x in self))
+
+    def world_poses(self, poses: Floats) -> Floats:
+        """(h, 3) pose of each scan in the world, by that of its anchor."""
+        return np.asarray(se2.compose(poses[self.anchor], self.poses))
 
 
 @partial(jax.jit, static_argnames="config")

@@ -10,14 +10,13 @@ from functools import partial
 from typing import NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import scipy.spatial
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array
 
 from dpmjax.geometry import se2
 from dpmjax.pose_graph.graph import Edges, join_edges
-from dpmjax.pose_graph.planar import solve_poses
+from dpmjax.pose_graph.normal_equations import solve_blocks
 from dpmjax.registration.incremental import incremental_icp
 from dpmjax.registration.line_adjustment import LineAdjustmentConfig, adjust_to_lines
 from dpmjax.registration.loop_closure import LoopConfig, close_loops, matched_steps, pose_steps
@@ -39,8 +38,6 @@ class RefinementConfig:
         radius: within which neighbours in space are looked for.
         max_turn: largest difference of heading of two neighbours in space, radians.
         refresh: neighbours are chosen anew after so many rounds.
-        step_sigma: standard deviation of the steps of the start, which decide directions that the scans leave open:
-            translation, radians.
         loops: settings of the loop search, which only ordered scans get; None: never.
         min_fitness: the start is sound, and no loops are searched, if the fitness of all its steps is above this ...
         min_eigenvalue: ... and so is the weakest eigenvalue of each, as a share of the beams.
@@ -56,7 +53,6 @@ class RefinementConfig:
     radius: float = 0.6
     max_turn: float = 2.0
     refresh: int = 4
-    step_sigma: tuple[float, float] = (0.045, 0.15)
     loops: LoopConfig | None = field(default_factory=LoopConfig)
     min_fitness: float = 0.35
     min_eigenvalue: float = 0.005
@@ -97,7 +93,7 @@ def refine(scans: PlanarScans, poses: Floats, config: RefinementConfig | None = 
     if scans.is_ordered and config.loops is not None and not _is_sound(scans, poses, config):
         # The steps again, with those of the start as guess and as prior, where the scans leave a direction open.
         chained, steps = incremental_icp(scans, odometry=poses)
-        edges = matched_steps(steps, config.loops, scans.typical_range)
+        edges = matched_steps(steps, scans.typical_range)
         poses, _, weights = close_loops(scans, chained, config.loops, steps=edges)
         num_loops = int((weights > 0.25).sum())
     refined = _align_all(scans, poses, config)
@@ -109,7 +105,7 @@ def refine(scans: PlanarScans, poses: Floats, config: RefinementConfig | None = 
 def _align_all(scans: PlanarScans, poses: Floats, config: RefinementConfig) -> Refined:
     """Multi-view point-to-line alignment of all scans from nearby poses; the first pose is held."""
     gates, kernels = config.schedule.gates_and_kernels(scans.typical_range, 1.25 * scans.noise)
-    steps = pose_steps(poses, config.step_sigma, scans.typical_range)
+    steps = pose_steps(poses, scans.typical_range)
     # In units of one beam's information, as the systems of the pairs are.
     trust = max(scans.noise, 0.00075 * scans.typical_range) ** 2 if scans.is_ordered else 1e-9
     steps = steps._replace(information=steps.information * trust)
@@ -122,8 +118,28 @@ def _align_all(scans: PlanarScans, poses: Floats, config: RefinementConfig) -> R
         pull = np.einsum("eij,ej->ei", steps.information, se2.relative(steps.measurements, here))
         gradient = np.concatenate([np.asarray(system.gradient), pull])
         edges = join_edges(edges, steps._replace(measurements=here))
-        poses = se2.compose(poses, solve_poses(len(poses), edges, gradient))
+        poses = se2.compose(poses, solve_step(len(poses), edges, gradient))
     return Refined(poses, 0, len(source))
+
+
+def solve_step(num_poses: int, edges: Edges, gradient: Floats) -> Floats:
+    """One Gauss-Newton step of all poses in their own frames (n, 3); the first one is held.
+
+    Args:
+        num_poses: n.
+        edges: the relative poses at which the system was linearised, with J^T W J as information.
+        gradient: (e, 3) J^T W r of each edge in the tangent of its source frame.
+
+    Returns:
+        (n, 3) steps.
+    """
+    # A step of the target moves the tangent of an edge by minus the adjoint of T_source_target.
+    adjoint = se2.adjoint(se2.inverse(edges.measurements))
+    jacobian = np.stack([-adjoint, np.broadcast_to(np.eye(3), adjoint.shape)], axis=1)
+    transposed = np.swapaxes(jacobian, 2, 3)
+    blocks = (transposed @ edges.information[:, None])[:, :, None] @ jacobian[:, None]
+    nodes = np.stack([edges.target, edges.source], axis=1)
+    return solve_blocks(nodes, blocks, np.einsum("esij,ej->esi", transposed, gradient), num_poses)
 
 
 def choose_pairs(scans: PlanarScans, poses: Floats, config: RefinementConfig) -> tuple[Indices, Indices]:
@@ -138,16 +154,14 @@ def choose_pairs(scans: PlanarScans, poses: Floats, config: RefinementConfig) ->
     count = min(num_scans, 6 * config.num_spatial + 2 * apart)
     nearest = tree.query(poses[:, :2], k=count, distance_upper_bound=config.radius * scans.typical_range)
     distances, rows = np.atleast_2d(nearest[0]), np.atleast_2d(nearest[1])
-    for scan in range(num_scans if config.num_spatial else 0):
+    for scan in range(num_scans):
         near = rows[scan][np.isfinite(distances[scan])]
         near = near[(np.abs(near - scan) > apart)]
         near = near[np.abs(se2.wrap_angle(poses[near, 2] - poses[scan, 2])) < config.max_turn]
         chosen: list[int] = []
         for other in near:
-            if all(abs(other - c) > visit for c in chosen):
+            if len(chosen) < config.num_spatial and all(abs(other - c) > visit for c in chosen):
                 chosen.append(int(other))
-            if len(chosen) == config.num_spatial:
-                break
         source.append(np.full(len(chosen), scan))
         target.append(np.array(chosen, np.int64))
     return np.concatenate(source).astype(np.int64), np.concatenate(target).astype(np.int64)
@@ -155,16 +169,14 @@ def choose_pairs(scans: PlanarScans, poses: Floats, config: RefinementConfig) ->
 
 @partial(jax.jit, static_argnames="source_stride")
 def _linearise_pairs(
-    scans: PlanarScans, source: Int[Array, " p"], target: Int[Array, " p"], poses: Float[Array, "p 3"],
-    scale: tuple[Float[Array, ""], Float[Array, ""]], *, source_stride: int,
-) -> PairSystem:  # fmt: skip
+    scans: PlanarScans, pairs: tuple[Array, Array, Array], scale: tuple[Array, Array], *, source_stride: int
+) -> PairSystem:
     thinned = scans.thin(source_stride)
 
     def linearise(pair: tuple[Array, Array, Array]) -> PairSystem:
-        i, j, pose = pair
-        return linearise_pair(thinned.take(i), scans.take(j), pose, *scale, metric="plane")
+        return linearise_pair(thinned.take(pair[0]), scans.take(pair[1]), pair[2], scale, metric="plane")
 
-    return jax.lax.map(linearise, (source, target, poses), batch_size=16)
+    return jax.lax.map(linearise, pairs, batch_size=16)
 
 
 def _linearise(
@@ -174,10 +186,8 @@ def _linearise(
     relative = se2.relative(poses[target], poses[source])
     stride = max(1, int(np.ceil(len(source) * scans.mask.shape[1] ** 2 / _ROUND_DISTANCES)))
     filled = np.resize(np.arange(len(source)), 1024 * -(-len(source) // 1024))
-    system = _linearise_pairs(
-        scans.replace(is_ordered=False), jnp.asarray(source[filled]), jnp.asarray(target[filled]),
-        jnp.asarray(relative[filled], jnp.float32), scale, source_stride=stride,
-    )  # fmt: skip
+    pairs = source[filled], target[filled], relative[filled].astype(np.float32)
+    system = _linearise_pairs(scans.replace(is_ordered=False), pairs, scale, source_stride=stride)
     system = jax.tree.map(lambda x: np.asarray(x, np.float64)[: len(source)], system)
     return Edges(source, target, relative, np.asarray(system.information)), system
 
