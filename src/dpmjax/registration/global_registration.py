@@ -18,11 +18,13 @@ from numpy.typing import NDArray
 from dpmjax.geometry import se2
 from dpmjax.pose_graph.graph import PoseGraph, join_edges
 from dpmjax.pose_graph.optimize import ROBUST, optimize_pose_graph
-from dpmjax.registration.map_assembly import AGREEMENT, PoseScorer, PositionPrior, agreeing_edges, assemble, settle
+from dpmjax.registration.map_assembly import PoseScorer, PositionPrior, assemble, settle
 from dpmjax.registration.pair_search import (
+    AGREEMENT,
     Candidates,
     CorrelativeConfig,
     Hypotheses,
+    agreeing_edges,
     chance_level,
     join_candidates,
     noisy_share,

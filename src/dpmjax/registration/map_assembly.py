@@ -19,14 +19,12 @@ import scipy.sparse.csgraph
 from numpy.typing import NDArray
 
 from dpmjax.geometry import se2
-from dpmjax.pose_graph.graph import Edges, PoseGraph
+from dpmjax.pose_graph.graph import PoseGraph
 from dpmjax.pose_graph.optimize import ROBUST, optimize_pose_graph
-from dpmjax.registration.pair_search import Candidates, Hypotheses, chance_level, noisy_share
+from dpmjax.registration.pair_search import AGREEMENT, Candidates, Hypotheses, agreeing_edges, chance_level, noisy_share
 from dpmjax.registration.planar_scans import Floats, Indices
 from dpmjax.registration.range_profiles import RangeProfiles, compare_pairs
 
-# A pair agrees with a map within this: translation in typical ranges, radians.
-AGREEMENT = (0.06, 0.1)
 # Matched beams that make up for a contradicting one.
 _CONTRADICTION_WEIGHT = 4.0
 # How much more the matched beams of neighbours in time count, where there is an order.
@@ -35,8 +33,6 @@ _NEXT_WEIGHT = 4.0
 _RADIUS, _NUM_SCORERS = 1.2, 32
 # Score of an impossible pose, below any real score.
 _IMPOSSIBLE = -1e6
-# Beams that a pair must hold by to be an edge; and the accuracy of a pair with all its beams: typical ranges, radians.
-_MIN_SCORE, _SIGMA = 40.0, (0.0045, 0.01)
 # Maps grown from so many different pairs; the best one is kept.
 _NUM_SEEDS = 6
 # Rounds in which scans may change their pose.
@@ -81,26 +77,24 @@ class PoseScorer(NamedTuple):
 
     def score(self, scan: Indices, candidates: Floats, placed: Indices, poses: Floats) -> Floats:
         """(m,) score of each `scan` at its candidate pose (m, 3) against all of `placed`, which are at `poses`."""
-        row, _, value = self.pairwise_scores(scan, candidates, placed, poses)
-        total = add_up(row, value, len(scan))
+        total = add_up(self.pairwise_scores(scan, candidates, placed, poses))
         if self.prior is not None:
             off = candidates[:, :2] - self.prior.centre[scan]
             total += np.where(np.hypot(off[:, 0], off[:, 1]) > self.prior.radius[scan], _IMPOSSIBLE, 0.0)
         return total
 
-    def pairwise_scores(
-        self, scan: Indices, candidates: Floats, placed: Indices, poses: Floats
-    ) -> tuple[Indices, Indices, Floats]:
-        """Scores of single ones of `scan` against single ones of `placed`: row, column, score."""
+    def pairwise_scores(self, scan: Indices, candidates: Floats, placed: Indices, poses: Floats) -> Floats:
+        """(m, k) score of each `scan` against each of `placed`; 0 for those too far apart."""
         apart = candidates[:, None, :2] - poses[placed][None, :, :2]
         apart = np.hypot(apart[..., 0], apart[..., 1])
         apart[scan[:, None] == placed[None]] = np.inf
         limit = np.full(len(scan), self.radius)
         if len(placed) > _NUM_SCORERS:
             limit = np.minimum(limit, np.partition(apart, _NUM_SCORERS, axis=1)[:, _NUM_SCORERS])
-        row, column = (x.astype(np.int64) for x in np.nonzero(apart < limit[:, None]))
-        other = placed[column]
-        return row, column, self.score_pairs(scan[row], other, se2.relative(poses[other], candidates[row]))
+        row, column = np.nonzero(apart < limit[:, None])
+        other, scores = placed[column], np.zeros(apart.shape)
+        scores[row, column] = self.score_pairs(scan[row], other, se2.relative(poses[other], candidates[row]))
+        return scores
 
     def score_pairs(self, source: Indices, target: Indices, poses: Floats) -> Floats:
         """(p,) matched less weighted contradicting beams of pairs at `poses`, T_target_source, above chance."""
@@ -122,24 +116,20 @@ class PoseScorer(NamedTuple):
         return values
 
 
-def add_up(row: Indices, value: Floats, count: int) -> Floats:
-    """Total score of each of `count` rows: negative scores in full, and the k-th best positive one by 1 / k.
+def add_up(scores: Floats) -> Floats:
+    """Total of pairwise scores: negative ones in full, and the k-th best positive one by 1 / k.
 
     A pose needs a few scans that match it well. Were all counted alike, rooms that look alike would be stacked: the
     more scans overlap, the more beams match.
 
     Args:
-        row: (k,) the row of each score.
-        value: (k,) scores.
-        count: rows in all.
+        scores: (..., k).
 
     Returns:
-        (count,) totals.
+        (...) totals.
     """
-    order = np.lexsort((-value, row))
-    row, value = row[order], value[order]
-    rank = np.arange(len(row)) - np.searchsorted(row, row)
-    return np.bincount(row, np.where(value > 0.0, value / (1.0 + rank), value), minlength=count).astype(np.float64)
+    ordered = -np.sort(-scores, axis=-1)
+    return np.where(ordered > 0.0, ordered / np.arange(1, scores.shape[-1] + 1), ordered).sum(axis=-1)
 
 
 def is_firmly_more(score: Floats | np.float64, reference: Floats | np.float64) -> NDArray[np.bool_]:
@@ -161,32 +151,13 @@ def assemble(profiles: RangeProfiles, candidates: Candidates, *, is_ordered: boo
     scorer = PoseScorer(profiles, chance_level(candidates), noisy_share(profiles, candidates), is_ordered)
     hypotheses, everyone = Hypotheses.of(candidates), np.arange(len(profiles))
     maps = [settle(_grow(hypotheses, scorer, seed), hypotheses, scorer) for seed in _choose_seeds(hypotheses)]
-    poses = max(
-        maps,
-        key=lambda poses: float(scorer.score(everyone, poses, everyone, poses).sum()),
-        default=np.zeros((len(profiles), 3)),
-    )
+    scores = [scorer.score(everyone, poses, everyone, poses).sum() for poses in maps]
+    poses = maps[int(np.argmax(scores))] if maps else np.zeros((len(profiles), 3))
     poses, num_moved = move_blocks(poses, hypotheses, scorer)
     poses = settle(poses, hypotheses, scorer) if num_moved else poses
     edges = agreeing_edges(poses, candidates, profiles.scans.typical_range)
     poses = optimize_pose_graph(PoseGraph.create(poses, edges), ROBUST).graph.poses
     return np.asarray(se2.relative(poses[0], poses))
-
-
-def agreeing_edges(poses: Floats, candidates: Candidates, typical_range: float) -> Edges:
-    """Edges of the pairs with a candidate that agrees with the map; of each pair the nearest one."""
-    here = se2.relative(poses[candidates.target], poses[candidates.source])
-    off = se2.relative(here[:, None], candidates.poses)
-    distance = np.hypot(off[..., 0], off[..., 1]) / (AGREEMENT[0] * typical_range)
-    turn = np.abs(se2.wrap_angle(off[..., 2])) / AGREEMENT[1]
-    mismatch = np.where(candidates.scores > _MIN_SCORE, np.maximum(distance, turn), np.inf)
-    best = mismatch.argmin(axis=1)
-    row = np.arange(len(best))
-    keep = mismatch[row, best] < 1.0
-    sigma = np.array(_SIGMA)[[0, 0, 1]] * [typical_range, typical_range, 1.0]
-    share = candidates.scores[row, best][keep] / 500.0
-    information = share[:, None, None] * np.diag(1.0 / sigma**2)
-    return Edges(candidates.source[keep], candidates.target[keep], candidates.poses[row, best][keep], information)
 
 
 def _choose_seeds(hypotheses: Hypotheses) -> list[int]:
@@ -216,13 +187,10 @@ def _grow(hypotheses: Hypotheses, scorer: PoseScorer, seed: int) -> Floats:
         worlds[is_fresh] = hypotheses.take(np.flatnonzero(is_fresh)).world_poses(poses)
         for chosen, placed in ((~is_fresh, np.array([newest])), (is_fresh, np.flatnonzero(is_placed))):
             rows = np.flatnonzero(is_open & chosen)
-            row, column, value = scorer.pairwise_scores(scan[rows], worlds[rows], placed, poses)
-            scores[rows[row], placed[column]] = value
+            scores[rows[:, None], placed] = scorer.pairwise_scores(scan[rows], worlds[rows], placed, poses)
         rows = np.flatnonzero(is_open)
         if len(rows):
-            row, column = np.nonzero(scores[rows])
-            total = add_up(row, scores[rows[row], column], len(rows))
-            best = rows[total.argmax()] if is_placed.sum() > 1 else seed
+            best = rows[add_up(scores[rows]).argmax()] if is_placed.sum() > 1 else seed
             newest, pose = int(scan[best]), worlds[best]
         else:
             newest, pose = int(np.flatnonzero(~is_placed)[0]), np.zeros(3)
@@ -313,13 +281,7 @@ def _better_motion(
     # Pairs on one side of the cut are the same for all motions.
     scores = np.repeat(np.where(block[:, None] == block, values, 0.0)[None], len(motions), axis=0)
     scores[which, inside[i], outside[j]] = value
-    total = np.array([_total(of_motion) for of_motion in scores])
+    # Each pair counts for both scans.
+    total = add_up(scores + np.swapaxes(scores, 1, 2)).sum(axis=-1)
     highest = int(total.argmax())
     return motions[highest] if is_firmly_more(total[highest], total[0]) else None
-
-
-def _total(scores: Floats) -> np.float64:
-    """Total score of a map with these pairwise scores (n, n), each of which counts for both scans."""
-    row, column = np.nonzero(scores)
-    value = scores[row, column]
-    return add_up(np.concatenate([row, column]), np.concatenate([value, value]), len(scores)).sum()

@@ -18,12 +18,17 @@ from jaxtyping import Array, Complex, Float, Int
 from numpy.typing import NDArray
 
 from dpmjax.geometry import se2
+from dpmjax.pose_graph.graph import Edges
 from dpmjax.registration.planar_scans import Floats, Indices, Tolerances, batches
 from dpmjax.registration.range_profiles import RangeProfiles, compare_pair, compare_pairs
 
 # Pairs of one turn are filled up to a power of two, at least this, so that few shapes are compiled.
 _SMALLEST = 64
 _REFINE_BATCH = 256
+# A pair agrees with a map within this: translation in typical ranges, radians.
+AGREEMENT = (0.06, 0.1)
+# Beams that a pair must hold by to be an edge; and the accuracy of a pair with all its beams: typical ranges, radians.
+_MIN_SCORE, _SIGMA = 40.0, (0.0045, 0.01)
 # Matched beams that make up for a contradicting one.
 _CONTRADICTION_WEIGHT = 2.0
 
@@ -78,6 +83,22 @@ class Candidates(NamedTuple):
 def join_candidates(*candidates: Candidates) -> Candidates:
     """Joins candidates of different pairs, of as many poses each."""
     return Candidates(*(np.concatenate(parts) for parts in zip(*candidates, strict=True)))
+
+
+def agreeing_edges(poses: Floats, candidates: Candidates, typical_range: float) -> Edges:
+    """Edges of the pairs with a candidate that agrees with the map; of each pair the nearest one."""
+    here = se2.relative(poses[candidates.target], poses[candidates.source])
+    off = se2.relative(here[:, None], candidates.poses)
+    distance = np.hypot(off[..., 0], off[..., 1]) / (AGREEMENT[0] * typical_range)
+    turn = np.abs(se2.wrap_angle(off[..., 2])) / AGREEMENT[1]
+    mismatch = np.where(candidates.scores > _MIN_SCORE, np.maximum(distance, turn), np.inf)
+    best = mismatch.argmin(axis=1)
+    row = np.arange(len(best))
+    keep = mismatch[row, best] < 1.0
+    sigma = np.array(_SIGMA)[[0, 0, 1]] * [typical_range, typical_range, 1.0]
+    share = candidates.scores[row, best][keep] / 500.0
+    information = share[:, None, None] * np.diag(1.0 / sigma**2)
+    return Edges(candidates.source[keep], candidates.target[keep], candidates.poses[row, best][keep], information)
 
 
 def chance_level(candidates: Candidates) -> float:

@@ -20,7 +20,7 @@ from dpmjax.pose_graph.normal_equations import solve_blocks
 from dpmjax.registration.incremental import incremental_icp
 from dpmjax.registration.line_adjustment import LineAdjustmentConfig, adjust_to_lines
 from dpmjax.registration.loop_closure import LoopConfig, close_loops, matched_steps, pose_steps
-from dpmjax.registration.pair_alignment import FINE, PairMatches, PairSystem, Schedule, linearise_pair, match_pairs
+from dpmjax.registration.pair_alignment import FINE, PairSystem, Schedule, linearise_pair, match_pairs
 from dpmjax.registration.planar_scans import Floats, Indices, PlanarScans
 
 # Distances of one round are kept below this by leaving out beams of the sources: about two seconds on two cores.
@@ -192,31 +192,25 @@ def _linearise(
     return Edges(source, target, relative, np.asarray(system.information)), system
 
 
-def match_steps(scans: PlanarScans, poses: Floats) -> PairMatches:
-    """Matches the steps of a trajectory again, each from where it is."""
-    guesses = se2.relative(poses[:-1], poses[1:])[:, None]
-    return match_pairs(scans.take(slice(1, None)), scans.take(slice(len(poses) - 1)), guesses, FINE)
-
-
 def _is_sound(scans: PlanarScans, poses: Floats, config: RefinementConfig) -> bool:
     """Whether all steps fit and are fixed in every direction, so that a chain of them cannot have gone far astray."""
-    steps = match_steps(scans, poses)
+    guesses = se2.relative(poses[:-1], poses[1:])[:, None]
+    steps = match_pairs(scans.take(slice(1, None)), scans.take(slice(len(poses) - 1)), guesses, FINE)
     share = steps.weakest_eigenvalue() / np.maximum(np.asarray(scans.is_on_line.sum(1))[1:], 1)
     return bool((steps.fitness > config.min_fitness).all() and (share > config.min_eigenvalue).all())
 
 
-def surface_misfit(scans: PlanarScans, poses: Floats, config: RefinementConfig | None = None) -> float:
+def surface_misfit(scans: PlanarScans, poses: Floats) -> float:
     """How badly neighbouring scans agree at these poses, without knowing the truth.
 
     Args:
         scans: n scans.
         poses: (n, 3) x, y, heading.
-        config: settings; its last kernel tells how fine the comparison is.
 
     Returns:
         The share of beams, 0 to 1, that do not find their surface in the scans nearby; fractions for near misses.
     """
-    config = config or RefinementConfig()
+    config = RefinementConfig()
     gates, kernels = config.schedule.gates_and_kernels(scans.typical_range, 1.25 * scans.noise)
     source, target = choose_pairs(scans, poses, config)
     _, system = _linearise(scans, source, target, poses, (gates[-1], kernels[-1]))
