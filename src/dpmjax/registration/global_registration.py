@@ -10,7 +10,6 @@ from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
-import scipy.sparse
 import scipy.sparse.csgraph
 import scipy.spatial
 from numpy.typing import NDArray
@@ -33,6 +32,17 @@ from dpmjax.registration.pair_search import (
 from dpmjax.registration.planar_scans import Floats, Indices, PlanarScans
 from dpmjax.registration.range_profiles import RangeProfiles, compare_pairs, make_profiles, view_similarity
 
+# Every scan that is no keyframe is searched against the keyframes with the so many most similar views, and without an
+# order against so many scans with the most similar views ...
+_NUM_ANCHORS, _NUM_NEAREST_VIEWS = 2, 3
+# ... at so many headings, by similarity, and their neighbours.
+_NUM_LIKELY_TURNS = 3
+# Where there is an order, its heading is within this of a linear one between the keyframes around it, radians.
+_MAX_BEND = 0.7
+# A scan whose best neighbour matches less than this share of the usual beams is unregistered; scans are of one cluster
+# if they match more than this share.
+_MIN_SUPPORT, _MIN_LINK = 0.6, 0.3
+
 
 @dataclass(frozen=True)
 class GlobalConfig:
@@ -40,25 +50,12 @@ class GlobalConfig:
 
     Attributes:
         max_keyframes: so many scans are searched all against all.
-        num_anchors: every other scan is searched against the keyframes with the so many most similar views ...
-        num_nearest_views: ... and, without an order, against so many scans with the most similar views.
-        num_likely_turns: headings that are tried for these, by similarity, and their neighbours.
-        max_bend: a scan's heading is within this of a linear one between the keyframes before and after it, radians;
-            only where there is an order.
-        min_support: a scan whose best neighbour matches less than this share of the usual beams is unregistered.
-        min_link: scans are of one cluster if they match more than this share of the usual beams.
         max_unregistered: so many unregistered scans are searched against all keyframes, and those that remain against
             as many of the other scans; a cluster of up to half as many, which matches no other, is unregistered too.
         search: of pairs.
     """
 
     max_keyframes: int = 32
-    num_anchors: int = 2
-    num_nearest_views: int = 3
-    num_likely_turns: int = 3
-    max_bend: float = 0.7
-    min_support: float = 0.6
-    min_link: float = 0.3
     max_unregistered: int = 12
     search: CorrelativeConfig = field(default_factory=CorrelativeConfig)
 
@@ -124,13 +121,12 @@ def register_globally(scans: PlanarScans, config: GlobalConfig | None = None) ->
 
 def choose_keyframes(similarity: Floats, count: int, *, is_ordered: bool) -> Indices:
     """Scans that cover the place: evenly in time where there is an order, else those most similar to all others."""
-    num_scans = len(similarity)
-    count = min(num_scans, count)
+    count = min(len(similarity), count)
     if is_ordered:
-        return np.unique(np.round(np.linspace(0, num_scans - 1, count)).astype(np.int64))
+        return np.unique(np.round(np.linspace(0, len(similarity) - 1, count)).astype(np.int64))
     chosen: list[int] = []
     # Similarity of each scan to the most similar chosen one; each choice adds as much to that as it can.
-    covered = np.full(num_scans, -1.0)
+    covered = np.full(len(similarity), -1.0)
     for _ in range(count):
         gain = np.maximum(similarity - covered[:, None], 0.0).sum(axis=0)
         gain[chosen] = -1.0
@@ -177,10 +173,10 @@ def _search_others(task: _Task, poses: Floats) -> Candidates:
 
 def _similar_pairs(task: _Task) -> tuple[Indices, Indices, NDArray[np.bool_]]:
     """Pairs of similar views, of each other scan with keyframes and with any scans; and the turns to try for each."""
-    best, others, config = task.similarity.max(-1), task.others, task.config
-    order = np.argsort(-best[np.ix_(others, task.keyframes)], axis=1)[:, : config.num_anchors]
+    best, others = task.similarity.max(-1), task.others
+    order = np.argsort(-best[np.ix_(others, task.keyframes)], axis=1)[:, :_NUM_ANCHORS]
     # Neighbours in time are better partners than any similar view.
-    num_views = 0 if task.is_ordered else config.num_nearest_views
+    num_views = 0 if task.is_ordered else _NUM_NEAREST_VIEWS
     nearest_views = np.argsort(-(best - 2.0 * np.eye(len(best)))[others], axis=1)[:, :num_views]
     pairs = np.concatenate([task.keyframes[order], nearest_views], axis=1)
     # Each pair once, with one scan that is turned for all its partners.
@@ -189,10 +185,10 @@ def _similar_pairs(task: _Task) -> tuple[Indices, Indices, NDArray[np.bool_]]:
     source, target = ends[np.sort(first)].T
     # T_target_source of a keyframe in the frame of the other scan.
     curve = task.similarity[target, source]
-    num_turns, count = config.search.num_turns, curve.shape[-1]
+    num_turns, count = task.config.search.num_turns, curve.shape[-1]
     turns = np.zeros((len(source), num_turns), bool)
     row = np.arange(len(source))[:, None]
-    for _ in range(config.num_likely_turns):
+    for _ in range(_NUM_LIKELY_TURNS):
         peak = curve.argmax(axis=1)[:, None]
         middle = np.round(peak * num_turns / count).astype(int)
         turns[row, (middle + np.arange(-2, 3)) % num_turns] = True
@@ -208,7 +204,7 @@ def _neighbour_pairs(task: _Task, headings: Floats) -> tuple[Indices, Indices, N
     source, target = np.concatenate([keyframes[after - 1], keyframes[after]]), np.concatenate([others, others])
     expected = np.concatenate([headings[after - 1], headings[after]]) - np.concatenate([between, between])
     turn = 2 * np.pi * np.arange(num_turns) / num_turns
-    return source, target, np.abs(se2.wrap_angle(turn - expected[:, None])) < task.config.max_bend
+    return source, target, np.abs(se2.wrap_angle(turn - expected[:, None])) < _MAX_BEND
 
 
 def place_others(task: _Task, poses: Floats, found: Candidates, more: Candidates) -> tuple[Floats, Candidates]:
@@ -277,15 +273,14 @@ def find_unregistered(profiles: RangeProfiles, poses: Floats, config: GlobalConf
     views = compare_pairs(profiles, scan, other, se2.relative(poses[other], poses[scan]))
     matched = np.where(scan == other, 0.0, views.matched)
     usual = float(np.median(matched.reshape(near.shape).max(axis=1)))
-    is_linked = matched > config.min_link * usual
-    links = (matched[is_linked], (scan[is_linked], other[is_linked]))
-    graph = scipy.sparse.csr_matrix(links, shape=(num_scans, num_scans))
-    cluster = scipy.sparse.csgraph.connected_components(graph, directed=False)[1]
+    is_linked = np.zeros((num_scans, num_scans), bool)
+    is_linked[scan, other] = matched > _MIN_LINK * usual
+    cluster = scipy.sparse.csgraph.connected_components(is_linked, directed=False)[1]
     is_small = np.bincount(cluster)[cluster] <= config.max_unregistered // 2
     matched = np.where(is_small[scan] & (cluster[scan] == cluster[other]), 0.0, matched)
     support = matched.reshape(near.shape).max(axis=1)
     worst = np.argsort(support)[: config.max_unregistered]
-    return worst[support[worst] < config.min_support * usual].astype(np.int64)
+    return worst[support[worst] < _MIN_SUPPORT * usual].astype(np.int64)
 
 
 def nearest_tour(poses: Floats) -> Indices:

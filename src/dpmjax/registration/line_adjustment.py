@@ -100,12 +100,9 @@ def _gather_beams(own: PlanarScans, others: PlanarScans, nearest: Int[Array, "b 
     faces_same_way = _einsum("bi,bski->bsk", own.normals, turn(others.normals)[scan, index]) > 0.8
     # Not the beam itself, which would agree with itself.
     is_near = (squared < (_WINDOW * noise) ** 2) & (squared > (1e-3 * noise) ** 2)
-    return _Beams(
-        offsets=offsets,
-        slant=turn(others.points / reach)[scan, index],
-        levers=turn(_levers(others.points))[scan, index],
-        mask=others.is_on_line[scan, index] & is_inside & is_near & faces_same_way,
-    )
+    slant, levers = (turn(x)[scan, index] for x in (others.points / reach, _levers(others.points)))
+    mask = others.is_on_line[scan, index] & is_inside & is_near & faces_same_way
+    return _Beams(offsets, slant, levers, mask)
 
 
 def _fit_lines(beams: _Beams, normals: Float[Array, "b 2"], noise: Float[Array, ""]) -> _Lines:
@@ -135,12 +132,9 @@ def _fit_lines(beams: _Beams, normals: Float[Array, "b 2"], noise: Float[Array, 
     along = _einsum("bi,bski->bsk", _levers(normals), centred)
     here = -(_levers(normals) * mean).sum(-1)
     length = jnp.maximum((weight * along**2).sum((1, 2)), 1e-12)
-    return _Lines(
-        normals=normals,
-        shares=weight * (1.0 / total[:, None, None] + along * (here / length)[:, None, None]),
-        variance=1.0 / total + here**2 / length,
-        is_line=is_slender & (chi2 < _MAX_CHI2) & (counts.sum((1, 2)) > 5),
-    )
+    shares = weight * (1.0 / total[:, None, None] + along * (here / length)[:, None, None])
+    is_line = is_slender & (chi2 < _MAX_CHI2) & (counts.sum((1, 2)) > 5)
+    return _Lines(normals, shares, 1.0 / total + here**2 / length, is_line)
 
 
 def _linearise(

@@ -52,10 +52,9 @@ class Schedule:
 
     def gates_and_kernels(self, typical_range: float, noise: float) -> tuple[jax.Array, jax.Array]:
         """Gate and kernel of each iteration in the unit of the points, bounded below by the range noise."""
-        gates = typical_range * np.geomspace(*self.gate, self.num_iterations)
-        kernels = typical_range * np.geomspace(*self.kernel, self.num_iterations)
-        widest = np.maximum(gates, 4.0 * noise), np.maximum(kernels, 2.0 * noise)
-        return jnp.asarray(widest[0], jnp.float32), jnp.asarray(widest[1], jnp.float32)
+        gates, kernels = (typical_range * np.geomspace(*x, self.num_iterations) for x in (self.gate, self.kernel))
+        gates, kernels = np.maximum(gates, 4.0 * noise), np.maximum(kernels, 2.0 * noise)
+        return jnp.asarray(gates, jnp.float32), jnp.asarray(kernels, jnp.float32)
 
 
 COARSE = Schedule(gate=(0.18, 0.045), kernel=(0.09, 0.0225), num_iterations=8, source_stride=3)
@@ -139,11 +138,9 @@ def linearise_pair(
     jacobian = jnp.concatenate([_matmul(axes, rotation), (axes * lever[:, None]).sum(-1, keepdims=True)], -1)
     weight = jnp.where(counts, (kernel**2 / (kernel**2 + (residual**2).sum(-1))) ** 2, 0.0)
     weighted = weight[:, None, None] * jacobian
-    return PairSystem(
-        information=jnp.einsum("bki,bkj->ij", weighted, jacobian, precision="highest"),
-        gradient=jnp.einsum("bki,bk->i", weighted, residual, precision="highest"),
-        weight=weight.sum(),
-    )
+    information = jnp.einsum("bki,bkj->ij", weighted, jacobian, precision="highest")
+    gradient = jnp.einsum("bki,bk->i", weighted, residual, precision="highest")
+    return PairSystem(information, gradient, weight.sum())
 
 
 def _move(pose: Float[Array, " 3"], delta: Float[Array, " 3"]) -> Float[Array, " 3"]:

@@ -197,9 +197,7 @@ class _Moments:
 
     count: float = flax.struct.field(pytree_node=False)
     mean: Float[Array, "... b 2"]
-    xx: Float[Array, "... b"]
-    xy: Float[Array, "... b"]
-    yy: Float[Array, "... b"]
+    scatter: Float[Array, "... b 2 2"]
     is_complete: Bool[Array, "... b"]
 
 
@@ -221,21 +219,18 @@ def _join(first: _Moments, second: _Moments) -> _Moments:
     """Moments of two disjoint runs together; stable, because only the difference of their means enters."""
     count = first.count + second.count
     step = second.mean - first.mean
-    weight = first.count * second.count / count
+    spread = (first.count * second.count / count) * step[..., :, None] * step[..., None, :]
     return _Moments(
         count=count,
         mean=first.mean + step * (second.count / count),
-        xx=first.xx + second.xx + weight * step[..., 0] ** 2,
-        xy=first.xy + second.xy + weight * step[..., 0] * step[..., 1],
-        yy=first.yy + second.yy + weight * step[..., 1] ** 2,
+        scatter=first.scatter + second.scatter + spread,
         is_complete=first.is_complete & second.is_complete,
     )
 
 
 def _runs(scans: ScanSet) -> list[_Moments]:
     """Runs of 3, 4, 8, 16 ... beams, each run joined from two shorter ones."""
-    nothing = jnp.zeros(scans.mask.shape, scans.points.dtype)
-    one = _Moments(1.0, scans.points, nothing, nothing, nothing, scans.mask)
+    one = _Moments(1.0, scans.points, jnp.zeros((*scans.mask.shape, 2, 2)), scans.mask)
     two = _join(one, _start_at(one, 1))
     runs = [_join(two, _start_at(one, 2))]
     for k in range(1, _NUM_DOUBLINGS + 1):
@@ -246,10 +241,11 @@ def _runs(scans: ScanSet) -> list[_Moments]:
 
 def _line_of(run: _Moments, noise: Float[Array, ""]) -> tuple[Float[Array, "... b 2"], Float[Array, "... b"]]:
     """Direction of the line through each run, and the error of that direction in radians: infinite if not straight."""
-    half_difference, half_sum = 0.5 * (run.xx - run.yy), 0.5 * (run.xx + run.yy)
-    radius = jnp.sqrt(half_difference**2 + run.xy**2)
+    xx, xy, yy = run.scatter[..., 0, 0], run.scatter[..., 0, 1], run.scatter[..., 1, 1]
+    half_difference, half_sum = 0.5 * (xx - yy), 0.5 * (xx + yy)
+    radius = jnp.sqrt(half_difference**2 + xy**2)
     along, across = half_sum + radius, jnp.maximum(half_sum - radius, 0.0)
-    angle = 0.5 * jnp.arctan2(run.xy, half_difference)
+    angle = 0.5 * jnp.arctan2(xy, half_difference)
     deviation = jnp.sqrt(across / (run.count - 2.0))
     length = jnp.sqrt(along / run.count)
     allowed = noise * (1.0 + 2.0 / run.count**0.5) + _BEND * length

@@ -28,6 +28,8 @@ _UNKNOWN_COSINE = 0.7
 _MAX_AVERTED = 0.1
 # Odd minimax polynomial of the arctangent on [0, 1], the highest power first.
 _ARCTANGENT = (-0.01171913, 0.05264734, -0.11642647, 0.19354037, -0.33262283, 0.99997722)
+# Bearings of a profile.
+_NUM_BEARINGS = 512
 # Bearings at which profiles are compared for similarity.
 _SIMILARITY_BEARINGS = 128
 # Ranges below this part of the typical range count about alike in similarity.
@@ -88,27 +90,25 @@ def _smooth_ranges(scans: PlanarScans) -> Float[Array, "n b 2"]:
     return beam * jnp.where(usable, on_line, reach)[..., None]
 
 
-def make_profiles(scans: PlanarScans, *, num_bearings: int = 512) -> RangeProfiles:
+def make_profiles(scans: PlanarScans) -> RangeProfiles:
     """Range profiles of planar scans.
 
     Args:
         scans: n scans.
-        num_bearings: bearings of a profile.
 
     Returns:
-        RangeProfiles with arrays (n, num_bearings).
+        RangeProfiles with arrays (n, 512).
     """
     # Profiles do not depend on the order of the scans; one program serves both.
-    return _make_profiles(scans.replace(is_ordered=False), num_bearings=num_bearings)
+    return _make_profiles(scans.replace(is_ordered=False))
 
 
-@partial(jax.jit, static_argnames="num_bearings")
-def _make_profiles(scans: PlanarScans, *, num_bearings: int) -> RangeProfiles:
-    scans = scans.replace(points=_smooth_ranges(scans))
-    return jax.vmap(partial(_profile, num_bearings=num_bearings))(scans)
+@jax.jit
+def _make_profiles(scans: PlanarScans) -> RangeProfiles:
+    return jax.vmap(_profile)(scans.replace(points=_smooth_ranges(scans)))
 
 
-def _profile(scan: PlanarScans, *, num_bearings: int) -> RangeProfiles:
+def _profile(scan: PlanarScans) -> RangeProfiles:
     """The profile of one scan."""
     points, valid = scan.points, scan.mask
     reach = jnp.maximum(jnp.linalg.norm(points, axis=-1), 1e-9)
@@ -118,7 +118,7 @@ def _profile(scan: PlanarScans, *, num_bearings: int) -> RangeProfiles:
     order = jnp.argsort(angle)
     sorted_angle, sorted_points, sorted_slant = angle[order], points[order], slant[order]
     count = jnp.maximum(valid.sum(), 1)
-    bearing = 2 * jnp.pi * (jnp.arange(num_bearings) + 0.5) / num_bearings
+    bearing = 2 * jnp.pi * (jnp.arange(_NUM_BEARINGS) + 0.5) / _NUM_BEARINGS
     index = jnp.searchsorted(sorted_angle, bearing)
     before, after = (index - 1) % count, index % count
     gap = jnp.mod(jnp.where(valid.any(), sorted_angle[after] - sorted_angle[before], 0.0), 2 * jnp.pi)

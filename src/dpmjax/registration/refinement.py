@@ -18,13 +18,20 @@ from dpmjax.geometry import se2
 from dpmjax.pose_graph.graph import Edges, join_edges
 from dpmjax.pose_graph.normal_equations import solve_blocks
 from dpmjax.registration.incremental import incremental_icp
-from dpmjax.registration.line_adjustment import LineAdjustmentConfig, adjust_to_lines
+from dpmjax.registration.line_adjustment import adjust_to_lines
 from dpmjax.registration.loop_closure import LoopConfig, close_loops, matched_steps, pose_steps
 from dpmjax.registration.pair_alignment import FINE, PairSystem, Schedule, linearise_pair, match_pairs
 from dpmjax.registration.planar_scans import Floats, Indices, PlanarScans
 
 # Distances of one round are kept below this by leaving out beams of the sources: about two seconds on two cores.
 _ROUND_DISTANCES = 1.5e9
+# How gates and kernels shrink over the rounds.
+_ROUNDS = Schedule(gate=(0.09, 0.015), kernel=(0.06, 0.0015), num_iterations=14)
+# The start is sound, and no loops are searched, if the fitness of all its steps is above this, and so is the weakest
+# eigenvalue of each, as a share of the beams.
+_MIN_FITNESS, _MIN_EIGENVALUE = 0.35, 0.005
+# Scans are adjusted to common lines above this range noise, in typical ranges.
+_MIN_NOISE = 1.5e-4
 
 
 @dataclass(frozen=True)
@@ -32,32 +39,20 @@ class RefinementConfig:
     """Settings of the refinement. Lengths are in typical ranges of the scans.
 
     Attributes:
-        schedule: how gates and kernels shrink over the rounds.
         temporal: offsets of the neighbours in time; only of ordered scans.
         num_spatial: at most so many neighbours in space, each from another visit.
         radius: within which neighbours in space are looked for.
         max_turn: largest difference of heading of two neighbours in space, radians.
         refresh: neighbours are chosen anew after so many rounds.
         loops: settings of the loop search, which only ordered scans get; None: never.
-        min_fitness: the start is sound, and no loops are searched, if the fitness of all its steps is above this ...
-        min_eigenvalue: ... and so is the weakest eigenvalue of each, as a share of the beams.
-        lines: settings of the last step, the adjustment to common lines ...
-        min_noise: ... which is done above this range noise.
     """
 
-    schedule: Schedule = field(
-        default_factory=lambda: Schedule(gate=(0.09, 0.015), kernel=(0.06, 0.0015), num_iterations=14)
-    )
     temporal: tuple[int, ...] = (1, 2, 3)
     num_spatial: int = 8
     radius: float = 0.6
     max_turn: float = 2.0
     refresh: int = 4
     loops: LoopConfig | None = field(default_factory=LoopConfig)
-    min_fitness: float = 0.35
-    min_eigenvalue: float = 0.005
-    lines: LineAdjustmentConfig = field(default_factory=LineAdjustmentConfig)
-    min_noise: float = 1.5e-4
 
 
 class Refined(NamedTuple):
@@ -66,12 +61,10 @@ class Refined(NamedTuple):
     Attributes:
         poses: (n, 3) x, y, heading.
         num_loops: loops that were found and kept; 0 where none was needed.
-        num_pairs: pairs of scans in the last round.
     """
 
     poses: Floats
     num_loops: int
-    num_pairs: int
 
 
 def refine(scans: PlanarScans, poses: Floats, config: RefinementConfig | None = None) -> Refined:
@@ -90,36 +83,35 @@ def refine(scans: PlanarScans, poses: Floats, config: RefinementConfig | None = 
     """
     config = config or RefinementConfig()
     num_loops = 0
-    if scans.is_ordered and config.loops is not None and not _is_sound(scans, poses, config):
+    if scans.is_ordered and config.loops is not None and not _is_sound(scans, poses):
         # The steps again, with those of the start as guess and as prior, where the scans leave a direction open.
         chained, steps = incremental_icp(scans, odometry=poses)
-        edges = matched_steps(steps, scans.typical_range)
-        poses, _, weights = close_loops(scans, chained, config.loops, steps=edges)
+        matched = matched_steps(steps, scans.typical_range)
+        poses, _, weights = close_loops(scans, chained, config.loops, steps=matched)
         num_loops = int((weights > 0.25).sum())
-    refined = _align_all(scans, poses, config)
-    if scans.noise > config.min_noise * scans.typical_range:
-        refined = refined._replace(poses=adjust_to_lines(scans, refined.poses, config.lines))
-    return refined._replace(num_loops=num_loops)
+    poses = _align_all(scans, poses, config)
+    if scans.noise > _MIN_NOISE * scans.typical_range:
+        poses = adjust_to_lines(scans, poses)
+    return Refined(poses, num_loops)
 
 
-def _align_all(scans: PlanarScans, poses: Floats, config: RefinementConfig) -> Refined:
+def _align_all(scans: PlanarScans, poses: Floats, config: RefinementConfig) -> Floats:
     """Multi-view point-to-line alignment of all scans from nearby poses; the first pose is held."""
-    gates, kernels = config.schedule.gates_and_kernels(scans.typical_range, 1.25 * scans.noise)
+    scales = _ROUNDS.gates_and_kernels(scans.typical_range, 1.25 * scans.noise)
     steps = pose_steps(poses, scans.typical_range)
     # In units of one beam's information, as the systems of the pairs are.
     trust = max(scans.noise, 0.00075 * scans.typical_range) ** 2 if scans.is_ordered else 1e-9
     steps = steps._replace(information=steps.information * trust)
-    source, target = np.zeros(0, np.int64), np.zeros(0, np.int64)
-    for round_number, (gate, kernel) in enumerate(zip(gates, kernels, strict=True)):
+    for round_number, scale in enumerate(zip(*scales, strict=True)):
         if round_number % config.refresh == 0:
             source, target = choose_pairs(scans, poses, config)
-        edges, system = _linearise(scans, source, target, poses, (gate, kernel))
+        edges, system = _linearise(scans, source, target, poses, scale)
         here = se2.relative(poses[steps.target], poses[steps.source])
         pull = np.einsum("eij,ej->ei", steps.information, se2.relative(steps.measurements, here))
         gradient = np.concatenate([np.asarray(system.gradient), pull])
         edges = join_edges(edges, steps._replace(measurements=here))
         poses = se2.compose(poses, solve_step(len(poses), edges, gradient))
-    return Refined(poses, 0, len(source))
+    return poses
 
 
 def solve_step(num_poses: int, edges: Edges, gradient: Floats) -> Floats:
@@ -192,12 +184,12 @@ def _linearise(
     return Edges(source, target, relative, np.asarray(system.information)), system
 
 
-def _is_sound(scans: PlanarScans, poses: Floats, config: RefinementConfig) -> bool:
+def _is_sound(scans: PlanarScans, poses: Floats) -> bool:
     """Whether all steps fit and are fixed in every direction, so that a chain of them cannot have gone far astray."""
     guesses = se2.relative(poses[:-1], poses[1:])[:, None]
     steps = match_pairs(scans.take(slice(1, None)), scans.take(slice(len(poses) - 1)), guesses, FINE)
     share = steps.weakest_eigenvalue() / np.maximum(np.asarray(scans.is_on_line.sum(1))[1:], 1)
-    return bool((steps.fitness > config.min_fitness).all() and (share > config.min_eigenvalue).all())
+    return bool((steps.fitness > _MIN_FITNESS).all() and (share > _MIN_EIGENVALUE).all())
 
 
 def surface_misfit(scans: PlanarScans, poses: Floats) -> float:
@@ -210,9 +202,8 @@ def surface_misfit(scans: PlanarScans, poses: Floats) -> float:
     Returns:
         The share of beams, 0 to 1, that do not find their surface in the scans nearby; fractions for near misses.
     """
-    config = RefinementConfig()
-    gates, kernels = config.schedule.gates_and_kernels(scans.typical_range, 1.25 * scans.noise)
-    source, target = choose_pairs(scans, poses, config)
+    gates, kernels = _ROUNDS.gates_and_kernels(scans.typical_range, 1.25 * scans.noise)
+    source, target = choose_pairs(scans, poses, RefinementConfig())
     _, system = _linearise(scans, source, target, poses, (gates[-1], kernels[-1]))
     num_beams = np.asarray(scans.is_on_line.sum(1), np.float64)
     return 1.0 - float(np.sum(system.weight) / np.maximum(num_beams[source].sum(), 1.0))
