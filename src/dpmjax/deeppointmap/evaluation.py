@@ -10,7 +10,7 @@ from jaxtyping import Float, Int
 from dpmjax.deeppointmap.data_pipeline import PosedScans
 from dpmjax.deeppointmap.inference import overlap, pyramid_of_scan, register
 from dpmjax.deeppointmap.model import Model, ModelConfig, encode_pyramid
-from dpmjax.metrics.recall import RegistrationRecall, registration_recall
+from dpmjax.metrics.poses import RegistrationRecall, registration_recall
 from dpmjax.types import DescriptorCloud, PointPyramid, Registration
 
 PAIR_STREAM = 3103

@@ -20,8 +20,7 @@ from dpmjax.checks import as_float, require_count, require_positive, require_sha
 from dpmjax.deeppointmap.matching import MaskedPositions, checked
 from dpmjax.geometry import rigid
 from dpmjax.geometry.neighbours import radius_search
-from dpmjax.losses.contrastive import info_nce
-from dpmjax.losses.offset import offset_loss
+from dpmjax.losses.descriptors import info_nce, offset_loss
 from dpmjax.types import AnyArray, DescriptorCloud
 
 

@@ -43,7 +43,7 @@ from dpmjax.deeppointmap.objective import (
     close_pairs,
     matching_loss,
 )
-from dpmjax.losses.overlap import overlap_loss
+from dpmjax.losses.descriptors import overlap_loss
 from dpmjax.types import AnyArray, DescriptorCloud, PointPyramid
 
 
