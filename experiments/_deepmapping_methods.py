@@ -87,7 +87,7 @@ def make_task(sequence: ScanSequence, *, is_ordered: bool = True, steps: int = 6
 
 def incremental(task: Task, metric: Literal["point", "plane"] = "plane") -> Floats:
     """Poses by incremental ICP."""
-    return registration.incremental_icp(task.planar, registration.IncrementalConfig(metric=metric)).poses
+    return registration.incremental_icp(task.planar, metric).poses
 
 
 def search(task: Task) -> Floats:

@@ -26,7 +26,7 @@ from dpmjax.deeppointmap.model import (
 )
 from dpmjax.geometry import se2
 from dpmjax.geometry.pyramid_host import build_pyramid_on_host
-from dpmjax.metrics.recall import RegistrationRecall, registration_recall
+from dpmjax.metrics.poses import RegistrationRecall, registration_recall
 from dpmjax.scans.preprocess import preprocess_scan_on_host
 from dpmjax.sequences import LidarSequence
 from dpmjax.types import AnyArray, DescriptorCloud, PointCloud, PointPyramid, Registration

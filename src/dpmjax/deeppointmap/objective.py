@@ -19,8 +19,7 @@ from jaxtyping import Array, Bool, Float, Int
 from dpmjax.checks import require_fields, require_positive_fields
 from dpmjax.geometry import rigid
 from dpmjax.geometry.neighbours import radius_search
-from dpmjax.losses.contrastive import info_nce
-from dpmjax.losses.offset import offset_loss
+from dpmjax.losses.descriptors import info_nce, offset_loss
 from dpmjax.types import AnyArray, DescriptorCloud
 
 

@@ -43,7 +43,7 @@ from dpmjax.deeppointmap.objective import (
     matching_loss,
 )
 from dpmjax.deeppointmap.sampling import MapOfScans, OverlapSample, RegistrationSample, Sample
-from dpmjax.losses.overlap import overlap_loss
+from dpmjax.losses.descriptors import overlap_loss
 from dpmjax.types import AnyArray, DescriptorCloud, PointPyramid
 
 
