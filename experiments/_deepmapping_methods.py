@@ -18,8 +18,9 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from dpmjax import deepmapping, metrics, registration
-from experiments._command import StopFlag
-from experiments._run_folder import RunFolder, do_row, recording
+from experiments._command import StopFlag, check_least, check_names
+from experiments._result_files import do_row
+from experiments._run_folder import RunFolder, RunOptions, open_run_folder, recording
 
 if TYPE_CHECKING:
     from dpmjax.deepmapping import DeepMappingConfig
@@ -101,9 +102,9 @@ def refined(task: Task, poses: Floats, *, is_ordered: bool) -> Floats:
 
 
 def choose(task: Task, candidates: Mapping[str, Floats]) -> tuple[str, dict[str, dict[str, float]]]:
-    """The name of the best candidate, judged by the scans alone, and the scores of all."""
+    """The name of the best candidate, judged by the scans alone; and the errors and scores of all."""
     kept, scores = registration.choose_trajectory(task.planar, candidates)
-    return kept, {name: score._asdict() for name, score in scores.items()}
+    return kept, {name: errors(task.sequence, candidates[name]) | score._asdict() for name, score in scores.items()}
 
 
 def assess(task: Task, poses: Floats) -> dict[str, Any]:
@@ -141,11 +142,6 @@ def _fit(task: Task, start: Floats | None, config: DeepMappingConfig | None = No
         scans, settings, key=jax.random.key(task.seed), init=None if start is None else start[order]
     )
     return fitted.poses[np.argsort(order)]
-
-
-def _direct_adam(task: Task) -> Floats:
-    """DeepMapping's loss without L-Net: poses from zero by Adam."""
-    return _fit(task, None, deepmapping.as_direct(deepmapping.preset("fast")))
 
 
 def _direct_lbfgs(task: Task) -> Floats:
@@ -187,15 +183,15 @@ def _refined_deepmapping(task: Task) -> Candidates:
 
 def _best_start(task: Task) -> tuple[str, Floats]:
     """Refined ICP if it can be trusted; else of it and refined global registration the more strongly connected one."""
-    starts: list[tuple[dict[str, Any], str, Floats]] = []
 
-    def add(name: str, poses: Floats) -> None:
-        starts.append((assess(task, poses), f"{name}, refined", poses))
+    def assessed(name: str, poses: Floats) -> tuple[dict[str, Any], str, Floats]:
+        return assess(task, poses), f"{name}, refined", poses
 
+    starts = []
     if task.is_ordered:
-        add(START_NAMES["icp-plane"], refined(task, incremental(task), is_ordered=True))
+        starts.append(assessed(START_NAMES["icp-plane"], refined(task, incremental(task), is_ordered=True)))
     if not starts or not starts[0][0]["is_trusted"]:
-        add(START_NAMES["global"], refined(task, search(task), is_ordered=False))
+        starts.append(assessed(START_NAMES["global"], refined(task, search(task), is_ordered=False)))
     # Between two different maps the sharper one may be wrong, so `choose` does not decide here.
     return max(starts, key=lambda start: start[0]["weakest_connection"])[1:]
 
@@ -220,28 +216,29 @@ METHODS: dict[str, Method] = {
     "icp-refined": Method("incremental ICP, refined", lambda task: refined(task, incremental(task), is_ordered=True)),
     "multiway": Method("multiway registration of Open3D", _multiway, "open3d"),
     "particle-swarm": Method("particle swarms, each scan onto the one before", _swarm, "evosax"),
-    "direct-adam": Method("direct optimisation from zero, Adam", _direct_adam),
+    "direct-adam": Method(
+        "direct optimisation from zero, Adam",
+        lambda task: _fit(task, None, deepmapping.as_direct(deepmapping.preset("fast"))),
+    ),
     "direct-lbfgs": Method("direct optimisation from zero, L-BFGS", _direct_lbfgs),
     "global-deepmapping": Method("global registration, then DeepMapping", _global_deepmapping),
     "refined-deepmapping": Method("ICP or global registration, then DeepMapping, refined", _refined_deepmapping),
 }
 
 
-def check_methods(methods: Sequence[str]) -> None:
-    """Raises a ValueError where a method does not exist, or none is named."""
-    unknown = [name for name in methods if name not in METHODS]
-    if unknown or not methods:
-        raise ValueError(f"--methods: expected some of {', '.join(METHODS)}, got {', '.join(unknown) or 'none'}")
+@dataclass(frozen=True, kw_only=True)
+class TableOptions(RunOptions):
+    """Options of a comparison of methods."""
 
+    methods: tuple[str, ...] = tuple(METHODS)
+    """Columns."""
+    steps: int = 600
+    """Steps of the fit."""
 
-def split_by_extras(methods: Sequence[str]) -> tuple[tuple[str, ...], dict[str, str]]:
-    """The methods that can run here, and why the others cannot."""
-    missing = {
-        name: f"needs {package}: pip install dpmjax[baselines]"
-        for name in methods
-        if (package := METHODS[name].package) is not None and importlib.util.find_spec(package) is None
-    }
-    return tuple(name for name in methods if name not in missing), missing
+    def __post_init__(self) -> None:
+        """Checks names and ranges."""
+        check_names("--methods", self.methods, METHODS)
+        check_least(self, steps=2)
 
 
 def run_method(name: str, task: Task) -> dict[str, Any]:
@@ -251,10 +248,9 @@ def run_method(name: str, task: Task) -> dict[str, Any]:
     found = method.run(task)
     candidates = found if isinstance(found, dict) else {method.title: found}
     # The choice belongs to a method that has several candidates, and to its time.
-    kept, scores = choose(task, candidates) if len(candidates) > 1 else (method.title, {})
+    chosen = choose(task, candidates) if len(candidates) > 1 else None
     seconds, cpu_seconds = time.perf_counter() - begun, time.process_time() - begun_cpu
-    scores = scores or choose(task, candidates)[1]
-    measured = {label: errors(task.sequence, poses) | scores[label] for label, poses in candidates.items()}
+    kept, measured = chosen or choose(task, candidates)
     return {
         **errors(task.sequence, candidates[kept]),
         "success": measured[kept]["ate_px"] < SUCCESS_PX,
@@ -266,41 +262,55 @@ def run_method(name: str, task: Task) -> dict[str, Any]:
     }
 
 
-def run_cells(
-    folder: RunFolder,
+def success_of_trusted(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """How many maps were trusted, and the share of these that are right."""
+    trusted = [row["success"] for row in rows if row["is_trusted"]]
+    return {"num_trusted": len(trusted), "success_of_trusted": float(np.mean(trusted)) if trusted else None}
+
+
+def run_table(
+    config: TableOptions,
+    experiment: str,
     cells: Sequence[dict[str, Any]],
-    methods: Sequence[str],
     prepare: Callable[[dict[str, Any]], tuple[Task, dict[str, Any]]],
-    write: Callable[[list[dict[str, Any]]], None],
-    *,
-    seed: int,
+    write: Callable[[RunFolder, list[dict[str, Any]], dict[str, str]], str],
 ) -> list[dict[str, Any]]:
     """Runs every method on every cell; what an earlier run has done is read from its files.
 
     Args:
-        folder: of the run.
+        config: options.
+        experiment: name of the experiment.
         cells: what identifies each set of scans.
-        methods: names.
         prepare: makes the task of a cell, and what its rows carry besides the results.
-        write: writes the results so far, after each cell.
-        seed: of the run.
+        write: writes the rows so far, and why some methods were not run, after each cell; returns a summary to print.
 
     Returns:
         All rows.
     """
+    folder = open_run_folder(config, experiment)
+    not_run = NOT_RUN | {
+        name: f"needs {package}: pip install dpmjax[baselines]"
+        for name in config.methods
+        if (package := METHODS[name].package) is not None and importlib.util.find_spec(package) is None
+    }
 
     def work(method: str, prepared: Callable[[], tuple[Task, dict[str, Any]]]) -> dict[str, Any]:
         task, extra = prepared()
         return run_method(method, task) | extra
 
     rows: list[dict[str, Any]] = []
+    summary = ""
     with recording(folder), StopFlag() as stop:
         for cell in tqdm(cells, unit=" sets"):
             # The scans are made once for all methods, and not at all where all rows exist.
             prepared = cache(partial(prepare, cell))
-            for method in methods:
+            for method in config.methods:
                 if stop.is_requested:
                     return rows
-                rows.append(do_row(folder, {"method": method, **cell}, partial(work, method, prepared), seed=seed))
-            write(rows)
+                if method not in not_run:
+                    case = {"method": method, **cell}
+                    rows.append(do_row(folder.path, case, partial(work, method, prepared), seed=config.seed))
+            summary = write(folder, rows, not_run)
+    print(summary, *(f"{name}: not run ({reason})" for name, reason in not_run.items()), sep="\n")
+    print(f"results in {folder.path}")
     return rows

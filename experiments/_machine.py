@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 PACKAGES = ("jax", "jaxlib", "flax", "optax", "numpy", "scipy")
+CACHES = "Library/Caches" if sys.platform == "darwin" else ".cache"
 
 
 def select_device(device: Literal["cpu", "gpu"] | None) -> None:
@@ -45,21 +46,11 @@ def enable_compilation_cache() -> None:
     if chosen == "off" or "JAX_COMPILATION_CACHE_DIR" in os.environ:
         return
     # A program belongs to a processor: a home directory may be shared by several kinds.
-    folder = Path(chosen) if chosen else _cache_home() / "dpmjax" / f"{zlib.crc32(cpu_model().encode()):08x}"
-    os.environ["JAX_COMPILATION_CACHE_DIR"] = str(folder)
+    caches = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / CACHES) / "dpmjax"
+    os.environ["JAX_COMPILATION_CACHE_DIR"] = chosen or str(caches / f"{zlib.crc32(cpu_model().encode()):08x}")
     # Also the hundreds of small programs, which take seconds together.
     os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
     os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES", "-1")
-
-
-def _cache_home() -> Path:
-    if named := os.environ.get("XDG_CACHE_HOME"):
-        return Path(named)
-    if sys.platform == "darwin":
-        return Path.home() / "Library" / "Caches"
-    if sys.platform == "win32":
-        return Path(os.environ.get("LOCALAPPDATA", Path.home() / "AppData" / "Local"))
-    return Path.home() / ".cache"
 
 
 def environment() -> dict[str, Any]:
@@ -104,12 +95,7 @@ def git_hash() -> str | None:
 
 def cpu_model() -> str:
     """Name of the processor as its maker gives it."""
-    try:
-        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
-    except OSError:
-        lines = []
-    names = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
-    return names[0] if names else platform.processor() or platform.machine()
+    return _fields("/proc/cpuinfo").get("model name") or platform.processor() or platform.machine()
 
 
 def usable_cores() -> int:
@@ -120,12 +106,15 @@ def usable_cores() -> int:
 def peak_rss_gb() -> float:
     """Largest resident memory of this process so far, in units of 10^9 bytes."""
     # On Linux, ru_maxrss starts from the parent's size at the fork; VmHWM belongs to this program alone.
+    if own := _fields("/proc/self/status").get("VmHWM"):
+        return int(own.split()[0]) * 1024 / 1e9
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024) / 1e9
+
+
+def _fields(path: str) -> dict[str, str]:
+    """The `name: value` lines of a file of the kernel; none on systems without it."""
     try:
-        status = Path("/proc/self/status").read_text(encoding="ascii", errors="replace").splitlines()
+        lines = Path(path).read_text(encoding="utf-8", errors="replace").splitlines()
     except OSError:
-        status = []
-    for line in status:
-        if line.startswith("VmHWM:"):
-            return int(line.split()[1]) * 1024 / 1e9
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return peak * (1 if sys.platform == "darwin" else 1024) / 1e9
+        return {}
+    return {name.strip(): value.strip() for name, _, value in (line.partition(":") for line in lines)}

@@ -25,7 +25,7 @@ from pathlib import Path
 from typing import ClassVar
 import tyro
 from experiments._command import StopFlag, run_command
-from experiments._history import HistoryFile, read_history
+from experiments._result_files import HistoryFile, read_history
 from experiments._run_folder import FolderOptions, open_run_folder, recording, write_metrics
 
 @dataclass(frozen=True, kw_only=True)
@@ -60,7 +60,7 @@ def main(config):
             while True:  # a step that does not end
                 time.sleep(0.01)
         write_metrics(folder, {"steps": step + 1}, seed=config.seed)
-    assert "jax" not in sys.modules
+    assert config.resume or "jax" not in sys.modules
 
 if __name__ == "__main__":
     raise SystemExit(run_command(main, Config, experiment="toy", description=__doc__))

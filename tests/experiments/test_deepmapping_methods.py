@@ -20,7 +20,6 @@ from experiments._deepmapping_methods import (
     in_fitting_order,
     make_task,
     run_method,
-    split_by_extras,
 )
 
 # ATE in px that each method stays below on the tiny walk; the start of all poses at zero has 14 px there. The direct
@@ -93,13 +92,6 @@ def test_shuffled_task_keeps_scans_with_their_truth(task) -> None:
     np.testing.assert_array_equal(in_fitting_order(replace(shuffled, is_ordered=True), x), np.arange(8))
 
 
-def test_methods_that_lack_their_package_are_named(monkeypatch) -> None:
-    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
-    methods, missing = split_by_extras(("icp-plane", "multiway"))
-    assert methods == ("icp-plane",)
-    assert "open3d" in missing["multiway"]
-
-
 def a_row(method: str, ate: float, kept: str = "search", **candidates: float) -> dict:
     numbers = {"ate_px": ate, "point_distance_px": 2 * ate}
     each = {name: {"ate_px": x, "point_distance_px": 2 * x} for name, x in (candidates or {kept: ate}).items()}
@@ -136,14 +128,17 @@ def test_limits_are_resumed_without_doing_a_row_twice(tmp_path, monkeypatch, cap
 
     monkeypatch.setattr(deepmapping_limits.simulation, "simulate_sequence", simulate)
     monkeypatch.setattr(_deepmapping_methods, "run_method", lambda name, task: a_row(name, len(task.sequence)))
+    absent = METHODS["multiway"]._replace(package="no_such_package")
+    monkeypatch.setitem(METHODS, "multiway", absent)
     first = run("--limit", "1", "--methods", "icp-plane", "icp-point")
-    second = run("--limit", "2", "--methods", "icp-plane", "icp-point", "--resume")
+    second = run("--limit", "2", "--methods", "icp-plane", "icp-point", "multiway", "--resume")
     assert second["rows"][:2] == first["rows"]
     assert [row["walk"] for row in second["rows"]] == [0, 0, 1, 1]
     assert {row["ate_px"] for row in second["rows"]} == {4}
     # Each walk is simulated once for both methods, and not again for rows that exist.
     assert simulated == [(0, 200), (1, 201)]
     assert second["note"] is None
+    assert "no_such_package" in second["not_run"]["multiway"]
     assert "ordered, icp-plane: 100% of 2" in capsys.readouterr().out
     assert (tmp_path / "out" / "ordered.png").exists()
 
