@@ -71,7 +71,7 @@ class Task:
 
     @property
     def scans(self) -> ScanSet:
-        """The scans without their names and reference."""
+        """Returns the scans without their names and reference."""
         from dpmjax.types import ScanSet
 
         return ScanSet(self.sequence.points, self.sequence.mask)
@@ -87,33 +87,33 @@ def make_task(sequence: ScanSequence, *, is_ordered: bool = True, steps: int = 6
 
 
 def incremental(task: Task, metric: Literal["point", "plane"] = "plane") -> Floats:
-    """Poses by incremental ICP."""
+    """Returns poses by incremental ICP."""
     return registration.incremental_icp(task.planar, registration.IncrementalConfig(metric=metric)).poses
 
 
 def search(task: Task) -> Floats:
-    """Poses by global registration: an exhaustive search of scan pairs, without a first guess."""
+    """Returns poses by global registration: an exhaustive search of scan pairs, without a first guess."""
     return registration.register_globally(task.planar).poses
 
 
 def refined(task: Task, poses: Floats, *, is_ordered: bool) -> Floats:
-    """Poses after the alignment of all scans together."""
+    """Returns the poses after the alignment of all scans together."""
     return registration.refine(task.planar.replace(is_ordered=is_ordered), poses).poses
 
 
 def choose(task: Task, candidates: Mapping[str, Floats]) -> tuple[str, dict[str, dict[str, float]]]:
-    """The name of the best candidate, judged by the scans alone; and the errors and scores of all."""
+    """Returns the name of the best candidate, chosen by the scans alone, and the errors and scores of all."""
     kept, scores = registration.choose_trajectory(task.planar, candidates)
     return kept, {name: errors(task.sequence, candidates[name]) | score._asdict() for name, score in scores.items()}
 
 
 def assess(task: Task, poses: Floats) -> dict[str, Any]:
-    """Whether the poses can be trusted, from the scans alone, by the names of the result files."""
+    """Returns the assessment of poses, from the scans alone, under the names of the result files."""
     return registration.assess_trajectory(task.planar, poses)._asdict()
 
 
 def errors(sequence: ScanSequence, poses: Floats) -> dict[str, float]:
-    """ATE and point distance in the unit of the scans; nothing where there is no reference."""
+    """Returns ATE and point distance in the unit of the scans; nothing where there is no reference."""
     from dpmjax.geometry import se2
 
     reference = sequence.reference_poses
@@ -127,12 +127,12 @@ def errors(sequence: ScanSequence, poses: Floats) -> dict[str, float]:
 
 
 def in_fitting_order(task: Task, start: Floats) -> NDArray[np.intp]:
-    """An order in which neighbours are near each other, for DeepMapping's losses: of time, or a tour of the start."""
+    """Returns an order in which neighbours are near each other: that of time, or a tour of the start."""
     return np.arange(len(start)) if task.is_ordered else registration.nearest_tour(start)
 
 
 def _fit(task: Task, start: Floats | None, config: DeepMappingConfig | None = None) -> Floats:
-    """DeepMapping from a start, or from zero poses."""
+    """Returns poses by DeepMapping from a start, or from zero poses."""
     import jax
 
     settings = deepmapping.with_steps(config or deepmapping.preset("fast"), task.steps)
@@ -145,7 +145,7 @@ def _fit(task: Task, start: Floats | None, config: DeepMappingConfig | None = No
 
 
 def _direct_lbfgs(task: Task) -> Floats:
-    """DeepMapping's loss without L-Net: poses from zero by L-BFGS."""
+    """Returns poses by DeepMapping's loss without L-Net, from zero by L-BFGS."""
     import jax
 
     from experiments.baselines.direct import optimize_directly
@@ -169,20 +169,20 @@ def _swarm(task: Task) -> Floats:
 
 
 def _global_deepmapping(task: Task) -> Candidates:
-    """DeepMapping from global registration: no ICP, no refinement."""
+    """Returns global registration and DeepMapping from it: no ICP, no refinement."""
     start = search(task)
     return {START_NAMES["global"]: start, DEEPMAPPING: _fit(task, start)}
 
 
 def _refined_deepmapping(task: Task) -> Candidates:
-    """DeepMapping from the better of refined ICP and refined global registration, then refined."""
+    """Returns refined ICP or refined global registration, DeepMapping from it, and that refined."""
     name, start = _best_start(task)
     fitted = _fit(task, start)
     return {name: start, DEEPMAPPING: fitted, f"{DEEPMAPPING}, refined": refined(task, fitted, is_ordered=False)}
 
 
 def _best_start(task: Task) -> tuple[str, Floats]:
-    """Refined ICP if it can be trusted; else of it and refined global registration the more strongly connected one."""
+    """Returns refined ICP if trusted; else of it and refined global registration the more strongly connected one."""
 
     def assessed(name: str, poses: Floats) -> tuple[dict[str, Any], str, Floats]:
         return assess(task, poses), f"{name}, refined", poses
@@ -242,7 +242,7 @@ class TableOptions(RunOptions):
 
 
 def run_method(name: str, task: Task) -> dict[str, Any]:
-    """One row: the errors, the time and the assessment of what was kept, and the numbers of every candidate."""
+    """Returns one row: errors, time and assessment of the kept candidate, and the numbers of every candidate."""
     method = METHODS[name]
     begun, begun_cpu = time.perf_counter(), time.process_time()
     found = method.run(task)
@@ -263,7 +263,7 @@ def run_method(name: str, task: Task) -> dict[str, Any]:
 
 
 def success_of_trusted(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """How many maps were trusted, and the share of these that are right."""
+    """Returns how many maps were trusted, and the share of these that are right."""
     trusted = [row["success"] for row in rows if row["is_trusted"]]
     return {"num_trusted": len(trusted), "success_of_trusted": float(np.mean(trusted)) if trusted else None}
 

@@ -54,7 +54,7 @@ def enable_compilation_cache() -> None:
 
 
 def environment() -> dict[str, Any]:
-    """Versions, device, git commit and machine, ready for `metrics.json`."""
+    """Returns versions, device, git commit and machine, ready for `metrics.json`."""
     return {
         "versions": versions(),
         "device": device_name(),
@@ -66,7 +66,7 @@ def environment() -> dict[str, Any]:
 
 
 def versions() -> dict[str, str]:
-    """Versions of Python, of this package, and of the packages that its numbers depend on."""
+    """Returns the versions of Python, of this package, and of the packages that its numbers depend on."""
     import dpmjax
 
     installed = {name: importlib.metadata.version(name) for name in PACKAGES}
@@ -74,7 +74,7 @@ def versions() -> dict[str, str]:
 
 
 def device_name() -> str | None:
-    """The device that JAX computes on; None in a run that never loaded JAX."""
+    """Returns the device that JAX computes on; None in a run that never loaded JAX."""
     if "jax" not in sys.modules:
         return None
     import jax
@@ -84,7 +84,7 @@ def device_name() -> str | None:
 
 
 def git_hash() -> str | None:
-    """Commit of the checkout that this file lies in, with `+changes` where it is not clean; None without git."""
+    """Returns the commit of this checkout, with `+changes` where it is not clean; None without git."""
     command = ["git", "-C", str(Path(__file__).parent), "describe", "--always", "--abbrev=40", "--exclude=*"]
     try:
         found = subprocess.run([*command, "--dirty=+changes"], capture_output=True, text=True, check=True, timeout=5)
@@ -94,17 +94,17 @@ def git_hash() -> str | None:
 
 
 def cpu_model() -> str:
-    """Name of the processor as its maker gives it."""
+    """Returns the name of the processor."""
     return _fields("/proc/cpuinfo").get("model name") or platform.processor() or platform.machine()
 
 
 def usable_cores() -> int:
-    """Cores that this process may run on, which a container may limit."""
+    """Returns the number of cores that this process may use, which a container may limit."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def peak_rss_gb() -> float:
-    """Largest resident memory of this process so far, in units of 10^9 bytes."""
+    """Returns the largest resident memory of this process so far, in units of 10^9 bytes."""
     # On Linux, ru_maxrss starts from the parent's size at the fork; VmHWM belongs to this program alone.
     if own := _fields("/proc/self/status").get("VmHWM"):
         return int(own.split()[0]) * 1024 / 1e9
@@ -112,7 +112,7 @@ def peak_rss_gb() -> float:
 
 
 def _fields(path: str) -> dict[str, str]:
-    """The `name: value` lines of a file of the kernel; none on systems without it."""
+    """Returns the `name: value` lines of a file of the kernel; none on systems without it."""
     try:
         lines = Path(path).read_text(encoding="utf-8", errors="replace").splitlines()
     except OSError:

@@ -28,7 +28,7 @@ def load_json(path: Path) -> dict[str, Any]:
     """Reads a JSON object.
 
     Raises:
-        ValueError: it is no JSON object.
+        ValueError: the file is no JSON object.
     """
     try:
         value = json.loads(path.read_text(encoding="utf-8"))
@@ -40,7 +40,7 @@ def load_json(path: Path) -> dict[str, Any]:
 
 
 def as_json(value: Any) -> Any:
-    """The same value out of JSON's types. What JSON cannot say, NaN and infinity, becomes null."""
+    """Returns the same value made of JSON's types; NaN and infinity become null."""
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         value = dataclasses.asdict(value)
     if isinstance(value, Mapping):
@@ -79,7 +79,7 @@ def do_row(folder: Path, case: dict[str, Any], work: Callable[[], dict[str, Any]
 
 
 def row_path(folder: Path, case: Mapping[str, Any]) -> Path:
-    """The file of a row: a readable name that no other case has."""
+    """Returns the file of a row, under a readable name that no other case has."""
     text = "_".join(f"{key}-{value}" for key, value in case.items())
     digest = hashlib.sha256(text.encode()).hexdigest()[:6]
     return folder / "rows" / f"{text.replace('.', 'p').replace('/', '-')[:120]}_{digest}.json"
@@ -145,6 +145,6 @@ class HistoryFile:
 
 
 def read_history(path: Path) -> list[dict[str, str]]:
-    """Rows of the table; a last line that was cut off by a crash is left out."""
+    """Returns the rows of the table, without a last line that a crash has cut off."""
     text = path.read_text(encoding="utf-8")
     return list(csv.DictReader(text[: text.rfind("\n") + 1].splitlines()))

@@ -170,7 +170,7 @@ def load_config(path: Path, config_type: type[ConfigT]) -> ConfigT:
     Raises:
         ValueError: its `config.json` holds an option that `config_type` does not have, or is no JSON.
     """
-    from dpmjax.weights.model_file import config_from_json
+    from dpmjax.weights.config_json import config_from_json
 
     stored = {name: value for name, value in load_json(path / CONFIG).items() if name not in FREE_OPTIONS}
     try:
@@ -191,7 +191,7 @@ def write_metrics(
         rows: rows made by `do_row`; the file names those of another commit than its own.
 
     Returns:
-        That note, or None where all rows are of this commit.
+        The note about such rows, or None where all rows are of this commit.
     """
     made_by = environment()
     note = commits_note(rows or (), made_by["git_hash"])

@@ -135,7 +135,7 @@ def main(config: Config) -> dict[str, Any]:
 def _fit(
     folder: RunFolder, task: Task, settings: DeepMappingConfig, start: Floats, config: Config, stop: StopFlag
 ) -> FitRun:
-    """DeepMapping, of the scans in an order in which neighbours are near each other."""
+    """Fits the scans in an order in which neighbours are near each other."""
     from dpmjax.geometry import se2
 
     order = shared.in_fitting_order(task, start)
@@ -153,7 +153,7 @@ def _fit(
 
 
 def read_scans(config: Config) -> ScanSequence:
-    """The scans of DATA or of the built-in world, sub-range and stride applied."""
+    """Returns the scans of DATA or of the built-in world, sub-range and stride applied."""
     stop = None if config.n_scans is None else config.start + config.n_scans * config.jump
     if config.data is not None:
         return io.read_sequence(config.data, start=config.start, stop=stop, stride=config.jump)
@@ -164,7 +164,7 @@ def read_scans(config: Config) -> ScanSequence:
 
 
 def starting_poses(config: Config, task: Task) -> tuple[str, Floats]:
-    """The name of the start and its (n, 3) poses; what is no word of `START_NAMES` names a trajectory file."""
+    """Returns the name of the start and its (n, 3) poses; other words than those of `START_NAMES` name a file."""
     sequence, name = task.sequence, shared.START_NAMES.get(config.init, f"poses of {Path(config.init).name}")
     match config.init:
         case "zero":
@@ -186,13 +186,13 @@ def starting_poses(config: Config, task: Task) -> tuple[str, Floats]:
 
 
 def fit_settings(config: Config, sequence: ScanSequence) -> DeepMappingConfig:
-    """The preset, with the number of steps asked for in its last phase."""
+    """Returns the preset, with the given number of steps."""
     settings = deepmapping.preset(config.preset, is_organised=sequence.is_organised)
     return settings if config.steps is None else deepmapping.with_steps(settings, config.steps)
 
 
 def before_and_after(sequence: ScanSequence, start: Floats, poses: Floats) -> dict[str, Any]:
-    """Errors of the kept poses and of the start; `success` is unknown where there is no reference."""
+    """Returns errors of the kept poses and of the start; `success` is None where there is no reference."""
     reference, unit = sequence.reference_poses, sequence.unit
     if reference is None:
         return {"success": None}
@@ -208,14 +208,14 @@ def before_and_after(sequence: ScanSequence, start: Floats, poses: Floats) -> di
 
 
 def write_trajectories(folder: RunFolder, sequence: ScanSequence, poses: Floats) -> None:
-    """trajectory.npy, trajectory_tum.txt, trajectory_kitti.txt: T_world_scan of every scan."""
+    """Writes T_world_scan of every scan: trajectory.npy, trajectory_tum.txt, trajectory_kitti.txt."""
     io.write_poses_npy(folder / "trajectory.npy", poses)
     io.write_tum(folder / "trajectory_tum.txt", poses, times=sequence.times, unit=sequence.unit)
     io.write_kitti(folder / "trajectory_kitti.txt", poses)
 
 
 def draw_map(folder: RunFolder, task: Task, candidates: Candidates, metrics: Mapping[str, Any]) -> viz.Limits:
-    """map.png: the start, DeepMapping, the candidate that was kept, and the reference; returns what it shows."""
+    """Draws map.png: the start, DeepMapping, the kept candidate, the reference; returns its limits."""
     scans, unit, kept = task.scans, task.sequence.unit, metrics["kept"]
     panels = []
     for name in dict.fromkeys((metrics["start"], shared.DEEPMAPPING, kept)):
@@ -233,7 +233,7 @@ def draw_map(folder: RunFolder, task: Task, candidates: Candidates, metrics: Map
 
 
 def draw_occupancy(folder: RunFolder, sequence: ScanSequence, run: FitRun, kept: Floats, limits: viz.Limits) -> None:
-    """occupancy.png: what M-Net learned, in the frame and within the limits of map.png."""
+    """Draws occupancy.png: what M-Net learned, in the frame and within the limits of map.png."""
     if not run.has_map:
         return
     picture = deepmapping.draw_map(run.fitted, sequence.points, sequence.mask)
@@ -245,7 +245,7 @@ def draw_occupancy(folder: RunFolder, sequence: ScanSequence, run: FitRun, kept:
 
 
 def draw_loss(folder: RunFolder, unit: str) -> None:
-    """loss.png: loss and error of the fit over its run time."""
+    """Draws loss.png: loss and error of the fit over its run time."""
     rows = read_history(folder / HISTORY)
     if rows:
         seconds, loss, ate = (
@@ -256,7 +256,7 @@ def draw_loss(folder: RunFolder, unit: str) -> None:
 
 
 def report(unit: str, metrics: Mapping[str, Any]) -> str:
-    """The last lines on the console: every candidate with its error and scores, and whether to trust the kept one."""
+    """Returns the last lines on the console: each candidate with its error and scores, and the assessment of the kept."""
     candidates, assessment = metrics["candidates"], metrics["assessment"]
     width = max(map(len, candidates))
     lines = [f"  {'candidate':{width}}  {'ATE, ' + unit:>10}  nats a beam  beams off a surface"]

@@ -75,7 +75,7 @@ def _prepare(config: Config, cell: dict[str, Any]) -> tuple[Task, dict[str, Any]
 
 
 def success_grid(rows: list[dict[str, Any]], method: str, order: str, config: Config) -> NDArray[np.float64]:
-    """(strides, noises) success rates, smallest stride first; NaN where nothing was run."""
+    """Returns (strides, noises) success rates, smallest stride first; NaN where nothing was run."""
     cells: dict[tuple[Any, ...], list[bool]] = defaultdict(list)
     for row in rows:
         cells[row["method"], row["order"], row["stride"], row["noise_px"]].append(row["success"])
@@ -85,7 +85,7 @@ def success_grid(rows: list[dict[str, Any]], method: str, order: str, config: Co
 
 
 def summary(rows: Sequence[dict[str, Any]]) -> list[str]:
-    """One line for each order and method: mean success over all cells that were run, and at every 8th scan."""
+    """Returns one line for each order and method: mean success of all cells that were run, and at every 8th scan."""
     lines = []
     for order, method in dict.fromkeys((row["order"], row["method"]) for row in rows):
         mine = [row for row in rows if (row["order"], row["method"]) == (order, method)]
@@ -96,7 +96,7 @@ def summary(rows: Sequence[dict[str, Any]]) -> list[str]:
 
 
 def _write(config: Config, folder: RunFolder, rows: list[dict[str, Any]], not_run: dict[str, str]) -> str:
-    """metrics.json and one picture an order; returns the summary."""
+    """Writes metrics.json and one picture an order; returns the summary."""
     lines = summary(rows)
     metrics = {"success_threshold_px": shared.SUCCESS_PX, "summary": lines, "not_run": not_run}
     write_metrics(folder, metrics | shared.success_of_trusted(rows), seed=config.seed, rows=rows)

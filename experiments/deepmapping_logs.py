@@ -55,7 +55,7 @@ def main(config: Config) -> list[dict[str, Any]]:
 
 
 def _run(log: Path, init: str, config: Config) -> dict[str, Any] | None:
-    """Metrics of one run in a process of its own, whose peak memory is its own; None where the log lacks odometry."""
+    """Returns the metrics of one run, in a process with a peak memory of its own; None where the log lacks odometry."""
     folder = config.output / f"{log.name.split('.')[0]}_{init}"
     if not (folder / METRICS).exists():
         command = [sys.executable, "-m", "experiments.deepmapping_2d", str(log), "-o", str(folder), "--force"]
@@ -70,7 +70,7 @@ def _run(log: Path, init: str, config: Config) -> dict[str, Any] | None:
 
 
 def markdown(rows: list[dict[str, Any]]) -> str:
-    """The table as README text."""
+    """Returns the table as Markdown."""
     head = "| log | scans | start | ATE before, m | ATE after, m | kept |\n|---|---|---|---|---|---|\n"
     line = "| {log} | {num_scans} | {init} | {ate_initial_m:.2f} | {ate_m:.2f} | {kept} |"
     return head + "\n".join(line.format_map(row) for row in rows)

@@ -48,7 +48,7 @@ class Config(shared.TableOptions):
 
 
 def list_trajectories() -> list[dict[str, int]]:
-    """World, length and seed of all 75, ordered so that the first few are of all kinds."""
+    """Returns world, length and seed of all 75, ordered so that the first few are of all kinds."""
     short = [{"world": k % NUM_WORLDS, "num_scans": 128, "walk": k} for k in range(NUM_SHORT)]
     long = [{"world": k % NUM_WORLDS, "num_scans": 256, "walk": 100 + k} for k in range(NUM_LONG)]
     # Two short ones, then a long one.
@@ -62,7 +62,7 @@ def main(config: Config) -> list[dict[str, Any]]:
 
 
 def _prepare(config: Config, cell: dict[str, Any]) -> tuple[Task, dict[str, Any]]:
-    """The scans of a trajectory, and with noise the Cramer-Rao bound on their ATE."""
+    """Returns the scans of a trajectory, and with noise the Cramer-Rao bound on their ATE."""
     world, noise = cell["world"], config.range_noise_px
     sequence = simulation.simulate_sequence(world, cell["num_scans"], seed=cell["walk"], range_noise_px=noise)
     task = shared.make_task(sequence, steps=config.steps, seed=config.seed)
@@ -75,7 +75,7 @@ def _prepare(config: Config, cell: dict[str, Any]) -> tuple[Task, dict[str, Any]
 
 
 def summarise(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """Medians and success of the rows of one method, of each of its candidates, and how right its assessment was."""
+    """Returns medians and success of one method and of each of its candidates, and how right its assessment was."""
     names = dict.fromkeys(name for row in rows for name in row["candidates"])
     medians = {"median_s": "seconds", "median_cpu_s": "cpu_s", "median_bound_px": "bound_px"}
     return {
@@ -103,13 +103,13 @@ def _medians(numbers: Sequence[dict[str, Any]]) -> dict[str, Any]:
 
 
 def by_method(rows: Sequence[dict[str, Any]]) -> dict[str, list[dict[str, Any]]]:
-    """The rows of each method, in the order in which the methods were run."""
+    """Returns the rows of each method, in the order in which the methods were run."""
     names = dict.fromkeys(row["method"] for row in rows)
     return {name: [row for row in rows if row["method"] == name] for name in names}
 
 
 def table(rows: Sequence[dict[str, Any]]) -> str:
-    """The table as Markdown: a row for each method, and below it one for each of several candidates."""
+    """Returns the table as Markdown: a row for each method, and below it one for each of several candidates."""
     lines = [
         "| method | trajectories | median ATE, px | median point distance, px | success (ATE < 20 px) | median s "
         "| trusted | of these right |",
@@ -134,7 +134,7 @@ def table(rows: Sequence[dict[str, Any]]) -> str:
 
 
 def _write(seed: int, folder: RunFolder, rows: list[dict[str, Any]], not_run: dict[str, str]) -> str:
-    """table.md, metrics.json, boxes.png; returns the table."""
+    """Writes table.md, metrics.json and boxes.png; returns the table."""
     groups = by_method(rows)
     methods = {method: {"title": shared.METHODS[method].title, **summarise(mine)} for method, mine in groups.items()}
     metrics = {"success_threshold_px": shared.SUCCESS_PX, "methods": methods, "not_run": not_run}
