@@ -256,7 +256,7 @@ def draw_loss(folder: RunFolder, unit: str) -> None:
 
 
 def report(unit: str, metrics: Mapping[str, Any]) -> str:
-    """Returns the last lines on the console: each candidate with its error and scores, and the assessment of the kept."""
+    """Returns the last lines on the console: errors and scores of each candidate, assessment of the kept one."""
     candidates, assessment = metrics["candidates"], metrics["assessment"]
     width = max(map(len, candidates))
     lines = [f"  {'candidate':{width}}  {'ATE, ' + unit:>10}  nats a beam  beams off a surface"]
