@@ -127,6 +127,7 @@ def test_limits_are_resumed_without_doing_a_row_twice(tmp_path, monkeypatch, cap
         return json.loads((tmp_path / "out" / "metrics.json").read_text())
 
     monkeypatch.setattr(deepmapping_limits.simulation, "simulate_sequence", simulate)
+    monkeypatch.setattr(_deepmapping_methods, "make_task", lambda sequence, **_: Task(sequence, planar=None))
     monkeypatch.setattr(_deepmapping_methods, "run_method", lambda name, task: a_row(name, len(task.sequence)))
     absent = METHODS["multiway"]._replace(package="no_such_package")
     monkeypatch.setitem(METHODS, "multiway", absent)
