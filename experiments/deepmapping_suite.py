@@ -20,7 +20,7 @@ from typing import Annotated, Any, ClassVar
 import numpy as np
 from tyro.conf import arg
 
-from dpmjax import simulation, viz
+from dpmjax import metrics, simulation, viz
 from experiments import _deepmapping_methods as shared
 from experiments._command import check_least, run_command
 from experiments._deepmapping_methods import Task
@@ -69,8 +69,8 @@ def _prepare(config: Config, cell: dict[str, Any]) -> tuple[Task, dict[str, Any]
     if not noise:
         return task, {}
     assert sequence.reference_poses is not None
-    is_obstacle, num_beams = simulation.make_world(world).is_obstacle, sequence.mask.shape[1]
-    bound = simulation.position_bound(is_obstacle, sequence.reference_poses, range_noise_px=noise, num_beams=num_beams)
+    cast = partial(simulation.cast_scans, simulation.make_world(world).is_obstacle, num_beams=sequence.mask.shape[1])
+    bound = metrics.position_bound(cast, sequence.reference_poses, range_noise=noise)
     return task, {"bound_px": float(np.sqrt(np.mean(bound**2)))}
 
 
@@ -137,8 +137,8 @@ def _write(seed: int, folder: RunFolder, rows: list[dict[str, Any]], not_run: di
     """Writes table.md, metrics.json and boxes.png; returns the table."""
     groups = by_method(rows)
     methods = {method: {"title": shared.METHODS[method].title, **summarise(mine)} for method, mine in groups.items()}
-    metrics = {"success_threshold_px": shared.SUCCESS_PX, "methods": methods, "not_run": not_run}
-    note = write_metrics(folder, metrics, seed=seed, rows=rows)
+    numbers = {"success_threshold_px": shared.SUCCESS_PX, "methods": methods, "not_run": not_run}
+    note = write_metrics(folder, numbers, seed=seed, rows=rows)
     text = table(rows)
     bounds = [row["bound_px"] for row in rows if "bound_px" in row]
     if bounds:

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from dpmjax.simulation import simulate_sequence
-from experiments import _deepmapping_methods, deepmapping_limits, deepmapping_suite
+from experiments import _deepmapping_methods, deepmapping_limits, deepmapping_logs, deepmapping_suite
 from experiments._command import run_command
 from experiments._deepmapping_methods import (
     DEEPMAPPING,
@@ -159,3 +159,45 @@ def test_success_grid_leaves_open_what_was_not_run() -> None:
 def test_bad_options_are_named(options) -> None:
     with pytest.raises(ValueError, match="--"):
         deepmapping_limits.Config(**options)
+
+
+@pytest.mark.slow
+def test_suite_writes_its_table_its_picture_and_the_bound(tmp_path, monkeypatch, capsys) -> None:
+    entries = [{"world": 0, "num_scans": 12, "walk": 3}]
+    monkeypatch.setattr(deepmapping_suite, "list_trajectories", lambda: entries)
+    options = ["-o", str(tmp_path / "out"), "--methods", "icp-plane", "global-deepmapping", "--steps", "2"]
+    options += ["--range-noise-px", "1"]
+    main, config = deepmapping_suite.main, deepmapping_suite.Config
+    assert run_command(main, config, experiment="suite", description=None, args=options) == 0
+    metrics = json.loads((tmp_path / "out" / "metrics.json").read_text())
+    assert [row["method"] for row in metrics["rows"]] == ["icp-plane", "global-deepmapping"]
+    candidates = metrics["methods"]["global-deepmapping"]["candidates"]
+    assert sum(numbers["num_kept"] for numbers in candidates.values()) == 1
+    assert 0.0 < metrics["methods"]["icp-plane"]["median_bound_px"] < 1.0
+    assert (tmp_path / "out" / "boxes.png").exists()
+    printed = capsys.readouterr().out
+    assert "No unbiased estimate has a median ATE below" in printed
+    assert printed.splitlines()[0] == (tmp_path / "out" / "table.md").read_text().splitlines()[0]
+
+
+@pytest.mark.slow
+def test_logs_keep_finished_runs_and_leave_out_lost_odometry(tmp_path, capsys) -> None:
+    """The corrected poses of the second log are its odometry, so it has none of its own."""
+    walk = simulate_sequence(0, 12, num_beams=360, seed=4, with_odometry=True)
+    bearings = np.arctan2(walk.points[0, :, 1], walk.points[0, :, 0])
+    ahead = np.argsort(bearings)[90:270]
+    for name, odometry in (("good", walk.odometry_poses), ("lost", walk.reference_poses)):
+        lines = []
+        for points, pose, wheels in zip(walk.points[:, ahead], walk.reference_poses, odometry, strict=True):
+            ranges = " ".join(f"{0.02 * reading:.3f}" for reading in np.linalg.norm(points, axis=1))
+            x, y = (" ".join(f"{value:.5f}" for value in p * [0.02, 0.02, 1.0]) for p in (pose, wheels))
+            lines.append(f"FLASER 180 {ranges} {x} {y} {len(lines)} robot {len(lines)}")
+        (tmp_path / f"{name}.log").write_text("\n".join(lines) + "\n")
+    options = [str(tmp_path), "-o", str(tmp_path / "out"), "--inits", "odometry", "--steps", "2"]
+    for _ in range(2):
+        main, config = deepmapping_logs.main, deepmapping_logs.Config
+        assert run_command(main, config, experiment="logs", description=None, args=options) == 0
+        printed = capsys.readouterr().out.splitlines()
+        assert [line.split(" | ")[:3] for line in printed if "good" in line] == [["| good", "12", "odometry"]]
+    (row,) = json.loads((tmp_path / "out" / "metrics.json").read_text())["rows"]
+    assert row["candidates"][row["kept"]]["ate_m"] == row["ate_m"]
