@@ -21,7 +21,7 @@ from dpmjax.deeppointmap.inference import EvaluationPairs, evaluate_registration
 from dpmjax.deeppointmap.training_loop import StepRecord, Trained, TrainingProgress, begin_training
 from dpmjax.io import LidarSequence, list_lidar_sequences, open_lidar_sequence
 from dpmjax.simulation import HDL64E, DriveConfig, TownConfig, simulate_lidar_sequence
-from experiments._history import HistoryFile, read_history
+from experiments._result_files import HistoryFile, read_history
 from experiments._run_folder import CHECKPOINTS, HISTORY, RunFolder
 
 LOGGER = logging.getLogger("dpmjax.training")

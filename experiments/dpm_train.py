@@ -26,8 +26,8 @@ import numpy as np
 from tyro.conf import FlagCreatePairsOff, arg
 
 from experiments._command import StopFlag, run_command
-from experiments._history import read_history
 from experiments._machine import peak_rss_gb, select_device
+from experiments._result_files import read_history
 from experiments._run_folder import HISTORY, METRICS, RunFolder, open_run_folder, recording, write_metrics
 
 if TYPE_CHECKING:

@@ -17,7 +17,7 @@ from optax.tree_utils import tree_get
 from dpmjax.checkpoints import Checkpoints
 from dpmjax.deeppointmap import CurriculumStage, SampleMaker, ScanStore, init_training, join_processes, make_step
 from dpmjax.deeppointmap.training_loop import begin_training
-from experiments._history import read_history
+from experiments._result_files import read_history
 from experiments._run_folder import CHECKPOINTS, HISTORY
 from tests.deeppointmap import toy
 

@@ -26,7 +26,7 @@ from dpmjax.io import InputError
 from experiments import _dpm_run
 from experiments._command import run_command
 from experiments._dpm_run import Records, run_training
-from experiments._history import read_history
+from experiments._result_files import read_history
 from experiments._run_folder import CHECKPOINTS, HISTORY, RunFolder
 from experiments.dpm_train import EXPERIMENT, Config, main
 from tests.deeppointmap import toy
