@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from benchmarks.rows import Row
 from dpmjax import deepmapping as dm
 from dpmjax.deepmapping.fit import Progress, fit
-from dpmjax.deepmapping.planar import planar_problem, scale_scans, start_poses
+from dpmjax.deepmapping.planar import as_fitted, planar_data, planar_problem
 from dpmjax.io import ScanSequence, read_sequence
 from dpmjax.metrics import absolute_trajectory_error
 from dpmjax.registration import PlanarScans, incremental_icp, planar_scans, refine
@@ -106,7 +106,7 @@ def _classical(sequence: ScanSequence, case: str, quick: bool) -> list[Row]:
 def _fit(sequence: ScanSequence, start: NDArray[np.float64] | None, case: str, quick: bool) -> list[Row]:
     """Neural losses alone, ATE at the marks and at the end; then the refinement of the result."""
     config = dm.with_steps(dm.preset("fast"), 100) if quick else dm.preset("fast")
-    scans, length = scale_scans(ScanSet(sequence.points, sequence.mask))
+    data, length = planar_data(ScanSet(sequence.points, sequence.mask), start)
     unit = np.array([length, length, 1.0])
     marks = list(_MARKS_S)
     rows = [Row(case, "ate at start", _ate(sequence, np.zeros((len(sequence), 3)) if start is None else start), "px")]
@@ -116,14 +116,8 @@ def _fit(sequence: ScanSequence, start: NDArray[np.float64] | None, case: str, q
             ate = _ate(sequence, np.asarray(progress.report.poses, np.float64) * unit)
             rows.append(Row(case, f"ate after {marks.pop(0):.0f} s", ate, "px"))
 
-    done = fit(
-        planar_problem(config, is_warm=start is not None),
-        scans,
-        key=jax.random.key(0),
-        start=None if start is None else start_poses(start, len(sequence), length),
-        on_report=at_mark,
-    )
-    poses = np.asarray(done.poses, np.float64) * unit
+    done = fit(planar_problem(config, data), data, key=jax.random.key(0), on_report=at_mark)
+    poses = as_fitted(done, length, config).poses
     rows += [
         Row(case, "ate at the end", _ate(sequence, poses), "px"),
         Row(case, "run", done.run_s, "s"),
@@ -136,15 +130,12 @@ def _fit(sequence: ScanSequence, start: NDArray[np.float64] | None, case: str, q
 
 def _paper_step(sequence: ScanSequence) -> list[Row]:
     """One step of the paper's architecture, losses and sampling: a batch of 128 scans, as published."""
-    scans, _ = scale_scans(ScanSet(sequence.points, sequence.mask))
-    run_s = [0.0]
+    data, _ = planar_data(ScanSet(sequence.points, sequence.mask))
+    problem, run_s = planar_problem(dm.preset("paper"), data), [0.0]
     done = fit(
-        planar_problem(dm.preset("paper"), is_warm=False),
-        scans,
-        key=jax.random.key(0),
+        problem, data, key=jax.random.key(0), stop=lambda: len(run_s) > 2,
         on_report=lambda progress: run_s.append(progress.run_s),
-        stop=lambda: len(run_s) > 2,
-    )
+    )  # fmt: skip
     case = f"{sequence.name}, paper preset"
     step_s = float(np.diff(run_s).min())
     return [Row(case, "compile", done.compile_s, "s"), Row(case, "one step of 128 scans", step_s, "s")]

@@ -107,23 +107,23 @@ def measure(num_scans: int, num_calls: int, seed: int, output: str) -> None:
 
     from dpmjax.deepmapping import preset
     from dpmjax.deepmapping.fit import fit, steps_per_call
-    from dpmjax.deepmapping.planar import planar_problem, scale_scans, start_poses
+    from dpmjax.deepmapping.planar import planar_data, planar_problem
     from dpmjax.simulation import simulate_sequence
     from dpmjax.types import ScanSet
 
     sequence = simulate_sequence(0, num_scans, seed=seed, with_odometry=True)
     before_gb = peak_rss_gb()
-    scans, unit = scale_scans(ScanSet(sequence.points, sequence.mask))
+    scans = ScanSet(sequence.points, sequence.mask)
     assert sequence.odometry_poses is not None
     phases: dict[str, Any] = {}
     for name, odometry in (("network", None), ("free", sequence.odometry_poses)):
-        problem = planar_problem(preset("fast"), is_warm=odometry is not None)
+        data, _ = planar_data(scans, odometry)
+        problem = planar_problem(preset("fast"), data)
         run_s = [0.0]
         done = fit(
             problem,
-            scans,
+            data,
             key=jax.random.key(seed),
-            start=None if odometry is None else start_poses(odometry, len(sequence), unit),
             on_report=lambda progress, run_s=run_s: run_s.append(progress.run_s),
             stop=lambda run_s=run_s: len(run_s) > num_calls,
         )

@@ -110,8 +110,8 @@ def network_value(config: ToyConfig, params: ToyParams) -> Float[Array, ""]:
     return ScalarNet(config.net).apply(params.net, params.z)  # type: ignore[return-value]
 
 
-def _init(config: ToyConfig, key: jax.Array, data: None, start: None) -> ToyParams:
-    del data, start
+def _init(config: ToyConfig, key: jax.Array, data: None) -> ToyParams:
+    del data
     net_key, z_key = jax.random.split(key)
     z = jax.random.normal(z_key)
     params = ToyParams(jnp.zeros(()), ScalarNet(config.net).init(net_key, z), z)
