@@ -122,8 +122,7 @@ def test_masked_beams_never_matter(tiny_data) -> None:
     scans = tiny_data.scans
     mask = scans.mask & (jax.random.uniform(KEY, scans.mask.shape) < 0.8)
     scans = [
-        as_scan_set(ScanSet(jnp.where(mask[..., None], scans.points, filling), mask))
-        for filling in (0.0, 1e6, np.nan)
+        as_scan_set(ScanSet(jnp.where(mask[..., None], scans.points, filling), mask)) for filling in (0.0, 1e6, np.nan)
     ]
     jax.tree.map(np.testing.assert_array_equal, scans[0], scans[1])
     jax.tree.map(np.testing.assert_array_equal, scans[0], scans[2])

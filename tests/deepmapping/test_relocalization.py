@@ -107,7 +107,7 @@ def test_a_second_call_compiles_nothing(trained, tiny_walk, assert_compiles_noth
 
 
 def test_bad_input_is_named(fitted, tiny_walk) -> None:
-    with pytest.raises(ValueError, match="scan: expected shape"):
+    with pytest.raises(ValueError, match="scans: expected shape"):
         dpmjax.relocalize(fitted, np.ones((4, 3, 3)))
     with pytest.raises(ValueError, match="no valid beam"):
         dpmjax.relocalize(fitted, np.zeros((64, 2)))

@@ -95,6 +95,6 @@ def test_solvers_end_at_the_minimum_of_their_valley(method: str) -> None:
         (lambda: ScalarNetConfig(initialization="zeros"), "initialization"),
     ],
 )
-def test_bad_settings_are_named(call, message) -> None:
+def test_bad_settings_are_named(call, message, as_user) -> None:
     with pytest.raises(ValueError, match=message):
         call()

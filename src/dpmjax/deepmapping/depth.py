@@ -193,7 +193,7 @@ def _init(config: DepthMappingConfig, key: jax.Array, data: MappingData) -> Para
         start=T_start,
         frame=_choose_frame(config, scans, T_start),
     )
-    first = config.phases(is_warm=start is not None)[0]
+    first = config.cold_phases[0]
     if first.poses == "free" and start is None:
         # The paper's direct baseline starts where L-Net's first forward pass puts the cameras.
         params = replace(params, poses=_motions(config, replace(first, poses="network"), params, scans))

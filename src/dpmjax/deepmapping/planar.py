@@ -58,17 +58,18 @@ class Fitted(NamedTuple):
         return se2.to_matrix(self.poses)
 
 
-def as_scan_set(scans: ScanSet | ArrayLike) -> ScanSet:
+def as_scan_set(scans: ScanSet | ArrayLike, *, min_scans: int = 2) -> ScanSet:
     """Checked scans; beams with coordinates that are not finite, or both zero, measured nothing.
 
     Args:
         scans: (n, b, 2) in the sensor frames, any unit; or a ScanSet.
+        min_scans: the smallest number of scans.
 
     Returns:
         The scans, zeros where nothing was measured.
 
     Raises:
-        ValueError: the shape is not (n, b, 2), there are fewer than two scans, a scan has no valid beam, or what the
+        ValueError: the shape is not (n, b, 2), there are too few scans, a scan has no valid beam, or what the
             mask of a ScanSet calls valid is not finite.
     """
     if not isinstance(scans, ScanSet):
@@ -77,8 +78,8 @@ def as_scan_set(scans: ScanSet | ArrayLike) -> ScanSet:
             raise ValueError(f"scans: expected shape (n, b, 2), got {points.shape}")
         mask = np.isfinite(points).all(-1) & (np.abs(points).sum(-1) > 0)
         scans = ScanSet(points=jnp.asarray(np.where(mask[..., None], points, 0.0)), mask=jnp.asarray(mask))
-    if scans.points.shape[0] < 2:
-        raise ValueError(f"scans: expected at least 2, got {scans.points.shape[0]}")
+    if scans.points.shape[0] < min_scans:
+        raise ValueError(f"scans: expected at least {min_scans}, got {scans.points.shape[0]}")
     empty = np.flatnonzero(~np.asarray(scans.mask).any(-1))
     if len(empty):
         raise ValueError(f"scans: scan {empty[0]} has no valid beam; leave it out ({len(empty)} such scans)")

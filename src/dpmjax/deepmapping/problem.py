@@ -13,14 +13,7 @@ import optax
 from jaxtyping import Array, Float, Int
 
 from dpmjax.deepmapping.config import DeepMappingConfig, PhaseConfig
-from dpmjax.deepmapping.objective import (
-    MapLogits,
-    Terms,
-    WorldBatch,
-    free_factors,
-    interpolate_log,
-    occupancy_term,
-)
+from dpmjax.deepmapping.objective import MapLogits, Terms, WorldBatch, free_factors, interpolate_log, occupancy_term
 from dpmjax.nets.occupancy import make_map_net
 
 # Points that M-Net's hidden layers hold at once when it is an MLP: 16 MB a layer of 512.
@@ -116,7 +109,7 @@ def mapping_problem(config: DeepMappingConfig, data: MappingData, functions: Map
     Returns:
         The problem.
     """
-    phases = config.phases(is_warm=data.start is not None)
+    phases = config.cold_phases if data.start is None else config.warm_phases
     return Problem(
         config, phases, optimizer=make_optimizer, **functions._asdict(),
         steps_per_call=config.steps_per_call, halve_at=config.halve_at,

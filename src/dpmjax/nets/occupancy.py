@@ -99,7 +99,9 @@ def interpolate_grid(grid: Float[Array, "*size"], points: Float[Array, "n d"]) -
     total = jnp.zeros((points.shape[0], 2), points.dtype)
     for sides in product((0, 1), repeat=dimensions - 1):
         shares = [part[:, axis] if side else 1.0 - part[:, axis] for axis, side in enumerate(sides)]
-        total += math.prod(shares)[:, None] * read((corner + jnp.array([*sides, 0])) @ strides)
+        total += math.prod(shares, start=jnp.ones(len(points)))[:, None] * read(
+            (corner + jnp.array([*sides, 0])) @ strides
+        )
     return total[:, 0] + part[:, -1] * (total[:, 1] - total[:, 0])
 
 
