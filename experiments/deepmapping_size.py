@@ -78,14 +78,13 @@ _KEYS = ("num_scans", "network", "free", "data_gb", "peak_rss_gb")
 
 def curves(rows: list[dict[str, Any]]) -> dict[str, Any]:
     """What is drawn and fitted, by name."""
-    return {
-        "num_scans": np.array([row["num_scans"] for row in rows], np.float64),
-        "step, L-Net (s)": np.array([row["network"]["step_s"] for row in rows]),
-        "step, free poses (s)": np.array([row["free"]["step_s"] for row in rows]),
-        "epoch, L-Net (s)": np.array([row["network"]["epoch_s"] for row in rows]),
-        "epoch, free poses (s)": np.array([row["free"]["epoch_s"] for row in rows]),
-        "peak memory (GB)": np.array([row["peak_rss_gb"] for row in rows]),
+    columns = {
+        f"{title}, {net} (s)": np.array([row[phase][f"{title}_s"] for row in rows])
+        for title in ("step", "epoch")
+        for net, phase in (("L-Net", "network"), ("free poses", "free"))
     }
+    sizes, memory = (np.array([row[key] for row in rows], np.float64) for key in ("num_scans", "peak_rss_gb"))
+    return {"num_scans": sizes, **columns, "peak memory (GB)": memory}
 
 
 def exponents(rows: list[dict[str, Any]]) -> dict[str, float | None]:
