@@ -36,7 +36,7 @@ COLUMNS = ("step", "stage", "run_s", "loss", *TERMS, *REPORTED, "recall")
 
 
 def town_drive(seed: int, *, length_m: float) -> LidarSequence:
-    """A drive through a town: 64 beams, a third of the columns, a scan every two metres."""
+    """Returns a drive through a town: 64 beams, a third of the columns, a scan every two metres."""
     return simulate_lidar_sequence(
         seed,
         TownConfig(route_length_m=length_m),
@@ -46,7 +46,11 @@ def town_drive(seed: int, *, length_m: float) -> LidarSequence:
 
 
 def open_drives(data: Sequence[str], *, num_towns: int, town_length_m: float, seed: int) -> list[LidarSequence]:
-    """Opens the drives to train on; a ValueError names a path that cannot be read or holds no useful drive."""
+    """Returns the drives to train on.
+
+    Raises:
+        ValueError: if a path cannot be read or holds no useful drive.
+    """
     drives: list[LidarSequence] = []
     for entry in data:
         if entry == TOWN and not Path(entry).exists():
@@ -66,7 +70,7 @@ def open_drives(data: Sequence[str], *, num_towns: int, town_length_m: float, se
 
 
 def why_useless(drive: LidarSequence) -> str | None:
-    """Says why nothing can be learned from a drive; None where something can."""
+    """Returns the reason why nothing can be learned from a drive; None where something can."""
     limits = SamplingConfig()
     if drive.T_world_lidar is None:
         return "no poses; training needs a pose for each scan"
@@ -114,7 +118,7 @@ class Records:
         self._tell_compilation(first)
 
     def evaluate(self, model: Model) -> float:
-        """Recall on the held-out pairs."""
+        """Returns the recall on the held-out pairs."""
         return evaluate_registration(model, self.pairs).recall.recall
 
     def on_report(self, record: StepRecord, progress: TrainingProgress) -> None:
@@ -155,7 +159,7 @@ def run_training(
     recall_every: int,
     stop: Callable[[], int],
 ) -> Trained:
-    """Trains, with records in the process that has them, and saves the end."""
+    """Returns the result of training, after saving its last state; one process has records."""
     with records or nullcontext():
         if records is None:
             return train(store, settings, seed=seed, hooks=TrainingHooks(evaluate_every=recall_every, stop=stop))

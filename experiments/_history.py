@@ -47,6 +47,6 @@ class HistoryFile:
 
 
 def read_history(path: Path) -> list[dict[str, str]]:
-    """Rows of the table; a last line that was cut off by a crash is left out."""
+    """Returns the rows of the table; a last line that a crash cut off is left out."""
     text = path.read_text(encoding="utf-8")
     return list(csv.DictReader(text[: text.rfind("\n") + 1].splitlines()))

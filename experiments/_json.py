@@ -24,7 +24,7 @@ def write_json(path: Path, value: Any) -> None:
 
 
 def load_json(path: Path) -> dict[str, Any]:
-    """Reads a JSON object.
+    """Returns the JSON object in a file.
 
     Raises:
         ValueError: it is no JSON object.
@@ -39,7 +39,7 @@ def load_json(path: Path) -> dict[str, Any]:
 
 
 def as_json(value: Any) -> Any:
-    """The same value out of JSON's types. What JSON cannot say, NaN and infinity, becomes null."""
+    """Returns the value in types of JSON; NaN and infinity become null."""
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         return {field.name: as_json(getattr(value, field.name)) for field in dataclasses.fields(value)}
     if isinstance(value, Mapping):
@@ -56,12 +56,12 @@ def as_json(value: Any) -> Any:
 
 
 def load_dataclass(path: Path, config_type: type[ConfigT], *, ignore: frozenset[str] = frozenset()) -> ConfigT:
-    """Reads back options from JSON; those that it lacks, and those in `ignore`, get their defaults.
+    """Returns options from a JSON file; missing ones, and those in `ignore`, get their defaults.
 
     Raises:
         ValueError: it holds an option that `config_type` does not have, or is no JSON.
     """
-    from dpmjax.weights.model_file import config_from_json
+    from dpmjax.weights.config_json import config_from_json
 
     kept = {name: value for name, value in load_json(path).items() if name not in ignore}
     try:

@@ -80,7 +80,11 @@ class Config:
     """Replace an earlier run in OUT."""
 
     def __post_init__(self) -> None:
-        """Checks ranges."""
+        """Checks ranges.
+
+        Raises:
+            ValueError: if an option is out of range.
+        """
         for name, least in (("steps", 3), ("num_towns", 1), ("held_out_pairs", 1), ("recall_every", 1), ("seed", 0)):
             value = getattr(self, name)
             if value is not None and value < least:
@@ -105,7 +109,7 @@ class Result:
 
 
 def main(config: Config) -> Result:
-    """Opens the drives, trains, evaluates, and writes the results."""
+    """Returns the result after training, evaluation and writing of the files."""
     from dpmjax.deeppointmap.processes import join_processes, merged, together
 
     started = time.perf_counter()
@@ -184,7 +188,7 @@ def print_summary(folder: RunFolder, metrics: dict[str, Any]) -> None:
 
 
 def training_settings(config: Config) -> TrainingConfig:
-    """The preset, with the options applied."""
+    """Returns the preset, with the options applied."""
     from dataclasses import replace
 
     from dpmjax.deeppointmap import training_preset
@@ -196,7 +200,7 @@ def training_settings(config: Config) -> TrainingConfig:
 
 
 def measure(trained: Trained, records: Records) -> tuple[Evaluation, dict[str, Any]]:
-    """Recall, errors and overlap accuracy of the trained and of the untrained network, and times."""
+    """Returns recall, errors and overlap accuracy of the trained and of the untrained network, and times."""
     from dpmjax.deeppointmap import evaluate_registration, overlap_accuracy
 
     models = {"": trained.model, "_untrained": records.untrained}

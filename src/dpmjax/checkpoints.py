@@ -47,7 +47,7 @@ class Checkpoints:
         self._folder.mkdir(parents=True, exist_ok=True)
         with ocp.CheckpointManager(self._folder, options=self._options) as manager:
             if step not in manager.all_steps():
-                manager.save(step, args=ocp.args.StandardSave(jax.tree.map(np.asarray, state)))
+                manager.save(step, args=ocp.args.StandardSave(_numbered(state)))
                 manager.wait_until_finished()
 
     def restore_latest(self, like: StateT, *, fallback: StateT) -> StateT:
@@ -63,7 +63,7 @@ class Checkpoints:
         if not self._folder.is_dir():
             return fallback
         logging.getLogger("absl").setLevel(logging.ERROR)
-        target = jax.tree.map(np.asarray, like)
+        target, structure = _numbered(like), jax.tree.structure(like)
         with ocp.CheckpointManager(self._folder, options=self._options) as manager:
             for step in sorted(manager.all_steps(), reverse=True):
                 try:
@@ -71,5 +71,10 @@ class Checkpoints:
                 except (ValueError, OSError, KeyError) as error:
                     LOGGER.warning("checkpoint %d cannot be read (%s); the one before is taken", step, error)
                     continue
-                return jax.tree.map(jax.numpy.asarray, restored)
+                return jax.tree.unflatten(structure, [jax.numpy.asarray(restored[name]) for name in target])
         return fallback
+
+
+def _numbered(state: object) -> dict[str, np.ndarray]:
+    # Plain arrays by number: orbax then never makes a state with leaves that are no arrays.
+    return {str(number): np.asarray(leaf) for number, leaf in enumerate(jax.tree.leaves(state))}

@@ -61,7 +61,7 @@ class TrainingState:
     params: dict[str, Any]
     registration_optimizer: optax.OptState
     overlap_optimizer: optax.OptState
-    step: Int[Array, ""]
+    step: Int[AnyArray, ""]
 
 
 class TrainingReport(NamedTuple):
