@@ -136,8 +136,6 @@ def _fit(
     folder: RunFolder, task: Task, settings: DeepMappingConfig, start: Floats, config: Config, stop: StopFlag
 ) -> FitRun:
     """Fits the scans in an order in which neighbours are near each other."""
-    from dpmjax.geometry import se2
-
     order = shared.in_fitting_order(task, start)
     run = run_fit(
         folder,
@@ -145,11 +143,9 @@ def _fit(
         settings,
         start=None if config.init == "zero" else start[order],
         seed=config.seed,
-        seconds=config.seconds,
-        stop=stop,
+        stop=lambda run_s: stop.is_requested or (config.seconds is not None and run_s >= config.seconds),
     )
-    poses = run.fitted.poses[np.argsort(order)]
-    return run._replace(fitted=run.fitted._replace(poses=poses, T_world_scan=se2.to_matrix(poses)))
+    return run._replace(fitted=run.fitted._replace(poses=run.fitted.poses[np.argsort(order)]))
 
 
 def read_scans(config: Config) -> ScanSequence:

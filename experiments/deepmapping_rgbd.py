@@ -138,11 +138,7 @@ def fit_settings(config: Config, sequence: DepthSequence) -> DepthMappingConfig:
 
 
 def run_one(
-    folder: RunFolder,
-    config: Config,
-    sequence: DepthSequence,
-    settings: DepthMappingConfig,
-    index: int,
+    folder: RunFolder, config: Config, sequence: DepthSequence, settings: DepthMappingConfig, index: int
 ) -> dict[str, Any]:
     """All methods on one trajectory; a fit from the result of another method is timed without that method.
 
