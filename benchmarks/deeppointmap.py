@@ -62,7 +62,7 @@ FIGURES: dict[str, Figure] = {
 
 
 def run(quick: bool) -> list[Row]:
-    """All stages on the CPU; then on the GPU, where JAX has one, under names that say so."""
+    """Returns rows of all stages on the CPU; then on the GPU, where JAX has one, under names that say so."""
     # Several processes share the GPU.
     os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
     with tempfile.TemporaryDirectory() as name:
@@ -78,11 +78,7 @@ def run(quick: bool) -> list[Row]:
 
 
 def run_stage(stage: str, folder: Path, quick: bool, *, platform: str | None = None) -> list[Row]:
-    """Runs one stage in a fresh process on a platform, or on what JAX chooses.
-
-    Raises:
-        CalledProcessError: it failed, which it has then told on stderr.
-    """
+    """Returns rows of one stage, run in a fresh process on a platform, or on the device that JAX chooses."""
     output = folder / "rows.json"
     command = [sys.executable, "-m", "benchmarks.deeppointmap_stages", stage, str(folder), str(output)]
     environment = os.environ if platform is None else {**os.environ, "JAX_PLATFORMS": platform}
@@ -91,7 +87,7 @@ def run_stage(stage: str, folder: Path, quick: bool, *, platform: str | None = N
 
 
 def with_figures(rows: list[Row]) -> list[Row]:
-    """The rows, each followed by the authors' figure and by the goal where there are such."""
+    """Returns the rows, each followed by the authors' figure and by the goal, where they exist."""
     result = []
     for row in rows:
         result.append(row)

@@ -18,8 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import dpmjax
-from benchmarks.rows import Row
-from benchmarks.timing import measure
+from benchmarks.rows import Row, measure
 from dpmjax.deeppointmap import merge_clouds
 from dpmjax.deeppointmap.inference import pyramid_of_cloud
 from dpmjax.geometry import build_pyramid
@@ -40,7 +39,7 @@ SCANS_IN_MAP = 8
 
 
 def make_scans(folder: Path, quick: bool) -> list[Row]:
-    """Writes the scans of all other stages: one of the simulated town, one of KITTI where the data folder has it."""
+    """Returns the sizes of the scans that it writes for the other stages: a simulated one, one of KITTI if found."""
     sensor = HDL64E.with_azimuths(256) if quick else HDL64E
     scans = {"town": simulate_lidar_sequence(0, sensor=sensor).read_scan(10)}
     for name in () if quick else KITTI:
@@ -53,12 +52,12 @@ def make_scans(folder: Path, quick: bool) -> list[Row]:
 
 
 def read_scans(folder: Path) -> dict[str, Scan]:
-    """What `make_scans` wrote, by name."""
+    """Returns the scans that `make_scans` wrote, by name."""
     return {file.stem: np.load(file) for file in sorted(folder.glob("*.npy"), reverse=True)}
 
 
 def time_encoding(folder: Path, quick: bool, *, preset: str) -> list[Row]:
-    """A raw scan to descriptors as `dpmjax.encode` does it, and its parts: two on the host, one on the device."""
+    """Returns times of `dpmjax.encode` and of its parts: two on the host, one on the device."""
     model = _model(preset)
     rows = []
     for name, points in read_scans(folder).items():
@@ -75,7 +74,7 @@ def time_encoding(folder: Path, quick: bool, *, preset: str) -> list[Row]:
 
 
 def time_jax_builders(folder: Path, quick: bool, *, preset: str) -> list[Row]:
-    """Preprocessing and pyramid by the kernels that training and GPUs use."""
+    """Returns times of preprocessing and pyramid by the JAX kernels."""
     model = _model(preset)
     points = jnp.asarray(read_scans(folder)["town"])
     config = model.config
@@ -90,7 +89,7 @@ def time_jax_builders(folder: Path, quick: bool, *, preset: str) -> list[Row]:
 
 
 def time_matching(folder: Path, quick: bool, *, preset: str, num_target: int) -> list[Row]:
-    """The decoder alone, and the whole way from two descriptor clouds to a motion."""
+    """Returns times of the decoder alone, and of the whole registration of two descriptor clouds."""
     model = _model(preset)
     source, target = _cloud(model, model.config.num_descriptors, seed=0), _cloud(model, num_target, seed=1)
     parts: dict[str, Callable[[], object]] = {
@@ -101,14 +100,14 @@ def time_matching(folder: Path, quick: bool, *, preset: str, num_target: int) ->
 
 
 def time_overlap(folder: Path, quick: bool, *, preset: str) -> list[Row]:
-    """Two descriptor clouds to the probability of overlap."""
+    """Returns times of the overlap prediction."""
     model = _model(preset)
     clouds = [_cloud(model, model.config.num_descriptors, seed=seed) for seed in range(2)]
     return _timed(f"{preset}, one pair", {"overlap": partial(dpmjax.overlap, model, *clouds)}, quick)
 
 
 def run_everything(folder: Path, quick: bool, *, preset: str) -> list[Row]:
-    """Raw scans to descriptors, to motions between scans and to a map, to an overlap: for the memory of all of it."""
+    """Returns no rows; runs encoding, registration of scans and maps, and overlap, to measure the memory."""
     model = _model(preset)
     scan = next(iter(read_scans(folder).values()))
     cloud = dpmjax.encode(model, scan)
@@ -125,7 +124,7 @@ def run_everything(folder: Path, quick: bool, *, preset: str) -> list[Row]:
 
 
 def time_products(folder: Path, quick: bool) -> list[Row]:
-    """What the device reaches on the decoder's largest matrix product: tells a quiet machine from a busy one."""
+    """Returns the speed of the decoder's largest matrix product, which shows if the machine is busy."""
     product = jax.jit(jnp.matmul)
     a, b = jnp.ones((2304, 256)), jnp.ones((256, 768))
     timing = measure(product, a, b, repeats=5 if quick else 30)

@@ -17,22 +17,18 @@ LOGGER = logging.getLogger("dpmjax.checkpoint")
 class Checkpoints:
     """The checkpoints in a folder, one for each saved step. With several processes, only one may use a folder."""
 
-    def __init__(self, folder: Path, *, num_kept: int = 2) -> None:
+    def __init__(self, folder: Path) -> None:
         """Prepares the folder; the first `save` makes it.
 
         Args:
             folder: where the checkpoints are.
-            num_kept: number of checkpoints to keep; older ones are removed.
         """
-        alone = None
+        processes = ocp.options.MultiprocessingOptions()
         if jax.process_count() > 1:  # without this, orbax waits for the other processes
             this = jax.process_index()
-            alone = ocp.options.MultiprocessingOptions(this, {this}, barrier_sync_key_prefix=f"process_{this}")
+            processes = ocp.options.MultiprocessingOptions(this, {this}, barrier_sync_key_prefix=f"process_{this}")
         self._options = ocp.CheckpointManagerOptions(
-            max_to_keep=num_kept,
-            create=False,
-            enable_async_checkpointing=False,
-            **({} if alone is None else {"multiprocessing_options": alone}),
+            max_to_keep=2, create=False, enable_async_checkpointing=False, multiprocessing_options=processes
         )
         self._folder = folder.resolve()
 
@@ -47,7 +43,7 @@ class Checkpoints:
         self._folder.mkdir(parents=True, exist_ok=True)
         with ocp.CheckpointManager(self._folder, options=self._options) as manager:
             if step not in manager.all_steps():
-                manager.save(step, args=ocp.args.StandardSave(jax.tree.map(np.asarray, state)))
+                manager.save(step, args=ocp.args.StandardSave(_numbered(state)))
                 manager.wait_until_finished()
 
     def restore_latest(self, like: StateT, *, fallback: StateT) -> StateT:
@@ -63,7 +59,7 @@ class Checkpoints:
         if not self._folder.is_dir():
             return fallback
         logging.getLogger("absl").setLevel(logging.ERROR)
-        target = jax.tree.map(np.asarray, like)
+        target, structure = _numbered(like), jax.tree.structure(like)
         with ocp.CheckpointManager(self._folder, options=self._options) as manager:
             for step in sorted(manager.all_steps(), reverse=True):
                 try:
@@ -71,5 +67,10 @@ class Checkpoints:
                 except (ValueError, OSError, KeyError) as error:
                     LOGGER.warning("checkpoint %d cannot be read (%s); the one before is taken", step, error)
                     continue
-                return jax.tree.map(jax.numpy.asarray, restored)
+                return jax.tree.unflatten(structure, [jax.numpy.asarray(restored[name]) for name in target])
         return fallback
+
+
+def _numbered(state: object) -> dict[str, np.ndarray]:
+    # Plain arrays by number: orbax then never makes a state with leaves that are no arrays.
+    return {str(number): np.asarray(leaf) for number, leaf in enumerate(jax.tree.leaves(state))}

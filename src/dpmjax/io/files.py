@@ -11,6 +11,7 @@ import zipfile
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.lib import format as npy_format
@@ -166,7 +167,7 @@ def read_table(path: str | Path) -> FloatArray:
     return to_numbers([line.replace(",", " ").split() for line in lines], path)
 
 
-def unpack_rows(body: bytes, layout: np.dtype[np.void], count: int, source: str | Path) -> NDArray[np.void]:
+def unpack_rows(body: bytes, layout: np.dtype[np.void], count: int, source: str | Path) -> NDArray[Any]:
     """Reads binary records.
 
     Args:

@@ -140,5 +140,5 @@ def _numbers(poses: FloatArray) -> FloatArray:
     return np.column_stack([poses[:, :3, 3], Rotation.from_matrix(poses[:, :3, :3]).as_quat()])
 
 
-def _line(tag: str, nodes: Iterable[int], values: FloatArray) -> str:
+def _line(tag: str, nodes: Iterable[np.integer], values: FloatArray) -> str:
     return " ".join([tag, *map(str, nodes), *(f"{value:.17g}" for value in values.tolist())])

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import types
-import typing
 from pathlib import Path
-from typing import Any, Literal, TypeVar
+from typing import Any, Literal
 
 import flax.traverse_util
 import jax
@@ -17,8 +15,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save_file
 
 from dpmjax.deeppointmap.model import Model, ModelConfig, model_shapes
-
-ConfigT = TypeVar("ConfigT")
+from dpmjax.weights.config_json import config_from_json
 
 SHIPPED = Path(__file__).parent
 FORMAT, FORMAT_VERSION = "dpmjax model", "1"
@@ -85,12 +82,8 @@ def save_model(
     for name, array in arrays.items():
         if not np.isfinite(array).all():
             raise ValueError(f"model: {name} holds numbers that are not finite in {dtype}")
-    header = {
-        "format": FORMAT,
-        "format_version": FORMAT_VERSION,
-        "config": json.dumps(config_to_json(model.config)),
-        "card": card,
-    }
+    config = json.dumps(dataclasses.asdict(model.config))
+    header = {"format": FORMAT, "format_version": FORMAT_VERSION, "config": config, "card": card}
     save_file(arrays, path, metadata=header)
 
 
@@ -157,55 +150,3 @@ def _existing(path: Path) -> Path:
     if not path.is_file():
         raise ValueError(f"{path}: no such file")
     return path
-
-
-def config_to_json(config: Any) -> dict[str, Any]:
-    """Converts a configuration to JSON values, field by field.
-
-    Args:
-        config: a frozen dataclass; nested dataclasses become nested objects, tuples become lists.
-
-    Returns:
-        The values by the names of their fields.
-    """
-    return dataclasses.asdict(config)
-
-
-def config_from_json(value: Any, config_type: type[ConfigT]) -> ConfigT:
-    """Reads a configuration back from what `config_to_json` returned.
-
-    A `ValueError` names a field that is unknown or has a value of another type.
-
-    Args:
-        value: the JSON value; missing fields get their defaults.
-        config_type: the dataclass.
-
-    Returns:
-        The configuration.
-    """
-    return _restored(value, config_type, config_type.__name__)
-
-
-def _restored(value: Any, expected: Any, name: str) -> Any:
-    if typing.get_origin(expected) in (types.UnionType, typing.Union):
-        if value is None and type(None) in typing.get_args(expected):
-            return None
-        (expected,) = (choice for choice in typing.get_args(expected) if choice is not type(None))
-    if expected is Path:
-        return Path(value)
-    if dataclasses.is_dataclass(expected) and isinstance(expected, type):
-        if not isinstance(value, dict):
-            raise ValueError(f"{name}: expected an object, got {value!r}")
-        fields = typing.get_type_hints(expected)
-        if unknown := value.keys() - fields.keys():
-            raise ValueError(f"{name}: unknown field {min(unknown)!r}")
-        return expected(**{key: _restored(item, fields[key], f"{name}.{key}") for key, item in value.items()})
-    if typing.get_origin(expected) is tuple:
-        if not isinstance(value, list | tuple):
-            raise ValueError(f"{name}: expected a list, got {value!r}")
-        (item_type, _) = typing.get_args(expected)
-        return tuple(_restored(item, item_type, f"{name}[{i}]") for i, item in enumerate(value))
-    is_number = expected is float and isinstance(value, int) and not isinstance(value, bool)
-    if isinstance(expected, type) and (type(value) is not expected) and not is_number:
-        raise ValueError(f"{name}: expected {expected.__name__}, got {value!r}")
-    return float(value) if is_number else value
