@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from experiments._history import HistoryFile, read_history
+from experiments._result_files import HistoryFile, read_history
 from experiments._run_folder import CHECKPOINTS, HISTORY, RunFolder
 
 if TYPE_CHECKING:

@@ -22,7 +22,7 @@ from tqdm import tqdm
 from tyro.conf import arg
 
 from experiments._command import StopFlag, run_command
-from experiments._json import load_json, write_json
+from experiments._result_files import load_json, write_json
 from experiments._rgbd_methods import errors_of
 from experiments._run_folder import RunFolder, RunOptions, open_run_folder, recording, write_metrics
 

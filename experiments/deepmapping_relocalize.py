@@ -22,8 +22,8 @@ from tyro.conf import Positional, arg
 
 from experiments import deepmapping_2d
 from experiments._command import run_command
-from experiments._json import write_json
 from experiments._machine import environment
+from experiments._result_files import write_json
 from experiments._run_folder import CHECKPOINTS, find_run, load_config
 
 if TYPE_CHECKING:

@@ -25,8 +25,8 @@ from tqdm import tqdm
 from tyro.conf import Positional, arg
 
 from experiments._command import StopFlag, run_command
-from experiments._json import load_json, write_json
 from experiments._machine import peak_rss_gb
+from experiments._result_files import load_json, write_json
 from experiments._rgbd_methods import METHODS, errors_of, run_method
 from experiments._run_folder import RunFolder, RunOptions, open_run_folder, recording, write_metrics
 

@@ -20,8 +20,8 @@ import numpy as np
 from tyro.conf import arg
 
 from experiments._command import run_command
-from experiments._json import load_json, write_json
 from experiments._machine import environment, peak_rss_gb
+from experiments._result_files import load_json, write_json
 from experiments._run_folder import FolderOptions, open_run_folder, recording, write_metrics
 
 EXPERIMENT = "deepmapping_size"

@@ -94,13 +94,13 @@ def test_a_line_slides_along_itself_only() -> None:
 @pytest.mark.parametrize(
     ("source", "target", "options", "message"),
     [
-        (np.ones((5, 4)), np.ones((5, 4)), {}, "target: expected"),
+        (np.ones((5, 4)), np.ones((5, 4)), {}, "source: expected"),
         (np.ones((5, 2)), np.ones((5, 3)), {}, "target: expected"),
-        (np.ones((0, 2)), np.ones((5, 2)), {}, "source: expected at least one point"),
-        (np.ones((5, 2)), np.full((5, 2), np.nan), {}, "target: expected finite"),
+        (np.ones((0, 2)), np.ones((5, 2)), {}, "source: expected one point or more"),
+        (np.ones((5, 2)), np.full((5, 2), np.nan), {}, "target: .* finite numbers"),
         (np.ones((5, 2)), np.ones((5, 2)), {"metric": "wall"}, "metric: expected 'point' or 'plane'"),
         (np.ones((5, 2)), np.ones((5, 2)), {"init": np.eye(4)}, "init: expected shape"),
-        (np.ones((5, 2)), np.ones((5, 2)), {"init": np.full((3, 3), np.nan)}, "init: expected finite"),
+        (np.ones((5, 2)), np.ones((5, 2)), {"init": np.full((3, 3), np.nan)}, "init: .* finite numbers"),
     ],
 )
 def test_bad_input_is_named(as_user, source, target, options, message) -> None:

@@ -6,7 +6,7 @@ import pytest
 
 from dpmjax.geometry import se2
 from dpmjax.metrics import absolute_trajectory_error
-from dpmjax.registration import IncrementalConfig, incremental_icp, planar_scans
+from dpmjax.registration import incremental_icp, planar_scans
 from dpmjax.registration.pair_alignment import Schedule
 
 
@@ -35,7 +35,7 @@ def test_chain_is_bounded_under_noise(noisy_walk, noisy_walk_scans) -> None:
 
 
 def test_point_metric_recovers_the_walk_roughly(walk, walk_scans) -> None:
-    poses, steps = incremental_icp(walk_scans, IncrementalConfig(metric="point"))
+    poses, steps = incremental_icp(walk_scans, "point")
     assert ate(poses, walk.reference_poses) < 3.0
     assert len(steps.poses) == len(poses) - 1
 

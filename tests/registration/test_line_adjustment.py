@@ -10,7 +10,8 @@ import pytest
 
 from dpmjax.geometry import se2
 from dpmjax.metrics import absolute_trajectory_error, position_bound
-from dpmjax.registration import LineAdjustmentConfig, adjust_to_lines, planar_scans
+from dpmjax.registration import planar_scans
+from dpmjax.registration.line_adjustment import LineAdjustmentConfig, adjust_to_lines
 from dpmjax.simulation import cast_scans, make_world
 
 CONFIG = LineAdjustmentConfig(num_neighbours=12, num_rounds=3)

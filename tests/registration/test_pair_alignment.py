@@ -29,7 +29,7 @@ def test_system_is_that_of_finite_differences(walk, walk_scans, metric: str) -> 
     pose = se2.relative(walk.reference_poses[0], walk.reference_poses[1]) + np.array([1.0, -0.7, 0.02])
     with jax.default_matmul_precision("highest"):
         system = linearise_pair(
-            source, target, jnp.asarray(pose, jnp.float32), jnp.float32(GATE), jnp.float32(KERNEL), metric=metric
+            source, target, jnp.asarray(pose, jnp.float32), (jnp.float32(GATE), jnp.float32(KERNEL)), metric=metric
         )
     moved = se2.transform_points(pose[None], np.asarray(source.points, np.float64)[None])[0]
     apart = np.linalg.norm(moved[:, None] - np.asarray(target.points, np.float64), axis=-1)

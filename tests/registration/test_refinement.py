@@ -11,7 +11,7 @@ from dpmjax.metrics import absolute_trajectory_error
 from dpmjax.pose_graph.graph import Edges
 from dpmjax.registration import LoopConfig, RefinementConfig, close_loops, planar_scans, refine
 from dpmjax.registration.loop_closure import count_support, find_candidates
-from dpmjax.registration.refinement import choose_pairs, match_steps
+from dpmjax.registration.refinement import choose_pairs
 from dpmjax.simulation import simulate_sequence
 
 WITHOUT_LOOPS = RefinementConfig(loops=None)
@@ -122,10 +122,4 @@ def test_a_wrong_loop_has_no_support() -> None:
     measured = np.zeros((4, 3))
     measured[2] = [50.0, 0.0, 0.0]
     edges = Edges(source, target, measured, np.zeros((4, 3, 3)))
-    assert count_support(edges, poses, LoopConfig(), 10.0).tolist() == [2, 2, 0, 2]
-
-
-def test_steps_are_matched_where_they_are(walk, walk_scans) -> None:
-    matches = match_steps(walk_scans, walk.reference_poses)
-    true = se2.relative(walk.reference_poses[:-1], walk.reference_poses[1:])
-    assert np.median(np.abs(matches.poses - true)[:, :2]) < 0.01
+    assert count_support(edges, poses, 10.0).tolist() == [2, 2, 0, 2]

@@ -131,7 +131,7 @@ def chamfer_term(
     """
     num_scans = world.rows.shape[0]
 
-    def compare(offset: Int[Array, ""]) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    def compare(offset: Int[Array, ""]) -> tuple[Float[Array, ""], Int[Array, ""]]:
         later = jnp.minimum(jnp.arange(num_scans) + offset, num_scans - 1)
         is_pair = (world.rows[later] == world.rows + offset) & (world.block[later] == world.block)
         distance = jax.vmap(partial(chamfer_distance, max_distance=max_distance))(

@@ -11,12 +11,7 @@ from jaxtyping import Bool, Float, Int
 from scipy.spatial import cKDTree
 
 from dpmjax.checks import require_count
-from dpmjax.geometry.pyramid import (
-    RADIUS_SLACK,
-    WEIGHT_EPSILON,
-    PyramidConfig,
-    PyramidStage,
-)
+from dpmjax.geometry.pyramid import RADIUS_SLACK, WEIGHT_EPSILON, PyramidConfig, PyramidStage
 from dpmjax.geometry.sampling import farthest_point_sample
 from dpmjax.types import Interpolation, PointPyramid, PyramidLevel
 

@@ -1,5 +1,5 @@
-from .chamfer import chamfer_distance as chamfer_distance
-from .contrastive import info_nce as info_nce
-from .occupancy import occupancy_loss as occupancy_loss
-from .offset import offset_loss as offset_loss
-from .overlap import overlap_loss as overlap_loss
+from .descriptors import info_nce as info_nce
+from .descriptors import offset_loss as offset_loss
+from .descriptors import overlap_loss as overlap_loss
+from .mapping import chamfer_distance as chamfer_distance
+from .mapping import occupancy_loss as occupancy_loss

@@ -33,11 +33,6 @@ class Edges(NamedTuple):
     measurements: Floats
     information: Floats
 
-    @property
-    def poses(self) -> Floats:
-        """`measurements`, under the name that registration uses."""
-        return self.measurements
-
 
 def join_edges(*edges: Edges) -> Edges:
     """Joins lists of edges into one list.

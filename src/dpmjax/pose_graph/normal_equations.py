@@ -157,27 +157,22 @@ def solve_symmetric(matrix: sp.csc_matrix, right: Floats, extra: Floats | float 
 
 
 def solve_blocks(
-    nodes: Indices,
-    blocks: Float[np.ndarray, "m s s d d"],
-    gradient: Float[np.ndarray, "m s d"],
-    is_held: NDArray[np.bool_],
-    *,
-    damping: float = 1e-6,
+    nodes: Indices, blocks: Float[np.ndarray, "m s s d d"], gradient: Float[np.ndarray, "m s d"], num_nodes: int
 ) -> Floats:
-    """One Gauss-Newton step of all nodes.
+    """One Gauss-Newton step of all nodes; the first one is held.
 
     Args:
         nodes: (m, s) the nodes of each term.
         blocks: J^T W J of each term.
         gradient: J^T W r of each term.
-        is_held: (n,) nodes that do not move.
-        damping: share of the diagonal that is added, so that nodes without a sharp term stay where they are.
+        num_nodes: n.
 
     Returns:
         (n, d) steps.
     """
-    pattern = BlockPattern.create(nodes, is_held)
+    pattern = BlockPattern.create(nodes, np.arange(num_nodes) == 0)
     matrix = pattern.matrix(blocks)
     diagonal = matrix.diagonal()
-    extra = damping * diagonal + 1e-9 * max(diagonal.max(initial=0.0), 1e-300)
+    # A little damping: nodes without a sharp term stay where they are.
+    extra = 1e-6 * diagonal + 1e-9 * max(diagonal.max(initial=0.0), 1e-300)
     return pattern.to_nodes(solve_symmetric(matrix, -pattern.vector(gradient), extra), gradient.shape[-1])

@@ -53,6 +53,10 @@ class PoseGraphConfig:
             require_positive("outlier_chi2", self.outlier_chi2)
 
 
+ROBUST = PoseGraphConfig(outlier_chi2=10.0, tolerance=1e-8, is_chordal_start=False)
+"""Wrong edges are let go; the poses that are given are the only start."""
+
+
 class OptimizedPoseGraph(NamedTuple):
     """An optimised graph.
 

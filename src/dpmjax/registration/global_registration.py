@@ -10,32 +10,38 @@ from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
-import scipy.sparse
 import scipy.sparse.csgraph
 import scipy.spatial
 from numpy.typing import NDArray
 
 from dpmjax.geometry import se2
-from dpmjax.pose_graph.graph import join_edges
-from dpmjax.pose_graph.planar import optimize_planar_graph
-from dpmjax.registration.map_assembly import agreeing_edges, assemble, place_in_map
-from dpmjax.registration.pair_search import Candidates, CorrelativeConfig, join_candidates, search_pairs
-from dpmjax.registration.planar_scans import Floats, Indices, PlanarScans
-from dpmjax.registration.pose_scoring import (
-    AssemblyConfig,
+from dpmjax.pose_graph.graph import PoseGraph, join_edges
+from dpmjax.pose_graph.optimize import ROBUST, optimize_pose_graph
+from dpmjax.registration.map_assembly import PoseScorer, PositionPrior, assemble, settle
+from dpmjax.registration.pair_search import (
+    AGREEMENT,
+    Candidates,
+    CorrelativeConfig,
     Hypotheses,
-    PoseScorer,
-    PositionPrior,
+    agreeing_edges,
     chance_level,
-    lower_pairs,
+    join_candidates,
     noisy_share,
+    search_pairs,
 )
-from dpmjax.registration.range_profiles import RangeProfiles, compare_pairs, make_profiles
+from dpmjax.registration.planar_scans import Floats, Indices, PlanarScans
+from dpmjax.registration.range_profiles import RangeProfiles, compare_pairs, make_profiles, view_similarity
 
-# Bearings at which profiles are compared for similarity.
-_SIMILARITY_BEARINGS = 128
-# Ranges below this part of the typical range count about alike in similarity.
-_NEAR_RANGE = 0.15
+# Every scan that is no keyframe is searched against the keyframes with the so many most similar views, and without an
+# order against so many scans with the most similar views ...
+_NUM_ANCHORS, _NUM_NEAREST_VIEWS = 2, 3
+# ... at so many headings, by similarity, and their neighbours.
+_NUM_LIKELY_TURNS = 3
+# Where there is an order, its heading is within this of a linear one between the keyframes around it, radians.
+_MAX_BEND = 0.7
+# A scan whose best neighbour matches less than this share of the usual beams is unregistered; scans are of one cluster
+# if they match more than this share.
+_MIN_SUPPORT, _MIN_LINK = 0.6, 0.3
 
 
 @dataclass(frozen=True)
@@ -44,29 +50,14 @@ class GlobalConfig:
 
     Attributes:
         max_keyframes: so many scans are searched all against all.
-        num_anchors: every other scan is searched against the keyframes with the so many most similar views ...
-        num_nearest_views: ... and, without an order, against so many scans with the most similar views.
-        num_likely_turns: headings that are tried for these, by similarity, and their neighbours.
-        max_bend: a scan's heading is within this of a linear one between the keyframes before and after it, radians;
-            only where there is an order.
-        min_support: a scan whose best neighbour matches less than this share of the usual beams is unregistered.
-        min_link: scans are of one cluster if they match more than this share of the usual beams.
         max_unregistered: so many unregistered scans are searched against all keyframes, and those that remain against
             as many of the other scans; a cluster of up to half as many, which matches no other, is unregistered too.
         search: of pairs.
-        assembly: of the map.
     """
 
     max_keyframes: int = 32
-    num_anchors: int = 2
-    num_nearest_views: int = 3
-    num_likely_turns: int = 3
-    max_bend: float = 0.7
-    min_support: float = 0.6
-    min_link: float = 0.3
     max_unregistered: int = 12
     search: CorrelativeConfig = field(default_factory=CorrelativeConfig)
-    assembly: AssemblyConfig = field(default_factory=AssemblyConfig)
 
 
 class GlobalRegistration(NamedTuple):
@@ -81,23 +72,11 @@ class GlobalRegistration(NamedTuple):
     keyframes: Indices
 
 
-class ViewSimilarity(NamedTuple):
-    """Correlation of the range profiles of all pairs of scans, -1 to 1.
-
-    Attributes:
-        best: (n, n) at the best turn.
-        by_turn: (n, n, 128); turn k of pair (i, j) is the heading 2 pi k / 128 of T_i_j.
-    """
-
-    best: Floats
-    by_turn: Floats
-
-
 class _Task(NamedTuple):
-    """The scans to be registered, the same for all stages."""
+    """The scans to be registered, the same for all stages; `similarity` is `view_similarity` of their profiles."""
 
     profiles: RangeProfiles
-    similarity: ViewSimilarity
+    similarity: Floats
     keyframes: Indices
     is_ordered: bool
     config: GlobalConfig
@@ -123,54 +102,64 @@ def register_globally(scans: PlanarScans, config: GlobalConfig | None = None) ->
     Returns:
         GlobalRegistration.
     """
-    config = config or GlobalConfig()
-    profiles = make_profiles(scans)
-    similarity = compare_profiles(profiles)
-    keyframes = choose_keyframes(similarity.best, config.max_keyframes, is_ordered=scans.is_ordered)
+    config, profiles = config or GlobalConfig(), make_profiles(scans)
+    similarity, unit = view_similarity(profiles), scans.typical_range
+    keyframes = choose_keyframes(similarity.max(-1), config.max_keyframes, is_ordered=scans.is_ordered)
     task = _Task(profiles, similarity, keyframes, scans.is_ordered, config)
-    first, second = lower_pairs(len(keyframes))
+    first, second = np.tril_indices(len(keyframes), k=-1)
     found = task.search(keyframes[first], keyframes[second])
     inside = found._replace(source=first, target=second)
     poses = np.zeros((len(scans), 3))
-    poses[keyframes] = assemble(profiles.take(keyframes), inside, config.assembly, is_ordered=scans.is_ordered)
+    poses[keyframes] = assemble(profiles.take(keyframes), inside, is_ordered=scans.is_ordered)
     if len(keyframes) < len(scans):
-        key_edges = agreeing_edges(poses, found, config.assembly, profiles.typical_range)
+        key_edges = agreeing_edges(poses, found, unit)
         poses, more = place_others(task, poses, found, _search_others(task, poses))
-        edges = join_edges(key_edges, agreeing_edges(poses, more, config.assembly, profiles.typical_range))
-        if len(edges.source):
-            poses, _ = optimize_planar_graph(poses, edges)
+        edges = join_edges(key_edges, agreeing_edges(poses, more, unit))
+        poses = optimize_pose_graph(PoseGraph.create(poses, edges), ROBUST).graph.poses
     return GlobalRegistration(se2.relative(poses[0], poses), keyframes)
-
-
-def compare_profiles(profiles: RangeProfiles) -> ViewSimilarity:
-    """View similarity of all pairs of scans, at all turns, by FFT."""
-    stride = profiles.surface.shape[1] // _SIMILARITY_BEARINGS
-    ranges = np.asarray(profiles.surface, np.float64).reshape(-1, _SIMILARITY_BEARINGS, stride).mean(-1)
-    # Near surfaces move most between two views of one place, so far ones are worth less.
-    seen = np.asarray(profiles.is_seen).reshape(-1, _SIMILARITY_BEARINGS, stride).any(-1)
-    view = np.where(seen, np.log1p(ranges / (_NEAR_RANGE * profiles.typical_range)), 0.0)
-    view = view - view.mean(axis=1, keepdims=True)
-    view /= np.maximum(np.linalg.norm(view, axis=1, keepdims=True), 1e-9)
-    spectrum = np.fft.rfft(view, axis=1)
-    by_turn = np.fft.irfft(spectrum[:, None] * np.conj(spectrum[None]), n=_SIMILARITY_BEARINGS, axis=-1)
-    return ViewSimilarity(by_turn.max(-1), by_turn)
 
 
 def choose_keyframes(similarity: Floats, count: int, *, is_ordered: bool) -> Indices:
     """Scans that cover the place: evenly in time where there is an order, else those most similar to all others."""
-    num_scans = len(similarity)
-    count = min(num_scans, count)
-    if is_ordered or count == num_scans:
-        return np.unique(np.round(np.linspace(0, num_scans - 1, count)).astype(np.int64))
+    count = min(len(similarity), count)
+    if is_ordered:
+        return np.unique(np.round(np.linspace(0, len(similarity) - 1, count)).astype(np.int64))
     chosen: list[int] = []
     # Similarity of each scan to the most similar chosen one; each choice adds as much to that as it can.
-    covered = np.full(num_scans, -1.0)
+    covered = np.full(len(similarity), -1.0)
     for _ in range(count):
         gain = np.maximum(similarity - covered[:, None], 0.0).sum(axis=0)
         gain[chosen] = -1.0
         chosen.append(int(gain.argmax()))
         covered = np.maximum(covered, similarity[:, chosen[-1]])
     return np.sort(np.array(chosen, np.int64))
+
+
+def place_in_map(poses: Floats, placed: Indices, hypotheses: Hypotheses, scorer: PoseScorer) -> Floats:
+    """Poses of the scans that are not yet placed: of their hypotheses the one with the best score against placed scans.
+
+    Then all scans may change their poses as in `assemble`.
+
+    Args:
+        poses: (n, 3); right for those of `placed`.
+        placed: rows.
+        hypotheses: of pairs; each scan that is not placed needs one with a placed scan.
+        scorer: of the map.
+
+    Returns:
+        (n, 3) poses. Scans without any hypothesis stay where `poses` has them.
+    """
+    is_placed = np.zeros(len(poses), bool)
+    is_placed[placed] = True
+    fresh = hypotheses.take(np.flatnonzero(is_placed[hypotheses.anchor] & ~is_placed[hypotheses.scan]))
+    candidates = fresh.world_poses(poses)
+    # Hypotheses of one scan compete with each other alone: no need to subtract what chance would give.
+    score = scorer._replace(chance=0.0, is_ordered=False).score(fresh.scan, candidates, placed, poses)
+    order = np.argsort(score, kind="stable")
+    poses = poses.copy()
+    # The best one of each scan is written last.
+    poses[fresh.scan[order]] = candidates[order]
+    return settle(poses, hypotheses, scorer)
 
 
 def _search_others(task: _Task, poses: Floats) -> Candidates:
@@ -184,10 +173,10 @@ def _search_others(task: _Task, poses: Floats) -> Candidates:
 
 def _similar_pairs(task: _Task) -> tuple[Indices, Indices, NDArray[np.bool_]]:
     """Pairs of similar views, of each other scan with keyframes and with any scans; and the turns to try for each."""
-    best, others, config = task.similarity.best, task.others, task.config
-    order = np.argsort(-best[np.ix_(others, task.keyframes)], axis=1)[:, : config.num_anchors]
+    best, others = task.similarity.max(-1), task.others
+    order = np.argsort(-best[np.ix_(others, task.keyframes)], axis=1)[:, :_NUM_ANCHORS]
     # Neighbours in time are better partners than any similar view.
-    num_views = 0 if task.is_ordered else config.num_nearest_views
+    num_views = 0 if task.is_ordered else _NUM_NEAREST_VIEWS
     nearest_views = np.argsort(-(best - 2.0 * np.eye(len(best)))[others], axis=1)[:, :num_views]
     pairs = np.concatenate([task.keyframes[order], nearest_views], axis=1)
     # Each pair once, with one scan that is turned for all its partners.
@@ -195,17 +184,15 @@ def _similar_pairs(task: _Task) -> tuple[Indices, Indices, NDArray[np.bool_]]:
     _, first = np.unique(np.sort(ends, axis=1), axis=0, return_index=True)
     source, target = ends[np.sort(first)].T
     # T_target_source of a keyframe in the frame of the other scan.
-    curve = task.similarity.by_turn[target, source]
-    num_turns, count = config.search.num_turns, curve.shape[-1]
+    curve = task.similarity[target, source]
+    num_turns, count = task.config.search.num_turns, curve.shape[-1]
     turns = np.zeros((len(source), num_turns), bool)
-    row = np.arange(len(source))
-    for _ in range(config.num_likely_turns):
-        peak = curve.argmax(axis=1)
+    row = np.arange(len(source))[:, None]
+    for _ in range(_NUM_LIKELY_TURNS):
+        peak = curve.argmax(axis=1)[:, None]
         middle = np.round(peak * num_turns / count).astype(int)
-        for offset in (-2, -1, 0, 1, 2):
-            turns[row, (middle + offset) % num_turns] = True
-        for offset in range(-6, 7):
-            curve[row, (peak + offset) % count] = -np.inf
+        turns[row, (middle + np.arange(-2, 3)) % num_turns] = True
+        curve[row, (peak + np.arange(-6, 7)) % count] = -np.inf
     return source, target, turns
 
 
@@ -217,7 +204,7 @@ def _neighbour_pairs(task: _Task, headings: Floats) -> tuple[Indices, Indices, N
     source, target = np.concatenate([keyframes[after - 1], keyframes[after]]), np.concatenate([others, others])
     expected = np.concatenate([headings[after - 1], headings[after]]) - np.concatenate([between, between])
     turn = 2 * np.pi * np.arange(num_turns) / num_turns
-    return source, target, np.abs(se2.wrap_angle(turn - expected[:, None])) < task.config.max_bend
+    return source, target, np.abs(se2.wrap_angle(turn - expected[:, None])) < _MAX_BEND
 
 
 def place_others(task: _Task, poses: Floats, found: Candidates, more: Candidates) -> tuple[Floats, Candidates]:
@@ -237,7 +224,7 @@ def place_others(task: _Task, poses: Floats, found: Candidates, more: Candidates
     def place(poses: Floats, more: Candidates) -> Floats:
         candidates = join_candidates(found, more)
         share = noisy_share(task.profiles, candidates)
-        scorer = PoseScorer(task.profiles, task.config.assembly, chance_level(found), share, task.is_ordered, prior)
+        scorer = PoseScorer(task.profiles, chance_level(found), share, task.is_ordered, prior)
         return place_in_map(poses, task.keyframes, Hypotheses.of(candidates), scorer)
 
     poses = place(poses, more)
@@ -247,7 +234,7 @@ def place_others(task: _Task, poses: Floats, found: Candidates, more: Candidates
         if not len(lost):
             break
         # Similarity has misled these, so all turns are tried, with the partners of the most similar views.
-        similarity = np.where(lost[:, None] == partners, -np.inf, task.similarity.best[np.ix_(lost, partners)])
+        similarity = np.where(lost[:, None] == partners, -np.inf, task.similarity[np.ix_(lost, partners)].max(-1))
         order = np.argsort(-similarity, axis=1, kind="stable")[:, : len(task.keyframes)]
         source, target = partners[order].reshape(-1), np.repeat(lost, order.shape[1])
         is_pair = source != target
@@ -262,7 +249,7 @@ def _prior_between(poses: Floats, task: _Task) -> PositionPrior:
     centre = np.stack([np.interp(scans, keyframes, poses[keyframes, axis]) for axis in (0, 1)], axis=-1)
     step = np.hypot(*np.diff(poses[keyframes, :2], axis=0).T)
     gap = step[np.clip(np.searchsorted(keyframes, scans) - 1, 0, len(step) - 1)]
-    slack = task.config.assembly.agreement[0] * task.profiles.typical_range
+    slack = AGREEMENT[0] * task.profiles.scans.typical_range
     return PositionPrior(centre, np.where(np.isin(scans, keyframes), slack, gap + slack))
 
 
@@ -286,15 +273,14 @@ def find_unregistered(profiles: RangeProfiles, poses: Floats, config: GlobalConf
     views = compare_pairs(profiles, scan, other, se2.relative(poses[other], poses[scan]))
     matched = np.where(scan == other, 0.0, views.matched)
     usual = float(np.median(matched.reshape(near.shape).max(axis=1)))
-    is_linked = matched > config.min_link * usual
-    links = (matched[is_linked], (scan[is_linked], other[is_linked]))
-    graph = scipy.sparse.csr_matrix(links, shape=(num_scans, num_scans))
-    cluster = scipy.sparse.csgraph.connected_components(graph, directed=False)[1]
+    is_linked = np.zeros((num_scans, num_scans), bool)
+    is_linked[scan, other] = matched > _MIN_LINK * usual
+    cluster = scipy.sparse.csgraph.connected_components(is_linked, directed=False)[1]
     is_small = np.bincount(cluster)[cluster] <= config.max_unregistered // 2
     matched = np.where(is_small[scan] & (cluster[scan] == cluster[other]), 0.0, matched)
     support = matched.reshape(near.shape).max(axis=1)
     worst = np.argsort(support)[: config.max_unregistered]
-    return worst[support[worst] < config.min_support * usual].astype(np.int64)
+    return worst[support[worst] < _MIN_SUPPORT * usual].astype(np.int64)
 
 
 def nearest_tour(poses: Floats) -> Indices:
@@ -306,10 +292,8 @@ def nearest_tour(poses: Floats) -> Indices:
     Returns:
         (n,) rows, the first one 0.
     """
-    left = set(range(1, len(poses)))
-    tour = [0]
-    while left:
-        here = poses[tour[-1], :2]
-        tour.append(min(left, key=lambda scan: (float(np.hypot(*(poses[scan, :2] - here))), scan)))
-        left.remove(tour[-1])
+    tour, apart = [0], np.linalg.norm(poses[:, None, :2] - poses[:, :2], axis=-1)
+    for _ in poses[1:]:
+        apart[:, tour[-1]] = np.inf
+        tour.append(int(apart[tour[-1]].argmin()))
     return np.array(tour, np.int64)

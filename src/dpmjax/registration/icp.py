@@ -7,9 +7,10 @@ from typing import Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from dpmjax.checks import as_float, as_points
+from dpmjax.checks import as_float, as_points, require_shape
 from dpmjax.geometry import rigid, se2, se3
 from dpmjax.geometry.alignment import weighted_svd
 from dpmjax.geometry.neighbours import k_nearest
@@ -64,35 +65,22 @@ def icp(
     Raises:
         ValueError: wrong shapes, not finite, unknown metric, or an empty cloud.
     """
-    source, target = as_points("source", source), as_points("target", target)
-    dimensions = source.shape[1]
-    if dimensions not in (2, 3) or target.shape[1] != dimensions:
-        raise ValueError(f"target: expected (m, {dimensions}) with 2 or 3 columns like source, got {target.shape}")
-    for name, cloud in (("source", source), ("target", target)):
-        if len(cloud) == 0:
-            raise ValueError(f"{name}: expected at least one point, got none")
-        if not bool(jnp.isfinite(cloud).all()):
-            raise ValueError(f"{name}: expected finite coordinates; leave invalid points out")
+    source = as_points("source", source, dimensions=(2, 3))
+    target = as_points("target", target, dimensions=source.shape[1:])
+    start = jnp.eye(source.shape[1] + 1) if init is None else as_float("init", init)
+    require_shape("init", start, (source.shape[1] + 1, source.shape[1] + 1))
+    for name, array in (("source", source), ("target", target), ("init", start)):
+        if len(array) == 0 or not bool(jnp.isfinite(array).all()):
+            raise ValueError(f"{name}: expected one point or more and finite numbers; leave invalid points out")
     if metric not in ("point", "plane"):
         raise ValueError(f"metric: expected 'point' or 'plane', got {metric!r}")
-    start = jnp.eye(dimensions + 1, dtype=source.dtype) if init is None else as_float("init", init)
-    if start.shape != (dimensions + 1, dimensions + 1):
-        raise ValueError(f"init: expected shape ({dimensions + 1}, {dimensions + 1}), got {start.shape}")
-    if not bool(jnp.isfinite(start).all()):
-        raise ValueError("init: expected finite numbers")
-    return _icp(
-        source, target.astype(source.dtype), start.astype(source.dtype), jnp.asarray(max_iterations), metric=metric
-    )
+    target, start = target.astype(source.dtype), start.astype(source.dtype)
+    return _icp(source, target, start, jnp.asarray(max_iterations), metric=metric)
 
 
 @partial(jax.jit, static_argnames="metric")
 def _icp(
-    source: Float[Array, "n d"],
-    target: Float[Array, "m d"],
-    start: Float[Array, "d1 d1"],
-    max_iterations: Int[Array, ""],
-    *,
-    metric: str,
+    source: Float[Array, "n d"], target: Float[Array, "m d"], start: Array, max_iterations: Array, *, metric: str
 ) -> IcpResult:
     size = jnp.sqrt(jnp.mean(jnp.sum((target - target.mean(0)) ** 2, -1)))
     normals = estimate_normals(target, _NORMAL_NEIGHBOURS)
@@ -104,39 +92,29 @@ def _icp(
         moved = rigid.transform_points(T, source)
         nearest = k_nearest(moved, target, 1).indices[:, 0]
         apart = moved - target[nearest]
-        normal = jnp.where(normals.mask[nearest][:, None], normals.normals[nearest], 0.0)
-        across = jnp.sum(apart * normal, -1)
-        # A point whose neighbourhood is no line or plane counts by its distance to the point itself.
-        residual = jnp.where(normals.mask[nearest], jnp.abs(across), jnp.linalg.norm(apart, axis=-1))
-        residual = residual if metric == "plane" else jnp.linalg.norm(apart, axis=-1)
         pair_distance = jnp.linalg.norm(apart, axis=-1)
+        # A point whose neighbourhood is no line or plane counts by its distance to the point itself.
+        has_plane = normals.mask[nearest] & (metric == "plane")
+        residual = jnp.where(has_plane, jnp.abs(jnp.sum(apart * normals.normals[nearest], -1)), pair_distance)
         scale = jnp.maximum(3.0 * jnp.median(pair_distance), tiny)
         weight = (scale**2 / (scale**2 + pair_distance**2)) ** 2
         return moved, nearest, residual, jnp.where(pair_distance <= 2.0 * scale, weight, 0.0)
 
-    def update(T: Float[Array, "d1 d1"]) -> Float[Array, "d1 d1"]:
-        moved, nearest, _, weight = distances(T)
-        if metric == "point":
-            return weighted_svd(source, target[nearest], weight)
-        step = _step_to_planes(moved, target[nearest], normals.normals[nearest], weight * normals.mask[nearest])
-        return jnp.matmul(step, T, precision="highest")
-
     def iterate(carry: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
         T, _, count = carry
-        T_next = update(T)
-        change = jnp.linalg.norm(
-            rigid.transform_points(T_next, source) - rigid.transform_points(T, source), axis=-1
-        ).max()
-        return T_next, change, count + 1
+        moved, nearest, _, weight = distances(T)
+        if metric == "point":
+            T = weighted_svd(source, target[nearest], weight)
+        else:
+            step = _step_to_planes(moved, target[nearest], normals.normals[nearest], weight * normals.mask[nearest])
+            T = jnp.matmul(step, T, precision="highest")
+        change = jnp.linalg.norm(rigid.transform_points(T, source) - moved, axis=-1).max()
+        return T, change, count + 1
 
-    T, change, _ = jax.lax.while_loop(
-        lambda c: (c[1] > tiny) & (c[2] < max_iterations),
-        iterate,
-        (start, jnp.asarray(jnp.inf, source.dtype), jnp.asarray(0)),
-    )
-    _, _, residual, _ = distances(T)
-    limit = jnp.maximum(3.0 * 1.4826 * jnp.median(residual), tiny)
-    is_inlier = residual <= limit
+    begin = start, jnp.asarray(jnp.inf, source.dtype), jnp.asarray(0)
+    T, change, _ = jax.lax.while_loop(lambda c: (c[1] > tiny) & (c[2] < max_iterations), iterate, begin)
+    residual = distances(T)[2]
+    is_inlier = residual <= jnp.maximum(3.0 * 1.4826 * jnp.median(residual), tiny)
     num_inliers = is_inlier.sum()
     rmse = jnp.sqrt(jnp.sum(jnp.where(is_inlier, residual**2, 0.0)) / jnp.maximum(num_inliers, 1))
     return IcpResult(T, rmse, num_inliers, change <= tiny)
@@ -146,13 +124,11 @@ def _step_to_planes(
     points: Float[Array, "n d"], matched: Float[Array, "n d"], normals: Float[Array, "n d"], weight: Float[Array, " n"]
 ) -> Float[Array, "d1 d1"]:
     """The small motion that brings points onto the lines or planes of their partners, about the points' mean."""
-    dimensions = points.shape[1]
+    dim = points.shape[1]
     centre = jnp.mean(points, axis=0)
     lever = points - centre
-    if dimensions == 2:
-        turning = lever[:, :1] * normals[:, 1:] - lever[:, 1:] * normals[:, :1]
-    else:
-        turning = jnp.cross(lever, normals)
+    i, j = np.array([[0], [1]] if dim == 2 else [[1, 2, 0], [2, 0, 1]])
+    turning = lever[:, i] * normals[:, j] - lever[:, j] * normals[:, i]
     jacobian = jnp.concatenate([normals, turning], axis=-1)
     residual = jnp.sum((points - matched) * normals, -1)
     weighted = weight[:, None] * jacobian
@@ -162,7 +138,6 @@ def _step_to_planes(
     damping = 1e-4 * diagonal + 1e-6 * diagonal.max() + jnp.finfo(points.dtype).tiny
     gradient = jnp.einsum("ni,n->i", weighted, residual, precision="highest")
     step = jnp.linalg.solve(system + jnp.diag(damping), -gradient)
-    motion = se2.exp(step) if dimensions == 2 else se3.exp(step)
-    there = jnp.eye(dimensions + 1, dtype=points.dtype).at[:dimensions, dimensions].set(centre)
-    back = jnp.eye(dimensions + 1, dtype=points.dtype).at[:dimensions, dimensions].set(-centre)
-    return jnp.matmul(jnp.matmul(there, motion, precision="highest"), back, precision="highest")
+    motion = se2.exp(step) if dim == 2 else se3.exp(step)
+    about_centre = centre - jnp.matmul(motion[:dim, :dim], centre, precision="highest")
+    return motion.at[:dim, dim].add(about_centre)

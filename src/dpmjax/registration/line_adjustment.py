@@ -24,35 +24,34 @@ from dpmjax.registration.planar_scans import Floats, Indices, PlanarScans
 _einsum = partial(jnp.einsum, precision="highest")
 
 
+# Of a neighbour the nearest beam and so many to either side may be part of the line.
+_NUM_BESIDE = 2
+# In standard deviations of the range noise: half the length of line that a beam is compared with; beams farther than
+# this off a line are not part of it; walls stray so far from a straight line, so grazing beams are trusted no further.
+_WINDOW, _GATE, _ROUGHNESS = 6.0, 4.0, 0.2
+# Residuals of this many of their standard deviations lose most of their weight.
+_OUTLIER = 3.0
+# A wall is bent if its points stray by more than this, as a mean square in standard deviations.
+_MAX_CHI2 = 1.15
+# Points are a line if they spread so many times more along than across (variances).
+_MIN_SLENDERNESS = 2.0
+# Gauss-Newton steps of each round.
+_NUM_ITERATIONS = 2
+
+
 @dataclass(frozen=True)
 class LineAdjustmentConfig:
-    """Settings of the line adjustment. Lengths are in standard deviations of the range noise, but for `radius`.
+    """Settings of the line adjustment.
 
     Attributes:
         num_neighbours: lines are made of the scan itself and so many others, evenly by nearness within `radius`.
         radius: within which scans share lines, in typical ranges of the scans.
-        num_beside: of a neighbour the nearest beam and so many to either side may be part of the line.
-        window: half the length of line that a beam is compared with.
-        gate: beams farther than this off a line are not part of it.
-        roughness: standard deviation of walls about a straight line; grazing beams are trusted no further.
-        outlier: residuals of this many of their standard deviations lose most of their weight.
-        max_chi2: a wall is bent if its points stray by more than this, as a mean square in standard deviations.
-        min_slenderness: points are a line if they spread so many times more along than across (variances).
         num_rounds: times that the beams of a line are chosen.
-        num_iterations: Gauss-Newton steps of each round.
     """
 
     num_neighbours: int = 48
     radius: float = 1.2
-    num_beside: int = 2
-    window: float = 6.0
-    gate: float = 4.0
-    roughness: float = 0.2
-    outlier: float = 3.0
-    max_chi2: float = 1.15
-    min_slenderness: float = 2.0
     num_rounds: int = 2
-    num_iterations: int = 2
 
 
 class _Beams(NamedTuple):
@@ -80,28 +79,18 @@ class _Lines(NamedTuple):
     is_line: Bool[Array, " b"]
 
 
-class _LineSystem(NamedTuple):
-    """Gauss-Newton system of one scan against the lines around it, over it and its neighbours (s scans)."""
-
-    information: Float[Array, "s s 3 3"]
-    gradient: Float[Array, "s 3"]
-
-
 def _levers(points: Float[Array, "... 2"]) -> Float[Array, "... 2"]:
     """How points move when their scan turns."""
     return jnp.stack([-points[..., 1], points[..., 0]], -1)
 
 
-def _gather_beams(
-    own: PlanarScans, others: PlanarScans, nearest: Int[Array, "b s"], poses: Float[Array, "s 3"],
-    config: LineAdjustmentConfig,
-) -> _Beams:  # fmt: skip
+def _gather_beams(own: PlanarScans, others: PlanarScans, nearest: Int[Array, "b s"], poses: Array) -> _Beams:
     """For each beam those of the scans around, beside the nearest one, that see the same side of a surface nearby."""
     noise = own.noises
     rotation = se2.rotation(poses[:, 2])
     turn = partial(_einsum, "sij,skj->ski", rotation)
     points = se2.transform_points(poses, others.points)
-    index = nearest[..., None] + jnp.arange(-config.num_beside, config.num_beside + 1)
+    index = nearest[..., None] + jnp.arange(-_NUM_BESIDE, _NUM_BESIDE + 1)
     is_inside = (index >= 0) & (index < points.shape[1])
     index = jnp.clip(index, 0, points.shape[1] - 1)
     scan = jnp.arange(points.shape[0])[:, None]
@@ -110,25 +99,20 @@ def _gather_beams(
     squared = (offsets**2).sum(-1)
     faces_same_way = _einsum("bi,bski->bsk", own.normals, turn(others.normals)[scan, index]) > 0.8
     # Not the beam itself, which would agree with itself.
-    is_near = (squared < (config.window * noise) ** 2) & (squared > (1e-3 * noise) ** 2)
-    return _Beams(
-        offsets=offsets,
-        slant=turn(others.points / reach)[scan, index],
-        levers=turn(_levers(others.points))[scan, index],
-        mask=others.is_on_line[scan, index] & is_inside & is_near & faces_same_way,
-    )
+    is_near = (squared < (_WINDOW * noise) ** 2) & (squared > (1e-3 * noise) ** 2)
+    slant, levers = (turn(x)[scan, index] for x in (others.points / reach, _levers(others.points)))
+    mask = others.is_on_line[scan, index] & is_inside & is_near & faces_same_way
+    return _Beams(offsets, slant, levers, mask)
 
 
-def _fit_lines(
-    beams: _Beams, normals: Float[Array, "b 2"], noise: Float[Array, ""], config: LineAdjustmentConfig
-) -> _Lines:
+def _fit_lines(beams: _Beams, normals: Float[Array, "b 2"], noise: Float[Array, ""]) -> _Lines:
     """Weighted straight lines, each from the beams around one beam; `normals` are where to start."""
-    floor = (config.roughness * noise) ** 2
-    taper = jnp.maximum(1.0 - (beams.offsets**2).sum(-1) / (config.window * noise) ** 2, 0.0) ** 2
+    floor = (_ROUGHNESS * noise) ** 2
+    taper = jnp.maximum(1.0 - (beams.offsets**2).sum(-1) / (_WINDOW * noise) ** 2, 0.0) ** 2
     for _ in range(2):
         across = _einsum("bi,bski->bsk", normals, beams.offsets)
         slant = _einsum("bi,bski->bsk", normals, beams.slant)
-        counts = beams.mask & (jnp.abs(across) < config.gate * noise)
+        counts = beams.mask & (jnp.abs(across) < _GATE * noise)
         certainty = 1.0 / (noise**2 * slant**2 + floor)
         weight = jnp.where(counts, taper * certainty, 0.0)
         total = jnp.maximum(weight.sum((1, 2)), 1e-12)
@@ -141,44 +125,38 @@ def _fit_lines(
         fitted = jnp.stack([-jnp.sin(angle), jnp.cos(angle)], -1)
         fitted = jnp.where((fitted * normals).sum(-1, keepdims=True) < 0, -fitted, fitted)
         half_sum = 0.5 * (spread[:, 0, 0] + spread[:, 1, 1])
-        is_slender = half_sum + radius > config.min_slenderness * (half_sum - radius)
+        is_slender = half_sum + radius > _MIN_SLENDERNESS * (half_sum - radius)
         normals = jnp.where(is_slender[:, None], fitted, normals)
     stray = (weight * _einsum("bi,bski->bsk", normals, centred) ** 2).sum((1, 2))
     chi2 = stray / jnp.maximum(jnp.where(counts, taper, 0.0).sum((1, 2)), 1e-12)
     along = _einsum("bi,bski->bsk", _levers(normals), centred)
     here = -(_levers(normals) * mean).sum(-1)
     length = jnp.maximum((weight * along**2).sum((1, 2)), 1e-12)
-    return _Lines(
-        normals=normals,
-        shares=weight * (1.0 / total[:, None, None] + along * (here / length)[:, None, None]),
-        variance=1.0 / total + here**2 / length,
-        is_line=is_slender & (chi2 < config.max_chi2) & (counts.sum((1, 2)) > 5),
-    )
+    shares = weight * (1.0 / total[:, None, None] + along * (here / length)[:, None, None])
+    is_line = is_slender & (chi2 < _MAX_CHI2) & (counts.sum((1, 2)) > 5)
+    return _Lines(normals, shares, 1.0 / total + here**2 / length, is_line)
 
 
 def _linearise(
-    own: PlanarScans, others: PlanarScans, nearest: Int[Array, "b s"], poses: Float[Array, "s 3"],
-    config: LineAdjustmentConfig,
-) -> _LineSystem:  # fmt: skip
-    """The system of one scan; the first of `others` is the scan itself, at pose zero."""
+    own: PlanarScans, others: PlanarScans, nearest: Int[Array, "b s"], poses: Float[Array, "s 3"]
+) -> tuple[Float[Array, "s s 3 3"], Float[Array, "s 3"]]:
+    """J^T W J and J^T W r of one scan over all; the first of `others` is the scan itself, at pose zero."""
     noise = own.noises
-    beams = _gather_beams(own, others, nearest, poses, config)
-    lines = _fit_lines(beams, own.normals, noise, config)
+    beams = _gather_beams(own, others, nearest, poses)
+    lines = _fit_lines(beams, own.normals, noise)
     normals = lines.normals
     residual = -_einsum("bsk,bski,bi->b", lines.shares, beams.offsets, normals)
     squared_slant = (normals * own.points).sum(-1) ** 2 / jnp.maximum((own.points**2).sum(-1), 1e-12)
-    variance = noise**2 * (squared_slant + config.roughness**2) + lines.variance
-    robust = 1.0 / (1.0 + residual**2 / (config.outlier**2 * variance)) ** 2
+    variance = noise**2 * (squared_slant + _ROUGHNESS**2) + lines.variance
+    robust = 1.0 / (1.0 + residual**2 / (_OUTLIER**2 * variance)) ** 2
     weight = jnp.where(own.is_on_line & lines.is_line, robust / variance, 0.0)
     rotation = se2.rotation(poses[:, 2])
     shift = lines.shares.sum(2)[..., None] * _einsum("bi,sij->bsj", normals, rotation)
     turn = _einsum("bsk,bski,bi->bs", lines.shares, beams.levers, normals)
     own_part = jnp.concatenate([normals, (normals * _levers(own.points)).sum(-1, keepdims=True)], -1)
     jacobian = (-jnp.concatenate([shift, turn[..., None]], -1)).at[:, 0].add(own_part)
-    return _LineSystem(
-        information=_einsum("b,bsi,btj->stij", weight, jacobian, jacobian),
-        gradient=_einsum("b,b,bsi->si", weight, residual, jacobian),
-    )
+    information = _einsum("b,bsi,btj->stij", weight, jacobian, jacobian)
+    return information, _einsum("b,b,bsi->si", weight, residual, jacobian)
 
 
 @jax.jit
@@ -196,14 +174,13 @@ def _find_nearest(scans: PlanarScans, around: Int[Array, "n s"], poses: Float[Ar
     return jax.lax.map(find, (around, poses))
 
 
-@partial(jax.jit, static_argnames="config")
+@jax.jit
 def _linearise_all(
-    scans: PlanarScans, around: Int[Array, "n s"], nearest: Int[Array, "n b s"], poses: Float[Array, "n s 3"],
-    *, config: LineAdjustmentConfig,
-) -> _LineSystem:  # fmt: skip
-    def linearise(one: tuple[Array, Array, Array]) -> _LineSystem:
+    scans: PlanarScans, around: Int[Array, "n s"], nearest: Int[Array, "n b s"], poses: Float[Array, "n s 3"]
+) -> tuple[Float[Array, "n s s 3 3"], Float[Array, "n s 3"]]:
+    def linearise(one: tuple[Array, Array, Array]) -> tuple[Array, Array]:
         rows, nearest, relative = one
-        return _linearise(scans.take(rows[0]), scans.take(rows), nearest, relative, config)
+        return _linearise(scans.take(rows[0]), scans.take(rows), nearest, relative)
 
     return jax.lax.map(linearise, (around, nearest, poses))
 
@@ -242,10 +219,10 @@ def adjust_to_lines(scans: PlanarScans, poses: Floats, config: LineAdjustmentCon
     for _ in range(config.num_rounds):
         around = _choose_around(poses, config.num_neighbours, radius)
         nearest = _find_nearest(scans, around, _relative_to_own(poses, around))
-        for _ in range(config.num_iterations):
-            system = _linearise_all(scans, around, nearest, _relative_to_own(poses, around), config=config)
+        for _ in range(_NUM_ITERATIONS):
+            system = _linearise_all(scans, around, nearest, _relative_to_own(poses, around))
             blocks, gradient = (np.asarray(x, np.float64) for x in system)
-            poses = se2.compose(poses, solve_blocks(around, blocks, gradient, np.arange(len(poses)) == 0))
+            poses = se2.compose(poses, solve_blocks(around, blocks, gradient, len(poses)))
     return poses
 
 

@@ -17,8 +17,8 @@ import scipy.spatial
 from jaxtyping import Array, Bool, Float, Int
 
 from dpmjax.geometry import se2
-from dpmjax.pose_graph.graph import Edges, join_edges
-from dpmjax.pose_graph.planar import optimize_planar_graph
+from dpmjax.pose_graph.graph import Edges, PoseGraph, join_edges
+from dpmjax.pose_graph.optimize import ROBUST, optimize_pose_graph
 from dpmjax.registration.incremental import contradicted_share
 from dpmjax.registration.pair_alignment import PairMatches, PosePrior, Schedule, match_pairs
 from dpmjax.registration.planar_scans import Floats, Indices, PlanarScans, batches
@@ -30,6 +30,18 @@ _REFINE = Schedule(gate=(0.075, 0.0225), kernel=(0.0225, 0.0045), num_iterations
 _BATCH = 512
 # Two views that overlap well are nearer than twice this, in typical ranges, whatever the drift.
 _NEARBY = 0.15
+# The target is a submap of so many scans to either side.
+_SUBMAP_WIDTH = 2
+# Robust share of the beams that must find their partner, and share that may contradict the other scan.
+_MIN_FITNESS, _MAX_CONTRADICTED = 0.4, 0.08
+# Share of the beams that the weakest eigenvalue of a pair must reach.
+_MIN_EIGENVALUE = 0.03
+# So many loops between scans nearby in time must agree with a loop: within this translation in typical ranges, radians.
+_MIN_SUPPORT, _NEIGHBOURHOOD, _AGREEMENT = 2, 6, (0.045, 0.08)
+# Accuracy of a fitted beam, and of a step of the start: translation in typical ranges, radians.
+_SIGMA, _STEP_SIGMA = 0.03, (0.045, 0.15)
+# So many loops must contradict a step before the trajectory is torn there.
+_STEP_TRUST = 30.0
 
 
 @dataclass(frozen=True)
@@ -42,16 +54,6 @@ class LoopConfig:
         max_radius: largest distance of a candidate.
         min_way: way between the two scans of a loop.
         max_candidates: at most so many pairs a round.
-        submap_width: the target is a submap of so many scans to either side.
-        min_fitness: robust share of the beams that must find their partner.
-        max_contradicted: share of the beams that may contradict the other scan.
-        min_eigenvalue: share of the beams that the weakest eigenvalue of a pair must reach.
-        min_support: so many neighbouring loops must agree.
-        agreement: within which they agree: translation, turn in radians.
-        neighbourhood: scans within which loops are neighbours.
-        sigma: accuracy of a fitted beam; it gives edges their information.
-        step_sigma: standard deviation of a step of the start: translation, turn in radians.
-        step_trust: so many loops must contradict a step before the trajectory is torn there.
     """
 
     num_rounds: int = 3
@@ -59,16 +61,6 @@ class LoopConfig:
     max_radius: float = 2.25
     min_way: float = 2.25
     max_candidates: int = 2000
-    submap_width: int = 2
-    min_fitness: float = 0.4
-    max_contradicted: float = 0.08
-    min_eigenvalue: float = 0.03
-    min_support: int = 2
-    agreement: tuple[float, float] = (0.045, 0.08)
-    neighbourhood: int = 6
-    sigma: float = 0.03
-    step_sigma: tuple[float, float] = (0.045, 0.15)
-    step_trust: float = 30.0
 
 
 class LoopResult(NamedTuple):
@@ -100,29 +92,28 @@ def close_loops(
         LoopResult; the poses are those of the start where there is no loop.
     """
     config = config or LoopConfig()
-    steps = steps or pose_steps(poses, config.step_sigma, scans.typical_range)
-    loops, weights = _find_loops(scans, poses, config), np.zeros(0)
-    for round_number in range(config.num_rounds):
-        loops = _find_loops(scans, poses, config) if round_number else loops
+    steps = steps or pose_steps(poses, scans.typical_range)
+    for _ in range(config.num_rounds):
+        loops, weights = _find_loops(scans, poses, config), np.zeros(0)
         if not len(loops.source):
             break
-        trust = np.repeat([config.step_trust, 1.0], [len(steps.source), len(loops.source)])
-        poses, weights = optimize_planar_graph(poses, join_edges(steps, loops), trust=trust)
-        weights = weights[len(steps.source) :]
+        trust = np.repeat([_STEP_TRUST, 1.0], [len(steps.source), len(loops.source)])
+        solved = optimize_pose_graph(PoseGraph.create(poses, join_edges(steps, loops)), ROBUST, trust=trust)
+        poses, weights = solved.graph.poses, solved.weights[len(steps.source) :]
     return LoopResult(poses, loops, weights)
 
 
-def pose_steps(poses: Floats, sigma: tuple[float, float], typical_range: float) -> Edges:
-    """Edges between neighbours in time of these poses, with standard deviations in typical ranges and radians."""
+def pose_steps(poses: Floats, typical_range: float) -> Edges:
+    """Edges between neighbours in time of these poses."""
     relative, later = se2.relative(poses[:-1], poses[1:]), np.arange(1, len(poses))
-    information = np.diag([(typical_range * sigma[0]) ** -2.0] * 2 + [sigma[1] ** -2.0])
+    information = np.diag((np.array(_STEP_SIGMA)[[0, 0, 1]] * [typical_range, typical_range, 1.0]) ** -2.0)
     return Edges(later, later - 1, relative, np.broadcast_to(information, (len(later), 3, 3)))
 
 
-def matched_steps(matches: PairMatches, config: LoopConfig, typical_range: float) -> Edges:
+def matched_steps(matches: PairMatches, typical_range: float) -> Edges:
     """Edges between neighbours in time from their matches; the trust in a step is the least that they have."""
-    least = pose_steps(np.zeros((len(matches.poses) + 1, 3)), config.step_sigma, typical_range)
-    information = matches.information / (config.sigma * typical_range) ** 2 + least.information
+    least = pose_steps(se2.chain(matches.poses), typical_range)
+    information = matches.information / (_SIGMA * typical_range) ** 2 + least.information
     return least._replace(measurements=matches.poses, information=information)
 
 
@@ -130,20 +121,17 @@ def _find_loops(scans: PlanarScans, poses: Floats, config: LoopConfig) -> Edges:
     """Loops between scans of one trajectory, each supported by its neighbours; perhaps none."""
     unit = scans.typical_range
     source, target = find_candidates(poses, config, unit)
-    found = [
-        PairMatches(*(x[: part.stop - part.start] for x in _match(scans, poses, source[rows], target[rows], config)))
-        for part, rows in batches(len(source), _BATCH)
-    ]
-    if not found:
-        return Edges(source, target, np.zeros((0, 3)), np.zeros((0, 3, 3)))
-    matches = PairMatches(*(np.concatenate(x) for x in zip(*found, strict=True)))
+    matches = PairMatches(np.zeros((len(source), 3)), np.zeros(len(source)), np.zeros((len(source), 3, 3)))
+    for part, rows in batches(len(source), _BATCH):
+        for kept, found in zip(matches, _match(scans, poses, source[rows], target[rows], config), strict=True):
+            kept[part] = found[: part.stop - part.start]
     contradicted = contradicted_share(make_profiles(scans), source, target, matches.poses)
     num_beams = np.maximum(np.asarray(scans.is_on_line.sum(1))[source], 1)
-    is_held = matches.weakest_eigenvalue() / num_beams > config.min_eigenvalue
-    fits = (matches.fitness > config.min_fitness) & (contradicted < config.max_contradicted) & is_held
-    information = matches.information[fits] / (config.sigma * unit) ** 2
+    is_held = matches.weakest_eigenvalue() / num_beams > _MIN_EIGENVALUE
+    fits = (matches.fitness > _MIN_FITNESS) & (contradicted < _MAX_CONTRADICTED) & is_held
+    information = matches.information[fits] / (_SIGMA * unit) ** 2
     edges = Edges(source[fits], target[fits], matches.poses[fits], information)
-    is_supported = count_support(edges, poses, config, unit) >= config.min_support
+    is_supported = count_support(edges, poses, unit) >= _MIN_SUPPORT
     return jax.tree.map(lambda x: x[is_supported], edges)
 
 
@@ -172,7 +160,7 @@ def _way_along(poses: Floats) -> Floats:
 def _match(scans: PlanarScans, poses: Floats, source: Indices, target: Indices, config: LoopConfig) -> PairMatches:
     """Matches scans to submaps around their targets, one batch of candidates."""
     unit, way = scans.typical_range, _way_along(poses)
-    submaps, ones = _build_submaps(scans, poses, target, config.submap_width), scans.take(source)
+    submaps, ones = _build_submaps(scans, poses, target), scans.take(source)
     predicted = se2.relative(poses[target], poses[source])
     # The prediction is believed as far as the drift allows: it decides along a corridor, where scans cannot.
     sigma = 0.045 * unit + 0.5 * config.drift * (way[source] - way[target])
@@ -191,15 +179,13 @@ def _guesses(predicted: Floats, typical_range: float) -> Floats:
     return np.concatenate([guesses, predicted[:, None]], axis=1)
 
 
-def _build_submaps(scans: PlanarScans, poses: Floats, centres: Indices, width: int) -> PlanarScans:
-    """A submap around each centre scan, in its frame: the scans up to `width` before and after it."""
-    rows = centres[:, None] + np.array(sorted(range(-width, width + 1), key=abs))
+def _build_submaps(scans: PlanarScans, poses: Floats, centres: Indices) -> PlanarScans:
+    """A submap around each centre scan, in its frame: some scans before and after it, the nearest first."""
+    rows = centres[:, None] + np.array(sorted(range(-_SUBMAP_WIDTH, _SUBMAP_WIDTH + 1), key=abs))
     is_there = (rows >= 0) & (rows < len(poses))
     rows = np.clip(rows, 0, len(poses) - 1)
-    relative = se2.relative(poses[centres][:, None], poses[rows])
-    return _merge_scans(
-        scans.replace(is_ordered=False), jnp.asarray(rows), jnp.asarray(is_there), jnp.asarray(relative, jnp.float32)
-    )
+    relative = se2.relative(poses[centres][:, None], poses[rows]).astype(np.float32)
+    return _merge_scans(scans.replace(is_ordered=False), rows, is_there, relative)
 
 
 @jax.jit
@@ -207,30 +193,25 @@ def _merge_scans(
     scans: PlanarScans, rows: Int[Array, "p w"], is_there: Bool[Array, "p w"], poses: Float[Array, "p w 3"]
 ) -> PlanarScans:
     """Submaps of w scans each; poses are T_submap_scan."""
-    some, rotation = scans.take(rows), se2.rotation(poses[..., 2])
-    flat = (rows.shape[0], -1)
-    return PlanarScans(
-        points=se2.transform_points(poses, some.points).reshape(*flat, 2),
-        mask=(some.mask & is_there[..., None]).reshape(flat),
-        normals=jnp.einsum("pwij,pwbj->pwbi", rotation, some.normals, precision="highest").reshape(*flat, 2),
-        centroids=se2.transform_points(poses, some.centroids).reshape(*flat, 2),
-        is_on_line=(some.is_on_line & is_there[..., None]).reshape(flat),
-        noises=some.noises[:, 0],
-        typical_ranges=some.typical_ranges[:, 0],
-        is_ordered=False,
-    )
+    some, there = scans.take(rows), is_there[..., None]
+    points, centroids = (se2.transform_points(poses, x) for x in (some.points, some.centroids))
+    normals = se2.transform_points(poses * jnp.array([0.0, 0.0, 1.0]), some.normals)
+    arrays = points, some.mask & there, normals, centroids, some.is_on_line & there
+    points, mask, normals, centroids, is_on_line = (x.reshape(len(rows), -1, *x.shape[3:]) for x in arrays)
+    noises, lengths = some.noises[:, 0], some.typical_ranges[:, 0]
+    return PlanarScans(points, mask, normals, centroids, is_on_line, noises, lengths, is_ordered=False)
 
 
-def count_support(edges: Edges, poses: Floats, config: LoopConfig, typical_range: float) -> Indices:
+def count_support(edges: Edges, poses: Floats, typical_range: float) -> Indices:
     """Number of neighbouring loops that agree with each loop, through the steps of the trajectory between them."""
-    near = np.abs(edges.source[:, None] - edges.source) <= config.neighbourhood
-    near &= np.abs(edges.target[:, None] - edges.target) <= config.neighbourhood
+    near = np.abs(edges.source[:, None] - edges.source) <= _NEIGHBOURHOOD
+    near &= np.abs(edges.target[:, None] - edges.target) <= _NEIGHBOURHOOD
     near &= (edges.source[:, None] != edges.source) | (edges.target[:, None] != edges.target)
     one, other = np.nonzero(near)
     step_target = se2.relative(poses[edges.target[one]], poses[edges.target[other]])
     step_source = se2.relative(poses[edges.source[other]], poses[edges.source[one]])
     through = se2.compose(se2.compose(step_target, edges.measurements[other]), step_source)
     error = se2.relative(edges.measurements[one], through)
-    agrees = np.hypot(error[:, 0], error[:, 1]) < config.agreement[0] * typical_range
-    agrees &= np.abs(error[:, 2]) < config.agreement[1]
+    agrees = np.hypot(error[:, 0], error[:, 1]) < _AGREEMENT[0] * typical_range
+    agrees &= np.abs(error[:, 2]) < _AGREEMENT[1]
     return np.bincount(one[agrees], minlength=len(edges.source))

@@ -11,110 +11,162 @@ to the best of the poses that any pair across the cut supports.
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 import scipy.sparse
 import scipy.sparse.csgraph
 from numpy.typing import NDArray
 
 from dpmjax.geometry import se2
-from dpmjax.pose_graph.graph import Edges
-from dpmjax.pose_graph.planar import optimize_planar_graph
-from dpmjax.registration.pair_search import Candidates
+from dpmjax.pose_graph.graph import PoseGraph
+from dpmjax.pose_graph.optimize import ROBUST, optimize_pose_graph
+from dpmjax.registration.pair_search import AGREEMENT, Candidates, Hypotheses, agreeing_edges, chance_level, noisy_share
 from dpmjax.registration.planar_scans import Floats, Indices
-from dpmjax.registration.pose_scoring import (
-    AssemblyConfig,
-    Hypotheses,
-    PoseScorer,
-    add_up,
-    chance_level,
-    is_firmly_more,
-    lower_pairs,
-    noisy_share,
-)
-from dpmjax.registration.range_profiles import RangeProfiles
+from dpmjax.registration.range_profiles import RangeProfiles, compare_pairs
+
+# Matched beams that make up for a contradicting one.
+_CONTRADICTION_WEIGHT = 4.0
+# How much more the matched beams of neighbours in time count, where there is an order.
+_NEXT_WEIGHT = 4.0
+# Scans farther apart than this, in typical ranges, do not score each other, and of the others so many nearest ones do.
+_RADIUS, _NUM_SCORERS = 1.2, 32
+# Score of an impossible pose, below any real score.
+_IMPOSSIBLE = -1e6
+# Maps grown from so many different pairs; the best one is kept.
+_NUM_SEEDS = 6
+# Rounds in which scans may change their pose.
+_NUM_REVISIONS = 3
+# Weakest connections at which a block is cut off, and poses that are tried for a block.
+_NUM_CUTS, _NUM_BLOCK_POSES = 6, 48
 
 
-def assemble(
-    profiles: RangeProfiles, candidates: Candidates, config: AssemblyConfig | None = None, *, is_ordered: bool = False
-) -> Floats:
+class PositionPrior(NamedTuple):
+    """Discs outside of which scans cannot be.
+
+    Attributes:
+        centre: (n, 2).
+        radius: (n,).
+    """
+
+    centre: Floats
+    radius: Floats
+
+
+class PoseScorer(NamedTuple):
+    """Scores poses of scans against those of placed ones.
+
+    Attributes:
+        profiles: n scans.
+        chance: beams that two scans of different places match by chance; they do not count.
+        noisy_share: share of visible beams that seem to contradict where all is right; they do not count.
+        is_ordered: neighbours in the array are neighbours in time.
+        prior: where scans can be; None: anywhere.
+    """
+
+    profiles: RangeProfiles
+    chance: float
+    noisy_share: float
+    is_ordered: bool
+    prior: PositionPrior | None = None
+
+    @property
+    def radius(self) -> float:
+        """Distance within which scans score each other, unit of the points."""
+        return _RADIUS * self.profiles.scans.typical_range
+
+    def score(self, scan: Indices, candidates: Floats, placed: Indices, poses: Floats) -> Floats:
+        """(m,) score of each `scan` at its candidate pose (m, 3) against all of `placed`, which are at `poses`."""
+        total = add_up(self.pairwise_scores(scan, candidates, placed, poses))
+        if self.prior is not None:
+            off = candidates[:, :2] - self.prior.centre[scan]
+            total += np.where(np.hypot(off[:, 0], off[:, 1]) > self.prior.radius[scan], _IMPOSSIBLE, 0.0)
+        return total
+
+    def pairwise_scores(self, scan: Indices, candidates: Floats, placed: Indices, poses: Floats) -> Floats:
+        """(m, k) score of each `scan` against each of `placed`; 0 for those too far apart."""
+        apart = candidates[:, None, :2] - poses[placed][None, :, :2]
+        apart = np.hypot(apart[..., 0], apart[..., 1])
+        apart[scan[:, None] == placed[None]] = np.inf
+        limit = np.full(len(scan), self.radius)
+        if len(placed) > _NUM_SCORERS:
+            limit = np.minimum(limit, np.partition(apart, _NUM_SCORERS, axis=1)[:, _NUM_SCORERS])
+        row, column = np.nonzero(apart < limit[:, None])
+        other, scores = placed[column], np.zeros(apart.shape)
+        scores[row, column] = self.score_pairs(scan[row], other, se2.relative(poses[other], candidates[row]))
+        return scores
+
+    def score_pairs(self, source: Indices, target: Indices, poses: Floats) -> Floats:
+        """(p,) matched less weighted contradicting beams of pairs at `poses`, T_target_source, above chance."""
+        views = compare_pairs(self.profiles, source, target, poses, stride=4)
+        # Matches by chance do not count; else rooms would be stacked on rooms.
+        is_next = self.is_ordered & (np.abs(source - target) == 1)
+        matched = np.maximum(views.matched - np.where(is_next, 0.5, 1.0) * self.chance, 0.0)
+        matched *= np.where(is_next, _NEXT_WEIGHT, 1.0)
+        contradicted = np.maximum(views.contradicted - self.noisy_share * views.visible, 0.0)
+        return np.asarray(matched - _CONTRADICTION_WEIGHT * contradicted, np.float64)
+
+    def score_map(self, poses: Floats) -> Floats:
+        """(n, n) pairwise scores of a map, below the diagonal; 0 for scans too far apart."""
+        source, target = np.tril_indices(len(poses), k=-1)
+        relative = se2.relative(poses[target], poses[source])
+        near = np.hypot(relative[:, 0], relative[:, 1]) < self.radius
+        values = np.zeros((len(poses), len(poses)))
+        values[source[near], target[near]] = self.score_pairs(source[near], target[near], relative[near])
+        return values
+
+
+def add_up(scores: Floats) -> Floats:
+    """Total of pairwise scores: negative ones in full, and the k-th best positive one by 1 / k.
+
+    A pose needs a few scans that match it well. Were all counted alike, rooms that look alike would be stacked: the
+    more scans overlap, the more beams match.
+
+    Args:
+        scores: (..., k).
+
+    Returns:
+        (...) totals.
+    """
+    ordered = -np.sort(-scores, axis=-1)
+    return np.where(ordered > 0.0, ordered / np.arange(1, scores.shape[-1] + 1), ordered).sum(axis=-1)
+
+
+def is_firmly_more(score: Floats | np.float64, reference: Floats | np.float64) -> NDArray[np.bool_]:
+    """Whether a score is more than 2 % above a reference: below that it is the same pose by another pair."""
+    return np.asarray(score > reference + 0.02 * np.abs(reference))
+
+
+def assemble(profiles: RangeProfiles, candidates: Candidates, *, is_ordered: bool = False) -> Floats:
     """Poses of all scans from candidates of their pairs, without a first guess.
 
     Args:
         profiles: n scans.
         candidates: of pairs that connect all scans.
-        config: settings.
         is_ordered: neighbours in the array are neighbours in time, so likely to overlap.
 
     Returns:
         (n, 3) T_world_scan; the first pose is zero.
     """
-    config = config or AssemblyConfig()
-    scorer = PoseScorer(profiles, config, chance_level(candidates), noisy_share(profiles, candidates), is_ordered)
+    scorer = PoseScorer(profiles, chance_level(candidates), noisy_share(profiles, candidates), is_ordered)
     hypotheses, everyone = Hypotheses.of(candidates), np.arange(len(profiles))
-    best, highest = np.zeros((len(profiles), 3)), -np.inf
-    for seed in _choose_seeds(hypotheses, config.num_seeds):
-        poses = _settle(_grow(hypotheses, scorer, seed), hypotheses, scorer)
-        total = float(scorer.score(everyone, poses, everyone, poses).sum())
-        if total > highest:
-            best, highest = poses, total
-    poses, num_moved = move_blocks(best, hypotheses, scorer)
-    poses = _settle(poses, hypotheses, scorer) if num_moved else poses
-    edges = agreeing_edges(poses, candidates, config, profiles.typical_range)
-    if len(edges.source):
-        poses, _ = optimize_planar_graph(poses, edges)
+    maps = [settle(_grow(hypotheses, scorer, seed), hypotheses, scorer) for seed in _choose_seeds(hypotheses)]
+    scores = [scorer.score(everyone, poses, everyone, poses).sum() for poses in maps]
+    poses = maps[int(np.argmax(scores))] if maps else np.zeros((len(profiles), 3))
+    poses, num_moved = move_blocks(poses, hypotheses, scorer)
+    poses = settle(poses, hypotheses, scorer) if num_moved else poses
+    edges = agreeing_edges(poses, candidates, profiles.scans.typical_range)
+    poses = optimize_pose_graph(PoseGraph.create(poses, edges), ROBUST).graph.poses
     return np.asarray(se2.relative(poses[0], poses))
 
 
-def place_in_map(poses: Floats, placed: Indices, hypotheses: Hypotheses, scorer: PoseScorer) -> Floats:
-    """Poses of the scans that are not yet placed: of their hypotheses the one with the best score against placed scans.
-
-    Then all scans may change their poses as in `assemble`.
-
-    Args:
-        poses: (n, 3); right for those of `placed`.
-        placed: rows.
-        hypotheses: of pairs; each scan that is not placed needs one with a placed scan.
-        scorer: of the map.
-
-    Returns:
-        (n, 3) poses. Scans without any hypothesis stay where `poses` has them.
-    """
-    is_placed = np.zeros(len(poses), bool)
-    is_placed[placed] = True
-    fresh = hypotheses.take(np.flatnonzero(is_placed[hypotheses.anchor] & ~is_placed[hypotheses.scan]))
-    candidates = fresh.world_poses(poses)
-    # Hypotheses of one scan compete with each other alone: no need to subtract what chance would give.
-    score = scorer._replace(chance=0.0, is_ordered=False).score(fresh.scan, candidates, placed, poses)
-    order = np.argsort(score, kind="stable")
-    poses = poses.copy()
-    # The best one of each scan is written last.
-    poses[fresh.scan[order]] = candidates[order]
-    return _settle(poses, hypotheses, scorer)
-
-
-def agreeing_edges(poses: Floats, candidates: Candidates, config: AssemblyConfig, typical_range: float) -> Edges:
-    """Edges of the pairs with a candidate that agrees with the map; of each pair the nearest one."""
-    here = se2.relative(poses[candidates.target], poses[candidates.source])
-    off = se2.relative(here[:, None], candidates.poses)
-    distance = np.hypot(off[..., 0], off[..., 1]) / (config.agreement[0] * typical_range)
-    turn = np.abs(se2.wrap_angle(off[..., 2])) / config.agreement[1]
-    mismatch = np.where(candidates.scores > config.min_score, np.maximum(distance, turn), np.inf)
-    best = mismatch.argmin(axis=1)
-    row = np.arange(len(best))
-    keep = mismatch[row, best] < 1.0
-    sigma = np.array([config.sigma[0] * typical_range, config.sigma[0] * typical_range, config.sigma[1]])
-    share = candidates.scores[row, best][keep] / 500.0
-    information = share[:, None, None] * np.diag(1.0 / sigma**2)
-    return Edges(candidates.source[keep], candidates.target[keep], candidates.poses[row, best][keep], information)
-
-
-def _choose_seeds(hypotheses: Hypotheses, count: int) -> list[int]:
+def _choose_seeds(hypotheses: Hypotheses) -> list[int]:
     """The best pairs, no scan in two of them."""
     chosen: list[int] = []
     used: set[int] = set()
     for row in np.argsort(-hypotheses.scores, kind="stable"):
         pair = {int(hypotheses.scan[row]), int(hypotheses.anchor[row])}
-        if len(chosen) < count and not pair & used:
+        if len(chosen) < _NUM_SEEDS and not pair & used:
             chosen.append(int(row))
             used |= pair
     return chosen
@@ -122,38 +174,31 @@ def _choose_seeds(hypotheses: Hypotheses, count: int) -> list[int]:
 
 def _grow(hypotheses: Hypotheses, scorer: PoseScorer, seed: int) -> Floats:
     """Poses of all scans, grown from the anchor of one hypothesis."""
-    num_scans = len(scorer.profiles)
+    scan, anchor, num_scans = hypotheses.scan, hypotheses.anchor, len(scorer.profiles)
     poses, is_placed = np.zeros((num_scans, 3)), np.zeros(num_scans, bool)
-    scan, newest = int(hypotheses.scan[seed]), int(hypotheses.anchor[seed])
-    is_placed[newest] = True
-    # Open hypotheses: the scan, its pose in the world, and its score against each placed scan.
-    open_scan, open_pose, scores = np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, num_scans))
-    while not is_placed.all():
-        fresh = hypotheses.take(np.flatnonzero((hypotheses.anchor == newest) & ~is_placed[hypotheses.scan]))
-        placed, added = np.flatnonzero(is_placed), fresh.world_poses(poses)
-        row, _, value = scorer.pairwise_scores(open_scan, open_pose, np.array([newest]), poses)
-        scores[row, newest] = value
-        row, column, value = scorer.pairwise_scores(fresh.scan, added, placed, poses)
-        added_scores = np.zeros((len(added), num_scans))
-        added_scores[row, placed[column]] = value
-        open_scan, open_pose = np.concatenate([open_scan, fresh.scan]), np.concatenate([open_pose, added])
-        scores = np.concatenate([scores, added_scores])
-        if len(open_scan):
-            row, column = (x.astype(np.int64) for x in np.nonzero(scores))
-            total = add_up(row, scores[row, column], len(scores))
-            best = int(total.argmax()) if is_placed.sum() > 1 else int(np.flatnonzero(open_scan == scan)[0])
-            newest, pose = int(open_scan[best]), open_pose[best]
+    # Of each open hypothesis: the pose of its scan in the world, and its score against each placed scan.
+    worlds, scores = np.zeros((len(scan), 3)), np.zeros((len(scan), num_scans))
+    newest, pose = int(anchor[seed]), np.zeros(3)
+    while True:
+        poses[newest], is_placed[newest] = pose, True
+        if is_placed.all():
+            return poses
+        is_open, is_fresh = is_placed[anchor] & ~is_placed[scan], anchor == newest
+        worlds[is_fresh] = hypotheses.take(np.flatnonzero(is_fresh)).world_poses(poses)
+        for chosen, placed in ((~is_fresh, np.array([newest])), (is_fresh, np.flatnonzero(is_placed))):
+            rows = np.flatnonzero(is_open & chosen)
+            scores[rows[:, None], placed] = scorer.pairwise_scores(scan[rows], worlds[rows], placed, poses)
+        rows = np.flatnonzero(is_open)
+        if len(rows):
+            best = rows[add_up(scores[rows]).argmax()] if is_placed.sum() > 1 else seed
+            newest, pose = int(scan[best]), worlds[best]
         else:
             newest, pose = int(np.flatnonzero(~is_placed)[0]), np.zeros(3)
-        poses[newest], is_placed[newest] = pose, True
-        keep = open_scan != newest
-        open_scan, open_pose, scores = open_scan[keep], open_pose[keep], scores[keep]
-    return poses
 
 
-def _settle(poses: Floats, hypotheses: Hypotheses, scorer: PoseScorer) -> Floats:
+def settle(poses: Floats, hypotheses: Hypotheses, scorer: PoseScorer) -> Floats:
     """Rounds in which scans move, until none does."""
-    for _ in range(scorer.config.num_revisions):
+    for _ in range(_NUM_REVISIONS):
         poses, num_moved = _revise(poses, hypotheses, scorer)
         if not num_moved:
             break
@@ -174,7 +219,7 @@ def _revise(poses: Floats, hypotheses: Hypotheses, scorer: PoseScorer) -> tuple[
         best = int(score.argmax())
         if is_firmly_more(score[best], score[0]):
             off = se2.relative(poses[scan], candidates[best])
-            far = scorer.config.agreement[0] * scorer.profiles.typical_range
+            far = AGREEMENT[0] * scorer.profiles.scans.typical_range
             num_moved += bool(np.hypot(off[0], off[1]) > far)
             poses[scan] = candidates[best]
     return poses, num_moved
@@ -192,9 +237,9 @@ def move_blocks(poses: Floats, hypotheses: Hypotheses, scorer: PoseScorer) -> tu
         (n, 3) poses, and how many blocks have moved.
     """
     num_moved = 0
-    for cut in range(scorer.config.num_cuts):
+    for cut in range(_NUM_CUTS):
         values = scorer.score_map(poses)
-        blocks = weakest_cuts(values, scorer.config.num_cuts)
+        blocks = weakest_cuts(values, _NUM_CUTS)
         if cut >= len(blocks):
             break
         motion = _better_motion(poses, blocks[cut], hypotheses, scorer, values)
@@ -224,7 +269,7 @@ def _better_motion(
 ) -> Floats | None:
     """The motion (3,) of the block in the world with the best score, of those by pairs across the cut; None: none."""
     across = np.flatnonzero(block[hypotheses.scan] & ~block[hypotheses.anchor])
-    across = across[np.argsort(-hypotheses.scores[across], kind="stable")[: scorer.config.num_block_poses]]
+    across = across[np.argsort(-hypotheses.scores[across], kind="stable")[:_NUM_BLOCK_POSES]]
     best = hypotheses.take(across)
     motions = se2.compose(best.world_poses(poses), se2.inverse(poses[best.scan]))
     motions = np.concatenate([np.zeros((1, 3)), motions])
@@ -234,15 +279,9 @@ def _better_motion(
     which, i, j = np.nonzero(np.hypot(apart[..., 0], apart[..., 1]) < scorer.radius)
     value = scorer.score_pairs(inside[i], outside[j], se2.relative(poses[outside[j]], moved[which, i]))
     # Pairs on one side of the cut are the same for all motions.
-    one, other = lower_pairs(len(poses))
-    is_kept = block[one] == block[other]
-    one, other = one[is_kept], other[is_kept]
-    motion = np.concatenate([np.repeat(np.arange(len(motions)), len(one)), which])
-    first = np.concatenate([np.tile(one, len(motions)), inside[i]])
-    second = np.concatenate([np.tile(other, len(motions)), outside[j]])
-    value = np.concatenate([np.tile(values[one, other], len(motions)), value])
-    row = np.concatenate([motion, motion]) * len(poses) + np.concatenate([first, second])
-    total = add_up(row, np.concatenate([value, value]), len(motions) * len(poses))
-    total = total.reshape(len(motions), -1).sum(axis=1)
+    scores = np.repeat(np.where(block[:, None] == block, values, 0.0)[None], len(motions), axis=0)
+    scores[which, inside[i], outside[j]] = value
+    # Each pair counts for both scans.
+    total = add_up(scores + np.swapaxes(scores, 1, 2)).sum(axis=-1)
     highest = int(total.argmax())
     return motions[highest] if is_firmly_more(total[highest], total[0]) else None

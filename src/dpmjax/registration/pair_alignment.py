@@ -52,10 +52,9 @@ class Schedule:
 
     def gates_and_kernels(self, typical_range: float, noise: float) -> tuple[jax.Array, jax.Array]:
         """Gate and kernel of each iteration in the unit of the points, bounded below by the range noise."""
-        gates = typical_range * np.geomspace(*self.gate, self.num_iterations)
-        kernels = typical_range * np.geomspace(*self.kernel, self.num_iterations)
-        widest = np.maximum(gates, 4.0 * noise), np.maximum(kernels, 2.0 * noise)
-        return jnp.asarray(widest[0], jnp.float32), jnp.asarray(widest[1], jnp.float32)
+        gates, kernels = (typical_range * np.geomspace(*x, self.num_iterations) for x in (self.gate, self.kernel))
+        gates, kernels = np.maximum(gates, 4.0 * noise), np.maximum(kernels, 2.0 * noise)
+        return jnp.asarray(gates, jnp.float32), jnp.asarray(kernels, jnp.float32)
 
 
 COARSE = Schedule(gate=(0.18, 0.045), kernel=(0.09, 0.0225), num_iterations=8, source_stride=3)
@@ -107,52 +106,41 @@ class PairSystem(NamedTuple):
 
 
 def linearise_pair(
-    source: PlanarScans,
-    target: PlanarScans,
-    pose_target_source: Float[Array, " 3"],
-    gate: Float[Array, ""],
-    kernel: Float[Array, ""],
-    *,
-    metric: Metric,
+    source: PlanarScans, target: PlanarScans, pose: Float[Array, " 3"], scale: tuple[Array, Array], *, metric: Metric
 ) -> PairSystem:
     """Pairs every source beam with its nearest target beam and linearises the distances.
 
     Args:
         source: one scan, (b, 2) arrays.
         target: one scan.
-        pose_target_source: relative pose (x, y, heading).
-        gate: pairs farther apart than this do not count, in the unit of the points.
-        kernel: scale of the Geman-McClure weight on the residual.
+        pose: T_target_source (x, y, heading).
+        scale: gate and kernel, in the unit of the points: pairs farther apart than the gate do not count; the kernel is
+            the scale of the Geman-McClure weight on the residual.
         metric: distance to the target's line ("plane") or to its nearest point.
 
     Returns:
         PairSystem at this pose.
     """
-    rotation = se2.rotation(pose_target_source[2])
-    points = se2.transform_points(pose_target_source, source.points)
+    (gate, kernel), rotation = scale, se2.rotation(pose[2])
+    points = se2.transform_points(pose, source.points)
     nearest = k_nearest(points, target.points, 1, mask=target.is_on_line).indices[:, 0]
     matched, normals = target.points[nearest], target.normals[nearest]
     faces_same_way = (_matmul(source.normals, rotation.T) * normals).sum(-1) > 0.7
     near = ((points - matched) ** 2).sum(-1) < gate**2
     counts = source.is_on_line & target.is_on_line[nearest] & near & faces_same_way
     lever = _matmul(jnp.stack([-source.points[:, 1], source.points[:, 0]], -1), rotation.T)
+    # Distances along the normal to the line, or along both axes to the point: (b, k, 2) and (b, 2).
     if metric == "plane":
-        residual = (normals * (points - target.centroids[nearest])).sum(-1)
-        jacobian = jnp.concatenate([_matmul(normals, rotation), (normals * lever).sum(-1, keepdims=True)], -1)
-        squared = residual**2
-        jacobian, residual = jacobian[:, None], residual[:, None]
+        axes, goal = normals[:, None], target.centroids[nearest]
     else:
-        residual = points - matched
-        frame = jnp.broadcast_to(rotation, (points.shape[0], 2, 2))
-        jacobian = jnp.concatenate([frame, lever[..., None]], -1)
-        squared = (residual**2).sum(-1)
-    weight = jnp.where(counts, (kernel**2 / (kernel**2 + squared)) ** 2, 0.0)
+        axes, goal = jnp.broadcast_to(jnp.eye(2), (len(points), 2, 2)), matched
+    residual = ((points - goal)[:, None] * axes).sum(-1)
+    jacobian = jnp.concatenate([_matmul(axes, rotation), (axes * lever[:, None]).sum(-1, keepdims=True)], -1)
+    weight = jnp.where(counts, (kernel**2 / (kernel**2 + (residual**2).sum(-1))) ** 2, 0.0)
     weighted = weight[:, None, None] * jacobian
-    return PairSystem(
-        information=jnp.einsum("bki,bkj->ij", weighted, jacobian, precision="highest"),
-        gradient=jnp.einsum("bki,bk->i", weighted, residual, precision="highest"),
-        weight=weight.sum(),
-    )
+    information = jnp.einsum("bki,bkj->ij", weighted, jacobian, precision="highest")
+    gradient = jnp.einsum("bki,bk->i", weighted, residual, precision="highest")
+    return PairSystem(information, gradient, weight.sum())
 
 
 def _move(pose: Float[Array, " 3"], delta: Float[Array, " 3"]) -> Float[Array, " 3"]:
@@ -175,33 +163,25 @@ def _solve(system: PairSystem, pose: Float[Array, " 3"], prior: PosePrior) -> Fl
 
 @partial(jax.jit, static_argnames="metric")
 def _align(
-    source: PlanarScans, target: PlanarScans, guesses: Float[Array, "p 3"],
-    scales: tuple[Float[Array, " t"], Float[Array, " t"]], prior: PosePrior, *, metric: Metric,
-) -> tuple[Float[Array, "p 3"], PairSystem]:  # fmt: skip
-    """Iterated closest point of p pairs; `scales` are gate and kernel of each iteration."""
+    pairs: tuple[PlanarScans, PlanarScans, Array, PosePrior], scales: tuple[Array, Array], *, metric: Metric
+) -> tuple[Float[Array, "p 3"], PairSystem]:
+    """Iterated closest point of (source, target, guess, prior); `scales` are gate and kernel of each iteration."""
 
-    def align(
-        source: PlanarScans, target: PlanarScans, guess: Float[Array, " 3"], prior: PosePrior
-    ) -> tuple[Array, PairSystem]:
+    def align(source: PlanarScans, target: PlanarScans, guess: Array, prior: PosePrior) -> tuple[Array, PairSystem]:
         def iterate(pose: Array, scale: tuple[Array, Array]) -> tuple[Array, None]:
-            system = linearise_pair(source, target, pose, *scale, metric=metric)
+            system = linearise_pair(source, target, pose, scale, metric=metric)
             return _move(pose, _solve(system, pose, prior)), None
 
         pose, _ = jax.lax.scan(iterate, guess, scales)
-        return pose, linearise_pair(source, target, pose, scales[0][-1], scales[1][-1], metric=metric)
+        return pose, linearise_pair(source, target, pose, (scales[0][-1], scales[1][-1]), metric=metric)
 
-    return jax.vmap(align)(source, target, guesses, prior)
+    return jax.vmap(align)(*pairs)
 
 
 def match_pairs(
-    source: PlanarScans,
-    target: PlanarScans,
-    guesses: Floats,
-    schedule: Schedule,
-    prior: PosePrior | None = None,
-    *,
-    metric: Metric = "plane",
-) -> PairMatches:
+    source: PlanarScans, target: PlanarScans, guesses: Floats, schedule: Schedule, prior: PosePrior | None = None,
+    *, metric: Metric = "plane",
+) -> PairMatches:  # fmt: skip
     """Aligns source scan p to target scan p from each of its guesses and keeps the best.
 
     Args:
@@ -228,21 +208,12 @@ def match_pairs(
     information = np.zeros((num_pairs, num_guesses, 3, 3))
     for part, rows in batches(num_pairs, batch):
         repeated = np.repeat(rows, num_guesses)
-        aligned, system = _align(
-            source.take(repeated),
-            target.take(repeated),
-            jnp.asarray(guesses[rows].reshape(-1, 3), jnp.float32),
-            scales,
-            PosePrior(*(jnp.asarray(np.asarray(x)[repeated], jnp.float32) for x in prior)),
-            metric=metric,
-        )
-        pairs = ((poses, aligned), (weight, system.weight), (information, system.information))
-        for kept, found in pairs:
+        belief = PosePrior(*(np.asarray(x, np.float32)[repeated] for x in prior))
+        start = guesses[rows].reshape(-1, 3).astype(np.float32)
+        pairs = source.take(repeated), target.take(repeated), start, belief
+        aligned, system = _align(pairs, scales, metric=metric)
+        for kept, found in ((poses, aligned), (weight, system.weight), (information, system.information)):
             kept[part] = np.asarray(found).reshape(batch, *kept.shape[1:])[: part.stop - part.start]
     row, best = np.arange(num_pairs), weight.argmax(axis=1)
     num_beams = np.minimum(np.asarray(source.is_on_line.sum(1)), np.asarray(target.is_on_line.sum(1)))
-    return PairMatches(
-        poses=poses[row, best],
-        fitness=weight[row, best] / np.maximum(num_beams, 1),
-        information=information[row, best],
-    )
+    return PairMatches(poses[row, best], weight[row, best] / np.maximum(num_beams, 1), information[row, best])

@@ -18,12 +18,19 @@ from jaxtyping import Array, Complex, Float, Int
 from numpy.typing import NDArray
 
 from dpmjax.geometry import se2
+from dpmjax.pose_graph.graph import Edges
 from dpmjax.registration.planar_scans import Floats, Indices, Tolerances, batches
-from dpmjax.registration.range_profiles import RangeProfiles, compare_pair
+from dpmjax.registration.range_profiles import RangeProfiles, compare_pair, compare_pairs
 
 # Pairs of one turn are filled up to a power of two, at least this, so that few shapes are compiled.
 _SMALLEST = 64
 _REFINE_BATCH = 256
+# A pair agrees with a map within this: translation in typical ranges, radians.
+AGREEMENT = (0.06, 0.1)
+# Beams that a pair must hold by to be an edge; and the accuracy of a pair with all its beams: typical ranges, radians.
+_MIN_SCORE, _SIGMA = 40.0, (0.0045, 0.01)
+# Matched beams that make up for a contradicting one.
+_CONTRADICTION_WEIGHT = 2.0
 
 
 @dataclass(frozen=True)
@@ -40,7 +47,6 @@ class CorrelativeConfig:
         num_candidates: poses that are kept of each pair.
         apart: two candidates of a pair differ by more than this: translation, radians.
         num_levels: local grids, each half as coarse as the one before.
-        contradiction_weight: matched beams that make up for a contradicting one.
     """
 
     num_cells: int = 128
@@ -52,7 +58,6 @@ class CorrelativeConfig:
     num_candidates: int = 4
     apart: tuple[float, float] = (0.12, 0.12)
     num_levels: int = 4
-    contradiction_weight: float = 2.0
 
     def __post_init__(self) -> None:
         if self.num_cells % self.block or self.num_cells % 4:
@@ -80,6 +85,65 @@ def join_candidates(*candidates: Candidates) -> Candidates:
     return Candidates(*(np.concatenate(parts) for parts in zip(*candidates, strict=True)))
 
 
+def agreeing_edges(poses: Floats, candidates: Candidates, typical_range: float) -> Edges:
+    """Edges of the pairs with a candidate that agrees with the map; of each pair the nearest one."""
+    here = se2.relative(poses[candidates.target], poses[candidates.source])
+    off = se2.relative(here[:, None], candidates.poses)
+    distance = np.hypot(off[..., 0], off[..., 1]) / (AGREEMENT[0] * typical_range)
+    turn = np.abs(se2.wrap_angle(off[..., 2])) / AGREEMENT[1]
+    mismatch = np.where(candidates.scores > _MIN_SCORE, np.maximum(distance, turn), np.inf)
+    best = mismatch.argmin(axis=1)
+    row = np.arange(len(best))
+    keep = mismatch[row, best] < 1.0
+    sigma = np.array(_SIGMA)[[0, 0, 1]] * [typical_range, typical_range, 1.0]
+    share = candidates.scores[row, best][keep] / 500.0
+    information = share[:, None, None] * np.diag(1.0 / sigma**2)
+    return Edges(candidates.source[keep], candidates.target[keep], candidates.poses[row, best][keep], information)
+
+
+def chance_level(candidates: Candidates) -> float:
+    """Score of a wrong pose of a pair, the median: second candidates are mostly wrong."""
+    second = candidates.scores[:, 1]
+    second = second[np.isfinite(second)]
+    return max(0.0, float(np.median(second))) if len(second) else 0.0
+
+
+def noisy_share(profiles: RangeProfiles, candidates: Candidates) -> float:
+    """Share of visible beams that seem to contradict in pairs that are right: what noise alone does."""
+    best = np.argsort(-candidates.scores[:, 0])[: len(profiles)]
+    views = compare_pairs(profiles, candidates.source[best], candidates.target[best], candidates.poses[best, 0])
+    share = views.contradicted / np.maximum(views.visible, 1.0)
+    return 3.0 * float(np.percentile(share, 90)) if len(share) else 0.0
+
+
+class Hypotheses(NamedTuple):
+    """Pose hypotheses: every candidate in both directions, the pose of `scan` in the frame of `anchor`."""
+
+    scan: Indices
+    anchor: Indices
+    poses: Floats
+    scores: Floats
+
+    @classmethod
+    def of(cls, candidates: Candidates) -> Hypotheses:
+        """Hypotheses of all candidates with a positive score."""
+        count = candidates.scores.shape[1]
+        source, target = np.repeat(candidates.source, count), np.repeat(candidates.target, count)
+        poses, scores = candidates.poses.reshape(-1, 3), candidates.scores.reshape(-1)
+        keep = np.isfinite(scores) & (scores > 0.0)
+        source, target, poses, scores = source[keep], target[keep], poses[keep], scores[keep]
+        both = (source, target), (target, source), (poses, se2.inverse(poses)), (scores, scores)
+        return cls(*(np.concatenate(x) for x in both))
+
+    def take(self, rows: NDArray[np.integer]) -> Hypotheses:
+        """The hypotheses of these rows."""
+        return Hypotheses(*(x[rows] for x in self))
+
+    def world_poses(self, poses: Floats) -> Floats:
+        """(h, 3) pose of each scan in the world, by that of its anchor."""
+        return np.asarray(se2.compose(poses[self.anchor], self.poses))
+
+
 @partial(jax.jit, static_argnames="config")
 def _spectra(
     profiles: RangeProfiles, turn: Float[Array, ""], cell: Float[Array, ""], config: CorrelativeConfig
@@ -103,9 +167,8 @@ def _spectra(
 
 @partial(jax.jit, static_argnames="config")
 def _search_turn(
-    sources: tuple[Array, Array], targets: tuple[Array, Array], source: Int[Array, " p"], target: Int[Array, " p"],
-    *, config: CorrelativeConfig,
-) -> tuple[Float[Array, "p k"], Int[Array, "p k 2"]]:  # fmt: skip
+    sources: tuple[Array, Array], targets: tuple[Array, Array], pairs: tuple[Array, Array], *, config: CorrelativeConfig
+) -> tuple[Float[Array, "p k"], Int[Array, "p k 2"]]:
     """Best scores and shifts (x, y in cells) of pairs of spectra, each from another block of cells."""
     size, block = config.num_cells, config.block
     num_blocks = size // block
@@ -122,7 +185,7 @@ def _search_turn(
         column = which % num_blocks * block + inner % block
         return value, (jnp.stack([column, row], -1) + size // 2) % size - size // 2
 
-    return jax.lax.map(search, (source, target), batch_size=32)
+    return jax.lax.map(search, pairs, batch_size=32)
 
 
 def search_pairs(
@@ -146,7 +209,8 @@ def search_pairs(
         Candidates.
     """
     config = config or CorrelativeConfig()
-    cell = config.cell * profiles.typical_range
+    unit = profiles.scans.typical_range
+    cell = config.cell * unit
     used, compact = np.unique(source, return_inverse=True)
     sources, cell_side = profiles.take(used), jnp.asarray(cell, jnp.float32)
     still = _spectra(profiles, jnp.zeros(()), cell_side, config=config)
@@ -159,40 +223,34 @@ def search_pairs(
         turn = 2 * np.pi * number / config.num_turns
         turned = _spectra(sources, jnp.asarray(turn, jnp.float32), cell_side, config=config)
         filled = np.resize(rows, max(_SMALLEST, 1 << (len(rows) - 1).bit_length()))
-        score, shift = _search_turn(
-            turned, still, jnp.asarray(compact[filled]), jnp.asarray(target[filled]), config=config
-        )
-        scores[rows, number] = np.asarray(score, np.float64)[: len(rows)]
+        score, shift = _search_turn(turned, still, (compact[filled], target[filled]), config=config)
+        scores[rows, number] = score[: len(rows)]
         poses[rows, number, :, :2] = cell * np.asarray(shift, np.float64)[: len(rows)]
-        poses[rows, number, :, 2] = se2.wrap_angle(np.asarray(turn))
-    apart = (config.apart[0] * profiles.typical_range, config.apart[1])
-    flat = poses.reshape(len(source), -1, 3), scores.reshape(len(source), -1)
-    best, values = _keep_apart(*flat, config.num_candidates, apart)
-    poses, values = _refine(profiles, Candidates(source, target, best, values), config)
-    # Two may have met at one place.
-    return Candidates(source, target, *_keep_apart(poses, values, config.num_candidates, apart))
+        poses[rows, number, :, 2] = se2.wrap_angle(turn)
+    found = Candidates(source, target, poses.reshape(len(source), -1, 3), scores.reshape(len(source), -1))
+    # After the refinement two may have met at one pose.
+    return _keep_apart(_refine(profiles, _keep_apart(found, config, unit), config), config, unit)
 
 
-def _keep_apart(poses: Floats, scores: Floats, count: int, apart: tuple[float, float]) -> tuple[Floats, Floats]:
+def _keep_apart(found: Candidates, config: CorrelativeConfig, typical_range: float) -> Candidates:
     """The best poses of each pair that are no neighbours of a better one."""
-    scores, rows = scores.copy(), np.arange(len(poses))
-    best = np.zeros((len(poses), count, 3))
+    poses, scores, rows = found.poses, found.scores.copy(), np.arange(len(found.poses))
+    best = np.zeros((len(poses), config.num_candidates, 3))
     values = np.full(best.shape[:2], -np.inf)
-    for k in range(count):
+    for k in range(config.num_candidates):
         first = scores.argmax(axis=1)
         best[:, k], values[:, k] = poses[rows, first], scores[rows, first]
         off = poses - best[:, k][:, None]
-        is_near = np.hypot(off[..., 0], off[..., 1]) < apart[0]
-        scores[is_near & (np.abs(se2.wrap_angle(off[..., 2])) < apart[1])] = -np.inf
-    return best, values
+        is_near = np.hypot(off[..., 0], off[..., 1]) < config.apart[0] * typical_range
+        scores[is_near & (np.abs(se2.wrap_angle(off[..., 2])) < config.apart[1])] = -np.inf
+    return found._replace(poses=best, scores=values)
 
 
-@partial(jax.jit, static_argnames="weight")
+@jax.jit
 def _refine_batch(
-    profiles: RangeProfiles, pairs: Int[Array, "2 p"], poses: Float[Array, "p 3"], step: Float[Array, " 3"],
-    tolerances: Tolerances, *, weight: float,
-) -> tuple[Float[Array, "p 3"], Float[Array, " p"]]:  # fmt: skip
-    """The best pose, and its score, on a grid of five steps along each axis around each pose."""
+    profiles: RangeProfiles, pairs: tuple[Array, Array, Array], step: Float[Array, " 3"], tolerances: Tolerances
+) -> tuple[Float[Array, "p 3"], Float[Array, " p"]]:
+    """The best pose, and its score, on a grid of five steps along each axis around the pose of each pair."""
     axis = jnp.arange(-2.0, 3.0)
     grid = jnp.stack(jnp.meshgrid(axis, axis, axis, indexing="ij"), -1).reshape(-1, 3) * step
 
@@ -200,28 +258,25 @@ def _refine_batch(
         i, j, pose = pair
         compare = partial(compare_pair, profiles.take(i), profiles.take(j), tolerances=tolerances, stride=4)
         views = jax.vmap(lambda offset: compare(pose + offset))(grid)
-        score = 4.0 * (views.matched - weight * views.contradicted)
+        score = 4.0 * (views.matched - _CONTRADICTION_WEIGHT * views.contradicted)
         best = score.argmax()
         return pose + grid[best], score[best]
 
-    return jax.lax.map(refine, (pairs[0], pairs[1], poses), batch_size=4)
+    return jax.lax.map(refine, pairs, batch_size=4)
 
 
-def _refine(profiles: RangeProfiles, found: Candidates, config: CorrelativeConfig) -> tuple[Floats, Floats]:
-    """Poses and scores of the candidates, refined on local grids from half a cell down."""
-    count, cell = found.poses.shape[1], config.cell * profiles.typical_range
-    rows = np.flatnonzero(np.isfinite(found.scores).reshape(-1))
-    pairs = np.stack([np.repeat(found.source, count), np.repeat(found.target, count)])[:, rows]
-    poses, scores = found.poses.reshape(-1, 3).copy(), np.full(found.scores.size, -np.inf)
-    match, contradict = profiles.tolerances
+def _refine(profiles: RangeProfiles, found: Candidates, config: CorrelativeConfig) -> Candidates:
+    """Candidates refined on local grids from half a cell down."""
+    cell = config.cell * profiles.scans.typical_range
+    first, which = np.nonzero(np.isfinite(found.scores))
+    poses, scores = found.poses.copy(), np.full(found.scores.shape, -np.inf)
+    match, contradict = profiles.scans.tolerances
     for level in range(config.num_levels):
         share = 0.5 ** (level + 1)
         step = jnp.asarray(share * np.array([cell, cell, 2 * np.pi / config.num_turns]), jnp.float32)
         blurred = Tolerances(max(match, 0.7 * share * cell), max(contradict, 2.1 * share * cell))
-        for _, part in batches(len(rows), _REFINE_BATCH):
-            moved, score = _refine_batch(
-                profiles, jnp.asarray(pairs[:, part]), jnp.asarray(poses[rows[part]], jnp.float32), step, blurred,
-                weight=config.contradiction_weight,
-            )  # fmt: skip
-            poses[rows[part]], scores[rows[part]] = np.asarray(moved, np.float64), np.asarray(score, np.float64)
-    return poses.reshape(found.poses.shape), scores.reshape(found.scores.shape)
+        for _, part in batches(len(first), _REFINE_BATCH):
+            row, at = first[part], (first[part], which[part])
+            pairs = found.source[row], found.target[row], poses[at].astype(np.float32)
+            poses[at], scores[at] = _refine_batch(profiles, pairs, step, blurred)
+    return found._replace(poses=poses, scores=scores)

@@ -98,13 +98,9 @@ class PlanarScans(flax.struct.PyTreeNode):
 
     def thin(self, stride: int) -> PlanarScans:
         """The same scans with every `stride`-th beam."""
-        return self.replace(
-            points=self.points[..., ::stride, :],
-            mask=self.mask[..., ::stride],
-            normals=self.normals[..., ::stride, :],
-            centroids=self.centroids[..., ::stride, :],
-            is_on_line=self.is_on_line[..., ::stride],
-        )
+        kept = (slice(None),) * (self.mask.ndim - 1) + (slice(None, None, stride),)
+        names = ("points", "mask", "normals", "centroids", "is_on_line")
+        return self.replace(**{name: getattr(self, name)[kept] for name in names})
 
 
 def planar_scans(points: AnyArray | ScanSet, mask: AnyArray | None = None, *, is_ordered: bool = True) -> PlanarScans:
@@ -135,9 +131,13 @@ def planar_scans(points: AnyArray | ScanSet, mask: AnyArray | None = None, *, is
     if not np.isfinite(values[valid]).all():
         raise ValueError("points: expected finite coordinates where the mask is True")
     # What is masked may hold anything; zero times NaN would be NaN later on.
-    scans = ScanSet(points=jnp.asarray(np.where(valid[..., None], values, 0.0)), mask=jnp.asarray(valid))
-    scans = scans if has_angular_order(values, valid) else _sort_by_angle(scans)
-    fitted = _fit_lines(scans)
+    values = np.where(valid[..., None], values, np.float32(0.0))
+    if not has_angular_order(values, valid):
+        angle = np.where(valid, np.arctan2(values[..., 1], values[..., 0]), np.inf)
+        order = np.argsort(angle, axis=1, kind="stable")
+        values = np.take_along_axis(values, order[..., None], axis=1)
+        valid = np.take_along_axis(valid, order, axis=1)
+    fitted = _fit_lines(ScanSet(points=jnp.asarray(values), mask=jnp.asarray(valid)))
     # Beams on lines end on walls; the others would let people and clutter decide on the unit.
     is_used = np.asarray(fitted.is_on_line if fitted.is_on_line.any() else fitted.mask)
     length = jnp.full(len(values), typical_range(np.asarray(fitted.points), is_used), jnp.float32)
@@ -157,17 +157,6 @@ def batches(count: int, size: int) -> Iterator[tuple[slice, Indices]]:
     for start in range(0, count, size):
         stop = min(start + size, count)
         yield slice(start, stop), np.resize(np.arange(start, stop), size)
-
-
-@jax.jit
-def _sort_by_angle(scans: ScanSet) -> ScanSet:
-    """The same scans with their beams in the order of their angles; masked ones last."""
-    angle = jnp.where(scans.mask, jnp.arctan2(scans.points[..., 1], scans.points[..., 0]), jnp.inf)
-    order = jnp.argsort(angle, axis=-1)
-    return ScanSet(
-        points=jnp.take_along_axis(scans.points, order[..., None], axis=1),
-        mask=jnp.take_along_axis(scans.mask, order, axis=1),
-    )
 
 
 def _cross(a: Float[Array, "... 2"], b: Float[Array, "... 2"]) -> Float[Array, "..."]:
@@ -208,48 +197,40 @@ class _Moments:
 
     count: float = flax.struct.field(pytree_node=False)
     mean: Float[Array, "... b 2"]
-    xx: Float[Array, "... b"]
-    xy: Float[Array, "... b"]
-    yy: Float[Array, "... b"]
+    scatter: Float[Array, "... b 2 2"]
     is_complete: Bool[Array, "... b"]
 
 
-def _shift(values: Array, offset: int, axis: int) -> Array:
-    """Entry i becomes entry i + offset; what would come from outside repeats the border."""
-    size = values.shape[axis]
-    kept = jax.lax.slice_in_dim(values, max(offset, 0), size + min(offset, 0), axis=axis)
-    border = jax.lax.slice_in_dim(values, size - 1 if offset > 0 else 0, size if offset > 0 else 1, axis=axis)
-    filling = jnp.repeat(border, abs(offset), axis=axis)
-    return jnp.concatenate([kept, filling] if offset > 0 else [filling, kept], axis=axis)
+def _shift(values: Any, offset: int) -> tuple[Any, NDArray[np.bool_]]:
+    """Arrays (n, b, ...) whose beam i is beam i + offset, and where that is inside the scan (b,)."""
+    moved = jax.tree.map(lambda x: jnp.roll(x, -offset, axis=1), values)
+    size = jax.tree.leaves(values)[0].shape[1]
+    beam = np.arange(size) + offset
+    return moved, (beam >= 0) & (beam < size)
 
 
 def _start_at(run: _Moments, offset: int) -> _Moments:
     """The runs that start `offset` beams later; incomplete where that is outside the scan."""
-    size = run.xx.shape[-1]
-    start = np.arange(size) + offset
-    moved = jax.tree.map(lambda x: _shift(x, offset, axis=run.xx.ndim - 1), run)
-    return dataclasses.replace(moved, is_complete=moved.is_complete & ((start >= 0) & (start < size)))
+    moved, is_inside = _shift(run, offset)
+    return dataclasses.replace(moved, is_complete=moved.is_complete & is_inside)
 
 
 def _join(first: _Moments, second: _Moments) -> _Moments:
     """Moments of two disjoint runs together; stable, because only the difference of their means enters."""
     count = first.count + second.count
     step = second.mean - first.mean
-    weight = first.count * second.count / count
+    spread = (first.count * second.count / count) * step[..., :, None] * step[..., None, :]
     return _Moments(
         count=count,
         mean=first.mean + step * (second.count / count),
-        xx=first.xx + second.xx + weight * step[..., 0] ** 2,
-        xy=first.xy + second.xy + weight * step[..., 0] * step[..., 1],
-        yy=first.yy + second.yy + weight * step[..., 1] ** 2,
+        scatter=first.scatter + second.scatter + spread,
         is_complete=first.is_complete & second.is_complete,
     )
 
 
 def _runs(scans: ScanSet) -> list[_Moments]:
     """Runs of 3, 4, 8, 16 ... beams, each run joined from two shorter ones."""
-    nothing = jnp.zeros(scans.mask.shape, scans.points.dtype)
-    one = _Moments(count=1.0, mean=scans.points, xx=nothing, xy=nothing, yy=nothing, is_complete=scans.mask)
+    one = _Moments(1.0, scans.points, jnp.zeros((*scans.mask.shape, 2, 2)), scans.mask)
     two = _join(one, _start_at(one, 1))
     runs = [_join(two, _start_at(one, 2))]
     for k in range(1, _NUM_DOUBLINGS + 1):
@@ -260,10 +241,11 @@ def _runs(scans: ScanSet) -> list[_Moments]:
 
 def _line_of(run: _Moments, noise: Float[Array, ""]) -> tuple[Float[Array, "... b 2"], Float[Array, "... b"]]:
     """Direction of the line through each run, and the error of that direction in radians: infinite if not straight."""
-    half_difference, half_sum = 0.5 * (run.xx - run.yy), 0.5 * (run.xx + run.yy)
-    radius = jnp.sqrt(half_difference**2 + run.xy**2)
+    xx, xy, yy = run.scatter[..., 0, 0], run.scatter[..., 0, 1], run.scatter[..., 1, 1]
+    half_difference, half_sum = 0.5 * (xx - yy), 0.5 * (xx + yy)
+    radius = jnp.sqrt(half_difference**2 + xy**2)
     along, across = half_sum + radius, jnp.maximum(half_sum - radius, 0.0)
-    angle = 0.5 * jnp.arctan2(run.xy, half_difference)
+    angle = 0.5 * jnp.arctan2(xy, half_difference)
     deviation = jnp.sqrt(across / (run.count - 2.0))
     length = jnp.sqrt(along / run.count)
     allowed = noise * (1.0 + 2.0 / run.count**0.5) + _BEND * length
@@ -281,25 +263,15 @@ def _fit_lines(scans: ScanSet) -> PlanarScans:
     tangent, centroid = jnp.zeros_like(scans.points), scans.points
     error = jnp.full(scans.mask.shape, jnp.inf, scans.points.dtype)
     for run in _runs(scans):
-        run_tangent, run_error = _line_of(run, noise)
         width = int(run.count)
         for start in (0, 1 - width, -(width // 2)):
-            here = _shift(run_error, start, axis=1)
-            index = np.arange(scans.mask.shape[1]) + start
-            here = jnp.where((index >= 0) & (index < scans.mask.shape[1]), here, jnp.inf)
-            better = here < error
-            error = jnp.where(better, here, error)
-            tangent = jnp.where(better[..., None], _shift(run_tangent, start, axis=1), tangent)
-            centroid = jnp.where(better[..., None], _shift(run.mean, start, axis=1), centroid)
+            found, is_inside = _shift((*_line_of(run, noise), run.mean), start)
+            better = is_inside & (found[1] < error)
+            error = jnp.where(better, found[1], error)
+            tangent = jnp.where(better[..., None], found[0], tangent)
+            centroid = jnp.where(better[..., None], found[2], centroid)
     is_on_line = jnp.isfinite(error)
     normal = jnp.stack([-tangent[..., 1], tangent[..., 0]], -1)
     towards_sensor = jnp.where((normal * centroid).sum(-1, keepdims=True) > 0, -normal, normal)
-    return PlanarScans(
-        points=scans.points,
-        mask=scans.mask,
-        normals=towards_sensor,
-        centroids=centroid,
-        is_on_line=is_on_line,
-        noises=jnp.broadcast_to(noise, is_on_line.shape[:1]),
-        typical_ranges=jnp.ones(is_on_line.shape[:1], noise.dtype),
-    )
+    noises, ones = jnp.full(len(scans.mask), noise), jnp.ones(len(scans.mask))
+    return PlanarScans(scans.points, scans.mask, towards_sensor, centroid, is_on_line, noises, ones)

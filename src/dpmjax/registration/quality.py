@@ -9,7 +9,6 @@ contradict another scan (`assess_trajectory`).
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -32,6 +31,14 @@ _SAMPLES_A_BEAM = 32
 _GRID_TURNS = (0.2, 0.5, 0.9, 1.3)
 # Side of a cell in typical ranges: some thicknesses of a wall. Finer agreement is the business of `surface_misfit`.
 _CELL = 0.015
+# Calibrated on right and wrong maps of simulated worlds (docs/deepmapping_notes.md).
+# The share of beams that the weakest connection of a right map holds by, each scan compared with so many nearest ones.
+_MIN_CONNECTION, _NUM_NEIGHBOURS = 0.36, 12
+# Share of beams that may contradict others in a right map: without noise, and so much more at the noisy end.
+_MAX_CONTRADICTION, _NOISY_CONTRADICTION = 0.01, 0.03
+# Range noise in typical ranges at which that allowance is full, and above which right and wrong maps look alike: no map
+# is trusted there.
+_NOISY, _MAX_NOISE = 0.015, 0.0225
 
 
 class Score(NamedTuple):
@@ -119,27 +126,6 @@ def _code_length(hits: Floats, sensors: Floats, cell: float) -> float:
     return float(nats.sum() / len(hits))
 
 
-@dataclass(frozen=True)
-class AssessmentConfig:
-    """Settings, calibrated on right and wrong maps of simulated worlds (docs/deepmapping_notes.md).
-
-    Attributes:
-        num_neighbours: each scan is compared with so many nearest ones.
-        min_connection: share of beams that the weakest connection of a right map holds by.
-        max_contradiction: share of beams that may contradict others in a right map, without noise ...
-        noisy_contradiction: ... and so much more when the range noise is `noisy` or above.
-        noisy: range noise in typical ranges at which that allowance is full.
-        max_noise: with more range noise than this, in typical ranges, right and wrong maps look alike: never trusted.
-    """
-
-    num_neighbours: int = 12
-    min_connection: float = 0.36
-    max_contradiction: float = 0.01
-    noisy_contradiction: float = 0.03
-    noisy: float = 0.015
-    max_noise: float = 0.0225
-
-
 class Assessment(NamedTuple):
     """How far a registration can be trusted, without the truth.
 
@@ -154,20 +140,18 @@ class Assessment(NamedTuple):
     is_trusted: bool
 
 
-def assess_trajectory(scans: PlanarScans, poses: Floats, config: AssessmentConfig | None = None) -> Assessment:
+def assess_trajectory(scans: PlanarScans, poses: Floats) -> Assessment:
     """Tells whether the registration of scans can be trusted.
 
     Args:
         scans: n scans, two at least.
         poses: (n, 3) x, y, heading.
-        config: settings.
 
     Returns:
         Assessment.
     """
-    config = config or AssessmentConfig()
     num_scans = len(poses)
-    nearest = scipy.spatial.cKDTree(poses[:, :2]).query(poses[:, :2], k=min(config.num_neighbours + 1, num_scans))[1]
+    nearest = scipy.spatial.cKDTree(poses[:, :2]).query(poses[:, :2], k=min(_NUM_NEIGHBOURS + 1, num_scans))[1]
     row = np.repeat(np.arange(num_scans), nearest.shape[1])
     pairs = np.unique(np.sort(np.stack([row, nearest.reshape(-1)], -1), axis=1), axis=0)
     target, source = pairs[pairs[:, 0] < pairs[:, 1]].astype(np.int64).T
@@ -179,6 +163,6 @@ def assess_trajectory(scans: PlanarScans, poses: Floats, config: AssessmentConfi
     connection = 2.0 - float(tree.data.max()) if tree.nnz == num_scans - 1 else 0.0
     contradiction = float(np.sum(views.contradicted)) / max(float(np.sum(views.visible)), 1.0)
     noise = scans.noise / scans.typical_range
-    limit = config.max_contradiction + min(1.0, noise / config.noisy) * config.noisy_contradiction
-    is_clear = contradiction <= limit and noise <= config.max_noise
-    return Assessment(connection, contradiction, is_clear and connection >= config.min_connection)
+    limit = _MAX_CONTRADICTION + min(1.0, noise / _NOISY) * _NOISY_CONTRADICTION
+    is_clear = contradiction <= limit and noise <= _MAX_NOISE
+    return Assessment(connection, contradiction, is_clear and connection >= _MIN_CONNECTION)

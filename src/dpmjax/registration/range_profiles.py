@@ -13,7 +13,7 @@ import flax.struct
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float
 
 from dpmjax.geometry import se2
 from dpmjax.registration.planar_scans import Floats, Indices, PlanarScans, Tolerances, batches
@@ -28,6 +28,12 @@ _UNKNOWN_COSINE = 0.7
 _MAX_AVERTED = 0.1
 # Odd minimax polynomial of the arctangent on [0, 1], the highest power first.
 _ARCTANGENT = (-0.01171913, 0.05264734, -0.11642647, 0.19354037, -0.33262283, 0.99997722)
+# Bearings of a profile.
+_NUM_BEARINGS = 512
+# Bearings at which profiles are compared for similarity.
+_SIMILARITY_BEARINGS = 128
+# Ranges below this part of the typical range count about alike in similarity.
+_NEAR_RANGE = 0.15
 # Pairs that are compared at a time, all batches of one shape; many calls have but a few hundred.
 _BATCH = 256
 
@@ -53,16 +59,6 @@ class RangeProfiles(flax.struct.PyTreeNode):
 
     def __len__(self) -> int:
         return len(self.scans)
-
-    @property
-    def typical_range(self) -> float:
-        """That of the scans."""
-        return self.scans.typical_range
-
-    @property
-    def tolerances(self) -> Tolerances:
-        """Those of the scans."""
-        return self.scans.tolerances
 
     def take(self, rows: Any) -> RangeProfiles:
         """The profiles of these rows."""
@@ -94,27 +90,25 @@ def _smooth_ranges(scans: PlanarScans) -> Float[Array, "n b 2"]:
     return beam * jnp.where(usable, on_line, reach)[..., None]
 
 
-def make_profiles(scans: PlanarScans, *, num_bearings: int = 512) -> RangeProfiles:
+def make_profiles(scans: PlanarScans) -> RangeProfiles:
     """Range profiles of planar scans.
 
     Args:
         scans: n scans.
-        num_bearings: bearings of a profile.
 
     Returns:
-        RangeProfiles with arrays (n, num_bearings).
+        RangeProfiles with arrays (n, 512).
     """
     # Profiles do not depend on the order of the scans; one program serves both.
-    return _make_profiles(scans.replace(is_ordered=False), num_bearings=num_bearings)
+    return _make_profiles(scans.replace(is_ordered=False))
 
 
-@partial(jax.jit, static_argnames="num_bearings")
-def _make_profiles(scans: PlanarScans, *, num_bearings: int) -> RangeProfiles:
-    scans = scans.replace(points=_smooth_ranges(scans))
-    return jax.vmap(partial(_profile, num_bearings=num_bearings))(scans)
+@jax.jit
+def _make_profiles(scans: PlanarScans) -> RangeProfiles:
+    return jax.vmap(_profile)(scans.replace(points=_smooth_ranges(scans)))
 
 
-def _profile(scan: PlanarScans, *, num_bearings: int) -> RangeProfiles:
+def _profile(scan: PlanarScans) -> RangeProfiles:
     """The profile of one scan."""
     points, valid = scan.points, scan.mask
     reach = jnp.maximum(jnp.linalg.norm(points, axis=-1), 1e-9)
@@ -124,7 +118,7 @@ def _profile(scan: PlanarScans, *, num_bearings: int) -> RangeProfiles:
     order = jnp.argsort(angle)
     sorted_angle, sorted_points, sorted_slant = angle[order], points[order], slant[order]
     count = jnp.maximum(valid.sum(), 1)
-    bearing = 2 * jnp.pi * (jnp.arange(num_bearings) + 0.5) / num_bearings
+    bearing = 2 * jnp.pi * (jnp.arange(_NUM_BEARINGS) + 0.5) / _NUM_BEARINGS
     index = jnp.searchsorted(sorted_angle, bearing)
     before, after = (index - 1) % count, index % count
     gap = jnp.mod(jnp.where(valid.any(), sorted_angle[after] - sorted_angle[before], 0.0), 2 * jnp.pi)
@@ -134,14 +128,9 @@ def _profile(scan: PlanarScans, *, num_bearings: int) -> RangeProfiles:
     along = one[:, 0] * chord[:, 1] - one[:, 1] * chord[:, 0]
     ends = jnp.linalg.norm(jnp.stack([one, other]), axis=-1)
     near, far = ends.min(0), ends.max(0)
-    return RangeProfiles(
-        scans=scan,
-        surface=jnp.clip(along / jnp.where(jnp.abs(across) > 1e-9, across, 1.0), near, far),
-        near=near,
-        far=far,
-        slant=jnp.minimum(sorted_slant[before], sorted_slant[after]),
-        is_seen=(gap < _MAX_GAP * 2 * jnp.pi / points.shape[0]) & (count > 1),
-    )
+    surface = jnp.clip(along / jnp.where(jnp.abs(across) > 1e-9, across, 1.0), near, far)
+    is_seen = (gap < _MAX_GAP * 2 * jnp.pi / points.shape[0]) & (count > 1)
+    return RangeProfiles(scan, surface, near, far, jnp.minimum(sorted_slant[before], sorted_slant[after]), is_seen)
 
 
 def _bearing(points: Float[Array, "b 2"]) -> Float[Array, " b"]:
@@ -185,14 +174,14 @@ def compare_pair(
 
 @partial(jax.jit, static_argnames="stride")
 def _compare(
-    profiles: RangeProfiles, source: Int[Array, " p"], target: Int[Array, " p"], poses: Float[Array, "p 3"],
-    tolerances: Tolerances, *, stride: int,
-) -> ViewComparison:  # fmt: skip
-    def compare(pair: tuple[Array, Array, Array]) -> ViewComparison:
-        i, j, pose = pair
-        return compare_pair(profiles.take(i), profiles.take(j), pose, tolerances, stride=stride)
+    profiles: RangeProfiles, pairs: tuple[Array, Array, Array], tolerances: Tolerances, *, stride: int
+) -> ViewComparison:
+    """Compares pairs, each a source, a target and a pose."""
 
-    return jax.lax.map(compare, (source, target, poses), batch_size=64)
+    def compare(pair: tuple[Array, Array, Array]) -> ViewComparison:
+        return compare_pair(profiles.take(pair[0]), profiles.take(pair[1]), pair[2], tolerances, stride=stride)
+
+    return jax.lax.map(compare, pairs, batch_size=64)
 
 
 def compare_pairs(
@@ -210,11 +199,29 @@ def compare_pairs(
     Returns:
         ViewComparison with float64 arrays (p,) on the host.
     """
-    tolerances, result = profiles.tolerances, np.zeros((3, len(source)))
+    tolerances, result = profiles.scans.tolerances, np.zeros((3, len(source)))
     for part, rows in batches(len(source), _BATCH):
-        found = _compare(
-            profiles, jnp.asarray(source[rows]), jnp.asarray(target[rows]), jnp.asarray(poses[rows], jnp.float32),
-            tolerances, stride=stride,
-        )  # fmt: skip
+        pairs = source[rows], target[rows], poses[rows].astype(np.float32)
+        found = _compare(profiles, pairs, tolerances, stride=stride)
         result[:, part] = stride * np.stack(found).astype(np.float64)[:, : part.stop - part.start]
     return ViewComparison(*result)
+
+
+def view_similarity(profiles: RangeProfiles) -> Floats:
+    """Correlation of the range profiles of all pairs of scans at all turns, -1 to 1, by FFT.
+
+    Args:
+        profiles: n scans.
+
+    Returns:
+        (n, n, 128); turn k of pair (i, j) is the heading 2 pi k / 128 of T_i_j.
+    """
+    stride = profiles.surface.shape[1] // _SIMILARITY_BEARINGS
+    ranges = np.asarray(profiles.surface, np.float64).reshape(-1, _SIMILARITY_BEARINGS, stride).mean(-1)
+    # Near surfaces move most between two views of one place, so far ones are worth less.
+    seen = np.asarray(profiles.is_seen).reshape(-1, _SIMILARITY_BEARINGS, stride).any(-1)
+    view = np.where(seen, np.log1p(ranges / (_NEAR_RANGE * profiles.scans.typical_range)), 0.0)
+    view = view - view.mean(axis=1, keepdims=True)
+    view /= np.maximum(np.linalg.norm(view, axis=1, keepdims=True), 1e-9)
+    spectrum = np.fft.rfft(view, axis=1)
+    return np.fft.irfft(spectrum[:, None] * np.conj(spectrum[None]), n=_SIMILARITY_BEARINGS, axis=-1)

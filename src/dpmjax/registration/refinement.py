@@ -10,22 +10,28 @@ from functools import partial
 from typing import NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import scipy.spatial
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array
 
 from dpmjax.geometry import se2
 from dpmjax.pose_graph.graph import Edges, join_edges
-from dpmjax.pose_graph.planar import solve_poses
+from dpmjax.pose_graph.normal_equations import solve_blocks
 from dpmjax.registration.incremental import incremental_icp
-from dpmjax.registration.line_adjustment import LineAdjustmentConfig, adjust_to_lines
+from dpmjax.registration.line_adjustment import adjust_to_lines
 from dpmjax.registration.loop_closure import LoopConfig, close_loops, matched_steps, pose_steps
-from dpmjax.registration.pair_alignment import FINE, PairMatches, PairSystem, Schedule, linearise_pair, match_pairs
+from dpmjax.registration.pair_alignment import FINE, PairSystem, Schedule, linearise_pair, match_pairs
 from dpmjax.registration.planar_scans import Floats, Indices, PlanarScans
 
 # Distances of one round are kept below this by leaving out beams of the sources: about two seconds on two cores.
 _ROUND_DISTANCES = 1.5e9
+# How gates and kernels shrink over the rounds.
+_ROUNDS = Schedule(gate=(0.09, 0.015), kernel=(0.06, 0.0015), num_iterations=14)
+# The start is sound, and no loops are searched, if the fitness of all its steps is above this, and so is the weakest
+# eigenvalue of each, as a share of the beams.
+_MIN_FITNESS, _MIN_EIGENVALUE = 0.35, 0.005
+# Scans are adjusted to common lines above this range noise, in typical ranges.
+_MIN_NOISE = 1.5e-4
 
 
 @dataclass(frozen=True)
@@ -33,35 +39,20 @@ class RefinementConfig:
     """Settings of the refinement. Lengths are in typical ranges of the scans.
 
     Attributes:
-        schedule: how gates and kernels shrink over the rounds.
         temporal: offsets of the neighbours in time; only of ordered scans.
         num_spatial: at most so many neighbours in space, each from another visit.
         radius: within which neighbours in space are looked for.
         max_turn: largest difference of heading of two neighbours in space, radians.
         refresh: neighbours are chosen anew after so many rounds.
-        step_sigma: standard deviation of the steps of the start, which decide directions that the scans leave open:
-            translation, radians.
         loops: settings of the loop search, which only ordered scans get; None: never.
-        min_fitness: the start is sound, and no loops are searched, if the fitness of all its steps is above this ...
-        min_eigenvalue: ... and so is the weakest eigenvalue of each, as a share of the beams.
-        lines: settings of the last step, the adjustment to common lines ...
-        min_noise: ... which is done above this range noise.
     """
 
-    schedule: Schedule = field(
-        default_factory=lambda: Schedule(gate=(0.09, 0.015), kernel=(0.06, 0.0015), num_iterations=14)
-    )
     temporal: tuple[int, ...] = (1, 2, 3)
     num_spatial: int = 8
     radius: float = 0.6
     max_turn: float = 2.0
     refresh: int = 4
-    step_sigma: tuple[float, float] = (0.045, 0.15)
     loops: LoopConfig | None = field(default_factory=LoopConfig)
-    min_fitness: float = 0.35
-    min_eigenvalue: float = 0.005
-    lines: LineAdjustmentConfig = field(default_factory=LineAdjustmentConfig)
-    min_noise: float = 1.5e-4
 
 
 class Refined(NamedTuple):
@@ -70,12 +61,10 @@ class Refined(NamedTuple):
     Attributes:
         poses: (n, 3) x, y, heading.
         num_loops: loops that were found and kept; 0 where none was needed.
-        num_pairs: pairs of scans in the last round.
     """
 
     poses: Floats
     num_loops: int
-    num_pairs: int
 
 
 def refine(scans: PlanarScans, poses: Floats, config: RefinementConfig | None = None) -> Refined:
@@ -94,36 +83,55 @@ def refine(scans: PlanarScans, poses: Floats, config: RefinementConfig | None = 
     """
     config = config or RefinementConfig()
     num_loops = 0
-    if scans.is_ordered and config.loops is not None and not _is_sound(scans, poses, config):
+    if scans.is_ordered and config.loops is not None and not _is_sound(scans, poses):
         # The steps again, with those of the start as guess and as prior, where the scans leave a direction open.
         chained, steps = incremental_icp(scans, odometry=poses)
-        edges = matched_steps(steps, config.loops, scans.typical_range)
-        poses, _, weights = close_loops(scans, chained, config.loops, steps=edges)
+        matched = matched_steps(steps, scans.typical_range)
+        poses, _, weights = close_loops(scans, chained, config.loops, steps=matched)
         num_loops = int((weights > 0.25).sum())
-    refined = _align_all(scans, poses, config)
-    if scans.noise > config.min_noise * scans.typical_range:
-        refined = refined._replace(poses=adjust_to_lines(scans, refined.poses, config.lines))
-    return refined._replace(num_loops=num_loops)
+    poses = _align_all(scans, poses, config)
+    if scans.noise > _MIN_NOISE * scans.typical_range:
+        poses = adjust_to_lines(scans, poses)
+    return Refined(poses, num_loops)
 
 
-def _align_all(scans: PlanarScans, poses: Floats, config: RefinementConfig) -> Refined:
+def _align_all(scans: PlanarScans, poses: Floats, config: RefinementConfig) -> Floats:
     """Multi-view point-to-line alignment of all scans from nearby poses; the first pose is held."""
-    gates, kernels = config.schedule.gates_and_kernels(scans.typical_range, 1.25 * scans.noise)
-    steps = pose_steps(poses, config.step_sigma, scans.typical_range)
+    scales = _ROUNDS.gates_and_kernels(scans.typical_range, 1.25 * scans.noise)
+    steps = pose_steps(poses, scans.typical_range)
     # In units of one beam's information, as the systems of the pairs are.
     trust = max(scans.noise, 0.00075 * scans.typical_range) ** 2 if scans.is_ordered else 1e-9
     steps = steps._replace(information=steps.information * trust)
-    source, target = np.zeros(0, np.int64), np.zeros(0, np.int64)
-    for round_number, (gate, kernel) in enumerate(zip(gates, kernels, strict=True)):
+    for round_number, scale in enumerate(zip(*scales, strict=True)):
         if round_number % config.refresh == 0:
             source, target = choose_pairs(scans, poses, config)
-        edges, system = _linearise(scans, source, target, poses, (gate, kernel))
+        edges, system = _linearise(scans, source, target, poses, scale)
         here = se2.relative(poses[steps.target], poses[steps.source])
         pull = np.einsum("eij,ej->ei", steps.information, se2.relative(steps.measurements, here))
         gradient = np.concatenate([np.asarray(system.gradient), pull])
         edges = join_edges(edges, steps._replace(measurements=here))
-        poses = se2.compose(poses, solve_poses(len(poses), edges, gradient))
-    return Refined(poses, 0, len(source))
+        poses = se2.compose(poses, solve_step(len(poses), edges, gradient))
+    return poses
+
+
+def solve_step(num_poses: int, edges: Edges, gradient: Floats) -> Floats:
+    """One Gauss-Newton step of all poses in their own frames (n, 3); the first one is held.
+
+    Args:
+        num_poses: n.
+        edges: the relative poses at which the system was linearised, with J^T W J as information.
+        gradient: (e, 3) J^T W r of each edge in the tangent of its source frame.
+
+    Returns:
+        (n, 3) steps.
+    """
+    # A step of the target moves the tangent of an edge by minus the adjoint of T_source_target.
+    adjoint = se2.adjoint(se2.inverse(edges.measurements))
+    jacobian = np.stack([-adjoint, np.broadcast_to(np.eye(3), adjoint.shape)], axis=1)
+    transposed = np.swapaxes(jacobian, 2, 3)
+    blocks = (transposed @ edges.information[:, None])[:, :, None] @ jacobian[:, None]
+    nodes = np.stack([edges.target, edges.source], axis=1)
+    return solve_blocks(nodes, blocks, np.einsum("esij,ej->esi", transposed, gradient), num_poses)
 
 
 def choose_pairs(scans: PlanarScans, poses: Floats, config: RefinementConfig) -> tuple[Indices, Indices]:
@@ -138,16 +146,14 @@ def choose_pairs(scans: PlanarScans, poses: Floats, config: RefinementConfig) ->
     count = min(num_scans, 6 * config.num_spatial + 2 * apart)
     nearest = tree.query(poses[:, :2], k=count, distance_upper_bound=config.radius * scans.typical_range)
     distances, rows = np.atleast_2d(nearest[0]), np.atleast_2d(nearest[1])
-    for scan in range(num_scans if config.num_spatial else 0):
+    for scan in range(num_scans):
         near = rows[scan][np.isfinite(distances[scan])]
         near = near[(np.abs(near - scan) > apart)]
         near = near[np.abs(se2.wrap_angle(poses[near, 2] - poses[scan, 2])) < config.max_turn]
         chosen: list[int] = []
         for other in near:
-            if all(abs(other - c) > visit for c in chosen):
+            if len(chosen) < config.num_spatial and all(abs(other - c) > visit for c in chosen):
                 chosen.append(int(other))
-            if len(chosen) == config.num_spatial:
-                break
         source.append(np.full(len(chosen), scan))
         target.append(np.array(chosen, np.int64))
     return np.concatenate(source).astype(np.int64), np.concatenate(target).astype(np.int64)
@@ -155,16 +161,14 @@ def choose_pairs(scans: PlanarScans, poses: Floats, config: RefinementConfig) ->
 
 @partial(jax.jit, static_argnames="source_stride")
 def _linearise_pairs(
-    scans: PlanarScans, source: Int[Array, " p"], target: Int[Array, " p"], poses: Float[Array, "p 3"],
-    scale: tuple[Float[Array, ""], Float[Array, ""]], *, source_stride: int,
-) -> PairSystem:  # fmt: skip
+    scans: PlanarScans, pairs: tuple[Array, Array, Array], scale: tuple[Array, Array], *, source_stride: int
+) -> PairSystem:
     thinned = scans.thin(source_stride)
 
     def linearise(pair: tuple[Array, Array, Array]) -> PairSystem:
-        i, j, pose = pair
-        return linearise_pair(thinned.take(i), scans.take(j), pose, *scale, metric="plane")
+        return linearise_pair(thinned.take(pair[0]), scans.take(pair[1]), pair[2], scale, metric="plane")
 
-    return jax.lax.map(linearise, (source, target, poses), batch_size=16)
+    return jax.lax.map(linearise, pairs, batch_size=16)
 
 
 def _linearise(
@@ -174,41 +178,32 @@ def _linearise(
     relative = se2.relative(poses[target], poses[source])
     stride = max(1, int(np.ceil(len(source) * scans.mask.shape[1] ** 2 / _ROUND_DISTANCES)))
     filled = np.resize(np.arange(len(source)), 1024 * -(-len(source) // 1024))
-    system = _linearise_pairs(
-        scans.replace(is_ordered=False), jnp.asarray(source[filled]), jnp.asarray(target[filled]),
-        jnp.asarray(relative[filled], jnp.float32), scale, source_stride=stride,
-    )  # fmt: skip
+    pairs = source[filled], target[filled], relative[filled].astype(np.float32)
+    system = _linearise_pairs(scans.replace(is_ordered=False), pairs, scale, source_stride=stride)
     system = jax.tree.map(lambda x: np.asarray(x, np.float64)[: len(source)], system)
     return Edges(source, target, relative, np.asarray(system.information)), system
 
 
-def match_steps(scans: PlanarScans, poses: Floats) -> PairMatches:
-    """Matches the steps of a trajectory again, each from where it is."""
-    guesses = se2.relative(poses[:-1], poses[1:])[:, None]
-    return match_pairs(scans.take(slice(1, None)), scans.take(slice(len(poses) - 1)), guesses, FINE)
-
-
-def _is_sound(scans: PlanarScans, poses: Floats, config: RefinementConfig) -> bool:
+def _is_sound(scans: PlanarScans, poses: Floats) -> bool:
     """Whether all steps fit and are fixed in every direction, so that a chain of them cannot have gone far astray."""
-    steps = match_steps(scans, poses)
+    guesses = se2.relative(poses[:-1], poses[1:])[:, None]
+    steps = match_pairs(scans.take(slice(1, None)), scans.take(slice(len(poses) - 1)), guesses, FINE)
     share = steps.weakest_eigenvalue() / np.maximum(np.asarray(scans.is_on_line.sum(1))[1:], 1)
-    return bool((steps.fitness > config.min_fitness).all() and (share > config.min_eigenvalue).all())
+    return bool((steps.fitness > _MIN_FITNESS).all() and (share > _MIN_EIGENVALUE).all())
 
 
-def surface_misfit(scans: PlanarScans, poses: Floats, config: RefinementConfig | None = None) -> float:
+def surface_misfit(scans: PlanarScans, poses: Floats) -> float:
     """How badly neighbouring scans agree at these poses, without knowing the truth.
 
     Args:
         scans: n scans.
         poses: (n, 3) x, y, heading.
-        config: settings; its last kernel tells how fine the comparison is.
 
     Returns:
         The share of beams, 0 to 1, that do not find their surface in the scans nearby; fractions for near misses.
     """
-    config = config or RefinementConfig()
-    gates, kernels = config.schedule.gates_and_kernels(scans.typical_range, 1.25 * scans.noise)
-    source, target = choose_pairs(scans, poses, config)
+    gates, kernels = _ROUNDS.gates_and_kernels(scans.typical_range, 1.25 * scans.noise)
+    source, target = choose_pairs(scans, poses, RefinementConfig())
     _, system = _linearise(scans, source, target, poses, (gates[-1], kernels[-1]))
     num_beams = np.asarray(scans.is_on_line.sum(1), np.float64)
     return 1.0 - float(np.sum(system.weight) / np.maximum(num_beams[source].sum(), 1.0))

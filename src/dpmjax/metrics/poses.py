@@ -1,4 +1,4 @@
-"""Trajectory metrics in float64 on the host: rigid alignment, ATE, RPE, point distance.
+"""Errors of poses in float64 on the host: rigid alignment, ATE, RPE, point distance, recall of registrations.
 
 Lengths come out in the unit they come in; angles in radians. Poses are `T_world_scan`, (n, d+1, d+1) with d = 2 or 3.
 """
@@ -27,6 +27,22 @@ class RelativePoseError(NamedTuple):
     translation_rmse: float
     rotation_rmse: float
     num_pairs: int
+
+
+class RegistrationRecall(NamedTuple):
+    """Errors of registrations of pairs of scans.
+
+    Attributes:
+        recall: share of pairs with both errors within the limits.
+        translation_errors_m: (n,) of each pair.
+        rotation_errors_deg: (n,) of each pair, in [0, 180].
+        is_right: (n,) which pairs count; those with a pose that is not finite do not.
+    """
+
+    recall: float
+    translation_errors_m: Float[np.ndarray, " n"]
+    rotation_errors_deg: Float[np.ndarray, " n"]
+    is_right: Bool[np.ndarray, " n"]
 
 
 def align_rigid(estimated: Float[AnyArray, "n d"], reference: Float[AnyArray, "n d"]) -> Float[np.ndarray, "d1 d1"]:
@@ -153,6 +169,39 @@ def point_distance(
     points = np.where(mask[..., None], points, 0)
     distances = np.linalg.norm(_transform(aligned, points) - _transform(reference, points), axis=-1)
     return float(distances[mask].mean())
+
+
+def registration_recall(
+    T_estimated: Float[AnyArray, "n 4 4"],
+    T_true: Float[AnyArray, "n 4 4"],
+    *,
+    max_translation_m: float = 2.0,
+    max_rotation_deg: float = 5.0,
+) -> RegistrationRecall:
+    """The share of motions that are right, and how wrong each is.
+
+    Args:
+        T_estimated: (n, 4, 4) `T_target_source`, metres.
+        T_true: the same, true.
+        max_translation_m: how far the translations may differ.
+        max_rotation_deg: how far the rotations may.
+
+    Returns:
+        The recall is 0 without any pair.
+
+    Raises:
+        ValueError: the shapes differ or are not (n, 4, 4).
+    """
+    estimated, true = np.asarray(T_estimated, np.float64), np.asarray(T_true, np.float64)
+    for name, value in (("T_estimated", estimated), ("T_true", true)):
+        if value.ndim != 3 or value.shape[1:] != (4, 4) or len(value) != len(true):
+            raise ValueError(f"{name}: expected shape ({len(true)}, 4, 4), got {value.shape}")
+    translation = np.linalg.norm(estimated[:, :3, 3] - true[:, :3, 3], axis=1)
+    difference = np.swapaxes(true[:, :3, :3], 1, 2) @ estimated[:, :3, :3]
+    rotation = np.degrees(_rotation_angle(difference))
+    with np.errstate(invalid="ignore"):
+        is_right = (translation <= max_translation_m) & (rotation <= max_rotation_deg)
+    return RegistrationRecall(float(is_right.mean()) if len(true) > 0 else 0.0, translation, rotation, is_right)
 
 
 def _checked_positions(name: str, value: AnyArray) -> NDArray[np.float64]:
