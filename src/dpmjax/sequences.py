@@ -5,16 +5,17 @@ NumPy only, on the host. `dpmjax.io` and `dpmjax.simulation` make these records.
 
 from __future__ import annotations
 
-import logging
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-_log = logging.getLogger(__name__)
+FloatArray = NDArray[np.float64]
+Unit = Literal["px", "m"]
+BoolArray = NDArray[np.bool_]
 Selection = slice | NDArray[np.integer]
 """Start, stop and stride in scans, or the rows to keep, in the order wanted."""
 
@@ -33,6 +34,22 @@ class InputError(ValueError):
     def __init__(self, source: str | Path, found: str, advice: str) -> None:
         self.source, self.found, self.advice = str(source), found, advice
         super().__init__(" ".join(f"{source}: {found}; {advice}.".split()))
+
+
+def require(is_good: bool | np.bool_, source: str | Path, found: str, advice: str) -> None:
+    """Raises an `InputError` unless the input is good.
+
+    Args:
+        is_good: the check.
+        source: see `InputError`.
+        found: what was found where the check fails.
+        advice: what to do then.
+
+    Raises:
+        InputError: the check fails.
+    """
+    if not is_good:
+        raise InputError(source, found, advice)
 
 
 def _require_shapes(record: Any, shapes: dict[str, tuple[int, ...]]) -> None:
@@ -69,12 +86,12 @@ class ScanSequence:
 
     name: str
     points: NDArray[np.float32]
-    mask: NDArray[np.bool_]
-    unit: Literal["px", "m"]
+    mask: BoolArray
+    unit: Unit
     is_organised: bool = True
-    reference_poses: NDArray[np.float64] | None = None
-    odometry_poses: NDArray[np.float64] | None = None
-    times: NDArray[np.float64] | None = None
+    reference_poses: FloatArray | None = None
+    odometry_poses: FloatArray | None = None
+    times: FloatArray | None = None
 
     def __post_init__(self) -> None:
         if self.unit not in ("px", "m"):
@@ -94,7 +111,7 @@ class ScanSequence:
         return replace(self, **_select(self, names, selection))
 
 
-def has_angular_order(points: NDArray[np.float32], mask: NDArray[np.bool_]) -> bool:
+def has_angular_order(points: NDArray[np.float32], mask: BoolArray) -> bool:
     """Whether the beams of scans are ordered by angle, as 1-D convolutions and neighbour normals need it.
 
     A scan is in order when at least 95 % of the turns from one valid beam to the next go the same way round and
@@ -132,7 +149,7 @@ class World:
     """
 
     name: str
-    is_obstacle: NDArray[np.bool_] = field(repr=False)
+    is_obstacle: BoolArray = field(repr=False)
 
     def __post_init__(self) -> None:
         if self.is_obstacle.ndim != 2 or self.is_obstacle.dtype != np.bool_:
@@ -142,12 +159,24 @@ class World:
 
     def fill_pockets(self) -> World:
         """The same world with every free pixel solid that cannot be reached from the largest free space."""
-        from scipy.ndimage import label
+        return replace(self, is_obstacle=~largest_region(~self.is_obstacle))
 
-        labels, _ = label(~self.is_obstacle)
-        sizes = np.bincount(labels.ravel())
-        sizes[0] = 0
-        return replace(self, is_obstacle=labels != sizes.argmax())
+
+def largest_region(is_free: BoolArray) -> BoolArray:
+    """The largest connected region of a raster.
+
+    Args:
+        is_free: (h, w).
+
+    Returns:
+        (h, w) True where a pixel is free and of the largest region.
+    """
+    from scipy.ndimage import label
+
+    labels, _ = label(is_free)
+    sizes = np.bincount(labels.ravel())
+    sizes[0] = 0
+    return is_free & (labels == sizes.argmax())
 
 
 @dataclass(frozen=True)
@@ -178,7 +207,7 @@ class Camera:
         if min(self.width, self.height) < 1 or not min(self.fx, self.fy) > 0.0 or not np.isfinite(numbers).all():
             raise ValueError(f"camera: expected a size and focal lengths above 0, got {self}")
 
-    def rays(self, columns: NDArray[np.float64], rows: NDArray[np.float64]) -> NDArray[np.float64]:
+    def rays(self, columns: FloatArray, rows: FloatArray) -> FloatArray:
         """Directions (h, w, 3) with z = 1 of the pixels at rows (h,) and columns (w,)."""
         x, y = np.meshgrid((columns - self.cx) / self.fx, (rows - self.cy) / self.fy)
         return np.stack([x, y, np.ones_like(x)], axis=-1)
@@ -210,9 +239,9 @@ class DepthSequence:
 
     name: str
     points: NDArray[np.float32]
-    mask: NDArray[np.bool_]
+    mask: BoolArray
     is_planar: bool
-    T_world_camera: NDArray[np.float64] | None = None
+    T_world_camera: FloatArray | None = None
 
     def __post_init__(self) -> None:
         if self.points.ndim != 4 or self.points.shape[3] != 3:
@@ -246,8 +275,8 @@ class LidarSequence:
     name: str
     sources: tuple[str, ...] = field(repr=False)
     read_scan: Callable[[int], NDArray[np.float32]] = field(repr=False)
-    T_world_lidar: NDArray[np.float64] | None = field(default=None, repr=False)
-    times: NDArray[np.float64] | None = field(default=None, repr=False)
+    T_world_lidar: FloatArray | None = field(default=None, repr=False)
+    times: FloatArray | None = field(default=None, repr=False)
 
     def __post_init__(self) -> None:
         _require_shapes(self, {"T_world_lidar": (self.num_scans, 4, 4), "times": (self.num_scans,)})
@@ -263,68 +292,5 @@ class LidarSequence:
     def take(self, selection: Selection) -> LidarSequence:
         """The selected scans with their poses and times, in the same world; nothing is read."""
         numbers = [int(i) for i in np.arange(self.num_scans)[selection]]
-
-        def read_scan(index: int) -> NDArray[np.float32]:
-            return self.read_scan(numbers[index])
-
-        sources = tuple(self.sources[i] for i in numbers)
-        return replace(
-            self, sources=sources, read_scan=read_scan, **_select(self, ("T_world_lidar", "times"), selection)
-        )
-
-
-@dataclass(frozen=True)
-class BadScan:
-    """A scan that could not be used.
-
-    Attributes:
-        index: its number in the sequence.
-        file: where it came from.
-        reason: what was found there.
-    """
-
-    index: int
-    file: str
-    reason: str
-
-
-class IndexedScan(NamedTuple):
-    """A scan and its number in the sequence.
-
-    Attributes:
-        number: of the scan in the sequence.
-        points: (n, 3) float32, lidar frame, m.
-    """
-
-    number: int
-    points: NDArray[np.float32]
-
-
-def iterate_scans(sequence: LidarSequence, bad: list[BadScan] | None = None) -> Iterator[IndexedScan]:
-    """Reads scan after scan and leaves out the bad ones; a warning names them at the end.
-
-    Args:
-        sequence: the scans.
-        bad: gets an entry for each scan that was left out.
-
-    Yields:
-        The good scans with their numbers.
-
-    Raises:
-        InputError: not one scan is good.
-    """
-    found = [] if bad is None else bad
-    for index, source in enumerate(sequence.sources):
-        try:
-            points = sequence.read_scan(index)
-        except InputError as error:
-            found.append(BadScan(index, source, error.found))
-            continue
-        yield IndexedScan(index, points)
-    if not found:
-        return
-    listed = "; ".join(f"scan {scan.index}, {scan.file}: {scan.reason}" for scan in found[:10])
-    listed += f"; and {len(found) - 10} more" if len(found) > 10 else ""
-    if len(found) == sequence.num_scans:
-        raise InputError(sequence.name, f"all {len(found)} scans are bad: {listed}", "check the files")
-    _log.warning("%s: %d of %d scans left out: %s", sequence.name, len(found), sequence.num_scans, listed)
+        sources, chosen = tuple(self.sources[i] for i in numbers), _select(self, ("T_world_lidar", "times"), selection)
+        return replace(self, sources=sources, read_scan=lambda index: self.read_scan(numbers[index]), **chosen)

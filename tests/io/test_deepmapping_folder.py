@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from dpmjax.io import InputError, read_pcd, write_deepmapping_folder, write_pcd
-from dpmjax.io.scans2d.deepmapping_folder import read_deepmapping_folder
+from dpmjax.io.deepmapping_folder import read_deepmapping_folder
 
 POINTS = np.array([[1, 2, 3], [4, 5, 6], [-7, 8.5, 0]], np.float32)
 

@@ -59,10 +59,10 @@ def test_walks_keep_to_the_grid_and_neighbours_differ_by_one_step():
     moved = np.linalg.norm(np.diff(T[:, :3, 3], axis=0), axis=1)
     turned = np.degrees(np.arccos(np.clip((np.einsum("nij,nij->n", T[:-1, :3, :3], T[1:, :3, :3]) - 1) / 2, -1, 1)))
     for distance, angle in zip(moved, turned, strict=True):
-        assert (distance, angle) == (pytest.approx(0.3), pytest.approx(0.0, abs=1e-5)) or (
-            distance,
-            angle,
-        ) == (pytest.approx(0.0), pytest.approx(30.0))
+        assert (distance, angle) == (pytest.approx(0.3), pytest.approx(0.0, abs=1e-5)) or (distance, angle) == (
+            pytest.approx(0.0),
+            pytest.approx(30.0),
+        )
 
 
 def test_a_seed_gives_one_walk():

@@ -152,7 +152,7 @@ def test_a_simulated_sequence_is_written_and_read_as_kitti(tmp_path):
 
 def test_a_street_is_laid_along_a_real_drive(real_data):
     from dpmjax.io import read_poses
-    from dpmjax.io.lidar.kitti import read_labelled_numbers
+    from dpmjax.io.lidar_datasets import read_labelled_numbers
 
     tr = read_labelled_numbers(real_data / "poses" / "kitti_00_calib.txt")["Tr"]
     T_cam0_lidar = np.vstack([tr.reshape(3, 4), [0, 0, 0, 1]])

@@ -7,20 +7,14 @@ import pytest
 
 from dpmjax.simulation import CastConfig, LidarSensor
 from dpmjax.simulation.town.cast import cast_turn
-from dpmjax.simulation.town.intersect import (
-    Hull,
-    cross_box,
-    cross_cylinder,
-    cross_ground,
-    cross_spheroid,
-    ground_height,
-)
+from dpmjax.simulation.town.intersect import cross_box, cross_cylinder, cross_ground, cross_spheroid, ground_height
 from dpmjax.simulation.town.primitives import (
     GROUND,
     NOTHING,
     POLE,
     SOFT,
     SOLID,
+    Bodies,
     Ground,
     TownPrimitives,
     Traffic,
@@ -83,7 +77,7 @@ def ground_oracle(heights, origin, cell, start, ray, max_range):
 
 
 def hull(centre, half_size, heading):
-    return Hull(*(jnp.asarray(x, jnp.float32) for x in (centre, half_size, heading)))
+    return Bodies(*(jnp.asarray(x, jnp.float32) for x in (centre, half_size, heading)), *[jnp.zeros(())] * 4)
 
 
 def first_hit(crossing):

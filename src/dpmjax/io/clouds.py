@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from dpmjax.io.files import read_bytes, split_rows, to_float32, unpack_rows, write_atomically
-from dpmjax.sequences import InputError
+from dpmjax.io.files import read_bytes, refusing, split_rows, to_float32, unpack_rows, write_atomically
+from dpmjax.sequences import InputError, require
 
 _PCD_TYPES = {"F": "f", "I": "i", "U": "u"}
 _PLY_TYPES = {
@@ -20,7 +21,7 @@ _PLY_TYPES = {
 _PLY_ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
 
 
-class _PcdHeader(NamedTuple):
+class _Header(NamedTuple):
     """Names of the fields, their layout as one NumPy type, number of points, encoding, and the header's length."""
 
     fields: list[str]
@@ -63,13 +64,11 @@ def parse_pcd(content: bytes, source: str, *, drop_nan: bool = False) -> NDArray
     """
     header = _parse_pcd_header(content, source)
     for name in ("x", "y"):
-        if name not in header.fields:
-            raise InputError(source, f"fields are {' '.join(header.fields)}", f"the file needs a column {name}")
-    body = content[header.size :]
-    read = {"ascii": _read_ascii_pcd, "binary": _read_binary_pcd}.get(header.encoding)
-    if read is None:
-        raise InputError(source, f"DATA {header.encoding} is not supported", "save the cloud as ascii or binary PCD")
-    columns = read(body, header, source)
+        found = f"fields are {' '.join(header.fields)}"
+        require(name in header.fields, source, found, f"the file needs a column {name}")
+    found = f"DATA {header.encoding} is not supported"
+    require(header.encoding in ("ascii", "binary"), source, found, "save the cloud as ascii or binary PCD")
+    columns = _read_columns(content, header, source)
     zeros = np.zeros(header.num_points, np.float32)
     points = np.stack([to_float32(columns.get(name, zeros)) for name in "xyz"], axis=1)
     if drop_nan:
@@ -106,18 +105,20 @@ def write_pcd(path: str | Path, points: ArrayLike) -> Path:
     return write_atomically(path, header.encode("ascii") + cloud.tobytes())
 
 
-def _parse_pcd_header(content: bytes, source: str) -> _PcdHeader:
+def _parse_pcd_header(content: bytes, source: str) -> _Header:
     entries: dict[str, list[str]] = {}
     size = 0
     while "DATA" not in entries:
         end = content.find(b"\n", size)
-        if end < 0 or size > 4096:
-            raise InputError(source, "no PCD header", "give PCD files (VERSION, FIELDS, SIZE, TYPE, ..., DATA)")
+        is_header = end >= 0 and size <= 4096
+        require(is_header, source, "no PCD header", "give PCD files (VERSION, FIELDS, SIZE, TYPE, ..., DATA)")
         words = content[size:end].decode("latin-1").split()
         size = end + 1
         if words and not words[0].startswith("#"):
             entries[words[0].upper()] = words[1:]
-    try:
+    found = "broken PCD header ({kind}: {error})"
+    advice = "write FIELDS, SIZE, TYPE, COUNT of one length, POINTS and DATA"
+    with refusing(source, found, advice, (KeyError, ValueError, IndexError, TypeError, OverflowError)):
         fields = entries["FIELDS"]
         types = ["<" + _PCD_TYPES[t] + s for t, s in zip(entries["TYPE"], entries["SIZE"], strict=True)]
         counts = [int(count) for count in entries.get("COUNT", ["1"] * len(fields))]
@@ -126,31 +127,19 @@ def _parse_pcd_header(content: bytes, source: str) -> _PcdHeader:
         if not len(fields) == len(types) == len(counts) or min(counts) < 1 or num_points < 0:
             raise ValueError("lengths differ, or a number is below one")
         layout = np.dtype([(f"{i}", t, (c,)) for i, (t, c) in enumerate(zip(types, counts, strict=True))])
-        return _PcdHeader(fields, layout, num_points, entries["DATA"][0].lower(), size)
-    except (KeyError, ValueError, IndexError, TypeError, OverflowError) as error:
-        found = f"broken PCD header ({type(error).__name__}: {error})"
-        raise InputError(source, found, "write FIELDS, SIZE, TYPE, COUNT of one length, POINTS and DATA") from error
+        return _Header(fields, layout, num_points, entries["DATA"][0].lower(), size)
 
 
-def _read_binary_pcd(body: bytes, header: _PcdHeader, source: str) -> dict[str, NDArray[np.generic]]:
-    table = unpack_rows(body, header.layout, header.num_points, source)
-    return {name: table[f"{i}"][:, 0] for i, name in enumerate(header.fields)}
-
-
-def _read_ascii_pcd(body: bytes, header: _PcdHeader, source: str) -> dict[str, NDArray[np.generic]]:
-    counts = [header.layout[i].shape[0] for i in range(len(header.fields))]
-    table = split_rows(body, sum(counts), header.num_points, source)
-    first = np.cumsum([0, *counts[:-1]])
-    return {name: table[:, first[i]] for i, name in enumerate(header.fields)}
-
-
-class _PlyHeader(NamedTuple):
-    """Encoding, number of vertices, their properties as one NumPy type, and the header's length in bytes."""
-
-    encoding: str
-    num_vertices: int
-    layout: np.dtype[np.void]
-    size: int
+def _read_columns(content: bytes, header: _Header, source: str) -> dict[str, NDArray[np.generic]]:
+    """The first number of each field, of all points."""
+    body = content[header.size :]
+    if header.encoding == "ascii":
+        widths = [math.prod(header.layout[index].shape) for index in range(len(header.fields))]
+        table = split_rows(body, sum(widths), header.num_points, source)
+        return dict(zip(header.fields, table[:, np.cumsum([0, *widths[:-1]])].T, strict=True))
+    records = unpack_rows(body, header.layout, header.num_points, source)
+    columns = [np.atleast_2d(records[name].T)[0] for name in header.layout.names or ()]
+    return dict(zip(header.fields, columns, strict=True))
 
 
 def read_ply(path: str | Path) -> NDArray[np.float32]:
@@ -166,13 +155,8 @@ def read_ply(path: str | Path) -> NDArray[np.float32]:
         InputError: the file is missing, has a broken header or no x, y, z, or is truncated.
     """
     content = read_bytes(path)
-    header = _parse_ply_header(content, str(path))
-    body, names = content[header.size :], list(header.layout.names or ())
-    if header.encoding == "ascii":
-        columns = [names.index(axis) for axis in "xyz"]
-        return to_float32(split_rows(body, len(names), header.num_vertices, path)[:, columns])
-    table = unpack_rows(body, header.layout, header.num_vertices, path)
-    return np.stack([to_float32(table[axis]) for axis in "xyz"], axis=1)
+    columns = _read_columns(content, _parse_ply_header(content, str(path)), str(path))
+    return np.stack([to_float32(columns[axis]) for axis in "xyz"], axis=1)
 
 
 def write_ply(path: str | Path, points: ArrayLike) -> Path:
@@ -196,26 +180,24 @@ def write_ply(path: str | Path, points: ArrayLike) -> Path:
     return write_atomically(path, header.encode("ascii") + values.tobytes())
 
 
-def _parse_ply_header(content: bytes, source: str) -> _PlyHeader:
+def _parse_ply_header(content: bytes, source: str) -> _Header:
     advice = "give a PLY file with float x, y, z in its first element, vertex"
     end = content.find(b"end_header")
-    if not content.startswith(b"ply") or end < 0 or end > 65536:
-        raise InputError(source, "no PLY header", advice)
+    require(content.startswith(b"ply") and 0 <= end <= 65536, source, "no PLY header", advice)
     size = content.find(b"\n", end) + 1 or len(content)
     rows = [line.split() for line in content[:end].decode("latin-1").splitlines() if line.strip()]
     encoding = next((row[1] for row in rows if row[0] == "format" and len(row) > 1), "")
     elements = [row for row in rows if row[0] == "element"]
-    if encoding not in _PLY_ORDERS or not elements or elements[0][1:2] != ["vertex"]:
-        raise InputError(source, f"PLY format {encoding or 'unknown'}, or no vertex element in front", advice)
+    is_good = encoding in _PLY_ORDERS and elements[:1] and elements[0][1:2] == ["vertex"]
+    require(bool(is_good), source, f"PLY format {encoding or 'unknown'}, or no vertex element in front", advice)
     first = rows.index(elements[0]) + 1
     stop = rows.index(elements[1]) if len(elements) > 1 else len(rows)
-    try:
+    kinds = (KeyError, ValueError, IndexError, TypeError)
+    with refusing(source, "broken PLY header ({kind}: {error})", advice, kinds):
         num_vertices = int(elements[0][2])
         order, entries = _PLY_ORDERS[encoding], [row for row in rows[first:stop] if row[0] == "property"]
         properties = [(name, order + _PLY_TYPES[kind]) for _, kind, name in entries]
         layout = np.dtype(properties)
-    except (KeyError, ValueError, IndexError, TypeError) as error:
-        raise InputError(source, f"broken PLY header ({type(error).__name__}: {error})", advice) from error
-    if num_vertices < 0 or not {"x", "y", "z"} <= {name for name, _ in properties}:
-        raise InputError(source, f"PLY properties {' '.join(name for name, _ in properties)}", advice)
-    return _PlyHeader(encoding, num_vertices, layout, size)
+    names = [name for name, _ in properties]
+    require(num_vertices >= 0 and {"x", "y", "z"} <= set(names), source, f"PLY properties {' '.join(names)}", advice)
+    return _Header(names, layout, num_vertices, encoding, size)

@@ -20,10 +20,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dpmjax.io.files import natural_key, read_bytes, read_lines, read_table
+from dpmjax.io.files import natural_key, read_bytes, read_lines, read_table, refusing
 from dpmjax.io.mat import parse_mat
 from dpmjax.io.pictures import read_depth_png
-from dpmjax.sequences import ACTIVE_VISION, Camera, DepthSequence, InputError
+from dpmjax.io.poses import homogeneous
+from dpmjax.sequences import ACTIVE_VISION, BoolArray, Camera, DepthSequence, FloatArray, InputError, require
 
 _NOTHING_MM = 65535  # besides 0
 _MOVES, _TURNS = ("forward", "backward", "left", "right"), ("rotate_cw", "rotate_ccw")
@@ -46,19 +47,17 @@ def read_pose_folder(path: str | Path, *, height: int = 30, width: int = 40, max
         InputError: no such folder, no depth image, no intrinsics, poses for some images only, or a damaged file.
     """
     folder = Path(path)
-    if not folder.is_dir():
-        raise InputError(folder, "no such folder", "give a folder of NAME.depth.png files")
+    require(folder.is_dir(), folder, "no such folder", "give a folder of NAME.depth.png files")
     images = sorted(folder.glob("*.depth.png"), key=lambda file: natural_key(file.name))
-    if len(images) < 2:
-        raise InputError(folder, f"{len(images)} .depth.png files", "give at least two")
+    require(len(images) >= 2, folder, f"{len(images)} .depth.png files", "give at least two")
     intrinsics = next(iter(sorted(folder.glob("*intrinsics*.txt"))), None)
     if intrinsics is None:
         raise InputError(folder, "no *intrinsics*.txt", "add the 3 x 3 matrix of the depth camera")
     matrix = _read_matrix(intrinsics, (3, 3))
     poses = [image.with_name(image.name.replace(".depth.png", ".pose.txt")) for image in images]
     missing = [pose.name for pose in poses if not pose.is_file()]
-    if missing and len(missing) < len(poses):
-        raise InputError(folder, f"no {missing[0]} ({len(missing)} missing)", "give a pose to every image or to none")
+    found = f"no {next(iter(missing), None)} ({len(missing)} missing)"
+    require(len(missing) in (0, len(poses)), folder, found, "give a pose to every image or to none")
     rows, columns = read_depth_png(images[0]).shape
     camera = _make_camera(intrinsics, columns, rows, matrix[[0, 1, 0, 1], [0, 1, 2, 2]])
     points, mask = _read_clouds(images, camera, (height, width), max_depth_m)
@@ -67,13 +66,7 @@ def read_pose_folder(path: str | Path, *, height: int = 30, width: int = 40, max
 
 
 def read_active_vision(
-    path: str | Path,
-    num_views: int = 16,
-    *,
-    seed: int = 0,
-    height: int = 27,
-    width: int = 48,
-    max_depth_m: float = 7.0,
+    path: str | Path, num_views: int = 16, *, seed: int = 0, height: int = 27, width: int = 48, max_depth_m: float = 7.0
 ) -> DepthSequence:
     """Reads one random trajectory through a scene (DeepMapping section 4.2); every second step moves, the others turn.
 
@@ -95,14 +88,13 @@ def read_active_vision(
     if num_views < 2:
         raise ValueError(f"num_views: expected at least 2, got {num_views}")
     scene = Path(path)
-    if not scene.is_dir():
-        raise InputError(scene, "no such folder", "give the folder of a scene, such as Home_001_1")
+    require(scene.is_dir(), scene, "no such folder", "give the folder of a scene, such as Home_001_1")
     poses = _read_scene_poses(scene / "image_structs.mat")
     links = _read_links(scene / "annotations.json")
     depth_of = {name: scene / "high_res_depth" / f"{Path(name).stem[:-2]}03.png" for name in poses}
     known = sorted(name for name in poses if name in links and depth_of[name].is_file())
-    if not known:
-        raise InputError(scene, "no image with links, pose and depth", "unpack the scene's high_res_depth folder too")
+    found = "no image with links, pose and depth"
+    require(len(known) > 0, scene, found, "unpack the scene's high_res_depth folder too")
     names = _walk(known, links, num_views, np.random.default_rng([seed, 13]))
     camera = _read_colmap_camera(scene / "cameras.txt")
     points, mask = _read_clouds([depth_of[name] for name in names], camera, (height, width), max_depth_m)
@@ -123,7 +115,7 @@ def is_active_vision(path: Path) -> bool:
 
 def back_project(
     depth_m: NDArray[np.floating], camera: Camera, *, height: int, width: int, max_depth_m: float
-) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+) -> tuple[NDArray[np.float32], BoolArray]:
     """An organised cloud out of a depth image, thinned to `height` x `width` of its pixels.
 
     Args:
@@ -153,33 +145,29 @@ def back_project(
 
 def _read_clouds(
     images: Iterable[Path], camera: Camera, shape: tuple[int, int], max_depth_m: float
-) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+) -> tuple[NDArray[np.float32], BoolArray]:
     """Points (n, h, w, 3) and mask (n, h, w) of depth images in millimetres."""
     clouds = []
     for image in images:
         depth_mm = read_depth_png(image)
         depth_m = np.where(depth_mm == _NOTHING_MM, 0, depth_mm) / 1000.0
-        try:
+        with refusing(image, "{error}", "give images of the camera's size, not smaller than a cloud", (ValueError,)):
             clouds.append(back_project(depth_m, camera, height=shape[0], width=shape[1], max_depth_m=max_depth_m))
-        except ValueError as error:
-            raise InputError(image, str(error), "give images of the camera's size, not smaller than a cloud") from error
     points, mask = zip(*clouds, strict=True)
     return np.stack(points), np.stack(mask)
 
 
-def _read_matrix(path: Path, shape: tuple[int, int]) -> NDArray[np.float64]:
+def _read_matrix(path: Path, shape: tuple[int, int]) -> FloatArray:
     matrix = read_table(path)
-    if matrix.shape != shape or not np.isfinite(matrix).all():
-        raise InputError(path, f"a matrix of {matrix.shape}", f"give {shape[0]} x {shape[1]} finite numbers")
+    is_good = matrix.shape == shape and np.isfinite(matrix).all()
+    require(is_good, path, f"a matrix of {matrix.shape}", f"give {shape[0]} x {shape[1]} finite numbers")
     return matrix
 
 
 def _make_camera(path: Path, width: int, height: int, intrinsics: Iterable[float]) -> Camera:
     """The camera of fx, fy, cx, cy."""
-    try:
+    with refusing(path, "not a camera ({error})", "give focal lengths above 0", (ValueError,)):
         return Camera(width, height, *(float(value) for value in intrinsics))
-    except ValueError as error:
-        raise InputError(path, f"not a camera ({error})", "give focal lengths above 0") from error
 
 
 def _walk(known: list[str], links: dict[str, Any], num_views: int, rng: np.random.Generator) -> list[str]:
@@ -194,38 +182,32 @@ def _walk(known: list[str], links: dict[str, Any], num_views: int, rng: np.rando
     while len(names) < num_views:
         moves, turns = reachable(name, _MOVES), reachable(name, _TURNS)
         options = moves if (rng.random() < 0.5 and moves) or not turns else turns
-        if not options:
-            raise InputError(name, "no neighbour with a depth image and a pose", "unpack the whole scene")
+        require(len(options) > 0, name, "no neighbour with a depth image and a pose", "unpack the whole scene")
         name = options[rng.integers(len(options))]
         names.append(name)
     return names
 
 
-def _read_scene_poses(path: Path) -> dict[str, NDArray[np.float64]]:
+def _read_scene_poses(path: Path) -> dict[str, FloatArray]:
     """T_world_camera of every image that the reconstruction has placed, metres."""
     poses = {}
     variables = parse_mat(read_bytes(path), path)
-    try:
+    found, advice = "not the dataset's pose file ({kind})", "copy image_structs.mat of the scene"
+    with refusing(path, found, advice, (KeyError, ValueError, TypeError, AttributeError)):
         scale_m = float(variables["scale"].item()) / 1000.0
         for entry in variables["image_structs"]:
             R, t = np.asarray(entry["R"], np.float64), np.asarray(entry["t"], np.float64).reshape(-1)
             if R.shape != (3, 3) or t.shape != (3,) or not (np.isfinite(R).all() and np.isfinite(t).all()):
                 continue  # not placed by the reconstruction
-            T = np.eye(4)
-            T[:3, :3], T[:3, 3] = R.T, -R.T @ t * scale_m
-            poses[str(entry["image_name"])] = T
-    except (KeyError, ValueError, TypeError, AttributeError) as error:
-        found = f"not the dataset's pose file ({type(error).__name__})"
-        raise InputError(path, found, "copy image_structs.mat of the scene") from error
+            poses[str(entry["image_name"])] = homogeneous(R.T, -R.T @ t * scale_m)
     return poses
 
 
 def _read_links(path: Path) -> dict[str, dict[str, str]]:
-    try:
-        links = json.loads(read_bytes(path))
+    content, kinds = read_bytes(path), (UnicodeDecodeError, json.JSONDecodeError, AttributeError, RecursionError)
+    with refusing(path, "not readable ({error})", "copy annotations.json of the scene", kinds):
+        links = json.loads(content)
         return {name: {kind: str(other) for kind, other in entry.items()} for name, entry in links.items()}
-    except (UnicodeDecodeError, json.JSONDecodeError, AttributeError, RecursionError) as error:
-        raise InputError(path, f"not readable ({error})", "copy annotations.json of the scene") from error
 
 
 def _read_colmap_camera(path: Path) -> Camera:
@@ -235,9 +217,7 @@ def _read_colmap_camera(path: Path) -> Camera:
     for line in read_lines(path):
         words = line.split()
         if len(words) >= 8 and not line.startswith("#"):
-            try:
+            found = f"not a camera: {line.strip()} ({{error}})"
+            with refusing(path, found, "give COLMAP's cameras.txt", (ValueError,)):
                 return Camera(int(words[2]), int(words[3]), *(float(word) for word in words[4:8]))
-            except ValueError as error:
-                found = f"not a camera: {line.strip()} ({error})"
-                raise InputError(path, found, "give COLMAP's cameras.txt") from error
     raise InputError(path, "no camera in it", "give COLMAP's cameras.txt")

@@ -8,7 +8,8 @@ import os
 import re
 import tempfile
 import zipfile
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -16,10 +17,33 @@ import numpy as np
 from numpy.lib import format as npy_format
 from numpy.typing import ArrayLike, NDArray
 
-from dpmjax.sequences import InputError
+from dpmjax.sequences import FloatArray, InputError, require
 
 # A member of an archive that unpacks to more than this many times its size has a wrong header: deflate reaches 1032.
-_LARGEST_COMPRESSION = 1100
+LARGEST_COMPRESSION = 1100
+
+
+@contextmanager
+def refusing(source: str | Path, found: str, advice: str, kinds: tuple[type[Exception], ...]) -> Iterator[None]:
+    """Turns errors of a parser into an `InputError`.
+
+    Args:
+        source: see `InputError`.
+        found: what was found; "{error}" in it becomes the parser's message, and "{kind}" the class of its error.
+        advice: see `InputError`.
+        kinds: the errors that damaged input can raise.
+
+    Yields:
+        Nothing.
+
+    Raises:
+        InputError: an error of one of these kinds was raised within.
+    """
+    try:
+        yield
+    except kinds as error:
+        found = found.replace("{kind}", type(error).__name__).replace("{error}", str(error))
+        raise InputError(source, found, advice) from error
 
 
 def write_atomically(path: str | Path, content: bytes | str) -> Path:
@@ -107,7 +131,7 @@ def read_lines(path: str | Path) -> list[str]:
     return read_bytes(path).decode("utf-8", errors="replace").splitlines()
 
 
-def to_numbers(rows: Sequence[Sequence[str]], source: str | Path) -> NDArray[np.float64]:
+def to_numbers(rows: Sequence[Sequence[str]], source: str | Path) -> FloatArray:
     """Converts words to numbers.
 
     Args:
@@ -121,16 +145,13 @@ def to_numbers(rows: Sequence[Sequence[str]], source: str | Path) -> NDArray[np.
         InputError: there is no row, rows differ in length, or a word is no number.
     """
     widths = sorted({len(row) for row in rows})
-    if len(widths) != 1:
-        found = f"rows of {' and '.join(map(str, widths))} columns" if rows else "no row"
-        raise InputError(source, found, "give rows of equal length")
-    try:
+    found = f"rows of {' and '.join(map(str, widths))} columns" if rows else "no row"
+    require(len(widths) == 1, source, found, "give rows of equal length")
+    with refusing(source, "not a number ({error})", "write plain decimal numbers", (ValueError,)):
         return np.array(rows, np.float64)
-    except ValueError as error:
-        raise InputError(source, f"not a number ({error})", "write plain decimal numbers") from error
 
 
-def read_table(path: str | Path) -> NDArray[np.float64]:
+def read_table(path: str | Path) -> FloatArray:
     """Reads rows of numbers, separated by blanks or commas; empty lines and lines with # in front are left out.
 
     Args:
@@ -162,13 +183,12 @@ def unpack_rows(body: bytes, layout: np.dtype[np.void], count: int, source: str 
         InputError: there are fewer bytes.
     """
     expected = count * layout.itemsize
-    if len(body) < expected:
-        found = f"truncated: {count} points need {expected} bytes, {len(body)} are there"
-        raise InputError(source, found, "copy the file again")
+    found = f"truncated: {count} points need {expected} bytes, {len(body)} are there"
+    require(len(body) >= expected, source, found, "copy the file again")
     return np.frombuffer(body, layout, count=count)
 
 
-def split_rows(body: bytes, width: int, count: int, source: str | Path) -> NDArray[np.float64]:
+def split_rows(body: bytes, width: int, count: int, source: str | Path) -> FloatArray:
     """Reads rows of numbers as text.
 
     Args:
@@ -184,9 +204,8 @@ def split_rows(body: bytes, width: int, count: int, source: str | Path) -> NDArr
         InputError: there are fewer rows, a row of another width, or a word that is no number.
     """
     rows = [line.split() for line in body.decode("latin-1").splitlines() if line.strip()]
-    if len(rows) < count:
-        found = f"truncated: the header promises {count} points, {len(rows)} are there"
-        raise InputError(source, found, "copy the file again")
+    found = f"truncated: the header promises {count} points, {len(rows)} are there"
+    require(len(rows) >= count, source, found, "copy the file again")
     wrong = next((i for i, row in enumerate(rows[:count]) if len(row) != width), None)
     if wrong is not None:
         found = f"row {wrong} has {len(rows[wrong])} columns, the header promises {width}"
@@ -213,25 +232,22 @@ def load_arrays(path: str | Path, keys: Sequence[str] | None = None) -> dict[str
     Raises:
         InputError: no such file, no NumPy file, a damaged one, or one of Python objects.
     """
-    try:
-        with Path(path).open("rb") as file:
-            if file.read(6) == npy_format.MAGIC_PREFIX:
-                file.seek(0)
-                return {"points": _parse_npy(file.read())}
-        with zipfile.ZipFile(path) as archive:
+    require(Path(path).exists(), path, "no such file", "check the path")
+    found, advice = "not a readable NumPy file ({error})", "save it again with numpy.save or numpy.savez"
+    # The parsers of zip, zlib and NumPy headers raise many kinds of errors.
+    with refusing(path, found, advice, (Exception,)), Path(path).open("rb") as file:
+        if file.read(6) == npy_format.MAGIC_PREFIX:
+            file.seek(0)
+            return {"points": _parse_npy(file.read())}
+        with zipfile.ZipFile(file) as archive:
             members = {entry.filename.removesuffix(".npy"): entry for entry in archive.infolist()}
             chosen = {key: members[key] for key in (members if keys is None else keys) if key in members}
             return {key: _parse_npy(_unpack(archive, member)) for key, member in chosen.items()}
-    except FileNotFoundError as error:
-        raise InputError(path, "no such file", "check the path") from error
-    except Exception as error:  # The parsers of zip, zlib and NumPy headers raise many kinds.
-        found = f"not a readable NumPy file ({error})"
-        raise InputError(path, found, "save it again with numpy.save or numpy.savez") from error
 
 
 def _unpack(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> bytes:
     """The bytes of a member; a ValueError where it claims more than its packed size can hold."""
-    if member.file_size > _LARGEST_COMPRESSION * (member.compress_size + 64):
+    if member.file_size > LARGEST_COMPRESSION * (member.compress_size + 64):
         raise ValueError(f"{member.filename} claims {member.file_size} bytes, packed into {member.compress_size}")
     return archive.read(member)
 

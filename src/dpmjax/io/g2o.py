@@ -15,9 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from dpmjax.io.files import read_lines, write_atomically
+from dpmjax.io.files import read_lines, refusing, write_atomically
+from dpmjax.io.poses import homogeneous
 from dpmjax.pose_graph.graph import Edges, PoseGraph
-from dpmjax.sequences import InputError
+from dpmjax.sequences import FloatArray, require
 
 
 class _Kind(NamedTuple):
@@ -51,30 +52,28 @@ def read_g2o(path: str | Path) -> PoseGraph:
     lines = _read_words(path)
     tags = {words[0] for _, words in lines} - {"FIX"}
     kind = _PLANAR if tags <= {_PLANAR.vertex, _PLANAR.edge} else _SPATIAL
-    for number, words in lines:
-        if words[0] not in ("FIX", kind.vertex, kind.edge):
-            raise InputError(f"{path}: line {number}", f"'{words[0][:40]}' is not read here", _ADVICE)
+    for number, (tag, *_) in lines:
+        is_known = tag in ("FIX", kind.vertex, kind.edge)
+        require(is_known, f"{path}: line {number}", f"'{tag[:40]}' is not read here", _ADVICE)
     triangle = np.triu_indices(kind.tangent_size)
     nodes, poses = _rows(path, (line for line in lines if line[1][0] == kind.vertex), 1, kind.pose_size)
     ends, values = _rows(
         path, (line for line in lines if line[1][0] == kind.edge), 2, kind.pose_size + len(triangle[0])
     )
-    if not len(nodes):
-        raise InputError(path, "no vertices", _ADVICE)
+    require(len(nodes) > 0, path, "no vertices", _ADVICE)
     row_of = {int(node): row for row, node in enumerate(nodes[:, 0])}
     fixed = [number for _, words in lines if words[0] == "FIX" for number in words[1:]]
     information = np.zeros((len(values), kind.tangent_size, kind.tangent_size))
     information[:, triangle[0], triangle[1]] = information[:, triangle[1], triangle[0]] = values[:, kind.pose_size :]
-    try:
+    with (
+        refusing(path, "node {error} has no vertex", "add its VERTEX line", (KeyError,)),
+        refusing(path, "{error}", "mend the file", (ValueError,)),
+    ):
         target, source = (np.array([row_of[int(node)] for node in column], np.int64) for column in ends.T)
         is_fixed = np.zeros(len(nodes), bool)
         is_fixed[[row_of[int(node)] for node in fixed]] = True
         edges = Edges(source, target, _poses(values[:, : kind.pose_size]), information)
         return PoseGraph.create(_poses(poses), edges, is_fixed=is_fixed, ids=nodes[:, 0])
-    except KeyError as error:
-        raise InputError(path, f"node {error} has no vertex", "add its VERTEX line") from error
-    except ValueError as error:
-        raise InputError(path, str(error), "mend the file") from error
 
 
 def write_g2o(path: str | Path, graph: PoseGraph) -> Path:
@@ -109,42 +108,37 @@ def _read_words(path: str | Path) -> list[tuple[int, list[str]]]:
 
 def _rows(
     path: str | Path, lines: Iterable[tuple[int, list[str]]], num_nodes: int, num_values: int
-) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+) -> tuple[NDArray[np.int64], FloatArray]:
     """Node ids and numbers of all lines of one tag."""
     nodes, values = [], []
     for number, (tag, *words) in lines:
-        if len(words) != num_nodes + num_values:
-            found = f"{len(words)} values after {tag}"
-            raise InputError(f"{path}: line {number}", found, f"give {num_nodes + num_values} values")
-        try:
+        source, count = f"{path}: line {number}", num_nodes + num_values
+        require(len(words) == count, source, f"{len(words)} values after {tag}", f"give {count} values")
+        with refusing(source, "not a number ({error})", "write plain numbers", (ValueError,)):
             nodes.append([int(word) for word in words[:num_nodes]])
             values.append([float(word) for word in words[num_nodes:]])
-        except ValueError as error:
-            raise InputError(f"{path}: line {number}", f"not a number ({error})", "write plain numbers") from error
-        if max(map(abs, nodes[-1])) > np.iinfo(np.int64).max:
-            raise InputError(f"{path}: line {number}", "a node number above 2^63", "number the nodes from 0")
+        is_small = max(map(abs, nodes[-1])) <= np.iinfo(np.int64).max
+        require(is_small, source, "a node number above 2^63", "number the nodes from 0")
     return np.array(nodes, np.int64).reshape(-1, num_nodes), np.array(values).reshape(-1, num_values)
 
 
-def _poses(numbers: NDArray[np.float64]) -> NDArray[np.float64]:
+def _poses(numbers: FloatArray) -> FloatArray:
     """Poses of the graph from numbers of the file: x y heading, or x y z qx qy qz qw to matrices."""
     if numbers.shape[1] == 3:
         return numbers
     quaternions = numbers[:, 3:]
     if not np.isfinite(numbers).all() or (np.abs(np.linalg.norm(np.clip(quaternions, -2, 2), axis=1) - 1) > 0.1).any():
         raise ValueError("a quaternion that is not of length 1, or a number that is not finite")
-    matrices = np.tile(np.eye(4), (len(numbers), 1, 1))
-    if len(numbers):
-        matrices[:, :3, :3], matrices[:, :3, 3] = Rotation.from_quat(quaternions).as_matrix(), numbers[:, :3]
-    return matrices
+    rotations = Rotation.from_quat(quaternions).as_matrix() if len(numbers) else np.zeros((0, 3, 3))
+    return homogeneous(rotations, numbers[:, :3])
 
 
-def _numbers(poses: NDArray[np.float64]) -> NDArray[np.float64]:
+def _numbers(poses: FloatArray) -> FloatArray:
     """Numbers of the file from poses of the graph."""
     if poses.ndim == 2 or not len(poses):
         return poses.reshape(len(poses), -1)
     return np.column_stack([poses[:, :3, 3], Rotation.from_matrix(poses[:, :3, :3]).as_quat()])
 
 
-def _line(tag: str, nodes: Iterable[np.integer], values: NDArray[np.float64]) -> str:
+def _line(tag: str, nodes: Iterable[np.integer], values: FloatArray) -> str:
     return " ".join([tag, *map(str, nodes), *(f"{value:.17g}" for value in values.tolist())])

@@ -12,25 +12,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dpmjax.sequences import InputError
+from dpmjax.io.files import LARGEST_COMPRESSION, refusing
 
 _MATRIX, _COMPRESSED = 14, 15
 _CELL, _STRUCT, _OBJECT, _CHAR, _SPARSE = range(1, 6)
-_STORAGE = {
-    1: "i1",
-    2: "u1",
-    3: "i2",
-    4: "u2",
-    5: "i4",
-    6: "u4",
-    7: "f4",
-    9: "f8",
-    12: "i8",
-    13: "u8",
-    16: "u1",
-    17: "u2",
-}
-_LARGEST_COMPRESSION = 1100
+_STORAGE = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8", 12: "i8", 13: "u8"}
+_STORAGE |= {16: "u1", 17: "u2"}  # text
 
 
 def parse_mat(content: bytes, source: str | Path) -> dict[str, Any]:
@@ -46,13 +33,12 @@ def parse_mat(content: bytes, source: str | Path) -> dict[str, Any]:
     Raises:
         InputError: no such file format, or a damaged file.
     """
-    try:
+    # Damage shows as one of many kinds of errors.
+    found, advice = "not a readable MATLAB file ({kind})", "save it again with -v7, or remove it"
+    with refusing(source, found, advice, (Exception,)):
         order = {b"IM": "<", b"MI": ">"}[content[126:128]]
         bodies = [body for kind, body in _elements(content[128:], order) if kind == _MATRIX]
         return dict(_parse_matrix(body, order) for body in bodies)
-    except Exception as error:  # Damage shows as one of many kinds.
-        found = f"not a readable MATLAB file ({type(error).__name__})"
-        raise InputError(source, found, "save it again with -v7, or remove it") from error
 
 
 def _elements(data: bytes, order: str) -> Iterator[tuple[int, bytes]]:
@@ -65,7 +51,7 @@ def _elements(data: bytes, order: str) -> Iterator[tuple[int, bytes]]:
         if start + size > len(data) or (end == 8 and size > 4):
             raise ValueError("an element is longer than the file")
         if kind == _COMPRESSED:
-            limit = _LARGEST_COMPRESSION * (size + 64)
+            limit = LARGEST_COMPRESSION * (size + 64)
             yield from _elements(zlib.decompressobj().decompress(data[start : start + size], limit), order)
         else:
             yield kind, data[start : start + size]

@@ -8,14 +8,13 @@ from __future__ import annotations
 import io
 import re
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from dpmjax.geometry import se2
 from dpmjax.io.files import load_arrays, read_lines, read_table, write_atomically
-from dpmjax.sequences import InputError
+from dpmjax.sequences import FloatArray, InputError, Unit, require
 
 _LAYOUTS = (
     "x y theta, TUM (stamp tx ty tz qx qy qz qw), KITTI (12 numbers a row), or .npy of (n, 3), (n, 3, 3) or (n, 4, 4)"
@@ -23,7 +22,7 @@ _LAYOUTS = (
 _LARGEST_TILT_DEG = 10.0
 
 
-def read_poses(path: str | Path) -> NDArray[np.float64]:
+def read_poses(path: str | Path) -> FloatArray:
     """Reads poses as they stand in the file, whatever frame they are in.
 
     Args:
@@ -39,7 +38,7 @@ def read_poses(path: str | Path) -> NDArray[np.float64]:
     return planar_to_homogeneous(poses) if poses.ndim == 2 else poses
 
 
-def read_planar_poses(path: str | Path, num_scans: int, unit: Literal["px", "m"]) -> NDArray[np.float64]:
+def read_planar_poses(path: str | Path, num_scans: int, unit: Unit) -> FloatArray:
     """Reads the planar trajectory of a set of scans.
 
     Args:
@@ -60,14 +59,13 @@ def read_planar_poses(path: str | Path, num_scans: int, unit: Literal["px", "m"]
         if named and named.group(1) != unit:
             raise InputError(path, f"poses in {named.group(1)}, the scans are in {unit}", f"give poses in {unit}")
     poses = _read(path)
-    if len(poses) != num_scans:
-        raise InputError(path, f"{len(poses)} poses for {num_scans} scans", "give one pose a scan, in the scans' order")
+    found = f"{len(poses)} poses for {num_scans} scans"
+    require(len(poses) == num_scans, path, found, "give one pose a scan, in the scans' order")
     if poses.ndim == 2:
         return poses
     tilt = np.rad2deg(np.arccos(np.clip(poses[:, 2, 2], -1, 1)))
-    if (tilt > _LARGEST_TILT_DEG).any():
-        found = f"pose {int(np.argmax(tilt))} is tilted by {tilt.max():.0f} degrees"
-        raise InputError(path, found, "give poses of an upright sensor, z up (not of a camera)")
+    found = f"pose {tilt.argmax()} is tilted by {tilt.max():.0f} degrees"
+    require(tilt.max() <= _LARGEST_TILT_DEG, path, found, "give poses of an upright sensor, z up (not of a camera)")
     return np.column_stack([poses[:, :2, 3], np.arctan2(poses[:, 1, 0], poses[:, 0, 0])])
 
 
@@ -95,11 +93,9 @@ def write_tum(
     stamps = np.arange(len(matrices), dtype=np.float64) if times is None else np.asarray(times, np.float64)
     if stamps.shape != (len(matrices),) or not np.isfinite(stamps).all():
         raise ValueError(f"times must be ({len(matrices)},) and finite, got {stamps.shape}")
-    rows = [f"# stamp_s tx ty tz qx qy qz qw; {frame}, unit {unit}"]
-    for stamp, matrix, quaternion in zip(stamps, matrices, _to_quaternions(matrices[:, :3, :3]), strict=True):
-        numbers = " ".join(f"{value:.9f}" for value in (*matrix[:3, 3], *quaternion))
-        rows.append(f"{stamp:.6f} {numbers}")
-    return write_atomically(path, "\n".join(rows) + "\n")
+    values = np.column_stack([stamps, matrices[:, :3, 3], _to_quaternions(matrices[:, :3, :3])])
+    header = f"stamp_s tx ty tz qx qy qz qw; {frame}, unit {unit}"
+    return _write_table(path, values, ["%.6f", *["%.9f"] * 7], header)
 
 
 def write_kitti(path: str | Path, poses: ArrayLike) -> Path:
@@ -115,8 +111,7 @@ def write_kitti(path: str | Path, poses: ArrayLike) -> Path:
     Raises:
         ValueError: see `write_tum`.
     """
-    rows = [" ".join(f"{value:.9e}" for value in matrix[:3].ravel()) for matrix in _as_matrices(poses)]
-    return write_atomically(path, "".join(f"{row}\n" for row in rows))
+    return _write_table(path, _as_matrices(poses)[:, :3].reshape(-1, 12), "%.9e")
 
 
 def write_poses_npy(path: str | Path, poses: ArrayLike) -> Path:
@@ -138,7 +133,22 @@ def write_poses_npy(path: str | Path, poses: ArrayLike) -> Path:
     return write_atomically(path, buffer.getvalue())
 
 
-def planar_to_homogeneous(poses: NDArray[np.float64]) -> NDArray[np.float64]:
+def homogeneous(rotations: FloatArray, translations: FloatArray) -> FloatArray:
+    """Homogeneous matrices of their parts.
+
+    Args:
+        rotations: (..., 3, 3).
+        translations: (..., 3).
+
+    Returns:
+        (..., 4, 4).
+    """
+    matrices = np.tile(np.eye(4), (*translations.shape[:-1], 1, 1))
+    matrices[..., :3, :3], matrices[..., :3, 3] = rotations, translations
+    return matrices
+
+
+def planar_to_homogeneous(poses: FloatArray) -> FloatArray:
     """Puts planar poses into space.
 
     Args:
@@ -152,21 +162,24 @@ def planar_to_homogeneous(poses: NDArray[np.float64]) -> NDArray[np.float64]:
     return matrices
 
 
-def to_homogeneous(rows: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Matrices of KITTI rows.
+def from_rows(rows: FloatArray, source: str | Path) -> FloatArray:
+    """Checked matrices of KITTI rows.
 
     Args:
-        rows: (n, 12) first three rows, row-major.
+        rows: (n, 12) or (12,), the first three rows of each matrix, row-major.
+        source: for messages.
 
     Returns:
         (n, 4, 4).
+
+    Raises:
+        InputError: see `check_poses`.
     """
-    matrices = np.tile(np.eye(4), (len(rows), 1, 1))
-    matrices[:, :3] = rows.reshape(-1, 3, 4)
-    return matrices
+    tops = rows.reshape(-1, 3, 4)
+    return check_poses(homogeneous(tops[..., :3], tops[..., 3]), source)
 
 
-def check_poses(poses: NDArray[np.float64], source: str | Path) -> NDArray[np.float64]:
+def check_poses(poses: FloatArray, source: str | Path) -> FloatArray:
     """Refuses poses that are not finite or no rigid motions.
 
     Args:
@@ -181,7 +194,7 @@ def check_poses(poses: NDArray[np.float64], source: str | Path) -> NDArray[np.fl
     """
     bad = ~np.isfinite(poses.reshape(len(poses), -1)).all(axis=1)
     if bad.any():
-        raise InputError(source, f"NaN or infinite values in pose {int(np.argmax(bad))}", "give a pose to every scan")
+        raise InputError(source, f"NaN or infinite values in pose {bad.argmax()}", "give a pose to every scan")
     if poses.ndim == 3:
         dim = poses.shape[2] - 1
         turn = poses[:, :dim, :dim]
@@ -189,13 +202,11 @@ def check_poses(poses: NDArray[np.float64], source: str | Path) -> NDArray[np.fl
             off = np.abs(turn @ turn.transpose(0, 2, 1) - np.eye(dim)).max(axis=(1, 2))
             bad = ~(off <= 1e-2) | ~(np.linalg.det(turn) > 0)
         if bad.any():
-            raise InputError(source, f"pose {int(np.argmax(bad))} is no rigid motion", "give rotation matrices")
+            raise InputError(source, f"pose {bad.argmax()} is no rigid motion", "give rotation matrices")
     return poses
 
 
-def interpolate_poses(
-    times: NDArray[np.float64], poses: NDArray[np.float64], wanted: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def interpolate_poses(times: FloatArray, poses: FloatArray, wanted: FloatArray) -> FloatArray:
     """Poses at other times: positions linear, rotations on the shortest arc.
 
     Args:
@@ -209,58 +220,55 @@ def interpolate_poses(
     from scipy.spatial.transform import Rotation, Slerp
 
     at = np.clip(wanted, times[0], times[-1])
-    found = np.tile(np.eye(4), (len(at), 1, 1))
-    found[:, :3, 3] = np.column_stack([np.interp(at, times, column) for column in poses[:, :3, 3].T])
     rotations = Rotation.from_matrix(poses[:, :3, :3])
-    found[:, :3, :3] = (Slerp(times, rotations)(at) if len(times) > 1 else rotations[[0] * len(at)]).as_matrix()
-    return found
+    turned = Slerp(times, rotations)(at) if len(times) > 1 else rotations[[0] * len(at)]
+    positions = np.column_stack([np.interp(at, times, column) for column in poses[:, :3, 3].T])
+    return homogeneous(turned.as_matrix(), positions)
 
 
-def _read(path: Path) -> NDArray[np.float64]:
+def _write_table(path: str | Path, values: FloatArray, form: str | list[str], header: str = "") -> Path:
+    buffer = io.StringIO()
+    np.savetxt(buffer, values, form, header=header)
+    return write_atomically(path, buffer.getvalue())
+
+
+def _read(path: Path) -> FloatArray:
     """Checked poses of a file: planar (n, 3), or (n, 4, 4)."""
     if path.suffix.lower() == ".npy":
         array = load_arrays(path).get("points", np.zeros(0))
-        if array.dtype.kind not in "fiu":
-            raise InputError(path, f"an array of {array.dtype}", f"give {_LAYOUTS}")
+        require(array.dtype.kind in "fiu", path, f"an array of {array.dtype}", f"give {_LAYOUTS}")
         values = array.astype(np.float64)
     else:
         values = read_table(path)
-    if values.ndim == 3 and values.shape[1:] == (3, 3):
+    if values.shape[1:] == (3, 3):
         return se2.from_matrix(check_poses(values, path))
-    if values.ndim == 3 and values.shape[1:] == (4, 4):
+    if values.shape[1:] == (4, 4):
         values = values.reshape(-1, 16)
     width = values.shape[1] if values.ndim == 2 else 0
-    if width not in (3, 8, 12, 16) or not len(values):
-        found = f"rows of {width} columns" if width else f"an array of {values.shape}"
-        raise InputError(path, found, f"give {_LAYOUTS}")
-    if width == 3:
-        return check_poses(values, path)
-    return check_poses(_from_tum(values, path) if width == 8 else to_homogeneous(values[:, :12]), path)
+    found = f"rows of {width} columns" if width else f"an array of {values.shape}"
+    require(width in (3, 8, 12, 16) and len(values) > 0, path, found, f"give {_LAYOUTS}")
+    if width == 8:
+        return check_poses(_from_tum(values, path), path)
+    return check_poses(values, path) if width == 3 else from_rows(values[:, :12], path)
 
 
-def _from_tum(rows: NDArray[np.float64], path: Path) -> NDArray[np.float64]:
+def _from_tum(rows: FloatArray, path: Path) -> FloatArray:
     from scipy.spatial.transform import Rotation
 
-    if not np.isfinite(rows).all():
-        raise InputError(path, "NaN or infinite values", "give a pose to every scan")
-    if not (np.abs(np.linalg.norm(np.clip(rows[:, 4:], -2, 2), axis=1) - 1) <= 0.01).all():
-        raise InputError(path, "quaternions of another length than 1", "write TUM rows: stamp tx ty tz qx qy qz qw")
-    poses = np.tile(np.eye(4), (len(rows), 1, 1))
-    poses[:, :3, 3], poses[:, :3, :3] = rows[:, 1:4], Rotation.from_quat(rows[:, 4:]).as_matrix()
-    return poses
+    require(np.isfinite(rows).all(), path, "NaN or infinite values", "give a pose to every scan")
+    is_unit = (np.abs(np.linalg.norm(np.clip(rows[:, 4:], -2, 2), axis=1) - 1) <= 0.01).all()
+    require(is_unit, path, "quaternions of another length than 1", "write TUM rows: stamp tx ty tz qx qy qz qw")
+    return homogeneous(Rotation.from_quat(rows[:, 4:]).as_matrix(), rows[:, 1:4])
 
 
-def _to_quaternions(rotations: NDArray[np.float64]) -> NDArray[np.float64]:
+def _to_quaternions(rotations: FloatArray) -> FloatArray:
     """(n, 4) x y z w with w >= 0."""
     from scipy.spatial.transform import Rotation
 
-    if not len(rotations):
-        return np.zeros((0, 4))
-    quaternions = Rotation.from_matrix(rotations).as_quat()
-    return np.where(quaternions[:, 3:] < 0, -quaternions, quaternions)
+    return Rotation.from_matrix(rotations).as_quat(canonical=True) if len(rotations) else np.zeros((0, 4))
 
 
-def _as_matrices(poses: ArrayLike) -> NDArray[np.float64]:
+def _as_matrices(poses: ArrayLike) -> FloatArray:
     """(n, 4, 4) out of (n, 3) or (n, 4, 4)."""
     values = np.asarray(poses, np.float64)
     if not (values.ndim == 2 and values.shape[1] == 3) and values.shape[1:] != (4, 4):

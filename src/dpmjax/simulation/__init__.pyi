@@ -2,6 +2,10 @@ from .apartment import Apartment as Apartment
 from .apartment import GridWalkConfig as GridWalkConfig
 from .apartment import make_apartment as make_apartment
 from .apartment import simulate_depth_sequence as simulate_depth_sequence
+from .raycast2d import cast_rays as cast_rays
+from .raycast2d import cast_scans as cast_scans
+from .raycast2d import scan_world as scan_world
+from .raycast2d import simulate_sequence as simulate_sequence
 from .town.cast import CastConfig as CastConfig
 from .town.driving import Drive as Drive
 from .town.driving import DriveConfig as DriveConfig
@@ -16,11 +20,6 @@ from .town.scan import OS1_64 as OS1_64
 from .town.scan import VLP16 as VLP16
 from .town.scan import LidarSensor as LidarSensor
 from .town.scan import scan_town as scan_town
-from .world2d.raycast import cast_rays as cast_rays
-from .world2d.raycast import cast_scans as cast_scans
-from .world2d.raycast import scan_world as scan_world
-from .world2d.raycast import simulate_sequence as simulate_sequence
-from .world2d.trajectory import TrajectoryConfig as TrajectoryConfig
-from .world2d.trajectory import simulate_trajectory as simulate_trajectory
-from .world2d.world import World as World
-from .world2d.world import make_world as make_world
+from .trajectory2d import simulate_trajectory as simulate_trajectory
+from .world2d import World as World
+from .world2d import make_world as make_world

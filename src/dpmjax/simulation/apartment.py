@@ -13,12 +13,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
-from numpy.typing import NDArray
 
-from dpmjax.sequences import ACTIVE_VISION, Camera, DepthSequence
+from dpmjax.sequences import ACTIVE_VISION, BoolArray, DepthSequence, FloatArray
 from dpmjax.types import AnyArray
 
 _CAMERA_HEIGHT_M, _ROOM_HEIGHT_M, _WALL_M, _DOOR_M = 1.1, 2.6, 0.12, 0.95
+# The walk (DeepMapping section 4.2): neighbouring places and views, share of the steps that move; the others turn.
+_GRID_M, _TURN_DEG, _MOVE_SHARE = 0.3, 30.0, 0.5
+_CLEARANCE_M = 0.2  # Places keep this distance from walls and furniture.
+_FARTHEST_M = 6.0  # Deeper pixels are masked.
 _PARALLEL = 1e-9
 _Box = tuple[list[float], list[float], float]  # centre, half sizes, yaw
 
@@ -38,14 +41,14 @@ class Apartment:
     """
 
     name: str
-    centres: NDArray[np.float64]
-    half_sizes: NDArray[np.float64]
-    yaws: NDArray[np.float64]
+    centres: FloatArray
+    half_sizes: FloatArray
+    yaws: FloatArray
     size_x_m: float
     size_z_m: float
-    is_seen_through: NDArray[np.bool_]
+    is_seen_through: BoolArray
 
-    def is_free(self, places: NDArray[np.float64], clearance_m: float) -> NDArray[np.bool_]:
+    def is_free(self, places: FloatArray, clearance_m: float) -> BoolArray:
         """Which places are free for the robot below the camera; lower furniture counts too.
 
         Args:
@@ -56,58 +59,41 @@ class Apartment:
             (m,) True where the place is free.
         """
         far = np.array([self.size_x_m, self.size_z_m]) - clearance_m
-        inside: NDArray[np.bool_] = np.all((places > clearance_m) & (places < far), axis=1)
-        for centre, half, yaw in zip(
-            self.centres[~self.is_seen_through],
-            self.half_sizes[~self.is_seen_through],
-            self.yaws[~self.is_seen_through],
-            strict=True,
-        ):
-            if centre[1] + half[1] < -0.9:  # hangs above the robot
-                continue
-            dx, dz = (places - centre[[0, 2]]).T
-            u, v = np.cos(yaw) * dx - np.sin(yaw) * dz, np.sin(yaw) * dx + np.cos(yaw) * dz
-            inside &= (np.abs(u) > half[0] + clearance_m) | (np.abs(v) > half[2] + clearance_m)
-        return inside
+        inside = np.all((places > clearance_m) & (places < far), axis=1)
+        hangs_above = self.centres[:, 1] + self.half_sizes[:, 1] < -0.9
+        kept = ~self.is_seen_through & ~hangs_above
+        dx, dz = np.moveaxis(places[:, None] - self.centres[kept][:, [0, 2]], -1, 0)
+        cos, sin = np.cos(self.yaws[kept]), np.sin(self.yaws[kept])
+        half = self.half_sizes[kept] + clearance_m
+        is_apart = (np.abs(cos * dx - sin * dz) > half[:, 0]) | (np.abs(sin * dx + cos * dz) > half[:, 2])
+        return inside & is_apart.all(axis=1)
 
 
 @dataclass(frozen=True)
 class GridWalkConfig:
-    """How the camera travels (DeepMapping section 4.2).
+    """What the clouds of a walk are like.
 
     Attributes:
-        grid_m: distance of neighbouring places.
-        turn_deg: angle between neighbouring views.
-        move_share: share of the steps that go to a neighbouring place; the others turn.
-        clearance_m: places keep this distance from walls and furniture.
         height: rows of a cloud.
         width: columns of a cloud.
-        max_depth_m: deeper pixels are masked.
         depth_noise_m: standard deviation of the depth at one metre; it grows with the square of the depth, as a
             structured-light camera's does.
+
+    Raises:
+        ValueError: negative noise.
     """
 
-    grid_m: float = 0.3
-    turn_deg: float = 30.0
-    move_share: float = 0.5
-    clearance_m: float = 0.2
     height: int = 27
     width: int = 48
-    max_depth_m: float = 6.0
     depth_noise_m: float = 0.0
 
     def __post_init__(self) -> None:
-        if not 0.0 <= self.move_share <= 1.0 or not min(self.grid_m, self.turn_deg) > 0.0 or self.depth_noise_m < 0.0:
-            raise ValueError(f"expected a grid, a turn above 0, a share of 0 to 1 and noise of 0 or more, got {self}")
+        if self.depth_noise_m < 0.0:
+            raise ValueError(f"depth_noise_m: expected 0 or more, got {self.depth_noise_m}")
 
 
 def simulate_depth_sequence(
-    apartment: int | Apartment = 0,
-    num_views: int = 16,
-    *,
-    seed: int = 0,
-    config: GridWalkConfig | None = None,
-    camera: Camera = ACTIVE_VISION,
+    apartment: int | Apartment = 0, num_views: int = 16, *, seed: int = 0, config: GridWalkConfig | None = None
 ) -> DepthSequence:
     """A random walk over the grid of an apartment, seen by a depth camera that looks level.
 
@@ -115,8 +101,7 @@ def simulate_depth_sequence(
         apartment: seed for `make_apartment`, or an apartment.
         num_views: 8 or 16 in the paper.
         seed: of walk and noise.
-        config: of the walk; the paper's protocol where None.
-        camera: whose rays are cast.
+        config: of the clouds; those of the paper's size without noise where None.
 
     Returns:
         The sequence; its motion is planar.
@@ -129,15 +114,15 @@ def simulate_depth_sequence(
     config = config or GridWalkConfig()
     home = apartment if isinstance(apartment, Apartment) else make_apartment(apartment)
     rng = np.random.default_rng([seed, 11])
-    T_world_camera = _planar_to_matrices(_walk(home, num_views, config, rng))
-    rows, columns = camera.sample_pixels(config.height, config.width)
-    rays = camera.rays(columns.astype(np.float64), rows.astype(np.float64))
+    T_world_camera = _planar_to_matrices(_walk(home, num_views, rng))
+    rows, columns = ACTIVE_VISION.sample_pixels(config.height, config.width)
+    rays = ACTIVE_VISION.rays(columns.astype(np.float64), rows.astype(np.float64))
     # One capacity for all apartments, so that the caster compiles once.
     spare = -len(home.centres) % 32
     boxes = (np.pad(home.centres, ((0, spare), (0, 0))), np.pad(home.half_sizes, ((0, spare), (0, 0))))
     cast = jax.vmap(cast_depth, in_axes=(0, None, None, None, None))
     depth = np.asarray(cast(T_world_camera, rays, *boxes, np.pad(home.yaws, (0, spare))), np.float64)
-    mask = np.isfinite(depth) & (depth <= config.max_depth_m) & (depth > 0.05)
+    mask = np.isfinite(depth) & (depth <= _FARTHEST_M) & (depth > 0.05)
     depth = np.where(mask, depth, 0.0)
     depth += config.depth_noise_m * depth**2 * rng.standard_normal(depth.shape)
     points = np.where(mask[..., None], rays * depth[..., None], 0.0).astype(np.float32)
@@ -211,7 +196,7 @@ def _place_furniture(rng: np.random.Generator, rooms: _Rooms) -> list[_Box]:
 
 
 def _build_furniture(
-    rng: np.random.Generator, kind: str, place: NDArray[np.float64], footprint: tuple[float, float, float]
+    rng: np.random.Generator, kind: str, place: FloatArray, footprint: tuple[float, float, float]
 ) -> list[_Box]:
     """The boxes of a piece; the footprint is width, depth and yaw."""
     floor, ceiling = _CAMERA_HEIGHT_M, _CAMERA_HEIGHT_M - _ROOM_HEIGHT_M
@@ -273,23 +258,23 @@ def cast_depth(
     return jax.vmap(meet)(jnp.asarray(centres), jnp.asarray(half_sizes), jnp.asarray(yaws)).min(0)
 
 
-def _walk(home: Apartment, num_views: int, config: GridWalkConfig, rng: np.random.Generator) -> NDArray[np.float64]:
+def _walk(home: Apartment, num_views: int, rng: np.random.Generator) -> FloatArray:
     """(n, 3) x, z and angle about y: one step to a neighbouring place, or one turn, from view to view."""
-    x, z = np.arange(0.0, home.size_x_m, config.grid_m), np.arange(0.0, home.size_z_m, config.grid_m)
+    x, z = np.arange(0.0, home.size_x_m, _GRID_M), np.arange(0.0, home.size_z_m, _GRID_M)
     places = np.stack(np.meshgrid(x, z, indexing="ij"), axis=-1)
-    is_free = home.is_free(places.reshape(-1, 2), config.clearance_m).reshape(places.shape[:2])
+    is_free = home.is_free(places.reshape(-1, 2), _CLEARANCE_M).reshape(places.shape[:2])
     free = np.argwhere(is_free)
     if len(free) == 0:
-        raise ValueError(f"{home.name} has no free place with {config.clearance_m} m of clearance")
-    at, view = free[rng.integers(len(free))], int(rng.integers(round(360.0 / config.turn_deg)))
+        raise ValueError(f"{home.name} has no free place with {_CLEARANCE_M} m of clearance")
+    at, view = free[rng.integers(len(free))], int(rng.integers(round(360.0 / _TURN_DEG)))
     turn_sign = int(rng.choice([-1, 1]))
     poses = []
     for _ in range(num_views):
-        poses.append([*places[tuple(at)], np.deg2rad(view * config.turn_deg)])
+        poses.append([*places[tuple(at)], np.deg2rad(view * _TURN_DEG)])
         neighbours = at + np.array([[1, 0], [-1, 0], [0, 1], [0, -1]])
         inside = ((neighbours >= 0) & (neighbours < is_free.shape)).all(1)
         reachable = [n for n, ok in zip(neighbours, inside, strict=True) if ok and is_free[tuple(n)]]
-        if reachable and rng.random() < config.move_share:
+        if reachable and rng.random() < _MOVE_SHARE:
             at = reachable[rng.integers(len(reachable))]
         else:
             turn_sign = -turn_sign if rng.random() < 0.2 else turn_sign
@@ -297,7 +282,7 @@ def _walk(home: Apartment, num_views: int, config: GridWalkConfig, rng: np.rando
     return np.array(poses)
 
 
-def _planar_to_matrices(poses: NDArray[np.float64]) -> NDArray[np.float64]:
+def _planar_to_matrices(poses: FloatArray) -> FloatArray:
     """(n, 4, 4) T_world_camera of x, z and the angle about y."""
     cos, sin = np.cos(poses[:, 2]), np.sin(poses[:, 2])
     T = np.tile(np.eye(4), (len(poses), 1, 1))

@@ -9,14 +9,14 @@ import jax
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from dpmjax.sequences import LidarSequence
-from dpmjax.simulation.town.cast import CastConfig
+from dpmjax.sequences import FloatArray, LidarSequence
 from dpmjax.simulation.town.make import Town, TownConfig, make_town
 from dpmjax.simulation.town.scan import HDL64E, LidarSensor, scan_town
 from dpmjax.simulation.town.streets import arc_lengths, at_way, lane_of, tangents
 
 _WHEELBASE_M = 2.7
 _TRACK_M = 1.6
+_SHAKE_DEG = 0.25  # Standard deviation of fast roll and pitch.
 _DRIVE_STREAM = 8151
 
 
@@ -27,12 +27,10 @@ class DriveConfig:
     Attributes:
         speed_m_s: on straight streets; in corners it is a third of that at least.
         rate_hz: scans per second.
-        start_m: where on the route the drive begins.
         length_m: way that is driven; None for once round (a closed route) or to the end.
         is_reversed: the other way round, in the other lane.
         sensor_height_m: above the ground.
         sway_m: standard deviation of the way the car wanders in its lane.
-        shake_deg: standard deviation of fast roll and pitch.
 
     Raises:
         ValueError: speed, rate or length not positive.
@@ -40,12 +38,10 @@ class DriveConfig:
 
     speed_m_s: float = 8.0
     rate_hz: float = 10.0
-    start_m: float = 0.0
     length_m: float | None = None
     is_reversed: bool = False
     sensor_height_m: float = 1.73
     sway_m: float = 0.15
-    shake_deg: float = 0.25
 
     def __post_init__(self) -> None:
         if not (self.speed_m_s > 0 and self.rate_hz > 0 and (self.length_m is None or self.length_m > 0)):
@@ -60,8 +56,8 @@ class Drive(NamedTuple):
         times: (n,) s, from 0.
     """
 
-    T_world_lidar: NDArray[np.float64]
-    times: NDArray[np.float64]
+    T_world_lidar: FloatArray
+    times: FloatArray
 
 
 def simulate_lidar_sequence(
@@ -71,7 +67,6 @@ def simulate_lidar_sequence(
     driving: DriveConfig | None = None,
     sensor: LidarSensor = HDL64E,
     trajectory: ArrayLike | None = None,
-    casting: CastConfig = CastConfig(),  # noqa: B008
 ) -> LidarSequence:
     """A drive through a town of its own; a scan is simulated when it is read.
 
@@ -81,7 +76,6 @@ def simulate_lidar_sequence(
         driving: how the car drives; None takes the default with the sensor's own height.
         sensor: the lidar.
         trajectory: (n, 4, 4) `T_world_lidar` of a real drive to lay the street along, see `make_town`.
-        casting: capacities of the ray caster.
 
     Returns:
         The sequence, with exact poses and times. The world is the town's.
@@ -96,16 +90,11 @@ def simulate_lidar_sequence(
     def read_scan(index: int) -> NDArray[np.float32]:
         key = jax.random.fold_in(jax.random.key(seed), index)
         pose, time = way.T_world_lidar[index], way.times[index]
-        cloud = scan_town(town.primitives, pose, time, key=key, sensor=sensor, config=casting)
+        cloud = scan_town(town.primitives, pose, time, key=key, sensor=sensor)
         return np.asarray(cloud.points)[np.asarray(cloud.mask)]
 
-    return LidarSequence(
-        name=town.name,
-        sources=tuple(f"{town.name}, scan {index}" for index in range(len(way.times))),
-        read_scan=read_scan,
-        T_world_lidar=way.T_world_lidar,
-        times=way.times,
-    )
+    sources = tuple(f"{town.name}, scan {index}" for index in range(len(way.times)))
+    return LidarSequence(town.name, sources, read_scan, way.T_world_lidar, way.times)
 
 
 def drive(town: Town, config: DriveConfig = DriveConfig(), *, seed: int = 0) -> Drive:
@@ -123,10 +112,8 @@ def drive(town: Town, config: DriveConfig = DriveConfig(), *, seed: int = 0) -> 
     lane = lane_of(town.streets, is_reversed=config.is_reversed)
     whole = arc_lengths(lane)[-1]
     is_closed = town.streets.is_closed
-    length = config.length_m or (whole if is_closed else whole - config.start_m)
-    if not is_closed:
-        length = min(length, whole - config.start_m)
-    way, times = _timetable(lane, length, config, is_closed=is_closed)
+    length = config.length_m or whole
+    way, times = _timetable(lane, length if is_closed else min(length, whole), config, is_closed)
     way = way % whole if is_closed else way
     along = _directions(lane, way)
     left = np.column_stack([-along[:, 1], along[:, 0]])
@@ -134,29 +121,25 @@ def drive(town: Town, config: DriveConfig = DriveConfig(), *, seed: int = 0) -> 
     return Drive(_poses(town, places, along, left, config, rng), times)
 
 
-def _timetable(
-    lane: NDArray[np.float64], length: float, config: DriveConfig, *, is_closed: bool
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _timetable(lane: FloatArray, length: float, config: DriveConfig, is_closed: bool) -> tuple[FloatArray, FloatArray]:
     """Ways along the lane and times of the scans."""
     way = np.arange(0.0, length, 0.5)
     whole = arc_lengths(lane)[-1]
-    at = (config.start_m + way) % whole if is_closed else config.start_m + way
+    at = way % whole if is_closed else way
     before, after = _directions(lane, at), _directions(lane, (at + 5.0) % whole if is_closed else at + 5.0)
     cosine = np.clip((before * after).sum(1), -1.0, 1.0)
     speed = config.speed_m_s * np.clip(1.0 - 0.9 * np.arccos(cosine), 1 / 3, 1.0)
     clock = np.concatenate([[0.0], np.cumsum(np.diff(way) / (0.5 * (speed[1:] + speed[:-1])))])
     times = np.arange(0.0, clock[-1] + 1e-9, 1.0 / config.rate_hz)
-    return config.start_m + np.interp(times, clock, way), times
+    return np.interp(times, clock, way), times
 
 
-def _directions(lane: NDArray[np.float64], way: NDArray[np.float64]) -> NDArray[np.float64]:
-    lengths = arc_lengths(lane)
-    slope = tangents(lane)
-    found = np.column_stack([np.interp(way, lengths, column) for column in slope.T])
+def _directions(lane: FloatArray, way: FloatArray) -> FloatArray:
+    found = at_way(np.column_stack([lane, tangents(lane)]), way)[:, 2:]
     return found / np.maximum(np.linalg.norm(found, axis=1, keepdims=True), 1e-9)
 
 
-def _slow_noise(rng: np.random.Generator, way: NDArray[np.float64]) -> NDArray[np.float64]:
+def _slow_noise(rng: np.random.Generator, way: FloatArray) -> FloatArray:
     """Unit noise that changes over tens of metres."""
     phases = rng.uniform(0, 2 * np.pi, 3)
     waves = 2 * np.pi / np.array([31.0, 53.0, 97.0])
@@ -164,16 +147,11 @@ def _slow_noise(rng: np.random.Generator, way: NDArray[np.float64]) -> NDArray[n
 
 
 def _poses(
-    town: Town,
-    places: NDArray[np.float64],
-    along: NDArray[np.float64],
-    left: NDArray[np.float64],
-    config: DriveConfig,
-    rng: np.random.Generator,
-) -> NDArray[np.float64]:
+    town: Town, places: FloatArray, along: FloatArray, left: FloatArray, config: DriveConfig, rng: np.random.Generator
+) -> FloatArray:
     """Stands the car on its wheels: pitch and roll from the ground under the axles, and a little shaking."""
     height = town.terrain.height_at
-    shake = np.radians(config.shake_deg) * rng.normal(size=(2, len(places)))
+    shake = np.radians(_SHAKE_DEG) * rng.normal(size=(2, len(places)))
     half = 0.5 * _WHEELBASE_M
     climb = (height(places + half * along) - height(places - half * along)) / _WHEELBASE_M + shake[0]
     bank = (height(places + 0.5 * _TRACK_M * left) - height(places - 0.5 * _TRACK_M * left)) / _TRACK_M + shake[1]

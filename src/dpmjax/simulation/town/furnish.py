@@ -7,10 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from dpmjax.sequences import FloatArray
 from dpmjax.simulation.town import objects
-from dpmjax.simulation.town.objects import Collection, Place
+from dpmjax.simulation.town.objects import Collection, Place, Size
+from dpmjax.simulation.town.primitives import CELL_M, Terrain
 from dpmjax.simulation.town.streets import Streets, arc_lengths, at_way, tangents
-from dpmjax.simulation.town.terrain import Plots
 
 
 @dataclass(frozen=True)
@@ -59,12 +60,53 @@ _PAVEMENT_M = 2.2
 _BORDERS = ("hedge", "wall", "fence")
 
 
+class Plots:
+    """The ground that is taken, so that no house stands in a street or in another house.
+
+    It changes while a town is made.
+
+    Args:
+        terrain: ground heights and distances from the streets.
+    """
+
+    def __init__(self, terrain: Terrain) -> None:
+        self.terrain = terrain
+        self._is_taken = np.zeros(terrain.heights.shape, bool)
+
+    def claim(self, place: Place, size: Size, kerb_distance: float) -> bool:
+        """Takes a rectangle if all of it is free.
+
+        Args:
+            place: its middle.
+            size: along and across its heading, m.
+            kerb_distance: no part may be nearer than this to a kerb, m; negative allows to stand on the street.
+
+        Returns:
+            Whether it was free.
+        """
+        cells = self._cells(place, size)
+        if (cells < 0).any() or (cells >= np.array(self._is_taken.shape)[::-1]).any():
+            return False
+        at = (cells[:, 1], cells[:, 0])
+        if self._is_taken[at].any() or (self.terrain.street_distance[at] < kerb_distance).any():
+            return False
+        self._is_taken[at] = True
+        return True
+
+    def _cells(self, place: Place, size: Size) -> NDArray[np.int64]:
+        axes = [np.linspace(-0.5 * side, 0.5 * side, max(int(np.ceil(side / CELL_M)) + 1, 2)) for side in size]
+        u, v = (grid.ravel() for grid in np.meshgrid(*axes))
+        cos, sin = np.cos(place.heading), np.sin(place.heading)
+        x, y = place.x + cos * u - sin * v, place.y + sin * u + cos * v
+        return np.round((np.column_stack([x, y]) - self.terrain.origin) / CELL_M).astype(np.int64)
+
+
 @dataclass(frozen=True)
 class _Side:
     """One side of one street: its kerb-to-kerb geometry and the direction of "away from the street"."""
 
-    path: NDArray[np.float64]
-    along: NDArray[np.float64]
+    path: FloatArray
+    along: FloatArray
     length: float
     half_width: float
     quarter: Quarter
@@ -77,10 +119,6 @@ class _Side:
         left = from_kerb + self.half_width
         x, y = spot[0] - np.sin(heading) * left, spot[1] + np.cos(heading) * left
         return Place(x, y, float(self.plots.terrain.height_at(np.array([[x, y]]))[0]), heading)
-
-    def claim(self, place: Place, size: tuple[float, float], kerb_distance: float) -> bool:
-        half = (0.5 * size[0], 0.5 * size[1])
-        return self.plots.claim(np.array([place.x, place.y]), half, place.heading, kerb_distance=kerb_distance)
 
 
 def furnish(rng: np.random.Generator, streets: Streets, plots: Plots) -> Collection:
@@ -120,35 +158,35 @@ def _houses(into: Collection, rng: np.random.Generator, side: _Side) -> None:
         setback = line + rng.normal(0.0, 0.25)
         middle = way + 0.5 * width
         place = side.place(middle, setback + 0.5 * depth)
-        has_house = rng.random() < quarter.house_rate and side.claim(place, (width - 0.6, depth), _PAVEMENT_M + 0.6)
+        is_built = rng.random() < quarter.house_rate
+        has_house = is_built and side.plots.claim(place, (width - 0.6, depth), _PAVEMENT_M + 0.6)
         if has_house:
-            objects.put_house(
-                into, rng, place, (width, depth), float(rng.uniform(*quarter.eaves)), is_plain=setback < 3.6
-            )
+            height = float(rng.uniform(*quarter.eaves))
+            objects.put_house(into, rng, place, (width, depth), height, is_plain=setback < 3.6)
             if gap > 4 and rng.random() < 0.5:
                 garage = side.place(way + width + 0.5 * gap, setback + 4.0)
-                if side.claim(garage, (3.0, 5.5), _PAVEMENT_M + 0.6):
+                if side.plots.claim(garage, (3.0, 5.5), _PAVEMENT_M + 0.6):
                     objects.put_box(into, garage, (3.0, 5.5), (-1.0, 2.6), window_depth=0.1)
         if setback > _PAVEMENT_M + 1.4 and rng.random() < quarter.border_rate:
             border = side.place(middle + 0.5 * gap, _PAVEMENT_M + 0.4)
-            if side.claim(border, (width + gap - 1.0, 0.4), _PAVEMENT_M - 0.4):
+            if side.plots.claim(border, (width + gap - 1.0, 0.4), _PAVEMENT_M - 0.4):
                 objects.put_border(into, rng, border, width + gap - 0.4, str(rng.choice(_BORDERS)))
         _garden(into, rng, side, (way, width + gap), setback if has_house else setback + depth)
         way += width + gap
 
 
-def _garden(into: Collection, rng: np.random.Generator, side: _Side, plot: tuple[float, float], front: float) -> None:
+def _garden(into: Collection, rng: np.random.Generator, side: _Side, plot: Size, front: float) -> None:
     """Trees and bushes between the pavement and the house."""
-    way, width = plot
+    (way, width), quarter = plot, side.quarter
     if front < _PAVEMENT_M + 2.0:
         return
     for mean, put, size in (
-        (side.quarter.garden_trees, objects.put_tree, 0.8),
-        (side.quarter.garden_bushes, objects.put_bush, 1.4),
+        (quarter.garden_trees, objects.put_tree, 0.8),
+        (quarter.garden_bushes, objects.put_bush, 1.4),
     ):
         for _ in range(rng.poisson(mean)):
             place = side.place(way + rng.uniform(0, width), rng.uniform(_PAVEMENT_M + 1.0, front - 0.8))
-            if side.claim(place, (size, size), _PAVEMENT_M + 0.4):
+            if side.plots.claim(place, (size, size), _PAVEMENT_M + 0.4):
                 put(into, rng, place)
 
 
@@ -159,7 +197,7 @@ def _kerbside(into: Collection, rng: np.random.Generator, side: _Side) -> None:
         if rng.random() < rate:
             place = side.place(way, -0.2 + float(rng.normal(0, 0.12)))
             turned = Place(place.x, place.y, place.ground - 0.06, place.heading + np.pi + float(rng.normal(0, 0.02)))
-            if side.claim(turned, (4.8, 1.7), -1.6):
+            if side.plots.claim(turned, (4.8, 1.7), -1.6):
                 objects.put_car(into, rng, turned)
         way += rng.uniform(5.3, 7.5)
 
@@ -171,16 +209,16 @@ def _pavement(into: Collection, rng: np.random.Generator, side: _Side) -> None:
     lamps = np.arange(rng.uniform(4, 24), side.length, rng.uniform(22, 36))
     for way in trees:
         place = side.place(float(way) + rng.normal(0, 0.4), 1.2)
-        if rng.random() < 0.75 and side.claim(place, (0.6, 0.6), 0.3):
+        if rng.random() < 0.75 and side.plots.claim(place, (0.6, 0.6), 0.3):
             objects.put_tree(into, rng, place)
     for way in lamps:
         place = side.place(float(way), 0.6)
-        if side.claim(place, (0.4, 0.4), 0.0):
+        if side.plots.claim(place, (0.4, 0.4), 0.0):
             objects.put_pole(into, place, float(rng.uniform(0.06, 0.12)), float(rng.uniform(4.5, 8.0)))
     for rate, put in ((40.0, objects.put_sign), (35.0, objects.put_person), (25.0, _put_cabinet)):
         for _ in range(rng.poisson(side.length / rate)):
             place = side.place(rng.uniform(0, side.length), rng.uniform(0.5, 1.9))
-            if side.claim(place, (0.8, 0.6), 0.0):
+            if side.plots.claim(place, (0.8, 0.6), 0.0):
                 put(into, rng, place)
 
 
@@ -196,10 +234,10 @@ def _second_row(into: Collection, rng: np.random.Generator, side: _Side) -> None
     while way < side.length:
         width, depth = rng.uniform(8, 20), rng.uniform(7, 12)
         place = side.place(way + 0.5 * width, rng.uniform(22, 34) + 0.5 * depth)
-        if rng.random() < 0.7 and side.claim(place, (width, depth), 4.0):
+        if rng.random() < 0.7 and side.plots.claim(place, (width, depth), 4.0):
             objects.put_house(into, rng, place, (width, depth), float(rng.uniform(3, 12)), is_plain=True)
         for _ in range(rng.poisson(1.2)):
             tree = side.place(way + rng.uniform(0, width), rng.uniform(14, 40))
-            if side.claim(tree, (1.5, 1.5), 3.0):
+            if side.plots.claim(tree, (1.5, 1.5), 3.0):
                 objects.put_tree(into, rng, tree)
         way += width + rng.uniform(3, 15)

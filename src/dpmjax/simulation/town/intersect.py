@@ -7,14 +7,15 @@ not seen.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
-from dpmjax.simulation.town.primitives import Bodies, Ground
+from dpmjax.simulation.town.primitives import Bodies, Ground, turn_back
 
 # Directions along an axis are nudged off zero by this: a thousandth of a millimetre at 100 m.
 _TINY = 1e-8
@@ -39,21 +40,11 @@ class Crossing(NamedTuple):
     exit: Float[Array, "..."]
 
 
-class Hull(NamedTuple):
-    """The upright box round a body, relative to the rays' start.
-
-    Attributes:
-        centre: m.
-        half_size: along the box's own x, y, z, m; of a round body: radius, radius, half height.
-        heading: cosine and sine of the box's turn about z.
-    """
-
-    centre: Float[Array, "... 3"]
-    half_size: Float[Array, "... 3"]
-    heading: Float[Array, "... 2"]
+Cross = Callable[[Float[Array, "... 3"], Bodies], Crossing]
+"""Finds where rays cross bodies of one kind."""
 
 
-def cross_box(direction: Float[Array, "... 3"], box: Hull) -> Crossing:
+def cross_box(direction: Float[Array, "... 3"], box: Bodies) -> Crossing:
     """A ray from the origin through an upright box (the slab method, Kay and Kajiya 1986).
 
     Args:
@@ -63,14 +54,14 @@ def cross_box(direction: Float[Array, "... 3"], box: Hull) -> Crossing:
     Returns:
         The crossing, m.
     """
-    centre, ray = turn_back(box.centre, box.heading), turn_back(direction, box.heading)
-    x_in, x_out = _slab(centre[..., 0], box.half_size[..., 0], ray[..., 0])
-    y_in, y_out = _slab(centre[..., 1], box.half_size[..., 1], ray[..., 1])
-    z_in, z_out = _slab(centre[..., 2], box.half_size[..., 2], ray[..., 2])
+    centre, ray = turn_back(box.centres, box.headings), turn_back(direction, box.headings)
+    x_in, x_out = _slab(centre[..., 0], box.half_sizes[..., 0], ray[..., 0])
+    y_in, y_out = _slab(centre[..., 1], box.half_sizes[..., 1], ray[..., 1])
+    z_in, z_out = _slab(centre[..., 2], box.half_sizes[..., 2], ray[..., 2])
     return Crossing(jnp.maximum(jnp.maximum(x_in, y_in), z_in), jnp.minimum(jnp.minimum(x_out, y_out), z_out))
 
 
-def cross_cylinder(direction: Float[Array, "... 3"], cylinder: Hull) -> Crossing:
+def cross_cylinder(direction: Float[Array, "... 3"], cylinder: Bodies) -> Crossing:
     """A ray from the origin through an upright cylinder with lids; see `cross_box`.
 
     Args:
@@ -80,19 +71,19 @@ def cross_cylinder(direction: Float[Array, "... 3"], cylinder: Hull) -> Crossing
     Returns:
         The crossing, m.
     """
-    (x, y, z), (u, v, w) = _split(direction), _split(cylinder.centre)
+    (x, y, z), (u, v, w) = _split(direction), _split(cylinder.centres)
     squared = jnp.maximum(x**2 + y**2, _TINY**2)
     nearest = (x * u + y * v) / squared
     # The distance from the axis, from a difference: the usual discriminant cancels at 100 m.
     across = (x * v - y * u) ** 2 / squared
-    inside = (cylinder.half_size[..., 0] ** 2 - across) / squared
+    inside = (cylinder.half_sizes[..., 0] ** 2 - across) / squared
     half_chord = jnp.sqrt(jnp.maximum(inside, 0.0))
-    z_in, z_out = _slab(w, cylinder.half_size[..., 2], z)
+    z_in, z_out = _slab(w, cylinder.half_sizes[..., 2], z)
     entry, leave = jnp.maximum(nearest - half_chord, z_in), jnp.minimum(nearest + half_chord, z_out)
     return Crossing(jnp.where(inside > 0, entry, jnp.inf), leave)
 
 
-def cross_spheroid(direction: Float[Array, "... 3"], spheroid: Hull) -> Crossing:
+def cross_spheroid(direction: Float[Array, "... 3"], spheroid: Bodies) -> Crossing:
     """A ray from the origin through an ellipsoid of revolution about z; see `cross_box`.
 
     Args:
@@ -103,7 +94,7 @@ def cross_spheroid(direction: Float[Array, "... 3"], spheroid: Hull) -> Crossing
         The crossing, m.
     """
     # In coordinates where it is the unit sphere; distances along the ray are the same.
-    (x, y, z), (u, v, w) = _split(direction / spheroid.half_size), _split(spheroid.centre / spheroid.half_size)
+    (x, y, z), (u, v, w) = _split(direction / spheroid.half_sizes), _split(spheroid.centres / spheroid.half_sizes)
     squared = x * x + y * y + z * z
     nearest = (x * u + y * v + z * w) / squared
     miss = (u - nearest * x) ** 2 + (v - nearest * y) ** 2 + (w - nearest * z) ** 2
@@ -112,21 +103,7 @@ def cross_spheroid(direction: Float[Array, "... 3"], spheroid: Hull) -> Crossing
     return Crossing(jnp.where(inside > 0, nearest - half_chord, jnp.inf), nearest + half_chord)
 
 
-class FaceHits(NamedTuple):
-    """Where rays end at faces of boxes.
-
-    Attributes:
-        ranges: m, behind the face where the ray goes into a window.
-        cosines: of the angle between the ray and the normal.
-        is_glass: True in windows and doors.
-    """
-
-    ranges: Float[Array, "..."]
-    cosines: Float[Array, "..."]
-    is_glass: Bool[Array, "..."]
-
-
-def recess(ranges: Float[Array, "..."], directions: Float[Array, "... 3"], body: Bodies) -> FaceHits:
+def recess(ranges: Float[Array, "..."], directions: Float[Array, "... 3"], body: Bodies) -> tuple[Array, Array, Array]:
     """Takes rays that have reached a face on to the window pane behind it, or to the side of the opening.
 
     Each side face of a box with windows is divided into bays of 2 to 4 m (a width of its own) and storeys of 2.9 m. The
@@ -138,7 +115,8 @@ def recess(ranges: Float[Array, "..."], directions: Float[Array, "... 3"], body:
         body: the box of each ray, relative to the sensor.
 
     Returns:
-        The hits.
+        Distances, m, behind the face where a ray goes into a window; cosines of the angle between ray and normal;
+        whether the ray ends at a window or door.
     """
     offset = turn_back(ranges[..., None] * directions - body.centres, body.headings)
     along = turn_back(directions, body.headings)
@@ -165,22 +143,7 @@ def recess(ranges: Float[Array, "..."], directions: Float[Array, "... 3"], body:
     to_sill = jnp.where(climb > 0, high - above, above - low) / jnp.maximum(jnp.abs(climb), _THIN_M)
     to_pane = body.window_depth / jnp.maximum(across, _THIN_M)
     deeper = jnp.minimum(jnp.minimum(to_jamb, to_sill), to_pane)
-    return FaceHits(ranges + jnp.where(is_open, deeper, 0.0), cosines, is_open & (deeper >= to_pane))
-
-
-def turn_back(vectors: Float[Array, "... 3"], heading: Float[Array, "... 2"]) -> Float[Array, "... 3"]:
-    """Vectors in the axes of a box that is turned about z.
-
-    Args:
-        vectors: in axes of the world.
-        heading: cosine and sine of the turn.
-
-    Returns:
-        The same vectors along the box's own x, y, z.
-    """
-    (x, y, z), cos, sin = _split(vectors), heading[..., 0], heading[..., 1]
-    along, across = cos * x + sin * y, cos * y - sin * x
-    return jnp.stack([along, across, jnp.broadcast_to(z, along.shape)], axis=-1)
+    return ranges + jnp.where(is_open, deeper, 0.0), cosines, is_open & (deeper >= to_pane)
 
 
 def _split(vectors: Float[Array, "... 3"]) -> tuple[Array, Array, Array]:

@@ -1,4 +1,4 @@
-"""Makes towns by seed."""
+"""Makes towns by seed: the ground with its slopes, kerbs and meadows, what stands on it, and the traffic."""
 
 from __future__ import annotations
 
@@ -6,23 +6,12 @@ from dataclasses import dataclass, field
 
 import jax.numpy as jnp
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from dpmjax.simulation.town.furnish import furnish
-from dpmjax.simulation.town.objects import Collection
-from dpmjax.simulation.town.primitives import (
-    LANE_STEP_M,
-    POLE,
-    SOFT,
-    SOLID,
-    Ground,
-    TownPrimitives,
-    Traffic,
-    capacity_for,
-    mask_of,
-    pack_bodies,
-    padded,
-)
+from dpmjax.sequences import FloatArray
+from dpmjax.simulation.town import primitives
+from dpmjax.simulation.town.furnish import Plots, furnish
+from dpmjax.simulation.town.primitives import CELL_M, LANE_STEP_M, Terrain, TownPrimitives, Traffic, pack_bodies, padded
 from dpmjax.simulation.town.streets import (
     LANE_M,
     RouteKind,
@@ -32,9 +21,14 @@ from dpmjax.simulation.town.streets import (
     resample,
     streets_along,
 )
-from dpmjax.simulation.town.terrain import CELL_M, Plots, Terrain, make_terrain
 
+_MARGIN_M = 50.0
+_TILE = 256
+_KERB_M = 0.12
+_PAVEMENT_M = 2.2
 _SENSOR_HEIGHT_M = 1.73
+_STEEPNESS = 0.015  # Typical slope of the land, rise over run.
+_CARS_PER_KM, _WALKERS_PER_KM = 10.0, 15.0  # For each kilometre of lane.
 _TOWN_STREAM = 8150
 
 
@@ -46,30 +40,21 @@ class TownConfig:
         route: kind of the drive's route; "there_and_back" drives the same street in both directions.
         route_length_m: wanted length of the route, met within a block or two.
         block_m: side of a block.
-        steepness: typical slope of the land, rise over run.
-        cars_per_km: driving cars for each kilometre of lane.
-        walkers_per_km: people that walk for each kilometre of lane.
 
     Raises:
-        ValueError: a length that is not positive, or a negative rate.
+        ValueError: another route, a length that is not positive, or blocks of less than 50 m.
     """
 
     route: RouteKind = "loop"
     route_length_m: float = 1000.0
     block_m: float = 100.0
-    steepness: float = 0.015
-    cars_per_km: float = 10.0
-    walkers_per_km: float = 15.0
 
     def __post_init__(self) -> None:
         if self.route not in ("loop", "there_and_back", "wander"):
             raise ValueError(f"route must be loop, there_and_back or wander, got {self.route!r}")
         if not (self.route_length_m > 0 and self.block_m >= 50):
-            raise ValueError(
-                f"route_length_m must be positive and block_m at least 50, got {self.route_length_m} and {self.block_m}"
-            )
-        if min(self.steepness, self.cars_per_km, self.walkers_per_km) < 0:
-            raise ValueError("steepness, cars_per_km and walkers_per_km must not be negative")
+            sizes = f"{self.route_length_m} and {self.block_m}"
+            raise ValueError(f"route_length_m must be positive and block_m at least 50, got {sizes}")
 
 
 @dataclass(frozen=True)
@@ -114,66 +99,125 @@ def make_town(seed: int, config: TownConfig = TownConfig(), *, trajectory: Array
         positions = _positions(trajectory)
         streets = streets_along(positions[:, :2], rng)
         support = positions - [0.0, 0.0, _SENSOR_HEIGHT_M]
-    terrain = make_terrain(rng, streets, steepness=config.steepness, support=support)
+    terrain = make_terrain(rng, streets, support)
     standing = furnish(rng, streets, Plots(terrain))
-    traffic = _make_traffic(rng, streets, terrain, config)
-    return Town(f"town-{seed}", streets, terrain, _pack_town(standing, terrain, traffic))
+    tables = (np.array(rows, np.float64) for rows in (standing.boxes, standing.cylinders, standing.spheroids))
+    kinds = (primitives.SOLID, primitives.POLE, primitives.SOFT)
+    boxes, cylinders, spheroids = map(pack_bodies, tables, kinds)
+    ground = primitives.Ground(*(jnp.asarray(x, jnp.float32) for x in (terrain.heights, terrain.origin, CELL_M)))
+    whole = TownPrimitives(boxes, cylinders, spheroids, ground, _make_traffic(rng, streets, terrain))
+    return Town(f"town-{seed}", streets, terrain, whole)
 
 
-def _pack_town(standing: Collection, terrain: Terrain, traffic: Traffic) -> TownPrimitives:
-    """The town as arrays on the device."""
-    return TownPrimitives(
-        boxes=pack_bodies(np.array(standing.boxes, np.float64), SOLID),
-        cylinders=pack_bodies(np.array(standing.cylinders, np.float64), POLE),
-        spheroids=pack_bodies(np.array(standing.spheroids, np.float64), SOFT),
-        ground=Ground(
-            heights=jnp.asarray(terrain.heights, jnp.float32),
-            origin=jnp.asarray(terrain.origin, jnp.float32),
-            cell=jnp.asarray(CELL_M, jnp.float32),
-        ),
-        traffic=traffic,
-    )
-
-
-def _positions(trajectory: ArrayLike) -> NDArray[np.float64]:
+def _positions(trajectory: ArrayLike) -> FloatArray:
     poses = np.asarray(trajectory, np.float64)
     if poses.ndim != 3 or poses.shape[1:] != (4, 4) or not np.isfinite(poses).all():
         raise ValueError(f"trajectory must be finite (n, 4, 4) poses, got {poses.shape}")
     return poses[:, :3, 3]
 
 
-def _make_traffic(rng: np.random.Generator, streets: Streets, terrain: Terrain, config: TownConfig) -> Traffic:
+def _make_traffic(rng: np.random.Generator, streets: Streets, terrain: Terrain) -> Traffic:
     lanes = [resample(lane, LANE_STEP_M) for line in streets.lanes for lane in (line, line[::-1])]
     lengths = np.array([arc_lengths(lane)[-1] for lane in lanes])
     users: list[tuple[float, ...]] = []
     half_width = float(np.mean(streets.half_widths))
     for index, length in enumerate(lengths):
-        for _ in range(rng.poisson(config.cars_per_km * length / 1000)):
+        for _ in range(rng.poisson(_CARS_PER_KM * length / 1000)):
             size = (rng.uniform(1.9, 2.5), rng.uniform(0.82, 0.95), rng.uniform(0.7, 0.9))
             users.append((index, rng.uniform(0, length), rng.uniform(6, 13), -LANE_M, *size))
-        for _ in range(rng.poisson(config.walkers_per_km * length / 1000)):
+        for _ in range(rng.poisson(_WALKERS_PER_KM * length / 1000)):
             side = -half_width - rng.uniform(0.4, 1.8)
-            users.append(
-                (index, rng.uniform(0, length), rng.uniform(0.8, 1.8), side, 0.2, 0.25, rng.uniform(0.75, 0.93))
-            )
+            way, speed = rng.uniform(0, length), rng.uniform(0.8, 1.8)
+            users.append((index, way, speed, side, 0.2, 0.25, rng.uniform(0.75, 0.93)))
     table = np.array(users, np.float64).reshape(-1, 7)
-    capacity = capacity_for(len(table))
-    rows = padded(table, capacity)
-    samples = capacity_for(max(len(lane) for lane in lanes))
-    points = np.stack([_fill(np.column_stack([lane, terrain.height_at(lane)]), samples) for lane in lanes])
-    lane_capacity = capacity_for(len(lanes), least=2)
-    return Traffic(
-        lane_points=padded(points, lane_capacity),
-        lane_lengths=jnp.maximum(padded(lengths, lane_capacity), 1.0),
-        lanes=rows[:, 0].astype(jnp.int32),
-        starts=rows[:, 1],
-        speeds=rows[:, 2],
-        sides=rows[:, 3],
-        half_sizes=rows[:, 4:7],
-        mask=mask_of(len(table), capacity),
-    )
+    rows = padded(table, primitives.capacity_for(len(table)))
+    samples = primitives.capacity_for(max(len(lane) for lane in lanes))
+    # Lanes are padded to one length by repeating their end.
+    points = [np.column_stack([lane, terrain.height_at(lane)]) for lane in lanes]
+    points = [np.pad(lane, ((0, samples - len(lane)), (0, 0)), mode="edge") for lane in points]
+    capacity = primitives.capacity_for(len(lanes), least=2)
+    lane_points, lane_lengths = padded(np.stack(points), capacity), jnp.maximum(padded(lengths, capacity), 1.0)
+    own_lanes, (starts, speeds, sides) = rows[:, 0].astype(jnp.int32), rows[:, 1:4].T
+    mask = primitives.mask_of(len(table), len(rows))
+    return Traffic(lane_points, lane_lengths, own_lanes, starts, speeds, sides, rows[:, 4:7], mask)
 
 
-def _fill(points: NDArray[np.float64], count: int) -> NDArray[np.float64]:
-    """Repeats the last row up to `count` rows."""
-    return np.vstack([points, np.repeat(points[-1:], count - len(points), axis=0)])
+def make_terrain(rng: np.random.Generator, streets: Streets, support: FloatArray | None) -> Terrain:
+    """Shapes the ground.
+
+    Args:
+        rng: source of all choices.
+        streets: where the streets are.
+        support: (n, 3) points that the streets must go through, m; None lets the land roll at random.
+
+    Returns:
+        The terrain; its grid is a whole number of tiles of 128 m, so that kernels see few shapes.
+    """
+    lines = np.vstack(streets.paths)
+    low = lines.min(0) - _MARGIN_M
+    cells = np.ceil((lines.max(0) + _MARGIN_M - low) / CELL_M).astype(int)
+    columns, rows = (int(-(-count // _TILE) * _TILE) for count in cells)
+    distance = _street_distance(streets, low, (rows, columns))
+    x, y = np.meshgrid(low[0] + CELL_M * np.arange(columns), low[1] + CELL_M * np.arange(rows))
+    land = _rolling(rng, x, y) if support is None else _through(support, low, (rows, columns))
+    return Terrain(low, land + _cross_section(distance) + _roughness(rng, distance), distance)
+
+
+def _street_distance(streets: Streets, origin: FloatArray, shape: tuple[int, int]) -> FloatArray:
+    """Distance from the nearest kerb; streets of different width count by their own."""
+    from scipy.ndimage import distance_transform_edt
+
+    widths = np.round(np.array(streets.half_widths), 1)
+    nearest = np.full(shape, np.inf)
+    for width in np.unique(np.round(widths * 2) / 2):
+        is_far = np.ones(shape, bool)
+        for path, own in zip(streets.paths, widths, strict=True):
+            if round(own * 2) / 2 == width:
+                cell = np.round((path - origin) / CELL_M).astype(int)
+                is_far[cell[:, 1], cell[:, 0]] = False
+        nearest = np.minimum(nearest, distance_transform_edt(is_far) * CELL_M - width)
+    return nearest
+
+
+def _rolling(rng: np.random.Generator, x: FloatArray, y: FloatArray) -> FloatArray:
+    land = np.zeros_like(x)
+    for wavelength in (900.0, 600.0, 400.0, 250.0):
+        angle, phase = rng.uniform(0, 2 * np.pi, 2)
+        wave = 2 * np.pi / wavelength
+        land += _STEEPNESS * 0.7 / wave * np.sin(wave * (np.cos(angle) * x + np.sin(angle) * y) + phase)
+    return land
+
+
+def _through(support: FloatArray, origin: FloatArray, shape: tuple[int, int]) -> FloatArray:
+    """Land through given points: inverse distances on a coarse grid, smoothed, then brought to the fine one."""
+    from scipy.ndimage import gaussian_filter, map_coordinates
+    from scipy.spatial import KDTree
+
+    coarse = 8
+    rows, columns = (count // coarse + 2 for count in shape)
+    step = CELL_M * coarse
+    x, y = np.meshgrid(origin[0] + step * np.arange(columns), origin[1] + step * np.arange(rows))
+    places = np.stack([x, y], axis=-1)
+    distance, index = KDTree(support[:, :2]).query(places, k=list(range(1, min(8, len(support)) + 1)))
+    weight = 1.0 / np.maximum(distance, 1.0) ** 2
+    values = support[:, 2][index]
+    land = gaussian_filter((weight * values).sum(-1) / weight.sum(-1), 2.0)
+    at = np.stack(np.meshgrid(np.arange(shape[0]) / coarse, np.arange(shape[1]) / coarse, indexing="ij"))
+    return map_coordinates(land, at, order=1, mode="nearest")
+
+
+def _cross_section(distance: FloatArray) -> FloatArray:
+    """A cambered street, a kerb, a pavement, and gardens a little higher."""
+    camber = 0.02 * np.clip(-distance, 0, 5)
+    kerb = _KERB_M * np.clip((distance + 0.25) / 0.5, 0, 1)
+    return camber + kerb + 0.15 * np.clip((distance - _PAVEMENT_M) / 2.0, 0, 1)
+
+
+def _roughness(rng: np.random.Generator, distance: FloatArray) -> FloatArray:
+    """Millimetres on streets, centimetres and gentle mounds in gardens."""
+    from scipy.ndimage import gaussian_filter
+
+    fine = rng.normal(size=distance.shape)
+    mounds = gaussian_filter(rng.normal(size=distance.shape), 8.0) * 28.0
+    is_garden = np.clip((distance - _PAVEMENT_M) / 2.0, 0, 1)
+    return (0.004 + 0.03 * is_garden) * fine + 0.12 * is_garden * mounds

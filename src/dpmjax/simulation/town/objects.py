@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 _SUNK_M = 1.0  # Houses and walls reach below the ground, which may slope.
+Size = tuple[float, float]
 
 
 @dataclass
@@ -51,13 +52,7 @@ class Place:
 
 
 def put_box(
-    into: Collection,
-    place: Place,
-    size: tuple[float, float],
-    levels: tuple[float, float],
-    *,
-    softness: float = 0.0,
-    window_depth: float = 0.0,
+    into: Collection, place: Place, size: Size, levels: Size, *, softness: float = 0.0, window_depth: float = 0.0
 ) -> None:
     """Adds an upright box.
 
@@ -75,13 +70,7 @@ def put_box(
 
 
 def put_house(
-    into: Collection,
-    rng: np.random.Generator,
-    place: Place,
-    size: tuple[float, float],
-    height: float,
-    *,
-    is_plain: bool,
+    into: Collection, rng: np.random.Generator, place: Place, size: Size, height: float, *, is_plain: bool
 ) -> None:
     """A house: body with windows, stepped roof, and bays, steps and balconies towards the street.
 
@@ -224,13 +213,8 @@ def put_border(into: Collection, rng: np.random.Generator, place: Place, length:
         at, piece = place.move(along, 0.0), length / count
         if kind == "hedge":
             top = height + rng.normal(0.0, 0.06)
-            put_box(
-                into,
-                at.move(0.0, float(rng.normal(0.0, 0.06))),
-                (piece, rng.uniform(0.5, 1.0)),
-                (-0.2, top),
-                softness=0.12,
-            )
+            beside = at.move(0.0, float(rng.normal(0.0, 0.06)))
+            put_box(into, beside, (piece, rng.uniform(0.5, 1.0)), (-0.2, top), softness=0.12)
         elif kind == "wall":
             put_box(into, at, (piece, 0.3), (-_SUNK_M, 0.7 * height))
         else:

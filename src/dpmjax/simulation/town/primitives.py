@@ -6,16 +6,19 @@ coordinates are in the world frame: metres, z up.
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 
 import flax.struct
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
-from numpy.typing import NDArray
+
+from dpmjax.sequences import FloatArray
 
 LANE_STEP_M = 2.0
+CELL_M = 0.5
+"""Distance of the nodes of the ground."""
 # Road users nearer to the sensor than this are left out: the sensor's own car is there.
 _CLEARANCE_M = 4.0
 _CAR_IS_LONGER_THAN_M = 0.5
@@ -61,6 +64,28 @@ class Ground:
     heights: Float[Array, "h w"]
     origin: Float[Array, " 2"]
     cell: Float[Array, ""]
+
+
+@dataclass(frozen=True)
+class Terrain:
+    """Ground heights and distances from the streets on one grid.
+
+    Attributes:
+        origin: (2,) x and y of entry [0, 0], m.
+        heights: (h, w) z, m; the column follows x.
+        street_distance: (h, w) from the nearest kerb, m; negative on a street.
+    """
+
+    origin: FloatArray
+    heights: FloatArray = field(repr=False)
+    street_distance: FloatArray = field(repr=False)
+
+    def height_at(self, positions: FloatArray) -> FloatArray:
+        """Ground heights (m,) at (m, 2) places, bilinear."""
+        from scipy.ndimage import map_coordinates
+
+        at = (np.atleast_2d(positions)[:, :2] - self.origin) / CELL_M
+        return map_coordinates(self.heights, at[:, ::-1].T, order=1, mode="nearest")
 
 
 @flax.struct.dataclass
@@ -120,7 +145,7 @@ def capacity_for(count: int, *, least: int = 64) -> int:
     return max(least, 1 << max(count - 1, 0).bit_length())
 
 
-def padded(rows: NDArray[np.float64], capacity: int) -> jax.Array:
+def padded(rows: FloatArray, capacity: int) -> jax.Array:
     """The rows as float32, followed by zeros up to the capacity.
 
     Args:
@@ -140,7 +165,7 @@ def mask_of(count: int, capacity: int) -> jax.Array:
     return jnp.asarray(np.arange(capacity) < count)
 
 
-def pack_bodies(table: NDArray[np.float64], surface: int) -> Bodies:
+def pack_bodies(table: FloatArray, surface: int) -> Bodies:
     """Bodies of one kind out of rows.
 
     Args:
@@ -153,15 +178,25 @@ def pack_bodies(table: NDArray[np.float64], surface: int) -> Bodies:
     table = table.reshape(-1, 9)
     rows = padded(table, capacity_for(len(table)))
     headings = padded(np.column_stack([np.cos(table[:, 6]), np.sin(table[:, 6])]), len(rows))
-    return Bodies(
-        centres=rows[:, :3],
-        half_sizes=rows[:, 3:6],
-        headings=headings,
-        softness=rows[:, 7],
-        window_depth=rows[:, 8],
-        surface=jnp.where((rows[:, 7] > 0) & (surface == SOLID), SOFT, surface),
-        mask=mask_of(len(table), len(rows)),
-    )
+    surfaces = jnp.where((rows[:, 7] > 0) & (surface == SOLID), SOFT, surface)
+    mask = mask_of(len(table), len(rows))
+    return Bodies(rows[:, :3], rows[:, 3:6], headings, rows[:, 7], rows[:, 8], surfaces, mask)
+
+
+def turn_back(vectors: Float[Array, "... 3"], heading: Float[Array, "... 2"]) -> Float[Array, "... 3"]:
+    """Vectors in the axes of a box that is turned about z.
+
+    Args:
+        vectors: in axes of the world.
+        heading: cosine and sine of the turn.
+
+    Returns:
+        The same vectors along the box's own x, y, z.
+    """
+    x, y, z = jnp.moveaxis(vectors, -1, 0)
+    cos, sin = heading[..., 0], heading[..., 1]
+    along, across = cos * x + sin * y, cos * y - sin * x
+    return jnp.stack([along, across, jnp.broadcast_to(z, along.shape)], axis=-1)
 
 
 def traffic_boxes(traffic: Traffic, sensor: Float[Array, " 3"], time: Float[Array, ""]) -> Bodies:
@@ -188,15 +223,9 @@ def traffic_boxes(traffic: Traffic, sensor: Float[Array, " 3"], time: Float[Arra
     lift = jnp.where(is_car, 0.25, 0.0)
     up = jnp.array([0.0, 0.0, 1.0], foot.dtype)
     zero = jnp.zeros(len(way), foot.dtype)
-    body = Bodies(
-        centres=foot + (lift + half_body)[:, None] * up,
-        half_sizes=traffic.half_sizes.at[:, 2].set(half_body),
-        headings=heading,
-        softness=zero,
-        window_depth=zero,
-        surface=jnp.full(len(way), MOVING),
-        mask=traffic.mask & is_free,
-    )
+    middle, half_sizes = foot + (lift + half_body)[:, None] * up, traffic.half_sizes.at[:, 2].set(half_body)
+    surface, mask = jnp.full(len(way), MOVING), traffic.mask & is_free
+    body = Bodies(middle, half_sizes, heading, zero, zero, surface, mask)
     cabin = replace(
         body,
         centres=foot + (lift + 2 * half_body + cabin_z)[:, None] * up,

@@ -58,9 +58,8 @@ class LidarSensor:
 
     def __post_init__(self) -> None:
         if not self.elevations_deg or self.num_azimuths < 8:
-            raise ValueError(
-                f"a sensor needs beams and at least 8 azimuths, got {len(self.elevations_deg)} and {self.num_azimuths}"
-            )
+            counts = f"{len(self.elevations_deg)} and {self.num_azimuths}"
+            raise ValueError(f"a sensor needs beams and at least 8 azimuths, got {counts}")
         if not 0 <= self.min_range_m < self.max_range_m:
             raise ValueError(f"ranges must be 0 <= min < max, got {self.min_range_m} and {self.max_range_m}")
 
@@ -78,30 +77,15 @@ def _spread(top_deg: float, bottom_deg: float, count: int) -> tuple[float, ...]:
     return tuple(float(v) for v in np.linspace(top_deg, bottom_deg, count))
 
 
-HDL64E = LidarSensor(
-    # Velodyne's manual: 32 lasers a third of a degree apart, and 32 below them half a degree apart (as on KITTI's car).
-    name="hdl64e",
-    elevations_deg=_spread(2.0, -8.33, 32) + _spread(-8.83, -24.33, 32),
-    num_azimuths=1800,
-    max_range_m=80.0,
-)
-OS1_64 = LidarSensor(
-    # Ouster OS1-64 of the first generation, as on MulRan's car.
-    name="os1_64",
-    elevations_deg=_spread(16.6, -16.6, 64),
-    num_azimuths=1024,
-    range_noise_m=0.03,
-    half_loss_m=60.0,
-    height_m=1.85,
-)
-HDL32E = LidarSensor(
-    name="hdl32e", elevations_deg=_spread(10.67, -30.67, 32), num_azimuths=1080, max_range_m=80.0, height_m=1.84
-)
-VLP16 = LidarSensor(name="vlp16", elevations_deg=_spread(15.0, -15.0, 16), num_azimuths=1800, range_noise_m=0.03)
-
-SENSORS = {sensor.name: sensor for sensor in (HDL64E, OS1_64, HDL32E, VLP16)}
+# Velodyne's manual: 32 lasers a third of a degree apart, and 32 below them half a degree apart (as on KITTI's car).
+HDL64E = LidarSensor("hdl64e", _spread(2.0, -8.33, 32) + _spread(-8.83, -24.33, 32), 1800, max_range_m=80.0)
+# Ouster OS1-64 of the first generation, as on MulRan's car.
+OS1_64 = LidarSensor("os1_64", _spread(16.6, -16.6, 64), 1024, range_noise_m=0.03, half_loss_m=60.0, height_m=1.85)
+HDL32E = LidarSensor("hdl32e", _spread(10.67, -30.67, 32), 1080, max_range_m=80.0, height_m=1.84)
+VLP16 = LidarSensor("vlp16", _spread(15.0, -15.0, 16), 1800, range_noise_m=0.03)
 
 
+@partial(jax.jit, static_argnames=("sensor", "config"))
 def scan_town(
     town: TownPrimitives,
     T_world_lidar: AnyArray,
@@ -131,22 +115,8 @@ def scan_town(
     Raises:
         ValueError: the pose is not (4, 4).
     """
-    pose = jnp.asarray(T_world_lidar, jnp.float32)
+    pose, time = jnp.asarray(T_world_lidar, jnp.float32), jnp.asarray(time, jnp.float32)
     require_shape("T_world_lidar", pose, (4, 4))
-    return _scan(town, pose, jnp.asarray(time, jnp.float32), key, sensor=sensor, config=config)
-
-
-@partial(jax.jit, static_argnames=("sensor", "config"))
-def _scan(
-    town: TownPrimitives,
-    pose: Float[Array, "4 4"],
-    time: Float[Array, ""],
-    key: PRNGKeyArray,
-    *,
-    sensor: LidarSensor,
-    config: CastConfig,
-) -> PointCloud:
-    """The kernel of `scan_town`."""
     key_phase, key_depth, key_noise, key_loss = jax.random.split(key, 4)
     shape = _ray_shape(sensor, config)
     phase = jax.random.uniform(key_phase, (), minval=0.0, maxval=2 * np.pi / sensor.num_azimuths)

@@ -11,7 +11,8 @@ from itertools import pairwise
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
+
+from dpmjax.sequences import FloatArray
 
 RouteKind = Literal["loop", "there_and_back", "wander"]
 LANE_M = 1.7
@@ -32,10 +33,10 @@ class Streets:
         is_closed: the route ends where it began.
     """
 
-    paths: tuple[NDArray[np.float64], ...]
+    paths: tuple[FloatArray, ...]
     half_widths: tuple[float, ...]
-    lanes: tuple[NDArray[np.float64], ...]
-    route: NDArray[np.float64]
+    lanes: tuple[FloatArray, ...]
+    route: FloatArray
     is_closed: bool
 
 
@@ -57,7 +58,7 @@ def make_streets(rng: np.random.Generator, kind: RouteKind, length: float, block
     shaken = np.stack(np.meshgrid(np.arange(size[0]), np.arange(size[1]), indexing="ij"), -1).astype(np.float64)
     shaken = (shaken + rng.uniform(-0.14, 0.14, shaken.shape)) * block
 
-    def street(start: tuple[int, int], end: tuple[int, int]) -> NDArray[np.float64]:
+    def street(start: tuple[int, int], end: tuple[int, int]) -> FloatArray:
         line = np.linspace(shaken[start], shaken[end], 60)
         return resample(place(line), _STEP_M)
 
@@ -77,7 +78,7 @@ def make_streets(rng: np.random.Generator, kind: RouteKind, length: float, block
     return Streets(tuple(paths), widths, tuple(resample(lane, _STEP_M) for lane in rows + columns), route, True)
 
 
-def streets_along(trajectory: NDArray[np.float64], rng: np.random.Generator) -> Streets:
+def streets_along(trajectory: FloatArray, rng: np.random.Generator) -> Streets:
     """A street along a driven trajectory, which is its right lane.
 
     Args:
@@ -102,13 +103,13 @@ def streets_along(trajectory: NDArray[np.float64], rng: np.random.Generator) -> 
     return Streets(tuple(pieces), widths, (middle,), middle, False)
 
 
-def _bend(rng: np.random.Generator, block: float) -> Callable[[NDArray[np.float64]], NDArray[np.float64]]:
+def _bend(rng: np.random.Generator, block: float) -> Callable[[FloatArray], FloatArray]:
     """A smooth displacement of the plane, which bends straight streets by some metres."""
     waves = rng.normal(size=(4, 2)) / (4 * block)
     sway = rng.normal(size=(4, 2)) * 0.05 * block
     phases = rng.uniform(0, 2 * np.pi, 4)
 
-    def place(points: NDArray[np.float64]) -> NDArray[np.float64]:
+    def place(points: FloatArray) -> FloatArray:
         return points + np.sin(2 * np.pi * points @ waves.T + phases) @ sway
 
     return place
@@ -161,7 +162,7 @@ def _neighbours(route: list[tuple[int, int]], side: int) -> list[tuple[int, int]
     return [s for s in steps if s != route[-2] and 0 <= s[0] < side and 0 <= s[1] < side]
 
 
-def lane_of(streets: Streets, *, is_reversed: bool) -> NDArray[np.float64]:
+def lane_of(streets: Streets, *, is_reversed: bool) -> FloatArray:
     """The right lane of the route.
 
     Args:
@@ -175,7 +176,7 @@ def lane_of(streets: Streets, *, is_reversed: bool) -> NDArray[np.float64]:
     return resample(shift_left(line, -LANE_M), 0.5)
 
 
-def arc_lengths(path: NDArray[np.float64]) -> NDArray[np.float64]:
+def arc_lengths(path: FloatArray) -> FloatArray:
     """Way from the start to each point.
 
     Args:
@@ -187,7 +188,7 @@ def arc_lengths(path: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(path[:, :2], axis=0), axis=1))])
 
 
-def at_way(path: NDArray[np.float64], way: NDArray[np.float64]) -> NDArray[np.float64]:
+def at_way(path: FloatArray, way: FloatArray) -> FloatArray:
     """Points at given ways along the path, linear between its points.
 
     Args:
@@ -201,7 +202,7 @@ def at_way(path: NDArray[np.float64], way: NDArray[np.float64]) -> NDArray[np.fl
     return np.column_stack([np.interp(way, lengths, column) for column in path.T])
 
 
-def resample(path: NDArray[np.float64], step: float) -> NDArray[np.float64]:
+def resample(path: FloatArray, step: float) -> FloatArray:
     """The path at (nearly) equal steps, both ends kept.
 
     Args:
@@ -215,7 +216,7 @@ def resample(path: NDArray[np.float64], step: float) -> NDArray[np.float64]:
     return at_way(path, np.linspace(0.0, length, max(round(length / step), 1) + 1))
 
 
-def tangents(path: NDArray[np.float64]) -> NDArray[np.float64]:
+def tangents(path: FloatArray) -> FloatArray:
     """Unit directions along the path.
 
     Args:
@@ -228,7 +229,7 @@ def tangents(path: NDArray[np.float64]) -> NDArray[np.float64]:
     return slope / np.maximum(np.linalg.norm(slope, axis=1, keepdims=True), 1e-9)
 
 
-def shift_left(path: NDArray[np.float64], distance: float | NDArray[np.float64]) -> NDArray[np.float64]:
+def shift_left(path: FloatArray, distance: float | FloatArray) -> FloatArray:
     """The path moved to its left.
 
     Args:
@@ -242,7 +243,7 @@ def shift_left(path: NDArray[np.float64], distance: float | NDArray[np.float64])
     return path[:, :2] + np.broadcast_to(distance, len(path))[:, None] * np.column_stack([-along[:, 1], along[:, 0]])
 
 
-def smooth(path: NDArray[np.float64], sigma: float, *, is_closed: bool) -> NDArray[np.float64]:
+def smooth(path: FloatArray, sigma: float, *, is_closed: bool) -> FloatArray:
     """Rounds corners with a Gaussian along the path.
 
     Args:

@@ -6,54 +6,29 @@ heading turns by an independent uniform angle, which keeps the statistics of the
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 
 from dpmjax.geometry import se2
-from dpmjax.sequences import World
+from dpmjax.sequences import BoolArray, FloatArray, World, largest_region
 
-
-@dataclass(frozen=True)
-class TrajectoryConfig:
-    """Step statistics of a simulated trajectory.
-
-    Attributes:
-        max_rotation_deg: headings of consecutive scans differ by a uniform angle within plus or minus this (section
-            4.1).
-        mean_step_px: mean translation between consecutive scans (section 4.1); steps are uniform between 0.6 and 1.4 of
-            it.
-        clearance_px: no point of the path comes closer to an obstacle or to the border of the image.
-        leg_px: wanted length of a leg to a new place; after two legs the robot comes home by another way.
-    """
-
-    max_rotation_deg: float = 10.0
-    mean_step_px: float = 8.16
-    clearance_px: float = 8.0
-    leg_px: float = 260.0
-
-    def __post_init__(self) -> None:
-        for name in ("max_rotation_deg", "mean_step_px", "clearance_px", "leg_px"):
-            if not getattr(self, name) > 0:
-                raise ValueError(f"{name} must be positive, got {getattr(self, name)}")
-
-
+# Section 4.1: headings of consecutive scans differ by a uniform angle within plus or minus this, and translations have
+# this mean; steps are uniform between 0.6 and 1.4 of it.
+_MAX_ROTATION_DEG, _MEAN_STEP_PX = 10.0, 8.16
+_CLEARANCE_PX = 8.0  # No point of the path comes closer to an obstacle or to the border of the image.
+_LEG_PX = 260.0  # Wanted length of a leg to a new place; after two legs the robot comes home by another way.
 _CELL_PX = 8  # Raster of the route planner.
 _PLAN_MARGIN_PX = 8.0  # Routes keep this much more clearance than the walk has to.
 _LOOKAHEAD_PX = 36.0
 
 
-def simulate_trajectory(
-    world: World, num_poses: int, *, rng: np.random.Generator, config: TrajectoryConfig | None = None
-) -> NDArray[np.float64]:
+def simulate_trajectory(world: World, num_poses: int, *, rng: np.random.Generator) -> FloatArray:
     """Walks through a world: out to new places, home again by another way, and so on.
 
     Args:
         world: where to walk.
         num_poses: number of poses.
         rng: source of all choices; the same state gives the same walk.
-        config: step statistics; the paper's where None.
 
     Returns:
         (num_poses, 3) x, y in px and heading in radians, in (-pi, pi], in the frame of the world.
@@ -63,24 +38,23 @@ def simulate_trajectory(
     """
     if num_poses < 1:
         raise ValueError(f"num_poses must be at least 1, got {num_poses}")
-    config = config or TrajectoryConfig()
     clearance = _clearance(world.is_obstacle)
-    route = _plan_route(clearance, 1.15 * num_poses * config.mean_step_px + 200.0, rng, config)
-    positions = _walk(route, clearance, num_poses, rng, config)
-    turns = rng.uniform(-1, 1, num_poses - 1) * np.deg2rad(config.max_rotation_deg)
+    route = _plan_route(clearance, 1.15 * num_poses * _MEAN_STEP_PX + 200.0, rng)
+    positions = _walk(route, clearance, num_poses, rng)
+    turns = rng.uniform(-1, 1, num_poses - 1) * np.deg2rad(_MAX_ROTATION_DEG)
     first = rng.uniform(-np.pi, np.pi)
     heading = first + np.concatenate([[0.0], np.cumsum(turns)])
     return np.column_stack([positions, np.pi - (np.pi - heading) % (2 * np.pi)])
 
 
 def simulate_odometry(
-    poses: NDArray[np.float64],
+    poses: FloatArray,
     *,
     rng: np.random.Generator,
     translation_noise: float = 0.05,
     rotation_noise_deg: float = 1.0,
     bias: float = 0.01,
-) -> NDArray[np.float64]:
+) -> FloatArray:
     """Simulates wheel odometry: each relative motion gets a fixed scale error and white noise; the motions are chained.
 
     Args:
@@ -103,7 +77,7 @@ def simulate_odometry(
     return se2.chain(np.column_stack([forward, left, turn]))[: len(pose)]
 
 
-def _clearance(is_obstacle: NDArray[np.bool_]) -> NDArray[np.float64]:
+def _clearance(is_obstacle: BoolArray) -> FloatArray:
     """(h, w) lower bound of the distance (px) of any point of a pixel to the next obstacle or to the border."""
     from scipy.ndimage import distance_transform_edt
 
@@ -111,12 +85,10 @@ def _clearance(is_obstacle: NDArray[np.bool_]) -> NDArray[np.float64]:
     return np.maximum(np.asarray(distance, np.float64) - np.sqrt(2.0), 0.0)
 
 
-def _plan_route(
-    clearance: NDArray[np.float64], length_px: float, rng: np.random.Generator, config: TrajectoryConfig
-) -> NDArray[np.float64]:
+def _plan_route(clearance: FloatArray, length_px: float, rng: np.random.Generator) -> FloatArray:
     """(k, 2) raster points of a route of at least the wanted length, every third leg back to where it began."""
     coarse = clearance[_CELL_PX // 2 :: _CELL_PX, _CELL_PX // 2 :: _CELL_PX]
-    cells = _largest_region(coarse >= config.clearance_px + _PLAN_MARGIN_PX)
+    cells = np.argwhere(largest_region(coarse >= _CLEARANCE_PX + _PLAN_MARGIN_PX))
     if len(cells) < 2:
         raise ValueError("world is too narrow to move in: no connected free space with the wanted clearance")
     centres = (cells[:, ::-1].astype(np.float64) + 0.5) * _CELL_PX
@@ -128,7 +100,7 @@ def _plan_route(
     while travelled < length_px:
         cost, before = _shortest_paths(cells, coarse, visits, place)
         leg += 1
-        goal = home if leg % 3 == 0 and place != home else _choose_goal(cost, visits, rng, config)
+        goal = home if leg % 3 == 0 and place != home else _choose_goal(cost, visits, rng)
         path = _trace(before, place, goal)
         travelled += float(np.linalg.norm(np.diff(centres[[place, *path]], axis=0), axis=1).sum())
         for cell in path:
@@ -138,19 +110,9 @@ def _plan_route(
     return centres[route]
 
 
-def _largest_region(is_open: NDArray[np.bool_]) -> NDArray[np.int64]:
-    """(k, 2) rows and columns of the largest connected open region."""
-    from scipy.ndimage import label
-
-    labels, _ = label(is_open)
-    sizes = np.bincount(labels.ravel())
-    sizes[0] = 0
-    return np.argwhere((labels == sizes.argmax()) & is_open)
-
-
 def _shortest_paths(
-    cells: NDArray[np.int64], coarse: NDArray[np.float64], visits: NDArray[np.float64], start: int
-) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
+    cells: NDArray[np.int64], coarse: FloatArray, visits: FloatArray, start: int
+) -> tuple[FloatArray, NDArray[np.int32]]:
     """Costs (k,) from the start cell and predecessors (k,); walls and used ways cost more than open new ground."""
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import dijkstra
@@ -158,24 +120,19 @@ def _shortest_paths(
     index = np.full(np.add(coarse.shape, 2), -1)
     index[cells[:, 0] + 1, cells[:, 1] + 1] = np.arange(len(cells))
     toll = 1.0 + 2.0 * np.exp(-coarse[cells[:, 0], cells[:, 1]] / 15.0) + 1.5 * np.minimum(visits, 1.0)
-    tails, heads, weights = [], [], []
-    for step in ((0, 1), (1, 0), (0, -1), (-1, 0)):
-        near = index[cells[:, 0] + 1 + step[0], cells[:, 1] + 1 + step[1]]
-        tail = np.flatnonzero(near >= 0)
-        tails.append(tail)
-        heads.append(near[tail])
-        weights.append(_CELL_PX * 0.5 * (toll[tail] + toll[near[tail]]))
-    ends = (np.concatenate(tails), np.concatenate(heads))
-    graph = coo_matrix((np.concatenate(weights), ends), shape=(len(cells), len(cells))).tocsr()
+    steps = np.array([[0, 1], [1, 0], [0, -1], [-1, 0]])
+    near = index[cells[:, 0] + 1 + steps[:, :1], cells[:, 1] + 1 + steps[:, 1:]]
+    step, tail = np.nonzero(near >= 0)
+    head = near[step, tail]
+    weights = _CELL_PX * 0.5 * (toll[tail] + toll[head])
+    graph = coo_matrix((weights, (tail, head)), shape=(len(cells), len(cells))).tocsr()
     cost, before = dijkstra(graph, indices=np.array([start]), return_predecessors=True)
     return cost[0], before[0]
 
 
-def _choose_goal(
-    cost: NDArray[np.float64], visits: NDArray[np.float64], rng: np.random.Generator, config: TrajectoryConfig
-) -> int:
+def _choose_goal(cost: FloatArray, visits: FloatArray, rng: np.random.Generator) -> int:
     """The least visited of a handful of places about a leg away."""
-    off = np.abs(cost / (1.5 * config.leg_px) - 1.0)
+    off = np.abs(cost / (1.5 * _LEG_PX) - 1.0)
     near_enough = np.flatnonzero((off <= max(0.4, float(np.partition(off, 1)[1]))) & (cost > 0))
     options = rng.choice(near_enough, size=min(8, len(near_enough)), replace=False)
     return int(options[np.argmin(visits[options])])
@@ -189,57 +146,41 @@ def _trace(before: NDArray[np.int32], start: int, goal: int) -> list[int]:
     return path[-2::-1]
 
 
-def _walk(
-    route: NDArray[np.float64],
-    clearance: NDArray[np.float64],
-    num_poses: int,
-    rng: np.random.Generator,
-    config: TrajectoryConfig,
-) -> NDArray[np.float64]:
+def _walk(route: FloatArray, clearance: FloatArray, num_poses: int, rng: np.random.Generator) -> FloatArray:
     """(num_poses, 2) positions: steps of random length towards the farthest visible point of the route, unsteadily."""
     positions, along = [route[0]], 0
-    lengths = config.mean_step_px * rng.uniform(0.6, 1.4, num_poses - 1)
+    lengths = _MEAN_STEP_PX * rng.uniform(0.6, 1.4, num_poses - 1)
     sway = np.deg2rad(12.0) * rng.normal(size=num_poses - 1)
     for length, swing in zip(lengths, sway, strict=True):
         here = positions[-1]
-        along = _aim(route, along, here, clearance, config)
+        along = _aim(route, along, here, clearance)
         bearing = np.arctan2(*(route[along] - here)[::-1])
         # Smaller swings, then other directions, are tried before a step would touch a wall.
-        spread = np.concatenate(
-            [[swing, 0.5 * swing, 0.0], np.deg2rad(np.arange(5, 180, 5).repeat(2)) * np.tile([1, -1], 35)]
-        )
-        angles = bearing + spread
+        others = np.deg2rad(np.arange(5, 180, 5).repeat(2)) * np.tile([1, -1], 35)
+        angles = bearing + np.concatenate([[swing, 0.5 * swing, 0.0], others])
         ends = here + length * np.column_stack([np.cos(angles), np.sin(angles)])
-        clear = [end for end in ends if _is_clear(here, end, clearance, config.clearance_px)]
+        clear = [end for end in ends if _is_clear(here, end, clearance)]
         if not clear:
             raise ValueError("world is too narrow to move in: a step would touch an obstacle in every direction")
         positions.append(clear[0])
     return np.array(positions)
 
 
-def _aim(
-    route: NDArray[np.float64],
-    along: int,
-    here: NDArray[np.float64],
-    clearance: NDArray[np.float64],
-    config: TrajectoryConfig,
-) -> int:
+def _aim(route: FloatArray, along: int, here: FloatArray, clearance: FloatArray) -> int:
     """Index of the route point to walk to: the farthest one ahead that is within sight and not far off."""
     last = min(along + int(2 * _LOOKAHEAD_PX / _CELL_PX), len(route) - 1)
     for index in range(last, along, -1):
         is_near = np.linalg.norm(route[index] - here) <= _LOOKAHEAD_PX
-        if is_near and _is_clear(here, route[index], clearance, config.clearance_px):
+        if is_near and _is_clear(here, route[index], clearance):
             return index
     return along if np.linalg.norm(route[along] - here) > _CELL_PX else min(along + 1, len(route) - 1)
 
 
-def _is_clear(
-    start: NDArray[np.float64], end: NDArray[np.float64], clearance: NDArray[np.float64], margin: float
-) -> bool:
-    """Whether a straight step keeps the margin, sampled every half pixel (a quarter is lost at most)."""
+def _is_clear(start: FloatArray, end: FloatArray, clearance: FloatArray) -> bool:
+    """Whether a straight step keeps the clearance, sampled every half pixel (a quarter is lost at most)."""
     count = int(np.linalg.norm(end - start) * 2) + 2
     samples = np.floor(np.linspace(start, end, count)).astype(np.int64)
     height, width = clearance.shape
     if (samples < 0).any() or (samples >= [width, height]).any():
         return False
-    return bool((clearance[samples[:, 1], samples[:, 0]] >= margin + 0.25).all())
+    return bool((clearance[samples[:, 1], samples[:, 0]] >= _CLEARANCE_PX + 0.25).all())

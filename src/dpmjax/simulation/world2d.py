@@ -11,9 +11,8 @@ from __future__ import annotations
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 
-from dpmjax.sequences import World
+from dpmjax.sequences import BoolArray, FloatArray, World
 
 SIZE_PX = 1024
 _WALL_PX = 10
@@ -42,14 +41,14 @@ def make_world(index: int) -> World:
     return World(f"{kind}-{index}", grid).fill_pockets()
 
 
-def _build_office(grid: NDArray[np.bool_], rng: np.random.Generator) -> None:
+def _build_office(grid: BoolArray, rng: np.random.Generator) -> None:
     """Rooms by repeated division, each wall with its doors."""
     _paint_frame(grid)
     _divide(grid, rng, (0, 0, SIZE_PX, SIZE_PX), depth=0)
     _furnish(grid, rng, num_tries=320, gap=40)
 
 
-def _build_yard(grid: NDArray[np.bool_], rng: np.random.Generator) -> None:
+def _build_yard(grid: BoolArray, rng: np.random.Generator) -> None:
     """Blocks of one to three boxes on a shaken 4 x 4 raster; the border is open, as in the authors' worlds."""
     for x, y in rng.permutation([(x, y) for x in range(4) for y in range(4)])[:13]:
         centre = (np.array([x, y]) + 0.5) * SIZE_PX / 4 + rng.uniform(-25, 25, 2)
@@ -58,7 +57,7 @@ def _build_yard(grid: NDArray[np.bool_], rng: np.random.Generator) -> None:
     _furnish(grid, rng, num_tries=160, gap=40)
 
 
-def _build_clinic(grid: NDArray[np.bool_], rng: np.random.Generator) -> None:
+def _build_clinic(grid: BoolArray, rng: np.random.Generator) -> None:
     """A crooked corridor from left to right, a row of rooms above and one below, and doors from room to room."""
     _paint_frame(grid)
     for sign, wall_y in ((1, 570), (-1, 430)):
@@ -76,7 +75,7 @@ def _build_clinic(grid: NDArray[np.bool_], rng: np.random.Generator) -> None:
     _furnish(grid, rng, num_tries=320, gap=38)
 
 
-def _divide(grid: NDArray[np.bool_], rng: np.random.Generator, room: tuple[int, int, int, int], depth: int) -> None:
+def _divide(grid: BoolArray, rng: np.random.Generator, room: tuple[int, int, int, int], depth: int) -> None:
     """Cuts a room (x, y, width, height) in two by a wall with one or two doors, and goes on with both halves."""
     x, y, width, height = room
     if max(width, height) < 330 or (depth >= 3 and max(width, height) < 420):
@@ -98,14 +97,14 @@ def _divide(grid: NDArray[np.bool_], rng: np.random.Generator, room: tuple[int, 
         _clear_door(grid, along, cut, door)
 
 
-def _clear_door(grid: NDArray[np.bool_], along: int, at: float, door: float) -> None:
+def _clear_door(grid: BoolArray, along: int, at: float, door: float) -> None:
     """Takes away what a later wall put into a doorway."""
     reach = slice(max(int(at) - 40, _WALL_PX), int(at) + 40)
     width = slice(int(door), int(door) + _DOOR_PX)
     grid[(width, reach) if along else (reach, width)] = False
 
 
-def _furnish(grid: NDArray[np.bool_], rng: np.random.Generator, num_tries: int, gap: int) -> None:
+def _furnish(grid: BoolArray, rng: np.random.Generator, num_tries: int, gap: int) -> None:
     """Puts obstacles of different shapes wherever a passage of `gap` pixels is left all round."""
     for _ in range(num_tries):
         centre, size = rng.uniform(40, SIZE_PX - 40, 2), rng.uniform(9, 34, 2)
@@ -116,11 +115,11 @@ def _furnish(grid: NDArray[np.bool_], rng: np.random.Generator, num_tries: int, 
         (_paint_box, _paint_disc, _paint_triangle)[rng.integers(3)](grid, centre, size, rng.uniform(0, np.pi))
 
 
-def _paint_frame(grid: NDArray[np.bool_]) -> None:
+def _paint_frame(grid: BoolArray) -> None:
     grid[:_WALL_PX], grid[-_WALL_PX:], grid[:, :_WALL_PX], grid[:, -_WALL_PX:] = True, True, True, True
 
 
-def _paint_span(grid: NDArray[np.bool_], along: int, at: float, span: tuple[float, float], doors: list[float]) -> None:
+def _paint_span(grid: BoolArray, along: int, at: float, span: tuple[float, float], doors: list[float]) -> None:
     """A wall along x (0) or y (1) at the other coordinate `at`, over `span`, with gaps that start at `doors`."""
     line = np.zeros(SIZE_PX, bool)
     line[max(int(span[0]), 0) : int(span[1])] = True
@@ -130,7 +129,7 @@ def _paint_span(grid: NDArray[np.bool_], along: int, at: float, span: tuple[floa
     grid[(slice(None), band) if along else (band, slice(None))] |= line[:, None] if along else line
 
 
-def _local(centre: NDArray[np.float64], angle: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _local(centre: FloatArray, angle: float) -> tuple[FloatArray, FloatArray]:
     """Coordinates of all pixel centres in a frame at `centre`, turned by `angle`."""
     x, y = centre
     axis = np.arange(SIZE_PX) + 0.5
@@ -138,18 +137,16 @@ def _local(centre: NDArray[np.float64], angle: float) -> tuple[NDArray[np.float6
     return np.cos(angle) * dx + np.sin(angle) * dy, np.cos(angle) * dy - np.sin(angle) * dx
 
 
-def _paint_box(grid: NDArray[np.bool_], centre: NDArray[np.float64], size: NDArray[np.float64], angle: float) -> None:
+def _paint_box(grid: BoolArray, centre: FloatArray, size: FloatArray, angle: float) -> None:
     (u, v), (half_u, half_v) = _local(centre, angle), size
     grid |= (np.abs(u) < half_u) & (np.abs(v) < half_v)
 
 
-def _paint_disc(grid: NDArray[np.bool_], centre: NDArray[np.float64], size: NDArray[np.float64], angle: float) -> None:
+def _paint_disc(grid: BoolArray, centre: FloatArray, size: FloatArray, angle: float) -> None:
     u, v = _local(centre, angle)
     grid |= u**2 + v**2 < np.mean(size) ** 2
 
 
-def _paint_triangle(
-    grid: NDArray[np.bool_], centre: NDArray[np.float64], size: NDArray[np.float64], angle: float
-) -> None:
+def _paint_triangle(grid: BoolArray, centre: FloatArray, size: FloatArray, angle: float) -> None:
     (u, v), (half_u, half_v) = _local(centre, angle), size
     grid |= (v > -half_v) & (np.abs(u) / half_u < (half_v - v) / (2 * half_v))

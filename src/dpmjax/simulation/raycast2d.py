@@ -13,9 +13,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from dpmjax.sequences import ScanSequence, World
-from dpmjax.simulation.world2d.trajectory import simulate_odometry, simulate_trajectory
-from dpmjax.simulation.world2d.world import make_world
+from dpmjax.sequences import BoolArray, FloatArray, ScanSequence, World
+from dpmjax.simulation.trajectory2d import simulate_odometry, simulate_trajectory
+from dpmjax.simulation.world2d import make_world
 
 
 class RayHits(NamedTuple):
@@ -29,13 +29,13 @@ class RayHits(NamedTuple):
         is_border: (m,) bool, True where the beam met nothing but the border of the image.
     """
 
-    points: NDArray[np.float64]
-    ranges: NDArray[np.float64]
+    points: FloatArray
+    ranges: FloatArray
     axis: NDArray[np.int64]
-    is_border: NDArray[np.bool_]
+    is_border: BoolArray
 
 
-def beam_angles(num_beams: int) -> NDArray[np.float64]:
+def beam_angles(num_beams: int) -> FloatArray:
     """Angles of a 360-degree scan as the DeepMapping authors order it.
 
     Args:
@@ -52,7 +52,7 @@ def beam_angles(num_beams: int) -> NDArray[np.float64]:
     return np.arange(num_beams, dtype=np.float64) * (2.0 * np.pi / num_beams)
 
 
-def cast_scans(is_obstacle: NDArray[np.bool_], poses: ArrayLike, *, num_beams: int = 256) -> NDArray[np.float64]:
+def cast_scans(is_obstacle: BoolArray, poses: ArrayLike, *, num_beams: int = 256) -> FloatArray:
     """Ranges of noise-free scans of 360 degrees.
 
     Args:
@@ -68,7 +68,7 @@ def cast_scans(is_obstacle: NDArray[np.bool_], poses: ArrayLike, *, num_beams: i
     return cast_rays(is_obstacle, np.repeat(at[:, :2], num_beams, axis=0), angles).ranges.reshape(-1, num_beams)
 
 
-def cast_rays(is_obstacle: NDArray[np.bool_], origins: ArrayLike, angles: ArrayLike) -> RayHits:
+def cast_rays(is_obstacle: BoolArray, origins: ArrayLike, angles: ArrayLike) -> RayHits:
     """Follows beams through the pixel grid to the first obstacle edge, or to the border of the image.
 
     Grid traversal in the manner of Amanatides and Woo (1987), in which a beam crosses a whole square of pixels known to
@@ -114,14 +114,14 @@ def cast_rays(is_obstacle: NDArray[np.bool_], origins: ArrayLike, angles: ArrayL
 
 
 def scan_world(
-    is_obstacle: NDArray[np.bool_],
+    is_obstacle: BoolArray,
     poses: ArrayLike,
     *,
     num_beams: int = 256,
     max_range: float | None = None,
     range_noise_px: float = 0.0,
     rng: np.random.Generator | None = None,
-) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+) -> tuple[NDArray[np.float32], BoolArray]:
     """Takes a 360-degree scan at every pose (DeepMapping section 4.1).
 
     Args:
@@ -189,17 +189,11 @@ def simulate_sequence(
     points, mask = scan_world(
         scene.is_obstacle, poses, num_beams=num_beams, range_noise_px=range_noise_px, rng=noise_rng
     )
-    return ScanSequence(
-        name=scene.name,
-        points=points,
-        mask=mask,
-        unit="px",
-        reference_poses=poses,
-        odometry_poses=simulate_odometry(poses, rng=odometry_rng) if with_odometry else None,
-    )
+    odometry = simulate_odometry(poses, rng=odometry_rng) if with_odometry else None
+    return ScanSequence(scene.name, points, mask, "px", reference_poses=poses, odometry_poses=odometry)
 
 
-def _check_origins(is_obstacle: NDArray[np.bool_], origins: NDArray[np.float64]) -> None:
+def _check_origins(is_obstacle: BoolArray, origins: FloatArray) -> None:
     height, width = is_obstacle.shape
     is_inside = ((origins >= 0) & (origins < [width, height])).all(axis=1)
     if not is_inside.all():
@@ -210,7 +204,7 @@ def _check_origins(is_obstacle: NDArray[np.bool_], origins: NDArray[np.float64])
         raise ValueError(f"origins must lie in free space, got {origins[is_blocked][0]} inside an obstacle")
 
 
-def _free_distance(is_obstacle: NDArray[np.bool_]) -> NDArray[np.int32]:
+def _free_distance(is_obstacle: BoolArray) -> NDArray[np.int32]:
     """(h + 2, w + 2) chessboard distance to the nearest solid pixel; a solid frame is put round the image."""
     from scipy.ndimage import distance_transform_cdt
 
@@ -219,12 +213,8 @@ def _free_distance(is_obstacle: NDArray[np.bool_]) -> NDArray[np.int32]:
 
 
 def _leap(
-    start: NDArray[np.float64],
-    direction: NDArray[np.float64],
-    cell: NDArray[np.int64],
-    reach: NDArray[np.int64],
-    reached: NDArray[np.float64],
-) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.int64]]:
+    start: FloatArray, direction: FloatArray, cell: NDArray[np.int64], reach: NDArray[np.int64], reached: FloatArray
+) -> tuple[NDArray[np.int64], FloatArray, NDArray[np.int64]]:
     """Moves each beam into the first pixel outside of the free square of half-width `reach` round its pixel.
 
     With reach 1 this is one step of the plain grid traversal.

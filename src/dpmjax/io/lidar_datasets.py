@@ -1,4 +1,4 @@
-"""Drives of other data sets as they lie on disk: KITTI raw, KITTI-360, KITTI-CARLA, MulRan."""
+"""Drives of the data sets as they lie on disk: KITTI odometry, KITTI raw, KITTI-360, KITTI-CARLA, MulRan."""
 
 from __future__ import annotations
 
@@ -6,20 +6,47 @@ import re
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from dpmjax.geometry import rigid
+from dpmjax.io.drives import Drive3D, match_poses, match_rows, match_times, numbers_of, scan_files
 from dpmjax.io.files import natural_key, read_lines, read_table
-from dpmjax.io.lidar.drive import Drive3D, from_first, match_poses, numbers_of, scan_files
-from dpmjax.io.lidar.kitti import read_labelled_numbers
-from dpmjax.io.poses import check_poses, interpolate_poses, to_homogeneous
-from dpmjax.sequences import InputError
+from dpmjax.io.poses import check_poses, from_rows, homogeneous, interpolate_poses, read_poses
+from dpmjax.sequences import FloatArray, InputError, require
 
 _CARLA_POSES_PER_FRAME = 100  # KITTI-CARLA writes poses at 1000 Hz and frames at 10 Hz.
 _EARTH_RADIUS_M = 6378137.0
 # MulRan's published calibration: the Ouster in the car's frame; rotation about z by 179.6654 degrees.
 _MULRAN_OUSTER_XYZ = (1.7042, -0.021, 1.8047)
 _MULRAN_OUSTER_RPY_DEG = (0.0001, 0.0003, 179.6654)
+
+
+def read_kitti_odometry(folder: Path) -> Drive3D:
+    """Lists a sequence of KITTI odometry.
+
+    Poses are looked for in poses_lidar.txt (already in the lidar's frame), poses.txt beside velodyne/ (SemanticKITTI's)
+    and poses/NN.txt two folders up, both in the left camera's frame.
+
+    Args:
+        folder: the folder that holds velodyne/.
+
+    Returns:
+        The drive; poses in the lidar's frame, world = first lidar frame where the first camera pose is the identity.
+
+    Raises:
+        InputError: camera poses without `Tr` in calib.txt, or broken files.
+    """
+    files = scan_files(folder / "velodyne")
+    in_lidar, name = folder / "poses_lidar.txt", folder.resolve().name
+    in_camera = [folder / "poses.txt", folder.resolve().parents[1] / "poses" / f"{name}.txt"]
+    drive = Drive3D(name, files, times=match_times(folder / "times.txt", files))
+    path = next((p for p in (in_lidar, *in_camera) if p.is_file()), None)
+    if path is None:
+        return drive
+    poses = read_poses(path)
+    if path != in_lidar:
+        T_cam0_lidar = _read_camera_calibration(folder / "calib.txt")
+        poses = rigid.inverse(T_cam0_lidar) @ poses @ T_cam0_lidar
+    return drive._replace(T_world_lidar=match_poses(poses, files, path))
 
 
 def read_kitti_raw(folder: Path) -> Drive3D:
@@ -37,9 +64,9 @@ def read_kitti_raw(folder: Path) -> Drive3D:
     files = scan_files(folder / "velodyne_points" / "data")
     stamps = _read_stamps(folder / "velodyne_points" / "timestamps.txt", files)
     home = folder / "oxts" / "data"
-    records = sorted(home.glob("*.txt"), key=lambda f: natural_key(f.name))
+    records = sorted(home.glob("*.txt"), key=lambda record: natural_key(record.name))
     if not records or not files:
-        return Drive3D(folder.resolve().name, files, None, stamps)
+        return Drive3D(folder.resolve().name, files, times=stamps)
     candidates = [parent / "calib_imu_to_velo.txt" for parent in (folder, folder.resolve().parent)]
     calibration = next((path for path in candidates if path.is_file()), None)
     if calibration is None:
@@ -48,7 +75,8 @@ def read_kitti_raw(folder: Path) -> Drive3D:
     table = np.vstack([_first_row(record, 6) for record in records])
     T_world_lidar = _poses_from_oxts(table, home) @ rigid.inverse(_read_imu_calibration(calibration))
     # A drive may lack scans that have a record: poses are matched by number.
-    return Drive3D(folder.resolve().name, files, from_first(match_poses(T_world_lidar, files, home)), stamps)
+    poses = match_poses(T_world_lidar, files, home)
+    return Drive3D(folder.resolve().name, files, rigid.inverse(poses[0]) @ poses, stamps)
 
 
 def read_kitti_360(folder: Path) -> Drive3D:
@@ -71,18 +99,17 @@ def read_kitti_360(folder: Path) -> Drive3D:
     name, root = folder.resolve().name, folder.resolve().parents[1]
     path = root / "data_poses" / name / "poses.txt"
     if not path.is_file():
-        return Drive3D(name, files, None, stamps)
+        return Drive3D(name, files, times=stamps)
     rows = _read_rows(path, "KITTI-360's poses.txt: frame and 12 numbers")
     calibration = root / "calibration" / "calib_cam_to_pose.txt"
     numbers = read_labelled_numbers(calibration).get("image_00", np.zeros(0))
-    if len(numbers) != 12:
-        raise InputError(calibration, "no line 'image_00:' of 12 numbers", "take KITTI-360's calibration folder")
-    T_imu_cam0 = check_poses(to_homogeneous(numbers[None]), calibration)
+    require(len(numbers) == 12, calibration, "no line 'image_00:' of 12 numbers", "take KITTI-360's calibration folder")
+    T_imu_cam0 = from_rows(numbers, calibration)
     calibration = root / "calibration" / "calib_cam_to_velo.txt"
-    T_lidar_cam0 = check_poses(to_homogeneous(_first_row(calibration, 12)), calibration)
-    T_world_lidar = check_poses(to_homogeneous(rows[:, 1:]), path) @ T_imu_cam0 @ rigid.inverse(T_lidar_cam0)
+    T_lidar_cam0 = from_rows(_first_row(calibration, 12), calibration)
+    T_world_lidar = from_rows(rows[:, 1:], path) @ T_imu_cam0 @ rigid.inverse(T_lidar_cam0)
     frames = np.array(_require_numbers(files), np.float64)
-    return _interpolate(Drive3D(name, files, None, stamps), frames, rows[:, 0], T_world_lidar, path)
+    return _interpolate(Drive3D(name, files, times=stamps), frames, rows[:, 0], T_world_lidar, path)
 
 
 def read_kitti_carla(folder: Path) -> Drive3D:
@@ -102,13 +129,12 @@ def read_kitti_carla(folder: Path) -> Drive3D:
     name = home.resolve().parent.name if home.resolve().name == "generated" else home.resolve().name
     path = home / "full_poses_lidar.txt"
     if not path.is_file():
-        return Drive3D(name, files, None, None)
+        return Drive3D(name, files)
     rows = _read_rows(path, "KITTI-CARLA's full_poses_lidar.txt: 12 numbers and a time")
     endings = [(re.findall(r"\d+", file.stem) or [str(index)])[-1] for index, file in enumerate(files)]
     at = [_CARLA_POSES_PER_FRAME * int(ending[-9:]) for ending in endings]
-    if max(at, default=0) >= len(rows):
-        raise InputError(path, f"{len(rows)} rows for {len(files)} frames", "give 100 rows a frame")
-    return Drive3D(name, files, check_poses(to_homogeneous(rows[at, :12]), path), rows[at, 12])
+    require(max(at, default=0) < len(rows), path, f"{len(rows)} rows for {len(files)} frames", "give 100 rows a frame")
+    return Drive3D(name, files, from_rows(rows[at, :12], path), rows[at, 12])
 
 
 def read_mulran(folder: Path) -> Drive3D:
@@ -129,37 +155,30 @@ def read_mulran(folder: Path) -> Drive3D:
     files = scan_files(home, (".bin",))
     stamps = np.array(_require_numbers(files), np.int64)
     times = (stamps - stamps[:1]).astype(np.float64) * 1e-9
-    drive = Drive3D(folder.resolve().name, files, None, times)
+    drive = Drive3D(folder.resolve().name, files, times=times)
     path = folder / "global_pose.csv"
     if not path.is_file() or not len(files):
         return drive
     rows = _read_rows(path, "MulRan's global_pose.csv: stamp and 12 numbers")
     # In float64 a stamp of 1.5e18 ns is good to 256 ns.
     pose_times = (rows[:, 0] - float(stamps[0])) * 1e-9
-    T_car_lidar = np.eye(4)
-    T_car_lidar[:3, 3] = _MULRAN_OUSTER_XYZ
-    T_car_lidar[:3, :3] = Rotation.from_euler("xyz", _MULRAN_OUSTER_RPY_DEG, degrees=True).as_matrix()
-    T_world_lidar = check_poses(to_homogeneous(rows[:, 1:]), path) @ T_car_lidar
+    R_car_lidar = Rotation.from_euler("xyz", _MULRAN_OUSTER_RPY_DEG, degrees=True).as_matrix()
+    T_car_lidar = homogeneous(R_car_lidar, np.array(_MULRAN_OUSTER_XYZ))
+    T_world_lidar = from_rows(rows[:, 1:], path) @ T_car_lidar
     return _interpolate(drive, times, pose_times, T_world_lidar, path, slack=0.5)
 
 
 def _interpolate(
-    drive: Drive3D,
-    wanted: NDArray[np.float64],
-    times: NDArray[np.float64],
-    poses: NDArray[np.float64],
-    path: Path,
-    *,
-    slack: float = 0.0,
+    drive: Drive3D, wanted: FloatArray, times: FloatArray, poses: FloatArray, path: Path, *, slack: float = 0.0
 ) -> Drive3D:
     """The scans less than `slack` beyond the times of the poses, with interpolated poses from the first on."""
     times, first = np.unique(times, return_index=True)
     kept = np.flatnonzero((wanted >= times[0] - slack) & (wanted <= times[-1] + slack))
-    if not len(kept):
-        raise InputError(path, "no scan lies within the times of the poses", "give scans and poses of one drive")
-    found = from_first(interpolate_poses(times, poses[first], wanted[kept]))
+    require(len(kept) > 0, path, "no scan lies within the times of the poses", "give scans and poses of one drive")
+    found = interpolate_poses(times, poses[first], wanted[kept])
     stamps = None if drive.times is None else drive.times[kept]
-    return Drive3D(drive.name, [drive.files[i] for i in kept], found, stamps)
+    # In the frame of the first, without the 1e6 m of national grids.
+    return Drive3D(drive.name, [drive.files[i] for i in kept], rigid.inverse(found[0]) @ found, stamps)
 
 
 def _require_numbers(files: list[Path]) -> list[int]:
@@ -169,23 +188,22 @@ def _require_numbers(files: list[Path]) -> list[int]:
     return numbers
 
 
-def _first_row(path: Path, width: int) -> NDArray[np.float64]:
+def _first_row(path: Path, width: int) -> FloatArray:
     """(1, width) first numbers of a file."""
     rows = read_table(path)
-    if rows.shape[1] < width:
-        raise InputError(path, f"rows of {rows.shape[1]} numbers", f"give {width} numbers or more")
+    require(rows.shape[1] >= width, path, f"rows of {rows.shape[1]} numbers", f"give {width} numbers or more")
     return rows[:1, :width]
 
 
-def _read_rows(path: Path, layout: str) -> NDArray[np.float64]:
+def _read_rows(path: Path, layout: str) -> FloatArray:
     """(n, 13) numbers of a pose file, all finite."""
     rows = read_table(path)
-    if rows.shape[1] != 13 or not np.isfinite(rows).all():
-        raise InputError(path, f"rows of {rows.shape[1]} numbers, or some not finite", f"give {layout}")
+    is_good = rows.shape[1] == 13 and np.isfinite(rows).all()
+    require(is_good, path, f"rows of {rows.shape[1]} numbers, or some not finite", f"give {layout}")
     return rows
 
 
-def _read_stamps(path: Path, files: list[Path]) -> NDArray[np.float64] | None:
+def _read_stamps(path: Path, files: list[Path]) -> FloatArray | None:
     """KITTI raw's timestamps.txt (2011-09-26 13:02:25.951199337) as seconds from the first; None if it does not fit."""
     try:
         lines = [line.strip() for line in read_lines(path) if line.strip()]
@@ -194,24 +212,51 @@ def _read_stamps(path: Path, files: list[Path]) -> NDArray[np.float64] | None:
         stamps = np.array([line.replace(" ", "T") for line in lines], "datetime64[ns]")
     except ValueError:
         return None
-    if len(stamps) != len(files):
-        numbers = numbers_of(files, len(stamps) - 1)
-        if numbers is None:
-            return None
-        stamps = stamps[numbers]
-    return (stamps - stamps[0]).astype(np.float64) * 1e-9 if len(stamps) else None
+    matched = match_rows(stamps, files)
+    return None if matched is None or not len(matched) else (matched - matched[0]).astype(np.float64) * 1e-9
 
 
-def _read_imu_calibration(path: Path) -> NDArray[np.float64]:
+def read_labelled_numbers(path: Path) -> dict[str, FloatArray]:
+    """Reads the lines `key: numbers` of a calibration file; other lines are ignored.
+
+    Args:
+        path: the file.
+
+    Returns:
+        The numbers by key.
+
+    Raises:
+        InputError: there is no such file.
+    """
+    found = {}
+    for key, _, numbers in (line.partition(":") for line in read_lines(path)):
+        try:
+            found[key.strip()] = np.array(numbers.split(), np.float64)
+        except ValueError:
+            continue
+    return found
+
+
+def _read_camera_calibration(path: Path) -> FloatArray:
+    """(4, 4) `T_cam0_lidar`: `Tr`, the lidar's frame to the left grey camera's, out of KITTI's calib.txt."""
+    entries = read_labelled_numbers(path)
+    for key in ("Tr", "Tr_velo_to_cam", "Tr_velo_cam"):
+        if key in entries and len(entries[key]) == 12:
+            return from_rows(entries[key], path)[0]
+    advice = "take the calib.txt with a line 'Tr:' of 12 numbers (data_odometry_calib); camera poses need it"
+    raise InputError(path, "no line 'Tr:' of 12 numbers", advice)
+
+
+def _read_imu_calibration(path: Path) -> FloatArray:
     """(4, 4) out of KITTI raw's `R:` and `T:` lines."""
     entries = read_labelled_numbers(path)
     turn, shift = entries.get("R", np.zeros(0)), entries.get("T", np.zeros(0))
-    if len(turn) != 9 or len(shift) != 3:
-        raise InputError(path, "no lines 'R:' of 9 and 'T:' of 3 numbers", "take KITTI's calibration file")
-    return check_poses(to_homogeneous(np.column_stack([turn.reshape(3, 3), shift]).reshape(1, 12)), path)[0]
+    is_good = len(turn) == 9 and len(shift) == 3
+    require(is_good, path, "no lines 'R:' of 9 and 'T:' of 3 numbers", "take KITTI's calibration file")
+    return check_poses(homogeneous(turn.reshape(1, 3, 3), shift[None]), path)[0]
 
 
-def _poses_from_oxts(records: NDArray[np.float64], source: Path) -> NDArray[np.float64]:
+def _poses_from_oxts(records: FloatArray, source: Path) -> FloatArray:
     """GPS/IMU records as poses, by the Mercator projection (Geiger et al. 2013, section III).
 
     Args:
@@ -226,13 +271,10 @@ def _poses_from_oxts(records: NDArray[np.float64], source: Path) -> NDArray[np.f
     """
     from scipy.spatial.transform import Rotation
 
-    if not (np.isfinite(records).all() and (np.abs(records[:, 0]) < 89.0).all()):
-        raise InputError(source, "records that are not finite, or a latitude beyond 89 degrees", "copy them again")
+    is_good = np.isfinite(records).all() and (np.abs(records[:, 0]) < 89.0).all()
+    require(is_good, source, "records that are not finite, or a latitude beyond 89 degrees", "copy them again")
     latitude, longitude = np.radians(records[:, 0]), np.radians(records[:, 1])
     scale = np.cos(latitude[0]) * _EARTH_RADIUS_M
-    poses = np.tile(np.eye(4), (len(records), 1, 1))
-    poses[:, 0, 3] = scale * longitude
-    poses[:, 1, 3] = scale * np.log(np.tan(0.25 * np.pi + 0.5 * latitude))
-    poses[:, 2, 3] = records[:, 2]
-    poses[:, :3, :3] = Rotation.from_euler("ZYX", records[:, [5, 4, 3]]).as_matrix()
-    return poses
+    east, north = scale * longitude, scale * np.log(np.tan(0.25 * np.pi + 0.5 * latitude))
+    rotations = Rotation.from_euler("ZYX", records[:, [5, 4, 3]]).as_matrix()
+    return homogeneous(rotations, np.column_stack([east, north, records[:, 2]]))

@@ -20,8 +20,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from dpmjax.io.files import read_bytes
-from dpmjax.sequences import InputError, ScanSequence
+from dpmjax.io.files import read_bytes, refusing
+from dpmjax.sequences import FloatArray, ScanSequence, require
 
 _log = logging.getLogger(__name__)
 _SHORTEST_SCALE_M = 7.9  # No laser of these logs has a shorter scale: a log that ends before has no code for "no echo".
@@ -32,9 +32,9 @@ _CODE_BAND_M = 0.1  # Codes for "no echo" scatter by a few centimetres (81.87 to
 class _Line(NamedTuple):
     """One FLASER line: ranges, m; corrected pose, odometry (x, y, theta); time stamp, s."""
 
-    ranges: NDArray[np.float64]
-    corrected: NDArray[np.float64]
-    odometry: NDArray[np.float64]
+    ranges: FloatArray
+    corrected: FloatArray
+    odometry: FloatArray
     time: float
 
 
@@ -70,19 +70,11 @@ def read_carmen_log(path: str | Path, *, max_range: float | None = None) -> Scan
     corrected, odometry = np.array([line.corrected for line in lines]), np.array([line.odometry for line in lines])
     has_odometry = not np.allclose(corrected, odometry, atol=1e-6)
     times, odometry = _repair(np.array([line.time for line in lines]), odometry, path)
-    return ScanSequence(
-        name=Path(path).name.split(".")[0],
-        points=points,
-        mask=mask,
-        unit="m",
-        is_organised=True,
-        reference_poses=corrected,
-        odometry_poses=odometry if has_odometry else None,
-        times=times,
-    )
+    name, raw = Path(path).name.split(".")[0], odometry if has_odometry else None
+    return ScanSequence(name, points, mask, "m", True, corrected, raw, times)
 
 
-def scan_angles(num_beams: int) -> NDArray[np.float64]:
+def scan_angles(num_beams: int) -> FloatArray:
     """Directions of the beams of a scan over 180 degrees, from right to left.
 
     An odd number of beams (181, 361) includes both ends; an even one (180, 360) has the step 180 / n and leaves out the
@@ -101,45 +93,35 @@ def scan_angles(num_beams: int) -> NDArray[np.float64]:
 def _flaser_lines(path: str | Path) -> list[tuple[int, list[str]]]:
     """Line numbers and words of the FLASER lines."""
     content = read_bytes(path)
-    try:
+    with refusing(path, "cannot be unpacked ({error})", "copy the file again", (OSError, EOFError, zlib.error)):
         text = (gzip.decompress(content) if content[:2] == b"\x1f\x8b" else content).decode("latin-1")
-    except (OSError, EOFError, zlib.error) as error:
-        raise InputError(path, f"cannot be unpacked ({error})", "copy the file again") from error
     lines = text.splitlines()
     found = [(number, line.split()) for number, line in enumerate(lines, 1) if line.startswith("FLASER")]
-    if not found:
-        newer = any(line.startswith("ROBOTLASER1") for line in lines)
-        what = "ROBOTLASER1 lines but no FLASER line" if newer else "no FLASER line"
-        raise InputError(path, what, "give a CARMEN log with FLASER lines")
+    is_newer = any(line.startswith("ROBOTLASER1") for line in lines)
+    what = "ROBOTLASER1 lines but no FLASER line" if is_newer else "no FLASER line"
+    require(len(found) > 0, path, what, "give a CARMEN log with FLASER lines")
     return found
 
 
 def _parse_line(words: list[str], source: str) -> _Line:
     advice = "a line reads FLASER n r1..rn x y theta odom_x odom_y odom_theta timestamp host timestamp"
-    try:
+    with refusing(source, "not a FLASER line ({error})", advice, (ValueError, IndexError, OverflowError)):
         count = int(words[1])
         values = np.array(words[2 : 2 + count + 6], np.float64)
         time = float(words[count + 8]) if len(words) > count + 8 else 0.0
-    except (ValueError, IndexError, OverflowError) as error:
-        raise InputError(source, f"not a FLASER line ({error})", advice) from error
-    if count < 1 or len(values) < count + 6:
-        raise InputError(source, f"{len(words) - 2} values after n = {count}, at least {count + 6} expected", advice)
-    ranges, corrected, odometry = values[:count], values[count : count + 3], values[count + 3 :]
-    if np.isnan(values).any() or not (np.abs([*values[count:], time]) < _LARGEST_NUMBER).all():
-        raise InputError(source, "NaN, infinite or huge values", "remove the line")
-    return _Line(ranges, corrected, odometry, time)
+    found = f"{len(words) - 2} values after n = {count}, at least {count + 6} expected"
+    require(count >= 1 and len(values) >= count + 6, source, found, advice)
+    is_good = not np.isnan(values).any() and (np.abs([*values[count:], time]) < _LARGEST_NUMBER).all()
+    require(is_good, source, "NaN, infinite or huge values", "remove the line")
+    return _Line(values[:count], values[count : count + 3], values[count + 3 :], time)
 
 
 def _no_echo_limit(lines: list[_Line]) -> float:
     largest = max(float(line.ranges.max()) for line in lines)
-    if np.isinf(largest):
-        return np.inf
     return largest - _CODE_BAND_M if largest >= _SHORTEST_SCALE_M else np.inf
 
 
-def _repair(
-    times: NDArray[np.float64], odometry: NDArray[np.float64], path: str | Path
-) -> tuple[NDArray[np.float64] | None, NDArray[np.float64]]:
+def _repair(times: FloatArray, odometry: FloatArray, path: str | Path) -> tuple[FloatArray | None, FloatArray]:
     """Interpolates time and odometry where the time stamp is out of order; no times where they stand still."""
     if np.ptp(times) == 0:
         return None, odometry
@@ -149,12 +131,8 @@ def _repair(
         _log.warning("%s: time stamps are in no order; odometry is taken as it stands, times are dropped", path)
         return None, odometry
     if num_wrong:
-        _log.warning(
-            "%s: %d of %d lines carry time and odometry of another moment; both are interpolated",
-            path,
-            num_wrong,
-            len(times),
-        )
+        message = "%s: %d of %d lines carry time and odometry of another moment; both are interpolated"
+        _log.warning(message, path, num_wrong, len(times))
     index = np.arange(len(times))
     pose = odometry[trusted].copy()
     pose[:, 2] = np.unwrap(pose[:, 2])
@@ -164,7 +142,7 @@ def _repair(
     return np.interp(index, trusted, times[trusted]), repaired
 
 
-def _longest_increasing(values: NDArray[np.float64]) -> NDArray[np.int64]:
+def _longest_increasing(values: FloatArray) -> NDArray[np.int64]:
     """Indices of the longest subsequence that strictly increases (patience sorting)."""
     tails: list[float] = []
     ends: list[int] = []

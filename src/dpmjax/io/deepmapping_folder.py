@@ -8,23 +8,22 @@ from __future__ import annotations
 import io
 import tarfile
 from pathlib import Path, PurePosixPath
-from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from dpmjax.io.clouds import parse_pcd, write_pcd
-from dpmjax.io.files import natural_key, read_bytes, write_atomically
+from dpmjax.io.files import natural_key, read_bytes, refusing, write_atomically
 from dpmjax.io.mat import parse_mat
-from dpmjax.sequences import InputError, ScanSequence, has_angular_order
+from dpmjax.sequences import FloatArray, ScanSequence, Unit, has_angular_order, require
 
 _PIXELS_PER_UNIT = 512.0
 _LARGEST_STORED = 8.0  # A picture of 2048 pixels has a diagonal of 5.7 stored units.
 _LARGEST_LENGTH = 1e7
+_SUFFIXES = (".pcd", ".mat")
 _POSE_FILE = "gt_pose.mat"
 
 
-def read_deepmapping_folder(path: str | Path, *, unit: Literal["px", "m"] | None = None) -> ScanSequence:
+def read_deepmapping_folder(path: str | Path, *, unit: Unit | None = None) -> ScanSequence:
     """Reads a folder or an uncompressed or compressed tar archive of `*.pcd` and `gt_pose.mat`.
 
     Args:
@@ -42,32 +41,25 @@ def read_deepmapping_folder(path: str | Path, *, unit: Literal["px", "m"] | None
     """
     files = _list_files(Path(path))
     names = sorted((name for name in files if name.lower().endswith(".pcd")), key=natural_key)
-    if not names:
-        raise InputError(path, "no .pcd file in it", "give the authors' folder or .tar of .pcd files")
+    require(len(names) > 0, path, "no .pcd file in it", "give the authors' folder or .tar of .pcd files")
     scans = [parse_pcd(files[name], f"{path}/{name}")[:, :2] for name in names]
     points = np.zeros((len(scans), max(len(scan) for scan in scans), 2), np.float32)
     for row, scan in zip(points, scans, strict=True):
         row[: len(scan)] = scan
     mask = (points != 0).any(axis=2)
-    if not mask.any():
-        found = "every point of every scan is zero (an invalid beam)"
-        raise InputError(path, found, "give scans that measured something")
-    if np.abs(points).max() > _LARGEST_LENGTH:
-        raise InputError(path, f"coordinates up to {np.abs(points).max():g}", "give metres, or pixels / 512")
-    if unit is None and np.abs(points).max() > _LARGEST_STORED:
-        found = f"coordinates up to {np.abs(points).max():g}, too large for pixels / 512"
-        raise InputError(path, found, "say --unit m if they are metres")
+    found = "every point of every scan is zero (an invalid beam)"
+    require(mask.any(), path, found, "give scans that measured something")
+    largest = np.abs(points).max()
+    found = f"coordinates up to {largest:g}"
+    require(largest <= _LARGEST_LENGTH, path, found, "give metres, or pixels / 512")
+    is_small = unit is not None or largest <= _LARGEST_STORED
+    require(is_small, path, f"{found}, too large for pixels / 512", "say --unit m if they are metres")
     if unit != "m":
         points *= np.float32(_PIXELS_PER_UNIT)
     pose_name = next((name for name in files if PurePosixPath(name).name == _POSE_FILE), None)
-    return ScanSequence(
-        name=Path(path).stem,
-        points=points,
-        mask=mask,
-        unit="m" if unit == "m" else "px",
-        is_organised=has_angular_order(points, mask),
-        reference_poses=None if pose_name is None else _read_poses(files[pose_name], f"{path}/{pose_name}", len(names)),
-    )
+    reference = None if pose_name is None else _read_poses(files[pose_name], f"{path}/{pose_name}", len(names))
+    is_organised = has_angular_order(points, mask)
+    return ScanSequence(Path(path).stem, points, mask, unit or "px", is_organised, reference)
 
 
 def write_deepmapping_folder(path: str | Path, sequence: ScanSequence) -> Path:
@@ -89,8 +81,8 @@ def write_deepmapping_folder(path: str | Path, sequence: ScanSequence) -> Path:
     digits = max(3, len(str(len(sequence) - 1)))
     names = [f"{index:0{digits}d}.pcd" for index in range(len(sequence))]
     others = sorted({file.name for file in folder.glob("*.pcd")} - set(names)) if folder.is_dir() else []
-    if others:
-        raise InputError(folder, f"{len(others)} other .pcd files, such as {others[0]}", "give an empty folder")
+    found = f"{len(others)} other .pcd files, such as {next(iter(others), None)}"
+    require(len(others) == 0, folder, found, "give an empty folder")
     scale = _PIXELS_PER_UNIT if sequence.unit == "px" else 1.0
     stored = np.where(sequence.mask[..., None], sequence.points, 0.0) / scale
     for name, points in zip(names, stored, strict=True):
@@ -105,28 +97,24 @@ def write_deepmapping_folder(path: str | Path, sequence: ScanSequence) -> Path:
 def _list_files(path: Path) -> dict[str, bytes]:
     """The PCD and MAT files by name; archives are read in memory and never unpacked."""
     if path.is_dir():
-        chosen = [file for file in path.iterdir() if file.suffix.lower() in (".pcd", ".mat")]
+        chosen = [file for file in path.iterdir() if file.suffix.lower() in _SUFFIXES]
         return {file.name: read_bytes(file) for file in chosen if file.is_file()}
-    if not path.exists():
-        raise InputError(path, "no such file or folder", "check the path")
-    try:
-        with tarfile.open(path) as archive:
-            members = [m for m in archive if m.isfile() and not m.issparse()]
-            members = [m for m in members if m.name.lower().endswith((".pcd", ".mat"))]
-            members = [m for m in members if not PurePosixPath(m.name).name.startswith("._")]
-            return {m.name: file.read() for m in members if (file := archive.extractfile(m)) is not None}
-    except Exception as error:  # The parsers of tar, gzip, bzip2 and xz raise many kinds.
-        raise InputError(path, f"not a readable tar archive ({error})", "copy the archive again") from error
+    require(path.exists(), path, "no such file or folder", "check the path")
+    # The parsers of tar, gzip, bzip2 and xz raise many kinds of errors.
+    found, advice = "not a readable tar archive ({error})", "copy the archive again"
+    with refusing(path, found, advice, (Exception,)), tarfile.open(path) as archive:
+        members = [m for m in archive if m.isfile() and not m.issparse() and m.name.lower().endswith(_SUFFIXES)]
+        members = [m for m in members if not PurePosixPath(m.name).name.startswith("._")]
+        return {m.name: file.read() for m in members if (file := archive.extractfile(m)) is not None}
 
 
-def _read_poses(content: bytes, source: str, num_scans: int) -> NDArray[np.float64]:
+def _read_poses(content: bytes, source: str, num_scans: int) -> FloatArray:
     """The (n, 3) array `pose` of a MATLAB file."""
     variables = parse_mat(content, source)
-    if "pose" not in variables:
-        raise InputError(source, f"variables are {', '.join(variables) or 'none'}", "the file needs a variable 'pose'")
+    found = f"variables are {', '.join(variables) or 'none'}"
+    require("pose" in variables, source, found, "the file needs a variable 'pose'")
     pose = np.asarray(variables["pose"])
-    if pose.shape != (num_scans, 3) or pose.dtype.kind not in "fiu":
-        raise InputError(source, f"pose is {pose.shape} for {num_scans} scans", "give (n, 3) x px, y px, theta rad")
-    if not np.isfinite(pose).all():
-        raise InputError(source, "pose holds NaN or infinite values", "give a pose to every scan")
+    is_good = pose.shape == (num_scans, 3) and pose.dtype.kind in "fiu"
+    require(is_good, source, f"pose is {pose.shape} for {num_scans} scans", "give (n, 3) x px, y px, theta rad")
+    require(np.isfinite(pose).all(), source, "pose holds NaN or infinite values", "give a pose to every scan")
     return pose.astype(np.float64)

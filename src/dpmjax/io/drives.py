@@ -1,0 +1,250 @@
+"""The files of a drive of 3-D scans with their poses and times; plain folders; reading on; writing as KITTI."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dpmjax.geometry import rigid
+from dpmjax.io.files import load_arrays, natural_key, read_table, write_atomically
+from dpmjax.io.poses import check_poses, homogeneous, read_poses, write_kitti
+from dpmjax.sequences import FloatArray, InputError, LidarSequence, require
+
+_log = logging.getLogger(__name__)
+SCAN_SUFFIXES = (".bin", ".npy", ".npz", ".pcd", ".ply")
+_POSE_FILES = ("poses_lidar.txt", "poses_lidar.npy", "poses.txt", "poses.npy", "trajectory.txt", "trajectory_tum.txt",
+               "trajectory.npy", "gt_poses.txt", "groundtruth.txt")  # fmt: skip
+# Axes of a camera that looks along x of the lidar: x right, y down, z forward. Written sequences have it in the lidar.
+_T_CAM0_LIDAR = np.array([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]])
+
+
+class Drive3D(NamedTuple):
+    """The files of a drive, one a scan in order, with poses and times where there are any.
+
+    Attributes:
+        name: for titles.
+        files: the scans.
+        T_world_lidar: (n, 4, 4), or None.
+        times: (n,) s, or None.
+    """
+
+    name: str
+    files: list[Path]
+    T_world_lidar: FloatArray | None = None
+    times: FloatArray | None = None
+
+
+def scan_files(folder: Path, suffixes: tuple[str, ...] = SCAN_SUFFIXES) -> list[Path]:
+    """Lists the scans of a folder in natural order: the files of the most frequent ending.
+
+    Args:
+        folder: where to look, not deeper.
+        suffixes: endings of scans.
+
+    Returns:
+        The files; none where there is no such folder.
+    """
+    if not folder.is_dir():
+        return []
+    files = [f for f in folder.iterdir() if f.is_file() and f.name[0] != "." and f.name not in _POSE_FILES]
+    most = max(([f for f in files if f.suffix.lower() == suffix] for suffix in suffixes), key=len)
+    return sorted(most, key=lambda file: natural_key(file.name))
+
+
+def numbers_of(files: Sequence[Path], largest: float = 2.0**62) -> list[int] | None:
+    """The numbers that are the names of files.
+
+    Args:
+        files: the scans.
+        largest: no number may be above this.
+
+    Returns:
+        One number a file, or None where a name is no number or too large.
+    """
+    names = [file.stem for file in files]
+    is_good = all(name.isascii() and name.isdecimal() and len(name) < 20 and int(name) <= largest for name in names)
+    return [int(name) for name in names] if is_good else None
+
+
+def match_rows(rows: NDArray[Any], files: list[Path]) -> NDArray[Any] | None:
+    """The row of each scan: in order if there are as many, else by the number that is the file's name.
+
+    Args:
+        rows: (m, ...) values.
+        files: the n scans.
+
+    Returns:
+        (n, ...), or None where there are more or fewer rows, and names that are no numbers of rows.
+    """
+    numbers = range(len(files)) if len(rows) == len(files) else numbers_of(files, len(rows) - 1)
+    return None if numbers is None else rows[list(numbers)]
+
+
+def match_poses(poses: FloatArray, files: list[Path], path: Path) -> FloatArray:
+    """The pose of each scan, see `match_rows`.
+
+    Args:
+        poses: (m, 4, 4).
+        files: the n scans.
+        path: of the poses, for messages.
+
+    Returns:
+        (n, 4, 4).
+
+    Raises:
+        InputError: another number of poses, and names that are no numbers.
+    """
+    matched = match_rows(poses, files)
+    if matched is None:
+        raise InputError(path, f"{len(poses)} poses for {len(files)} scans", "give one pose a scan, in their order")
+    return matched
+
+
+def match_times(path: Path, files: list[Path]) -> FloatArray | None:
+    """The times of the scans out of times.txt; a file that does not fit is ignored.
+
+    Args:
+        path: of times.txt.
+        files: the n scans.
+
+    Returns:
+        (n,) s, or None.
+    """
+    try:
+        times = match_rows(read_table(path)[:, 0], files)
+    except InputError:
+        return None
+    return times if times is not None and np.isfinite(times).all() else None
+
+
+def read_plain_folder(folder: Path, *, poses: Path | None = None) -> Drive3D:
+    """A folder of scans in natural order, with a pose file and times.txt beside or above them.
+
+    Args:
+        folder: the scans.
+        poses: the pose file in the lidar's frame; None looks for the usual names in the folder and the one above.
+
+    Returns:
+        The drive.
+
+    Raises:
+        InputError: broken files, or another number of poses than of scans.
+    """
+    files = scan_files(folder)
+    homes = [folder, folder.resolve().parent] if folder.name in ("data", "scans", "lidar", "velodyne") else [folder]
+    path = poses or next((h / n for h in homes for n in _POSE_FILES if (h / n).is_file()), None)
+    found = None if path is None else match_poses(read_poses(path), files, path)
+    times = next((match_times(home / "times.txt", files) for home in homes if (home / "times.txt").is_file()), None)
+    return Drive3D(folder.resolve().name, files, found, times)
+
+
+def read_learned_folder(folder: Path) -> Drive3D:
+    """Folders of N.npz with lidar_pcd, ego_rotation and ego_translation (as DeepPointMap's published data).
+
+    Args:
+        folder: the agent's folder that holds the files.
+
+    Returns:
+        The drive; broken files get the pose of the file before. Where a readable file has no pose, it is a plain
+        folder.
+
+    Raises:
+        InputError: a pose that is no rigid motion.
+    """
+    files = scan_files(folder, (".npz",))
+    keys = ("ego_rotation", "ego_translation")
+    poses: list[FloatArray | None] = []
+    for file in files:
+        try:
+            table = load_arrays(file, keys)
+        except InputError:  # The scan is bad too, and is named when it is read.
+            poses.append(poses[-1] if poses else None)
+            continue
+        parts = [table.get(key, np.zeros(0)) for key in keys]
+        if [part.size for part in parts] != [9, 3] or any(part.dtype.kind not in "fiu" for part in parts):
+            return read_plain_folder(folder)
+        poses.append(homogeneous(*(part.astype(np.float64).reshape(3, -1).squeeze() for part in parts)))
+    known = next((pose for pose in poses if pose is not None), None)
+    if known is None:
+        return Drive3D(folder.resolve().name, files)
+    stacked = np.stack([known if pose is None else pose for pose in poses])
+    return Drive3D(folder.resolve().name, files, check_poses(stacked, folder))
+
+
+class IndexedScan(NamedTuple):
+    """A scan and its number in the sequence.
+
+    Attributes:
+        number: of the scan in the sequence.
+        points: (n, 3) float32, lidar frame, m.
+    """
+
+    number: int
+    points: NDArray[np.float32]
+
+
+def iterate_scans(sequence: LidarSequence) -> Iterator[IndexedScan]:
+    """Reads scan after scan and leaves out the bad ones; a warning names them at the end.
+
+    Args:
+        sequence: the scans.
+
+    Yields:
+        The good scans with their numbers.
+
+    Raises:
+        InputError: not one scan is good.
+    """
+    bad: list[str] = []
+    for index, source in enumerate(sequence.sources):
+        try:
+            points = sequence.read_scan(index)
+        except InputError as error:
+            bad.append(f"scan {index}, {source}: {error.found}")
+            continue
+        yield IndexedScan(index, points)
+    listed = "; ".join(bad[:10]) + (f"; and {len(bad) - 10} more" if len(bad) > 10 else "")
+    is_usable = not bad or len(bad) < sequence.num_scans
+    require(is_usable, sequence.name, f"all {len(bad)} scans are bad: {listed}", "check the files")
+    if bad:
+        _log.warning("%s: %d of %d scans left out: %s", sequence.name, len(bad), sequence.num_scans, listed)
+
+
+def write_kitti_sequence(root: str | Path, name: str, sequence: LidarSequence) -> Path:
+    """Writes a sequence as KITTI odometry lays it out: sequences/NAME/{velodyne,calib.txt,times.txt}, poses/NAME.txt.
+
+    Reflectance is written as 0. Poses are those of the camera of the written calib.txt, from the first scan on.
+
+    Args:
+        root: folder of the data set.
+        name: of the sequence, like "00".
+        sequence: the scans; it must have poses. Bad scans are left out, with their poses.
+
+    Returns:
+        The sequence's folder.
+
+    Raises:
+        InputError: no poses, or not one good scan.
+    """
+    if sequence.T_world_lidar is None:
+        raise InputError(sequence.name, "no poses", "a KITTI sequence needs a pose for each scan")
+    root = Path(root)
+    folder = root / "sequences" / name
+    kept: list[int] = []
+    for index, points in iterate_scans(sequence):
+        rows = np.zeros((len(points), 4), "<f4")
+        rows[:, :3] = points
+        write_atomically(folder / "velodyne" / f"{len(kept):06d}.bin", rows.tobytes())
+        kept.append(index)
+    T_first_lidar = rigid.inverse(sequence.T_world_lidar[kept[0]]) @ sequence.T_world_lidar[kept]
+    write_kitti(root / "poses" / f"{name}.txt", _T_CAM0_LIDAR @ T_first_lidar @ rigid.inverse(_T_CAM0_LIDAR))
+    numbers = " ".join(f"{value:.12e}" for value in _T_CAM0_LIDAR[:3].ravel())
+    write_atomically(folder / "calib.txt", f"Tr: {numbers}\n")
+    times = np.arange(len(kept)) / 10.0 if sequence.times is None else sequence.times[kept]
+    write_atomically(folder / "times.txt", "".join(f"{time:.6f}\n" for time in times))
+    return folder

@@ -1,1 +1,0 @@
-"""Readers of 3-D lidar drives."""

@@ -1,0 +1,232 @@
+"""The entrance for planar scans: finds out what a path holds, reads it, and refuses what cannot be registered."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dpmjax.geometry import se2
+from dpmjax.io.carmen import read_carmen_log
+from dpmjax.io.deepmapping_folder import read_deepmapping_folder
+from dpmjax.io.files import load_arrays, read_bytes, to_float32
+from dpmjax.io.poses import check_poses
+from dpmjax.sequences import BoolArray, FloatArray, InputError, ScanSequence, Unit, has_angular_order, require
+
+Table = Mapping[str, NDArray[np.generic]]
+_log = logging.getLogger(__name__)
+_FORMATS = "a folder or .tar of .pcd files, a CARMEN .log, .clf or .log.gz, or .npy / .npz arrays"
+_KEYS = "points (n, b, 2), or ranges (n, b) and angles (b,); optional mask, poses, odometry, times, unit"
+_ENDINGS = {"folder": (".tar", ".tar.gz", ".tgz"), "arrays": (".npy", ".npz")}
+_ENDINGS |= {"carmen": (".log", ".clf", ".log.gz", ".clf.gz")}
+# Median ranges outside of these are a mistaken unit: millimetres, or pixels / 512.
+_PLAUSIBLE_RANGE = {"m": (0.05, 500.0), "px": (2.0, 20000.0)}
+# Few planar lidars measure farther; a sequence with hardly any shorter beam may be in millimetres.
+_USUAL_M, _LEAST_USUAL_SHARE = 100.0, 0.05
+_LEAST_BEAMS = 17  # Lines are fitted to up to 17 neighbouring beams.
+
+
+def read_sequence(
+    path: str | Path,
+    *,
+    start: int = 0,
+    stop: int | None = None,
+    stride: int = 1,
+    unit: Unit | None = None,
+    max_range: float | None = None,
+) -> ScanSequence:
+    """Reads a sequence of planar scans, whatever of the known formats it is in.
+
+    Args:
+        path: a folder or tar archive of PCD files (`read_deepmapping_folder`), a CARMEN log (`read_carmen_log`), or a
+            NumPy file (`read_arrays`). The ending decides, else the first bytes.
+        start: first scan to keep.
+        stop: scan to stop before; None for the end.
+        stride: keep every `stride`-th scan.
+        unit: unit of the file's lengths where the file does not state it; None takes PCD files as pixels / 512 and
+            arrays as metres. CARMEN logs are in metres.
+        max_range: beams of this length or more (in the sequence's unit) are masked; None leaves it to the reader.
+
+    Returns:
+        The sequence: two scans at least of 17 beams at least, each with one valid beam at least.
+
+    Raises:
+        InputError: one line with the file, what was found and what to do: no such file, an unknown format, damage, too
+            few scans or beams, a scan without a valid beam, scans of a single point, lengths that no such unit
+            explains, or arguments out of range.
+    """
+    path = Path(path)
+    chosen = f"start {start}, stop {stop}, stride {stride}"
+    is_good = start >= 0 and stride >= 1 and (stop is None or stop >= 0)
+    require(is_good, path, chosen, "start and stop count from 0, stride from 1")
+    require(max_range is None or max_range > 0, path, f"max_range is {max_range}", "give a positive length")
+    whole = _read_any(path, unit, max_range)
+    if max_range is not None:
+        whole = _limit(whole, max_range)
+    sequence = whole.take(slice(start, stop, stride))
+    found = f"{len(sequence)} of {len(whole)} scans chosen ({chosen})"
+    require(len(sequence) >= 2, path, found, "a registration needs two scans at least")
+    _check_beams(sequence, path, start, stride)
+    _check_unit(sequence, path)
+    if whole.odometry_poses is None and whole.unit == "m":
+        _log.info("%s: no raw odometry", path)
+    return sequence
+
+
+def _read_any(path: Path, unit: Unit | None, max_range: float | None) -> ScanSequence:
+    require(path.exists(), path, "no such file or folder", "check the path")
+    kind = _detect(path)
+    if kind == "folder":
+        return read_deepmapping_folder(path, unit=unit)
+    if kind == "arrays":
+        return read_arrays(path, unit=unit)
+    require(unit != "px", path, "a CARMEN log is in metres, not px", "leave the unit out")
+    return read_carmen_log(path, max_range=max_range)
+
+
+def _detect(path: Path) -> str:
+    """What the path holds, by its ending, else by its first bytes: "folder", "arrays" or "carmen"."""
+    if path.is_dir():
+        has_scans = any(file.suffix.lower() == ".pcd" for file in path.iterdir())
+        require(has_scans, path, "a folder without .pcd files", f"give {_FORMATS}")
+        return "folder"
+    name = path.name.lower()
+    for kind, endings in _ENDINGS.items():
+        if name.endswith(endings):
+            return kind
+    require(not name.endswith(".pcd"), path, "a single scan", "give the folder that holds all of its .pcd files")
+    head = read_bytes(path)[:65536]
+    if head[257:262] == b"ustar":
+        return "folder"
+    if head[:6] == b"\x93NUMPY" or head[:2] == b"PK":
+        return "arrays"
+    found = "no known format" if head else "an empty file"
+    require(b"FLASER" in head, path, found, f"give {_FORMATS}")
+    return "carmen"
+
+
+def _limit(sequence: ScanSequence, max_range: float) -> ScanSequence:
+    """Masks the beams of `max_range` and more."""
+    mask = sequence.mask & (np.linalg.norm(sequence.points, axis=2) < max_range)
+    return replace(sequence, mask=mask, points=np.where(mask[..., None], sequence.points, np.float32(0)))
+
+
+def _check_beams(sequence: ScanSequence, path: Path, start: int, stride: int) -> None:
+    num_beams = sequence.mask.shape[1]
+    advice = f"give {_LEAST_BEAMS} beams or more; arrays are (scans, beams, 2)"
+    require(num_beams >= _LEAST_BEAMS, path, f"scans of {num_beams} beams", advice)
+    empty = np.flatnonzero(~sequence.mask.any(axis=1))
+    found = "every beam of every scan is invalid or at maximum range"
+    require(len(empty) < len(sequence), path, found, "check ranges and --max-range")
+    if len(empty):
+        first = start + stride * empty[0]
+        found = f"{len(empty)} of {len(sequence)} scans have no valid beam, the first is scan {first}"
+        raise InputError(path, found, "remove such scans, or choose others by start, stop and stride")
+    points = sequence.points[np.arange(len(sequence)), sequence.mask.argmax(axis=1)]
+    differ = (sequence.points != points[:, None]).any(axis=2) & sequence.mask
+    require(differ.any(), path, "all points of each scan are one and the same", "give scans that see some surroundings")
+
+
+def _check_unit(sequence: ScanSequence, path: Path) -> None:
+    ranges = np.linalg.norm(sequence.points[sequence.mask].astype(np.float64), axis=1)
+    median = float(np.median(ranges))
+    low, high = _PLAUSIBLE_RANGE[sequence.unit]
+    is_metric = sequence.unit == "m"
+    advice = "convert millimetres to metres, or name the unit" if is_metric else "name the unit, or give pixels"
+    require(low <= median <= high, path, f"the median range is {median:.4g} {sequence.unit}", advice)
+    share = float((ranges < _USUAL_M).mean())
+    if is_metric and share < _LEAST_USUAL_SHARE:
+        _log.warning("%s: %.1f %% of the beams are below %g m; are these millimetres?", path, 100 * share, _USUAL_M)
+
+
+def read_arrays(path: str | Path, *, unit: Unit | None = None) -> ScanSequence:
+    """Reads scans from `.npy` or `.npz`.
+
+    A `.npy` holds points (n, b, 2) in the sensor frame; the third coordinate of (n, b, 3) is ignored. A `.npz` holds
+    `points` like that, or `ranges` (n, b) with `angles` (b,) or (n, b) in radians counter-clockwise from straight
+    ahead; and optionally `mask` (n, b), `poses` (the reference) and `odometry` as (n, 3) x, y, heading or (n, 3, 3)
+    `T_world_scan`, `times` (n,) in seconds, and `unit`, "px" or "m".
+
+    A beam is invalid where `mask` is False, where both coordinates are NaN, or where its range is NaN, infinite or not
+    positive (as scanner drivers write a beam without echo). A beam with one NaN coordinate is an error.
+
+    Args:
+        path: the file.
+        unit: unit of lengths; None takes the file's `unit`, and "m" where it has none.
+
+    Returns:
+        The sequence.
+
+    Raises:
+        InputError: the file is missing or damaged, lacks an array, has wrong shapes, or holds NaN or infinite values
+            other than for invalid beams.
+    """
+    table = load_arrays(path)
+    points, mask = _points(table, path) if "points" in table else _from_ranges(table, path)
+    given = table.get("mask", mask)
+    is_good = given.shape == mask.shape and given.dtype.kind in "biu"
+    require(is_good, path, f"mask is {given.shape} {given.dtype}", f"give {mask.shape} booleans")
+    mask &= given.astype(bool)
+    stored = np.where(mask[..., None], to_float32(points), np.float32(0))
+    bad = ~np.isfinite(stored).all(axis=2)
+    if bad.any():
+        scan, beam = np.argwhere(bad)[0]
+        advice = "mark an invalid beam by NaN in both coordinates"
+        raise InputError(path, f"{bad.sum()} NaN or infinite points, the first in scan {scan}, beam {beam}", advice)
+    times = table.get("times", np.zeros(len(points)))
+    is_good = _is_numeric(times, (len(points),)) and np.isfinite(times).all()
+    require(is_good, path, f"times are {times.shape} {times.dtype}", f"give ({len(points)},) finite seconds")
+    poses, odometry = (_planar(table, key, len(points), path) for key in ("poses", "odometry"))
+    stamps = times.astype(np.float64) if "times" in table else None
+    is_organised, unit = has_angular_order(stored, mask), unit or _unit(table, path)
+    return ScanSequence(Path(path).stem, stored, mask, unit, is_organised, poses, odometry, stamps)
+
+
+def _is_numeric(array: NDArray[np.generic], *shapes: tuple[int, ...]) -> bool:
+    return array.shape in shapes and array.dtype.kind in "fiu"
+
+
+def _points(table: Table, path: str | Path) -> tuple[FloatArray, BoolArray]:
+    points = table["points"]
+    is_good = _is_numeric(points, (*points.shape[:2], 2), (*points.shape[:2], 3)) and points.ndim == 3
+    require(is_good, path, f"points are {points.shape} {points.dtype}", "give (n, b, 2): scans, beams, x and y")
+    planar = points[..., :2].astype(np.float64)
+    return planar, np.isnan(planar).sum(axis=2) < 2
+
+
+def _from_ranges(table: Table, path: str | Path) -> tuple[FloatArray, BoolArray]:
+    found = f"keys are {', '.join(table) or 'none'}"
+    require("ranges" in table and "angles" in table, path, found, f"give {_KEYS}")
+    ranges, angles = table["ranges"], table["angles"]
+    fits = (
+        ranges.ndim == 2 and _is_numeric(ranges, ranges.shape) and _is_numeric(angles, ranges.shape, ranges.shape[1:])
+    )
+    found = f"ranges are {ranges.shape}, angles {angles.shape}"
+    require(fits, path, found, "give (n, b) and (b,) or (n, b)")
+    distance, theta = ranges.astype(np.float64), angles.astype(np.float64)
+    found = "angles hold NaN, infinite or huge values"
+    require((np.abs(theta) < 1e6).all(), path, found, "give a direction to every beam, in radians")
+    mask = np.isfinite(distance) & (distance > 0)
+    distance = np.where(mask, distance, 0.0)
+    return distance[..., None] * np.stack([np.cos(theta), np.sin(theta)], axis=-1), mask
+
+
+def _unit(table: Table, path: str | Path) -> Unit:
+    unit = str(table.get("unit", "m"))
+    require(unit in ("px", "m"), path, f"unit is {unit!r}", "say 'px' or 'm'")
+    return "px" if unit == "px" else "m"
+
+
+def _planar(table: Table, key: str, num_scans: int, path: str | Path) -> FloatArray | None:
+    """Poses (n, 3) x, y, heading out of (n, 3) or homogeneous (n, 3, 3)."""
+    if key not in table:
+        return None
+    poses = table[key]
+    is_good = _is_numeric(poses, (num_scans, 3), (num_scans, 3, 3))
+    require(is_good, path, f"{key} are {poses.shape} for {num_scans} scans", "give (n, 3) x, y, heading or (n, 3, 3)")
+    values = check_poses(poses.astype(np.float64), f"{path}: {key}")
+    return values if values.ndim == 2 else se2.from_matrix(values)

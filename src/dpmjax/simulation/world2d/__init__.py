@@ -1,1 +1,0 @@
-"""Planar worlds and walks through them."""
