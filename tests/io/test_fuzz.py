@@ -402,7 +402,7 @@ def test_the_command_refuses_spoilt_scans_in_one_line(tmp_path, name, capsys, mo
     def begin(*_):
         raise BegunError
 
-    monkeypatch.setattr(command, "warm_start", begin)
+    monkeypatch.setattr(command, "starting_poses", begin)
     num_refused = 0
     for seed in COMMAND_SEEDS:
         path = make_input(f"scans, {name}", seed, tmp_path / str(seed))

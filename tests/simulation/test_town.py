@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -128,8 +129,8 @@ def test_a_second_scan_of_a_place_fits_the_first(town, way):
 def test_traffic_moves(town):
     from dpmjax.simulation.town.primitives import traffic_boxes
 
-    here = np.array([1e4, 1e4, 0.0], np.float32)
-    start, later = (traffic_boxes(town.primitives.traffic, here, time) for time in (0.0, 0.5))
+    here = jnp.array([1e4, 1e4, 0.0])
+    start, later = (traffic_boxes(town.primitives.traffic, here, time) for time in jnp.array([0.0, 0.5]))
     mask = np.asarray(start.mask & later.mask)
     way = np.linalg.norm(np.asarray(later.centres - start.centres)[mask], axis=1)
     assert mask.sum() > 5

@@ -224,17 +224,17 @@ def test_padding_takes_no_part(turn):
     centres[~full] = pose[:3, 3] + np.array([3.0, 0, 0], np.float32)
     sizes = np.asarray(town.boxes.half_sizes).copy()
     sizes[~full] = 2.0
-    boxes = town.boxes.replace(centres=jnp.asarray(centres), half_sizes=jnp.asarray(sizes))
-    garbage = garbage.replace(boxes=boxes)
+    boxes = town.boxes._replace(centres=jnp.asarray(centres), half_sizes=jnp.asarray(sizes))
+    garbage = garbage._replace(boxes=boxes)
     np.testing.assert_array_equal(look(town, pose).ranges, look(garbage, pose).ranges)
 
 
 def test_an_empty_town_is_ground_only(turn):
     look, town, _, _ = turn
-    empty = town.replace(
-        boxes=town.boxes.replace(mask=jnp.zeros_like(town.boxes.mask)),
-        cylinders=town.cylinders.replace(mask=jnp.zeros_like(town.cylinders.mask)),
-        spheroids=town.spheroids.replace(mask=jnp.zeros_like(town.spheroids.mask)),
+    empty = town._replace(
+        boxes=town.boxes._replace(mask=jnp.zeros_like(town.boxes.mask)),
+        cylinders=town.cylinders._replace(mask=jnp.zeros_like(town.cylinders.mask)),
+        spheroids=town.spheroids._replace(mask=jnp.zeros_like(town.spheroids.mask)),
     )
     hits = look(empty, jnp.asarray(tilted_pose(), jnp.float32))
     assert set(np.unique(hits.surfaces)) == {NOTHING, GROUND}
@@ -246,8 +246,8 @@ def test_windows_lie_behind_their_wall(turn):
     pose = jnp.asarray(tilted_pose(), jnp.float32)
     walls = look(town, pose)
     depth = 0.3
-    boxes = town.boxes.replace(window_depth=jnp.full(town.boxes.mask.shape, depth))
-    fronts = look(town.replace(boxes=boxes), pose)
+    boxes = town.boxes._replace(window_depth=jnp.full(town.boxes.mask.shape, depth))
+    fronts = look(town._replace(boxes=boxes), pose)
     is_wall = np.asarray(walls.surfaces) == SOLID
     deeper = np.asarray(fronts.ranges)[is_wall] - np.asarray(walls.ranges)[is_wall]
     cosines = np.asarray(walls.cosines)[is_wall]

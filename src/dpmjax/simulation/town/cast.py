@@ -7,10 +7,9 @@ farthest bodies are missing.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import NamedTuple
 
-import flax.struct
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -50,8 +49,7 @@ class CastConfig:
             raise ValueError(f"all capacities must be at least 1, got {self}")
 
 
-@flax.struct.dataclass
-class Hits:
+class Hits(NamedTuple):
     """First hits of r rays in each of s sectors.
 
     Attributes:
@@ -110,7 +108,7 @@ def cast_turn(
     in_world = rays._replace(directions=directions)
 
     def first_hits(bodies: Bodies, num_nearest: int, capacity: int, cross: Cross) -> Hits:
-        near = nearest_bodies(replace(bodies, centres=bodies.centres - start), num_nearest, max_range)
+        near = nearest_bodies(bodies._replace(centres=bodies.centres - start), num_nearest, max_range)
         return _body_hits(bodies_by_sector(near, T_lidar_world, rays.azimuths, capacity), in_world, cross)
 
     boxes = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), town.boxes, traffic_boxes(town.traffic, start, time))
@@ -124,7 +122,7 @@ def cast_turn(
         hits = _nearer(hits, others)
     is_seen = hits.ranges <= max_range
     ranges, surfaces = jnp.where(is_seen, hits.ranges, jnp.inf), jnp.where(is_seen, hits.surfaces, NOTHING)
-    return replace(hits, ranges=ranges, surfaces=surfaces)
+    return hits._replace(ranges=ranges, surfaces=surfaces)
 
 
 def _nearer(a: Hits, b: Hits) -> Hits:
@@ -178,7 +176,7 @@ def nearest_bodies(bodies: Bodies, capacity: int, max_range: float) -> Bodies:
     squared = jnp.where(bodies.mask, (outside**2).sum(-1), jnp.inf)
     best, order = jax.lax.top_k(-squared, min(capacity, len(squared)))
     kept = jax.tree.map(lambda x: x[order], bodies)
-    return kept.replace(mask=best >= -(max_range**2))
+    return kept._replace(mask=best >= -(max_range**2))
 
 
 def _azimuth_intervals(
@@ -229,4 +227,4 @@ def bodies_by_sector(
     entries = jnp.broadcast_to(jnp.arange(len(bodies.mask)), slot.shape)
     chosen = jnp.full((len(sector_azimuths), capacity + 1), -1).at[rows, slot].set(entries)[:, :capacity]
     listed = jax.tree.map(lambda x: x[chosen], bodies)
-    return listed.replace(mask=chosen >= 0)
+    return listed._replace(mask=chosen >= 0)

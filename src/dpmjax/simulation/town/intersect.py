@@ -211,7 +211,7 @@ def cross_ground(
         far, below = jnp.where(is_open, distance, far), jnp.where(is_open, here, below)
         return (near, far, above, below), None
 
-    def refine(_: int, carry: tuple[Array, Array, Array, Array]) -> tuple[Array, Array, Array, Array]:
+    def refine(_: Array, carry: tuple[Array, Array, Array, Array]) -> tuple[Array, Array, Array, Array]:
         near, far, above, below = carry
         middle = near + (far - near) * jnp.clip(above / jnp.maximum(above - below, 1e-9), 0.02, 0.98)
         return _narrow(carry, middle, clearance(middle))

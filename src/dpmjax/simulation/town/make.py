@@ -12,15 +12,7 @@ from dpmjax.sequences import FloatArray
 from dpmjax.simulation.town import primitives
 from dpmjax.simulation.town.furnish import Plots, furnish
 from dpmjax.simulation.town.primitives import CELL_M, LANE_STEP_M, Terrain, TownPrimitives, Traffic, pack_bodies, padded
-from dpmjax.simulation.town.streets import (
-    LANE_M,
-    RouteKind,
-    Streets,
-    arc_lengths,
-    make_streets,
-    resample,
-    streets_along,
-)
+from dpmjax.simulation.town.streets import LANE_M, Streets, arc_lengths, make_streets, resample, streets_along
 
 _MARGIN_M = 50.0
 _TILE = 256
@@ -45,7 +37,7 @@ class TownConfig:
         ValueError: another route, a length that is not positive, or blocks of less than 50 m.
     """
 
-    route: RouteKind = "loop"
+    route: str = "loop"
     route_length_m: float = 1000.0
     block_m: float = 100.0
 

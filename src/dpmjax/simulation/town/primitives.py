@@ -6,9 +6,9 @@ coordinates are in the world frame: metres, z up.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
+from typing import NamedTuple
 
-import flax.struct
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -28,8 +28,7 @@ NOTHING, GROUND, SOLID, SOFT, POLE, MOVING = range(6)
 """What a ray can meet."""
 
 
-@flax.struct.dataclass
-class Bodies:
+class Bodies(NamedTuple):
     """Upright boxes, cylinders or ellipsoids of revolution, by the boxes round them, turned about z only.
 
     Attributes:
@@ -51,8 +50,7 @@ class Bodies:
     mask: Bool[Array, " n"]
 
 
-@flax.struct.dataclass
-class Ground:
+class Ground(NamedTuple):
     """Heights on a square grid, bilinear between the nodes; outside, the border goes on.
 
     Attributes:
@@ -88,8 +86,7 @@ class Terrain:
         return map_coordinates(self.heights, at[:, ::-1].T, order=1, mode="nearest")
 
 
-@flax.struct.dataclass
-class Traffic:
+class Traffic(NamedTuple):
     """Cars that drive and people that walk, each at its own speed along a lane.
 
     Attributes:
@@ -113,8 +110,7 @@ class Traffic:
     mask: Bool[Array, " n"]
 
 
-@flax.struct.dataclass
-class TownPrimitives:
+class TownPrimitives(NamedTuple):
     """Everything that a beam can meet.
 
     Attributes:
@@ -226,8 +222,7 @@ def traffic_boxes(traffic: Traffic, sensor: Float[Array, " 3"], time: Float[Arra
     middle, half_sizes = foot + (lift + half_body)[:, None] * up, traffic.half_sizes.at[:, 2].set(half_body)
     surface, mask = jnp.full(len(way), MOVING), traffic.mask & is_free
     body = Bodies(middle, half_sizes, heading, zero, zero, surface, mask)
-    cabin = replace(
-        body,
+    cabin = body._replace(
         centres=foot + (lift + 2 * half_body + cabin_z)[:, None] * up,
         half_sizes=traffic.half_sizes * jnp.array([0.55, 0.85, 0.0], foot.dtype) + cabin_z[:, None] * up,
         mask=body.mask & is_car,

@@ -8,13 +8,11 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Literal
 
 import numpy as np
 
 from dpmjax.sequences import FloatArray
 
-RouteKind = Literal["loop", "there_and_back", "wander"]
 LANE_M = 1.7
 """From the middle of a street to the middle of a lane."""
 _STEP_M = 0.5
@@ -40,7 +38,7 @@ class Streets:
     is_closed: bool
 
 
-def make_streets(rng: np.random.Generator, kind: RouteKind, length: float, block: float) -> Streets:
+def make_streets(rng: np.random.Generator, kind: str, length: float, block: float) -> Streets:
     """Lays out blocks and a closed route round them.
 
     Args:
@@ -115,7 +113,7 @@ def _bend(rng: np.random.Generator, block: float) -> Callable[[FloatArray], Floa
     return place
 
 
-def _plan(rng: np.random.Generator, kind: RouteKind, num_blocks: int) -> tuple[list[tuple[int, int]], tuple[int, int]]:
+def _plan(rng: np.random.Generator, kind: str, num_blocks: int) -> tuple[list[tuple[int, int]], tuple[int, int]]:
     """Corners of a closed route on the lattice, and the size of the lattice."""
     if kind == "loop":
         around = max(num_blocks // 2, 2)
