@@ -102,19 +102,6 @@ def motion_matrices(values: Float[Array, "n k"]) -> Float[Array, "n 4 4"]:
     return jnp.stack([jnp.stack(row, axis=-1) for row in rows], axis=-2)
 
 
-def depth_problem(config: DepthMappingConfig, data: MappingData) -> Problem:
-    """DeepMapping of depth images; poses are (n, 4, 4) T_world_camera.
-
-    Args:
-        config: settings of the fit.
-        data: DepthScans and first poses, in typical ranges.
-
-    Returns:
-        The problem.
-    """
-    return mapping_problem(config, data, MappingFunctions(_init, _loss, _poses, _next_phase))
-
-
 def fit_depth(
     scans: DepthScans | ArrayLike,
     config: DepthMappingConfig | None = None,
@@ -244,3 +231,16 @@ def _loss(
         offsets = draw_offsets(phase, count // 2, key=offset_key)
         pair_term = 1.0 - consistency_of_pairs(T, sample, scans, offsets, tolerance)
     return mapping_loss(config, phase, params, world, pair_term, key=free_key)
+
+
+def depth_problem(config: DepthMappingConfig, data: MappingData) -> Problem:
+    """DeepMapping of depth images; poses are (n, 4, 4) T_world_camera.
+
+    Args:
+        config: settings of the fit.
+        data: DepthScans and first poses, in typical ranges.
+
+    Returns:
+        The problem.
+    """
+    return mapping_problem(config, data, MappingFunctions(_init, _loss, _poses, _next_phase))
