@@ -11,8 +11,7 @@ from scipy.spatial import KDTree
 from scipy.special import logsumexp
 
 import dpmjax
-from benchmarks.rows import Row
-from benchmarks.timing import measure
+from benchmarks.rows import Row, measure
 
 NAME = "core"
 TEMPERATURE = 0.1

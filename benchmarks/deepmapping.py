@@ -1,4 +1,4 @@
-"""Time to accuracy of DeepMapping: ATE after 15, 30, 60 s of run time, beside ICP, the polish and the paper.
+"""Time to accuracy of DeepMapping: ATE after 15, 30, 60 s of run time, beside ICP, the refinement and the paper.
 
 The authors' trajectory (v1_pose0) and its poor start are used where they lie in `$DPMJAX_DATA/deepmapping_2d`
 (default `../shared/data`); the built-in world always.
@@ -7,34 +7,31 @@ The authors' trajectory (v1_pose0) and its poor start are used where they lie in
 from __future__ import annotations
 
 import os
-import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import TypeVar
 
 import jax
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.rows import Row
+from benchmarks.rows import Row, measure
 from dpmjax import deepmapping as dm
 from dpmjax.deepmapping.fit import Progress, fit
-from dpmjax.deepmapping.planar import planar_problem, scale_scans, start_poses
+from dpmjax.deepmapping.planar import as_fitted, planar_data, planar_problem
 from dpmjax.io import ScanSequence, read_sequence
 from dpmjax.metrics import absolute_trajectory_error
 from dpmjax.registration import PlanarScans, incremental_icp, planar_scans, refine
 from dpmjax.simulation import simulate_sequence
 from dpmjax.types import ScanSet
 
-T = TypeVar("T")
 NAME = "deepmapping"
 DATA = Path(os.environ.get("DPMJAX_DATA", "../shared/data")) / "deepmapping_2d"
 _MARKS_S = (15.0, 30.0, 60.0, 120.0, 180.0)
 
 
 def run(quick: bool) -> list[Row]:
-    """ICP and polish with and without noise, the fit from a poor start and from zero, the paper's step."""
+    """ICP and refinement with and without noise, the fit from a poor start and from zero, the paper's step."""
     rows: list[Row] = []
     sequences = [simulate_sequence(0, 64 if quick else 256, seed=0)]
     if DATA.is_dir():
@@ -78,35 +75,32 @@ def _ate(sequence: ScanSequence, poses: NDArray[np.float64]) -> float:
 
 
 def _classical(sequence: ScanSequence, case: str, quick: bool) -> list[Row]:
-    """Incremental point-to-line ICP, then the polish; the second call of each is timed."""
-    rows = []
-
-    def timed(metric: str, function: Callable[[], T]) -> T:
-        begun = time.perf_counter()
-        function()
-        first_s = time.perf_counter() - begun
-        begun = time.perf_counter()
-        result = function()
-        run_s = time.perf_counter() - begun
-        rows.append(Row(f"{case}: {metric}", "compile", max(0.0, first_s - run_s), "s"))
-        rows.append(Row(f"{case}: {metric}", "run", run_s, "s"))
-        return result
-
+    """Incremental point-to-line ICP, then its refinement; the second call of each is timed."""
     lines = _lines(sequence)
-    poses, _ = timed("icp-plane", lambda: incremental_icp(_lines(sequence)))
-    rows.append(Row(f"{case}: icp-plane", "ate", _ate(sequence, poses), "px"))
-    polished = timed("icp-plane + polish", lambda: refine(lines, poses))
-    rows.append(Row(f"{case}: icp-plane + polish", "ate", _ate(sequence, polished.poses), "px"))
+    poses, rows = _timed(f"{case}: icp-plane", sequence, lambda: incremental_icp(_lines(sequence)).poses)
+    rows += _timed(f"{case}: icp-plane, refined", sequence, lambda: refine(lines, poses).poses)[1]
     if not quick:
-        polished = refine(lines, _poor_start(sequence))
-        rows.append(Row(f"{case}: poor start + polish", "ate", _ate(sequence, polished.poses), "px"))
+        refined = refine(lines, _poor_start(sequence))
+        rows.append(Row(f"{case}: poor start, refined", "ate", _ate(sequence, refined.poses), "px"))
     return rows
+
+
+def _timed(
+    case: str, sequence: ScanSequence, function: Callable[[], NDArray[np.float64]]
+) -> tuple[NDArray[np.float64], list[Row]]:
+    """The poses of the function, and its rows."""
+    timing, poses = measure(function, repeats=1), function()
+    times = (("compile", timing.compile_s), ("run", timing.median_s))
+    return poses, [
+        *(Row(case, name, value, "s") for name, value in times),
+        Row(case, "ate", _ate(sequence, poses), "px"),
+    ]
 
 
 def _fit(sequence: ScanSequence, start: NDArray[np.float64] | None, case: str, quick: bool) -> list[Row]:
     """Neural losses alone, ATE at the marks and at the end; then the refinement of the result."""
     config = dm.with_steps(dm.preset("fast"), 100) if quick else dm.preset("fast")
-    scans, length = scale_scans(ScanSet(sequence.points, sequence.mask))
+    data, length = planar_data(ScanSet(sequence.points, sequence.mask), start)
     unit = np.array([length, length, 1.0])
     marks = list(_MARKS_S)
     rows = [Row(case, "ate at start", _ate(sequence, np.zeros((len(sequence), 3)) if start is None else start), "px")]
@@ -116,35 +110,26 @@ def _fit(sequence: ScanSequence, start: NDArray[np.float64] | None, case: str, q
             ate = _ate(sequence, np.asarray(progress.report.poses, np.float64) * unit)
             rows.append(Row(case, f"ate after {marks.pop(0):.0f} s", ate, "px"))
 
-    done = fit(
-        planar_problem(config, is_warm=start is not None),
-        scans,
-        key=jax.random.key(0),
-        start=None if start is None else start_poses(start, len(sequence), length),
-        on_report=at_mark,
-    )
-    poses = np.asarray(done.poses, np.float64) * unit
+    done = fit(planar_problem(config, data), data, key=jax.random.key(0), on_report=at_mark)
+    poses = as_fitted(done, length, config).poses
     rows += [
         Row(case, "ate at the end", _ate(sequence, poses), "px"),
         Row(case, "run", done.run_s, "s"),
         Row(case, "steps", float(done.state.step), ""),
         Row(case, "compile", done.compile_s, "s"),
     ]
-    polished = refine(_lines(sequence), poses)
-    return [*rows, Row(f"{case}: + polish", "ate", _ate(sequence, polished.poses), "px")]
+    refined = refine(_lines(sequence), poses)
+    return [*rows, Row(f"{case}: refined", "ate", _ate(sequence, refined.poses), "px")]
 
 
 def _paper_step(sequence: ScanSequence) -> list[Row]:
     """One step of the paper's architecture, losses and sampling: a batch of 128 scans, as published."""
-    scans, _ = scale_scans(ScanSet(sequence.points, sequence.mask))
-    run_s = [0.0]
+    data, _ = planar_data(ScanSet(sequence.points, sequence.mask))
+    problem, run_s = planar_problem(dm.preset("paper"), data), [0.0]
     done = fit(
-        planar_problem(dm.preset("paper"), is_warm=False),
-        scans,
-        key=jax.random.key(0),
+        problem, data, key=jax.random.key(0), stop=lambda: len(run_s) > 2,
         on_report=lambda progress: run_s.append(progress.run_s),
-        stop=lambda: len(run_s) > 2,
-    )
+    )  # fmt: skip
     case = f"{sequence.name}, paper preset"
     step_s = float(np.diff(run_s).min())
     return [Row(case, "compile", done.compile_s, "s"), Row(case, "one step of 128 scans", step_s, "s")]

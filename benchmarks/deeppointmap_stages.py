@@ -18,8 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import dpmjax
-from benchmarks.rows import Row
-from benchmarks.timing import measure
+from benchmarks.rows import Row, measure
 from dpmjax.deeppointmap import merge_clouds
 from dpmjax.deeppointmap.inference import pyramid_of_cloud
 from dpmjax.geometry import build_pyramid

@@ -13,8 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import dpmjax
-from benchmarks.rows import Row
-from benchmarks.timing import Timing, measure
+from benchmarks.rows import Row, Timing, measure
 
 NAME = "pose_graph"
 DATA = Path(os.environ.get("DPMJAX_DATA", "../shared/data")) / "g2o"

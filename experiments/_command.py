@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import logging
+import math
 import signal
 import sys
 import threading
 import traceback
-from collections.abc import Callable, Sequence
-from types import FrameType, TracebackType
-from typing import Self, TypeVar
+from collections.abc import Callable, Iterable, Sequence
+from functools import partial
+from types import FrameType
+from typing import Any, Self, TypeVar
 
 import tyro
 
@@ -23,16 +25,15 @@ ConfigT = TypeVar("ConfigT")
 
 
 class Interrupted(KeyboardInterrupt):
-    """A signal has stopped the run."""
+    """A signal has stopped the run.
+
+    Attributes:
+        exit_code: what a shell reports for a program ended by this signal: 130 for Ctrl-C, 143 for SIGTERM.
+    """
 
     def __init__(self, signal_number: int) -> None:
         super().__init__(signal.Signals(signal_number).name)
-        self.signal_number = signal_number
-
-    @property
-    def exit_code(self) -> int:
-        """What a shell reports for a program ended by this signal: 130 for Ctrl-C, 143 for SIGTERM."""
-        return 128 + self.signal_number
+        self.exit_code = 128 + signal_number
 
 
 class StopFlag:
@@ -46,44 +47,63 @@ class StopFlag:
     At the end of the block, after everything in it was written, a requested stop is raised as `Interrupted`. The
     command then ends with the exit code of the signal. Outside the main thread, where Python delivers no signals, the
     flag is never set.
+
+    Attributes:
+        received: the number of the signal, None where none came.
     """
 
     def __init__(self) -> None:
-        self._received: int | None = None
-        self._previous: dict[int, object] = {}
+        self.received: int | None = None
+        self._previous: dict[signal.Signals, Any] = {}
 
     @property
     def is_requested(self) -> bool:
         """Whether a signal came."""
-        return self._received is not None
-
-    @property
-    def received(self) -> int | None:
-        """The number of the signal, None where none came."""
-        return self._received
+        return self.received is not None
 
     def request(self, signal_number: int) -> None:
         """Sets the flag where another process of the same run has received the signal."""
-        if self._received is None:
-            self._received = signal_number
+        self.received = self.received or signal_number
 
     def __enter__(self) -> Self:
         if threading.current_thread() is threading.main_thread():
             self._previous = {number: signal.signal(number, self._on_signal) for number in SIGNALS}
         return self
 
-    def __exit__(
-        self, error_type: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
+    def __exit__(self, error_type: type[BaseException] | None, *error: object) -> None:
         for number, handler in self._previous.items():
-            signal.signal(number, handler)  # type: ignore[arg-type]
-        if self._received is not None and error_type is None:
-            raise Interrupted(self._received)
+            signal.signal(number, handler)
+        if self.received is not None and error_type is None:
+            raise Interrupted(self.received)
 
     def _on_signal(self, number: int, frame: FrameType | None) -> None:
-        if self._received is not None:
+        if self.received is not None:
             raise Interrupted(number)
-        self._received = number
+        self.received = number
+
+
+def check_least(config: Any, **least: float) -> None:
+    """Checks the ranges of options that are numbers, tuples of numbers, or None.
+
+    Args:
+        config: the options.
+        **least: the smallest allowed value of each option.
+
+    Raises:
+        ValueError: an option is smaller, or not finite.
+    """
+    for name, smallest in least.items():
+        values = getattr(config, name)
+        for value in values if isinstance(values, tuple) else (values,):
+            if value is not None and not smallest <= value < math.inf:
+                raise ValueError(f"--{name.replace('_', '-')}: expected at least {smallest}, got {value}")
+
+
+def check_names(option: str, names: Sequence[str], allowed: Iterable[str]) -> None:
+    """Raises a ValueError where a name is not among those that are allowed, or none is given."""
+    unknown = [name for name in names if name not in allowed]
+    if unknown or not names:
+        raise ValueError(f"{option}: expected some of {', '.join(allowed)}, got {', '.join(unknown) or 'none'}")
 
 
 def run_command(
@@ -119,7 +139,7 @@ def run_command(
     console = logging.StreamHandler()
     console.setLevel(logging.WARNING)
     logging.basicConfig(format="dpmjax: %(levelname)s: %(message)s", handlers=[console])
-    previous = signal.signal(signal.SIGTERM, _interrupt)
+    previous = {number: signal.signal(number, _interrupt) for number in SIGNALS}
     enable_compilation_cache()
     try:
         config = _parse(config_type, experiment, description, arguments)
@@ -131,8 +151,6 @@ def run_command(
         return EXIT_OK if done.code is None else int(done.code)
     except Interrupted as stop:
         return _say(f"stopped by {stop}", stop.exit_code)
-    except KeyboardInterrupt:
-        return _say("stopped by SIGINT", 128 + signal.SIGINT)
     except ValueError as error:
         return _say(f"error: {error}", EXIT_BAD_INPUT)
     except RunFailedError as error:
@@ -142,19 +160,21 @@ def run_command(
         traceback.print_exception(error)
         return _say(f"error: {type(error).__name__}: {error}", EXIT_FAILED)
     finally:
-        signal.signal(signal.SIGTERM, previous)
+        for number, handler in previous.items():
+            signal.signal(number, handler)
     return EXIT_OK
 
 
 def _parse(config_type: type[ConfigT], experiment: str, description: str | None, arguments: list[str]) -> ConfigT:
-    prog = f"python -m experiments.{experiment}"
     old_names = getattr(config_type, "old_names", {})
     arguments = [old_names.get(argument, argument) for argument in arguments]
-    config = tyro.cli(config_type, prog=prog, description=description, args=arguments)
+    parse = partial(
+        tyro.cli, config_type, prog=f"python -m experiments.{experiment}", description=description, args=arguments
+    )
+    config = parse()
     if not getattr(config, "resume", False):
         return config
-    stored = load_config(find_run(experiment, getattr(config, "output", None)), config_type)
-    return tyro.cli(config_type, prog=prog, description=description, args=arguments, default=stored)
+    return parse(default=load_config(find_run(experiment, getattr(config, "output", None)), config_type))
 
 
 def _interrupt(number: int, frame: FrameType | None) -> None:

@@ -12,8 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from experiments._command import StopFlag
-from experiments._history import HistoryFile, read_history
+from experiments._result_files import HistoryFile, read_history
 from experiments._run_folder import CHECKPOINTS, HISTORY, RunFolder
 
 if TYPE_CHECKING:
@@ -53,8 +52,7 @@ def run_fit(
     *,
     start: NDArray[np.float64] | None,
     seed: int,
-    seconds: float | None,
-    stop: StopFlag,
+    stop: Callable[[float], bool],
 ) -> FitRun:
     """Fits, or continues where the checkpoints of the folder end.
 
@@ -64,8 +62,7 @@ def run_fit(
         settings: of DeepMapping.
         start: (n, 3) poses, or None for a cold start.
         seed: of the run.
-        seconds: run time after which the fit stops, or None.
-        stop: asked between calls of the step.
+        stop: called before each call of the step with the run time so far, seconds; the fit ends where it is True.
 
     Returns:
         FitRun.
@@ -73,33 +70,21 @@ def run_fit(
     import jax
 
     from dpmjax.checkpoints import Checkpoints
-    from dpmjax.deepmapping import Fitted
-    from dpmjax.deepmapping.fit import fit, init
-    from dpmjax.deepmapping.planar import planar_problem, scale_scans, start_poses
-    from dpmjax.geometry import se2
+    from dpmjax.deepmapping.fit import init, resume
+    from dpmjax.deepmapping.planar import as_fitted, planar_data, planar_problem
     from dpmjax.types import ScanSet
 
-    scans, unit = scale_scans(ScanSet(sequence.points, sequence.mask))
-    problem = planar_problem(settings, is_warm=start is not None)
-    first = None if start is None else start_poses(start, len(sequence), unit)
-    state = init(problem, scans, key=jax.random.key(seed), start=first)
+    data, unit = planar_data(ScanSet(sequence.points, sequence.mask), start)
+    problem = planar_problem(settings, data)
+    state = init(problem, data, key=jax.random.key(seed))
     checkpoints = Checkpoints(Path(folder.path) / CHECKPOINTS)
     if folder.is_resumed:
         state = checkpoints.restore_latest(state, fallback=state)
     with _Recorder(folder, sequence, unit, checkpoints, int(state.step)) as recorder:
-        done = fit(
-            problem,
-            scans,
-            key=jax.random.key(seed),
-            start=state,
-            on_report=recorder.record,
-            stop=lambda: stop.is_requested or (seconds is not None and recorder.run_s >= seconds),
-        )
+        done = resume(problem, state, data, on_report=recorder.record, stop=lambda: stop(recorder.run_s))
     checkpoints.save(int(done.state.step), done.state)
-    poses = np.asarray(done.poses, np.float64) * [unit, unit, 1.0]
-    fitted = Fitted(se2.to_matrix(poses), poses, done.state.params, done.report, unit, settings)
     has_map = problem.phases[int(done.state.phase)].occupancy_weight > 0.0
-    return FitRun(fitted, int(done.state.step), recorder.run_s, done.compile_s, has_map)
+    return FitRun(as_fitted(done, unit, settings), int(done.state.step), recorder.run_s, done.compile_s, has_map)
 
 
 class _Recorder:

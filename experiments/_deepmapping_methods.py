@@ -18,8 +18,9 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from dpmjax import deepmapping, metrics, registration
-from experiments._command import StopFlag
-from experiments._run_folder import RunFolder, do_row, recording
+from experiments._command import StopFlag, check_least, check_names
+from experiments._result_files import do_row
+from experiments._run_folder import RunFolder, RunOptions, open_run_folder, recording
 
 if TYPE_CHECKING:
     from dpmjax.deepmapping import DeepMappingConfig
@@ -70,7 +71,7 @@ class Task:
 
     @property
     def scans(self) -> ScanSet:
-        """The scans without their names and reference."""
+        """Returns the scans without their names and reference."""
         from dpmjax.types import ScanSet
 
         return ScanSet(self.sequence.points, self.sequence.mask)
@@ -86,33 +87,33 @@ def make_task(sequence: ScanSequence, *, is_ordered: bool = True, steps: int = 6
 
 
 def incremental(task: Task, metric: Literal["point", "plane"] = "plane") -> Floats:
-    """Poses by incremental ICP."""
+    """Returns poses by incremental ICP."""
     return registration.incremental_icp(task.planar, metric).poses
 
 
 def search(task: Task) -> Floats:
-    """Poses by global registration: an exhaustive search of scan pairs, without a first guess."""
+    """Returns poses by global registration: an exhaustive search of scan pairs, without a first guess."""
     return registration.register_globally(task.planar).poses
 
 
 def refined(task: Task, poses: Floats, *, is_ordered: bool) -> Floats:
-    """Poses after the alignment of all scans together."""
+    """Returns the poses after the alignment of all scans together."""
     return registration.refine(task.planar.replace(is_ordered=is_ordered), poses).poses
 
 
 def choose(task: Task, candidates: Mapping[str, Floats]) -> tuple[str, dict[str, dict[str, float]]]:
-    """The name of the best candidate, judged by the scans alone, and the scores of all."""
+    """Returns the name of the best candidate, chosen by the scans alone, and the errors and scores of all."""
     kept, scores = registration.choose_trajectory(task.planar, candidates)
-    return kept, {name: score._asdict() for name, score in scores.items()}
+    return kept, {name: errors(task.sequence, candidates[name]) | score._asdict() for name, score in scores.items()}
 
 
 def assess(task: Task, poses: Floats) -> dict[str, Any]:
-    """Whether the poses can be trusted, from the scans alone, by the names of the result files."""
+    """Returns the assessment of poses, from the scans alone, under the names of the result files."""
     return registration.assess_trajectory(task.planar, poses)._asdict()
 
 
 def errors(sequence: ScanSequence, poses: Floats) -> dict[str, float]:
-    """ATE and point distance in the unit of the scans; nothing where there is no reference."""
+    """Returns ATE and point distance in the unit of the scans; nothing where there is no reference."""
     from dpmjax.geometry import se2
 
     reference = sequence.reference_poses
@@ -126,12 +127,12 @@ def errors(sequence: ScanSequence, poses: Floats) -> dict[str, float]:
 
 
 def in_fitting_order(task: Task, start: Floats) -> NDArray[np.intp]:
-    """An order in which neighbours are near each other, for DeepMapping's losses: of time, or a tour of the start."""
+    """Returns an order in which neighbours are near each other: that of time, or a tour of the start."""
     return np.arange(len(start)) if task.is_ordered else registration.nearest_tour(start)
 
 
 def _fit(task: Task, start: Floats | None, config: DeepMappingConfig | None = None) -> Floats:
-    """DeepMapping from a start, or from zero poses."""
+    """Returns poses by DeepMapping from a start, or from zero poses."""
     import jax
 
     settings = deepmapping.with_steps(config or deepmapping.preset("fast"), task.steps)
@@ -143,13 +144,8 @@ def _fit(task: Task, start: Floats | None, config: DeepMappingConfig | None = No
     return fitted.poses[np.argsort(order)]
 
 
-def _direct_adam(task: Task) -> Floats:
-    """DeepMapping's loss without L-Net: poses from zero by Adam."""
-    return _fit(task, None, deepmapping.as_direct(deepmapping.preset("fast")))
-
-
 def _direct_lbfgs(task: Task) -> Floats:
-    """DeepMapping's loss without L-Net: poses from zero by L-BFGS."""
+    """Returns poses by DeepMapping's loss without L-Net, from zero by L-BFGS."""
     import jax
 
     from experiments.baselines.direct import optimize_directly
@@ -173,29 +169,29 @@ def _swarm(task: Task) -> Floats:
 
 
 def _global_deepmapping(task: Task) -> Candidates:
-    """DeepMapping from global registration: no ICP, no refinement."""
+    """Returns global registration and DeepMapping from it: no ICP, no refinement."""
     start = search(task)
     return {START_NAMES["global"]: start, DEEPMAPPING: _fit(task, start)}
 
 
 def _refined_deepmapping(task: Task) -> Candidates:
-    """DeepMapping from the better of refined ICP and refined global registration, then refined."""
+    """Returns refined ICP or refined global registration, DeepMapping from it, and that refined."""
     name, start = _best_start(task)
     fitted = _fit(task, start)
     return {name: start, DEEPMAPPING: fitted, f"{DEEPMAPPING}, refined": refined(task, fitted, is_ordered=False)}
 
 
 def _best_start(task: Task) -> tuple[str, Floats]:
-    """Refined ICP if it can be trusted; else of it and refined global registration the more strongly connected one."""
-    starts: list[tuple[dict[str, Any], str, Floats]] = []
+    """Returns refined ICP if trusted; else of it and refined global registration the more strongly connected one."""
 
-    def add(name: str, poses: Floats) -> None:
-        starts.append((assess(task, poses), f"{name}, refined", poses))
+    def assessed(name: str, poses: Floats) -> tuple[dict[str, Any], str, Floats]:
+        return assess(task, poses), f"{name}, refined", poses
 
+    starts = []
     if task.is_ordered:
-        add(START_NAMES["icp-plane"], refined(task, incremental(task), is_ordered=True))
+        starts.append(assessed(START_NAMES["icp-plane"], refined(task, incremental(task), is_ordered=True)))
     if not starts or not starts[0][0]["is_trusted"]:
-        add(START_NAMES["global"], refined(task, search(task), is_ordered=False))
+        starts.append(assessed(START_NAMES["global"], refined(task, search(task), is_ordered=False)))
     # Between two different maps the sharper one may be wrong, so `choose` does not decide here.
     return max(starts, key=lambda start: start[0]["weakest_connection"])[1:]
 
@@ -220,41 +216,41 @@ METHODS: dict[str, Method] = {
     "icp-refined": Method("incremental ICP, refined", lambda task: refined(task, incremental(task), is_ordered=True)),
     "multiway": Method("multiway registration of Open3D", _multiway, "open3d"),
     "particle-swarm": Method("particle swarms, each scan onto the one before", _swarm, "evosax"),
-    "direct-adam": Method("direct optimisation from zero, Adam", _direct_adam),
+    "direct-adam": Method(
+        "direct optimisation from zero, Adam",
+        lambda task: _fit(task, None, deepmapping.as_direct(deepmapping.preset("fast"))),
+    ),
     "direct-lbfgs": Method("direct optimisation from zero, L-BFGS", _direct_lbfgs),
     "global-deepmapping": Method("global registration, then DeepMapping", _global_deepmapping),
     "refined-deepmapping": Method("ICP or global registration, then DeepMapping, refined", _refined_deepmapping),
 }
 
 
-def check_methods(methods: Sequence[str]) -> None:
-    """Raises a ValueError where a method does not exist, or none is named."""
-    unknown = [name for name in methods if name not in METHODS]
-    if unknown or not methods:
-        raise ValueError(f"--methods: expected some of {', '.join(METHODS)}, got {', '.join(unknown) or 'none'}")
+@dataclass(frozen=True, kw_only=True)
+class TableOptions(RunOptions):
+    """Options of a comparison of methods."""
 
+    methods: tuple[str, ...] = tuple(METHODS)
+    """Columns."""
+    steps: int = 600
+    """Steps of the fit."""
 
-def split_by_extras(methods: Sequence[str]) -> tuple[tuple[str, ...], dict[str, str]]:
-    """The methods that can run here, and why the others cannot."""
-    missing = {
-        name: f"needs {package}: pip install dpmjax[baselines]"
-        for name in methods
-        if (package := METHODS[name].package) is not None and importlib.util.find_spec(package) is None
-    }
-    return tuple(name for name in methods if name not in missing), missing
+    def __post_init__(self) -> None:
+        """Checks names and ranges."""
+        check_names("--methods", self.methods, METHODS)
+        check_least(self, steps=2)
 
 
 def run_method(name: str, task: Task) -> dict[str, Any]:
-    """One row: the errors, the time and the assessment of what was kept, and the numbers of every candidate."""
+    """Returns one row: errors, time and assessment of the kept candidate, and the numbers of every candidate."""
     method = METHODS[name]
     begun, begun_cpu = time.perf_counter(), time.process_time()
     found = method.run(task)
     candidates = found if isinstance(found, dict) else {method.title: found}
     # The choice belongs to a method that has several candidates, and to its time.
-    kept, scores = choose(task, candidates) if len(candidates) > 1 else (method.title, {})
+    chosen = choose(task, candidates) if len(candidates) > 1 else None
     seconds, cpu_seconds = time.perf_counter() - begun, time.process_time() - begun_cpu
-    scores = scores or choose(task, candidates)[1]
-    measured = {label: errors(task.sequence, poses) | scores[label] for label, poses in candidates.items()}
+    kept, measured = chosen or choose(task, candidates)
     return {
         **errors(task.sequence, candidates[kept]),
         "success": measured[kept]["ate_px"] < SUCCESS_PX,
@@ -266,41 +262,55 @@ def run_method(name: str, task: Task) -> dict[str, Any]:
     }
 
 
-def run_cells(
-    folder: RunFolder,
+def success_of_trusted(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Returns how many maps were trusted, and the share of these that are right."""
+    trusted = [row["success"] for row in rows if row["is_trusted"]]
+    return {"num_trusted": len(trusted), "success_of_trusted": float(np.mean(trusted)) if trusted else None}
+
+
+def run_table(
+    config: TableOptions,
+    experiment: str,
     cells: Sequence[dict[str, Any]],
-    methods: Sequence[str],
     prepare: Callable[[dict[str, Any]], tuple[Task, dict[str, Any]]],
-    write: Callable[[list[dict[str, Any]]], None],
-    *,
-    seed: int,
+    write: Callable[[RunFolder, list[dict[str, Any]], dict[str, str]], str],
 ) -> list[dict[str, Any]]:
     """Runs every method on every cell; what an earlier run has done is read from its files.
 
     Args:
-        folder: of the run.
+        config: options.
+        experiment: name of the experiment.
         cells: what identifies each set of scans.
-        methods: names.
         prepare: makes the task of a cell, and what its rows carry besides the results.
-        write: writes the results so far, after each cell.
-        seed: of the run.
+        write: writes the rows so far, and why some methods were not run, after each cell; returns a summary to print.
 
     Returns:
         All rows.
     """
+    folder = open_run_folder(config, experiment)
+    not_run = NOT_RUN | {
+        name: f"needs {package}: pip install dpmjax[baselines]"
+        for name in config.methods
+        if (package := METHODS[name].package) is not None and importlib.util.find_spec(package) is None
+    }
 
     def work(method: str, prepared: Callable[[], tuple[Task, dict[str, Any]]]) -> dict[str, Any]:
         task, extra = prepared()
         return run_method(method, task) | extra
 
     rows: list[dict[str, Any]] = []
+    summary = ""
     with recording(folder), StopFlag() as stop:
         for cell in tqdm(cells, unit=" sets"):
             # The scans are made once for all methods, and not at all where all rows exist.
             prepared = cache(partial(prepare, cell))
-            for method in methods:
+            for method in config.methods:
                 if stop.is_requested:
                     return rows
-                rows.append(do_row(folder, {"method": method, **cell}, partial(work, method, prepared), seed=seed))
-            write(rows)
+                if method not in not_run:
+                    case = {"method": method, **cell}
+                    rows.append(do_row(folder.path, case, partial(work, method, prepared), seed=config.seed))
+            summary = write(folder, rows, not_run)
+    print(summary, *(f"{name}: not run ({reason})" for name, reason in not_run.items()), sep="\n")
+    print(f"results in {folder.path}")
     return rows

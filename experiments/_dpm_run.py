@@ -5,8 +5,8 @@ from __future__ import annotations
 import logging
 import math
 import time
-from collections.abc import Callable, Sequence
-from contextlib import nullcontext
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Self
 
@@ -17,11 +17,11 @@ from tqdm import tqdm
 from dpmjax.checkpoints import Checkpoints
 from dpmjax.deeppointmap import Model, SamplingConfig, ScanStore, TrainingConfig, TrainingHooks, init_training, train
 from dpmjax.deeppointmap.curriculum import CurriculumStage
-from dpmjax.deeppointmap.evaluation import EvaluationPairs, evaluate_registration
+from dpmjax.deeppointmap.inference import EvaluationPairs, evaluate_registration
 from dpmjax.deeppointmap.training_loop import StepRecord, Trained, TrainingProgress, begin_training
 from dpmjax.io import LidarSequence, list_lidar_sequences, open_lidar_sequence
 from dpmjax.simulation import HDL64E, DriveConfig, TownConfig, simulate_lidar_sequence
-from experiments._history import HistoryFile, read_history
+from experiments._result_files import HistoryFile, read_history
 from experiments._run_folder import CHECKPOINTS, HISTORY, RunFolder
 
 LOGGER = logging.getLogger("dpmjax.training")
@@ -30,9 +30,9 @@ TOWN = "town"
 HELD_OUT_SEED = 1_000_000
 # Seconds between checkpoints; Ctrl-C and the end write one too.
 SAVE_EVERY_S = 60.0
-TERMS = ("pairing", "coarse", "offset", "top1_accuracy")
-REPORTED = ("overlap_accuracy", "gradient_norm", "learning_rate")
-COLUMNS = ("step", "stage", "run_s", "loss", *TERMS, *REPORTED, "recall")
+SHOWN = ("loss", "overlap_accuracy", "pairing", "offset", "top1_accuracy", "recall")
+MEASURES = (*SHOWN, "coarse", "gradient_norm", "learning_rate")
+COLUMNS = ("step", "stage", "run_s", *MEASURES)
 
 
 def town_drive(seed: int, *, length_m: float) -> LidarSequence:
@@ -45,7 +45,7 @@ def town_drive(seed: int, *, length_m: float) -> LidarSequence:
     )
 
 
-def open_drives(data: Sequence[str], *, num_towns: int, town_length_m: float, seed: int) -> list[LidarSequence]:
+def open_drives(data: Sequence[str], towns: Sequence[int], town_length_m: float) -> list[LidarSequence]:
     """Returns the drives to train on.
 
     Raises:
@@ -54,18 +54,16 @@ def open_drives(data: Sequence[str], *, num_towns: int, town_length_m: float, se
     drives: list[LidarSequence] = []
     for entry in data:
         if entry == TOWN and not Path(entry).exists():
-            drives += [town_drive(seed + number, length_m=town_length_m) for number in range(num_towns)]
+            drives += [town_drive(seed, length_m=town_length_m) for seed in towns]
             continue
         names: Sequence[str | None] = list_lidar_sequences(entry) or [None]
         found = [open_lidar_sequence(entry, sequence=name) for name in names]
-        reasons = {drive.name: why_useless(drive) for drive in found}
-        useful = [drive for drive in found if reasons[drive.name] is None]
-        if not useful:
+        reasons = {drive.name: reason for drive in found if (reason := why_useless(drive)) is not None}
+        if len(reasons) == len(found):
             raise ValueError("; ".join(f"{entry}: {reason}" for reason in dict.fromkeys(reasons.values())))
-        for drive in found:
-            if reasons[drive.name] is not None:
-                LOGGER.warning("%s is left out: %s", drive.name, reasons[drive.name])
-        drives += useful
+        for name, reason in reasons.items():
+            LOGGER.warning("%s is left out: %s", name, reason)
+        drives += [drive for drive in found if drive.name not in reasons]
     return drives
 
 
@@ -110,8 +108,8 @@ class Records:
         if folder.is_resumed:
             self.start = self._checkpoints.restore_latest(self.start, fallback=self.start)
         first = int(self.start.state.step)
-        self.earlier_s = _earlier_seconds(folder, first)
         self._history = HistoryFile(folder / HISTORY, COLUMNS, keep_until=first if folder.is_resumed else None)
+        self.earlier_s = max((float(row["run_s"]) for row in read_history(folder / HISTORY)), default=0.0)
         self._bar = tqdm(total=settings.num_steps, initial=first, desc="train", unit=" steps", dynamic_ncols=True)
         self._last_saved, self._recall = time.perf_counter(), math.nan
         self._seen: set[CurriculumStage | None] = set()
@@ -124,7 +122,9 @@ class Records:
     def on_report(self, record: StepRecord, progress: TrainingProgress) -> None:
         """Adds a row, updates the bar, and writes a checkpoint when it is time."""
         self._recall = record.score if math.isfinite(record.score) else self._recall
-        self._history.append(**_row(record, self.earlier_s + record.run_s))
+        measured = {name: f"{value:.7g}" for name, value in _values(record).items()}
+        run_s = round(self.earlier_s + record.speed.run_s, 3)
+        self._history.append(step=record.step, stage=_stage_name(record.stage), run_s=run_s, **measured)
         self._bar.set_postfix_str(_summary(record, self._recall), refresh=False)
         self._bar.update(1)
         self._tell_compilation(record.step)
@@ -151,19 +151,13 @@ class Records:
 
 
 def run_training(
-    records: Records | None,
-    store: ScanStore,
-    settings: TrainingConfig,
-    *,
-    seed: int,
-    recall_every: int,
-    stop: Callable[[], int],
+    records: Records | None, store: ScanStore, settings: TrainingConfig, hooks: TrainingHooks, *, seed: int
 ) -> Trained:
     """Returns the result of training, after saving its last state; one process has records."""
-    with records or nullcontext():
-        if records is None:
-            return train(store, settings, seed=seed, hooks=TrainingHooks(evaluate_every=recall_every, stop=stop))
-        hooks = TrainingHooks(records.evaluate, recall_every, records.on_report, stop)
+    if records is None:
+        return train(store, settings, seed=seed, hooks=hooks)
+    with records:
+        hooks = replace(hooks, evaluate=records.evaluate, on_report=records.on_report)
         trained = train(store, settings, seed=seed, start=records.start, hooks=hooks)
         records.save(trained.progress)
         return trained
@@ -173,29 +167,12 @@ def _stage_name(stage: CurriculumStage | None) -> str:
     return "overlap" if stage is None else f"K={stage.max_group}"
 
 
-def _row(record: StepRecord, run_s: float) -> dict[str, Any]:
-    report = record.report
-    values = {"loss": report.loss, "recall": record.score}
-    values |= {name: getattr(report.terms, name) for name in TERMS} | {name: getattr(report, name) for name in REPORTED}
-    known = {name: f"{float(value):.7g}" for name, value in values.items() if math.isfinite(value)}
-    return {"step": record.step, "stage": _stage_name(record.stage), "run_s": round(run_s, 3), **known}
+def _values(record: StepRecord) -> dict[str, Any]:
+    values = {**record.report._asdict(), **record.report.terms._asdict(), "recall": record.score}
+    return {name: float(values[name]) for name in MEASURES if math.isfinite(values[name])}
 
 
 def _summary(record: StepRecord, recall: float) -> str:
-    report = record.report
-    values = {
-        "loss": report.loss,
-        "accuracy": report.overlap_accuracy,
-        "pairing": report.terms.pairing,
-        "offset": report.terms.offset,
-        "top-1": report.terms.top1_accuracy,
-        "recall": recall,
-    }
-    parts = [f"{name} {float(value):.3f}" for name, value in values.items() if math.isfinite(value)]
-    return ", ".join([_stage_name(record.stage), *parts, f"{record.scans_per_s:.1f} scans/s"])
-
-
-def _earlier_seconds(folder: RunFolder, step: int) -> float:
-    if not folder.is_resumed or not (folder / HISTORY).exists():
-        return 0.0
-    return max((float(row["run_s"]) for row in read_history(folder / HISTORY) if int(row["step"]) <= step), default=0.0)
+    values = {**_values(record), **({"recall": recall} if math.isfinite(recall) else {})}
+    parts = [f"{name} {values[name]:.3f}" for name in SHOWN if name in values]
+    return ", ".join([_stage_name(record.stage), *parts, f"{record.speed.scans_per_s:.1f} scans/s"])

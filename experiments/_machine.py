@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 PACKAGES = ("jax", "jaxlib", "flax", "optax", "numpy", "scipy")
+CACHES = "Library/Caches" if sys.platform == "darwin" else ".cache"
 
 
 def select_device(device: Literal["cpu", "gpu"] | None) -> None:
@@ -45,25 +46,15 @@ def enable_compilation_cache() -> None:
     if chosen == "off" or "JAX_COMPILATION_CACHE_DIR" in os.environ:
         return
     # A program belongs to a processor: a home directory may be shared by several kinds.
-    folder = Path(chosen) if chosen else _cache_home() / "dpmjax" / f"{zlib.crc32(cpu_model().encode()):08x}"
-    os.environ["JAX_COMPILATION_CACHE_DIR"] = str(folder)
+    caches = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / CACHES) / "dpmjax"
+    os.environ["JAX_COMPILATION_CACHE_DIR"] = chosen or str(caches / f"{zlib.crc32(cpu_model().encode()):08x}")
     # Also the hundreds of small programs, which take seconds together.
     os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
     os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES", "-1")
 
 
-def _cache_home() -> Path:
-    if named := os.environ.get("XDG_CACHE_HOME"):
-        return Path(named)
-    if sys.platform == "darwin":
-        return Path.home() / "Library" / "Caches"
-    if sys.platform == "win32":
-        return Path(os.environ.get("LOCALAPPDATA", Path.home() / "AppData" / "Local"))
-    return Path.home() / ".cache"
-
-
 def environment() -> dict[str, Any]:
-    """Versions, device, git commit and machine, ready for `metrics.json`."""
+    """Returns versions, device, git commit and machine, ready for `metrics.json`."""
     return {
         "versions": versions(),
         "device": device_name(),
@@ -75,7 +66,7 @@ def environment() -> dict[str, Any]:
 
 
 def versions() -> dict[str, str]:
-    """Versions of Python, of this package, and of the packages that its numbers depend on."""
+    """Returns the versions of Python, of this package, and of the packages that its numbers depend on."""
     import dpmjax
 
     installed = {name: importlib.metadata.version(name) for name in PACKAGES}
@@ -83,7 +74,7 @@ def versions() -> dict[str, str]:
 
 
 def device_name() -> str | None:
-    """The device that JAX computes on; None in a run that never loaded JAX."""
+    """Returns the device that JAX computes on; None in a run that never loaded JAX."""
     if "jax" not in sys.modules:
         return None
     import jax
@@ -93,7 +84,7 @@ def device_name() -> str | None:
 
 
 def git_hash() -> str | None:
-    """Commit of the checkout that this file lies in, with `+changes` where it is not clean; None without git."""
+    """Returns the commit of this checkout, with `+changes` where it is not clean; None without git."""
     command = ["git", "-C", str(Path(__file__).parent), "describe", "--always", "--abbrev=40", "--exclude=*"]
     try:
         found = subprocess.run([*command, "--dirty=+changes"], capture_output=True, text=True, check=True, timeout=5)
@@ -103,29 +94,27 @@ def git_hash() -> str | None:
 
 
 def cpu_model() -> str:
-    """Name of the processor as its maker gives it."""
-    try:
-        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
-    except OSError:
-        lines = []
-    names = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
-    return names[0] if names else platform.processor() or platform.machine()
+    """Returns the name of the processor."""
+    return _fields("/proc/cpuinfo").get("model name") or platform.processor() or platform.machine()
 
 
 def usable_cores() -> int:
-    """Cores that this process may run on, which a container may limit."""
+    """Returns the number of cores that this process may use, which a container may limit."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def peak_rss_gb() -> float:
-    """Largest resident memory of this process so far, in units of 10^9 bytes."""
+    """Returns the largest resident memory of this process so far, in units of 10^9 bytes."""
     # On Linux, ru_maxrss starts from the parent's size at the fork; VmHWM belongs to this program alone.
+    if own := _fields("/proc/self/status").get("VmHWM"):
+        return int(own.split()[0]) * 1024 / 1e9
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024) / 1e9
+
+
+def _fields(path: str) -> dict[str, str]:
+    """Returns the `name: value` lines of a file of the kernel; none on systems without it."""
     try:
-        status = Path("/proc/self/status").read_text(encoding="ascii", errors="replace").splitlines()
+        lines = Path(path).read_text(encoding="utf-8", errors="replace").splitlines()
     except OSError:
-        status = []
-    for line in status:
-        if line.startswith("VmHWM:"):
-            return int(line.split()[1]) * 1024 / 1e9
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return peak * (1 if sys.platform == "darwin" else 1024) / 1e9
+        return {}
+    return {name.strip(): value.strip() for name, _, value in (line.partition(":") for line in lines)}

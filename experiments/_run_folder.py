@@ -1,24 +1,22 @@
-"""The folder of one run: its options, what may be overwritten, and result files that tell which commit made them."""
+"""The folder of one run: the options of every command, what may be overwritten, and the log."""
 
 from __future__ import annotations
 
-import hashlib
+import itertools
 import logging
 import os
 import shutil
-from collections import defaultdict
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
-from types import TracebackType
 from typing import Annotated, Any, ClassVar, Literal, TypeVar
 
 from tyro.conf import FlagCreatePairsOff, arg
 
-from experiments._json import as_json, load_dataclass, load_json, write_json
-from experiments._machine import environment, git_hash, versions
+from experiments._machine import environment
+from experiments._result_files import as_json, commits_note, load_json, write_json
 
 CONFIG, METRICS, HISTORY, LOG = "config.json", "metrics.json", "metrics.csv", "log.txt"
 CHECKPOINTS = "checkpoints"
@@ -28,8 +26,6 @@ RESULT_SUFFIXES = (".json", ".csv", ".txt", ".npy", ".npz", ".png", ".ply", ".g2
 LOGGERS = ("dpmjax", "experiments", "__main__")
 # Options that do not change what is computed.
 FREE_OPTIONS = frozenset({"output", "resume", "force", "device", "coordinator", "num_processes", "process_id"})
-
-UNKNOWN = "unknown"
 RESULTS = Path("results")
 
 ConfigT = TypeVar("ConfigT")
@@ -89,17 +85,16 @@ class RunFolder:
         return self.path / name
 
 
-def open_run_folder(config: Any, experiment: str, *, root: Path = RESULTS) -> RunFolder:
+def open_run_folder(config: Any, experiment: str) -> RunFolder:
     """Makes the folder of a run, or finds the one to continue, and writes `config.json`.
 
     Call it after the input was read, so that bad input leaves no folder behind.
 
     Args:
         config: the resolved options, a dataclass such as `FolderOptions`. Its `output` None makes
-            `root/<experiment>/<timestamp>` and lets `latest` beside it point there; `resume` continues the run in
+            `results/<experiment>/<timestamp>` and lets `latest` beside it point there; `resume` continues the run in
             `output`, or the latest one; `force` empties `output` first where it holds an earlier run.
         experiment: name of the experiment.
-        root: folder of all results.
 
     Returns:
         The open folder.
@@ -107,31 +102,29 @@ def open_run_folder(config: Any, experiment: str, *, root: Path = RESULTS) -> Ru
     Raises:
         ValueError: as `check_run_folder`; or the folder cannot be made.
     """
-    check_run_folder(config, experiment, root=root)
+    check_run_folder(config, experiment)
     is_resumed = getattr(config, "resume", False)
     try:
         if is_resumed:
-            path = find_run(experiment, config.output, root)
+            path = find_run(experiment, config.output)
         elif config.output is None:
-            path = _make_timestamped(root / experiment)
+            path = _make_timestamped(RESULTS / experiment)
         else:
             path = config.output
             path.mkdir(parents=True, exist_ok=True)
             _clear(path)
         write_json(path / CONFIG, config)
     except OSError as error:
-        where = root / experiment if config.output is None else config.output
-        raise _cannot_write(where, error.strerror or str(error)) from error
+        raise _cannot_write(config.output or RESULTS / experiment, error.strerror or str(error)) from error
     return RunFolder(path, is_resumed=is_resumed)
 
 
-def check_run_folder(config: Any, experiment: str, *, root: Path = RESULTS) -> None:
+def check_run_folder(config: Any, experiment: str) -> None:
     """Refuses what `open_run_folder` would refuse and changes nothing, so that a command can ask before any work.
 
     Args:
         config: the resolved options.
         experiment: name of the experiment.
-        root: folder of all results.
 
     Raises:
         ValueError: `output` holds something and neither `resume` nor `force` is given; there is nothing to resume; the
@@ -140,20 +133,17 @@ def check_run_folder(config: Any, experiment: str, *, root: Path = RESULTS) -> N
     if getattr(config, "resume", False):
         if config.force:
             raise ValueError("--resume continues a run and --force starts it over: give one of them")
-        path = find_run(experiment, config.output, root)
-        may_change = FREE_OPTIONS | getattr(config, "may_change", frozenset())
-        _check_same_options(load_json(path / CONFIG), as_json(config), path, may_change)
+        _check_same_options(config, find_run(experiment, config.output))
     elif config.output is not None:
         _check_replaceable(config.output, config.force)
 
 
-def find_run(experiment: str, output: Path | None, root: Path = RESULTS) -> Path:
+def find_run(experiment: str, output: Path | None) -> Path:
     """Finds the folder of an earlier run.
 
     Args:
         experiment: name of the experiment.
         output: the folder, or None for the latest run of this experiment.
-        root: folder of all results.
 
     Returns:
         The folder.
@@ -161,14 +151,14 @@ def find_run(experiment: str, output: Path | None, root: Path = RESULTS) -> Path
     Raises:
         ValueError: there is none.
     """
-    path = output if output is not None else root / experiment / "latest"
+    path = output or RESULTS / experiment / "latest"
     if not (path / CONFIG).is_file():
         raise ValueError(f"nothing to resume: {path} holds no {CONFIG}; name the folder of a run with -o")
-    return path.resolve() if output is None else path
+    return path if output else path.resolve()
 
 
 def load_config(path: Path, config_type: type[ConfigT]) -> ConfigT:
-    """Reads the options of an earlier run; options such as `output` get their defaults.
+    """Reads the options of an earlier run; those that its file lacks, and such as `output`, get their defaults.
 
     Args:
         path: folder of the run.
@@ -180,7 +170,13 @@ def load_config(path: Path, config_type: type[ConfigT]) -> ConfigT:
     Raises:
         ValueError: its `config.json` holds an option that `config_type` does not have, or is no JSON.
     """
-    return load_dataclass(path / CONFIG, config_type, ignore=FREE_OPTIONS)
+    from dpmjax.weights.config_json import config_from_json
+
+    stored = {name: value for name, value in load_json(path / CONFIG).items() if name not in FREE_OPTIONS}
+    try:
+        return config_from_json(stored, config_type)
+    except ValueError as error:
+        raise ValueError(f"{path / CONFIG} holds options that this version does not know: {error}") from error
 
 
 def write_metrics(
@@ -195,80 +191,13 @@ def write_metrics(
         rows: rows made by `do_row`; the file names those of another commit than its own.
 
     Returns:
-        That note, or None where all rows are of this commit.
+        The note about such rows, or None where all rows are of this commit.
     """
     made_by = environment()
     note = commits_note(rows or (), made_by["git_hash"])
     table = {} if rows is None else {"note": note, "rows": rows}
     write_json(folder / METRICS, {**metrics, "seed": seed, **made_by, **table})
     return note
-
-
-def do_row(
-    folder: RunFolder, case: Mapping[str, Any], work: Callable[[], Mapping[str, Any]], *, seed: int
-) -> dict[str, Any]:
-    """Makes one row of results, or reads it where an earlier, perhaps killed, run has made it.
-
-    Each row is a file of its own below `rows/`, written whole, and carries the commit, the versions and the seed that
-    made it.
-
-    Args:
-        folder: of the run.
-        case: identifies the row and becomes part of it.
-        work: makes the rest of the row.
-        seed: of the run.
-
-    Returns:
-        The row. The commit of a row that carries none is "unknown".
-    """
-    path = row_path(folder.path, case)
-    if path.exists():
-        return {"git_hash": UNKNOWN, **load_json(path)}
-    made_by = {
-        "git_hash": git_hash() or UNKNOWN,
-        "versions": ", ".join(f"{name} {version}" for name, version in versions().items()),
-        "seed": seed,
-    }
-    row = {**case, **work(), **made_by}
-    path.parent.mkdir(parents=True, exist_ok=True)
-    write_json(path, row)
-    return row
-
-
-def row_path(folder: Path, case: Mapping[str, Any]) -> Path:
-    """The file of a row: a readable name that no other case has."""
-    text = "_".join(f"{key}-{value}" for key, value in case.items())
-    digest = hashlib.sha256(text.encode()).hexdigest()[:6]
-    return folder / "rows" / f"{text.replace('.', 'p').replace('/', '-')[:120]}_{digest}.json"
-
-
-def commits_note(rows: Sequence[Mapping[str, Any]], commit: str | None) -> str | None:
-    """Names the rows that another commit has made than the one that writes the file.
-
-    Args:
-        rows: with `git_hash`, and `method` where there are several.
-        commit: of the program that writes the file, None where it is not known.
-
-    Returns:
-        One sentence, or None where all rows are of `commit`.
-    """
-    methods: dict[str, list[str]] = defaultdict(list)
-    for row in rows:
-        if row.get("git_hash", UNKNOWN) != commit:
-            methods[row.get("git_hash", UNKNOWN)].append(str(row.get("method", "")))
-    if not methods:
-        return None
-
-    def short(name: str) -> str:
-        return name[:10] + ("+changes" if name.endswith("+changes") else "")
-
-    parts = [
-        f"{len(names)} of {short(made_by)}" + (f" ({', '.join(sorted(set(names)))})" if any(names) else "")
-        for made_by, names in methods.items()
-    ]
-    count = sum(map(len, methods.values()))
-    own = short(commit or UNKNOWN)
-    return f"{count} of {len(rows)} rows were made by another commit than this file ({own}): {'; '.join(parts)}"
 
 
 @contextmanager
@@ -297,8 +226,8 @@ def recording(folder: RunFolder) -> Iterator[None]:
         loggers[-1].info("stopped by %s", stop or "SIGINT")
         raise
     except Exception as error:
-        # The console shows the error too; this handler makes sure that the file has it.
-        handler.handle(logging.LogRecord("dpmjax", logging.ERROR, __file__, 0, "failed", (), _exc_info(error)))
+        # The console shows the error too, and leaves out what is below a warning.
+        loggers[-1].info("failed", exc_info=error)
         raise RunFailedError(folder.path, error) from error
     finally:
         for logger, level in zip(loggers, levels, strict=True):
@@ -307,12 +236,12 @@ def recording(folder: RunFolder) -> Iterator[None]:
         handler.close()
 
 
-def _check_same_options(stored: dict[str, Any], now: dict[str, Any], path: Path, may_change: frozenset[str]) -> None:
-    for name in sorted(set(stored) & set(now) - may_change):
+def _check_same_options(config: Any, path: Path) -> None:
+    stored, now = load_json(path / CONFIG), as_json(config)
+    for name in sorted(stored.keys() & now.keys() - FREE_OPTIONS - getattr(config, "may_change", frozenset())):
         if stored[name] != now[name]:
-            option = "--" + name.replace("_", "-")
             raise ValueError(
-                f"{option} was {stored[name]} in {path} and is {now[name]} now: "
+                f"--{name.replace('_', '-')} was {stored[name]} in {path} and is {now[name]} now: "
                 "a resumed run keeps its options; start a new run for others"
             )
 
@@ -320,26 +249,18 @@ def _check_same_options(stored: dict[str, Any], now: dict[str, Any], path: Path,
 def _make_timestamped(parent: Path) -> Path:
     parent.mkdir(parents=True, exist_ok=True)
     stamp = datetime.now().strftime("%Y-%m-%d_%H-%M-%S")
-    number = 1
-    while True:
+    for number in itertools.count(1):
         path = parent / (stamp if number == 1 else f"{stamp}_{number}")
-        try:
+        with suppress(FileExistsError):
             path.mkdir()
-        except FileExistsError:
-            number += 1
-            continue
-        break
-    _link_latest(path)
-    return path
-
-
-def _link_latest(path: Path) -> None:
-    link, unfinished = path.parent / "latest", path.parent / f".latest_{path.name}"
+            break
+    link, unfinished = parent / "latest", parent / f".latest_{path.name}"
     try:
         unfinished.symlink_to(path.name, target_is_directory=True)
         os.replace(unfinished, link)
     except OSError as error:  # a file system without links
         logging.getLogger(__name__).warning("cannot link %s to the newest run: %s", link, error)
+    return path
 
 
 def _check_replaceable(path: Path, force: bool) -> None:
@@ -368,7 +289,3 @@ def _clear(path: Path) -> None:
             shutil.rmtree(entry)
         elif entry.is_file() and entry.suffix in RESULT_SUFFIXES:
             entry.unlink()
-
-
-def _exc_info(error: Exception) -> tuple[type[Exception], Exception, TracebackType | None]:
-    return type(error), error, error.__traceback__

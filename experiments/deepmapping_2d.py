@@ -29,11 +29,11 @@ from tyro.conf import Positional, arg
 from dpmjax import deepmapping, io, registration, simulation, viz
 from dpmjax import metrics as trajectory_metrics
 from experiments import _deepmapping_methods as shared
-from experiments._command import StopFlag, run_command
+from experiments._command import StopFlag, check_least, run_command
 from experiments._deepmapping_fit import FitRun, run_fit
 from experiments._deepmapping_methods import Candidates, Floats, Task
-from experiments._history import read_history
 from experiments._machine import peak_rss_gb
+from experiments._result_files import read_history
 from experiments._run_folder import HISTORY, RunFolder, RunOptions, open_run_folder, recording, write_metrics
 
 if TYPE_CHECKING:
@@ -78,35 +78,15 @@ class Config(RunOptions):
 
     def __post_init__(self) -> None:
         """Checks ranges."""
-        for name, least in (("steps", 1), ("n_scans", 1), ("jump", 1), ("start", 0)):
-            value = getattr(self, name)
-            if value is not None and value < least:
-                raise ValueError(f"--{name.replace('_', '-')}: expected at least {least}, got {value}")
+        check_least(self, steps=1, n_scans=1, jump=1, start=0, range_noise_px=0)
         if self.seconds is not None and not self.seconds > 0.0:
             raise ValueError(f"--seconds: expected a positive time, got {self.seconds}")
         if not self.ordered and self.init != "global":
             raise ValueError(f"--no-ordered: only --init global needs no order, got --init {self.init}")
-        if not (math.isfinite(self.range_noise_px) and self.range_noise_px >= 0.0):
-            raise ValueError(f"--range-noise-px: expected zero or more, got {self.range_noise_px}")
 
 
-@dataclass(frozen=True)
-class Result:
-    """What a run found.
-
-    Attributes:
-        folder: where it was written.
-        poses: (n, 3) float64 x, y, heading of each scan in the world: the candidate that was kept.
-        metrics: the content of `metrics.json`.
-    """
-
-    folder: Path
-    poses: Floats
-    metrics: dict[str, Any]
-
-
-def main(config: Config) -> Result:
-    """Reads, starts, fits, refines, keeps the best candidate, writes."""
+def main(config: Config) -> dict[str, Any]:
+    """Reads, starts, fits, refines, keeps the best candidate, writes; returns the content of `metrics.json`."""
     started = time.perf_counter()
     sequence = read_scans(config)
     planar = registration.planar_scans(sequence.points, sequence.mask, is_ordered=config.ordered)
@@ -119,8 +99,12 @@ def main(config: Config) -> Result:
         run = _fit(folder, task, settings, start, config, stop)
         candidates = {start_name: start, shared.DEEPMAPPING: run.fitted.poses}
         if config.refine and not stop.is_requested:
-            candidates |= _refine(task, candidates, config.init)
-        kept, compared = compare(task, candidates)
+            # The fit is sharper near a good start; the start keeps what a robot's odometry knows.
+            candidates |= {
+                f"{name}, refined": shared.refined(task, poses, is_ordered=config.init != "global")
+                for name, poses in list(candidates.items())[config.init == "zero" :]
+            }
+        kept, compared = shared.choose(task, candidates)
         metrics = {
             "num_scans": len(sequence),
             "steps": run.steps,
@@ -131,31 +115,27 @@ def main(config: Config) -> Result:
             "assessment": shared.assess(task, candidates[kept]),
             "fit_s": run.run_s,
             "compile_s": run.compile_s,
-            "wall_s": time.perf_counter() - started,
             "peak_rss_gb": peak_rss_gb(),
             "is_interrupted": stop.is_requested,
         }
         # Numbers first: a picture that fails must not cost them.
         write_trajectories(folder, sequence, candidates[kept])
-        write_metrics(folder, metrics, seed=config.seed)
+        write_metrics(folder, metrics | {"wall_s": time.perf_counter() - started}, seed=config.seed)
         limits = draw_map(folder, task, candidates, metrics)
         draw_occupancy(folder, sequence, run, candidates[kept], limits)
         draw_loss(folder, sequence.unit)
         metrics["wall_s"] = time.perf_counter() - started
         write_metrics(folder, metrics, seed=config.seed)
-        for line in report(sequence.unit, metrics):
-            print(line)
-            LOGGER.info(line)
-        print(f"results in {folder.path}")
-    return Result(folder.path, candidates[kept], metrics)
+        summary = report(sequence.unit, metrics)
+        LOGGER.info(summary)
+        print(summary, f"results in {folder.path}", sep="\n")
+    return metrics
 
 
 def _fit(
     folder: RunFolder, task: Task, settings: DeepMappingConfig, start: Floats, config: Config, stop: StopFlag
 ) -> FitRun:
-    """DeepMapping, of the scans in an order in which neighbours are near each other."""
-    from dpmjax.geometry import se2
-
+    """Fits the scans in an order in which neighbours are near each other."""
     order = shared.in_fitting_order(task, start)
     run = run_fit(
         folder,
@@ -163,27 +143,13 @@ def _fit(
         settings,
         start=None if config.init == "zero" else start[order],
         seed=config.seed,
-        seconds=config.seconds,
-        stop=stop,
+        stop=lambda run_s: stop.is_requested or (config.seconds is not None and run_s >= config.seconds),
     )
-    poses = run.fitted.poses[np.argsort(order)]
-    return run._replace(fitted=run.fitted._replace(poses=poses, T_world_scan=se2.to_matrix(poses)))
-
-
-def _refine(task: Task, candidates: Candidates, init: str) -> Candidates:
-    """Both refined: the fit is sharper near a good start, the start keeps what a robot's odometry knows."""
-    names = list(candidates)[init == "zero" :]
-    return {f"{name}, refined": shared.refined(task, candidates[name], is_ordered=init != "global") for name in names}
-
-
-def compare(task: Task, candidates: Candidates) -> tuple[str, dict[str, dict[str, float]]]:
-    """The name of the candidate to keep, chosen without ground truth; and the errors and scores of all."""
-    kept, scores = shared.choose(task, candidates)
-    return kept, {name: shared.errors(task.sequence, poses) | scores[name] for name, poses in candidates.items()}
+    return run._replace(fitted=run.fitted._replace(poses=run.fitted.poses[np.argsort(order)]))
 
 
 def read_scans(config: Config) -> ScanSequence:
-    """The scans of DATA or of the built-in world, sub-range and stride applied."""
+    """Returns the scans of DATA or of the built-in world, sub-range and stride applied."""
     stop = None if config.n_scans is None else config.start + config.n_scans * config.jump
     if config.data is not None:
         return io.read_sequence(config.data, start=config.start, stop=stop, stride=config.jump)
@@ -194,35 +160,35 @@ def read_scans(config: Config) -> ScanSequence:
 
 
 def starting_poses(config: Config, task: Task) -> tuple[str, Floats]:
-    """The name of the start and its (n, 3) poses; what is no word of `START_NAMES` names a trajectory file."""
+    """Returns the name of the start and its (n, 3) poses; other words than those of `START_NAMES` name a file."""
     sequence, name = task.sequence, shared.START_NAMES.get(config.init, f"poses of {Path(config.init).name}")
-    if config.init == "zero":
-        return name, np.zeros((len(sequence), 3))
-    if config.init == "global":
-        return name, shared.search(task)
-    if config.init in ("icp-plane", "icp-point"):
-        return name, shared.incremental(task, "plane" if config.init == "icp-plane" else "point")
-    if config.init == "odometry":
-        if sequence.odometry_poses is None:
+    match config.init:
+        case "zero":
+            return name, np.zeros((len(sequence), 3))
+        case "global":
+            return name, shared.search(task)
+        case "icp-plane" | "icp-point":
+            return name, shared.incremental(task, "plane" if config.init == "icp-plane" else "point")
+        case "odometry" if sequence.odometry_poses is None:
             raise ValueError(
                 f"{sequence.name}: has no odometry of its own (its odometry column repeats the corrected pose, or is "
                 "missing); use --init icp-plane"
             )
-        return name, sequence.odometry_poses
-
-    if not Path(config.init).exists():
-        raise ValueError(f"--init {config.init}: no such file, and none of {', '.join(shared.START_NAMES)}")
+        case "odometry":
+            return name, sequence.odometry_poses
+        case _ if not Path(config.init).exists():
+            raise ValueError(f"--init {config.init}: no such file, and none of {', '.join(shared.START_NAMES)}")
     return name, io.read_planar_poses(config.init, len(sequence), sequence.unit)
 
 
 def fit_settings(config: Config, sequence: ScanSequence) -> DeepMappingConfig:
-    """The preset, with the number of steps asked for in its last phase."""
+    """Returns the preset, with the given number of steps."""
     settings = deepmapping.preset(config.preset, is_organised=sequence.is_organised)
     return settings if config.steps is None else deepmapping.with_steps(settings, config.steps)
 
 
 def before_and_after(sequence: ScanSequence, start: Floats, poses: Floats) -> dict[str, Any]:
-    """Errors of the kept poses and of the start; `success` is unknown where there is no reference."""
+    """Returns errors of the kept poses and of the start; `success` is None where there is no reference."""
     reference, unit = sequence.reference_poses, sequence.unit
     if reference is None:
         return {"success": None}
@@ -238,14 +204,14 @@ def before_and_after(sequence: ScanSequence, start: Floats, poses: Floats) -> di
 
 
 def write_trajectories(folder: RunFolder, sequence: ScanSequence, poses: Floats) -> None:
-    """trajectory.npy, trajectory_tum.txt, trajectory_kitti.txt: T_world_scan of every scan."""
+    """Writes T_world_scan of every scan: trajectory.npy, trajectory_tum.txt, trajectory_kitti.txt."""
     io.write_poses_npy(folder / "trajectory.npy", poses)
     io.write_tum(folder / "trajectory_tum.txt", poses, times=sequence.times, unit=sequence.unit)
     io.write_kitti(folder / "trajectory_kitti.txt", poses)
 
 
 def draw_map(folder: RunFolder, task: Task, candidates: Candidates, metrics: Mapping[str, Any]) -> viz.Limits:
-    """map.png: the start, DeepMapping, the candidate that was kept, and the reference; returns what it shows."""
+    """Draws map.png: the start, DeepMapping, the kept candidate, the reference; returns its limits."""
     scans, unit, kept = task.scans, task.sequence.unit, metrics["kept"]
     panels = []
     for name in dict.fromkeys((metrics["start"], shared.DEEPMAPPING, kept)):
@@ -263,7 +229,7 @@ def draw_map(folder: RunFolder, task: Task, candidates: Candidates, metrics: Map
 
 
 def draw_occupancy(folder: RunFolder, sequence: ScanSequence, run: FitRun, kept: Floats, limits: viz.Limits) -> None:
-    """occupancy.png: what M-Net learned, in the frame and within the limits of map.png."""
+    """Draws occupancy.png: what M-Net learned, in the frame and within the limits of map.png."""
     if not run.has_map:
         return
     picture = deepmapping.draw_map(run.fitted, sequence.points, sequence.mask)
@@ -275,7 +241,7 @@ def draw_occupancy(folder: RunFolder, sequence: ScanSequence, run: FitRun, kept:
 
 
 def draw_loss(folder: RunFolder, unit: str) -> None:
-    """loss.png: loss and error of the fit over its run time."""
+    """Draws loss.png: loss and error of the fit over its run time."""
     rows = read_history(folder / HISTORY)
     if rows:
         seconds, loss, ate = (
@@ -285,22 +251,21 @@ def draw_loss(folder: RunFolder, unit: str) -> None:
         viz.save_figure(viz.history_figure(history, unit), folder / "loss.png")
 
 
-def report(unit: str, metrics: Mapping[str, Any]) -> list[str]:
-    """The last lines on the console: every candidate with its error and scores, and whether to trust the kept one."""
-    candidates = metrics["candidates"]
+def report(unit: str, metrics: Mapping[str, Any]) -> str:
+    """Returns the last lines on the console: errors and scores of each candidate, assessment of the kept one."""
+    candidates, assessment = metrics["candidates"], metrics["assessment"]
     width = max(map(len, candidates))
     lines = [f"  {'candidate':{width}}  {'ATE, ' + unit:>10}  nats a beam  beams off a surface"]
     for name, numbers in candidates.items():
         mark, ate = "*" if name == metrics["kept"] else " ", numbers.get(f"ate_{unit}", math.nan)
         lines.append(f"{mark} {name:{width}}  {ate:10.3g}  {numbers['code_length']:11.3f}  {numbers['misfit']:19.1%}")
-    assessment = metrics["assessment"]
     trust = "can be trusted" if assessment["is_trusted"] else "DO NOT TRUST this map"
-    return [
-        *lines,
+    weakest, contradiction = assessment["weakest_connection"], assessment["contradiction"]
+    lines += [
         f"kept: {metrics['kept']} (chosen by the scans alone)",
-        f"{trust}: weakest connection {assessment['weakest_connection']:.0%} of the beams, "
-        f"{assessment['contradiction']:.1%} contradict others",
+        f"{trust}: weakest connection {weakest:.0%} of the beams, {contradiction:.1%} contradict others",
     ]
+    return "\n".join(lines)
 
 
 if __name__ == "__main__":

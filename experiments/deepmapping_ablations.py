@@ -22,7 +22,7 @@ from tqdm import tqdm
 from tyro.conf import arg
 
 from experiments._command import StopFlag, run_command
-from experiments._json import load_json, write_json
+from experiments._result_files import load_json, write_json
 from experiments._rgbd_methods import errors_of
 from experiments._run_folder import RunFolder, RunOptions, open_run_folder, recording, write_metrics
 
@@ -117,26 +117,24 @@ def settings_of(ablation: str, variant: str, config: Config) -> DepthMappingConf
         num_free=4,
         is_free_factor_shared=False,
     )
-    localization = depth_preset("fast").localization
-    occupancy = OccupancyConfig(features=(64,) * 6)
-    if ablation == "lnet" and variant == "PointNet":
-        localization = replace(localization, kind="point")
-    elif ablation == "mnet":
-        occupancy = {
-            "MLP": occupancy,
-            "ResMLP": OccupancyConfig(kind="resmlp", features=(64, 64, 64, 128, 128)),
-            "grid": depth_preset("fast").occupancy,
-        }[variant]
-        if variant == "grid":
-            phase = replace(phase, map_learning_rate=0.1, map_decay=1e-3)
-    elif ablation == "depth":
-        occupancy = OccupancyConfig(features=(64,) * int(variant))
-    elif ablation == "width":
-        occupancy = OccupancyConfig(features=(int(variant),) * 4)
-    elif ablation == "chamfer" and variant == "without":
-        phase = replace(phase, occupancy_weight=1.0)
-    elif ablation == "free":
-        phase = replace(phase, num_free=int(variant))
+    fast, number = depth_preset("fast"), int(variant) if variant.isdigit() else 0
+    localization = replace(fast.localization, kind="point") if variant == "PointNet" else fast.localization
+    maps = {
+        "ResMLP": OccupancyConfig(kind="resmlp", features=(64, 64, 64, 128, 128)),
+        "grid": fast.occupancy,
+        "depth": OccupancyConfig(features=(64,) * number),
+        "width": OccupancyConfig(features=(number,) * 4),
+    }
+    changes: dict[str, dict[str, Any]] = {
+        "grid": {"map_learning_rate": 0.1, "map_decay": 1e-3},
+        "without": {"occupancy_weight": 1.0},
+        "free": {"num_free": number},
+    }
+    changed = ablation if number else variant
+    phase, occupancy = (
+        replace(phase, **changes.get(changed, {})),
+        maps.get(changed, OccupancyConfig(features=(64,) * 6)),
+    )
     per_call = min(50, config.steps)
     return DepthMappingConfig((phase,), (phase,), localization, occupancy, steps_per_call=per_call)
 
@@ -158,24 +156,20 @@ def run_one(trajectory: int, settings: DepthMappingConfig, config: Config) -> di
 
 def summarise(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
     """A row a variant."""
+    groups: dict[tuple[str, str], list[dict[str, Any]]] = {
+        (ablation, variant): [row for row in rows if (row["ablation"], row["variant"]) == (ablation, variant)]
+        for ablation, variants in VARIANTS.items()
+        for variant in variants
+    }
     table = []
-    for ablation, variants in VARIANTS.items():
-        for variant in variants:
-            some = [row for row in rows if (row["ablation"], row["variant"]) == (ablation, variant)]
-            if not some:
-                continue
+    for (ablation, variant), some in groups.items():
+        if some:
             ate = np.array([row["ate_mm"] for row in some])
-            table.append(
-                {
-                    "ablation": ablation,
-                    "variant": variant,
-                    "num_runs": len(some),
-                    "median_ate_mm": float(np.median(ate)),
-                    "quartiles_ate_mm": [float(q) for q in np.quantile(ate, [0.25, 0.75])],
-                    "success": float((ate < _SUCCESS_MM).mean()),
-                    "median_run_s": float(np.median([row["run_s"] for row in some])),
-                }
-            )
+            numbers = {"median_ate_mm": np.median(ate), "success": (ate < _SUCCESS_MM).mean()}
+            numbers["median_run_s"] = np.median([row["run_s"] for row in some])
+            case = {"ablation": ablation, "variant": variant, "num_runs": len(some)}
+            quartiles = np.quantile(ate, [0.25, 0.75]).tolist()
+            table.append({**case, **{key: float(n) for key, n in numbers.items()}, "quartiles_ate_mm": quartiles})
     return table
 
 

@@ -9,6 +9,8 @@ Trajectories of 256 poses in the built-in worlds, thinned to every 1st, 2nd, 4th
 
 from __future__ import annotations
 
+import itertools
+from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -20,9 +22,9 @@ from tyro.conf import arg
 
 from dpmjax import simulation, viz
 from experiments import _deepmapping_methods as shared
-from experiments._command import run_command
+from experiments._command import check_least, check_names, run_command
 from experiments._deepmapping_methods import Task
-from experiments._run_folder import RunFolder, RunOptions, open_run_folder, write_metrics
+from experiments._run_folder import RunFolder, write_metrics
 
 EXPERIMENT = "deepmapping_limits"
 COLUMNS = ("icp-plane", "icp-refined", "direct-adam", "global-deepmapping", "refined-deepmapping")
@@ -31,7 +33,7 @@ NUM_SCANS, NUM_WORLDS = 256, 3
 
 
 @dataclass(frozen=True, kw_only=True)
-class Config(RunOptions):
+class Config(shared.TableOptions):
     """Options of the grid."""
 
     may_change: ClassVar[frozenset[str]] = frozenset({"limit", "methods", "strides", "noises_px", "orders"})
@@ -46,39 +48,21 @@ class Config(RunOptions):
     """With the order of time, or without."""
     methods: tuple[str, ...] = COLUMNS
     """Methods to compare."""
-    steps: int = 600
-    """Steps of the fit."""
 
     def __post_init__(self) -> None:
         """Checks names and ranges."""
-        shared.check_methods(self.methods)
-        if not self.orders or any(order not in ORDERS for order in self.orders):
-            raise ValueError(f"--orders: expected some of {', '.join(ORDERS)}, got {', '.join(self.orders) or 'none'}")
-        if self.limit < 1 or self.steps < 2 or any(s < 1 or s > NUM_SCANS // 4 for s in self.strides):
-            raise ValueError(f"--limit, --steps, --strides: expected at least 1, at least 2, 1 to {NUM_SCANS // 4}")
-        if any(noise < 0 for noise in self.noises_px):
-            raise ValueError(f"--noises-px: expected zero or more, got {self.noises_px}")
+        super().__post_init__()
+        check_names("--orders", self.orders, ORDERS)
+        check_least(self, limit=1, strides=1, noises_px=0)
+        if max(self.strides) > NUM_SCANS // 4:
+            raise ValueError(f"--strides: expected at most {NUM_SCANS // 4}, got {max(self.strides)}")
 
 
 def main(config: Config) -> list[dict[str, Any]]:
     """Runs what is missing, cell by cell."""
-    folder = open_run_folder(config, EXPERIMENT)
-    names, missing = shared.split_by_extras(config.methods)
-    cells = [
-        {"stride": stride, "noise_px": noise, "order": order, "walk": walk}
-        for stride in config.strides
-        for walk in range(config.limit)
-        for noise in config.noises_px
-        for order in config.orders
-    ]
-    write = partial(_write, folder, config)
-    rows = shared.run_cells(folder, cells, names, partial(_prepare, config), write, seed=config.seed)
-    for line in summary(rows):
-        print(line)
-    for name, reason in missing.items():
-        print(f"{name}: not run ({reason})")
-    print(f"results in {folder.path}")
-    return rows
+    grid = itertools.product(config.strides, range(config.limit), config.noises_px, config.orders)
+    cells = [{"stride": stride, "noise_px": noise, "order": order, "walk": walk} for stride, walk, noise, order in grid]
+    return shared.run_table(config, EXPERIMENT, cells, partial(_prepare, config), partial(_write, config))
 
 
 def _prepare(config: Config, cell: dict[str, Any]) -> tuple[Task, dict[str, Any]]:
@@ -91,18 +75,17 @@ def _prepare(config: Config, cell: dict[str, Any]) -> tuple[Task, dict[str, Any]
 
 
 def success_grid(rows: list[dict[str, Any]], method: str, order: str, config: Config) -> NDArray[np.float64]:
-    """(strides, noises) success rates, smallest stride first; NaN where nothing was run."""
-    grid = np.full((len(config.strides), len(config.noises_px)), np.nan)
-    for i, stride in enumerate(sorted(config.strides)):
-        for j, noise in enumerate(config.noises_px):
-            key = (method, order, stride, noise)
-            mine = [r["success"] for r in rows if (r["method"], r["order"], r["stride"], r["noise_px"]) == key]
-            grid[i, j] = np.mean(mine) if mine else np.nan
-    return grid
+    """Returns (strides, noises) success rates, smallest stride first; NaN where nothing was run."""
+    cells: dict[tuple[Any, ...], list[bool]] = defaultdict(list)
+    for row in rows:
+        cells[row["method"], row["order"], row["stride"], row["noise_px"]].append(row["success"])
+    means = {cell: np.mean(successes) for cell, successes in cells.items()}
+    strides = sorted(config.strides)
+    return np.array([[means.get((method, order, i, j), np.nan) for j in config.noises_px] for i in strides])
 
 
 def summary(rows: Sequence[dict[str, Any]]) -> list[str]:
-    """One line for each order and method: mean success over all cells that were run, and at every 8th scan."""
+    """Returns one line for each order and method: mean success of all cells that were run, and at every 8th scan."""
     lines = []
     for order, method in dict.fromkeys((row["order"], row["method"]) for row in rows):
         mine = [row for row in rows if (row["order"], row["method"]) == (order, method)]
@@ -112,16 +95,11 @@ def summary(rows: Sequence[dict[str, Any]]) -> list[str]:
     return lines
 
 
-def _write(folder: RunFolder, config: Config, rows: list[dict[str, Any]]) -> None:
-    """metrics.json and one picture an order."""
-    trusted = [row["success"] for row in rows if row["is_trusted"]]
-    metrics = {
-        "success_threshold_px": shared.SUCCESS_PX,
-        "summary": summary(rows),
-        "num_trusted": len(trusted),
-        "success_of_trusted": float(np.mean(trusted)) if trusted else None,
-    }
-    write_metrics(folder, metrics, seed=config.seed, rows=rows)
+def _write(config: Config, folder: RunFolder, rows: list[dict[str, Any]], not_run: dict[str, str]) -> str:
+    """Writes metrics.json and one picture an order; returns the summary."""
+    lines = summary(rows)
+    metrics = {"success_threshold_px": shared.SUCCESS_PX, "summary": lines, "not_run": not_run}
+    write_metrics(folder, metrics | shared.success_of_trusted(rows), seed=config.seed, rows=rows)
     methods = dict.fromkeys(row["method"] for row in rows)
     for order in config.orders:
         figure = viz.success_grids_figure(
@@ -130,6 +108,7 @@ def _write(folder: RunFolder, config: Config, rows: list[dict[str, Any]]) -> Non
             {"range noise, px": [f"{noise:g}" for noise in config.noises_px]},
         )
         viz.save_figure(figure, folder / f"{order}.png")
+    return "\n".join(lines)
 
 
 if __name__ == "__main__":

@@ -7,6 +7,7 @@ Each run keeps its own folder below OUT, with its pictures; a run that is finish
 
 from __future__ import annotations
 
+import itertools
 import subprocess
 import sys
 from dataclasses import dataclass
@@ -15,12 +16,11 @@ from typing import Annotated, Any
 
 from tyro.conf import Positional, arg
 
-from experiments._command import run_command
-from experiments._json import load_json
+from experiments._command import EXIT_BAD_INPUT, run_command
+from experiments._result_files import load_json
 from experiments._run_folder import METRICS, RunFolder, write_metrics
 
 EXPERIMENT = "deepmapping_logs"
-_BAD_INPUT = 2
 
 
 @dataclass(frozen=True)
@@ -44,27 +44,25 @@ def main(config: Config) -> list[dict[str, Any]]:
     logs = sorted(p for p in config.logs.glob("*") if p.name.endswith((".log", ".log.gz", ".clf")))
     if not logs:
         raise ValueError(f"{config.logs}: no .log, .log.gz or .clf file there; name a folder of CARMEN logs")
-    rows = []
-    for log in logs:
-        for init in config.inits:
-            metrics = _run(log, init, config)
-            if metrics is not None:
-                # A row has the commit of its own run, which may be an earlier one.
-                rows.append({"log": log.name.split(".")[0], "init": init, **metrics})
-                write_metrics(RunFolder(config.output, is_resumed=True), {}, seed=config.seed, rows=rows)
+    rows: list[dict[str, Any]] = []
+    for log, init in itertools.product(logs, config.inits):
+        if (metrics := _run(log, init, config)) is not None:
+            # A row has the commit of its own run, which may be an earlier one.
+            rows.append({"log": log.name.split(".")[0], "init": init, **metrics})
+            write_metrics(RunFolder(config.output, is_resumed=True), {}, seed=config.seed, rows=rows)
     print(markdown(rows))
     return rows
 
 
 def _run(log: Path, init: str, config: Config) -> dict[str, Any] | None:
-    """Metrics of one run in a process of its own, whose peak memory is its own; None where the log lacks odometry."""
+    """Returns the metrics of one run, in a process with a peak memory of its own; None where the log lacks odometry."""
     folder = config.output / f"{log.name.split('.')[0]}_{init}"
     if not (folder / METRICS).exists():
         command = [sys.executable, "-m", "experiments.deepmapping_2d", str(log), "-o", str(folder), "--force"]
         command += ["--init", init, "--seed", str(config.seed)]
         command += [] if config.steps is None else ["--steps", str(config.steps)]
         code = subprocess.run(command).returncode
-        if code == _BAD_INPUT:
+        if code == EXIT_BAD_INPUT:
             return None
         if code != 0:
             raise RuntimeError(f"{log} from {init}: the run ended with exit code {code}")
@@ -72,14 +70,10 @@ def _run(log: Path, init: str, config: Config) -> dict[str, Any] | None:
 
 
 def markdown(rows: list[dict[str, Any]]) -> str:
-    """The table as README text."""
-    lines = ["| log | scans | start | ATE before, m | ATE after, m | kept |", "|---|---|---|---|---|---|"]
-    for row in rows:
-        before, after = row["ate_initial_m"], row["ate_m"]
-        lines.append(
-            f"| {row['log']} | {row['num_scans']} | {row['init']} | {before:.2f} | {after:.2f} | {row['kept']} |"
-        )
-    return "\n".join(lines)
+    """Returns the table as Markdown."""
+    head = "| log | scans | start | ATE before, m | ATE after, m | kept |\n|---|---|---|---|---|---|\n"
+    line = "| {log} | {num_scans} | {init} | {ate_initial_m:.2f} | {ate_m:.2f} | {kept} |"
+    return head + "\n".join(line.format_map(row) for row in rows)
 
 
 if __name__ == "__main__":

@@ -22,8 +22,8 @@ from tyro.conf import Positional, arg
 
 from experiments import deepmapping_2d
 from experiments._command import run_command
-from experiments._json import write_json
 from experiments._machine import environment
+from experiments._result_files import write_json
 from experiments._run_folder import CHECKPOINTS, find_run, load_config
 
 if TYPE_CHECKING:
@@ -149,23 +149,20 @@ def load_fit(run: Path, options: deepmapping_2d.Config, sequence: ScanSequence) 
     from dpmjax.checkpoints import Checkpoints
     from dpmjax.deepmapping import Fitted
     from dpmjax.deepmapping.fit import init
-    from dpmjax.deepmapping.planar import planar_problem, scale_scans, start_poses
-    from dpmjax.geometry import se2
+    from dpmjax.deepmapping.planar import planar_data, planar_problem
     from dpmjax.types import ScanSet
 
     trajectory = run / "trajectory.npy"
     if not trajectory.is_file():
         raise ValueError(f"{run} holds no trajectory.npy: let the run end, or resume it")
     settings = deepmapping_2d.fit_settings(options, sequence)
-    scans, unit = scale_scans(ScanSet(sequence.points, sequence.mask))
     poses = np.load(trajectory)
-    is_warm = options.init != "zero"
-    start = start_poses(poses, len(sequence), unit) if is_warm else None
-    like = init(planar_problem(settings, is_warm=is_warm), scans, key=jax.random.key(0), start=start)
+    data, unit = planar_data(ScanSet(sequence.points, sequence.mask), None if options.init == "zero" else poses)
+    like = init(planar_problem(settings, data), data, key=jax.random.key(0))
     state = Checkpoints((run / CHECKPOINTS).resolve()).restore_latest(like, fallback=None)
     if state is None:
         raise ValueError(f"{run} holds no checkpoint that can be read")
-    return Fitted(se2.to_matrix(poses), poses, state.params, None, unit, settings)
+    return Fitted(poses, state.params, None, unit, settings)
 
 
 def free_poses(grid: NDArray[np.bool_], sequence: ScanSequence, config: Config) -> NDArray[np.float64]:

@@ -25,8 +25,8 @@ from tqdm import tqdm
 from tyro.conf import Positional, arg
 
 from experiments._command import StopFlag, run_command
-from experiments._json import load_json, write_json
 from experiments._machine import peak_rss_gb
+from experiments._result_files import load_json, write_json
 from experiments._rgbd_methods import METHODS, errors_of, run_method
 from experiments._run_folder import RunFolder, RunOptions, open_run_folder, recording, write_metrics
 
@@ -138,11 +138,7 @@ def fit_settings(config: Config, sequence: DepthSequence) -> DepthMappingConfig:
 
 
 def run_one(
-    folder: RunFolder,
-    config: Config,
-    sequence: DepthSequence,
-    settings: DepthMappingConfig,
-    index: int,
+    folder: RunFolder, config: Config, sequence: DepthSequence, settings: DepthMappingConfig, index: int
 ) -> dict[str, Any]:
     """All methods on one trajectory; a fit from the result of another method is timed without that method.
 

@@ -20,8 +20,8 @@ import numpy as np
 from tyro.conf import arg
 
 from experiments._command import run_command
-from experiments._json import load_json, write_json
 from experiments._machine import environment, peak_rss_gb
+from experiments._result_files import load_json, write_json
 from experiments._run_folder import FolderOptions, open_run_folder, recording, write_metrics
 
 EXPERIMENT = "deepmapping_size"
@@ -78,14 +78,13 @@ _KEYS = ("num_scans", "network", "free", "data_gb", "peak_rss_gb")
 
 def curves(rows: list[dict[str, Any]]) -> dict[str, Any]:
     """What is drawn and fitted, by name."""
-    return {
-        "num_scans": np.array([row["num_scans"] for row in rows], np.float64),
-        "step, L-Net (s)": np.array([row["network"]["step_s"] for row in rows]),
-        "step, free poses (s)": np.array([row["free"]["step_s"] for row in rows]),
-        "epoch, L-Net (s)": np.array([row["network"]["epoch_s"] for row in rows]),
-        "epoch, free poses (s)": np.array([row["free"]["epoch_s"] for row in rows]),
-        "peak memory (GB)": np.array([row["peak_rss_gb"] for row in rows]),
+    columns = {
+        f"{title}, {net} (s)": np.array([row[phase][f"{title}_s"] for row in rows])
+        for title in ("step", "epoch")
+        for net, phase in (("L-Net", "network"), ("free poses", "free"))
     }
+    sizes, memory = (np.array([row[key] for row in rows], np.float64) for key in ("num_scans", "peak_rss_gb"))
+    return {"num_scans": sizes, **columns, "peak memory (GB)": memory}
 
 
 def exponents(rows: list[dict[str, Any]]) -> dict[str, float | None]:
@@ -107,23 +106,23 @@ def measure(num_scans: int, num_calls: int, seed: int, output: str) -> None:
 
     from dpmjax.deepmapping import preset
     from dpmjax.deepmapping.fit import fit, steps_per_call
-    from dpmjax.deepmapping.planar import planar_problem, scale_scans, start_poses
+    from dpmjax.deepmapping.planar import planar_data, planar_problem
     from dpmjax.simulation import simulate_sequence
     from dpmjax.types import ScanSet
 
     sequence = simulate_sequence(0, num_scans, seed=seed, with_odometry=True)
     before_gb = peak_rss_gb()
-    scans, unit = scale_scans(ScanSet(sequence.points, sequence.mask))
+    scans = ScanSet(sequence.points, sequence.mask)
     assert sequence.odometry_poses is not None
     phases: dict[str, Any] = {}
     for name, odometry in (("network", None), ("free", sequence.odometry_poses)):
-        problem = planar_problem(preset("fast"), is_warm=odometry is not None)
+        data, _ = planar_data(scans, odometry)
+        problem = planar_problem(preset("fast"), data)
         run_s = [0.0]
         done = fit(
             problem,
-            scans,
+            data,
             key=jax.random.key(seed),
-            start=None if odometry is None else start_poses(odometry, len(sequence), unit),
             on_report=lambda progress, run_s=run_s: run_s.append(progress.run_s),
             stop=lambda run_s=run_s: len(run_s) > num_calls,
         )

@@ -15,48 +15,40 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar
+from typing import Annotated, Any, ClassVar
 
 import numpy as np
 from tyro.conf import arg
 
-from dpmjax import simulation, viz
+from dpmjax import metrics, simulation, viz
 from experiments import _deepmapping_methods as shared
-from experiments._command import run_command
+from experiments._command import check_least, run_command
 from experiments._deepmapping_methods import Task
-from experiments._run_folder import RunFolder, RunOptions, open_run_folder, write_metrics
-
-if TYPE_CHECKING:
-    pass
+from experiments._run_folder import RunFolder, write_metrics
 
 EXPERIMENT = "deepmapping_suite"
 NUM_WORLDS, NUM_SHORT, NUM_LONG = 3, 50, 25
 
 
 @dataclass(frozen=True, kw_only=True)
-class Config(RunOptions):
+class Config(shared.TableOptions):
     """Options of the suite."""
 
     may_change: ClassVar[frozenset[str]] = frozenset({"limit", "methods"})
 
     limit: Annotated[int | None, arg(metavar="N")] = None
     """Only the first N trajectories; they go through worlds and lengths in turn."""
-    methods: tuple[str, ...] = tuple(shared.METHODS)
-    """Columns."""
-    steps: int = 600
-    """Steps of the fit."""
     range_noise_px: Annotated[float, arg(metavar="PX")] = 0.0
     """Standard deviation of the range noise."""
 
     def __post_init__(self) -> None:
         """Checks names and ranges."""
-        shared.check_methods(self.methods)
-        if self.steps < 2 or (self.limit is not None and self.limit < 1) or self.range_noise_px < 0:
-            raise ValueError("--steps, --limit and --range-noise-px: expected at least 2, 1 and 0")
+        super().__post_init__()
+        check_least(self, limit=1, range_noise_px=0)
 
 
 def list_trajectories() -> list[dict[str, int]]:
-    """World, length and seed of all 75, ordered so that the first few are of all kinds."""
+    """Returns world, length and seed of all 75, ordered so that the first few are of all kinds."""
     short = [{"world": k % NUM_WORLDS, "num_scans": 128, "walk": k} for k in range(NUM_SHORT)]
     long = [{"world": k % NUM_WORLDS, "num_scans": 256, "walk": 100 + k} for k in range(NUM_LONG)]
     # Two short ones, then a long one.
@@ -65,45 +57,31 @@ def list_trajectories() -> list[dict[str, int]]:
 
 def main(config: Config) -> list[dict[str, Any]]:
     """Runs what is missing, writes the table after every trajectory."""
-    folder = open_run_folder(config, EXPERIMENT)
-    names, missing = shared.split_by_extras(config.methods)
-    not_run = shared.NOT_RUN | missing
-    write = partial(_write, folder, not_run=not_run, seed=config.seed)
     cells = list_trajectories()[: config.limit]
-    rows = shared.run_cells(folder, cells, names, partial(_prepare, config), write, seed=config.seed)
-    print(table(rows))
-    if config.range_noise_px and rows:
-        bound = float(np.median([row["bound_px"] for row in rows]))
-        print(f"no unbiased estimate can have a median ATE below {bound:.3g} px, not even with the world known")
-    for name, reason in not_run.items():
-        print(f"{name}: not run ({reason})")
-    print(f"results in {folder.path}")
-    return rows
+    return shared.run_table(config, EXPERIMENT, cells, partial(_prepare, config), partial(_write, config.seed))
 
 
 def _prepare(config: Config, cell: dict[str, Any]) -> tuple[Task, dict[str, Any]]:
-    """The scans of a trajectory, and with noise the Cramer-Rao bound on their ATE."""
+    """Returns the scans of a trajectory, and with noise the Cramer-Rao bound on their ATE."""
     world, noise = cell["world"], config.range_noise_px
     sequence = simulation.simulate_sequence(world, cell["num_scans"], seed=cell["walk"], range_noise_px=noise)
     task = shared.make_task(sequence, steps=config.steps, seed=config.seed)
     if not noise:
         return task, {}
     assert sequence.reference_poses is not None
-    is_obstacle, num_beams = simulation.make_world(world).is_obstacle, sequence.mask.shape[1]
-    bound = simulation.position_bound(is_obstacle, sequence.reference_poses, range_noise_px=noise, num_beams=num_beams)
+    cast = partial(simulation.cast_scans, simulation.make_world(world).is_obstacle, num_beams=sequence.mask.shape[1])
+    bound = metrics.position_bound(cast, sequence.reference_poses, range_noise=noise)
     return task, {"bound_px": float(np.sqrt(np.mean(bound**2)))}
 
 
 def summarise(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """Medians and success of the rows of one method, of each of its candidates, and how right its assessment was."""
-    trusted = [row["success"] for row in rows if row["is_trusted"]]
-    names = list(dict.fromkeys(name for row in rows for name in row["candidates"]))
-    summary = {
+    """Returns medians and success of one method and of each of its candidates, and how right its assessment was."""
+    names = dict.fromkeys(name for row in rows for name in row["candidates"])
+    medians = {"median_s": "seconds", "median_cpu_s": "cpu_s", "median_bound_px": "bound_px"}
+    return {
         **_medians(rows),
-        "median_s": float(np.median([row["seconds"] for row in rows])),
-        "median_cpu_s": float(np.median([row["cpu_s"] for row in rows])),
-        "num_trusted": len(trusted),
-        "success_of_trusted": float(np.mean(trusted)) if trusted else None,
+        **{name: float(np.median([row[key] for row in rows])) for name, key in medians.items() if key in rows[0]},
+        **shared.success_of_trusted(rows),
         "candidates": {
             name: {
                 **_medians([row["candidates"][name] for row in rows if name in row["candidates"]]),
@@ -112,9 +90,6 @@ def summarise(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
             for name in names
         },
     }
-    if "bound_px" in rows[0]:
-        summary["median_bound_px"] = float(np.median([row["bound_px"] for row in rows]))
-    return summary
 
 
 def _medians(numbers: Sequence[dict[str, Any]]) -> dict[str, Any]:
@@ -128,13 +103,13 @@ def _medians(numbers: Sequence[dict[str, Any]]) -> dict[str, Any]:
 
 
 def by_method(rows: Sequence[dict[str, Any]]) -> dict[str, list[dict[str, Any]]]:
-    """The rows of each method, in the order in which the methods were run."""
+    """Returns the rows of each method, in the order in which the methods were run."""
     names = dict.fromkeys(row["method"] for row in rows)
     return {name: [row for row in rows if row["method"] == name] for name in names}
 
 
 def table(rows: Sequence[dict[str, Any]]) -> str:
-    """The table as Markdown: a row for each method, and below it one for each of several candidates."""
+    """Returns the table as Markdown: a row for each method, and below it one for each of several candidates."""
     lines = [
         "| method | trajectories | median ATE, px | median point distance, px | success (ATE < 20 px) | median s "
         "| trusted | of these right |",
@@ -158,23 +133,24 @@ def table(rows: Sequence[dict[str, Any]]) -> str:
     return "\n".join(lines)
 
 
-def _write(folder: RunFolder, rows: list[dict[str, Any]], *, not_run: dict[str, str], seed: int) -> None:
-    """table.md, metrics.json, boxes.png."""
+def _write(seed: int, folder: RunFolder, rows: list[dict[str, Any]], not_run: dict[str, str]) -> str:
+    """Writes table.md, metrics.json and boxes.png; returns the table."""
     groups = by_method(rows)
-    metrics = {
-        "success_threshold_px": shared.SUCCESS_PX,
-        "methods": {
-            method: {"title": shared.METHODS[method].title, **summarise(mine)} for method, mine in groups.items()
-        },
-        "not_run": not_run,
-    }
-    note = write_metrics(folder, metrics, seed=seed, rows=rows)
-    (folder / "table.md").write_text(table(rows) + (f"\n\n{note}.\n" if note else "\n"), encoding="utf-8")
+    methods = {method: {"title": shared.METHODS[method].title, **summarise(mine)} for method, mine in groups.items()}
+    numbers = {"success_threshold_px": shared.SUCCESS_PX, "methods": methods, "not_run": not_run}
+    note = write_metrics(folder, numbers, seed=seed, rows=rows)
+    text = table(rows)
+    bounds = [row["bound_px"] for row in rows if "bound_px" in row]
+    if bounds:
+        least = f"{np.median(bounds):.3g} px"
+        text += f"\n\nNo unbiased estimate has a median ATE below {least}, not even where the world is known."
+    (folder / "table.md").write_text(text + (f"\n\n{note}.\n" if note else "\n"), encoding="utf-8")
     panels = {
         label: {method: [row[key] for row in mine] for method, mine in groups.items()}
         for label, key in (("ATE, px", "ate_px"), ("point distance, px", "point_distance_px"))
     }
     viz.save_figure(viz.error_boxes_figure(panels, threshold=shared.SUCCESS_PX), folder / "boxes.png")
+    return text
 
 
 if __name__ == "__main__":

@@ -26,13 +26,13 @@ import numpy as np
 from tyro.conf import FlagCreatePairsOff, arg
 
 from experiments._command import StopFlag, run_command
-from experiments._history import read_history
 from experiments._machine import peak_rss_gb, select_device
+from experiments._result_files import read_history
 from experiments._run_folder import HISTORY, METRICS, RunFolder, open_run_folder, recording, write_metrics
 
 if TYPE_CHECKING:
     from dpmjax.deeppointmap import Model, TrainingConfig
-    from dpmjax.deeppointmap.evaluation import Evaluation, EvaluationPairs
+    from dpmjax.deeppointmap.inference import Evaluation, EvaluationPairs
     from dpmjax.deeppointmap.training_loop import Trained
     from experiments._dpm_run import Records
 
@@ -95,52 +95,31 @@ class Config:
             raise ValueError("--data: expected town or a folder of scans")
 
 
-@dataclass(frozen=True)
-class Result:
-    """Result of a run.
-
-    Attributes:
-        folder: folder of the run; None in all processes but the first.
-        metrics: content of `metrics.json`.
-    """
-
-    folder: Path | None
-    metrics: dict[str, Any]
-
-
-def main(config: Config) -> Result:
-    """Returns the result after training, evaluation and writing of the files."""
-    from dpmjax.deeppointmap.processes import join_processes, merged, together
+def main(config: Config) -> None:
+    """Trains, evaluates, and writes the files; one of several processes writes."""
+    from dpmjax.deeppointmap.processes import is_first, join_processes, merged, together
 
     started = time.perf_counter()
     join_processes(config.coordinator, config.num_processes, config.process_id)
     select_device(config.device)
-    from dpmjax.deeppointmap import ScanStore
+    from dpmjax.deeppointmap import ScanStore, TrainingHooks
     from experiments._dpm_run import open_drives, run_training
 
     with together():
         settings = training_settings(config)
-        drives = open_drives(
-            config.data, num_towns=config.num_towns, town_length_m=config.town_length_m, seed=config.seed
-        )
-        store = ScanStore(drives, settings.model.preprocess)
-        folder = _open_folder(config)
+        towns = range(config.seed, config.seed + config.num_towns)
+        store = ScanStore(open_drives(config.data, towns, config.town_length_m), settings.model.preprocess)
+        folder = open_run_folder(config, EXPERIMENT) if is_first() else None
     with recording(folder) if folder is not None else nullcontext(), StopFlag() as stop:
         with together():
             records = None if folder is None else _open_records(folder, config, settings, store)
-        trained = run_training(
-            records,
-            store,
-            settings,
-            seed=config.seed,
-            recall_every=config.recall_every,
-            stop=lambda: stop.received or 0,
-        )
+        hooks = TrainingHooks(evaluate_every=config.recall_every, stop=lambda: stop.received or 0)
+        trained = run_training(records, store, settings, hooks, seed=config.seed)
         if trained.stopped_by:
             stop.request(trained.stopped_by)
         bad = merged(store.bad)
         if folder is None or records is None:
-            return Result(None, {})
+            return
         evaluation, metrics = measure(trained, records)
         metrics |= {
             "num_scans": len(store.table),
@@ -154,15 +133,6 @@ def main(config: Config) -> Result:
         write_model(folder, trained.model, config, metrics)
         draw(folder, evaluation, records.pairs)
         print_summary(folder, metrics)
-    return Result(folder.path, metrics)
-
-
-def _open_folder(config: Config) -> RunFolder | None:
-    from dpmjax.deeppointmap.processes import is_first
-
-    if not is_first():
-        return None
-    return open_run_folder(config, EXPERIMENT)
 
 
 def _open_records(folder: RunFolder, config: Config, settings: TrainingConfig, store: Any) -> Records:
@@ -209,9 +179,9 @@ def measure(trained: Trained, records: Records) -> tuple[Evaluation, dict[str, A
         "num_held_out_pairs": len(records.pairs.pairs),
         "steps": int(trained.progress.state.step),
         "best_step": int(trained.progress.best_step) or None,
-        "train_s": records.earlier_s + trained.run_s,
-        "compile_s": trained.compile_s,
-        "scans_per_s": trained.scans_per_s,
+        "train_s": records.earlier_s + trained.speed.run_s,
+        "compile_s": trained.speed.compile_s,
+        "scans_per_s": trained.speed.scans_per_s,
     }
     for suffix, evaluation in evaluations.items():
         recall = evaluation.recall

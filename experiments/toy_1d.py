@@ -147,11 +147,9 @@ def run_paper(toy: ToyConfig, config: Config) -> tuple[dict[str, NDArray[np.floa
     converted = toy_loss(jax.vmap(lambda one: network_value(toy, params.replace(z=one)))(z))
     x_direct, visited = float(direct[chosen, -1]), network[chosen]
     return ends, {
-        "z": np.asarray(z),
-        "converted_loss": np.asarray(converted),
+        "converted": (np.asarray(z), np.asarray(converted)),
         "visited": (visited, np.asarray(toy_loss(visited))),
         "direct_end": (x_direct, float(toy_loss(x_direct))),
-        "network_end": (float(visited[-1]), float(toy_loss(visited[-1]))),
         "network_end_z": float(params.z),
     }
 
@@ -226,7 +224,7 @@ def draw(
 
     x = np.linspace(-VIEW, VIEW, 2401)
     loss = np.asarray(toy_loss(x))
-    viz.save_figure(viz.toy_figure(x, loss, **figure), folder / "toy.png")
+    viz.save_figure(viz.toy_figure((x, loss), **figure), folder / "toy.png")
     viz.save_figure(viz.endings_figure(x, loss, ends, shares), folder / "endings.png")
 
 

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from dpmjax.deepmapping.config import DeepMappingConfig
 from dpmjax.deepmapping.fit import init
-from dpmjax.deepmapping.planar import planar_problem, scale_scans
+from dpmjax.deepmapping.planar import planar_data, planar_problem
 from dpmjax.deepmapping.toy import toy_loss
 from dpmjax.types import ScanSet
 
@@ -36,15 +36,14 @@ def optimize_directly(
     Returns:
         (n, 3) poses, unit of the scans.
     """
-    scaled, unit = scale_scans(scans)
-    num_scans = len(scaled.points)
-    phase = replace(config.warm_phases[-1], scans_per_step=num_scans)
-    problem = planar_problem(replace(config, warm_phases=(phase,)), is_warm=True)
-    start = init(problem, scaled, key=key, start=jnp.zeros((num_scans, 3))).params
+    data, unit = planar_data(scans, np.zeros((len(scans.points), 3)))
+    phase = replace(config.warm_phases[-1], scans_per_step=len(scans.points))
+    problem = planar_problem(replace(config, warm_phases=(phase,)), data)
+    start = init(problem, data, key=key).params
 
     def loss(moving: tuple[Array, Any]) -> Float[Array, ""]:
         params = replace(start, poses=moving[0], occupancy=moving[1])
-        return problem.loss(problem.config, phase, params, scaled, jnp.asarray(phase.num_steps), key)[0]
+        return problem.loss(problem.config, phase, params, data, jnp.asarray(phase.num_steps), key)[0]
 
     solver = jaxopt.LBFGS(loss, maxiter=num_iterations, history_size=10, linesearch="backtracking", maxls=20)
     solution, _ = solver.run((start.poses, start.occupancy))

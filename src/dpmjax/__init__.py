@@ -2,15 +2,14 @@
 
 How the data flows, and the package that each step lives in:
 
-1. `data` reads scans from disk, or simulates a world, into NumPy arrays on the host.
-2. `scans` and `types` make of each a cloud of fixed capacity with a mask.
-3. `registration` aligns pairs the classical way: the warm starts and the baselines.
-4. `deepmapping` registers a whole set by optimising two small networks (`nets`) under two losses (`losses`).
+1. `io` reads scans from disk, `simulation` makes worlds: NumPy arrays on the host.
+2. `scans` and `types` turn each scan into a cloud of fixed capacity with a mask.
+3. `registration` aligns planar scans the classical way, and `pose_graph` solves pose graphs.
+4. `deepmapping` registers a whole set by training two small networks (`nets`) under two losses (`losses`).
 5. `deeppointmap` turns each 3-D scan into a few hundred descriptors and registers descriptor clouds.
-6. `slam` makes of a stream of those an odometry, a map with closed loops, and localisation in it.
-7. `metrics` compares trajectories with a reference, `viz` draws them.
+6. `metrics` compares trajectories with a reference, `viz` draws them.
 
-`geometry` lies under all of them: poses, alignment, neighbours, sampling, normals, rays.
+All of them use `geometry`: poses, alignment, neighbours, sampling, normals, rays.
 The names below are loaded on first use, so that `import dpmjax` costs nothing.
 """
 

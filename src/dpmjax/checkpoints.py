@@ -17,22 +17,18 @@ LOGGER = logging.getLogger("dpmjax.checkpoint")
 class Checkpoints:
     """The checkpoints in a folder, one for each saved step. With several processes, only one may use a folder."""
 
-    def __init__(self, folder: Path, *, num_kept: int = 2) -> None:
+    def __init__(self, folder: Path) -> None:
         """Prepares the folder; the first `save` makes it.
 
         Args:
             folder: where the checkpoints are.
-            num_kept: number of checkpoints to keep; older ones are removed.
         """
-        alone = None
+        processes = ocp.options.MultiprocessingOptions()
         if jax.process_count() > 1:  # without this, orbax waits for the other processes
             this = jax.process_index()
-            alone = ocp.options.MultiprocessingOptions(this, {this}, barrier_sync_key_prefix=f"process_{this}")
+            processes = ocp.options.MultiprocessingOptions(this, {this}, barrier_sync_key_prefix=f"process_{this}")
         self._options = ocp.CheckpointManagerOptions(
-            max_to_keep=num_kept,
-            create=False,
-            enable_async_checkpointing=False,
-            **({} if alone is None else {"multiprocessing_options": alone}),
+            max_to_keep=2, create=False, enable_async_checkpointing=False, multiprocessing_options=processes
         )
         self._folder = folder.resolve()
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import jax
 import jax.numpy as jnp
 
@@ -115,3 +117,32 @@ def require_count(name: str, value: int) -> None:
     """
     if value < 1:
         raise ValueError(f"{name}: expected at least 1, got {value}")
+
+
+def require_fields(config: object, *names: str, low: float, high: float = math.inf) -> None:
+    """Checks that fields of a configuration lie within bounds.
+
+    Args:
+        config: the configuration.
+        *names: of the fields.
+        low: least value.
+        high: largest value.
+
+    Raises:
+        ValueError: a field is out of bounds or NaN.
+    """
+    for name in names:
+        if not low <= getattr(config, name) <= high:
+            expected = f"at least {low}" if high == math.inf else f"from {low} to {high}"
+            raise ValueError(f"{name}: expected {expected}, got {getattr(config, name)}")
+
+
+def require_positive_fields(config: object, *names: str) -> None:
+    """Checks that fields of a configuration are above zero; a `ValueError` names one that is not.
+
+    Args:
+        config: the configuration.
+        *names: of the fields.
+    """
+    for name in names:
+        require_positive(name, getattr(config, name))

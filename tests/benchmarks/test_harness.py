@@ -10,8 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.rows import Row, format_table
-from benchmarks.timing import measure
+from benchmarks.rows import Row, format_table, measure
 
 REPOSITORY = Path(__file__).parents[2]
 

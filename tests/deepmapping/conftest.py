@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from dpmjax.deepmapping.planar import scale_scans
+from dpmjax.deepmapping.planar import planar_data
+from dpmjax.deepmapping.problem import MappingData
 from dpmjax.io import ScanSequence
 from dpmjax.simulation import simulate_sequence
 from dpmjax.types import ScanSet
@@ -19,9 +20,9 @@ def tiny_walk() -> ScanSequence:
 
 
 @pytest.fixture(scope="session")
-def tiny_scans(tiny_walk: ScanSequence) -> ScanSet:
-    """In typical ranges."""
-    return scale_scans(ScanSet(tiny_walk.points, tiny_walk.mask))[0]
+def tiny_data(tiny_walk: ScanSequence) -> MappingData:
+    """In typical ranges, without a start."""
+    return planar_data(ScanSet(tiny_walk.points, tiny_walk.mask))[0]
 
 
 @pytest.fixture(scope="session")

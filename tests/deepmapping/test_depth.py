@@ -13,6 +13,7 @@ from dpmjax import deepmapping as dm
 from dpmjax import io, simulation
 from dpmjax.deepmapping.depth import depth_problem, motion_matrices
 from dpmjax.deepmapping.fit import init
+from dpmjax.deepmapping.problem import MappingData
 from dpmjax.deepmapping.projective_consistency import PixelSample, fit_pinhole, image_consistency
 from dpmjax.metrics import absolute_trajectory_error
 from dpmjax.nets.localization import LocalizationConfig
@@ -109,9 +110,8 @@ def test_masked_pixels_never_matter(walk) -> None:
 
 def test_direct_form_starts_where_the_network_does(scans) -> None:
     config = small("planar")
-    direct, network = (
-        init(depth_problem(c, is_warm=False), scans, key=KEY).params for c in (dm.as_direct(config), config)
-    )
+    data = MappingData(scans)
+    direct, network = (init(depth_problem(c, data), data, key=KEY).params for c in (dm.as_direct(config), config))
     assert float(jnp.abs(direct.poses).max()) > 0.0
     assert float(jnp.abs(network.poses).max()) == 0.0
     assert all(phase.poses == "free" for phase in dm.as_direct(config).cold_phases)

@@ -13,9 +13,9 @@ import pytest
 
 from dpmjax import deepmapping as dm
 from dpmjax.checkpoints import Checkpoints
-from dpmjax.deepmapping.fit import Progress, fit, init, is_finished, step, steps_per_call
+from dpmjax.deepmapping.fit import Progress, fit, init, is_finished, resume, step, steps_per_call
 from dpmjax.deepmapping.planar import planar_problem
-from dpmjax.deepmapping.problem import Problem, draw_offsets
+from dpmjax.deepmapping.problem import MappingData, Problem, draw_offsets
 from dpmjax.nets.localization import LocalizationConfig
 from dpmjax.nets.occupancy import OccupancyConfig
 from tests.tolerances import ACCUMULATED, DOUBLE
@@ -49,8 +49,8 @@ def valley(halve_at: tuple[float, ...] = (0.25, 0.5, 0.75)) -> Problem:
     )
 
 
-def draw_start(config, key, data, start):
-    return 2.0 * jax.random.normal(key) if start is None else start
+def draw_start(config, key, data):
+    return 2.0 * jax.random.normal(key)
 
 
 def descent(config, phase):
@@ -77,7 +77,8 @@ def descend(x: float, num_steps: int) -> float:
 
 
 def test_a_fit_is_plain_gradient_descent_through_all_phases() -> None:
-    done = fit(valley(), jnp.zeros(()), key=KEY, start=jnp.asarray(0.9))
+    problem = replace(valley(), init=lambda config, key, data: jnp.asarray(0.9))
+    done = fit(problem, jnp.zeros(()), key=KEY)
     assert float(done.poses) == pytest.approx(descend(0.9, 80), abs=1e-4)
     assert (int(done.state.step), int(done.state.phase), int(done.state.phase_step)) == (80, 1, 20)
     np.testing.assert_allclose(
@@ -117,7 +118,7 @@ def test_without_halving_all_starts_are_kept_and_each_is_a_fit_of_its_own() -> N
 
 
 def test_diverged_starts_are_dropped_first() -> None:
-    def nan_or_zero(config, key, data, start):
+    def nan_or_zero(config, key, data):
         return jnp.where(jax.random.uniform(key) < 0.5, jnp.nan, 0.5)
 
     problem = replace(valley(), init=nan_or_zero)
@@ -131,9 +132,25 @@ def test_stop_ends_the_fit_and_a_state_goes_on_to_the_same_numbers() -> None:
     # The first phase has 12 calls: the stop falls on the border of the phases.
     assert int(stopped.state.step) == 60
     assert not is_finished(problem, stopped.state)
-    resumed = fit(problem, jnp.zeros(()), key=jax.random.key(9), start=stopped.state)
+    resumed = resume(problem, stopped.state, jnp.zeros(()))
     jax.tree.map(np.testing.assert_array_equal, resumed.state, unbroken.state)
-    assert fit(problem, jnp.zeros(()), key=KEY, start=unbroken.state).report is None
+    assert resume(problem, unbroken.state, jnp.zeros(())).report is None
+
+
+def test_a_second_fit_traces_nothing() -> None:
+    num_traced = 0
+
+    def counted(*arguments):
+        nonlocal num_traced
+        num_traced += 1
+        return valley_loss(*arguments)
+
+    problem = replace(valley(), loss=counted)
+    fit(problem, jnp.zeros(()), key=KEY)
+    first = num_traced
+    assert first > 0
+    fit(problem, jnp.ones(()), key=jax.random.key(8))
+    assert num_traced == first
 
 
 def test_step_by_step_is_the_fit() -> None:
@@ -161,7 +178,7 @@ def test_no_start_is_refused() -> None:
 
 @pytest.mark.parametrize(("num_steps", "expected"), [(60, 60), (20, 20), (61, 63), (25, 25)])
 def test_calls_of_a_step_share_the_steps_of_the_phase(num_steps: int, expected: int) -> None:
-    problem = planar_problem(dm.with_steps(dm.preset("fast"), num_steps), is_warm=True)
+    problem = planar_problem(dm.with_steps(dm.preset("fast"), num_steps), MappingData(None, np.zeros(3)))
     length = steps_per_call(problem, problem.phases[0])
     assert length * -(-num_steps // length) == expected
 
@@ -178,40 +195,40 @@ BRIEF = replace(
     ),
     steps_per_call=2,
 )
-COLD = planar_problem(BRIEF, is_warm=False)
+COLD = planar_problem(BRIEF, MappingData(None))
 
 
-def test_other_data_of_the_same_shape_compile_nothing_in_any_phase(tiny_scans, assert_compiles_nothing) -> None:
-    first = fit(COLD, tiny_scans, key=KEY)
+def test_other_data_of_the_same_shape_compile_nothing_in_any_phase(tiny_data, assert_compiles_nothing) -> None:
+    first = fit(COLD, tiny_data, key=KEY)
     # Another random key and other scans; the problem is made anew from equal settings.
-    other = replace(tiny_scans, points=0.9 * tiny_scans.points)
+    other = MappingData(replace(tiny_data.scans, points=0.9 * tiny_data.scans.points))
     with assert_compiles_nothing():
-        second = fit(planar_problem(replace(BRIEF), is_warm=False), other, key=jax.random.key(4))
+        second = fit(planar_problem(replace(BRIEF), other), other, key=jax.random.key(4))
     assert int(first.state.phase) == int(second.state.phase) == len(COLD.phases) - 1
     assert not np.array_equal(first.poses, second.poses)
 
 
-def test_same_key_same_numbers_and_another_key_others(tiny_scans) -> None:
-    one, same, other = (fit(COLD, tiny_scans, key=key).state for key in (KEY, KEY, jax.random.key(4)))
+def test_same_key_same_numbers_and_another_key_others(tiny_data) -> None:
+    one, same, other = (fit(COLD, tiny_data, key=key).state for key in (KEY, KEY, jax.random.key(4)))
     jax.tree.map(np.testing.assert_array_equal, one, same)
     assert not np.array_equal(*(jax.tree.leaves(s.params.localization)[-1] for s in (one, other)))
 
 
-def test_restored_from_disk_in_any_phase_equals_unbroken(tiny_scans, tmp_path) -> None:
+def test_restored_from_disk_in_any_phase_equals_unbroken(tiny_data, tmp_path) -> None:
     states = []
-    fit(COLD, tiny_scans, key=KEY, on_report=lambda progress: states.append(progress.state))
-    like = init(COLD, tiny_scans, key=jax.random.key(0))
+    fit(COLD, tiny_data, key=KEY, on_report=lambda progress: states.append(progress.state))
+    like = init(COLD, tiny_data, key=jax.random.key(0))
     for number, state in enumerate(states[:-1]):
         folder = tmp_path / str(number)
         Checkpoints(folder).save(int(state.step), state)
         restored = Checkpoints(folder).restore_latest(like, fallback=None)
         jax.tree.map(np.testing.assert_array_equal, restored, state)
-    resumed = fit(COLD, tiny_scans, key=KEY, start=restored)
+    resumed = resume(COLD, restored, tiny_data)
     jax.tree.map(np.testing.assert_array_equal, resumed.state, states[-1])
 
 
-def test_several_planar_starts_end_as_one(tiny_scans) -> None:
-    done = fit(COLD, tiny_scans, key=KEY, num_starts=2)
+def test_several_planar_starts_end_as_one(tiny_data) -> None:
+    done = fit(COLD, tiny_data, key=KEY, num_starts=2)
     assert done.poses.shape == (20, 3)
     assert np.isfinite(done.report.loss)
 

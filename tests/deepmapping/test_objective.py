@@ -24,7 +24,7 @@ def make_world(
     points = rng.uniform(-1, 1, (NUM_SCANS, NUM_POINTS, 2)).astype(np.float32)
     mask = rng.uniform(size=(NUM_SCANS, NUM_POINTS)) < 0.8
     sensors = rng.normal(scale=0.3, size=(NUM_SCANS, 2)).astype(np.float32)
-    return WorldBatch(*map(jnp.asarray, (points, sensors, mask, rows, block)))
+    return WorldBatch(*map(jnp.asarray, (points, sensors, mask, rows, block, 0.2)))
 
 
 def some_logits(points: jax.Array) -> jax.Array:
@@ -126,7 +126,7 @@ MLP = DeepMappingConfig(occupancy=OccupancyConfig(kind="mlp", features=(8,)))
 
 def loss_of(world: WorldBatch, phase: PhaseConfig, occupancy, config: DeepMappingConfig = MLP, pair=0.25):
     params = Params(None, jnp.zeros((1, 3)), occupancy, jnp.zeros((1, 3)), MapFrame(jnp.zeros(2), jnp.ones(())))
-    return mapping_loss(config, phase, params, world, jnp.asarray(pair), jnp.float32(0.2), key=KEY)
+    return mapping_loss(config, phase, params, world, jnp.asarray(pair), key=KEY)
 
 
 @pytest.mark.parametrize("gamma", [0.0, 0.1, 1.0])

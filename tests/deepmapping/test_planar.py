@@ -12,6 +12,7 @@ import pytest
 from dpmjax import deepmapping as dm
 from dpmjax.deepmapping.fit import fit, init
 from dpmjax.deepmapping.planar import as_scan_set, draw_rows, planar_problem
+from dpmjax.deepmapping.problem import MappingData
 from dpmjax.geometry import se2
 from dpmjax.metrics import absolute_trajectory_error
 from dpmjax.nets.localization import LocalizationConfig
@@ -71,7 +72,7 @@ def test_picture_is_dark_at_walls_and_light_in_free_space(tiny_walk, warm) -> No
     assert not picture.explored.all()
 
 
-def test_steps_of_the_paper_preset_lower_its_loss(tiny_scans) -> None:
+def test_steps_of_the_paper_preset_lower_its_loss(tiny_data) -> None:
     config = dm.preset("paper")
     (phase,) = config.cold_phases
     assert (phase.num_free, phase.is_free_factor_shared, phase.occupancy_weight, phase.num_offsets) == (
@@ -88,9 +89,10 @@ def test_steps_of_the_paper_preset_lower_its_loss(tiny_scans) -> None:
         occupancy=replace(config.occupancy, features=(32, 32)),
         steps_per_call=20,
     )
-    few = ScanSet(tiny_scans.points[:6, ::2], tiny_scans.mask[:6, ::2])
+    scans = tiny_data.scans
+    few = MappingData(ScanSet(scans.points[:6, ::2], scans.mask[:6, ::2]))
     losses: list[float] = []
-    problem = planar_problem(small, is_warm=False)
+    problem = planar_problem(small, few)
     before = init(problem, few, key=KEY).params
     after = fit(problem, few, key=KEY, on_report=lambda p: losses.append(p.report.loss)).state.params
     assert losses[2] < losses[1] < losses[0]
@@ -116,11 +118,11 @@ def test_large_sets_are_drawn_in_blocks_of_neighbours() -> None:
     assert rows.max() < 1000
 
 
-def test_masked_beams_never_matter(tiny_scans) -> None:
-    mask = tiny_scans.mask & (jax.random.uniform(KEY, tiny_scans.mask.shape) < 0.8)
+def test_masked_beams_never_matter(tiny_data) -> None:
+    scans = tiny_data.scans
+    mask = scans.mask & (jax.random.uniform(KEY, scans.mask.shape) < 0.8)
     scans = [
-        as_scan_set(ScanSet(jnp.where(mask[..., None], tiny_scans.points, filling), mask))
-        for filling in (0.0, 1e6, np.nan)
+        as_scan_set(ScanSet(jnp.where(mask[..., None], scans.points, filling), mask)) for filling in (0.0, 1e6, np.nan)
     ]
     jax.tree.map(np.testing.assert_array_equal, scans[0], scans[1])
     jax.tree.map(np.testing.assert_array_equal, scans[0], scans[2])

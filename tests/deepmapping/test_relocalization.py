@@ -12,7 +12,7 @@ import pytest
 import dpmjax
 from dpmjax import deepmapping as dm
 from dpmjax.deepmapping.fit import init
-from dpmjax.deepmapping.planar import planar_problem, scale_scans
+from dpmjax.deepmapping.planar import planar_data, planar_problem
 from dpmjax.deepmapping.relocalization import shift_scan, turn_scan
 from dpmjax.geometry import se2
 from dpmjax.nets.localization import LocalizationConfig
@@ -32,11 +32,10 @@ def fitted(tiny_walk) -> dm.Fitted:
         occupancy=OccupancyConfig(kind="grid", resolutions=(4,)),
         localization=LocalizationConfig(features=(16, 32), strides=(1, 2), is_circular=True, hidden=(32,)),
     )
-    scans, unit = scale_scans(ScanSet(tiny_walk.points, tiny_walk.mask))
-    params = init(planar_problem(config, is_warm=False), scans, key=KEY).params
+    data, unit = planar_data(ScanSet(tiny_walk.points, tiny_walk.mask))
+    params = init(planar_problem(config, data), data, key=KEY).params
     poses = tiny_walk.reference_poses - tiny_walk.reference_poses.mean(axis=0)
-    T = se2.to_matrix(poses)
-    return dm.Fitted(T, poses, params, None, unit, config)
+    return dm.Fitted(poses, params, None, unit, config)
 
 
 @pytest.fixture(scope="module")
@@ -108,7 +107,7 @@ def test_a_second_call_compiles_nothing(trained, tiny_walk, assert_compiles_noth
 
 
 def test_bad_input_is_named(fitted, tiny_walk) -> None:
-    with pytest.raises(ValueError, match="scan: expected shape"):
+    with pytest.raises(ValueError, match="scans: expected shape"):
         dpmjax.relocalize(fitted, np.ones((4, 3, 3)))
     with pytest.raises(ValueError, match="no valid beam"):
         dpmjax.relocalize(fitted, np.zeros((64, 2)))

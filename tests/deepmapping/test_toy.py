@@ -42,7 +42,7 @@ def test_direct_form_is_plain_gradient_descent() -> None:
 
 def test_both_forms_start_alike_and_the_first_network_step_is_descent_on_all_of_it() -> None:
     problem = toy_problem(SHORT)
-    start = problem.init(SHORT, KEY, None, None)
+    start = problem.init(SHORT, KEY, None)
     run, direct = fit(problem, None, key=KEY), fit(toy_problem(DIRECT), None, key=KEY)
     np.testing.assert_allclose(run.report.terms[0], direct.report.terms[0], **ROUNDING)
     gradient = jax.grad(lambda params: toy_loss(network_value(SHORT, params)))(start)
@@ -60,7 +60,7 @@ def test_seeds_are_starts_and_none_is_dropped() -> None:
 
 
 def test_network_is_a_chain_of_linear_maps_and_elus() -> None:
-    start = toy_problem(SHORT).init(SHORT, jax.random.key(1), None, None)
+    start = toy_problem(SHORT).init(SHORT, jax.random.key(1), None)
     layers = [start.net["params"][f"Dense_{k}"] for k in range(5)]
     x = np.array([start.z], np.float64)
     for k, layer in enumerate(layers):
@@ -95,6 +95,6 @@ def test_solvers_end_at_the_minimum_of_their_valley(method: str) -> None:
         (lambda: ScalarNetConfig(initialization="zeros"), "initialization"),
     ],
 )
-def test_bad_settings_are_named(call, message) -> None:
+def test_bad_settings_are_named(call, message, as_user) -> None:
     with pytest.raises(ValueError, match=message):
         call()

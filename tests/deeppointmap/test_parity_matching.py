@@ -10,8 +10,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from dpmjax.deeppointmap.matching import MaskedPositions, MatchConfig, match_descriptors
+from dpmjax.deeppointmap.matching import MatchConfig, match_descriptors
 from dpmjax.deeppointmap.objective import ObjectiveConfig, TrainingSide, close_pairs, matching_loss
+from tests.deeppointmap import toy
 
 FOLDER = Path(os.environ.get("DPMJAX_PARITY", Path(__file__).parents[3] / "shared" / "parity" / "small"))
 PARITY: dict[str, Any] = {"rtol": 1e-4, "atol": 1e-5}
@@ -65,8 +66,8 @@ def test_registration_is_the_published_one(case, decoder) -> None:
         return tuple(jnp.asarray(offset, jnp.float32) for offset in offsets)
 
     match = match_descriptors(
-        MaskedPositions(case["descriptor_xyz_a"], ~case["descriptor_padding_a"]),
-        MaskedPositions(case["descriptor_xyz_b"], ~case["descriptor_padding_b"]),
+        toy.cloud(case["descriptor_xyz_a"], ~case["descriptor_padding_a"]),
+        toy.cloud(case["descriptor_xyz_b"], ~case["descriptor_padding_b"]),
         case["similarity"],
         predict_offsets,
         config=MatchConfig(),
@@ -86,7 +87,7 @@ def test_losses_are_the_published_ones(case, decoder) -> None:
     masks = [~case[f"descriptor_padding_{side}"] for side in "ab"]
     correlated = [case[f"correlated_features_{side}"] for side in "ab"]
     T_b_a = case["T_b_a"].astype(np.float32)
-    close = close_pairs(*map(MaskedPositions, positions, masks), T_b_a, config=config)
+    close = close_pairs(*map(toy.cloud, positions, masks), T_b_a, config=config)
     sides = []
     for here, there in ((0, 1), (1, 0)):
         partners = correlated[there][np.asarray(close[here].indices)]

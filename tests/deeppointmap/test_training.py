@@ -13,9 +13,8 @@ import numpy as np
 import pytest
 
 from dpmjax.deeppointmap import SampleMaker, ScanStore, init_training, make_step
-from dpmjax.deeppointmap.batches import RegistrationSample, arrange_groups, stack
 from dpmjax.deeppointmap.inference import pyramid_of_scan
-from dpmjax.deeppointmap.sampling import draw_groups
+from dpmjax.deeppointmap.sampling import RegistrationSample, arrange_groups, draw_groups, stack
 from dpmjax.deeppointmap.training import TrainingState, batch_loss
 from tests.deeppointmap import toy
 from tests.tolerances import ACCUMULATED
@@ -117,7 +116,7 @@ def test_a_sample_depends_on_seed_and_step_alone(maker) -> None:
 EIGHT_DEVICES = """
 import jax, numpy as np
 from dpmjax.deeppointmap import SampleMaker, ScanStore, init_training
-from dpmjax.deeppointmap.processes import device_mesh, replicate, shard_batch
+from dpmjax.deeppointmap.processes import BATCH_AXIS, device_mesh, place
 from dpmjax.deeppointmap.training import batch_loss
 from tests.deeppointmap import toy
 assert jax.device_count() == 8
@@ -126,9 +125,9 @@ batch, params = maker(0), init_training(jax.random.key(0), toy.TRAINING).params
 gradient = jax.jit(jax.grad(lambda params, batch: batch_loss(params, batch, toy.TRAINING)[0]))
 alone = gradient(params, batch)
 mesh = device_mesh()
-spread = shard_batch(batch, mesh)
+spread = place(batch, mesh, BATCH_AXIS)
 assert len(spread.mask.sharding.device_set) == 8 and spread.mask.addressable_shards[0].data.shape[0] == 1
-together = gradient(replicate(params, mesh), spread)
+together = gradient(place(params, mesh), spread)
 for a, b in zip(jax.tree.leaves(alone), jax.tree.leaves(together), strict=True):
     np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-5)
 """

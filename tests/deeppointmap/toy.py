@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from dpmjax.deeppointmap import CurriculumStage, ModelConfig, ObjectiveConfig, SamplingConfig, TrainingConfig
@@ -11,6 +12,7 @@ from dpmjax.io import LidarSequence
 from dpmjax.nets.decoder import DecoderConfig
 from dpmjax.nets.point_encoder import EncoderConfig
 from dpmjax.scans import PreprocessConfig
+from dpmjax.types import DescriptorCloud
 
 MODEL = ModelConfig(
     pyramid=PyramidConfig(stages=(PyramidStage(32, (0.2,), 8), PyramidStage(8, (0.4,), 4)), num_interpolations=1),
@@ -26,6 +28,12 @@ TRAINING = TrainingConfig(
     sampling=SamplingConfig(num_scans=6, num_overlap_pairs=4, max_side=2),
     objective=ObjectiveConfig(max_close=4, positive_radius_m=3.0, offset_radius_m=5.0),
 )
+
+
+def cloud(positions: np.ndarray, mask: np.ndarray | None = None) -> DescriptorCloud:
+    """Descriptors without features; all are there unless a mask is given."""
+    mask = np.ones(len(positions), bool) if mask is None else mask
+    return DescriptorCloud(jnp.asarray(positions), jnp.zeros((len(positions), 0)), jnp.asarray(mask))
 
 
 def drive(seed: int = 0, num_scans: int = 24, step_m: float = 4.0) -> LidarSequence:

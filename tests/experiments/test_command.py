@@ -25,7 +25,7 @@ from pathlib import Path
 from typing import ClassVar
 import tyro
 from experiments._command import StopFlag, run_command
-from experiments._history import HistoryFile, read_history
+from experiments._result_files import HistoryFile, read_history
 from experiments._run_folder import FolderOptions, open_run_folder, recording, write_metrics
 
 @dataclass(frozen=True, kw_only=True)

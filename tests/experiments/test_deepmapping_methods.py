@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from dpmjax.simulation import simulate_sequence
-from experiments import _deepmapping_methods, deepmapping_limits, deepmapping_suite
+from experiments import _deepmapping_methods, deepmapping_limits, deepmapping_logs, deepmapping_suite
 from experiments._command import run_command
 from experiments._deepmapping_methods import (
     DEEPMAPPING,
@@ -20,7 +20,6 @@ from experiments._deepmapping_methods import (
     in_fitting_order,
     make_task,
     run_method,
-    split_by_extras,
 )
 
 # ATE in px that each method stays below on the tiny walk; the start of all poses at zero has 14 px there. The direct
@@ -93,13 +92,6 @@ def test_shuffled_task_keeps_scans_with_their_truth(task) -> None:
     np.testing.assert_array_equal(in_fitting_order(replace(shuffled, is_ordered=True), x), np.arange(8))
 
 
-def test_methods_that_lack_their_package_are_named(monkeypatch) -> None:
-    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
-    methods, missing = split_by_extras(("icp-plane", "multiway"))
-    assert methods == ("icp-plane",)
-    assert "open3d" in missing["multiway"]
-
-
 def a_row(method: str, ate: float, kept: str = "search", **candidates: float) -> dict:
     numbers = {"ate_px": ate, "point_distance_px": 2 * ate}
     each = {name: {"ate_px": x, "point_distance_px": 2 * x} for name, x in (candidates or {kept: ate}).items()}
@@ -135,15 +127,19 @@ def test_limits_are_resumed_without_doing_a_row_twice(tmp_path, monkeypatch, cap
         return json.loads((tmp_path / "out" / "metrics.json").read_text())
 
     monkeypatch.setattr(deepmapping_limits.simulation, "simulate_sequence", simulate)
+    monkeypatch.setattr(_deepmapping_methods, "make_task", lambda sequence, **_: Task(sequence, planar=None))
     monkeypatch.setattr(_deepmapping_methods, "run_method", lambda name, task: a_row(name, len(task.sequence)))
+    absent = METHODS["multiway"]._replace(package="no_such_package")
+    monkeypatch.setitem(METHODS, "multiway", absent)
     first = run("--limit", "1", "--methods", "icp-plane", "icp-point")
-    second = run("--limit", "2", "--methods", "icp-plane", "icp-point", "--resume")
+    second = run("--limit", "2", "--methods", "icp-plane", "icp-point", "multiway", "--resume")
     assert second["rows"][:2] == first["rows"]
     assert [row["walk"] for row in second["rows"]] == [0, 0, 1, 1]
     assert {row["ate_px"] for row in second["rows"]} == {4}
     # Each walk is simulated once for both methods, and not again for rows that exist.
     assert simulated == [(0, 200), (1, 201)]
     assert second["note"] is None
+    assert "no_such_package" in second["not_run"]["multiway"]
     assert "ordered, icp-plane: 100% of 2" in capsys.readouterr().out
     assert (tmp_path / "out" / "ordered.png").exists()
 
@@ -163,3 +159,45 @@ def test_success_grid_leaves_open_what_was_not_run() -> None:
 def test_bad_options_are_named(options) -> None:
     with pytest.raises(ValueError, match="--"):
         deepmapping_limits.Config(**options)
+
+
+@pytest.mark.slow
+def test_suite_writes_its_table_its_picture_and_the_bound(tmp_path, monkeypatch, capsys) -> None:
+    entries = [{"world": 0, "num_scans": 12, "walk": 3}]
+    monkeypatch.setattr(deepmapping_suite, "list_trajectories", lambda: entries)
+    options = ["-o", str(tmp_path / "out"), "--methods", "icp-plane", "global-deepmapping", "--steps", "2"]
+    options += ["--range-noise-px", "1"]
+    main, config = deepmapping_suite.main, deepmapping_suite.Config
+    assert run_command(main, config, experiment="suite", description=None, args=options) == 0
+    metrics = json.loads((tmp_path / "out" / "metrics.json").read_text())
+    assert [row["method"] for row in metrics["rows"]] == ["icp-plane", "global-deepmapping"]
+    candidates = metrics["methods"]["global-deepmapping"]["candidates"]
+    assert sum(numbers["num_kept"] for numbers in candidates.values()) == 1
+    assert 0.0 < metrics["methods"]["icp-plane"]["median_bound_px"] < 1.0
+    assert (tmp_path / "out" / "boxes.png").exists()
+    printed = capsys.readouterr().out
+    assert "No unbiased estimate has a median ATE below" in printed
+    assert printed.splitlines()[0] == (tmp_path / "out" / "table.md").read_text().splitlines()[0]
+
+
+@pytest.mark.slow
+def test_logs_keep_finished_runs_and_leave_out_lost_odometry(tmp_path, capsys) -> None:
+    """The corrected poses of the second log are its odometry, so it has none of its own."""
+    walk = simulate_sequence(0, 12, num_beams=360, seed=4, with_odometry=True)
+    bearings = np.arctan2(walk.points[0, :, 1], walk.points[0, :, 0])
+    ahead = np.argsort(bearings)[90:270]
+    for name, odometry in (("good", walk.odometry_poses), ("lost", walk.reference_poses)):
+        lines = []
+        for points, pose, wheels in zip(walk.points[:, ahead], walk.reference_poses, odometry, strict=True):
+            ranges = " ".join(f"{0.02 * reading:.3f}" for reading in np.linalg.norm(points, axis=1))
+            x, y = (" ".join(f"{value:.5f}" for value in p * [0.02, 0.02, 1.0]) for p in (pose, wheels))
+            lines.append(f"FLASER 180 {ranges} {x} {y} {len(lines)} robot {len(lines)}")
+        (tmp_path / f"{name}.log").write_text("\n".join(lines) + "\n")
+    options = [str(tmp_path), "-o", str(tmp_path / "out"), "--inits", "odometry", "--steps", "2"]
+    for _ in range(2):
+        main, config = deepmapping_logs.main, deepmapping_logs.Config
+        assert run_command(main, config, experiment="logs", description=None, args=options) == 0
+        printed = capsys.readouterr().out.splitlines()
+        assert [line.split(" | ")[:3] for line in printed if "good" in line] == [["| good", "12", "odometry"]]
+    (row,) = json.loads((tmp_path / "out" / "metrics.json").read_text())["rows"]
+    assert row["candidates"][row["kept"]]["ate_m"] == row["ate_m"]

@@ -17,7 +17,7 @@ from optax.tree_utils import tree_get
 from dpmjax.checkpoints import Checkpoints
 from dpmjax.deeppointmap import CurriculumStage, SampleMaker, ScanStore, init_training, join_processes, make_step
 from dpmjax.deeppointmap.training_loop import begin_training
-from experiments._history import read_history
+from experiments._result_files import read_history
 from experiments._run_folder import CHECKPOINTS, HISTORY
 from tests.deeppointmap import toy
 
@@ -31,7 +31,7 @@ from dpmjax.deeppointmap.processes import is_first, join_processes, merged
 coordinator, number, folder = sys.argv[1], int(sys.argv[2]), sys.argv[3]
 join_processes(coordinator, 2, number)
 
-from dpmjax.deeppointmap import ScanStore, draw_evaluation_pairs
+from dpmjax.deeppointmap import ScanStore, TrainingHooks, draw_evaluation_pairs
 from experiments._dpm_run import Records, run_training
 from experiments._run_folder import RunFolder
 from experiments._command import Interrupted, StopFlag
@@ -54,7 +54,8 @@ try:
         pairs = draw_evaluation_pairs(toy.drive(seed=9), 1, toy.MODEL)
         records = Records(RunFolder(Path(folder), False), TRAINING, pairs, seed=0) if is_first() else None
         store = ScanStore([toy.drive()], toy.MODEL.preprocess)
-        done = run_training(records, store, TRAINING, seed=0, recall_every=1, stop=stop_requested)
+        hooks = TrainingHooks(evaluate_every=1, stop=stop_requested)
+        done = run_training(records, store, TRAINING, hooks, seed=0)
         assert done.stopped_by == signal.SIGINT
         stop.request(done.stopped_by)
 except Interrupted as stopped:

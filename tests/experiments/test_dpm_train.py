@@ -13,13 +13,20 @@ import jax
 import numpy as np
 import pytest
 
-from dpmjax.deeppointmap import CurriculumStage, SampleMaker, ScanStore, draw_evaluation_pairs, init_training
+from dpmjax.deeppointmap import (
+    CurriculumStage,
+    SampleMaker,
+    ScanStore,
+    TrainingHooks,
+    draw_evaluation_pairs,
+    init_training,
+)
 from dpmjax.deeppointmap.training_loop import after_evaluation, before_step, begin_training, params_to_use
 from dpmjax.io import InputError
 from experiments import _dpm_run
 from experiments._command import run_command
 from experiments._dpm_run import Records, run_training
-from experiments._history import read_history
+from experiments._result_files import read_history
 from experiments._run_folder import CHECKPOINTS, HISTORY, RunFolder
 from experiments.dpm_train import EXPERIMENT, Config, main
 from tests.deeppointmap import toy
@@ -44,7 +51,7 @@ def train(folder: Path, *, stop_after: int = 99, is_resumed: bool = False):
     store = ScanStore([toy.drive()], toy.MODEL.preprocess)
     pairs = draw_evaluation_pairs(toy.drive(seed=9), 2, toy.MODEL)
     records = Records(RunFolder(folder, is_resumed), TRAINING, pairs, seed=0)
-    return run_training(records, store, TRAINING, seed=0, recall_every=2, stop=StopAfter(stop_after))
+    return run_training(records, store, TRAINING, TrainingHooks(evaluate_every=2, stop=StopAfter(stop_after)), seed=0)
 
 
 def num_steps(trained) -> int:

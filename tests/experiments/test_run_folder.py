@@ -11,19 +11,15 @@ from typing import ClassVar
 import numpy as np
 import pytest
 
-from experiments import _run_folder
-from experiments._history import HistoryFile, read_history
-from experiments._json import write_json
+from experiments import _result_files, _run_folder
+from experiments._result_files import HistoryFile, commits_note, do_row, read_history, row_path, write_json
 from experiments._run_folder import (
     FolderOptions,
     RunFailedError,
     check_run_folder,
-    commits_note,
-    do_row,
     load_config,
     open_run_folder,
     recording,
-    row_path,
     write_metrics,
 )
 
@@ -136,8 +132,8 @@ def test_metrics_are_valid_json_with_seed_and_versions():
 
 
 def run_rows(folder, commit, monkeypatch, methods):
-    monkeypatch.setattr(_run_folder, "git_hash", lambda: commit)
-    return [do_row(folder, {"method": method}, lambda: {"ate_px": 1.5}, seed=3) for method in methods]
+    monkeypatch.setattr(_result_files, "git_hash", lambda: commit)
+    return [do_row(folder.path, {"method": method}, lambda: {"ate_px": 1.5}, seed=3) for method in methods]
 
 
 def test_each_row_carries_its_own_commit_seed_and_versions(monkeypatch):
@@ -174,7 +170,7 @@ def test_a_failed_row_leaves_no_file_and_no_two_cases_share_one():
         raise RuntimeError("no")
 
     with pytest.raises(RuntimeError):
-        do_row(run, {"method": "x"}, work, seed=0)
+        do_row(run.path, {"method": "x"}, work, seed=0)
     assert not list((run.path).glob("rows/*"))
     case = {"method": "icp", "walk": 3, "noise_px": 0.5}
     assert row_path(run.path, case) != row_path(run.path, {**case, "noise_px": 5})

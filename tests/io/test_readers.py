@@ -192,7 +192,7 @@ def test_order_of_beams_is_seen(turn):
 @pytest.mark.parametrize(
     "change", [{"unit": "mm"}, {"mask": np.ones((6, 6), bool)}, {"points": POSES}, {"times": np.ones(2)}]
 )
-def test_sequence_refuses_shapes_that_do_not_belong_together(change):
+def test_sequence_refuses_shapes_that_do_not_belong_together(as_user, change):
     fields = {"name": "a", "points": POINTS.astype(np.float32), "mask": np.ones((6, NUM_BEAMS), bool), "unit": "m"}
     whole = ScanSequence(**fields)
     assert len(whole.take(slice(1, 4))) == 3

@@ -165,10 +165,12 @@ def test_second_call_compiles_nothing(model: Model, assert_compiles_nothing) -> 
         overlap(model, *pairs[1])
 
 
-def test_wrong_channels_are_named(model: Model) -> None:
+def test_wrong_shapes_are_named(as_user, model: Model) -> None:
     wrong = cloud(22, 4).replace(features=jnp.ones((4, 3)))
     with pytest.raises(ValueError, match="^b.features: expected shape .4, 64., got .4, 3."):
         correlate(model, cloud(22, 4), wrong)
+    with pytest.raises(ValueError, match="^a.mask: expected shape"):
+        correlate(model, cloud(22, 4).replace(mask=jnp.ones(3, bool)), wrong)
     with pytest.raises(
         ValueError, match="^model_channels: expected at least 6 and a multiple of num_heads = 8, got 20"
     ):

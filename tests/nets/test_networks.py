@@ -8,7 +8,7 @@ import pytest
 
 from dpmjax.deepmapping import preset
 from dpmjax.nets.localization import LocalizationConfig, LocalizationNet
-from dpmjax.nets.occupancy import OccupancyConfig, init_map_net, interpolate_grid, make_map_net
+from dpmjax.nets.occupancy import OccupancyConfig, double_resolution, init_map_net, interpolate_grid, make_map_net
 from tests.tolerances import ACCUMULATED
 
 KEY = jax.random.key(0)
@@ -119,6 +119,32 @@ def test_gradient_of_the_grid_is_that_of_finite_differences(dimensions: int) -> 
         return jnp.sum(jnp.sin(interpolate_grid(jnp.asarray(grid), jnp.asarray(points))))
 
     jax.test_util.check_grads(total, (grid, points), order=1, modes=("rev",), eps=1e-3, rtol=0.02, atol=0.02)
+
+
+@pytest.mark.parametrize("dimensions", [2, 3])
+def test_doubled_resolution_is_the_same_function(dimensions: int) -> None:
+    rng = np.random.default_rng(2)
+    grid = jnp.asarray(rng.normal(size=(5,) * dimensions), jnp.float32)
+    points = jnp.asarray(rng.uniform(-1.1, 1.1, size=(50, dimensions)), jnp.float32)
+    doubled = double_resolution(grid)
+    assert doubled.shape == (9,) * dimensions
+    np.testing.assert_allclose(interpolate_grid(doubled, points), interpolate_grid(grid, points), **ACCUMULATED)
+
+
+def test_the_map_is_the_sum_of_its_levels() -> None:
+    config = OccupancyConfig(kind="grid", resolutions=(4, 8, 16))
+    rng = np.random.default_rng(3)
+    params = jax.tree.map(lambda x: jnp.asarray(rng.normal(size=x.shape), x.dtype), init_map_net(config, key=KEY))
+    points, weights = jnp.asarray(rng.uniform(-1.0, 1.0, size=(40, 2)), jnp.float32), jnp.array([1.0, 0.7, 0.2])
+    levels = [interpolate_grid(params["params"][f"level_{cells}"], points) for cells in config.resolutions]
+    expected = sum(weight * level for weight, level in zip(weights, levels, strict=True))
+    np.testing.assert_allclose(make_map_net(config).apply(params, points, weights), expected, **ACCUMULATED)
+
+
+@pytest.mark.parametrize("resolutions", [(4, 12), (8, 4), (3, 6)])
+def test_levels_that_do_not_double_are_refused(resolutions) -> None:
+    with pytest.raises(ValueError, match="resolutions"):
+        OccupancyConfig(kind="grid", resolutions=resolutions)
 
 
 def test_levels_that_are_off_do_not_count() -> None:

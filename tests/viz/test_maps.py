@@ -127,7 +127,7 @@ def test_many_points_are_thinned_to_the_budget():
     points = np.random.default_rng(0).uniform(0, 50, (4, MAX_POINTS_PER_PANEL // 2, 2))
     poses = np.zeros((4, 3))
     (axes,) = map_axes(
-        registered_scans_figure([Panel("result", ScanSet(points, np.ones(points.shape[:2])), poses)], "m")
+        registered_scans_figure([Panel("result", ScanSet(points, np.ones(points.shape[:2], bool)), poses)], "m")
     )
     assert len(axes.collections[0].get_offsets()) == MAX_POINTS_PER_PANEL
 

@@ -12,9 +12,7 @@ X = np.linspace(-6.0, 6.0, 101)
 
 def test_figure_14_marks_the_ends_of_both_forms():
     visited = np.array([3.0, 1.0, -1.4]), np.array([5.0, 2.0, -23.0])
-    figure = toy_figure(
-        X, X**2, X, np.cos(X), visited=visited, direct_end=(3.4, 1.0), network_end=(-1.4, -23.0), network_end_z=0.7
-    )
+    figure = toy_figure((X, X**2), (X, np.cos(X)), visited=visited, direct_end=(3.4, 1.0), network_end_z=0.7)
     (axes,) = figure.axes
     drawn = {line.get_label(): line.get_xydata() for line in axes.lines}
     np.testing.assert_array_equal(drawn["L(x)"], np.stack([X, X**2], -1))

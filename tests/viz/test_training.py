@@ -23,7 +23,8 @@ def test_matches_join_the_clouds_and_wrong_ones_stand_out():
     T = np.eye(4)
     T[:2, 3] = [2.0, 3.0]
     matched = np.array([[0.0, 0.0, 0.0], [0.5, 0.5, 0.0]])
-    figure = viz.matches_figure(source, target, T, matched, matched, [True, False], "pair")
+    scans = viz.MatchedScans(source, target, matched, matched, [True, False])
+    figure = viz.matches_figure(scans, T, title="pair")
     left, right = figure.axes
     right_match, wrong_match = left.lines[2:4]
     assert right_match.get_color() != wrong_match.get_color()

@@ -1,7 +1,9 @@
 from __future__ import annotations
 
+import dataclasses
 import importlib.util
 import io
+import json
 import os
 import pickle
 import subprocess
@@ -17,7 +19,7 @@ import pytest
 from dpmjax.deeppointmap import Model, ModelConfig, init_model, model_preset
 from dpmjax.weights import load_model, read_card, save_model
 from dpmjax.weights.__main__ import main
-from dpmjax.weights.config_json import config_from_json, config_to_json
+from dpmjax.weights.config_json import config_from_json
 from dpmjax.weights.torch_import import read_torch_file
 from tests.deeppointmap import toy
 from tests.weights.published import published_tensors
@@ -50,13 +52,13 @@ def test_half_precision_costs_three_digits_and_is_half_the_size(model: Model, tm
     assert all(leaf.dtype == jnp.float32 for leaf in jax.tree.leaves(half.params))
     assert_same(half, model, rtol=1e-3)
     sizes = [(tmp_path / f"{dtype}.safetensors").stat().st_size for dtype in ("float16", "float32")]
-    saved = sizes[1] - sizes[0] - 2 * sum(leaf.size for leaf in jax.tree.leaves(model.params))
-    assert abs(saved) < 100  # digits of the offsets in the header
+    # The header, which is longer where the numbers in it are, is padded.
+    assert sizes[1] - sizes[0] == pytest.approx(2 * sum(leaf.size for leaf in jax.tree.leaves(model.params)), abs=256)
 
 
 @pytest.mark.parametrize("config", [model_preset("tiny"), model_preset("paper")], ids=["tiny", "paper"])
 def test_configuration_survives_json(config: ModelConfig) -> None:
-    assert config_from_json(config_to_json(config), ModelConfig) == config
+    assert config_from_json(json.loads(json.dumps(dataclasses.asdict(config))), ModelConfig) == config
 
 
 def test_wrong_configurations_are_named() -> None:

@@ -147,13 +147,7 @@ REFINE_DEPTH = replace(
 the surface between its pixels, and it pulls where only one image has seen; a projection does neither."""
 
 JOINT_DEPTH = replace(
-    JOINT,
-    num_steps=3000,
-    occupancy_weight=0.9,
-    scans_per_step=256,
-    num_offsets=1,
-    max_offset=1,
-    num_free=35,
+    JOINT, num_steps=3000, occupancy_weight=0.9, scans_per_step=256, num_offsets=1, max_offset=1, num_free=35
 )
 """The paper: all pixels, 35 free samples a ray, gamma 0.9, windows of 2."""
 
@@ -183,17 +177,6 @@ class DeepMappingConfig:
     steps_per_call: int = 25
     map_margin: float = 1.15
     halve_at: tuple[float, ...] = (0.25, 0.5, 0.75)
-
-    def phases(self, *, is_warm: bool) -> tuple[PhaseConfig, ...]:
-        """The phases of a fit.
-
-        Args:
-            is_warm: the fit starts from given poses.
-
-        Returns:
-            The phases in order.
-        """
-        return self.warm_phases if is_warm else self.cold_phases
 
 
 @dataclass(frozen=True)
@@ -233,9 +216,7 @@ def preset(name: Literal["fast", "paper"], *, is_organised: bool = True) -> Deep
     _check_preset(name)
     config = DeepMappingConfig()
     if name == "paper":
-        config = replace(
-            _with_phase(config, JOINT), localization=LocalizationConfig(), occupancy=OccupancyConfig(), steps_per_call=1
-        )
+        config = _as_published(config, JOINT, LocalizationConfig())
     if not is_organised:
         config = replace(config, localization=replace(config.localization, kind="point"))
     return config
@@ -257,9 +238,7 @@ def depth_preset(name: Literal["fast", "paper"], *, motion: Motion = "planar") -
     _check_preset(name)
     config = DepthMappingConfig(motion=motion)
     if name == "paper":
-        localization = LocalizationConfig(features=(64, 128, 256, 1024), strides=(1, 1, 1, 1))
-        config = _with_phase(config, JOINT_DEPTH)
-        return replace(config, localization=localization, occupancy=OccupancyConfig(), steps_per_call=1)
+        return _as_published(config, JOINT_DEPTH, LocalizationConfig(features=(64, 128, 256, 1024), strides=(1,) * 4))
     if motion == "planar":
         return config
     # Real depth images in SE(3) do not agree to half a percent of the depth, and their first poses are rougher.
@@ -267,7 +246,8 @@ def depth_preset(name: Literal["fast", "paper"], *, motion: Motion = "planar") -
     return replace(config, cold_phases=(*config.cold_phases[:-1], refine), warm_phases=(refine,))
 
 
-def _with_phase(config: ConfigT, phase: PhaseConfig) -> ConfigT:
+def _as_published(config: ConfigT, phase: PhaseConfig, localization: LocalizationConfig) -> ConfigT:
+    config = replace(config, localization=localization, occupancy=OccupancyConfig(), steps_per_call=1)
     return replace(config, cold_phases=(phase,), warm_phases=(phase,))
 
 
@@ -285,11 +265,8 @@ def as_direct(config: ConfigT) -> ConfigT:
     Returns:
         The settings with free poses in every phase.
     """
-
-    def free(phases: tuple[PhaseConfig, ...]) -> tuple[PhaseConfig, ...]:
-        return tuple(replace(phase, poses="free") for phase in phases)
-
-    return replace(config, cold_phases=free(config.cold_phases), warm_phases=free(config.warm_phases))
+    cold, warm = ([replace(phase, poses="free") for phase in p] for p in (config.cold_phases, config.warm_phases))
+    return replace(config, cold_phases=tuple(cold), warm_phases=tuple(warm))
 
 
 def with_steps(config: ConfigT, num_steps: int) -> ConfigT:
@@ -314,10 +291,5 @@ def with_steps(config: ConfigT, num_steps: int) -> ConfigT:
         counts.append(max(1, num_steps - sum(counts)))
         return tuple(replace(phase, num_steps=count) for phase, count in zip(phases, counts, strict=True))
 
-    per_call = min(config.steps_per_call, num_steps)
-    return replace(
-        config,
-        cold_phases=shorten(config.cold_phases),
-        warm_phases=shorten(config.warm_phases),
-        steps_per_call=per_call,
-    )
+    cold, warm = shorten(config.cold_phases), shorten(config.warm_phases)
+    return replace(config, cold_phases=cold, warm_phases=warm, steps_per_call=min(config.steps_per_call, num_steps))

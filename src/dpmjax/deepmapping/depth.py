@@ -20,12 +20,14 @@ from dpmjax.deepmapping.fit import Report, fit
 from dpmjax.deepmapping.objective import Terms, WorldBatch, chamfer_term, interpolate_log
 from dpmjax.deepmapping.problem import (
     MapFrame,
+    MappingData,
+    MappingFunctions,
     Params,
     Problem,
     choose_frame,
     draw_offsets,
-    make_optimizer,
     mapping_loss,
+    mapping_problem,
 )
 from dpmjax.deepmapping.projective_consistency import DepthScans, PixelSample, consistency_of_pairs, fit_pinhole
 from dpmjax.geometry import rigid, se3
@@ -100,20 +102,6 @@ def motion_matrices(values: Float[Array, "n k"]) -> Float[Array, "n 4 4"]:
     return jnp.stack([jnp.stack(row, axis=-1) for row in rows], axis=-2)
 
 
-def depth_problem(config: DepthMappingConfig, *, is_warm: bool) -> Problem:
-    """DeepMapping of depth images: data are DepthScans in typical ranges, poses are (n, 4, 4) T_world_camera.
-
-    Args:
-        config: settings of the fit.
-        is_warm: the fit starts from given poses.
-
-    Returns:
-        The problem.
-    """
-    phases, functions = config.phases(is_warm=is_warm), (_init, make_optimizer, _loss, _poses, _next_phase)
-    return Problem(config, phases, *functions, config.steps_per_call, config.halve_at)
-
-
 def fit_depth(
     scans: DepthScans | ArrayLike,
     config: DepthMappingConfig | None = None,
@@ -140,10 +128,9 @@ def fit_depth(
     config = config or DepthMappingConfig()
     scans = scans if isinstance(scans, DepthScans) else as_depth_scans(scans)
     unit = typical_range(scans.points, scans.mask)
-    scaled = replace(scans, points=scans.points / unit)
-    start = None if init is None else _start_poses(init, len(scaled.points), unit)
-    problem = depth_problem(config, is_warm=init is not None)
-    fitted = fit(problem, scaled, key=key, start=start, num_starts=num_starts)
+    start = None if init is None else _start_poses(init, len(scans.points), unit)
+    data = MappingData(replace(scans, points=scans.points / unit), start)
+    fitted = fit(depth_problem(config, data), data, key=key, num_starts=num_starts)
     T = np.array(fitted.poses, np.float64)
     T[:, :3, 3] *= unit
     return DepthFitted(T, fitted.state.params, fitted.report, unit)
@@ -168,8 +155,8 @@ def _motions(config: DepthMappingConfig, phase: PhaseConfig, params: Params, sca
     return jax.vmap(_net(config).apply, in_axes=(None, 0, 0))(params.localization, scans.points, scans.mask)  # type: ignore[return-value]
 
 
-def _poses(config: DepthMappingConfig, phase: PhaseConfig, params: Params, scans: DepthScans) -> Float[Array, "n 4 4"]:
-    motions = motion_matrices(_motions(config, phase, params, scans))
+def _poses(config: DepthMappingConfig, phase: PhaseConfig, params: Params, data: MappingData) -> Float[Array, "n 4 4"]:
+    motions = motion_matrices(_motions(config, phase, params, data.scans))
     return jnp.matmul(params.start, motions, precision=jax.lax.Precision.HIGHEST)
 
 
@@ -180,11 +167,12 @@ def _choose_frame(config: DepthMappingConfig, scans: DepthScans, T: Float[Array,
     return choose_frame(world, scans.mask.reshape(count, -1), config.map_margin)
 
 
-def _init(config: DepthMappingConfig, key: jax.Array, scans: DepthScans, start: Array | None) -> Params:
+def _init(config: DepthMappingConfig, key: jax.Array, data: MappingData) -> Params:
     """Without a start all cameras are at one place."""
     net_key, map_key = jax.random.split(key)
+    scans, start = data
     count, net = scans.mask.shape[0], _net(config)
-    T_start = jnp.tile(jnp.eye(4), (count, 1, 1)) if start is None else jnp.asarray(start, jnp.float32)
+    T_start = jnp.tile(jnp.eye(4), (count, 1, 1)) if start is None else start
     params = Params(
         localization=net.init(net_key, scans.points[0], scans.mask[0]),
         poses=jnp.zeros((count, net.num_outputs)),
@@ -192,17 +180,17 @@ def _init(config: DepthMappingConfig, key: jax.Array, scans: DepthScans, start: 
         start=T_start,
         frame=_choose_frame(config, scans, T_start),
     )
-    first = config.phases(is_warm=start is not None)[0]
+    first = config.cold_phases[0]
     if first.poses == "free" and start is None:
         # The paper's direct baseline starts where L-Net's first forward pass puts the cameras.
         params = replace(params, poses=_motions(config, replace(first, poses="network"), params, scans))
     return params
 
 
-def _next_phase(config: DepthMappingConfig, phase: PhaseConfig, params: Params, scans: DepthScans) -> Params:
+def _next_phase(config: DepthMappingConfig, phase: PhaseConfig, params: Params, data: MappingData) -> Params:
     """The poses reached are the new start, in a map frame around them."""
-    T = _poses(config, phase, params, scans)
-    return replace(params, poses=jnp.zeros_like(params.poses), start=T, frame=_choose_frame(config, scans, T))
+    T = _poses(config, phase, params, data)
+    return replace(params, poses=jnp.zeros_like(params.poses), start=T, frame=_choose_frame(config, data.scans, T))
 
 
 def _draw_pixels(scans: DepthScans, count: int, *, key: jax.Array) -> PixelSample:
@@ -221,19 +209,20 @@ def _loss(
     config: DepthMappingConfig,
     phase: PhaseConfig,
     params: Params,
-    scans: DepthScans,
+    data: MappingData,
     step: Int[Array, ""],
     key: jax.Array,
 ) -> tuple[Float[Array, ""], Terms]:
     """DeepMapping eq. 6 of a batch of pixels; images are compared by the Chamfer distance or by projection."""
     batch_key, loss_key = jax.random.split(key)
+    scans, progress = data.scans, step / phase.num_steps
     count = scans.mask.shape[0]
     sample = _draw_pixels(scans, phase.beams_per_step, key=batch_key)
-    T = _poses(config, phase, params, scans)
+    T = _poses(config, phase, params, data)
     rows = jnp.arange(count)
-    world = WorldBatch(rigid.transform_points(T, sample.points), T[:, :3, 3], sample.mask, rows, jnp.zeros_like(rows))
+    points = rigid.transform_points(T, sample.points)
+    world = WorldBatch(points, T[:, :3, 3], sample.mask, rows, jnp.zeros_like(rows), progress)
     free_key, offset_key = jax.random.split(loss_key)
-    progress = step / phase.num_steps
     if phase.projection_tolerance is None:
         limit = None if phase.chamfer_limit is None else interpolate_log(phase.chamfer_limit, progress)
         pair_term = chamfer_term(world, draw_offsets(phase, count - 1, key=offset_key), limit)
@@ -241,4 +230,17 @@ def _loss(
         tolerance = interpolate_log(phase.projection_tolerance, progress)
         offsets = draw_offsets(phase, count // 2, key=offset_key)
         pair_term = 1.0 - consistency_of_pairs(T, sample, scans, offsets, tolerance)
-    return mapping_loss(config, phase, params, world, pair_term, progress, key=free_key)
+    return mapping_loss(config, phase, params, world, pair_term, key=free_key)
+
+
+def depth_problem(config: DepthMappingConfig, data: MappingData) -> Problem:
+    """DeepMapping of depth images; poses are (n, 4, 4) T_world_camera.
+
+    Args:
+        config: settings of the fit.
+        data: DepthScans and first poses, in typical ranges.
+
+    Returns:
+        The problem.
+    """
+    return mapping_problem(config, data, MappingFunctions(_init, _loss, _poses, _next_phase))

@@ -73,12 +73,7 @@ PLANAR_SEARCH = DepthInitializationConfig()
 """A level camera on wheels."""
 
 FULL_SEARCH = DepthInitializationConfig(
-    num_candidates=16384,
-    num_kept=32,
-    num_varied=48,
-    tolerance=(0.12, 0.03),
-    translation_weight=0.2,
-    turn_weight=0.3,
+    num_candidates=16384, num_kept=32, num_varied=48, tolerance=(0.12, 0.03), translation_weight=0.2, turn_weight=0.3
 )
 """A hand-held camera: six numbers to search instead of three, small moves between images, a real sensor's noise."""
 
@@ -128,9 +123,7 @@ def initialize_depth(
 
     def score(T: NDArray[np.float64]) -> float:
         moved = np.linalg.norm(np.diff(T[:, :3, 3], axis=0), axis=-1).mean() / config.max_translation
-        return float(projective_consistency(scans, jnp.asarray(T, jnp.float32))) - config.translation_weight * float(
-            moved
-        )
+        return float(projective_consistency(scans, T) - config.translation_weight * moved)
 
     return max(tries, key=score)
 

@@ -1,4 +1,4 @@
-"""The engine: `init` a state, `step` it, `fit` to the end. Training a problem's parameters is the registration.
+"""The engine: `init` a state, `step` it, `resume` it to the end. Training a problem's parameters is the registration.
 
 A state is one pytree of arrays: written to disk after any call, it goes on exactly. The data are arguments of the
 compiled step, so that another set of the same shape compiles nothing. Several starts are one more leading axis.
@@ -100,14 +100,13 @@ class Fit(NamedTuple):
     compile_s: float
 
 
-def init(problem: Problem, data: Any, *, key: jax.Array, start: Any = None, num_starts: int = 1) -> FitState:
+def init(problem: Problem, data: Any, *, key: jax.Array, num_starts: int = 1) -> FitState:
     """A fresh state at the start of the first phase.
 
     Args:
         problem: what to fit.
         data: of the problem.
         key: of the run.
-        start: poses to start from, as the problem takes them; None: cold start.
         num_starts: number of starts that differ in their keys; with 1, there is no leading axis.
 
     Returns:
@@ -118,9 +117,7 @@ def init(problem: Problem, data: Any, *, key: jax.Array, start: Any = None, num_
     """
     if num_starts < 1:
         raise ValueError(f"num_starts: expected at least 1, got {num_starts}")
-    if num_starts == 1:
-        return _init(problem, data, key, start)
-    return _init_all(problem, data, jax.random.split(key, num_starts), start)
+    return _init(problem, data, key if num_starts == 1 else jax.random.split(key, num_starts))
 
 
 def step(problem: Problem, state: FitState, data: Any) -> tuple[FitState, Report]:
@@ -157,21 +154,16 @@ def fit(
     data: Any,
     *,
     key: jax.Array,
-    start: Any = None,
     num_starts: int = 1,
     on_report: Callable[[Progress], None] | None = None,
     stop: Callable[[], bool] | None = None,
 ) -> Fit:
-    """Steps a state through all phases that are left.
-
-    Of several starts, the worse half by the loss is dropped at `problem.halve_at`, and the best one is kept at the end
-    of the fit. A problem without `halve_at` keeps all of them to the end.
+    """Steps a fresh state through all phases.
 
     Args:
         problem: what to fit.
-        data: of the problem.
+        data: of the problem, with the poses to start from where it has some.
         key: of the run.
-        start: poses to start from, None for a cold start, or a FitState to go on from.
         num_starts: number of starts that advance side by side.
         on_report: called after each call of the step.
         stop: called before each call of the step; the fit ends where it returns True.
@@ -179,27 +171,50 @@ def fit(
     Returns:
         Fit.
     """
-    state = start if isinstance(start, FitState) else init(problem, data, key=key, start=start, num_starts=num_starts)
+    state = init(problem, data, key=key, num_starts=num_starts)
+    return resume(problem, state, data, on_report=on_report, stop=stop)
+
+
+def resume(
+    problem: Problem,
+    state: FitState,
+    data: Any,
+    *,
+    on_report: Callable[[Progress], None] | None = None,
+    stop: Callable[[], bool] | None = None,
+) -> Fit:
+    """Steps a state through all phases that are left; a second fit of the same shapes compiles nothing.
+
+    Of several starts, the worse half by the loss is dropped at `problem.halve_at`, and the best one is kept at the end
+    of the fit. A problem without `halve_at` keeps all of them to the end.
+
+    Args:
+        problem: what to fit.
+        state: from `init` or from an earlier fit.
+        data: of the problem.
+        on_report: called after each call of the step.
+        stop: called before each call of the step; the fit ends where it returns True.
+
+    Returns:
+        Fit.
+    """
     total = sum(phase.num_steps for phase in problem.phases)
     run_s = compile_s = 0.0
-    report = program = None
+    report = None
     while not is_finished(problem, state) and not (stop is not None and stop()):
         begun = time.perf_counter()
-        if program is None or _is_phase_over(problem, state):
-            state = _enter_phase(problem, state, data)
-            program = _advance.lower(problem, _scalar(state.phase), state, data).compile()
-            compile_s += time.perf_counter() - begun
-            begun = time.perf_counter()
+        state = _enter_phase(problem, state, data)
+        # JAX keeps the program of each phase and number of starts.
+        program = _advance.lower(problem, _scalar(state.phase), state, data).compile()
+        compiled = time.perf_counter()
         before = _scalar(state.step)
         state, report = jax.block_until_ready(program(state, data))
-        run_s += time.perf_counter() - begun
+        compile_s, run_s = compile_s + compiled - begun, run_s + time.perf_counter() - compiled
         if on_report is not None:
             share = min(1.0, _scalar(state.step) / total)
-            phase = problem.phases[_scalar(state.phase)]
-            on_report(Progress(phase, state, report, share, run_s, compile_s))
+            on_report(Progress(problem.phases[_scalar(state.phase)], state, report, share, run_s, compile_s))
         if num_kept := _num_kept(problem, state, before):
             state, report = _keep_best(state, report, num_kept)
-            program = None
     return Fit(state, _current_poses(problem, _scalar(state.phase), state, data), report, run_s, compile_s)
 
 
@@ -223,26 +238,20 @@ def steps_per_call(problem: Problem, phase: Any) -> int:
 
 
 @partial(jax.jit, static_argnums=0)
-def _init(problem: Problem, data: Any, key: Array, start: Any) -> FitState:
-    params = problem.init(problem.config, key, data, start)
+def _init(problem: Problem, data: Any, key: Array) -> FitState:
+    """A state, or one for each of several keys."""
+    if key.ndim:
+        return jax.vmap(lambda one: _init(problem, data, one))(key)
+    params = problem.init(problem.config, key, data)
     moments = problem.optimizer(problem.config, problem.phases[0]).init(params)
     zero = jnp.zeros((), jnp.int32)
     return FitState(params, moments, jax.random.key_data(key), zero, zero, zero)
 
 
-@partial(jax.jit, static_argnums=0)
-def _init_all(problem: Problem, data: Any, keys: Array, start: Any) -> FitState:
-    return jax.vmap(lambda key: _init(problem, data, key, start))(keys)
-
-
-def _is_phase_over(problem: Problem, state: FitState) -> bool:
-    return _scalar(state.phase_step) >= problem.phases[_scalar(state.phase)].num_steps
-
-
 def _enter_phase(problem: Problem, state: FitState, data: Any) -> FitState:
     """The state at the start of the next phase if its phase is over and not the last; else the same state."""
     phase = _scalar(state.phase)
-    if phase + 1 == len(problem.phases) or not _is_phase_over(problem, state):
+    if phase + 1 == len(problem.phases) or _scalar(state.phase_step) < problem.phases[phase].num_steps:
         return state
     return _begin_next_phase(problem, phase, state, data)
 
@@ -275,21 +284,19 @@ def _advance(problem: Problem, phase_index: int, state: FitState, data: Any) -> 
     phase = problem.phases[phase_index]
     optimizer = problem.optimizer(problem.config, phase)
 
-    def one_step(state: FitState, data: Any) -> tuple[FitState, tuple[Array, Any]]:
-        key = jax.random.fold_in(jax.random.wrap_key_data(state.key), state.step)
-
-        def loss_of(params: Any) -> tuple[Array, Any]:
-            return problem.loss(problem.config, phase, params, data, state.phase_step, key)
-
-        (loss, terms), gradient = jax.value_and_grad(loss_of, has_aux=True)(state.params)
-        updates, moments = optimizer.update(gradient, state.optimizer, state.params)
-        params = optax.apply_updates(state.params, updates)
-        state = replace(state, params=params, optimizer=moments, phase_step=state.phase_step + 1, step=state.step + 1)
-        return state, (loss, terms)
-
     def call(state: FitState, data: Any) -> tuple[FitState, Report]:
-        length = steps_per_call(problem, phase)
-        state, (losses, terms) = jax.lax.scan(lambda s, _: one_step(s, data), state, None, length=length)
+        def one_step(state: FitState, _: None) -> tuple[FitState, tuple[Array, Any]]:
+            key = jax.random.fold_in(jax.random.wrap_key_data(state.key), state.step)
+            loss_of = partial(problem.loss, problem.config, phase)
+            (loss, terms), gradient = jax.value_and_grad(loss_of, has_aux=True)(
+                state.params, data, state.phase_step, key
+            )
+            updates, moments = optimizer.update(gradient, state.optimizer, state.params)
+            params = optax.apply_updates(state.params, updates)
+            counts = {"phase_step": state.phase_step + 1, "step": state.step + 1}
+            return replace(state, params=params, optimizer=moments, **counts), (loss, terms)
+
+        state, (losses, terms) = jax.lax.scan(one_step, state, length=steps_per_call(problem, phase))
         return state, Report(losses, terms, problem.poses(problem.config, phase, state.params, data))
 
     return _over_starts(call, state, data)

@@ -30,6 +30,7 @@ class WorldBatch(NamedTuple):
         mask: (m, b) False for beams that measured nothing.
         rows: (m,) index of each scan in the set; consecutive within a block.
         block: (m,) which block each belongs to.
+        progress: of the phase, 0 at its start, 1 at its end.
     """
 
     points: Float[Array, "m b d"]
@@ -37,6 +38,7 @@ class WorldBatch(NamedTuple):
     mask: Bool[Array, "m b"]
     rows: Int[Array, " m"]
     block: Int[Array, " m"]
+    progress: Float[Array, ""]
 
 
 class Terms(NamedTuple):
@@ -62,8 +64,7 @@ def interpolate_log(ends: tuple[float, float], progress: Float[Array, ""]) -> Fl
     Returns:
         The value.
     """
-    first, last = jnp.log(ends[0]), jnp.log(ends[1])
-    return jnp.exp(first + progress * (last - first))
+    return ends[0] * (ends[1] / ends[0]) ** progress
 
 
 def free_factors(
@@ -130,7 +131,7 @@ def chamfer_term(
     """
     num_scans = world.rows.shape[0]
 
-    def compare(offset: Int[Array, ""]) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    def compare(offset: Int[Array, ""]) -> tuple[Float[Array, ""], Int[Array, ""]]:
         later = jnp.minimum(jnp.arange(num_scans) + offset, num_scans - 1)
         is_pair = (world.rows[later] == world.rows + offset) & (world.block[later] == world.block)
         distance = jax.vmap(partial(chamfer_distance, max_distance=max_distance))(

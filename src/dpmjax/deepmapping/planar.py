@@ -12,16 +12,18 @@ from jaxtyping import Array, Bool, Float, Int
 from numpy.typing import ArrayLike, NDArray
 
 from dpmjax.deepmapping.config import DeepMappingConfig, PhaseConfig
-from dpmjax.deepmapping.fit import Report, fit
+from dpmjax.deepmapping.fit import Fit, Report, fit
 from dpmjax.deepmapping.objective import Terms, WorldBatch, chamfer_term, interpolate_log
 from dpmjax.deepmapping.problem import (
     MapFrame,
+    MappingData,
+    MappingFunctions,
     Params,
     Problem,
     choose_frame,
     draw_offsets,
-    make_optimizer,
     mapping_loss,
+    mapping_problem,
 )
 from dpmjax.geometry import se2
 from dpmjax.geometry.rays import typical_range
@@ -37,33 +39,37 @@ class Fitted(NamedTuple):
     """Result of `fit_deepmapping`.
 
     Attributes:
-        T_world_scan: (n, 3, 3) float64.
-        poses: the same as (n, 3) x, y, heading.
+        poses: (n, 3) x, y, heading, float64.
         params: of L-Net and M-Net.
         report: of the last call of the step.
         unit: the length that the parameters count in, unit of the points.
         config: settings of the fit.
     """
 
-    T_world_scan: NDArray[np.float64]
     poses: NDArray[np.float64]
     params: Params
     report: Report | None
     unit: float
     config: DeepMappingConfig
 
+    @property
+    def T_world_scan(self) -> NDArray[np.float64]:
+        """(n, 3, 3) the poses as matrices."""
+        return se2.to_matrix(self.poses)
 
-def as_scan_set(scans: ScanSet | ArrayLike) -> ScanSet:
+
+def as_scan_set(scans: ScanSet | ArrayLike, *, min_scans: int = 2) -> ScanSet:
     """Checked scans; beams with coordinates that are not finite, or both zero, measured nothing.
 
     Args:
         scans: (n, b, 2) in the sensor frames, any unit; or a ScanSet.
+        min_scans: the smallest number of scans.
 
     Returns:
         The scans, zeros where nothing was measured.
 
     Raises:
-        ValueError: the shape is not (n, b, 2), there are fewer than two scans, a scan has no valid beam, or what the
+        ValueError: the shape is not (n, b, 2), there are too few scans, a scan has no valid beam, or what the
             mask of a ScanSet calls valid is not finite.
     """
     if not isinstance(scans, ScanSet):
@@ -72,8 +78,8 @@ def as_scan_set(scans: ScanSet | ArrayLike) -> ScanSet:
             raise ValueError(f"scans: expected shape (n, b, 2), got {points.shape}")
         mask = np.isfinite(points).all(-1) & (np.abs(points).sum(-1) > 0)
         scans = ScanSet(points=jnp.asarray(np.where(mask[..., None], points, 0.0)), mask=jnp.asarray(mask))
-    if scans.points.shape[0] < 2:
-        raise ValueError(f"scans: expected at least 2, got {scans.points.shape[0]}")
+    if scans.points.shape[0] < min_scans:
+        raise ValueError(f"scans: expected at least {min_scans}, got {scans.points.shape[0]}")
     empty = np.flatnonzero(~np.asarray(scans.mask).any(-1))
     if len(empty):
         raise ValueError(f"scans: scan {empty[0]} has no valid beam; leave it out ({len(empty)} such scans)")
@@ -84,32 +90,44 @@ def as_scan_set(scans: ScanSet | ArrayLike) -> ScanSet:
     return ScanSet(points=clean, mask=mask)
 
 
-def scale_scans(scans: ScanSet | ArrayLike) -> tuple[ScanSet, float]:
-    """Checked scans with their typical range as the unit of length, as the problem takes them.
+def planar_data(scans: ScanSet | ArrayLike, init: ArrayLike | None = None) -> tuple[MappingData, float]:
+    """Checked scans and poses with the typical range of the scans as the unit of length, as the problem takes them.
 
     Args:
         scans: as `as_scan_set`.
+        init: (n, 3) x, y, heading or (n, 3, 3) matrices to start from; None: cold start.
 
     Returns:
-        The scans, and the typical range in their unit.
+        The data, and the typical range in the unit of the scans.
+
+    Raises:
+        ValueError: the scans or the poses have a wrong shape or are not finite, or a scan has no valid beam.
     """
     checked = as_scan_set(scans)
-    unit = typical_range(checked.points, checked.mask)
-    return replace(checked, points=checked.points / unit), unit
+    unit, count = typical_range(checked.points, checked.mask), len(checked.points)
+    scaled = replace(checked, points=checked.points / unit)
+    if init is None:
+        return MappingData(scaled), unit
+    given = np.asarray(init, np.float64)
+    if not np.isfinite(given).all():
+        raise ValueError("init: expected finite poses")
+    if given.shape not in ((count, 3), (count, 3, 3)):
+        raise ValueError(f"init: expected shape ({count}, 3) or ({count}, 3, 3), got {given.shape}")
+    poses = given if given.ndim == 2 else se2.from_matrix(given)
+    return MappingData(scaled, jnp.asarray(poses / [unit, unit, 1.0], jnp.float32)), unit
 
 
-def planar_problem(config: DeepMappingConfig, *, is_warm: bool) -> Problem:
-    """DeepMapping of planar scans: data are a ScanSet in typical ranges, poses are (n, 3) x, y, heading.
+def planar_problem(config: DeepMappingConfig, data: MappingData) -> Problem:
+    """DeepMapping of planar scans; poses are (n, 3) x, y, heading.
 
     Args:
         config: settings of the fit.
-        is_warm: the fit starts from given poses.
+        data: of `planar_data`.
 
     Returns:
         The problem.
     """
-    phases, functions = config.phases(is_warm=is_warm), (_init, make_optimizer, _loss, _poses, _next_phase)
-    return Problem(config, phases, *functions, config.steps_per_call, config.halve_at)
+    return mapping_problem(config, data, MappingFunctions(_init, _loss, _poses, _next_phase))
 
 
 def fit_deepmapping(
@@ -137,36 +155,23 @@ def fit_deepmapping(
             no start.
     """
     config = config or DeepMappingConfig()
-    scaled, unit = scale_scans(scans)
-    start = None if init is None else start_poses(init, len(scaled.points), unit)
-    problem = planar_problem(config, is_warm=init is not None)
-    fitted = fit(problem, scaled, key=key, start=start, num_starts=num_starts)
-    poses = np.asarray(fitted.poses, np.float64) * [unit, unit, 1.0]
-    return Fitted(se2.to_matrix(poses), poses, fitted.state.params, fitted.report, unit, config)
+    data, unit = planar_data(scans, init)
+    return as_fitted(fit(planar_problem(config, data), data, key=key, num_starts=num_starts), unit, config)
 
 
-def start_poses(poses: ArrayLike, num_scans: int, unit: float) -> Float[Array, "n 3"]:
-    """Checked poses to start from, as the problem takes them.
+def as_fitted(done: Fit, unit: float, config: DeepMappingConfig) -> Fitted:
+    """The result of a fit in the unit of the points.
 
     Args:
-        poses: (n, 3) x, y, heading or (n, 3, 3) matrices, unit of the points.
-        num_scans: n.
+        done: a fit of `planar_problem`.
         unit: the typical range.
+        config: settings of the fit.
 
     Returns:
-        (n, 3) in typical ranges and radians.
-
-    Raises:
-        ValueError: the poses have a wrong shape or are not finite.
+        Fitted.
     """
-    given = np.asarray(poses, np.float64)
-    if not np.isfinite(given).all():
-        raise ValueError("init: expected finite poses")
-    if given.shape == (num_scans, 3, 3):
-        given = se2.from_matrix(given)
-    if given.shape != (num_scans, 3):
-        raise ValueError(f"init: expected shape ({num_scans}, 3) or ({num_scans}, 3, 3), got {given.shape}")
-    return jnp.asarray(given / [unit, unit, 1.0], jnp.float32)
+    poses = np.asarray(done.poses, np.float64) * [unit, unit, 1.0]
+    return Fitted(poses, done.state.params, done.report, unit, config)
 
 
 def localize_scans(
@@ -201,10 +206,10 @@ def choose_beams(num_beams: int, phase: PhaseConfig, first: Int[Array, ""] | int
     return first % stride + stride * jnp.arange(num_beams // stride)
 
 
-def _init(config: DeepMappingConfig, key: jax.Array, scans: ScanSet, start: Array | None) -> Params:
+def _init(config: DeepMappingConfig, key: jax.Array, data: MappingData) -> Params:
     net_key, map_key = jax.random.split(key)
-    net = LocalizationNet(config.localization)
-    poses = jnp.zeros((scans.mask.shape[0], 3)) if start is None else jnp.asarray(start, jnp.float32)
+    net, scans = LocalizationNet(config.localization), data.scans
+    poses = jnp.zeros((scans.mask.shape[0], 3)) if data.start is None else data.start
     return Params(
         localization=net.init(net_key, scans.points[0], scans.mask[0]),
         poses=poses,
@@ -221,16 +226,17 @@ def _choose_frame(config: DeepMappingConfig, scans: ScanSet, poses: Float[Array,
     return choose_frame(se2.transform_points(poses, scans.points), scans.mask, config.map_margin)
 
 
-def _next_phase(config: DeepMappingConfig, phase: PhaseConfig, params: Params, scans: ScanSet) -> Params:
+def _next_phase(config: DeepMappingConfig, phase: PhaseConfig, params: Params, data: MappingData) -> Params:
     """Free poses take over where L-Net is, in a map frame around them."""
-    poses = _poses(config, phase, params, scans)
-    return replace(params, poses=poses, frame=_choose_frame(config, scans, poses))
+    poses = _poses(config, phase, params, data)
+    return replace(params, poses=poses, frame=_choose_frame(config, data.scans, poses))
 
 
-def _poses(config: DeepMappingConfig, phase: PhaseConfig, params: Params, scans: ScanSet) -> Float[Array, "n 3"]:
+def _poses(config: DeepMappingConfig, phase: PhaseConfig, params: Params, data: MappingData) -> Float[Array, "n 3"]:
     """Poses of all scans; L-Net sees the same number of beams as in training."""
     if phase.poses == "free":
         return params.poses
+    scans = data.scans
     beams = choose_beams(scans.mask.shape[1], phase)
     return se2.compose(
         params.start, localize_scans(params.localization, scans.points[:, beams], scans.mask[:, beams], config)
@@ -241,11 +247,12 @@ def _loss(
     config: DeepMappingConfig,
     phase: PhaseConfig,
     params: Params,
-    scans: ScanSet,
+    data: MappingData,
     step: Int[Array, ""],
     key: jax.Array,
 ) -> tuple[Float[Array, ""], Terms]:
     """DeepMapping eq. 6 of a batch of scans and beams."""
+    scans, progress = data.scans, step / phase.num_steps
     batch_key, loss_key = jax.random.split(key)
     beam_key, row_key = jax.random.split(batch_key)
     beams = choose_beams(scans.mask.shape[1], phase, jax.random.randint(beam_key, (), 0, scans.mask.shape[1]))
@@ -255,13 +262,12 @@ def _loss(
         poses = se2.compose(params.start[rows], localize_scans(params.localization, points, mask, config))
     else:
         poses = params.poses[rows]
-    world = WorldBatch(se2.transform_points(poses, points), poses[:, :2], mask, rows, block)
+    world = WorldBatch(se2.transform_points(poses, points), poses[:, :2], mask, rows, block, progress)
     free_key, offset_key = jax.random.split(loss_key)
-    progress = step / phase.num_steps
     limit = None if phase.chamfer_limit is None else interpolate_log(phase.chamfer_limit, progress)
     offsets = draw_offsets(phase, _scans_in_block(phase, scans.mask.shape[0]) - 1, key=offset_key)
     chamfer = chamfer_term(world, offsets, limit)
-    return mapping_loss(config, phase, params, world, chamfer, progress, key=free_key)
+    return mapping_loss(config, phase, params, world, chamfer, key=free_key)
 
 
 def _scans_in_block(phase: PhaseConfig, num_scans: int) -> int:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import flax.struct
 import jax
@@ -13,14 +13,7 @@ import optax
 from jaxtyping import Array, Float, Int
 
 from dpmjax.deepmapping.config import DeepMappingConfig, PhaseConfig
-from dpmjax.deepmapping.objective import (
-    MapLogits,
-    Terms,
-    WorldBatch,
-    free_factors,
-    interpolate_log,
-    occupancy_term,
-)
+from dpmjax.deepmapping.objective import MapLogits, Terms, WorldBatch, free_factors, interpolate_log, occupancy_term
 from dpmjax.nets.occupancy import make_map_net
 
 # Points that M-Net's hidden layers hold at once when it is an MLP: 16 MB a layer of 512.
@@ -37,7 +30,7 @@ class Problem:
     Attributes:
         config: settings, given to every function as its first argument; hashable.
         phases: settings of each phase; each has a `name` and `num_steps`. A function of a phase gets them second.
-        init: (config, key, data, start) -> Params; `start` are given poses or None.
+        init: (config, key, data) -> Params; the data hold the poses to start from where there are some.
         optimizer: (config, phase) -> what changes the parameters; its state has the same structure in all phases.
         loss: (config, phase, params, data, step, key) -> (scalar, terms); `step` counts from 0 within the phase.
         poses: (config, phase, params, data) -> poses of the whole data set.
@@ -55,6 +48,27 @@ class Problem:
     next_phase: Callable[..., Any]
     steps_per_call: int
     halve_at: tuple[float, ...] = ()
+
+
+class MappingData(NamedTuple):
+    """Data of DeepMapping, in typical ranges.
+
+    Attributes:
+        scans: a ScanSet or DepthScans.
+        start: poses to start from, as the problem has them; None: cold start.
+    """
+
+    scans: Any
+    start: Float[Array, "n ..."] | None = None
+
+
+class MappingFunctions(NamedTuple):
+    """What planar scans and depth images differ in; the functions are those of a Problem."""
+
+    init: Callable[..., Params]
+    loss: Callable[..., tuple[Float[Array, ""], Terms]]
+    poses: Callable[..., Array]
+    next_phase: Callable[..., Params]
 
 
 @flax.struct.dataclass
@@ -82,6 +96,24 @@ class Params:
     occupancy: Any
     start: Float[Array, "n ..."]
     frame: MapFrame
+
+
+def mapping_problem(config: DeepMappingConfig, data: MappingData, functions: MappingFunctions) -> Problem:
+    """DeepMapping as a problem of the engine, its phases by whether there is a start.
+
+    Args:
+        config: settings of the fit.
+        data: with the start.
+        functions: of planar scans or of depth images.
+
+    Returns:
+        The problem.
+    """
+    phases = config.cold_phases if data.start is None else config.warm_phases
+    return Problem(
+        config, phases, optimizer=make_optimizer, **functions._asdict(),
+        steps_per_call=config.steps_per_call, halve_at=config.halve_at,
+    )  # fmt: skip
 
 
 def make_optimizer(config: DeepMappingConfig, phase: PhaseConfig) -> optax.GradientTransformation:
@@ -204,7 +236,6 @@ def mapping_loss(
     params: Params,
     world: WorldBatch,
     pair_term: Float[Array, ""],
-    progress: Float[Array, ""],
     *,
     key: jax.Array,
 ) -> tuple[Float[Array, ""], Terms]:
@@ -216,7 +247,6 @@ def mapping_loss(
         params: with M-Net and its frame.
         world: the scans of the batch in the world.
         pair_term: eq. 7, or another comparison of pairs of scans.
-        progress: 0 at the start of the phase, 1 at its end.
         key: of the free samples.
 
     Returns:
@@ -224,8 +254,8 @@ def mapping_loss(
     """
     gamma, loss, occupancy = phase.occupancy_weight, pair_term, jnp.zeros(())
     if gamma > 0.0:
-        logits = bind_map(params, config, level_weights(phase, config.occupancy.num_levels, progress))
-        distance = None if phase.surface_distance is None else interpolate_log(phase.surface_distance, progress)
+        logits = bind_map(params, config, level_weights(phase, config.occupancy.num_levels, world.progress))
+        distance = None if phase.surface_distance is None else interpolate_log(phase.surface_distance, world.progress)
         factors = free_factors(world, phase, distance, key=key)
         occupancy = occupancy_term(world, logits, factors)
         loss = gamma * occupancy + (1.0 - gamma) * pair_term

@@ -13,6 +13,7 @@ import optax
 from jaxtyping import Array, Bool, Float
 from numpy.typing import ArrayLike, NDArray
 
+from dpmjax.checks import require_count
 from dpmjax.deepmapping.config import DeepMappingConfig
 from dpmjax.deepmapping.planar import Fitted, as_scan_set, choose_beams, localize_scans
 from dpmjax.geometry import se2
@@ -26,12 +27,15 @@ class Relocalized(NamedTuple):
     """Poses of scans in the world of a fit.
 
     Attributes:
-        T_world_scan: (3, 3), or (m, 3, 3) for m scans, float64.
         pose: (3,) or (m, 3) x, y, heading in (-pi, pi], unit of the points.
     """
 
-    T_world_scan: NDArray[np.float64]
     pose: NDArray[np.float64]
+
+    @property
+    def T_world_scan(self) -> NDArray[np.float64]:
+        """(3, 3), or (m, 3, 3) for m scans: the poses as matrices."""
+        return se2.to_matrix(self.pose)
 
 
 @dataclass(frozen=True)
@@ -57,10 +61,8 @@ class LocalizationTrainingConfig:
     drop: float = 0.2
 
     def __post_init__(self) -> None:
-        if self.num_steps < 1 or self.scans_per_step < 1:
-            raise ValueError(
-                f"num_steps, scans_per_step: expected at least 1, got {self.num_steps}, {self.scans_per_step}"
-            )
+        require_count("num_steps", self.num_steps)
+        require_count("scans_per_step", self.scans_per_step)
         if not self.max_shift >= 0.0:
             raise ValueError(f"max_shift: expected zero or more, got {self.max_shift}")
         if not 0.0 <= self.drop < 1.0:
@@ -91,7 +93,7 @@ def relocalize(fitted: Fitted, scan: ScanSet | ArrayLike) -> Relocalized:
             "fitted: its L-Net corrects given start poses, which a new scan has not; call train_localization first"
         )
     is_one = not isinstance(scan, ScanSet) and np.ndim(scan) == 2
-    scans = _as_scans(np.asarray(scan)[None] if is_one else scan)
+    scans = as_scan_set(np.asarray(scan)[None] if is_one else scan, min_scans=1)
     beams = choose_beams(scans.mask.shape[1], fitted.config.cold_phases[0])
     points, mask = scans.points[:, beams] / fitted.unit, scans.mask[:, beams]
     chunks = [slice(k, k + _CHUNK) for k in range(0, len(points), _CHUNK)]
@@ -99,8 +101,7 @@ def relocalize(fitted: Fitted, scan: ScanSet | ArrayLike) -> Relocalized:
     poses = np.concatenate([np.asarray(part, np.float64) for part in parts])
     poses[:, :2] *= fitted.unit
     poses[:, 2] = se2.wrap_angle(poses[:, 2])
-    T_world_scan = se2.to_matrix(poses)
-    return Relocalized(T_world_scan[0], poses[0]) if is_one else Relocalized(T_world_scan, poses)
+    return Relocalized(poses[0] if is_one else poses)
 
 
 def train_localization(
@@ -233,24 +234,6 @@ def shift_scan(points: Float[Array, "b 2"], mask: Bool[Array, " b"], shift: Floa
     ranges = 1.0 / jnp.interp(target, known, jnp.where(known < 4.0, inverse[order], inverse[order][last]))
     seen = ranges[:, None] * jnp.stack([jnp.cos(target), jnp.sin(target)], -1)
     return jnp.where(mask[:, None], jnp.where((shift == 0).all(), points, seen), points)
-
-
-def _as_scans(scan: ScanSet | ArrayLike) -> ScanSet:
-    """As `as_scan_set`, but one scan is enough."""
-    if isinstance(scan, ScanSet):
-        return as_scan_set(scan) if len(scan.points) > 1 else _first(as_scan_set(_twice(scan)))
-    points = np.asarray(scan, np.float32)
-    if points.ndim != 3 or points.shape[-1] != 2 or len(points) == 0:
-        raise ValueError(f"scan: expected shape (b, 2) or (m, b, 2), got {points.shape}")
-    return as_scan_set(points) if len(points) > 1 else _first(as_scan_set(np.concatenate([points, points])))
-
-
-def _twice(scans: ScanSet) -> ScanSet:
-    return jax.tree.map(lambda leaf: jnp.concatenate([jnp.asarray(leaf)] * 2), scans)
-
-
-def _first(scans: ScanSet) -> ScanSet:
-    return jax.tree.map(lambda leaf: leaf[:1], scans)
 
 
 _localize = jax.jit(localize_scans, static_argnames="config")

@@ -110,8 +110,8 @@ def network_value(config: ToyConfig, params: ToyParams) -> Float[Array, ""]:
     return ScalarNet(config.net).apply(params.net, params.z)  # type: ignore[return-value]
 
 
-def _init(config: ToyConfig, key: jax.Array, data: None, start: None) -> ToyParams:
-    del data, start
+def _init(config: ToyConfig, key: jax.Array, data: None) -> ToyParams:
+    del data
     net_key, z_key = jax.random.split(key)
     z = jax.random.normal(z_key)
     params = ToyParams(jnp.zeros(()), ScalarNet(config.net).init(net_key, z), z)
@@ -123,21 +123,17 @@ def _optimizer(config: ToyConfig, phase: ToyConfig) -> optax.GradientTransformat
     return optax.sgd(config.learning_rate)
 
 
-def _value(config: ToyConfig, params: ToyParams) -> Float[Array, ""]:
-    return params.x if config.form == "direct" else network_value(config, params)
-
-
 def _loss(
     config: ToyConfig, phase: ToyConfig, params: ToyParams, data: None, step: Array, key: jax.Array
 ) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    del phase, data, step, key
-    x = _value(config, params)
+    del step, key
+    x = _poses(config, phase, params, data)
     return toy_loss(x), x
 
 
 def _poses(config: ToyConfig, phase: ToyConfig, params: ToyParams, data: None) -> Float[Array, ""]:
     del phase, data
-    return _value(config, params)
+    return params.x if config.form == "direct" else network_value(config, params)
 
 
 def _next_phase(config: ToyConfig, phase: ToyConfig, params: ToyParams, data: None) -> ToyParams:

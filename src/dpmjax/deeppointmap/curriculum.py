@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 
-from dpmjax.checks import require_count, require_positive
+from dpmjax.checks import require_count, require_fields, require_positive_fields
 from dpmjax.deeppointmap.model import ModelConfig, Preset, model_preset
 from dpmjax.deeppointmap.objective import ObjectiveConfig
-from dpmjax.deeppointmap.sampling import SamplingConfig
 from dpmjax.scans.augment import AugmentConfig
 
 
@@ -25,9 +24,67 @@ class CurriculumStage:
     num_steps: int
 
     def __post_init__(self) -> None:
-        if self.max_group < 2:
-            raise ValueError(f"max_group: expected at least 2, got {self.max_group}")
-        require_count("num_steps", self.num_steps)
+        require_fields(self, "max_group", low=2)
+        require_fields(self, "num_steps", low=1)
+
+
+@dataclass(frozen=True)
+class SamplingConfig:
+    """Sizes and distances of samples (defaults: DeepPointMap's published configuration).
+
+    Attributes:
+        num_scans: capacity of one sample, all groups together.
+        min_distance_m: scans nearer to the anchor are too similar to it.
+        max_distance_m: scans farther from the anchor do not belong to its group.
+        pair_probability: probability that a group is one pair of scans, in every stage.
+        max_side: largest number of scans of one map. Half of the groups up to this size are split into one scan
+            against all others.
+        num_overlap_pairs: pairs of one sample of the overlap part.
+        overlap_distance_m: scans nearer to each other than this overlap.
+        far_distance_m: a quarter of the overlap pairs is farther apart than this, a quarter lies between the two
+            distances.
+    """
+
+    num_scans: int = 32
+    min_distance_m: float = 0.25
+    max_distance_m: float = 20.0
+    pair_probability: float = 0.34
+    max_side: int = 16
+    num_overlap_pairs: int = 32
+    overlap_distance_m: float = 20.0
+    far_distance_m: float = 40.0
+
+    def __post_init__(self) -> None:
+        require_fields(self, "max_side", "num_overlap_pairs", low=1)
+        require_fields(self, "num_scans", low=2)
+        require_fields(self, "pair_probability", low=0, high=1)
+        if not 0 <= self.min_distance_m < self.max_distance_m:
+            raise ValueError(f"min_distance_m: expected 0 to below {self.max_distance_m}, got {self.min_distance_m}")
+        if not 0 < self.overlap_distance_m <= self.far_distance_m:
+            raise ValueError(f"far_distance_m: expected {self.overlap_distance_m} at least, got {self.far_distance_m}")
+
+    def side_capacity(self, max_group: int) -> int:
+        """Returns the capacity of one map of a group.
+
+        Args:
+            max_group: scans in both maps of a group together, at most.
+
+        Returns:
+            The largest number of scans in one map.
+        """
+        return min(max_group - 1, self.max_side)
+
+    def num_groups(self, max_group: int) -> int:
+        """Returns the number of groups in a sample.
+
+        Args:
+            max_group: scans in both maps of a group together, at most.
+
+        Returns:
+            About as many groups as fill the sample.
+        """
+        mean = 2 * self.pair_probability + (1 - self.pair_probability) * (2 + max_group) / 2
+        return max(1, round(self.num_scans / mean))
 
 
 @dataclass(frozen=True)
@@ -53,8 +110,7 @@ class TrainingConfig:
 
     model: ModelConfig = field(default_factory=ModelConfig)
     curriculum: tuple[CurriculumStage, ...] = tuple(
-        CurriculumStage(max_group, num_steps)
-        for max_group, num_steps in ((2, 20000), (4, 20000), (8, 30000), (16, 30000), (32, 20000))
+        map(CurriculumStage, (2, 4, 8, 16, 32), (20000, 20000, 30000, 30000, 20000))
     )
     overlap_steps: int = 20000
     sampling: SamplingConfig = field(default_factory=SamplingConfig)
@@ -69,13 +125,10 @@ class TrainingConfig:
     scans_at_once: int = 8
 
     def __post_init__(self) -> None:
-        for name in ("learning_rate", "final_learning_rate", "max_gradient_norm", "overlap_ratio"):
-            require_positive(name, getattr(self, name))
-        for name in ("overlap_steps", "weight_decay", "warmup_steps"):
-            if not getattr(self, name) >= 0:
-                raise ValueError(f"{name}: expected at least 0, got {getattr(self, name)}")
+        require_positive_fields(self, "learning_rate", "final_learning_rate", "max_gradient_norm", "overlap_ratio")
+        require_fields(self, "overlap_steps", "weight_decay", "warmup_steps", low=0)
+        require_fields(self, "scans_at_once", low=1)
         require_count("len(curriculum)", len(self.curriculum))
-        require_count("scans_at_once", self.scans_at_once)
         largest = max(stage.max_group for stage in self.curriculum)
         if largest > self.sampling.num_scans:
             raise ValueError(
@@ -129,39 +182,41 @@ class TrainingConfig:
 
 
 def training_preset(name: Preset) -> TrainingConfig:
-    """Returns the training configuration of a preset. A `ValueError` says if no preset has this name.
+    """Returns the training configuration of a preset.
 
     Args:
         name: "tiny" (minutes on two cores), "small" (hours on one GPU) or "paper" (days on several GPUs).
 
     Returns:
         The configuration.
+
+    Raises:
+        ValueError: if no preset has this name.
     """
-    model = model_preset(name)
-    if name == "tiny":
-        return TrainingConfig(
-            model=model,
-            curriculum=(CurriculumStage(2, 700), CurriculumStage(4, 40)),
-            overlap_steps=60,
-            sampling=SamplingConfig(num_scans=16, max_side=2, num_overlap_pairs=8),
-            # So few steps need weaker augmentation, more positives, and a direct loss on the encoder.
-            augment=AugmentConfig(max_drop_ratio=0.3, max_tilt_rad=0.05, translation_sigma_m=0.3),
-            objective=ObjectiveConfig(coarse_weight=1.0, positive_radius_m=1.5, max_close=4),
-            learning_rate=2e-3,
-            warmup_steps=20,
-            max_gradient_norm=5.0,
-        )
-    if name == "small":
-        return TrainingConfig(
-            model=model,
-            curriculum=(
-                CurriculumStage(2, 12000),
-                CurriculumStage(4, 6000),
-                CurriculumStage(8, 6000),
-                CurriculumStage(16, 6000),
-            ),
-            overlap_steps=3000,
-            objective=ObjectiveConfig(max_close=8),
-            warmup_steps=500,
-        )
-    return TrainingConfig(model=model)
+    if name not in PRESETS:
+        raise ValueError(f"name: expected one of {', '.join(PRESETS)}, got {name!r}")
+    return PRESETS[name]
+
+
+PRESETS = {
+    "tiny": TrainingConfig(
+        model=model_preset("tiny"),
+        curriculum=(CurriculumStage(2, 700), CurriculumStage(4, 40)),
+        overlap_steps=60,
+        sampling=SamplingConfig(num_scans=16, max_side=2, num_overlap_pairs=8),
+        # So few steps need weaker augmentation, more positives, and a direct loss on the encoder.
+        augment=AugmentConfig(max_drop_ratio=0.3, max_tilt_rad=0.05, translation_sigma_m=0.3),
+        objective=ObjectiveConfig(coarse_weight=1.0, positive_radius_m=1.5, max_close=4),
+        learning_rate=2e-3,
+        warmup_steps=20,
+        max_gradient_norm=5.0,
+    ),
+    "small": TrainingConfig(
+        model=model_preset("small"),
+        curriculum=tuple(map(CurriculumStage, (2, 4, 8, 16), (12000, 6000, 6000, 6000))),
+        overlap_steps=3000,
+        objective=ObjectiveConfig(max_close=8),
+        warmup_steps=500,
+    ),
+    "paper": TrainingConfig(),
+}

@@ -12,48 +12,32 @@ import os
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
-from typing import NamedTuple, Protocol, runtime_checkable
+from typing import NamedTuple
 
 import jax
 import numpy as np
 from jaxtyping import Array, Float
 from numpy.typing import NDArray
 
-from dpmjax.deeppointmap.batches import OverlapSample, RegistrationSample, Sample, arrange_groups, stack
 from dpmjax.deeppointmap.curriculum import TrainingConfig
 from dpmjax.deeppointmap.inference import pyramid_of_cloud
 from dpmjax.deeppointmap.sampling import (
-    Group,
-    OverlapPairs,
-    SamplingConfig,
+    OverlapSample,
+    Sample,
     ScanTable,
+    arrange_groups,
     draw_groups,
     draw_overlap_pairs,
+    stack,
 )
 from dpmjax.scans.augment import AugmentConfig, AugmentedScan, augment_scan
 from dpmjax.scans.preprocess import PreprocessConfig, preprocess_scan_on_host
+from dpmjax.sequences import LidarSequence
 from dpmjax.types import PointCloud, PointPyramid
 
 LOGGER = logging.getLogger("dpmjax.training")
 SAMPLE_STREAM, EPOCH_STREAM = 3101, 3102
 STEPS_AHEAD = 2
-
-
-@runtime_checkable
-class PosedScans(Protocol):
-    """One drive with true poses, read scan by scan; a `dpmjax.io.LidarSequence` is one."""
-
-    @property
-    def sources(self) -> Sequence[str]:
-        """Name of each scan, for messages."""
-
-    @property
-    def read_scan(self) -> Callable[[int], NDArray[np.float32]]:
-        """Reads scan i as (n, 3) points in the frame of the lidar, metres; raises a ValueError if it is bad."""
-
-    @property
-    def T_world_lidar(self) -> NDArray[np.float64] | None:
-        """True poses (num_scans, 4, 4), metres."""
 
 
 class ScanStore:
@@ -64,14 +48,19 @@ class ScanStore:
         bad: for each bad scan the reason; bad scans count as empty.
     """
 
-    def __init__(self, drives: Sequence[PosedScans], config: PreprocessConfig) -> None:
-        """Collects the poses; a `ValueError` says if a drive has none.
+    def __init__(self, drives: Sequence[LidarSequence], config: PreprocessConfig) -> None:
+        """Collects the poses.
 
         Args:
             drives: with poses.
             config: filters of the scans.
+
+        Raises:
+            ValueError: if a drive has no poses.
         """
-        poses = [_poses(drive) for drive in drives]
+        poses = [drive.T_world_lidar for drive in drives if drive.T_world_lidar is not None]
+        if len(poses) < len(drives):
+            raise ValueError("drives: expected a true pose for each scan, got a drive without poses")
         scene = np.concatenate([np.full(len(T), number) for number, T in enumerate(poses)])
         self.table = ScanTable(np.concatenate(poses), scene)
         self.bad: dict[str, str] = {}
@@ -179,15 +168,21 @@ class SampleMaker:
         table, sampling = self._store.table, self._config.sampling
         rng = np.random.default_rng([SAMPLE_STREAM, self._seed, step, number])
         stage = self._config.stage_at(step)
-        arrange: Callable[[list[PointPyramid], NDArray[np.float64]], Sample]
         if stage is None:
             pairs = draw_overlap_pairs(table, sampling, rng)
             rows = np.concatenate([pairs.first, pairs.second])
-            arrange = functools.partial(_arrange_pairs, pairs)
+
+            def arrange(pyramids: list[PointPyramid], T_augmented_lidar: NDArray[np.float64]) -> Sample:
+                half = len(pairs.first)
+                return OverlapSample(stack(pyramids[:half]), stack(pyramids[half:]), pairs.is_overlap)
         else:
             groups = draw_groups(table, self._anchor(step), stage.max_group, sampling, rng)
             rows = np.concatenate([side for group in groups for side in group])
-            arrange = functools.partial(_arrange_drawn, groups, table.T_world_lidar[rows], stage.max_group, sampling)
+
+            def arrange(pyramids: list[PointPyramid], T_augmented_lidar: NDArray[np.float64]) -> Sample:
+                T_world_augmented = table.T_world_lidar[rows] @ np.linalg.inv(T_augmented_lidar)
+                return arrange_groups(groups, pyramids, T_world_augmented, stage.max_group, sampling)
+
         points = [self._store.request(int(row), self._pool) for row in rows]
         return _Drawn((self._seed, step, number), points, arrange)
 
@@ -198,15 +193,17 @@ class SampleMaker:
 
     def _start(self, sample: _Drawn) -> Callable[[], Sample]:
         model = self._config.model
-        points = np.zeros((len(sample.points), model.preprocess.capacity, 3), np.float32)
+        num = len(sample.points)
+        # Always room for as many scans as there can be: another number would be compiled again.
+        points = np.zeros((max(num, self._config.sampling.num_scans), model.preprocess.capacity, 3), np.float32)
         mask = np.zeros(points.shape[:2], bool)
         for row, future in enumerate(sample.points):
             kept = future.result()
             points[row, : len(kept)], mask[row, : len(kept)] = kept, True
         clouds, motions = augment_on_host(PointCloud(points, mask), self._config.augment, sample.seeds)
         build = functools.partial(pyramid_of_cloud, config=model, num_threads=1)
-        pyramids = [self._pool.submit(build, PointCloud(p, m)) for p, m in zip(clouds.points, clouds.mask, strict=True)]
-        return lambda: sample.arrange([pyramid.result() for pyramid in pyramids], motions)
+        pyramids = [self._pool.submit(build, PointCloud(clouds.points[i], clouds.mask[i])) for i in range(num)]
+        return lambda: sample.arrange([pyramid.result() for pyramid in pyramids], motions[:num])
 
     def _anchor(self, step: int) -> int:
         # Every scan is the first anchor once in an epoch.
@@ -239,27 +236,3 @@ def augment_on_host(
 def _augment_all(clouds: PointCloud, key: Array, *, config: AugmentConfig) -> AugmentedScan:
     keys = jax.random.split(key, len(clouds.points))
     return jax.vmap(lambda cloud, key: augment_scan(cloud, config, key=key))(clouds, keys)
-
-
-def _arrange_pairs(
-    pairs: OverlapPairs, pyramids: list[PointPyramid], T_augmented_lidar: NDArray[np.float64]
-) -> OverlapSample:
-    half = len(pairs.first)
-    return OverlapSample(stack(pyramids[:half]), stack(pyramids[half:]), pairs.is_overlap)
-
-
-def _arrange_drawn(
-    groups: Sequence[Group],
-    T_world_lidar: NDArray[np.float64],
-    max_group: int,
-    config: SamplingConfig,
-    pyramids: list[PointPyramid],
-    T_augmented_lidar: NDArray[np.float64],
-) -> RegistrationSample:
-    return arrange_groups(groups, pyramids, T_world_lidar @ np.linalg.inv(T_augmented_lidar), max_group, config)
-
-
-def _poses(drive: PosedScans) -> NDArray[np.float64]:
-    if drive.T_world_lidar is None:
-        raise ValueError("drives: expected a true pose for each scan, got a drive without poses")
-    return drive.T_world_lidar

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from dpmjax.checks import as_float, as_mask, as_points, require_count, require_positive, require_shape
+from dpmjax.checks import as_float, require_fields, require_positive_fields, require_shape
 from dpmjax.geometry import rigid
 from dpmjax.geometry.alignment import weighted_svd
 from dpmjax.geometry.consensus import ConsensusConfig, find_consensus
@@ -62,43 +62,14 @@ class MatchConfig:
     consensus: ConsensusConfig | None = None
 
     def __post_init__(self) -> None:
-        for name in ("temperature", "pair_ratio", "max_offset_m", "inlier_sigmas"):
-            require_positive(name, getattr(self, name))
-        for name in ("min_num_first", "num_rounds", "min_num_inliers", "num_confident"):
-            require_count(name, getattr(self, name))
-        if self.pair_ratio > 1:
-            raise ValueError(f"pair_ratio: expected at most 1, got {self.pair_ratio}")
-
-
-class MaskedPositions(NamedTuple):
-    """Positions of descriptors, or of anything else that is matched.
-
-    Attributes:
-        positions: metres.
-        mask: False for descriptors that are not there; None if all are.
-    """
-
-    positions: Float[AnyArray, "m 3"]
-    mask: Bool[AnyArray, " m"] | None = None
-
-
-def checked(name: str, cloud: MaskedPositions | DescriptorCloud) -> tuple[Float[Array, "m 3"], Bool[Array, " m"]]:
-    """Checks positions and mask; a `ValueError` names an argument of a wrong shape.
-
-    Args:
-        name: name of the argument.
-        cloud: the argument.
-
-    Returns:
-        Positions and mask as JAX arrays.
-    """
-    positions = as_points(f"{name}.positions", cloud.positions, dimensions=(3,))
-    return positions, as_mask(f"{name}.mask", cloud.mask, positions.shape[:1])
+        require_positive_fields(self, "temperature", "pair_ratio", "max_offset_m", "inlier_sigmas")
+        require_fields(self, "min_num_first", "num_rounds", "min_num_inliers", "num_confident", low=1)
+        require_fields(self, "pair_ratio", low=0, high=1)
 
 
 def match_descriptors(
-    source: MaskedPositions | DescriptorCloud,
-    target: MaskedPositions | DescriptorCloud,
+    source: DescriptorCloud,
+    target: DescriptorCloud,
     similarity: Float[AnyArray, "m n"],
     predict_offsets: PredictOffsets,
     *,
@@ -111,10 +82,10 @@ def match_descriptors(
     about the inliers again, in rounds. The number of pairs depends on the number of valid descriptors, so padded clouds
     give the same result as unpadded ones.
 
-    Use `vmap` for several pairs of clouds. A `ValueError` names an argument of a wrong shape.
+    Use `vmap` for several pairs of clouds.
 
     Args:
-        source: positions in metres, source frame, and their mask; masked descriptors may hold anything.
+        source: descriptors in the source frame, metres; positions and mask are read; masked ones may be anything.
         target: the same in the target frame.
         similarity: cosine of each pair of descriptors, in [-1, 1].
         predict_offsets: the offset head on pairs of rows; it is called once, with static shapes.
@@ -123,12 +94,8 @@ def match_descriptors(
     Returns:
         The motion, its confidence and the pairs; see `Registration`.
     """
-    source_positions, source_mask = checked("source", source)
-    target_positions, target_mask = checked("target", target)
-    similarity = as_float("similarity", similarity)
-    require_shape("similarity", similarity, (len(source_positions), len(target_positions)))
-    best = best_pairs(similarity, source_mask, target_mask, config=config)
-    points = source_positions[best.source_indices], target_positions[best.target_indices]
+    best = best_pairs(jnp.asarray(similarity), source.mask, target.mask, config=config)
+    points = source.positions[best.source_indices], target.positions[best.target_indices]
     return _align(*points, predict_offsets(best.source_indices, best.target_indices), best, config=config)
 
 
@@ -171,8 +138,8 @@ def best_pairs(
     # floor(floor(ratio * (m + n)) / 2): the count of the published configuration.
     capacity = min(int(config.pair_ratio * (num_source + num_target)) // 2, num_source * num_target)
     is_pair = source_mask[:, None] & target_mask[None, :]
-    logits = jnp.where(is_pair, similarity, 0) / config.temperature
-    scores = _softmax(logits, is_pair, 1) * _softmax(logits, is_pair, 0)
+    logits = jnp.where(is_pair, similarity / config.temperature, jnp.finfo(similarity.dtype).min)
+    scores = jax.nn.softmax(logits, axis=1) * jax.nn.softmax(logits, axis=0)
     scores, flat = lax.top_k(jnp.where(is_pair, scores, -1).ravel(), capacity)
     num_valid = jnp.sum(source_mask) + jnp.sum(target_mask)
     num_pairs = jnp.floor(config.pair_ratio * num_valid).astype(int) // 2
@@ -230,21 +197,6 @@ def _sqrt(squared: Float[Array, "*p"]) -> Float[Array, "*p"]:
     return jnp.where(squared > 0, jnp.sqrt(jnp.where(squared > 0, squared, 1)), 0)
 
 
-def _softmax(logits: Float[Array, "m n"], is_pair: Bool[Array, "m n"], axis: int) -> Float[Array, "m n"]:
-    largest = jnp.max(jnp.where(is_pair, logits, -jnp.inf), axis=axis, keepdims=True, initial=-jnp.inf)
-    shifted = jnp.where(is_pair, logits - jnp.where(jnp.isfinite(largest), largest, 0), 0)
-    powers = jnp.where(is_pair, jnp.exp(shifted), 0)
-    total = jnp.sum(powers, axis=axis, keepdims=True)
-    return powers / jnp.where(total > 0, total, 1)
-
-
-def _first_inliers(scores: Float[Array, " p"], is_used: Bool[Array, " p"], config: MatchConfig) -> Bool[Array, " p"]:
-    is_good = is_used & (scores > config.min_inlier_score)
-    ranks = jnp.argsort(jnp.argsort(jnp.where(is_used, -scores, jnp.inf)))
-    is_best = is_used & (ranks < config.min_num_first)
-    return is_good | is_best
-
-
 def _agreeing(
     source: Float[Array, "p 3"], target: Float[Array, "p 3"], is_used: Bool[Array, " p"], config: ConsensusConfig
 ) -> Bool[Array, " p"]:
@@ -267,11 +219,14 @@ def _choose_inliers(
 
     def choose(_: Int[Array, ""], is_inlier: Bool[Array, " p"]) -> Bool[Array, " p"]:
         _, errors = _solve(source, target, scores, is_inlier)
-        chosen = is_used & (errors <= _error_limit(errors, is_inlier, config))
+        spread = jnp.std(errors, where=is_inlier)
+        limit = (jnp.mean(errors, where=is_inlier) + config.inlier_sigmas * spread) * ERROR_SLACK
+        chosen = is_used & (errors <= limit)  # none without an inlier, where the limit is NaN
         return jnp.where(jnp.sum(chosen) >= config.min_num_inliers, chosen, is_inlier)
 
     if config.consensus is None:
-        first = _first_inliers(scores, is_used, config)
+        ranks = jnp.argsort(jnp.argsort(jnp.where(is_used, -scores, jnp.inf)))
+        first = is_used & ((scores > config.min_inlier_score) | (ranks < config.min_num_first))
     else:
         first = _agreeing(source, target, is_used, config.consensus)
     return lax.fori_loop(0, config.num_rounds, choose, first)
@@ -285,13 +240,7 @@ def _solve(
     return T_target_source, _sqrt(squared)
 
 
-def _error_limit(errors: Float[Array, " p"], is_inlier: Bool[Array, " p"], config: MatchConfig) -> Float[Array, ""]:
-    count = jnp.maximum(jnp.sum(is_inlier), 1)
-    mean = jnp.sum(jnp.where(is_inlier, errors, 0)) / count
-    variance = jnp.sum(jnp.where(is_inlier, (errors - mean) ** 2, 0)) / count
-    return (mean + config.inlier_sigmas * jnp.sqrt(variance)) * ERROR_SLACK
-
-
+@jax.jit
 def merge_clouds(clouds: DescriptorCloud, T_map_cloud: Float[AnyArray, "s 4 4"]) -> DescriptorCloud:
     """Merges several descriptor clouds into one frame: a map, without new extraction (DeepPointMap section 3.1).
 
@@ -310,11 +259,6 @@ def merge_clouds(clouds: DescriptorCloud, T_map_cloud: Float[AnyArray, "s 4 4"])
         raise ValueError(f"clouds: expected stacked clouds, positions (s, m, 3), got {clouds.positions.shape}")
     T_map_cloud = as_float("T_map_cloud", T_map_cloud)
     require_shape("T_map_cloud", T_map_cloud, (len(clouds.positions), 4, 4))
-    return _merge_clouds(clouds, T_map_cloud)
-
-
-@jax.jit
-def _merge_clouds(clouds: DescriptorCloud, T_map_cloud: jax.Array) -> DescriptorCloud:
     positions_cloud = jnp.where(clouds.mask[..., None], clouds.positions, 0)
     T_map_cloud = jnp.where(jnp.any(clouds.mask, axis=1)[:, None, None], T_map_cloud, 0)
     positions_map = jnp.where(clouds.mask[..., None], rigid.transform_points(T_map_cloud, positions_cloud), 0)

@@ -18,11 +18,12 @@ from dpmjax.checks import require_positive, require_shape
 from dpmjax.deeppointmap.matching import MatchConfig
 from dpmjax.geometry.consensus import ConsensusConfig
 from dpmjax.geometry.pyramid import PyramidConfig, PyramidStage
+from dpmjax.geometry.pyramid_host import build_pyramid_on_host
 from dpmjax.nets.decoder import DecoderConfig, DescriptorDecoder
 from dpmjax.nets.layers import ComputeDtype
 from dpmjax.nets.point_encoder import EncoderConfig, PointEncoder
 from dpmjax.scans.preprocess import PreprocessConfig
-from dpmjax.types import DescriptorCloud, Interpolation, PointPyramid, PyramidLevel
+from dpmjax.types import DescriptorCloud, PointPyramid
 
 Preset = Literal["tiny", "small", "paper"]
 
@@ -67,11 +68,8 @@ class ModelConfig:
         Returns:
             A new configuration.
         """
-        return replace(
-            self,
-            encoder=replace(self.encoder, compute_dtype=compute_dtype),
-            decoder=replace(self.decoder, compute_dtype=compute_dtype),
-        )
+        encoder = replace(self.encoder, compute_dtype=compute_dtype)
+        return replace(self, encoder=encoder, decoder=replace(self.decoder, compute_dtype=compute_dtype))
 
 
 def model_preset(name: str) -> ModelConfig:
@@ -166,11 +164,13 @@ def model_shapes(config: ModelConfig) -> dict[str, Any]:
     key = jax.random.key(0)
     num, channels = config.num_descriptors, config.decoder.input_channels
     cloud = DescriptorCloud(jnp.zeros((num, 3)), jnp.zeros((num, channels)), jnp.ones(num, bool))
-    encoder = jax.eval_shape(_encoder(config).init, key, _blank_pyramid(config.pyramid))
+    pyramid = build_pyramid_on_host(np.zeros((1, 3), np.float32), np.ones(1, bool), config.pyramid)
+    encoder = jax.eval_shape(_encoder(config).init, key, pyramid)
     decoder = jax.eval_shape(DescriptorDecoder(config.decoder).init, key, cloud, cloud)
     return {"encoder": encoder["params"], "decoder": decoder["params"]}
 
 
+@jax.jit
 def encode_pyramid(model: Model, pyramid: PointPyramid) -> DescriptorCloud:
     """Encodes one scan to descriptors in metres, in the frame of the lidar (DeepPointMap section 3.1).
 
@@ -191,13 +191,17 @@ def encode_pyramid(model: Model, pyramid: PointPyramid) -> DescriptorCloud:
         if len(level.neighbours) != len(stage.radii):
             expected = f"expected {len(stage.radii)} neighbourhoods"
             raise ValueError(f"pyramid.levels[{number}]: {expected}, got {len(level.neighbours)}")
-    return _encode_pyramid(model, pyramid)
+    features: Any = _encoder(model.config).apply({"params": model.params["encoder"]}, pyramid)
+    level = pyramid.levels[-1 - len(pyramid.interpolation)]
+    positions = jnp.where(level.mask[:, None], level.positions, 0) * model.config.scale_m
+    return DescriptorCloud(positions, features, jnp.asarray(level.mask))
 
 
+@jax.jit
 def correlate(model: Model, a: DescriptorCloud, b: DescriptorCloud) -> tuple[DescriptorCloud, DescriptorCloud]:
     """Correlates two descriptor clouds by attention (DeepPointMap section 3.2, figure 2b).
 
-    A `ValueError` says if the features have another width than the model.
+    A `ValueError` names an array of another shape.
 
     Args:
         model: encoder and decoder.
@@ -207,11 +211,12 @@ def correlate(model: Model, a: DescriptorCloud, b: DescriptorCloud) -> tuple[Des
     Returns:
         Both clouds with correlated features; positions and masks stay as they are (zero where masked).
     """
-    _require_features("a", a, model.config.decoder.input_channels)
-    _require_features("b", b, model.config.decoder.input_channels)
-    return _correlate(model, a, b)
+    for name, cloud in (("a", a), ("b", b)):
+        _require_cloud(name, cloud, model.config.decoder.input_channels)
+    return _decode(model, a, b, part="correlate")
 
 
+@jax.jit
 def overlap_probability(model: Model, a: DescriptorCloud, b: DescriptorCloud) -> Float[Array, ""]:
     """Predicts the probability that two clouds overlap: less than 20 m apart (DeepPointMap section 3.2).
 
@@ -290,19 +295,6 @@ def predict_offsets(
     return _decode(model, features, partners, part="offset_head")
 
 
-@jax.jit
-def _encode_pyramid(model: Model, pyramid: PointPyramid) -> DescriptorCloud:
-    features: Any = _encoder(model.config).apply({"params": model.params["encoder"]}, pyramid)
-    level = pyramid.levels[-1 - len(pyramid.interpolation)]
-    positions = jnp.where(level.mask[:, None], level.positions, 0) * model.config.scale_m
-    return DescriptorCloud(positions, features, jnp.asarray(level.mask))
-
-
-@jax.jit
-def _correlate(model: Model, a: DescriptorCloud, b: DescriptorCloud) -> tuple[DescriptorCloud, DescriptorCloud]:
-    return _decode(model, a, b, part="correlate")
-
-
 def _encoder(config: ModelConfig) -> PointEncoder:
     return PointEncoder(config.encoder, tuple(stage.radii for stage in config.pyramid.stages))
 
@@ -316,20 +308,7 @@ def _decode(model: Model, *arguments: Any, part: str) -> Any:
     )
 
 
-def _blank_pyramid(config: PyramidConfig) -> PointPyramid:
-    # A pyramid of the right structure: the shapes of the parameters depend on nothing else.
-
-    def level(num: int, num_blocks: int) -> PyramidLevel:
-        indices = jnp.zeros(num, jnp.int32)
-        return PyramidLevel(jnp.zeros((num, 3)), jnp.ones(num, bool), indices, (indices[:, None],) * num_blocks)
-
-    levels = [level(1, 0), *(level(stage.num_points, len(stage.radii)) for stage in config.stages)]
-    steps = [
-        Interpolation(jnp.zeros((len(fine.mask), 3), jnp.int32), jnp.ones((len(fine.mask), 3)))
-        for fine in levels[-2 : -2 - config.num_interpolations : -1]
-    ]
-    return PointPyramid(tuple(levels), tuple(steps))
-
-
-def _require_features(name: str, cloud: DescriptorCloud, num_channels: int) -> None:
-    require_shape(f"{name}.features", cloud.features, (cloud.positions.shape[0], num_channels))
+def _require_cloud(name: str, cloud: DescriptorCloud, num_channels: int) -> None:
+    num = cloud.positions.shape[0]
+    for part, shape in (("positions", (num, 3)), ("features", (num, num_channels)), ("mask", (num,))):
+        require_shape(f"{name}.{part}", getattr(cloud, part), shape)

@@ -16,8 +16,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from dpmjax.checks import as_float, require_count, require_positive, require_shape
-from dpmjax.deeppointmap.matching import MaskedPositions, checked
+from dpmjax.checks import require_fields, require_positive_fields
 from dpmjax.geometry import rigid
 from dpmjax.geometry.neighbours import radius_search
 from dpmjax.losses.descriptors import info_nce, offset_loss
@@ -48,12 +47,9 @@ class ObjectiveConfig:
     max_close: int = 16
 
     def __post_init__(self) -> None:
-        for name in ("temperature", "positive_radius_m", "offset_radius_m"):
-            require_positive(name, getattr(self, name))
-        for name in ("pairing_weight", "coarse_weight", "offset_weight"):
-            if not getattr(self, name) >= 0:
-                raise ValueError(f"{name}: expected at least 0, got {getattr(self, name)}")
-        require_count("max_close", self.max_close)
+        require_positive_fields(self, "temperature", "positive_radius_m", "offset_radius_m")
+        require_fields(self, "pairing_weight", "coarse_weight", "offset_weight", low=0)
+        require_fields(self, "max_close", low=1)
 
 
 @flax.struct.dataclass
@@ -111,16 +107,12 @@ class ObjectiveTerms(NamedTuple):
 
 
 def close_pairs(
-    a: MaskedPositions | DescriptorCloud,
-    b: MaskedPositions | DescriptorCloud,
-    T_b_a: Float[AnyArray, "4 4"],
-    *,
-    config: ObjectiveConfig,
+    a: DescriptorCloud, b: DescriptorCloud, T_b_a: Float[AnyArray, "4 4"], *, config: ObjectiveConfig
 ) -> tuple[ClosePairs, ClosePairs]:
-    """Finds the pairs closer than `offset_radius_m`, and their true offsets. A `ValueError` names a wrong shape.
+    """Finds the pairs closer than `offset_radius_m`, and their true offsets.
 
     Args:
-        a: metres, in the frame of a; masked descriptors may hold anything.
+        a: descriptors in their own frame, metres; positions and mask are read; masked ones may be anything.
         b: the same in the frame of b.
         T_b_a: the true motion.
         config: radius and capacity.
@@ -128,22 +120,18 @@ def close_pairs(
     Returns:
         The pairs of each descriptor of a, and those of each descriptor of b.
     """
-    T_b_a = as_float("T_b_a", T_b_a)
-    require_shape("T_b_a", T_b_a, (4, 4))
-    positions_a, mask_a = checked("a", a)
-    positions_b, mask_b = checked("b", b)
-    of_a = _close_of(positions_a, rigid.transform_points(rigid.inverse(T_b_a), positions_b), mask_a, mask_b, config)
-    of_b = _close_of(positions_b, rigid.transform_points(T_b_a, positions_a), mask_b, mask_a, config)
-    return of_a, of_b
+    T_b_a = jnp.asarray(T_b_a)
+    of_a = _close_of(a, b, rigid.inverse(T_b_a), config)
+    return of_a, _close_of(b, a, T_b_a, config)
 
 
+@functools.partial(jax.jit, static_argnames="config")
 def matching_loss(
     a: TrainingSide, b: TrainingSide, T_b_a: Float[AnyArray, "4 4"], *, config: ObjectiveConfig
 ) -> tuple[Float[Array, ""], ObjectiveTerms]:
     """Combines pairing, coarse pairing and offset loss, the mean of both directions (DeepPointMap eq. 4 to 7).
 
-    Use `vmap` for several pairs of clouds. Without any close pair, the loss and its gradient are 0. A `ValueError`
-    names an argument of a wrong shape.
+    Use `vmap` for several pairs of clouds. Without any close pair, the loss and its gradient are 0.
 
     Args:
         a: one cloud, with the predictions of the networks.
@@ -154,23 +142,9 @@ def matching_loss(
     Returns:
         The weighted sum, and its parts.
     """
-    T_b_a = as_float("T_b_a", T_b_a)
-    require_shape("T_b_a", T_b_a, (4, 4))
-    for name, side in (("a", a), ("b", b)):
-        require_shape(f"{name}.offsets", jnp.asarray(side.offsets), side.close.offsets.shape)
-        require_shape(f"{name}.mask", jnp.asarray(side.mask), side.positions.shape[:1])
-    return _matching_loss(a, b, T_b_a, config=config)
-
-
-@functools.partial(jax.jit, static_argnames="config")
-def _matching_loss(
-    a: TrainingSide, b: TrainingSide, T_b_a: jax.Array, *, config: ObjectiveConfig
-) -> tuple[jax.Array, ObjectiveTerms]:
-    positions_b = jnp.where(
-        a.mask[:, None], rigid.transform_points(T_b_a, jnp.where(a.mask[:, None], a.positions, 0)), 0
-    )
-    squared = _squared_distances(positions_b, jnp.where(b.mask[:, None], b.positions, 0))
-    squared = lax.stop_gradient(jnp.where(a.mask[:, None] & b.mask[None, :], squared, jnp.inf))
+    is_pair = a.mask[:, None] & b.mask
+    squared = jnp.sum((rigid.transform_points(T_b_a, a.positions)[:, None] - b.positions) ** 2, axis=-1)
+    squared = lax.stop_gradient(jnp.where(is_pair, squared, jnp.inf))
     forward = _direction(a, b, squared, config)
     backward = _direction(b, a, squared.T, config)
     mean = jax.tree.map(lambda one, other: (one + other) / 2, forward, backward)
@@ -188,30 +162,20 @@ def _direction(
 ) -> ObjectiveTerms:
     is_close = squared <= config.positive_radius_m**2
     has_positive = jnp.any(is_close, axis=1)
-    nearest = jnp.argmin(squared, axis=1) if squared.shape[1] > 0 else jnp.zeros(len(squared), int)
-    positives = jnp.where(has_positive, nearest, -1)
+    positives = jnp.where(has_positive, jnp.argmin(squared, axis=1), -1)
     is_absent = jnp.broadcast_to(~target.mask, squared.shape)
-    matched, coarse = (
-        info_nce(features, keys, positives, config.temperature, ignore=ignore)
-        for features, keys, ignore in (
-            (source.matched_features, target.matched_features, is_absent),
-            (source.coarse_features, target.coarse_features, is_absent | is_close),
-        )
-    )
+    loss = functools.partial(info_nce, positives=positives, temperature=config.temperature)
+    close = source.close
     return ObjectiveTerms(
-        pairing=matched,
-        coarse=coarse,
-        offset=offset_loss(
-            source.offsets.reshape(-1, 3), source.close.offsets.reshape(-1, 3), source.close.mask.reshape(-1)
-        ),
+        pairing=loss(source.matched_features, target.matched_features, ignore=is_absent),
+        coarse=loss(source.coarse_features, target.coarse_features, ignore=is_absent | is_close),
+        offset=offset_loss(source.offsets.reshape(-1, 3), close.offsets.reshape(-1, 3), close.mask.reshape(-1)),
         top1_accuracy=_top1_accuracy(source, target, positives),
         num_positives=jnp.sum(has_positive),
     )
 
 
 def _top1_accuracy(source: TrainingSide, target: TrainingSide, positives: Int[Array, " m"]) -> Float[Array, ""]:
-    if len(target.mask) == 0:
-        return jnp.zeros(())
     is_counted = positives >= 0
     queries = jnp.where(is_counted[:, None], source.matched_features, 0)
     keys = jnp.where(target.mask[:, None], target.matched_features, 0)
@@ -221,22 +185,12 @@ def _top1_accuracy(source: TrainingSide, target: TrainingSide, positives: Int[Ar
     return jnp.sum(is_counted & (best == positives)) / jnp.maximum(jnp.sum(is_counted), 1)
 
 
-def _squared_distances(a: Float[Array, "m 3"], b: Float[Array, "n 3"]) -> Float[Array, "m n"]:
-    difference = [a[:, None, axis] - b[None, :, axis] for axis in range(3)]
-    return difference[0] ** 2 + difference[1] ** 2 + difference[2] ** 2
-
-
 def _close_of(
-    positions: Float[Array, "m 3"],
-    others: Float[Array, "n 3"],
-    mask: Bool[Array, " m"],
-    others_mask: Bool[Array, " n"],
-    config: ObjectiveConfig,
+    cloud: DescriptorCloud, other: DescriptorCloud, T_cloud_other: Float[Array, "4 4"], config: ObjectiveConfig
 ) -> ClosePairs:
-    positions = jnp.where(mask[:, None], positions, 0)
-    near = radius_search(positions, others, config.offset_radius_m, config.max_close, others_mask)
-    is_close = near.mask & mask[:, None]
-    if len(others) == 0:
-        return ClosePairs(near.indices, is_close, jnp.zeros((*near.mask.shape, 3), positions.dtype))
+    positions = jnp.where(cloud.mask[:, None], cloud.positions, 0)
+    others = rigid.transform_points(T_cloud_other, other.positions)
+    near = radius_search(positions, others, config.offset_radius_m, config.max_close, other.mask)
+    is_close = near.mask & cloud.mask[:, None]
     offsets = jnp.where(is_close[..., None], others[near.indices] - positions[:, None], 0)
     return ClosePairs(jnp.where(is_close, near.indices, 0), is_close, offsets)

@@ -65,33 +65,19 @@ def device_mesh() -> Mesh:
     return Mesh(np.array(jax.devices()), (BATCH_AXIS,))
 
 
-def shard_batch(samples: TreeT, mesh: Mesh) -> TreeT:
-    """Makes the samples of this process its part of the batch of all devices.
+def place(tree: TreeT, mesh: Mesh, *axes: str) -> TreeT:
+    """Puts arrays on the devices of a mesh.
 
     Args:
-        samples: stacked along the first axis; as many as this process has devices in the mesh, or a multiple.
+        tree: without an axis, the same in every process. With `BATCH_AXIS`, the samples of this process, stacked along
+            the first axis; as many as this process has devices in the mesh, or a multiple.
         mesh: from `device_mesh`.
+        *axes: `BATCH_AXIS` to spread the first axis over the devices; none to copy the tree to every device.
 
     Returns:
-        The batch of all processes.
+        The tree as arrays of all processes.
     """
-    return _placed(samples, NamedSharding(mesh, PartitionSpec(BATCH_AXIS)))
-
-
-def replicate(tree: TreeT, mesh: Mesh) -> TreeT:
-    """Copies a tree to every device of the mesh.
-
-    Args:
-        tree: the same in every process.
-        mesh: from `device_mesh`.
-
-    Returns:
-        The tree, replicated.
-    """
-    return _placed(tree, NamedSharding(mesh, PartitionSpec()))
-
-
-def _placed(tree: TreeT, sharding: NamedSharding) -> TreeT:
+    sharding = NamedSharding(mesh, PartitionSpec(*axes))
     return jax.tree.map(lambda x: jax.make_array_from_process_local_data(sharding, np.asarray(x)), tree)
 
 

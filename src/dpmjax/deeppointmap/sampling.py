@@ -1,84 +1,26 @@
-"""Sampling for training: which scans form two maps, and which pairs of scans overlap. On the host.
+"""Sampling for training, on the host: which scans form two maps, which pairs overlap, and both as arrays.
 
 Scans are drawn by their true poses, before augmentation, and from the given generator only, so that the sample of a
-step does not depend on the steps before.
+step does not depend on the steps before. A batch is samples stacked along a new first axis, which is spread over
+devices.
 """
 
 from __future__ import annotations
 
-import functools
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
+import flax.struct
+import jax
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from scipy.spatial import cKDTree
 
-from dpmjax.checks import require_count
+from dpmjax.deeppointmap.curriculum import SamplingConfig
+from dpmjax.types import AnyArray, PointPyramid
 
+TreeT = TypeVar("TreeT")
 NUM_ATTEMPTS = 100
-
-
-@dataclass(frozen=True)
-class SamplingConfig:
-    """Sizes and distances of samples (defaults: DeepPointMap's published configuration).
-
-    Attributes:
-        num_scans: capacity of one sample, all groups together.
-        min_distance_m: scans nearer to the anchor are too similar to it.
-        max_distance_m: scans farther from the anchor do not belong to its group.
-        pair_probability: probability that a group is one pair of scans, in every stage.
-        max_side: largest number of scans of one map. Half of the groups up to this size are split into one scan
-            against all others.
-        num_overlap_pairs: pairs of one sample of the overlap part.
-        overlap_distance_m: scans nearer to each other than this overlap.
-        far_distance_m: a quarter of the overlap pairs is farther apart than this, a quarter lies between the two
-            distances.
-    """
-
-    num_scans: int = 32
-    min_distance_m: float = 0.25
-    max_distance_m: float = 20.0
-    pair_probability: float = 0.34
-    max_side: int = 16
-    num_overlap_pairs: int = 32
-    overlap_distance_m: float = 20.0
-    far_distance_m: float = 40.0
-
-    def __post_init__(self) -> None:
-        require_count("max_side", self.max_side)
-        require_count("num_overlap_pairs", self.num_overlap_pairs)
-        if self.num_scans < 2:
-            raise ValueError(f"num_scans: expected at least 2, got {self.num_scans}")
-        if not 0 <= self.min_distance_m < self.max_distance_m:
-            raise ValueError(f"min_distance_m: expected 0 to below {self.max_distance_m}, got {self.min_distance_m}")
-        if not 0 < self.overlap_distance_m <= self.far_distance_m:
-            raise ValueError(f"far_distance_m: expected {self.overlap_distance_m} at least, got {self.far_distance_m}")
-        if not 0 <= self.pair_probability <= 1:
-            raise ValueError(f"pair_probability: expected from 0 to 1, got {self.pair_probability}")
-
-    def side_capacity(self, max_group: int) -> int:
-        """Returns the capacity of one map of a group.
-
-        Args:
-            max_group: scans in both maps of a group together, at most.
-
-        Returns:
-            The largest number of scans in one map.
-        """
-        return min(max_group - 1, self.max_side)
-
-    def num_groups(self, max_group: int) -> int:
-        """Returns the number of groups in a sample.
-
-        Args:
-            max_group: scans in both maps of a group together, at most.
-
-        Returns:
-            About as many groups as fill the sample.
-        """
-        mean = 2 * self.pair_probability + (1 - self.pair_probability) * (2 + max_group) / 2
-        return max(1, round(self.num_scans / mean))
 
 
 @dataclass(frozen=True)
@@ -103,34 +45,22 @@ class ScanTable:
     def __len__(self) -> int:
         return len(self.scene)
 
-    @functools.cached_property
+    @property
     def positions(self) -> Float[np.ndarray, "n 3"]:
         """Positions of the lidar, metres."""
         return self.T_world_lidar[:, :3, 3]
 
-    @functools.cached_property
-    def trees(self) -> tuple[cKDTree, ...]:
-        """One search tree for each scene."""
-        return tuple(cKDTree(self.positions[rows]) for rows in self.rows)
-
-    @functools.cached_property
-    def rows(self) -> tuple[Int[np.ndarray, " s"], ...]:
-        """Numbers of the scans of each scene."""
-        return tuple(np.flatnonzero(self.scene == scene) for scene in range(int(self.scene.max()) + 1))
-
-    def within(self, row: int, max_distance_m: float) -> Int[np.ndarray, " k"]:
-        """Finds the scans of the same scene up to a distance.
+    def distances_from(self, row: int) -> Float[np.ndarray, " n"]:
+        """Computes the distances of all scans from one scan.
 
         Args:
-            row: number of the scan in the middle.
-            max_distance_m: the distance.
+            row: number of the scan.
 
         Returns:
-            Numbers of the scans in order, `row` among them.
+            Metres; infinite for scans of other scenes.
         """
-        scene = int(self.scene[row])
-        near = self.trees[scene].query_ball_point(self.positions[row], max_distance_m)
-        return self.rows[scene][np.sort(np.asarray(near, int))]
+        distances = np.linalg.norm(self.positions - self.positions[row], axis=1)
+        return np.where(self.scene == self.scene[row], distances, np.inf)
 
 
 class Group(NamedTuple):
@@ -210,8 +140,7 @@ def draw_overlap_pairs(table: ScanTable, config: SamplingConfig, rng: np.random.
     for _ in range(config.num_overlap_pairs):
         anchor = int(rng.integers(len(table)))
         kind = int(rng.choice(3, p=(0.5, 0.25, 0.25)))
-        distances = np.linalg.norm(table.positions - table.positions[anchor], axis=1)
-        distances = np.where(table.scene == table.scene[anchor], distances, np.inf)
+        distances = table.distances_from(anchor)
         choices = [np.flatnonzero((distances > low) & (distances <= high)) for low, high in bands]
         choices.append(np.flatnonzero(np.isfinite(distances) & (distances > config.far_distance_m)))
         elsewhere = np.flatnonzero(np.isinf(distances))
@@ -226,9 +155,9 @@ def draw_overlap_pairs(table: ScanTable, config: SamplingConfig, rng: np.random.
 def _members(
     table: ScanTable, anchor: int, size: int, config: SamplingConfig, rng: np.random.Generator
 ) -> Int[np.ndarray, " s"]:
-    near = table.within(anchor, config.max_distance_m)
-    distances = np.linalg.norm(table.positions[near] - table.positions[anchor], axis=1)
-    others = near[(distances >= config.min_distance_m) & (near != anchor)]
+    distances = table.distances_from(anchor)
+    distances[anchor] = np.inf
+    others = np.flatnonzero((distances >= config.min_distance_m) & (distances <= config.max_distance_m))
     chosen = rng.choice(others, min(size - 1, len(others)), replace=False) if len(others) > 0 else others
     return rng.permutation(np.concatenate([[anchor], chosen]).astype(int))
 
@@ -240,3 +169,119 @@ def _split(members: Int[np.ndarray, " s"], config: SamplingConfig, rng: np.rando
     is_one_to_all = least == 1 and num <= config.max_side and rng.random() < 0.5
     num_source = 1 if is_one_to_all else int(rng.integers(least, most + 1))
     return Group(members[:num_source], members[num_source:])
+
+
+@flax.struct.dataclass
+class MapOfScans:
+    """One map of each group.
+
+    Attributes:
+        rows: its scans, as rows of the pyramids of the sample; 0 where `mask` is False.
+        mask: False where a map has fewer scans.
+        T_map_scan: poses of the scans in the frame of the map, metres.
+    """
+
+    rows: Int[AnyArray, "*b s"]
+    mask: Bool[AnyArray, "*b s"]
+    T_map_scan: Float[AnyArray, "*b s 4 4"]
+
+
+@flax.struct.dataclass
+class RegistrationSample:
+    """Groups of scans that form two maps each; a batch has one more axis in front.
+
+    Attributes:
+        pyramids: pyramids of all scans; unused rows repeat the first.
+        source: first map of each group.
+        target: second map of each group.
+        T_target_source: true motion between both maps, metres.
+        mask: False where there are fewer groups.
+    """
+
+    pyramids: PointPyramid
+    source: MapOfScans
+    target: MapOfScans
+    T_target_source: Float[AnyArray, "*b 4 4"]
+    mask: Bool[AnyArray, "*b"]
+
+
+@flax.struct.dataclass
+class OverlapSample:
+    """Pairs of scans; a batch has one more axis in front.
+
+    Attributes:
+        first: pyramid of the first scan of each pair.
+        second: pyramid of the second scan of each pair.
+        is_overlap: whether the two overlap in truth.
+    """
+
+    first: PointPyramid
+    second: PointPyramid
+    is_overlap: Bool[AnyArray, "*b p"]
+
+
+Sample = RegistrationSample | OverlapSample
+"""What a step trains on; a batch has one more axis in front, which is spread over devices."""
+
+
+def arrange_groups(
+    groups: Sequence[Group],
+    pyramids: Sequence[PointPyramid],
+    T_world_scan: Float[np.ndarray, "s 4 4"],
+    max_group: int,
+    config: SamplingConfig,
+) -> RegistrationSample:
+    """Arranges groups as a sample of NumPy arrays; its shapes depend on `max_group` and `config` only.
+
+    Args:
+        groups: from `draw_groups`.
+        pyramids: one for each scan: the source of the first group, its target, the source of the second, ...
+        T_world_scan: float64 poses of the frames of the pyramids, in the same order.
+        max_group: scans in both maps of a group together, at most.
+        config: sizes.
+
+    Returns:
+        The sample.
+
+    Raises:
+        ValueError: if there are not as many pyramids and poses as scans in the groups, or more than fit.
+    """
+    sizes = [len(side) for group in groups for side in group]
+    if not len(pyramids) == len(T_world_scan) == sum(sizes) <= config.num_scans:
+        found = f"{len(pyramids)} and {len(T_world_scan)} for groups of {sum(sizes)} scans"
+        raise ValueError(f"pyramids, T_world_scan: expected as many as scans, at most {config.num_scans}, got {found}")
+    num_groups, capacity = config.num_groups(max_group), config.side_capacity(max_group)
+    ends = np.cumsum(sizes)
+    rows = [np.arange(end - size, end) for end, size in zip(ends, sizes, strict=True)]
+    source, target = (_map_of_scans(rows[side::2], T_world_scan, num_groups, capacity) for side in (0, 1))
+    T_world_source, T_world_target = (T_world_scan[[of_map[0] for of_map in rows[side::2]]] for side in (0, 1))
+    T = np.tile(np.eye(4), (num_groups, 1, 1))
+    T[: len(groups)] = np.linalg.inv(T_world_target) @ T_world_source
+    spare = [pyramids[0]] * (config.num_scans - len(pyramids))
+    mask = np.arange(num_groups) < len(groups)
+    return RegistrationSample(stack([*pyramids, *spare]), source, target, T.astype(np.float32), mask)
+
+
+def stack(trees: Sequence[TreeT]) -> TreeT:
+    """Stacks pytrees of NumPy arrays along a new first axis.
+
+    Args:
+        trees: pyramids or samples of the same shapes.
+
+    Returns:
+        One tree of NumPy arrays.
+    """
+    return jax.tree.map(lambda *leaves: np.stack(leaves), *trees)
+
+
+def _map_of_scans(
+    rows: Sequence[Int[np.ndarray, " k"]], T_world_scan: Float[np.ndarray, "s 4 4"], num_groups: int, capacity: int
+) -> MapOfScans:
+    padded = np.zeros((num_groups, capacity), np.int32)
+    mask = np.zeros((num_groups, capacity), bool)
+    T_map_scan = np.tile(np.eye(4, dtype=np.float32), (num_groups, capacity, 1, 1))
+    for number, scans in enumerate(rows):
+        padded[number, : len(scans)] = scans
+        mask[number, : len(scans)] = True
+        T_map_scan[number, : len(scans)] = np.linalg.inv(T_world_scan[scans[0]]) @ T_world_scan[scans]
+    return MapOfScans(padded, mask, T_map_scan)

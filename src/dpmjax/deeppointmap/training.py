@@ -22,7 +22,6 @@ import optax
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
-from dpmjax.deeppointmap.batches import MapOfScans, OverlapSample, RegistrationSample, Sample
 from dpmjax.deeppointmap.curriculum import TrainingConfig
 from dpmjax.deeppointmap.matching import merge_clouds
 from dpmjax.deeppointmap.model import (
@@ -43,6 +42,7 @@ from dpmjax.deeppointmap.objective import (
     close_pairs,
     matching_loss,
 )
+from dpmjax.deeppointmap.sampling import MapOfScans, OverlapSample, RegistrationSample, Sample
 from dpmjax.losses.descriptors import overlap_loss
 from dpmjax.types import AnyArray, DescriptorCloud, PointPyramid
 
@@ -107,7 +107,7 @@ def init_training(key: PRNGKeyArray, config: TrainingConfig) -> TrainingState:
 def make_step(config: TrainingConfig, mesh: Mesh | None = None) -> Step:
     """Makes the jitted step, which compiles once for each stage of the curriculum and once for the overlap part.
 
-    Batches carry samples along their first axis and may be spread over devices by `shard_batch`. The loss is the mean
+    Batches carry samples along their first axis and may be spread over devices by `place`. The loss is the mean
     over all groups of all samples, so the number of devices changes the speed only.
 
     Args:
@@ -123,9 +123,28 @@ def make_step(config: TrainingConfig, mesh: Mesh | None = None) -> Step:
 
 
 def _one_step(state: TrainingState, batch: Sample, *, config: TrainingConfig) -> tuple[TrainingState, TrainingReport]:
+    is_overlap = isinstance(batch, OverlapSample)
     if isinstance(batch, OverlapSample):
-        return _overlap_step(state, batch, config)
-    return _registration_step(state, batch, config)
+        learned, optimizer_state = state.params["decoder"]["overlap_head"], state.overlap_optimizer
+        loss_of, step = _overlap_loss_of(state, batch, config), state.step - config.registration_steps
+    else:
+        learned, optimizer_state, step = state.params, state.registration_optimizer, state.step
+
+        def loss_of(params: dict[str, Any]) -> tuple[Array, tuple[ObjectiveTerms, Array]]:
+            loss, terms = batch_loss(params, batch, config)
+            return loss, (terms, jnp.asarray(jnp.nan))
+
+    (loss, (terms, accuracy)), gradient = jax.value_and_grad(loss_of, has_aux=True)(learned)
+    learning_rate = jnp.asarray(_schedule(config, is_overlap=is_overlap)(step))
+    gradient_norm = jnp.sqrt(sum(jnp.sum(leaf**2) for leaf in jax.tree.leaves(gradient)))
+    report = TrainingReport(loss, terms, accuracy, gradient_norm, learning_rate)
+    updates, optimizer_state = _optimizer(config, is_overlap=is_overlap).update(gradient, optimizer_state, learned)
+    learned = optax.apply_updates(learned, updates)
+    if is_overlap:
+        state = replace(state, params=_with_head(state.params, learned), overlap_optimizer=optimizer_state)
+    else:
+        state = replace(state, params=learned, registration_optimizer=optimizer_state)
+    return replace(state, step=state.step + 1), report
 
 
 _step = jax.jit(_one_step, static_argnames="config")
@@ -171,10 +190,7 @@ def _map_pair_loss(
     # Applies the networks to two maps, and computes the losses (DeepPointMap eq. 4 to 7).
     correlated_a, correlated_b = correlate(model, a, b)
     close_a, close_b = close_pairs(a, b, T_b_a, config=config)
-    sides = (
-        _side(model, a, correlated_a, correlated_b, close_a),
-        _side(model, b, correlated_b, correlated_a, close_b),
-    )
+    sides = (_side(model, a, correlated_a, correlated_b, close_a), _side(model, b, correlated_b, correlated_a, close_b))
     return matching_loss(*sides, T_b_a, config=config)
 
 
@@ -188,11 +204,7 @@ def _in_parts(function: Callable[[Any], Any], trees: Any, at_once: int) -> Any:
 
 
 def _side(
-    model: Model,
-    cloud: DescriptorCloud,
-    correlated: DescriptorCloud,
-    other: DescriptorCloud,
-    close: ClosePairs,
+    model: Model, cloud: DescriptorCloud, correlated: DescriptorCloud, other: DescriptorCloud, close: ClosePairs
 ) -> TrainingSide:
     partners = other.features[close.indices]
     own = jnp.broadcast_to(correlated.features[:, None], partners.shape)
@@ -211,48 +223,19 @@ def _merged(clouds: DescriptorCloud, scans: MapOfScans) -> DescriptorCloud:
     return merge_clouds(replace(chosen, mask=chosen.mask & scans.mask[:, None]), scans.T_map_scan)
 
 
-def _registration_step(
-    state: TrainingState, batch: RegistrationSample, config: TrainingConfig
-) -> tuple[TrainingState, TrainingReport]:
-    (loss, terms), gradient = jax.value_and_grad(batch_loss, has_aux=True)(state.params, batch, config)
-    optimizer = _optimizer(config, is_overlap=False)
-    updates, optimizer_state = optimizer.update(gradient, state.registration_optimizer, state.params)
-    report = TrainingReport(
-        loss=loss,
-        terms=terms,
-        overlap_accuracy=jnp.full((), jnp.nan),
-        gradient_norm=_length(gradient),
-        learning_rate=jnp.asarray(_schedule(config, is_overlap=False)(state.step)),
-    )
-    params = optax.apply_updates(state.params, updates)
-    return replace(state, params=params, registration_optimizer=optimizer_state, step=state.step + 1), report
-
-
-def _overlap_step(
+def _overlap_loss_of(
     state: TrainingState, batch: OverlapSample, config: TrainingConfig
-) -> tuple[TrainingState, TrainingReport]:
-    head = state.params["decoder"]["overlap_head"]
+) -> Callable[[dict[str, Any]], tuple[Array, tuple[ObjectiveTerms, Array]]]:
     correlated = _correlated_pairs(Model(state.params, config.model), batch, config.scans_at_once // 2)
     labels = batch.is_overlap.reshape(-1)
 
-    def loss_of(head: dict[str, Any]) -> tuple[Array, Array]:
+    def loss_of(head: dict[str, Any]) -> tuple[Array, tuple[ObjectiveTerms, Array]]:
         model = Model(_with_head(state.params, head), config.model)
         logits = jax.vmap(overlap_logit, (None, 0, 0))(model, *correlated)
-        return overlap_loss(logits, labels), jnp.mean((logits > 0) == labels)
+        terms = ObjectiveTerms(*[jnp.asarray(jnp.nan)] * len(ObjectiveTerms._fields))
+        return overlap_loss(logits, labels), (terms, jnp.mean((logits > 0) == labels))
 
-    (loss, accuracy), gradient = jax.value_and_grad(loss_of, has_aux=True)(head)
-    optimizer = _optimizer(config, is_overlap=True)
-    updates, optimizer_state = optimizer.update(gradient, state.overlap_optimizer, head)
-    nothing = jnp.full((), jnp.nan)
-    report = TrainingReport(
-        loss=loss,
-        terms=ObjectiveTerms(nothing, nothing, nothing, nothing, nothing),
-        overlap_accuracy=accuracy,
-        gradient_norm=_length(gradient),
-        learning_rate=jnp.asarray(_schedule(config, is_overlap=True)(state.step - config.registration_steps)),
-    )
-    params = _with_head(state.params, optax.apply_updates(head, updates))
-    return replace(state, params=params, overlap_optimizer=optimizer_state, step=state.step + 1), report
+    return loss_of
 
 
 def _correlated_pairs(
@@ -269,10 +252,6 @@ def _correlated_pairs(
 
     clouds = jax.vmap(of_sample)(batch.first, batch.second)
     return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), clouds)
-
-
-def _length(gradient: Any) -> Float[Array, ""]:
-    return jnp.sqrt(sum(jnp.sum(leaf**2) for leaf in jax.tree.leaves(gradient)))
 
 
 def _with_head(params: dict[str, Any], head: Any) -> dict[str, Any]:

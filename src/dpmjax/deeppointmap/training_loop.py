@@ -10,8 +10,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -24,7 +23,7 @@ from dpmjax.checks import require_count
 from dpmjax.deeppointmap.curriculum import CurriculumStage, TrainingConfig
 from dpmjax.deeppointmap.data_pipeline import SampleMaker, ScanStore
 from dpmjax.deeppointmap.model import Model
-from dpmjax.deeppointmap.processes import device_mesh, from_first, is_first, largest, replicate, shard_batch, together
+from dpmjax.deeppointmap.processes import BATCH_AXIS, device_mesh, from_first, is_first, largest, place, together
 from dpmjax.deeppointmap.training import TrainingReport, TrainingState, init_training, make_step
 from dpmjax.types import AnyArray
 
@@ -50,6 +49,20 @@ class TrainingProgress:
     best_step: Int[AnyArray, ""]
 
 
+class Speed(NamedTuple):
+    """Seconds of steps.
+
+    Attributes:
+        run_s: seconds of all steps, without compilation.
+        compile_s: seconds of the first step of each stage.
+        scans_per_s: scans that a second of steps processes.
+    """
+
+    run_s: float
+    compile_s: float
+    scans_per_s: float
+
+
 class StepRecord(NamedTuple):
     """What the loop reports after a step.
 
@@ -58,18 +71,14 @@ class StepRecord(NamedTuple):
         stage: stage of the step; None in the overlap part.
         report: measures of the step.
         score: score of an evaluation after this step; NaN without one.
-        run_s: seconds of all steps of this call, without compilation.
-        compile_s: seconds of the first step of each stage.
-        scans_per_s: scans that a second of steps processes.
+        speed: seconds of the steps of this call.
     """
 
     step: int
     stage: CurriculumStage | None
     report: TrainingReport
     score: float
-    run_s: float
-    compile_s: float
-    scans_per_s: float
+    speed: Speed
 
 
 @dataclass(frozen=True)
@@ -99,17 +108,13 @@ class Trained(NamedTuple):
         model: the model with the best score, with the trained overlap head; the last one without an evaluation.
         progress: progress after the last step.
         stopped_by: the number that `stop` returned; 0 after the last step.
-        run_s: seconds of the steps of this call, without compilation.
-        compile_s: seconds of the first step of each stage.
-        scans_per_s: scans that a second of steps processed.
+        speed: seconds of the steps of this call.
     """
 
     model: Model
     progress: TrainingProgress
     stopped_by: int
-    run_s: float
-    compile_s: float
-    scans_per_s: float
+    speed: Speed
 
 
 def train(
@@ -140,7 +145,7 @@ def train(
     if start is None:
         start = begin_training(init_training(jax.random.key(seed), config))
     mesh, num_local = device_mesh(), jax.local_device_count()
-    progress = replicate(from_first(start), mesh)
+    progress = place(from_first(start), mesh)
     step = make_step(config, mesh if jax.device_count() > 1 else None)
     clock, stopped_by = _Clock(config.sampling.num_scans * jax.device_count()), 0
     first_sample = jax.process_index() * num_local
@@ -151,23 +156,22 @@ def train(
         while batch is not None and not (stopped_by := largest(int(hooks.stop()))):
             progress = before_step(progress, config)
             stage = config.stage_at(int(progress.state.step))
-            with clock.step(stage):
-                state, report = step(progress.state, shard_batch(batch, mesh))
-                with together():  # the next batch is prepared while the device computes
-                    batch = next(batches, None)
-                report = jax.device_get(report)
+            begun = time.perf_counter()
+            state, report = step(progress.state, place(batch, mesh, BATCH_AXIS))
+            with together():  # the next batch is prepared while the device computes
+                batch = next(batches, None)
+            report = jax.device_get(report)
+            clock.add(stage, time.perf_counter() - begun)
             progress = replace(progress, state=state)
             number = int(state.step)
             if not math.isfinite(report.loss):
-                raise TrainingLostError(
-                    f"the loss of step {number} is {report.loss}; resume from a checkpoint before it"
-                )
+                raise TrainingLostError(f"the loss of step {number} is {report.loss}; resume from an older checkpoint")
             progress, score = _evaluate_when_due(progress, stage, config, hooks)
             with together():
                 if hooks.on_report is not None and is_first():
-                    hooks.on_report(StepRecord(number, stage, report, score, *clock.seconds), progress)
+                    hooks.on_report(StepRecord(number, stage, report, score, clock.speed), progress)
     model = _local(Model(params_to_use(progress, config), config.model))
-    return Trained(model, progress, stopped_by, *clock.seconds)
+    return Trained(model, progress, stopped_by, clock.speed)
 
 
 def begin_training(state: TrainingState) -> TrainingProgress:
@@ -246,25 +250,17 @@ def _local(tree: Any) -> Any:
 
 
 class _Clock:
-    """Measures steps; the first step of each stage counts as compilation."""
+    """Sums up the seconds of steps; the first step of each stage counts as compilation."""
 
     def __init__(self, scans_per_step: int) -> None:
-        self._scans_per_step, self._num, self._run_s, self._compile_s = scans_per_step, 0, 0.0, 0.0
+        self.speed, self._scans, self._scans_per_step = Speed(0.0, 0.0, 0.0), 0, scans_per_step
         self._seen: set[CurriculumStage | None] = set()
 
-    @contextmanager
-    def step(self, stage: CurriculumStage | None) -> Iterator[None]:
-        begun = time.perf_counter()
-        yield
-        seconds = time.perf_counter() - begun
-        if stage in self._seen:
-            self._run_s, self._num = self._run_s + seconds, self._num + 1
-        else:
-            self._compile_s += seconds
+    def add(self, stage: CurriculumStage | None, seconds: float) -> None:
+        if stage not in self._seen:
             self._seen.add(stage)
-
-    @property
-    def seconds(self) -> tuple[float, float, float]:
-        """Seconds of running and of compiling, and scans a second."""
-        rate = self._num / self._run_s if self._run_s > 0 else 0.0
-        return self._run_s, self._compile_s, rate * self._scans_per_step
+            self.speed = self.speed._replace(compile_s=self.speed.compile_s + seconds)
+            return
+        self._scans += self._scans_per_step
+        run_s = self.speed.run_s + seconds
+        self.speed = self.speed._replace(run_s=run_s, scans_per_s=self._scans / run_s)

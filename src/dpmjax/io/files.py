@@ -10,6 +10,7 @@ import tempfile
 import zipfile
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.lib import format as npy_format
@@ -145,7 +146,7 @@ def read_table(path: str | Path) -> NDArray[np.float64]:
     return to_numbers([line.replace(",", " ").split() for line in lines], path)
 
 
-def unpack_rows(body: bytes, layout: np.dtype[np.void], count: int, source: str | Path) -> NDArray[np.void]:
+def unpack_rows(body: bytes, layout: np.dtype[np.void], count: int, source: str | Path) -> NDArray[Any]:
     """Reads binary records.
 
     Args:

@@ -146,5 +146,5 @@ def _numbers(poses: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.column_stack([poses[:, :3, 3], Rotation.from_matrix(poses[:, :3, :3]).as_quat()])
 
 
-def _line(tag: str, nodes: Iterable[int], values: NDArray[np.float64]) -> str:
+def _line(tag: str, nodes: Iterable[np.integer], values: NDArray[np.float64]) -> str:
     return " ".join([tag, *map(str, nodes), *(f"{value:.17g}" for value in values.tolist())])

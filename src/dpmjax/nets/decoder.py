@@ -46,10 +46,8 @@ class DecoderConfig:
         require_compute_dtype(self.compute_dtype)
 
 
-class OffsetHead(nn.Module):
-    """Predicts the offset from a descriptor to its partner (DeepPointMap section 3.2, figure 2d).
-
-    Three linear layers of halving width run beside a linear short cut; a linear map to three coordinates follows.
+class Head(nn.Module):
+    """What the heads have in common.
 
     Attributes:
         num_channels: channels of one descriptor.
@@ -58,6 +56,13 @@ class OffsetHead(nn.Module):
 
     num_channels: int
     compute_dtype: ComputeDtype = "float32"
+
+
+class OffsetHead(Head):
+    """Predicts the offset from a descriptor to its partner (DeepPointMap section 3.2, figure 2d).
+
+    Three linear layers of halving width run beside a linear short cut; a linear map to three coordinates follows.
+    """
 
     @nn.compact
     def __call__(self, features: Float[Array, "... c"], partners: Float[Array, "... c"]) -> Float[Array, "... 3"]:
@@ -78,16 +83,8 @@ class OffsetHead(nn.Module):
         return linear(3, "float32", "output")(nn.relu(x + short_cut).astype(jnp.float32))
 
 
-class OverlapHead(nn.Module):
-    """Predicts whether two clouds overlap (DeepPointMap section 3.2, figure 2e).
-
-    Attributes:
-        num_channels: channels of one descriptor.
-        compute_dtype: type of the matrix products.
-    """
-
-    num_channels: int
-    compute_dtype: ComputeDtype = "float32"
+class OverlapHead(Head):
+    """Predicts whether two clouds overlap (DeepPointMap section 3.2, figure 2e)."""
 
     @nn.compact
     def __call__(

@@ -56,12 +56,9 @@ class ScalarNet(nn.Module):
 
     def _linear(self, features: int, x: Float[Array, " c"]) -> Float[Array, " f"]:
         kernel_init = nn.initializers.variance_scaling(*_KERNELS[self.config.initialization])
-        bias_init: nn.initializers.Initializer = nn.initializers.zeros
-        if self.config.initialization == "pytorch":
-            bound = x.shape[0] ** -0.5
+        bound = x.shape[0] ** -0.5 if self.config.initialization == "pytorch" else 0.0
 
-            def uniform(key: jax.Array, shape: Any, dtype: Any = float) -> Array:
-                return jax.random.uniform(key, shape, dtype, -bound, bound)
+        def bias_init(key: jax.Array, shape: Any, dtype: Any = float) -> Array:
+            return jax.random.uniform(key, shape, dtype, -bound, bound)
 
-            bias_init = uniform
         return nn.Dense(features, kernel_init=kernel_init, bias_init=bias_init)(x)

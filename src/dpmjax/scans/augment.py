@@ -14,12 +14,13 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
-from dpmjax.checks import require_count
+from dpmjax.checks import require_fields
 from dpmjax.geometry import rigid
 from dpmjax.scans.preprocess import farthest_first
 from dpmjax.types import AnyArray, PointCloud
 
 Interval = tuple[float, float]
+TURN = (-math.pi, math.pi)
 
 
 @dataclass(frozen=True)
@@ -37,9 +38,8 @@ class SectorConfig:
     min_range_m: Interval = (2.0, 10.0)
 
     def __post_init__(self) -> None:
-        require_count("max_count", self.max_count)
-        _require_interval("width_deg", self.width_deg)
-        _require_interval("min_range_m", self.min_range_m)
+        require_fields(self, "max_count", low=1)
+        _require_intervals(self, "width_deg", "min_range_m")
 
 
 @dataclass(frozen=True)
@@ -65,16 +65,16 @@ class BoxConfig:
     centre_z_m: Interval = (-1.5, 0.5)
 
     def __post_init__(self) -> None:
-        require_count("max_count", self.max_count)
-        for name in ("length_m", "width_m", "height_m", "gap_m"):
-            _require_interval(name, getattr(self, name))
-        if self.centre_z_m[0] > self.centre_z_m[1]:
-            raise ValueError(f"centre_z_m: expected lower and upper bound, got {self.centre_z_m}")
+        require_fields(self, "max_count", low=1)
+        _require_intervals(self, "length_m", "width_m", "height_m", "gap_m")
+        _require_intervals(self, "centre_z_m", low=-math.inf)
 
 
-def _require_interval(name: str, interval: Interval) -> None:
-    if not 0 <= interval[0] <= interval[1]:
-        raise ValueError(f"{name}: expected 0 <= lower <= upper bound, got {interval}")
+def _require_intervals(config: SectorConfig | BoxConfig, *names: str, low: float = 0.0) -> None:
+    for name in names:
+        interval: Interval = getattr(config, name)
+        if not low <= interval[0] <= interval[1]:
+            raise ValueError(f"{name}: expected {low:g} <= lower <= upper bound, got {interval}")
 
 
 @dataclass(frozen=True)
@@ -106,12 +106,9 @@ class AugmentConfig:
     jitter_clip_sigmas: float = 3.0
 
     def __post_init__(self) -> None:
-        for name in ("max_drop_ratio", "sector_probability", "box_probability"):
-            if not 0 <= getattr(self, name) <= 1:
-                raise ValueError(f"{name}: expected from 0 to 1, got {getattr(self, name)}")
-        for name in ("max_yaw_rad", "max_tilt_rad", "translation_sigma_m", "jitter_sigma_m", "jitter_clip_sigmas"):
-            if not getattr(self, name) >= 0:
-                raise ValueError(f"{name}: expected at least 0, got {getattr(self, name)}")
+        require_fields(self, "max_drop_ratio", "sector_probability", "box_probability", low=0, high=1)
+        require_fields(self, "max_yaw_rad", "max_tilt_rad", "translation_sigma_m", low=0)
+        require_fields(self, "jitter_sigma_m", "jitter_clip_sigmas", low=0)
 
 
 class AugmentedScan(NamedTuple):
@@ -147,10 +144,8 @@ def augment_scan(cloud: PointCloud, config: AugmentConfig, *, key: PRNGKeyArray)
     is_lost = _is_dropped(len(points), config, drop_key) | _is_occluded(points, config, occlusion_key)
     mask = cloud.mask & ~is_lost
     T_augmented_lidar = random_motion(config, key=motion_key).astype(points.dtype)
-    noise = jnp.clip(
-        jax.random.normal(jitter_key, points.shape, points.dtype), -config.jitter_clip_sigmas, config.jitter_clip_sigmas
-    )
-    points = rigid.transform_points(T_augmented_lidar, points) + config.jitter_sigma_m * noise
+    noise, limit = jax.random.normal(jitter_key, points.shape, points.dtype), config.jitter_clip_sigmas
+    points = rigid.transform_points(T_augmented_lidar, points) + config.jitter_sigma_m * jnp.clip(noise, -limit, limit)
     return AugmentedScan(farthest_first(PointCloud(jnp.where(mask[:, None], points, 0), mask)), T_augmented_lidar)
 
 
@@ -197,9 +192,8 @@ def is_behind_sectors(points: Float[AnyArray, "n 3"], config: SectorConfig, *, k
     draws = jax.random.uniform(key, (4, config.max_count))
     index = jnp.arange(1, config.max_count + 1)
     count = _count(draws[0, 0], config.max_count)
-    width = jnp.deg2rad(_between(config.width_deg, draws[1])) / index
-    start = _between((-jnp.pi, jnp.pi), draws[2])
-    min_range = _between(config.min_range_m, draws[3])
+    width_deg, start, min_range = _between((config.width_deg, TURN, config.min_range_m), draws[1:])
+    width = jnp.deg2rad(width_deg) / index
     azimuth = jnp.arctan2(points[:, 1], points[:, 0])[:, None]
     is_in_sector = jnp.mod(azimuth - start, 2 * jnp.pi) <= width
     is_far = jnp.sum(points**2, axis=1)[:, None] > min_range**2
@@ -210,14 +204,10 @@ def is_behind_boxes(points: Float[AnyArray, "n 3"], config: BoxConfig, *, key: P
     """Returns True for points that a random box hides; metres, in the frame of the sensor, z up."""
     draws = jax.random.uniform(key, (8, config.max_count))
     count = _count(draws[0, 0], config.max_count)
-    length = _between(config.length_m, draws[1])
-    width = _between(config.width_m, draws[2])
-    height = _between(config.height_m, draws[3])
-    z = _between(config.centre_z_m, draws[4])
-    azimuth = _between((-jnp.pi, jnp.pi), draws[5])
-    heading = _between((-jnp.pi, jnp.pi), draws[6])
+    bounds = (config.length_m, config.width_m, config.height_m, config.centre_z_m, TURN, TURN, config.gap_m)
+    length, width, height, z, azimuth, heading, gap = _between(bounds, draws[1:])
     # The gap keeps the sensor outside of the box: inside, everything would be hidden.
-    distance = _between(config.gap_m, draws[7]) + jnp.hypot(length, width) / 2
+    distance = gap + jnp.hypot(length, width) / 2
     centres = jnp.stack([distance * jnp.cos(azimuth), distance * jnp.sin(azimuth), z], axis=1)
     sizes = jnp.stack([length, width, height], axis=1)
     is_hidden = jax.vmap(is_behind_box, (None, 0, 0, 0))(points, centres, sizes, heading)
@@ -225,10 +215,7 @@ def is_behind_boxes(points: Float[AnyArray, "n 3"], config: BoxConfig, *, key: P
 
 
 def is_behind_box(
-    points: Float[AnyArray, "n 3"],
-    centre: Float[AnyArray, " 3"],
-    size: Float[AnyArray, " 3"],
-    heading: Float[Array, ""],
+    points: Float[AnyArray, "n 3"], centre: Float[AnyArray, " 3"], size: Float[AnyArray, " 3"], heading: jax.Array
 ) -> Bool[Array, " n"]:
     """Finds the points whose segment to the origin meets one upright box (slab method).
 
@@ -257,8 +244,9 @@ def is_behind_box(
     return (enters <= leaves) & (leaves >= 0) & (enters <= 1)
 
 
-def _between(bounds: Interval, draws: Float[Array, " c"]) -> Float[Array, " c"]:
-    return bounds[0] + (bounds[1] - bounds[0]) * draws
+def _between(bounds: tuple[Interval, ...], draws: Float[Array, "k c"]) -> Float[Array, "k c"]:
+    low, high = jnp.array(bounds).T[..., None]
+    return low + (high - low) * draws
 
 
 def _count(draw: Float[Array, ""], max_count: int) -> Array:

@@ -17,7 +17,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 from scipy.spatial import cKDTree
 
-from dpmjax.checks import as_mask, as_points, require_count, require_positive
+from dpmjax.checks import as_mask, as_points, require_count, require_fields, require_positive_fields
 from dpmjax.geometry.neighbours import k_nearest
 from dpmjax.geometry.sampling import voxel_sample
 from dpmjax.types import AnyArray, PointCloud
@@ -58,13 +58,9 @@ class PreprocessConfig:
     def __post_init__(self) -> None:
         if not 0 <= self.min_range_m < self.max_range_m:
             raise ValueError(f"min_range_m: expected from 0 to below {self.max_range_m}, got {self.min_range_m}")
-        require_positive("voxel_size_m", self.voxel_size_m)
-        require_positive("outlier_sigmas", self.outlier_sigmas)
-        require_count("capacity", self.capacity)
-        if self.num_outlier_neighbours < 0:
-            raise ValueError(f"num_outlier_neighbours: expected at least 0, got {self.num_outlier_neighbours}")
-        if self.capacity > MAX_CAPACITY:
-            raise ValueError(f"capacity: expected at most {MAX_CAPACITY}, got {self.capacity}")
+        require_positive_fields(self, "voxel_size_m", "outlier_sigmas")
+        require_fields(self, "capacity", low=1, high=MAX_CAPACITY)
+        require_fields(self, "num_outlier_neighbours", low=0)
         if self.max_range_m / self.voxel_size_m >= MAX_VOXELS:
             raise ValueError(f"voxel_size_m: expected fewer than {MAX_VOXELS} voxels in max_range_m")
 
@@ -139,11 +135,8 @@ def _is_inlier(points: Float[Array, "n 3"], mask: Bool[Array, " n"], config: Pre
     others = near.mask[:, 1:]
     distances = jnp.sqrt(jnp.where(others, near.squared_distances[:, 1:], 0))
     spread = jnp.sum(distances, axis=1) / jnp.maximum(jnp.sum(others, axis=1), 1)
-    spread = jnp.where(mask, spread, 0)
-    num_points = jnp.maximum(jnp.sum(mask), 1)
-    mean = jnp.sum(spread) / num_points
-    variance = jnp.sum(jnp.where(mask, (spread - mean) ** 2, 0)) / num_points
-    return mask & (spread <= (mean + config.outlier_sigmas * jnp.sqrt(variance)) * OUTLIER_SLACK)
+    limit = jnp.mean(spread, where=mask) + config.outlier_sigmas * jnp.std(spread, where=mask)
+    return mask & (spread <= limit * OUTLIER_SLACK)
 
 
 def preprocess_scan_on_host(

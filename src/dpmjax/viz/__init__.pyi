@@ -1,6 +1,11 @@
+from .comparison import MatchedScans as MatchedScans
+from .comparison import endings_figure as endings_figure
 from .comparison import error_boxes_figure as error_boxes_figure
+from .comparison import matches_figure as matches_figure
 from .comparison import success_grids_figure as success_grids_figure
+from .comparison import toy_figure as toy_figure
 from .curves import History as History
+from .curves import curves_figure as curves_figure
 from .curves import history_figure as history_figure
 from .curves import size_figure as size_figure
 from .figures import Limits as Limits
@@ -11,8 +16,3 @@ from .rasters import ErrorMap as ErrorMap
 from .rasters import error_maps_figure as error_maps_figure
 from .rasters import from_above_figure as from_above_figure
 from .rasters import occupancy_figure as occupancy_figure
-from .toy import endings_figure as endings_figure
-from .toy import toy_figure as toy_figure
-from .training import MatchedScans as MatchedScans
-from .training import curves_figure as curves_figure
-from .training import matches_figure as matches_figure

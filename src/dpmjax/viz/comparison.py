@@ -1,17 +1,20 @@
-"""Methods side by side: boxes of their errors (DeepMapping figure 6) and grids of their success."""
+"""Comparisons: errors and success of methods (DeepMapping figure 6), forms of the toy (figure 14), matches of scans."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from dpmjax.viz.figures import ACCENT, INK, MUTED, new_figure
+from dpmjax.viz.figures import ACCENT, INK, MUTED, annotate_corner, new_figure, style_axes
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+
+SOURCE, GREEN, DIRECT = "#30638e", "#2a9d6f", "#00a6c8"
 
 
 def error_boxes_figure(
@@ -82,3 +85,129 @@ def success_grids_figure(
     axes[0].set_ylabel(row_label, fontsize=8)
     figure.tight_layout()
     return figure
+
+
+def toy_figure(
+    curve: tuple[ArrayLike, ArrayLike], converted: tuple[ArrayLike, ArrayLike], *, visited: tuple[ArrayLike, ArrayLike],
+    direct_end: tuple[float, float], network_end_z: float,
+) -> Figure:  # fmt: skip
+    """Draws DeepMapping figure 14.
+
+    Args:
+        curve: (k,) values of x, and L there.
+        converted: (m,) inputs of the fitted network, and L of its output there.
+        visited: x and L of the descent of the network form; its last entry is the end.
+        direct_end: x and L where the direct form ends.
+        network_end_z: the input of the network where the network form ends.
+
+    Returns:
+        The figure.
+    """
+    x, loss = map(np.asarray, curve)
+    network_end = tuple(float(np.asarray(values)[-1]) for values in visited)
+    figure = new_figure(8.0, 4.6)
+    axes = figure.add_subplot()
+    axes.plot(x, loss, color=INK, lw=1.2, label="L(x)", zorder=2)
+    axes.plot(*map(np.asarray, converted), "--", color=SOURCE, lw=1.4, label="L(f(z)), fitted f")
+    axes.plot(*map(np.asarray, visited), "*", color=GREEN, ms=7, mew=0, alpha=0.5, label="x visited by the network")
+    axes.plot(*direct_end, "o", color=DIRECT, ms=9, mec="white", label="direct descent ends", zorder=5)
+    axes.plot(network_end_z, network_end[1], "P", color=ACCENT, ms=10, mec="white", label="z* of the network", zorder=6)
+    axes.plot(*network_end, "o", color=ACCENT, ms=9, mec="white", label="x* = f(z*)", zorder=6)
+    axes.set_xlabel("x, or z for the dashed line", color=INK, fontsize=9)
+    axes.set_ylabel("L", color=INK, fontsize=9)
+    style_axes(axes)
+    axes.legend(fontsize=8, frameon=False, loc="upper left", ncols=2)
+    axes.set_xlim(float(x.min()), float(x.max()))
+    axes.set_ylim(top=1.5 * float(loss.max()))
+    figure.tight_layout()
+    return figure
+
+
+def endings_figure(
+    x: ArrayLike, loss: ArrayLike, ends: Mapping[str, NDArray[np.floating]], shares: Mapping[str, float]
+) -> Figure:
+    """Draws where the seeds end: L on top, then a histogram a method with the share that found the global minimum.
+
+    Args:
+        x: (k,) values of x; their range is shown.
+        loss: (k,) L there.
+        ends: x at the end of each seed, by method.
+        shares: share of the seeds at the global minimum, by method.
+
+    Returns:
+        The figure.
+
+    Raises:
+        ValueError: no method, or a share is missing.
+    """
+    if not ends or set(ends) != set(shares):
+        raise ValueError(f"expected shares of the same methods as ends; got {sorted(ends)} and {sorted(shares)}")
+    shown = np.asarray(x, np.float64)
+    figure = new_figure(8.0, 1.8 + 0.95 * len(ends))
+    top, *rows = figure.subplots(1 + len(ends), 1, sharex=True, height_ratios=(1.8, *([1.0] * len(ends))))
+    top.plot(shown, np.asarray(loss), color=INK, lw=1.2)
+    top.set_ylabel("L(x)", fontsize=9, color=INK)
+    style_axes(top)
+    edges = np.linspace(shown.min(), shown.max(), 241)
+    for axes, (name, values) in zip(rows, ends.items(), strict=True):
+        finite = values[np.isfinite(values)]
+        axes.hist(np.clip(finite, edges[0], edges[-1]), edges, color=ACCENT if "network" in name else DIRECT)
+        axes.set_yscale("symlog", linthresh=1.0)
+        annotate_corner(axes, f"{name}: {100 * shares[name]:.1f} % at the global minimum", (3, 2), color=INK)
+        style_axes(axes)
+    rows[-1].set_xlabel("x at the end of a seed", fontsize=9, color=INK)
+    figure.tight_layout()
+    return figure
+
+
+class MatchedScans(NamedTuple):
+    """Two scans and the matches between them, metres.
+
+    Attributes:
+        source: (n, 3) points in the source frame.
+        target: (m, 3) points in the target frame.
+        source_matched: (k, 3) matched points of the source.
+        target_matched: (k, 3) matched points of the target, row for row.
+        is_right: (k,) whether the true motion brings the two points of a match together.
+    """
+
+    source: ArrayLike
+    target: ArrayLike
+    source_matched: ArrayLike
+    target_matched: ArrayLike
+    is_right: ArrayLike
+
+
+def matches_figure(scans: MatchedScans, T_target_source: ArrayLike, *, title: str) -> Figure:
+    """Draws two scans side by side from above with lines between matches, and overlaid by the estimated motion.
+
+    Args:
+        scans: both scans and their matches.
+        T_target_source: (4, 4) the estimated motion, metres.
+        title: title of the picture.
+
+    Returns:
+        The figure.
+    """
+    a, b, T = (np.asarray(x, np.float64) for x in (scans.source, scans.target, T_target_source))
+    pa, pb = np.asarray(scans.source_matched, np.float64), np.asarray(scans.target_matched, np.float64)
+    figure = new_figure(12.0, 4.6)
+    left, right = figure.subplots(1, 2, width_ratios=(2, 1))
+    shift = np.array([a[:, 0].max(initial=0) - b[:, 0].min(initial=0) + 5.0, 0.0])
+    _dots(left, a[:, :2], SOURCE)
+    _dots(left, b[:, :2] + shift, MUTED)
+    for start, end, fits in zip(pa[:, :2], pb[:, :2] + shift, np.asarray(scans.is_right, bool), strict=True):
+        left.plot(*zip(start, end, strict=True), color=GREEN if fits else ACCENT, lw=0.6, alpha=0.7)
+    left.set_title(title, fontsize=10, color=INK)
+    _dots(right, b[:, :2], MUTED)
+    _dots(right, a[:, :2] @ T[:2, :2].T + a[:, 2:] @ T[:2, 2:3].T + T[:2, 3], SOURCE)
+    right.set_title("source laid onto target", fontsize=10, color=INK)
+    for axes in (left, right):
+        axes.set_aspect("equal")
+        axes.set_axis_off()
+    figure.tight_layout()
+    return figure
+
+
+def _dots(axes: Axes, points: NDArray[np.float64], color: str) -> None:
+    axes.plot(points[:, 0], points[:, 1], ",", color=color, alpha=0.6)

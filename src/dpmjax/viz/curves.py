@@ -1,15 +1,16 @@
-"""Curves: loss and trajectory error of a fit over time; time and memory against the number of scans."""
+"""Curves: a fit over its run time, a training over its steps, time and memory against the number of scans."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+import itertools
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from dpmjax.viz.figures import ACCENT, FRAME, INK, MUTED, format_length, new_figure
+from dpmjax.viz.figures import ACCENT, FRAME, INK, MUTED, format_length, new_figure, style_axes
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -18,6 +19,7 @@ if TYPE_CHECKING:
 PHASE_COLORS = ("#eef2f7", "#fbf3e6", "#ecf5ee", "#f6eef6")
 LOSS_COLOR = "#30638e"
 RATIO_FOR_LOG_AXIS = 10.0
+SMOOTHED_PART = 0.03
 SIZE_COLORS = (LOSS_COLOR, ACCENT, "#2a9d6f", "#e09f3e")
 
 
@@ -39,9 +41,11 @@ class History:
 
 
 class _Phase(NamedTuple):
+    """A run of records of one phase: its name, its rows and its first and last second."""
+
     name: str
-    start: int
-    stop: int
+    rows: slice
+    seconds: tuple[float, float]
 
 
 def history_figure(history: History, unit: str) -> Figure:
@@ -69,12 +73,12 @@ def history_figure(history: History, unit: str) -> Figure:
     has_ate = ate is not None and bool(np.isfinite(ate).any())
     figure = new_figure(8.0, 5.2 if has_ate else 3.0)
     rows = figure.subplots(2 if has_ate else 1, 1, sharex=True, squeeze=False)[:, 0]
-    phases = list(_phases(history.phase))
+    phases = _phases(history.phase, seconds)
     for axes in rows:
-        _shade_phases(axes, phases, seconds)
+        for number, phase in enumerate(phases):
+            axes.axvspan(*phase.seconds, color=PHASE_COLORS[number % len(PHASE_COLORS)], linewidth=0, zorder=0)
     for phase in phases:
-        part = slice(phase.start, phase.stop)
-        _draw_line(rows[0], seconds[part], loss[part], LOSS_COLOR)
+        _draw_line(rows[0], seconds[phase.rows], loss[phase.rows], LOSS_COLOR)
     _finish_value_axis(rows[0], loss, "loss")
     if has_ate and ate is not None:
         is_known = np.isfinite(ate)
@@ -83,7 +87,7 @@ def history_figure(history: History, unit: str) -> Figure:
         last = seconds[is_known][-1], ate[is_known][-1]
         style: Any = {"va": "center", "fontsize": 9, "color": ACCENT, "annotation_clip": False}
         rows[1].annotate(format_length(last[1], unit), last, xytext=(7, 0), textcoords="offset points", **style)
-    _name_phases(rows[0], phases, seconds)
+    _name_phases(rows[0], phases)
     rows[-1].set_xlabel("run time (s)", color=INK)
     first, last = seconds[0], seconds[-1]
     rows[-1].set_xlim(first, last if last > first else first + 1.0)
@@ -93,41 +97,23 @@ def history_figure(history: History, unit: str) -> Figure:
     return figure
 
 
-def _phases(names: Sequence[str]) -> Iterator[_Phase]:
-    """Runs of equal names."""
-    start = 0
-    for index in range(1, len(names) + 1):
-        if index == len(names) or names[index] != names[start]:
-            yield _Phase(names[start], start, index)
-            start = index
+def _phases(names: Sequence[str], seconds: NDArray[np.floating]) -> list[_Phase]:
+    """Runs of equal names; a phase lasts from its predecessor's last record to its own last record."""
+    borders = [0, *(k for k in range(1, len(names)) if names[k] != names[k - 1]), len(names)]
+    return [
+        _Phase(names[first], slice(first, last), (float(seconds[max(0, first - 1)]), float(seconds[last - 1])))
+        for first, last in itertools.pairwise(borders)
+    ]
 
 
-def _bounds(phase: _Phase, seconds: NDArray[np.floating]) -> tuple[float, float]:
-    """A phase lasts from its predecessor's last record to its own last record."""
-    return float(seconds[max(0, phase.start - 1)]), float(seconds[phase.stop - 1])
-
-
-def _shade_phases(axes: Axes, phases: Sequence[_Phase], seconds: NDArray[np.floating]) -> None:
-    for number, phase in enumerate(phases):
-        axes.axvspan(*_bounds(phase, seconds), color=PHASE_COLORS[number % len(PHASE_COLORS)], linewidth=0, zorder=0)
-
-
-def _name_phases(axes: Axes, phases: Sequence[_Phase], seconds: NDArray[np.floating]) -> None:
+def _name_phases(axes: Axes, phases: Sequence[_Phase]) -> None:
     """Writes the names above the first row; a name that would run into its left neighbour moves right of it."""
-    span = max(seconds[-1] - seconds[0], 1e-9)
+    first, last = phases[0].seconds[0], phases[-1].seconds[1]
     taken_until = 0.0
     for phase in phases:
-        start = (_bounds(phase, seconds)[0] - seconds[0]) / span
-        start = max(start, taken_until)
-        axes.annotate(
-            phase.name,
-            (start, 1),
-            xycoords="axes fraction",
-            xytext=(2, 5),
-            textcoords="offset points",
-            fontsize=9.5,
-            color=MUTED,
-        )
+        start = max((phase.seconds[0] - first) / max(last - first, 1e-9), taken_until)
+        style: Any = {"xycoords": "axes fraction", "textcoords": "offset points", "fontsize": 9.5, "color": MUTED}
+        axes.annotate(phase.name, (start, 1), xytext=(2, 5), **style)
         taken_until = start + 0.0135 * (len(phase.name) + 2)
 
 
@@ -167,11 +153,11 @@ def size_figure(curves: Mapping[str, ArrayLike], *, memory_limit_gb: float) -> F
         raise ValueError(f"curves: expected one or more sizes and curves as long; got {len(sizes)} sizes")
     figure = new_figure(9.0, 3.9)
     left, right = figure.subplots(1, 2)
-    times = [name for name in others if not name.endswith("(GB)")]
-    for name, color in zip(times, SIZE_COLORS * len(times), strict=False):
-        left.plot(sizes, others[name], "-o", ms=4, lw=1.4, color=color, label=name)
-    for name in (name for name in others if name.endswith("(GB)")):
-        right.plot(sizes, others[name], "-o", ms=4, lw=1.4, color=SIZE_COLORS[0], label=name)
+    colors = itertools.cycle(SIZE_COLORS)
+    for name, values in others.items():
+        is_memory = name.endswith("(GB)")
+        color = SIZE_COLORS[0] if is_memory else next(colors)
+        (right if is_memory else left).plot(sizes, values, "-o", ms=4, lw=1.4, color=color, label=name)
     right.axhline(memory_limit_gb, color=MUTED, ls=":", lw=1.0)
     right.set_ylim(bottom=0.0, top=1.15 * memory_limit_gb)
     left.set_yscale("log")
@@ -179,10 +165,47 @@ def size_figure(curves: Mapping[str, ArrayLike], *, memory_limit_gb: float) -> F
         axes.set_xscale("log", base=2)
         axes.set_xlabel("scans", fontsize=9, color=INK)
         axes.set_xticks(sizes, [f"{int(size)}" for size in sizes])
-        axes.grid(color=FRAME, lw=0.6)
-        axes.tick_params(colors=MUTED, labelsize=8)
         axes.legend(fontsize=8, frameon=False)
-        for spine in axes.spines.values():
-            spine.set_color(FRAME)
+        style_axes(axes)
     figure.tight_layout()
     return figure
+
+
+def curves_figure(steps: ArrayLike, curves: Mapping[str, ArrayLike]) -> Figure:
+    """Draws each curve over the steps in a row of its own; NaN is left out.
+
+    Args:
+        steps: numbers of the steps.
+        curves: one value for each step, by name.
+
+    Returns:
+        The figure.
+
+    Raises:
+        ValueError: if there is no step, no curve, or a curve of another length.
+    """
+    x = np.asarray(steps, np.float64)
+    values = {name: np.asarray(curve, np.float64) for name, curve in curves.items()}
+    if len(x) == 0 or not values or any(len(curve) != len(x) for curve in values.values()):
+        raise ValueError(f"expected one or more steps and curves as long; got {len(x)} steps, {len(values)} curves")
+    figure = new_figure(8.0, 1.0 + 1.5 * len(values))
+    rows = figure.subplots(len(values), 1, sharex=True, squeeze=False)[:, 0]
+    for axes, (name, curve) in zip(rows, values.items(), strict=True):
+        is_known = np.isfinite(curve)
+        many = int(is_known.sum()) > 40
+        style: dict[str, Any] = {"alpha": 0.3} if many else {"marker": "."}
+        axes.plot(x[is_known], curve[is_known], color=LOSS_COLOR, lw=1, **style)
+        if many:
+            axes.plot(x[is_known], _smoothed(curve[is_known]), color=LOSS_COLOR, lw=1.6)
+        axes.set_ylabel(name, color=INK, fontsize=9)
+        style_axes(axes)
+    rows[-1].set_xlabel("step", color=INK, fontsize=9)
+    figure.tight_layout()
+    return figure
+
+
+def _smoothed(values: NDArray[np.float64]) -> NDArray[np.float64]:
+    # Running mean over a small part of the curve; at the ends, of the values that are there.
+    width = max(3, int(SMOOTHED_PART * len(values)))
+    ones = np.ones(width)
+    return np.convolve(values, ones, "same") / np.convolve(np.ones_like(values), ones, "same")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -53,6 +53,21 @@ def save_figure(figure: Figure, path: str | os.PathLike[str], dpi: int = 160) ->
         os.replace(unfinished, path)
     finally:
         unfinished.unlink(missing_ok=True)
+
+
+def style_axes(axes: Axes) -> None:
+    """Gives the axes of a curve a light grid, small ticks and a thin frame."""
+    axes.grid(color=FRAME, lw=0.6)
+    axes.set_axisbelow(True)
+    axes.tick_params(colors=MUTED, labelsize=8)
+    for spine in axes.spines.values():
+        spine.set_color(FRAME)
+
+
+def annotate_corner(axes: Axes, text: str, offset: tuple[float, float], **style: Any) -> None:
+    """Writes text at the upper left corner of the axes, so many points right of it and above it."""
+    style = {"fontsize": 8.5, "color": MUTED, **style}
+    axes.annotate(text, (0, 1), xytext=offset, xycoords="axes fraction", textcoords="offset points", **style)
 
 
 def frame_map(axes: Axes, limits: Limits) -> None:

@@ -10,7 +10,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dpmjax.geometry import se2
-from dpmjax.viz.figures import INK, MUTED, Limits, add_scale_bar, draw_trajectory, format_length, frame_map, new_figure
+from dpmjax.viz.figures import (
+    INK,
+    MUTED,
+    Limits,
+    add_scale_bar,
+    annotate_corner,
+    draw_trajectory,
+    format_length,
+    frame_map,
+    new_figure,
+)
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -177,30 +187,17 @@ def _extent(panel: Panel) -> tuple[NDArray[np.floating], NDArray[np.floating]]:
 def _draw_panel(axes: Axes, panel: Panel, limits: Limits, unit: str, colormap: Colormap) -> None:
     points, scans = panel.visible_points()
     order = np.random.default_rng(0).permutation(len(points))[:MAX_POINTS_PER_PANEL]
-    axes.scatter(
-        points[order, 0],
-        points[order, 1],
-        c=scans[order],
-        cmap=colormap,
-        vmin=0,
-        vmax=max(1, len(panel.poses) - 1),
-        s=np.clip(50_000.0 / max(1, len(order)), 0.45, 4.0),
-        linewidths=0,
-        rasterized=True,
-        zorder=2,
-    )
+    size = np.clip(50_000.0 / max(1, len(order)), 0.45, 4.0)
+    colors = colormap(scans[order] / max(1, len(panel.poses) - 1))
+    axes.scatter(points[order, 0], points[order, 1], size, colors, linewidths=0, rasterized=True, zorder=2)
     draw_trajectory(axes, panel.trajectory_world, "black")
     frame_map(axes, limits)
-    numbers = []
-    if panel.ate is not None:
-        numbers.append(f"ATE {format_length(panel.ate, unit)}")
-    if panel.point_distance is not None:
-        numbers.append(f"point distance {format_length(panel.point_distance, unit)}")
-    style: dict[str, Any] = {"xycoords": "axes fraction", "textcoords": "offset points", "va": "baseline"}
+    known = {"ATE": panel.ate, "point distance": panel.point_distance}
+    numbers = [f"{name} {format_length(value, unit)}" for name, value in known.items() if value is not None]
     # A long title is drawn smaller, so that it does not run into the next panel.
     title_size = min(12.5, 480.0 / max(1, len(panel.title)))
-    axes.annotate(panel.title, (0, 1), xytext=(1, 21), fontsize=title_size, fontweight="bold", color=INK, **style)
-    axes.annotate("   ".join(numbers), (0, 1), xytext=(1, 7), fontsize=9.5, color=MUTED, **style)
+    annotate_corner(axes, panel.title, (1, 21), fontsize=title_size, fontweight="bold", color=INK)
+    annotate_corner(axes, "   ".join(numbers), (1, 7), fontsize=9.5)
 
 
 def _add_time_bar(figure: Figure, num_scans: int, width_in: float, total_in: float, colormap: Colormap) -> None:
@@ -209,11 +206,6 @@ def _add_time_bar(figure: Figure, num_scans: int, width_in: float, total_in: flo
     axes = figure.add_axes((0.5 - length_in / 2.0 / width_in, 0.24 / total_in, length_in / width_in, 0.09 / total_in))
     axes.imshow(np.linspace(0.0, 1.0, 256)[None, :], aspect="auto", cmap=colormap)
     axes.set_axis_off()
-    style: dict[str, Any] = {
-        "xycoords": "axes fraction",
-        "textcoords": "offset points",
-        "va": "center",
-        "fontsize": 8.5,
-    }
+    style: Any = {"xycoords": "axes fraction", "textcoords": "offset points", "va": "center", "fontsize": 8.5}
     axes.annotate("first scan", (0, 0.5), xytext=(-6, 0), ha="right", color=MUTED, **style)
     axes.annotate(f"scan {num_scans}", (1, 0.5), xytext=(6, 0), ha="left", color=MUTED, **style)

@@ -8,7 +8,16 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from dpmjax.viz.figures import ACCENT, INK, MUTED, Limits, add_scale_bar, draw_trajectory, frame_map, new_figure
+from dpmjax.viz.figures import (
+    ACCENT,
+    INK,
+    Limits,
+    add_scale_bar,
+    annotate_corner,
+    draw_trajectory,
+    frame_map,
+    new_figure,
+)
 from dpmjax.viz.maps import time_colormap
 
 if TYPE_CHECKING:
@@ -127,15 +136,7 @@ def error_maps_figure(
         axes.plot(*np.asarray(trajectory_world).T, ".", color=TRAJECTORY, ms=1.8)
         frame_map(axes, limits)
         axes.set_title(f"{panel.title}\n", fontsize=11, color=INK, loc="left", fontweight="bold")
-        axes.annotate(
-            panel.subtitle,
-            (0, 1),
-            xytext=(0, 6),
-            xycoords="axes fraction",
-            textcoords="offset points",
-            fontsize=8.5,
-            color=MUTED,
-        )
+        annotate_corner(axes, panel.subtitle, (0, 6))
     add_scale_bar(axes_row[0], limits, unit)
     # The bar and its label need about 0.9 inches at the right, whatever the number of maps.
     right = 1.0 - 0.9 / figure.get_figwidth()

@@ -8,8 +8,6 @@ from collections.abc import Sequence
 
 from dpmjax.weights.model_file import load_model, save_model
 
-EXIT_OK, EXIT_BAD_INPUT = 0, 2
-
 
 def main(args: Sequence[str] | None = None) -> int:
     """Converts a checkpoint; bad input ends in one line on stderr.
@@ -30,8 +28,8 @@ def main(args: Sequence[str] | None = None) -> int:
         save_model(load_model(options.source), options.target, card=options.card, dtype=options.dtype)
     except (ValueError, OSError) as error:
         sys.stderr.write(f"error: {' '.join(str(error).split())}\n")
-        return EXIT_BAD_INPUT
-    return EXIT_OK
+        return 2
+    return 0
 
 
 if __name__ == "__main__":

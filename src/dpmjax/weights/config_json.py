@@ -1,4 +1,4 @@
-"""Configurations to JSON values and back, field by field. The commands use it too, before they load JAX."""
+"""Configurations from the JSON of `dataclasses.asdict`; the commands use it too, before they load JAX."""
 
 from __future__ import annotations
 
@@ -11,20 +11,8 @@ from typing import Any, TypeVar
 ConfigT = TypeVar("ConfigT")
 
 
-def config_to_json(config: Any) -> dict[str, Any]:
-    """Converts a configuration to JSON values, field by field.
-
-    Args:
-        config: a frozen dataclass; nested dataclasses become nested objects, tuples become lists.
-
-    Returns:
-        The values by the names of their fields.
-    """
-    return dataclasses.asdict(config)
-
-
 def config_from_json(value: Any, config_type: type[ConfigT]) -> ConfigT:
-    """Reads a configuration back from what `config_to_json` returned.
+    """Reads a configuration back from the JSON of `dataclasses.asdict`.
 
     A `ValueError` names a field that is unknown or has a value of another type.
 

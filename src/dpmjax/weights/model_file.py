@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from pathlib import Path
 from typing import Any, Literal
@@ -14,7 +15,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save_file
 
 from dpmjax.deeppointmap.model import Model, ModelConfig, model_shapes
-from dpmjax.weights.config_json import config_from_json, config_to_json
+from dpmjax.weights.config_json import config_from_json
 
 SHIPPED = Path(__file__).parent
 FORMAT, FORMAT_VERSION = "dpmjax model", "1"
@@ -81,12 +82,8 @@ def save_model(
     for name, array in arrays.items():
         if not np.isfinite(array).all():
             raise ValueError(f"model: {name} holds numbers that are not finite in {dtype}")
-    header = {
-        "format": FORMAT,
-        "format_version": FORMAT_VERSION,
-        "config": json.dumps(config_to_json(model.config)),
-        "card": card,
-    }
+    config = json.dumps(dataclasses.asdict(model.config))
+    header = {"format": FORMAT, "format_version": FORMAT_VERSION, "config": config, "card": card}
     save_file(arrays, path, metadata=header)
 
 

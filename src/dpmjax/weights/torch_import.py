@@ -15,7 +15,7 @@ import re
 import zipfile
 from collections import OrderedDict
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -182,12 +182,10 @@ def read_torch_file(path: str | Path) -> Any:
         Dictionaries, lists and numbers, with NumPy arrays for tensors.
 
     Raises:
-        ValueError: if the file is missing, broken, or holds other objects; or if it has the format before PyTorch 1.6
+        ValueError: if the file is broken or holds other objects; or if it has the format before PyTorch 1.6
             and PyTorch is not installed.
     """
     path = Path(path)
-    if not path.is_file():
-        raise ValueError(f"{path}: no such file")
     if not zipfile.is_zipfile(path):
         return _read_with_torch(path)
     try:
@@ -220,13 +218,13 @@ class _TensorUnpickler(pickle.Unpickler):
         known = {
             ("collections", "OrderedDict"): OrderedDict,
             ("torch._utils", "_rebuild_tensor_v2"): _tensor,
-            ("torch._utils", "_rebuild_parameter"): _parameter,
+            ("torch._utils", "_rebuild_parameter"): lambda tensor, *_: tensor,
         }
         if (module, name) not in known:
             raise pickle.UnpicklingError(f"it holds a {module}.{name}, which is no tensor")
         return known[module, name]
 
-    def persistent_load(self, pid: Any) -> _Storage:
+    def persistent_load(self, pid: Any) -> np.ndarray:
         kind, storage_class, key, _, num_numbers = pid
         if kind != "storage" or storage_class not in STORAGE_DTYPES or not str(key).isalnum():
             raise pickle.UnpicklingError("a storage of an unknown kind")
@@ -234,28 +232,21 @@ class _TensorUnpickler(pickle.Unpickler):
         content = self._archive.read(f"{self._root}data/{key}")
         if len(content) != num_numbers * dtype.itemsize:
             raise pickle.UnpicklingError(f"storage {key} has {len(content)} bytes for {num_numbers} numbers")
-        return _Storage(np.frombuffer(content, dtype))
-
-
-class _Storage(NamedTuple):
-    numbers: np.ndarray
+        return np.frombuffer(content, dtype)
 
 
 def _tensor(storage: Any, offset: int, shape: tuple[int, ...], strides: tuple[int, ...], *_: Any) -> np.ndarray:
     # A tensor is a strided part of a storage, and must lie within it.
-    if not isinstance(storage, _Storage) or len(shape) != len(strides) or min((offset, *shape, *strides)) < 0:
+    is_storage = isinstance(storage, np.ndarray) and storage.ndim == 1
+    if not is_storage or len(shape) != len(strides) or min((offset, *shape, *strides)) < 0:
         raise pickle.UnpicklingError("a tensor that is not part of a storage")
     last = offset + sum((size - 1) * stride for size, stride in zip(shape, strides, strict=True))
     if math.prod(shape) == 0:
-        return np.zeros(shape, storage.numbers.dtype)
-    if last >= storage.numbers.size:
+        return np.zeros(shape, storage.dtype)
+    if last >= storage.size:
         raise pickle.UnpicklingError("a tensor that reaches beyond its storage")
-    byte_strides = tuple(stride * storage.numbers.itemsize for stride in strides)
-    return np.lib.stride_tricks.as_strided(storage.numbers[offset:], shape, byte_strides).copy()
-
-
-def _parameter(tensor: Any, *_: Any) -> Any:
-    return tensor
+    byte_strides = tuple(stride * storage.itemsize for stride in strides)
+    return np.lib.stride_tricks.as_strided(storage[offset:], shape, byte_strides).copy()
 
 
 def _read_with_torch(path: Path) -> Any:

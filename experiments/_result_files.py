@@ -1,0 +1,150 @@
+"""Result files: JSON that appears whole or not at all, rows that name their commit, a table that grows by the row."""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import hashlib
+import json
+import math
+import os
+from collections import defaultdict
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, Self
+
+from dpmjax.io.files import write_atomically
+from experiments._machine import git_hash, versions
+
+UNKNOWN = "unknown"
+
+
+def write_json(path: Path, value: Any) -> None:
+    """Writes dataclasses, paths, NumPy values as JSON; the file appears whole or not at all."""
+    write_atomically(path, json.dumps(as_json(value), indent=2, allow_nan=False) + "\n")
+
+
+def load_json(path: Path) -> dict[str, Any]:
+    """Reads a JSON object.
+
+    Raises:
+        ValueError: the file is no JSON object.
+    """
+    try:
+        value = json.loads(path.read_text(encoding="utf-8"))
+    except (UnicodeDecodeError, json.JSONDecodeError) as error:
+        raise ValueError(f"{path} is not JSON: {error}") from error
+    if not isinstance(value, dict):
+        raise ValueError(f"{path}: expected a JSON object, found {type(value).__name__}")
+    return value
+
+
+def as_json(value: Any) -> Any:
+    """Returns the same value made of JSON's types; NaN and infinity become null."""
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        value = dataclasses.asdict(value)
+    if isinstance(value, Mapping):
+        return {str(name): as_json(entry) for name, entry in value.items()}
+    if isinstance(value, list | tuple):
+        return [as_json(entry) for entry in value]
+    if isinstance(value, Path):
+        return str(value)
+    if hasattr(value, "__array__"):
+        return as_json(value.tolist())
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def do_row(folder: Path, case: dict[str, Any], work: Callable[[], dict[str, Any]], *, seed: int) -> dict[str, Any]:
+    """Makes one row of results, or reads it where an earlier, perhaps killed, run has made it.
+
+    Each row is a file of its own below `rows/`, written whole, and carries the commit, the versions and the seed that
+    made it.
+
+    Args:
+        folder: of the run.
+        case: identifies the row and becomes part of it.
+        work: makes the rest of the row.
+        seed: of the run.
+
+    Returns:
+        The row. The commit of a row that carries none is "unknown".
+    """
+    path = row_path(folder, case)
+    if path.exists():
+        return {"git_hash": UNKNOWN, **load_json(path)}
+    row = {**case, **work(), "git_hash": git_hash() or UNKNOWN, "seed": seed}
+    row["versions"] = ", ".join(f"{name} {version}" for name, version in versions().items())
+    write_json(path, row)
+    return row
+
+
+def row_path(folder: Path, case: Mapping[str, Any]) -> Path:
+    """Returns the file of a row, under a readable name that no other case has."""
+    text = "_".join(f"{key}-{value}" for key, value in case.items())
+    digest = hashlib.sha256(text.encode()).hexdigest()[:6]
+    return folder / "rows" / f"{text.replace('.', 'p').replace('/', '-')[:120]}_{digest}.json"
+
+
+def commits_note(rows: Sequence[Mapping[str, Any]], commit: str | None) -> str | None:
+    """Names the rows that another commit has made than the one that writes the file.
+
+    Args:
+        rows: with `git_hash`, and `method` where there are several.
+        commit: of the program that writes the file, None where it is not known.
+
+    Returns:
+        One sentence, or None where all rows are of `commit`.
+    """
+    methods: dict[str, list[str]] = defaultdict(list)
+    for row in rows:
+        if row.get("git_hash", UNKNOWN) != commit:
+            methods[row.get("git_hash", UNKNOWN)].append(row.get("method", ""))
+    if not methods:
+        return None
+
+    def short(name: str) -> str:
+        return name[:10] + ("+changes" if name.endswith("+changes") else "")
+
+    parts = [
+        f"{len(names)} of {short(made_by)}" + (f" ({', '.join(sorted(set(names)))})" if any(names) else "")
+        for made_by, names in methods.items()
+    ]
+    count, own = sum(map(len, methods.values())), short(commit or UNKNOWN)
+    return f"{count} of {len(rows)} rows were made by another commit than this file ({own}): {'; '.join(parts)}"
+
+
+class HistoryFile:
+    """The table of a run, one row a record, each on disk as soon as it is known.
+
+    Args:
+        path: the CSV file; it is replaced, but for the rows to keep.
+        columns: names of the columns, the first counts steps.
+        keep_until: in a resumed run, rows with a larger first column are dropped; they will be computed again.
+    """
+
+    def __init__(self, path: Path, columns: Sequence[str], *, keep_until: int | None = None) -> None:
+        earlier = read_history(path) if keep_until is not None and path.exists() else []
+        unfinished = path.with_name(f".{path.name}.tmp")
+        self._file = unfinished.open("w", newline="", encoding="utf-8")
+        self._writer = csv.DictWriter(self._file, columns, lineterminator="\n")
+        self._writer.writeheader()
+        self._writer.writerows(row for row in earlier if int(row[columns[0]]) <= (keep_until or 0))
+        self._file.flush()
+        os.replace(unfinished, path)
+
+    def append(self, **row: object) -> None:
+        """Adds a row; a column that is not given stays empty."""
+        self._writer.writerow(row)
+        self._file.flush()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self._file.close()
+
+
+def read_history(path: Path) -> list[dict[str, str]]:
+    """Returns the rows of the table, without a last line that a crash has cut off."""
+    text = path.read_text(encoding="utf-8")
+    return list(csv.DictReader(text[: text.rfind("\n") + 1].splitlines()))
