@@ -116,8 +116,8 @@ def planar_scans(points: AnyArray | ScanSet, mask: AnyArray | None = None, *, is
         PlanarScans.
 
     Raises:
-        ValueError: wrong shapes, no scan, fewer than three beams, no valid beam, or coordinates that are not finite where
-            the mask is True.
+        ValueError: wrong shapes, no scan, fewer than three beams, no valid beam, or coordinates that are not finite
+            where the mask is True.
     """
     if isinstance(points, ScanSet):
         mask, points = points.mask if mask is None else mask, points.points
