@@ -77,7 +77,9 @@ def ground_oracle(heights, origin, cell, start, ray, max_range):
 
 
 def hull(centre, half_size, heading):
-    return Bodies(*(jnp.asarray(x, jnp.float32) for x in (centre, half_size, heading)), *[jnp.zeros(())] * 4)
+    shape = [np.atleast_2d(np.asarray(x, np.float32)) for x in (centre, half_size, heading)]
+    zero = jnp.zeros(len(shape[0]))
+    return Bodies(*map(jnp.asarray, shape), zero, zero, jnp.full(len(zero), SOLID), jnp.ones(len(zero), bool))
 
 
 def first_hit(crossing):
