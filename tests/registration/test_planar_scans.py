@@ -102,6 +102,15 @@ def test_padded_equals_unpadded() -> None:
     )
 
 
+@pytest.mark.parametrize("num_beams", [3, 5, 16])
+def test_scans_of_few_beams_are_prepared(num_beams: int) -> None:
+    angle = 2 * np.pi * np.arange(num_beams) / num_beams
+    points = 10.0 * np.stack([np.cos(angle), np.sin(angle)], -1)
+    scans = planar_scans(np.stack([points, points + 0.1]))
+    assert scans.typical_range == pytest.approx(10.0, rel=0.05)
+    assert np.isfinite(scans.normals).all()
+
+
 def test_isolated_points_have_no_line_and_no_noise() -> None:
     scan, _ = scan_of_room((15.0, -20.0))
     lines = planar_scans(scan.points, (jnp.arange(NUM_BEAMS) % 3 == 0)[None])
@@ -171,6 +180,7 @@ def test_a_selection_has_no_order() -> None:
         (np.zeros((3, 4)), None, "points: expected shape"),
         (np.zeros((3, 4, 3)), None, "points: expected shape"),
         (np.zeros((0, 4, 2)), None, "at least one scan"),
+        (np.ones((3, 2, 2)), None, "three beams"),
         (np.full((3, 4, 2), np.nan), None, "points: expected finite"),
         (np.ones((3, 4, 2)), np.ones((3, 5), bool), "mask: expected bool of shape"),
         (np.ones((3, 4, 2)), np.ones((3, 4)), "mask: expected bool"),

@@ -116,13 +116,14 @@ def planar_scans(points: AnyArray | ScanSet, mask: AnyArray | None = None, *, is
         PlanarScans.
 
     Raises:
-        ValueError: wrong shapes, no scan, no valid beam, or coordinates that are not finite where the mask is True.
+        ValueError: wrong shapes, no scan, fewer than three beams, no valid beam, or coordinates that are not finite
+            where the mask is True.
     """
     if isinstance(points, ScanSet):
         mask, points = points.mask if mask is None else mask, points.points
     values = np.asarray(points, np.float32)
-    if values.ndim != 3 or values.shape[-1] != 2 or 0 in values.shape:
-        raise ValueError(f"points: expected shape (n, b, 2) with at least one scan and beam, got {values.shape}")
+    if values.ndim != 3 or values.shape[2] != 2 or len(values) < 1 or values.shape[1] < 3:
+        raise ValueError(f"points: expected shape (n, b, 2) with at least one scan and three beams, got {values.shape}")
     valid = np.ones(values.shape[:2], bool) if mask is None else np.asarray(mask)
     if valid.dtype != bool or valid.shape != values.shape[:2]:
         raise ValueError(f"mask: expected bool of shape {values.shape[:2]}, got {valid.dtype} of {valid.shape}")

@@ -130,8 +130,8 @@ def solve_step(num_poses: int, edges: Edges, gradient: Floats) -> Floats:
     jacobian = np.stack([-adjoint, np.broadcast_to(np.eye(3), adjoint.shape)], axis=1)
     transposed = np.swapaxes(jacobian, 2, 3)
     blocks = (transposed @ edges.information[:, None])[:, :, None] @ jacobian[:, None]
-    nodes = np.stack([edges.target, edges.source], axis=1)
-    return solve_blocks(nodes, blocks, np.einsum("esij,ej->esi", transposed, gradient), num_poses)
+    gradients = np.einsum("esij,ej->esi", transposed, gradient)
+    return solve_blocks(np.stack([edges.target, edges.source], axis=1), blocks, gradients, num_poses)
 
 
 def choose_pairs(scans: PlanarScans, poses: Floats, config: RefinementConfig) -> tuple[Indices, Indices]:
