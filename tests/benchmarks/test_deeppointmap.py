@@ -53,6 +53,7 @@ def test_figures_follow_the_number_they_are_held_against() -> None:
     assert [row.value for row in rows[2:4]] == [82.0, 40.0]
 
 
+@pytest.mark.slow
 def test_figures_have_a_case(folder) -> None:
     timed = [
         partial(time_encoding, preset="tiny"),

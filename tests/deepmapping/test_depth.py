@@ -64,6 +64,7 @@ def test_a_fit_goes_through_all_phases_and_returns_rigid_motions(scans) -> None:
     assert np.isfinite(fitted.report.loss)
 
 
+@pytest.mark.slow
 def test_a_fit_improves_the_trajectory_of_a_perturbed_start(walk, scans) -> None:
     rng = np.random.default_rng(0)
     shake = np.asarray(motion_matrices(jnp.asarray(rng.normal(size=(4, 3)) * [0.06, 0.06, 0.03], jnp.float32)))
@@ -78,6 +79,7 @@ def test_a_fit_improves_the_trajectory_of_a_perturbed_start(walk, scans) -> None
     assert ate(fitted.T_world_camera) < 0.5 * ate(start)
 
 
+@pytest.mark.slow
 def test_full_motion_leaves_the_plane(scans) -> None:
     fitted = dm.fit_depth(scans, small("full"), key=KEY, init=np.tile(np.eye(4), (4, 1, 1)))
     assert_rigid(fitted.T_world_camera)
@@ -150,6 +152,7 @@ def test_every_pair_of_images_counts_once(walk, count: int) -> None:
     np.testing.assert_allclose(dm.projective_consistency(scans, T), np.mean(pairs), rtol=1e-3, atol=1e-4)
 
 
+@pytest.mark.slow
 def test_images_are_registered_without_a_first_guess(walk, scans) -> None:
     config = dm.DepthInitializationConfig(num_candidates=512, num_kept=16, num_points=100, num_references=2)
     T = dm.initialize_depth(scans, config, key=KEY)

@@ -227,6 +227,7 @@ def test_restored_from_disk_in_any_phase_equals_unbroken(tiny_data, tmp_path) ->
     jax.tree.map(np.testing.assert_array_equal, resumed.state, states[-1])
 
 
+@pytest.mark.slow
 def test_several_planar_starts_end_as_one(tiny_data) -> None:
     done = fit(COLD, tiny_data, key=KEY, num_starts=2)
     assert done.poses.shape == (20, 3)

@@ -72,6 +72,7 @@ def test_picture_is_dark_at_walls_and_light_in_free_space(tiny_walk, warm) -> No
     assert not picture.explored.all()
 
 
+@pytest.mark.slow
 def test_steps_of_the_paper_preset_lower_its_loss(tiny_data) -> None:
     config = dm.preset("paper")
     (phase,) = config.cold_phases

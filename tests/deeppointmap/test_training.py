@@ -51,6 +51,7 @@ def changed(before: TrainingState, after: TrainingState) -> dict[str, bool]:
     }
 
 
+@pytest.mark.slow
 def test_loss_falls_on_one_batch_and_all_parts_but_the_overlap_head_learn(maker, step, start) -> None:
     batch, state, losses = maker(0), start, []
     for _ in range(15):

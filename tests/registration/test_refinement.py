@@ -81,6 +81,7 @@ def revisit() -> ScanSequence:
     )
 
 
+@pytest.mark.slow
 def test_a_drifted_trajectory_is_closed(revisit, monkeypatch) -> None:
     monkeypatch.setattr(
         "dpmjax.registration.loop_closure._BATCH", 128
