@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 
 import jax
 import jax.numpy as jnp
@@ -146,3 +147,18 @@ def require_positive_fields(config: object, *names: str) -> None:
     """
     for name in names:
         require_positive(name, getattr(config, name))
+
+
+def require_one_of(name: str, value: str, options: Iterable[str]) -> None:
+    """Checks that a word is one of those that there are.
+
+    Args:
+        name: of the argument, for messages.
+        value: the word.
+        options: the words that there are.
+
+    Raises:
+        ValueError: `value` is another word.
+    """
+    if value not in options:
+        raise ValueError(f"{name}: expected one of {', '.join(options)}, got {value!r}")

@@ -59,8 +59,8 @@ def draw_map(
         explored[np.clip(row, 0, height - 1), np.clip(column, 0, width - 1)] = True
     x, y = low[0] + cell * (np.arange(width) + 0.5), low[1] + cell * (np.arange(height) + 0.5)
     centres = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2) / fitted.unit
-    logits = bind_map(fitted.params, fitted.config)(jax.numpy.asarray(centres, jax.numpy.float32))
-    probability = np.asarray(jax.nn.sigmoid(logits)).reshape(height, width)
+    occupied = jax.jit(lambda params, points: jax.nn.sigmoid(bind_map(params, fitted.config)(points)))
+    probability = np.asarray(occupied(fitted.params, centres.astype(np.float32))).reshape(height, width)
     extent = (float(low[0]), float(low[0] + cell * width), float(low[1]), float(low[1] + cell * height))
     return MapPicture(probability, _close_gaps(explored), extent)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 
-from dpmjax.checks import require_count, require_fields, require_positive_fields
+from dpmjax.checks import require_count, require_fields, require_one_of, require_positive_fields
 from dpmjax.deeppointmap.model import ModelConfig, Preset, model_preset
 from dpmjax.deeppointmap.objective import ObjectiveConfig
 from dpmjax.scans.augment import AugmentConfig
@@ -190,11 +190,9 @@ def training_preset(name: Preset) -> TrainingConfig:
     Returns:
         The configuration.
 
-    Raises:
-        ValueError: if no preset has this name.
+    A name that no preset has is a `ValueError`.
     """
-    if name not in PRESETS:
-        raise ValueError(f"name: expected one of {', '.join(PRESETS)}, got {name!r}")
+    require_one_of("name", name, PRESETS)
     return PRESETS[name]
 
 

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from dpmjax.checks import require_positive, require_shape
+from dpmjax.checks import require_one_of, require_positive, require_shape
 from dpmjax.deeppointmap.matching import MatchConfig
 from dpmjax.geometry.consensus import ConsensusConfig
 from dpmjax.geometry.pyramid import PyramidConfig, PyramidStage
@@ -81,11 +81,9 @@ def model_preset(name: str) -> ModelConfig:
     Returns:
         The configuration.
 
-    Raises:
-        ValueError: if no preset has this name.
+    A name that no preset has is a `ValueError`.
     """
-    if name not in PRESETS:
-        raise ValueError(f"name: expected one of {', '.join(PRESETS)}, got {name!r}")
+    require_one_of("name", name, PRESETS)
     return PRESETS[name]
 
 

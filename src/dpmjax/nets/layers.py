@@ -8,6 +8,8 @@ import flax.linen as nn
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from dpmjax.checks import require_one_of
+
 ComputeDtype = Literal["float32", "bfloat16"]
 """Type of the matrix products. Parameters, normalisation, softmax and geometry are float32 either way."""
 
@@ -20,11 +22,9 @@ def require_compute_dtype(value: str) -> None:
     Args:
         value: one of the names in `ComputeDtype`.
 
-    Raises:
-        ValueError: if it is another name.
+    Another name is a `ValueError`.
     """
-    if value not in get_args(ComputeDtype):
-        raise ValueError(f"compute_dtype: expected one of {', '.join(get_args(ComputeDtype))}, got {value!r}")
+    require_one_of("compute_dtype", value, get_args(ComputeDtype))
 
 
 def linear(num_features: int, compute_dtype: ComputeDtype, name: str) -> nn.Dense:

@@ -17,7 +17,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float, Int
 
-from dpmjax.checks import require_count
+from dpmjax.checks import require_count, require_one_of
 from dpmjax.nets.layers import ComputeDtype, layer_norm, linear, require_compute_dtype
 from dpmjax.nets.neighbourhood import maximum_of_normalised
 from dpmjax.types import AnyArray, Interpolation, PointPyramid, PyramidLevel
@@ -49,8 +49,7 @@ class EncoderConfig:
         require_count("stem_channels", self.stem_channels)
         require_count("expansion", self.expansion)
         require_count("output_channels", self.output_channels)
-        if self.frame not in get_args(Frame):
-            raise ValueError(f"frame: expected one of {', '.join(get_args(Frame))}, got {self.frame!r}")
+        require_one_of("frame", self.frame, get_args(Frame))
         require_compute_dtype(self.compute_dtype)
 
 

@@ -9,6 +9,8 @@ import flax.linen as nn
 import jax
 from jaxtyping import Array, Float
 
+from dpmjax.checks import require_one_of
+
 Initialization = Literal["xavier-relu", "xavier", "he", "lecun", "pytorch"]
 
 # Scale, fan and distribution of `variance_scaling`.
@@ -36,9 +38,7 @@ class ScalarNetConfig:
     initialization: Initialization = "xavier-relu"
 
     def __post_init__(self) -> None:
-        if self.initialization not in get_args(Initialization):
-            known = ", ".join(get_args(Initialization))
-            raise ValueError(f"initialization: expected one of {known}, got {self.initialization!r}")
+        require_one_of("initialization", self.initialization, get_args(Initialization))
 
 
 class ScalarNet(nn.Module):
