@@ -25,6 +25,7 @@ from dpmjax.deeppointmap.model import (
     similarity_features,
 )
 from dpmjax.geometry import se2
+from dpmjax.geometry.bearing import directions_of
 from dpmjax.geometry.pyramid_host import build_pyramid_on_host
 from dpmjax.metrics.poses import RegistrationRecall, registration_recall
 from dpmjax.scans.preprocess import preprocess_scan_on_host
@@ -267,7 +268,8 @@ def _register(model: Model, source: DescriptorCloud, target: DescriptorCloud, *,
 
     def offsets(source_rows: Array, target_rows: Array) -> tuple[Array, Array]:
         a, b = source.features[source_rows], target.features[target_rows]
-        return predict_offsets(model, a, b), predict_offsets(model, b, a)
+        of_source, of_target = directions_of(source)[source_rows], directions_of(target)[target_rows]
+        return predict_offsets(model, a, b, of_source), predict_offsets(model, b, a, of_target)
 
     return match_descriptors(source, target, similarity, offsets, config=config)
 

@@ -16,6 +16,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from dpmjax.checks import require_one_of, require_positive, require_shape
 from dpmjax.deeppointmap.matching import MatchConfig
+from dpmjax.geometry.bearing import from_ray_frame, ray_directions
 from dpmjax.geometry.consensus import ConsensusConfig
 from dpmjax.geometry.pyramid import PyramidConfig, PyramidStage
 from dpmjax.geometry.pyramid_host import build_pyramid_on_host
@@ -192,7 +193,7 @@ def encode_pyramid(model: Model, pyramid: PointPyramid) -> DescriptorCloud:
     features: Any = _encoder(model.config).apply({"params": model.params["encoder"]}, pyramid)
     level = pyramid.levels[-1 - len(pyramid.interpolation)]
     positions = jnp.where(level.mask[:, None], level.positions, 0) * model.config.scale_m
-    return DescriptorCloud(positions, features, jnp.asarray(level.mask))
+    return DescriptorCloud(positions, features, jnp.asarray(level.mask), ray_directions(positions))
 
 
 @jax.jit
@@ -278,19 +279,28 @@ def coarse_features(model: Model, cloud: DescriptorCloud) -> Float[Array, "m c"]
 
 @jax.jit
 def predict_offsets(
-    model: Model, features: Float[Array, "... c"], partners: Float[Array, "... c"]
+    model: Model,
+    features: Float[Array, "... c"],
+    partners: Float[Array, "... c"],
+    directions: Float[Array, "... 2"] | None = None,
 ) -> Float[Array, "... 3"]:
     """Predicts the offset from each descriptor to its partner (DeepPointMap section 3.2).
+
+    The head predicts in the frame of the features: that of each descriptor's ray with `EncoderConfig.frame` "bearing".
 
     Args:
         model: encoder and decoder.
         features: correlated features of the first cloud, one row for each pair.
         partners: correlated features of the second cloud, row for row.
+        directions: directions of the rays of the first cloud, row for row (`geometry.bearing.directions_of`). With
+            None, and in the frame "lidar", offsets stay as the head predicts them.
 
     Returns:
-        Offsets in metres, in the frame of the first cloud.
+        Offsets in metres, in the frame of the first cloud; in the frames of the rays without directions.
     """
-    return _decode(model, features, partners, part="offset_head")
+    offsets = _decode(model, features, partners, part="offset_head")
+    is_turned = directions is not None and model.config.encoder.frame == "bearing"
+    return from_ray_frame(offsets, directions) if is_turned else offsets
 
 
 def _encoder(config: ModelConfig) -> PointEncoder:

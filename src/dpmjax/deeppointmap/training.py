@@ -43,6 +43,7 @@ from dpmjax.deeppointmap.objective import (
     matching_loss,
 )
 from dpmjax.deeppointmap.sampling import MapOfScans, OverlapSample, RegistrationSample, Sample
+from dpmjax.geometry.bearing import directions_of
 from dpmjax.losses.descriptors import overlap_loss
 from dpmjax.types import AnyArray, DescriptorCloud, PointPyramid
 
@@ -208,13 +209,14 @@ def _side(
 ) -> TrainingSide:
     partners = other.features[close.indices]
     own = jnp.broadcast_to(correlated.features[:, None], partners.shape)
+    directions = directions_of(cloud)[:, None]
     return TrainingSide(
         positions=cloud.positions,
         mask=cloud.mask,
         matched_features=similarity_features(model, correlated),
         coarse_features=coarse_features(model, cloud),
         close=close,
-        offsets=predict_offsets(model, own, partners),
+        offsets=predict_offsets(model, own, partners, directions),
     )
 
 

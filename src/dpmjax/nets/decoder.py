@@ -5,7 +5,7 @@ DeepPointMap section 3.2. Call a method by its name: `decoder.apply({"params": p
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import flax.linen as nn
 import jax.numpy as jnp
@@ -73,7 +73,7 @@ class OffsetHead(Head):
             partners: correlated features of their partners.
 
         Returns:
-            Offsets in metres, in the frame of the first cloud.
+            Offsets in metres, in the frame that the features are relative to.
         """
         pair = jnp.concatenate([features, partners], axis=-1)
         x = nn.relu(linear(self.num_channels, self.compute_dtype, "linear_0")(pair))
@@ -145,9 +145,7 @@ class DescriptorDecoder(nn.Module):
         for i in range(self.config.num_layers):
             x = self.layers[i % len(self.layers)](x, embeddings, masks)
         features_a, features_b = jnp.split(x, [a.mask.size])
-        correlated_a = DescriptorCloud(a.positions, features_a, masks[0])
-        correlated_b = DescriptorCloud(b.positions, features_b, masks[1])
-        return _cleared(correlated_a), _cleared(correlated_b)
+        return _cleared(replace(a, features=features_a)), _cleared(replace(b, features=features_b))
 
     def overlap_logit(self, a: DescriptorCloud, b: DescriptorCloud) -> Float[Array, ""]:
         """Predicts the logit of the probability that two clouds overlap.
@@ -179,7 +177,7 @@ def _cleared(cloud: DescriptorCloud) -> DescriptorCloud:
     # Masked entries may hold anything, and must not reach a gradient.
     mask = cloud.mask[:, None]
     positions, features = jnp.where(mask, cloud.positions, 0), jnp.where(mask, cloud.features, 0)
-    return DescriptorCloud(positions, features, cloud.mask)
+    return replace(cloud, positions=positions, features=features)
 
 
 def _masked_mean(features: Float[Array, "m c"], mask: Bool[Array, " m"]) -> Float[Array, " c"]:
