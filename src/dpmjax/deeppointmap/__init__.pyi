@@ -2,7 +2,6 @@ from .curriculum import CurriculumStage as CurriculumStage
 from .curriculum import TrainingConfig as TrainingConfig
 from .curriculum import training_preset as training_preset
 from .data_pipeline import SampleMaker as SampleMaker
-from .data_pipeline import ScanStore as ScanStore
 from .inference import draw_evaluation_pairs as draw_evaluation_pairs
 from .inference import encode as encode
 from .inference import evaluate_registration as evaluate_registration
@@ -20,6 +19,10 @@ from .model import model_preset as model_preset
 from .objective import ObjectiveConfig as ObjectiveConfig
 from .processes import join_processes as join_processes
 from .sampling import SamplingConfig as SamplingConfig
+from .scan_store import PreparedDrive as PreparedDrive
+from .scan_store import ScanStore as ScanStore
+from .scan_store import prepare_drive as prepare_drive
+from .training import finish as finish
 from .training import init_training as init_training
 from .training import make_step as make_step
 from .training_loop import TrainingHooks as TrainingHooks
