@@ -12,7 +12,7 @@ import flax.struct
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from dpmjax.checks import require_one_of, require_positive, require_shape
 from dpmjax.deeppointmap.matching import MatchConfig
@@ -283,6 +283,7 @@ def predict_offsets(
     features: Float[Array, "... c"],
     partners: Float[Array, "... c"],
     directions: Float[Array, "... 2"] | None = None,
+    partner_rows: Int[Array, "..."] | None = None,
 ) -> Float[Array, "... 3"]:
     """Predicts the offset from each descriptor to its partner (DeepPointMap section 3.2).
 
@@ -294,11 +295,12 @@ def predict_offsets(
         partners: correlated features of the second cloud, row for row.
         directions: directions of the rays of the first cloud, row for row (`geometry.bearing.directions_of`). With
             None, and in the frame "lidar", offsets stay as the head predicts them.
+        partner_rows: if given, the partners are `partners[partner_rows]`; cheaper where partners are in several pairs.
 
     Returns:
         Offsets in metres, in the frame of the first cloud; in the frames of the rays without directions.
     """
-    offsets = _decode(model, features, partners, part="offset_head")
+    offsets = _decode(model, features, partners, partner_rows, part="offset_head")
     is_turned = directions is not None and model.config.encoder.frame == "bearing"
     return from_ray_frame(offsets, directions) if is_turned else offsets
 

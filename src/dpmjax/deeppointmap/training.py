@@ -250,16 +250,15 @@ def _in_parts(function: Callable[[Any], Any], trees: Any, at_once: int) -> Any:
 def _side(
     model: Model, cloud: DescriptorCloud, correlated: DescriptorCloud, other: DescriptorCloud, close: ClosePairs
 ) -> TrainingSide:
-    partners = other.features[close.indices]
-    own = jnp.broadcast_to(correlated.features[:, None], partners.shape)
     directions = directions_of(cloud)[:, None]
+    own = correlated.features[:, None]
     return TrainingSide(
         positions=cloud.positions,
         mask=cloud.mask,
         matched_features=similarity_features(model, correlated),
         coarse_features=coarse_features(model, cloud),
         close=close,
-        offsets=predict_offsets(model, own, partners, directions),
+        offsets=predict_offsets(model, own, other.features, directions, close.indices),
     )
 
 
