@@ -2,11 +2,12 @@ from .curriculum import CurriculumStage as CurriculumStage
 from .curriculum import TrainingConfig as TrainingConfig
 from .curriculum import training_preset as training_preset
 from .data_pipeline import SampleMaker as SampleMaker
-from .inference import draw_evaluation_pairs as draw_evaluation_pairs
+from .evaluation import PairKind as PairKind
+from .evaluation import draw_evaluation_pairs as draw_evaluation_pairs
+from .evaluation import evaluate_registration as evaluate_registration
+from .evaluation import overlap_accuracy as overlap_accuracy
 from .inference import encode as encode
-from .inference import evaluate_registration as evaluate_registration
 from .inference import overlap as overlap
-from .inference import overlap_accuracy as overlap_accuracy
 from .inference import register as register
 from .matching import MatchConfig as MatchConfig
 from .matching import merge_clouds as merge_clouds

@@ -1,18 +1,14 @@
-"""Inference: encode a raw scan to descriptors, register two scans or maps, predict their overlap.
-
-`evaluate_registration` and `overlap_accuracy` measure a model on held-out pairs of scans.
-"""
+"""Inference: encode a raw scan to descriptors, register two scans or maps, predict their overlap."""
 
 from __future__ import annotations
 
 import functools
-from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float
 
 from dpmjax.deeppointmap.matching import MatchConfig, match_descriptors
 from dpmjax.deeppointmap.model import (
@@ -24,20 +20,10 @@ from dpmjax.deeppointmap.model import (
     predict_offsets,
     similarity_features,
 )
-from dpmjax.geometry import se2
 from dpmjax.geometry.bearing import directions_of
 from dpmjax.geometry.pyramid_host import build_pyramid_on_host
-from dpmjax.metrics.poses import RegistrationRecall, registration_recall
 from dpmjax.scans.preprocess import preprocess_scan_on_host
-from dpmjax.sequences import LidarSequence
 from dpmjax.types import AnyArray, DescriptorCloud, PointCloud, PointPyramid, Registration
-
-PAIR_STREAM = 3103
-NEAR_M = (2.0, 10.0)
-"""Least and largest distance between the scans of an evaluation pair."""
-
-FAR_M = 40.0
-"""Scans farther apart than this do not overlap."""
 
 ScanOrCloud = DescriptorCloud | PointCloud | Float[AnyArray, "_n 3"]
 """A raw scan in metres, in the frame of its lidar; or the descriptors of a scan; or a map of such descriptors."""
@@ -117,7 +103,7 @@ def register(
     """
     clouds = _as_cloud(model, source), _as_cloud(model, target)
     correlated = correlate(model, *clouds)
-    return _register(model, *correlated, config=config or model.config.matching)
+    return register_correlated(model, *correlated, config=config or model.config.matching)
 
 
 def overlap(model: Model, source: ScanOrCloud, target: ScanOrCloud) -> Float[Array, ""]:
@@ -136,133 +122,25 @@ def overlap(model: Model, source: ScanOrCloud, target: ScanOrCloud) -> Float[Arr
     return overlap_probability(model, _as_cloud(model, source), _as_cloud(model, target))
 
 
-class EvaluationPairs(NamedTuple):
-    """Pairs of scans that are ready for all models of one configuration.
-
-    Attributes:
-        pyramids: pyramids of all scans, in normalised coordinates.
-        T_world_scan: (n, 4, 4) true poses, metres.
-        pairs: (p, 2) source and target of each pair.
-        scale_m: metres in one unit of the pyramids.
-    """
-
-    pyramids: list[PointPyramid]
-    T_world_scan: Float[np.ndarray, "n 4 4"]
-    pairs: Int[np.ndarray, "p 2"]
-    scale_m: float
-
-    def scan_points(self, row: int) -> Float[np.ndarray, "n 3"]:
-        """Returns the preprocessed points of a scan.
-
-        Args:
-            row: number of the scan.
-
-        Returns:
-            Points in the frame of the scan, metres.
-        """
-        level = self.pyramids[row].levels[0]
-        return np.asarray(level.positions)[np.asarray(level.mask)] * np.float32(self.scale_m)
-
-
-class Evaluation(NamedTuple):
-    """Results of a model on evaluation pairs.
-
-    Attributes:
-        recall: errors, and the share of correct registrations.
-        matches: registrations in the order of the pairs.
-        clouds: descriptors of all scans.
-        T_true: (p, 4, 4) true motions, target from source, metres.
-    """
-
-    recall: RegistrationRecall
-    matches: list[Registration]
-    clouds: list[DescriptorCloud]
-    T_true: Float[np.ndarray, "p 4 4"]
-
-
-def draw_evaluation_pairs(
-    drive: LidarSequence, num_pairs: int, config: ModelConfig, *, seed: int = 0
-) -> EvaluationPairs:
-    """Draws random pairs of one drive; each scan is rotated by a random yaw. The two are 2 to 10 m apart.
-
-    Args:
-        drive: scans with true poses.
-        num_pairs: number of pairs; fewer where the drive has fewer.
-        config: preprocessing and pyramid.
-        seed: seed of the draws.
-
-    Returns:
-        The pairs.
-
-    Raises:
-        ValueError: if the drive has no poses, or no such pairs.
-    """
-    rng = np.random.default_rng([PAIR_STREAM, seed])
-    poses = drive.T_world_lidar
-    if poses is None:
-        raise ValueError("drive: expected a true pose for each scan, got none")
-    distances = np.linalg.norm(poses[:, None, :3, 3] - poses[None, :, :3, 3], axis=2)
-    sources, targets = np.nonzero((distances >= NEAR_M[0]) & (distances <= NEAR_M[1]))
-    if len(sources) == 0:
-        raise ValueError(f"drive: expected scans {NEAR_M[0]} to {NEAR_M[1]} m apart, got none")
-    chosen = rng.choice(len(sources), min(num_pairs, len(sources)), replace=False)
-    rows = np.stack([sources[chosen], targets[chosen]], axis=1)
-    pyramids, rotated = [], []
-    for row, yaw in zip(rows.ravel(), rng.uniform(-np.pi, np.pi, rows.size), strict=True):
-        T = np.eye(4)
-        T[:2, :2] = se2.rotation(np.asarray(yaw))
-        points = (drive.read_scan(int(row)) @ T[:3, :3].T).astype(np.float32)
-        pyramids.append(pyramid_of_scan(points, config))
-        rotated.append(poses[row] @ np.linalg.inv(T))
-    return EvaluationPairs(pyramids, np.stack(rotated), np.arange(rows.size).reshape(-1, 2), config.scale_m)
-
-
-def evaluate_registration(model: Model, pairs: EvaluationPairs) -> Evaluation:
-    """Registers all pairs.
-
-    Args:
-        model: a model of the configuration that the pairs were drawn for.
-        pairs: from `draw_evaluation_pairs`.
-
-    Returns:
-        Errors, registrations and descriptors.
-    """
-    clouds = [encode_pyramid(model, pyramid) for pyramid in pairs.pyramids]
-    matches = [register(model, clouds[a], clouds[b]) for a, b in pairs.pairs]
-    poses, (sources, targets) = pairs.T_world_scan, pairs.pairs.T
-    T_true = np.linalg.inv(poses[targets]) @ poses[sources]
-    T_found = np.stack([np.asarray(match.T_target_source) for match in matches])
-    return Evaluation(registration_recall(T_found, T_true), matches, clouds, T_true)
-
-
-def overlap_accuracy(model: Model, evaluation: Evaluation, pairs: EvaluationPairs) -> float:
-    """Measures the overlap prediction on the pairs, and on as many pairs that are over 40 m apart.
-
-    Args:
-        model: the model of the evaluation.
-        evaluation: from `evaluate_registration`.
-        pairs: the pairs of the evaluation.
-
-    Returns:
-        Share of correct predictions.
-    """
-    positions, clouds = pairs.T_world_scan[:, :3, 3], evaluation.clouds
-    is_right = []
-    for a, b in pairs.pairs:
-        is_right.append(float(overlap(model, clouds[a], clouds[b])) > 0.5)
-        far = np.flatnonzero(np.linalg.norm(positions - positions[a], axis=1) > FAR_M)
-        if len(far) > 0:
-            other = int(far[(7 * int(a)) % len(far)])
-            is_right.append(float(overlap(model, clouds[a], clouds[other])) <= 0.5)
-    return float(np.mean(is_right))
-
-
 def _as_cloud(model: Model, scan: ScanOrCloud) -> DescriptorCloud:
     return scan if isinstance(scan, DescriptorCloud) else encode(model, scan)
 
 
 @functools.partial(jax.jit, static_argnames="config")
-def _register(model: Model, source: DescriptorCloud, target: DescriptorCloud, *, config: MatchConfig) -> Registration:
+def register_correlated(
+    model: Model, source: DescriptorCloud, target: DescriptorCloud, *, config: MatchConfig
+) -> Registration:
+    """Registers two clouds whose features are correlated already.
+
+    Args:
+        model: encoder and decoder.
+        source: from `correlate`.
+        target: the other one.
+        config: choice of pairs and inliers.
+
+    Returns:
+        As `register`.
+    """
     directions = [_unit(similarity_features(model, cloud)) for cloud in (source, target)]
     similarity = jnp.matmul(directions[0], directions[1].T, precision=lax.Precision.HIGHEST)
 

@@ -20,11 +20,12 @@ from dpmjax.geometry.bearing import from_ray_frame, ray_directions
 from dpmjax.geometry.consensus import ConsensusConfig
 from dpmjax.geometry.pyramid import PyramidConfig, PyramidStage
 from dpmjax.geometry.pyramid_host import build_pyramid_on_host
+from dpmjax.geometry.pyramid_storage import StoredPyramid, moved_pyramid
 from dpmjax.nets.decoder import DecoderConfig, DescriptorDecoder
 from dpmjax.nets.layers import ComputeDtype
 from dpmjax.nets.point_encoder import EncoderConfig, PointEncoder
 from dpmjax.scans.preprocess import PreprocessConfig
-from dpmjax.types import DescriptorCloud, PointPyramid
+from dpmjax.types import AnyArray, DescriptorCloud, PointPyramid
 
 Preset = Literal["tiny", "small", "paper"]
 
@@ -194,6 +195,22 @@ def encode_pyramid(model: Model, pyramid: PointPyramid) -> DescriptorCloud:
     level = pyramid.levels[-1 - len(pyramid.interpolation)]
     positions = jnp.where(level.mask[:, None], level.positions, 0) * model.config.scale_m
     return DescriptorCloud(positions, features, jnp.asarray(level.mask), ray_directions(positions))
+
+
+def encode_stored(model: Model, stored: StoredPyramid, T_new_lidar: Float[AnyArray, "4 4"]) -> DescriptorCloud:
+    """Encodes one scan from its stored pyramid, after a rigid motion.
+
+    Args:
+        model: a model whose `config.pyramid` built the pyramid.
+        stored: the pyramid of the scan.
+        T_new_lidar: the motion, metres.
+
+    Returns:
+        As `encode_pyramid`, in the frame after the motion.
+    """
+    # A rigid motion in metres is one in normalised coordinates with a shorter translation.
+    unit = jnp.ones((4, 4)).at[:3, 3].set(1 / model.config.scale_m)
+    return encode_pyramid(model, moved_pyramid(stored, T_new_lidar * unit))
 
 
 @jax.jit

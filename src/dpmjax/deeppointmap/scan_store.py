@@ -45,12 +45,12 @@ class PreparedDrive(NamedTuple):
 
     Attributes:
         T_world_lidar: (n, 4, 4) float64 true poses, metres.
-        pyramids: (n, num_variants) records of `record_type`, in memory or of a file.
+        pyramids: (n, num_variants) records of `record_type`, or the file that holds them.
         bad: for each bad scan the reason; bad scans count as empty.
     """
 
     T_world_lidar: Float[np.ndarray, "n 4 4"]
-    pyramids: NDArray[np.void]
+    pyramids: NDArray[np.void] | Path
     bad: dict[str, str]
 
 
@@ -72,7 +72,11 @@ class ScanStore:
         scene = np.concatenate([np.full(len(T), number) for number, T in enumerate(poses)])
         self.table = ScanTable(np.concatenate(poses), scene)
         self.bad = {source: reason for drive in drives for source, reason in drive.bad.items()}
-        self._pyramids = [drive.pyramids for drive in drives]
+        # Fails where a file is shorter than its header says.
+        self._pyramids = [
+            np.load(drive.pyramids, mmap_mode="r") if isinstance(drive.pyramids, Path) else drive.pyramids
+            for drive in drives
+        ]
         self._number = np.concatenate([np.arange(len(T)) for T in poses])
 
     def read(
@@ -107,7 +111,7 @@ def prepare_drive(
     seed: int = 0,
     on_scan: Callable[[], object] | None = None,
 ) -> PreparedDrive:
-    """Makes the pyramids of all variants of all scans, or opens the file that an earlier call has made.
+    """Makes the pyramids of all variants of all scans, or finds the file that an earlier call has made.
 
     A file belongs to the poses, the first, middle and last scan, the settings and the seed. It is written under another
     name until it is whole.
@@ -145,11 +149,7 @@ def prepare_drive(
         del written
         reasons.write_text(json.dumps(bad), encoding="utf-8")
         unfinished.replace(path)
-    # Fails where the file is shorter than its header says.
-    found = np.load(path, mmap_mode="r")
-    if found.dtype != dtype or found.shape != shape:
-        raise ValueError(f"{path}: expected {shape} pyramids of another type; remove the file")
-    return PreparedDrive(poses, found, json.loads(reasons.read_text(encoding="utf-8")))
+    return PreparedDrive(poses, path, json.loads(reasons.read_text(encoding="utf-8")))
 
 
 def _fill(

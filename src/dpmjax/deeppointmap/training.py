@@ -29,7 +29,7 @@ from dpmjax.deeppointmap.model import (
     Model,
     coarse_features,
     correlate,
-    encode_pyramid,
+    encode_stored,
     init_model,
     overlap_logit,
     predict_offsets,
@@ -52,7 +52,6 @@ from dpmjax.deeppointmap.sampling import (
     SampleScans,
 )
 from dpmjax.geometry.bearing import directions_of
-from dpmjax.geometry.pyramid_storage import moved_pyramid
 from dpmjax.losses.descriptors import overlap_loss
 from dpmjax.types import AnyArray, DescriptorCloud
 
@@ -210,7 +209,9 @@ def batch_loss(
             return _map_pair_loss(model, *maps, group.T_target_source, config.objective)
 
         return [
-            _in_parts(of_group, group, config.scans_at_once // (group.source.rows.shape[1] + group.target.rows.shape[1]))
+            _in_parts(
+                of_group, group, config.scans_at_once // (group.source.rows.shape[1] + group.target.rows.shape[1])
+            )
             for group in sample.groups
         ]
 
@@ -223,9 +224,7 @@ def batch_loss(
 
 
 def _encoded(model: Model, scan: SampleScans) -> DescriptorCloud:
-    # A rigid motion in metres is one in normalised coordinates with a shorter translation.
-    unit = jnp.ones((4, 4)).at[:3, 3].set(1 / model.config.scale_m)
-    return encode_pyramid(model, moved_pyramid(scan.pyramids, scan.T_augmented_lidar * unit))
+    return encode_stored(model, scan.pyramids, scan.T_augmented_lidar)
 
 
 def _map_pair_loss(

@@ -1,6 +1,6 @@
 """Point pyramids on disk: small integers that become a pyramid again in the training step.
 
-A rigid motion changes neither farthest points nor neighbours, so a pyramid is stored once and moved whenever it is read.
+A rigid motion changes neither farthest points nor neighbours, so a pyramid is stored once and moved when it is read.
 Levels after the first are the first rows of the sampled points, so that positions are stored once. Positions are
 rounded to 1/32,767 of the largest coordinate (2 mm at 60 m).
 """

@@ -21,7 +21,6 @@ from dpmjax.types import AnyArray
 _UNROLL = 4
 
 
-
 class Residuals(NamedTuple):
     """What the backward pass needs: the inputs; for each query and channel the winner and its normalised number; and
     for each pair 1 / |x|.
