@@ -60,7 +60,7 @@ class Config:
     town_length_m: Annotated[float, arg(metavar="M")] = 600.0
     """Length of the drive through each town."""
     hours: Annotated[float | None, arg(metavar="H")] = None
-    """Train for about H hours of steps: the learning rate falls in the last part of them. Else --steps or the preset."""
+    """Train for about H hours: the learning rate falls in the last part of them. Without it, the steps decide."""
     finish: FlagCreatePairsOff[bool] = False
     """Let the learning rate fall from here on, and end: with --resume, a run that was planned longer ends well."""
     cache: Annotated[Path, arg(metavar="DIR")] = Path("results/dpm_train/cache")

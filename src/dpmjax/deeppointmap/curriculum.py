@@ -83,8 +83,9 @@ class TrainingConfig:
         warmup_steps: number of steps in which the learning rate rises from 0.
         max_gradient_norm: longer gradients are scaled down to this norm.
         overlap_ratio: learning rates and weight decay of the overlap part, relative to those above.
-        scans_at_once: about this many scans of a sample are processed at the same time. More scans need more memory and
+        scans_at_once: about this many scans of a sample are encoded at the same time. More scans need more memory and
             keep a large device busy; the results change by rounding only.
+        group_scans_at_once: groups of about this many scans are decoded at the same time.
     """
 
     model: ModelConfig = field(default_factory=ModelConfig)
@@ -104,11 +105,12 @@ class TrainingConfig:
     max_gradient_norm: float = 35.0
     overlap_ratio: float = 0.1
     scans_at_once: int = 8
+    group_scans_at_once: int = 16
 
     def __post_init__(self) -> None:
         require_positive_fields(self, "learning_rate", "final_learning_rate", "max_gradient_norm", "overlap_ratio")
         require_fields(self, "overlap_steps", "weight_decay", "warmup_steps", low=0)
-        require_fields(self, "scans_at_once", "num_variants", low=1)
+        require_fields(self, "scans_at_once", "group_scans_at_once", "num_variants", low=1)
         require_fields(self, "decay_ratio", low=0, high=1)
         require_count("len(curriculum)", len(self.curriculum))
         largest = max(stage.max_group for stage in self.curriculum)
@@ -197,6 +199,7 @@ PRESETS = {
         augment=NEAR_THE_LIDAR,
         objective=ObjectiveConfig(max_close=4),
         warmup_steps=500,
+        scans_at_once=4,
     ),
     "paper": TrainingConfig(),
 }

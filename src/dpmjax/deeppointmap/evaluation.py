@@ -100,7 +100,7 @@ class EvaluationPairs(NamedTuple):
         """
         stored, T = self.scans.pyramids, self.scans.T_augmented_lidar[row]
         points = stored.points[row, : stored.num_points[row]] * (stored.unit[row] * np.float32(self.scale_m))
-        return points @ T[:3, :3].T + T[:3, 3]
+        return np.asarray(points @ T[:3, :3].T + T[:3, 3])
 
     def true_motions(self, pairs: Pairs) -> Float[np.ndarray, "p 4 4"]:
         """Computes the true motions of pairs.

@@ -318,8 +318,9 @@ def predict_offsets(
         Offsets in metres, in the frame of the first cloud; in the frames of the rays without directions.
     """
     offsets = _decode(model, features, partners, partner_rows, part="offset_head")
-    is_turned = directions is not None and model.config.encoder.frame == "bearing"
-    return from_ray_frame(offsets, directions) if is_turned else offsets
+    if directions is None or model.config.encoder.frame == "lidar":
+        return offsets
+    return from_ray_frame(offsets, directions)
 
 
 def _encoder(config: ModelConfig) -> PointEncoder:

@@ -195,8 +195,8 @@ class GroupBatch:
 
     source: MapOfScans
     target: MapOfScans
-    T_target_source: Float[AnyArray, "*b g 4 4"]
-    mask: Bool[AnyArray, "*b g"]
+    T_target_source: Float[AnyArray, "*b 4 4"]
+    mask: Bool[AnyArray, "*b"]
 
 
 @flax.struct.dataclass
@@ -209,7 +209,7 @@ class SampleScans:
     """
 
     pyramids: StoredPyramid
-    T_augmented_lidar: Float[AnyArray, "*b s 4 4"]
+    T_augmented_lidar: Float[AnyArray, "*b 4 4"]
 
 
 @flax.struct.dataclass

@@ -23,7 +23,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
-from numpy.typing import NDArray
 
 from dpmjax.deeppointmap.curriculum import TrainingConfig
 from dpmjax.deeppointmap.inference import pyramid_of_cloud
@@ -50,7 +49,7 @@ class PreparedDrive(NamedTuple):
     """
 
     T_world_lidar: Float[np.ndarray, "n 4 4"]
-    pyramids: NDArray[np.void] | Path
+    pyramids: np.ndarray | Path
     bad: dict[str, str]
 
 
@@ -153,7 +152,7 @@ def prepare_drive(
 
 
 def _fill(
-    pyramids: NDArray[np.void], drive: LidarSequence, config: TrainingConfig, seed: int, on_scan: Callable[[], object]
+    pyramids: np.ndarray, drive: LidarSequence, config: TrainingConfig, seed: int, on_scan: Callable[[], object]
 ) -> dict[str, str]:
     # The motion is left to the step.
     still = replace(config.augment, max_yaw_rad=0.0, max_tilt_rad=0.0, translation_sigma_m=0.0)

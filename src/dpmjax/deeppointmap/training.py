@@ -210,7 +210,7 @@ def batch_loss(
 
         return [
             _in_parts(
-                of_group, group, config.scans_at_once // (group.source.rows.shape[1] + group.target.rows.shape[1])
+                of_group, group, config.group_scans_at_once // (group.source.rows.shape[1] + group.target.rows.shape[1])
             )
             for group in sample.groups
         ]
@@ -243,6 +243,8 @@ def _in_parts(function: Callable[[Any], Any], trees: Any, at_once: int) -> Any:
     num = len(jax.tree.leaves(trees)[0])
     # A divisor, because a last part of another size would be compiled separately.
     size = max(size for size in range(1, max(1, min(at_once, num)) + 1) if num % size == 0)
+    if size == num:
+        return jax.vmap(function)(trees)
     return jax.lax.map(jax.checkpoint(function), trees, batch_size=size)
 
 

@@ -12,7 +12,7 @@ from typing import Any
 import flax.struct
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float, Int, UInt
 
 from dpmjax.geometry import rigid
 from dpmjax.geometry.pyramid import PyramidConfig, interpolation_weights
@@ -37,13 +37,13 @@ class StoredPyramid:
 
     num_points: Int[AnyArray, "*b"]
     unit: Float[AnyArray, "*b"]
-    points: Int[AnyArray, "*b n 3"]
-    samples: Int[AnyArray, "*b m"]
-    neighbours: tuple[tuple[Int[AnyArray, "*b m k"], ...], ...]
-    interpolation: tuple[Int[AnyArray, "*b m 3"], ...]
+    points: Int[AnyArray, "*b _n 3"]
+    samples: UInt[AnyArray, "*b _m"]
+    neighbours: tuple[tuple[UInt[AnyArray, "*b _m _k"], ...], ...]
+    interpolation: tuple[UInt[AnyArray, "*b _m 3"], ...]
 
 
-def record_type(config: PyramidConfig, capacity: int) -> np.dtype[np.void]:
+def record_type(config: PyramidConfig, capacity: int) -> np.dtype:
     """Returns the type of one pyramid in a file.
 
     Args:
@@ -113,12 +113,15 @@ def stored_pyramids(records: np.ndarray, config: PyramidConfig) -> StoredPyramid
         return np.ascontiguousarray(records[name])
 
     return StoredPyramid(
-        *(field(name) for name in ("num_points", "unit", "points", "samples")),
-        tuple(
+        num_points=field("num_points"),
+        unit=field("unit"),
+        points=field("points"),
+        samples=field("samples"),
+        neighbours=tuple(
             tuple(field(_neighbours(number, block)) for block in range(len(stage.radii)))
             for number, stage in enumerate(config.stages)
         ),
-        tuple(field(f"interpolation_{step}") for step in range(config.num_interpolations)),
+        interpolation=tuple(field(f"interpolation_{step}") for step in range(config.num_interpolations)),
     )
 
 
@@ -148,7 +151,7 @@ def moved_pyramid(stored: StoredPyramid, T_new_old: Float[AnyArray, "4 4"]) -> P
     return PointPyramid(tuple(levels), tuple(up))
 
 
-def _interpolation(fine: PyramidLevel, coarse: PyramidLevel, stored: Int[AnyArray, "m 3"]) -> Interpolation:
+def _interpolation(fine: PyramidLevel, coarse: PyramidLevel, stored: UInt[AnyArray, "m 3"]) -> Interpolation:
     indices = jnp.asarray(stored, jnp.int32)
     squared: Array = jnp.sum((fine.positions[:, None] - coarse.positions[indices]) ** 2, axis=-1)
     is_used = (jnp.arange(indices.shape[1]) < jnp.sum(coarse.mask)) & jnp.asarray(fine.mask)[:, None]
