@@ -1,7 +1,8 @@
 """Trains the networks of DeepPointMap: descriptors of lidar scans, and how two clouds of them are registered.
 
     python -m experiments.dpm_train                                   tiny network, simulated towns, two cores
-    python -m experiments.dpm_train --preset small --num-towns 40     on one GPU
+    python -m experiments.dpm_train --preset small --num-towns 20 --hours 8   two cores, over night
+    python -m experiments.dpm_train --resume --finish                 end a longer run now: the learning rate falls
     python -m experiments.dpm_train --data kitti town --preset paper  drives from files, and towns
     python -m experiments.dpm_train --resume                          continue the latest run
     python -m experiments.dpm_train --coordinator host0:8476 --num-processes 2 --process-id 0     on two hosts, and
@@ -9,8 +10,9 @@
 
 Results go to results/dpm_train/<time>/ (latest links to the newest): model.safetensors for dpmjax.load_model,
 metrics.csv, metrics.json, checkpoints, and pictures: loss.png, matches.png. Recall is the share of pairs of a held-out
-town, 2 to 10 m apart and turned by any yaw, that are registered within 2 m and 5 degrees; the model is the one of the
-step with the best recall (metrics.json: best_step), and the overlap head is trained on that one.
+town, turned by any yaw, that are registered within 2 m and 5 degrees: of scans and of maps, 2 to 10 and 10 to 20 m
+apart. The model is the one of the step with the best mean recall on other towns (metrics.json: best_step), and the
+overlap head is trained on that one.
 """
 
 from __future__ import annotations
