@@ -6,7 +6,7 @@ from .raycast2d import cast_rays as cast_rays
 from .raycast2d import cast_scans as cast_scans
 from .raycast2d import scan_world as scan_world
 from .raycast2d import simulate_sequence as simulate_sequence
-from .town.cast import CastConfig as CastConfig
+from .town.culling import CastConfig as CastConfig
 from .town.driving import Drive as Drive
 from .town.driving import DriveConfig as DriveConfig
 from .town.driving import drive as drive
@@ -17,6 +17,8 @@ from .town.make import make_town as make_town
 from .town.scan import HDL32E as HDL32E
 from .town.scan import HDL64E as HDL64E
 from .town.scan import OS1_64 as OS1_64
+from .town.scan import OS1_128 as OS1_128
+from .town.scan import PANDAR64 as PANDAR64
 from .town.scan import VLP16 as VLP16
 from .town.scan import LidarSensor as LidarSensor
 from .town.scan import scan_town as scan_town
