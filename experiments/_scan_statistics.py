@@ -70,7 +70,9 @@ def scan_statistics(scans: Iterable[NDArray[np.float32]]) -> ScanStatistics:
         histograms.append([np.histogram(x, edges)[0] / len(points) for x, edges in values])
     if not rows:
         raise ValueError(f"scans: expected some with at least {_FEW} points after preprocessing, got none")
-    means = {name: np.mean(column, axis=0) for name, column in zip(HISTOGRAMS, zip(*histograms, strict=True), strict=True)}
+    means = {
+        name: np.mean(column, axis=0) for name, column in zip(HISTOGRAMS, zip(*histograms, strict=True), strict=True)
+    }
     return ScanStatistics(*(float(value) for value in np.mean(rows, axis=0)), histograms=means)
 
 

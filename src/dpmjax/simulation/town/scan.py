@@ -165,9 +165,7 @@ def _mix_edges(ranges: Float[Array, " b"], sensor: LidarSensor, key: PRNGKeyArra
     return jnp.where(is_mixed, grid + part * gap, grid).reshape(-1)
 
 
-def make_rays(
-    sensor: LidarSensor, config: CastConfig, phase: Float[Array, ""], motion: Float[Array, " 6"]
-) -> Rays:
+def make_rays(sensor: LidarSensor, config: CastConfig, phase: Float[Array, ""], motion: Float[Array, " 6"]) -> Rays:
     """The rays of a turn, by sectors of whole columns; foliage is met at its surface.
 
     Args:
@@ -186,7 +184,9 @@ def make_rays(
     columns = columns.reshape(num_sectors, -1)
     elevation = np.radians(np.array(sensor.elevations_deg, np.float32))
     # Each band holds neighbouring beams.
-    elevation = np.broadcast_to(elevation.reshape(num_bands, 1, -1), (num_bands, columns.shape[1], num_beams // num_bands))
+    elevation = np.broadcast_to(
+        elevation.reshape(num_bands, 1, -1), (num_bands, columns.shape[1], num_beams // num_bands)
+    )
     flat, up = jnp.cos(elevation), jnp.sin(elevation)
     azimuth = (phase + jnp.asarray(columns))[:, None, :, None]
     rays = jnp.stack(jnp.broadcast_arrays(flat * jnp.cos(azimuth), flat * jnp.sin(azimuth), up), axis=-1)
