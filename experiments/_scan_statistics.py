@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -105,3 +105,20 @@ def histogram_distance(a: ScanStatistics, b: ScanStatistics) -> dict[str, float]
         One distance a histogram.
     """
     return {name: 0.5 * float(np.abs(a.histograms[name] - b.histograms[name]).sum()) for name in HISTOGRAMS}
+
+
+def mean_statistics(rows: Sequence[ScanStatistics], weights: Sequence[float] | None = None) -> ScanStatistics:
+    """The statistics of several sets together.
+
+    Args:
+        rows: one of each set.
+        weights: of the sets; None counts them the same.
+
+    Returns:
+        Weighted means.
+    """
+    histograms = {
+        name: np.average([row.histograms[name] for row in rows], axis=0, weights=weights) for name in HISTOGRAMS
+    }
+    numbers = [[row.points, row.far, row.low, row.high, row.linear, row.planar, row.volumetric] for row in rows]
+    return ScanStatistics(*(float(x) for x in np.average(numbers, axis=0, weights=weights)), histograms=histograms)

@@ -113,7 +113,7 @@ def cast_turn(
 
 
 def _cast_band(near: NearWorld, bodies: Bodies, height: Float[Array, ""], band: _Band, max_range: float) -> Hits:
-    """What the rays of a band meet first; `height` is the sensor's at the time of the scan, `bodies` those of all kinds."""
+    """What the rays of a band meet first; `height` is the sensor's, `bodies` those of all kinds."""
     down = cross_ground(near.ground, band.offset.at[2].add(height), band.directions, max_range)
     is_down = down <= max_range
     rows = jnp.where(is_down, _ON_GROUND, _ON_NOTHING)

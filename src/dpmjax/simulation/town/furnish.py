@@ -14,7 +14,6 @@ from dpmjax.simulation.town.plots import Plots
 from dpmjax.simulation.town.streets import Streets, arc_lengths, at_way, tangents
 from dpmjax.simulation.town.vegetation import plant_bushes, plant_land, plant_trees
 
-
 _PAVEMENT_M = 2.2
 _BORDERS = ("hedge", "wall", "fence")
 

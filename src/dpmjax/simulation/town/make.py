@@ -141,9 +141,10 @@ def _users(
             return (rng.uniform(3.2, 6.5), rng.uniform(1.15, 1.27), rng.uniform(1.3, 1.8))
         return (rng.uniform(1.9, 2.5), rng.uniform(0.82, 0.95), rng.uniform(0.7, 0.9))
 
-    users: list[tuple[float, ...]] = []
-    for _ in range(rng.poisson(kind.cars_per_km * length / 1000)):
-        users.append((lane, rng.uniform(0, length), rng.uniform(6, 13), -LANE_M, *vehicle()))
+    users: list[tuple[float, ...]] = [
+        (lane, rng.uniform(0, length), rng.uniform(6, 13), -LANE_M, *vehicle())
+        for _ in range(rng.poisson(kind.cars_per_km * length / 1000))
+    ]
     for _ in range(rng.poisson(kind.queues_per_km * length / 1000)):
         way, speed = rng.uniform(0, length), rng.uniform(0.3, 3.0)
         for _ in range(rng.integers(3, 10)):

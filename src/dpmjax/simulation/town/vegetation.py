@@ -82,10 +82,10 @@ def plant_trees(
         level = base + part * (tall - base)
         # A conifer narrows upwards; another crown is widest in its middle.
         wide = np.where(is_conifer, 1.1 - part, 0.35 + 0.65 * np.sin(np.pi * part)) * radius
-        angle, out = rng.uniform(0, 2 * np.pi, count), np.where(is_conifer, 0.1, rng.uniform(0.1, 0.7, count)) * wide
+        angle, out = rng.uniform(0, 2 * np.pi, count), np.where(is_conifer, 0.1, rng.uniform(0.2, 0.9, count)) * wide
         at = feet + np.column_stack([out * np.cos(angle), out * np.sin(angle), level])
-        size, high = wide * rng.uniform(0.7, 1.0, count), (tall - base) / _NUM_TUFTS * rng.uniform(0.6, 1.1, count)
-        softness = rng.uniform(0.5, 1.6, count)
+        size, high = wide * rng.uniform(0.5, 0.9, count), (tall - base) / _NUM_TUFTS * rng.uniform(0.6, 1.1, count)
+        softness = rng.uniform(0.7, 2.2, count)
         into.spheroids.extend(map(tuple, np.column_stack([at, size, size, high, zero, softness, zero])))
 
 
