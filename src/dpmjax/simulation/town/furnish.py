@@ -15,6 +15,7 @@ from dpmjax.simulation.town.streets import Streets, arc_lengths, at_way, tangent
 from dpmjax.simulation.town.vegetation import plant_bushes, plant_land, plant_trees
 
 _PAVEMENT_M = 2.2
+_FREE_M = 4.2  # Least distance of parked cars from the middle of a street.
 _BORDERS = ("hedge", "wall", "fence")
 
 
@@ -176,7 +177,8 @@ def _kerbside(into: Collection, rng: np.random.Generator, side: _Side) -> None:
     way, rate = float(rng.uniform(3, 9)), side.quarter.parked_rate * rng.uniform(0.4, 1.3)
     while way < side.length - 3:
         if rng.random() < rate:
-            place = side.place(way, -0.2 + float(rng.normal(0, 0.12)))
+            from_kerb = max(-0.2, _FREE_M - side.half_width) + float(rng.normal(0, 0.12))
+            place = side.place(way, from_kerb)
             turned = Place(place.x, place.y, place.ground - 0.06, place.heading + np.pi + float(rng.normal(0, 0.02)))
             if side.plots.claim(turned, (4.8, 1.7), -1.6):
                 objects.put_car(into, rng, turned)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from dpmjax.sequences import FloatArray
+from dpmjax.sequences import BoolArray, FloatArray
 from dpmjax.simulation.town.kinds import Kind, Span
 from dpmjax.simulation.town.objects import Collection
 from dpmjax.simulation.town.plots import Plots
@@ -35,7 +35,7 @@ def plant_land(into: Collection, rng: np.random.Generator, plots: Plots, kind: K
             plant_bushes(into, rng, _on_ground(plots, places))
 
 
-def _patches(rng: np.random.Generator, shape: tuple[int, ...], share: float) -> FloatArray:
+def _patches(rng: np.random.Generator, shape: tuple[int, ...], share: float) -> BoolArray:
     from scipy.ndimage import gaussian_filter, zoom
 
     coarse = rng.normal(size=tuple(-(-size // 8) for size in shape))
@@ -43,7 +43,7 @@ def _patches(rng: np.random.Generator, shape: tuple[int, ...], share: float) -> 
     return zoom(field <= np.quantile(field, share), 8, order=0)[: shape[0], : shape[1]]
 
 
-def _scatter(rng: np.random.Generator, plots: Plots, per_ha: float, is_wooded: FloatArray) -> FloatArray:
+def _scatter(rng: np.random.Generator, plots: Plots, per_ha: float, is_wooded: BoolArray) -> FloatArray:
     """(n, 2) places in woods not far from streets."""
     terrain = plots.terrain
     size = CELL_M * (np.array(terrain.heights.shape)[::-1] - 1)

@@ -1,0 +1,52 @@
+"""Statistics of scans against shapes that are known, and the simulation against real scans."""
+
+import numpy as np
+import pytest
+
+from experiments._scan_statistics import (
+    HISTOGRAMS,
+    histogram_distance,
+    mean_statistics,
+    scan_statistics,
+    shape_features,
+)
+from experiments.town_statistics import Config
+
+
+@pytest.mark.parametrize(("dimensions", "kind"), [(1, 0), (2, 1), (3, 2)])
+def test_lines_planes_and_volumes_are_told_apart(dimensions, kind):
+    points = np.random.default_rng(0).uniform(-1, 1, (1500, 3)) * (np.arange(3) < dimensions)
+    features = shape_features(points.astype(np.float32))
+    np.testing.assert_allclose(features.sum(1), 1.0, atol=1e-9)
+    assert (features.argmax(1) == kind).mean() > 0.85
+
+
+def boxes(seed, size):
+    return [np.random.default_rng(seed).uniform(-size, size, (2000, 3)).astype(np.float32)]
+
+
+def test_distances_are_those_of_a_metric():
+    a, b, c = (scan_statistics(boxes(seed, size)) for seed, size in ((0, 10.0), (1, 20.0), (2, 40.0)))
+    for name in HISTOGRAMS:
+        assert a.histograms[name].sum() == pytest.approx(1.0)
+        assert histogram_distance(a, a)[name] == 0.0
+        assert histogram_distance(a, b)[name] == pytest.approx(histogram_distance(b, a)[name])
+        assert histogram_distance(a, c)[name] <= histogram_distance(a, b)[name] + histogram_distance(b, c)[name] + 1e-9
+
+
+def test_the_mean_of_two_sets_is_that_of_their_scans():
+    scans = boxes(0, 10.0) + boxes(1, 30.0)
+    together, parts = scan_statistics(scans), mean_statistics([scan_statistics([scan]) for scan in scans])
+    assert together.points == pytest.approx(parts.points)
+    np.testing.assert_allclose(together.histograms["range"], parts.histograms["range"])
+
+
+@pytest.mark.parametrize("change", [{"scenes": 0}, {"scans": 0}, {"seed": -1}])
+def test_bad_options_are_refused(change):
+    with pytest.raises(ValueError, match="expected at least"):
+        Config(**change)
+
+
+def test_scans_without_points_are_refused():
+    with pytest.raises(ValueError, match="scans"):
+        scan_statistics([np.zeros((0, 3), np.float32)])
