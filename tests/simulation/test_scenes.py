@@ -140,6 +140,21 @@ def test_a_lidar_that_does_not_move_is_one_with_no_motion():
     np.testing.assert_allclose(first.points, again.points, **ACCUMULATED)
 
 
+def test_scans_of_several_poses_at_once_are_those_of_each():
+    town = make_town(3, TownConfig(route_length_m=200)).primitives
+    poses = np.tile(np.eye(4, dtype=np.float32), (2, 1, 1))
+    poses[:, :3, 3] = [[0.0, 0.0, 2.0], [30.0, 5.0, 3.0]]
+
+    def look(pose):
+        return scan_town(town, pose, 0.0, key=jax.random.key(1), sensor=SENSOR).points
+
+    together = jax.vmap(look)(poses)
+    for points, pose in zip(together, poses, strict=True):
+        alone = look(pose)
+        same = np.isclose(points, alone, atol=1e-3).all(1)
+        assert same.mean() > 0.999, "only a ray that touches an edge may differ"
+
+
 def test_beams_on_an_edge_may_end_between_foreground_and_background():
     rows = [[10.0, 0, 30, 0.5, 1.0, 30, 0, 0, 0], [12.5, 0, 30, 0.5, 30, 30, 0, 0, 0]]
     town, pose = soft_town(rows), np.eye(4)

@@ -3,25 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from typing import TypeVar, cast
 
-import jax
 import numpy as np
-from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
-from dpmjax.sequences import FloatArray, LidarSequence
+from dpmjax.sequences import LidarSequence
 from dpmjax.simulation.indoors.building import KINDS as INDOOR_KINDS
-from dpmjax.simulation.indoors.building import BuildingConfig, make_building
+from dpmjax.simulation.indoors.building import Building, BuildingConfig, make_building
 from dpmjax.simulation.indoors.walking import WalkConfig, walk
-from dpmjax.simulation.town.driving import Drive, DriveConfig, drive
+from dpmjax.simulation.town.driving import DriveConfig, drive, scan_along
 from dpmjax.simulation.town.kinds import KINDS as OUTDOOR_KINDS
-from dpmjax.simulation.town.make import TownConfig, make_town
-from dpmjax.simulation.town.primitives import TownPrimitives
-from dpmjax.simulation.town.scan import HDL32E, HDL64E, OS1_64, OS1_128, PANDAR64, VLP16, LidarSensor, scan_town
+from dpmjax.simulation.town.make import Town, TownConfig, make_town
+from dpmjax.simulation.town.scan import HDL32E, HDL64E, OS1_64, OS1_128, PANDAR64, VLP16, LidarSensor
 
 _SCENE_STREAM = 8170
-_TURN_S = 0.1
+_Entry = TypeVar("_Entry")
 _ROUTES = ("loop", "there_and_back", "wander")
 
 
@@ -89,6 +86,9 @@ class Scene:
         sensor: the lidar.
         scale: factor of points and poses.
         is_moving: the lidar moves during its turn, and the scans are not corrected for it.
+
+    Raises:
+        ValueError: a motion that does not belong to the place.
     """
 
     seed: int
@@ -97,6 +97,10 @@ class Scene:
     sensor: LidarSensor = field(repr=False)
     scale: float = 1.0
     is_moving: bool = False
+
+    def __post_init__(self) -> None:
+        if isinstance(self.place, BuildingConfig) != isinstance(self.motion, WalkConfig):
+            raise ValueError("motion must be a WalkConfig in a building and a DriveConfig in a town")
 
 
 def draw_scene(seed: int, mixture: SceneMixture = SceneMixture()) -> Scene:
@@ -133,7 +137,7 @@ def draw_scene(seed: int, mixture: SceneMixture = SceneMixture()) -> Scene:
     return Scene(seed, town, driving, sensor, scale, is_moving)
 
 
-def _choice(rng: np.random.Generator, entries: tuple[tuple[object, float], ...]) -> object:
+def _choice(rng: np.random.Generator, entries: tuple[tuple[_Entry, float], ...]) -> _Entry:
     weights = np.array([weight for _, weight in entries])
     return entries[rng.choice(len(entries), p=weights / weights.sum())][0]
 
@@ -147,13 +151,22 @@ def simulate_scene(scene: Scene) -> LidarSequence:
     Returns:
         The sequence, with exact poses and times.
     """
+    world: Building | Town
     if isinstance(scene.place, BuildingConfig):
-        building = make_building(scene.seed, scene.place)
-        way, primitives, name = walk(building, scene.motion, seed=scene.seed), building.primitives, building.name
+        world = make_building(scene.seed, scene.place)
+        way = walk(world, cast(WalkConfig, scene.motion), seed=scene.seed)
     else:
-        town = make_town(scene.seed, scene.place)
-        way, primitives, name = drive(town, scene.motion, seed=scene.seed), town.primitives, town.name
-    return _sequence(f"{scene.place.kind}-{name}-{scene.sensor.name}", primitives, way, scene)
+        world = make_town(scene.seed, scene.place)
+        way = drive(world, cast(DriveConfig, scene.motion), seed=scene.seed)
+    name = f"{world.name}-{scene.sensor.name}"
+    sequence = scan_along(name, world.primitives, way, seed=scene.seed, sensor=scene.sensor, is_moving=scene.is_moving)
+    return _scaled(sequence, scene.scale)
+
+
+def _scaled(sequence: LidarSequence, scale: float) -> LidarSequence:
+    poses = np.array(sequence.T_world_lidar)
+    poses[:, :3, 3] *= scale
+    return replace(sequence, read_scan=lambda index: np.float32(scale) * sequence.read_scan(index), T_world_lidar=poses)
 
 
 def simulate_scenes(seeds: Sequence[int], mixture: SceneMixture = SceneMixture()) -> list[LidarSequence]:
@@ -167,31 +180,3 @@ def simulate_scenes(seeds: Sequence[int], mixture: SceneMixture = SceneMixture()
         One sequence a seed.
     """
     return [simulate_scene(draw_scene(seed, mixture)) for seed in seeds]
-
-
-def _sequence(name: str, primitives: TownPrimitives, way: Drive, scene: Scene) -> LidarSequence:
-    motions = _motions(way) if scene.is_moving else np.zeros((len(way.times), 6))
-
-    def read_scan(index: int) -> NDArray[np.float32]:
-        key = jax.random.fold_in(jax.random.key(scene.seed), index)
-        pose, time, motion = way.T_world_lidar[index], way.times[index], motions[index]
-        cloud = scan_town(primitives, pose, time, key=key, sensor=scene.sensor, motion=motion)
-        return np.float32(scene.scale) * np.asarray(cloud.points)[np.asarray(cloud.mask)]
-
-    poses = way.T_world_lidar.copy()
-    poses[:, :3, 3] *= scene.scale
-    sources = tuple(f"{name}, scan {index}" for index in range(len(way.times)))
-    return LidarSequence(name, sources, read_scan, poses, way.times)
-
-
-def _motions(way: Drive) -> FloatArray:
-    """(n, 6) twists of the sensor during a turn, of the way to the next pose; the last is that before."""
-    poses = way.T_world_lidar
-    if len(poses) < 2:
-        return np.zeros((len(poses), 6))
-    part = _TURN_S / np.maximum(np.diff(way.times), _TURN_S)[:, None]
-    turns = poses[:-1, :3, :3].transpose(0, 2, 1)
-    moved = np.einsum("nij,nj->ni", turns, np.diff(poses[:, :3, 3], axis=0))
-    turned = Rotation.from_matrix(turns @ poses[1:, :3, :3]).as_rotvec()
-    twists = np.hstack([moved, turned]) * part
-    return np.vstack([twists, twists[-1:]])

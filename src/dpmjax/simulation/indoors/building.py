@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 import jax.numpy as jnp
@@ -86,8 +86,9 @@ def make_building(seed: int, config: BuildingConfig = BuildingConfig()) -> Build
         _ceiling(into, rng, room)
         _furniture(into, rng, room, route, is_hall=config.kind == "hall")
     tables = (np.array(rows, np.float64) for rows in (into.boxes, into.cylinders, into.spheroids))
-    bodies = map(pack_bodies, tables, (primitives.SOLID, primitives.POLE, primitives.SOFT))
-    whole = TownPrimitives(*bodies, _floor(plan), _nobody())
+    kinds = (primitives.SOLID, primitives.POLE, primitives.SOFT)
+    boxes, cylinders, spheroids = map(pack_bodies, tables, kinds)
+    whole = TownPrimitives(boxes, cylinders, spheroids, _floor(plan), _nobody())
     return Building(f"{config.kind}-{seed}", plan, route, whole)
 
 
@@ -155,14 +156,16 @@ def _ceiling(into: Collection, rng: np.random.Generator, room: Room) -> None:
 def _furniture(into: Collection, rng: np.random.Generator, room: Room, route: FloatArray, *, is_hall: bool) -> None:
     """Furniture along the walls and in the room, off the route."""
     area, inside = room.size[0] * room.size[1], np.minimum(1.0, 0.4 * np.array(room.size))
-    beside = [_put_cabinet, _put_cabinet, _put_desk, _put_plant]
-    within = [_put_rack, _put_machine, _put_column, _put_plant, _put_stairs] if is_hall else [_put_desk, _put_machine]
-    for _ in range(rng.poisson(0.9 * sum(room.size))):
+    beside: list[_Put] = [_put_cabinet, _put_cabinet, _put_desk, _put_plant]
+    within: list[_Put] = (
+        [_put_rack, _put_machine, _put_column, _put_plant, _put_stairs] if is_hall else [_put_desk, _put_machine]
+    )
+    for _ in range(rng.poisson(0.7 * sum(room.size))):
         axis, end = int(rng.integers(2)), int(rng.integers(2))
         spot = rng.uniform(room.low, room.high)
         spot[axis] = room.low[axis] + 0.45 if end == 0 else room.high[axis] - 0.45
         _put_if_free(into, rng, (spot, 0.5 * np.pi * (axis == 0)), route, beside)
-    for _ in range(rng.poisson(0.08 * area)):
+    for _ in range(rng.poisson(0.05 * area)):
         spot = rng.uniform(room.low + inside, room.high - inside)
         turn = float(rng.choice([0.0, 0.5 * np.pi])) + (rng.normal(0, 0.3) if rng.random() < 0.3 else 0.0)
         _put_if_free(into, rng, (spot, turn), route, within)
@@ -172,11 +175,11 @@ def _furniture(into: Collection, rng: np.random.Generator, room: Room, route: Fl
 
 
 def _put_if_free(
-    into: Collection, rng: np.random.Generator, spot: tuple[FloatArray, float], route: FloatArray, puts: list[_Put]
+    into: Collection, rng: np.random.Generator, spot: tuple[FloatArray, float], route: FloatArray, puts: Sequence[_Put]
 ) -> None:
     """Puts one of some things unless it would stand in the way; `spot` is its place and heading."""
     part = Collection()
-    puts[rng.integers(len(puts))](part, rng, _place(*spot[0], spot[1]))
+    puts[int(rng.integers(len(puts)))](part, rng, _place(spot[0][0], spot[0][1], spot[1]))
     rows = np.array([*part.boxes, *part.cylinders, *part.spheroids])
     reach = np.hypot(rows[:, 3], rows[:, 4]) + _CLEARANCE_M
     apart = np.linalg.norm(rows[:, None, :2] - route[None, ::3], axis=-1).min(1)

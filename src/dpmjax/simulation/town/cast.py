@@ -20,7 +20,7 @@ from dpmjax.simulation.town.primitives import GROUND, NOTHING, Bodies
 
 _KINDS: tuple[Cross, ...] = (cross_box, cross_cylinder, cross_spheroid)
 # Bodies that a band of rays is tested against before it asks whether it is done.
-_AT_ONCE = 4
+_AT_ONCE = 2
 _ON_NOTHING, _ON_GROUND = -2, -1
 
 

@@ -110,7 +110,7 @@ def near_world(
     boxes = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), town.boxes, traffic_boxes(town.traffic, start, time))
     kinds = (boxes, config.num_boxes), (town.cylinders, config.num_cylinders), (town.spheroids, config.num_spheroids)
     near = [nearest_bodies(x._replace(centres=x.centres - start), number, max_range) for x, number in kinds]
-    return NearWorld(*near, _near_ground(town.ground, start, config.ground_m))
+    return NearWorld(near[0], near[1], near[2], _near_ground(town.ground, start, config.ground_m))
 
 
 def _near_ground(ground: Ground, start: Float[Array, " 3"], side_m: int) -> Ground:

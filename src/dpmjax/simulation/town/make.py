@@ -103,7 +103,7 @@ def make_town(seed: int, config: TownConfig = TownConfig(), *, trajectory: Array
     boxes, cylinders, spheroids = map(pack_bodies, tables, kinds)
     ground = primitives.Ground(*(jnp.asarray(x, jnp.float32) for x in (terrain.heights, terrain.origin, CELL_M)))
     whole = TownPrimitives(boxes, cylinders, spheroids, ground, _make_traffic(rng, streets, terrain, kind))
-    return Town(f"town-{seed}", streets, terrain, whole)
+    return Town(f"{config.kind}-{seed}", streets, terrain, whole)
 
 
 def _positions(trajectory: ArrayLike) -> FloatArray:

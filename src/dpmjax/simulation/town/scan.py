@@ -11,6 +11,7 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.scipy.special import ndtri
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from dpmjax.checks import require_shape
@@ -140,29 +141,29 @@ def scan_town(
 def _scan_near(
     near: NearWorld, pose: Array, twist: Array, *, key: PRNGKeyArray, sensor: LidarSensor, config: CastConfig
 ) -> PointCloud:
-    key_phase, key_depth, key_noise, key_loss, key_mix = jax.random.split(key, 5)
+    key_phase, key_rays = jax.random.split(key)
     phase = jax.random.uniform(key_phase, (), minval=0.0, maxval=2 * np.pi / sensor.num_azimuths)
+    # One draw for all: each draw of its own would take a second to compile.
+    depth, noise, loss, mix, part = jax.random.uniform(key_rays, (5, sensor.num_rays), minval=1e-6, maxval=1.0)
     rays = make_rays(sensor, config, phase, twist)
-    rays = rays._replace(depths=jax.random.exponential(key_depth, rays.depths.shape))
+    rays = rays._replace(depths=-jnp.log(depth).reshape(rays.depths.shape))
     hits = cast_turn(near, pose, rays, max_range=sensor.max_range_m, config=config)
     probability = _by_beam(_return_probability(hits, sensor), sensor)
     directions = _by_beam(rays.directions, sensor)
-    ranges = _mix_edges(_by_beam(hits.ranges, sensor), sensor, key_mix)
-    ranges += sensor.range_noise_m * jax.random.normal(key_noise, ranges.shape)
-    is_back = jax.random.uniform(key_loss, ranges.shape) < probability
+    ranges = _mix_edges(_by_beam(hits.ranges, sensor), sensor, mix, part)
+    ranges += sensor.range_noise_m * ndtri(noise)
+    is_back = loss < probability
     mask = is_back & (ranges >= sensor.min_range_m) & (ranges <= sensor.max_range_m)
     return PointCloud(points=jnp.where(mask[:, None], ranges[:, None] * directions, 0.0), mask=mask)
 
 
-def _mix_edges(ranges: Float[Array, " b"], sensor: LidarSensor, key: PRNGKeyArray) -> Float[Array, " b"]:
-    """Ranges between foreground and background for some beams beside an edge, where a pulse covers both."""
-    key_choice, key_place = jax.random.split(key)
+def _mix_edges(ranges: Float[Array, " b"], sensor: LidarSensor, choice: Array, part: Array) -> Float[Array, " b"]:
+    """Ranges between foreground and background for beams beside an edge; `choice` and `part` are uniform draws."""
     grid = ranges.reshape(-1, sensor.num_azimuths)
     gap = jnp.roll(grid, 1, axis=1) - grid
     is_edge = (jnp.abs(gap) > _EDGE_M[0]) & (jnp.abs(gap) < _EDGE_M[1])
-    is_mixed = is_edge & (jax.random.uniform(key_choice, grid.shape) < sensor.mixed_rate)
-    part = jax.random.uniform(key_place, grid.shape)
-    return jnp.where(is_mixed, grid + part * gap, grid).reshape(-1)
+    is_mixed = is_edge.reshape(-1) & (choice < sensor.mixed_rate)
+    return jnp.where(is_mixed, ranges + part * gap.reshape(-1), ranges)
 
 
 def make_rays(sensor: LidarSensor, config: CastConfig, phase: Float[Array, ""], motion: Float[Array, " 6"]) -> Rays:
