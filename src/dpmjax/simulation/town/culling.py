@@ -175,10 +175,7 @@ def sector_lists(
 def _azimuth_intervals(
     bodies: Bodies, T_world_lidar: Float[Array, "4 4"]
 ) -> tuple[Float[Array, " k"], Float[Array, " k"]]:
-    """Middle and half-width, radians, of the azimuths under which the boxes are seen in the sensor frame.
-
-    The half-width is pi, the whole turn, where the box lies over or under the sensor.
-    """
+    """Middle and half-width of the azimuths of boxes in the sensor frame; pi for a box over or under the sensor."""
     # A box is the hull of its corners, and so is its shadow on the sensor's x-y plane.
     turn = jnp.zeros((4, 4), T_world_lidar.dtype).at[:3, :3].set(T_world_lidar[:3, :3].T).at[3, 3].set(1.0)
     local = jnp.asarray(_CORNERS)[None] * bodies.half_sizes[:, None]

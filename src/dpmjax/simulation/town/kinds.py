@@ -95,10 +95,12 @@ _FOREST = Quarter((10.0, 20.0), (7, 12), (6, 10), (3, 6), (60, 150), 0.15, 0.1, 
 KINDS: dict[str, Kind] = {
     "suburb": Kind(
         (_DETACHED, _ROWS, _PARK, _WORKSHOPS),
-        (0.46, 0.28, 0.16, 0.10),
-        trees_per_ha=110.0,
-        bushes_per_ha=110.0,
-        verge_step=18.0,
+        (0.46, 0.26, 0.20, 0.08),
+        roughness=1.5,
+        trees_per_ha=170.0,
+        bushes_per_ha=220.0,
+        woodland=0.5,
+        verge_step=11.0,
     ),
     "canyon": Kind(
         (_TOWERS, _OFFICES, _PARK),
