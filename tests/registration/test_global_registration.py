@@ -159,7 +159,8 @@ def test_scans_beyond_the_keyframes_find_their_poses(sequence, is_ordered: bool)
     assert ate(start.poses, sequence) < 4.0
 
 
-def test_refinement_without_order_is_exact(sequence, truth) -> None:
+def test_refinement_without_order_is_exact(truth) -> None:
+    sequence = simulate_sequence(0, 49, seed=1, num_beams=128).take(slice(0, None, 8))
     poses = truth + np.random.default_rng(0).normal(size=truth.shape) * [2.0, 2.0, 0.01]
     assert ate(refine(scans_of(sequence, is_ordered=False), poses).poses, sequence) < 0.05
 
