@@ -15,6 +15,10 @@ KEY = jax.random.key(0)
 interpolate = jax.jit(interpolate_grid)  # Call by call, each of its operations would be compiled alone.
 
 
+def init_map(config: OccupancyConfig):
+    return jax.jit(lambda key: init_map_net(config, key=key))(KEY)
+
+
 def layer_sizes(params) -> list[tuple[int, int]]:
     return sorted(tuple(x.shape) for x in jax.tree.leaves(params) if x.ndim == 2)
 
@@ -33,7 +37,7 @@ def test_paper_networks_have_the_published_sizes() -> None:
 
 
 def test_weights_start_xavier_uniform_with_the_gain_of_relu() -> None:
-    params = init_map_net(OccupancyConfig(), key=KEY)
+    params = init_map(OccupancyConfig())
     for weight in (x for x in jax.tree.leaves(params) if x.ndim == 2 and x.size > 10_000):
         limit = np.sqrt(2.0) * np.sqrt(6.0 / sum(weight.shape))
         assert 0.95 * limit < float(jnp.abs(weight).max()) <= limit
@@ -137,7 +141,7 @@ def test_doubled_resolution_is_the_same_function(dimensions: int) -> None:
 def test_the_map_is_the_sum_of_its_levels() -> None:
     config = OccupancyConfig(kind="grid", resolutions=(4, 8, 16))
     rng = np.random.default_rng(3)
-    params = jax.tree.map(lambda x: jnp.asarray(rng.normal(size=x.shape), x.dtype), init_map_net(config, key=KEY))
+    params = jax.tree.map(lambda x: jnp.asarray(rng.normal(size=x.shape), x.dtype), init_map(config))
     points, weights = jnp.asarray(rng.uniform(-1.0, 1.0, size=(40, 2)), jnp.float32), jnp.array([1.0, 0.7, 0.2])
     levels = [interpolate(params["params"][f"level_{cells}"], points) for cells in config.resolutions]
     expected = sum(weight * level for weight, level in zip(weights, levels, strict=True))
@@ -152,7 +156,7 @@ def test_levels_that_do_not_double_are_refused(resolutions) -> None:
 
 def test_levels_that_are_off_do_not_count() -> None:
     config = OccupancyConfig(kind="grid", resolutions=(4, 8))
-    apply, params = jax.jit(make_map_net(config).apply), init_map_net(config, key=KEY)
+    apply, params = jax.jit(make_map_net(config).apply), init_map(config)
     assert not any(np.asarray(x).any() for x in jax.tree.leaves(params))
     params = jax.tree.map(jnp.ones_like, params)
     points = jax.random.uniform(KEY, (9, 2), minval=-1.0)
