@@ -237,10 +237,10 @@ def _cross_section(distance: FloatArray) -> FloatArray:
 
 
 def _roughness(rng: np.random.Generator, distance: FloatArray) -> FloatArray:
-    """Millimetres on streets, centimetres and gentle mounds in gardens."""
+    """A centimetre on streets, several and gentle mounds beside them."""
     from scipy.ndimage import gaussian_filter
 
     fine = rng.normal(size=distance.shape)
     mounds = gaussian_filter(rng.normal(size=distance.shape), 8.0) * 28.0
     is_garden = np.clip((distance - _PAVEMENT_M) / 2.0, 0, 1)
-    return (0.004 + 0.03 * is_garden) * fine + 0.12 * is_garden * mounds
+    return (0.01 + 0.05 * is_garden) * fine + 0.12 * is_garden * mounds

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.scipy.special import ndtri
 from jaxtyping import Array, Float, PRNGKeyArray
+from numpy.typing import NDArray
 
 from dpmjax.checks import require_shape
 from dpmjax.geometry import se3
@@ -23,6 +24,9 @@ from dpmjax.types import AnyArray, PointCloud
 
 # Reflectivity of each surface (nothing, ground, solid, soft, pole, moving): asphalt is dark, leaves and paint are not.
 _REFLECTIVITY = np.array([0.0, 0.17, 0.35, 0.4, 0.35, 0.3], np.float32)
+# Unevenness of each of them: shutters, plaster and paintwork are no planes.
+_ROUGHNESS_M = np.array([0.0, 0.0, 0.025, 0.0, 0.01, 0.02], np.float32)
+_BIAS_STREAM = 8152
 _GLASS_RETURNS = 0.35
 # How sharply returns end at that range, in natural logarithms of range.
 _FADE = 0.18
@@ -46,6 +50,7 @@ class LidarSensor:
         drop_rate: share of the returns that is lost at any range.
         half_loss_m: range at which half of the returns of a surface of 20 % reflectivity, met head-on, are lost.
         height_m: mounting height above the ground, for drives.
+        beam_bias_m: standard deviation of the constant range errors of the beams, which calibration leaves.
         mixed_rate: share of the beams on an edge that return a range between foreground and background.
 
     Raises:
@@ -61,6 +66,7 @@ class LidarSensor:
     drop_rate: float = 0.03
     half_loss_m: float = 75.0
     height_m: float = 1.73
+    beam_bias_m: float = 0.01
     mixed_rate: float = 0.25
 
     def __post_init__(self) -> None:
@@ -85,7 +91,9 @@ def _spread(top_deg: float, bottom_deg: float, count: int) -> tuple[float, ...]:
 
 
 # Velodyne's manual: 32 lasers a third of a degree apart, and 32 below them half a degree apart (as on KITTI's car).
-HDL64E = LidarSensor("hdl64e", _spread(2.0, -8.33, 32) + _spread(-8.83, -24.33, 32), 1800, max_range_m=80.0)
+HDL64E = LidarSensor(
+    "hdl64e", _spread(2.0, -8.33, 32) + _spread(-8.83, -24.33, 32), 1800, max_range_m=80.0, beam_bias_m=0.025
+)
 # Ouster OS1-64 of the first generation, as on MulRan's car.
 OS1_64 = LidarSensor("os1_64", _spread(16.6, -16.6, 64), 1024, range_noise_m=0.03, half_loss_m=60.0, height_m=1.85)
 # The same with 128 beams, and a wider view.
@@ -151,10 +159,17 @@ def _scan_near(
     probability = _by_beam(_return_probability(hits, sensor), sensor)
     directions = _by_beam(rays.directions, sensor)
     ranges = _mix_edges(_by_beam(hits.ranges, sensor), sensor, mix, part)
-    ranges += sensor.range_noise_m * ndtri(noise)
+    rough = jnp.asarray(_ROUGHNESS_M)[_by_beam(hits.surfaces, sensor)]
+    ranges += jnp.sqrt(sensor.range_noise_m**2 + rough**2) * ndtri(noise) + _beam_bias(sensor)
     is_back = loss < probability
     mask = is_back & (ranges >= sensor.min_range_m) & (ranges <= sensor.max_range_m)
     return PointCloud(points=jnp.where(mask[:, None], ranges[:, None] * directions, 0.0), mask=mask)
+
+
+def _beam_bias(sensor: LidarSensor) -> NDArray[np.float32]:
+    """Constant error of the range of each ray, m; the same in every scan."""
+    biases = np.random.default_rng(_BIAS_STREAM).normal(size=len(sensor.elevations_deg))
+    return np.repeat(np.float32(sensor.beam_bias_m) * biases.astype(np.float32), sensor.num_azimuths)
 
 
 def _mix_edges(ranges: Float[Array, " b"], sensor: LidarSensor, choice: Array, part: Array) -> Float[Array, " b"]:
