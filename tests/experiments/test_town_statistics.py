@@ -3,6 +3,8 @@
 import numpy as np
 import pytest
 
+from dpmjax.io import open_lidar_sequence
+from dpmjax.simulation import HDL64E, DriveConfig, TownConfig, simulate_lidar_sequence
 from experiments._scan_statistics import (
     HISTOGRAMS,
     histogram_distance,
