@@ -6,7 +6,7 @@ import logging
 import os
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from multiprocessing import get_context
 from pathlib import Path
 
@@ -16,7 +16,7 @@ from tqdm import tqdm
 
 from dpmjax.deeppointmap import PreparedDrive, SamplingConfig, TrainingConfig, prepare_drive
 from dpmjax.io import LidarSequence, list_lidar_sequences, open_lidar_sequence
-from dpmjax.simulation import HDL64E, DriveConfig, TownConfig, simulate_lidar_sequence
+from dpmjax.simulation import LidarSensor, SceneMixture, draw_scene, simulate_scene
 
 LOGGER = logging.getLogger("dpmjax.training")
 TOWN = "town"
@@ -47,14 +47,16 @@ class Source:
         return open_lidar_sequence(self.path, sequence=self.name)
 
 
-def town_drive(seed: int, *, length_m: float) -> LidarSequence:
-    """Returns a drive through a town: 64 beams, a third of the columns, a scan every two metres."""
-    return simulate_lidar_sequence(
-        seed,
-        TownConfig(route_length_m=length_m),
-        driving=DriveConfig(speed_m_s=8.0, rate_hz=4.0),
-        sensor=HDL64E.with_azimuths(600),
-    )
+def town_drive(
+    seed: int, *, length_m: float, kind: str | None = None, sensor: LidarSensor | None = None
+) -> LidarSequence:
+    """Returns the simulated drive of a seed: any place and lidar of the mixture, or those that are given."""
+    mixture = SceneMixture(length_m=length_m)
+    if kind is not None:
+        mixture = replace(mixture, kinds=((kind, 1.0),))
+    if sensor is not None:
+        mixture = replace(mixture, sensors=((sensor, 1.0),))
+    return simulate_scene(draw_scene(seed, mixture))
 
 
 def find_sources(data: Sequence[str], towns: Sequence[int], town_length_m: float) -> list[Source]:

@@ -32,13 +32,15 @@ from dpmjax.deeppointmap.evaluation import EvaluationPairs
 from dpmjax.deeppointmap.training import TrainingState
 from dpmjax.deeppointmap.training_loop import StepRecord, Trained, TrainingProgress, begin_training, stage_of
 from dpmjax.io import open_lidar_sequence
+from dpmjax.simulation import HDL32E, HDL64E, OS1_64
 from experiments._dpm_data import HELD_OUT_SEED, SELECTION_SEED, town_drive
 from experiments._result_files import HistoryFile, read_history
 from experiments._run_folder import CHECKPOINTS, HISTORY, RunFolder
 
 # Seconds between checkpoints; Ctrl-C and the end write one too.
 SAVE_EVERY_S = 300.0
-NUM_SELECTION_TOWNS, VALIDATION_PAIRS = 2, 60
+VALIDATION_PAIRS = 60
+SELECTION_SCENES = (("suburb", HDL64E), ("canyon", OS1_64), ("country", HDL32E), ("campus", OS1_64))
 SHOWN = ("loss", "overlap_accuracy", "pairing", "offset", "top1_accuracy", "score")
 MEASURES = (*SHOWN, "coarse", "gradient_norm", "learning_rate")
 KINDS = (PairKind(2.0, 10.0), PairKind(10.0, 20.0), PairKind(2.0, 10.0, 4), PairKind(10.0, 20.0, 4))
@@ -70,13 +72,15 @@ def draw_sets(
 ) -> EvaluationSets:
     """Returns the pairs of a run."""
     draw = partial(draw_evaluation_pairs, config=settings.model)
-    num = max(1, selection_pairs // (len(KINDS) * NUM_SELECTION_TOWNS))
-    towns = [town_drive(SELECTION_SEED + i, length_m=min(length_m, 200.0)) for i in range(NUM_SELECTION_TOWNS)]
+    num = max(1, selection_pairs // (len(KINDS) * len(SELECTION_SCENES)))
+    towns = [
+        town_drive(SELECTION_SEED + number, length_m=min(length_m, 250.0), kind=kind, sensor=sensor)
+        for number, (kind, sensor) in enumerate(SELECTION_SCENES)
+    ]
     real = tuple(draw(open_lidar_sequence(path), VALIDATION_PAIRS, kinds=KINDS[:2]) for path in validate)
-    selection = tuple(draw(town, num, kinds=KINDS) for town in towns)
-    return EvaluationSets(
-        selection, real, draw(town_drive(HELD_OUT_SEED, length_m=length_m), held_out_pairs, kinds=KINDS)
-    )
+    selection = tuple(draw(town, num, kinds=KINDS, max_scans=64) for town in towns)
+    held_out = town_drive(HELD_OUT_SEED, length_m=length_m, kind="suburb", sensor=HDL64E)
+    return EvaluationSets(selection, real, draw(held_out, held_out_pairs, kinds=KINDS))
 
 
 class Records:

@@ -199,6 +199,7 @@ PRESETS = {
         augment=NEAR_THE_LIDAR,
         objective=ObjectiveConfig(max_close=4),
         warmup_steps=500,
+        num_variants=2,
         scans_at_once=4,
     ),
     "paper": TrainingConfig(),
