@@ -78,8 +78,11 @@ class Registration:
 
     Attributes:
         T_target_source: maps points of the source to the target; the identity where no pair was left.
-        confidence: mean score of the first inliers, in [0, 1]; 0 without any.
+        confidence: in [0, 1], 0 without any inlier. With a calibrated model, `register` makes it the probability that
+            the motion is right within 2 m and 5 degrees; else it is `mean_score`, which is no probability.
+        mean_score: mean score of the first inliers, in [0, 1]; 0 without any.
         rmse_m: of the inliers after alignment; infinite without any.
+        support: consensus support of the motion: sum of 1 - error / tolerance over distinct pairs.
         num_inliers: how many pairs the motion rests on, both directions counted.
         source_indices: row of each pair in the source; first the pairs of eq. 1, then the same of eq. 2.
         target_indices: the same in the target.
@@ -89,7 +92,9 @@ class Registration:
 
     T_target_source: Float[Array, "4 4"]
     confidence: Float[Array, ""]
+    mean_score: Float[Array, ""]
     rmse_m: Float[Array, ""]
+    support: Float[Array, ""]
     num_inliers: Int[Array, ""]
     source_indices: Int[Array, " p"]
     target_indices: Int[Array, " p"]
