@@ -72,6 +72,26 @@ class DescriptorCloud:
     mask: Bool[Array, " m"]
 
 
+class Verification(NamedTuple):
+    """How well two scans agree under a motion; shares are in [0, 1].
+
+    Attributes:
+        visible_share: share of the points of both scans that lie in the field of view of the other.
+        matched_share: share of the source points that meet a plane of the target.
+        contradicted_share: share of the visible points that lie in the free space of the other scan.
+        score: `matched_share` less the weighted `contradicted_share`.
+        gap: how much more it is than the score of the best other hypothesis that was tried, or than 0.
+        num_tried: number of hypotheses that were tried.
+    """
+
+    visible_share: float
+    matched_share: float
+    contradicted_share: float
+    score: float
+    gap: float = 0.0
+    num_tried: int = 1
+
+
 @flax.struct.dataclass
 class Registration:
     """The motion between two descriptor clouds, and how far it can be trusted; failure is data.
@@ -88,6 +108,7 @@ class Registration:
         target_indices: the same in the target.
         scores: how well the two of a pair match, in [0, 1].
         is_inlier: True for pairs that the motion rests on.
+        verification: how well the scans themselves agree; None where only descriptors were registered.
     """
 
     T_target_source: Float[Array, "4 4"]
@@ -100,6 +121,7 @@ class Registration:
     target_indices: Int[Array, " p"]
     scores: Float[Array, " p"]
     is_inlier: Bool[Array, " p"]
+    verification: Verification | None = None
 
     @property
     def rmse(self) -> Float[Array, ""]:

@@ -3,11 +3,13 @@ from .curriculum import TrainingConfig as TrainingConfig
 from .curriculum import training_preset as training_preset
 from .data_pipeline import SampleMaker as SampleMaker
 from .data_pipeline import ScanStore as ScanStore
+from .inference import PreparedScan as PreparedScan
 from .inference import draw_evaluation_pairs as draw_evaluation_pairs
 from .inference import encode as encode
 from .inference import evaluate_registration as evaluate_registration
 from .inference import overlap as overlap
 from .inference import overlap_accuracy as overlap_accuracy
+from .inference import prepare_scan as prepare_scan
 from .inference import register as register
 from .matching import MatchConfig as MatchConfig
 from .matching import merge_clouds as merge_clouds
@@ -25,3 +27,4 @@ from .training import make_step as make_step
 from .training_loop import TrainingHooks as TrainingHooks
 from .training_loop import TrainingProgress as TrainingProgress
 from .training_loop import train as train
+from .verification import VerificationConfig as VerificationConfig

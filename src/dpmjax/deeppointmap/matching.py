@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import jax
@@ -64,7 +64,7 @@ class MatchConfig:
     def __post_init__(self) -> None:
         require_positive_fields(self, "temperature", "pair_ratio", "max_offset_m", "inlier_sigmas")
         require_fields(self, "min_num_first", "num_rounds", "min_num_inliers", "num_confident", low=1)
-        require_fields(self, "pair_ratio", low=0, high=1)
+        require_fields(self, "pair_ratio", low=0, high=4)
 
 
 def match_descriptors(
@@ -94,7 +94,10 @@ def match_descriptors(
     Returns:
         The motion, its score and the pairs; see `Registration`.
     """
-    return first_hypothesis(match_hypotheses(source, target, similarity, predict_offsets, config=config))
+    if config.consensus is not None:
+        config = replace(config, consensus=replace(config.consensus, num_motions=1))
+    hypotheses = match_hypotheses(source, target, similarity, predict_offsets, config=config)
+    return jax.tree.map(lambda leaf: leaf[0], hypotheses)
 
 
 def match_hypotheses(
@@ -120,18 +123,6 @@ def match_hypotheses(
     best = best_pairs(jnp.asarray(similarity), source.mask, target.mask, config=config)
     points = source.positions[best.source_indices], target.positions[best.target_indices]
     return _align(*points, predict_offsets(best.source_indices, best.target_indices), best, config=config)
-
-
-def first_hypothesis(hypotheses: Registration) -> Registration:
-    """Returns the hypothesis with the most support.
-
-    Args:
-        hypotheses: from `match_hypotheses`.
-
-    Returns:
-        The same without the leading axis.
-    """
-    return jax.tree.map(lambda leaf: leaf[0], hypotheses)
 
 
 class BestPairs(NamedTuple):

@@ -45,7 +45,7 @@ class ConsensusConfig:
     num_seeds: int = 128
     num_partners: int = 8
     num_rounds: int = 5
-    num_motions: int = 6
+    num_motions: int = 24
     distinct_m: float = 2.0
 
     def __post_init__(self) -> None:
@@ -89,8 +89,8 @@ def find_consensus(
         config: tolerances.
 
     Returns:
-        `config.num_motions` motions, best first; with fewer than three pairs that agree the first is a guess with little
-        support. Without derivative.
+        `config.num_motions` motions, best first; with fewer than three pairs that agree the first is a guess with
+        little support. Without derivative.
 
     Raises:
         ValueError: the shapes do not match.
