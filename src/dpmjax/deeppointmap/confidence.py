@@ -6,7 +6,7 @@ Platt (1999): a score becomes a probability by a logistic function that is fitte
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import jax
@@ -152,4 +152,4 @@ def with_confidence(match: Registration, evidence: Evidence, calibration: Calibr
     features, model = evidence.of_scans, calibration.of_scans
     if features is None:
         features, model = evidence.of_clouds, calibration.of_clouds
-    return match.replace(confidence=jax.numpy.float32(probability(model, features)))
+    return replace(match, confidence=jax.numpy.float32(probability(model, features)))

@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import functools
+from dataclasses import replace
 from typing import NamedTuple
 
 import jax
@@ -177,7 +178,7 @@ def register(
     if refine:
         motion = refine_motion(prepared[0].measured, prepared[1].measured, motion, model.config.verification)
     T = jnp.asarray(motion.T_target_source, match.T_target_source.dtype)
-    return match.replace(T_target_source=T, verification=motion.verification)
+    return replace(match, T_target_source=T, verification=motion.verification)
 
 
 def verify_hypotheses(
@@ -363,7 +364,8 @@ def _as_cloud(model: Model, scan: ScanOrCloud) -> DescriptorCloud:
 def _with_confidence(
     model: Model, hypotheses: Registration, row: int, verification: Verification | None
 ) -> Registration:
-    match = jax.tree.map(lambda leaf: jnp.asarray(leaf[row]), hypotheses).replace(verification=verification)
+    match = jax.tree.map(lambda leaf: jnp.asarray(leaf[row]), hypotheses)
+    match = replace(match, verification=verification)
     return with_confidence(match, gather_evidence(hypotheses, row, verification), model.config.calibration)
 
 

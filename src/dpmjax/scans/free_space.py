@@ -65,14 +65,12 @@ def range_image(points: Float[np.ndarray, "n 3"], config: RangeImageConfig = Ran
         The image.
     """
     rows, columns = _shape(config)
-    nearest, farthest = np.full(rows * columns, np.inf), np.zeros(rows * columns)
+    nearest, farthest = np.full((rows, columns), np.inf), np.zeros((rows, columns))
     pixels, ranges = _project(points, config)
-    np.minimum.at(nearest, pixels, ranges)
-    np.maximum.at(farthest, pixels, ranges)
-    nearest, farthest = nearest.reshape(rows, columns), farthest.reshape(rows, columns)
-    for axis, mode in ((0, "nearest"), (1, "wrap")):
-        nearest = minimum_filter1d(nearest, 3, axis=axis, mode=mode)
-        farthest = maximum_filter1d(farthest, 3, axis=axis, mode=mode)
+    np.minimum.at(nearest.reshape(-1), pixels, ranges)
+    np.maximum.at(farthest.reshape(-1), pixels, ranges)
+    nearest = minimum_filter1d(minimum_filter1d(nearest, 3, axis=0, mode="nearest"), 3, axis=1, mode="wrap")
+    farthest = maximum_filter1d(maximum_filter1d(farthest, 3, axis=0, mode="nearest"), 3, axis=1, mode="wrap")
     return RangeImage(nearest, farthest)
 
 

@@ -165,7 +165,8 @@ def pair_with_planes(
     if len(rows) == 0 or len(target.points) == 0:
         empty = np.zeros((0, 3))
         return PlanePairs(empty, np.zeros(0), empty, np.zeros(0), np.zeros(0))
-    distances, nearest = target.tree.query(moved, distance_upper_bound=level.radius_m, workers=num_threads)
+    found = target.tree.query(moved, distance_upper_bound=level.radius_m, workers=num_threads)
+    distances, nearest = map(np.asarray, found)
     is_paired = np.isfinite(distances)
     rows, moved, nearest = rows[is_paired], moved[is_paired], nearest[is_paired]
     normals = target.normals[nearest]
