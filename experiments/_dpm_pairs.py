@@ -11,7 +11,7 @@ import numpy as np
 
 from dpmjax.deeppointmap import Model, encode
 from dpmjax.deeppointmap.confidence import Evidence, gather_evidence
-from dpmjax.deeppointmap.inference import PreparedScan, match_clouds
+from dpmjax.deeppointmap.scan_registration import PreparedScan, match_clouds
 from dpmjax.deeppointmap.verification import choose_motion, measure_scan, refine_motion
 from dpmjax.geometry import rigid, se2
 from dpmjax.io import LidarSequence
