@@ -53,7 +53,7 @@ def test_other_numbers_of_scans_compile_nothing(model, scans, assert_compiles_no
     dpmjax.encode_scans(model, scans[:2])
     with assert_compiles_nothing():
         dpmjax.encode_scans(model, scans[:2])
-        dpmjax.encode_scans(model, [scans[3], scans[1][:100]])
+        dpmjax.encode_scans(model, [scans[3], scans[1][:200]])
 
 
 def test_lists_that_do_not_match_are_refused(model, scans) -> None:

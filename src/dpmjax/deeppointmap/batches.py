@@ -76,7 +76,7 @@ def register_pairs(
         ready = dict(zip(scans, pool.map(prepared, scans.values()), strict=True))
         pairs = ((ready[id(source)], ready[id(target)]) for source, target in zip(sources, targets, strict=True))
         found = list(pool.map(lambda pair: register(model, *pair, config=config, refine=refine), pairs))
-    return jax.tree.map(lambda *leaves: jnp.stack([jnp.asarray(leaf) for leaf in leaves]), *found)
+    return jax.tree.map(lambda *leaves: jnp.asarray(np.stack(leaves)), *jax.device_get(found))
 
 
 def overlap_pairs(model: Model, sources: Sequence[ScanOrCloud], targets: Sequence[ScanOrCloud]) -> Float[Array, " n"]:
@@ -126,7 +126,9 @@ def _stacked(items: list[Any]) -> Any:
 
 
 def _joined(parts: Sequence[Any], num: int) -> Any:
-    return jax.tree.map(lambda *leaves: jnp.concatenate(leaves)[:num], *parts)
+    # On the host: there, another number of parts compiles nothing.
+    parts = jax.device_get(parts)
+    return jax.tree.map(lambda *leaves: jnp.asarray(np.concatenate(leaves)[:num]), *parts)
 
 
 def _require_some(name: str, items: Sequence[Any]) -> None:
