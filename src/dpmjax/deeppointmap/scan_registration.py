@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -95,7 +96,8 @@ def register(
     if isinstance(source, DescriptorCloud) or isinstance(target, DescriptorCloud):
         hypotheses = match_clouds(model, _as_cloud(model, source), _as_cloud(model, target), config=matching)
         return _with_confidence(model, hypotheses, 0, None)
-    prepared = [scan if isinstance(scan, PreparedScan) else prepare_scan(model, scan) for scan in (source, target)]
+    with ThreadPoolExecutor(2) as pool:
+        prepared = list(pool.map(functools.partial(_as_prepared, model), (source, target)))
     hypotheses, motion = verify_hypotheses(model, prepared[0], prepared[1], config=matching)
     match = _with_confidence(model, hypotheses, motion.row, motion.verification)
     if refine:
@@ -155,6 +157,10 @@ def overlap(model: Model, source: ScanOrCloud, target: ScanOrCloud) -> Float[Arr
         The probability; 0 where a scan is empty or a feature is not finite.
     """
     return overlap_probability(model, _as_cloud(model, source), _as_cloud(model, target))
+
+
+def _as_prepared(model: Model, scan: PreparedScan | PointCloud | Float[AnyArray, "_n 3"]) -> PreparedScan:
+    return scan if isinstance(scan, PreparedScan) else prepare_scan(model, scan)
 
 
 def _as_cloud(model: Model, scan: ScanOrCloud) -> DescriptorCloud:
