@@ -10,8 +10,11 @@ import math
 import os
 from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, Self
+
+from tqdm import tqdm
 
 from dpmjax.io.files import write_atomically
 from experiments._machine import git_hash, versions
@@ -76,6 +79,34 @@ def do_row(folder: Path, case: dict[str, Any], work: Callable[[], dict[str, Any]
     row["versions"] = ", ".join(f"{name} {version}" for name, version in versions().items())
     write_json(path, row)
     return row
+
+
+def do_rows(
+    folder: Path,
+    cases: Sequence[dict[str, Any]],
+    work: Callable[..., dict[str, Any]],
+    *,
+    seed: int,
+    is_stopped: Callable[[], bool],
+) -> list[dict[str, Any]]:
+    """Makes one row a case by `do_row`, under a progress bar.
+
+    Args:
+        folder: of the run.
+        cases: what identifies the rows.
+        work: makes the rest of a row; it is called with the entries of the case as keywords.
+        seed: of the run.
+        is_stopped: whether to end before the next row.
+
+    Returns:
+        The rows so far.
+    """
+    rows: list[dict[str, Any]] = []
+    for case in tqdm(cases, unit=" rows"):
+        if is_stopped():
+            break
+        rows.append(do_row(folder, case, partial(work, **case), seed=seed))
+    return rows
 
 
 def row_path(folder: Path, case: Mapping[str, Any]) -> Path:

@@ -7,22 +7,22 @@
 As in the paper on short walks of a depth camera (here through simulated apartments), from zero: L-Net and M-Net are
 trained together. lnet: CNN or PointNet; mnet: MLP or ResMLP, or our grid; depth: 4 to 7 layers of 64; width: 32 to 128
 with 4 layers; chamfer: with and without; free: number of free samples a ray. All others stay as they are; the basis is
-a small CNN and an MLP of 6 layers of 64, so that a run takes half a minute on a CPU. Each run is written to runs.json
-when it is done; ablations.png has the box plots.
+a small CNN and an MLP of 6 layers of 64, so that a run takes half a minute on a CPU. Each run is written to rows/ when
+it is done; ablations.png has the box plots.
 """
 
 from __future__ import annotations
 
 import time
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 import numpy as np
-from tqdm import tqdm
 from tyro.conf import arg
 
 from experiments._command import StopFlag, run_command
-from experiments._result_files import load_json, write_json
+from experiments._result_files import do_rows
 from experiments._rgbd_methods import errors_of
 from experiments._run_folder import RunFolder, RunOptions, open_run_folder, recording, write_metrics
 
@@ -30,7 +30,6 @@ if TYPE_CHECKING:
     from dpmjax.deepmapping import DepthMappingConfig
 
 EXPERIMENT = "deepmapping_ablations"
-RUNS = "runs.json"
 _SUCCESS_MM = 450.0
 VARIANTS: dict[str, tuple[str, ...]] = {
     "lnet": ("CNN", "PointNet"),
@@ -72,26 +71,19 @@ class Config(RunOptions):
 def main(config: Config) -> dict[str, Any]:
     """Runs what is missing, variant by variant, then writes the table and the box plots."""
     folder = open_run_folder(config, EXPERIMENT)
+    cases = [
+        {"ablation": ablation, "variant": variant, "trajectory": trajectory}
+        for ablation in config.only
+        for variant in VARIANTS[ablation]
+        for trajectory in range(config.limit)
+    ]
     with recording(folder), StopFlag() as stop:
-        rows = load_json(folder / RUNS)["rows"] if folder.is_resumed and (folder / RUNS).exists() else []
-        done = {(row["ablation"], row["variant"], row["trajectory"]) for row in rows}
-        missing = [
-            (ablation, variant, trajectory)
-            for ablation in config.only
-            for variant in VARIANTS[ablation]
-            for trajectory in range(config.limit)
-            if (ablation, variant, trajectory) not in done
-        ]
-        for ablation, variant, trajectory in tqdm(missing, unit=" runs"):
-            if stop.is_requested:
-                break
-            settings = settings_of(ablation, variant, config)
-            case = {"ablation": ablation, "variant": variant, "trajectory": trajectory}
-            rows.append({**case, **run_one(trajectory, settings, config)})
-            write_json(folder / RUNS, {"rows": rows, "seed": config.seed})
+        work = partial(run_one, config=config)
+        rows = do_rows(folder.path, cases, work, seed=config.seed, is_stopped=lambda: stop.is_requested)
         if rows:
             table = summarise(rows)
-            write_metrics(folder, {"variants": table, "is_interrupted": stop.is_requested}, seed=config.seed)
+            metrics = {"variants": table, "is_interrupted": stop.is_requested}
+            write_metrics(folder, metrics, seed=config.seed, rows=rows)
             draw(folder, rows)
             for row in table:
                 print(
@@ -139,7 +131,7 @@ def settings_of(ablation: str, variant: str, config: Config) -> DepthMappingConf
     return DepthMappingConfig((phase,), (phase,), localization, occupancy, steps_per_call=per_call)
 
 
-def run_one(trajectory: int, settings: DepthMappingConfig, config: Config) -> dict[str, Any]:
+def run_one(ablation: str, variant: str, trajectory: int, *, config: Config) -> dict[str, Any]:
     """Errors of one fit; the first of a variant compiles, and its `run_s` contains that."""
     import jax
 
@@ -150,7 +142,7 @@ def run_one(trajectory: int, settings: DepthMappingConfig, config: Config) -> di
     sequence = simulation.simulate_depth_sequence(seed % 15, config.views, seed=seed)
     begun = time.perf_counter()
     scans = dm.as_depth_scans(sequence.points, sequence.mask)
-    fitted = dm.fit_depth(scans, settings, key=jax.random.key(config.seed))
+    fitted = dm.fit_depth(scans, settings_of(ablation, variant, config), key=jax.random.key(config.seed))
     return {**errors_of(fitted.T_world_camera, sequence), "run_s": time.perf_counter() - begun}
 
 

@@ -7,7 +7,7 @@
     python -m experiments.deepmapping_rgbd --resume -o out
 
 The simulated apartments follow the dataset's protocol: places 300 mm apart, views every 30 degrees, 8 or 16 views. Each
-trajectory is written to runs.json as soon as all methods have done it; metrics.json has the success rates (ATE below
+trajectory is written to rows/ as soon as all methods have done it; metrics.json has the success rates (ATE below
 450 mm, the paper's threshold, and below 100 mm, for the first is met by not moving at all on most walks),
 errors.png the box plots, map_K.png some trajectories from above.
 """
@@ -16,17 +16,17 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from tqdm import tqdm
 from tyro.conf import Positional, arg
 
 from experiments._command import StopFlag, run_command
 from experiments._machine import peak_rss_gb
-from experiments._result_files import load_json, write_json
+from experiments._result_files import do_rows
 from experiments._rgbd_methods import METHODS, errors_of, run_method
 from experiments._run_folder import RunFolder, RunOptions, open_run_folder, recording, write_metrics
 
@@ -35,7 +35,6 @@ if TYPE_CHECKING:
     from dpmjax.io import DepthSequence
 
 EXPERIMENT = "deepmapping_rgbd"
-RUNS = "runs.json"
 _SUCCESS_MM = 450.0
 _CLOSE_MM = 100.0
 
@@ -78,22 +77,17 @@ class Config(RunOptions):
 
 def main(config: Config) -> dict[str, Any]:
     """Runs what is missing, then writes the table and the pictures."""
-    first = read_trajectory(config, 0)
-    settings = fit_settings(config, first)
+    settings = fit_settings(config, read_trajectory(config, 0))
+    cases = [{"trajectory": index} for index in range(num_trajectories(config))]
     folder = open_run_folder(config, EXPERIMENT)
     with recording(folder), StopFlag() as stop:
         begun = time.perf_counter()
-        rows = load_json(folder / RUNS)["rows"] if folder.is_resumed and (folder / RUNS).exists() else []
-        for index in tqdm(range(len(rows), num_trajectories(config)), unit=" trajectories"):
-            if stop.is_requested:
-                break
-            sequence = first if index == 0 else read_trajectory(config, index)
-            rows.append(run_one(folder, config, sequence, settings, index))
-            write_json(folder / RUNS, {"rows": rows, "seed": config.seed})
+        work = partial(run_one, folder=folder, config=config, settings=settings)
+        rows = do_rows(folder.path, cases, work, seed=config.seed, is_stopped=lambda: stop.is_requested)
         if rows:
             metrics = summarise(rows, config.methods)
             metrics |= {"wall_s": time.perf_counter() - begun, "peak_rss_gb": peak_rss_gb()}
-            write_metrics(folder, {**metrics, "is_interrupted": stop.is_requested}, seed=config.seed)
+            write_metrics(folder, {**metrics, "is_interrupted": stop.is_requested}, seed=config.seed, rows=rows)
             draw_errors(folder, rows, config.methods)
             tell(folder, metrics)
             return metrics
@@ -137,37 +131,35 @@ def fit_settings(config: Config, sequence: DepthSequence) -> DepthMappingConfig:
     return depth_preset(config.preset, motion="planar" if is_planar else "full")
 
 
-def run_one(
-    folder: RunFolder, config: Config, sequence: DepthSequence, settings: DepthMappingConfig, index: int
-) -> dict[str, Any]:
+def run_one(trajectory: int, *, folder: RunFolder, config: Config, settings: DepthMappingConfig) -> dict[str, Any]:
     """All methods on one trajectory; a fit from the result of another method is timed without that method.
 
     The first `run_s` of each number of images contains its compilation.
 
     Args:
+        trajectory: its number.
         folder: of the run; gets the pictures.
         config: options.
-        sequence: the trajectory.
         settings: of DeepMapping.
-        index: of the trajectory.
 
     Returns:
-        The row of the table.
+        The rest of the row.
     """
+    sequence = read_trajectory(config, trajectory)
     found: dict[str, NDArray[np.float64]] = {}
     row: dict[str, Any] = {"name": sequence.name, "views": len(sequence)}
     for name in config.methods:
         begun = time.perf_counter()
         found[name] = run_method(name, sequence, settings, found, seed=config.seed)
         row[name] = {**errors_of(found[name], sequence), "run_s": time.perf_counter() - begun}
-    if index < config.pictures:
+    if trajectory < config.pictures:
         from dpmjax import viz
 
         panels = [(f"{name}, ATE {row[name]['ate_mm']:.0f} mm", T) for name, T in found.items() if name != "zero"]
         figure = viz.from_above_figure(
             [*panels, ("reference", sequence.T_world_camera)], sequence.points, sequence.mask
         )
-        viz.save_figure(figure, folder / f"map_{index}.png", dpi=110)
+        viz.save_figure(figure, folder / f"map_{trajectory}.png", dpi=110)
     return row
 
 

@@ -82,12 +82,12 @@ def test_the_chosen_seed_is_one_that_tells_the_story() -> None:
 def test_rgbd_resumes_trajectory_by_trajectory(tmp_path) -> None:
     out = tmp_path / "out"
     assert run(deepmapping_rgbd, "--limit", 1, "--methods", "zero", "-o", out, "--pictures", 0) == 0
-    first = json.loads((out / "runs.json").read_text())["rows"]
+    first = json.loads((out / "metrics.json").read_text())["rows"]
     assert run(deepmapping_rgbd, "--resume", "-o", out, "--limit", 2) == 0
-    rows = json.loads((out / "runs.json").read_text())["rows"]
-    assert rows[0] == first[0]
-    assert [row["views"] for row in rows] == [8, 16]
     metrics = json.loads((out / "metrics.json").read_text())
+    rows = metrics["rows"]
+    assert rows[:1] == first
+    assert [row["views"] for row in rows] == [8, 16]
     assert metrics["num_trajectories"] == 2
     assert metrics["methods"]["zero"]["median_ate_mm"] > 0.0
     assert (out / "errors.png").exists()

@@ -24,6 +24,16 @@ def test_loss_is_its_definition(seed: int) -> None:
     np.testing.assert_allclose(occupancy_loss(*example(seed)), expected, **ACCUMULATED)
 
 
+@pytest.mark.parametrize("seed", [0, 1])
+def test_gradient_is_probability_less_label(seed: int) -> None:
+    logits, labels, weights = (array.astype(np.float64) for array in example(seed))
+    logits[0, 0] = 0.0
+    share = np.broadcast_to(weights, logits.shape) / np.broadcast_to(weights, logits.shape).sum()
+    by_logits, by_labels = jax.grad(occupancy_loss, argnums=(0, 1))(*map(jnp.float32, (logits, labels, weights)))
+    np.testing.assert_allclose(by_logits, share * (1 / (1 + np.exp(-logits)) - labels), **ACCUMULATED)
+    np.testing.assert_allclose(by_labels, -share * logits, **ACCUMULATED)
+
+
 def test_samples_of_weight_zero_take_no_part() -> None:
     logits, labels, weights = example(2)
     weights[1] = 0

@@ -12,6 +12,11 @@ from dpmjax.nets.occupancy import OccupancyConfig, double_resolution, init_map_n
 from tests.tolerances import ACCUMULATED
 
 KEY = jax.random.key(0)
+interpolate = jax.jit(interpolate_grid)  # Call by call, each of its operations would be compiled alone.
+
+
+def init_map(config: OccupancyConfig):
+    return jax.jit(lambda key: init_map_net(config, key=key))(KEY)
 
 
 def layer_sizes(params) -> list[tuple[int, int]]:
@@ -32,7 +37,7 @@ def test_paper_networks_have_the_published_sizes() -> None:
 
 
 def test_weights_start_xavier_uniform_with_the_gain_of_relu() -> None:
-    params = init_map_net(OccupancyConfig(), key=KEY)
+    params = init_map(OccupancyConfig())
     for weight in (x for x in jax.tree.leaves(params) if x.ndim == 2 and x.size > 10_000):
         limit = np.sqrt(2.0) * np.sqrt(6.0 / sum(weight.shape))
         assert 0.95 * limit < float(jnp.abs(weight).max()) <= limit
@@ -42,23 +47,26 @@ def test_weights_start_xavier_uniform_with_the_gain_of_relu() -> None:
 def test_convolution_is_that_of_the_textbook() -> None:
     config = LocalizationConfig(features=(5,), strides=(2,), hidden=())
     net, points = LocalizationNet(config), jax.random.normal(KEY, (20, 2))
-    params = net.init(KEY, points, jnp.ones(20, bool))["params"]
+    params = jax.jit(net.init)(KEY, points, jnp.ones(20, bool))["params"]
     weight = np.asarray(params["DilatedConvolution_0"]["Dense_0"]["kernel"], np.float64).reshape(3, 2, 5)
     padded = np.pad(np.asarray(points, np.float64), ((3, 3), (0, 0)))
     features = np.array([sum(padded[b + 3 * k] @ weight[k] for k in range(3)) for b in range(0, 20, 2)])
     expected = features.max(0) @ np.asarray(params["Dense_0"]["kernel"], np.float64)
-    np.testing.assert_allclose(net.apply({"params": params}, points, jnp.ones(20, bool)), expected, **ACCUMULATED)
+    np.testing.assert_allclose(
+        jax.jit(net.apply)({"params": params}, points, jnp.ones(20, bool)), expected, **ACCUMULATED
+    )
 
 
 @pytest.mark.parametrize("kind", ["conv", "point"])
 def test_masked_beams_never_matter_and_no_beam_is_finite(kind) -> None:
     net = LocalizationNet(LocalizationConfig(kind=kind, features=(8, 16), strides=(1, 2), hidden=(8,)))
     points, mask = jax.random.normal(KEY, (32, 2)), jnp.arange(32) % 3 > 0
-    params = net.init(KEY, points, mask)
+    params = jax.jit(net.init)(KEY, points, mask)
     filled = jnp.where(mask[:, None], points, jnp.nan)
-    np.testing.assert_array_equal(net.apply(params, points, mask), net.apply(params, filled, mask))
+    apply = jax.jit(net.apply)
+    np.testing.assert_array_equal(apply(params, points, mask), apply(params, filled, mask))
     nothing = jnp.zeros(32, bool)
-    assert np.isfinite(net.apply(params, filled, nothing)).all()
+    assert np.isfinite(apply(params, filled, nothing)).all()
     gradient = jax.jit(jax.grad(lambda p: net.apply(p, filled, nothing).sum()))(params)
     assert all(np.isfinite(x).all() for x in jax.tree.leaves(gradient))
 
@@ -66,25 +74,24 @@ def test_masked_beams_never_matter_and_no_beam_is_finite(kind) -> None:
 def test_pointnet_does_not_see_the_order() -> None:
     net = LocalizationNet(LocalizationConfig(kind="point", features=(8, 16), hidden=(8,)))
     points, mask = jax.random.normal(KEY, (32, 2)), jnp.arange(32) % 3 > 0
-    params, order = net.init(KEY, points, mask), np.random.default_rng(0).permutation(32)
-    np.testing.assert_allclose(
-        net.apply(params, points[order], mask[order]), net.apply(params, points, mask), **ACCUMULATED
-    )
+    params, order = jax.jit(net.init)(KEY, points, mask), np.random.default_rng(0).permutation(32)
+    apply = jax.jit(net.apply)
+    np.testing.assert_allclose(apply(params, points[order], mask[order]), apply(params, points, mask), **ACCUMULATED)
 
 
 def test_circular_convolution_does_not_see_where_the_turn_begins() -> None:
     net = LocalizationNet(LocalizationConfig(features=(8, 16), strides=(1, 1), is_circular=True, hidden=(8,)))
     points, mask = jax.random.normal(KEY, (32, 2)), jnp.ones(32, bool)
-    params = net.init(KEY, points, mask)
+    params, apply = jax.jit(net.init)(KEY, points, mask), jax.jit(net.apply)
     np.testing.assert_allclose(
-        net.apply(params, jnp.roll(points, 5, axis=0), mask), net.apply(params, points, mask), **ACCUMULATED
+        apply(params, jnp.roll(points, 5, axis=0), mask), apply(params, points, mask), **ACCUMULATED
     )
 
 
 def test_image_convolution_is_that_of_the_textbook() -> None:
     config = LocalizationConfig(features=(4,), strides=(2,), dilation=2, hidden=())
     net, points, mask = LocalizationNet(config), jax.random.normal(KEY, (6, 8, 3)), jnp.ones((6, 8), bool)
-    params = net.init(KEY, points, mask)["params"]
+    params = jax.jit(net.init)(KEY, points, mask)["params"]
     weight = np.asarray(params["DilatedConvolution_0"]["Dense_0"]["kernel"], np.float64).reshape(3, 3, 3, 4)
     padded = np.pad(np.asarray(points, np.float64), ((2, 2), (2, 2), (0, 0)))
     features = np.array(
@@ -95,17 +102,17 @@ def test_image_convolution_is_that_of_the_textbook() -> None:
         ]
     )
     expected = features.max(0) @ np.asarray(params["Dense_0"]["kernel"], np.float64)
-    np.testing.assert_allclose(net.apply({"params": params}, points, mask), expected, **ACCUMULATED)
+    np.testing.assert_allclose(jax.jit(net.apply)({"params": params}, points, mask), expected, **ACCUMULATED)
 
 
 @pytest.mark.parametrize("dimensions", [2, 3])
 def test_grid_is_exact_at_its_nodes_and_linear_between(dimensions: int) -> None:
     grid = jnp.asarray(np.random.default_rng(0).normal(size=(5,) * dimensions), jnp.float32)
     nodes = np.stack(np.meshgrid(*[np.linspace(-1, 1, 5)] * dimensions, indexing="ij"), -1).reshape(-1, dimensions)
-    np.testing.assert_allclose(interpolate_grid(grid, jnp.asarray(nodes, jnp.float32)), grid.reshape(-1), **ACCUMULATED)
-    middle = interpolate_grid(grid, jnp.full((1, dimensions), -0.75))[0]
+    np.testing.assert_allclose(interpolate(grid, jnp.asarray(nodes, jnp.float32)), grid.reshape(-1), **ACCUMULATED)
+    middle = interpolate(grid, jnp.full((1, dimensions), -0.75))[0]
     np.testing.assert_allclose(middle, grid[(slice(2),) * dimensions].mean(), **ACCUMULATED)
-    outside = interpolate_grid(grid, jnp.array([[-3.0, 9.0, 9.0][:dimensions]]))[0]
+    outside = interpolate(grid, jnp.array([[-3.0, 9.0, 9.0][:dimensions]]))[0]
     np.testing.assert_allclose(outside, grid[(0, -1, -1)[:dimensions]], **ACCUMULATED)
 
 
@@ -118,7 +125,7 @@ def test_gradient_of_the_grid_is_that_of_finite_differences(dimensions: int) -> 
     def total(grid, points):
         return jnp.sum(jnp.sin(interpolate_grid(jnp.asarray(grid), jnp.asarray(points))))
 
-    jax.test_util.check_grads(total, (grid, points), order=1, modes=("rev",), eps=1e-3, rtol=0.02, atol=0.02)
+    jax.test_util.check_grads(jax.jit(total), (grid, points), order=1, modes=("rev",), eps=1e-3, rtol=0.02, atol=0.02)
 
 
 @pytest.mark.parametrize("dimensions", [2, 3])
@@ -126,19 +133,19 @@ def test_doubled_resolution_is_the_same_function(dimensions: int) -> None:
     rng = np.random.default_rng(2)
     grid = jnp.asarray(rng.normal(size=(5,) * dimensions), jnp.float32)
     points = jnp.asarray(rng.uniform(-1.1, 1.1, size=(50, dimensions)), jnp.float32)
-    doubled = double_resolution(grid)
+    doubled = jax.jit(double_resolution)(grid)
     assert doubled.shape == (9,) * dimensions
-    np.testing.assert_allclose(interpolate_grid(doubled, points), interpolate_grid(grid, points), **ACCUMULATED)
+    np.testing.assert_allclose(interpolate(doubled, points), interpolate(grid, points), **ACCUMULATED)
 
 
 def test_the_map_is_the_sum_of_its_levels() -> None:
     config = OccupancyConfig(kind="grid", resolutions=(4, 8, 16))
     rng = np.random.default_rng(3)
-    params = jax.tree.map(lambda x: jnp.asarray(rng.normal(size=x.shape), x.dtype), init_map_net(config, key=KEY))
+    params = jax.tree.map(lambda x: jnp.asarray(rng.normal(size=x.shape), x.dtype), init_map(config))
     points, weights = jnp.asarray(rng.uniform(-1.0, 1.0, size=(40, 2)), jnp.float32), jnp.array([1.0, 0.7, 0.2])
-    levels = [interpolate_grid(params["params"][f"level_{cells}"], points) for cells in config.resolutions]
+    levels = [interpolate(params["params"][f"level_{cells}"], points) for cells in config.resolutions]
     expected = sum(weight * level for weight, level in zip(weights, levels, strict=True))
-    np.testing.assert_allclose(make_map_net(config).apply(params, points, weights), expected, **ACCUMULATED)
+    np.testing.assert_allclose(jax.jit(make_map_net(config).apply)(params, points, weights), expected, **ACCUMULATED)
 
 
 @pytest.mark.parametrize("resolutions", [(4, 12), (8, 4), (3, 6)])
@@ -149,12 +156,12 @@ def test_levels_that_do_not_double_are_refused(resolutions) -> None:
 
 def test_levels_that_are_off_do_not_count() -> None:
     config = OccupancyConfig(kind="grid", resolutions=(4, 8))
-    net, params = make_map_net(config), init_map_net(config, key=KEY)
+    apply, params = jax.jit(make_map_net(config).apply), init_map(config)
     assert not any(np.asarray(x).any() for x in jax.tree.leaves(params))
     params = jax.tree.map(jnp.ones_like, params)
     points = jax.random.uniform(KEY, (9, 2), minval=-1.0)
     for weights, expected in (([0.0, 0.0], 0.0), ([1.0, 0.0], 1.0), ([1.0, 0.5], 1.5)):
-        np.testing.assert_allclose(net.apply(params, points, jnp.array(weights)), expected, **ACCUMULATED)
+        np.testing.assert_allclose(apply(params, points, jnp.array(weights)), expected, **ACCUMULATED)
 
 
 def test_strides_belong_to_layers() -> None:

@@ -64,16 +64,17 @@ def test_support_counts_by_rank_and_contradictions_in_full() -> None:
     np.testing.assert_allclose(add_up(scores), [3.0, 0.0, -7.0], atol=1e-12)
 
 
-@pytest.mark.parametrize("yaw", [0.0, 1.3, 3.1, -2.0])
-def test_search_finds_the_relative_pose_from_any_yaw(sequence, truth, yaw: float) -> None:
-    points = sequence.points[:2].copy()
-    points[1] = se2.transform_points(np.array([0.0, 0.0, -yaw]), points[1])
-    some = make_profiles(planar_scans(points, sequence.mask[:2]))
-    found = search_pairs(some, np.array([1]), np.array([0]), COARSE)
-    error = se2.relative(se2.relative(truth[0], truth[1] + [0.0, 0.0, yaw]), found.poses[0, 0])
-    assert np.hypot(error[0], error[1]) < 3.0
-    assert abs(error[2]) < 0.03
-    assert found.scores[0, 0] > found.scores[0, 1] + 20
+def test_search_finds_the_relative_pose_from_any_yaw(sequence, truth) -> None:
+    # Scan 0, and scan 1 turned by each yaw: all are searched at once.
+    yaws = np.array([0.0, 1.3, 3.1, -2.0])
+    turned = [se2.transform_points(np.array([0.0, 0.0, -yaw]), sequence.points[1]) for yaw in yaws]
+    some = make_profiles(planar_scans(np.stack([sequence.points[0], *turned]), sequence.mask[[0, 1, 1, 1, 1]]))
+    found = search_pairs(some, np.arange(1, 5), np.zeros(4, int), COARSE)
+    expected = se2.relative(truth[0], truth[1] + yaws[:, None] * [0.0, 0.0, 1.0])
+    error = se2.relative(expected, found.poses[:, 0])
+    assert (np.hypot(error[:, 0], error[:, 1]) < 3.0).all()
+    assert (np.abs(error[:, 2]) < 0.03).all()
+    assert (found.scores[:, 0] > found.scores[:, 1] + 20).all()
 
 
 def test_candidates_of_a_pair_are_different_poses(profiles, found) -> None:
@@ -141,8 +142,7 @@ def half_circle(sequence: ScanSequence) -> ScanSequence:
     return replace(sequence, mask=sequence.mask & is_seen)
 
 
-@pytest.mark.parametrize("noise", [0.0, 2.0])
-@pytest.mark.parametrize("is_ordered", [True, False])
+@pytest.mark.parametrize(("is_ordered", "noise"), [(True, 2.0), (False, 0.0), (False, 2.0)])
 def test_scans_are_registered_at_180_degrees_and_with_noise(is_ordered: bool, noise: float) -> None:
     # 30 px apart, so that half circles overlap; the world is 1024 px wide.
     walk = half_circle(simulate_sequence(0, 37, seed=1, range_noise_px=noise).take(slice(0, None, 4)))
@@ -159,7 +159,8 @@ def test_scans_beyond_the_keyframes_find_their_poses(sequence, is_ordered: bool)
     assert ate(start.poses, sequence) < 4.0
 
 
-def test_refinement_without_order_is_exact(sequence, truth) -> None:
+def test_refinement_without_order_is_exact(truth) -> None:
+    sequence = simulate_sequence(0, 49, seed=1, num_beams=128).take(slice(0, None, 8))
     poses = truth + np.random.default_rng(0).normal(size=truth.shape) * [2.0, 2.0, 0.01]
     assert ate(refine(scans_of(sequence, is_ordered=False), poses).poses, sequence) < 0.05
 

@@ -26,11 +26,10 @@ def shaken(poses: np.ndarray, px: float, seed: int = 0) -> np.ndarray:
     return poses + np.concatenate([np.zeros((1, 3)), rng.normal(size=(len(poses) - 1, 3)) * [px, px, 0.01 * px]])
 
 
-@pytest.mark.parametrize("px", [5.0, 10.0])
-def test_refinement_is_exact_without_noise(walk, walk_scans, px: float) -> None:
-    start = shaken(walk.reference_poses, px)
+def test_refinement_is_exact_without_noise(walk, walk_scans) -> None:
+    start = shaken(walk.reference_poses, 10.0)
     refined = refine(walk_scans, start, WITHOUT_LOOPS)
-    assert ate(start, walk.reference_poses) > 0.8 * px
+    assert ate(start, walk.reference_poses) > 8.0
     assert ate(refined.poses, walk.reference_poses) < 0.01
     np.testing.assert_allclose(refined.poses[0], start[0], atol=1e-4)
 
@@ -44,11 +43,11 @@ def test_refinement_never_uses_masked_beams(walk) -> None:
     mask = walk.mask & (np.random.default_rng(2).uniform(size=walk.mask.shape) < 0.9)
     start = shaken(walk.reference_poses, 5.0)
     results = []
-    for filling in (0.0, 77.0, np.nan):
-        points = np.where(mask[..., None], walk.points, np.float32(filling))
+    some_or_nothing = np.where(np.arange(mask.shape[1]) % 2, 77.0, np.nan)[:, None]
+    for filling in (0.0, some_or_nothing):
+        points = np.where(mask[..., None], walk.points, filling).astype(np.float32)
         results.append(refine(planar_scans(points, mask), start, WITHOUT_LOOPS).poses)
     np.testing.assert_array_equal(results[0], results[1])
-    np.testing.assert_array_equal(results[0], results[2])
     assert ate(results[0], walk.reference_poses) < 0.05
 
 

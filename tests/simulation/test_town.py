@@ -1,6 +1,6 @@
 """Towns, drives through them and what a lidar sees there."""
 
-from dataclasses import replace
+from functools import cache
 
 import jax
 import jax.numpy as jnp
@@ -22,7 +22,7 @@ from dpmjax.simulation import (
     simulate_lidar_sequence,
 )
 
-SENSOR = LidarSensor("test", tuple(np.linspace(2.0, -24.0, 16)), 360, max_range_m=80.0)
+SENSOR = LidarSensor("test", HDL64E.elevations_deg[::4], 360, max_range_m=80.0)
 SHORT = TownConfig(route_length_m=500)
 
 
@@ -36,9 +36,9 @@ def way(town):
     return drive(town)
 
 
-def scan(town, way, index, seed=0, sensor=SENSOR):
+def scan(town, way, index, seed=0):
     pose, time = way.T_world_lidar[index], way.times[index]
-    return scan_town(town.primitives, pose, time, key=jax.random.key(seed), sensor=sensor)
+    return scan_town(town.primitives, pose, time, key=jax.random.key(seed), sensor=SENSOR)
 
 
 def test_a_seed_makes_one_town(town):
@@ -69,10 +69,14 @@ def test_points_lie_on_beams_within_range(town, way):
     np.testing.assert_allclose(np.arcsin(points[mask, 2] / ranges), beams, atol=1e-4)
 
 
+@cache
+def route(kind):
+    return drive(make_town(1, TownConfig(route=kind, route_length_m=1200, block_m=90))).T_world_lidar
+
+
 @pytest.mark.parametrize("kind", ["loop", "there_and_back", "wander"])
 def test_routes_close_and_have_the_wanted_length(kind):
-    town = make_town(1, TownConfig(route=kind, route_length_m=1200, block_m=90))
-    poses = drive(town).T_world_lidar
+    poses = route(kind)
     steps = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
     assert np.linalg.norm(poses[-1, :3, 3] - poses[0, :3, 3]) < 1.5
     assert steps.max() < 1.0
@@ -80,8 +84,7 @@ def test_routes_close_and_have_the_wanted_length(kind):
 
 
 def test_there_and_back_sees_a_street_from_both_sides():
-    town = make_town(2, TownConfig(route="there_and_back", route_length_m=1000, block_m=90))
-    poses = drive(town).T_world_lidar
+    poses = route("there_and_back")
     apart = np.linalg.norm(poses[:, None, :2, 3] - poses[None, :, :2, 3], axis=-1)
     facing = np.einsum("ni,mi->nm", poses[:, :2, 0], poses[:, :2, 0])
     assert ((apart < 5) & (facing < -0.9)).any(axis=1).mean() > 0.1
@@ -130,7 +133,8 @@ def test_traffic_moves(town):
     from dpmjax.simulation.town.primitives import traffic_boxes
 
     here = jnp.array([1e4, 1e4, 0.0])
-    start, later = (traffic_boxes(town.primitives.traffic, here, time) for time in jnp.array([0.0, 0.5]))
+    look = jax.jit(traffic_boxes)
+    start, later = (look(town.primitives.traffic, here, np.float32(time)) for time in (0.0, 0.5))
     mask = np.asarray(start.mask & later.mask)
     way = np.linalg.norm(np.asarray(later.centres - start.centres)[mask], axis=1)
     assert mask.sum() > 5
@@ -178,10 +182,9 @@ def test_a_scan_of_the_town_has_the_statistics_of_a_real_one(town, way, real_dat
     real = [
         describe(open_lidar_sequence(real_data / "lidar_3d" / name).read_scan(0)) for name in ("kitti_00", "kitti_07")
     ]
-    sensor = replace(SENSOR, elevations_deg=HDL64E.elevations_deg[::4])
     made = []
     for index in range(0, len(way.times), 60):
-        cloud = scan(town, way, index, sensor=sensor)
+        cloud = scan(town, way, index)
         made.append(describe(np.asarray(cloud.points)[np.asarray(cloud.mask)]))
     np.testing.assert_allclose(np.mean(made, axis=0), np.mean(real, axis=0), atol=0.12)
 

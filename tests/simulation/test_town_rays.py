@@ -194,8 +194,9 @@ def test_a_turn_meets_the_nearest_of_all_bodies(turn, land):
     look, town, (boxes, poles, tufts), rays = turn
     pose = tilted_pose()
     hits = look(town, jnp.asarray(pose, jnp.float32))
-    found, surfaces = np.asarray(hits.ranges).ravel(), np.asarray(hits.surfaces).ravel()
-    world = rays.reshape(-1, 3) @ pose[:3, :3].T
+    # The oracle is slow: it sees every third ray.
+    found, surfaces = np.asarray(hits.ranges).ravel()[::3], np.asarray(hits.surfaces).ravel()[::3]
+    world = rays.reshape(-1, 3)[::3] @ pose[:3, :3].T
     start = pose[:3, 3]
     wanted, kinds = [], []
     for ray in world:
@@ -246,7 +247,7 @@ def test_windows_lie_behind_their_wall(turn):
     pose = jnp.asarray(tilted_pose(), jnp.float32)
     walls = look(town, pose)
     depth = 0.3
-    boxes = town.boxes._replace(window_depth=jnp.full(town.boxes.mask.shape, depth))
+    boxes = town.boxes._replace(window_depth=jnp.full_like(town.boxes.window_depth, depth))
     fronts = look(town._replace(boxes=boxes), pose)
     is_wall = np.asarray(walls.surfaces) == SOLID
     deeper = np.asarray(fronts.ranges)[is_wall] - np.asarray(walls.ranges)[is_wall]

@@ -89,14 +89,14 @@ LOCALIZE = PhaseConfig(
 REFINE = PhaseConfig(
     name="free poses",
     poses="free",
-    num_steps=2000,
+    num_steps=800,
     occupancy_weight=0.5,
     learning_rate=2.5e-3,
     final_learning_rate=0.02,
     map_learning_rate=0.1,
     adam_decay=(0.9, 0.99),
     num_free=1,
-    surface_distance=(0.1, 0.008),
+    surface_distance=(0.1, 0.004),
     anneal_until=0.7,
     map_decay=1e-3,
 )

@@ -139,5 +139,5 @@ def chamfer_term(
         )
         return jnp.sum(jnp.where(is_pair, distance, 0.0)), is_pair.sum()
 
-    totals, counts = jax.lax.map(compare, offsets)
+    totals, counts = jax.vmap(compare)(offsets)
     return totals.sum() / jnp.maximum(counts.sum(), 1)

@@ -76,8 +76,8 @@ def as_scan_set(scans: ScanSet | ArrayLike, *, min_scans: int = 2) -> ScanSet:
         points = np.asarray(scans, np.float32)
         if points.ndim != 3 or points.shape[-1] != 2:
             raise ValueError(f"scans: expected shape (n, b, 2), got {points.shape}")
-        mask = np.isfinite(points).all(-1) & (np.abs(points).sum(-1) > 0)
-        scans = ScanSet(points=jnp.asarray(np.where(mask[..., None], points, 0.0)), mask=jnp.asarray(mask))
+        is_hit = np.isfinite(points).all(-1) & (np.abs(points).sum(-1) > 0)
+        scans = ScanSet(points=jnp.asarray(np.where(is_hit[..., None], points, 0.0)), mask=jnp.asarray(is_hit))
     if scans.points.shape[0] < min_scans:
         raise ValueError(f"scans: expected at least {min_scans}, got {scans.points.shape[0]}")
     empty = np.flatnonzero(~np.asarray(scans.mask).any(-1))

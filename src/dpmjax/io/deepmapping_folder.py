@@ -8,6 +8,7 @@ from __future__ import annotations
 import io
 import tarfile
 from pathlib import Path, PurePosixPath
+from typing import Any
 
 import numpy as np
 
@@ -88,8 +89,8 @@ def write_deepmapping_folder(path: str | Path, sequence: ScanSequence) -> Path:
     for name, points in zip(names, stored, strict=True):
         write_pcd(folder / name, points)
     if sequence.reference_poses is not None:
-        buffer = io.BytesIO()
-        savemat(buffer, {"pose": sequence.reference_poses})  # type: ignore[arg-type]  # Streams are fine.
+        buffer: Any = io.BytesIO()  # Older stubs of SciPy know names of files only.
+        savemat(buffer, {"pose": sequence.reference_poses})
         write_atomically(folder / _POSE_FILE, buffer.getvalue())
     return folder
 

@@ -178,7 +178,7 @@ def read_arrays(path: str | Path, *, unit: Unit | None = None) -> ScanSequence:
         advice = "mark an invalid beam by NaN in both coordinates"
         raise InputError(path, f"{bad.sum()} NaN or infinite points, the first in scan {scan}, beam {beam}", advice)
     times = table.get("times", np.zeros(len(points)))
-    is_good = _is_numeric(times, (len(points),)) and np.isfinite(times).all()
+    is_good = _is_numeric(times, (len(points),)) and bool(np.isfinite(times).all())
     require(is_good, path, f"times are {times.shape} {times.dtype}", f"give ({len(points)},) finite seconds")
     poses, odometry = (_planar(table, key, len(points), path) for key in ("poses", "odometry"))
     stamps = times.astype(np.float64) if "times" in table else None

@@ -104,7 +104,18 @@ def _occupancy_loss(logits: jax.Array, labels: jax.Array, weights: jax.Array) ->
     is_counted = weights != 0
     logits = jnp.where(is_counted, logits, 0)
     labels = jnp.where(is_counted, labels, 0)
-    # Equals -y log p - (1 - y) log(1 - p) for p = sigmoid(logit), without the overflow.
-    cross_entropy = jax.nn.softplus(logits) - labels * logits
     total = jnp.sum(weights)
-    return jnp.sum(weights * cross_entropy) / jnp.where(total > 0, total, 1)
+    return jnp.sum(weights * _cross_entropy(logits, labels)) / jnp.where(total > 0, total, 1)
+
+
+@jax.custom_jvp
+def _cross_entropy(logits: jax.Array, labels: jax.Array) -> jax.Array:
+    """-y log p - (1 - y) log(1 - p) for p = sigmoid(logit), without the overflow."""
+    return jnp.maximum(logits, 0) - labels * logits + jnp.log1p(jnp.exp(-jnp.abs(logits)))
+
+
+# The derivative that JAX finds for softplus takes several exponentials, and XLA computes them again for every sum.
+_cross_entropy.defjvps(
+    lambda tangent, _, logits, labels: tangent * (jax.nn.sigmoid(logits) - labels),
+    lambda tangent, _, logits, labels: -tangent * logits,
+)

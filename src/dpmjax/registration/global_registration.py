@@ -268,8 +268,9 @@ def find_unregistered(profiles: RangeProfiles, poses: Floats, config: GlobalConf
         Rows of the unregistered scans.
     """
     num_scans = len(poses)
-    near = scipy.spatial.cKDTree(poses[:, :2]).query(poses[:, :2], k=min(7, num_scans))[1]
-    scan, other = np.repeat(np.arange(num_scans), near.shape[1]), near.reshape(-1).astype(np.int64)
+    num_near = min(7, num_scans)
+    near = scipy.spatial.cKDTree(poses[:, :2]).query(poses[:, :2], k=num_near)[1]
+    scan, other = np.repeat(np.arange(num_scans), num_near), near.reshape(-1).astype(np.int64)
     views = compare_pairs(profiles, scan, other, se2.relative(poses[other], poses[scan]))
     matched = np.where(scan == other, 0.0, views.matched)
     usual = float(np.median(matched.reshape(near.shape).max(axis=1)))

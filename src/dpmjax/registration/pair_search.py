@@ -23,8 +23,9 @@ from dpmjax.registration.planar_scans import Floats, Indices, Tolerances, batche
 from dpmjax.registration.range_profiles import RangeProfiles, compare_pair, compare_pairs
 
 # Pairs of one turn are filled up to a power of two, at least this, so that few shapes are compiled.
-_SMALLEST = 64
-_REFINE_BATCH = 256
+# Small, as the last batch is filled up; larger ones are no quicker, for `lax.map` goes through them piece by piece.
+_SMALLEST = 32
+_REFINE_BATCH = 32
 # A pair agrees with a map within this: translation in typical ranges, radians.
 AGREEMENT = (0.06, 0.1)
 # Beams that a pair must hold by to be an edge; and the accuracy of a pair with all its beams: typical ranges, radians.

@@ -151,8 +151,9 @@ def assess_trajectory(scans: PlanarScans, poses: Floats) -> Assessment:
         Assessment.
     """
     num_scans = len(poses)
-    nearest = scipy.spatial.cKDTree(poses[:, :2]).query(poses[:, :2], k=min(_NUM_NEIGHBOURS + 1, num_scans))[1]
-    row = np.repeat(np.arange(num_scans), nearest.shape[1])
+    num_nearest = min(_NUM_NEIGHBOURS + 1, num_scans)
+    nearest = scipy.spatial.cKDTree(poses[:, :2]).query(poses[:, :2], k=num_nearest)[1]
+    row = np.repeat(np.arange(num_scans), num_nearest)
     pairs = np.unique(np.sort(np.stack([row, nearest.reshape(-1)], -1), axis=1), axis=0)
     target, source = pairs[pairs[:, 0] < pairs[:, 1]].astype(np.int64).T
     views = compare_pairs(make_profiles(scans), source, target, se2.relative(poses[target], poses[source]))

@@ -25,6 +25,8 @@ from dpmjax.registration.planar_scans import Floats, Indices, PlanarScans
 
 # Distances of one round are kept below this by leaving out beams of the sources: about two seconds on two cores.
 _ROUND_DISTANCES = 1.5e9
+# Pairs that are linearised side by side: few enough for the cache, enough for all cores.
+_PAIRS_AT_ONCE = 128
 # How gates and kernels shrink over the rounds.
 _ROUNDS = Schedule(gate=(0.09, 0.015), kernel=(0.06, 0.0015), num_iterations=14)
 # The start is sound, and no loops are searched, if the fitness of all its steps is above this, and so is the weakest
@@ -151,9 +153,9 @@ def choose_pairs(scans: PlanarScans, poses: Floats, config: RefinementConfig) ->
         near = near[(np.abs(near - scan) > apart)]
         near = near[np.abs(se2.wrap_angle(poses[near, 2] - poses[scan, 2])) < config.max_turn]
         chosen: list[int] = []
-        for other in near:
-            if len(chosen) < config.num_spatial and all(abs(other - c) > visit for c in chosen):
-                chosen.append(int(other))
+        while len(near) and len(chosen) < config.num_spatial:
+            chosen.append(int(near[0]))
+            near = near[np.abs(near - near[0]) > visit]
         source.append(np.full(len(chosen), scan))
         target.append(np.array(chosen, np.int64))
     return np.concatenate(source).astype(np.int64), np.concatenate(target).astype(np.int64)
@@ -168,7 +170,7 @@ def _linearise_pairs(
     def linearise(pair: tuple[Array, Array, Array]) -> PairSystem:
         return linearise_pair(thinned.take(pair[0]), scans.take(pair[1]), pair[2], scale, metric="plane")
 
-    return jax.lax.map(linearise, pairs, batch_size=16)
+    return jax.lax.map(linearise, pairs, batch_size=_PAIRS_AT_ONCE)
 
 
 def _linearise(

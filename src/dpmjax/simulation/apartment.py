@@ -23,6 +23,7 @@ _GRID_M, _TURN_DEG, _MOVE_SHARE = 0.3, 30.0, 0.5
 _CLEARANCE_M = 0.2  # Places keep this distance from walls and furniture.
 _FARTHEST_M = 6.0  # Deeper pixels are masked.
 _PARALLEL = 1e-9
+_KINDS, _KIND_SHARES = ("cupboard", "table", "picture", "shelf", "bench"), (0.26, 0.16, 0.26, 0.16, 0.16)
 _Box = tuple[list[float], list[float], float]  # centre, half sizes, yaw
 
 
@@ -172,7 +173,7 @@ class _Rooms(NamedTuple):
 def _place_furniture(rng: np.random.Generator, rooms: _Rooms) -> list[_Box]:
     """One piece at a wall, on a wall, or in the room; nothing where it would block the doorway."""
     size_x, size_z, wall_x, door_z = rooms
-    kind = rng.choice(["cupboard", "table", "picture", "shelf", "bench"], p=[0.26, 0.16, 0.26, 0.16, 0.16])
+    kind = _KINDS[int(rng.choice(len(_KINDS), p=_KIND_SHARES))]
     width, depth = rng.uniform(0.3, 1.1), rng.uniform(0.25, 0.6)
     wall = int(rng.integers(6))
     along = rng.uniform(0.15, 0.85)

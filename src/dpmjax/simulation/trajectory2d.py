@@ -159,10 +159,10 @@ def _walk(route: FloatArray, clearance: FloatArray, num_poses: int, rng: np.rand
         others = np.deg2rad(np.arange(5, 180, 5).repeat(2)) * np.tile([1, -1], 35)
         angles = bearing + np.concatenate([[swing, 0.5 * swing, 0.0], others])
         ends = here + length * np.column_stack([np.cos(angles), np.sin(angles)])
-        clear = [end for end in ends if _is_clear(here, end, clearance)]
-        if not clear:
+        clear = next((end for end in ends if _is_clear(here, end, clearance)), None)
+        if clear is None:
             raise ValueError("world is too narrow to move in: a step would touch an obstacle in every direction")
-        positions.append(clear[0])
+        positions.append(clear)
     return np.array(positions)
 
 

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 PHASE_COLORS = ("#eef2f7", "#fbf3e6", "#ecf5ee", "#f6eef6")
 LOSS_COLOR = "#30638e"
 RATIO_FOR_LOG_AXIS = 10.0
+_FEW_DECADES = 2
 SMOOTHED_PART = 0.03
 SIZE_COLORS = (LOSS_COLOR, ACCENT, "#2a9d6f", "#e09f3e")
 
@@ -126,12 +127,23 @@ def _finish_value_axis(axes: Axes, values: NDArray[np.floating], label: str) -> 
     known = values[np.isfinite(values)]
     if len(known) and known.min() > 0.0 and known.max() > RATIO_FOR_LOG_AXIS * known.min():
         axes.set_yscale("log")
+        _label_log_axis(axes, known)
     axes.set_ylabel(label, color=INK)
     axes.grid(axis="y", color=FRAME, linewidth=0.6, zorder=1)
     axes.tick_params(which="both", colors=MUTED, labelsize=9, length=3)
     for side, spine in axes.spines.items():
         spine.set_visible(side in ("left", "bottom"))
         spine.set_color(FRAME)
+
+
+def _label_log_axis(axes: Axes, values: NDArray[np.floating]) -> None:
+    # Plain numbers at powers of ten; over few decades also at 2 and 5 times these. Other ticks have no label.
+    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+
+    is_short = values.max() < RATIO_FOR_LOG_AXIS**_FEW_DECADES * values.min()
+    axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if is_short else (1.0,), numticks=8))
+    axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axes.yaxis.set_minor_formatter(NullFormatter())
 
 
 def size_figure(curves: Mapping[str, ArrayLike], *, memory_limit_gb: float) -> Figure:
