@@ -106,13 +106,13 @@ PRESETS: dict[str, ModelConfig] = {
         encoder=EncoderConfig(stem_channels=8, expansion=2, output_channels=64, frame="bearing"),
         decoder=DecoderConfig(input_channels=64, model_channels=64, num_heads=2),
         preprocess=PreprocessConfig(capacity=4096),
-        matching=MatchConfig(pair_ratio=1.0, consensus=ConsensusConfig()),
+        matching=MatchConfig(pair_ratio=2.0, consensus=ConsensusConfig()),
     ),
     "small": ModelConfig(
         pyramid=_pyramid((2048, 768, 256, 64, 16), (24, 24, 24, 24, 16), (0.8, 1.6)),
         encoder=EncoderConfig(stem_channels=16, expansion=2, output_channels=128, frame="bearing"),
         decoder=DecoderConfig(input_channels=128, model_channels=128),
-        matching=MatchConfig(pair_ratio=1.0, consensus=ConsensusConfig()),
+        matching=MatchConfig(pair_ratio=2.0, consensus=ConsensusConfig()),
     ),
     "paper": ModelConfig(),
 }

@@ -73,9 +73,6 @@ def register(
     Where both are scans, the best distinct motions of the descriptors are verified by the scans themselves: points
     must meet surfaces and leave free space free. The motion under which the scans agree best is taken.
 
-    A `ValueError` says if the points are no real numbers (n, 3), if features have another width than the model, or if
-    `refine` is asked for without two scans.
-
     Args:
         model: encoder and decoder.
         source: a raw scan (n, 3) in metres, a scan from `prepare_scan`, or a descriptor cloud.
@@ -89,6 +86,10 @@ def register(
         right within 2 m and 5 degrees if the model is calibrated (`model.config.calibration`), else the mean score of
         the pairs, which is no probability. Failure is data: without any pair the motion is the identity and the
         confidence 0; with fewer than three distinct pairs `rmse_m` is infinite.
+
+    Raises:
+        ValueError: if the points are no real numbers (n, 3), if features have another width than the model, or if
+            `refine` is asked for without two scans.
     """
     if refine and (isinstance(source, DescriptorCloud) or isinstance(target, DescriptorCloud)):
         raise ValueError("refine: expected two scans, raw or from prepare_scan, got descriptors without points")
