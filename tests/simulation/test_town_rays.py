@@ -7,6 +7,7 @@ import pytest
 
 from dpmjax.simulation import CastConfig, LidarSensor
 from dpmjax.simulation.town.cast import cast_turn
+from dpmjax.simulation.town.culling import near_world
 from dpmjax.simulation.town.intersect import cross_box, cross_cylinder, cross_ground, cross_spheroid, ground_height
 from dpmjax.simulation.town.primitives import (
     GROUND,
@@ -131,7 +132,7 @@ def test_ground_is_met_where_a_ray_first_goes_below_it(land):
     ground = Ground(jnp.asarray(heights, jnp.float32), jnp.asarray(origin, jnp.float32), jnp.float32(1.0))
     rays = directions(np.random.default_rng(5), 150)
     start = np.array([1.0, 2.0, float(ground_height(ground, jnp.array([1.0, 2.0]))) + 1.73])
-    found = cross_ground(ground, jnp.asarray(start, jnp.float32), jnp.asarray(rays, jnp.float32), 40.0)
+    found = cross_ground(ground, jnp.asarray(start, jnp.float32), jnp.asarray(rays, jnp.float32)[:, None], 40.0)[:, 0]
     wanted = np.array([ground_oracle(heights, origin, 1.0, start, ray, 40.0) for ray in rays])
     same = np.isclose(found, wanted, rtol=0, atol=0.05)
     assert np.isfinite(wanted).sum() > 50
@@ -181,11 +182,12 @@ def tilted_pose():
 def turn(land):
     """A small town and what a turn of the sensor meets there."""
     town, *tables = small_town(land, np.random.default_rng(11))
-    rays = make_rays(SENSOR, CONFIG, jnp.float32(0.01))
+    rays = make_rays(SENSOR, CONFIG, jnp.float32(0.01), jnp.zeros(6))
 
     @jax.jit
     def look(town, pose):
-        return cast_turn(town, pose, jnp.float32(0.0), rays, max_range=SENSOR.max_range_m, config=CONFIG)
+        near = near_world(town, pose[:3, 3], jnp.float32(0.0), max_range=SENSOR.max_range_m, config=CONFIG)
+        return cast_turn(near, pose, rays, max_range=SENSOR.max_range_m, config=CONFIG)
 
     return look, town, tables, np.asarray(rays.directions, np.float64)
 

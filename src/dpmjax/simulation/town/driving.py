@@ -8,15 +8,18 @@ from typing import NamedTuple
 import jax
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.spatial.transform import Rotation
 
 from dpmjax.sequences import FloatArray, LidarSequence
 from dpmjax.simulation.town.make import Town, TownConfig, make_town
+from dpmjax.simulation.town.primitives import TownPrimitives
 from dpmjax.simulation.town.scan import HDL64E, LidarSensor, scan_town
 from dpmjax.simulation.town.streets import arc_lengths, at_way, lane_of, tangents
 
 _WHEELBASE_M = 2.7
 _TRACK_M = 1.6
 _SHAKE_DEG = 0.25  # Standard deviation of fast roll and pitch.
+_TURN_S = 0.1
 _DRIVE_STREAM = 8151
 
 
@@ -86,15 +89,54 @@ def simulate_lidar_sequence(
     town = make_town(seed, config, trajectory=trajectory)
     driving = driving or DriveConfig(sensor_height_m=sensor.height_m)
     way = drive(town, driving, seed=seed)
+    return scan_along(town.name, town.primitives, way, seed=seed, sensor=sensor)
+
+
+def scan_along(
+    name: str,
+    primitives: TownPrimitives,
+    way: Drive,
+    *,
+    seed: int,
+    sensor: LidarSensor,
+    is_moving: bool = False,
+) -> LidarSequence:
+    """Scans taken on the way through a world; each is simulated when it is read.
+
+    Args:
+        name: of the sequence.
+        primitives: the world.
+        way: poses and times.
+        seed: of the noise.
+        sensor: the lidar.
+        is_moving: the lidar moves during its turn, as fast as it goes to the next pose.
+
+    Returns:
+        The sequence.
+    """
+    motions = _motions(way) if is_moving else np.zeros((len(way.times), 6))
 
     def read_scan(index: int) -> NDArray[np.float32]:
         key = jax.random.fold_in(jax.random.key(seed), index)
-        pose, time = way.T_world_lidar[index], way.times[index]
-        cloud = scan_town(town.primitives, pose, time, key=key, sensor=sensor)
+        pose, time, motion = way.T_world_lidar[index], way.times[index], motions[index]
+        cloud = scan_town(primitives, pose, time, key=key, sensor=sensor, motion=motion)
         return np.asarray(cloud.points)[np.asarray(cloud.mask)]
 
-    sources = tuple(f"{town.name}, scan {index}" for index in range(len(way.times)))
-    return LidarSequence(town.name, sources, read_scan, way.T_world_lidar, way.times)
+    sources = tuple(f"{name}, scan {index}" for index in range(len(way.times)))
+    return LidarSequence(name, sources, read_scan, way.T_world_lidar, way.times)
+
+
+def _motions(way: Drive) -> FloatArray:
+    """(n, 6) twists of the sensor during a turn, on its way to the next pose; the last is that before."""
+    poses = way.T_world_lidar
+    if len(poses) < 2:
+        return np.zeros((len(poses), 6))
+    part = _TURN_S / np.maximum(np.diff(way.times), _TURN_S)[:, None]
+    back = poses[:-1, :3, :3].transpose(0, 2, 1)
+    moved = np.einsum("nij,nj->ni", back, np.diff(poses[:, :3, 3], axis=0))
+    turned = Rotation.from_matrix(back @ poses[1:, :3, :3]).as_rotvec()
+    twists = np.hstack([moved, turned]) * part
+    return np.vstack([twists, twists[-1:]])
 
 
 def drive(town: Town, config: DriveConfig = DriveConfig(), *, seed: int = 0) -> Drive:

@@ -1,104 +1,22 @@
-"""Furnishes streets: both sides of each, plot by plot, in the manner of its quarter."""
+"""Furnishes streets: both sides of each, plot by plot, in the manner of its quarter, and the land behind."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from dpmjax.sequences import FloatArray
 from dpmjax.simulation.town import objects
+from dpmjax.simulation.town.kinds import Kind, Quarter
 from dpmjax.simulation.town.objects import Collection, Place, Size
-from dpmjax.simulation.town.primitives import CELL_M, Terrain
+from dpmjax.simulation.town.plots import Plots
 from dpmjax.simulation.town.streets import Streets, arc_lengths, at_way, tangents
+from dpmjax.simulation.town.vegetation import plant_bushes, plant_land, plant_trees
 
-
-@dataclass(frozen=True)
-class Quarter:
-    """What a street looks like. Ranges are (low, high); distances in metres.
-
-    Attributes:
-        setback: from the kerb to the house fronts.
-        house_width: along the street.
-        house_depth: across it.
-        eaves: height of the houses.
-        gap: between houses; below 1 they touch.
-        house_rate: part of the plots that has a house.
-        border_rate: part of the plots with a hedge, wall or fence along the pavement.
-        parked_rate: part of the parking places that is taken.
-        garden_trees: mean number of trees on a plot.
-        street_tree_step: distance of trees on the pavement; 0 for none.
-        garden_bushes: mean number of bushes on a plot.
-    """
-
-    setback: tuple[float, float]
-    house_width: tuple[float, float]
-    house_depth: tuple[float, float]
-    eaves: tuple[float, float]
-    gap: tuple[float, float]
-    house_rate: float
-    border_rate: float
-    parked_rate: float
-    garden_trees: float
-    street_tree_step: float
-    garden_bushes: float
-
-
-QUARTERS = (
-    # Detached houses behind gardens.
-    Quarter((4.5, 10.0), (8, 14), (8, 12), (4.5, 8), (2, 8), 0.92, 0.75, 0.45, 0.9, 0.0, 1.5),
-    # Rows of town houses.
-    Quarter((3.2, 5.5), (7, 14), (9, 13), (7, 14), (0, 1.6), 0.95, 0.3, 0.75, 0.1, 14.0, 0.3),
-    # A park or an allotment.
-    Quarter((8.0, 20.0), (6, 12), (6, 10), (3, 6), (10, 30), 0.35, 0.6, 0.25, 3.0, 10.0, 2.5),
-    # Workshops and markets.
-    Quarter((5.0, 14.0), (18, 40), (14, 28), (5, 15), (6, 18), 0.9, 0.4, 0.3, 0.6, 0.0, 0.6),
-)
-_QUARTER_SHARES = (0.42, 0.32, 0.12, 0.14)
 _PAVEMENT_M = 2.2
+_FREE_M = 4.2  # Least distance of parked cars from the middle of a street.
 _BORDERS = ("hedge", "wall", "fence")
-
-
-class Plots:
-    """The ground that is taken, so that no house stands in a street or in another house.
-
-    It changes while a town is made.
-
-    Args:
-        terrain: ground heights and distances from the streets.
-    """
-
-    def __init__(self, terrain: Terrain) -> None:
-        self.terrain = terrain
-        self._is_taken = np.zeros(terrain.heights.shape, bool)
-
-    def claim(self, place: Place, size: Size, kerb_distance: float) -> bool:
-        """Takes a rectangle if all of it is free.
-
-        Args:
-            place: its middle.
-            size: along and across its heading, m.
-            kerb_distance: no part may be nearer than this to a kerb, m; negative allows to stand on the street.
-
-        Returns:
-            Whether it was free.
-        """
-        cells = self._cells(place, size)
-        if (cells < 0).any() or (cells >= np.array(self._is_taken.shape)[::-1]).any():
-            return False
-        at = (cells[:, 1], cells[:, 0])
-        if self._is_taken[at].any() or (self.terrain.street_distance[at] < kerb_distance).any():
-            return False
-        self._is_taken[at] = True
-        return True
-
-    def _cells(self, place: Place, size: Size) -> NDArray[np.int64]:
-        axes = [np.linspace(-0.5 * side, 0.5 * side, max(int(np.ceil(side / CELL_M)) + 1, 2)) for side in size]
-        u, v = (grid.ravel() for grid in np.meshgrid(*axes))
-        cos, sin = np.cos(place.heading), np.sin(place.heading)
-        x, y = place.x + cos * u - sin * v, place.y + sin * u + cos * v
-        return np.round((np.column_stack([x, y]) - self.terrain.origin) / CELL_M).astype(np.int64)
 
 
 @dataclass(frozen=True)
@@ -110,6 +28,7 @@ class _Side:
     length: float
     half_width: float
     quarter: Quarter
+    kind: Kind
     plots: Plots
 
     def place(self, way: float, from_kerb: float) -> Place:
@@ -121,28 +40,77 @@ class _Side:
         return Place(x, y, float(self.plots.terrain.height_at(np.array([[x, y]]))[0]), heading)
 
 
-def furnish(rng: np.random.Generator, streets: Streets, plots: Plots) -> Collection:
+def furnish(rng: np.random.Generator, streets: Streets, plots: Plots, kind: Kind) -> Collection:
     """Builds everything that stands in the town.
 
     Args:
         rng: source of all choices.
         streets: where the streets are.
         plots: the ground that is free; taken from as it is built upon.
+        kind: what the place is like.
 
     Returns:
         The rows of primitives.
     """
     into = Collection()
     sides = []
+
+    def draw() -> Quarter:
+        return kind.quarters[rng.choice(len(kind.quarters), p=kind.shares)]
+
     for path, half_width in zip(streets.paths, streets.half_widths, strict=True):
-        quarter = QUARTERS[rng.choice(len(QUARTERS), p=_QUARTER_SHARES)]
+        quarter = draw()
         for line in (path, path[::-1]):
-            other = QUARTERS[rng.choice(len(QUARTERS), p=_QUARTER_SHARES)] if rng.random() < 0.25 else quarter
-            sides.append(_Side(line, tangents(line), float(arc_lengths(line)[-1]), half_width, other, plots))
-    for step in (_houses, _kerbside, _pavement, _second_row):
+            other = draw() if rng.random() < 0.25 else quarter
+            sides.append(_Side(line, tangents(line), float(arc_lengths(line)[-1]), half_width, other, kind, plots))
+    steps = (_bridges, _houses, _kerbside, _pavement if kind.has_pavement else _roadside, _verge, _second_row)
+    for step in steps:
         for side in sides:
             step(into, rng, side)
+    plant_land(into, rng, plots, kind)
     return into
+
+
+def _put_tree(into: Collection, rng: np.random.Generator, place: Place, side: _Side, scale: float = 1.0) -> None:
+    low, high = side.kind.tree_height
+    feet = np.array([[place.x, place.y, place.ground]])
+    plant_trees(into, rng, feet, (scale * low, scale * high), conifers=0.5 * side.kind.conifers)
+
+
+def _put_bush(into: Collection, rng: np.random.Generator, place: Place) -> None:
+    near = [place.move(*rng.normal(0.0, 0.5, 2)) for _ in range(rng.integers(1, 4))]
+    plant_bushes(into, rng, np.array([[at.x, at.y, at.ground] for at in near]))
+
+
+def _bridges(into: Collection, rng: np.random.Generator, side: _Side) -> None:
+    for _ in range(rng.poisson(0.5 * side.kind.bridges_per_km * side.length / 1000)):
+        place = side.place(rng.uniform(0.25, 0.75) * side.length, -side.half_width)
+        objects.put_bridge(into, rng, place, side.half_width)
+
+
+def _verge(into: Collection, rng: np.random.Generator, side: _Side) -> None:
+    """Bushes and tall grass along the kerb, and posts of a rail."""
+    step = side.kind.verge_step
+    for _ in range(rng.poisson(side.length / step) if step else 0):
+        place = side.place(rng.uniform(0, side.length), rng.uniform(1.3, 5.0))
+        if side.plots.claim(place, (0.8, 0.8), 0.9):
+            _put_bush(into, rng, place)
+
+
+def _roadside(into: Collection, rng: np.random.Generator, side: _Side) -> None:
+    """What stands beside a road without pavement: delineators, signs, poles of a line."""
+    lines = [(float(rng.uniform(25, 50)), 0.06, 1.0, 0.7)]
+    if rng.random() < 0.5:
+        lines.append((float(rng.uniform(30, 50)), 0.12, 7.5, 2.5))
+    for step, radius, height, from_kerb in lines:
+        for way in np.arange(rng.uniform(2, step), side.length, step):
+            place = side.place(float(way), from_kerb)
+            if side.plots.claim(place, (0.4, 0.4), 0.2):
+                objects.put_pole(into, place, radius, height)
+    for _ in range(rng.poisson(side.length / 90.0)):
+        place = side.place(rng.uniform(0, side.length), rng.uniform(0.6, 1.5))
+        if side.plots.claim(place, (0.8, 0.6), 0.3):
+            objects.put_sign(into, rng, place)
 
 
 def _houses(into: Collection, rng: np.random.Generator, side: _Side) -> None:
@@ -167,6 +135,8 @@ def _houses(into: Collection, rng: np.random.Generator, side: _Side) -> None:
                 garage = side.place(way + width + 0.5 * gap, setback + 4.0)
                 if side.plots.claim(garage, (3.0, 5.5), _PAVEMENT_M + 0.6):
                     objects.put_box(into, garage, (3.0, 5.5), (-1.0, 2.6), window_depth=0.1)
+        elif rng.random() < quarter.car_park_rate:
+            _car_park(into, rng, side, (middle, width + gap))
         if setback > _PAVEMENT_M + 1.4 and rng.random() < quarter.border_rate:
             border = side.place(middle + 0.5 * gap, _PAVEMENT_M + 0.4)
             if side.plots.claim(border, (width + gap - 1.0, 0.4), _PAVEMENT_M - 0.4):
@@ -180,14 +150,26 @@ def _garden(into: Collection, rng: np.random.Generator, side: _Side, plot: Size,
     (way, width), quarter = plot, side.quarter
     if front < _PAVEMENT_M + 2.0:
         return
-    for mean, put, size in (
-        (quarter.garden_trees, objects.put_tree, 0.8),
-        (quarter.garden_bushes, objects.put_bush, 1.4),
-    ):
-        for _ in range(rng.poisson(mean)):
-            place = side.place(way + rng.uniform(0, width), rng.uniform(_PAVEMENT_M + 1.0, front - 0.8))
-            if side.plots.claim(place, (size, size), _PAVEMENT_M + 0.4):
-                put(into, rng, place)
+
+    def places(mean: float, size: float) -> list[Place]:
+        drawn = [
+            side.place(way + rng.uniform(0, width), rng.uniform(_PAVEMENT_M + 1.0, front - 0.8))
+            for _ in range(rng.poisson(mean))
+        ]
+        return [place for place in drawn if side.plots.claim(place, (size, size), _PAVEMENT_M + 0.4)]
+
+    for place in places(quarter.garden_trees, 0.8):
+        _put_tree(into, rng, place, side, 0.8)
+    for place in places(quarter.garden_bushes, 1.4):
+        _put_bush(into, rng, place)
+
+
+def _car_park(into: Collection, rng: np.random.Generator, side: _Side, plot: Size) -> None:
+    middle, width = plot
+    size = (max(width - 2.0, 14.0), float(rng.uniform(16, 34)))
+    place = side.place(middle, _PAVEMENT_M + 1.0 + 0.5 * size[1])
+    if side.plots.claim(place, size, _PAVEMENT_M):
+        objects.put_car_park(into, rng, place, size)
 
 
 def _kerbside(into: Collection, rng: np.random.Generator, side: _Side) -> None:
@@ -195,7 +177,8 @@ def _kerbside(into: Collection, rng: np.random.Generator, side: _Side) -> None:
     way, rate = float(rng.uniform(3, 9)), side.quarter.parked_rate * rng.uniform(0.4, 1.3)
     while way < side.length - 3:
         if rng.random() < rate:
-            place = side.place(way, -0.2 + float(rng.normal(0, 0.12)))
+            from_kerb = max(-0.2, _FREE_M - side.half_width) + float(rng.normal(0, 0.12))
+            place = side.place(way, from_kerb)
             turned = Place(place.x, place.y, place.ground - 0.06, place.heading + np.pi + float(rng.normal(0, 0.02)))
             if side.plots.claim(turned, (4.8, 1.7), -1.6):
                 objects.put_car(into, rng, turned)
@@ -210,7 +193,7 @@ def _pavement(into: Collection, rng: np.random.Generator, side: _Side) -> None:
     for way in trees:
         place = side.place(float(way) + rng.normal(0, 0.4), 1.2)
         if rng.random() < 0.75 and side.plots.claim(place, (0.6, 0.6), 0.3):
-            objects.put_tree(into, rng, place)
+            _put_tree(into, rng, place, side, 0.75)
     for way in lamps:
         place = side.place(float(way), 0.6)
         if side.plots.claim(place, (0.4, 0.4), 0.0):
@@ -234,10 +217,14 @@ def _second_row(into: Collection, rng: np.random.Generator, side: _Side) -> None
     while way < side.length:
         width, depth = rng.uniform(8, 20), rng.uniform(7, 12)
         place = side.place(way + 0.5 * width, rng.uniform(22, 34) + 0.5 * depth)
-        if rng.random() < 0.7 and side.plots.claim(place, (width, depth), 4.0):
-            objects.put_house(into, rng, place, (width, depth), float(rng.uniform(3, 12)), is_plain=True)
+        is_built = rng.random() < 0.75 * side.quarter.house_rate
+        if is_built and side.plots.claim(place, (width, depth), 4.0):
+            height = float(rng.uniform(0.6, 1.3) * rng.uniform(*side.quarter.eaves))
+            objects.put_house(into, rng, place, (width, depth), height, is_plain=True)
+        elif rng.random() < 0.5 * side.quarter.car_park_rate:
+            _car_park(into, rng, side, (way + 0.5 * width, width))
         for _ in range(rng.poisson(1.2)):
             tree = side.place(way + rng.uniform(0, width), rng.uniform(14, 40))
             if side.plots.claim(tree, (1.5, 1.5), 3.0):
-                objects.put_tree(into, rng, tree)
+                _put_tree(into, rng, tree, side)
         way += width + rng.uniform(3, 15)

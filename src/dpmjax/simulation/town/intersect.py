@@ -20,8 +20,8 @@ from dpmjax.simulation.town.primitives import Bodies, Ground, turn_back
 # Directions along an axis are nudged off zero by this: a thousandth of a millimetre at 100 m.
 _TINY = 1e-8
 # Ground: geometric steps of the search, then refinements of the interval found: millimetres at 20 m, less nearer.
-_NUM_STEPS = 14
-_NUM_REFINEMENTS = 5
+_NUM_STEPS = 28
+_NUM_REFINEMENTS = 3
 _NEAREST_M = 1.0
 # Facades: windows and doors lie behind the wall, so that scans fix the position along a front.
 _STOREY_M, _SILL_M, _LINTEL_M = 2.9, 0.9, 2.2
@@ -179,50 +179,49 @@ def ground_height(ground: Ground, positions: Float[Array, "... 2"]) -> Float[Arr
 
 
 def cross_ground(
-    ground: Ground, start: Float[Array, " 3"], direction: Float[Array, "... 3"], max_range: float
-) -> Float[Array, "..."]:
+    ground: Ground, start: Float[Array, " 3"], direction: Float[Array, "*c b 3"], max_range: float
+) -> Float[Array, "*c b"]:
     """Distance at which rays first go below the ground.
 
-    The height over ground is evaluated in steps that grow with the distance. Within the first step that ends below, the
-    false position method (Illinois) finds the crossing.
+    The ground under each column of rays is sampled once, at distances that grow. The first interval at whose end a ray
+    lies below is refined along the ray itself by the false position method (Illinois).
 
     Args:
         ground: the height field.
         start: common start of the rays, in the world, m.
-        direction: of the rays, unit length, in the world.
+        direction: of the rays, unit length, in the world; the b rays of a column have nearly the same azimuth.
         max_range: rays are followed so far, m.
 
     Returns:
         Distance, m; infinite where a ray stays above the ground.
     """
-    steps = np.geomspace(_NEAREST_M, max_range, _NUM_STEPS)
-
-    def clearance(distance: Float[Array, "..."]) -> Float[Array, "..."]:
-        place = start[:2] + distance[..., None] * direction[..., :2]
-        return start[2] + distance * direction[..., 2] - ground_height(ground, place)
-
-    def look(
-        carry: tuple[Array, Array, Array, Array], distance: Array
-    ) -> tuple[tuple[Array, Array, Array, Array], None]:
-        near, far, above, below = carry
-        here = clearance(jnp.broadcast_to(distance, near.shape))
-        is_open = below > 0
-        near, above = jnp.where(is_open & (here > 0), distance, near), jnp.where(is_open & (here > 0), here, above)
-        far, below = jnp.where(is_open, distance, far), jnp.where(is_open, here, below)
-        return (near, far, above, below), None
+    ways = jnp.asarray(np.append(0.0, np.geomspace(_NEAREST_M, max_range, _NUM_STEPS)), direction.dtype)
+    level = jnp.maximum(jnp.linalg.norm(direction[..., :2], axis=-1), 1e-6)
+    heading = (direction[..., :2] / level[..., None]).mean(-2)
+    profile = ground_height(ground, start[:2] + ways[:, None] * heading[..., None, :])
+    slope = direction[..., 2] / level
+    over = start[2] + slope[..., None] * ways - profile[..., None, :]
+    far = jnp.where(over <= 0, ways, jnp.inf).min(-1)
+    near = jnp.where(ways < far[..., None], ways, 0.0).max(-1)
+    is_met = jnp.isfinite(far)
+    far = jnp.where(is_met, far, near)
+    above = jnp.where(ways == near[..., None], over, 0.0).sum(-1)
+    below = jnp.where(ways == far[..., None], over, 0.0).sum(-1)
+    along = direction[..., :2] / level[..., None]
 
     def refine(_: Array, carry: tuple[Array, Array, Array, Array]) -> tuple[Array, Array, Array, Array]:
-        near, far, above, below = carry
-        middle = near + (far - near) * jnp.clip(above / jnp.maximum(above - below, 1e-9), 0.02, 0.98)
-        return _narrow(carry, middle, clearance(middle))
+        middle = _false_position(carry, 0.02)
+        here = start[2] + slope * middle - ground_height(ground, start[:2] + middle[..., None] * along)
+        return _narrow(carry, middle, here)
 
-    zero = jnp.zeros(direction.shape[:-1], direction.dtype)
-    top = start[2] - ground_height(ground, start[:2])
-    begin = (zero, zero, jnp.broadcast_to(top, zero.shape), zero + 1.0)
-    found, _ = jax.lax.scan(look, begin, jnp.asarray(steps, direction.dtype))
-    near, far, above, below = jax.lax.fori_loop(0, _NUM_REFINEMENTS, refine, found)
-    last = near + (far - near) * jnp.clip(above / jnp.maximum(above - below, 1e-9), 0.0, 1.0)
-    return jnp.where(found[3] <= 0, last, jnp.inf)
+    bracket = jax.lax.fori_loop(0, _NUM_REFINEMENTS, refine, (near, far, above, below))
+    return jnp.where(is_met, _false_position(bracket, 0.0) / level, jnp.inf)
+
+
+def _false_position(bracket: tuple[Array, Array, Array, Array], margin: float) -> Array:
+    """Where a straight line between the ends of the bracket is zero, kept off the ends by a part of its length."""
+    near, far, above, below = bracket
+    return near + (far - near) * jnp.clip(above / jnp.maximum(above - below, 1e-9), margin, 1.0 - margin)
 
 
 def _narrow(

@@ -10,17 +10,18 @@ from numpy.typing import ArrayLike
 
 from dpmjax.sequences import FloatArray
 from dpmjax.simulation.town import primitives
-from dpmjax.simulation.town.furnish import Plots, furnish
+from dpmjax.simulation.town.furnish import furnish
+from dpmjax.simulation.town.kinds import KINDS, Kind
+from dpmjax.simulation.town.plots import Plots
 from dpmjax.simulation.town.primitives import CELL_M, LANE_STEP_M, Terrain, TownPrimitives, Traffic, pack_bodies, padded
 from dpmjax.simulation.town.streets import LANE_M, Streets, arc_lengths, make_streets, resample, streets_along
 
-_MARGIN_M = 50.0
+_MARGIN_M = 70.0
 _TILE = 256
 _KERB_M = 0.12
 _PAVEMENT_M = 2.2
 _SENSOR_HEIGHT_M = 1.73
-_STEEPNESS = 0.015  # Typical slope of the land, rise over run.
-_CARS_PER_KM, _WALKERS_PER_KM = 10.0, 15.0  # For each kilometre of lane.
+_WALKERS_PER_KM = 15.0  # For each kilometre of lane.
 _TOWN_STREAM = 8150
 
 
@@ -29,19 +30,23 @@ class TownConfig:
     """What a town is like.
 
     Attributes:
+        kind: of the place: suburb, canyon (tall houses), country, car_park, campus or wood.
         route: kind of the drive's route; "there_and_back" drives the same street in both directions.
         route_length_m: wanted length of the route, met within a block or two.
         block_m: side of a block.
 
     Raises:
-        ValueError: another route, a length that is not positive, or blocks of less than 50 m.
+        ValueError: another kind or route, a length that is not positive, or blocks of less than 50 m.
     """
 
+    kind: str = "suburb"
     route: str = "loop"
     route_length_m: float = 1000.0
     block_m: float = 100.0
 
     def __post_init__(self) -> None:
+        if self.kind not in KINDS:
+            raise ValueError(f"kind must be one of {', '.join(KINDS)}, got {self.kind!r}")
         if self.route not in ("loop", "there_and_back", "wander"):
             raise ValueError(f"route must be loop, there_and_back or wander, got {self.route!r}")
         if not (self.route_length_m > 0 and self.block_m >= 50):
@@ -84,21 +89,21 @@ def make_town(seed: int, config: TownConfig = TownConfig(), *, trajectory: Array
     if seed < 0:
         raise ValueError(f"seed must not be negative, got {seed}")
     rng = np.random.default_rng([_TOWN_STREAM, seed])
-    support = None
+    support, kind = None, KINDS[config.kind]
     if trajectory is None:
-        streets = make_streets(rng, config.route, config.route_length_m, config.block_m)
+        streets = make_streets(rng, config.route, config.route_length_m, config.block_m, kind.half_width)
     else:
         positions = _positions(trajectory)
         streets = streets_along(positions[:, :2], rng)
         support = positions - [0.0, 0.0, _SENSOR_HEIGHT_M]
-    terrain = make_terrain(rng, streets, support)
-    standing = furnish(rng, streets, Plots(terrain))
+    terrain = make_terrain(rng, streets, support, kind)
+    standing = furnish(rng, streets, Plots(terrain), kind)
     tables = (np.array(rows, np.float64) for rows in (standing.boxes, standing.cylinders, standing.spheroids))
     kinds = (primitives.SOLID, primitives.POLE, primitives.SOFT)
     boxes, cylinders, spheroids = map(pack_bodies, tables, kinds)
     ground = primitives.Ground(*(jnp.asarray(x, jnp.float32) for x in (terrain.heights, terrain.origin, CELL_M)))
-    whole = TownPrimitives(boxes, cylinders, spheroids, ground, _make_traffic(rng, streets, terrain))
-    return Town(f"town-{seed}", streets, terrain, whole)
+    whole = TownPrimitives(boxes, cylinders, spheroids, ground, _make_traffic(rng, streets, terrain, kind))
+    return Town(f"{config.kind}-{seed}", streets, terrain, whole)
 
 
 def _positions(trajectory: ArrayLike) -> FloatArray:
@@ -108,19 +113,11 @@ def _positions(trajectory: ArrayLike) -> FloatArray:
     return poses[:, :3, 3]
 
 
-def _make_traffic(rng: np.random.Generator, streets: Streets, terrain: Terrain) -> Traffic:
+def _make_traffic(rng: np.random.Generator, streets: Streets, terrain: Terrain, kind: Kind) -> Traffic:
     lanes = [resample(lane, LANE_STEP_M) for line in streets.lanes for lane in (line, line[::-1])]
     lengths = np.array([arc_lengths(lane)[-1] for lane in lanes])
-    users: list[tuple[float, ...]] = []
     half_width = float(np.mean(streets.half_widths))
-    for index, length in enumerate(lengths):
-        for _ in range(rng.poisson(_CARS_PER_KM * length / 1000)):
-            size = (rng.uniform(1.9, 2.5), rng.uniform(0.82, 0.95), rng.uniform(0.7, 0.9))
-            users.append((index, rng.uniform(0, length), rng.uniform(6, 13), -LANE_M, *size))
-        for _ in range(rng.poisson(_WALKERS_PER_KM * length / 1000)):
-            side = -half_width - rng.uniform(0.4, 1.8)
-            way, speed = rng.uniform(0, length), rng.uniform(0.8, 1.8)
-            users.append((index, way, speed, side, 0.2, 0.25, rng.uniform(0.75, 0.93)))
+    users = [user for index, length in enumerate(lengths) for user in _users(rng, index, length, half_width, kind)]
     table = np.array(users, np.float64).reshape(-1, 7)
     rows = padded(table, primitives.capacity_for(len(table)))
     samples = primitives.capacity_for(max(len(lane) for lane in lanes))
@@ -134,13 +131,43 @@ def _make_traffic(rng: np.random.Generator, streets: Streets, terrain: Terrain) 
     return Traffic(lane_points, lane_lengths, own_lanes, starts, speeds, sides, rows[:, 4:7], mask)
 
 
-def make_terrain(rng: np.random.Generator, streets: Streets, support: FloatArray | None) -> Terrain:
+def _users(
+    rng: np.random.Generator, lane: int, length: float, half_width: float, kind: Kind
+) -> list[tuple[float, ...]]:
+    """Rows of the road users of a lane: lane, way, speed, distance to the left, half sizes."""
+
+    def vehicle() -> tuple[float, float, float]:
+        if rng.random() < kind.trucks:
+            return (rng.uniform(3.2, 6.5), rng.uniform(1.15, 1.27), rng.uniform(1.3, 1.8))
+        return (rng.uniform(1.9, 2.5), rng.uniform(0.82, 0.95), rng.uniform(0.7, 0.9))
+
+    users: list[tuple[float, ...]] = [
+        (lane, rng.uniform(0, length), rng.uniform(6, 13), -LANE_M, *vehicle())
+        for _ in range(rng.poisson(kind.cars_per_km * length / 1000))
+    ]
+    for _ in range(rng.poisson(kind.queues_per_km * length / 1000)):
+        way, speed = rng.uniform(0, length), rng.uniform(0.3, 3.0)
+        for _ in range(rng.integers(3, 10)):
+            size = vehicle()
+            way = (way + 2 * size[0] + rng.uniform(1.5, 4.0)) % length
+            users.append((lane, way, speed, -LANE_M, *size))
+    for _ in range(rng.poisson(_WALKERS_PER_KM * length / 1000) if kind.has_pavement else 0):
+        side = -half_width - rng.uniform(0.4, 1.8)
+        way, speed = rng.uniform(0, length), rng.uniform(0.8, 1.8)
+        users.append((lane, way, speed, side, 0.2, 0.25, rng.uniform(0.75, 0.93)))
+    return users
+
+
+def make_terrain(
+    rng: np.random.Generator, streets: Streets, support: FloatArray | None, kind: Kind = KINDS["suburb"]
+) -> Terrain:
     """Shapes the ground.
 
     Args:
         rng: source of all choices.
         streets: where the streets are.
         support: (n, 3) points that the streets must go through, m; None lets the land roll at random.
+        kind: how steep and rough the land is.
 
     Returns:
         The terrain; its grid is a whole number of tiles of 128 m, so that kernels see few shapes.
@@ -151,8 +178,12 @@ def make_terrain(rng: np.random.Generator, streets: Streets, support: FloatArray
     columns, rows = (int(-(-count // _TILE) * _TILE) for count in cells)
     distance = _street_distance(streets, low, (rows, columns))
     x, y = np.meshgrid(low[0] + CELL_M * np.arange(columns), low[1] + CELL_M * np.arange(rows))
-    land = _rolling(rng, x, y) if support is None else _through(support, low, (rows, columns))
-    return Terrain(low, land + _cross_section(distance) + _roughness(rng, distance), distance)
+    land = (
+        _rolling(rng, x, y, rng.uniform(*kind.steepness))
+        if support is None
+        else _through(support, low, (rows, columns))
+    )
+    return Terrain(low, land + _cross_section(distance) + kind.roughness * _roughness(rng, distance), distance)
 
 
 def _street_distance(streets: Streets, origin: FloatArray, shape: tuple[int, int]) -> FloatArray:
@@ -171,12 +202,12 @@ def _street_distance(streets: Streets, origin: FloatArray, shape: tuple[int, int
     return nearest
 
 
-def _rolling(rng: np.random.Generator, x: FloatArray, y: FloatArray) -> FloatArray:
+def _rolling(rng: np.random.Generator, x: FloatArray, y: FloatArray, steepness: float) -> FloatArray:
     land = np.zeros_like(x)
     for wavelength in (900.0, 600.0, 400.0, 250.0):
         angle, phase = rng.uniform(0, 2 * np.pi, 2)
         wave = 2 * np.pi / wavelength
-        land += _STEEPNESS * 0.7 / wave * np.sin(wave * (np.cos(angle) * x + np.sin(angle) * y) + phase)
+        land += steepness * 0.7 / wave * np.sin(wave * (np.cos(angle) * x + np.sin(angle) * y) + phase)
     return land
 
 
@@ -206,10 +237,10 @@ def _cross_section(distance: FloatArray) -> FloatArray:
 
 
 def _roughness(rng: np.random.Generator, distance: FloatArray) -> FloatArray:
-    """Millimetres on streets, centimetres and gentle mounds in gardens."""
+    """A centimetre on streets, several and gentle mounds beside them."""
     from scipy.ndimage import gaussian_filter
 
     fine = rng.normal(size=distance.shape)
     mounds = gaussian_filter(rng.normal(size=distance.shape), 8.0) * 28.0
     is_garden = np.clip((distance - _PAVEMENT_M) / 2.0, 0, 1)
-    return (0.004 + 0.03 * is_garden) * fine + 0.12 * is_garden * mounds
+    return (0.01 + 0.05 * is_garden) * fine + 0.12 * is_garden * mounds

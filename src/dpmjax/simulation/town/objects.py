@@ -1,4 +1,4 @@
-"""Objects of a town as rows of primitives: houses, cars, trees, hedges, poles, people.
+"""Objects of a town as rows of primitives: houses, cars, hedges, poles, people, car parks, bridges.
 
 Every builder gets a place on the ground and a heading (the street's direction; the street lies to the object's right)
 and appends rows to a `Collection`.
@@ -107,14 +107,19 @@ def put_house(
 
 
 def put_car(into: Collection, rng: np.random.Generator, place: Place) -> None:
-    """A parked car or van: body, cabin, a gap below.
+    """A parked car, van or lorry: body, cabin, a gap below.
 
     Args:
         into: where to.
         rng: source of its size.
         place: its middle.
     """
-    if rng.random() < 0.12:
+    draw = rng.random()
+    if draw < 0.04:
+        length, width, top = rng.uniform(7.0, 12.0), rng.uniform(2.3, 2.5), rng.uniform(2.8, 3.8)
+        put_box(into, place.move(-1.2, 0.0), (length - 2.4, width), (0.9, top))
+        put_box(into, place.move(0.5 * length - 1.0, 0.0), (2.0, 0.95 * width), (0.5, 0.8 * top))
+    elif draw < 0.14:
         length, width, top = rng.uniform(4.8, 6.2), rng.uniform(1.9, 2.1), rng.uniform(2.0, 2.7)
         put_box(into, place, (length, width), (0.35, top))
         put_box(into, place.move(0.5 * length + 0.25, 0.0), (0.5, width), (0.35, 0.5 * top))
@@ -162,38 +167,6 @@ def put_sign(into: Collection, rng: np.random.Generator, place: Place) -> None:
     put_box(into, place, (0.04, float(plate)), (float(height - plate), float(height)))
 
 
-def put_tree(into: Collection, rng: np.random.Generator, place: Place) -> None:
-    """A trunk and a crown of tufts, no two alike.
-
-    Args:
-        into: where to.
-        rng: source of its shape.
-        place: its foot.
-    """
-    trunk, radius = rng.uniform(1.6, 3.2), rng.uniform(1.0, 2.4)
-    put_pole(into, place, float(rng.uniform(0.09, 0.28)), float(trunk + radius))
-    for _ in range(rng.integers(4, 8)):
-        along, left = rng.normal(0.0, 0.5 * radius, 2)
-        at = place.move(float(along), float(left))
-        size = radius * rng.uniform(0.45, 0.8)
-        level = trunk + radius + rng.uniform(-0.5, 0.7) * radius
-        _put_tuft(into, at, level, size, size * rng.uniform(0.7, 1.1), float(rng.uniform(0.3, 1.0)))
-
-
-def put_bush(into: Collection, rng: np.random.Generator, place: Place) -> None:
-    """Two or three tufts on the ground.
-
-    Args:
-        into: where to.
-        rng: source of its shape.
-        place: its foot.
-    """
-    for _ in range(rng.integers(2, 4)):
-        along, left = rng.normal(0.0, 0.5, 2)
-        at, size = place.move(float(along), float(left)), rng.uniform(0.4, 1.1)
-        _put_tuft(into, at, 0.6 * size, size, 0.9 * size, float(rng.uniform(0.1, 0.35)))
-
-
 def put_border(into: Collection, rng: np.random.Generator, place: Place, length: float, kind: str) -> None:
     """A hedge, wall or fence along the street, in pieces, with an open gate.
 
@@ -233,3 +206,45 @@ def put_person(into: Collection, rng: np.random.Generator, place: Place) -> None
     height = rng.uniform(1.5, 1.9)
     put_pole(into, place, 0.22, height - 0.25)
     _put_tuft(into, place, height - 0.12, 0.11, 0.14)
+
+
+def put_car_park(into: Collection, rng: np.random.Generator, place: Place, size: Size) -> None:
+    """Rows of parked cars, lamps and a few trolleys or bollards between them.
+
+    Args:
+        into: where to.
+        rng: source of all choices.
+        place: middle of the car park.
+        size: along and across the heading, m.
+    """
+    taken = rng.uniform(0.25, 0.9)
+    for across in np.arange(-0.5 * size[1] + 3.0, 0.5 * size[1] - 2.5, 8.5):
+        for along in np.arange(-0.5 * size[0] + 2.0, 0.5 * size[0] - 1.5, 2.6):
+            at = place.move(float(along), float(across + rng.normal(0, 0.2)))
+            if rng.random() < taken:
+                turn = 0.5 * np.pi * float(rng.choice([-1, 1])) + float(rng.normal(0, 0.03))
+                put_car(into, rng, Place(at.x, at.y, at.ground, at.heading + turn))
+            elif rng.random() < 0.05:
+                put_box(into, at, (0.6, 1.0), (-0.1, float(rng.uniform(0.8, 1.1))), softness=0.1)
+        lamp = place.move(float(rng.uniform(-0.4, 0.4) * size[0]), float(across) + 3.6)
+        put_pole(into, lamp, 0.1, float(rng.uniform(6, 10)))
+
+
+def put_bridge(into: Collection, rng: np.random.Generator, place: Place, half_width: float) -> None:
+    """A bridge over the street: a deck with parapets on piers, high enough for the traffic.
+
+    Args:
+        into: where to.
+        rng: source of its size.
+        place: on the middle of the street, heading along it.
+        half_width: of the street, m.
+    """
+    wide, clear, thick = rng.uniform(4, 14), rng.uniform(4.8, 6.5), rng.uniform(0.6, 1.4)
+    span = 2 * half_width + rng.uniform(6, 30)
+    put_box(into, place, (wide, span), (clear, clear + thick))
+    for side in (-1, 1):
+        edge = place.move(side * (0.5 * wide - 0.15), 0.0)
+        put_box(into, edge, (0.3, span), (clear + thick, clear + thick + 1.1), softness=0.1)
+        put_box(into, place.move(0.0, side * (half_width + 1.8)), (0.8 * wide, 1.0), (-_SUNK_M, clear))
+        bank = place.move(0.0, side * (0.5 * span + 1.5))
+        put_box(into, bank, (wide, 3.0), (-_SUNK_M, clear + thick))

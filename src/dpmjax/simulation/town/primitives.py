@@ -21,7 +21,8 @@ CELL_M = 0.5
 """Distance of the nodes of the ground."""
 # Road users nearer to the sensor than this are left out: the sensor's own car is there.
 _CLEARANCE_M = 4.0
-_CAR_IS_LONGER_THAN_M = 0.5
+# Half lengths of cars; what is shorter walks, what is longer is a lorry: one box above the street.
+_CAR_LENGTH_M = (0.5, 2.9)
 
 
 NOTHING, GROUND, SOLID, SOFT, POLE, MOVING = range(6)
@@ -204,7 +205,7 @@ def traffic_boxes(traffic: Traffic, sensor: Float[Array, " 3"], time: Float[Arra
         time: s.
 
     Returns:
-        Two boxes for each: body and cabin (masked for people).
+        Two boxes for each: body and cabin (masked for people and lorries).
     """
     way = jnp.mod(traffic.starts + traffic.speeds * time, traffic.lane_lengths[traffic.lanes])
     here, ahead = _on_lane(traffic, way), _on_lane(traffic, way + 0.5 * LANE_STEP_M)
@@ -213,10 +214,11 @@ def traffic_boxes(traffic: Traffic, sensor: Float[Array, " 3"], time: Float[Arra
     left = jnp.stack([-heading[:, 1], heading[:, 0], jnp.zeros(len(heading))], axis=-1)
     foot = here + traffic.sides[:, None] * left
     is_free = ((foot[:, :2] - sensor[:2]) ** 2).sum(-1) > _CLEARANCE_M**2
-    is_car = traffic.half_sizes[:, 0] > _CAR_IS_LONGER_THAN_M
+    low, high = _CAR_LENGTH_M
+    is_car = (traffic.half_sizes[:, 0] > low) & (traffic.half_sizes[:, 0] < high)
     body_z, cabin_z = _car_levels(traffic.half_sizes[:, 2])
     half_body = jnp.where(is_car, body_z, traffic.half_sizes[:, 2])
-    lift = jnp.where(is_car, 0.25, 0.0)
+    lift = jnp.where(is_car, 0.25, jnp.where(traffic.half_sizes[:, 0] >= high, 0.5, 0.0))
     up = jnp.array([0.0, 0.0, 1.0], foot.dtype)
     zero = jnp.zeros(len(way), foot.dtype)
     middle, half_sizes = foot + (lift + half_body)[:, None] * up, traffic.half_sizes.at[:, 2].set(half_body)

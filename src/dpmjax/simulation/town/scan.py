@@ -11,18 +11,27 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.scipy.special import ndtri
 from jaxtyping import Array, Float, PRNGKeyArray
+from numpy.typing import NDArray
 
 from dpmjax.checks import require_shape
-from dpmjax.simulation.town.cast import CastConfig, Hits, Rays, cast_turn
+from dpmjax.geometry import se3
+from dpmjax.simulation.town.cast import Hits, Rays, cast_turn
+from dpmjax.simulation.town.culling import CastConfig, NearWorld, near_world
 from dpmjax.simulation.town.primitives import NOTHING, TownPrimitives
 from dpmjax.types import AnyArray, PointCloud
 
 # Reflectivity of each surface (nothing, ground, solid, soft, pole, moving): asphalt is dark, leaves and paint are not.
 _REFLECTIVITY = np.array([0.0, 0.17, 0.35, 0.4, 0.35, 0.3], np.float32)
+# Unevenness of each of them: shutters, plaster and paintwork are no planes.
+_ROUGHNESS_M = np.array([0.0, 0.0, 0.025, 0.0, 0.01, 0.02], np.float32)
+_BIAS_STREAM = 8152
 _GLASS_RETURNS = 0.35
 # How sharply returns end at that range, in natural logarithms of range.
 _FADE = 0.18
+# Steps in range that the length of a pulse can mix, m.
+_EDGE_M = (0.2, 2.5)
 
 
 @dataclass(frozen=True)
@@ -41,6 +50,8 @@ class LidarSensor:
         drop_rate: share of the returns that is lost at any range.
         half_loss_m: range at which half of the returns of a surface of 20 % reflectivity, met head-on, are lost.
         height_m: mounting height above the ground, for drives.
+        beam_bias_m: standard deviation of the constant range errors of the beams, which calibration leaves.
+        mixed_rate: share of the beams on an edge that return a range between foreground and background.
 
     Raises:
         ValueError: no beams, fewer than 8 columns, or ranges that are not 0 <= min < max.
@@ -55,6 +66,8 @@ class LidarSensor:
     drop_rate: float = 0.03
     half_loss_m: float = 75.0
     height_m: float = 1.73
+    beam_bias_m: float = 0.01
+    mixed_rate: float = 0.25
 
     def __post_init__(self) -> None:
         if not self.elevations_deg or self.num_azimuths < 8:
@@ -78,14 +91,20 @@ def _spread(top_deg: float, bottom_deg: float, count: int) -> tuple[float, ...]:
 
 
 # Velodyne's manual: 32 lasers a third of a degree apart, and 32 below them half a degree apart (as on KITTI's car).
-HDL64E = LidarSensor("hdl64e", _spread(2.0, -8.33, 32) + _spread(-8.83, -24.33, 32), 1800, max_range_m=80.0)
+HDL64E = LidarSensor(
+    "hdl64e", _spread(2.0, -8.33, 32) + _spread(-8.83, -24.33, 32), 1800, max_range_m=80.0, beam_bias_m=0.025
+)
 # Ouster OS1-64 of the first generation, as on MulRan's car.
 OS1_64 = LidarSensor("os1_64", _spread(16.6, -16.6, 64), 1024, range_noise_m=0.03, half_loss_m=60.0, height_m=1.85)
+# The same with 128 beams, and a wider view.
+OS1_128 = LidarSensor("os1_128", _spread(22.5, -22.5, 128), 1024, range_noise_m=0.03, half_loss_m=70.0, height_m=1.85)
+# Hesai's manual: most beams a sixth of a degree apart around the horizontal (as on PandaSet's car).
+_PANDAR64_DEG = (15.0, 11.0, 8.0, 5.0, 3.0, *_spread(2.0, -6.0, 49), *_spread(-7.0, -14.0, 8), -19.0, -25.0)
+PANDAR64 = LidarSensor("pandar64", _PANDAR64_DEG, 1800, half_loss_m=110.0, height_m=1.9)
 HDL32E = LidarSensor("hdl32e", _spread(10.67, -30.67, 32), 1080, max_range_m=80.0, height_m=1.84)
 VLP16 = LidarSensor("vlp16", _spread(15.0, -15.0, 16), 1800, range_noise_m=0.03)
 
 
-@partial(jax.jit, static_argnames=("sensor", "config"))
 def scan_town(
     town: TownPrimitives,
     T_world_lidar: AnyArray,
@@ -94,72 +113,112 @@ def scan_town(
     key: PRNGKeyArray,
     sensor: LidarSensor,
     config: CastConfig = CastConfig(),  # noqa: B008 (frozen)
+    motion: AnyArray | None = None,
 ) -> PointCloud:
     """Takes one scan.
 
-    The sensor stands still during its turn. Ranges carry Gaussian noise; returns are lost with distance, dark surface
-    and grazing angle, behind glass, and at random.
+    Ranges carry Gaussian noise; beams on an edge may mix both ranges; returns are lost with distance, dark surface and
+    grazing angle, behind glass, and at random. The kernel of the rays compiles once for each sensor, whatever the town.
 
     Args:
-        town: the world, from `make_town`.
-        T_world_lidar: (4, 4) pose of the sensor, x forward, y left, z up.
+        town: the world, from `make_town` or `make_interior`.
+        T_world_lidar: (4, 4) pose of the sensor in the middle of its turn, x forward, y left, z up.
         time: s, moves the traffic.
         key: of noise, lost returns and foliage.
         sensor: the lidar.
         config: capacities of the ray caster.
+        motion: (6,) twist of the sensor during one turn (m, radians; see `geometry.se3.exp`), in its own frame: points
+            stay in the frame of the moment of their beam, as a raw scan's do. None for a sensor that stands still.
 
     Returns:
         (b, 3) points in the sensor frame, m, with b = beams times azimuths: beam by beam from the highest down, each
         clockwise from straight behind; masked where nothing came back (points there are zero).
 
     Raises:
-        ValueError: the pose is not (4, 4).
+        ValueError: the pose is not (4, 4), or the motion not (6,).
     """
     pose, time = jnp.asarray(T_world_lidar, jnp.float32), jnp.asarray(time, jnp.float32)
+    twist = jnp.zeros(6) if motion is None else jnp.asarray(motion, jnp.float32)
     require_shape("T_world_lidar", pose, (4, 4))
-    key_phase, key_depth, key_noise, key_loss = jax.random.split(key, 4)
-    shape = _ray_shape(sensor, config)
+    require_shape("motion", twist, (6,))
+    near = near_world(town, pose[:3, 3], time, max_range=sensor.max_range_m, config=config)
+    return _scan_near(near, pose, twist, key=key, sensor=sensor, config=config)
+
+
+@partial(jax.jit, static_argnames=("sensor", "config"))
+def _scan_near(
+    near: NearWorld, pose: Array, twist: Array, *, key: PRNGKeyArray, sensor: LidarSensor, config: CastConfig
+) -> PointCloud:
+    key_phase, key_rays = jax.random.split(key)
     phase = jax.random.uniform(key_phase, (), minval=0.0, maxval=2 * np.pi / sensor.num_azimuths)
-    depths = -jnp.log(jax.random.uniform(key_depth, shape, minval=1e-6, maxval=1.0))
-    rays = make_rays(sensor, config, phase)._replace(depths=depths)
-    hits = cast_turn(town, pose, time, rays, max_range=sensor.max_range_m, config=config)
-    ranges = hits.ranges + sensor.range_noise_m * jax.random.normal(key_noise, shape)
-    is_back = jax.random.uniform(key_loss, shape) < _return_probability(hits, sensor)
+    # One draw for all: each draw of its own would take a second to compile.
+    depth, noise, loss, mix, part = jax.random.uniform(key_rays, (5, sensor.num_rays), minval=1e-6, maxval=1.0)
+    rays = make_rays(sensor, config, phase, twist)
+    rays = rays._replace(depths=-jnp.log(depth).reshape(rays.depths.shape))
+    hits = cast_turn(near, pose, rays, max_range=sensor.max_range_m, config=config)
+    probability = _by_beam(_return_probability(hits, sensor), sensor)
+    directions = _by_beam(rays.directions, sensor)
+    ranges = _mix_edges(_by_beam(hits.ranges, sensor), sensor, mix, part)
+    rough = jnp.asarray(_ROUGHNESS_M)[_by_beam(hits.surfaces, sensor)]
+    ranges += jnp.sqrt(sensor.range_noise_m**2 + rough**2) * ndtri(noise) + _beam_bias(sensor)
+    is_back = loss < probability
     mask = is_back & (ranges >= sensor.min_range_m) & (ranges <= sensor.max_range_m)
-    points = jnp.where(mask[..., None], ranges[..., None] * rays.directions, 0.0)
-    return PointCloud(points=_by_beam(points, sensor), mask=_by_beam(mask, sensor))
+    return PointCloud(points=jnp.where(mask[:, None], ranges[:, None] * directions, 0.0), mask=mask)
 
 
-def make_rays(sensor: LidarSensor, config: CastConfig, phase: Float[Array, ""]) -> Rays:
+def _beam_bias(sensor: LidarSensor) -> NDArray[np.float32]:
+    """Constant error of the range of each ray, m; the same in every scan."""
+    biases = np.random.default_rng(_BIAS_STREAM).normal(size=len(sensor.elevations_deg))
+    return np.repeat(np.float32(sensor.beam_bias_m) * biases.astype(np.float32), sensor.num_azimuths)
+
+
+def _mix_edges(ranges: Float[Array, " b"], sensor: LidarSensor, choice: Array, part: Array) -> Float[Array, " b"]:
+    """Ranges between foreground and background for beams beside an edge; `choice` and `part` are uniform draws."""
+    grid = ranges.reshape(-1, sensor.num_azimuths)
+    gap = jnp.roll(grid, 1, axis=1) - grid
+    is_edge = (jnp.abs(gap) > _EDGE_M[0]) & (jnp.abs(gap) < _EDGE_M[1])
+    is_mixed = is_edge.reshape(-1) & (choice < sensor.mixed_rate)
+    return jnp.where(is_mixed, ranges + part * gap.reshape(-1), ranges)
+
+
+def make_rays(sensor: LidarSensor, config: CastConfig, phase: Float[Array, ""], motion: Float[Array, " 6"]) -> Rays:
     """The rays of a turn, by sectors of whole columns; foliage is met at its surface.
 
     Args:
         sensor: the lidar.
         config: capacities.
         phase: by how much the turn is turned to the left, radians.
+        motion: twist of the sensor during the turn, in its own frame.
 
     Returns:
         The rays, in the sensor frame.
     """
-    shape = _ray_shape(sensor, config)
+    (num_sectors, num_bands), num_beams = _ray_shape(sensor, config), len(sensor.elevations_deg)
     step = 2 * np.pi / sensor.num_azimuths
     # Clockwise from straight behind.
-    columns = (np.pi - step * (np.arange(sensor.num_azimuths) + 0.5)).astype(np.float32).reshape(shape[0], -1)
+    columns = (np.pi - step * (np.arange(sensor.num_azimuths) + 0.5)).astype(np.float32)
+    columns = columns.reshape(num_sectors, -1)
     elevation = np.radians(np.array(sensor.elevations_deg, np.float32))
+    # Each band holds neighbouring beams.
+    elevation = np.broadcast_to(
+        elevation.reshape(num_bands, 1, -1), (num_bands, columns.shape[1], num_beams // num_bands)
+    )
     flat, up = jnp.cos(elevation), jnp.sin(elevation)
-    azimuth = phase + jnp.asarray(columns[..., None])
-    azimuth = jnp.broadcast_to(azimuth, (*azimuth.shape[:2], len(elevation)))
-    rays = jnp.stack([flat * jnp.cos(azimuth), flat * jnp.sin(azimuth), jnp.broadcast_to(up, azimuth.shape)], axis=-1)
-    return Rays(rays.reshape(*shape, 3), phase + jnp.asarray(columns.mean(axis=1)), jnp.zeros(shape))
+    azimuth = (phase + jnp.asarray(columns))[:, None, :, None]
+    rays = jnp.stack(jnp.broadcast_arrays(flat * jnp.cos(azimuth), flat * jnp.sin(azimuth), up), axis=-1)
+    moments = (np.arange(num_sectors, dtype=np.float32) + 0.5) / num_sectors - 0.5
+    T_lidar_sector = se3.exp(jnp.asarray(moments)[:, None] * motion)
+    return Rays(rays, phase + jnp.asarray(columns.mean(axis=1)), jnp.zeros(rays.shape[:-1]), T_lidar_sector)
 
 
 def _ray_shape(sensor: LidarSensor, config: CastConfig) -> tuple[int, int]:
-    """Number of sectors, the largest of whole columns, and rays of a sector."""
-    count = max(count for count in range(1, config.max_sectors + 1) if sensor.num_azimuths % count == 0)
-    return count, sensor.num_rays // count
+    """Number of sectors, the largest of whole columns, and of bands, the largest of whole beams."""
+    num_beams = len(sensor.elevations_deg)
+    sectors = max(count for count in range(1, config.max_sectors + 1) if sensor.num_azimuths % count == 0)
+    return sectors, max(count for count in range(1, config.max_bands + 1) if num_beams % count == 0)
 
 
-def _return_probability(hits: Hits, sensor: LidarSensor) -> Float[Array, "s r"]:
+def _return_probability(hits: Hits, sensor: LidarSensor) -> Float[Array, "s g c b"]:
     """Probability that a ray comes back; 0 for nothing."""
     # Half of the returns are lost at `half_loss_m`, scaled by the root of the reflectivity (the energy falls with the
     # square of the range) and by the fourth root of the cosine: real surfaces are rough, and asphalt is seen farther
@@ -173,7 +232,6 @@ def _return_probability(hits: Hits, sensor: LidarSensor) -> Float[Array, "s r"]:
 
 
 def _by_beam(values: Array, sensor: LidarSensor) -> Array:
-    """Values (s, r, ...) by sector in the order of points, (beams * azimuths, ...): beam by beam."""
-    tail = values.shape[2:]
-    grid = values.reshape(sensor.num_azimuths, len(sensor.elevations_deg), *tail)
-    return jnp.swapaxes(grid, 0, 1).reshape(sensor.num_rays, *tail)
+    """Values (s, g, c, b, ...) by sector and band in the order of points, (beams * azimuths, ...): beam by beam."""
+    order = (1, 3, 0, 2, *range(4, values.ndim))
+    return jnp.transpose(values, order).reshape(sensor.num_rays, *values.shape[4:])

@@ -38,7 +38,9 @@ class Streets:
     is_closed: bool
 
 
-def make_streets(rng: np.random.Generator, kind: str, length: float, block: float) -> Streets:
+def make_streets(
+    rng: np.random.Generator, kind: str, length: float, block: float, half_width: tuple[float, float] = (4.6, 5.6)
+) -> Streets:
     """Lays out blocks and a closed route round them.
 
     Args:
@@ -47,6 +49,7 @@ def make_streets(rng: np.random.Generator, kind: str, length: float, block: floa
             of the street, round a block there; "wander": at random, and home by the shortest way.
         length: wanted length of the route, m; met within a block or two.
         block: side of a block, m.
+        half_width: narrowest and widest street, from the middle to the kerb, m.
 
     Returns:
         The streets.
@@ -72,7 +75,7 @@ def make_streets(rng: np.random.Generator, kind: str, length: float, block: floa
     route = np.vstack([street(a, b)[:-1] for a, b in pairwise(corners)])
     route = resample(np.vstack([route, route[:1]]), _STEP_M)
     route = resample(smooth(route, _CORNER_M / _STEP_M, is_closed=True), _STEP_M)
-    widths = tuple(float(w) for w in rng.uniform(4.6, 5.6, len(paths)))
+    widths = tuple(float(w) for w in rng.uniform(*half_width, len(paths)))
     return Streets(tuple(paths), widths, tuple(resample(lane, _STEP_M) for lane in rows + columns), route, True)
 
 

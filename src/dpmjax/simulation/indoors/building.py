@@ -1,0 +1,249 @@
+"""Buildings as the ray caster sees them: walls with doors, ceilings, furniture, stairs, on a flat floor."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+
+import jax.numpy as jnp
+import numpy as np
+
+from dpmjax.sequences import FloatArray
+from dpmjax.simulation.indoors.plan import Door, Plan, Room, make_plan, make_route
+from dpmjax.simulation.town import primitives
+from dpmjax.simulation.town.objects import Collection, Place, put_box, put_person, put_pole
+from dpmjax.simulation.town.primitives import CELL_M, Ground, TownPrimitives, Traffic, pack_bodies
+from dpmjax.simulation.town.vegetation import plant_bushes
+
+_Put = Callable[[Collection, np.random.Generator, Place], None]
+KINDS = ("office", "hall", "flat")
+_THICKNESS_M = 0.12
+_CLEARANCE_M = 0.45  # Nothing stands nearer than this to the route.
+_MARGIN_M = 20.0
+_BUILDING_STREAM = 8160
+
+
+@dataclass(frozen=True)
+class BuildingConfig:
+    """What a building is like.
+
+    Attributes:
+        kind: office, hall or flat.
+        route_length_m: least length of the walk.
+
+    Raises:
+        ValueError: another kind, or a length that is not positive.
+    """
+
+    kind: str = "office"
+    route_length_m: float = 100.0
+
+    def __post_init__(self) -> None:
+        if self.kind not in KINDS:
+            raise ValueError(f"kind must be one of {', '.join(KINDS)}, got {self.kind!r}")
+        if not self.route_length_m > 0:
+            raise ValueError(f"route_length_m must be positive, got {self.route_length_m}")
+
+
+@dataclass(frozen=True)
+class Building:
+    """A storey of a building.
+
+    Attributes:
+        name: with its seed, for titles.
+        plan: rooms and doors.
+        route: (k, 2) points of the walk at steps of a decimetre, m; nothing stands in the way.
+        primitives: what a beam meets, on the device; the floor is at z = 0.
+    """
+
+    name: str
+    plan: Plan = field(repr=False)
+    route: FloatArray = field(repr=False)
+    primitives: TownPrimitives = field(repr=False)
+
+
+def make_building(seed: int, config: BuildingConfig = BuildingConfig()) -> Building:
+    """Builds the building of a seed; the same one every time.
+
+    Args:
+        seed: of all choices, not negative.
+        config: what the building is like.
+
+    Returns:
+        The building.
+
+    Raises:
+        ValueError: a negative seed.
+    """
+    if seed < 0:
+        raise ValueError(f"seed must not be negative, got {seed}")
+    rng = np.random.default_rng([_BUILDING_STREAM, seed])
+    plan = make_plan(rng, config.kind)
+    route = make_route(rng, plan, config.route_length_m)
+    into = Collection()
+    for number, room in enumerate(plan.rooms):
+        _walls(into, rng, room, [door for door in plan.doors if number in door.rooms])
+        _ceiling(into, rng, room)
+        _furniture(into, rng, room, route, is_hall=config.kind == "hall")
+    tables = (np.array(rows, np.float64) for rows in (into.boxes, into.cylinders, into.spheroids))
+    kinds = (primitives.SOLID, primitives.POLE, primitives.SOFT)
+    boxes, cylinders, spheroids = map(pack_bodies, tables, kinds)
+    whole = TownPrimitives(boxes, cylinders, spheroids, _floor(plan), _nobody())
+    return Building(f"{config.kind}-{seed}", plan, route, whole)
+
+
+def _floor(plan: Plan) -> Ground:
+    low = np.min([room.low for room in plan.rooms], axis=0) - _MARGIN_M
+    return Ground(jnp.zeros((256, 256)), jnp.asarray(low, jnp.float32), jnp.float32(CELL_M))
+
+
+def _nobody() -> Traffic:
+    empty = np.zeros((0, 3))
+    rows, flags = primitives.padded(empty, 64), primitives.mask_of(0, 64)
+    zero = rows[:, 0]
+    return Traffic(jnp.zeros((2, 64, 3)), jnp.ones(2), zero.astype(jnp.int32), zero, zero, zero, rows, flags)
+
+
+def _place(x: float, y: float, heading: float = 0.0) -> Place:
+    return Place(float(x), float(y), 0.0, heading)
+
+
+def _walls(into: Collection, rng: np.random.Generator, room: Room, doors: list[Door]) -> None:
+    """Four walls inside of the room's border, each cut at its doors; outer walls may have windows."""
+    for axis in (0, 1):
+        for at, inwards in ((room.low[axis], 1), (room.high[axis], -1)):
+            cuts = sorted(
+                (d.place[1 - axis], d.width, d.height)
+                for d in doors
+                if d.axis == axis and abs(d.place[axis] - at) < 0.01
+            )
+            depth = 0.08 if not cuts and rng.random() < 0.5 else 0.0
+            start, across = room.low[1 - axis], at + 0.5 * inwards * _THICKNESS_M
+            for middle, width, height in cuts:
+                _wall(into, axis, across, (start, middle - 0.5 * width), (-0.5, room.height), depth)
+                _wall(into, axis, across, (middle - 0.5 * width, middle + 0.5 * width), (height, room.height), 0.0)
+                start = middle + 0.5 * width
+            _wall(into, axis, across, (start, room.high[1 - axis]), (-0.5, room.height), depth)
+
+
+def _wall(
+    into: Collection, axis: int, across: float, ends: tuple[float, float], levels: tuple[float, float], depth: float
+) -> None:
+    length, middle = ends[1] - ends[0], 0.5 * (ends[0] + ends[1])
+    place = _place(across, middle, 0.5 * np.pi) if axis == 0 else _place(middle, across)
+    if length > 0.02 and levels[1] > levels[0]:
+        put_box(into, place, (length, _THICKNESS_M), levels, window_depth=depth)
+
+
+def _ceiling(into: Collection, rng: np.random.Generator, room: Room) -> None:
+    """A ceiling with beams, ducts or lamps."""
+    middle = 0.5 * (np.array(room.low) + room.high)
+    put_box(into, _place(*middle), room.size, (room.height, room.height + 0.3))
+    deep, step = rng.uniform(0.06, 0.12) * room.height, rng.uniform(2.0, 6.0)
+    if rng.random() < 0.7:
+        for x in np.arange(room.low[0] + rng.uniform(0.5, step), room.high[0] - 0.3, step):
+            put_box(
+                into,
+                _place(x, middle[1]),
+                (rng.uniform(0.1, 0.4), 0.98 * room.size[1]),
+                (room.height - deep, room.height),
+            )
+    if rng.random() < 0.5:
+        at = _place(middle[0], rng.uniform(room.low[1] + 0.5, room.high[1] - 0.5))
+        put_box(into, at, (0.97 * room.size[0], 0.4), (room.height - 2.2 * deep, room.height - 1.2 * deep))
+
+
+def _furniture(into: Collection, rng: np.random.Generator, room: Room, route: FloatArray, *, is_hall: bool) -> None:
+    """Furniture along the walls and in the room, off the route."""
+    area, inside = room.size[0] * room.size[1], np.minimum(1.0, 0.4 * np.array(room.size))
+    beside: list[_Put] = [_put_cabinet, _put_cabinet, _put_desk, _put_plant]
+    within: list[_Put] = (
+        [_put_rack, _put_machine, _put_column, _put_plant, _put_stairs] if is_hall else [_put_desk, _put_machine]
+    )
+    for _ in range(rng.poisson(0.7 * sum(room.size))):
+        axis, end = int(rng.integers(2)), int(rng.integers(2))
+        spot = rng.uniform(room.low, room.high)
+        spot[axis] = room.low[axis] + 0.45 if end == 0 else room.high[axis] - 0.45
+        _put_if_free(into, rng, (spot, 0.5 * np.pi * (axis == 0)), route, beside)
+    for _ in range(rng.poisson(0.05 * area)):
+        spot = rng.uniform(room.low + inside, room.high - inside)
+        turn = float(rng.choice([0.0, 0.5 * np.pi])) + (rng.normal(0, 0.3) if rng.random() < 0.3 else 0.0)
+        _put_if_free(into, rng, (spot, turn), route, within)
+    for _ in range(rng.poisson(0.006 * area)):
+        spot = rng.uniform(room.low + inside, room.high - inside)
+        _put_if_free(into, rng, (spot, 0.0), route, [put_person])
+
+
+def _put_if_free(
+    into: Collection, rng: np.random.Generator, spot: tuple[FloatArray, float], route: FloatArray, puts: Sequence[_Put]
+) -> None:
+    """Puts one of some things unless it would stand in the way; `spot` is its place and heading."""
+    part = Collection()
+    puts[int(rng.integers(len(puts)))](part, rng, _place(spot[0][0], spot[0][1], spot[1]))
+    rows = np.array([*part.boxes, *part.cylinders, *part.spheroids])
+    reach = np.hypot(rows[:, 3], rows[:, 4]) + _CLEARANCE_M
+    apart = np.linalg.norm(rows[:, None, :2] - route[None, ::3], axis=-1).min(1)
+    if (apart > reach).all():
+        into.boxes += part.boxes
+        into.cylinders += part.cylinders
+        into.spheroids += part.spheroids
+
+
+def _put_cabinet(into: Collection, rng: np.random.Generator, place: Place) -> None:
+    high, wide = rng.uniform(0.7, 2.3), rng.uniform(0.6, 2.2)
+    put_box(into, place, (wide, rng.uniform(0.35, 0.7)), (0.0, high), window_depth=0.0)
+    if rng.random() < 0.4:
+        put_box(into, place.move(rng.uniform(-0.2, 0.2), 0.0), (0.4, 0.3), (high, high + rng.uniform(0.2, 0.5)))
+
+
+def _put_desk(into: Collection, rng: np.random.Generator, place: Place) -> None:
+    wide = rng.uniform(1.0, 1.9)
+    put_box(into, place, (wide, 0.8), (0.68, 0.74))
+    for side in (-0.47, 0.47):
+        put_box(into, place.move(side * wide, 0.0), (0.06, 0.7), (0.0, 0.68))
+    put_box(into, place.move(rng.uniform(-0.3, 0.3), 0.2), (0.5, 0.1), (0.74, 1.2))
+    chair = place.move(rng.uniform(-0.2, 0.2), -0.7)
+    put_box(into, chair, (0.5, 0.5), (0.38, 0.5))
+    put_box(into, chair.move(0.0, -0.22), (0.5, 0.08), (0.5, 1.0))
+    put_pole(into, chair, 0.05, 0.4)
+
+
+def _put_machine(into: Collection, rng: np.random.Generator, place: Place) -> None:
+    size, high = rng.uniform(0.5, 2.0, 2), rng.uniform(0.5, 2.0)
+    put_box(into, place, (size[0], size[1]), (0.0, high))
+    put_box(into, place.move(0.2 * size[0], 0.0), (0.5 * size[0], 0.6 * size[1]), (high, high + rng.uniform(0.1, 0.8)))
+
+
+def _put_rack(into: Collection, rng: np.random.Generator, place: Place) -> None:
+    length, high = rng.uniform(2.5, 8.0), rng.uniform(1.8, 4.5)
+    for level in np.arange(0.2, high, rng.uniform(0.8, 1.4)):
+        put_box(into, place, (length, 1.0), (level - 0.05, level))
+        full = rng.uniform(0.1, 0.9) * length
+        at = place.move(rng.uniform(-0.5, 0.5) * (length - full), 0.0)
+        put_box(into, at, (full, 0.8), (level, level + rng.uniform(0.3, 0.7)))
+    for end in (-0.5, 0.5):
+        put_box(into, place.move(end * length, 0.0), (0.08, 1.0), (0.0, high), softness=0.1)
+
+
+def _put_column(into: Collection, rng: np.random.Generator, place: Place) -> None:
+    if rng.random() < 0.5:
+        put_pole(into, place, rng.uniform(0.15, 0.4), 11.0)
+    else:
+        side = rng.uniform(0.3, 0.7)
+        put_box(into, place, (side, side), (-0.2, 11.0))
+
+
+def _put_plant(into: Collection, rng: np.random.Generator, place: Place) -> None:
+    put_box(into, place, (0.45, 0.45), (0.0, 0.45))
+    plant_bushes(into, rng, np.array([[place.x, place.y, 0.6]]))
+
+
+def _put_stairs(into: Collection, rng: np.random.Generator, place: Place) -> None:
+    """A flight of stairs with a rail."""
+    wide, count = rng.uniform(1.0, 2.0), int(rng.integers(6, 16))
+    for step in range(count):
+        put_box(into, place.move(0.28 * step, 0.0), (0.28, wide), (0.0, 0.18 * (step + 1)))
+        if step % 4 == 0:
+            put_box(
+                into, place.move(0.28 * step, 0.5 * wide), (1.1, 0.05), (0.18 * step, 0.18 * step + 1.0), softness=0.2
+            )

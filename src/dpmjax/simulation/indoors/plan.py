@@ -1,0 +1,154 @@
+"""Plans of buildings: rooms, the doors between them, and a route through them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from dpmjax.sequences import FloatArray
+from dpmjax.simulation.town.streets import resample, smooth
+
+_STEP_M = 0.1
+_CORNER_M = 0.25
+_DOORSTEP_M = 0.8
+
+
+@dataclass(frozen=True)
+class Room:
+    """A rectangular room.
+
+    Attributes:
+        low: x and y of one corner, m.
+        high: x and y of the opposite corner, m.
+        height: of the ceiling, m.
+    """
+
+    low: tuple[float, float]
+    high: tuple[float, float]
+    height: float
+
+    @property
+    def size(self) -> tuple[float, float]:
+        """Sides along x and y, m."""
+        return self.high[0] - self.low[0], self.high[1] - self.low[1]
+
+
+@dataclass(frozen=True)
+class Door:
+    """An opening between two rooms.
+
+    Attributes:
+        rooms: numbers of the rooms.
+        place: x and y of its middle, m.
+        axis: 0 where one walks through along x, 1 along y.
+        width: m.
+        height: m.
+    """
+
+    rooms: tuple[int, int]
+    place: tuple[float, float]
+    axis: int
+    width: float
+    height: float
+
+
+@dataclass(frozen=True)
+class Plan:
+    """A storey.
+
+    Attributes:
+        rooms: all rooms.
+        doors: all doors; every room can be reached.
+    """
+
+    rooms: tuple[Room, ...]
+    doors: tuple[Door, ...]
+
+
+def make_plan(rng: np.random.Generator, kind: str) -> Plan:
+    """Draws a plan.
+
+    Args:
+        rng: source of all choices.
+        kind: "office": rooms on both sides of a corridor; "hall": one to three halls in a row, with side rooms;
+            "flat": small rooms on both sides of a short corridor.
+
+    Returns:
+        The plan.
+    """
+    if kind == "hall":
+        return _row_of_halls(rng)
+    small = kind == "flat"
+    width, height = rng.uniform(1.2, 2.0) if small else rng.uniform(1.8, 3.5), rng.uniform(2.4, 3.4)
+    length = rng.uniform(7, 12) if small else rng.uniform(22, 50)
+    rooms, doors = [Room((0.0, -0.5 * width), (length, 0.5 * width), height)], []
+    for side in (-1, 1):
+        depth, x = rng.uniform(3, 5) if small else rng.uniform(3.5, 9), 0.0
+        while length - x > 2.5:
+            wide = rng.uniform(2.5, 5) if small else rng.uniform(3, 10)
+            end = length if length - x - wide < 2.5 else x + wide
+            near, far = 0.5 * width * side, (0.5 * width + depth) * side
+            room = Room((x, min(near, far)), (end, max(near, far)), height + float(rng.choice([0.0, 0.0, 0.4])))
+            doors.append(_door(rng, (0, len(rooms)), (float(rng.uniform(x + 0.8, end - 0.8)), near), 1, (0.85, 1.4)))
+            rooms.append(room)
+            x = end
+    return Plan(tuple(rooms), tuple(doors))
+
+
+def _row_of_halls(rng: np.random.Generator) -> Plan:
+    height, x = rng.uniform(3.5, 10.0), 0.0
+    rooms: list[Room] = []
+    doors: list[Door] = []
+    for index in range(rng.integers(1, 4)):
+        end, half = x + rng.uniform(10, 35), 0.5 * rng.uniform(9, 26)
+        rooms.append(Room((x, -half), (end, half), height * float(rng.uniform(0.8, 1.0))))
+        if index:
+            doors.append(_door(rng, (index - 1, index), (x, 0.0), 0, (2.0, 4.0)))
+        x = end
+    for number, hall in enumerate(tuple(rooms)):
+        low, wide, top = hall.low[0] + rng.uniform(0, 3), rng.uniform(4, 8), hall.high[1]
+        room = Room((low, top), (low + wide, top + rng.uniform(3, 8)), rng.uniform(2.5, 3.5))
+        doors.append(_door(rng, (number, len(rooms)), (low + 0.5 * wide, top), 1, (0.9, 1.8)))
+        rooms.append(room)
+    return Plan(tuple(rooms), tuple(doors))
+
+
+def _door(
+    rng: np.random.Generator, rooms: tuple[int, int], place: tuple[float, float], axis: int, width: tuple[float, float]
+) -> Door:
+    return Door(rooms, place, axis, float(rng.uniform(*width)), 2.1)
+
+
+def make_route(rng: np.random.Generator, plan: Plan, length: float) -> FloatArray:
+    """Walks from room to room at random, round in each room; rooms are seen again in both directions.
+
+    Args:
+        rng: source of all choices.
+        plan: the rooms.
+        length: least length of the walk, m.
+
+    Returns:
+        (k, 2) points at steps of a decimetre.
+    """
+    here, points = int(rng.integers(len(plan.rooms))), []
+    points += _round(rng, plan.rooms[here])
+    last = -1
+    while len(points) < 2 or np.linalg.norm(np.diff(points, axis=0), axis=1).sum() < length:
+        exits = [(n, door) for n, door in enumerate(plan.doors) if here in door.rooms]
+        others = [(n, door) for n, door in exits if n != last] or exits
+        number, door = others[rng.integers(len(others))]
+        last, there = number, door.rooms[0] if door.rooms[1] == here else door.rooms[1]
+        towards = np.sign(np.mean([plan.rooms[there].low, plan.rooms[there].high], axis=0) - door.place)
+        step = _DOORSTEP_M * towards * (np.arange(2) == door.axis)
+        points += [np.array(door.place) - step, np.array(door.place) + step, *_round(rng, plan.rooms[there])]
+        here = there
+    path = resample(np.array(points), _STEP_M)
+    return resample(smooth(path, _CORNER_M / _STEP_M, is_closed=False), _STEP_M)
+
+
+def _round(rng: np.random.Generator, room: Room) -> list[FloatArray]:
+    """Some places of a room."""
+    count = int(np.clip(round(min(room.size) / 4), 1, 4))
+    margin = 0.3 * np.minimum(room.size, 4.0)
+    return [rng.uniform(room.low + margin, room.high - margin) for _ in range(count)]

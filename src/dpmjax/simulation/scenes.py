@@ -1,0 +1,182 @@
+"""Scenes to train on: a place, a lidar and a route, drawn by seed from a mixture that spans what lidars see."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import TypeVar, cast
+
+import numpy as np
+
+from dpmjax.sequences import LidarSequence
+from dpmjax.simulation.indoors.building import KINDS as INDOOR_KINDS
+from dpmjax.simulation.indoors.building import Building, BuildingConfig, make_building
+from dpmjax.simulation.indoors.walking import WalkConfig, walk
+from dpmjax.simulation.town.driving import DriveConfig, drive, scan_along
+from dpmjax.simulation.town.kinds import KINDS as OUTDOOR_KINDS
+from dpmjax.simulation.town.make import Town, TownConfig, make_town
+from dpmjax.simulation.town.scan import HDL32E, HDL64E, OS1_64, OS1_128, PANDAR64, VLP16, LidarSensor
+
+_SCENE_STREAM = 8170
+_Entry = TypeVar("_Entry")
+_ROUTES = ("loop", "there_and_back", "wander")
+
+
+@dataclass(frozen=True)
+class SceneMixture:
+    """What scenes are drawn from.
+
+    Attributes:
+        kinds: kinds of place, outdoors and indoors, with their weights.
+        sensors: lidars, with their weights.
+        length_m: length of the way outdoors; indoors a quarter of it.
+        spacing_m: mean way between scans outdoors; indoors a quarter of it.
+        scale: lowest and highest factor that a scene and its poses are scaled by, drawn uniformly in its logarithm.
+        moving_rate: share of the drives whose lidar moves during its turn.
+
+    Raises:
+        ValueError: an unknown kind, weights that are negative or all zero, or lengths or scales that are not positive.
+    """
+
+    kinds: tuple[tuple[str, float], ...] = (
+        ("suburb", 0.3),
+        ("canyon", 0.14),
+        ("country", 0.12),
+        ("car_park", 0.08),
+        ("campus", 0.12),
+        ("wood", 0.08),
+        ("office", 0.05),
+        ("hall", 0.08),
+        ("flat", 0.03),
+    )
+    sensors: tuple[tuple[LidarSensor, float], ...] = (
+        (HDL64E, 0.4),
+        (OS1_64, 0.16),
+        (OS1_128, 0.08),
+        (PANDAR64, 0.1),
+        (HDL32E, 0.16),
+        (VLP16, 0.1),
+    )
+    length_m: float = 600.0
+    spacing_m: float = 2.0
+    scale: tuple[float, float] = (1.0, 1.0)
+    moving_rate: float = 0.4
+
+    def __post_init__(self) -> None:
+        for name, entries in (("kinds", self.kinds), ("sensors", self.sensors)):
+            weights = [weight for _, weight in entries]
+            if not weights or min(weights) < 0 or sum(weights) <= 0:
+                raise ValueError(f"{name} must have weights from 0 up, not all 0, got {weights}")
+        unknown = {kind for kind, _ in self.kinds} - {*OUTDOOR_KINDS, *INDOOR_KINDS}
+        if unknown:
+            known = ", ".join((*OUTDOOR_KINDS, *INDOOR_KINDS))
+            raise ValueError(f"kinds must be of {known}, got {sorted(unknown)[0]!r}")
+        if not (min(self.length_m, self.spacing_m) > 0 and 0 < self.scale[0] <= self.scale[1]):
+            raise ValueError("length_m, spacing_m and scale must be positive, and scale ascending")
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A place, and how a lidar is moved through it.
+
+    Attributes:
+        seed: of everything random in it.
+        place: what the place is like.
+        motion: how the lidar is moved, `DriveConfig` in a town, `WalkConfig` in a building.
+        sensor: the lidar.
+        scale: factor of points and poses.
+        is_moving: the lidar moves during its turn, and the scans are not corrected for it.
+
+    Raises:
+        ValueError: a motion that does not belong to the place.
+    """
+
+    seed: int
+    place: TownConfig | BuildingConfig
+    motion: DriveConfig | WalkConfig = field(repr=False)
+    sensor: LidarSensor = field(repr=False)
+    scale: float = 1.0
+    is_moving: bool = False
+
+    def __post_init__(self) -> None:
+        if isinstance(self.place, BuildingConfig) != isinstance(self.motion, WalkConfig):
+            raise ValueError("motion must be a WalkConfig in a building and a DriveConfig in a town")
+
+
+def draw_scene(seed: int, mixture: SceneMixture = SceneMixture()) -> Scene:
+    """Draws the scene of a seed, the same one every time; nothing is built yet.
+
+    Args:
+        seed: of all choices, not negative.
+        mixture: what is drawn from.
+
+    Returns:
+        The scene.
+
+    Raises:
+        ValueError: a negative seed.
+    """
+    if seed < 0:
+        raise ValueError(f"seed must not be negative, got {seed}")
+    rng = np.random.default_rng([_SCENE_STREAM, seed])
+    kind, sensor = _choice(rng, mixture.kinds), _choice(rng, mixture.sensors)
+    scale = float(np.exp(rng.uniform(*np.log(mixture.scale))))
+    is_moving = bool(rng.random() < mixture.moving_rate)
+    if kind in INDOOR_KINDS:
+        is_robot = rng.random() < 0.3
+        height, tilt = (rng.uniform(0.3, 0.9), 1.0) if is_robot else (rng.uniform(0.9, 1.7), rng.uniform(3, 10))
+        rate = 4.0 / mixture.spacing_m
+        look, bob = (3.0, 0.0) if is_robot else (25.0, 0.03)
+        walking = WalkConfig(1.0, rate, float(height), float(tilt), look, bob)
+        place = BuildingConfig(kind, 0.25 * mixture.length_m)
+        return Scene(seed, place, walking, sensor, scale, is_moving)
+    town = TownConfig(kind, str(rng.choice(_ROUTES)), mixture.length_m, float(rng.uniform(75, 130)))
+    # Most cars carry their lidar on the roof; small robots carry it low.
+    height = sensor.height_m + rng.normal(0, 0.12) if rng.random() < 0.7 else rng.uniform(0.5, 2.5)
+    driving = DriveConfig(8.0, 8.0 / mixture.spacing_m, mixture.length_m, bool(rng.random() < 0.3), float(height))
+    return Scene(seed, town, driving, sensor, scale, is_moving)
+
+
+def _choice(rng: np.random.Generator, entries: tuple[tuple[_Entry, float], ...]) -> _Entry:
+    weights = np.array([weight for _, weight in entries])
+    return entries[rng.choice(len(entries), p=weights / weights.sum())][0]
+
+
+def simulate_scene(scene: Scene) -> LidarSequence:
+    """Builds a scene; a scan is simulated when it is read.
+
+    Args:
+        scene: from `draw_scene`, or made by hand.
+
+    Returns:
+        The sequence, with exact poses and times.
+    """
+    world: Building | Town
+    if isinstance(scene.place, BuildingConfig):
+        world = make_building(scene.seed, scene.place)
+        way = walk(world, cast(WalkConfig, scene.motion), seed=scene.seed)
+    else:
+        world = make_town(scene.seed, scene.place)
+        way = drive(world, cast(DriveConfig, scene.motion), seed=scene.seed)
+    name = f"{world.name}-{scene.sensor.name}"
+    sequence = scan_along(name, world.primitives, way, seed=scene.seed, sensor=scene.sensor, is_moving=scene.is_moving)
+    return _scaled(sequence, scene.scale)
+
+
+def _scaled(sequence: LidarSequence, scale: float) -> LidarSequence:
+    poses = np.array(sequence.T_world_lidar)
+    poses[:, :3, 3] *= scale
+    return replace(sequence, read_scan=lambda index: np.float32(scale) * sequence.read_scan(index), T_world_lidar=poses)
+
+
+def simulate_scenes(seeds: Sequence[int], mixture: SceneMixture = SceneMixture()) -> list[LidarSequence]:
+    """Draws and builds scenes.
+
+    Args:
+        seeds: one for each scene.
+        mixture: what is drawn from.
+
+    Returns:
+        One sequence a seed.
+    """
+    return [simulate_scene(draw_scene(seed, mixture)) for seed in seeds]

@@ -1,0 +1,189 @@
+"""Picks what a scan can meet: the nearest bodies of each kind, the ground around, a list of bodies for each sector.
+
+What is picked has the same shapes in every world, so that the ray caster compiles once for each sensor.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from dpmjax.geometry import rigid, se2
+from dpmjax.simulation.town.primitives import CELL_M, Bodies, Ground, TownPrimitives, traffic_boxes, turn_back
+
+_CORNERS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], np.float32)
+
+
+@dataclass(frozen=True)
+class CastConfig:
+    """How much of the world a scan looks at.
+
+    Attributes:
+        num_boxes: nearest boxes that take part.
+        num_cylinders: nearest cylinders.
+        num_spheroids: nearest spheroids.
+        boxes_per_sector: boxes that one sector of the turn holds.
+        cylinders_per_sector: cylinders of a sector.
+        spheroids_per_sector: spheroids of a sector.
+        ground_m: side of the square of ground around the sensor; its border goes on outside.
+        max_sectors: largest number of sectors of a turn.
+        max_bands: largest number of bands of elevation of a sector.
+    """
+
+    num_boxes: int = 1024
+    num_cylinders: int = 512
+    num_spheroids: int = 2048
+    boxes_per_sector: int = 96
+    cylinders_per_sector: int = 48
+    spheroids_per_sector: int = 160
+    ground_m: int = 168
+    max_sectors: int = 72
+    max_bands: int = 2
+
+    def __post_init__(self) -> None:
+        if min(vars(self).values()) < 1:
+            raise ValueError(f"all capacities must be at least 1, got {self}")
+
+
+class NearBodies(NamedTuple):
+    """Bodies of one kind that lie near the sensor, nearest first.
+
+    Attributes:
+        bodies: relative to the sensor.
+        distances: from the sensor to each body's surface at least, m; ascending, infinite for what does not exist.
+    """
+
+    bodies: Bodies
+    distances: Float[Array, " n"]
+
+
+class NearWorld(NamedTuple):
+    """What lies near the sensor.
+
+    Attributes:
+        boxes: nearest boxes, those of the traffic among them.
+        cylinders: nearest cylinders.
+        spheroids: nearest spheroids.
+        ground: a square of ground, its origin relative to the sensor; heights are those of the world.
+    """
+
+    boxes: NearBodies
+    cylinders: NearBodies
+    spheroids: NearBodies
+    ground: Ground
+
+
+class SectorLists(NamedTuple):
+    """The bodies of each sector, nearest first; where a list is full, the farthest are missing.
+
+    Attributes:
+        rows: rows of the bodies; those from `counts` on have no meaning.
+        counts: how many bodies a sector has.
+    """
+
+    rows: Int[Array, "*s c"]
+    counts: Int[Array, "*s"]
+
+
+@partial(jax.jit, static_argnames=("max_range", "config"))
+def near_world(
+    town: TownPrimitives, start: Float[Array, " 3"], time: Float[Array, ""], *, max_range: float, config: CastConfig
+) -> NearWorld:
+    """Picks what a scan can meet.
+
+    Args:
+        town: the world.
+        start: position of the sensor, m.
+        time: s, for the traffic.
+        max_range: what lies beyond this is left out, m.
+        config: capacities.
+
+    Returns:
+        What lies near, in shapes that depend on the capacities alone.
+    """
+    boxes = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), town.boxes, traffic_boxes(town.traffic, start, time))
+    kinds = (boxes, config.num_boxes), (town.cylinders, config.num_cylinders), (town.spheroids, config.num_spheroids)
+    near = [nearest_bodies(x._replace(centres=x.centres - start), number, max_range) for x, number in kinds]
+    return NearWorld(near[0], near[1], near[2], _near_ground(town.ground, start, config.ground_m))
+
+
+def _near_ground(ground: Ground, start: Float[Array, " 3"], side_m: int) -> Ground:
+    count = round(side_m / CELL_M) + 1
+    heights = jnp.pad(ground.heights, [(0, max(count - size, 0)) for size in ground.heights.shape], mode="edge")
+    corner = jnp.round((start[:2] - ground.origin) / ground.cell - 0.5 * count).astype(jnp.int32)
+    corner = jnp.clip(corner, 0, jnp.array([heights.shape[1] - count, heights.shape[0] - count]))
+    part = jax.lax.dynamic_slice(heights, (corner[1], corner[0]), (count, count))
+    return Ground(part, ground.origin + corner * ground.cell - start[:2], ground.cell)
+
+
+def nearest_bodies(bodies: Bodies, capacity: int, max_range: float) -> NearBodies:
+    """The bodies with the nearest surfaces.
+
+    Args:
+        bodies: all of the town, relative to the sensor.
+        capacity: how many to keep.
+        max_range: bodies beyond this are left out, m.
+
+    Returns:
+        The nearest bodies, masked where there are fewer.
+    """
+    outside = jnp.maximum(jnp.abs(turn_back(bodies.centres, bodies.headings)) - bodies.half_sizes, 0.0)
+    squared = jnp.where(bodies.mask, (outside**2).sum(-1), jnp.inf)
+    missing = max(capacity - len(squared), 0)
+    best, order = jax.lax.top_k(-jnp.pad(squared, (0, missing), constant_values=jnp.inf), capacity)
+    kept = jax.tree.map(lambda x: x[jnp.minimum(order, len(squared) - 1)], bodies)
+    return NearBodies(kept._replace(mask=best >= -(max_range**2)), jnp.sqrt(-best))
+
+
+def sector_lists(
+    near: NearBodies,
+    T_world_lidar: Float[Array, "4 4"],
+    sector_azimuths: Float[Array, " s"],
+    capacity: int,
+    way: Float[Array, ""],
+) -> SectorLists:
+    """Gives each sector of a turn the list of the bodies that it sees.
+
+    Args:
+        near: the bodies.
+        T_world_lidar: pose of the sensor; only its rotation counts.
+        sector_azimuths: middles of equal sectors of the turn in the sensor frame, radians.
+        capacity: how many bodies a sector holds.
+        way: how far the sensor moves during the turn at most, m, turning by less than half a sector.
+
+    Returns:
+        The lists.
+    """
+    middle, half_width = _azimuth_intervals(near.bodies, T_world_lidar)
+    half_width += jnp.arctan(way / jnp.maximum(near.distances, 1e-3)) + jnp.where(way > 0, 0.05, 0.0)
+    apart = jnp.abs(se2.wrap_angle(middle[None] - sector_azimuths[:, None]))
+    is_seen = near.bodies.mask[None] & (apart <= half_width[None] + np.pi / len(sector_azimuths))
+    place = jnp.cumsum(is_seen, axis=1) - 1
+    slot = jnp.where(is_seen & (place < capacity), place, capacity)
+    sectors = jnp.arange(len(sector_azimuths))[:, None]
+    entries = jnp.broadcast_to(jnp.arange(len(near.distances)), slot.shape)
+    rows = jnp.zeros((len(sector_azimuths), capacity + 1), jnp.int32).at[sectors, slot].set(entries)[:, :capacity]
+    return SectorLists(rows, jnp.minimum(is_seen.sum(axis=1), capacity))
+
+
+def _azimuth_intervals(
+    bodies: Bodies, T_world_lidar: Float[Array, "4 4"]
+) -> tuple[Float[Array, " k"], Float[Array, " k"]]:
+    """Middle and half-width of the azimuths of boxes in the sensor frame; pi for a box over or under the sensor."""
+    # A box is the hull of its corners, and so is its shadow on the sensor's x-y plane.
+    turn = jnp.zeros((4, 4), T_world_lidar.dtype).at[:3, :3].set(T_world_lidar[:3, :3].T).at[3, 3].set(1.0)
+    local = jnp.asarray(_CORNERS)[None] * bodies.half_sizes[:, None]
+    turned = turn_back(local, bodies.headings[:, None] * jnp.array([1.0, -1.0]))
+    corners = rigid.transform_points(turn, (bodies.centres[:, None] + turned).reshape(-1, 3)).reshape(turned.shape)
+    middle = rigid.transform_points(turn, bodies.centres)
+    towards = jnp.arctan2(middle[:, 1], middle[:, 0])
+    azimuth = se2.wrap_angle(jnp.arctan2(corners[..., 1], corners[..., 0]) - towards[:, None])
+    low, high = azimuth.min(-1), azimuth.max(-1)
+    half_width = jnp.where(high - low < np.pi, 0.5 * (high - low), np.pi)
+    return se2.wrap_angle(towards + 0.5 * (low + high)), half_width

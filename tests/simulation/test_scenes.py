@@ -1,0 +1,187 @@
+"""Scenes of a mixture: drawn by seed, of all kinds, scaled, and seen by a lidar that moves."""
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from dpmjax.simulation import (
+    CastConfig,
+    LidarSensor,
+    SceneMixture,
+    TownConfig,
+    draw_scene,
+    make_town,
+    scan_town,
+    simulate_scene,
+    simulate_scenes,
+)
+from dpmjax.simulation.town.cast import cast_turn
+from dpmjax.simulation.town.culling import near_world
+from dpmjax.simulation.town.kinds import KINDS
+from dpmjax.simulation.town.primitives import SOFT, SOLID, pack_bodies
+from dpmjax.simulation.town.scan import make_rays
+from tests.tolerances import ACCUMULATED
+
+SENSOR = LidarSensor("test", tuple(np.linspace(10.0, -20.0, 16)), 360, max_range_m=60.0)
+SMALL = SceneMixture(sensors=((SENSOR, 1.0),), length_m=150.0)
+
+
+def test_a_seed_draws_one_scene_and_the_mixture_is_met():
+    mixture = SceneMixture()
+    drawn = [draw_scene(seed) for seed in range(300)]
+    assert drawn == [draw_scene(seed) for seed in range(300)]
+    for kind, weight in mixture.kinds:
+        assert np.mean([scene.place.kind == kind for scene in drawn]) == pytest.approx(weight, abs=0.09)
+    for sensor, weight in mixture.sensors:
+        assert np.mean([scene.sensor == sensor for scene in drawn]) == pytest.approx(weight, abs=0.09)
+    assert np.mean([scene.is_moving for scene in drawn]) == pytest.approx(mixture.moving_rate, abs=0.09)
+
+
+@pytest.mark.parametrize("kind", ["canyon", "wood", "hall"])
+def test_a_scene_gives_scans_with_poses(kind):
+    sequence = simulate_scene(draw_scene(4, replace(SMALL, kinds=((kind, 1.0),))))
+    assert len(sequence) > 20
+    first, again = sequence.read_scan(3), sequence.read_scan(3)
+    np.testing.assert_array_equal(first, again)
+    assert len(first) > 0.3 * SENSOR.num_rays
+    assert kind in sequence.name
+
+
+def test_scale_multiplies_points_and_poses():
+    kinds = (("flat", 1.0),)
+    plain, scaled = simulate_scenes([7], replace(SMALL, kinds=kinds))[0], replace(SMALL, kinds=kinds, scale=(2.0, 2.0))
+    double = simulate_scene(draw_scene(7, scaled))
+    np.testing.assert_allclose(double.T_world_lidar[:, :3, 3], 2 * plain.T_world_lidar[:, :3, 3])
+    np.testing.assert_array_equal(double.T_world_lidar[:, :3, :3], plain.T_world_lidar[:, :3, :3])
+    np.testing.assert_allclose(double.read_scan(2), 2 * plain.read_scan(2))
+
+
+def test_scales_spread_evenly_in_their_logarithm():
+    scales = np.log([draw_scene(seed, replace(SMALL, scale=(0.5, 4.0))).scale for seed in range(200)])
+    assert scales.min() > np.log(0.5)
+    assert scales.max() < np.log(4.0)
+    assert scales.mean() == pytest.approx(0.5 * np.log(2.0), abs=0.15)
+
+
+@pytest.mark.parametrize("kind", list(KINDS))
+def test_nothing_solid_stands_in_the_lane_of_any_kind(kind):
+    scene = draw_scene(11, replace(SMALL, kinds=((kind, 1.0),)))
+    sequence, town = simulate_scene(scene), make_town(11, scene.place)
+    for bodies in town.primitives[:2]:
+        mask = np.asarray(bodies.mask)
+        centres, half, turn = (np.asarray(x, np.float64)[mask] for x in bodies[:3])
+        offset = sequence.T_world_lidar[:, None, :3, 3] - centres
+        along = np.abs(offset[..., 0] * turn[:, 0] + offset[..., 1] * turn[:, 1]) - half[:, 0]
+        across = np.abs(offset[..., 1] * turn[:, 0] - offset[..., 0] * turn[:, 1]) - half[:, 1]
+        above = np.abs(offset[..., 2]) - half[:, 2]
+        assert np.maximum(np.maximum(along, across), above).min() > 0.5
+
+
+def soft_town(rows):
+    """An empty town with boxes only."""
+    town = make_town(0, TownConfig(route_length_m=100)).primitives
+    empty = [bodies._replace(mask=jnp.zeros_like(bodies.mask)) for bodies in town[:3]]
+    traffic = town.traffic._replace(mask=jnp.zeros_like(town.traffic.mask))
+    boxes = pack_bodies(np.array(rows, np.float64), SOLID)
+    return town._replace(boxes=boxes, cylinders=empty[1], spheroids=empty[2], traffic=traffic)
+
+
+def cast(town, pose, motion=None, depths=None):
+    config = CastConfig()
+    rays = make_rays(SENSOR, config, jnp.float32(0.0), jnp.zeros(6) if motion is None else jnp.asarray(motion))
+    if depths is not None:
+        rays = rays._replace(depths=jax.random.exponential(depths, rays.depths.shape))
+    pose = jnp.asarray(pose, jnp.float32)
+    near = near_world(town, pose[:3, 3], jnp.float32(0.0), max_range=SENSOR.max_range_m, config=config)
+    return cast_turn(near, pose, rays, max_range=SENSOR.max_range_m, config=config), rays
+
+
+def test_foliage_lets_through_what_beer_and_lambert_say():
+    """exp(-thickness / softness), in one layer or in two."""
+    pose = np.eye(4)
+    pose[:3, 3] = [0.0, 0.0, 30.0]
+    one = [[5.0, 0, 30, 1.0, 20, 20, 0, 1.5, 0]]
+    two = [[4.5, 0, 30, 0.5, 20, 20, 0, 1.5, 0], [8.5, 0, 30, 0.5, 20, 20, 0, 1.5, 0]]
+    for rows in (one, two):
+        hits, rays = cast(soft_town(rows), pose, depths=jax.random.key(3))
+        directions = np.asarray(rays.directions)
+        ahead = directions[..., 0] > 0.8
+        is_met = np.asarray(hits.surfaces)[ahead] == SOFT
+        wanted = 1 - np.exp(-2.0 / directions[ahead][:, 0] / 1.5)
+        assert is_met.mean() == pytest.approx(wanted.mean(), abs=0.03)
+
+
+def test_a_moving_lidar_sees_the_same_walls_from_where_its_beam_left():
+    rows = [[20.0, 0, 30, 1, 30, 30, 0, 0, 0], [-15.0, 0, 30, 1, 30, 30, 0, 0, 0], [0.0, 12, 30, 30, 1, 30, 0, 0, 0]]
+    pose, town = np.eye(4), soft_town(rows)
+    pose[:3, 3] = [0.0, 0.0, 30.0]
+    motion = np.array([1.5, 0.2, 0.0, 0.0, 0.0, 0.05], np.float32)
+    (still, _), (hits, rays) = cast(town, pose), cast(town, pose, motion)
+    places = np.asarray(rays.T_lidar_sector, np.float64)
+    points = np.nan_to_num(np.asarray(hits.ranges), posinf=0.0)[..., None] * np.asarray(rays.directions)
+    world = np.einsum("sij,sgcbj->sgcbi", places[:, :3, :3], points) + places[:, None, None, None, :3, 3] + pose[:3, 3]
+    is_wall = np.asarray(hits.surfaces) == SOLID
+    on_wall = np.min([np.abs(world[..., 0] - 19), np.abs(world[..., 0] + 14), np.abs(world[..., 1] - 11)], axis=0)
+    np.testing.assert_allclose(on_wall[is_wall], 0.0, atol=2e-3)
+    assert is_wall.sum() == pytest.approx((np.asarray(still.surfaces) == SOLID).sum(), rel=0.02)
+    both = is_wall & (np.asarray(still.surfaces) == SOLID)
+    assert np.abs(np.asarray(hits.ranges)[both] - np.asarray(still.ranges)[both]).max() > 0.3
+
+
+def test_a_lidar_that_does_not_move_is_one_with_no_motion():
+    town = make_town(3, TownConfig(route_length_m=200)).primitives
+    pose = np.eye(4)
+    pose[2, 3] = 2.0
+    first, again = (
+        scan_town(town, pose, 0.0, key=jax.random.key(1), sensor=SENSOR, motion=m) for m in (None, np.zeros(6))
+    )
+    np.testing.assert_allclose(first.points, again.points, **ACCUMULATED)
+
+
+def test_scans_of_several_poses_at_once_are_those_of_each():
+    town = make_town(3, TownConfig(route_length_m=200)).primitives
+    poses = np.tile(np.eye(4, dtype=np.float32), (2, 1, 1))
+    poses[:, :3, 3] = [[0.0, 0.0, 2.0], [30.0, 5.0, 3.0]]
+
+    def look(pose):
+        return scan_town(town, pose, 0.0, key=jax.random.key(1), sensor=SENSOR).points
+
+    together = jax.vmap(look)(poses)
+    for points, pose in zip(together, poses, strict=True):
+        alone = look(pose)
+        same = np.isclose(points, alone, atol=1e-3).all(1)
+        assert same.mean() > 0.999, "only a ray that touches an edge may differ"
+
+
+def test_beams_on_an_edge_may_end_between_foreground_and_background():
+    rows = [[10.0, 0, 30, 0.5, 1.0, 30, 0, 0, 0], [12.5, 0, 30, 0.5, 30, 30, 0, 0, 0]]
+    town, pose = soft_town(rows), np.eye(4)
+    pose[:3, 3] = [0.0, 0.0, 30.0]
+    sharp = replace(SENSOR, range_noise_m=0.0, drop_rate=0.0, mixed_rate=0.0)
+    clouds = [
+        scan_town(town, pose, 0.0, key=jax.random.key(1), sensor=sensor)
+        for sensor in (sharp, replace(sharp, mixed_rate=1.0))
+    ]
+    clean, mixed = (np.asarray(cloud.points)[np.asarray(cloud.mask)][:, 0] for cloud in clouds)
+    between = [((x > 9.6) & (x < 11.9)).sum() for x in (clean, mixed)]
+    assert between[0] == 0
+    assert between[1] >= 8
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda: draw_scene(-1),
+        lambda: SceneMixture(kinds=(("moon", 1.0),)),
+        lambda: SceneMixture(kinds=(("wood", 0.0),)),
+        lambda: SceneMixture(length_m=0.0),
+        lambda: SceneMixture(scale=(2.0, 1.0)),
+        lambda: TownConfig(kind="moon"),
+    ],
+)
+def test_senseless_wishes_are_refused(make):
+    with pytest.raises(ValueError, match="must"):
+        make()
