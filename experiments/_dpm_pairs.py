@@ -11,7 +11,7 @@ import numpy as np
 
 from dpmjax.deeppointmap import Model, encode
 from dpmjax.deeppointmap.confidence import Evidence, gather_evidence
-from dpmjax.deeppointmap.scan_registration import PreparedScan, match_clouds
+from dpmjax.deeppointmap.scan_registration import distinct_motions, match_clouds
 from dpmjax.deeppointmap.verification import choose_motion, measure_scan, refine_motion
 from dpmjax.geometry import rigid, se2
 from dpmjax.io import LidarSequence
@@ -83,13 +83,12 @@ def register_pair(model: Model, pair: ScanPair) -> PairResult:
     settings = model.config.verification
     measured = [measure_scan(points, settings) for points in (pair.source, pair.target)]
     clock.stop("measure")
-    source, target = (PreparedScan(*parts) for parts in zip(clouds, measured, strict=True))
-    hypotheses = match_clouds(model, source.descriptors, target.descriptors, config=model.config.matching)
-    motions = np.asarray(hypotheses.T_target_source, np.float64)[: max(1, int((hypotheses.support > 0).sum()))]
+    hypotheses = match_clouds(model, *clouds, config=model.config.matching)
+    motions = distinct_motions(hypotheses)
     clock.stop("match")
-    verified = choose_motion(source.measured, target.measured, motions, settings)
+    verified = choose_motion(*measured, motions, settings)
     clock.stop("verify")
-    refined = refine_motion(source.measured, target.measured, verified, settings)
+    refined = refine_motion(*measured, verified, settings)
     clock.stop("refine")
     evidence = gather_evidence(hypotheses, verified.row, verified.verification)
     found = {"descriptors": motions[0], "verified": verified.T_target_source, "refined": refined.T_target_source}

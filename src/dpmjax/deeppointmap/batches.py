@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import jax
@@ -15,11 +14,10 @@ from jaxtyping import Array, Float
 from dpmjax.deeppointmap.encoding import pyramid_of_scan
 from dpmjax.deeppointmap.matching import MatchConfig
 from dpmjax.deeppointmap.model import Model, encode_pyramid, overlap_probability
-from dpmjax.deeppointmap.scan_registration import PreparedScan, ScanOrCloud, prepare_scan, register
+from dpmjax.deeppointmap.scan_registration import PreparedScan, ScanOrCloud, register_each
 from dpmjax.types import AnyArray, DescriptorCloud, PointCloud, Registration
 
 CHUNK = 8
-NUM_THREADS = 2
 
 
 def encode_scans(model: Model, scans: Sequence[PointCloud | Float[AnyArray, "_n 3"]]) -> DescriptorCloud:
@@ -36,11 +34,10 @@ def encode_scans(model: Model, scans: Sequence[PointCloud | Float[AnyArray, "_n 
     """
     _require_some("scans", scans)
     parts = []
-    with ThreadPoolExecutor(NUM_THREADS) as pool:
-        for start in range(0, len(scans), CHUNK):
-            # The device still encodes the chunk before.
-            pyramids = pool.map(lambda points: pyramid_of_scan(points, model.config), scans[start : start + CHUNK])
-            parts.append(_encode_chunk(model, _stacked(list(pyramids))))
+    for start in range(0, len(scans), CHUNK):
+        # JAX still encodes the chunk before.
+        pyramids = [pyramid_of_scan(points, model.config) for points in scans[start : start + CHUNK]]
+        parts.append(_encode_chunk(model, _stacked(pyramids)))
     return _joined(parts, len(scans))
 
 
@@ -67,15 +64,7 @@ def register_pairs(
         All fields with a leading axis, in the order of the pairs.
     """
     _require_pairs(sources, targets)
-    scans = {id(scan): scan for scan in (*sources, *targets)}
-
-    def prepared(scan: ScanOrCloud) -> DescriptorCloud | PreparedScan:
-        return scan if isinstance(scan, DescriptorCloud | PreparedScan) else prepare_scan(model, scan)
-
-    with ThreadPoolExecutor(NUM_THREADS) as pool:
-        ready = dict(zip(scans, pool.map(prepared, scans.values()), strict=True))
-        pairs = ((ready[id(source)], ready[id(target)]) for source, target in zip(sources, targets, strict=True))
-        found = list(pool.map(lambda pair: register(model, *pair, config=config, refine=refine), pairs))
+    found = register_each(model, list(zip(sources, targets, strict=True)), config=config, refine=refine)
     return jax.tree.map(lambda *leaves: jnp.asarray(np.stack(leaves)), *jax.device_get(found))
 
 

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import functools
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -14,17 +15,27 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from dpmjax.deeppointmap.confidence import gather_evidence, with_confidence
-from dpmjax.deeppointmap.encoding import encode
+from dpmjax.deeppointmap.encoding import encode, pyramid_of_scan
 from dpmjax.deeppointmap.matching import MatchConfig, match_hypotheses
-from dpmjax.deeppointmap.model import Model, correlate, overlap_probability, predict_offsets, similarity_features
+from dpmjax.deeppointmap.model import (
+    Model,
+    correlate,
+    encode_pyramid,
+    overlap_probability,
+    predict_offsets,
+    similarity_features,
+)
 from dpmjax.deeppointmap.verification import (
     MeasuredScan,
+    VerificationConfig,
     VerifiedMotion,
     choose_motion,
     measure_scan,
     refine_motion,
 )
-from dpmjax.types import AnyArray, DescriptorCloud, PointCloud, Registration, Verification
+from dpmjax.types import AnyArray, DescriptorCloud, PointCloud, Registration
+
+NUM_THREADS = 2
 
 
 class PreparedScan(NamedTuple):
@@ -39,11 +50,14 @@ class PreparedScan(NamedTuple):
     measured: MeasuredScan
 
 
-ScanOrCloud = DescriptorCloud | PreparedScan | PointCloud | Float[AnyArray, "_n 3"]
-"""A raw scan in metres, in the frame of its lidar; or the same prepared; or descriptors of a scan or of a map."""
+RawScan = PointCloud | Float[AnyArray, "_n 3"]
+"""Points in metres, in the frame of the lidar."""
+
+ScanOrCloud = DescriptorCloud | PreparedScan | RawScan
+"""A raw scan; or the same prepared; or descriptors of a scan or of a map."""
 
 
-def prepare_scan(model: Model, points: PointCloud | Float[AnyArray, "n 3"]) -> PreparedScan:
+def prepare_scan(model: Model, points: RawScan) -> PreparedScan:
     """Encodes a raw scan and prepares the verification by its points, so that `register` need not do it again.
 
     A `ValueError` says if the points are no real numbers (n, 3).
@@ -55,9 +69,29 @@ def prepare_scan(model: Model, points: PointCloud | Float[AnyArray, "n 3"]) -> P
     Returns:
         Descriptors, surface and free space.
     """
-    cloud = encode(model, points)
-    array = np.asarray(points.points)[np.asarray(points.mask)] if isinstance(points, PointCloud) else np.asarray(points)
-    return PreparedScan(cloud, measure_scan(array, model.config.verification))
+    return prepare_scans(model, [points])[0]
+
+
+def prepare_scans(model: Model, scans: Sequence[RawScan]) -> list[PreparedScan]:
+    """Prepares scans one after the other; threads measure their surfaces while JAX encodes.
+
+    A `ValueError` says if the points of a scan are no real numbers (n, 3).
+
+    Args:
+        model: encoder and configuration.
+        scans: points in metres, each in the frame of its lidar.
+
+    Returns:
+        The prepared scans.
+    """
+    # Threads run NumPy only: compiled programs wait for threads of JAX, and may wait for each other.
+    with ThreadPoolExecutor(NUM_THREADS) as pool:
+        clouds, measured = [], []
+        for points in scans:
+            pyramid = pyramid_of_scan(points, model.config)
+            measured.append(pool.submit(_measured, points, model.config.verification))
+            clouds.append(encode_pyramid(model, pyramid))
+        return [PreparedScan(cloud, future.result()) for cloud, future in zip(clouds, measured, strict=True)]
 
 
 def register(
@@ -91,40 +125,48 @@ def register(
         ValueError: if the points are no real numbers (n, 3), if features have another width than the model, or if
             `refine` is asked for without two scans.
     """
-    if refine and (isinstance(source, DescriptorCloud) or isinstance(target, DescriptorCloud)):
-        raise ValueError("refine: expected two scans, raw or from prepare_scan, got descriptors without points")
-    matching = config or model.config.matching
-    if isinstance(source, DescriptorCloud) or isinstance(target, DescriptorCloud):
-        hypotheses = match_clouds(model, _as_cloud(model, source), _as_cloud(model, target), config=matching)
-        return _with_confidence(model, hypotheses, 0, None)
-    with ThreadPoolExecutor(2) as pool:
-        prepared = list(pool.map(functools.partial(_as_prepared, model), (source, target)))
-    hypotheses, motion = verify_hypotheses(model, prepared[0], prepared[1], config=matching)
-    match = _with_confidence(model, hypotheses, motion.row, motion.verification)
-    if refine:
-        motion = refine_motion(prepared[0].measured, prepared[1].measured, motion, model.config.verification)
-    T = jnp.asarray(motion.T_target_source, match.T_target_source.dtype)
-    return replace(match, T_target_source=T, verification=motion.verification)
+    return register_each(model, [(source, target)], config=config, refine=refine)[0]
 
 
-def verify_hypotheses(
-    model: Model, source: PreparedScan, target: PreparedScan, *, config: MatchConfig
-) -> tuple[Registration, VerifiedMotion]:
-    """Matches the descriptors of two scans and chooses the motion under which the scans agree best.
+def register_each(
+    model: Model,
+    pairs: Sequence[tuple[ScanOrCloud, ScanOrCloud]],
+    *,
+    config: MatchConfig | None = None,
+    refine: bool = False,
+) -> list[Registration]:
+    """Registers pairs as `register` does; threads verify one pair while JAX matches the next.
 
     Args:
         model: encoder and decoder.
-        source: a scan.
-        target: the other.
-        config: choice of pairs, inliers and hypotheses.
+        pairs: source and target of each; a scan that is in several pairs is prepared once.
+        config: see `register`.
+        refine: see `register`.
 
     Returns:
-        All hypotheses, with a leading axis and on the host; and the chosen one, aligned.
+        One registration for each pair.
+
+    Raises:
+        ValueError: as `register` says.
     """
-    hypotheses = match_clouds(model, source.descriptors, target.descriptors, config=config)
-    num_motions = max(1, int((hypotheses.support > 0).sum()))
-    motions = np.asarray(hypotheses.T_target_source[:num_motions], np.float64)
-    return hypotheses, choose_motion(source.measured, target.measured, motions, model.config.verification)
+    if refine and any(isinstance(scan, DescriptorCloud) for pair in pairs for scan in pair):
+        raise ValueError("refine: expected two scans, raw or from prepare_scan, got descriptors without points")
+    prepared = _prepared(model, pairs)
+    matching, verification = config or model.config.matching, model.config.verification
+    with ThreadPoolExecutor(NUM_THREADS) as pool:
+        started = []
+        for pair in pairs:
+            source, target = (prepared[id(scan)] for scan in pair)
+            hypotheses = match_clouds(model, _descriptors(source), _descriptors(target), config=matching)
+            motions: Future[_Motions] | None = None
+            if isinstance(source, PreparedScan) and isinstance(target, PreparedScan):
+                scans = source.measured, target.measured
+                motions = pool.submit(_verified, *scans, hypotheses, verification, refine=refine)
+            started.append((hypotheses, motions))
+        return [
+            _finished(model, hypotheses, None if motions is None else motions.result())
+            for hypotheses, motions in started
+        ]
 
 
 def match_clouds(
@@ -160,22 +202,63 @@ def overlap(model: Model, source: ScanOrCloud, target: ScanOrCloud) -> Float[Arr
     return overlap_probability(model, _as_cloud(model, source), _as_cloud(model, target))
 
 
-def _as_prepared(model: Model, scan: PreparedScan | PointCloud | Float[AnyArray, "_n 3"]) -> PreparedScan:
-    return scan if isinstance(scan, PreparedScan) else prepare_scan(model, scan)
+def distinct_motions(hypotheses: Registration) -> Float[np.ndarray, "h 4 4"]:
+    """Returns the motions of the hypotheses that any pair supports; at least one.
+
+    Args:
+        hypotheses: from `match_clouds`.
+
+    Returns:
+        T_target_source in float64, best first.
+    """
+    num_motions = max(1, int((hypotheses.support > 0).sum()))
+    return np.asarray(hypotheses.T_target_source[:num_motions], np.float64)
+
+
+class _Motions(NamedTuple):
+    # The confidence rests on the chosen motion, with and without a refinement.
+    chosen: VerifiedMotion
+    final: VerifiedMotion
+
+
+def _measured(points: RawScan, config: VerificationConfig) -> MeasuredScan:
+    array = np.asarray(points.points)[np.asarray(points.mask)] if isinstance(points, PointCloud) else np.asarray(points)
+    return measure_scan(array, config)
+
+
+def _prepared(
+    model: Model, pairs: Sequence[tuple[ScanOrCloud, ScanOrCloud]]
+) -> dict[int, DescriptorCloud | PreparedScan]:
+    # By identity; each scan once. Where the other side is a descriptor cloud, the surface is measured in vain.
+    scans = {id(scan): scan for pair in pairs for scan in pair}
+    ready = {key: scan for key, scan in scans.items() if isinstance(scan, DescriptorCloud | PreparedScan)}
+    raw = {key: scan for key, scan in scans.items() if not isinstance(scan, DescriptorCloud | PreparedScan)}
+    return {**ready, **dict(zip(raw, prepare_scans(model, list(raw.values())), strict=True))}
+
+
+def _verified(
+    source: MeasuredScan, target: MeasuredScan, hypotheses: Registration, config: VerificationConfig, *, refine: bool
+) -> _Motions:
+    chosen = choose_motion(source, target, distinct_motions(hypotheses), config)
+    return _Motions(chosen, refine_motion(source, target, chosen, config) if refine else chosen)
+
+
+def _finished(model: Model, hypotheses: Registration, motions: _Motions | None) -> Registration:
+    row = 0 if motions is None else motions.chosen.row
+    evidence = gather_evidence(hypotheses, row, None if motions is None else motions.chosen.verification)
+    match = jax.tree.map(lambda leaf: jnp.asarray(leaf[row]), hypotheses)
+    if motions is not None:
+        T = jnp.asarray(motions.final.T_target_source, match.T_target_source.dtype)
+        match = replace(match, T_target_source=T, verification=motions.final.verification)
+    return with_confidence(match, evidence, model.config.calibration)
+
+
+def _descriptors(scan: DescriptorCloud | PreparedScan) -> DescriptorCloud:
+    return scan.descriptors if isinstance(scan, PreparedScan) else scan
 
 
 def _as_cloud(model: Model, scan: ScanOrCloud) -> DescriptorCloud:
-    if isinstance(scan, PreparedScan):
-        return scan.descriptors
-    return scan if isinstance(scan, DescriptorCloud) else encode(model, scan)
-
-
-def _with_confidence(
-    model: Model, hypotheses: Registration, row: int, verification: Verification | None
-) -> Registration:
-    match = jax.tree.map(lambda leaf: jnp.asarray(leaf[row]), hypotheses)
-    match = replace(match, verification=verification)
-    return with_confidence(match, gather_evidence(hypotheses, row, verification), model.config.calibration)
+    return _descriptors(scan) if isinstance(scan, DescriptorCloud | PreparedScan) else encode(model, scan)
 
 
 @functools.partial(jax.jit, static_argnames="config")
