@@ -12,7 +12,6 @@ mixture, of the nearest scene, and of the nearest other real sequence.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated
@@ -37,7 +36,6 @@ EXPERIMENT = "town_statistics"
 # Far from the seeds of training and of held-out towns.
 _FIRST_SEED = 2_000_000
 _NUMBERS = ("points", "far", "low", "high", "linear", "planar", "volumetric")
-_NUM_THREADS = 2
 
 
 @dataclass(frozen=True)
@@ -115,9 +113,7 @@ def simulated(config: Config) -> dict[tuple[str, int], ScanStatistics]:
         drawn = draw_scene(seed, replace(mixture, kinds=((scene[0], 1.0),)))
         return scan_statistics(evenly(simulate_scene(drawn), config.scans))
 
-    with ThreadPoolExecutor(_NUM_THREADS) as pool:
-        rows = tqdm(pool.map(measure, wanted), total=len(wanted), desc="scenes", leave=False)
-        return dict(zip(wanted, rows, strict=True))
+    return {scene: measure(scene) for scene in tqdm(wanted, desc="scenes", leave=False)}
 
 
 if __name__ == "__main__":

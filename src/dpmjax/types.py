@@ -75,29 +75,56 @@ class DescriptorCloud:
     directions: Float[Array, "m 2"] | None = None
 
 
+class Verification(NamedTuple):
+    """How well two scans agree under a motion; shares are in [0, 1].
+
+    Attributes:
+        visible_share: share of the points of both scans that lie in the field of view of the other.
+        matched_share: share of the source points that meet a plane of the target.
+        contradicted_share: share of the visible points that lie in the free space of the other scan.
+        score: `matched_share` less the weighted `contradicted_share`.
+        gap: how much more it is than the score of the best other hypothesis that was tried, or than 0.
+        num_tried: number of hypotheses that were tried.
+    """
+
+    visible_share: float
+    matched_share: float
+    contradicted_share: float
+    score: float
+    gap: float = 0.0
+    num_tried: int = 1
+
+
 @flax.struct.dataclass
 class Registration:
     """The motion between two descriptor clouds, and how far it can be trusted; failure is data.
 
     Attributes:
         T_target_source: maps points of the source to the target; the identity where no pair was left.
-        confidence: mean score of the first inliers, in [0, 1]; 0 without any.
+        confidence: in [0, 1], 0 without any inlier. With a calibrated model, `register` makes it the probability that
+            the motion is right within 2 m and 5 degrees; else it is `mean_score`, which is no probability.
+        mean_score: mean score of the first inliers, in [0, 1]; 0 without any.
         rmse_m: of the inliers after alignment; infinite without any.
+        support: consensus support of the motion: sum of 1 - error / tolerance over distinct pairs.
         num_inliers: how many pairs the motion rests on, both directions counted.
         source_indices: row of each pair in the source; first the pairs of eq. 1, then the same of eq. 2.
         target_indices: the same in the target.
         scores: how well the two of a pair match, in [0, 1].
         is_inlier: True for pairs that the motion rests on.
+        verification: how well the scans themselves agree; None where only descriptors were registered.
     """
 
     T_target_source: Float[Array, "4 4"]
     confidence: Float[Array, ""]
+    mean_score: Float[Array, ""]
     rmse_m: Float[Array, ""]
+    support: Float[Array, ""]
     num_inliers: Int[Array, ""]
     source_indices: Int[Array, " p"]
     target_indices: Int[Array, " p"]
     scores: Float[Array, " p"]
     is_inlier: Bool[Array, " p"]
+    verification: Verification | None = None
 
     @property
     def rmse(self) -> Float[Array, ""]:

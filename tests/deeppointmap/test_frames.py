@@ -11,7 +11,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from dpmjax.deeppointmap import Model, encode_pyramid, init_model, merge_clouds
-from dpmjax.deeppointmap.inference import pyramid_of_scan
+from dpmjax.deeppointmap.encoding import pyramid_of_scan
 from dpmjax.deeppointmap.model import predict_offsets
 from dpmjax.geometry.bearing import directions_of
 from dpmjax.types import DescriptorCloud

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 import dpmjax
+from dpmjax.deeppointmap import prepare_scan
 from dpmjax.types import PointCloud
 from tests.deeppointmap import toy
 from tests.tolerances import ACCUMULATED
@@ -91,3 +92,17 @@ def test_second_call_compiles_nothing(model, scans, assert_compiles_nothing) -> 
 def test_what_is_no_scan_is_refused(as_user, model, points, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         dpmjax.encode(model, points)
+
+
+def test_prepared_scans_register_as_raw_ones(model, scans) -> None:
+    expected = dpmjax.register(model, *scans, refine=True)
+    prepared = [prepare_scan(model, scan) for scan in scans]
+    found = dpmjax.register(model, *prepared, refine=True)
+    np.testing.assert_array_equal(found.T_target_source, expected.T_target_source)
+    assert found.verification == expected.verification
+    assert dpmjax.overlap(model, *prepared) == dpmjax.overlap(model, *scans)
+
+
+def test_refinement_without_points_is_refused(model, scans) -> None:
+    with pytest.raises(ValueError, match="refine: expected two scans"):
+        dpmjax.register(model, scans[0], dpmjax.encode(model, scans[1]), refine=True)

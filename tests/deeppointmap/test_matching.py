@@ -221,7 +221,7 @@ def test_merging_ignores_what_is_masked() -> None:
 
 def test_wrong_arguments_are_named(as_user) -> None:
     with pytest.raises(ValueError, match="^pair_ratio: expected"):
-        MatchConfig(pair_ratio=1.5)
+        MatchConfig(pair_ratio=5.0)
     with pytest.raises(ValueError, match="^T_map_cloud: expected shape"):
         merge_clouds(DescriptorCloud(jnp.ones((2, 3, 3)), jnp.ones((2, 3, 5)), jnp.ones((2, 3), bool)), np.eye(4))
 

@@ -1,14 +1,15 @@
+from .batches import encode_scans as encode_scans
+from .batches import overlap_pairs as overlap_pairs
+from .batches import register_pairs as register_pairs
 from .curriculum import CurriculumStage as CurriculumStage
 from .curriculum import TrainingConfig as TrainingConfig
 from .curriculum import training_preset as training_preset
 from .data_pipeline import SampleMaker as SampleMaker
+from .encoding import encode as encode
 from .evaluation import PairKind as PairKind
 from .evaluation import draw_evaluation_pairs as draw_evaluation_pairs
 from .evaluation import evaluate_registration as evaluate_registration
 from .evaluation import overlap_accuracy as overlap_accuracy
-from .inference import encode as encode
-from .inference import overlap as overlap
-from .inference import register as register
 from .matching import MatchConfig as MatchConfig
 from .matching import merge_clouds as merge_clouds
 from .model import Model as Model
@@ -20,6 +21,10 @@ from .model import model_preset as model_preset
 from .objective import ObjectiveConfig as ObjectiveConfig
 from .processes import join_processes as join_processes
 from .sampling import SamplingConfig as SamplingConfig
+from .scan_registration import PreparedScan as PreparedScan
+from .scan_registration import overlap as overlap
+from .scan_registration import prepare_scan as prepare_scan
+from .scan_registration import register as register
 from .scan_store import PreparedDrive as PreparedDrive
 from .scan_store import ScanStore as ScanStore
 from .scan_store import prepare_drive as prepare_drive
@@ -29,3 +34,4 @@ from .training import make_step as make_step
 from .training_loop import TrainingHooks as TrainingHooks
 from .training_loop import TrainingProgress as TrainingProgress
 from .training_loop import train as train
+from .verification import VerificationConfig as VerificationConfig

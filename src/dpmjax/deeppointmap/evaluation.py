@@ -17,10 +17,10 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from dpmjax.deeppointmap.curriculum import TrainingConfig
-from dpmjax.deeppointmap.inference import overlap, register_correlated
 from dpmjax.deeppointmap.matching import merge_clouds
-from dpmjax.deeppointmap.model import Model, ModelConfig, correlate, encode_stored
+from dpmjax.deeppointmap.model import Model, ModelConfig, encode_stored
 from dpmjax.deeppointmap.sampling import SampleScans
+from dpmjax.deeppointmap.scan_registration import overlap, trace_match
 from dpmjax.deeppointmap.scan_store import ScanStore, prepare_drive
 from dpmjax.geometry import rigid
 from dpmjax.metrics.poses import RegistrationRecall, registration_recall
@@ -244,7 +244,8 @@ def _encode_one(model: Model, scan: SampleScans) -> DescriptorCloud:
 @jax.jit
 def _register_all(model: Model, sources: DescriptorCloud, targets: DescriptorCloud) -> Registration:
     def register_one(maps: tuple[DescriptorCloud, DescriptorCloud]) -> Registration:
-        return register_correlated(model, *correlate(model, *maps), config=model.config.matching)
+        hypotheses = trace_match(model, *maps, config=model.config.matching)
+        return jax.tree.map(lambda leaf: leaf[0], hypotheses)
 
     return jax.lax.map(register_one, (sources, targets))
 

@@ -19,7 +19,7 @@ from dpmjax.checks import as_float, require_fields, require_positive_fields, req
 from dpmjax.geometry import rigid
 from dpmjax.geometry.alignment import weighted_svd
 from dpmjax.geometry.bearing import directions_of, turned_directions
-from dpmjax.geometry.consensus import ConsensusConfig, find_consensus
+from dpmjax.geometry.consensus import ConsensusConfig, find_consensus, motion_support
 from dpmjax.types import AnyArray, DescriptorCloud, Registration
 
 PredictOffsets = Callable[[Int[Array, " k"], Int[Array, " k"]], tuple[Float[Array, "k 3"], Float[Array, "k 3"]]]
@@ -65,7 +65,7 @@ class MatchConfig:
     def __post_init__(self) -> None:
         require_positive_fields(self, "temperature", "pair_ratio", "max_offset_m", "inlier_sigmas")
         require_fields(self, "min_num_first", "num_rounds", "min_num_inliers", "num_confident", low=1)
-        require_fields(self, "pair_ratio", low=0, high=1)
+        require_fields(self, "pair_ratio", low=0, high=4)
 
 
 def match_descriptors(
@@ -93,7 +93,33 @@ def match_descriptors(
         config: thresholds.
 
     Returns:
-        The motion, its confidence and the pairs; see `Registration`.
+        The motion, its score and the pairs; see `Registration`.
+    """
+    if config.consensus is not None:
+        config = replace(config, consensus=replace(config.consensus, num_motions=1))
+    hypotheses = match_hypotheses(source, target, similarity, predict_offsets, config=config)
+    return jax.tree.map(lambda leaf: leaf[0], hypotheses)
+
+
+def match_hypotheses(
+    source: DescriptorCloud,
+    target: DescriptorCloud,
+    similarity: Float[AnyArray, "m n"],
+    predict_offsets: PredictOffsets,
+    *,
+    config: MatchConfig,
+) -> Registration:
+    """Estimates the best distinct motions between two descriptor clouds, one for each motion of the consensus.
+
+    Args:
+        source: see `match_descriptors`.
+        target: the same in the target frame.
+        similarity: cosine of each pair of descriptors.
+        predict_offsets: the offset head on pairs of rows.
+        config: thresholds; without `consensus` there is one motion.
+
+    Returns:
+        All fields with a leading axis h, best support first. Where there are fewer motions, `support` is 0.
     """
     best = best_pairs(jnp.asarray(similarity), source.mask, target.mask, config=config)
     points = source.positions[best.source_indices], target.positions[best.target_indices]
@@ -169,23 +195,34 @@ def _align(
     source = jnp.tile(source_points, (2, 1)).at[:num_pairs].add(offsets[:num_pairs])
     target = jnp.tile(target_points, (2, 1)).at[num_pairs:].add(offsets[num_pairs:])
     source, target = (jnp.where(is_used[:, None], points, 0) for points in (source, target))
-    is_inlier = _choose_inliers(source, target, scores, is_used, config)
-    T_target_source, errors = _solve(source, target, scores, is_inlier)
-    num_inliers = jnp.sum(is_inlier)
-    squared = jnp.sum(jnp.where(is_inlier, errors**2, 0)) / jnp.maximum(num_inliers, 1)
     rows = jnp.tile(pairs.source_indices, 2), jnp.tile(pairs.target_indices, 2)
-    is_determined = jnp.minimum(*(_num_distinct(some, is_inlier) for some in rows)) >= MIN_NUM_POINTS
-    is_confident = is_inlier & (jnp.cumsum(is_inlier) <= config.num_confident)
-    return Registration(
-        T_target_source=T_target_source,
-        confidence=jnp.sum(jnp.where(is_confident, scores, 0)) / jnp.maximum(jnp.sum(is_confident), 1),
-        rmse_m=jnp.where(is_determined, _sqrt(squared), jnp.inf),
-        num_inliers=num_inliers,
-        source_indices=rows[0],
-        target_indices=rows[1],
-        scores=jnp.where(is_used, scores, 0),
-        is_inlier=is_inlier,
-    )
+
+    def solve(first: Bool[Array, " p"]) -> Registration:
+        is_inlier = _choose_inliers(source, target, scores, is_used, first, config)
+        T_target_source, errors = _solve(source, target, scores, is_inlier)
+        num_inliers = jnp.sum(is_inlier)
+        squared = jnp.sum(jnp.where(is_inlier, errors**2, 0)) / jnp.maximum(num_inliers, 1)
+        is_determined = jnp.minimum(*(_num_distinct(some, is_inlier) for some in rows)) >= MIN_NUM_POINTS
+        is_scored = is_inlier & (jnp.cumsum(is_inlier) <= config.num_confident)
+        mean_score = jnp.sum(jnp.where(is_scored, scores, 0)) / jnp.maximum(jnp.sum(is_scored), 1)
+        half = slice(num_pairs)
+        support = motion_support(
+            T_target_source, source[half], target[half], is_inlier[half], config=config.consensus or ConsensusConfig()
+        )
+        return Registration(
+            T_target_source=T_target_source,
+            confidence=mean_score,
+            mean_score=mean_score,
+            rmse_m=jnp.where(is_determined, _sqrt(squared), jnp.inf),
+            support=support,
+            num_inliers=num_inliers,
+            source_indices=rows[0],
+            target_indices=rows[1],
+            scores=jnp.where(is_used, scores, 0),
+            is_inlier=is_inlier,
+        )
+
+    return jax.vmap(solve)(_first_inliers(source, target, scores, is_used, config))
 
 
 def _num_distinct(rows: Int[Array, " p"], mask: Bool[Array, " p"]) -> Int[Array, ""]:
@@ -198,14 +235,25 @@ def _sqrt(squared: Float[Array, "*p"]) -> Float[Array, "*p"]:
     return jnp.where(squared > 0, jnp.sqrt(jnp.where(squared > 0, squared, 1)), 0)
 
 
-def _agreeing(
-    source: Float[Array, "p 3"], target: Float[Array, "p 3"], is_used: Bool[Array, " p"], config: ConsensusConfig
-) -> Bool[Array, " p"]:
+def _first_inliers(
+    source: Float[Array, "p 3"],
+    target: Float[Array, "p 3"],
+    scores: Float[Array, " p"],
+    is_used: Bool[Array, " p"],
+    config: MatchConfig,
+) -> Bool[Array, "h p"]:
+    """Returns the first inliers of each hypothesis: the best scores, or what supports each motion of the consensus."""
+    source, target, scores = lax.stop_gradient((source, target, scores))
+    if config.consensus is None:
+        ranks = jnp.argsort(jnp.argsort(jnp.where(is_used, -scores, jnp.inf)))
+        return (is_used & ((scores > config.min_inlier_score) | (ranks < config.min_num_first)))[None]
     # The consensus is found in the first direction alone, at a quarter of the work, and then applied to both.
     half = len(source) // 2
-    T_target_source = find_consensus(source[:half], target[:half], is_used[:half], config=config).T_target_source
-    squared = jnp.sum((rigid.transform_points(T_target_source, source) - target) ** 2, axis=1)
-    return is_used & (squared < config.inlier_m**2)
+    consensus = find_consensus(source[:half], target[:half], is_used[:half], config=config.consensus)
+    moved = jax.vmap(lambda T: rigid.transform_points(T, source))(consensus.T_target_source)
+    is_near = jnp.sum((moved - target) ** 2, axis=2) < config.consensus.inlier_m**2
+    is_motion = (consensus.support > 0).at[0].set(True)
+    return is_used & is_near & is_motion[:, None]
 
 
 def _choose_inliers(
@@ -213,6 +261,7 @@ def _choose_inliers(
     target: Float[Array, "p 3"],
     scores: Float[Array, " p"],
     is_used: Bool[Array, " p"],
+    first: Bool[Array, " p"],
     config: MatchConfig,
 ) -> Bool[Array, " p"]:
     # The choice has no derivative.
@@ -225,11 +274,6 @@ def _choose_inliers(
         chosen = is_used & (errors <= limit)  # none without an inlier, where the limit is NaN
         return jnp.where(jnp.sum(chosen) >= config.min_num_inliers, chosen, is_inlier)
 
-    if config.consensus is None:
-        ranks = jnp.argsort(jnp.argsort(jnp.where(is_used, -scores, jnp.inf)))
-        first = is_used & ((scores > config.min_inlier_score) | (ranks < config.min_num_first))
-    else:
-        first = _agreeing(source, target, is_used, config.consensus)
     return lax.fori_loop(0, config.num_rounds, choose, first)
 
 

@@ -15,7 +15,9 @@ import numpy as np
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from dpmjax.checks import require_one_of, require_positive, require_shape
+from dpmjax.deeppointmap.confidence import Calibration
 from dpmjax.deeppointmap.matching import MatchConfig
+from dpmjax.deeppointmap.verification import VerificationConfig
 from dpmjax.geometry.bearing import from_ray_frame, ray_directions
 from dpmjax.geometry.consensus import ConsensusConfig
 from dpmjax.geometry.pyramid import PyramidConfig, PyramidStage
@@ -41,6 +43,8 @@ class ModelConfig:
         scale_m: metres in one unit of the pyramid's normalised coordinates.
         preprocess: filters of raw scans, in training and inference alike.
         matching: choice of descriptor pairs and inliers.
+        verification: verification of hypotheses by the scans, and the final alignment.
+        calibration: of the confidence; None where it was not fitted.
     """
 
     pyramid: PyramidConfig = field(default_factory=PyramidConfig)
@@ -49,6 +53,8 @@ class ModelConfig:
     scale_m: float = 60.0
     preprocess: PreprocessConfig = field(default_factory=PreprocessConfig)
     matching: MatchConfig = field(default_factory=MatchConfig)
+    verification: VerificationConfig = field(default_factory=VerificationConfig)
+    calibration: Calibration | None = None
 
     def __post_init__(self) -> None:
         require_positive("scale_m", self.scale_m)
@@ -102,13 +108,13 @@ PRESETS: dict[str, ModelConfig] = {
         encoder=EncoderConfig(stem_channels=8, expansion=2, output_channels=64, frame="bearing"),
         decoder=DecoderConfig(input_channels=64, model_channels=64, num_heads=2),
         preprocess=PreprocessConfig(capacity=4096),
-        matching=MatchConfig(consensus=ConsensusConfig()),
+        matching=MatchConfig(pair_ratio=2.0, consensus=ConsensusConfig()),
     ),
     "small": ModelConfig(
         pyramid=_pyramid((2048, 768, 256, 64, 16), (24, 24, 24, 24, 16), (0.8, 1.6)),
         encoder=EncoderConfig(stem_channels=16, expansion=2, output_channels=128, frame="bearing"),
         decoder=DecoderConfig(input_channels=128, model_channels=128),
-        matching=MatchConfig(consensus=ConsensusConfig()),
+        matching=MatchConfig(pair_ratio=2.0, consensus=ConsensusConfig()),
     ),
     "paper": ModelConfig(),
 }

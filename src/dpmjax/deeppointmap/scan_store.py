@@ -25,7 +25,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from dpmjax.deeppointmap.curriculum import TrainingConfig
-from dpmjax.deeppointmap.inference import pyramid_of_cloud
+from dpmjax.deeppointmap.encoding import pyramid_of_cloud
 from dpmjax.deeppointmap.sampling import SampleScans, ScanTable
 from dpmjax.geometry.pyramid_storage import pack_pyramid, record_type, stored_pyramids
 from dpmjax.scans.augment import AugmentConfig, augment_scan, random_motions_on_host

@@ -1,10 +1,10 @@
-"""The motion that most point pairs agree on, even if most pairs are wrong.
+"""The motions that most point pairs agree on, even if most pairs are wrong.
 
 A rigid motion keeps distances: two right pairs have the same distance between their points on both sides. So right
 pairs agree with each other, and wrong ones only by chance (spectral matching, Leordeanu and Hebert 2005). Two pairs
 that agree and have many third pairs in common that agree with both are right with far better odds (second-order
-compatibility, Chen et al. 2022). Each of the best pairs proposes a motion from the pairs it goes best with; the one
-with the most support is taken.
+compatibility, Chen et al. 2022). Each of the best pairs proposes a motion from the pairs it goes best with. Proposals
+are ranked by their support, and of near-equal ones only the best is kept (non-maximum suppression).
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from dpmjax.types import AnyArray
 
 @dataclass(frozen=True)
 class ConsensusConfig:
-    """Tolerances, and how many motions are tried.
+    """Tolerances, and how many motions are tried and returned.
 
     Attributes:
         agreement_m: two pairs agree if the distances between their points differ by less than this on the two sides.
@@ -35,35 +35,40 @@ class ConsensusConfig:
         num_seeds: how many pairs propose a motion.
         num_partners: from how many other pairs each.
         num_rounds: how often a motion is fitted again to what supports it.
+        num_motions: how many motions are returned.
+        distinct_m: of two motions that put the source points nearer to each other than this, on average, only the one
+            with more support is returned.
     """
 
     agreement_m: float = 1.0
     inlier_m: float = 2.0
-    num_seeds: int = 40
+    num_seeds: int = 128
     num_partners: int = 8
     num_rounds: int = 5
+    num_motions: int = 24
+    distinct_m: float = 2.0
 
     def __post_init__(self) -> None:
-        for name in ("agreement_m", "inlier_m"):
+        for name in ("agreement_m", "inlier_m", "distinct_m"):
             require_positive(name, getattr(self, name))
-        for name in ("num_seeds", "num_partners", "num_rounds"):
+        for name in ("num_seeds", "num_partners", "num_rounds", "num_motions"):
             require_count(name, getattr(self, name))
 
 
 @flax.struct.dataclass
 class Consensus:
-    """A motion and the pairs that support it.
+    """The best distinct motions, best first, and the pairs that support each.
 
     Attributes:
-        T_target_source: the motion.
-        is_inlier: which pairs are nearer than `inlier_m` under it.
+        T_target_source: the motions; where there are fewer, the first is repeated with support 0.
+        is_inlier: which pairs are nearer than `inlier_m` under each.
         support: sum of 1 - error / inlier_m over the inliers; pairs of nearly the same points count as one. The caller
             knows how much support arises by chance.
     """
 
-    T_target_source: Float[Array, "*b 4 4"]
-    is_inlier: Bool[Array, "*b k"]
-    support: Float[Array, "*b"]
+    T_target_source: Float[Array, "*b h 4 4"]
+    is_inlier: Bool[Array, "*b h k"]
+    support: Float[Array, "*b h"]
 
 
 def find_consensus(
@@ -73,7 +78,7 @@ def find_consensus(
     *,
     config: ConsensusConfig = ConsensusConfig(),
 ) -> Consensus:
-    """The motion from source to target that most pairs support. For one set of pairs; `vmap` for more.
+    """The motions from source to target that most pairs support. For one set of pairs; `vmap` for more.
 
     Memory and time grow with the square and the cube of the number of pairs; 1,000 take tens of milliseconds.
 
@@ -84,7 +89,8 @@ def find_consensus(
         config: tolerances.
 
     Returns:
-        The motion; with fewer than three pairs that agree it is a guess with little support. Without derivative.
+        `config.num_motions` motions, best first; with fewer than three pairs that agree the first is a guess with
+        little support. Without derivative.
 
     Raises:
         ValueError: the shapes do not match.
@@ -93,7 +99,9 @@ def find_consensus(
     require_shape("target", target, source.shape)
     mask = as_mask("mask", mask, source.shape[:1])
     if len(source) == 0:
-        return Consensus(jnp.eye(4, dtype=source.dtype), jnp.zeros(0, bool), jnp.zeros((), source.dtype))
+        num, dtype = config.num_motions, source.dtype
+        motions = jnp.tile(jnp.eye(4, dtype=dtype), (num, 1, 1))
+        return Consensus(motions, jnp.zeros((num, 0), bool), jnp.zeros(num, dtype))
     return _find_consensus(*lax.stop_gradient((source, target)), mask, config=config)
 
 
@@ -116,9 +124,57 @@ def _find_consensus(source: jax.Array, target: jax.Array, mask: jax.Array, *, co
         return T, jnp.sum(worth * _closeness(T, source, target, config))
 
     motions, supports = jax.vmap(propose)(seeds)
-    best = jnp.argmax(supports)
-    is_inlier = mask & (_closeness(motions[best], source, target, config) > 0)
-    return Consensus(motions[best], is_inlier, supports[best])
+    chosen, supports = _distinct(motions, supports, source, mask, config)
+    motions = motions[chosen]
+    closeness = jax.vmap(lambda T: _closeness(T, source, target, config))(motions)
+    return Consensus(motions, mask & (closeness > 0) & (supports > 0)[:, None], supports)
+
+
+def _distinct(
+    motions: Float[Array, "s 4 4"],
+    supports: Float[Array, " s"],
+    source: Float[Array, "k 3"],
+    mask: Bool[Array, " k"],
+    config: ConsensusConfig,
+) -> tuple[Int[Array, " h"], Float[Array, " h"]]:
+    """Returns rows and supports of the best motions after non-maximum suppression; support 0 where there are fewer."""
+    # The mean distance over the points grows with the translation and with the rotation.
+    moved = jax.vmap(lambda T: rigid.transform_points(T, source))(motions)
+    first = jnp.argmax(supports)
+
+    def pick(remaining: Float[Array, " s"], _: None) -> tuple[Array, tuple[Array, Array]]:
+        best = jnp.argmax(remaining)
+        support = remaining[best]
+        apart = jnp.sqrt(jnp.sum((moved - moved[best]) ** 2, axis=2))
+        is_same = jnp.sum(jnp.where(mask, apart, 0), axis=1) <= config.distinct_m * jnp.sum(mask)
+        return jnp.where(is_same, 0, remaining), (jnp.where(support > 0, best, first), support)
+
+    _, (rows, kept) = lax.scan(pick, supports, None, length=config.num_motions)
+    return rows, kept
+
+
+def motion_support(
+    T_target_source: Float[Array, "4 4"],
+    source: Float[Array, "k 3"],
+    target: Float[Array, "k 3"],
+    mask: Bool[Array, " k"],
+    *,
+    config: ConsensusConfig,
+) -> Float[Array, ""]:
+    """The support of any motion, as `Consensus.support`.
+
+    Args:
+        T_target_source: the motion.
+        source: metres, source frame.
+        target: metres, target frame, row for row.
+        mask: False for pairs that are not there; they may hold anything finite.
+        config: tolerances.
+
+    Returns:
+        The support.
+    """
+    worth = _worth(_distances(source), _distances(target), mask, config)
+    return jnp.sum(worth * _closeness(T_target_source, source, target, config))
 
 
 def _second_order(
@@ -134,9 +190,14 @@ def _second_order(
     is_apart = jnp.minimum(lengths, other_lengths) > config.agreement_m
     agrees = (jnp.abs(lengths - other_lengths) < config.agreement_m) & is_apart & is_pair
     agrees = agrees.astype(jnp.float32)
-    says_the_same = (jnp.maximum(lengths, other_lengths) <= config.agreement_m) & is_pair
-    worth = mask / jnp.maximum(jnp.sum(says_the_same, axis=1), 1).astype(source.dtype)
-    return agrees * (agrees @ agrees), worth
+    return agrees * (agrees @ agrees), _worth(lengths, other_lengths, mask, config)
+
+
+def _worth(
+    lengths: Float[Array, "k k"], other_lengths: Float[Array, "k k"], mask: Bool[Array, " k"], config: ConsensusConfig
+) -> Float[Array, " k"]:
+    is_same = (jnp.maximum(lengths, other_lengths) <= config.agreement_m) & mask[:, None] & mask[None, :]
+    return mask / jnp.maximum(jnp.sum(is_same, axis=1), 1).astype(lengths.dtype)
 
 
 def _distances(points: Float[Array, "k 3"]) -> Float[Array, "k k"]:

@@ -5,3 +5,10 @@ from .augment import augment_scan as augment_scan
 from .preprocess import PreprocessConfig as PreprocessConfig
 from .preprocess import preprocess_scan as preprocess_scan
 from .preprocess import preprocess_scan_on_host as preprocess_scan_on_host
+from .surface_alignment import AlignmentConfig as AlignmentConfig
+from .surface_alignment import AlignmentLevel as AlignmentLevel
+from .surface_alignment import SurfaceAlignment as SurfaceAlignment
+from .surface_alignment import align_surfaces as align_surfaces
+from .surfaces import Surface as Surface
+from .surfaces import SurfaceConfig as SurfaceConfig
+from .surfaces import scan_surface as scan_surface

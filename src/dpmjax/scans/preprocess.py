@@ -171,7 +171,7 @@ def preprocess_scan_on_host(
     is_kept = _is_within(points, config) if mask is None else _is_within(points, config) & mask
     _warn_if_out_of_range(points, mask, int(is_kept.sum()), config)
     kept = points.take(np.flatnonzero(is_kept), axis=0)  # four times faster than by the mask
-    kept = kept[_first_of_each_voxel(kept, config.voxel_size_m)]
+    kept = kept[first_of_each_voxel(kept, config.voxel_size_m)]
     kept = kept[_evenly_spaced(len(kept), config.capacity)]
     if config.num_outlier_neighbours > 0 and len(kept) > 1:
         kept = kept[_is_inlier_on_host(kept, config, num_threads)]
@@ -202,7 +202,16 @@ def _warn_if_out_of_range(
         warnings.warn(f"hardly any point of the scan is {limits} from the lidar: is it in metres?", stacklevel=3)
 
 
-def _first_of_each_voxel(points: Float[np.ndarray, "n 3"], voxel_size: float) -> Int[np.ndarray, " v"]:
+def first_of_each_voxel(points: Float[np.ndarray, "n 3"], voxel_size: float) -> Int[np.ndarray, " v"]:
+    """Selects the first point of each voxel, on the host.
+
+    Args:
+        points: finite, metres.
+        voxel_size: side of a voxel, metres.
+
+    Returns:
+        Rows of the points, in order.
+    """
     rows = np.arange(len(points))
     if len(points) == 0:
         return rows

@@ -16,3 +16,6 @@ from .rasters import ErrorMap as ErrorMap
 from .rasters import error_maps_figure as error_maps_figure
 from .rasters import from_above_figure as from_above_figure
 from .rasters import occupancy_figure as occupancy_figure
+from .registrations import RegisteredPair as RegisteredPair
+from .registrations import registered_pairs_figure as registered_pairs_figure
+from .registrations import reliability_figure as reliability_figure

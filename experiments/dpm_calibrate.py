@@ -1,0 +1,121 @@
+"""Calibrates the confidence of a DeepPointMap model on towns that it was not trained on.
+
+    python -m experiments.dpm_calibrate results/dpm_train/latest/model.safetensors
+
+Pairs of scans of held-out towns, overlapping and not, are registered; a logistic regression on a few features of each
+registration (consensus support, share of points that meet surfaces, share in free space ...) then predicts whether the
+motion is right within 2 m and 5 degrees. Results go to results/dpm_calibrate/<time>/: model.safetensors, which is the
+model with its calibration; metrics.json, with the Brier scores of towns that were left out of the fit; reliability.png.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+from tqdm import tqdm
+from tyro.conf import Positional, arg
+
+from experiments._command import check_least, run_command
+from experiments._result_files import do_row
+from experiments._run_folder import RunOptions, open_run_folder, recording, write_metrics
+
+EXPERIMENT = "dpm_calibrate"
+MODEL = "model.safetensors"
+# Far from the seeds of the towns of dpm_train, also of its held-out one.
+FIRST_TOWN = 3_000_000
+
+
+@dataclass(frozen=True, kw_only=True)
+class Config(RunOptions):
+    """Options of the run."""
+
+    model: Positional[str]
+    """The model: a .safetensors file, or the name of a shipped one."""
+    towns: Annotated[int, arg(metavar="N")] = 6
+    """Number of towns."""
+    pairs: Annotated[int, arg(metavar="N")] = 30
+    """Pairs of each town that are 2 to 10 m apart, as many 10 to 20 m apart, and as many without overlap."""
+    town_length_m: Annotated[float, arg(metavar="M")] = 400.0
+    """Length of the drive through each town."""
+
+    def __post_init__(self) -> None:
+        """Checks ranges."""
+        check_least(self, towns=2, pairs=5, town_length_m=150, seed=0)
+
+
+def main(config: Config) -> dict[str, Any]:
+    """Registers the pairs, fits, and writes the model."""
+    from dpmjax import load_model, save_model, viz
+    from dpmjax.weights import read_card
+    from experiments._dpm_pairs import BANDS
+
+    model = load_model(config.model)
+    folder = open_run_folder(config, EXPERIMENT)
+    rows = []
+    with recording(folder), tqdm(total=config.towns * len(BANDS) * config.pairs, unit=" pairs") as bar:
+        for town in range(FIRST_TOWN, FIRST_TOWN + config.towns):
+            work = partial(_town, config, model, town, bar)
+            rows.append(do_row(folder.path, {"town": town}, work, seed=config.seed))
+            bar.update(sum(len(row["is_right"]) for row in rows) - bar.n)
+        calibration, numbers, held_out = fit(rows)
+        calibrated = model.replace(config=replace(model.config, calibration=calibration))
+        card = read_card(Path(config.model)) if config.model.endswith(".safetensors") else config.model
+        note = f"Confidence calibrated on {config.towns} towns, {numbers['num_pairs']} pairs."
+        save_model(calibrated, folder / MODEL, card=f"{card} {note}".strip())
+        write_metrics(folder, {"model": config.model, **numbers}, seed=config.seed)
+        figure = viz.reliability_figure(held_out["confidence"], held_out["is_right"], title="towns left out of the fit")
+        viz.save_figure(figure, folder / "reliability.png")
+    print(", ".join(f"{name} {value:.3f}" for name, value in numbers.items() if isinstance(value, float)))
+    print(f"results in {folder.path}")
+    return numbers
+
+
+def _town(config: Config, model: Any, town: int, bar: tqdm) -> dict[str, Any]:
+    from dpmjax.metrics import registration_recall
+    from experiments._dpm_data import town_drive
+    from experiments._dpm_pairs import BANDS, draw_pairs, read_pairs, register_pair
+
+    drive = town_drive(town, length_m=config.town_length_m)
+    found: dict[str, list[Any]] = {"of_clouds": [], "of_scans": [], "is_right_of_clouds": [], "is_right": []}
+    for band in BANDS:
+        for pair in read_pairs(drive, draw_pairs(drive, band, config.pairs, config.seed), config.seed):
+            result = register_pair(model, pair)
+            motions = np.stack([result.motions["descriptors"], result.motions["verified"]])
+            is_right = registration_recall(motions, np.stack([pair.T_target_source] * 2)).is_right
+            found["of_clouds"].append(result.evidence.of_clouds.tolist())
+            found["of_scans"].append(result.evidence.of_scans.tolist())
+            found["is_right_of_clouds"].append(bool(is_right[0]))
+            found["is_right"].append(bool(is_right[1]))
+            bar.update(1)
+    return found
+
+
+def fit(rows: list[dict[str, Any]]) -> tuple[Any, dict[str, Any], dict[str, np.ndarray]]:
+    """Returns the calibration of all towns, its numbers, and the confidence of each town when it is left out."""
+    from dpmjax.deeppointmap.confidence import CLOUD_FEATURES, SCAN_FEATURES, Calibration, fit_logistic, probability
+
+    kinds = {"of_clouds": (CLOUD_FEATURES, "is_right_of_clouds"), "of_scans": (SCAN_FEATURES, "is_right")}
+    towns = np.concatenate([np.full(len(row["is_right"]), row["town"]) for row in rows])
+    models, numbers = {}, {"num_pairs": len(towns)}
+    for kind, (names, label) in kinds.items():
+        features = np.concatenate([np.asarray(row[kind], float).reshape(-1, len(names)) for row in rows])
+        is_right = np.concatenate([np.asarray(row[label], bool) for row in rows])
+        models[kind] = fit_logistic(names, features, is_right)
+        confidence = np.empty(len(towns))
+        for town in np.unique(towns):
+            part = towns == town
+            confidence[part] = probability(fit_logistic(names, features[~part], is_right[~part]), features[part])
+        numbers |= {
+            f"share_right_{kind}": float(is_right.mean()),
+            f"brier_{kind}": float(np.mean((confidence - is_right) ** 2)),
+            f"brier_of_a_constant_{kind}": float(np.mean((is_right.mean() - is_right) ** 2)),
+        }
+    return Calibration(**models), numbers, {"confidence": confidence, "is_right": is_right}
+
+
+if __name__ == "__main__":
+    raise SystemExit(run_command(main, Config, experiment=EXPERIMENT, description=__doc__))

@@ -1,0 +1,143 @@
+"""Measures how well a DeepPointMap model registers the scans of drives with known poses, beside KISS-Matcher.
+
+    python -m experiments.dpm_evaluate path/to/drive another/drive --weights model.safetensors
+    python -m experiments.dpm_evaluate town                             towns that no training has seen
+    python -m experiments.dpm_evaluate --resume                         go on where the last run stopped
+
+A path is any folder of scans with poses (KITTI, KITTI-360, MulRan, plain ...). Random pairs of scans, 2 to 10 m and 10
+to 20 m apart and turned by any yaw, are registered; a registration within 2 m and 5 degrees is right. Results go to
+results/dpm_evaluate/<time>/: table.md, metrics.json, reliability.png, failures.png (the worst pairs from above). The
+extra `kiss` adds KISS-Matcher on the same pairs.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import numpy as np
+from tqdm import tqdm
+from tyro.conf import FlagCreatePairsOff, Positional, arg
+
+from experiments._command import StopFlag, check_least, run_command
+from experiments._result_files import do_row
+from experiments._run_folder import RunFolder, RunOptions, open_run_folder, recording, write_metrics
+
+if TYPE_CHECKING:
+    from dpmjax.io import LidarSequence
+
+EXPERIMENT = "dpm_evaluate"
+# No training, selection or calibration uses these towns.
+FIRST_TOWN = 5_000_000
+NUM_SHOWN = 4
+TOWN_LENGTH_M = 400.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Config(RunOptions):
+    """Options of the run."""
+
+    paths: Annotated[Positional[tuple[str, ...]], arg(metavar="town|PATH ...")] = ("town",)
+    """Folders of scans with poses, or simulated towns."""
+    weights: Annotated[str, arg(metavar="NAME|FILE")] = "dpm_small"
+    """Name of a shipped model, or a .safetensors file."""
+    pairs: Annotated[int, arg(metavar="N")] = 30
+    """Pairs for each distance."""
+    num_towns: Annotated[int, arg(metavar="N")] = 3
+    """Number of towns, where town is among the paths."""
+    no_kiss: FlagCreatePairsOff[bool] = False
+    """Leave KISS-Matcher out."""
+
+    def __post_init__(self) -> None:
+        """Checks ranges."""
+        check_least(self, pairs=1, num_towns=1, seed=0)
+        if not self.paths:
+            raise ValueError("give at least one folder of scans, or town")
+
+
+def main(config: Config) -> list[dict[str, Any]]:
+    """Registers the pairs that are missing, and writes table, numbers and pictures."""
+    from dpmjax import load_model
+    from experiments._dpm_evaluation import (
+        evaluate_kiss,
+        evaluate_overlap,
+        evaluate_registrations,
+        kiss_matcher,
+        why_no_kiss,
+    )
+
+    model = load_model(config.weights)
+    drives = open_drives(config)
+    no_kiss = why_no_kiss() if not config.no_kiss else "left out by --no-kiss"
+    folder = open_run_folder(config, EXPERIMENT)
+    rows: list[dict[str, Any]] = []
+    with recording(folder), StopFlag() as stop, tqdm(unit=" pairs", dynamic_ncols=True) as bar:
+
+        def add(method: str, drive: LidarSequence, band: str, work: Any) -> None:
+            if not stop.is_requested:
+                bar.set_description(f"{drive.name}, {band}, {method}")
+                case = {"method": method, "sequence": drive.name, "band": band}
+                rows.append(do_row(folder.path, case, work, seed=config.seed))
+
+        for drive in drives:
+            for band in ("near", "middle", "far"):
+                pairs = (drive, band, config.pairs, config.seed)
+                add("DeepPointMap", drive, band, lambda p=pairs: evaluate_registrations(model, *p, bar))
+                if band != "far" and no_kiss is None:
+                    add("KISS-Matcher", drive, band, lambda p=pairs: evaluate_kiss(kiss_matcher, *p, bar))
+            add("overlap", drive, "all", lambda d=drive: evaluate_overlap(model, d, config.pairs, config.seed, bar))
+        text = write_results(folder, config, rows, no_kiss)
+        draw(folder, config, drives, rows)
+    print(text)
+    print(f"results in {folder.path}")
+    return rows
+
+
+def open_drives(config: Config) -> list[LidarSequence]:
+    """Opens the drives; a `ValueError` names one without poses or without pairs."""
+    from experiments._dpm_data import find_sources
+    from experiments._dpm_pairs import draw_pairs
+
+    towns = range(FIRST_TOWN, FIRST_TOWN + config.num_towns)
+    drives = [source.open() for source in find_sources(config.paths, towns, TOWN_LENGTH_M)]
+    for drive in drives:
+        if not len(draw_pairs(drive, "near", 1, 0)):
+            raise ValueError(f"{drive.name}: no two scans are 2 to 10 m apart; are the poses in metres?")
+    names = [drive.name for drive in drives]
+    if len(set(names)) < len(names):
+        raise ValueError(f"two drives have the same name ({', '.join(sorted(names))}); evaluate them one by one")
+    return drives
+
+
+def write_results(folder: RunFolder, config: Config, rows: Sequence[dict[str, Any]], no_kiss: str | None) -> str:
+    """Writes table.md and metrics.json; returns the table."""
+    from experiments._dpm_evaluation import calibration_numbers, table
+
+    numbers = {"weights": config.weights, "kiss_matcher": no_kiss or "run", **calibration_numbers(rows)}
+    note = write_metrics(folder, numbers, seed=config.seed, rows=rows)
+    text = table(rows)
+    if no_kiss is not None:
+        text += f"\n\nKISS-Matcher was not run: {no_kiss}."
+    (folder / "table.md").write_text(text + (f"\n\n{note}.\n" if note else "\n"), encoding="utf-8")
+    return text
+
+
+def draw(folder: RunFolder, config: Config, drives: Sequence[LidarSequence], rows: Sequence[dict[str, Any]]) -> None:
+    """Draws reliability.png and failures.png."""
+    from dpmjax import viz
+    from experiments._dpm_evaluation import worst_failures
+
+    mine = [row for row in rows if row["method"] == "DeepPointMap"]
+    confidence = np.concatenate([row["confidence"] for row in mine] or [np.zeros(0)])
+    is_right = np.concatenate([row["is_right"] for row in mine] or [np.zeros(0, bool)])
+    figure = viz.reliability_figure(confidence, is_right, title=f"{Path(config.weights).stem}, all pairs")
+    viz.save_figure(figure, folder / "reliability.png")
+    worst = worst_failures(drives, mine, NUM_SHOWN, config.seed)
+    if worst:
+        viz.save_figure(viz.registered_pairs_figure(worst), folder / "failures.png")
+
+
+if __name__ == "__main__":
+    raise SystemExit(run_command(main, Config, experiment=EXPERIMENT, description=__doc__))

@@ -1,0 +1,155 @@
+"""Confidence of a registration: the probability that it is right, by logistic regression on a few features.
+
+Platt (1999): a score becomes a probability by a logistic function that is fitted on held-out examples. It is fitted by
+`python -m experiments.dpm_calibrate` and stored in the configuration of the model.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import jax
+import numpy as np
+from jaxtyping import Bool, Float
+from scipy.optimize import minimize
+from scipy.special import expit
+
+from dpmjax.types import Registration, Verification
+
+CLOUD_FEATURES = ("support", "mean_score", "rmse_m", "support_gap")
+SCAN_FEATURES = (*CLOUD_FEATURES, "visible_share", "matched_share", "contradicted_share", "score_gap")
+MAX_RMSE_M = 5.0
+RIDGE = 1e-3
+
+
+@dataclass(frozen=True)
+class LogisticModel:
+    """Probability 1 / (1 + exp(-(weights . features + bias))).
+
+    Attributes:
+        features: names of the features.
+        weights: one for each.
+        bias: the constant.
+    """
+
+    features: tuple[str, ...]
+    weights: tuple[float, ...]
+    bias: float
+
+    def __post_init__(self) -> None:
+        if len(self.features) != len(self.weights):
+            raise ValueError(f"weights: expected {len(self.features)}, one for each feature, got {len(self.weights)}")
+        if self.features not in (CLOUD_FEATURES, SCAN_FEATURES):
+            raise ValueError(f"features: expected those that this version computes, got {', '.join(self.features)}")
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """Logistic models of P(right within 2 m and 5 degrees).
+
+    Attributes:
+        of_clouds: of registrations of descriptor clouds.
+        of_scans: of registrations that the scans have verified.
+    """
+
+    of_clouds: LogisticModel
+    of_scans: LogisticModel
+
+
+class Evidence(NamedTuple):
+    """What the confidence rests on.
+
+    Attributes:
+        of_clouds: `CLOUD_FEATURES`.
+        of_scans: `SCAN_FEATURES`; None without scans.
+    """
+
+    of_clouds: Float[np.ndarray, " f"]
+    of_scans: Float[np.ndarray, " g"] | None
+
+
+def gather_evidence(hypotheses: Registration, row: int, verification: Verification | None) -> Evidence:
+    """Gathers the features of one hypothesis.
+
+    Args:
+        hypotheses: all hypotheses of a pair, with a leading axis.
+        row: the one that was chosen.
+        verification: its verification; None without scans.
+
+    Returns:
+        The features.
+    """
+    support = np.asarray(hypotheses.support, np.float64)
+    second = np.delete(support, row).max(initial=0.0)
+    rmse_m = min(float(hypotheses.rmse_m[row]), MAX_RMSE_M)
+    of_clouds = np.array([support[row], float(hypotheses.mean_score[row]), rmse_m, support[row] - second])
+    if verification is None:
+        return Evidence(of_clouds, None)
+    shares = (verification.visible_share, verification.matched_share, verification.contradicted_share, verification.gap)
+    return Evidence(of_clouds, np.concatenate([of_clouds, shares]))
+
+
+def probability(model: LogisticModel, features: Float[np.ndarray, "*n f"]) -> Float[np.ndarray, "*n"]:
+    """Computes the probability that a registration is right.
+
+    Args:
+        model: fitted weights.
+        features: in the order of `model.features`.
+
+    Returns:
+        In [0, 1].
+    """
+    return np.asarray(expit(np.asarray(features, np.float64) @ np.asarray(model.weights) + model.bias))
+
+
+def fit_logistic(
+    names: tuple[str, ...], features: Float[np.ndarray, "n f"], is_right: Bool[np.ndarray, " n"]
+) -> LogisticModel:
+    """Fits a logistic model by maximum likelihood, with a small ridge on standardised weights.
+
+    Args:
+        names: names of the features.
+        features: of held-out registrations.
+        is_right: which of them are right.
+
+    Returns:
+        The model.
+
+    Raises:
+        ValueError: if all are right, or none.
+    """
+    if is_right.all() or not is_right.any():
+        raise ValueError(f"is_right: expected right and wrong registrations, got {is_right.sum()} of {len(is_right)}")
+    mean, scale = features.mean(axis=0), np.maximum(features.std(axis=0), 1e-9)
+    standard = np.column_stack([(features - mean) / scale, np.ones(len(features))])
+    sign = np.where(is_right, 1.0, -1.0)
+
+    def loss(weights: Float[np.ndarray, " w"]) -> tuple[float, Float[np.ndarray, " w"]]:
+        margins = sign * (standard @ weights)
+        slope = -sign * expit(-margins) / len(sign)
+        ridge = RIDGE * np.append(weights[:-1], 0.0)
+        return float(np.logaddexp(0, -margins).mean() + ridge @ weights / 2), standard.T @ slope + ridge
+
+    found = minimize(loss, np.zeros(standard.shape[1]), jac=True, method="L-BFGS-B").x
+    weights = found[:-1] / scale
+    return LogisticModel(names, tuple(map(float, weights)), float(found[-1] - weights @ mean))
+
+
+def with_confidence(match: Registration, evidence: Evidence, calibration: Calibration | None) -> Registration:
+    """Sets the confidence of a registration to the calibrated probability.
+
+    Args:
+        match: a registration.
+        evidence: its features.
+        calibration: None leaves the mean score.
+
+    Returns:
+        The registration.
+    """
+    if calibration is None or int(match.num_inliers) == 0:
+        return match
+    features, model = evidence.of_scans, calibration.of_scans
+    if features is None:
+        features, model = evidence.of_clouds, calibration.of_clouds
+    return replace(match, confidence=jax.numpy.float32(probability(model, features)))

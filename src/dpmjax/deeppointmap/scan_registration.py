@@ -1,0 +1,292 @@
+"""Registration of scans and maps: hypotheses from descriptors, verified by the scans; and whether two overlap."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import replace
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Float
+
+from dpmjax.deeppointmap.confidence import gather_evidence, with_confidence
+from dpmjax.deeppointmap.encoding import encode, pyramid_of_scan
+from dpmjax.deeppointmap.matching import MatchConfig, match_hypotheses
+from dpmjax.deeppointmap.model import (
+    Model,
+    correlate,
+    encode_pyramid,
+    overlap_probability,
+    predict_offsets,
+    similarity_features,
+)
+from dpmjax.deeppointmap.verification import (
+    MeasuredScan,
+    VerificationConfig,
+    VerifiedMotion,
+    choose_motion,
+    measure_scan,
+    refine_motion,
+)
+from dpmjax.geometry.bearing import directions_of
+from dpmjax.types import AnyArray, DescriptorCloud, PointCloud, Registration
+
+NUM_THREADS = 2
+
+
+class PreparedScan(NamedTuple):
+    """A scan that is ready for any number of registrations.
+
+    Attributes:
+        descriptors: of the scan, or of a map in its frame.
+        measured: surface and free space of the scan.
+    """
+
+    descriptors: DescriptorCloud
+    measured: MeasuredScan
+
+
+RawScan = PointCloud | Float[AnyArray, "_n 3"]
+"""Points in metres, in the frame of the lidar."""
+
+ScanOrCloud = DescriptorCloud | PreparedScan | RawScan
+"""A raw scan; or the same prepared; or descriptors of a scan or of a map."""
+
+
+def prepare_scan(model: Model, points: RawScan) -> PreparedScan:
+    """Encodes a raw scan and prepares the verification by its points, so that `register` need not do it again.
+
+    A `ValueError` says if the points are no real numbers (n, 3).
+
+    Args:
+        model: encoder and configuration.
+        points: (n, 3), metres, in the frame of the lidar; points that are not finite are dropped.
+
+    Returns:
+        Descriptors, surface and free space.
+    """
+    return prepare_scans(model, [points])[0]
+
+
+def prepare_scans(model: Model, scans: Sequence[RawScan]) -> list[PreparedScan]:
+    """Prepares scans one after the other; threads measure their surfaces while JAX encodes.
+
+    A `ValueError` says if the points of a scan are no real numbers (n, 3).
+
+    Args:
+        model: encoder and configuration.
+        scans: points in metres, each in the frame of its lidar.
+
+    Returns:
+        The prepared scans.
+    """
+    # Threads run NumPy only: compiled programs wait for threads of JAX, and may wait for each other.
+    with ThreadPoolExecutor(NUM_THREADS) as pool:
+        clouds, measured = [], []
+        for points in scans:
+            pyramid = pyramid_of_scan(points, model.config)
+            measured.append(pool.submit(_measured, points, model.config.verification))
+            clouds.append(encode_pyramid(model, pyramid))
+        return [PreparedScan(cloud, future.result()) for cloud, future in zip(clouds, measured, strict=True)]
+
+
+def register(
+    model: Model,
+    source: ScanOrCloud,
+    target: ScanOrCloud,
+    *,
+    config: MatchConfig | None = None,
+    refine: bool = False,
+) -> Registration:
+    """Registers two scans or maps without a first guess (DeepPointMap section 3.2).
+
+    Where both are scans, the best distinct motions of the descriptors are verified by the scans themselves: points
+    must meet surfaces and leave free space free. The motion under which the scans agree best is taken.
+
+    Args:
+        model: encoder and decoder.
+        source: a raw scan (n, 3) in metres, a scan from `prepare_scan`, or a descriptor cloud.
+        target: the same; one may be a scan and the other a map.
+        config: choice of pairs and inliers; None takes that of the model.
+        refine: whether to end with a fine point-to-plane alignment of the scans. Without it, the motion of two scans is
+            that of the short alignment that verified it, and any other that of the descriptors.
+
+    Returns:
+        `T_target_source`, `confidence`, `rmse_m` and the pairs. The confidence is the probability that the motion is
+        right within 2 m and 5 degrees if the model is calibrated (`model.config.calibration`), else the mean score of
+        the pairs, which is no probability. Failure is data: without any pair the motion is the identity and the
+        confidence 0; with fewer than three distinct pairs `rmse_m` is infinite.
+
+    Raises:
+        ValueError: if the points are no real numbers (n, 3), if features have another width than the model, or if
+            `refine` is asked for without two scans.
+    """
+    return register_each(model, [(source, target)], config=config, refine=refine)[0]
+
+
+def register_each(
+    model: Model,
+    pairs: Sequence[tuple[ScanOrCloud, ScanOrCloud]],
+    *,
+    config: MatchConfig | None = None,
+    refine: bool = False,
+) -> list[Registration]:
+    """Registers pairs as `register` does; threads verify one pair while JAX matches the next.
+
+    Args:
+        model: encoder and decoder.
+        pairs: source and target of each; a scan that is in several pairs is prepared once.
+        config: see `register`.
+        refine: see `register`.
+
+    Returns:
+        One registration for each pair.
+
+    Raises:
+        ValueError: as `register` says.
+    """
+    if refine and any(isinstance(scan, DescriptorCloud) for pair in pairs for scan in pair):
+        raise ValueError("refine: expected two scans, raw or from prepare_scan, got descriptors without points")
+    prepared = _prepared(model, pairs)
+    matching, verification = config or model.config.matching, model.config.verification
+    with ThreadPoolExecutor(NUM_THREADS) as pool:
+        started = []
+        for pair in pairs:
+            source, target = (prepared[id(scan)] for scan in pair)
+            hypotheses = match_clouds(model, _descriptors(source), _descriptors(target), config=matching)
+            motions: Future[_Motions] | None = None
+            if isinstance(source, PreparedScan) and isinstance(target, PreparedScan):
+                scans = source.measured, target.measured
+                motions = pool.submit(_verified, *scans, hypotheses, verification, refine=refine)
+            started.append((hypotheses, motions))
+        return [
+            _finished(model, hypotheses, None if motions is None else motions.result())
+            for hypotheses, motions in started
+        ]
+
+
+def match_clouds(
+    model: Model, source: DescriptorCloud, target: DescriptorCloud, *, config: MatchConfig
+) -> Registration:
+    """Correlates two descriptor clouds and estimates the best distinct motions between them.
+
+    Args:
+        model: encoder and decoder.
+        source: uncorrelated descriptors.
+        target: the same.
+        config: choice of pairs, inliers and hypotheses.
+
+    Returns:
+        All hypotheses, with a leading axis, as arrays of NumPy on the host.
+    """
+    return jax.device_get(trace_match(model, source, target, config=config))
+
+
+def overlap(model: Model, source: ScanOrCloud, target: ScanOrCloud) -> Float[Array, ""]:
+    """Predicts the probability that two scans or maps overlap: less than 20 m apart (DeepPointMap section 3.2).
+
+    A `ValueError` says if the points are no real numbers (n, 3), or if features have another width than the model.
+
+    Args:
+        model: encoder and decoder.
+        source: a raw scan (n, 3) in metres, or a descriptor cloud.
+        target: the same; the order matters a little.
+
+    Returns:
+        The probability; 0 where a scan is empty or a feature is not finite.
+    """
+    return overlap_probability(model, _as_cloud(model, source), _as_cloud(model, target))
+
+
+def distinct_motions(hypotheses: Registration) -> Float[np.ndarray, "h 4 4"]:
+    """Returns the motions of the hypotheses that any pair supports; at least one.
+
+    Args:
+        hypotheses: from `match_clouds`.
+
+    Returns:
+        T_target_source in float64, best first.
+    """
+    num_motions = max(1, int((hypotheses.support > 0).sum()))
+    return np.asarray(hypotheses.T_target_source[:num_motions], np.float64)
+
+
+class _Motions(NamedTuple):
+    # The confidence rests on the chosen motion, with and without a refinement.
+    chosen: VerifiedMotion
+    final: VerifiedMotion
+
+
+def _measured(points: RawScan, config: VerificationConfig) -> MeasuredScan:
+    array = np.asarray(points.points)[np.asarray(points.mask)] if isinstance(points, PointCloud) else np.asarray(points)
+    return measure_scan(array, config)
+
+
+def _prepared(
+    model: Model, pairs: Sequence[tuple[ScanOrCloud, ScanOrCloud]]
+) -> dict[int, DescriptorCloud | PreparedScan]:
+    # By identity; each scan once. Where the other side is a descriptor cloud, the surface is measured in vain.
+    scans = {id(scan): scan for pair in pairs for scan in pair}
+    ready = {key: scan for key, scan in scans.items() if isinstance(scan, DescriptorCloud | PreparedScan)}
+    raw = {key: scan for key, scan in scans.items() if not isinstance(scan, DescriptorCloud | PreparedScan)}
+    return {**ready, **dict(zip(raw, prepare_scans(model, list(raw.values())), strict=True))}
+
+
+def _verified(
+    source: MeasuredScan, target: MeasuredScan, hypotheses: Registration, config: VerificationConfig, *, refine: bool
+) -> _Motions:
+    chosen = choose_motion(source, target, distinct_motions(hypotheses), config)
+    return _Motions(chosen, refine_motion(source, target, chosen, config) if refine else chosen)
+
+
+def _finished(model: Model, hypotheses: Registration, motions: _Motions | None) -> Registration:
+    row = 0 if motions is None else motions.chosen.row
+    evidence = gather_evidence(hypotheses, row, None if motions is None else motions.chosen.verification)
+    match = jax.tree.map(lambda leaf: jnp.asarray(leaf[row]), hypotheses)
+    if motions is not None:
+        T = jnp.asarray(motions.final.T_target_source, match.T_target_source.dtype)
+        match = replace(match, T_target_source=T, verification=motions.final.verification)
+    return with_confidence(match, evidence, model.config.calibration)
+
+
+def _descriptors(scan: DescriptorCloud | PreparedScan) -> DescriptorCloud:
+    return scan.descriptors if isinstance(scan, PreparedScan) else scan
+
+
+def _as_cloud(model: Model, scan: ScanOrCloud) -> DescriptorCloud:
+    return _descriptors(scan) if isinstance(scan, DescriptorCloud | PreparedScan) else encode(model, scan)
+
+
+@functools.partial(jax.jit, static_argnames="config")
+def trace_match(model: Model, source: DescriptorCloud, target: DescriptorCloud, *, config: MatchConfig) -> Registration:
+    """Does the work of `match_clouds`; for use in compiled programs.
+
+    Args:
+        model: encoder and decoder.
+        source: uncorrelated descriptors.
+        target: the same.
+        config: choice of pairs, inliers and hypotheses.
+
+    Returns:
+        All hypotheses, with a leading axis.
+    """
+    source, target = correlate(model, source, target)
+    directions = [_unit(similarity_features(model, cloud)) for cloud in (source, target)]
+    similarity = jnp.matmul(directions[0], directions[1].T, precision=lax.Precision.HIGHEST)
+
+    def offsets(source_rows: Array, target_rows: Array) -> tuple[Array, Array]:
+        a, b = source.features[source_rows], target.features[target_rows]
+        of_source, of_target = directions_of(source)[source_rows], directions_of(target)[target_rows]
+        return predict_offsets(model, a, b, of_source), predict_offsets(model, b, a, of_target)
+
+    return match_hypotheses(source, target, similarity, offsets, config=config)
+
+
+def _unit(features: Float[Array, "m c"]) -> Float[Array, "m c"]:
+    squared = jnp.sum(features.astype(jnp.float32) ** 2, axis=1, keepdims=True)
+    return features / jnp.sqrt(jnp.where(squared > 0, squared, 1))

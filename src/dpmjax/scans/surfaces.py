@@ -1,0 +1,120 @@
+"""The surface that a lidar scan has measured, on the host: thinned points, their normals, and a tree to search them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int
+from scipy.spatial import cKDTree
+
+from dpmjax.checks import require_count, require_positive_fields
+from dpmjax.scans.preprocess import first_of_each_voxel
+
+MIN_NEIGHBOURS = 4
+"""A normal needs this many neighbours, the point itself among them."""
+
+MIN_FLATNESS = 0.1
+"""Less flat neighbourhoods are no part of a surface: foliage, wires, edges."""
+
+
+@dataclass(frozen=True)
+class SurfaceConfig:
+    """Range and density of the points, and neighbourhoods of the normals.
+
+    Attributes:
+        min_range_m: nearer points belong to the vehicle and are dropped.
+        max_range_m: farther points are too sparse and are dropped.
+        voxel_size_m: the first point of each voxel is kept.
+        num_neighbours: number of neighbours of a normal, the point itself among them.
+        neighbour_radius_m: neighbours farther away do not count.
+    """
+
+    min_range_m: float = 1.0
+    max_range_m: float = 80.0
+    voxel_size_m: float = 0.3
+    num_neighbours: int = 12
+    neighbour_radius_m: float = 1.5
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.min_range_m < self.max_range_m:
+            raise ValueError(f"min_range_m: expected from 0 to below {self.max_range_m}, got {self.min_range_m}")
+        require_positive_fields(self, "voxel_size_m", "neighbour_radius_m")
+        require_count("num_neighbours", self.num_neighbours)
+
+
+class Surface(NamedTuple):
+    """The surface of a scan.
+
+    Attributes:
+        points: (n, 3) float64, metres, in the frame of the lidar.
+        normals: (n, 3) unit normals, either side; any where `flatness` is 0.
+        flatness: (n,) in [0, 1], how much the neighbourhood is a plane: (l2 - l1) / l3 of the eigenvalues of its
+            covariance, smallest first; 0 where there are too few neighbours.
+        samples: rows of flat points in random order, those of the three main directions of normals in turn, so that
+            the first few tell as much about each direction (normal-space sampling, Rusinkiewicz and Levoy 2001).
+        tree: a tree of the points.
+    """
+
+    points: Float[np.ndarray, "n 3"]
+    normals: Float[np.ndarray, "n 3"]
+    flatness: Float[np.ndarray, " n"]
+    samples: Int[np.ndarray, " s"]
+    tree: cKDTree
+
+
+def scan_surface(points: Float[np.ndarray, "n 3"], config: SurfaceConfig = SurfaceConfig()) -> Surface:
+    """Thins a scan and estimates its normals, ten times faster on a CPU than `estimate_normals`.
+
+    Args:
+        points: metres, in the frame of the lidar; points that are not finite are dropped.
+        config: range, density and neighbourhoods.
+
+    Returns:
+        The surface; its points are in the order of the scan. It is empty where no point is in range.
+
+    Raises:
+        ValueError: if the shape is not (n, 3).
+    """
+    points = np.asarray(points)
+    if points.ndim != 2 or points.shape[1] != 3:
+        raise ValueError(f"points: expected shape (n, 3), got {points.shape}")
+    with np.errstate(invalid="ignore", over="ignore"):
+        squared = np.sum(points.astype(np.float64) ** 2, axis=1)
+        is_within = (squared >= config.min_range_m**2) & (squared <= config.max_range_m**2)
+    points = points.take(np.flatnonzero(is_within), axis=0)
+    points = points[first_of_each_voxel(points, config.voxel_size_m)].astype(np.float64)
+    tree = cKDTree(points, leafsize=16, balanced_tree=False, compact_nodes=False)
+    normals, flatness = _normals(points, tree, config)
+    return Surface(points, normals, flatness, _samples(normals, flatness), tree)
+
+
+def _normals(
+    points: Float[np.ndarray, "n 3"], tree: cKDTree, config: SurfaceConfig
+) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, " n"]]:
+    num_neighbours = min(config.num_neighbours, len(points))
+    if num_neighbours < MIN_NEIGHBOURS:
+        return np.zeros((len(points), 3)), np.zeros(len(points))
+    order = tree.indices  # queries in the order of the tree find what they need in the cache
+    distances, rows = map(np.asarray, tree.query(points[order], num_neighbours))
+    is_near = distances <= config.neighbour_radius_m
+    counts = is_near.sum(axis=1)[:, None]
+    apart = np.where(is_near[..., None], points[rows] - points[order, None], 0)
+    centred = np.where(is_near[..., None], apart - (apart.sum(axis=1) / counts)[:, None], 0)
+    spread, axes = np.linalg.eigh(np.matmul(centred.transpose(0, 2, 1), centred) / counts[..., None])
+    flatness = np.clip((spread[:, 1] - spread[:, 0]) / np.maximum(spread[:, 2], np.finfo(float).tiny), 0, 1)
+    found_normals, found_flatness = np.empty_like(points), np.empty(len(points))
+    found_normals[order] = axes[:, :, 0]
+    found_flatness[order] = np.where(counts[:, 0] >= MIN_NEIGHBOURS, flatness, 0)
+    return found_normals, found_flatness
+
+
+def _samples(normals: Float[np.ndarray, "n 3"], flatness: Float[np.ndarray, " n"]) -> Int[np.ndarray, " s"]:
+    rows = np.random.default_rng(0).permutation(np.flatnonzero(flatness > MIN_FLATNESS))
+    direction = np.argmax(np.abs(normals[rows]), axis=1)
+    rank = np.zeros(len(rows), np.int64)
+    for axis in range(3):
+        is_along = direction == axis
+        rank[is_along] = np.arange(is_along.sum())
+    return rows[np.argsort(rank, kind="stable")]

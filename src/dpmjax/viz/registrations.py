@@ -1,0 +1,94 @@
+"""Pictures of registrations: how far a confidence can be trusted, and pairs of scans under wrong and true motions."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from dpmjax.viz.figures import ACCENT, FRAME, INK, MUTED, new_figure, style_axes
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+NUM_BINS = 10
+SOURCE = "#2e6f9e"
+
+
+class RegisteredPair(NamedTuple):
+    """Two scans and the motions between them.
+
+    Attributes:
+        title: title of the row.
+        source: (n, 3) points, metres.
+        target: (m, 3) points, metres.
+        T_found: (4, 4) target from source, as it was found.
+        T_true: the true one.
+    """
+
+    title: str
+    source: NDArray[np.float32]
+    target: NDArray[np.float32]
+    T_found: NDArray[np.float64]
+    T_true: NDArray[np.float64]
+
+
+def reliability_figure(confidence: ArrayLike, is_right: ArrayLike, *, title: str) -> Figure:
+    """Draws the share of right registrations against their confidence, in ten bins; calibrated ones lie on the line.
+
+    Args:
+        confidence: (n,) in [0, 1].
+        is_right: (n,) which registrations are right.
+        title: title of the picture.
+
+    Returns:
+        The figure.
+    """
+    confidence, right = np.asarray(confidence, float), np.asarray(is_right, bool)
+    bins = np.minimum((confidence * NUM_BINS).astype(int), NUM_BINS - 1)
+    figure = new_figure(4.6, 4.6)
+    axes = figure.subplots()
+    style_axes(axes)
+    axes.plot([0, 1], [0, 1], color=MUTED, lw=1, ls="--")
+    used = [number for number in range(NUM_BINS) if np.any(bins == number)]
+    x = [confidence[bins == number].mean() for number in used]
+    y = [right[bins == number].mean() for number in used]
+    axes.plot(x, y, "o-", color=ACCENT, lw=1.4, ms=4)
+    for number, left, up in zip(used, x, y, strict=True):
+        count = int(np.sum(bins == number))
+        axes.annotate(str(count), (left, up), xytext=(5, -10), textcoords="offset points", fontsize=7, color=MUTED)
+    brier = float(np.mean((confidence - right) ** 2)) if len(right) else float("nan")
+    axes.set_title(f"{title}\n{len(right)} pairs, Brier score {brier:.3f}", fontsize=10, color=INK)
+    axes.set_xlabel("confidence", color=INK)
+    axes.set_ylabel("share of right registrations", color=INK)
+    figure.tight_layout()
+    return figure
+
+
+def registered_pairs_figure(pairs: Sequence[RegisteredPair]) -> Figure:
+    """Draws pairs of scans from above: on the left under the motion that was found, on the right under the true one.
+
+    Args:
+        pairs: one row each; at least one.
+
+    Returns:
+        The figure.
+    """
+    figure = new_figure(9.0, 4.2 * len(pairs))
+    grid = figure.subplots(len(pairs), 2, squeeze=False)
+    for row, pair in zip(grid, pairs, strict=True):
+        for axes, T, label in zip(row, (pair.T_found, pair.T_true), ("found", "true"), strict=True):
+            moved = pair.source @ T[:3, :3].T + T[:3, 3]
+            axes.plot(pair.target[:, 0], pair.target[:, 1], ",", color=MUTED, alpha=0.6)
+            axes.plot(moved[:, 0], moved[:, 1], ",", color=SOURCE, alpha=0.6)
+            axes.plot([0, T[0, 3]], [0, T[1, 3]], "o-", color=ACCENT, ms=4, lw=1)
+            axes.set_title(f"{pair.title}, {label}", fontsize=9, color=INK)
+            axes.set_aspect("equal")
+            axes.set_xticks([])
+            axes.set_yticks([])
+            for spine in axes.spines.values():
+                spine.set_color(FRAME)
+    figure.tight_layout()
+    return figure

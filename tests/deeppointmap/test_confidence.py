@@ -1,0 +1,94 @@
+from __future__ import annotations
+
+import dataclasses
+import json
+
+import jax
+import numpy as np
+import pytest
+
+import dpmjax
+from dpmjax.deeppointmap.confidence import (
+    CLOUD_FEATURES,
+    SCAN_FEATURES,
+    Calibration,
+    LogisticModel,
+    fit_logistic,
+    probability,
+)
+from tests.deeppointmap import toy
+
+
+def examples(seed: int, num: int = 4000) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Features, labels drawn with known probabilities, and those probabilities."""
+    rng = np.random.default_rng(seed)
+    features = rng.normal(size=(num, 4)) * [1, 10, 0.1, 1] + [0, 5, 2, 0]
+    logits = 1.5 * features[:, 0] - 0.2 * (features[:, 1] - 5) + 6 * (features[:, 2] - 2) - 1
+    p = 1 / (1 + np.exp(-logits))
+    return features, rng.uniform(size=num) < p, p
+
+
+def test_fit_finds_the_probabilities_of_the_examples() -> None:
+    features, is_right, _ = examples(0)
+    model = fit_logistic(CLOUD_FEATURES, features, is_right)
+    other, _, p = examples(1)
+    np.testing.assert_allclose(probability(model, other), p, atol=0.07)
+
+
+def test_fit_is_calibrated_as_a_whole() -> None:
+    """At the optimum of the likelihood the mean probability is the share of right ones."""
+    features, is_right, _ = examples(2, 300)
+    assert probability(fit_logistic(CLOUD_FEATURES, features, is_right), features).mean() == pytest.approx(
+        is_right.mean(), abs=1e-3
+    )
+
+
+def test_separable_examples_have_a_finite_fit() -> None:
+    features = np.repeat(np.array([[0.0], [1.0]]), 20, axis=0) * np.ones(4)
+    model = fit_logistic(CLOUD_FEATURES, features, features[:, 0] > 0.5)
+    assert np.isfinite(model.weights).all()
+    assert probability(model, features[-1]) > 0.9 > 0.1 > probability(model, features[0])
+
+
+def test_examples_of_one_kind_are_refused() -> None:
+    with pytest.raises(ValueError, match="is_right: expected right and wrong"):
+        fit_logistic(CLOUD_FEATURES, np.ones((3, 4)), np.ones(3, bool))
+
+
+def test_features_of_another_version_are_refused() -> None:
+    with pytest.raises(ValueError, match="features"):
+        LogisticModel(("speed",), (1.0,), 0.0)
+    with pytest.raises(ValueError, match="weights: expected 4"):
+        LogisticModel(CLOUD_FEATURES, (1.0,), 0.0)
+
+
+@pytest.fixture(scope="module")
+def calibrated() -> dpmjax.Model:
+    model = dpmjax.init_model(jax.random.key(0), toy.MODEL)
+    calibration = Calibration(
+        LogisticModel(CLOUD_FEATURES, (0.0,) * 4, -1.0), LogisticModel(SCAN_FEATURES, (0.0,) * 8, 2.0)
+    )
+    return model.replace(config=dataclasses.replace(model.config, calibration=calibration))
+
+
+def test_calibration_decides_the_confidence(calibrated) -> None:
+    scans = [toy.drive().read_scan(index) for index in range(2)]
+    clouds = [dpmjax.encode(calibrated, scan) for scan in scans]
+    of_clouds, of_scans = dpmjax.register(calibrated, *clouds), dpmjax.register(calibrated, *scans)
+    assert float(of_clouds.confidence) == pytest.approx(1 / (1 + np.exp(1.0)))
+    assert float(of_scans.confidence) == pytest.approx(1 / (1 + np.exp(-2.0)))
+    assert of_clouds.verification is None
+    assert of_scans.verification is not None
+    assert 0 < float(of_clouds.mean_score) < 1
+
+
+def test_an_empty_scan_has_no_confidence(calibrated) -> None:
+    match = dpmjax.register(calibrated, np.zeros((0, 3), np.float32), toy.drive().read_scan(0))
+    assert match.confidence == 0
+    np.testing.assert_array_equal(match.T_target_source, np.eye(4))
+
+
+def test_calibration_is_stored_with_the_model(calibrated, tmp_path) -> None:
+    dpmjax.save_model(calibrated, tmp_path / "model.safetensors")
+    assert dpmjax.load_model(tmp_path / "model.safetensors").config == calibrated.config
+    assert json.dumps(dataclasses.asdict(calibrated.config))

@@ -1,0 +1,79 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from dpmjax.deeppointmap.verification import (
+    VerificationConfig,
+    VerifiedMotion,
+    choose_motion,
+    measure_scan,
+    refine_motion,
+    verify_motion,
+)
+from tests.scans.surface_scenes import motion, seen_from, street
+
+CONFIG = VerificationConfig()
+T_WORLD_A, T_WORLD_B = motion(5, (1, -2, 0), 1), motion(130, (-4, 3, 0))
+T_TRUE = np.linalg.inv(T_WORLD_B) @ T_WORLD_A
+
+
+@pytest.fixture(scope="module")
+def scans():
+    return tuple(measure_scan(seen_from(street(seed), T), CONFIG) for seed, T in enumerate((T_WORLD_A, T_WORLD_B)))
+
+
+def translation_error(T: np.ndarray) -> float:
+    return float(np.linalg.norm(T[:3, 3] - T_TRUE[:3, 3]))
+
+
+def test_the_true_motion_is_better_than_any_other(scans) -> None:
+    right = verify_motion(*scans, T_TRUE, CONFIG)
+    assert right.matched_share > 0.8
+    assert right.visible_share > 0.8
+    for yaw, translation in ((180, (0, 0, 0)), (0, (6, 0, 0)), (60, (0, 0, 0)), (0, (0, 0, 3))):
+        wrong = verify_motion(*scans, T_TRUE @ motion(yaw, translation), CONFIG)
+        assert wrong.score < right.score - 0.2
+
+
+def test_verification_of_a_scan_on_itself_is_perfect(scans) -> None:
+    found = verify_motion(scans[0], scans[0], np.eye(4), CONFIG)
+    assert found.matched_share == 1
+    assert found.contradicted_share == 0
+    assert found.visible_share == 1
+
+
+@pytest.mark.parametrize("row", [0, 3, 5])
+def test_the_right_hypothesis_is_chosen_whatever_its_rank(scans, row: int) -> None:
+    rng = np.random.default_rng(row)
+    hypotheses = np.stack([T_TRUE @ motion(rng.uniform(40, 320), tuple(rng.uniform(-9, 9, 3))) for _ in range(6)])
+    hypotheses[row] = T_TRUE @ motion(3, (1.0, -0.8, 0.1))
+    found = choose_motion(*scans, hypotheses, CONFIG)
+    assert found.row == row
+    assert translation_error(found.T_target_source) < 0.1
+    assert found.verification.gap > 0.2
+    assert found.verification.num_tried == (4 if row < 4 else 6)
+    refined = refine_motion(*scans, found, CONFIG)
+    assert translation_error(refined.T_target_source) < 0.02
+    assert refined.verification.gap == found.verification.gap
+
+
+def test_near_equal_hypotheses_do_not_compete(scans) -> None:
+    hypotheses = np.stack([T_TRUE @ motion(angle, (0, 0, 0)) for angle in (0, 1, -1, 2)])
+    found = choose_motion(*scans, hypotheses, CONFIG)
+    assert found.verification.gap == found.verification.score
+
+
+def test_empty_scans_leave_the_hypothesis(scans) -> None:
+    empty = measure_scan(np.zeros((0, 3)), CONFIG)
+    for pair in ((empty, scans[0]), (scans[0], empty), (empty, empty)):
+        found = choose_motion(*pair, T_TRUE[None], CONFIG)
+        np.testing.assert_allclose(found.T_target_source, T_TRUE)
+        assert found.verification.matched_share == 0
+        assert np.isfinite(found.verification).all()
+        assert isinstance(refine_motion(*pair, found, CONFIG), VerifiedMotion)
+
+
+def test_settings_out_of_range_are_named() -> None:
+    with pytest.raises(ValueError, match="num_samples"):
+        VerificationConfig(num_samples=0)

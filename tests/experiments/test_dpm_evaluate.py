@@ -1,0 +1,107 @@
+"""The commands that measure and calibrate a model, on a network that compiles in seconds."""
+
+from __future__ import annotations
+
+import jax
+import numpy as np
+import pytest
+
+import dpmjax
+from experiments import _dpm_evaluation, _dpm_pairs, _dpm_run, dpm_calibrate, dpm_evaluate
+from experiments._command import EXIT_BAD_INPUT, EXIT_OK, run_command
+from experiments._result_files import load_json
+from tests.deeppointmap import toy
+
+
+@pytest.fixture
+def weights(tmp_path):
+    path = tmp_path / "model.safetensors"
+    dpmjax.save_model(dpmjax.init_model(jax.random.key(0), toy.MODEL), path, card="toy")
+    return path
+
+
+def run(module, arguments) -> int:
+    arguments = list(map(str, arguments))
+    return run_command(
+        module.main, module.Config, experiment=module.EXPERIMENT, description=module.__doc__, args=arguments
+    )
+
+
+def test_evaluation_measures_every_sequence_and_resumes(weights, tmp_path, monkeypatch, capsys) -> None:
+    monkeypatch.setattr(_dpm_run, "town_drive", lambda seed, **_: toy.drive(seed))
+    monkeypatch.setattr(_dpm_evaluation, "why_no_kiss", lambda: "it is not installed")
+    arguments = ["town", "--weights", weights, "--pairs", 2, "--num-towns", 1, "-o", tmp_path / "out"]
+    assert run(dpm_evaluate, arguments) == EXIT_OK
+    printed = capsys.readouterr().out
+    assert "| toy 5000000 | 2-10 m | 2 |" in printed
+    assert "KISS-Matcher was not run: it is not installed." in printed
+    metrics = load_json(tmp_path / "out" / "metrics.json")
+    by_band = {row["band"]: row for row in metrics["rows"]}
+    assert set(by_band) == {"near", "middle", "far", "all"}
+    assert len(by_band["near"]["translation_errors_refined_m"]) == 2
+    assert 0 <= metrics["brier"] <= 1
+    assert 0 <= by_band["all"]["auc"] <= 1
+    for name in ("table.md", "reliability.png", "failures.png"):
+        assert (tmp_path / "out" / name).stat().st_size > 0
+    # All rows are there: nothing is registered again.
+    monkeypatch.setattr(_dpm_evaluation, "register_pair", None)
+    assert run(dpm_evaluate, ["--resume", "-o", tmp_path / "out"]) == EXIT_OK
+    assert load_json(tmp_path / "out" / "metrics.json")["rows"] == metrics["rows"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["nowhere", "--weights", "WEIGHTS"], "nowhere"),
+        (["town", "--weights", "no_such_model"], "no_such_model"),
+    ],
+)
+def test_bad_input_is_one_line(weights, tmp_path, capsys, arguments, message: str) -> None:
+    given = [str(weights) if argument == "WEIGHTS" else argument for argument in arguments]
+    assert run(dpm_evaluate, [*given, "-o", tmp_path / "out"]) == EXIT_BAD_INPUT
+    lines = capsys.readouterr().err.strip().splitlines()
+    assert len(lines) == 1
+    assert message in lines[0]
+    assert not (tmp_path / "out").exists()
+
+
+def test_calibration_is_stored_in_a_copy_of_the_model(weights, tmp_path, monkeypatch) -> None:
+    monkeypatch.setattr(_dpm_run, "town_drive", lambda seed, **_: toy.drive(seed))
+    rng = np.random.default_rng(0)
+
+    def found(model, pair):
+        """Registrations that are right as often as their features say."""
+        is_right = rng.uniform() < 0.5
+        T = pair.T_target_source if is_right else np.eye(4)
+        of_clouds = rng.normal(size=4) + is_right
+        motions = {"descriptors": T, "verified": T, "refined": T}
+        evidence = _dpm_pairs.Evidence(of_clouds, np.concatenate([of_clouds, rng.normal(size=4) + 2 * is_right]))
+        return _dpm_pairs.PairResult(motions, evidence, {})
+
+    monkeypatch.setattr(_dpm_pairs, "register_pair", found)
+    assert run(dpm_calibrate, [weights, "--towns", 3, "--pairs", 20, "-o", tmp_path / "out"]) == EXIT_OK
+    model = dpmjax.load_model(tmp_path / "out" / "model.safetensors")
+    assert model.config.calibration is not None
+    assert max(model.config.calibration.of_scans.weights[4:]) > 0
+    metrics = load_json(tmp_path / "out" / "metrics.json")
+    assert metrics["brier_of_scans"] < metrics["brier_of_clouds"] < metrics["brier_of_a_constant_of_clouds"]
+    assert "Confidence calibrated on 3 towns" in dpmjax.weights.read_card(tmp_path / "out" / "model.safetensors")
+
+
+def test_pairs_have_the_motion_of_their_poses() -> None:
+    """World points that both scans see coincide under the true motion, whatever the yaws."""
+    drive = toy.drive()
+    (pair,) = _dpm_pairs.read_pairs(drive, _dpm_pairs.draw_pairs(drive, "near", 1, seed=3), seed=3)
+    moved = pair.source @ pair.T_target_source[:3, :3].T + pair.T_target_source[:3, 3]
+    distances = np.linalg.norm(moved[:, None] - pair.target[None], axis=2).min(axis=1)
+    assert np.quantile(distances, 0.3) < 1e-3
+
+
+@pytest.mark.parametrize(("band", "low", "high"), [("near", 2, 10), ("middle", 10, 20), ("far", 60, np.inf)])
+def test_pairs_are_as_far_apart_as_their_band_says(band: str, low: float, high: float) -> None:
+    drive = toy.drive()
+    pairs = _dpm_pairs.draw_pairs(drive, band, 7, seed=0)
+    assert len(pairs) == 7
+    distances = np.linalg.norm(np.diff(drive.T_world_lidar[pairs, :3, 3], axis=1)[:, 0], axis=1)
+    assert ((distances >= low) & (distances <= high)).all()
+    np.testing.assert_array_equal(pairs, _dpm_pairs.draw_pairs(drive, band, 7, seed=0))

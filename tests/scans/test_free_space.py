@@ -1,0 +1,49 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from dpmjax.scans.free_space import RangeImageConfig, range_image, view_points
+
+
+def sphere(radius: float, num: int = 20000) -> np.ndarray:
+    directions = np.random.default_rng(0).normal(size=(num, 3))
+    return radius * directions / np.linalg.norm(directions, axis=1, keepdims=True)
+
+
+@pytest.mark.parametrize(
+    ("radius", "is_visible", "is_contradicted"), [(20.0, True, False), (10.0, True, True), (40.0, False, False)]
+)
+def test_points_before_on_and_behind_a_sphere(radius: float, is_visible: bool, is_contradicted: bool) -> None:
+    view = view_points(range_image(sphere(20.0)), sphere(radius, 500))
+    assert (view.is_visible == is_visible).all()
+    assert (view.is_contradicted == is_contradicted).all()
+
+
+def test_margin_grows_with_the_range() -> None:
+    config = RangeImageConfig(margin_m=1.0, margin_share=0.1)
+    image = range_image(sphere(30.0), config)
+    assert not view_points(image, sphere(27.5, 100), config).is_contradicted.any()
+    assert view_points(image, sphere(26.5, 100), config).is_contradicted.all()
+
+
+def test_nothing_is_known_where_nothing_was_measured() -> None:
+    ahead = sphere(20.0)
+    ahead = ahead[ahead[:, 0] > 10]
+    view = view_points(range_image(ahead), np.array([[-5.0, 0, 0], [5.0, 0, 0]]))
+    np.testing.assert_array_equal(view.is_visible, [False, True])
+    np.testing.assert_array_equal(view.is_contradicted, [False, True])
+    empty = view_points(range_image(np.zeros((0, 3))), ahead)
+    assert not empty.is_visible.any()
+    assert not empty.is_contradicted.any()
+
+
+def test_the_image_has_no_seam_behind_the_lidar() -> None:
+    """Azimuths just above -pi and just below pi are neighbours."""
+    wall = np.array([[-20.0, 0.05, 0.0]])
+    assert view_points(range_image(wall), np.array([[-5.0, -0.05, 0.0]])).is_contradicted.all()
+
+
+def test_settings_out_of_range_are_named() -> None:
+    with pytest.raises(ValueError, match="pixel_deg"):
+        RangeImageConfig(pixel_deg=0.0)

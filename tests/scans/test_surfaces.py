@@ -1,0 +1,101 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from dpmjax.geometry import estimate_normals
+from dpmjax.scans.surface_alignment import AlignmentConfig, AlignmentLevel, align_surfaces
+from dpmjax.scans.surfaces import SurfaceConfig, scan_surface
+from tests.scans.surface_scenes import motion, seen_from, street
+
+
+def test_normals_are_those_of_the_device() -> None:
+    points = street(0, 800)
+    surface = scan_surface(points, SurfaceConfig(voxel_size_m=0.01, neighbour_radius_m=100, num_neighbours=8))
+    expected = estimate_normals(surface.points.astype(np.float32), 8)
+    flat = (np.asarray(expected.flatness) > 0.05) & (surface.flatness > 0.05)
+    cosines = np.abs(np.sum(np.asarray(expected.normals) * surface.normals, axis=1))
+    assert flat.mean() > 0.5
+    np.testing.assert_allclose(cosines[flat], 1, atol=1e-2)
+    np.testing.assert_allclose(surface.flatness, expected.flatness, atol=1e-2)
+
+
+def test_points_are_thinned_and_within_range() -> None:
+    points = np.concatenate([street(1), [[0.1, 0, 0], [500, 0, 0], [np.nan, 0, 0]]])
+    surface = scan_surface(points, SurfaceConfig(voxel_size_m=1.0, max_range_m=20))
+    ranges = np.linalg.norm(surface.points, axis=1)
+    assert ((ranges >= 1) & (ranges <= 20)).all()
+    voxels = np.floor(surface.points).astype(int)
+    assert len(np.unique(voxels, axis=0)) == len(surface.points)
+
+
+def test_samples_tell_as_much_about_each_direction() -> None:
+    surface = scan_surface(street(2))
+    first = np.argmax(np.abs(surface.normals[surface.samples[:300]]), axis=1)
+    np.testing.assert_array_less(80, np.bincount(first, minlength=3))
+    assert len(np.unique(surface.samples)) == len(surface.samples)
+
+
+@pytest.mark.parametrize("num_points", [0, 1, 3])
+def test_surface_of_hardly_any_point_is_flat_nowhere(num_points: int) -> None:
+    surface = scan_surface(np.eye(3)[:num_points] * 5)
+    assert len(surface.points) == num_points
+    assert len(surface.samples) == 0
+    start = motion(10, (1, 0, 0))
+    found = align_surfaces(surface, surface, start)
+    np.testing.assert_array_equal(found.T_target_source, start)
+    assert np.isinf(found.rmse_m)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_two_samplings_of_a_street_are_aligned(seed: int) -> None:
+    """The oracle is the motion with which the scans were made."""
+    rng = np.random.default_rng(seed)
+    T_world_a, T_world_b = motion(5, (1, -2, 0.1), 1), motion(rng.uniform(-180, 180), (-4, 3, 0), -1)
+    a, b = seen_from(street(seed), T_world_a), seen_from(street(10 + seed), T_world_b)
+    T_b_a = np.linalg.inv(T_world_b) @ T_world_a
+    guess = T_b_a @ motion(rng.uniform(-4, 4), tuple(rng.uniform(-1, 1, 3)), 0.5)
+    found = align_surfaces(scan_surface(a), scan_surface(b), guess, num_threads=1)
+    difference = np.linalg.inv(T_b_a) @ found.T_target_source
+    assert np.linalg.norm(difference[:3, 3]) < 0.02
+    assert np.degrees(np.arccos(np.clip((np.trace(difference[:3, :3]) - 1) / 2, -1, 1))) < 0.1
+    assert found.rmse_m < 0.05
+
+
+def test_what_no_plane_holds_stays() -> None:
+    """On a plain, only height and tilt are fixed."""
+    rng = np.random.default_rng(0)
+    plain = [np.column_stack([rng.uniform(-20, 20, (3000, 2)), np.full(3000, -2.0)]) for _ in range(2)]
+    start = motion(3, (0.5, -0.4, 0.3))
+    found = align_surfaces(*map(scan_surface, plain), start, num_threads=1).T_target_source
+    assert abs(found[2, 3]) < 0.01
+    np.testing.assert_allclose(found[:2, 3], start[:2, 3], atol=0.05)
+
+
+def test_alignment_moves_with_the_frames() -> None:
+    a, b, move = street(4), street(5), motion(40, (3, -2, 0))
+    guess = motion(2, (0.5, 0.3, 0))
+    plain = align_surfaces(scan_surface(a), scan_surface(b), guess, num_threads=1).T_target_source
+    moved = align_surfaces(
+        scan_surface(a), scan_surface(seen_from(b, np.linalg.inv(move))), move @ guess, num_threads=1
+    ).T_target_source
+    np.testing.assert_allclose(moved, move @ plain, atol=0.02)
+
+
+@pytest.mark.parametrize(
+    ("make", "name"),
+    [
+        (lambda: SurfaceConfig(voxel_size_m=0.0), "voxel_size_m"),
+        (lambda: SurfaceConfig(min_range_m=90.0), "min_range_m"),
+        (lambda: AlignmentLevel(0.0, 10, 1), "radius_m"),
+        (lambda: AlignmentConfig(min_cosine=2.0), "min_cosine"),
+    ],
+)
+def test_settings_out_of_range_are_named(make, name: str) -> None:
+    with pytest.raises(ValueError, match=name):
+        make()
+
+
+def test_wrong_shape_is_named(as_user) -> None:
+    with pytest.raises(ValueError, match="^points: expected shape"):
+        scan_surface(np.zeros((4, 2)))
