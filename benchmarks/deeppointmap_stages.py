@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 import dpmjax
 from benchmarks.rows import Row, measure
 from dpmjax.deeppointmap import merge_clouds
-from dpmjax.deeppointmap.inference import pyramid_of_cloud
+from dpmjax.deeppointmap.encoding import pyramid_of_cloud
 from dpmjax.geometry import build_pyramid
 from dpmjax.io import open_lidar_sequence
 from dpmjax.scans import preprocess_scan, preprocess_scan_on_host

@@ -1,92 +1,86 @@
-"""The drives that a DeepPointMap training reads; the table, the progress bar and the checkpoints that it writes."""
+"""A DeepPointMap training: its evaluations, and the table, the progress bar and the checkpoints that it writes."""
 
 from __future__ import annotations
 
-import logging
 import math
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, NamedTuple, Self
 
 import jax
-from scipy.spatial import cKDTree
+import numpy as np
 from tqdm import tqdm
 
 from dpmjax.checkpoints import Checkpoints
-from dpmjax.deeppointmap import Model, SamplingConfig, ScanStore, TrainingConfig, TrainingHooks, init_training, train
+from dpmjax.deeppointmap import (
+    Model,
+    PairKind,
+    ScanStore,
+    TrainingConfig,
+    TrainingHooks,
+    draw_evaluation_pairs,
+    evaluate_registration,
+    finish,
+    init_training,
+    train,
+)
 from dpmjax.deeppointmap.curriculum import CurriculumStage
-from dpmjax.deeppointmap.inference import EvaluationPairs, evaluate_registration
-from dpmjax.deeppointmap.training_loop import StepRecord, Trained, TrainingProgress, begin_training
-from dpmjax.io import LidarSequence, list_lidar_sequences, open_lidar_sequence
-from dpmjax.simulation import HDL64E, DriveConfig, TownConfig, simulate_lidar_sequence
+from dpmjax.deeppointmap.evaluation import EvaluationPairs
+from dpmjax.deeppointmap.training import TrainingState
+from dpmjax.deeppointmap.training_loop import StepRecord, Trained, TrainingProgress, begin_training, stage_of
+from dpmjax.io import open_lidar_sequence
+from dpmjax.simulation import HDL32E, HDL64E, OS1_64
+from experiments._dpm_data import HELD_OUT_SEED, SELECTION_SEED, town_drive
 from experiments._result_files import HistoryFile, read_history
 from experiments._run_folder import CHECKPOINTS, HISTORY, RunFolder
 
-LOGGER = logging.getLogger("dpmjax.training")
-TOWN = "town"
-# Far from the seeds of training towns, which count up from the seed of the run.
-HELD_OUT_SEED = 1_000_000
 # Seconds between checkpoints; Ctrl-C and the end write one too.
-SAVE_EVERY_S = 60.0
-SHOWN = ("loss", "overlap_accuracy", "pairing", "offset", "top1_accuracy", "recall")
+SAVE_EVERY_S = 300.0
+VALIDATION_PAIRS = 60
+SELECTION_SCENES = (("suburb", HDL64E), ("canyon", OS1_64), ("country", HDL32E), ("campus", OS1_64))
+SHOWN = ("loss", "overlap_accuracy", "pairing", "offset", "top1_accuracy", "score")
 MEASURES = (*SHOWN, "coarse", "gradient_norm", "learning_rate")
-COLUMNS = ("step", "stage", "run_s", *MEASURES)
+KINDS = (PairKind(2.0, 10.0), PairKind(10.0, 20.0), PairKind(2.0, 10.0, 4), PairKind(10.0, 20.0, 4))
+"""Pairs that models are selected and reported by: scans and maps of four scans, near and far."""
+
+KIND_NAMES = ("recall", "recall_far", "recall_maps", "recall_maps_far")
+RECALLS = (*KIND_NAMES, "real_recall", "real_recall_far")
+COLUMNS = ("step", "stage", "run_s", *MEASURES, *RECALLS)
+BEGIN_DECAY = 1
+"""What a stop hook returns when the time for the constant learning rate is over; no signal that stops a run."""
 
 
-def town_drive(seed: int, *, length_m: float) -> LidarSequence:
-    """Returns a drive through a town: 64 beams, a third of the columns, a scan every two metres."""
-    return simulate_lidar_sequence(
-        seed,
-        TownConfig(route_length_m=length_m),
-        driving=DriveConfig(speed_m_s=8.0, rate_hz=4.0),
-        sensor=HDL64E.with_azimuths(600),
-    )
+class EvaluationSets(NamedTuple):
+    """Pairs of a run.
 
-
-def open_drives(data: Sequence[str], towns: Sequence[int], town_length_m: float) -> list[LidarSequence]:
-    """Returns the drives to train on.
-
-    Raises:
-        ValueError: if a path cannot be read or holds no useful drive.
+    Attributes:
+        selection: pairs of towns of their own, by which the best model is chosen.
+        real: pairs of each folder of real scans that are measured beside; they choose nothing.
+        held_out: pairs of another town, measured once at the end.
     """
-    drives: list[LidarSequence] = []
-    for entry in data:
-        if entry == TOWN and not Path(entry).exists():
-            drives += [town_drive(seed, length_m=town_length_m) for seed in towns]
-            continue
-        names: Sequence[str | None] = list_lidar_sequences(entry) or [None]
-        found = [open_lidar_sequence(entry, sequence=name) for name in names]
-        reasons = {drive.name: reason for drive in found if (reason := why_useless(drive)) is not None}
-        if len(reasons) == len(found):
-            raise ValueError("; ".join(f"{entry}: {reason}" for reason in dict.fromkeys(reasons.values())))
-        for name, reason in reasons.items():
-            LOGGER.warning("%s is left out: %s", name, reason)
-        drives += [drive for drive in found if drive.name not in reasons]
-    return drives
+
+    selection: tuple[EvaluationPairs, ...]
+    real: tuple[EvaluationPairs, ...]
+    held_out: EvaluationPairs
 
 
-def why_useless(drive: LidarSequence) -> str | None:
-    """Returns the reason why nothing can be learned from a drive; None where something can."""
-    limits = SamplingConfig()
-    if drive.T_world_lidar is None:
-        return "no poses; training needs a pose for each scan"
-    positions = drive.T_world_lidar[:, :3, 3]
-    tree = cKDTree(positions)
-    num_near, num_too_near = (tree.count_neighbors(tree, r) for r in (limits.max_distance_m, limits.min_distance_m))
-    if num_near == num_too_near:
-        found = f"{len(positions)} scans, no two of them {limits.min_distance_m} to {limits.max_distance_m} m apart"
-        return f"{found}; training needs such pairs (are the poses in metres?)"
-    reason = ""
-    for number in range(len(drive)):
-        try:
-            drive.read_scan(number)
-        except ValueError as error:
-            reason = reason or str(error)
-            continue
-        return None
-    return f"all {len(drive)} scans are bad; the first, {reason}"
+def draw_sets(
+    settings: TrainingConfig, *, selection_pairs: int, held_out_pairs: int, validate: Sequence[Path], length_m: float
+) -> EvaluationSets:
+    """Returns the pairs of a run."""
+    draw = partial(draw_evaluation_pairs, config=settings.model)
+    num = max(1, selection_pairs // (len(KINDS) * len(SELECTION_SCENES)))
+    towns = [
+        town_drive(SELECTION_SEED + number, length_m=min(length_m, 250.0), kind=kind, sensor=sensor)
+        for number, (kind, sensor) in enumerate(SELECTION_SCENES)
+    ]
+    real = tuple(draw(open_lidar_sequence(path), VALIDATION_PAIRS, kinds=KINDS[:2]) for path in validate)
+    selection = tuple(draw(town, num, kinds=KINDS, max_scans=64) for town in towns)
+    held_out = town_drive(HELD_OUT_SEED, length_m=length_m, kind="suburb", sensor=HDL64E)
+    return EvaluationSets(selection, real, draw(held_out, held_out_pairs, kinds=KINDS))
 
 
 class Records:
@@ -94,14 +88,14 @@ class Records:
 
     Attributes:
         folder: folder of the run.
-        pairs: held-out pairs.
+        sets: pairs of evaluations.
         untrained: the model before the first step.
         start: progress to start from: the latest checkpoint of a resumed run.
         earlier_s: run time of the steps before `start`.
     """
 
-    def __init__(self, folder: RunFolder, settings: TrainingConfig, pairs: EvaluationPairs, *, seed: int) -> None:
-        self.folder, self.pairs, self._settings = folder, pairs, settings
+    def __init__(self, folder: RunFolder, settings: TrainingConfig, sets: EvaluationSets, *, seed: int) -> None:
+        self.folder, self.sets, self._settings = folder, sets, settings
         self._checkpoints = Checkpoints(folder / CHECKPOINTS)
         self.start = begin_training(init_training(jax.random.key(seed), settings))
         self.untrained = Model(self.start.state.params, settings.model)
@@ -110,24 +104,35 @@ class Records:
         first = int(self.start.state.step)
         self._history = HistoryFile(folder / HISTORY, COLUMNS, keep_until=first if folder.is_resumed else None)
         self.earlier_s = max((float(row["run_s"]) for row in read_history(folder / HISTORY)), default=0.0)
-        self._bar = tqdm(total=settings.num_steps, initial=first, desc="train", unit=" steps", dynamic_ncols=True)
-        self._last_saved, self._recall = time.perf_counter(), math.nan
+        total = int(self.start.state.registration_end) + settings.overlap_steps
+        self._bar = tqdm(total=total, initial=first, desc="train", unit=" steps", dynamic_ncols=True)
+        self._last_saved, self._recalls = time.perf_counter(), dict.fromkeys(RECALLS, math.nan)
+        self.run_s = self.earlier_s
         self._seen: set[CurriculumStage | None] = set()
-        self._tell_compilation(first)
+        self._tell_compilation(self.start.state)
 
     def evaluate(self, model: Model) -> float:
-        """Returns the recall on the held-out pairs."""
-        return evaluate_registration(model, self.pairs).recall.recall
+        """Returns the mean recall on the selection pairs, and measures that on real pairs."""
+        found = [evaluate_registration(model, pairs) for pairs in self.sets.selection]
+        real = [evaluate_registration(model, pairs) for pairs in self.sets.real]
+        of_kinds = np.mean([[recall.recall for recall in evaluation.recalls] for evaluation in found], axis=0)
+        of_real = np.mean(
+            [[recall.recall for recall in evaluation.recalls] for evaluation in real] or [[math.nan] * 2], 0
+        )
+        self._recalls = dict(zip(RECALLS, (*of_kinds.tolist(), *of_real.tolist()), strict=True))
+        return float(np.mean(of_kinds))
 
     def on_report(self, record: StepRecord, progress: TrainingProgress) -> None:
         """Adds a row, updates the bar, and writes a checkpoint when it is time."""
-        self._recall = record.score if math.isfinite(record.score) else self._recall
-        measured = {name: f"{value:.7g}" for name, value in _values(record).items()}
-        run_s = round(self.earlier_s + record.speed.run_s, 3)
-        self._history.append(step=record.step, stage=_stage_name(record.stage), run_s=run_s, **measured)
-        self._bar.set_postfix_str(_summary(record, self._recall), refresh=False)
+        values = _values(record)
+        if math.isfinite(record.score):
+            values |= {name: value for name, value in self._recalls.items() if math.isfinite(value)}
+        measured = {name: f"{value:.7g}" for name, value in values.items()}
+        self.run_s = self.earlier_s + record.speed.run_s + record.speed.compile_s
+        self._history.append(step=record.step, stage=_stage_name(record.stage), run_s=round(self.run_s, 3), **measured)
+        self._bar.set_postfix_str(_summary(record, self._recalls["recall"]), refresh=False)
         self._bar.update(1)
-        self._tell_compilation(record.step)
+        self._tell_compilation(progress.state)
         if time.perf_counter() - self._last_saved > SAVE_EVERY_S:
             self.save(progress)
             self._last_saved = time.perf_counter()
@@ -136,9 +141,10 @@ class Records:
         """Writes a checkpoint."""
         self._checkpoints.save(int(progress.state.step), progress)
 
-    def _tell_compilation(self, done: int) -> None:
-        stage = self._settings.stage_at(done) if done < self._settings.num_steps else None
-        if done < self._settings.num_steps and stage not in self._seen:
+    def _tell_compilation(self, state: TrainingState) -> None:
+        is_done = int(state.step) >= int(state.registration_end) + self._settings.overlap_steps
+        stage = stage_of(state, self._settings)
+        if not is_done and stage not in self._seen:
             self._seen.add(stage)
             self._bar.set_postfix_str(f"compiling {_stage_name(stage)}")
 
@@ -151,16 +157,53 @@ class Records:
 
 
 def run_training(
-    records: Records | None, store: ScanStore, settings: TrainingConfig, hooks: TrainingHooks, *, seed: int
+    records: Records | None,
+    store: ScanStore,
+    settings: TrainingConfig,
+    hooks: TrainingHooks,
+    *,
+    seed: int,
+    plateau_s: float | None = None,
 ) -> Trained:
-    """Returns the result of training, after saving its last state; one process has records."""
+    """Returns the result of training, after saving its last state; one process has records.
+
+    After `plateau_s` seconds of steps, compilation and evaluation, those of earlier calls included, the decay of the
+    learning rate begins.
+    """
     if records is None:
-        return train(store, settings, seed=seed, hooks=hooks)
+        return train_with_decay(store, settings, hooks, seed=seed)
     with records:
         hooks = replace(hooks, evaluate=records.evaluate, on_report=records.on_report)
-        trained = train(store, settings, seed=seed, start=records.start, hooks=hooks)
+        if plateau_s is not None:
+            hooks = replace(hooks, stop=partial(_stop_or_decay, hooks.stop, records, plateau_s))
+        trained = train_with_decay(store, settings, hooks, seed=seed, start=records.start)
         records.save(trained.progress)
         return trained
+
+
+def train_with_decay(
+    store: ScanStore,
+    settings: TrainingConfig,
+    hooks: TrainingHooks,
+    *,
+    seed: int,
+    start: TrainingProgress | None = None,
+) -> Trained:
+    """Returns the result of training; where `hooks.stop` returns `BEGIN_DECAY`, the learning rate falls from there."""
+    trained = train(store, settings, seed=seed, start=start, hooks=hooks)
+    if trained.stopped_by != BEGIN_DECAY:
+        return trained
+    progress = replace(trained.progress, state=finish(trained.progress.state, settings))
+    hooks = replace(hooks, stop=lambda: _without_decay(hooks.stop()))
+    return train(store, settings, seed=seed, start=progress, hooks=hooks)
+
+
+def _stop_or_decay(stop: Callable[[], int], records: Records, plateau_s: float) -> int:
+    return stop() or (BEGIN_DECAY if records.run_s >= plateau_s else 0)
+
+
+def _without_decay(stopped_by: int) -> int:
+    return 0 if stopped_by == BEGIN_DECAY else stopped_by
 
 
 def _stage_name(stage: CurriculumStage | None) -> str:
@@ -168,7 +211,7 @@ def _stage_name(stage: CurriculumStage | None) -> str:
 
 
 def _values(record: StepRecord) -> dict[str, Any]:
-    values = {**record.report._asdict(), **record.report.terms._asdict(), "recall": record.score}
+    values = {**record.report._asdict(), **record.report.terms._asdict(), "score": record.score}
     return {name: float(values[name]) for name in MEASURES if math.isfinite(values[name])}
 
 

@@ -76,8 +76,8 @@ def main(config: Config) -> dict[str, Any]:
 
 def _town(config: Config, model: Any, town: int, bar: tqdm) -> dict[str, Any]:
     from dpmjax.metrics import registration_recall
+    from experiments._dpm_data import town_drive
     from experiments._dpm_pairs import BANDS, draw_pairs, read_pairs, register_pair
-    from experiments._dpm_run import town_drive
 
     drive = town_drive(town, length_m=config.town_length_m)
     found: dict[str, list[Any]] = {"of_clouds": [], "of_scans": [], "is_right_of_clouds": [], "is_right": []}

@@ -97,11 +97,11 @@ def main(config: Config) -> list[dict[str, Any]]:
 
 def open_drives(config: Config) -> list[LidarSequence]:
     """Opens the drives; a `ValueError` names one without poses or without pairs."""
+    from experiments._dpm_data import find_sources
     from experiments._dpm_pairs import draw_pairs
-    from experiments._dpm_run import open_drives as open_paths
 
     towns = range(FIRST_TOWN, FIRST_TOWN + config.num_towns)
-    drives = [drive for path in config.paths for drive in open_paths([path], towns, TOWN_LENGTH_M)]
+    drives = [source.open() for source in find_sources(config.paths, towns, TOWN_LENGTH_M)]
     for drive in drives:
         if not len(draw_pairs(drive, "near", 1, 0)):
             raise ValueError(f"{drive.name}: no two scans are 2 to 10 m apart; are the poses in metres?")

@@ -1,7 +1,8 @@
 """Trains the networks of DeepPointMap: descriptors of lidar scans, and how two clouds of them are registered.
 
     python -m experiments.dpm_train                                   tiny network, simulated towns, two cores
-    python -m experiments.dpm_train --preset small --num-towns 40     on one GPU
+    python -m experiments.dpm_train --preset small --num-towns 20 --hours 8   two cores, over night
+    python -m experiments.dpm_train --resume --finish                 end a longer run now: the learning rate falls
     python -m experiments.dpm_train --data kitti town --preset paper  drives from files, and towns
     python -m experiments.dpm_train --resume                          continue the latest run
     python -m experiments.dpm_train --coordinator host0:8476 --num-processes 2 --process-id 0     on two hosts, and
@@ -9,8 +10,9 @@
 
 Results go to results/dpm_train/<time>/ (latest links to the newest): model.safetensors for dpmjax.load_model,
 metrics.csv, metrics.json, checkpoints, and pictures: loss.png, matches.png. Recall is the share of pairs of a held-out
-town, 2 to 10 m apart and turned by any yaw, that are registered within 2 m and 5 degrees; the model is the one of the
-step with the best recall (metrics.json: best_step), and the overlap head is trained on that one.
+town, turned by any yaw, that are registered within 2 m and 5 degrees: of scans and of maps, 2 to 10 and 10 to 20 m
+apart. The model is the one of the step with the best mean recall on other towns (metrics.json: best_step), and the
+overlap head is trained on that one.
 """
 
 from __future__ import annotations
@@ -20,7 +22,7 @@ import time
 from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 import numpy as np
 from tyro.conf import FlagCreatePairsOff, arg
@@ -32,7 +34,7 @@ from experiments._run_folder import HISTORY, METRICS, RunFolder, open_run_folder
 
 if TYPE_CHECKING:
     from dpmjax.deeppointmap import Model, TrainingConfig
-    from dpmjax.deeppointmap.inference import Evaluation, EvaluationPairs
+    from dpmjax.deeppointmap.evaluation import Evaluation, EvaluationPairs
     from dpmjax.deeppointmap.training_loop import Trained
     from experiments._dpm_run import Records
 
@@ -40,6 +42,7 @@ EXPERIMENT = "dpm_train"
 MODEL = "model.safetensors"
 # More bad scans than this are counted only.
 MAX_LISTED = 10
+SHOWN_CURVES = ("loss", "pairing", "offset", "top1_accuracy", "recall", "recall_far", "real_recall", "overlap_accuracy")
 
 
 @dataclass(frozen=True)
@@ -58,10 +61,20 @@ class Config:
     """How many towns to train on, where town is among the data."""
     town_length_m: Annotated[float, arg(metavar="M")] = 600.0
     """Length of the drive through each town."""
+    hours: Annotated[float | None, arg(metavar="H")] = None
+    """Train for about H hours: the learning rate falls in the last part of them. Without it, the steps decide."""
+    finish: FlagCreatePairsOff[bool] = False
+    """Let the learning rate fall from here on, and end: with --resume, a run that was planned longer ends well."""
+    cache: Annotated[Path, arg(metavar="DIR")] = Path("results/dpm_train/cache")
+    """Folder where prepared scans are kept between runs; 0.8 MB for each scan of `small`."""
+    selection_pairs: Annotated[int, arg(metavar="N")] = 320
+    """Pairs of scans and of maps, of towns of their own, by which the best model is chosen."""
     held_out_pairs: Annotated[int, arg(metavar="N")] = 60
-    """Pairs of scans of the held-out town that recall is measured on."""
-    recall_every: Annotated[int, arg(metavar="N")] = 100
-    """Measure it every N steps, and at the end."""
+    """Pairs of each kind of the held-out town that recall is reported on."""
+    validate: Annotated[tuple[Path, ...], arg(metavar="PATH")] = ()
+    """Folders of real scans with poses: their recall is drawn beside that of the towns, and chooses nothing."""
+    recall_every: Annotated[int, arg(metavar="N")] = 200
+    """Measure recall every N steps, and at the end."""
     bfloat16: FlagCreatePairsOff[bool] = False
     """Multiply matrices of the networks in bfloat16; geometry stays in float32."""
     seed: int = 0
@@ -74,6 +87,7 @@ class Config:
     """How many processes there are."""
     process_id: Annotated[int | None, arg(metavar="I")] = None
     """Which of them this one is, from 0; process 0 alone writes and prints."""
+    may_change: ClassVar[frozenset[str]] = frozenset({"hours", "finish", "cache", "validate"})
     resume: FlagCreatePairsOff[bool] = False
     """Continue an interrupted run, the latest or that in OUT; options not given are the same as then."""
     force: FlagCreatePairsOff[bool] = False
@@ -85,12 +99,15 @@ class Config:
         Raises:
             ValueError: if an option is out of range.
         """
-        for name, least in (("steps", 3), ("num_towns", 1), ("held_out_pairs", 1), ("recall_every", 1), ("seed", 0)):
+        least_of = {"steps": 3, "num_towns": 1, "selection_pairs": 1, "held_out_pairs": 1, "recall_every": 1, "seed": 0}
+        for name, least in least_of.items():
             value = getattr(self, name)
             if value is not None and value < least:
                 raise ValueError(f"--{name.replace('_', '-')}: expected at least {least}, got {value}")
         if not (math.isfinite(self.town_length_m) and self.town_length_m >= 100.0):
             raise ValueError(f"--town-length-m: expected at least 100, got {self.town_length_m}")
+        if self.hours is not None and not (math.isfinite(self.hours) and self.hours > 0):
+            raise ValueError(f"--hours: expected more than 0, got {self.hours}")
         if not self.data:
             raise ValueError("--data: expected town or a folder of scans")
 
@@ -103,18 +120,21 @@ def main(config: Config) -> None:
     join_processes(config.coordinator, config.num_processes, config.process_id)
     select_device(config.device)
     from dpmjax.deeppointmap import ScanStore, TrainingHooks
-    from experiments._dpm_run import open_drives, run_training
+    from experiments._dpm_data import find_sources, prepare_sources
+    from experiments._dpm_run import run_training
 
     with together():
         settings = training_settings(config)
         towns = range(config.seed, config.seed + config.num_towns)
-        store = ScanStore(open_drives(config.data, towns, config.town_length_m), settings.model.preprocess)
+        sources = find_sources(config.data, towns, config.town_length_m)
         folder = open_run_folder(config, EXPERIMENT) if is_first() else None
     with recording(folder) if folder is not None else nullcontext(), StopFlag() as stop:
         with together():
+            store = ScanStore(prepare_sources(sources, settings, config.cache, seed=config.seed))
             records = None if folder is None else _open_records(folder, config, settings, store)
         hooks = TrainingHooks(evaluate_every=config.recall_every, stop=lambda: stop.received or 0)
-        trained = run_training(records, store, settings, hooks, seed=config.seed)
+        plateau_s = plateau_seconds(config, settings)
+        trained = run_training(records, store, settings, hooks, seed=config.seed, plateau_s=plateau_s)
         if trained.stopped_by:
             stop.request(trained.stopped_by)
         bad = merged(store.bad)
@@ -131,18 +151,29 @@ def main(config: Config) -> None:
         # Numbers first: a picture that fails must not cost them.
         write_metrics(folder, metrics, seed=config.seed)
         write_model(folder, trained.model, config, metrics)
-        draw(folder, evaluation, records.pairs)
+        draw(folder, evaluation, records.sets.held_out)
         print_summary(folder, metrics)
 
 
 def _open_records(folder: RunFolder, config: Config, settings: TrainingConfig, store: Any) -> Records:
-    from dpmjax.deeppointmap import draw_evaluation_pairs
-    from experiments._dpm_run import HELD_OUT_SEED, Records, town_drive
+    from experiments._dpm_run import Records, draw_sets
 
-    print(f"{len(store.table)} scans; {config.preset}: {settings.num_steps} steps")
-    held_out = town_drive(HELD_OUT_SEED, length_m=config.town_length_m)
-    pairs = draw_evaluation_pairs(held_out, config.held_out_pairs, settings.model)
-    return Records(folder, settings, pairs, seed=config.seed)
+    print(f"{len(store.table)} scans; {config.preset}: {settings.num_steps} steps at most")
+    sets = draw_sets(
+        settings,
+        selection_pairs=config.selection_pairs,
+        held_out_pairs=config.held_out_pairs,
+        validate=config.validate,
+        length_m=config.town_length_m,
+    )
+    return Records(folder, settings, sets, seed=config.seed)
+
+
+def plateau_seconds(config: Config, settings: TrainingConfig) -> float | None:
+    """Returns the seconds of steps after which the learning rate falls; None where the steps decide."""
+    if config.finish:
+        return 0.0
+    return None if config.hours is None else 3600 * config.hours * (1 - settings.decay_ratio)
 
 
 def print_summary(folder: RunFolder, metrics: dict[str, Any]) -> None:
@@ -172,24 +203,28 @@ def training_settings(config: Config) -> TrainingConfig:
 def measure(trained: Trained, records: Records) -> tuple[Evaluation, dict[str, Any]]:
     """Returns recall, errors and overlap accuracy of the trained and of the untrained network, and times."""
     from dpmjax.deeppointmap import evaluate_registration, overlap_accuracy
+    from experiments._dpm_run import KIND_NAMES
 
+    pairs = records.sets.held_out
     models = {"": trained.model, "_untrained": records.untrained}
-    evaluations = {suffix: evaluate_registration(model, records.pairs) for suffix, model in models.items()}
+    evaluations = {suffix: evaluate_registration(model, pairs) for suffix, model in models.items()}
     metrics: dict[str, Any] = {
-        "num_held_out_pairs": len(records.pairs.pairs),
+        "num_held_out_pairs": len(pairs.pairs[0].sources),
         "steps": int(trained.progress.state.step),
         "best_step": int(trained.progress.best_step) or None,
-        "train_s": records.earlier_s + trained.speed.run_s,
+        "selection_score": float(trained.progress.best_score),
+        "train_s": records.run_s,
         "compile_s": trained.speed.compile_s,
         "scans_per_s": trained.speed.scans_per_s,
     }
     for suffix, evaluation in evaluations.items():
-        recall = evaluation.recall
+        near = evaluation.recalls[0]
+        of_kinds = zip(KIND_NAMES, evaluation.recalls, strict=True)
+        metrics |= {f"{name}{suffix}": recall.recall for name, recall in of_kinds}
         metrics |= {
-            f"recall{suffix}": recall.recall,
-            f"translation_error_median{suffix}_m": float(np.median(recall.translation_errors_m)),
-            f"rotation_error_median{suffix}_deg": float(np.median(recall.rotation_errors_deg)),
-            f"overlap_accuracy{suffix}": overlap_accuracy(models[suffix], evaluation, records.pairs),
+            f"translation_error_median{suffix}_m": float(np.median(near.translation_errors_m)),
+            f"rotation_error_median{suffix}_deg": float(np.median(near.rotation_errors_deg)),
+            f"overlap_accuracy{suffix}": overlap_accuracy(models[suffix], evaluation, pairs),
         }
     return evaluations[""], metrics
 
@@ -216,25 +251,25 @@ def draw(folder: RunFolder, evaluation: Evaluation, pairs: EvaluationPairs) -> N
 
     rows = read_history(folder / HISTORY)
     if rows:
-        names = {"loss": "loss", "pairing": "pairing", "offset": "offset", "top1_accuracy": "top-1", "recall": "recall"}
-        names["overlap_accuracy"] = "overlap"
+        names = {name: name.replace("_", " ") for name in SHOWN_CURVES}
         curves = {label: np.array([float(row[name] or "nan") for row in rows]) for name, label in names.items()}
+        curves = {label: curve for label, curve in curves.items() if np.isfinite(curve).any()}
         # The loss of the overlap part is another one.
         curves["loss"][[row["stage"] == "overlap" for row in rows]] = np.nan
         steps = [int(row["step"]) for row in rows]
         viz.save_figure(viz.curves_figure(steps, curves), folder / "loss.png")
-    # The held-out pair of median error.
-    errors = evaluation.recall.translation_errors_m
+    # The held-out pair of scans of median error.
+    errors, of_kind = evaluation.recalls[0].translation_errors_m, pairs.pairs[0]
     number = int(np.argsort(errors)[len(errors) // 2])
-    a, b = (int(row) for row in pairs.pairs[number])
-    match, T_true = evaluation.matches[number], evaluation.T_true[number]
-    is_inlier = np.asarray(match.is_inlier)
-    p = np.asarray(evaluation.clouds[a].positions)[np.asarray(match.source_indices)[is_inlier]]
-    q = np.asarray(evaluation.clouds[b].positions)[np.asarray(match.target_indices)[is_inlier]]
+    a, b = int(of_kind.sources[number, 0]), int(of_kind.targets[number, 0])
+    matches, T_true = evaluation.matches[0], pairs.true_motions(of_kind)[number]
+    is_inlier = matches.is_inlier[number]
+    p = np.asarray(evaluation.clouds.positions[a])[matches.source_indices[number][is_inlier]]
+    q = np.asarray(evaluation.clouds.positions[b])[matches.target_indices[number][is_inlier]]
     distances = np.linalg.norm(p @ T_true[:3, :3].T + T_true[:3, 3] - q, axis=1)
     title = f"held-out pair of median error, {errors[number]:.2f} m; green: matches less than 3 m apart"
     scans = viz.MatchedScans(pairs.scan_points(a), pairs.scan_points(b), p, q, distances < 3.0)
-    viz.save_figure(viz.matches_figure(scans, match.T_target_source, title=title), folder / "matches.png")
+    viz.save_figure(viz.matches_figure(scans, matches.T_target_source[number], title=title), folder / "matches.png")
 
 
 if __name__ == "__main__":

@@ -65,11 +65,14 @@ class DescriptorCloud:
         positions: metres, in the frame of the lidar or of the map.
         features: what the network says of the surroundings of each.
         mask: True for descriptors that are there.
+        directions: cosine and sine of the azimuth of the ray from the lidar to each descriptor, in the frame of the
+            cloud; a map keeps those of its scans. None for a single scan, whose positions give them.
     """
 
     positions: Float[Array, "m 3"]
     features: Float[Array, "m c"]
     mask: Bool[Array, " m"]
+    directions: Float[Array, "m 2"] | None = None
 
 
 class Verification(NamedTuple):

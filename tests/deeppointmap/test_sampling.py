@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from dpmjax.deeppointmap import CurriculumStage, SamplingConfig, TrainingConfig, training_preset
-from dpmjax.deeppointmap.sampling import ScanTable, draw_groups, draw_overlap_pairs
+from dpmjax.deeppointmap.layouts import stage_layouts
+from dpmjax.deeppointmap.sampling import Group, ScanTable, arrange_groups, draw_groups, draw_overlap_pairs
 
 
 def table(num: int = 60, step_m: float = 2.0) -> ScanTable:
@@ -16,32 +17,59 @@ def table(num: int = 60, step_m: float = 2.0) -> ScanTable:
     return ScanTable(poses, np.repeat([0, 1], num))
 
 
-@pytest.mark.parametrize("max_group", [2, 4, 32])
+@pytest.mark.parametrize("max_group", [2, 4, 8, 16, 32])
+def test_layouts_hold_the_sizes_of_the_published_draw_and_leave_no_room(max_group: int) -> None:
+    config = SamplingConfig()
+    layouts = stage_layouts(max_group, config)
+    assert 1 <= len(layouts) <= 4
+    shapes = [shape for layout in layouts for shape in layout]
+    assert all(config.num_scans - 2 <= sum(map(sum, layout)) <= config.num_scans for layout in layouts)
+    assert all(1 <= a <= b <= config.max_side and a + b <= max_group for a, b in shapes)
+    sizes = np.array([sum(shape) for shape in shapes])
+    # Of the mean size of the published draw, within what fits into so few samples.
+    mean = 2 * config.pair_probability + (1 - config.pair_probability) * (2 + max_group) / 2
+    assert 0.7 < sizes.mean() / mean < 1.4
+    assert max_group == 2 or sizes.max() > max_group / 2
+
+
+@pytest.mark.parametrize("max_group", [2, 8])
 def test_groups_hold_scans_of_one_place(max_group: int) -> None:
     scans, config = table(), SamplingConfig()
-    sizes = []
+    layout = stage_layouts(max_group, config)[0]
     for seed in range(20):
-        groups = draw_groups(scans, 5, max_group, config, np.random.default_rng(seed))
-        assert 5 in np.concatenate(groups[0])
-        assert sum(len(side) for group in groups for side in group) <= config.num_scans
-        assert len(groups) <= config.num_groups(max_group)
-        for group in groups:
-            members = np.concatenate(group)
-            assert len(set(members)) == len(members)
-            assert len(set(scans.scene[members])) == 1
-            assert max(map(len, group)) <= config.side_capacity(max_group)
-            assert min(map(len, group)) >= 1
-            places = scans.positions[members, 0]
-            assert np.ptp(places) <= 2 * config.max_distance_m
-            sizes.append(len(members))
-    assert max(sizes) <= max_group
-    assert np.mean(np.array(sizes) == 2) >= config.pair_probability / 2
-    assert max_group == 2 or max(sizes) > 2
+        groups = draw_groups(scans, 5, layout, config, np.random.default_rng(seed))
+        assert any(5 in group.rows for group in groups)
+        for group, shape in zip(groups, layout, strict=True):
+            assert (len(group.source), len(group.target)) == shape
+            assert len(set(group.rows)) == len(group.rows)
+            assert len(set(scans.scene[group.rows])) == 1
+            assert np.ptp(scans.positions[group.rows, 0]) <= 2 * config.max_distance_m
+
+
+def test_groups_are_smaller_where_scans_are_rare() -> None:
+    (group,) = draw_groups(table(step_m=15.0), 4, ((3, 5),), SamplingConfig(), np.random.default_rng(0))
+    assert 4 in group.rows
+    assert len(group.rows) <= 3
+    assert len(group.target) >= 1
+    (batch,) = arrange_groups([group], ((3, 5),), np.tile(np.eye(4), (len(group.rows), 1, 1)))
+    assert batch.source.rows.shape == (1, 3)
+    assert batch.target.mask.sum() + batch.source.mask.sum() == len(group.rows)
+
+
+def test_groups_of_one_shape_stand_together_with_their_true_motions() -> None:
+    layout, scans = ((1, 1), (1, 2), (1, 1)), table()
+    groups = [Group(np.array([3]), np.array([5])), None, Group(np.array([8]), np.array([4]))]
+    rows = np.concatenate([group.rows for group in groups if group is not None])
+    pairs, others = arrange_groups(groups, layout, scans.T_world_lidar[rows])
+    np.testing.assert_array_equal(pairs.mask, [True, True])
+    np.testing.assert_array_equal(others.mask, [False])
+    np.testing.assert_array_equal(rows[pairs.source.rows[:, 0]], [3, 8])
+    np.testing.assert_array_equal(pairs.T_target_source[:, 0, 3], [-4, 8])
 
 
 def test_a_lonely_scan_has_no_group() -> None:
     with pytest.raises(ValueError, match="none in"):
-        draw_groups(table(step_m=100.0), 0, 2, SamplingConfig(), np.random.default_rng(0))
+        draw_groups(table(step_m=100.0), 0, ((1, 1),), SamplingConfig(), np.random.default_rng(0))
 
 
 def test_overlap_pairs_are_half_near_a_quarter_apart_a_quarter_far() -> None:
@@ -55,17 +83,15 @@ def test_overlap_pairs_are_half_near_a_quarter_apart_a_quarter_far() -> None:
 
 
 def test_draws_depend_on_the_generator_alone() -> None:
-    first, second = (draw_groups(table(), 3, 8, SamplingConfig(), np.random.default_rng(4)) for _ in range(2))
+    layout = ((1, 1), (2, 4))
+    first, second = (draw_groups(table(), 3, layout, SamplingConfig(), np.random.default_rng(4)) for _ in range(2))
     for a, b in zip(first, second, strict=True):
-        np.testing.assert_array_equal(np.concatenate(a), np.concatenate(b))
+        np.testing.assert_array_equal(a.rows, b.rows)
 
 
 def test_stages_follow_each_other() -> None:
     config = TrainingConfig(curriculum=(CurriculumStage(2, 3), CurriculumStage(4, 2)), overlap_steps=1)
-    found = [config.stage_at(step) for step in range(config.num_steps)]
-    assert [stage.max_group if stage else None for stage in found] == [2, 2, 2, 4, 4, None]
-    with pytest.raises(ValueError, match="step"):
-        config.stage_at(6)
+    assert [config.stage_at(step).max_group for step in range(config.num_steps)] == [2, 2, 2, 4, 4, 4]
     assert config.with_steps(60).num_steps == 60
     assert config.with_steps(1).num_steps == 3
 

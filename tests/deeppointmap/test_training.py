@@ -12,10 +12,9 @@ import jax
 import numpy as np
 import pytest
 
-from dpmjax.deeppointmap import SampleMaker, ScanStore, init_training, make_step
-from dpmjax.deeppointmap.inference import pyramid_of_scan
-from dpmjax.deeppointmap.sampling import RegistrationSample, arrange_groups, draw_groups, stack
-from dpmjax.deeppointmap.training import TrainingState, batch_loss
+from dpmjax.deeppointmap import CurriculumStage, SampleMaker, finish, init_training, make_step
+from dpmjax.deeppointmap.sampling import RegistrationSample
+from dpmjax.deeppointmap.training import TrainingState, _learning_rate, batch_loss
 from tests.deeppointmap import toy
 from tests.tolerances import ACCUMULATED
 
@@ -24,7 +23,7 @@ REPOSITORY = Path(__file__).parents[2]
 
 @pytest.fixture(scope="module")
 def maker() -> SampleMaker:
-    return SampleMaker(ScanStore([toy.drive()], toy.MODEL.preprocess), toy.TRAINING, seed=0)
+    return SampleMaker(toy.store(), toy.TRAINING, seed=0)
 
 
 @pytest.fixture(scope="module")
@@ -73,61 +72,85 @@ def test_the_overlap_part_changes_the_overlap_head_alone(maker, step, start) -> 
 
 
 @pytest.mark.slow
-def test_a_step_compiles_once_for_each_stage(maker, start, assert_compiles_nothing) -> None:
-    step = make_step(toy.TRAINING)
+def test_a_step_compiles_once_for_each_layout(maker, start, assert_compiles_nothing) -> None:
+    step, other = make_step(toy.TRAINING), SampleMaker(toy.store(), toy.TRAINING, seed=1)
     state = start
-    for first in (0, 3, 5):
-        state, _ = step(state, maker(first))
-        following = maker(first + 1)
+    for number in (0, 3, 5):
+        state, _ = step(state, maker(number))
+        following = other(number)
         with assert_compiles_nothing():
             state, _ = step(state, following)
 
 
 @pytest.mark.slow
-def test_spare_places_change_nothing(maker, start) -> None:
-    config = toy.TRAINING.sampling
-    roomy = replace(config, num_scans=9)
-    table = maker._store.table
-    groups = draw_groups(table, 3, 2, config, np.random.default_rng(1))
-    rows = np.concatenate([side for group in groups for side in group])
-    drive = toy.drive()
-    pyramids = [pyramid_of_scan(drive.read_scan(int(row)), toy.MODEL) for row in rows]
-    tight, loose = (stack([arrange_groups(groups, pyramids, table.T_world_lidar[rows], 2, c)]) for c in (config, roomy))
-    assert loose.mask.shape[1] > tight.mask.shape[1]
+def test_places_without_a_group_change_nothing(maker, start) -> None:
+    batch = maker(0)
+    (pairs,) = batch.groups
     # That what is masked reaches no gradient either is a law of each term (test_objective).
     loss = jax.jit(lambda params, batch: batch_loss(params, batch, toy.TRAINING)[0])
-    np.testing.assert_allclose(loss(start.params, tight), loss(start.params, loose), **ACCUMULATED)
+    masked = replace(batch, groups=(replace(pairs, mask=np.array([[True, False, True]])),))
+    kept = jax.tree.map(lambda leaf: leaf[:, [0, 2]], pairs)
+    expected = loss(start.params, replace(batch, groups=(kept,)))
+    np.testing.assert_allclose(loss(start.params, masked), expected, **ACCUMULATED)
 
 
 def test_a_batch_of_empty_scans_has_no_loss_and_a_finite_gradient(maker, step, start) -> None:
     batch: RegistrationSample = maker(0)
-    levels = tuple(replace(level, mask=np.zeros_like(level.mask)) for level in batch.pyramids.levels)
-    state, report = step(start, replace(batch, pyramids=replace(batch.pyramids, levels=levels)))
+    empty = replace(batch.scans.pyramids, num_points=np.zeros_like(batch.scans.pyramids.num_points))
+    state, report = step(start, replace(batch, scans=replace(batch.scans, pyramids=empty)))
     assert report.loss == 0
     assert np.isfinite(report.gradient_norm)
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(state.params))
 
 
 def test_a_sample_depends_on_seed_and_step_alone(maker) -> None:
-    fresh = SampleMaker(ScanStore([toy.drive()], toy.MODEL.preprocess), toy.TRAINING, seed=0)
+    fresh = SampleMaker(toy.store(), toy.TRAINING, seed=0)
     toy.assert_trees_equal(fresh(4), maker(4))
-    assert np.any(fresh(4).pyramids.levels[0].positions != fresh(3).pyramids.levels[0].positions)
+    assert np.any(fresh(4).scans.T_augmented_lidar[:, 0] != fresh(3).scans.T_augmented_lidar[:, 0])
+
+
+def test_devices_begin_with_different_anchors(maker) -> None:
+    both = SampleMaker(toy.store(), toy.TRAINING, seed=0, num_samples=2)
+    toy.assert_trees_equal(jax.tree.map(lambda leaf: leaf[:1], both(0)), maker(0))
+    anchors = {both._anchor(0, number) for number in range(8)}
+    assert len(anchors) > 1
+    num = len(toy.store().table)
+    assert {both._anchor(step, 1) for step in range(num)} == set(range(num))
+
+
+def test_the_learning_rate_falls_at_the_end_or_when_it_is_asked_to(start) -> None:
+    config = replace(toy.TRAINING, curriculum=(CurriculumStage(2, 100),), warmup_steps=4)
+    state = init_training(jax.random.key(0), config)
+    assert (int(state.decay_start), int(state.registration_end)) == (80, 100)
+
+    def rate(state: TrainingState, step: int, *, is_overlap: bool = False) -> float:
+        return float(_learning_rate(replace(state, step=jax.numpy.asarray(step)), config, is_overlap=is_overlap))
+
+    np.testing.assert_allclose([rate(state, step) for step in (0, 3, 50, 80)], [2.5e-4, 1e-3, 1e-3, 1e-3], rtol=1e-5)
+    np.testing.assert_allclose([rate(state, 90), rate(state, 100)], [5.05e-4, 1e-5], rtol=1e-4)
+    early = finish(replace(state, step=jax.numpy.asarray(40)), config)
+    assert (int(early.decay_start), int(early.registration_end)) == (40, 50)
+    np.testing.assert_allclose([rate(early, 40), rate(early, 50)], [1e-3, 1e-5], rtol=1e-4)
+    np.testing.assert_allclose(rate(early, 50, is_overlap=True), 1e-4, rtol=1e-4)
+    late = replace(state, step=jax.numpy.asarray(85))
+    assert finish(late, config) is late
 
 
 EIGHT_DEVICES = """
 import jax, numpy as np
-from dpmjax.deeppointmap import SampleMaker, ScanStore, init_training
+from dpmjax.deeppointmap import SampleMaker, init_training
 from dpmjax.deeppointmap.processes import BATCH_AXIS, device_mesh, place
 from dpmjax.deeppointmap.training import batch_loss
 from tests.deeppointmap import toy
 assert jax.device_count() == 8
-maker = SampleMaker(ScanStore([toy.drive()], toy.MODEL.preprocess), toy.TRAINING, seed=0, num_samples=8)
+maker = SampleMaker(toy.store(), toy.TRAINING, seed=0, num_samples=8)
 batch, params = maker(0), init_training(jax.random.key(0), toy.TRAINING).params
 gradient = jax.jit(jax.grad(lambda params, batch: batch_loss(params, batch, toy.TRAINING)[0]))
 alone = gradient(params, batch)
 mesh = device_mesh()
 spread = place(batch, mesh, BATCH_AXIS)
-assert len(spread.mask.sharding.device_set) == 8 and spread.mask.addressable_shards[0].data.shape[0] == 1
+mask = spread.groups[0].mask
+assert len(mask.sharding.device_set) == 8 and mask.addressable_shards[0].data.shape[0] == 1
 together = gradient(place(params, mesh), spread)
 for a, b in zip(jax.tree.leaves(alone), jax.tree.leaves(together), strict=True):
     np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-5)

@@ -6,7 +6,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dpmjax.deeppointmap import CurriculumStage, ModelConfig, ObjectiveConfig, SamplingConfig, TrainingConfig
+from dpmjax.deeppointmap import (
+    CurriculumStage,
+    ModelConfig,
+    ObjectiveConfig,
+    SamplingConfig,
+    ScanStore,
+    TrainingConfig,
+    prepare_drive,
+)
 from dpmjax.geometry.pyramid import PyramidConfig, PyramidStage
 from dpmjax.io import LidarSequence
 from dpmjax.nets.decoder import DecoderConfig
@@ -48,6 +56,11 @@ def drive(seed: int = 0, num_scans: int = 24, step_m: float = 4.0) -> LidarSeque
         return points[np.linalg.norm(points, axis=1) < 30].astype(np.float32)
 
     return LidarSequence(f"toy {seed}", tuple(map(str, range(num_scans))), read_scan, poses)
+
+
+def store(*drives: LidarSequence) -> ScanStore:
+    """Prepared drives, in memory."""
+    return ScanStore([prepare_drive(one, TRAINING) for one in drives or (drive(),)])
 
 
 def assert_trees_equal(found: object, expected: object) -> None:

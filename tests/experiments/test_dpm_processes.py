@@ -15,7 +15,7 @@ import pytest
 from optax.tree_utils import tree_get
 
 from dpmjax.checkpoints import Checkpoints
-from dpmjax.deeppointmap import CurriculumStage, SampleMaker, ScanStore, init_training, join_processes, make_step
+from dpmjax.deeppointmap import CurriculumStage, SampleMaker, init_training, join_processes, make_step
 from dpmjax.deeppointmap.training_loop import begin_training
 from experiments._result_files import read_history
 from experiments._run_folder import CHECKPOINTS, HISTORY
@@ -31,8 +31,8 @@ from dpmjax.deeppointmap.processes import is_first, join_processes, merged
 coordinator, number, folder = sys.argv[1], int(sys.argv[2]), sys.argv[3]
 join_processes(coordinator, 2, number)
 
-from dpmjax.deeppointmap import ScanStore, TrainingHooks, draw_evaluation_pairs
-from experiments._dpm_run import Records, run_training
+from dpmjax.deeppointmap import TrainingHooks, draw_evaluation_pairs
+from experiments._dpm_run import KINDS, EvaluationSets, Records, run_training
 from experiments._run_folder import RunFolder
 from experiments._command import Interrupted, StopFlag
 from pathlib import Path
@@ -51,9 +51,10 @@ assert merged({str(number): "bad"}) == {"0": "bad", "1": "bad"}
 assert is_first() == (number == 0)
 try:
     with StopFlag() as stop:
-        pairs = draw_evaluation_pairs(toy.drive(seed=9), 1, toy.MODEL)
-        records = Records(RunFolder(Path(folder), False), TRAINING, pairs, seed=0) if is_first() else None
-        store = ScanStore([toy.drive()], toy.MODEL.preprocess)
+        pairs = draw_evaluation_pairs(toy.drive(seed=9), 1, toy.MODEL, kinds=KINDS)
+        sets = EvaluationSets((pairs,), (), pairs)
+        records = Records(RunFolder(Path(folder), False), TRAINING, sets, seed=0) if is_first() else None
+        store = toy.store()
         hooks = TrainingHooks(evaluate_every=1, stop=stop_requested)
         done = run_training(records, store, TRAINING, hooks, seed=0)
         assert done.stopped_by == signal.SIGINT
@@ -98,7 +99,7 @@ def test_two_processes_train_as_one_and_stop_as_one(tmp_path: Path) -> None:
     assert [row["step"] for row in read_history(tmp_path / HISTORY)] == ["1", "2"]
 
     state, step = init_training(jax.random.key(0), TRAINING), make_step(TRAINING)
-    maker = SampleMaker(ScanStore([toy.drive()], toy.MODEL.preprocess), TRAINING, seed=0, num_samples=2)
+    maker = SampleMaker(toy.store(), TRAINING, seed=0, num_samples=2)
     progress = Checkpoints(tmp_path / CHECKPOINTS).restore_latest(begin_training(state), fallback=None)
     for number in range(2):
         state, _ = step(state, maker(number))

@@ -5,7 +5,6 @@ from __future__ import annotations
 import errno
 import subprocess
 import sys
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,16 +15,14 @@ import pytest
 from dpmjax.deeppointmap import (
     CurriculumStage,
     SampleMaker,
-    ScanStore,
     TrainingHooks,
     draw_evaluation_pairs,
     init_training,
 )
 from dpmjax.deeppointmap.training_loop import after_evaluation, before_step, begin_training, params_to_use
-from dpmjax.io import InputError
 from experiments import _dpm_run
 from experiments._command import run_command
-from experiments._dpm_run import Records, run_training
+from experiments._dpm_run import KINDS, EvaluationSets, Records, run_training
 from experiments._result_files import read_history
 from experiments._run_folder import CHECKPOINTS, HISTORY, RunFolder
 from experiments.dpm_train import EXPERIMENT, Config, main
@@ -48,10 +45,11 @@ class StopAfter:
 
 def train(folder: Path, *, stop_after: int = 99, is_resumed: bool = False):
     folder.mkdir(exist_ok=True)
-    store = ScanStore([toy.drive()], toy.MODEL.preprocess)
-    pairs = draw_evaluation_pairs(toy.drive(seed=9), 2, toy.MODEL)
-    records = Records(RunFolder(folder, is_resumed), TRAINING, pairs, seed=0)
-    return run_training(records, store, TRAINING, TrainingHooks(evaluate_every=2, stop=StopAfter(stop_after)), seed=0)
+    pairs = draw_evaluation_pairs(toy.drive(seed=9), 2, toy.MODEL, kinds=KINDS)
+    records = Records(RunFolder(folder, is_resumed), TRAINING, EvaluationSets((pairs,), (), pairs), seed=0)
+    return run_training(
+        records, toy.store(), TRAINING, TrainingHooks(evaluate_every=2, stop=StopAfter(stop_after)), seed=0
+    )
 
 
 def num_steps(trained) -> int:
@@ -110,31 +108,16 @@ def test_the_best_of_equal_models_is_the_later_and_the_overlap_part_goes_on_from
     assert (int(worse.best_step), int(equal.best_step)) == (0, last)
     assert worse.best_params is first.best_params
     second = after_evaluation(replace(first, state=after(1, 2.0)), 0.6)
-    over = before_step(replace(second, state=after(last, 3.0)), TRAINING)
+    over = before_step(replace(second, state=after(last, 3.0)))
     assert over.state.params is second.best_params
-    assert before_step(replace(second, state=after(last - 1, 3.0)), TRAINING).state.params is not second.best_params
-    assert params_to_use(replace(second, state=after(last + 1, 3.0)), TRAINING) is not second.best_params
+    assert before_step(replace(second, state=after(last - 1, 3.0))).state.params is not second.best_params
+    assert params_to_use(replace(second, state=after(last + 1, 3.0))) is not second.best_params
 
 
 def test_batches_made_ahead_are_those_made_alone() -> None:
-    with SampleMaker(ScanStore([toy.drive()], toy.MODEL.preprocess), TRAINING, seed=0) as maker:
+    with SampleMaker(toy.store(), TRAINING, seed=0) as maker:
         for step, batch in zip(range(1, 6), maker.batches(1, 6), strict=True):
             toy.assert_trees_equal(batch, maker(step))
-
-
-def test_a_bad_scan_is_empty_and_named() -> None:
-    drive = toy.drive()
-
-    def read_scan(index: int) -> np.ndarray:
-        if index == 2:
-            raise InputError("2", "cut off", "leave it out")
-        return drive.read_scan(index)
-
-    store = ScanStore([replace(drive, read_scan=read_scan)], toy.MODEL.preprocess)
-    with ThreadPoolExecutor(1) as pool:
-        assert len(store.request(1, pool).result()) > 0
-        assert len(store.request(2, pool).result()) == 0
-    assert store.bad == {"2": "cut off; leave it out."}
 
 
 def test_help_needs_no_jax_and_shows_examples() -> None:

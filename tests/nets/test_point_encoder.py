@@ -9,10 +9,11 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from dpmjax.deeppointmap.model import Model, ModelConfig, encode_pyramid, init_model, model_shapes
+from dpmjax.geometry.bearing import ray_directions, to_ray_frame
 from dpmjax.geometry.pyramid import PyramidConfig, PyramidStage
 from dpmjax.geometry.pyramid_host import build_pyramid_on_host
 from dpmjax.nets import DecoderConfig, EncoderConfig
-from dpmjax.nets.point_encoder import NeighbourhoodMaximum, turn_to_bearing
+from dpmjax.nets.point_encoder import NeighbourhoodMaximum
 from dpmjax.types import PointPyramid
 from tests.tolerances import ACCUMULATED, ROUNDING
 
@@ -177,5 +178,5 @@ def test_direction_along_the_ray_is_x() -> None:
     positions = np.array([[3.0, 4, 5], [0, 0, 2], [0, -2, 0]], np.float32)
     across = np.array([[-0.8, 0.6, 0], [0, 1, 0], [1, 0, 0]], np.float32)
     expected = np.array([[5.0, 0, 5], [0, 0, 2], [2, 0, 0]])
-    np.testing.assert_allclose(turn_to_bearing(positions, positions), expected, atol=1e-6)
-    np.testing.assert_allclose(turn_to_bearing(across, positions), np.tile([0.0, 1, 0], (3, 1)), atol=1e-6)
+    np.testing.assert_allclose(to_ray_frame(positions, ray_directions(positions)), expected, atol=1e-6)
+    np.testing.assert_allclose(to_ray_frame(across, ray_directions(positions)), np.tile([0.0, 1, 0], (3, 1)), atol=1e-6)

@@ -9,7 +9,13 @@ import pytest
 
 from dpmjax.geometry import rigid
 from dpmjax.scans import AugmentConfig, BoxConfig, SectorConfig, augment_scan
-from dpmjax.scans.augment import is_behind_box, is_behind_boxes, is_behind_sectors, random_motion
+from dpmjax.scans.augment import (
+    is_behind_box,
+    is_behind_boxes,
+    is_behind_sectors,
+    random_motion,
+    random_motions_on_host,
+)
 from dpmjax.types import PointCloud
 from tests.tolerances import ACCUMULATED
 
@@ -151,7 +157,7 @@ def test_boxes_never_hide_what_is_nearer_than_their_gap() -> None:
 
 
 def test_masked_points_reach_neither_value_nor_gradient() -> None:
-    config = AugmentConfig(sector_probability=1.0, box_probability=1.0)
+    config = AugmentConfig(sector_probability=0.5, box_probability=0.5)
 
     @jax.jit
     @jax.value_and_grad
@@ -182,3 +188,25 @@ def test_wrong_numbers_are_named() -> None:
         SectorConfig(width_deg=(3.0, 1.0))
     with pytest.raises(ValueError, match="^max_count: expected"):
         BoxConfig(max_count=0)
+
+
+def test_one_scan_in_ten_is_occluded_as_the_paper_says() -> None:
+    angles = np.linspace(0, 2 * np.pi, 720, endpoint=False)
+    ring = jnp.asarray(np.stack([40 * np.cos(angles), 40 * np.sin(angles), np.full(720, -1.0)], 1), jnp.float32)
+    config = replace(NOTHING, sector_probability=0.05, box_probability=0.05)
+    assert (AugmentConfig().sector_probability, AugmentConfig().box_probability) == (0.05, 0.05)
+    scan = PointCloud(ring, jnp.ones(720, bool))
+    kept = jax.jit(jax.vmap(lambda key: augment_scan(scan, config, key=key).cloud.mask.all()))
+    share = 1 - np.mean(kept(jax.random.split(jax.random.key(7), 2000)))
+    assert abs(share - 0.1) < 0.03
+
+
+def test_motions_of_the_host_are_those_of_the_device() -> None:
+    """The same distribution: rotations, bounds of the angles, spread of the translation."""
+    T = random_motions_on_host(AugmentConfig(), 4000, np.random.default_rng(0))
+    np.testing.assert_allclose(
+        T[:, :3, :3] @ np.swapaxes(T[:, :3, :3], 1, 2), np.tile(np.eye(3), (4000, 1, 1)), atol=1e-9
+    )
+    np.testing.assert_allclose(T[:, :3, 3].std(axis=0), [3, 3, 1.5], rtol=0.05)
+    assert np.abs(np.arcsin(T[:, 0, 2])).max() <= np.pi / 10
+    assert np.histogram(np.arctan2(-T[:, 0, 1], T[:, 0, 0]), 8, (-np.pi, np.pi))[0].min() > 400

@@ -5,11 +5,11 @@ from .curriculum import CurriculumStage as CurriculumStage
 from .curriculum import TrainingConfig as TrainingConfig
 from .curriculum import training_preset as training_preset
 from .data_pipeline import SampleMaker as SampleMaker
-from .data_pipeline import ScanStore as ScanStore
 from .encoding import encode as encode
-from .inference import draw_evaluation_pairs as draw_evaluation_pairs
-from .inference import evaluate_registration as evaluate_registration
-from .inference import overlap_accuracy as overlap_accuracy
+from .evaluation import PairKind as PairKind
+from .evaluation import draw_evaluation_pairs as draw_evaluation_pairs
+from .evaluation import evaluate_registration as evaluate_registration
+from .evaluation import overlap_accuracy as overlap_accuracy
 from .matching import MatchConfig as MatchConfig
 from .matching import merge_clouds as merge_clouds
 from .model import Model as Model
@@ -25,6 +25,10 @@ from .scan_registration import PreparedScan as PreparedScan
 from .scan_registration import overlap as overlap
 from .scan_registration import prepare_scan as prepare_scan
 from .scan_registration import register as register
+from .scan_store import PreparedDrive as PreparedDrive
+from .scan_store import ScanStore as ScanStore
+from .scan_store import prepare_drive as prepare_drive
+from .training import finish as finish
 from .training import init_training as init_training
 from .training import make_step as make_step
 from .training_loop import TrainingHooks as TrainingHooks

@@ -12,7 +12,7 @@ from dpmjax.scans.augment import AugmentConfig
 
 @dataclass(frozen=True)
 class CurriculumStage:
-    """A part of training with one size of groups. Each stage compiles one step.
+    """A part of training with one size of groups. Each stage compiles one step for each of its layouts.
 
     Attributes:
         max_group: largest number of scans in both maps of a group together; the published curriculum doubles it from 2
@@ -63,29 +63,6 @@ class SamplingConfig:
         if not 0 < self.overlap_distance_m <= self.far_distance_m:
             raise ValueError(f"far_distance_m: expected {self.overlap_distance_m} at least, got {self.far_distance_m}")
 
-    def side_capacity(self, max_group: int) -> int:
-        """Returns the capacity of one map of a group.
-
-        Args:
-            max_group: scans in both maps of a group together, at most.
-
-        Returns:
-            The largest number of scans in one map.
-        """
-        return min(max_group - 1, self.max_side)
-
-    def num_groups(self, max_group: int) -> int:
-        """Returns the number of groups in a sample.
-
-        Args:
-            max_group: scans in both maps of a group together, at most.
-
-        Returns:
-            About as many groups as fill the sample.
-        """
-        mean = 2 * self.pair_probability + (1 - self.pair_probability) * (2 + max_group) / 2
-        return max(1, round(self.num_scans / mean))
-
 
 @dataclass(frozen=True)
 class TrainingConfig:
@@ -96,16 +73,19 @@ class TrainingConfig:
         curriculum: stages of the registration part.
         overlap_steps: steps of the second part, in which only the overlap head learns; may be 0.
         sampling: choice of the scans of a sample.
-        augment: augmentation of each scan.
+        augment: augmentation of each scan. Each step draws a new motion for each scan.
+        num_variants: number of times that a scan is thinned, occluded and jittered; steps choose among these variants.
         objective: losses of the registration part.
-        learning_rate: learning rate at the start of the cosine.
-        final_learning_rate: learning rate at the end of the cosine.
+        learning_rate: learning rate after the warm-up and before the decay.
+        final_learning_rate: learning rate at the end of the decay.
+        decay_ratio: share of the registration part in which the learning rate falls, at its end.
         weight_decay: weight decay of AdamW.
         warmup_steps: number of steps in which the learning rate rises from 0.
         max_gradient_norm: longer gradients are scaled down to this norm.
         overlap_ratio: learning rates and weight decay of the overlap part, relative to those above.
-        scans_at_once: about this many scans of a sample are processed at the same time. More scans need more memory and
+        scans_at_once: about this many scans of a sample are encoded at the same time. More scans need more memory and
             keep a large device busy; the results change by rounding only.
+        group_scans_at_once: groups of about this many scans are decoded at the same time.
     """
 
     model: ModelConfig = field(default_factory=ModelConfig)
@@ -115,19 +95,23 @@ class TrainingConfig:
     overlap_steps: int = 20000
     sampling: SamplingConfig = field(default_factory=SamplingConfig)
     augment: AugmentConfig = field(default_factory=AugmentConfig)
+    num_variants: int = 4
     objective: ObjectiveConfig = field(default_factory=ObjectiveConfig)
     learning_rate: float = 1e-3
     final_learning_rate: float = 1e-5
+    decay_ratio: float = 0.2
     weight_decay: float = 1e-4
     warmup_steps: int = 0
     max_gradient_norm: float = 35.0
     overlap_ratio: float = 0.1
     scans_at_once: int = 8
+    group_scans_at_once: int = 16
 
     def __post_init__(self) -> None:
         require_positive_fields(self, "learning_rate", "final_learning_rate", "max_gradient_norm", "overlap_ratio")
         require_fields(self, "overlap_steps", "weight_decay", "warmup_steps", low=0)
-        require_fields(self, "scans_at_once", low=1)
+        require_fields(self, "scans_at_once", "group_scans_at_once", "num_variants", low=1)
+        require_fields(self, "decay_ratio", low=0, high=1)
         require_count("len(curriculum)", len(self.curriculum))
         largest = max(stage.max_group for stage in self.curriculum)
         if largest > self.sampling.num_scans:
@@ -145,25 +129,20 @@ class TrainingConfig:
         """Number of steps of both parts."""
         return self.registration_steps + self.overlap_steps
 
-    def stage_at(self, step: int) -> CurriculumStage | None:
-        """Finds the stage of a step.
+    def stage_at(self, step: int) -> CurriculumStage:
+        """Finds the stage of a step of the registration part.
 
         Args:
             step: number of the step, from 0.
 
         Returns:
-            The stage; None in the overlap part.
-
-        Raises:
-            ValueError: if training has fewer steps.
+            The stage; the last one for later steps.
         """
-        if not 0 <= step < self.num_steps:
-            raise ValueError(f"step: expected from 0 to {self.num_steps - 1}, got {step}")
         for stage in self.curriculum:
             if step < stage.num_steps:
                 return stage
             step -= stage.num_steps
-        return None
+        return self.curriculum[-1]
 
     def with_steps(self, num_steps: int) -> TrainingConfig:
         """Shortens or stretches all parts in proportion, none to less than one step.
@@ -196,14 +175,17 @@ def training_preset(name: Preset) -> TrainingConfig:
     return PRESETS[name]
 
 
+NEAR_THE_LIDAR = AugmentConfig(max_tilt_rad=0.05, translation_sigma_m=0.3)
+"""For frames along the rays from the lidar: a large motion would put the origin of the rays beside the lidar."""
+
 PRESETS = {
     "tiny": TrainingConfig(
         model=model_preset("tiny"),
         curriculum=(CurriculumStage(2, 700), CurriculumStage(4, 40)),
         overlap_steps=60,
-        sampling=SamplingConfig(num_scans=16, max_side=2, num_overlap_pairs=8),
+        sampling=SamplingConfig(num_scans=16, num_overlap_pairs=8),
         # So few steps need weaker augmentation, more positives, and a direct loss on the encoder.
-        augment=AugmentConfig(max_drop_ratio=0.3, max_tilt_rad=0.05, translation_sigma_m=0.3),
+        augment=replace(NEAR_THE_LIDAR, max_drop_ratio=0.3),
         objective=ObjectiveConfig(coarse_weight=1.0, positive_radius_m=1.5, max_close=4),
         learning_rate=2e-3,
         warmup_steps=20,
@@ -213,8 +195,12 @@ PRESETS = {
         model=model_preset("small"),
         curriculum=tuple(map(CurriculumStage, (2, 4, 8, 16), (12000, 6000, 6000, 6000))),
         overlap_steps=3000,
-        objective=ObjectiveConfig(max_close=8),
+        sampling=SamplingConfig(num_scans=16),
+        augment=NEAR_THE_LIDAR,
+        objective=ObjectiveConfig(max_close=4),
         warmup_steps=500,
+        num_variants=2,
+        scans_at_once=4,
     ),
     "paper": TrainingConfig(),
 }

@@ -18,6 +18,7 @@ from jaxtyping import Array, Bool, Float, Int
 from dpmjax.checks import as_float, require_fields, require_positive_fields, require_shape
 from dpmjax.geometry import rigid
 from dpmjax.geometry.alignment import weighted_svd
+from dpmjax.geometry.bearing import directions_of, turned_directions
 from dpmjax.geometry.consensus import ConsensusConfig, find_consensus, motion_support
 from dpmjax.types import AnyArray, DescriptorCloud, Registration
 
@@ -294,7 +295,8 @@ def merge_clouds(clouds: DescriptorCloud, T_map_cloud: Float[AnyArray, "s 4 4"])
             may be anything.
 
     Returns:
-        One cloud of capacity s * m; positions are 0 where the mask is False.
+        One cloud of capacity s * m, with the directions of the rays of all clouds; positions are 0 where the mask is
+        False.
 
     Raises:
         ValueError: if the shapes do not match.
@@ -306,8 +308,10 @@ def merge_clouds(clouds: DescriptorCloud, T_map_cloud: Float[AnyArray, "s 4 4"])
     positions_cloud = jnp.where(clouds.mask[..., None], clouds.positions, 0)
     T_map_cloud = jnp.where(jnp.any(clouds.mask, axis=1)[:, None, None], T_map_cloud, 0)
     positions_map = jnp.where(clouds.mask[..., None], rigid.transform_points(T_map_cloud, positions_cloud), 0)
+    directions = turned_directions(directions_of(replace(clouds, positions=positions_cloud)), T_map_cloud)
     return DescriptorCloud(
         positions=positions_map.reshape(-1, 3),
         features=clouds.features.reshape(-1, clouds.features.shape[-1]),
         mask=clouds.mask.reshape(-1),
+        directions=directions.reshape(-1, 2),
     )

@@ -12,20 +12,22 @@ import flax.struct
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from dpmjax.checks import require_one_of, require_positive, require_shape
 from dpmjax.deeppointmap.confidence import Calibration
 from dpmjax.deeppointmap.matching import MatchConfig
 from dpmjax.deeppointmap.verification import VerificationConfig
+from dpmjax.geometry.bearing import from_ray_frame, ray_directions
 from dpmjax.geometry.consensus import ConsensusConfig
 from dpmjax.geometry.pyramid import PyramidConfig, PyramidStage
 from dpmjax.geometry.pyramid_host import build_pyramid_on_host
+from dpmjax.geometry.pyramid_storage import StoredPyramid, moved_pyramid
 from dpmjax.nets.decoder import DecoderConfig, DescriptorDecoder
 from dpmjax.nets.layers import ComputeDtype
 from dpmjax.nets.point_encoder import EncoderConfig, PointEncoder
 from dpmjax.scans.preprocess import PreprocessConfig
-from dpmjax.types import DescriptorCloud, PointPyramid
+from dpmjax.types import AnyArray, DescriptorCloud, PointPyramid
 
 Preset = Literal["tiny", "small", "paper"]
 
@@ -198,7 +200,23 @@ def encode_pyramid(model: Model, pyramid: PointPyramid) -> DescriptorCloud:
     features: Any = _encoder(model.config).apply({"params": model.params["encoder"]}, pyramid)
     level = pyramid.levels[-1 - len(pyramid.interpolation)]
     positions = jnp.where(level.mask[:, None], level.positions, 0) * model.config.scale_m
-    return DescriptorCloud(positions, features, jnp.asarray(level.mask))
+    return DescriptorCloud(positions, features, jnp.asarray(level.mask), ray_directions(positions))
+
+
+def encode_stored(model: Model, stored: StoredPyramid, T_new_lidar: Float[AnyArray, "4 4"]) -> DescriptorCloud:
+    """Encodes one scan from its stored pyramid, after a rigid motion.
+
+    Args:
+        model: a model whose `config.pyramid` built the pyramid.
+        stored: the pyramid of the scan.
+        T_new_lidar: the motion, metres.
+
+    Returns:
+        As `encode_pyramid`, in the frame after the motion.
+    """
+    # A rigid motion in metres is one in normalised coordinates with a shorter translation.
+    unit = jnp.ones((4, 4)).at[:3, 3].set(1 / model.config.scale_m)
+    return encode_pyramid(model, moved_pyramid(stored, T_new_lidar * unit))
 
 
 @jax.jit
@@ -284,19 +302,31 @@ def coarse_features(model: Model, cloud: DescriptorCloud) -> Float[Array, "m c"]
 
 @jax.jit
 def predict_offsets(
-    model: Model, features: Float[Array, "... c"], partners: Float[Array, "... c"]
+    model: Model,
+    features: Float[Array, "... c"],
+    partners: Float[Array, "... c"],
+    directions: Float[Array, "... 2"] | None = None,
+    partner_rows: Int[Array, "..."] | None = None,
 ) -> Float[Array, "... 3"]:
     """Predicts the offset from each descriptor to its partner (DeepPointMap section 3.2).
+
+    The head predicts in the frame of the features: that of each descriptor's ray with `EncoderConfig.frame` "bearing".
 
     Args:
         model: encoder and decoder.
         features: correlated features of the first cloud, one row for each pair.
         partners: correlated features of the second cloud, row for row.
+        directions: directions of the rays of the first cloud, row for row (`geometry.bearing.directions_of`). With
+            None, and in the frame "lidar", offsets stay as the head predicts them.
+        partner_rows: if given, the partners are `partners[partner_rows]`; cheaper where partners are in several pairs.
 
     Returns:
-        Offsets in metres, in the frame of the first cloud.
+        Offsets in metres, in the frame of the first cloud; in the frames of the rays without directions.
     """
-    return _decode(model, features, partners, part="offset_head")
+    offsets = _decode(model, features, partners, partner_rows, part="offset_head")
+    if directions is None or model.config.encoder.frame == "lidar":
+        return offsets
+    return from_ray_frame(offsets, directions)
 
 
 def _encoder(config: ModelConfig) -> PointEncoder:

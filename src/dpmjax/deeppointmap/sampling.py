@@ -17,7 +17,10 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from dpmjax.deeppointmap.curriculum import SamplingConfig
-from dpmjax.types import AnyArray, PointPyramid
+from dpmjax.deeppointmap.layouts import GroupShape, Layout
+from dpmjax.geometry import rigid
+from dpmjax.geometry.pyramid_storage import StoredPyramid
+from dpmjax.types import AnyArray
 
 TreeT = TypeVar("TreeT")
 NUM_ATTEMPTS = 100
@@ -74,6 +77,11 @@ class Group(NamedTuple):
     source: Int[np.ndarray, " a"]
     target: Int[np.ndarray, " b"]
 
+    @property
+    def rows(self) -> Int[np.ndarray, " s"]:
+        """Scans of both maps."""
+        return np.concatenate([self.source, self.target])
+
 
 class OverlapPairs(NamedTuple):
     """Numbers of the scans of each pair, and whether they are closer than `overlap_distance_m`."""
@@ -84,39 +92,32 @@ class OverlapPairs(NamedTuple):
 
 
 def draw_groups(
-    table: ScanTable, first_anchor: int, max_group: int, config: SamplingConfig, rng: np.random.Generator
-) -> tuple[Group, ...]:
-    """Draws the groups of one sample: at most `config.num_groups`, with at most `config.num_scans` scans together.
-
-    A group is an anchor and random scans around it: two scans with `pair_probability`, else 2 to `max_group`, each
-    number equally likely. Every group draws its own size, so that all steps of a stage have the same shapes (the
-    published program draws one size for each step).
+    table: ScanTable, first_anchor: int, layout: Layout, config: SamplingConfig, rng: np.random.Generator
+) -> tuple[Group | None, ...]:
+    """Draws the groups of one sample: for each an anchor, and random scans around it.
 
     Args:
         table: the scans.
-        first_anchor: anchor of the first group; the other anchors are random.
-        max_group: scans in both maps of a group together, at most.
-        config: sizes and distances.
+        first_anchor: anchor of one of the groups; those of the others are random.
+        layout: sizes of the groups.
+        config: distances.
         rng: source of the draws.
 
     Returns:
-        At least one group.
+        A group for each entry of the layout; smaller where there are fewer scans, None where no scan was found with
+        another one near it.
 
     Raises:
-        ValueError: if no scan has another one near it.
+        ValueError: if all are None.
     """
-    groups: list[Group] = []
-    num_left, anchor = config.num_scans, first_anchor
-    for _ in range(NUM_ATTEMPTS):
-        if len(groups) == config.num_groups(max_group) or num_left < 2:
-            break
-        size = 2 if rng.random() < config.pair_probability else int(rng.integers(2, max_group + 1))
-        members = _members(table, anchor, min(size, num_left), config, rng)
-        if len(members) > 1:
-            groups.append(_split(members, config, rng))
-            num_left -= len(members)
-        anchor = int(rng.integers(len(table)))
-    if not groups:
+    groups: list[Group | None] = [None] * len(layout)
+    anchor, num_left = first_anchor, NUM_ATTEMPTS
+    for place in rng.permutation(len(layout)):
+        while groups[place] is None and num_left > 0:
+            groups[place] = _group_at(table, anchor, layout[place], config, rng)
+            num_left -= groups[place] is None
+            anchor = int(rng.integers(len(table)))
+    if not any(groups):
         limits = f"{config.min_distance_m} to {config.max_distance_m} m"
         raise ValueError(f"table: expected scans with others {limits} from them, found none in {NUM_ATTEMPTS} draws")
     return tuple(groups)
@@ -152,22 +153,17 @@ def draw_overlap_pairs(table: ScanTable, config: SamplingConfig, rng: np.random.
     return OverlapPairs(a, b, (table.scene[a] == table.scene[b]) & (distances <= config.overlap_distance_m))
 
 
-def _members(
-    table: ScanTable, anchor: int, size: int, config: SamplingConfig, rng: np.random.Generator
-) -> Int[np.ndarray, " s"]:
+def _group_at(
+    table: ScanTable, anchor: int, shape: GroupShape, config: SamplingConfig, rng: np.random.Generator
+) -> Group | None:
     distances = table.distances_from(anchor)
     distances[anchor] = np.inf
     others = np.flatnonzero((distances >= config.min_distance_m) & (distances <= config.max_distance_m))
-    chosen = rng.choice(others, min(size - 1, len(others)), replace=False) if len(others) > 0 else others
-    return rng.permutation(np.concatenate([[anchor], chosen]).astype(int))
-
-
-def _split(members: Int[np.ndarray, " s"], config: SamplingConfig, rng: np.random.Generator) -> Group:
-    # Half of the groups are split into one scan and all others, the rest anywhere; no side exceeds `max_side`.
-    num = len(members)
-    least, most = max(1, num - config.max_side), min(num - 1, config.max_side)
-    is_one_to_all = least == 1 and num <= config.max_side and rng.random() < 0.5
-    num_source = 1 if is_one_to_all else int(rng.integers(least, most + 1))
+    if len(others) == 0:
+        return None
+    chosen = rng.choice(others, min(sum(shape) - 1, len(others)), replace=False)
+    members = rng.permutation(np.concatenate([[anchor], chosen]))
+    num_source = min(shape[0], len(members) - 1)
     return Group(members[:num_source], members[num_source:])
 
 
@@ -176,7 +172,7 @@ class MapOfScans:
     """One map of each group.
 
     Attributes:
-        rows: its scans, as rows of the pyramids of the sample; 0 where `mask` is False.
+        rows: its scans, as rows of the sample; 0 where `mask` is False.
         mask: False where a map has fewer scans.
         T_map_scan: poses of the scans in the frame of the map, metres.
     """
@@ -187,18 +183,16 @@ class MapOfScans:
 
 
 @flax.struct.dataclass
-class RegistrationSample:
-    """Groups of scans that form two maps each; a batch has one more axis in front.
+class GroupBatch:
+    """Groups of one shape.
 
     Attributes:
-        pyramids: pyramids of all scans; unused rows repeat the first.
         source: first map of each group.
         target: second map of each group.
         T_target_source: true motion between both maps, metres.
         mask: False where there are fewer groups.
     """
 
-    pyramids: PointPyramid
     source: MapOfScans
     target: MapOfScans
     T_target_source: Float[AnyArray, "*b 4 4"]
@@ -206,17 +200,41 @@ class RegistrationSample:
 
 
 @flax.struct.dataclass
+class SampleScans:
+    """The scans of a sample as they are stored, and the motion that each gets in the step.
+
+    Attributes:
+        pyramids: stored pyramids; spare rows repeat the first.
+        T_augmented_lidar: the motion of each scan, metres.
+    """
+
+    pyramids: StoredPyramid
+    T_augmented_lidar: Float[AnyArray, "*b 4 4"]
+
+
+@flax.struct.dataclass
+class RegistrationSample:
+    """Groups of scans that form two maps each; a batch has one more axis in front.
+
+    Attributes:
+        scans: all scans.
+        groups: the groups, those of one shape together.
+    """
+
+    scans: SampleScans
+    groups: tuple[GroupBatch, ...]
+
+
+@flax.struct.dataclass
 class OverlapSample:
     """Pairs of scans; a batch has one more axis in front.
 
     Attributes:
-        first: pyramid of the first scan of each pair.
-        second: pyramid of the second scan of each pair.
+        scans: first the first scan of each pair, then the second of each.
         is_overlap: whether the two overlap in truth.
     """
 
-    first: PointPyramid
-    second: PointPyramid
+    scans: SampleScans
     is_overlap: Bool[AnyArray, "*b p"]
 
 
@@ -225,41 +243,43 @@ Sample = RegistrationSample | OverlapSample
 
 
 def arrange_groups(
-    groups: Sequence[Group],
-    pyramids: Sequence[PointPyramid],
-    T_world_scan: Float[np.ndarray, "s 4 4"],
-    max_group: int,
-    config: SamplingConfig,
-) -> RegistrationSample:
-    """Arranges groups as a sample of NumPy arrays; its shapes depend on `max_group` and `config` only.
+    groups: Sequence[Group | None], layout: Layout, T_world_scan: Float[np.ndarray, "s 4 4"]
+) -> tuple[GroupBatch, ...]:
+    """Arranges groups as NumPy arrays, whose shapes depend on the layout only.
 
     Args:
         groups: from `draw_groups`.
-        pyramids: one for each scan: the source of the first group, its target, the source of the second, ...
-        T_world_scan: float64 poses of the frames of the pyramids, in the same order.
-        max_group: scans in both maps of a group together, at most.
-        config: sizes.
+        layout: sizes of the groups.
+        T_world_scan: float64 poses of the scans of all groups: the source of the first group, its target, the source of
+            the second, ...
 
     Returns:
-        The sample.
+        One batch for each shape in the layout, in its order.
 
     Raises:
-        ValueError: if there are not as many pyramids and poses as scans in the groups, or more than fit.
+        ValueError: if there are not as many poses as scans in the groups.
     """
-    sizes = [len(side) for group in groups for side in group]
-    if not len(pyramids) == len(T_world_scan) == sum(sizes) <= config.num_scans:
-        found = f"{len(pyramids)} and {len(T_world_scan)} for groups of {sum(sizes)} scans"
-        raise ValueError(f"pyramids, T_world_scan: expected as many as scans, at most {config.num_scans}, got {found}")
-    num_groups, capacity = config.num_groups(max_group), config.side_capacity(max_group)
-    ends = np.cumsum(sizes)
-    rows = [np.arange(end - size, end) for end, size in zip(ends, sizes, strict=True)]
-    source, target = (_map_of_scans(rows[side::2], T_world_scan, num_groups, capacity) for side in (0, 1))
-    T_world_source, T_world_target = (T_world_scan[[of_map[0] for of_map in rows[side::2]]] for side in (0, 1))
-    T = np.tile(np.eye(4), (num_groups, 1, 1))
-    T[: len(groups)] = np.linalg.inv(T_world_target) @ T_world_source
-    spare = [pyramids[0]] * (config.num_scans - len(pyramids))
-    mask = np.arange(num_groups) < len(groups)
-    return RegistrationSample(stack([*pyramids, *spare]), source, target, T.astype(np.float32), mask)
+    ends = np.cumsum([0 if group is None else len(group.rows) for group in groups])
+    if ends[-1] != len(T_world_scan):
+        raise ValueError(f"T_world_scan: expected {ends[-1]} poses, one for each scan, got {len(T_world_scan)}")
+    rows_of = [
+        None if group is None else Group(*np.split(np.arange(end - len(group.rows), end), [len(group.source)]))
+        for group, end in zip(groups, ends, strict=True)
+    ]
+    batches = []
+    for shape in dict.fromkeys(layout):
+        places = [rows for rows, its_shape in zip(rows_of, layout, strict=True) if its_shape == shape]
+        sides = [
+            _maps_of_scans([None if rows is None else rows[side] for rows in places], T_world_scan, shape[side])
+            for side in (0, 1)
+        ]
+        T = np.tile(np.eye(4), (len(places), 1, 1))
+        for number, rows in enumerate(places):
+            if rows is not None:
+                T[number] = rigid.inverse(T_world_scan[rows.target[0]]) @ T_world_scan[rows.source[0]]
+        mask = np.array([rows is not None for rows in places])
+        batches.append(GroupBatch(sides[0], sides[1], T.astype(np.float32), mask))
+    return tuple(batches)
 
 
 def stack(trees: Sequence[TreeT]) -> TreeT:
@@ -274,14 +294,15 @@ def stack(trees: Sequence[TreeT]) -> TreeT:
     return jax.tree.map(lambda *leaves: np.stack(leaves), *trees)
 
 
-def _map_of_scans(
-    rows: Sequence[Int[np.ndarray, " k"]], T_world_scan: Float[np.ndarray, "s 4 4"], num_groups: int, capacity: int
+def _maps_of_scans(
+    rows: Sequence[Int[np.ndarray, " k"] | None], T_world_scan: Float[np.ndarray, "s 4 4"], capacity: int
 ) -> MapOfScans:
-    padded = np.zeros((num_groups, capacity), np.int32)
-    mask = np.zeros((num_groups, capacity), bool)
-    T_map_scan = np.tile(np.eye(4, dtype=np.float32), (num_groups, capacity, 1, 1))
+    padded = np.zeros((len(rows), capacity), np.int32)
+    mask = np.zeros((len(rows), capacity), bool)
+    T_map_scan = np.tile(np.eye(4, dtype=np.float32), (len(rows), capacity, 1, 1))
     for number, scans in enumerate(rows):
-        padded[number, : len(scans)] = scans
-        mask[number, : len(scans)] = True
-        T_map_scan[number, : len(scans)] = np.linalg.inv(T_world_scan[scans[0]]) @ T_world_scan[scans]
+        if scans is not None:
+            padded[number, : len(scans)] = scans
+            mask[number, : len(scans)] = True
+            T_map_scan[number, : len(scans)] = rigid.inverse(T_world_scan[scans[0]]) @ T_world_scan[scans]
     return MapOfScans(padded, mask, T_map_scan)

@@ -33,6 +33,7 @@ from dpmjax.deeppointmap.verification import (
     measure_scan,
     refine_motion,
 )
+from dpmjax.geometry.bearing import directions_of
 from dpmjax.types import AnyArray, DescriptorCloud, PointCloud, Registration
 
 NUM_THREADS = 2
@@ -183,7 +184,7 @@ def match_clouds(
     Returns:
         All hypotheses, with a leading axis, as arrays of NumPy on the host.
     """
-    return jax.device_get(_match_clouds(model, source, target, config=config))
+    return jax.device_get(trace_match(model, source, target, config=config))
 
 
 def overlap(model: Model, source: ScanOrCloud, target: ScanOrCloud) -> Float[Array, ""]:
@@ -262,16 +263,26 @@ def _as_cloud(model: Model, scan: ScanOrCloud) -> DescriptorCloud:
 
 
 @functools.partial(jax.jit, static_argnames="config")
-def _match_clouds(
-    model: Model, source: DescriptorCloud, target: DescriptorCloud, *, config: MatchConfig
-) -> Registration:
+def trace_match(model: Model, source: DescriptorCloud, target: DescriptorCloud, *, config: MatchConfig) -> Registration:
+    """Does the work of `match_clouds`; for use in compiled programs.
+
+    Args:
+        model: encoder and decoder.
+        source: uncorrelated descriptors.
+        target: the same.
+        config: choice of pairs, inliers and hypotheses.
+
+    Returns:
+        All hypotheses, with a leading axis.
+    """
     source, target = correlate(model, source, target)
     directions = [_unit(similarity_features(model, cloud)) for cloud in (source, target)]
     similarity = jnp.matmul(directions[0], directions[1].T, precision=lax.Precision.HIGHEST)
 
     def offsets(source_rows: Array, target_rows: Array) -> tuple[Array, Array]:
         a, b = source.features[source_rows], target.features[target_rows]
-        return predict_offsets(model, a, b), predict_offsets(model, b, a)
+        of_source, of_target = directions_of(source)[source_rows], directions_of(target)[target_rows]
+        return predict_offsets(model, a, b, of_source), predict_offsets(model, b, a, of_target)
 
     return match_hypotheses(source, target, similarity, offsets, config=config)
 

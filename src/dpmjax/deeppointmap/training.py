@@ -11,6 +11,7 @@ The step is deterministic: samples and their augmentation are drawn when a batch
 from __future__ import annotations
 
 import functools
+import math
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any, NamedTuple
@@ -28,7 +29,7 @@ from dpmjax.deeppointmap.model import (
     Model,
     coarse_features,
     correlate,
-    encode_pyramid,
+    encode_stored,
     init_model,
     overlap_logit,
     predict_offsets,
@@ -42,9 +43,17 @@ from dpmjax.deeppointmap.objective import (
     close_pairs,
     matching_loss,
 )
-from dpmjax.deeppointmap.sampling import MapOfScans, OverlapSample, RegistrationSample, Sample
+from dpmjax.deeppointmap.sampling import (
+    GroupBatch,
+    MapOfScans,
+    OverlapSample,
+    RegistrationSample,
+    Sample,
+    SampleScans,
+)
+from dpmjax.geometry.bearing import directions_of
 from dpmjax.losses.descriptors import overlap_loss
-from dpmjax.types import AnyArray, DescriptorCloud, PointPyramid
+from dpmjax.types import AnyArray, DescriptorCloud
 
 
 @flax.struct.dataclass
@@ -56,12 +65,16 @@ class TrainingState:
         registration_optimizer: state of the optimiser of all parameters.
         overlap_optimizer: state of the optimiser of the overlap head.
         step: number of steps done, both parts together.
+        decay_start: step from which on the learning rate of the registration part falls.
+        registration_end: step after the last of the registration part.
     """
 
     params: dict[str, Any]
     registration_optimizer: optax.OptState
     overlap_optimizer: optax.OptState
     step: Int[AnyArray, ""]
+    decay_start: Int[AnyArray, ""]
+    registration_end: Int[AnyArray, ""]
 
 
 class TrainingReport(NamedTuple):
@@ -96,16 +109,39 @@ def init_training(key: PRNGKeyArray, config: TrainingConfig) -> TrainingState:
         The state.
     """
     params = init_model(key, config.model).params
+    num_steps = config.registration_steps
     return TrainingState(
         params=params,
         registration_optimizer=_optimizer(config, is_overlap=False).init(params),
         overlap_optimizer=_optimizer(config, is_overlap=True).init(params["decoder"]["overlap_head"]),
         step=jnp.zeros((), jnp.int32),
+        decay_start=jnp.asarray(num_steps - round(config.decay_ratio * num_steps), jnp.int32),
+        registration_end=jnp.asarray(num_steps, jnp.int32),
     )
 
 
+def finish(state: TrainingState, config: TrainingConfig) -> TrainingState:
+    """Begins the decay of the learning rate at once, so that the registration part ends early.
+
+    The decay then has the share of the steps that `config.decay_ratio` says.
+
+    Args:
+        state: state before any step.
+        config: settings of training.
+
+    Returns:
+        The state with its new end; the same state if its decay has begun, or would end no earlier.
+    """
+    step = int(state.step)
+    num_decay = max(1, math.ceil(step * config.decay_ratio / max(1 - config.decay_ratio, 1e-6)))
+    if step >= int(state.decay_start) or step + num_decay >= int(state.registration_end):
+        return state
+    end = jnp.asarray(step + num_decay, jnp.int32)
+    return replace(state, decay_start=jnp.asarray(step, jnp.int32), registration_end=end)
+
+
 def make_step(config: TrainingConfig, mesh: Mesh | None = None) -> Step:
-    """Makes the jitted step, which compiles once for each stage of the curriculum and once for the overlap part.
+    """Makes the jitted step, which compiles once for each layout of the curriculum and once for the overlap part.
 
     Batches carry samples along their first axis and may be spread over devices by `place`. The loss is the mean
     over all groups of all samples, so the number of devices changes the speed only.
@@ -126,20 +162,20 @@ def _one_step(state: TrainingState, batch: Sample, *, config: TrainingConfig) ->
     is_overlap = isinstance(batch, OverlapSample)
     if isinstance(batch, OverlapSample):
         learned, optimizer_state = state.params["decoder"]["overlap_head"], state.overlap_optimizer
-        loss_of, step = _overlap_loss_of(state, batch, config), state.step - config.registration_steps
+        loss_of = _overlap_loss_of(state, batch, config)
     else:
-        learned, optimizer_state, step = state.params, state.registration_optimizer, state.step
+        learned, optimizer_state = state.params, state.registration_optimizer
 
         def loss_of(params: dict[str, Any]) -> tuple[Array, tuple[ObjectiveTerms, Array]]:
             loss, terms = batch_loss(params, batch, config)
             return loss, (terms, jnp.asarray(jnp.nan))
 
     (loss, (terms, accuracy)), gradient = jax.value_and_grad(loss_of, has_aux=True)(learned)
-    learning_rate = jnp.asarray(_schedule(config, is_overlap=is_overlap)(step))
+    learning_rate = _learning_rate(state, config, is_overlap=is_overlap)
     gradient_norm = jnp.sqrt(sum(jnp.sum(leaf**2) for leaf in jax.tree.leaves(gradient)))
     report = TrainingReport(loss, terms, accuracy, gradient_norm, learning_rate)
     updates, optimizer_state = _optimizer(config, is_overlap=is_overlap).update(gradient, optimizer_state, learned)
-    learned = optax.apply_updates(learned, updates)
+    learned = jax.tree.map(lambda value, update: value - learning_rate * update, learned, updates)
     if is_overlap:
         state = replace(state, params=_with_head(state.params, learned), overlap_optimizer=optimizer_state)
     else:
@@ -165,23 +201,30 @@ def batch_loss(
     """
     model = Model(params, config.model)
 
-    def of_sample(sample: RegistrationSample) -> tuple[Array, ObjectiveTerms]:
-        clouds = _in_parts(functools.partial(encode_pyramid, model), sample.pyramids, config.scans_at_once)
+    def of_sample(sample: RegistrationSample) -> list[tuple[Array, ObjectiveTerms]]:
+        clouds = _in_parts(functools.partial(_encoded, model), sample.scans, config.scans_at_once)
 
-        def of_group(group: tuple[MapOfScans, MapOfScans, AnyArray]) -> tuple[Array, ObjectiveTerms]:
-            source, target, T_target_source = group
-            return _map_pair_loss(
-                model, _merged(clouds, source), _merged(clouds, target), T_target_source, config.objective
+        def of_group(group: GroupBatch) -> tuple[Array, ObjectiveTerms]:
+            maps = _merged(clouds, group.source), _merged(clouds, group.target)
+            return _map_pair_loss(model, *maps, group.T_target_source, config.objective)
+
+        return [
+            _in_parts(
+                of_group, group, config.group_scans_at_once // (group.source.rows.shape[1] + group.target.rows.shape[1])
             )
+            for group in sample.groups
+        ]
 
-        scans_of_group = sample.source.rows.shape[-1] + sample.target.rows.shape[-1]
-        groups = (sample.source, sample.target, sample.T_target_source)
-        return _in_parts(of_group, groups, config.scans_at_once // scans_of_group)
-
-    losses, terms = jax.vmap(of_sample)(batch)
-    count = jnp.maximum(jnp.sum(batch.mask), 1)
-    loss, terms = jax.tree.map(lambda x: jnp.sum(jnp.where(batch.mask, x, 0)) / count, (losses, terms))
+    of_shapes = jax.vmap(of_sample)(batch)
+    mask = jnp.concatenate([group.mask for group in batch.groups], axis=1)
+    losses, terms = jax.tree.map(lambda *parts: jnp.concatenate(parts, axis=1), *of_shapes)
+    count = jnp.maximum(jnp.sum(mask), 1)
+    loss, terms = jax.tree.map(lambda x: jnp.sum(jnp.where(mask, x, 0)) / count, (losses, terms))
     return loss, terms
+
+
+def _encoded(model: Model, scan: SampleScans) -> DescriptorCloud:
+    return encode_stored(model, scan.pyramids, scan.T_augmented_lidar)
 
 
 def _map_pair_loss(
@@ -200,21 +243,23 @@ def _in_parts(function: Callable[[Any], Any], trees: Any, at_once: int) -> Any:
     num = len(jax.tree.leaves(trees)[0])
     # A divisor, because a last part of another size would be compiled separately.
     size = max(size for size in range(1, max(1, min(at_once, num)) + 1) if num % size == 0)
+    if size == num:
+        return jax.vmap(function)(trees)
     return jax.lax.map(jax.checkpoint(function), trees, batch_size=size)
 
 
 def _side(
     model: Model, cloud: DescriptorCloud, correlated: DescriptorCloud, other: DescriptorCloud, close: ClosePairs
 ) -> TrainingSide:
-    partners = other.features[close.indices]
-    own = jnp.broadcast_to(correlated.features[:, None], partners.shape)
+    directions = directions_of(cloud)[:, None]
+    own = correlated.features[:, None]
     return TrainingSide(
         positions=cloud.positions,
         mask=cloud.mask,
         matched_features=similarity_features(model, correlated),
         coarse_features=coarse_features(model, cloud),
         close=close,
-        offsets=predict_offsets(model, own, partners),
+        offsets=predict_offsets(model, own, other.features, directions, close.indices),
     )
 
 
@@ -243,14 +288,13 @@ def _correlated_pairs(
 ) -> tuple[DescriptorCloud, DescriptorCloud]:
     # All pairs of all samples along one axis; they need no gradient.
 
-    def of_pair(pair: tuple[PointPyramid, PointPyramid]) -> tuple[DescriptorCloud, DescriptorCloud]:
-        first, second = pair
-        return correlate(model, encode_pyramid(model, first), encode_pyramid(model, second))
+    def of_sample(scans: SampleScans) -> tuple[DescriptorCloud, DescriptorCloud]:
+        clouds = _in_parts(functools.partial(_encoded, model), scans, 2 * pairs_at_once)
+        pairs = jax.tree.map(lambda x: x.reshape(2, -1, *x.shape[1:]), clouds)
+        sides = (jax.tree.map(lambda x, side=side: x[side], pairs) for side in (0, 1))
+        return _in_parts(lambda pair: correlate(model, *pair), tuple(sides), pairs_at_once)
 
-    def of_sample(first: PointPyramid, second: PointPyramid) -> tuple[DescriptorCloud, DescriptorCloud]:
-        return _in_parts(of_pair, (first, second), pairs_at_once)
-
-    clouds = jax.vmap(of_sample)(batch.first, batch.second)
+    clouds = jax.vmap(of_sample)(batch.scans)
     return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), clouds)
 
 
@@ -258,21 +302,23 @@ def _with_head(params: dict[str, Any], head: Any) -> dict[str, Any]:
     return {**params, "decoder": {**params["decoder"], "overlap_head": head}}
 
 
-def _schedule(config: TrainingConfig, *, is_overlap: bool) -> optax.Schedule:
-    # A cosine from the first learning rate to the last, after the warm-up.
-    ratio = config.overlap_ratio if is_overlap else 1.0
-    return optax.warmup_cosine_decay_schedule(
-        init_value=0.0 if config.warmup_steps > 0 and not is_overlap else ratio * config.learning_rate,
-        peak_value=ratio * config.learning_rate,
-        warmup_steps=0 if is_overlap else config.warmup_steps,
-        decay_steps=max(1, config.overlap_steps if is_overlap else config.registration_steps),
-        end_value=ratio * config.final_learning_rate,
-    )
+def _learning_rate(state: TrainingState, config: TrainingConfig, *, is_overlap: bool) -> Float[Array, ""]:
+    # Registration: warm-up, constant, half a cosine at the end. Overlap: half a cosine.
+    begin = state.registration_end if is_overlap else state.decay_start
+    length = config.overlap_steps if is_overlap else state.registration_end - state.decay_start
+    progress = jnp.clip((state.step - begin) / jnp.maximum(length, 1), 0, 1)
+    share = (1 + jnp.cos(jnp.pi * progress)) / 2
+    rate = config.final_learning_rate + share * (config.learning_rate - config.final_learning_rate)
+    if is_overlap:
+        return config.overlap_ratio * rate
+    return rate * jnp.minimum(1, (state.step + 1) / max(1, config.warmup_steps))
 
 
 def _optimizer(config: TrainingConfig, *, is_overlap: bool) -> optax.GradientTransformation:
+    # AdamW without its learning rate, which the state decides about.
     ratio = config.overlap_ratio if is_overlap else 1.0
     return optax.chain(
         optax.clip_by_global_norm(config.max_gradient_norm),
-        optax.adamw(_schedule(config, is_overlap=is_overlap), weight_decay=ratio * config.weight_decay),
+        optax.scale_by_adam(),
+        optax.add_decayed_weights(ratio * config.weight_decay),
     )

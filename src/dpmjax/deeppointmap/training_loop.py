@@ -1,6 +1,6 @@
 """The training loop: batches, steps, evaluation, reports, and the best parameters so far.
 
-    store = ScanStore(drives, config.model.preprocess)
+    store = ScanStore([prepare_drive(drive, config) for drive in drives])
     trained = train(store, config, hooks=TrainingHooks(evaluate=..., on_report=...))
 
 A run that continues from the `TrainingProgress` of any report gives the numbers of an unbroken run.
@@ -21,9 +21,10 @@ from jaxtyping import Float, Int
 
 from dpmjax.checks import require_count
 from dpmjax.deeppointmap.curriculum import CurriculumStage, TrainingConfig
-from dpmjax.deeppointmap.data_pipeline import SampleMaker, ScanStore
+from dpmjax.deeppointmap.data_pipeline import SampleMaker
 from dpmjax.deeppointmap.model import Model
 from dpmjax.deeppointmap.processes import BATCH_AXIS, device_mesh, from_first, is_first, largest, place, together
+from dpmjax.deeppointmap.scan_store import ScanStore
 from dpmjax.deeppointmap.training import TrainingReport, TrainingState, init_training, make_step
 from dpmjax.types import AnyArray
 
@@ -149,13 +150,16 @@ def train(
     step = make_step(config, mesh if jax.device_count() > 1 else None)
     clock, stopped_by = _Clock(config.sampling.num_scans * jax.device_count()), 0
     first_sample = jax.process_index() * num_local
-    with SampleMaker(store, config, seed=seed, num_samples=num_local, first_sample=first_sample) as maker:
-        batches = maker.batches(int(progress.state.step), config.num_steps)
+    last = int(start.state.registration_end)
+    with SampleMaker(
+        store, config, seed=seed, num_samples=num_local, first_sample=first_sample, registration_steps=last
+    ) as maker:
+        batches = maker.batches(int(progress.state.step), last + config.overlap_steps)
         with together():
             batch = next(batches, None)
         while batch is not None and not (stopped_by := largest(int(hooks.stop()))):
-            progress = before_step(progress, config)
-            stage = config.stage_at(int(progress.state.step))
+            progress = before_step(progress)
+            stage = stage_of(progress.state, config)
             begun = time.perf_counter()
             state, report = step(progress.state, place(batch, mesh, BATCH_AXIS))
             with together():  # the next batch is prepared while the device computes
@@ -170,7 +174,7 @@ def train(
             with together():
                 if hooks.on_report is not None and is_first():
                     hooks.on_report(StepRecord(number, stage, report, score, clock.speed), progress)
-    model = _local(Model(params_to_use(progress, config), config.model))
+    model = _local(Model(params_to_use(progress), config.model))
     return Trained(model, progress, stopped_by, clock.speed)
 
 
@@ -202,32 +206,43 @@ def after_evaluation(progress: TrainingProgress, score: float) -> TrainingProgre
     return TrainingProgress(state, state.params, np.asarray(score, np.float32), np.asarray(state.step, np.int32))
 
 
-def before_step(progress: TrainingProgress, config: TrainingConfig) -> TrainingProgress:
+def stage_of(state: TrainingState, config: TrainingConfig) -> CurriculumStage | None:
+    """Finds the stage of the next step.
+
+    Args:
+        state: state before the step.
+        config: settings of training.
+
+    Returns:
+        The stage; None in the overlap part.
+    """
+    return config.stage_at(int(state.step)) if int(state.step) < int(state.registration_end) else None
+
+
+def before_step(progress: TrainingProgress) -> TrainingProgress:
     """Restores the best parameters at the beginning of the overlap part, whose head is trained on them.
 
     Args:
         progress: progress before a step.
-        config: settings of training.
 
     Returns:
         The progress to take the step from.
     """
-    if int(progress.state.step) != config.registration_steps or int(progress.best_step) == 0:
+    if int(progress.state.step) != int(progress.state.registration_end) or int(progress.best_step) == 0:
         return progress
     return replace(progress, state=replace(progress.state, params=progress.best_params))
 
 
-def params_to_use(progress: TrainingProgress, config: TrainingConfig) -> dict[str, Any]:
+def params_to_use(progress: TrainingProgress) -> dict[str, Any]:
     """Selects the parameters of the result.
 
     Args:
         progress: progress after any step.
-        config: settings of training.
 
     Returns:
         The best parameters. In the overlap part these are the parameters of the state, with a new head.
     """
-    is_over = int(progress.state.step) > config.registration_steps
+    is_over = int(progress.state.step) > int(progress.state.registration_end)
     return progress.state.params if is_over or int(progress.best_step) == 0 else progress.best_params
 
 
@@ -235,7 +250,7 @@ def _evaluate_when_due(
     progress: TrainingProgress, stage: CurriculumStage | None, config: TrainingConfig, hooks: TrainingHooks
 ) -> tuple[TrainingProgress, float]:
     done = int(progress.state.step)
-    if stage is None or (done % hooks.evaluate_every and done != config.registration_steps):
+    if stage is None or (done % hooks.evaluate_every and done != int(progress.state.registration_end)):
         return progress, math.nan
     score = math.nan
     with together():

@@ -140,9 +140,22 @@ def _neighbours_of_stage(
     return tuple(blocks)
 
 
+def interpolation_weights(squared: Float[Array, "m 3"], is_used: Bool[Array, "m 3"]) -> Float[Array, "m 3"]:
+    """Computes the shares of the nearest points: their inverse squared distances, with sum one.
+
+    Args:
+        squared: squared normalised distances; anything where they are not used.
+        is_used: False where there are fewer points.
+
+    Returns:
+        The shares; zero where they are not used.
+    """
+    inverse = jnp.where(is_used, 1 / (jnp.where(is_used, squared, 0) + WEIGHT_EPSILON), 0)
+    total = jnp.sum(inverse, axis=1, keepdims=True)
+    return inverse / jnp.where(total > 0, total, 1)
+
+
 def _interpolate(fine: PyramidLevel, coarse: PyramidLevel) -> Interpolation:
     near = k_nearest(fine.positions, coarse.positions, 3, coarse.mask)
     is_used = near.mask & fine.mask[:, None]
-    inverse = jnp.where(is_used, 1 / (jnp.where(is_used, near.squared_distances, 0) + WEIGHT_EPSILON), 0)
-    total = jnp.sum(inverse, axis=1, keepdims=True)
-    return Interpolation(jnp.where(is_used, near.indices, 0), inverse / jnp.where(total > 0, total, 1))
+    return Interpolation(jnp.where(is_used, near.indices, 0), interpolation_weights(near.squared_distances, is_used))

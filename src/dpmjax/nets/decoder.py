@@ -5,11 +5,11 @@ DeepPointMap section 3.2. Call a method by its name: `decoder.apply({"params": p
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import flax.linen as nn
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from dpmjax.checks import require_count
 from dpmjax.nets.attention import AttentionLayer, embed_positions
@@ -58,6 +58,41 @@ class Head(nn.Module):
     compute_dtype: ComputeDtype = "float32"
 
 
+class LinearOfPair(nn.Module):
+    """A linear map of two concatenated rows: the sum of one map of each, so that each row is mapped once.
+
+    Attributes:
+        num_features: channels of the result.
+        compute_dtype: type of the matrix products.
+    """
+
+    num_features: int
+    compute_dtype: ComputeDtype
+
+    @nn.compact
+    def __call__(
+        self, first: Float[Array, "... c"], second: Float[Array, "... c"], rows: Int[Array, "..."] | None
+    ) -> Float[Array, "... f"]:
+        """Maps pairs.
+
+        Args:
+            first: first rows.
+            second: second rows.
+            rows: if given, the second row of each pair is `second[rows]`.
+
+        Returns:
+            The sums, in the type of the matrix products.
+        """
+        num_channels = first.shape[-1]
+        shape = (2 * num_channels, self.num_features)
+        kernel = self.param("kernel", nn.initializers.lecun_normal(), shape)
+        bias = self.param("bias", nn.initializers.zeros_init(), (self.num_features,))
+        dtype = jnp.dtype(self.compute_dtype)
+        first, second, kernel, bias = (x.astype(dtype) for x in (first, second, kernel, bias))
+        of_second = jnp.matmul(second, kernel[num_channels:])
+        return jnp.matmul(first, kernel[:num_channels]) + (of_second if rows is None else of_second[rows]) + bias
+
+
 class OffsetHead(Head):
     """Predicts the offset from a descriptor to its partner (DeepPointMap section 3.2, figure 2d).
 
@@ -65,21 +100,23 @@ class OffsetHead(Head):
     """
 
     @nn.compact
-    def __call__(self, features: Float[Array, "... c"], partners: Float[Array, "... c"]) -> Float[Array, "... 3"]:
+    def __call__(
+        self, features: Float[Array, "... c"], partners: Float[Array, "... c"], rows: Int[Array, "..."] | None = None
+    ) -> Float[Array, "... 3"]:
         """Predicts offsets, row for row.
 
         Args:
             features: correlated features of the first cloud.
             partners: correlated features of their partners.
+            rows: if given, the partners are `partners[rows]`.
 
         Returns:
-            Offsets in metres, in the frame of the first cloud.
+            Offsets in metres, in the frame that the features are relative to.
         """
-        pair = jnp.concatenate([features, partners], axis=-1)
-        x = nn.relu(linear(self.num_channels, self.compute_dtype, "linear_0")(pair))
+        x = nn.relu(LinearOfPair(self.num_channels, self.compute_dtype, name="linear_0")(features, partners, rows))
         x = nn.relu(linear(self.num_channels // 2, self.compute_dtype, "linear_1")(x))
         x = linear(self.num_channels // 4, self.compute_dtype, "linear_2")(x)
-        short_cut = linear(self.num_channels // 4, self.compute_dtype, "short_cut")(pair)
+        short_cut = LinearOfPair(self.num_channels // 4, self.compute_dtype, name="short_cut")(features, partners, rows)
         return linear(3, "float32", "output")(nn.relu(x + short_cut).astype(jnp.float32))
 
 
@@ -145,9 +182,7 @@ class DescriptorDecoder(nn.Module):
         for i in range(self.config.num_layers):
             x = self.layers[i % len(self.layers)](x, embeddings, masks)
         features_a, features_b = jnp.split(x, [a.mask.size])
-        correlated_a = DescriptorCloud(a.positions, features_a, masks[0])
-        correlated_b = DescriptorCloud(b.positions, features_b, masks[1])
-        return _cleared(correlated_a), _cleared(correlated_b)
+        return _cleared(replace(a, features=features_a)), _cleared(replace(b, features=features_b))
 
     def overlap_logit(self, a: DescriptorCloud, b: DescriptorCloud) -> Float[Array, ""]:
         """Predicts the logit of the probability that two clouds overlap.
@@ -179,7 +214,7 @@ def _cleared(cloud: DescriptorCloud) -> DescriptorCloud:
     # Masked entries may hold anything, and must not reach a gradient.
     mask = cloud.mask[:, None]
     positions, features = jnp.where(mask, cloud.positions, 0), jnp.where(mask, cloud.features, 0)
-    return DescriptorCloud(positions, features, cloud.mask)
+    return replace(cloud, positions=positions, features=features)
 
 
 def _masked_mean(features: Float[Array, "m c"], mask: Bool[Array, " m"]) -> Float[Array, " c"]:

@@ -1,10 +1,14 @@
 """The maximum over neighbours of normalised differences: the inner loop of the encoder, with its own backward pass.
 
 The automatic derivative of gather, norm and maximum over (m, k, f) numbers takes fifteen times as long as the value on
-a CPU. Both passes here visit one neighbour after the other, on (m, f) numbers that stay in the cache.
+a CPU. The forward pass here visits one neighbour after the other, on (m, f) numbers that stay in the cache. The
+backward pass handles (m, f) winners and (m, k) pairs, never both at once: with the length |x| of each pair kept, the
+derivative of the norm is a multiple of x = of_points + offset kernel, whose sums over the pairs are sums of numbers.
 """
 
 from __future__ import annotations
+
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -16,7 +20,20 @@ from dpmjax.types import AnyArray
 
 _UNROLL = 4
 
-Residuals = tuple[jax.Array, jax.Array, jax.Array, jax.Array, jax.Array, jax.Array]
+
+class Residuals(NamedTuple):
+    """What the backward pass needs: the inputs; for each query and channel the winner and its normalised number; and
+    for each pair 1 / |x|.
+    """
+
+    of_points: jax.Array
+    offsets: jax.Array
+    kernel: jax.Array
+    neighbours: jax.Array
+    scale: jax.Array
+    winner: jax.Array
+    normalised: jax.Array
+    inverse: jax.Array
 
 
 @jax.custom_vjp
@@ -50,43 +67,49 @@ def _forward(
 ) -> tuple[jax.Array, Residuals]:
     neighbours, shape = jnp.asarray(neighbours), (len(neighbours), of_points.shape[1])
 
-    def look_at(j: jax.Array, best: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
-        value, winner = best
+    def look_at(j: jax.Array, best: tuple[jax.Array, ...]) -> tuple[jax.Array, ...]:
+        value, winner, of_winner, inverses = best
         x = _with_offsets(of_points[neighbours[:, j]], offsets[:, j], kernel)
-        candidate = x * _inverse_length(x) * scale
-        return jnp.maximum(value, candidate), jnp.where(candidate > value, j, winner)
+        inverse = _inverse_length(x)
+        normalised = x * inverse
+        candidate = normalised * scale
+        has_won = candidate > value
+        return (
+            jnp.maximum(value, candidate),
+            jnp.where(has_won, j, winner),
+            jnp.where(has_won, normalised, of_winner),
+            inverses.at[:, j].set(inverse[:, 0]),
+        )
 
-    start = jnp.full(shape, -jnp.inf, of_points.dtype), jnp.zeros(shape, jnp.int32)
-    value, winner = lax.fori_loop(0, neighbours.shape[1], look_at, start, unroll=_UNROLL)
-    return value, (of_points, offsets, kernel, neighbours, scale, winner)
+    zeros = jnp.zeros(shape, of_points.dtype)
+    start = zeros - jnp.inf, jnp.zeros(shape, jnp.int32), zeros, jnp.zeros(neighbours.shape, of_points.dtype)
+    value, *found = lax.fori_loop(0, neighbours.shape[1], look_at, start, unroll=_UNROLL)
+    return value, Residuals(of_points, offsets, kernel, neighbours, scale, *found)
 
 
 def _backward(residuals: Residuals, gradient: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array, None, jax.Array]:
-    of_points, offsets, kernel, neighbours, scale, winner = residuals
+    # With g = gradient * scale at the winners and 0 elsewhere, the derivative by x of a pair is
+    #     inverse * g - weight * x,   weight = inverse^2 * mean over channels of (g * normalised).
+    # Outputs that nobody uses, such as those to the offsets, are removed by the compiler.
+    of_points, offsets, kernel, neighbours, scale, winner, normalised, inverse = residuals
+    num_queries, num_channels = winner.shape
+    queries, channels = jnp.arange(num_queries)[:, None], jnp.arange(num_channels)
     weighted = gradient * scale
-
-    def pass_to(j: jax.Array, sums: tuple[jax.Array, ...]) -> tuple[jax.Array, ...]:
-        to_points, to_offsets, to_kernel, to_scale = sums
-        rows = neighbours[:, j]
-        x = _with_offsets(of_points[rows], offsets[:, j], kernel)
-        inverse = _inverse_length(x)
-        normalised = x * inverse
-        has_won = winner == j
-        won = jnp.where(has_won, weighted, 0)
-        # The component along x only changes its length, which the norm removes.
-        along = jnp.mean(won * normalised, axis=-1, keepdims=True)
-        share = inverse * (won - normalised * along)
-        return (
-            to_points.at[rows].add(share),
-            to_offsets.at[:, j].set(_product(share, kernel.T)),
-            to_kernel + _product(offsets[:, j].T, share),
-            to_scale + jnp.where(has_won, gradient * normalised, 0),
-        )
-
-    zeros = tuple(jnp.zeros_like(x) for x in (of_points, offsets, kernel, gradient))
-    sums = lax.fori_loop(0, neighbours.shape[1], pass_to, zeros, unroll=_UNROLL)
-    to_points, to_offsets, to_kernel, to_scale = sums
-    return to_points, to_offsets, to_kernel, None, jnp.sum(to_scale, axis=0)
+    along = jnp.zeros_like(inverse).at[queries, winner].add(weighted * normalised) / num_channels
+    weight = inverse**2 * along
+    won = weighted * inverse[queries, winner]
+    weighted_offsets = weight[..., None] * offsets
+    to_points = jnp.zeros_like(of_points).at[neighbours[queries, winner], channels].add(won)
+    weight_of_points = jnp.zeros(len(of_points), weight.dtype).at[neighbours].add(weight)
+    offsets_of_points = jnp.zeros((len(of_points), 3), weight.dtype).at[neighbours].add(weighted_offsets)
+    to_points -= _with_offsets(weight_of_points[:, None] * of_points, offsets_of_points, kernel)
+    to_kernel = jnp.stack([jnp.sum(won * offsets[queries, winner, axis], axis=0) for axis in range(3)])
+    squares = _product(weighted_offsets.reshape(-1, 3).T, offsets.reshape(-1, 3))
+    to_kernel -= _product(offsets_of_points.T, of_points) + _product(squares, kernel)
+    of_x = _product(of_points, kernel.T)[neighbours] + _product(offsets, _product(kernel, kernel.T))
+    to_offsets = jnp.zeros_like(offsets).at[queries, winner].add(won[..., None] * kernel.T)
+    to_offsets -= weight[..., None] * of_x
+    return to_points, to_offsets, to_kernel, None, jnp.sum(gradient * normalised, axis=0)
 
 
 def _with_offsets(
@@ -98,7 +121,7 @@ def _with_offsets(
     return of_points
 
 
-def _product(a: Float[Array, "m k"], b: Float[Array, "k n"]) -> Float[Array, "m n"]:
+def _product(a: Float[Array, "... k"], b: Float[Array, "k n"]) -> Float[Array, "... n"]:
     return jnp.matmul(a, b, precision=lax.Precision.HIGHEST)
 
 

@@ -14,10 +14,10 @@ from typing import Literal, get_args
 
 import flax.linen as nn
 import jax.numpy as jnp
-from jax import lax
 from jaxtyping import Array, Float, Int
 
 from dpmjax.checks import require_count, require_one_of
+from dpmjax.geometry.bearing import ray_directions, to_ray_frame
 from dpmjax.nets.layers import ComputeDtype, layer_norm, linear, require_compute_dtype
 from dpmjax.nets.neighbourhood import maximum_of_normalised
 from dpmjax.types import AnyArray, Interpolation, PointPyramid, PyramidLevel
@@ -35,7 +35,8 @@ class EncoderConfig:
         output_channels: channels of a descriptor.
         frame: frame of the offsets between points. "lidar": the axes of the lidar (the published networks, which have
             to learn that a scan may be rotated). "bearing": along and across the ray from the lidar to each point;
-            descriptors are then invariant to rotations of the scan about the vertical.
+            descriptors are then invariant to rotations of the scan about the vertical, and the offsets between
+            descriptors are predicted in the frame of their rays, too.
         compute_dtype: type of the matrix products over features.
     """
 
@@ -98,31 +99,10 @@ class NeighbourhoodMaximum(nn.Module):
         )
         offsets = jnp.asarray(positions[neighbours] - queries[:, None]) / self.radius
         if self.config.frame == "bearing":
-            offsets = turn_to_bearing(offsets, queries[:, None])
+            offsets = to_ray_frame(offsets, ray_directions(queries)[:, None])
         # relu grows with its argument, so it may follow the maximum.
         maximum = maximum_of_normalised(from_features + bias, offsets, kernel[-3:], neighbours, scale)
         return nn.relu(maximum + norm_bias)
-
-
-def turn_to_bearing(vectors: Float[AnyArray, "... 3"], positions: Float[AnyArray, "... 3"]) -> Float[Array, "... 3"]:
-    """Rotates vectors into the frame of the ray from the lidar: x away from the lidar, y to the left, z up.
-
-    The result is invariant to rotations about the z axis of the lidar. On that axis itself, vectors stay as they are.
-
-    Args:
-        vectors: one for each position, in the frame of the lidar.
-        positions: in the frame of the lidar.
-
-    Returns:
-        The rotated vectors.
-    """
-    squared = jnp.sum(positions[..., :2] ** 2, axis=-1)
-    is_off_axis = squared > 0
-    inverse = lax.rsqrt(jnp.where(is_off_axis, squared, 1))
-    cosine = jnp.where(is_off_axis, positions[..., 0] * inverse, 1)
-    sine = jnp.where(is_off_axis, positions[..., 1] * inverse, 0)
-    x, y, z = vectors[..., 0], vectors[..., 1], vectors[..., 2]
-    return jnp.stack([cosine * x + sine * y, cosine * y - sine * x, z], axis=-1)
 
 
 class InvertedResidual(nn.Module):
@@ -252,7 +232,8 @@ class PointEncoder(nn.Module):
             replace(level, positions=jnp.where(level.mask[:, None], level.positions, 0)) for level in pyramid.levels
         ]
         positions = levels[0].positions
-        seen = turn_to_bearing(positions, positions) if config.frame == "bearing" else jnp.asarray(positions)
+        is_bearing = config.frame == "bearing"
+        seen = to_ray_frame(positions, ray_directions(positions)) if is_bearing else jnp.asarray(positions)
         features = [linear(config.stem_channels, "float32", "stem")(seen)]
         for stage, radii in enumerate(self.radii):
             module = Stage(config.stem_channels * 2 ** (stage + 1), radii, config, name=f"stage_{stage}")

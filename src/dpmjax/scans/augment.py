@@ -8,10 +8,11 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from dpmjax.checks import require_fields
@@ -83,7 +84,8 @@ class AugmentConfig:
 
     Attributes:
         max_drop_ratio: each scan loses a share of its points, uniform between 0 and this.
-        sector_probability: probability that sectors occlude a scan.
+        sector_probability: probability that sectors occlude a scan. A scan has sectors or boxes, never both; one
+            scan in ten is occluded (DeepPointMap section 3.3), by either at equal odds.
         sectors: settings of the sectors.
         box_probability: probability that boxes occlude a scan.
         boxes: settings of the boxes.
@@ -95,9 +97,9 @@ class AugmentConfig:
     """
 
     max_drop_ratio: float = 0.5
-    sector_probability: float = 0.1
+    sector_probability: float = 0.05
     sectors: SectorConfig = field(default_factory=SectorConfig)
-    box_probability: float = 0.1
+    box_probability: float = 0.05
     boxes: BoxConfig = field(default_factory=BoxConfig)
     max_yaw_rad: float = math.pi
     max_tilt_rad: float = math.pi / 10
@@ -107,6 +109,9 @@ class AugmentConfig:
 
     def __post_init__(self) -> None:
         require_fields(self, "max_drop_ratio", "sector_probability", "box_probability", low=0, high=1)
+        if self.sector_probability + self.box_probability > 1:
+            both = f"{self.sector_probability} and {self.box_probability}"
+            raise ValueError(f"sector_probability, box_probability: expected a sum of at most 1, got {both}")
         require_fields(self, "max_yaw_rad", "max_tilt_rad", "translation_sigma_m", low=0)
         require_fields(self, "jitter_sigma_m", "jitter_clip_sigmas", low=0)
 
@@ -160,18 +165,39 @@ def random_motion(config: AugmentConfig, *, key: PRNGKeyArray) -> Float[Array, "
         A homogeneous matrix (4, 4), metres.
     """
     angle_key, translation_key = jax.random.split(key)
-    bounds = jnp.array([config.max_tilt_rad, config.max_tilt_rad, config.max_yaw_rad])
-    roll, pitch, yaw = bounds * jax.random.uniform(angle_key, (3,), minval=-1, maxval=1)
-    sigmas = config.translation_sigma_m * jnp.array([1, 1, 0.5])
-    translation = sigmas * jax.random.normal(translation_key, (3,))
-    (sx, sy, sz), (cx, cy, cz) = (f(jnp.stack([roll, pitch, yaw])) for f in (jnp.sin, jnp.cos))
-    R = [  # the product of the three, written out: exact on devices with short matrix products
-        [cy * cz, -cy * sz, sy],
-        [cx * sz + sx * sy * cz, cx * cz - sx * sy * sz, -sx * cy],
-        [sx * sz - cx * sy * cz, sx * cz + cx * sy * sz, cx * cy],
+    angles = jax.random.uniform(angle_key, (3,), minval=-1, maxval=1)
+    return _motion(angles, jax.random.normal(translation_key, (3,)), config)
+
+
+def random_motions_on_host(config: AugmentConfig, num: int, rng: np.random.Generator) -> Float[np.ndarray, "s 4 4"]:
+    """Draws motions as `random_motion` does, in NumPy.
+
+    Args:
+        config: bounds of the angles and sigma of the translation.
+        num: number of motions.
+        rng: source of the draws.
+
+    Returns:
+        Homogeneous matrices (s, 4, 4) in float64, metres.
+    """
+    return np.asarray(_motion(rng.uniform(-1, 1, (num, 3)), rng.normal(size=(num, 3)), config))
+
+
+def _motion(angles: AnyArray, translation: AnyArray, config: AugmentConfig) -> Any:
+    # From uniform and normal numbers (..., 3), of NumPy or of JAX.
+    xp = jnp if isinstance(angles, jax.Array) else np
+    angles = angles * xp.array([config.max_tilt_rad, config.max_tilt_rad, config.max_yaw_rad])
+    translation = translation * config.translation_sigma_m * xp.array([1, 1, 0.5])
+    (sx, sy, sz), (cx, cy, cz) = (xp.moveaxis(f(angles), -1, 0) for f in (xp.sin, xp.cos))
+    x, y, z = xp.moveaxis(translation, -1, 0)
+    zero, one = xp.zeros_like(x), xp.ones_like(x)
+    T = [  # the product of the three, written out: exact on devices with short matrix products
+        [cy * cz, -cy * sz, sy, x],
+        [cx * sz + sx * sy * cz, cx * cz - sx * sy * sz, -sx * cy, y],
+        [sx * sz - cx * sy * cz, sx * cz + cx * sy * sz, cx * cy, z],
+        [zero, zero, zero, one],
     ]
-    T = jnp.eye(4).at[:3, :3].set(jnp.stack([jnp.stack(row) for row in R]))
-    return T.at[:3, 3].set(translation)
+    return xp.stack([xp.stack(row, axis=-1) for row in T], axis=-2)
 
 
 def _is_dropped(num_points: int, config: AugmentConfig, key: PRNGKeyArray) -> Bool[Array, " n"]:
@@ -181,8 +207,9 @@ def _is_dropped(num_points: int, config: AugmentConfig, key: PRNGKeyArray) -> Bo
 
 def _is_occluded(points: Float[Array, "n 3"], config: AugmentConfig, key: PRNGKeyArray) -> Bool[Array, " n"]:
     coin_key, sector_key, box_key = jax.random.split(key, 3)
-    probabilities = jnp.array([config.sector_probability, config.box_probability])
-    has_sectors, has_boxes = jax.random.uniform(coin_key, (2,)) < probabilities
+    coin = jax.random.uniform(coin_key)
+    has_sectors = coin < config.sector_probability
+    has_boxes = ~has_sectors & (coin < config.sector_probability + config.box_probability)
     by_sectors = has_sectors & is_behind_sectors(points, config.sectors, key=sector_key)
     return by_sectors | (has_boxes & is_behind_boxes(points, config.boxes, key=box_key))
 

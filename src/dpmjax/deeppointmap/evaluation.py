@@ -1,0 +1,262 @@
+"""Evaluation: pairs of scans and of maps with true motions, and how many of them a model registers.
+
+    pairs = draw_evaluation_pairs(drive, 100, model.config, kinds=(PairKind(), PairKind(10.0, 20.0)))
+    evaluation = evaluate_registration(model, pairs)
+
+Each scan is turned by a random yaw, prepared once and encoded once, however many pairs it is in.
+"""
+
+from __future__ import annotations
+
+import functools
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from dpmjax.deeppointmap.curriculum import TrainingConfig
+from dpmjax.deeppointmap.matching import merge_clouds
+from dpmjax.deeppointmap.model import Model, ModelConfig, encode_stored
+from dpmjax.deeppointmap.sampling import SampleScans
+from dpmjax.deeppointmap.scan_registration import overlap, trace_match
+from dpmjax.deeppointmap.scan_store import ScanStore, prepare_drive
+from dpmjax.geometry import rigid
+from dpmjax.metrics.poses import RegistrationRecall, registration_recall
+from dpmjax.scans.augment import AugmentConfig
+from dpmjax.sequences import LidarSequence
+from dpmjax.types import DescriptorCloud, Registration
+
+PAIR_STREAM = 3103
+FAR_M = 40.0
+"""Scans farther apart than this do not overlap."""
+
+MAP_RADIUS_M = 10.0
+"""A map of an evaluation holds scans so near to its first one."""
+
+UPRIGHT = AugmentConfig(
+    max_drop_ratio=0.0,
+    sector_probability=0.0,
+    box_probability=0.0,
+    max_tilt_rad=0.0,
+    translation_sigma_m=0.0,
+    jitter_sigma_m=0.0,
+)
+"""Nothing but a random yaw."""
+
+
+class PairKind(NamedTuple):
+    """What the pairs of an evaluation are.
+
+    Attributes:
+        min_distance_m: least distance between the two scans, or between the first scans of the two maps.
+        max_distance_m: largest such distance.
+        num_scans: number of scans in each of the two maps; 1 for pairs of scans.
+    """
+
+    min_distance_m: float = 2.0
+    max_distance_m: float = 10.0
+    num_scans: int = 1
+
+
+class Pairs(NamedTuple):
+    """Pairs of one kind.
+
+    Attributes:
+        kind: what they are.
+        sources: (p, s) scans of the first map of each pair; the first scan is its frame.
+        targets: (p, s) scans of the second map.
+    """
+
+    kind: PairKind
+    sources: Int[np.ndarray, "p s"]
+    targets: Int[np.ndarray, "p s"]
+
+
+class EvaluationPairs(NamedTuple):
+    """Pairs that are ready for all models of one configuration.
+
+    Attributes:
+        scans: all scans, and the yaw of each.
+        T_world_scan: (n, 4, 4) true poses after the yaw, float64 metres.
+        pairs: pairs of each kind.
+        scale_m: metres in one unit of the pyramids.
+    """
+
+    scans: SampleScans
+    T_world_scan: Float[np.ndarray, "n 4 4"]
+    pairs: tuple[Pairs, ...]
+    scale_m: float
+
+    def scan_points(self, row: int) -> Float[np.ndarray, "n 3"]:
+        """Returns the preprocessed points of a scan.
+
+        Args:
+            row: number of the scan.
+
+        Returns:
+            Points in the frame of the scan, metres.
+        """
+        stored, T = self.scans.pyramids, self.scans.T_augmented_lidar[row]
+        points = stored.points[row, : stored.num_points[row]] * (stored.unit[row] * np.float32(self.scale_m))
+        return np.asarray(points @ T[:3, :3].T + T[:3, 3])
+
+    def true_motions(self, pairs: Pairs) -> Float[np.ndarray, "p 4 4"]:
+        """Computes the true motions of pairs.
+
+        Args:
+            pairs: of these.
+
+        Returns:
+            Target from source, metres.
+        """
+        poses = self.T_world_scan
+        return rigid.inverse(poses[pairs.targets[:, 0]]) @ poses[pairs.sources[:, 0]]
+
+
+class Evaluation(NamedTuple):
+    """Results of a model on evaluation pairs.
+
+    Attributes:
+        recalls: for each kind, errors and the share of correct registrations.
+        matches: for each kind, the registrations, stacked.
+        clouds: descriptors of all scans, stacked.
+    """
+
+    recalls: tuple[RegistrationRecall, ...]
+    matches: tuple[Registration, ...]
+    clouds: DescriptorCloud
+
+    @property
+    def mean_recall(self) -> float:
+        """The mean over the kinds."""
+        return float(np.mean([recall.recall for recall in self.recalls]))
+
+
+def draw_evaluation_pairs(
+    drive: LidarSequence,
+    num_pairs: int,
+    config: ModelConfig,
+    *,
+    kinds: tuple[PairKind, ...] = (PairKind(),),
+    max_scans: int = 160,
+    seed: int = 0,
+) -> EvaluationPairs:
+    """Draws random pairs of one drive.
+
+    Args:
+        drive: scans with true poses.
+        num_pairs: number of pairs of each kind; fewer where the drive has fewer.
+        config: preprocessing and pyramid.
+        kinds: what the pairs are.
+        max_scans: a longer drive is thinned to this number of scans, evenly.
+        seed: seed of the draws.
+
+    Returns:
+        The pairs.
+
+    Raises:
+        ValueError: if the drive has no poses, or no pairs of a kind.
+    """
+    if drive.T_world_lidar is None:
+        raise ValueError("drive: expected a true pose for each scan, got none")
+    rng = np.random.default_rng([PAIR_STREAM, seed])
+    thinned = drive.take(slice(None, None, -(-len(drive) // max_scans)))
+    pairs = tuple(_draw(thinned, num_pairs, kind, rng) for kind in kinds)
+    settings = TrainingConfig(model=config, augment=UPRIGHT, num_variants=1)
+    store = ScanStore([prepare_drive(thinned, settings)])
+    scans, T_world_scan = store.read(np.arange(len(thinned)), settings, rng)
+    return EvaluationPairs(scans, T_world_scan, pairs, config.scale_m)
+
+
+def _draw(drive: LidarSequence, num_pairs: int, kind: PairKind, rng: np.random.Generator) -> Pairs:
+    positions = np.asarray(drive.T_world_lidar)[:, :3, 3]
+    distances = np.linalg.norm(positions[:, None] - positions, axis=2)
+    first, second = np.nonzero((distances >= kind.min_distance_m) & (distances <= kind.max_distance_m))
+    if len(first) == 0:
+        raise ValueError(f"drive: expected scans {kind.min_distance_m} to {kind.max_distance_m} m apart, got none")
+    chosen = rng.choice(len(first), min(num_pairs, len(first)), replace=False)
+
+    def maps(rows: Int[np.ndarray, " p"]) -> Int[np.ndarray, "p s"]:
+        near = [np.flatnonzero(distances[row] <= MAP_RADIUS_M) for row in rows]
+        others = [rng.choice(around, kind.num_scans - 1, len(around) < kind.num_scans) for around in near]
+        return np.concatenate([rows[:, None], np.stack(others)], axis=1).astype(int)
+
+    return Pairs(kind, maps(first[chosen]), maps(second[chosen]))
+
+
+def evaluate_registration(model: Model, pairs: EvaluationPairs) -> Evaluation:
+    """Encodes each scan once, and registers all pairs.
+
+    Args:
+        model: a model of the configuration that the pairs were drawn for.
+        pairs: from `draw_evaluation_pairs`.
+
+    Returns:
+        Errors, registrations and descriptors.
+    """
+    clouds = _encode_all(model, pairs.scans)
+    matches, recalls = [], []
+    for some in pairs.pairs:
+        sides = [_maps(clouds, rows, pairs.T_world_scan) for rows in (some.sources, some.targets)]
+        matches.append(jax.device_get(_register_all(model, *sides)))
+        recalls.append(registration_recall(matches[-1].T_target_source, pairs.true_motions(some)))
+    return Evaluation(tuple(recalls), tuple(matches), clouds)
+
+
+def overlap_accuracy(model: Model, evaluation: Evaluation, pairs: EvaluationPairs) -> float:
+    """Measures the overlap prediction on the pairs of the first kind, and on as many that are over 40 m apart.
+
+    Args:
+        model: the model of the evaluation.
+        evaluation: from `evaluate_registration`.
+        pairs: the pairs of the evaluation.
+
+    Returns:
+        Share of correct predictions.
+    """
+
+    def cloud(row: int) -> DescriptorCloud:
+        one: DescriptorCloud = jax.tree.map(lambda leaf: leaf[row], evaluation.clouds)
+        return one
+
+    positions, some = pairs.T_world_scan[:, :3, 3], pairs.pairs[0]
+    is_right = []
+    for a, b in zip(some.sources[:, 0], some.targets[:, 0], strict=True):
+        is_right.append(float(overlap(model, cloud(a), cloud(b))) > 0.5)
+        far = np.flatnonzero(np.linalg.norm(positions - positions[a], axis=1) > FAR_M)
+        if len(far) > 0:
+            other = int(far[(7 * int(a)) % len(far)])
+            is_right.append(float(overlap(model, cloud(a), cloud(other))) <= 0.5)
+    return float(np.mean(is_right))
+
+
+@jax.jit
+def _encode_all(model: Model, scans: SampleScans) -> DescriptorCloud:
+    return jax.lax.map(functools.partial(_encode_one, model), scans)
+
+
+def _encode_one(model: Model, scan: SampleScans) -> DescriptorCloud:
+    return encode_stored(model, scan.pyramids, scan.T_augmented_lidar)
+
+
+@jax.jit
+def _register_all(model: Model, sources: DescriptorCloud, targets: DescriptorCloud) -> Registration:
+    def register_one(maps: tuple[DescriptorCloud, DescriptorCloud]) -> Registration:
+        hypotheses = trace_match(model, *maps, config=model.config.matching)
+        return jax.tree.map(lambda leaf: leaf[0], hypotheses)
+
+    return jax.lax.map(register_one, (sources, targets))
+
+
+def _maps(
+    clouds: DescriptorCloud, rows: Int[np.ndarray, "p s"], T_world_scan: Float[np.ndarray, "n 4 4"]
+) -> DescriptorCloud:
+    T_map_scan = rigid.inverse(T_world_scan[rows[:, :1]]) @ T_world_scan[rows]
+    return _merge_all(clouds, jnp.asarray(rows), jnp.asarray(T_map_scan, jnp.float32))
+
+
+@jax.jit
+def _merge_all(clouds: DescriptorCloud, rows: Array, T_map_scan: Array) -> DescriptorCloud:
+    return jax.vmap(merge_clouds)(jax.tree.map(lambda leaf: leaf[rows], clouds), T_map_scan)

@@ -1,0 +1,220 @@
+"""The scans of training on disk: a few variants of each, thinned, occluded, jittered, and their point pyramids.
+
+    drives = [prepare_drive(drive, config, folder=Path("cache")) for drive in drives]
+    store = ScanStore(drives)
+
+Preprocessing, augmentation and pyramids are done once. A step reads the pyramids of its scans and moves them.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import hashlib
+import json
+import logging
+import os
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from dpmjax.deeppointmap.curriculum import TrainingConfig
+from dpmjax.deeppointmap.encoding import pyramid_of_cloud
+from dpmjax.deeppointmap.sampling import SampleScans, ScanTable
+from dpmjax.geometry.pyramid_storage import pack_pyramid, record_type, stored_pyramids
+from dpmjax.scans.augment import AugmentConfig, augment_scan, random_motions_on_host
+from dpmjax.scans.preprocess import preprocess_scan_on_host
+from dpmjax.sequences import LidarSequence
+from dpmjax.types import PointCloud
+
+LOGGER = logging.getLogger("dpmjax.training")
+VARIANT_STREAM = 3104
+FORMAT = 1
+"""Raise it when the same scans and settings shall give other files."""
+
+
+class PreparedDrive(NamedTuple):
+    """The scans of one drive, ready for training.
+
+    Attributes:
+        T_world_lidar: (n, 4, 4) float64 true poses, metres.
+        pyramids: (n, num_variants) records of `record_type`, or the file that holds them.
+        bad: for each bad scan the reason; bad scans count as empty.
+    """
+
+    T_world_lidar: Float[np.ndarray, "n 4 4"]
+    pyramids: np.ndarray | Path
+    bad: dict[str, str]
+
+
+class ScanStore:
+    """The scans of all drives.
+
+    Attributes:
+        table: poses of all scans.
+        bad: for each bad scan the reason.
+    """
+
+    def __init__(self, drives: Sequence[PreparedDrive]) -> None:
+        """Collects the poses.
+
+        Args:
+            drives: from `prepare_drive`, all with the same settings.
+        """
+        poses = [drive.T_world_lidar for drive in drives]
+        scene = np.concatenate([np.full(len(T), number) for number, T in enumerate(poses)])
+        self.table = ScanTable(np.concatenate(poses), scene)
+        self.bad = {source: reason for drive in drives for source, reason in drive.bad.items()}
+        # Fails where a file is shorter than its header says.
+        self._pyramids = [
+            np.load(drive.pyramids, mmap_mode="r") if isinstance(drive.pyramids, Path) else drive.pyramids
+            for drive in drives
+        ]
+        self._number = np.concatenate([np.arange(len(T)) for T in poses])
+
+    def read(
+        self, rows: Int[np.ndarray, " s"], config: TrainingConfig, rng: np.random.Generator
+    ) -> tuple[SampleScans, Float[np.ndarray, "s 4 4"]]:
+        """Reads a random variant of each scan, and draws its motion.
+
+        Args:
+            rows: numbers of the scans in the table.
+            config: settings of training that the drives were prepared with.
+            rng: source of the draws.
+
+        Returns:
+            The scans, and their poses after the motions, float64.
+        """
+        variants = rng.integers(config.num_variants, size=len(rows))
+        motions = random_motions_on_host(config.augment, len(rows), rng)
+        records = [
+            self._pyramids[self.table.scene[row]][self._number[row], variant]
+            for row, variant in zip(rows, variants, strict=True)
+        ]
+        pyramids = stored_pyramids(np.stack(records), config.model.pyramid)
+        T_world_augmented = self.table.T_world_lidar[rows] @ np.linalg.inv(motions)
+        return SampleScans(pyramids, motions.astype(np.float32)), T_world_augmented
+
+
+def prepare_drive(
+    drive: LidarSequence,
+    config: TrainingConfig,
+    *,
+    folder: Path | None = None,
+    seed: int = 0,
+    on_scan: Callable[[], object] | None = None,
+) -> PreparedDrive:
+    """Makes the pyramids of all variants of all scans, or finds the file that an earlier call has made.
+
+    A file belongs to the poses, the first, middle and last scan, the settings and the seed. It is written under another
+    name until it is whole.
+
+    Args:
+        drive: with poses.
+        config: settings of training.
+        folder: where files are kept; None keeps the pyramids in memory.
+        seed: seed of the variants.
+        on_scan: called after each scan, to show progress.
+
+    Returns:
+        The drive.
+
+    Raises:
+        ValueError: if the drive has no poses.
+    """
+    poses = drive.T_world_lidar
+    if poses is None:
+        raise ValueError("drives: expected a true pose for each scan, got a drive without poses")
+    dtype = record_type(config.model.pyramid, config.model.preprocess.capacity)
+    shape = (len(drive), config.num_variants)
+    make = functools.partial(_fill, drive=drive, config=config, seed=seed, on_scan=on_scan or (lambda: None))
+    if folder is None:
+        pyramids = np.zeros(shape, dtype)
+        return PreparedDrive(poses, pyramids, make(pyramids))
+    folder.mkdir(parents=True, exist_ok=True)
+    path = folder / f"{_key(drive, config, seed)}.npy"
+    reasons = path.with_suffix(".json")
+    if not (path.is_file() and reasons.is_file()):
+        unfinished = path.with_name(f".{path.name}.{os.getpid()}")
+        written = np.lib.format.open_memmap(unfinished, mode="w+", dtype=dtype, shape=shape)
+        bad = make(written)
+        written.flush()
+        del written
+        reasons.write_text(json.dumps(bad), encoding="utf-8")
+        unfinished.replace(path)
+    return PreparedDrive(poses, path, json.loads(reasons.read_text(encoding="utf-8")))
+
+
+def _fill(
+    pyramids: np.ndarray, drive: LidarSequence, config: TrainingConfig, seed: int, on_scan: Callable[[], object]
+) -> dict[str, str]:
+    # The motion is left to the step.
+    still = replace(config.augment, max_yaw_rad=0.0, max_tilt_rad=0.0, translation_sigma_m=0.0)
+    bad = {}
+    for number in range(len(drive)):
+        try:
+            points = drive.read_scan(number)
+        except ValueError as error:
+            source = drive.sources[number]
+            bad[source] = str(error).removeprefix(f"{source}: ")
+            LOGGER.warning("scan %s is left out: %s", source, bad[source])
+            points = np.zeros((0, 3), np.float32)
+        cloud = preprocess_scan_on_host(points, None, config.model.preprocess, num_threads=1)
+        for variant, thinned in enumerate(variants_on_host(cloud, still, config.num_variants, (seed, number))):
+            pyramid = pyramid_of_cloud(thinned, config.model, num_threads=1)
+            pack_pyramid(pyramid, pyramids[number, variant])
+        on_scan()
+    return bad
+
+
+def variants_on_host(
+    cloud: PointCloud, config: AugmentConfig, num_variants: int, seeds: tuple[int, int]
+) -> list[PointCloud]:
+    """Augments a scan several times, on the processor, whatever device trains.
+
+    Args:
+        cloud: a preprocessed scan, metres.
+        config: strength of the augmentation.
+        num_variants: number of variants.
+        seeds: seed of the run, and number of the scan.
+
+    Returns:
+        The variants in NumPy, valid points in front.
+    """
+    with jax.default_device(jax.local_devices(backend="cpu")[0]):
+        key = jax.random.fold_in(jax.random.fold_in(jax.random.key(VARIANT_STREAM), seeds[0]), seeds[1])
+        host = PointCloud(np.asarray(cloud.points), np.asarray(cloud.mask))
+        done = jax.device_get(_augmented(host, jax.random.split(key, num_variants), config=config))
+    variants = []
+    for points, mask in zip(done.points, done.mask, strict=True):
+        front = np.argsort(~mask, kind="stable")
+        variants.append(PointCloud(points[front], mask[front]))
+    return variants
+
+
+@functools.partial(jax.jit, static_argnames="config")
+def _augmented(cloud: PointCloud, keys: Array, *, config: AugmentConfig) -> PointCloud:
+    return jax.vmap(lambda key: augment_scan(jax.tree.map(jnp.asarray, cloud), config, key=key).cloud)(keys)
+
+
+def _key(drive: LidarSequence, config: TrainingConfig, seed: int) -> str:
+    model = config.model
+    settings = [dataclasses.asdict(part) for part in (model.preprocess, model.pyramid, config.augment)]
+    # What changes in the step does not change the file.
+    for name in ("max_yaw_rad", "max_tilt_rad", "translation_sigma_m"):
+        del settings[-1][name]
+    content = json.dumps([FORMAT, settings, model.scale_m, config.num_variants, seed], sort_keys=True)
+    digest = hashlib.sha256(content.encode())
+    digest.update(np.ascontiguousarray(drive.T_world_lidar).tobytes())
+    for number in sorted({0, len(drive) // 2, len(drive) - 1}):
+        try:
+            digest.update(np.ascontiguousarray(drive.read_scan(number)).tobytes())
+        except ValueError as error:
+            digest.update(str(error).encode())
+    return digest.hexdigest()[:24]

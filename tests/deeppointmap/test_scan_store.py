@@ -1,0 +1,58 @@
+"""Prepared drives: what is kept, what is read again, and what a bad scan does."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from dpmjax.deeppointmap import ScanStore, prepare_drive
+from dpmjax.io import InputError
+from dpmjax.sequences import LidarSequence
+from tests.deeppointmap import toy
+
+
+def short(*, num_scans: int = 4, bad: int | None = None) -> LidarSequence:
+    drive = toy.drive(num_scans=num_scans)
+
+    def read_scan(index: int) -> np.ndarray:
+        if index == bad:
+            raise InputError(str(index), "cut off", "leave it out")
+        return drive.read_scan(index)
+
+    return replace(drive, read_scan=read_scan)
+
+
+def test_a_kept_file_is_read_instead_of_made_again(tmp_path) -> None:
+    in_memory = prepare_drive(short(), toy.TRAINING)
+    made = prepare_drive(short(), toy.TRAINING, folder=tmp_path)
+    calls: list[int] = []
+    found = prepare_drive(short(), toy.TRAINING, folder=tmp_path, on_scan=lambda: calls.append(0))
+    assert not calls
+    assert found.pyramids == made.pyramids
+    np.testing.assert_array_equal(np.load(found.pyramids), in_memory.pyramids)
+    assert sorted(path.suffix for path in tmp_path.iterdir()) == [".json", ".npy"]
+
+
+def test_other_scans_or_settings_are_another_file(tmp_path) -> None:
+    moving = replace(toy.TRAINING, augment=replace(toy.TRAINING.augment, max_yaw_rad=1.0))
+    dropping = replace(toy.TRAINING, augment=replace(toy.TRAINING.augment, max_drop_ratio=0.1))
+    first = prepare_drive(short(), toy.TRAINING, folder=tmp_path).pyramids
+    assert prepare_drive(short(), moving, folder=tmp_path).pyramids == first
+    for drive, config, seed in ((short(), dropping, 0), (short(num_scans=3), toy.TRAINING, 0), (short(), moving, 1)):
+        assert prepare_drive(drive, config, folder=tmp_path, seed=seed).pyramids != first
+
+
+def test_a_bad_scan_is_empty_and_named(tmp_path) -> None:
+    prepared = [prepare_drive(short(bad=2), toy.TRAINING, folder=tmp_path) for _ in range(2)]
+    assert prepared[0].bad == prepared[1].bad == {"2": "cut off; leave it out."}
+    store = ScanStore(prepared[:1])
+    scans, _ = store.read(np.arange(4), toy.TRAINING, np.random.default_rng(0))
+    np.testing.assert_array_equal(scans.pyramids.num_points > 0, [True, True, False, True])
+
+
+def test_poses_follow_the_motions_of_the_scans() -> None:
+    store = ScanStore([prepare_drive(short(), toy.TRAINING)])
+    scans, T_world_scan = store.read(np.arange(4), toy.TRAINING, np.random.default_rng(1))
+    found = T_world_scan @ scans.T_augmented_lidar
+    np.testing.assert_allclose(found, store.table.T_world_lidar, atol=1e-4)
