@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import dpmjax
-from experiments import _dpm_evaluation, _dpm_pairs, _dpm_run, dpm_calibrate, dpm_evaluate
+from experiments import _dpm_data, _dpm_evaluation, _dpm_pairs, dpm_calibrate, dpm_evaluate
 from experiments._command import EXIT_BAD_INPUT, EXIT_OK, run_command
 from experiments._result_files import load_json
 from tests.deeppointmap import toy
@@ -28,7 +28,7 @@ def run(module, arguments) -> int:
 
 
 def test_evaluation_measures_every_sequence_and_resumes(weights, tmp_path, monkeypatch, capsys) -> None:
-    monkeypatch.setattr(_dpm_run, "town_drive", lambda seed, **_: toy.drive(seed))
+    monkeypatch.setattr(_dpm_data, "town_drive", lambda seed, **_: toy.drive(seed))
     monkeypatch.setattr(_dpm_evaluation, "why_no_kiss", lambda: "it is not installed")
     arguments = ["town", "--weights", weights, "--pairs", 2, "--num-towns", 1, "-o", tmp_path / "out"]
     assert run(dpm_evaluate, arguments) == EXIT_OK
@@ -66,7 +66,7 @@ def test_bad_input_is_one_line(weights, tmp_path, capsys, arguments, message: st
 
 
 def test_calibration_is_stored_in_a_copy_of_the_model(weights, tmp_path, monkeypatch) -> None:
-    monkeypatch.setattr(_dpm_run, "town_drive", lambda seed, **_: toy.drive(seed))
+    monkeypatch.setattr(_dpm_data, "town_drive", lambda seed, **_: toy.drive(seed))
     rng = np.random.default_rng(0)
 
     def found(model, pair):
