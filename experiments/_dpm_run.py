@@ -49,8 +49,8 @@ KINDS = (PairKind(2.0, 10.0), PairKind(10.0, 20.0), PairKind(2.0, 10.0, 4), Pair
 KIND_NAMES = ("recall", "recall_far", "recall_maps", "recall_maps_far")
 RECALLS = (*KIND_NAMES, "real_recall", "real_recall_far")
 COLUMNS = ("step", "stage", "run_s", *MEASURES, *RECALLS)
-BEGIN_DECAY = 1
-"""What a stop hook returns when the time for the constant learning rate is over; no signal that stops a run."""
+BEGIN_DECAY = 1000
+"""What a stop hook returns when the time for the constant learning rate is over; larger than the numbers of all signals."""
 
 
 class EvaluationSets(NamedTuple):
@@ -194,8 +194,8 @@ def train_with_decay(
     if trained.stopped_by != BEGIN_DECAY:
         return trained
     progress = replace(trained.progress, state=finish(trained.progress.state, settings))
-    hooks = replace(hooks, stop=lambda: _without_decay(hooks.stop()))
-    return train(store, settings, seed=seed, start=progress, hooks=hooks)
+    without_decay = replace(hooks, stop=lambda: _without_decay(hooks.stop()))
+    return train(store, settings, seed=seed, start=progress, hooks=without_decay)
 
 
 def _stop_or_decay(stop: Callable[[], int], records: Records, plateau_s: float) -> int:
