@@ -19,7 +19,6 @@ from dpmjax.io import LidarSequence
 # Distances between the scans of a pair, metres; scans of "far" do not overlap.
 BANDS = {"near": (2.0, 10.0), "middle": (10.0, 20.0), "far": (60.0, np.inf)}
 PAIR_STREAM = 4127
-STAGES = ("encode", "measure", "match", "verify", "refine")
 
 
 class ScanPair(NamedTuple):

@@ -77,10 +77,12 @@ def draw_sets(
         town_drive(SELECTION_SEED + number, length_m=min(length_m, 250.0), kind=kind, sensor=sensor)
         for number, (kind, sensor) in enumerate(SELECTION_SCENES)
     ]
-    real = tuple(draw(open_lidar_sequence(path), VALIDATION_PAIRS, kinds=KINDS[:2]) for path in validate)
-    selection = tuple(draw(town, num, kinds=KINDS, max_scans=64) for town in towns)
     held_out = town_drive(HELD_OUT_SEED, length_m=length_m, kind="suburb", sensor=HDL64E)
-    return EvaluationSets(selection, real, draw(held_out, held_out_pairs, kinds=KINDS))
+    work = [partial(draw, town, num, kinds=KINDS, max_scans=64) for town in towns]
+    work += [partial(draw, open_lidar_sequence(path), VALIDATION_PAIRS, kinds=KINDS[:2]) for path in validate]
+    work += [partial(draw, held_out, held_out_pairs, kinds=KINDS)]
+    sets = [one() for one in tqdm(work, desc="prepare evaluation", unit=" drives", dynamic_ncols=True)]
+    return EvaluationSets(tuple(sets[: len(towns)]), tuple(sets[len(towns) : -1]), sets[-1])
 
 
 class Records:

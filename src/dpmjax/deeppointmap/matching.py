@@ -195,11 +195,12 @@ def _align(
     source = jnp.tile(source_points, (2, 1)).at[:num_pairs].add(offsets[:num_pairs])
     target = jnp.tile(target_points, (2, 1)).at[num_pairs:].add(offsets[num_pairs:])
     source, target = (jnp.where(is_used[:, None], points, 0) for points in (source, target))
+    both = _PointPairs(source, target, scores, is_used)
     rows = jnp.tile(pairs.source_indices, 2), jnp.tile(pairs.target_indices, 2)
 
     def solve(first: Bool[Array, " p"]) -> Registration:
-        is_inlier = _choose_inliers(source, target, scores, is_used, first, config)
-        T_target_source, errors = _solve(source, target, scores, is_inlier)
+        is_inlier = _choose_inliers(both, first, config)
+        T_target_source, errors = _solve(both, is_inlier)
         num_inliers = jnp.sum(is_inlier)
         squared = jnp.sum(jnp.where(is_inlier, errors**2, 0)) / jnp.maximum(num_inliers, 1)
         is_determined = jnp.minimum(*(_num_distinct(some, is_inlier) for some in rows)) >= MIN_NUM_POINTS
@@ -222,7 +223,7 @@ def _align(
             is_inlier=is_inlier,
         )
 
-    return jax.vmap(solve)(_first_inliers(source, target, scores, is_used, config))
+    return jax.vmap(solve)(_first_inliers(both, config))
 
 
 def _num_distinct(rows: Int[Array, " p"], mask: Bool[Array, " p"]) -> Int[Array, ""]:
@@ -235,15 +236,17 @@ def _sqrt(squared: Float[Array, "*p"]) -> Float[Array, "*p"]:
     return jnp.where(squared > 0, jnp.sqrt(jnp.where(squared > 0, squared, 1)), 0)
 
 
-def _first_inliers(
-    source: Float[Array, "p 3"],
-    target: Float[Array, "p 3"],
-    scores: Float[Array, " p"],
-    is_used: Bool[Array, " p"],
-    config: MatchConfig,
-) -> Bool[Array, "h p"]:
+class _PointPairs(NamedTuple):
+    # Pairs of points of both directions, offsets added.
+    source: Float[Array, "p 3"]
+    target: Float[Array, "p 3"]
+    scores: Float[Array, " p"]
+    is_used: Bool[Array, " p"]
+
+
+def _first_inliers(pairs: _PointPairs, config: MatchConfig) -> Bool[Array, "h p"]:
     """Returns the first inliers of each hypothesis: the best scores, or what supports each motion of the consensus."""
-    source, target, scores = lax.stop_gradient((source, target, scores))
+    source, target, scores, is_used = lax.stop_gradient(pairs)
     if config.consensus is None:
         ranks = jnp.argsort(jnp.argsort(jnp.where(is_used, -scores, jnp.inf)))
         return (is_used & ((scores > config.min_inlier_score) | (ranks < config.min_num_first)))[None]
@@ -256,32 +259,23 @@ def _first_inliers(
     return is_used & is_near & is_motion[:, None]
 
 
-def _choose_inliers(
-    source: Float[Array, "p 3"],
-    target: Float[Array, "p 3"],
-    scores: Float[Array, " p"],
-    is_used: Bool[Array, " p"],
-    first: Bool[Array, " p"],
-    config: MatchConfig,
-) -> Bool[Array, " p"]:
+def _choose_inliers(pairs: _PointPairs, first: Bool[Array, " p"], config: MatchConfig) -> Bool[Array, " p"]:
     # The choice has no derivative.
-    source, target, scores = lax.stop_gradient((source, target, scores))
+    pairs = lax.stop_gradient(pairs)
 
     def choose(_: Int[Array, ""], is_inlier: Bool[Array, " p"]) -> Bool[Array, " p"]:
-        _, errors = _solve(source, target, scores, is_inlier)
+        _, errors = _solve(pairs, is_inlier)
         spread = jnp.std(errors, where=is_inlier)
         limit = (jnp.mean(errors, where=is_inlier) + config.inlier_sigmas * spread) * ERROR_SLACK
-        chosen = is_used & (errors <= limit)  # none without an inlier, where the limit is NaN
+        chosen = pairs.is_used & (errors <= limit)  # none without an inlier, where the limit is NaN
         return jnp.where(jnp.sum(chosen) >= config.min_num_inliers, chosen, is_inlier)
 
     return lax.fori_loop(0, config.num_rounds, choose, first)
 
 
-def _solve(
-    source: Float[Array, "p 3"], target: Float[Array, "p 3"], scores: Float[Array, " p"], is_inlier: Bool[Array, " p"]
-) -> tuple[Float[Array, "4 4"], Float[Array, " p"]]:
-    T_target_source = weighted_svd(source, target, jnp.where(is_inlier, scores, 0))
-    squared = jnp.sum((rigid.transform_points(T_target_source, source) - target) ** 2, axis=1)
+def _solve(pairs: _PointPairs, is_inlier: Bool[Array, " p"]) -> tuple[Float[Array, "4 4"], Float[Array, " p"]]:
+    T_target_source = weighted_svd(pairs.source, pairs.target, jnp.where(is_inlier, pairs.scores, 0))
+    squared = jnp.sum((rigid.transform_points(T_target_source, pairs.source) - pairs.target) ** 2, axis=1)
     return T_target_source, _sqrt(squared)
 
 

@@ -230,10 +230,18 @@ def _measured(points: RawScan, config: VerificationConfig) -> MeasuredScan:
 def _prepared(
     model: Model, pairs: Sequence[tuple[ScanOrCloud, ScanOrCloud]]
 ) -> dict[int, DescriptorCloud | PreparedScan]:
-    # By identity; each scan once. Where the other side is a descriptor cloud, the surface is measured in vain.
-    scans = {id(scan): scan for pair in pairs for scan in pair}
-    ready = {key: scan for key, scan in scans.items() if isinstance(scan, DescriptorCloud | PreparedScan)}
-    raw = {key: scan for key, scan in scans.items() if not isinstance(scan, DescriptorCloud | PreparedScan)}
+    # By identity; each scan once. Surfaces are measured only where both sides of a pair are scans.
+    raw: dict[int, RawScan] = {}
+    ready: dict[int, DescriptorCloud | PreparedScan] = {}
+    for pair in pairs:
+        is_verified = not any(isinstance(scan, DescriptorCloud) for scan in pair)
+        for scan in pair:
+            if isinstance(scan, DescriptorCloud | PreparedScan):
+                ready[id(scan)] = scan
+            elif is_verified:
+                raw[id(scan)] = scan
+            elif id(scan) not in ready:
+                ready[id(scan)] = encode(model, scan)
     return {**ready, **dict(zip(raw, prepare_scans(model, list(raw.values())), strict=True))}
 
 
