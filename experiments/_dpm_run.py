@@ -50,7 +50,7 @@ KIND_NAMES = ("recall", "recall_far", "recall_maps", "recall_maps_far")
 RECALLS = (*KIND_NAMES, "real_recall", "real_recall_far")
 COLUMNS = ("step", "stage", "run_s", *MEASURES, *RECALLS)
 BEGIN_DECAY = 1000
-"""What a stop hook returns when the time for the constant learning rate is over; larger than the numbers of all signals."""
+"""What a stop hook returns when the time for the constant learning rate is over; no signal has this number."""
 
 
 class EvaluationSets(NamedTuple):

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from dpmjax.simulation import (
-    CastConfig,
     LidarSensor,
     SceneMixture,
     TownConfig,
@@ -19,7 +18,7 @@ from dpmjax.simulation import (
     simulate_scenes,
 )
 from dpmjax.simulation.town.cast import cast_turn
-from dpmjax.simulation.town.culling import near_world
+from dpmjax.simulation.town.culling import CastConfig, near_world
 from dpmjax.simulation.town.kinds import KINDS
 from dpmjax.simulation.town.primitives import SOFT, SOLID, pack_bodies
 from dpmjax.simulation.town.scan import make_rays

@@ -16,7 +16,6 @@ from .scenes import SceneMixture as SceneMixture
 from .scenes import draw_scene as draw_scene
 from .scenes import simulate_scene as simulate_scene
 from .scenes import simulate_scenes as simulate_scenes
-from .town.culling import CastConfig as CastConfig
 from .town.driving import Drive as Drive
 from .town.driving import DriveConfig as DriveConfig
 from .town.driving import drive as drive

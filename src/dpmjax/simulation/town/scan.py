@@ -112,7 +112,6 @@ def scan_town(
     *,
     key: PRNGKeyArray,
     sensor: LidarSensor,
-    config: CastConfig = CastConfig(),  # noqa: B008 (frozen)
     motion: AnyArray | None = None,
 ) -> PointCloud:
     """Takes one scan.
@@ -126,7 +125,6 @@ def scan_town(
         time: s, moves the traffic.
         key: of noise, lost returns and foliage.
         sensor: the lidar.
-        config: capacities of the ray caster.
         motion: (6,) twist of the sensor during one turn (m, radians; see `geometry.se3.exp`), in its own frame: points
             stay in the frame of the moment of their beam, as a raw scan's do. None for a sensor that stands still.
 
@@ -141,6 +139,7 @@ def scan_town(
     twist = jnp.zeros(6) if motion is None else jnp.asarray(motion, jnp.float32)
     require_shape("T_world_lidar", pose, (4, 4))
     require_shape("motion", twist, (6,))
+    config = CastConfig()
     near = near_world(town, pose[:3, 3], time, max_range=sensor.max_range_m, config=config)
     return _scan_near(near, pose, twist, key=key, sensor=sensor, config=config)
 
