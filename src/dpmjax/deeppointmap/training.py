@@ -53,6 +53,7 @@ from dpmjax.deeppointmap.sampling import (
 )
 from dpmjax.geometry.bearing import directions_of
 from dpmjax.losses.descriptors import overlap_loss
+from dpmjax.nets.neighbourhood import WINNERS
 from dpmjax.types import AnyArray, DescriptorCloud
 
 
@@ -215,7 +216,7 @@ def batch_loss(
             for group in sample.groups
         ]
 
-    of_shapes = jax.vmap(of_sample)(batch)
+    of_shapes = _over_samples(of_sample, batch)
     mask = jnp.concatenate([group.mask for group in batch.groups], axis=1)
     losses, terms = jax.tree.map(lambda *parts: jnp.concatenate(parts, axis=1), *of_shapes)
     count = jnp.maximum(jnp.sum(mask), 1)
@@ -237,15 +238,24 @@ def _map_pair_loss(
     return matching_loss(*sides, T_b_a, config=config)
 
 
+def _over_samples(function: Callable[[Any], Any], batch: Any) -> Any:
+    # A single sample is not mapped: one more axis makes gathers and scatters slower on a CPU.
+    if len(jax.tree.leaves(batch)[0]) > 1:
+        return jax.vmap(function)(batch)
+    result = function(jax.tree.map(lambda x: jnp.asarray(x)[0], batch))
+    return jax.tree.map(lambda x: x[None], result)
+
+
 def _in_parts(function: Callable[[Any], Any], trees: Any, at_once: int) -> Any:
     # Maps the function over the first axis, about `at_once` entries at a time. The gradient computes the inside again
-    # instead of keeping it: this takes a tenth of the memory, and no more time on a CPU, where small parts stay cached.
+    # instead of keeping it, except for the loops over neighbours: a tenth of the memory, and small parts stay cached.
     num = len(jax.tree.leaves(trees)[0])
     # A divisor, because a last part of another size would be compiled separately.
     size = max(size for size in range(1, max(1, min(at_once, num)) + 1) if num % size == 0)
     if size == num:
         return jax.vmap(function)(trees)
-    return jax.lax.map(jax.checkpoint(function), trees, batch_size=size)
+    keep_winners = jax.checkpoint_policies.save_only_these_names(WINNERS)
+    return jax.lax.map(jax.checkpoint(function, policy=keep_winners), trees, batch_size=size)
 
 
 def _side(
@@ -294,7 +304,7 @@ def _correlated_pairs(
         sides = (jax.tree.map(lambda x, side=side: x[side], pairs) for side in (0, 1))
         return _in_parts(lambda pair: correlate(model, *pair), tuple(sides), pairs_at_once)
 
-    clouds = jax.vmap(of_sample)(batch.scans)
+    clouds = _over_samples(of_sample, batch.scans)
     return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), clouds)
 
 

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import Any
+
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
@@ -12,8 +15,8 @@ from dpmjax.nets.layers import ComputeDtype, TwoLayers, layer_norm, linear
 
 EMBEDDING_TEMPERATURE = 10_000.0
 
-MAX_LIVE_LOGITS = 1 << 20
-"""Largest number of logits that a CPU holds at once: 4 MB."""
+MAX_LIVE_LOGITS = 1 << 18
+"""Largest number of logits of one head that a CPU holds at once: 1 MB."""
 
 
 def embed_positions(positions: Float[Array, "n 3"], num_channels: int) -> Float[Array, "n c"]:
@@ -41,6 +44,8 @@ def attend(
 ) -> Float[Array, "m h c"]:
     """Applies masked scaled dot-product attention; the softmax is computed in float32.
 
+    The gradient computes the softmax again instead of keeping it (Dao et al. 2022, FlashAttention).
+
     Args:
         queries: m rows of h heads.
         keys: n rows of h heads.
@@ -50,45 +55,78 @@ def attend(
     Returns:
         A weighted mean of the values for each query; zero without any key.
     """
-    per_head = [jnp.swapaxes(x, 0, 1) for x in (queries / queries.shape[-1] ** 0.5, keys, values)]
-
-    def all_heads(*heads: jax.Array) -> jax.Array:
-        return jax.vmap(lambda query, key, value: _attend_with_one_head(query, key, value, mask))(*heads)
-
-    def head_by_head(*heads: jax.Array) -> jax.Array:
-        return lax.map(lambda head: _attend_in_chunks(head[0], head[1], head[2], mask), heads)
-
-    num_logits = queries.shape[0] * queries.shape[1] * keys.shape[0]
-    if num_logits <= MAX_LIVE_LOGITS:
-        mixed = all_heads(*per_head)
-    else:
-        # Logits that do not fit the cache of a CPU take three times as long there.
-        mixed = lax.platform_dependent(*per_head, cpu=head_by_head, default=all_heads)
-    return jnp.swapaxes(mixed, 0, 1)
+    num_queries, num_heads, num_channels = queries.shape
+    num_blocks = max(1, -(-num_queries * len(keys) // MAX_LIVE_LOGITS))
+    size = -(-num_queries // num_blocks)
+    padded = jnp.pad(queries / num_channels**0.5, ((0, num_blocks * size - num_queries), (0, 0), (0, 0)))
+    blocks = jnp.transpose(padded.reshape(num_blocks, size, num_heads, num_channels), (2, 0, 3, 1))
+    mixed = _attend(blocks, jnp.moveaxis(keys, 0, 2), jnp.moveaxis(values, 0, 2), jnp.where(mask, 0, -jnp.inf))
+    return jnp.transpose(mixed, (1, 3, 0, 2)).reshape(-1, num_heads, num_channels)[:num_queries]
 
 
-def _attend_in_chunks(
-    queries: Float[Array, "m c"], keys: Float[Array, "n c"], values: Float[Array, "n c"], mask: Bool[Array, " n"]
-) -> Float[Array, "m c"]:
-    @jax.checkpoint  # a gradient would keep all logits of all chunks
-    def attend_one(query: Float[Array, " c"]) -> Float[Array, " c"]:
-        return _attend_with_one_head(query[None], keys, values, mask)[0]
-
-    return lax.map(attend_one, queries, batch_size=max(1, MAX_LIVE_LOGITS // keys.shape[0]))
+# Below, queries (h, b, c, m) stand in b blocks, and channels before rows: keys and values are (h, c, n). Sums over keys
+# and the products with 16 channels are faster on a CPU in this order. The bias is 0 or, without a key, -infinity.
 
 
-def _attend_with_one_head(
-    queries: Float[Array, "m c"], keys: Float[Array, "n c"], values: Float[Array, "n c"], mask: Bool[Array, " n"]
-) -> Float[Array, "m c"]:
-    logits = jnp.matmul(queries, keys.T, preferred_element_type=jnp.float32) + jnp.where(mask, 0, -jnp.inf)
-    # Finite even without any key, so that masked keys have a share of exactly zero.
-    lowest = jnp.finfo(jnp.float32).min
-    largest = lax.stop_gradient(jnp.max(logits, axis=-1, keepdims=True, initial=lowest))
-    shares = jnp.exp(logits - largest)
-    # Divided after the product: (m, c) numbers instead of (m, n).
-    total = jnp.sum(shares, axis=-1, keepdims=True)
-    mixed = jnp.matmul(shares.astype(values.dtype), values, preferred_element_type=jnp.float32)
-    return mixed / jnp.where(total > 0, total, 1)
+@jax.custom_vjp
+def _attend(queries: jax.Array, keys: jax.Array, values: jax.Array, bias: jax.Array) -> jax.Array:
+    return _attend_forward(queries, keys, values, bias)[0]
+
+
+def _attend_forward(
+    queries: jax.Array, keys: jax.Array, values: jax.Array, bias: jax.Array
+) -> tuple[jax.Array, tuple[jax.Array, ...]]:
+    def of_head(queries: jax.Array, keys: jax.Array, values: jax.Array) -> tuple[jax.Array, jax.Array]:
+        def of_block(query: jax.Array) -> tuple[jax.Array, jax.Array]:
+            logits = _product("cn,cm->nm", keys, query) + bias[:, None]
+            # Finite even without any key, so that masked keys have a share of exactly zero.
+            largest = jnp.max(logits, axis=0, initial=jnp.finfo(jnp.float32).min)
+            shares = jnp.exp(logits - largest)
+            total = jnp.sum(shares, axis=0)
+            total = jnp.where(total > 0, total, 1)
+            # Divided after the product: (c, m) numbers instead of (n, m).
+            return _product("cn,nm->cm", values, shares.astype(values.dtype)) / total, largest + jnp.log(total)
+
+        return _one_after_the_other(of_block, queries)
+
+    mixed, log_total = _one_after_the_other(of_head, queries, keys, values)
+    return mixed, (queries, keys, values, bias, mixed, log_total)
+
+
+def _attend_backward(residuals: tuple[jax.Array, ...], gradient: jax.Array) -> tuple[jax.Array | None, ...]:
+    queries, keys, values, bias, mixed, log_total = residuals
+    dtype = queries.dtype
+    # The derivative by the logits is shares * (derivative by the shares - its mean under the shares).
+    means = jnp.sum(gradient * mixed, axis=2)
+
+    def of_head(keys: jax.Array, values: jax.Array, *blocks: jax.Array) -> tuple[jax.Array, ...]:
+        def of_block(
+            query: jax.Array, log_total: jax.Array, gradient: jax.Array, mean: jax.Array
+        ) -> tuple[jax.Array, ...]:
+            shares = jnp.exp(_product("cn,cm->nm", keys, query) + bias[:, None] - log_total)
+            to_logits = (shares * (_product("cn,cm->nm", values, gradient) - mean)).astype(dtype)
+            to_values = _product("cm,nm->cn", gradient, shares.astype(dtype))
+            return _product("cn,nm->cm", keys, to_logits), _product("cm,nm->cn", query, to_logits), to_values
+
+        to_queries, to_keys, to_values = _one_after_the_other(of_block, *blocks)
+        return to_queries, jnp.sum(to_keys, axis=0), jnp.sum(to_values, axis=0)
+
+    found = _one_after_the_other(of_head, keys, values, queries, log_total, gradient.astype(dtype), means)
+    return *(x.astype(dtype) for x in found), None
+
+
+_attend.defvjp(_attend_forward, _attend_backward)
+
+
+def _one_after_the_other(function: Callable[..., Any], *arrays: jax.Array) -> Any:
+    # Maps over the first axis. Logits that do not fit the cache of a CPU take twice as long there.
+    return lax.platform_dependent(
+        *arrays, cpu=lambda *arrays: lax.map(lambda one: function(*one), arrays), default=jax.vmap(function)
+    )
+
+
+def _product(subscripts: str, a: jax.Array, b: jax.Array) -> jax.Array:
+    return jnp.einsum(subscripts, a, b, preferred_element_type=jnp.float32)
 
 
 class PairAttention(nn.Module):

@@ -13,10 +13,14 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 from jax import lax
+from jax.ad_checkpoint import checkpoint_name
 from jaxtyping import Array, Float, Int
 
 from dpmjax.nets.layers import NORM_EPSILON
 from dpmjax.types import AnyArray
+
+WINNERS = "winners"
+"""Name of what `jax.checkpoint` should keep: (m, f) and (m, k) numbers, which spare the loop over the neighbours."""
 
 _UNROLL = 4
 
@@ -82,9 +86,21 @@ def _forward(
         )
 
     zeros = jnp.zeros(shape, of_points.dtype)
-    start = zeros - jnp.inf, jnp.zeros(shape, jnp.int32), zeros, jnp.zeros(neighbours.shape, of_points.dtype)
-    value, *found = lax.fori_loop(0, neighbours.shape[1], look_at, start, unroll=_UNROLL)
-    return value, Residuals(of_points, offsets, kernel, neighbours, scale, *found)
+    empty = jnp.zeros(neighbours.shape, of_points.dtype)
+    start: tuple[jax.Array, ...] = zeros - jnp.inf, jnp.zeros(shape, jnp.int32), zeros, empty
+    # A while loop: checkpointing takes a loop of known length apart, and keeps something of every turn.
+    num = neighbours.shape[1]
+    at_once = max(size for size in range(1, _UNROLL + 1) if num % size == 0)
+
+    def look_at_some(state: tuple[jax.Array, tuple[jax.Array, ...]]) -> tuple[jax.Array, tuple[jax.Array, ...]]:
+        first, best = state
+        for j in range(at_once):
+            best = look_at(first + j, best)
+        return first + at_once, best
+
+    _, (_, *found) = lax.while_loop(lambda state: state[0] < num, look_at_some, (jnp.zeros((), jnp.int32), start))
+    winner, of_winner, inverses = (checkpoint_name(x, WINNERS) for x in found)
+    return of_winner * scale, Residuals(of_points, offsets, kernel, neighbours, scale, winner, of_winner, inverses)
 
 
 def _backward(residuals: Residuals, gradient: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array, None, jax.Array]:
