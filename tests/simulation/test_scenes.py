@@ -49,17 +49,20 @@ def test_a_scene_gives_scans_with_poses(kind):
     assert kind in sequence.name
 
 
-def test_scale_multiplies_points_and_poses():
-    kinds = (("flat", 1.0),)
-    plain, scaled = simulate_scenes([7], replace(SMALL, kinds=kinds))[0], replace(SMALL, kinds=kinds, scale=(2.0, 2.0))
-    double = simulate_scene(draw_scene(7, scaled))
+@pytest.mark.parametrize(("kind", "name"), [("flat", "indoor_scale"), ("country", "scale")])
+def test_scale_multiplies_points_and_poses(kind, name):
+    plain, double = (
+        simulate_scene(draw_scene(7, replace(SMALL, kinds=((kind, 1.0),), **{name: (factor, factor)})))
+        for factor in (1.0, 2.0)
+    )
     np.testing.assert_allclose(double.T_world_lidar[:, :3, 3], 2 * plain.T_world_lidar[:, :3, 3])
     np.testing.assert_array_equal(double.T_world_lidar[:, :3, :3], plain.T_world_lidar[:, :3, :3])
     np.testing.assert_allclose(double.read_scan(2), 2 * plain.read_scan(2))
 
 
 def test_scales_spread_evenly_in_their_logarithm():
-    scales = np.log([draw_scene(seed, replace(SMALL, scale=(0.5, 4.0))).scale for seed in range(200)])
+    mixture = replace(SMALL, scale=(0.5, 4.0), indoor_scale=(0.5, 4.0))
+    scales = np.log([draw_scene(seed, mixture).scale for seed in range(200)])
     assert scales.min() > np.log(0.5)
     assert scales.max() < np.log(4.0)
     assert scales.mean() == pytest.approx(0.5 * np.log(2.0), abs=0.15)
@@ -178,6 +181,7 @@ def test_beams_on_an_edge_may_end_between_foreground_and_background():
         lambda: SceneMixture(kinds=(("wood", 0.0),)),
         lambda: SceneMixture(length_m=0.0),
         lambda: SceneMixture(scale=(2.0, 1.0)),
+        lambda: SceneMixture(indoor_scale=(0.0, 1.0)),
         lambda: TownConfig(kind="moon"),
     ],
 )

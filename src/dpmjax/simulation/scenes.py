@@ -31,7 +31,9 @@ class SceneMixture:
         sensors: lidars, with their weights.
         length_m: length of the way outdoors; indoors a quarter of it.
         spacing_m: mean way between scans outdoors; indoors a quarter of it.
-        scale: lowest and highest factor that a scene and its poses are scaled by, drawn uniformly in its logarithm.
+        scale: lowest and highest factor that a scene outdoors and its poses are scaled by, drawn uniformly in its
+            logarithm.
+        indoor_scale: the same indoors, where networks made for tens of metres see more of a scene that is enlarged.
         moving_rate: share of the drives whose lidar moves during its turn.
 
     Raises:
@@ -60,6 +62,7 @@ class SceneMixture:
     length_m: float = 600.0
     spacing_m: float = 2.0
     scale: tuple[float, float] = (1.0, 1.0)
+    indoor_scale: tuple[float, float] = (1.0, 4.0)
     moving_rate: float = 0.4
 
     def __post_init__(self) -> None:
@@ -71,8 +74,11 @@ class SceneMixture:
         if unknown:
             known = ", ".join((*OUTDOOR_KINDS, *INDOOR_KINDS))
             raise ValueError(f"kinds must be of {known}, got {sorted(unknown)[0]!r}")
-        if not (min(self.length_m, self.spacing_m) > 0 and 0 < self.scale[0] <= self.scale[1]):
-            raise ValueError("length_m, spacing_m and scale must be positive, and scale ascending")
+        if min(self.length_m, self.spacing_m) <= 0:
+            raise ValueError("length_m and spacing_m must be positive")
+        for name, (low, high) in (("scale", self.scale), ("indoor_scale", self.indoor_scale)):
+            if not 0 < low <= high:
+                raise ValueError(f"{name} must be positive and ascending, got {low}, {high}")
 
 
 @dataclass(frozen=True)
@@ -120,7 +126,8 @@ def draw_scene(seed: int, mixture: SceneMixture = SceneMixture()) -> Scene:
         raise ValueError(f"seed must not be negative, got {seed}")
     rng = np.random.default_rng([_SCENE_STREAM, seed])
     kind, sensor = _choice(rng, mixture.kinds), _choice(rng, mixture.sensors)
-    scale = float(np.exp(rng.uniform(*np.log(mixture.scale))))
+    scales = mixture.indoor_scale if kind in INDOOR_KINDS else mixture.scale
+    scale = float(np.exp(rng.uniform(*np.log(scales))))
     is_moving = bool(rng.random() < mixture.moving_rate)
     if kind in INDOOR_KINDS:
         is_robot = rng.random() < 0.3
