@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import jax
 import numpy as np
 import pytest
 
 import dpmjax
-from dpmjax.deeppointmap import prepare_scan
+from dpmjax.deeppointmap import VerificationConfig, prepare_scan
+from dpmjax.scans import ViewCorrelationConfig
 from dpmjax.types import PointCloud
 from tests.deeppointmap import toy
 from tests.tolerances import ACCUMULATED
@@ -24,13 +27,22 @@ def scans() -> list[np.ndarray]:
     return [drive.read_scan(index) for index in range(2)]
 
 
-def test_scans_and_their_descriptors_register_alike(model, scans) -> None:
+def test_scans_and_their_descriptors_register_alike_where_the_scans_suggest_nothing(model, scans) -> None:
+    verification = VerificationConfig(views=ViewCorrelationConfig(num_motions=0))
+    model = model.replace(config=replace(model.config, verification=verification))
     of_scans = dpmjax.register(model, *scans)
     of_clouds = dpmjax.register(model, *(dpmjax.encode(model, scan) for scan in scans))
     np.testing.assert_allclose(of_scans.T_target_source, of_clouds.T_target_source, **ACCUMULATED)
     assert 0 <= of_scans.confidence <= 1
     assert of_scans.rmse == of_scans.rmse_m
     assert 0 < dpmjax.overlap(model, scans[0], dpmjax.encode(model, scans[1])) < 1
+
+
+def test_a_motion_that_only_the_scans_suggest_has_no_inliers(model, scans) -> None:
+    match = dpmjax.register(model, *scans)
+    np.testing.assert_allclose(match.T_target_source[:3, 3], [-4, 0, 0], atol=0.7)
+    assert match.num_inliers == match.is_inlier.sum() == match.support == match.confidence == 0
+    assert np.isinf(match.rmse)
 
 
 def test_a_scan_on_itself_does_not_move_where_offsets_are_zero(model, scans) -> None:

@@ -106,7 +106,8 @@ def register(
     """Registers two scans or maps without a first guess (DeepPointMap section 3.2).
 
     Where both are scans, the best distinct motions of the descriptors are verified by the scans themselves: points
-    must meet surfaces and leave free space free. The motion under which the scans agree best is taken.
+    must meet surfaces and leave free space free. Where none of the first is clearly right, motions under which the
+    scans look alike from above are tried too. The motion under which the scans agree best is taken.
 
     Args:
         model: encoder and decoder.
@@ -119,8 +120,9 @@ def register(
     Returns:
         `T_target_source`, `confidence`, `rmse_m` and the pairs. The confidence is the probability that the motion is
         right within 2 m and 5 degrees if the model is calibrated (`model.config.calibration`), else the mean score of
-        the pairs, which is no probability. Failure is data: without any pair the motion is the identity and the
-        confidence 0; with fewer than three distinct pairs `rmse_m` is infinite.
+        the pairs, which is no probability. A motion that only the views from above suggested has no inliers, and
+        without calibration the confidence 0. Failure is data: without any pair and without a view the motion is the
+        identity and the confidence 0; with fewer than three distinct pairs `rmse_m` is infinite.
 
     Raises:
         ValueError: if the points are no real numbers (n, 3), if features have another width than the model, or if
@@ -255,11 +257,26 @@ def _verified(
 def _finished(model: Model, hypotheses: Registration, motions: _Motions | None) -> Registration:
     row = 0 if motions is None else motions.chosen.row
     evidence = gather_evidence(hypotheses, row, None if motions is None else motions.chosen.verification)
-    match = jax.tree.map(lambda leaf: jnp.asarray(leaf[row]), hypotheses)
+    match = jax.tree.map(lambda leaf: jnp.asarray(leaf[0 if row is None else row]), hypotheses)
+    if row is None:
+        match = _without_inliers(match)
     if motions is not None:
         T = jnp.asarray(motions.final.T_target_source, match.T_target_source.dtype)
         match = replace(match, T_target_source=T, verification=motions.final.verification)
     return with_confidence(match, evidence, model.config.calibration)
+
+
+def _without_inliers(match: Registration) -> Registration:
+    zero = jnp.zeros_like(match.support)
+    return replace(
+        match,
+        confidence=zero,
+        mean_score=zero,
+        rmse_m=zero + jnp.inf,
+        support=zero,
+        num_inliers=jnp.zeros_like(match.num_inliers),
+        is_inlier=jnp.zeros_like(match.is_inlier),
+    )
 
 
 def _descriptors(scan: DescriptorCloud | PreparedScan) -> DescriptorCloud:
