@@ -106,7 +106,7 @@ def probability(model: LogisticModel, features: Float[np.ndarray, "*n f"]) -> Fl
 def fit_logistic(
     names: tuple[str, ...], features: Float[np.ndarray, "n f"], is_right: Bool[np.ndarray, " n"]
 ) -> LogisticModel:
-    """Fits a logistic model by maximum likelihood, with a small ridge on standardised weights.
+    """Fits a logistic model.
 
     Args:
         names: names of the features.
@@ -121,6 +121,22 @@ def fit_logistic(
     """
     if is_right.all() or not is_right.any():
         raise ValueError(f"is_right: expected right and wrong registrations, got {is_right.sum()} of {len(is_right)}")
+    weights, bias = logistic_weights(features, is_right)
+    return LogisticModel(names, tuple(map(float, weights)), bias)
+
+
+def logistic_weights(
+    features: Float[np.ndarray, "n f"], is_right: Bool[np.ndarray, " n"]
+) -> tuple[Float[np.ndarray, " f"], float]:
+    """Fits a logistic regression by maximum likelihood, with a small ridge on standardised weights.
+
+    Args:
+        features: of examples.
+        is_right: which of them are right; some, but not all.
+
+    Returns:
+        Weights and bias of the log odds.
+    """
     mean, scale = features.mean(axis=0), np.maximum(features.std(axis=0), 1e-9)
     standard = np.column_stack([(features - mean) / scale, np.ones(len(features))])
     sign = np.where(is_right, 1.0, -1.0)
@@ -133,7 +149,7 @@ def fit_logistic(
 
     found = minimize(loss, np.zeros(standard.shape[1]), jac=True, method="L-BFGS-B").x
     weights = found[:-1] / scale
-    return LogisticModel(names, tuple(map(float, weights)), float(found[-1] - weights @ mean))
+    return weights, float(found[-1] - weights @ mean)
 
 
 def with_confidence(match: Registration, evidence: Evidence, calibration: Calibration | None) -> Registration:

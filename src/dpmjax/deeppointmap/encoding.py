@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float
 
-from dpmjax.deeppointmap.model import Model, ModelConfig, encode_pyramid
+from dpmjax.deeppointmap.model import Model, encode_pyramid
+from dpmjax.deeppointmap.model_config import ModelConfig
 from dpmjax.geometry.pyramid_host import build_pyramid_on_host
 from dpmjax.scans.preprocess import preprocess_scan_on_host
 from dpmjax.types import AnyArray, DescriptorCloud, PointCloud, PointPyramid

@@ -11,7 +11,6 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import lax
 from jaxtyping import Array, Float
 
 from dpmjax.deeppointmap.confidence import gather_evidence, with_confidence
@@ -20,11 +19,11 @@ from dpmjax.deeppointmap.matching import MatchConfig, match_hypotheses
 from dpmjax.deeppointmap.model import (
     Model,
     correlate,
+    descriptor_similarity,
     encode_pyramid,
-    overlap_probability,
     predict_offsets,
-    similarity_features,
 )
+from dpmjax.deeppointmap.overlap import overlap_probability
 from dpmjax.deeppointmap.verification import (
     MeasuredScan,
     VerificationConfig,
@@ -284,8 +283,7 @@ def trace_match(model: Model, source: DescriptorCloud, target: DescriptorCloud, 
         All hypotheses, with a leading axis.
     """
     source, target = correlate(model, source, target)
-    directions = [_unit(similarity_features(model, cloud)) for cloud in (source, target)]
-    similarity = jnp.matmul(directions[0], directions[1].T, precision=lax.Precision.HIGHEST)
+    similarity = descriptor_similarity(model, source, target)
 
     def offsets(source_rows: Array, target_rows: Array) -> tuple[Array, Array]:
         a, b = source.features[source_rows], target.features[target_rows]
@@ -293,8 +291,3 @@ def trace_match(model: Model, source: DescriptorCloud, target: DescriptorCloud, 
         return predict_offsets(model, a, b, of_source), predict_offsets(model, b, a, of_target)
 
     return match_hypotheses(source, target, similarity, offsets, config=config)
-
-
-def _unit(features: Float[Array, "m c"]) -> Float[Array, "m c"]:
-    squared = jnp.sum(features.astype(jnp.float32) ** 2, axis=1, keepdims=True)
-    return features / jnp.sqrt(jnp.where(squared > 0, squared, 1))
