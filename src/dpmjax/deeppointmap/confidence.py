@@ -1,4 +1,4 @@
-"""Confidence of a registration: the probability that it is right, by logistic regression on a few features.
+"""Confidence of a registration, and of an overlap: probabilities by logistic regression on a few features.
 
 Platt (1999): a score becomes a probability by a logistic function that is fitted on held-out examples. It is fitted by
 `python -m experiments.dpm_calibrate` and stored in the configuration of the model.
@@ -19,6 +19,26 @@ from dpmjax.types import Registration, Verification
 
 CLOUD_FEATURES = ("support", "mean_score", "rmse_m", "support_gap")
 SCAN_FEATURES = (*CLOUD_FEATURES, "visible_share", "matched_share", "contradicted_share", "score_gap")
+OVERLAP_FEATURES = (
+    "scan_similarity",
+    "similarity_median",
+    "similarity_high",
+    "score_median",
+    "score_high",
+    "mutual_share",
+    "support",
+    "near_support",
+    "support_second",
+    "offset_disagreement_m",
+    "distance_m",
+    "met_share",
+    "met_similarity",
+    "spread_m",
+    "log_radius",
+    "log_radius_ratio",
+)
+"""`deeppointmap.overlap` computes them."""
+
 MAX_RMSE_M = 5.0
 RIDGE = 1e-3
 
@@ -40,7 +60,7 @@ class LogisticModel:
     def __post_init__(self) -> None:
         if len(self.features) != len(self.weights):
             raise ValueError(f"weights: expected {len(self.features)}, one for each feature, got {len(self.weights)}")
-        if self.features not in (CLOUD_FEATURES, SCAN_FEATURES):
+        if self.features not in (CLOUD_FEATURES, SCAN_FEATURES, OVERLAP_FEATURES):
             raise ValueError(f"features: expected those that this version computes, got {', '.join(self.features)}")
 
 
@@ -106,7 +126,7 @@ def probability(model: LogisticModel, features: Float[np.ndarray, "*n f"]) -> Fl
 def fit_logistic(
     names: tuple[str, ...], features: Float[np.ndarray, "n f"], is_right: Bool[np.ndarray, " n"]
 ) -> LogisticModel:
-    """Fits a logistic model.
+    """Fits a logistic model by maximum likelihood, with a small ridge on standardised weights.
 
     Args:
         names: names of the features.
@@ -121,22 +141,6 @@ def fit_logistic(
     """
     if is_right.all() or not is_right.any():
         raise ValueError(f"is_right: expected right and wrong registrations, got {is_right.sum()} of {len(is_right)}")
-    weights, bias = logistic_weights(features, is_right)
-    return LogisticModel(names, tuple(map(float, weights)), bias)
-
-
-def logistic_weights(
-    features: Float[np.ndarray, "n f"], is_right: Bool[np.ndarray, " n"]
-) -> tuple[Float[np.ndarray, " f"], float]:
-    """Fits a logistic regression by maximum likelihood, with a small ridge on standardised weights.
-
-    Args:
-        features: of examples.
-        is_right: which of them are right; some, but not all.
-
-    Returns:
-        Weights and bias of the log odds.
-    """
     mean, scale = features.mean(axis=0), np.maximum(features.std(axis=0), 1e-9)
     standard = np.column_stack([(features - mean) / scale, np.ones(len(features))])
     sign = np.where(is_right, 1.0, -1.0)
@@ -149,7 +153,7 @@ def logistic_weights(
 
     found = minimize(loss, np.zeros(standard.shape[1]), jac=True, method="L-BFGS-B").x
     weights = found[:-1] / scale
-    return weights, float(found[-1] - weights @ mean)
+    return LogisticModel(names, tuple(map(float, weights)), float(found[-1] - weights @ mean))
 
 
 def with_confidence(match: Registration, evidence: Evidence, calibration: Calibration | None) -> Registration:

@@ -15,7 +15,7 @@ from jax import lax
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from dpmjax.checks import require_shape
-from dpmjax.deeppointmap.model_config import ModelConfig, OverlapConfig
+from dpmjax.deeppointmap.model_config import ModelConfig
 from dpmjax.geometry.bearing import from_ray_frame, ray_directions
 from dpmjax.geometry.pyramid_host import build_pyramid_on_host
 from dpmjax.geometry.pyramid_storage import StoredPyramid, moved_pyramid
@@ -29,7 +29,7 @@ class Model:
     """Parameters and their configuration.
 
     Attributes:
-        params: {"encoder": ..., "decoder": ...}, each a tree of Flax parameters; and "overlap" where it was fitted.
+        params: {"encoder": ..., "decoder": ...}, each a tree of Flax parameters.
         config: the configuration; static under jit.
     """
 
@@ -69,7 +69,7 @@ def model_shapes(config: ModelConfig) -> dict[str, Any]:
         config: configuration of the model.
 
     Returns:
-        The tree of `Model.params`, with `jax.ShapeDtypeStruct` leaves.
+        {"encoder": ..., "decoder": ...}, with `jax.ShapeDtypeStruct` leaves.
     """
     key = jax.random.key(0)
     num, channels = config.num_descriptors, config.decoder.input_channels
@@ -77,17 +77,7 @@ def model_shapes(config: ModelConfig) -> dict[str, Any]:
     pyramid = build_pyramid_on_host(np.zeros((1, 3), np.float32), np.ones(1, bool), config.pyramid)
     encoder = jax.eval_shape(_encoder(config).init, key, pyramid)
     decoder = jax.eval_shape(DescriptorDecoder(config.decoder).init, key, cloud, cloud)
-    parts = {"encoder": encoder["params"], "decoder": decoder["params"]}
-    return parts if config.overlap is None else {**parts, "overlap": _overlap_shapes(config.overlap)}
-
-
-def _overlap_shapes(config: OverlapConfig) -> dict[str, Any]:
-    num, width = config.num_evidence, config.hidden_channels
-    hidden, output = {"kernel": (num, width), "bias": (width,)}, {"kernel": (width, 1), "bias": (1,)}
-    shapes = {"mean": (num,), "scale": (num,), "hidden": hidden, "output": output}
-    return jax.tree.map(
-        lambda shape: jax.ShapeDtypeStruct(shape, jnp.float32), shapes, is_leaf=lambda leaf: isinstance(leaf, tuple)
-    )
+    return {"encoder": encoder["params"], "decoder": decoder["params"]}
 
 
 @jax.jit

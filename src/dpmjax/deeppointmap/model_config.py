@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from typing import Literal
 
-from dpmjax.checks import require_fields, require_one_of, require_positive
-from dpmjax.deeppointmap.confidence import Calibration
+from dpmjax.checks import require_one_of, require_positive
+from dpmjax.deeppointmap.confidence import Calibration, LogisticModel
 from dpmjax.deeppointmap.matching import MatchConfig
 from dpmjax.deeppointmap.verification import VerificationConfig
 from dpmjax.geometry.consensus import ConsensusConfig
@@ -17,22 +17,6 @@ from dpmjax.nets.point_encoder import EncoderConfig
 from dpmjax.scans.preprocess import PreprocessConfig
 
 Preset = Literal["tiny", "small", "paper"]
-
-
-@dataclass(frozen=True)
-class OverlapConfig:
-    """Shape of the network that turns the evidence of a match into an overlap probability.
-
-    Attributes:
-        num_evidence: numbers of the evidence (`deeppointmap.overlap`).
-        hidden_channels: width of the network.
-    """
-
-    num_evidence: int
-    hidden_channels: int
-
-    def __post_init__(self) -> None:
-        require_fields(self, "num_evidence", "hidden_channels", low=1)
 
 
 @dataclass(frozen=True)
@@ -48,7 +32,7 @@ class ModelConfig:
         matching: choice of descriptor pairs and inliers.
         verification: verification of hypotheses by the scans, and the final alignment.
         calibration: of the confidence; None where it was not fitted.
-        overlap: network of the overlap probability; None where it was not fitted, and the decoder's head answers.
+        overlap: model of the overlap probability; None where it was not fitted, and the decoder's head answers.
     """
 
     pyramid: PyramidConfig = field(default_factory=PyramidConfig)
@@ -59,7 +43,7 @@ class ModelConfig:
     matching: MatchConfig = field(default_factory=MatchConfig)
     verification: VerificationConfig = field(default_factory=VerificationConfig)
     calibration: Calibration | None = None
-    overlap: OverlapConfig | None = None
+    overlap: LogisticModel | None = None
 
     def __post_init__(self) -> None:
         require_positive("scale_m", self.scale_m)

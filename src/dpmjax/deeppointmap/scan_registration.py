@@ -187,13 +187,18 @@ def match_clouds(
 
 
 def overlap(model: Model, source: ScanOrCloud, target: ScanOrCloud) -> Float[Array, ""]:
-    """Predicts the probability that two scans or maps overlap: less than 20 m apart (DeepPointMap section 3.2).
+    """Predicts the probability that two scans or maps overlap: that their origins are less than 20 m apart.
+
+    A calibrated model (`model.config.overlap`, from `python -m experiments.dpm_calibrate`) rests it on the match of the
+    descriptors. It is fitted on simulated towns and buildings, where half of the pairs overlapped, a quarter was 20 to
+    40 m apart, and the rest farther or of other places: where overlap is rarer, the probability is too high. A model
+    without it answers with the decoder's head (DeepPointMap section 3.2), which is right for published weights only.
 
     A `ValueError` says if the points are no real numbers (n, 3), or if features have another width than the model.
 
     Args:
         model: encoder and decoder.
-        source: a raw scan (n, 3) in metres, or a descriptor cloud.
+        source: a raw scan (n, 3) in metres, a scan from `prepare_scan`, or a descriptor cloud.
         target: the same; the order matters a little.
 
     Returns:
