@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from dpmjax.checks import require_fields, require_positive_fields
 from dpmjax.scans.surface_alignment import AlignmentConfig, AlignmentLevel
 
-NARROW = AlignmentConfig(levels=(AlignmentLevel(1.0, 1500, 10), AlignmentLevel(0.5, 3000, 10)))
+NARROW = AlignmentConfig(levels=(AlignmentLevel(1.0, 1000, 10), AlignmentLevel(0.3, 4000, 12)), min_kernel_m=0.03)
 WIDE = AlignmentConfig(levels=(AlignmentLevel(3.0, 300, 10),))
 
 
