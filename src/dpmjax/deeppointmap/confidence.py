@@ -1,4 +1,4 @@
-"""Confidence of a registration: the probability that it is right, by logistic regression on a few features.
+"""Confidence of a registration, and of an overlap: probabilities by logistic regression on a few features.
 
 Platt (1999): a score becomes a probability by a logistic function that is fitted on held-out examples. It is fitted by
 `python -m experiments.dpm_calibrate` and stored in the configuration of the model.
@@ -19,6 +19,26 @@ from dpmjax.types import Registration, Verification
 
 CLOUD_FEATURES = ("support", "mean_score", "rmse_m", "support_gap")
 SCAN_FEATURES = (*CLOUD_FEATURES, "visible_share", "matched_share", "contradicted_share", "score_gap")
+OVERLAP_FEATURES = (
+    "scan_similarity",
+    "similarity_median",
+    "similarity_high",
+    "score_median",
+    "score_high",
+    "mutual_share",
+    "support",
+    "near_support",
+    "support_second",
+    "offset_disagreement_m",
+    "distance_m",
+    "met_share",
+    "met_similarity",
+    "spread_m",
+    "log_radius",
+    "log_radius_ratio",
+)
+"""`deeppointmap.overlap` computes them."""
+
 MAX_RMSE_M = 5.0
 RIDGE = 1e-3
 
@@ -40,7 +60,7 @@ class LogisticModel:
     def __post_init__(self) -> None:
         if len(self.features) != len(self.weights):
             raise ValueError(f"weights: expected {len(self.features)}, one for each feature, got {len(self.weights)}")
-        if self.features not in (CLOUD_FEATURES, SCAN_FEATURES):
+        if self.features not in (CLOUD_FEATURES, SCAN_FEATURES, OVERLAP_FEATURES):
             raise ValueError(f"features: expected those that this version computes, got {', '.join(self.features)}")
 
 
@@ -69,21 +89,24 @@ class Evidence(NamedTuple):
     of_scans: Float[np.ndarray, " g"] | None
 
 
-def gather_evidence(hypotheses: Registration, row: int, verification: Verification | None) -> Evidence:
+def gather_evidence(hypotheses: Registration, row: int | None, verification: Verification | None) -> Evidence:
     """Gathers the features of one hypothesis.
 
     Args:
         hypotheses: all hypotheses of a pair, with a leading axis.
-        row: the one that was chosen.
+        row: the one that was chosen; None for a motion that no pairs of descriptors support.
         verification: its verification; None without scans.
 
     Returns:
         The features.
     """
     support = np.asarray(hypotheses.support, np.float64)
-    second = np.delete(support, row).max(initial=0.0)
-    rmse_m = min(float(hypotheses.rmse_m[row]), MAX_RMSE_M)
-    of_clouds = np.array([support[row], float(hypotheses.mean_score[row]), rmse_m, support[row] - second])
+    if row is None:
+        of_clouds = np.array([0.0, 0.0, MAX_RMSE_M, -support.max()])
+    else:
+        second = np.delete(support, row).max(initial=0.0)
+        rmse_m = min(float(hypotheses.rmse_m[row]), MAX_RMSE_M)
+        of_clouds = np.array([support[row], float(hypotheses.mean_score[row]), rmse_m, support[row] - second])
     if verification is None:
         return Evidence(of_clouds, None)
     shares = (verification.visible_share, verification.matched_share, verification.contradicted_share, verification.gap)
@@ -147,7 +170,9 @@ def with_confidence(match: Registration, evidence: Evidence, calibration: Calibr
     Returns:
         The registration.
     """
-    if calibration is None or int(match.num_inliers) == 0:
+    verified = match.verification
+    is_empty = int(match.num_inliers) == 0 and (verified is None or verified.matched_share == 0)
+    if calibration is None or is_empty:
         return match
     features, model = evidence.of_scans, calibration.of_scans
     if features is None:
