@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import pytest
 
 import dpmjax
-from dpmjax import deeppointmap, geometry, losses, metrics, nets, weights
+from dpmjax import deeppointmap, geometry, losses, metrics, nets, slam, weights
 
 
 def test_import_loads_no_jax_and_is_fast() -> None:
@@ -26,7 +26,9 @@ def test_import_loads_no_jax_and_is_fast() -> None:
 
 
 @pytest.mark.parametrize(
-    "package", [dpmjax, deeppointmap, geometry, losses, metrics, nets, weights], ids=lambda package: package.__name__
+    "package",
+    [dpmjax, deeppointmap, geometry, losses, metrics, nets, slam, weights],
+    ids=lambda package: package.__name__,
 )
 def test_every_listed_name_resolves(package) -> None:
     assert package.__all__
@@ -50,7 +52,7 @@ def test_api_page_lists_exactly_the_root_names() -> None:
     listed = re.findall(r"^\* `(\w+)`: .+\.$", page, re.MULTILINE)
     assert len(listed) == page.count("\n* "), "one line each: * `name`: what it is."
     assert sorted(listed) == sorted(set(dpmjax.__all__) - {"__version__"})
-    assert page.count("\n## ") == 11, "ten groups, and the packages"
+    assert page.count("\n## ") == 12, "eleven groups, and the packages"
 
 
 def test_links_of_the_pages_lead_somewhere() -> None:

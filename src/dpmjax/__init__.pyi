@@ -34,6 +34,9 @@ from .pose_graph.graph import PoseGraph as PoseGraph
 from .pose_graph.optimize import PoseGraphConfig as PoseGraphConfig
 from .pose_graph.optimize import optimize_pose_graph as optimize_pose_graph
 from .registration.icp import icp as icp
+from .slam.config import SlamConfig as SlamConfig
+from .slam.system import SlamResult as SlamResult
+from .slam.system import run_slam as run_slam
 from .types import DescriptorCloud as DescriptorCloud
 from .types import Neighbours as Neighbours
 from .types import PointCloud as PointCloud

@@ -1,0 +1,204 @@
+"""Settings of SLAM, one record for each stage. Lengths that depend on the place are shares of the scans' extent.
+
+The extent of a scan is the median range of its surface points: about 12 m in a street, 4 m in a room.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from dpmjax.checks import require_fields, require_positive_fields
+from dpmjax.scans.surface_alignment import AlignmentConfig, AlignmentLevel
+
+NARROW = AlignmentConfig(levels=(AlignmentLevel(1.0, 1000, 10), AlignmentLevel(0.3, 4000, 12)), min_kernel_m=0.03)
+WIDE = AlignmentConfig(levels=(AlignmentLevel(3.0, 300, 10),))
+
+
+@dataclass(frozen=True)
+class OdometryConfig:
+    """Registration of a scan against the local map of recent scans, point to plane.
+
+    Attributes:
+        min_range_m: nearer points belong to the vehicle and are dropped.
+        max_range_m: farther points are too sparse and are dropped.
+        voxel_share: side of the voxels that thin a scan, as a share of its extent ...
+        voxel_sizes_m: ... rounded down to one of these.
+        min_num_points: a scan with fewer surface points counts as empty.
+        narrow: alignment from a prior that is nearly right.
+        wide: alignment from any other start.
+        num_frames: number of scans in the local map.
+        frame_share: a scan joins the local map where it is farther than this share of the extent from the last one ...
+        frame_rad: ... or turned by more than this.
+        num_samples: number of points that decide about the quality of a pose.
+        plane_distance_m: a point meets a plane that is nearer than this.
+        min_cosine: and whose normal makes a larger cosine with its own.
+        contradiction_weight: how much a point in free space counts against one that meets a plane.
+        good_share: no other start is tried for a pose of this share of the usual score.
+        step_factors: starts of the search: the predicted step, times these numbers; ...
+        ahead_shares: ... steps along the x axis of the lidar, as shares of the extent; ...
+        turns_deg: ... and turns by these angles about its vertical.
+        num_independent: the information of a pose counts as that of this many independent points, for residuals are
+            correlated.
+        floor_m: standard deviation of the translation that no number of points undercuts ...
+        floor_rad: ... and of the rotation.
+    """
+
+    min_range_m: float = 1.0
+    max_range_m: float = 80.0
+    voxel_share: float = 0.025
+    voxel_sizes_m: tuple[float, ...] = (0.1, 0.15, 0.2, 0.3)
+    min_num_points: int = 100
+    narrow: AlignmentConfig = NARROW
+    wide: AlignmentConfig = WIDE
+    num_frames: int = 16
+    frame_share: float = 0.08
+    frame_rad: float = 0.17
+    num_samples: int = 1000
+    plane_distance_m: float = 0.15
+    min_cosine: float = 0.7
+    contradiction_weight: float = 2.0
+    good_share: float = 0.85
+    step_factors: tuple[float, ...] = (0.0, 0.5, 1.0, 1.5, 2.0, 3.0, 4.0)
+    ahead_shares: tuple[float, ...] = (-0.08, 0.08, 0.16)
+    turns_deg: tuple[float, ...] = (-10.0, 10.0, -20.0, 20.0, -35.0, 35.0, -50.0, 50.0)
+    num_independent: int = 200
+    floor_m: float = 0.01
+    floor_rad: float = 0.001
+
+    def __post_init__(self) -> None:
+        require_positive_fields(self, "voxel_share", "frame_share", "frame_rad", "plane_distance_m", "floor_m")
+        require_positive_fields(self, "floor_rad")
+        require_fields(self, "min_num_points", "num_frames", "num_samples", "num_independent", low=1)
+        require_fields(self, "min_range_m", "contradiction_weight", low=0)
+        require_fields(self, "min_cosine", "good_share", low=0, high=1)
+        require_fields(self, "max_range_m", low=self.min_range_m)
+        if not self.voxel_sizes_m or min(self.voxel_sizes_m) <= 0:
+            raise ValueError(f"voxel_sizes_m: expected sizes above 0, got {self.voxel_sizes_m}")
+
+
+@dataclass(frozen=True)
+class FrontEndConfig:
+    """Which pose of a scan is believed, and which scans become keyframes.
+
+    Attributes:
+        min_score_share: a pose with a lower share of the usual score is not believed.
+        min_score: nor one with a lower score.
+        min_probability: a registration by the network is believed from this P(correct) on, where the geometry agrees.
+        num_submap: at most so many keyframes are merged for a registration (attention is quadratic in their number).
+        submap_radius_m: keyframes farther away are not merged (DeepPointMap's published configuration).
+        num_lost: after this many scans without a believed pose, the scan is looked for in the whole map.
+        num_relocation: number of keyframes that are tried then.
+        keyframe_share: a keyframe is made where the nearest one is farther than this share of the extent ...
+        keyframe_rad: ... or the last one is turned by more than this.
+        max_keyframe_m: upper bound of the distance of keyframes (DeepPointMap: 3 to 10 m).
+        min_keyframe_m: lower bound of it.
+        usual_window: the usual score is the median over this many scans.
+        guess_m: standard deviation of a motion that was only predicted ...
+        guess_rad: ... and of its rotation.
+    """
+
+    min_score_share: float = 0.6
+    min_score: float = 0.2
+    min_probability: float = 0.5
+    num_submap: int = 4
+    submap_radius_m: float = 20.0
+    num_lost: int = 3
+    num_relocation: int = 3
+    keyframe_share: float = 0.3
+    keyframe_rad: float = 0.6
+    max_keyframe_m: float = 5.0
+    min_keyframe_m: float = 0.5
+    usual_window: int = 20
+    guess_m: float = 1.0
+    guess_rad: float = 0.2
+
+    def __post_init__(self) -> None:
+        require_fields(self, "min_score_share", "min_probability", low=0, high=1)
+        require_fields(self, "num_submap", "num_lost", "num_relocation", "usual_window", low=1)
+        require_positive_fields(self, "submap_radius_m", "keyframe_share", "keyframe_rad", "guess_m", "guess_rad")
+        require_fields(self, "min_keyframe_m", low=1e-3, high=self.max_keyframe_m)
+
+
+@dataclass(frozen=True)
+class LoopClosureConfig:
+    """Which keyframes are compared with a new one, and which registrations become edges.
+
+    Attributes:
+        is_on: False leaves the map as odometry makes it.
+        min_path_share: keyframes nearer than this many extents along the path are no candidates.
+        radius_share: candidates are within this many extents ...
+        drift_share: ... plus this share of the path since.
+        max_radius_m: upper bound of that radius (DeepPointMap: 100 m).
+        num_near: at most so many candidates by distance.
+        num_similar: at most so many candidates by retrieval.
+        min_cosine: candidates by retrieval are at least this similar.
+        min_overlap: a candidate is registered from this overlap probability on; 0 asks no network.
+        num_registered: at most so many candidates are registered.
+        min_probability: a registration is believed from this P(correct) on.
+        min_matched_share: share of the points that must meet planes, where the scans verify a registration.
+        max_contradicted_share: share of the points that may lie in free space.
+        min_support: number of consistent registrations, itself among them, that a loop needs to become an edge.
+        pending_path_m: registrations support each other if both ends are nearer than this along the path.
+        sigma_m: standard deviation of a registration ...
+        sigma_rad: ... and of its rotation.
+        drift_m: standard deviation of odometry over one metre; it grows with the root of the path ...
+        drift_rad: ... and that of its rotation.
+        consistent_sigmas: a cycle closes within this many standard deviations.
+        min_drift_share: a loop may also contradict odometry by this share of the path.
+        edge_outlier_chi2: cost at which the optimisation lets a loop edge go.
+        taken_back_weight: a loop edge with a smaller weight after the optimisation is taken back.
+        rest_share: no loop is looked for on this many extents of the path after an accepted one.
+        every_keyframes: the graph is optimised at most once in this many keyframes ...
+        every_share: ... and in this share of all, so that the cost of a scan does not grow with the map.
+    """
+
+    is_on: bool = True
+    min_path_share: float = 4.0
+    radius_share: float = 1.5
+    drift_share: float = 0.03
+    max_radius_m: float = 100.0
+    num_near: int = 6
+    num_similar: int = 6
+    min_cosine: float = 0.8
+    min_overlap: float = 0.3
+    num_registered: int = 2
+    min_probability: float = 0.5
+    min_matched_share: float = 0.35
+    max_contradicted_share: float = 0.1
+    min_support: int = 2
+    pending_path_m: float = 40.0
+    sigma_m: float = 0.2
+    sigma_rad: float = 0.02
+    drift_m: float = 0.05
+    drift_rad: float = 0.004
+    consistent_sigmas: float = 3.0
+    min_drift_share: float = 0.1
+    edge_outlier_chi2: float = 25.0
+    taken_back_weight: float = 0.25
+    rest_share: float = 0.3
+    every_keyframes: int = 8
+    every_share: float = 0.05
+
+    def __post_init__(self) -> None:
+        require_fields(self, "min_overlap", "min_probability", low=0, high=1)
+        require_fields(self, "min_matched_share", "max_contradicted_share", "taken_back_weight", low=0, high=1)
+        require_fields(self, "min_support", "every_keyframes", "num_registered", low=1)
+        require_fields(self, "num_near", "num_similar", "min_path_share", "drift_share", "min_drift_share", low=0)
+        require_fields(self, "rest_share", "every_share", low=0)
+        require_positive_fields(self, "radius_share", "max_radius_m", "pending_path_m", "consistent_sigmas")
+        require_positive_fields(self, "sigma_m", "sigma_rad", "drift_m", "drift_rad", "edge_outlier_chi2")
+
+
+@dataclass(frozen=True)
+class SlamConfig:
+    """Settings of `run_slam`.
+
+    Attributes:
+        odometry: registration against the local map.
+        front_end: belief, keyframes, re-localisation.
+        loops: loop closure and optimisation.
+    """
+
+    odometry: OdometryConfig = field(default_factory=OdometryConfig)
+    front_end: FrontEndConfig = field(default_factory=FrontEndConfig)
+    loops: LoopClosureConfig = field(default_factory=LoopClosureConfig)

@@ -1,0 +1,196 @@
+"""The front end: one scan after the other gets a pose, and some become keyframes (DeepPointMap section 4).
+
+Geometry comes first, because it is more accurate than descriptors of 0.3 m voxels. Where it fails, the network gives
+another start, and the scans themselves decide between the two. Where nothing agrees, the motion is predicted.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from dpmjax.geometry import rigid
+from dpmjax.slam.keyframes import (
+    EdgeKind,
+    Keyframe,
+    KeyframeMap,
+    MapEdge,
+    Pose,
+    Submap,
+    add_keyframe,
+    diagonal_information,
+    orthonormal,
+    submap_around,
+    turn_rad,
+)
+from dpmjax.slam.methods import SlamMethods
+from dpmjax.slam.odometry import PosePrior
+from dpmjax.slam.reports import ScanReport, ScanStatus
+
+
+class FrontEndState(NamedTuple):
+    """What the next scan needs of those before. The frame is that of the last keyframe.
+
+    Attributes:
+        num_scans: number of scans so far.
+        local_map: recent scans; None before the first.
+        T_keyframe_last: pose of the last scan.
+        T_before_last: its motion since the scan before.
+        scores: of recent scans that were believed.
+        num_lost: number of scans since one was believed.
+    """
+
+    num_scans: int = 0
+    local_map: Any | None = None
+    T_keyframe_last: Pose = np.eye(4)
+    T_before_last: Pose = np.eye(4)
+    scores: tuple[float, ...] = ()
+    num_lost: int = 0
+
+
+class Located(NamedTuple):
+    """The pose of a scan in the frame of the last keyframe, and why it is believed or not.
+
+    Attributes:
+        T_keyframe_scan: the pose.
+        status: how it was found.
+        reason: the numbers that decided.
+        score: agreement with the local map.
+        information: (6, 6) in the tangent of the scan.
+        probability: P(correct) of the network; None where it was not asked.
+    """
+
+    T_keyframe_scan: Pose
+    status: ScanStatus
+    reason: str
+    score: float
+    information: Float[np.ndarray, "6 6"]
+    probability: float | None = None
+
+
+def step(
+    methods: SlamMethods, state: FrontEndState, slam_map: KeyframeMap, points: Float[np.ndarray, "n 3"]
+) -> tuple[FrontEndState, KeyframeMap, ScanReport]:
+    """Places a scan.
+
+    Args:
+        methods: matcher, geometry, settings.
+        state: after the scan before.
+        slam_map: the map so far.
+        points: the scan, metres, in the frame of the lidar.
+
+    Returns:
+        The state and the map after, and how the scan was placed.
+    """
+    measured = methods.geometry.measure(points)
+    if measured is None:
+        return _pass_over(state, slam_map)
+    if len(slam_map) == 0:
+        located = Located(np.eye(4), "first", "the map begins here", 1.0, np.eye(6))
+        return _make_keyframe(methods, state, slam_map, Scan(points, measured), located)
+    located = _locate(methods, state, slam_map, Scan(points, measured))
+    # The next prediction uses this pose three times, so a rounding error would triple from scan to scan.
+    located = located._replace(T_keyframe_scan=orthonormal(located.T_keyframe_scan))
+    if located.status == "restarted" or _is_keyframe(methods, located, measured):
+        return _make_keyframe(methods, state, slam_map, Scan(points, measured), located)
+    after = _advanced(methods, state, located, measured)
+    return after, slam_map, _report(state, slam_map, located, is_keyframe=False)
+
+
+class Scan(NamedTuple):
+    """A scan that is not empty.
+
+    Attributes:
+        points: metres, in the frame of the lidar.
+        measured: what the geometry has measured of it.
+    """
+
+    points: Float[np.ndarray, "n 3"]
+    measured: Any
+
+
+def _pass_over(state: FrontEndState, slam_map: KeyframeMap) -> tuple[FrontEndState, KeyframeMap, ScanReport]:
+    guess = diagonal_information(1.0, 1.0)
+    located = Located(state.T_keyframe_last @ state.T_before_last, "empty", "too few points", 0.0, guess)
+    after = state._replace(num_scans=state.num_scans + 1, T_keyframe_last=located.T_keyframe_scan)
+    return after, slam_map, _report(state, slam_map, located, is_keyframe=False)
+
+
+def _locate(methods: SlamMethods, state: FrontEndState, slam_map: KeyframeMap, scan: Scan) -> Located:
+    config = methods.config.front_end
+    usual = float(np.median(state.scores)) if state.scores else 1.0
+    wanted = max(config.min_score, config.min_score_share * usual)
+    prior = PosePrior(state.T_keyframe_last, state.T_before_last, usual)
+    found = methods.geometry.align(state.local_map, scan.measured, prior)
+    if found.score >= wanted:
+        reason = f"score {found.score:.2f} of usually {usual:.2f}"
+        return Located(found.T_map_scan, "tracked", reason, found.score, found.information)
+    source = Submap((methods.matcher.describe(scan.points, scan.measured),), np.eye(4)[None])
+    target = submap_around(slam_map, len(slam_map) - 1, config.num_submap, config.submap_radius_m)
+    match = methods.matcher.register([(source, target)])[0]
+    start = PosePrior(match.T_target_source, np.eye(4), usual, is_sure=True)
+    other = methods.geometry.align(state.local_map, scan.measured, start)
+    numbers = f"score {found.score:.2f} by geometry, {other.score:.2f} by the network with P {match.probability:.2f}"
+    if other.score >= wanted and other.score > found.score:
+        return Located(other.T_map_scan, "network", numbers, other.score, other.information, match.probability)
+    status: ScanStatus = "restarted" if state.num_lost + 1 >= config.num_lost else "predicted"
+    guess = diagonal_information(config.guess_m, config.guess_rad)
+    predicted = state.T_keyframe_last @ state.T_before_last
+    return Located(predicted, status, numbers, max(found.score, other.score), guess, match.probability)
+
+
+def _is_keyframe(methods: SlamMethods, located: Located, measured: Any) -> bool:
+    if located.status == "predicted":
+        return False
+    config, T = methods.config.front_end, located.T_keyframe_scan
+    spacing_m = config.keyframe_share * methods.geometry.extent_m(measured)
+    spacing_m = float(np.clip(spacing_m, config.min_keyframe_m, config.max_keyframe_m))
+    return bool(np.linalg.norm(T[:3, 3]) > spacing_m) or turn_rad(T) > config.keyframe_rad
+
+
+def _make_keyframe(
+    methods: SlamMethods, state: FrontEndState, slam_map: KeyframeMap, scan: Scan, located: Located
+) -> tuple[FrontEndState, KeyframeMap, ScanReport]:
+    matcher, geometry, T = methods.matcher, methods.geometry, located.T_keyframe_scan
+    row, is_guess = len(slam_map), located.status == "restarted"
+    description = matcher.describe(scan.points, scan.measured)
+    T_odometry, T_world, path_m, segment, edge = T, T, 0.0, 0, None
+    if row:
+        last = slam_map.keyframes[-1]
+        T_odometry, T_world = last.T_odometry_keyframe @ T, slam_map.T_world_keyframe[-1] @ T
+        path_m, segment = last.path_m + float(np.linalg.norm(T[:3, 3])), last.segment + is_guess
+        kind: EdgeKind = "guess" if is_guess else "odometry"
+        edge = MapEdge(row, row - 1, T, located.information, kind)
+    keyframe = Keyframe(state.num_scans, T_odometry, path_m, segment, geometry.extent_m(scan.measured), description)
+    slam_map = add_keyframe(slam_map, keyframe, T_world, matcher.vector(description), edge)
+    after = _advanced(methods, state, located, scan.measured)
+    if is_guess or row == 0:
+        local_map = geometry.insert(None, scan.measured, np.eye(4))
+    else:
+        local_map = geometry.move(after.local_map, rigid.inverse(T))
+    after = after._replace(local_map=local_map, T_keyframe_last=np.eye(4))
+    return after, slam_map, _report(state, slam_map, located._replace(T_keyframe_scan=np.eye(4)), is_keyframe=True)
+
+
+def _advanced(methods: SlamMethods, state: FrontEndState, located: Located, measured: Any) -> FrontEndState:
+    """Returns the state after a scan: only a believed one joins the local map and changes the predicted motion."""
+    T = located.T_keyframe_scan
+    after = state._replace(num_scans=state.num_scans + 1, T_keyframe_last=T)
+    if located.status == "predicted":
+        return after._replace(num_lost=state.num_lost + 1)
+    if located.status in ("first", "restarted"):
+        return after._replace(num_lost=0, scores=())
+    return after._replace(
+        local_map=methods.geometry.insert(state.local_map, measured, T),
+        T_before_last=rigid.inverse(state.T_keyframe_last) @ T,
+        scores=(*state.scores, located.score)[-methods.config.front_end.usual_window :],
+        num_lost=0,
+    )
+
+
+def _report(state: FrontEndState, slam_map: KeyframeMap, located: Located, *, is_keyframe: bool) -> ScanReport:
+    keyframe, T = max(len(slam_map) - 1, 0), located.T_keyframe_scan
+    numbers = located.score, located.probability
+    return ScanReport(state.num_scans, located.status, located.reason, keyframe, T, is_keyframe, *numbers)

@@ -1,0 +1,267 @@
+"""The map: keyframes, their poses, and the relative poses measured between them. Nothing is changed in place."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, field, replace
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+import scipy.sparse as sp
+from jaxtyping import Float
+from scipy.spatial.transform import Rotation
+
+from dpmjax.geometry import rigid
+from dpmjax.pose_graph.graph import Edges, PoseGraph
+
+Pose = Float[np.ndarray, "4 4"]
+EdgeKind = Literal["odometry", "loop", "guess"]
+
+
+class Keyframe(NamedTuple):
+    """A scan that the map keeps.
+
+    Attributes:
+        scan: number of the scan.
+        T_odometry_keyframe: pose by the chain of odometry alone, which no loop corrects.
+        path_m: length of the path until here, by odometry.
+        segment: number of the unbroken chain of odometry that it belongs to.
+        extent_m: median range of its points.
+        description: what the matcher registers.
+    """
+
+    scan: int
+    T_odometry_keyframe: Pose
+    path_m: float
+    segment: int
+    extent_m: float
+    description: Any
+
+
+class MapEdge(NamedTuple):
+    """A measured relative pose between two keyframes.
+
+    Attributes:
+        source: row of a keyframe.
+        target: row of the other.
+        T_target_source: float64.
+        information: (6, 6) inverse covariance in the tangent of the source, translation first.
+        kind: what measured it; a "guess" is a motion that was only predicted.
+    """
+
+    source: int
+    target: int
+    T_target_source: Pose
+    information: Float[np.ndarray, "6 6"]
+    kind: EdgeKind
+
+
+@dataclass(frozen=True, eq=False)
+class KeyframeMap:
+    """Keyframes (k of them), poses and edges.
+
+    Attributes:
+        keyframes: in the order of time.
+        T_world_keyframe: (k, 4, 4) float64, corrected by loops.
+        vectors: (k, c) unit vectors for retrieval, float32.
+        edges: all relative poses.
+    """
+
+    keyframes: tuple[Keyframe, ...] = ()
+    T_world_keyframe: Float[np.ndarray, "k 4 4"] = field(default_factory=lambda: np.zeros((0, 4, 4)))
+    vectors: Float[np.ndarray, "k c"] = field(default_factory=lambda: np.zeros((0, 0), np.float32))
+    edges: tuple[MapEdge, ...] = ()
+
+    def __len__(self) -> int:
+        return len(self.keyframes)
+
+
+class Submap(NamedTuple):
+    """Keyframes around one of them, to be registered as a whole.
+
+    Attributes:
+        descriptions: of the keyframes; the first is the central one.
+        T_submap_keyframe: (n, 4, 4) their poses in the frame of the first.
+    """
+
+    descriptions: tuple[Any, ...]
+    T_submap_keyframe: Float[np.ndarray, "n 4 4"]
+
+
+def add_keyframe(
+    slam_map: KeyframeMap,
+    keyframe: Keyframe,
+    T_world_keyframe: Pose,
+    vector: Float[np.ndarray, " c"],
+    edge: MapEdge | None,
+) -> KeyframeMap:
+    """Adds a keyframe.
+
+    Args:
+        slam_map: the map before.
+        keyframe: the new one.
+        T_world_keyframe: its pose.
+        vector: for retrieval; any length of vector.
+        edge: how it was measured; None for the first of a map.
+
+    Returns:
+        The map after.
+    """
+    unit = np.asarray(vector, np.float32)[None] / np.float32(max(float(np.linalg.norm(vector)), 1e-12))
+    return KeyframeMap(
+        (*slam_map.keyframes, keyframe),
+        np.concatenate([slam_map.T_world_keyframe, T_world_keyframe[None]]),
+        np.concatenate([slam_map.vectors.reshape(len(slam_map), -1 if len(slam_map) else unit.shape[1]), unit]),
+        slam_map.edges if edge is None else (*slam_map.edges, edge),
+    )
+
+
+def with_edges(slam_map: KeyframeMap, edges: Iterable[MapEdge]) -> KeyframeMap:
+    """Replaces the edges.
+
+    Args:
+        slam_map: the map before.
+        edges: all edges after.
+
+    Returns:
+        The map after.
+    """
+    return replace(slam_map, edges=tuple(edges))
+
+
+def with_poses(slam_map: KeyframeMap, T_world_keyframe: Float[np.ndarray, "k 4 4"]) -> KeyframeMap:
+    """Replaces the poses.
+
+    Args:
+        slam_map: the map before.
+        T_world_keyframe: all poses after.
+
+    Returns:
+        The map after.
+    """
+    return replace(slam_map, T_world_keyframe=np.asarray(T_world_keyframe, np.float64))
+
+
+def nearest_keyframes(slam_map: KeyframeMap, position_world: Float[np.ndarray, " 3"], count: int) -> np.ndarray:
+    """Finds the keyframes nearest to a position.
+
+    Args:
+        slam_map: the map.
+        position_world: metres.
+        count: at most so many.
+
+    Returns:
+        Rows, nearest first.
+    """
+    return np.argsort(distances_to(slam_map, position_world), kind="stable")[:count]
+
+
+def distances_to(slam_map: KeyframeMap, position_world: Float[np.ndarray, " 3"]) -> Float[np.ndarray, " k"]:
+    """Computes the distances of all keyframes to a position.
+
+    Args:
+        slam_map: the map.
+        position_world: metres.
+
+    Returns:
+        Metres.
+    """
+    return np.asarray(np.linalg.norm(slam_map.T_world_keyframe[:, :3, 3] - position_world, axis=1))
+
+
+def graph_steps(slam_map: KeyframeMap, row: int, max_steps: int) -> Float[np.ndarray, " k"]:
+    """Counts the edges between a keyframe and all others.
+
+    Args:
+        slam_map: the map.
+        row: of the keyframe.
+        max_steps: others farther away count as not reached.
+
+    Returns:
+        Number of edges; infinite where not reached. Predicted motions are no edges here.
+    """
+    measured = [(edge.source, edge.target) for edge in slam_map.edges if edge.kind != "guess"]
+    sources, targets = np.asarray(measured, np.int64).reshape(-1, 2).T
+    joined = sp.coo_array((np.ones(len(sources)), (sources, targets)), (len(slam_map), len(slam_map))).tocsr()
+    found = sp.csgraph.dijkstra(joined, directed=False, indices=[row], unweighted=True, limit=max_steps)
+    return np.asarray(found)[0]
+
+
+def submap_around(slam_map: KeyframeMap, row: int, num_keyframes: int, radius_m: float) -> Submap:
+    """Gathers a keyframe and its neighbours in the graph, nearest first.
+
+    Args:
+        slam_map: the map.
+        row: of the central keyframe.
+        num_keyframes: at most so many, the central one among them.
+        radius_m: neighbours farther away are left out.
+
+    Returns:
+        The submap, in the frame of the central keyframe.
+    """
+    steps = graph_steps(slam_map, row, num_keyframes)
+    apart = distances_to(slam_map, slam_map.T_world_keyframe[row, :3, 3])
+    rows = np.flatnonzero(np.isfinite(steps) & (apart <= radius_m))
+    rows = rows[np.lexsort((apart[rows], rows != row))][:num_keyframes]
+    T_submap_world = rigid.inverse(slam_map.T_world_keyframe[row])
+    return Submap(
+        tuple(slam_map.keyframes[i].description for i in rows), T_submap_world @ slam_map.T_world_keyframe[rows]
+    )
+
+
+def as_pose_graph(slam_map: KeyframeMap) -> PoseGraph:
+    """Makes the pose graph of a map; the ids of its nodes are numbers of scans.
+
+    Args:
+        slam_map: with at least one keyframe.
+
+    Returns:
+        The graph.
+    """
+    edges = slam_map.edges
+    records = Edges(
+        np.array([edge.source for edge in edges], np.int64),
+        np.array([edge.target for edge in edges], np.int64),
+        np.array([edge.T_target_source for edge in edges]).reshape(-1, 4, 4),
+        np.array([edge.information for edge in edges]).reshape(-1, 6, 6),
+    )
+    return PoseGraph.create(slam_map.T_world_keyframe, records, ids=[keyframe.scan for keyframe in slam_map.keyframes])
+
+
+def turn_rad(T_a_b: Pose) -> float:
+    """Returns the angle of a rotation.
+
+    Args:
+        T_a_b: a motion.
+
+    Returns:
+        Radians, from 0 to pi.
+    """
+    return float(Rotation.from_matrix(T_a_b[:3, :3]).magnitude())
+
+
+def orthonormal(T_a_b: Pose) -> Pose:
+    """Removes the rounding errors of a rotation, which would grow from scan to scan.
+
+    Args:
+        T_a_b: nearly a rigid motion.
+
+    Returns:
+        The rigid motion.
+    """
+    T = np.array(T_a_b, np.float64)
+    T[:3, :3] = Rotation.from_matrix(T[:3, :3]).as_matrix()
+    return T
+
+
+def diagonal_information(sigma_m: float, sigma_rad: float) -> Float[np.ndarray, "6 6"]:
+    """Makes the information of a motion whose six errors are independent.
+
+    Args:
+        sigma_m: standard deviation of each translation.
+        sigma_rad: of each rotation.
+
+    Returns:
+        The inverse covariance, translation first.
+    """
+    return np.diag(np.repeat([sigma_m**-2.0, sigma_rad**-2.0], 3))

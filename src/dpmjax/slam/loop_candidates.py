@@ -1,0 +1,67 @@
+"""Candidates of loops: older keyframes near the new one, by the estimated poses and by what they look like."""
+
+from __future__ import annotations
+
+from typing import Literal, NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from dpmjax.slam.config import LoopClosureConfig
+from dpmjax.slam.keyframes import KeyframeMap, distances_to
+from dpmjax.slam.retrieval import most_similar
+
+
+class LoopCandidate(NamedTuple):
+    """An older keyframe that may show the same place.
+
+    Attributes:
+        row: of the keyframe.
+        found_by: how.
+    """
+
+    row: int
+    found_by: Literal["distance", "retrieval"]
+
+
+def find_candidates(slam_map: KeyframeMap, row: int, config: LoopClosureConfig) -> list[LoopCandidate]:
+    """Finds older keyframes that may show the place of a keyframe.
+
+    By distance: within a radius that grows with the path since, for odometry drifts. By retrieval: over the whole map,
+    so that neither drift nor a lost track matters. Of several neighbours only the best is taken.
+
+    Args:
+        slam_map: the map.
+        row: of the new keyframe.
+        config: radii and numbers.
+
+    Returns:
+        Candidates by distance, nearest first, then those by retrieval, most similar first; each row once.
+    """
+    keyframe = slam_map.keyframes[row]
+    path_m = np.array([other.path_m for other in slam_map.keyframes])
+    is_chained = np.array([other.segment == keyframe.segment for other in slam_map.keyframes])
+    since_m = np.where(is_chained, keyframe.path_m - path_m, np.inf)
+    is_old = (np.arange(len(slam_map)) < row) & (since_m > config.min_path_share * keyframe.extent_m)
+    apart_m = distances_to(slam_map, slam_map.T_world_keyframe[row, :3, 3])
+    radius_m = config.radius_share * keyframe.extent_m + config.drift_share * since_m
+    is_near = is_old & (apart_m <= np.minimum(radius_m, config.max_radius_m))
+    near = np.argsort(np.where(is_near, apart_m, np.inf), kind="stable")[: int(is_near.sum())]
+    near = _spread(near, slam_map, keyframe.extent_m / 2, config.num_near)
+    similar, cosines = most_similar(slam_map.vectors, slam_map.vectors[row], 5 * config.num_similar, is_allowed=is_old)
+    similar = _spread(similar[cosines >= config.min_cosine], slam_map, keyframe.extent_m / 2, config.num_similar)
+    found = [LoopCandidate(int(other), "distance") for other in near]
+    return found + [LoopCandidate(int(other), "retrieval") for other in similar if other not in near]
+
+
+def _spread(rows: Int[np.ndarray, " n"], slam_map: KeyframeMap, spacing_m: float, count: int) -> Int[np.ndarray, " m"]:
+    """Returns the first rows that are not within `spacing_m` of one taken before."""
+    positions = slam_map.T_world_keyframe[rows, :3, 3]
+    is_free: Bool[np.ndarray, " n"] = np.ones(len(rows), bool)
+    taken: list[int] = []
+    for number in range(len(rows)):
+        if is_free[number] and len(taken) < count:
+            taken.append(number)
+            distance: Float[np.ndarray, " n"] = np.linalg.norm(positions - positions[number], axis=1)
+            is_free &= distance > spacing_m
+    return rows[taken]

@@ -1,0 +1,23 @@
+"""What SLAM is made of: who recognises places, who aligns scans, and the settings."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from dpmjax.slam.config import SlamConfig
+from dpmjax.slam.matcher import Matcher
+from dpmjax.slam.odometry import Geometry
+
+
+class SlamMethods(NamedTuple):
+    """The parts of SLAM that are arguments.
+
+    Attributes:
+        matcher: recognises places and registers scans without a first guess.
+        geometry: aligns a scan with recent ones.
+        config: settings of all stages.
+    """
+
+    matcher: Matcher
+    geometry: Geometry
+    config: SlamConfig

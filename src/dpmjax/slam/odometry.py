@@ -1,0 +1,340 @@
+"""Geometry: a scan is registered point to plane against a local map of recent scans, on the host.
+
+Where the predicted pose is nearly right, one alignment suffices. Where its result is worse than usual, other starts
+are tried: the robot stood still, went faster, or turned.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple, Protocol
+
+import numpy as np
+from jaxtyping import Float
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
+
+from dpmjax.deeppointmap.verification import MeasuredScan
+from dpmjax.geometry import rigid
+from dpmjax.scans.free_space import range_image, view_points
+from dpmjax.scans.preprocess import first_of_each_voxel
+from dpmjax.scans.surface_alignment import AlignmentLevel, align_surfaces, pair_with_planes
+from dpmjax.scans.surfaces import MIN_FLATNESS, Surface, SurfaceConfig, scan_surface
+from dpmjax.slam.config import OdometryConfig
+from dpmjax.slam.keyframes import Pose, diagonal_information, orthonormal, turn_rad
+
+MAX_LOCAL_POINTS = 4000
+"""Points of the local map that are compared with the free space of a scan."""
+
+
+class Alignment(NamedTuple):
+    """A scan in the frame of the local map.
+
+    Attributes:
+        T_map_scan: float64.
+        matched_share: share of the scan's points that meet planes of the map.
+        contradicted_share: share of the map's visible points that lie in the scan's free space.
+        score: `matched_share` less the weighted `contradicted_share`.
+        information: (6, 6) inverse covariance in the tangent of the scan, translation first: weak along a corridor.
+        num_starts: number of starts that were tried.
+    """
+
+    T_map_scan: Pose
+    matched_share: float
+    contradicted_share: float
+    score: float
+    information: Float[np.ndarray, "6 6"]
+    num_starts: int = 1
+
+
+class Geometry(Protocol):
+    """Measures scans and aligns them with the recent ones."""
+
+    def measure(self, points: Float[np.ndarray, "n 3"]) -> Any | None:
+        """Prepares a scan.
+
+        Args:
+            points: metres, in the frame of the lidar; may hold NaN.
+
+        Returns:
+            A record that the geometry and the matcher read; None for a scan without enough points.
+        """
+        ...
+
+    def extent_m(self, measured: Any) -> float:
+        """Returns the median range of a scan.
+
+        Args:
+            measured: from `measure`.
+
+        Returns:
+            Metres.
+        """
+        ...
+
+    def insert(self, local_map: Any | None, measured: Any, T_map_scan: Pose) -> Any:
+        """Adds a scan to the local map, where it tells something new.
+
+        Args:
+            local_map: None for an empty one.
+            measured: the scan.
+            T_map_scan: its pose.
+
+        Returns:
+            The local map after.
+        """
+        ...
+
+    def move(self, local_map: Any, T_new_map: Pose) -> Any:
+        """Changes the frame of the local map.
+
+        Args:
+            local_map: the map.
+            T_new_map: the old frame in the new one.
+
+        Returns:
+            The map in its new frame.
+        """
+        ...
+
+    def align(self, local_map: Any, measured: Any, starts: PosePrior) -> Alignment:
+        """Aligns a scan with the local map.
+
+        Args:
+            local_map: the map.
+            measured: the scan.
+            starts: the predicted pose and what is usual.
+
+        Returns:
+            The best pose.
+        """
+        ...
+
+
+class PosePrior(NamedTuple):
+    """Where the search for a pose begins.
+
+    Attributes:
+        T_map_last: pose of the last scan.
+        T_last_scan: predicted motion since.
+        usual_score: of recent alignments; 1 where there is none yet.
+        is_sure: whether only small errors of the prediction are searched.
+    """
+
+    T_map_last: Pose
+    T_last_scan: Pose
+    usual_score: float = 1.0
+    is_sure: bool = False
+
+
+class MapFrame(NamedTuple):
+    """A scan of the local map.
+
+    Attributes:
+        T_map_scan: its pose.
+        measured: the scan.
+    """
+
+    T_map_scan: Pose
+    measured: MeasuredScan
+
+
+class LocalMap(NamedTuple):
+    """Recent scans and their common surface.
+
+    Attributes:
+        frames: oldest first.
+        surface: flat points of all, in the frame of the map.
+        voxel_m: side of the voxels that thin them.
+    """
+
+    frames: tuple[MapFrame, ...]
+    surface: Surface
+    voxel_m: float
+
+
+class SurfaceGeometry:
+    """Point-to-plane alignment against the surfaces of recent scans.
+
+    Args:
+        config: settings; None takes the defaults.
+    """
+
+    def __init__(self, config: OdometryConfig | None = None) -> None:
+        self.config = config or OdometryConfig()
+
+    def measure(self, points: Float[np.ndarray, "n 3"]) -> MeasuredScan | None:
+        """Measures surface and free space; see `Geometry`.
+
+        Args:
+            points: metres, in the frame of the lidar.
+
+        Returns:
+            The measured scan; None if it is empty.
+        """
+        config, ranges = self.config, np.linalg.norm(np.asarray(points, np.float64), axis=1)
+        is_within = (ranges >= config.min_range_m) & (ranges <= config.max_range_m)
+        if is_within.sum() < config.min_num_points:
+            return None
+        voxel_m = self._voxel_m(float(np.median(ranges[is_within])))
+        radius_m = 5 * voxel_m
+        surface = scan_surface(
+            points,
+            SurfaceConfig(config.min_range_m, config.max_range_m, voxel_m, neighbour_radius_m=radius_m),
+        )
+        if len(surface.samples) < config.min_num_points:
+            return None
+        return MeasuredScan(surface, range_image(surface.points))
+
+    def extent_m(self, measured: MeasuredScan) -> float:
+        """Returns the median range of the thinned points; see `Geometry`.
+
+        Args:
+            measured: the scan.
+
+        Returns:
+            Metres.
+        """
+        return float(np.median(np.linalg.norm(measured.surface.points, axis=1)))
+
+    def insert(self, local_map: LocalMap | None, measured: MeasuredScan, T_map_scan: Pose) -> LocalMap:
+        """Adds a scan that is far enough from the last one; see `Geometry`.
+
+        Args:
+            local_map: None for an empty one.
+            measured: the scan.
+            T_map_scan: its pose.
+
+        Returns:
+            The local map.
+        """
+        config, extent_m = self.config, self.extent_m(measured)
+        frame = MapFrame(T_map_scan, measured)
+        if local_map is None:
+            return _local_map((frame,), self._voxel_m(extent_m))
+        T_last_scan = rigid.inverse(local_map.frames[-1].T_map_scan) @ T_map_scan
+        apart_m = float(np.linalg.norm(T_last_scan[:3, 3]))
+        if apart_m < config.frame_share * extent_m and turn_rad(T_last_scan) < config.frame_rad:
+            return local_map
+        return _local_map((*local_map.frames, frame)[-config.num_frames :], local_map.voxel_m)
+
+    def move(self, local_map: LocalMap, T_new_map: Pose) -> LocalMap:
+        """Moves all frames; see `Geometry`.
+
+        Args:
+            local_map: the map.
+            T_new_map: the old frame in the new one.
+
+        Returns:
+            The map in its new frame.
+        """
+        frames = tuple(frame._replace(T_map_scan=T_new_map @ frame.T_map_scan) for frame in local_map.frames)
+        return _local_map(frames, local_map.voxel_m)
+
+    def align(self, local_map: LocalMap, measured: MeasuredScan, starts: PosePrior) -> Alignment:
+        """Aligns from the prediction, and from other starts where the result is worse than usual; see `Geometry`.
+
+        Args:
+            local_map: the map.
+            measured: the scan.
+            starts: the prediction.
+
+        Returns:
+            The best pose by points that meet planes and points in free space.
+        """
+        config = self.config
+        best = self._aligned(local_map, measured, starts.T_map_last @ starts.T_last_scan)
+        wanted = config.good_share * starts.usual_score
+        if best.score >= wanted or starts.is_sure:
+            return best
+        tried = 1
+        coarse = []
+        for T_last_scan in _other_motions(starts.T_last_scan, self.extent_m(measured), config):
+            start = starts.T_map_last @ T_last_scan
+            T = align_surfaces(measured.surface, local_map.surface, start, config.wide).T_target_source
+            coarse.append((self._matched(local_map, measured, T, config.num_samples // 3), tried, T))
+            tried += 1
+        for _, _, T in sorted(coarse, key=lambda entry: (-entry[0], entry[1]))[:3]:
+            best = max(best, self._aligned(local_map, measured, T), key=lambda found: found.score)
+        return best._replace(num_starts=tried)
+
+    def _voxel_m(self, extent_m: float) -> float:
+        sizes = [size for size in self.config.voxel_sizes_m if size <= self.config.voxel_share * extent_m]
+        return max(sizes, default=min(self.config.voxel_sizes_m))
+
+    def _aligned(self, local_map: LocalMap, measured: MeasuredScan, start: Pose) -> Alignment:
+        config = self.config
+        T = align_surfaces(measured.surface, local_map.surface, orthonormal(start), config.narrow).T_target_source
+        matched = self._matched(local_map, measured, T, config.num_samples)
+        contradicted = _contradicted_share(local_map, measured, T)
+        score = matched - config.contradiction_weight * contradicted
+        return Alignment(T, matched, contradicted, score, self._information(local_map, measured, T))
+
+    def _matched(self, local_map: LocalMap, measured: MeasuredScan, T_map_scan: Pose, num_samples: int) -> float:
+        config = self.config
+        level = AlignmentLevel(5 * local_map.voxel_m, num_samples, 1)
+        pairs = pair_with_planes(measured.surface, local_map.surface, T_map_scan, level)
+        meets = (np.abs(pairs.residuals) < config.plane_distance_m) & (pairs.cosines > config.min_cosine)
+        return float(meets.sum()) / max(min(num_samples, len(measured.surface.samples)), 1)
+
+    def _information(self, local_map: LocalMap, measured: MeasuredScan, T_map_scan: Pose) -> Float[np.ndarray, "6 6"]:
+        """Returns the inverse of (covariance of the plane distances, as of few independent points, and a floor)."""
+        config = self.config
+        level = AlignmentLevel(5 * local_map.voxel_m, config.num_samples, 1)
+        pairs = pair_with_planes(measured.surface, local_map.surface, T_map_scan, level)
+        is_used = np.abs(pairs.residuals) < config.plane_distance_m
+        if is_used.sum() < 6:
+            return diagonal_information(10.0, 1.0)
+        normals = pairs.normals[is_used] @ T_map_scan[:3, :3]
+        points = (pairs.points[is_used] - T_map_scan[:3, 3]) @ T_map_scan[:3, :3]
+        jacobian = np.concatenate([normals, np.cross(points, normals)], axis=1)
+        variance = max(float(np.mean(pairs.residuals[is_used] ** 2)), config.floor_m**2)
+        share = config.num_independent / len(jacobian)
+        system = share / variance * jacobian.T @ jacobian
+        # A direction that no plane holds is known to 10 m and 1 rad.
+        covariance = np.linalg.inv(system + diagonal_information(10.0, 1.0))
+        covariance += np.diag(np.repeat([config.floor_m**2, config.floor_rad**2], 3))
+        information = np.linalg.inv(covariance)
+        return (information + information.T) / 2
+
+
+def _local_map(frames: tuple[MapFrame, ...], voxel_m: float) -> LocalMap:
+    points, normals, flatness = [], [], []
+    for frame in frames[::-1]:
+        surface, R = frame.measured.surface, frame.T_map_scan[:3, :3]
+        is_flat = surface.flatness > MIN_FLATNESS
+        points.append(surface.points[is_flat] @ R.T + frame.T_map_scan[:3, 3])
+        normals.append(surface.normals[is_flat] @ R.T)
+        flatness.append(surface.flatness[is_flat])
+    all_points = np.concatenate(points)
+    kept = first_of_each_voxel(all_points, voxel_m)
+    all_points = all_points[kept]
+    surface = Surface(
+        points=all_points,
+        normals=np.concatenate(normals)[kept],
+        flatness=np.concatenate(flatness)[kept],
+        samples=np.random.default_rng(0).permutation(len(all_points)),
+        tree=cKDTree(all_points, leafsize=16, balanced_tree=False, compact_nodes=False),
+    )
+    return LocalMap(frames, surface, voxel_m)
+
+
+def _contradicted_share(local_map: LocalMap, measured: MeasuredScan, T_map_scan: Pose) -> float:
+    """Returns the share of visible points of the map that lie in the free space of the scan."""
+    points = local_map.surface.points[local_map.surface.samples[:MAX_LOCAL_POINTS]]
+    in_scan = (points - T_map_scan[:3, 3]) @ T_map_scan[:3, :3]
+    views = view_points(measured.image, in_scan)
+    return float(views.is_contradicted.sum()) / max(int(views.is_visible.sum()), 1)
+
+
+def _other_motions(T_last_scan: Pose, extent_m: float, config: OdometryConfig) -> list[Pose]:
+    """Returns the predicted step, shorter, longer and turned, and steps straight ahead and back."""
+    R = T_last_scan[:3, :3]
+    motions = [(R, factor * T_last_scan[:3, 3]) for factor in config.step_factors]
+    motions += [(R, np.array([share * extent_m, 0.0, 0.0])) for share in config.ahead_shares]
+    for turn_deg in config.turns_deg:
+        turned = R @ Rotation.from_euler("z", turn_deg, degrees=True).as_matrix()
+        motions += [(turned, np.zeros(3)), (turned, T_last_scan[:3, 3])]
+    found = np.tile(np.eye(4), (len(motions), 1, 1))
+    for T, (rotation, translation) in zip(found, motions, strict=True):
+        T[:3, :3], T[:3, 3] = rotation, translation
+    return list(found)

@@ -1,0 +1,77 @@
+"""What SLAM reports: one record for each scan and one for each loop candidate, each with the reason of its decision."""
+
+from __future__ import annotations
+
+from typing import Literal, NamedTuple
+
+from dpmjax.slam.keyframes import Pose
+
+ScanStatus = Literal["first", "tracked", "network", "predicted", "empty", "restarted"]
+"""How the pose of a scan was found.
+
+"first": the scan starts the map. "tracked": geometry, from the predicted pose. "network": geometry failed there, and
+agreed from the network's pose. "predicted": nothing agreed, the motion goes on as before. "empty": the scan has too few
+points. "restarted": nothing agreed for a while, a new part of the map begins here, and loops may join it.
+"""
+
+LoopStatus = Literal[
+    "no overlap",
+    "not registered",
+    "improbable",
+    "scans disagree",
+    "against odometry",
+    "waits for support",
+    "accepted",
+    "taken back",
+]
+"""What became of a loop candidate; all but "accepted" are reasons why it is no edge."""
+
+
+class ScanReport(NamedTuple):
+    """How a scan was placed.
+
+    Attributes:
+        scan: its number.
+        status: how the pose was found.
+        reason: the numbers that decided.
+        keyframe: row of the keyframe that it hangs on; its own row if it is one.
+        T_keyframe_scan: relative pose; loops move the keyframe only.
+        is_keyframe: whether it became one.
+        score: agreement of the scan with the local map.
+        probability: P(correct) of the network; None where it was not asked.
+        num_accepted: number of loops that were accepted at this scan.
+    """
+
+    scan: int
+    status: ScanStatus
+    reason: str
+    keyframe: int
+    T_keyframe_scan: Pose
+    is_keyframe: bool
+    score: float = 0.0
+    probability: float | None = None
+    num_accepted: int = 0
+
+
+class Loop(NamedTuple):
+    """A candidate of a loop.
+
+    Attributes:
+        source: row of the new keyframe.
+        target: row of an older one.
+        found_by: how it became a candidate.
+        status: what became of it.
+        overlap: probability of overlap; 1 where no network was asked.
+        probability: P(correct) of the registration; None without one.
+        rmse_m: of the registration; None without one.
+        T_target_source: the registration; None without one.
+    """
+
+    source: int
+    target: int
+    found_by: Literal["distance", "retrieval"]
+    status: LoopStatus
+    overlap: float
+    probability: float | None = None
+    rmse_m: float | None = None
+    T_target_source: Pose | None = None

@@ -1,0 +1,182 @@
+"""The whole system: scans in, one map out. Front end, loop closure and optimisation, one scan after the other."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from dpmjax.deeppointmap.model import Model
+from dpmjax.geometry import rigid
+from dpmjax.pose_graph.graph import PoseGraph
+from dpmjax.slam import front_end
+from dpmjax.slam.config import SlamConfig
+from dpmjax.slam.front_end import FrontEndState
+from dpmjax.slam.keyframes import KeyframeMap, as_pose_graph
+from dpmjax.slam.loop_closure import LoopState, close_loops, optimize_map
+from dpmjax.slam.matcher import NetworkMatcher
+from dpmjax.slam.methods import SlamMethods
+from dpmjax.slam.odometry import SurfaceGeometry
+from dpmjax.slam.reports import Loop, ScanReport
+from dpmjax.types import AnyArray
+
+
+class SlamState(NamedTuple):
+    """All that the next scan needs.
+
+    Attributes:
+        front_end: the last scan and the local map.
+        slam_map: keyframes and edges.
+        loops: candidates of loops.
+    """
+
+    front_end: FrontEndState
+    slam_map: KeyframeMap
+    loops: LoopState
+
+
+class SlamResult(NamedTuple):
+    """What `run_slam` returns.
+
+    Attributes:
+        T_world_scan: (n, 4, 4) float64, of every scan; the world is the frame of the first one.
+        keyframes: (k,) numbers of the scans that are keyframes.
+        loops: every candidate and what became of it; rows are those of `keyframes`.
+        graph: poses of the keyframes and the edges that were kept, with ids of scans; None without any keyframe.
+        reports: how each scan was placed.
+        state: goes on with `step_slam`.
+    """
+
+    T_world_scan: Float[np.ndarray, "n 4 4"]
+    keyframes: np.ndarray
+    loops: tuple[Loop, ...]
+    graph: PoseGraph | None
+    reports: tuple[ScanReport, ...]
+    state: SlamState
+
+
+def make_methods(model: Model, config: SlamConfig | None = None) -> SlamMethods:
+    """Makes the methods of a trained model: its networks, and point-to-plane geometry.
+
+    Args:
+        model: encoder and decoder.
+        config: settings of all stages.
+
+    Returns:
+        The methods.
+    """
+    config = config or SlamConfig()
+    return SlamMethods(NetworkMatcher(model), SurfaceGeometry(config.odometry), config)
+
+
+def init_slam() -> SlamState:
+    """Begins an empty map.
+
+    Returns:
+        The state before the first scan.
+    """
+    return SlamState(FrontEndState(), KeyframeMap(), LoopState())
+
+
+def step_slam(methods: SlamMethods, state: SlamState, points: Float[AnyArray, "n 3"]) -> tuple[SlamState, ScanReport]:
+    """Places a scan; a new keyframe is compared with the map.
+
+    Args:
+        methods: from `make_methods`.
+        state: after the scan before.
+        points: metres, in the frame of the lidar; points that are not finite are dropped.
+
+    Returns:
+        The state after, and how the scan was placed.
+
+    Raises:
+        ValueError: if the shape is not (n, 3).
+    """
+    points = np.asarray(points)
+    if points.ndim != 2 or points.shape[1] != 3:
+        raise ValueError(f"points: expected shape (n, 3), got {points.shape}")
+    points = points[np.isfinite(points).all(axis=1)]
+    front, slam_map, report = front_end.step(methods, state.front_end, state.slam_map, points)
+    loops = state.loops
+    if report.is_keyframe:
+        num_before = _num_accepted(loops)
+        slam_map, loops = close_loops(methods, slam_map, loops)
+        report = report._replace(num_accepted=_num_accepted(loops) - num_before)
+    return SlamState(front, slam_map, loops), report
+
+
+def finish_slam(state: SlamState, reports: Iterable[ScanReport], config: SlamConfig) -> SlamResult:
+    """Optimises a last time and puts every scan into the world.
+
+    Args:
+        state: after the last scan.
+        reports: of all scans.
+        config: settings.
+
+    Returns:
+        Trajectory, keyframes, loops and graph.
+    """
+    reports, slam_map, loops = tuple(reports), state.slam_map, state.loops
+    if loops.is_stale:
+        slam_map, loops = optimize_map(slam_map, loops, config.loops)
+    T_world_scan = np.tile(np.eye(4), (len(reports), 1, 1))
+    if len(slam_map):
+        T_keyframe_scan = np.array([report.T_keyframe_scan for report in reports]).reshape(-1, 4, 4)
+        T_world_scan = slam_map.T_world_keyframe[[report.keyframe for report in reports]] @ T_keyframe_scan
+        T_world_scan = rigid.inverse(T_world_scan[0]) @ T_world_scan
+    keyframes = np.array([keyframe.scan for keyframe in slam_map.keyframes], np.int64)
+    graph = as_pose_graph(slam_map) if len(slam_map) else None
+    state = SlamState(state.front_end, slam_map, loops)
+    return SlamResult(T_world_scan, keyframes, loops.loops, graph, reports, state)
+
+
+def iterate_slam(
+    methods: SlamMethods, scans: Iterable[Float[AnyArray, "_n 3"]], state: SlamState | None = None
+) -> Iterator[tuple[SlamState, ScanReport]]:
+    """Places scans one after the other, for progress and for files that grow.
+
+    Args:
+        methods: from `make_methods`.
+        scans: points in metres, each in the frame of the lidar; a scan may be empty.
+        state: goes on from there; None begins an empty map.
+
+    Yields:
+        The state after each scan and how the scan was placed.
+    """
+    state = state or init_slam()
+    for points in scans:
+        state, report = step_slam(methods, state, points)
+        yield state, report
+
+
+def run_slam(
+    scans: Iterable[Float[AnyArray, "_n 3"]], model: Model | SlamMethods, config: SlamConfig | None = None
+) -> SlamResult:
+    """Makes one map of a drive: odometry, loops, and a graph that agrees with both (DeepPointMap section 4).
+
+    Every scan gets a pose, also an empty one. What is uncertain is flagged in `reports`.
+
+    Args:
+        scans: points in metres, each in the frame of the lidar, in the order of time; any iterable.
+        model: a trained model; or methods of your own.
+        config: settings; None takes the defaults. Methods of your own carry theirs.
+
+    Returns:
+        `T_world_scan` of every scan, keyframes, loops, graph and reports.
+
+    Raises:
+        ValueError: if a scan is not (n, 3), or if methods come with another configuration.
+    """
+    if isinstance(model, SlamMethods) and config is not None:
+        raise ValueError("config: expected None with methods, which carry their own")
+    methods = model if isinstance(model, SlamMethods) else make_methods(model, config)
+    state, reports = init_slam(), []
+    for state, report in iterate_slam(methods, scans):  # noqa: B007 (the last one is used)
+        reports.append(report)
+    return finish_slam(state, reports, methods.config)
+
+
+def _num_accepted(loops: LoopState) -> int:
+    return sum(loop.status == "accepted" for loop in loops.loops)

@@ -1,0 +1,141 @@
+"""Laws of retrieval, of the consistency of loops, and of loops that are taken back."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from dpmjax.geometry import rigid
+from dpmjax.metrics import absolute_trajectory_error
+from dpmjax.slam import KeyframeMap, LoopClosureConfig
+from dpmjax.slam.keyframes import Keyframe, MapEdge, add_keyframe, diagonal_information, submap_around
+from dpmjax.slam.loop_candidates import find_candidates
+from dpmjax.slam.loop_closure import LoopState, are_consistent, optimize_map
+from dpmjax.slam.reports import Loop
+from dpmjax.slam.retrieval import most_similar, pooled_vector
+from dpmjax.types import DescriptorCloud
+from tests.slam.truth import laps, noise, pose
+
+CONFIG = LoopClosureConfig()
+
+
+def map_of(T_world_keyframe: np.ndarray, *, sigma_m: float = 0.0, segments=None, seed: int = 0) -> KeyframeMap:
+    """A chain of keyframes 2 m apart."""
+    rng = np.random.default_rng(seed)
+    slam_map, T = KeyframeMap(), T_world_keyframe[0]
+    for row, T_true in enumerate(T_world_keyframe):
+        edge = None
+        if row:
+            step = rigid.inverse(T_world_keyframe[row - 1]) @ T_true @ noise(rng, sigma_m, sigma_m / 10)
+            T, edge = T @ step, MapEdge(row, row - 1, step, diagonal_information(0.05, 0.005), "odometry")
+        segment = 0 if segments is None else segments[row]
+        keyframe = Keyframe(row, T, 2.0 * row, segment, 10.0, row)
+        slam_map = add_keyframe(slam_map, keyframe, T, np.ones(3), edge)
+    return slam_map
+
+
+def loop_between(truth: np.ndarray, source: int, target: int, error=None, status="accepted") -> Loop:
+    T = rigid.inverse(truth[target]) @ truth[source]
+    T = T if error is None else T @ error
+    return Loop(source, target, "distance", status, 1.0, 0.9, 0.2, T)
+
+
+def test_a_vector_finds_itself() -> None:
+    vectors = np.random.default_rng(0).normal(size=(200, 32)).astype(np.float32)
+    vectors /= np.linalg.norm(vectors, axis=1, keepdims=True)
+    for row in (0, 57, 199):
+        rows, cosines = most_similar(vectors, vectors[row], 5)
+        assert rows[0] == row
+        np.testing.assert_allclose(cosines[0], 1.0, atol=1e-4)
+        assert (np.diff(cosines) <= 0).all()
+
+
+def test_retrieval_keeps_to_what_is_allowed() -> None:
+    vectors = np.eye(30, dtype=np.float32)
+    is_allowed = np.arange(30) > 20
+    rows, _ = most_similar(vectors, vectors[3], 50, is_allowed=is_allowed)
+    assert len(rows) == 9
+    assert rows.min() > 20
+    assert len(most_similar(vectors[:0], vectors[0], 5)[0]) == 0
+    assert len(most_similar(vectors, vectors[0], 5, is_allowed=np.zeros(30, bool))[0]) == 0
+
+
+def test_pooling_ignores_order_and_padding() -> None:
+    rng = np.random.default_rng(0)
+    features, positions = rng.normal(size=(10, 4)).astype(np.float32), np.zeros((10, 3), np.float32)
+    mask = np.arange(10) < 7
+    order = np.append(rng.permutation(7), [7, 8, 9])
+    dirty = np.where(mask[:, None], features, np.nan)[order]
+    first = pooled_vector(DescriptorCloud(positions, features, mask))
+    np.testing.assert_allclose(first, pooled_vector(DescriptorCloud(positions, dirty, mask)), atol=1e-6)
+    np.testing.assert_allclose(np.linalg.norm(first), 1.0, atol=1e-6)
+    assert not pooled_vector(DescriptorCloud(positions, features, np.zeros(10, bool))).any()
+
+
+def test_candidates_are_old_and_near() -> None:
+    truth = laps(2, side_m=40.0, step_m=2.0)
+    slam_map = map_of(truth)
+    row = len(truth) - 1
+    near = [candidate.row for candidate in find_candidates(slam_map, row, CONFIG) if candidate.found_by == "distance"]
+    assert row - len(truth) // 2 in near
+    for candidate in near:
+        assert slam_map.keyframes[row].path_m - slam_map.keyframes[candidate].path_m > 40.0
+    assert not find_candidates(slam_map, 3, CONFIG)
+
+
+def test_right_loops_agree_and_wrong_ones_do_not() -> None:
+    truth = laps(2, side_m=40.0, step_m=2.0)
+    slam_map = map_of(truth, sigma_m=0.02)
+    half = len(truth) // 2
+    right = [loop_between(truth, half + row, row, noise(np.random.default_rng(row), 0.1, 0.01)) for row in (5, 8)]
+    wrong = loop_between(truth, half + 9, 9, pose(3.0, 0.0, 0.0))
+    turned = loop_between(truth, half + 9, 9, pose(0.0, 0.0, 0.5))
+    assert are_consistent(slam_map, *right, CONFIG)
+    assert not are_consistent(slam_map, right[0], wrong, CONFIG)
+    assert not are_consistent(slam_map, right[0], turned, CONFIG)
+    # A keyframe is no witness for itself, and far loops tell nothing of each other.
+    assert not are_consistent(slam_map, right[0], right[0], CONFIG)
+    assert not are_consistent(slam_map, right[0], loop_between(truth, half + 60, 60), CONFIG)
+
+
+def test_a_wrong_loop_is_taken_back() -> None:
+    truth = laps(2, side_m=40.0, step_m=2.0)
+    slam_map = map_of(truth, sigma_m=0.05)
+    half = len(truth) // 2
+    loops = [loop_between(truth, half + row, row) for row in range(0, 40, 8)]
+    wrong = [loop_between(truth, 70, 20), loop_between(truth, 71, 21)]
+    wrong = [loop._replace(T_target_source=pose(1.0, 1.0, 0.3)) for loop in wrong]
+    after, state = optimize_map(slam_map, LoopState((*loops, *wrong)), CONFIG)
+    assert [loop.status for loop in state.loops] == ["accepted"] * 5 + ["taken back"] * 2
+    assert sum(edge.kind == "loop" for edge in after.edges) == 5
+    before, found = (
+        absolute_trajectory_error(each.T_world_keyframe[:, :3, 3], truth[:, :3, 3]) for each in (slam_map, after)
+    )
+    assert found < 0.8 * before
+
+
+def test_a_guess_gives_way_to_loops() -> None:
+    truth = laps(1, side_m=40.0, step_m=2.0)
+    moved = truth.copy()
+    moved[40:] = truth[:40]
+    slam_map = map_of(moved, segments=[0] * 40 + [1] * 40)
+    edges = [
+        edge._replace(kind="guess", T_target_source=pose(2.0, 0, 0)) if edge.source == 40 else edge
+        for edge in slam_map.edges
+    ]
+    T_world_keyframe = slam_map.T_world_keyframe.copy()
+    T_world_keyframe[40:] = pose(30.0, 80.0, 1.0) @ T_world_keyframe[40:]
+    lost = KeyframeMap(slam_map.keyframes, T_world_keyframe, slam_map.vectors, tuple(edges))
+    loops = tuple(loop_between(moved, row, row - 40) for row in (45, 50))
+    after, _ = optimize_map(lost, LoopState(loops), CONFIG)
+    np.testing.assert_allclose(after.T_world_keyframe, moved, atol=1e-3)
+
+
+@pytest.mark.parametrize("num_keyframes", [1, 4])
+def test_a_submap_is_in_the_frame_of_its_centre(num_keyframes) -> None:
+    truth = laps(1, side_m=40.0, step_m=2.0)
+    submap = submap_around(map_of(truth), 10, num_keyframes, 20.0)
+    assert submap.descriptions[0] == 10
+    assert len(submap.descriptions) == num_keyframes
+    expected = rigid.inverse(truth[10]) @ truth[list(submap.descriptions)]
+    np.testing.assert_allclose(submap.T_submap_keyframe, expected, atol=1e-9)

@@ -1,0 +1,149 @@
+"""Laws of the whole system, with a matcher and a geometry that know the truth."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from dpmjax.geometry import rigid
+from dpmjax.metrics import absolute_trajectory_error
+from dpmjax.slam import SlamConfig, SlamMethods, SlamResult, init_slam, run_slam, step_slam
+from tests.slam.truth import EMPTY, TruthGeometry, TruthMatcher, laps, pose, scans_of
+
+CONFIG = SlamConfig()
+
+
+def run(T_world_scan: np.ndarray, numbers=None, *, geometry=None, matcher=None, config=CONFIG) -> SlamResult:
+    scans = scans_of(range(len(T_world_scan)) if numbers is None else numbers)
+    methods = SlamMethods(matcher or TruthMatcher(T_world_scan), geometry or TruthGeometry(T_world_scan), config)
+    return run_slam(scans, methods)
+
+
+def without_loops() -> SlamConfig:
+    return replace(CONFIG, loops=replace(CONFIG.loops, is_on=False))
+
+
+def errors_of_loops(result: SlamResult, T_world_scan: np.ndarray) -> np.ndarray:
+    accepted = [loop for loop in result.loops if loop.status == "accepted"]
+    found = np.array([loop.T_target_source for loop in accepted]).reshape(-1, 4, 4)
+    source, target = (T_world_scan[result.keyframes[[loop[end] for loop in accepted]]] for end in (0, 1))
+    true = rigid.inverse(target) @ source
+    return np.linalg.norm((rigid.inverse(true) @ found)[:, :3, 3], axis=1)
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_gross_errors_of_the_matcher_do_no_harm(seed) -> None:
+    truth = laps(2, side_m=80.0, step_m=2.0)
+    geometry = TruthGeometry(truth, sigma_m=0.04, sigma_rad=0.005, seed=seed)
+    matcher = TruthMatcher(truth, seed=seed)
+    drifted = run(truth, geometry=geometry, matcher=matcher, config=without_loops())
+    closed = run(truth, geometry=geometry, matcher=matcher)
+    errors = errors_of_loops(closed, truth)
+    assert len(errors) >= 5
+    assert errors.max() < 2.0
+    ate = absolute_trajectory_error(closed.T_world_scan[:, :3, 3], truth[:, :3, 3])
+    assert ate < 1.0
+    assert ate < 0.5 * absolute_trajectory_error(drifted.T_world_scan[:, :3, 3], truth[:, :3, 3])
+
+
+def test_exact_parts_give_the_exact_trajectory() -> None:
+    truth = laps(1, side_m=20.0)
+    exact = TruthMatcher(truth, gross_share=0.0, sigma_m=0.0, sigma_rad=0.0)
+    result = run(truth, geometry=TruthGeometry(truth, sigma_m=0.0, sigma_rad=0.0), matcher=exact)
+    np.testing.assert_allclose(result.T_world_scan, rigid.inverse(truth[0]) @ truth, atol=1e-6)
+    assert result.reports[0].status == "first"
+    assert {report.status for report in result.reports[1:]} == {"tracked"}
+
+
+def test_same_input_gives_same_output() -> None:
+    truth = laps(1, side_m=30.0)
+    first, second = run(truth), run(truth)
+    np.testing.assert_array_equal(first.T_world_scan, second.T_world_scan)
+    assert first.reports[-1].reason == second.reports[-1].reason
+
+
+def test_a_step_leaves_the_state_before_as_it_was() -> None:
+    truth = laps(1, side_m=30.0)
+    methods = SlamMethods(TruthMatcher(truth), TruthGeometry(truth), CONFIG)
+    state = init_slam()
+    for scan in scans_of(range(40)):
+        state, _ = step_slam(methods, state, scan)
+    once, twice = (step_slam(methods, state, scans_of([40])[0])[0] for _ in range(2))
+    np.testing.assert_array_equal(once.slam_map.T_world_keyframe, twice.slam_map.T_world_keyframe)
+
+
+def test_every_scan_gets_a_pose_and_empty_ones_are_flagged() -> None:
+    truth = laps(1, side_m=20.0)
+    scans = scans_of(range(len(truth)))
+    for number in (0, 10, 11, 40):
+        scans[number] = EMPTY
+    methods = SlamMethods(TruthMatcher(truth), TruthGeometry(truth), CONFIG)
+    result = run_slam(scans, methods)
+    assert result.T_world_scan.shape == (len(truth), 4, 4)
+    assert [report.scan for report in result.reports if report.status == "empty"] == [0, 10, 11, 40]
+    assert absolute_trajectory_error(result.T_world_scan[2:, :3, 3], truth[2:, :3, 3]) < 0.5
+
+
+def test_only_empty_scans_stay_at_the_origin() -> None:
+    methods = SlamMethods(TruthMatcher(np.eye(4)[None]), TruthGeometry(np.eye(4)[None]), CONFIG)
+    result = run_slam([EMPTY, EMPTY], methods)
+    np.testing.assert_array_equal(result.T_world_scan, np.tile(np.eye(4), (2, 1, 1)))
+    assert result.graph is None
+    assert run_slam([], methods).T_world_scan.shape == (0, 4, 4)
+
+
+def test_standing_still_makes_one_keyframe() -> None:
+    truth = np.tile(pose(3.0, 4.0, 1.0), (50, 1, 1))
+    result = run(truth, geometry=TruthGeometry(truth, sigma_m=0.003, sigma_rad=1e-4))
+    assert len(result.keyframes) == 1
+    assert np.abs(result.T_world_scan[:, :3, 3]).max() < 0.5
+
+
+def test_repeated_scans_stay_where_they_are() -> None:
+    truth = laps(1, side_m=20.0)
+    result = run(truth, numbers=[*range(10), *[9] * 20, *range(10, 20)])
+    assert np.linalg.norm(result.T_world_scan[9:29, :3, 3] - result.T_world_scan[9, :3, 3], axis=1).max() < 0.1
+
+
+def test_a_kidnapped_robot_is_found_again() -> None:
+    truth = laps(1, side_m=60.0)
+    # Half way round, then it is put back to a place that it knows, and drives on from there.
+    numbers = [*range(120), *range(20, 70)]
+    result = run(truth, numbers)
+    assert "restarted" in {report.status for report in result.reports}
+    expected = (rigid.inverse(truth[0]) @ truth[numbers])[:, :3, 3]
+    apart = np.linalg.norm(result.T_world_scan[:, :3, 3] - expected, axis=1)
+    assert np.median(apart[125:]) < 1.0
+    assert apart[:120].max() < 1.0
+    # Until it restarts, a lost scan has only the predicted motion; it says so.
+    assert all(result.reports[row].status == "predicted" for row in np.flatnonzero(apart > 2.0))
+
+
+def test_the_network_helps_where_geometry_fails() -> None:
+    # Of each ten scans nine are dropped for a while: the prediction is wrong by more than geometry can do.
+    truth = laps(1, side_m=60.0)
+    numbers = [*range(10), 20, *range(21, 50)]
+    exact = TruthMatcher(truth, gross_share=0.0)
+    result = run(truth, numbers, matcher=exact)
+    assert result.reports[10].status == "network"
+    assert result.reports[10].probability is not None
+    expected = truth[numbers][:, :3, 3]
+    assert absolute_trajectory_error(result.T_world_scan[:, :3, 3], expected) < 0.5
+
+
+def test_a_scan_where_nothing_agrees_is_predicted() -> None:
+    truth = laps(1, side_m=60.0)
+    geometry = TruthGeometry(truth, failures=frozenset({15}))
+    result = run(truth, range(40), geometry=geometry)
+    assert [report.scan for report in result.reports if report.status == "predicted"] == [15]
+    assert absolute_trajectory_error(result.T_world_scan[:, :3, 3], truth[:40, :3, 3]) < 0.5
+
+
+def test_a_scan_of_another_shape_is_refused(as_user) -> None:
+    methods = SlamMethods(TruthMatcher(np.eye(4)[None]), TruthGeometry(np.eye(4)[None]), CONFIG)
+    with pytest.raises(ValueError, match="points: expected shape"):
+        step_slam(methods, init_slam(), np.zeros((5, 4)))
+    with pytest.raises(ValueError, match="config: expected None"):
+        run_slam([], methods, CONFIG)
