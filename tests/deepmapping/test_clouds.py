@@ -85,11 +85,13 @@ def test_misfit_of_a_point_is_the_kernel_of_its_distance_to_the_plane() -> None:
     target = Cloud(
         jnp.asarray(np.column_stack([floor, np.zeros(25)])), jnp.ones(25, bool), jnp.asarray(up), jnp.ones(25)
     )
-    source = Cloud(jnp.array([[0.3, 0.2, 0.1]]), jnp.ones(1, bool), jnp.array([[0.0, 0.0, -1.0]]), jnp.ones(1))
+    source = Cloud(jnp.array([[0.3, 0.2, 0.1]]), jnp.ones(1, bool), jnp.array([[0.0, 0.0, 1.0]]), jnp.ones(1))
     found = plane_misfit(jnp.eye(4), source, target, 0.2, 1.0)
     np.testing.assert_allclose(found, 0.1**2 / (0.1**2 + 0.2**2), **ROUNDING)
     far = replace_points(source, [[0.3, 0.2, 5.0]])
     np.testing.assert_allclose(plane_misfit(jnp.eye(4), far, target, 0.2, 1.0), 1.0, **ROUNDING)
+    other_side = source._replace(normals=-source.normals)
+    np.testing.assert_allclose(plane_misfit(jnp.eye(4), other_side, target, 0.2, 1.0), 1.0, **ROUNDING)
 
 
 def replace_points(cloud: Cloud, points: list[list[float]]) -> Cloud:

@@ -28,7 +28,7 @@ class CloudScans:
     Attributes:
         points: in the lidar frames, any unit; in typical ranges inside of the fit.
         mask: False for rows that are not there.
-        normals: unit normals of the planes around the points, either side.
+        normals: unit normals of the planes around the points, on the side of the lidar.
         flatness: in [0, 1], how much the neighbourhood is a plane.
         spacing: median distance of a point to the nearest other one of its scan.
         partners: scans near in space, though not in time, at the poses to start from; -1: none.
@@ -101,6 +101,8 @@ def _thinned(
     points[:count], normals[:count], flatness[:count] = (
         surface.points[rows], surface.normals[rows], surface.flatness[rows]
     )  # fmt: skip
+    # Both sides of a wall are surfaces of their own: the lidar has seen the side that faces it.
+    normals[np.sum(normals * points, axis=1) > 0.0] *= -1.0
     return points, normals, flatness, mask
 
 

@@ -18,7 +18,7 @@ from dpmjax.geometry.neighbours import k_nearest
 
 # Reach of the search for a plane, in widths of the kernel and in spacings of the points; the larger of both.
 _REACH_WIDTHS, _REACH_SPACINGS = 5.0, 2.0
-# Planes whose normals have a smaller cosine do not match.
+# Planes whose normals have a smaller cosine do not match; the two sides of a wall do not either.
 _MIN_COSINE = 0.3
 # Poses are judged by pairs of scans at these distances in time, and by so many points of each scan.
 _JUDGED_OFFSETS, _JUDGED_POINTS = (1, 2, 4, 8), 512
@@ -73,7 +73,7 @@ def plane_misfit(
     normals = target.normals[nearest]
     gap = jnp.where(is_paired, jnp.sum((moved - target.points[nearest]) * normals, axis=-1), 0.0)
     turned = jnp.einsum("ij,pj->pi", T_target_source[:3, :3], source.normals, precision=jax.lax.Precision.HIGHEST)
-    cosines = jnp.abs(jnp.sum(turned * normals, axis=-1))
+    cosines = jnp.sum(turned * normals, axis=-1)
     agreement = target.flatness[nearest] * jnp.maximum(cosines - _MIN_COSINE, 0.0) / (1.0 - _MIN_COSINE)
     agreement = jax.lax.stop_gradient(jnp.where(is_paired, agreement, 0.0))
     weights = jnp.where(source.mask, source.flatness, 0.0)
