@@ -36,7 +36,7 @@ REFINE_CLOUDS = replace(
     num_offsets=3,
     max_offset=8,
     surface_distance=(0.05, 0.01),
-    plane_width=(0.02, 0.002),
+    plane_width=(0.04, 0.002),
     num_revisits=1,
 )
 """Free poses, planes and a map that sharpens. The Chamfer distance pulls the sparse rings of two scans onto each other;

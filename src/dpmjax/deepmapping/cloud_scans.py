@@ -16,6 +16,7 @@ from dpmjax.scans.preprocess import first_of_each_voxel
 
 # In typical ranges: the vehicle, what is too far, side of the voxels and reach of the neighbours for the normals.
 _NEAREST, _FARTHEST, _VOXEL, _NEIGHBOURS = 0.03, 3.0, 0.01, 0.1
+_NUM_NEIGHBOURS = 24
 # Scans with more than so many others between them meet again, if they are nearer than so many typical ranges.
 _REVISIT_GAP, _REVISIT_DISTANCE = 8, 0.5
 _NUM_PARTNERS = 8
@@ -64,7 +65,7 @@ def as_cloud_scans(
     unit = float(np.median([np.percentile(np.linalg.norm(cloud, axis=1), 90) for cloud in clouds]))
     config = SurfaceConfig(
         min_range_m=_NEAREST * unit, max_range_m=_FARTHEST * unit, voxel_size_m=_VOXEL * unit,
-        neighbour_radius_m=_NEIGHBOURS * unit,
+        num_neighbours=_NUM_NEIGHBOURS, neighbour_radius_m=_NEIGHBOURS * unit,
     )  # fmt: skip
     rows = []
     for number, cloud in enumerate(clouds):
