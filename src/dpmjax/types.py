@@ -101,8 +101,8 @@ class Registration:
 
     Attributes:
         T_target_source: maps points of the source to the target; the identity where no pair was left.
-        confidence: in [0, 1], 0 without any inlier. With a calibrated model, `register` makes it the probability that
-            the motion is right within 2 m and 5 degrees; else it is `mean_score`, which is no probability.
+        confidence: in [0, 1]. With a calibrated model, `register` makes it the probability that the motion is right
+            within 2 m and 5 degrees; else it is `mean_score`, which is no probability and 0 without any inlier.
         mean_score: mean score of the first inliers, in [0, 1]; 0 without any.
         rmse_m: of the inliers after alignment; infinite without any.
         support: consensus support of the motion: sum of 1 - error / tolerance over distinct pairs.

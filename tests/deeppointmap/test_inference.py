@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import jax
 import numpy as np
 import pytest
 
 import dpmjax
-from dpmjax.deeppointmap import prepare_scan
+from dpmjax.deeppointmap import VerificationConfig, prepare_scan, scene_scale
+from dpmjax.scans import ViewCorrelationConfig
 from dpmjax.types import PointCloud
 from tests.deeppointmap import toy
 from tests.tolerances import ACCUMULATED
@@ -24,13 +27,22 @@ def scans() -> list[np.ndarray]:
     return [drive.read_scan(index) for index in range(2)]
 
 
-def test_scans_and_their_descriptors_register_alike(model, scans) -> None:
+def test_scans_and_their_descriptors_register_alike_where_the_scans_suggest_nothing(model, scans) -> None:
+    verification = VerificationConfig(views=ViewCorrelationConfig(num_motions=0))
+    model = model.replace(config=replace(model.config, verification=verification))
     of_scans = dpmjax.register(model, *scans)
     of_clouds = dpmjax.register(model, *(dpmjax.encode(model, scan) for scan in scans))
     np.testing.assert_allclose(of_scans.T_target_source, of_clouds.T_target_source, **ACCUMULATED)
     assert 0 <= of_scans.confidence <= 1
     assert of_scans.rmse == of_scans.rmse_m
     assert 0 < dpmjax.overlap(model, scans[0], dpmjax.encode(model, scans[1])) < 1
+
+
+def test_a_motion_that_only_the_scans_suggest_has_no_inliers(model, scans) -> None:
+    match = dpmjax.register(model, *scans)
+    np.testing.assert_allclose(match.T_target_source[:3, 3], [-4, 0, 0], atol=0.7)
+    assert match.num_inliers == match.is_inlier.sum() == match.support == match.confidence == 0
+    assert np.isinf(match.rmse)
 
 
 def test_a_scan_on_itself_does_not_move_where_offsets_are_zero(model, scans) -> None:
@@ -101,6 +113,37 @@ def test_prepared_scans_register_as_raw_ones(model, scans) -> None:
     np.testing.assert_array_equal(found.T_target_source, expected.T_target_source)
     assert found.verification == expected.verification
     assert dpmjax.overlap(model, *prepared) == dpmjax.overlap(model, *scans)
+
+
+def test_a_scan_enlarged_by_the_user_or_by_the_scale_is_encoded_alike(model, scans) -> None:
+    expected, found = dpmjax.encode(model, 2 * scans[0]), dpmjax.encode(model, scans[0], scale=2)
+    np.testing.assert_array_equal(found.features, expected.features)
+    np.testing.assert_array_equal(found.positions, expected.positions)
+    with pytest.raises(ValueError, match="scale"):
+        dpmjax.encode(model, scans[0], scale=0)
+
+
+def test_motions_are_in_metres_whatever_the_scale(model, scans) -> None:
+    clouds = [dpmjax.encode(model, scan, scale=2) for scan in scans]
+    enlarged, found = dpmjax.register(model, *clouds), dpmjax.register(model, *clouds, scale=2)
+    np.testing.assert_allclose(2 * found.T_target_source[:3, 3], enlarged.T_target_source[:3, 3], rtol=1e-6)
+    np.testing.assert_array_equal(found.T_target_source[:3, :3], enlarged.T_target_source[:3, :3])
+    np.testing.assert_allclose(2 * found.rmse_m, enlarged.rmse_m, rtol=1e-6)
+    of_scans = dpmjax.register(model, *scans, scale=2)
+    prepared = [prepare_scan(model, scan, scale=2) for scan in scans]
+    np.testing.assert_array_equal(dpmjax.register(model, *prepared).T_target_source, of_scans.T_target_source)
+    with pytest.raises(ValueError, match="target: expected scale 2"):
+        dpmjax.register(model, prepared[0], scans[1])
+    with pytest.raises(ValueError, match="needs scans"):
+        dpmjax.register(model, *clouds, scale="auto")
+
+
+@pytest.mark.parametrize(("extent_m", "scale"), [(60, 1), (24, 1), (17, 2), (8, 4), (2, 4), (0, 1)])
+def test_the_scale_of_a_scene_follows_the_larger_scan(model, extent_m: float, scale: float) -> None:
+    points = np.random.default_rng(0).uniform(-1, 1, (4000, 3))
+    points *= extent_m / np.linalg.norm(points, axis=1, keepdims=True).clip(1e-9)
+    small = points[:0] if extent_m == 0 else points / 2
+    assert scene_scale([small, points], model.config) == scale
 
 
 def test_refinement_without_points_is_refused(model, scans) -> None:

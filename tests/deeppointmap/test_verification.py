@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -52,10 +54,20 @@ def test_the_right_hypothesis_is_chosen_whatever_its_rank(scans, row: int) -> No
     assert found.row == row
     assert translation_error(found.T_target_source) < 0.1
     assert found.verification.gap > 0.2
-    assert found.verification.num_tried == (4 if row < 4 else 6)
+    assert found.verification.num_tried == (4 if row < 4 else 8)
     refined = refine_motion(*scans, found, CONFIG)
     assert translation_error(refined.T_target_source) < 0.02
     assert refined.verification.gap == found.verification.gap
+
+
+def test_the_scans_find_the_motion_that_no_hypothesis_names(scans) -> None:
+    found = choose_motion(*scans, (T_TRUE @ motion(90, (9, 0, 0)))[None], CONFIG)
+    assert found.row is None
+    assert translation_error(found.T_target_source) < 0.1
+    without = replace(CONFIG, views=replace(CONFIG.views, num_motions=0))
+    found = choose_motion(*scans, (T_TRUE @ motion(90, (9, 0, 0)))[None], without)
+    assert found.row == 0
+    assert found.verification.num_tried == 1
 
 
 def test_near_equal_hypotheses_do_not_compete(scans) -> None:

@@ -6,6 +6,7 @@ from .curriculum import TrainingConfig as TrainingConfig
 from .curriculum import training_preset as training_preset
 from .data_pipeline import SampleMaker as SampleMaker
 from .encoding import encode as encode
+from .encoding import scene_scale as scene_scale
 from .evaluation import PairKind as PairKind
 from .evaluation import draw_evaluation_pairs as draw_evaluation_pairs
 from .evaluation import evaluate_registration as evaluate_registration

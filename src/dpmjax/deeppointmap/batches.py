@@ -14,13 +14,15 @@ from jaxtyping import Array, Float
 from dpmjax.deeppointmap.encoding import pyramid_of_scan
 from dpmjax.deeppointmap.matching import MatchConfig
 from dpmjax.deeppointmap.model import Model, encode_pyramid, overlap_probability
-from dpmjax.deeppointmap.scan_registration import PreparedScan, ScanOrCloud, register_each
+from dpmjax.deeppointmap.scan_registration import PreparedScan, Scale, ScanOrCloud, register_each
 from dpmjax.types import AnyArray, DescriptorCloud, PointCloud, Registration
 
 CHUNK = 8
 
 
-def encode_scans(model: Model, scans: Sequence[PointCloud | Float[AnyArray, "_n 3"]]) -> DescriptorCloud:
+def encode_scans(
+    model: Model, scans: Sequence[PointCloud | Float[AnyArray, "_n 3"]], *, scale: float = 1.0
+) -> DescriptorCloud:
     """Encodes many raw scans; they may have different numbers of points.
 
     A `ValueError` says if there is no scan, or if points are no real numbers (n, 3).
@@ -28,6 +30,7 @@ def encode_scans(model: Model, scans: Sequence[PointCloud | Float[AnyArray, "_n 
     Args:
         model: encoder and configuration.
         scans: points in metres, each in the frame of its lidar.
+        scale: see `encode`.
 
     Returns:
         Stacked clouds, as `merge_clouds` takes them: positions (s, m, 3), features (s, m, c), mask (s, m).
@@ -36,7 +39,7 @@ def encode_scans(model: Model, scans: Sequence[PointCloud | Float[AnyArray, "_n 
     parts = []
     for start in range(0, len(scans), CHUNK):
         # JAX still encodes the chunk before.
-        pyramids = [pyramid_of_scan(points, model.config) for points in scans[start : start + CHUNK]]
+        pyramids = [pyramid_of_scan(points, model.config, scale=scale) for points in scans[start : start + CHUNK]]
         parts.append(_encode_chunk(model, _stacked(pyramids)))
     return _joined(parts, len(scans))
 
@@ -48,6 +51,7 @@ def register_pairs(
     *,
     config: MatchConfig | None = None,
     refine: bool = False,
+    scale: Scale = 1.0,
 ) -> Registration:
     """Registers many pairs as `register` does; a scan that is in several pairs is prepared once.
 
@@ -59,12 +63,13 @@ def register_pairs(
         targets: the same, one for each source.
         config: see `register`.
         refine: see `register`.
+        scale: see `register`; all raw scans share one.
 
     Returns:
         All fields with a leading axis, in the order of the pairs.
     """
     _require_pairs(sources, targets)
-    found = register_each(model, list(zip(sources, targets, strict=True)), config=config, refine=refine)
+    found = register_each(model, list(zip(sources, targets, strict=True)), config=config, refine=refine, scale=scale)
     return jax.tree.map(lambda *leaves: jnp.asarray(np.stack(leaves)), *jax.device_get(found))
 
 

@@ -69,21 +69,24 @@ class Evidence(NamedTuple):
     of_scans: Float[np.ndarray, " g"] | None
 
 
-def gather_evidence(hypotheses: Registration, row: int, verification: Verification | None) -> Evidence:
+def gather_evidence(hypotheses: Registration, row: int | None, verification: Verification | None) -> Evidence:
     """Gathers the features of one hypothesis.
 
     Args:
         hypotheses: all hypotheses of a pair, with a leading axis.
-        row: the one that was chosen.
+        row: the one that was chosen; None for a motion that no pairs of descriptors support.
         verification: its verification; None without scans.
 
     Returns:
         The features.
     """
     support = np.asarray(hypotheses.support, np.float64)
-    second = np.delete(support, row).max(initial=0.0)
-    rmse_m = min(float(hypotheses.rmse_m[row]), MAX_RMSE_M)
-    of_clouds = np.array([support[row], float(hypotheses.mean_score[row]), rmse_m, support[row] - second])
+    if row is None:
+        of_clouds = np.array([0.0, 0.0, MAX_RMSE_M, -support.max()])
+    else:
+        second = np.delete(support, row).max(initial=0.0)
+        rmse_m = min(float(hypotheses.rmse_m[row]), MAX_RMSE_M)
+        of_clouds = np.array([support[row], float(hypotheses.mean_score[row]), rmse_m, support[row] - second])
     if verification is None:
         return Evidence(of_clouds, None)
     shares = (verification.visible_share, verification.matched_share, verification.contradicted_share, verification.gap)
@@ -147,7 +150,9 @@ def with_confidence(match: Registration, evidence: Evidence, calibration: Calibr
     Returns:
         The registration.
     """
-    if calibration is None or int(match.num_inliers) == 0:
+    verified = match.verification
+    is_empty = int(match.num_inliers) == 0 and (verified is None or verified.matched_share == 0)
+    if calibration is None or is_empty:
         return match
     features, model = evidence.of_scans, calibration.of_scans
     if features is None:

@@ -2,44 +2,85 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from jaxtyping import Float
 
+from dpmjax.checks import require_positive
 from dpmjax.deeppointmap.model import Model, ModelConfig, encode_pyramid
 from dpmjax.geometry.pyramid_host import build_pyramid_on_host
-from dpmjax.scans.preprocess import preprocess_scan_on_host
+from dpmjax.scans.preprocess import first_of_each_voxel, preprocess_scan_on_host
 from dpmjax.types import AnyArray, DescriptorCloud, PointCloud, PointPyramid
 
+EXTENT_PERCENT, FULL_EXTENT_M, MAX_SCALE = 90, 32.0, 4.0
+"""Scans whose extent is nearer to half or a quarter of the full one than to the whole are enlarged by 2 or 4."""
 
-def encode(model: Model, points: PointCloud | Float[AnyArray, "n 3"]) -> DescriptorCloud:
+
+def encode(model: Model, points: PointCloud | Float[AnyArray, "n 3"], *, scale: float = 1.0) -> DescriptorCloud:
     """Encodes a raw scan to descriptors, preprocessing included (DeepPointMap section 3.1).
 
-    A `ValueError` says if the points are no real numbers (n, 3). A warning says if hardly any point is in range: the
-    points are then probably not in metres.
+    A `ValueError` says if the points are no real numbers (n, 3), or if the scale is not positive. A warning says if
+    hardly any point is in range: the points are then probably not in metres.
 
     Args:
         model: its configuration includes the preprocessing.
         points: (n, 3), metres, in the frame of the lidar; points that are not finite are dropped.
+        scale: factor by which the points are enlarged first, for rooms (`scene_scale`). All scans that are compared
+            or merged must share it; positions, and poses for `merge_clouds`, are then in metres times this factor.
 
     Returns:
         `model.config.num_descriptors` descriptors, metres, same frame. The mask of an empty scan is all False.
     """
-    return encode_pyramid(model, pyramid_of_scan(points, model.config))
+    return encode_pyramid(model, pyramid_of_scan(points, model.config, scale=scale))
 
 
-def pyramid_of_scan(points: PointCloud | Float[AnyArray, "n 3"], config: ModelConfig) -> PointPyramid:
+def scene_scale(scans: Sequence[PointCloud | Float[AnyArray, "_n 3"]], config: ModelConfig) -> float:
+    """Chooses the factor by which scans are enlarged so that rooms fill the range of the encoder as streets do.
+
+    Args:
+        scans: all scans that are to be compared, metres, each in the frame of its lidar; the largest decides.
+        config: range and voxels of the preprocessing.
+
+    Returns:
+        1 outdoors; 2 or 4 where the thinned points of all scans are near.
+    """
+    extent_m = max((_extent_m(_array_of(points), config) for points in scans), default=0.0)
+    if extent_m == 0:
+        return 1.0
+    return float(np.clip(2.0 ** np.round(np.log2(FULL_EXTENT_M / extent_m)), 1, MAX_SCALE))
+
+
+def _extent_m(points: Float[np.ndarray, "n 3"], config: ModelConfig) -> float:
+    limits = config.preprocess
+    with np.errstate(invalid="ignore", over="ignore"):
+        ranges = np.linalg.norm(points, axis=1)
+        points = points[(ranges >= limits.min_range_m) & (ranges <= limits.max_range_m)]
+    thinned = points[first_of_each_voxel(points, limits.voxel_size_m)]
+    return float(np.percentile(np.linalg.norm(thinned, axis=1), EXTENT_PERCENT)) if len(thinned) else 0.0
+
+
+def _array_of(points: PointCloud | Float[AnyArray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+    return np.asarray(points.points)[np.asarray(points.mask)] if isinstance(points, PointCloud) else np.asarray(points)
+
+
+def pyramid_of_scan(
+    points: PointCloud | Float[AnyArray, "n 3"], config: ModelConfig, *, scale: float = 1.0
+) -> PointPyramid:
     """Computes the first half of `encode` on the host: preprocessing, normalisation and the point pyramid.
 
     Args:
         points: (n, 3), metres, in the frame of the lidar; points that are not finite are dropped.
         config: preprocessing, pyramid, and scale of its coordinates.
+        scale: factor by which the points are enlarged first.
 
     Returns:
         The pyramid, in normalised coordinates.
 
     Raises:
-        ValueError: if the points are no real numbers (n, 3).
+        ValueError: if the points are no real numbers (n, 3), or if the scale is not positive.
     """
+    require_positive("scale", scale)
     array, mask = (points.points, points.mask) if isinstance(points, PointCloud) else (points, None)
     array = np.asarray(array)
     if array.ndim != 2 or array.shape[1] != 3:
@@ -47,6 +88,8 @@ def pyramid_of_scan(points: PointCloud | Float[AnyArray, "n 3"], config: ModelCo
         raise ValueError(f"points: expected shape (n, 3), got {array.shape}{hint}")
     if not (np.issubdtype(array.dtype, np.floating) or np.issubdtype(array.dtype, np.integer)):
         raise ValueError(f"points: expected real numbers, got dtype {array.dtype}")
+    if scale != 1:
+        array = array * np.float32(scale)
     cloud = preprocess_scan_on_host(array, None if mask is None else np.asarray(mask), config.preprocess)
     return pyramid_of_cloud(cloud, config)
 

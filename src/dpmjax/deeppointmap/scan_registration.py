@@ -6,7 +6,7 @@ import functools
 from collections.abc import Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -15,7 +15,7 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from dpmjax.deeppointmap.confidence import gather_evidence, with_confidence
-from dpmjax.deeppointmap.encoding import encode, pyramid_of_scan
+from dpmjax.deeppointmap.encoding import encode, pyramid_of_scan, scene_scale
 from dpmjax.deeppointmap.matching import MatchConfig, match_hypotheses
 from dpmjax.deeppointmap.model import (
     Model,
@@ -43,12 +43,14 @@ class PreparedScan(NamedTuple):
     """A scan that is ready for any number of registrations.
 
     Attributes:
-        descriptors: of the scan, or of a map in its frame.
-        measured: surface and free space of the scan.
+        descriptors: of the scan; positions in metres times `scale`.
+        measured: surface and free space of the scan, metres.
+        scale: factor by which the points were enlarged for the encoder.
     """
 
     descriptors: DescriptorCloud
     measured: MeasuredScan
+    scale: float = 1.0
 
 
 RawScan = PointCloud | Float[AnyArray, "_n 3"]
@@ -57,23 +59,27 @@ RawScan = PointCloud | Float[AnyArray, "_n 3"]
 ScanOrCloud = DescriptorCloud | PreparedScan | RawScan
 """A raw scan; or the same prepared; or descriptors of a scan or of a map."""
 
+Scale = float | Literal["auto"]
+"""Factor by which scans are enlarged for the encoder; "auto" chooses it by `scene_scale`."""
 
-def prepare_scan(model: Model, points: RawScan) -> PreparedScan:
+
+def prepare_scan(model: Model, points: RawScan, *, scale: float = 1.0) -> PreparedScan:
     """Encodes a raw scan and prepares the verification by its points, so that `register` need not do it again.
 
-    A `ValueError` says if the points are no real numbers (n, 3).
+    A `ValueError` says if the points are no real numbers (n, 3), or if the scale is not positive.
 
     Args:
         model: encoder and configuration.
         points: (n, 3), metres, in the frame of the lidar; points that are not finite are dropped.
+        scale: see `encode`.
 
     Returns:
         Descriptors, surface and free space.
     """
-    return prepare_scans(model, [points])[0]
+    return prepare_scans(model, [points], scale=scale)[0]
 
 
-def prepare_scans(model: Model, scans: Sequence[RawScan]) -> list[PreparedScan]:
+def prepare_scans(model: Model, scans: Sequence[RawScan], *, scale: float = 1.0) -> list[PreparedScan]:
     """Prepares scans one after the other; threads measure their surfaces while JAX encodes.
 
     A `ValueError` says if the points of a scan are no real numbers (n, 3).
@@ -81,6 +87,7 @@ def prepare_scans(model: Model, scans: Sequence[RawScan]) -> list[PreparedScan]:
     Args:
         model: encoder and configuration.
         scans: points in metres, each in the frame of its lidar.
+        scale: see `encode`.
 
     Returns:
         The prepared scans.
@@ -89,10 +96,10 @@ def prepare_scans(model: Model, scans: Sequence[RawScan]) -> list[PreparedScan]:
     with ThreadPoolExecutor(NUM_THREADS) as pool:
         clouds, measured = [], []
         for points in scans:
-            pyramid = pyramid_of_scan(points, model.config)
+            pyramid = pyramid_of_scan(points, model.config, scale=scale)
             measured.append(pool.submit(_measured, points, model.config.verification))
             clouds.append(encode_pyramid(model, pyramid))
-        return [PreparedScan(cloud, future.result()) for cloud, future in zip(clouds, measured, strict=True)]
+        return [PreparedScan(cloud, future.result(), scale) for cloud, future in zip(clouds, measured, strict=True)]
 
 
 def register(
@@ -102,11 +109,13 @@ def register(
     *,
     config: MatchConfig | None = None,
     refine: bool = False,
+    scale: Scale = 1.0,
 ) -> Registration:
     """Registers two scans or maps without a first guess (DeepPointMap section 3.2).
 
     Where both are scans, the best distinct motions of the descriptors are verified by the scans themselves: points
-    must meet surfaces and leave free space free. The motion under which the scans agree best is taken.
+    must meet surfaces and leave free space free. Where none of the first is clearly right, motions under which the
+    scans look alike from above are tried too. The motion under which the scans agree best is taken.
 
     Args:
         model: encoder and decoder.
@@ -115,18 +124,21 @@ def register(
         config: choice of pairs and inliers; None takes that of the model.
         refine: whether to end with a fine point-to-plane alignment of the scans. Without it, the motion of two scans is
             that of the short alignment that verified it, and any other that of the descriptors.
+        scale: factor by which raw scans are enlarged for the encoder, or by which descriptors were; "auto" chooses 1,
+            2 or 4 from the extent of both scans. Prepared scans know theirs. The result is in metres.
 
     Returns:
         `T_target_source`, `confidence`, `rmse_m` and the pairs. The confidence is the probability that the motion is
         right within 2 m and 5 degrees if the model is calibrated (`model.config.calibration`), else the mean score of
-        the pairs, which is no probability. Failure is data: without any pair the motion is the identity and the
-        confidence 0; with fewer than three distinct pairs `rmse_m` is infinite.
+        the pairs, which is no probability. A motion that only the views from above suggested has no inliers, and
+        without calibration the confidence 0. Failure is data: without any pair and without a view the motion is the
+        identity and the confidence 0; with fewer than three distinct pairs `rmse_m` is infinite.
 
     Raises:
-        ValueError: if the points are no real numbers (n, 3), if features have another width than the model, or if
-            `refine` is asked for without two scans.
+        ValueError: if the points are no real numbers (n, 3), if features have another width than the model, if
+            `refine` is asked for without two scans, if both have another scale, or if "auto" meets descriptors.
     """
-    return register_each(model, [(source, target)], config=config, refine=refine)[0]
+    return register_each(model, [(source, target)], config=config, refine=refine, scale=scale)[0]
 
 
 def register_each(
@@ -135,6 +147,7 @@ def register_each(
     *,
     config: MatchConfig | None = None,
     refine: bool = False,
+    scale: Scale = 1.0,
 ) -> list[Registration]:
     """Registers pairs as `register` does; threads verify one pair while JAX matches the next.
 
@@ -143,6 +156,7 @@ def register_each(
         pairs: source and target of each; a scan that is in several pairs is prepared once.
         config: see `register`.
         refine: see `register`.
+        scale: see `register`; all raw scans share one.
 
     Returns:
         One registration for each pair.
@@ -152,13 +166,15 @@ def register_each(
     """
     if refine and any(isinstance(scan, DescriptorCloud) for pair in pairs for scan in pair):
         raise ValueError("refine: expected two scans, raw or from prepare_scan, got descriptors without points")
-    prepared = _prepared(model, pairs)
+    scale = _scale_of(pairs, scale, model)
+    prepared = _prepared(model, pairs, scale)
     matching, verification = config or model.config.matching, model.config.verification
     with ThreadPoolExecutor(NUM_THREADS) as pool:
         started = []
         for pair in pairs:
             source, target = (prepared[id(scan)] for scan in pair)
             hypotheses = match_clouds(model, _descriptors(source), _descriptors(target), config=matching)
+            hypotheses = _in_metres(hypotheses, _shared_scale(source, target, scale))
             motions: Future[_Motions] | None = None
             if isinstance(source, PreparedScan) and isinstance(target, PreparedScan):
                 scans = source.measured, target.measured
@@ -227,8 +243,34 @@ def _measured(points: RawScan, config: VerificationConfig) -> MeasuredScan:
     return measure_scan(array, config)
 
 
+def _scale_of(pairs: Sequence[tuple[ScanOrCloud, ScanOrCloud]], scale: Scale, model: Model) -> float:
+    if scale != "auto":
+        return scale
+    scans = [scan for pair in pairs for scan in pair if not isinstance(scan, PreparedScan)]
+    if any(isinstance(scan, DescriptorCloud) for scan in scans):
+        raise ValueError('scale: "auto" needs scans, got descriptors; give the factor that they were encoded with')
+    return scene_scale([scan for scan in scans if not isinstance(scan, DescriptorCloud)], model.config)
+
+
+def _shared_scale(
+    source: DescriptorCloud | PreparedScan, target: DescriptorCloud | PreparedScan, scale: float
+) -> float:
+    scales = [scan.scale if isinstance(scan, PreparedScan) else scale for scan in (source, target)]
+    if scales[0] != scales[1]:
+        raise ValueError(f"target: expected scale {scales[0]:g} as the source, got {scales[1]:g}")
+    return scales[0]
+
+
+def _in_metres(hypotheses: Registration, scale: float) -> Registration:
+    if scale == 1:
+        return hypotheses
+    T = np.array(hypotheses.T_target_source)
+    T[:, :3, 3] /= scale
+    return replace(hypotheses, T_target_source=jnp.asarray(T), rmse_m=hypotheses.rmse_m / np.float32(scale))
+
+
 def _prepared(
-    model: Model, pairs: Sequence[tuple[ScanOrCloud, ScanOrCloud]]
+    model: Model, pairs: Sequence[tuple[ScanOrCloud, ScanOrCloud]], scale: float
 ) -> dict[int, DescriptorCloud | PreparedScan]:
     # By identity; each scan once. Surfaces are measured only where both sides of a pair are scans.
     raw: dict[int, RawScan] = {}
@@ -241,8 +283,8 @@ def _prepared(
             elif is_verified:
                 raw[id(scan)] = scan
             elif id(scan) not in ready:
-                ready[id(scan)] = encode(model, scan)
-    return {**ready, **dict(zip(raw, prepare_scans(model, list(raw.values())), strict=True))}
+                ready[id(scan)] = encode(model, scan, scale=scale)
+    return {**ready, **dict(zip(raw, prepare_scans(model, list(raw.values()), scale=scale), strict=True))}
 
 
 def _verified(
@@ -255,11 +297,26 @@ def _verified(
 def _finished(model: Model, hypotheses: Registration, motions: _Motions | None) -> Registration:
     row = 0 if motions is None else motions.chosen.row
     evidence = gather_evidence(hypotheses, row, None if motions is None else motions.chosen.verification)
-    match = jax.tree.map(lambda leaf: jnp.asarray(leaf[row]), hypotheses)
+    match = jax.tree.map(lambda leaf: jnp.asarray(leaf[0 if row is None else row]), hypotheses)
+    if row is None:
+        match = _without_inliers(match)
     if motions is not None:
         T = jnp.asarray(motions.final.T_target_source, match.T_target_source.dtype)
         match = replace(match, T_target_source=T, verification=motions.final.verification)
     return with_confidence(match, evidence, model.config.calibration)
+
+
+def _without_inliers(match: Registration) -> Registration:
+    zero = jnp.zeros_like(match.support)
+    return replace(
+        match,
+        confidence=zero,
+        mean_score=zero,
+        rmse_m=zero + jnp.inf,
+        support=zero,
+        num_inliers=jnp.zeros_like(match.num_inliers),
+        is_inlier=jnp.zeros_like(match.is_inlier),
+    )
 
 
 def _descriptors(scan: DescriptorCloud | PreparedScan) -> DescriptorCloud:

@@ -6,6 +6,7 @@ puts most points onto planes of the other scan, and hardly any into its free spa
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from typing import NamedTuple
@@ -18,6 +19,7 @@ from dpmjax.geometry import rigid
 from dpmjax.scans.free_space import RangeImage, RangeImageConfig, range_image, view_points
 from dpmjax.scans.surface_alignment import AlignmentConfig, AlignmentLevel, align_surfaces, pair_with_planes
 from dpmjax.scans.surfaces import Surface, SurfaceConfig, scan_surface
+from dpmjax.scans.view_correlation import ViewCorrelationConfig, correlate_views
 from dpmjax.types import Verification
 
 HYPOTHESES_AT_ONCE = 4
@@ -38,6 +40,7 @@ class VerificationConfig:
     Attributes:
         surface: points and normals of a scan.
         image: free space of a scan.
+        views: search of further motions by the scans alone, where the first hypotheses are not clearly right.
         coarse: alignment of each hypothesis.
         fine: alignment of the best `num_fine` of them.
         refinement: alignment of the chosen one, for `register(..., refine=True)`; it starts where `fine` ended.
@@ -52,6 +55,7 @@ class VerificationConfig:
 
     surface: SurfaceConfig = field(default_factory=SurfaceConfig)
     image: RangeImageConfig = field(default_factory=RangeImageConfig)
+    views: ViewCorrelationConfig = field(default_factory=ViewCorrelationConfig)
     coarse: AlignmentConfig = COARSE
     fine: AlignmentConfig = FINE
     refinement: AlignmentConfig = REFINEMENT
@@ -85,12 +89,13 @@ class VerifiedMotion(NamedTuple):
     """A hypothesis after verification.
 
     Attributes:
-        row: which hypothesis.
+        row: the hypothesis of the descriptors that it comes from, or agrees with; None where only the views of the
+            scans have suggested it.
         T_target_source: its motion after the alignment of the surfaces.
         verification: how well the scans agree under that motion.
     """
 
-    row: int
+    row: int | None
     T_target_source: Float[np.ndarray, "4 4"]
     verification: Verification
 
@@ -156,25 +161,55 @@ def choose_motion(
         The best hypothesis, aligned.
     """
 
-    def aligned(alignment: AlignmentConfig, row: int, start: Float[np.ndarray, "4 4"]) -> VerifiedMotion:
+    def aligned(alignment: AlignmentConfig, row: int | None, start: Float[np.ndarray, "4 4"]) -> VerifiedMotion:
         T = align_surfaces(source.surface, target.surface, start, alignment, num_threads=1).T_target_source
         return VerifiedMotion(row, T, verify_motion(source, target, T, config))
 
     tried: list[VerifiedMotion] = []
     with ThreadPoolExecutor(2) as pool:
-        for first in range(0, len(T_target_source), HYPOTHESES_AT_ONCE):
-            rows = range(first, min(first + HYPOTHESES_AT_ONCE, len(T_target_source)))
-            tried += pool.map(lambda row: aligned(config.coarse, row, np.asarray(T_target_source[row], float)), rows)
+        for some in _candidates(source, target, np.asarray(T_target_source, float), config):
+            tried += pool.map(lambda candidate: aligned(config.coarse, *candidate), some)
             tried.sort(key=lambda motion: -motion.verification.score)
             if tried[0].verification.score > config.clear_score:
                 break
         best = tried[: config.num_fine]
         fine = list(pool.map(lambda motion: aligned(config.fine, motion.row, motion.T_target_source), best))
     chosen = max(fine, key=lambda motion: motion.verification.score)
-    others = [other for other in (*fine, *tried[config.num_fine :]) if _is_apart(other, chosen)]
+    others = [*fine, *tried[config.num_fine :]]
+    others = [other for other in others if _is_apart(other.T_target_source, chosen.T_target_source)]
     second = max((other.verification.score for other in others), default=0.0)
     gap = chosen.verification.score - max(second, 0.0)
+    if chosen.row is None:
+        agreeing = (row for row, T in enumerate(T_target_source) if not _is_apart(T, chosen.T_target_source))
+        chosen = chosen._replace(row=next(agreeing, None))
     return chosen._replace(verification=chosen.verification._replace(gap=gap, num_tried=len(tried)))
+
+
+class _Candidate(NamedTuple):
+    row: int | None
+    T_target_source: Float[np.ndarray, "4 4"]
+
+
+def _candidates(
+    source: MeasuredScan, target: MeasuredScan, T_target_source: Float[np.ndarray, "h 4 4"], config: VerificationConfig
+) -> Iterator[list[_Candidate]]:
+    """Yields hypotheses, some at a time, from the second time on in turn with motions from the views of the scans."""
+    hypotheses = _batched([_Candidate(row, T) for row, T in enumerate(T_target_source)])
+    yield hypotheses[0]
+    searched = _batched([_Candidate(None, T) for T in _searched(source, target, config)])
+    for number in range(max(len(searched), len(hypotheses) - 1)):
+        yield from (*searched[number : number + 1], *hypotheses[number + 1 : number + 2])
+
+
+def _searched(source: MeasuredScan, target: MeasuredScan, config: VerificationConfig) -> Float[np.ndarray, "s 4 4"]:
+    if config.views.num_motions == 0:
+        return np.zeros((0, 4, 4))
+    return correlate_views(source.surface, target.surface, config.views)
+
+
+def _batched(candidates: list[_Candidate]) -> list[list[_Candidate]]:
+    starts = range(0, len(candidates), HYPOTHESES_AT_ONCE)
+    return [candidates[start : start + HYPOTHESES_AT_ONCE] for start in starts]
 
 
 def refine_motion(
@@ -198,8 +233,8 @@ def refine_motion(
     return VerifiedMotion(motion.row, T, found._replace(gap=kept.gap, num_tried=kept.num_tried))
 
 
-def _is_apart(motion: VerifiedMotion, other: VerifiedMotion) -> bool:
+def _is_apart(T_a: Float[np.ndarray, "4 4"], T_b: Float[np.ndarray, "4 4"]) -> bool:
     """Whether two motions differ: near-equal ones do not compete."""
-    difference = rigid.inverse(motion.T_target_source) @ other.T_target_source
+    difference = rigid.inverse(T_a) @ T_b
     cosine = (np.trace(difference[:3, :3]) - 1) / 2
     return bool(np.linalg.norm(difference[:3, 3]) > DISTINCT_M or cosine < np.cos(DISTINCT_RAD))

@@ -12,3 +12,5 @@ from .surface_alignment import align_surfaces as align_surfaces
 from .surfaces import Surface as Surface
 from .surfaces import SurfaceConfig as SurfaceConfig
 from .surfaces import scan_surface as scan_surface
+from .view_correlation import ViewCorrelationConfig as ViewCorrelationConfig
+from .view_correlation import correlate_views as correlate_views

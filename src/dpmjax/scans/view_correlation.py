@@ -1,0 +1,186 @@
+"""Search of the motion between two scans without a first guess: correlation of their views from above.
+
+Upright surfaces are drawn into images by the direction of their normals, one image for each turn about the vertical.
+One FFT gives the correlation for all shifts of one turn (correlative scan matching, Olson 2009). The best distinct
+peaks are motions within a cell and half a step of the turn; `align_surfaces` finishes them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Float
+from scipy import fft
+from scipy.ndimage import gaussian_filter
+from scipy.spatial.transform import Rotation
+
+from dpmjax.checks import require_fields
+from dpmjax.geometry import rigid
+from dpmjax.scans.surfaces import MIN_FLATNESS, Surface
+
+STEEP_COSINE = 0.5
+"""Normals with a smaller vertical component belong to upright surfaces."""
+
+LEVEL_COSINE = 0.9
+"""Normals this near to the vertical belong to the ground, in each of `LEVEL_ROUNDS` rounds."""
+
+LEVEL_ROUNDS = 3
+MIN_LEVEL_POINTS = 50
+NUM_PEAKS = 4000
+BLUR_CELLS = 0.7
+EXTENT_PERCENT, MIN_EXTENT_SHARE = 90.0, 0.5
+
+
+@dataclass(frozen=True)
+class ViewCorrelationConfig:
+    """Resolution and extent of the search.
+
+    Attributes:
+        cell_m: side of a cell; down to half of it where scans reach less than `full_extent_m`, as in rooms.
+        full_extent_m: horizontal range of a tenth of the points of a scan that needs whole cells.
+        num_cells: cells along a side; points within 0.36 sides and shifts up to 0.27 sides do not wrap around.
+        num_turns: turns of a circle.
+        num_directions: images by the direction of the normals; one more holds what is no surface.
+        num_motions: distinct motions that are returned; 0 switches the search off.
+        distinct_cells: two motions differ by more than this, ...
+        distinct_turns: ... or by more than so many steps of the turn.
+    """
+
+    cell_m: float = 1.0
+    full_extent_m: float = 25.0
+    num_cells: int = 96
+    num_turns: int = 60
+    num_directions: int = 4
+    num_motions: int = 8
+    distinct_cells: float = 2.0
+    distinct_turns: float = 1.5
+
+    def __post_init__(self) -> None:
+        require_fields(self, "num_cells", "num_turns", "num_directions", low=1)
+        require_fields(self, "cell_m", "full_extent_m", "distinct_cells", "distinct_turns", low=1e-9)
+        require_fields(self, "num_motions", low=0)
+
+    @property
+    def max_range_m(self) -> float:
+        """Farther points are left out."""
+        return 0.36 * self.num_cells * self.cell_m
+
+    @property
+    def max_shift_m(self) -> float:
+        """Longer shifts are not tried."""
+        return 0.27 * self.num_cells * self.cell_m
+
+
+def correlate_views(
+    source: Surface, target: Surface, config: ViewCorrelationConfig = ViewCorrelationConfig()
+) -> Float[np.ndarray, "h 4 4"]:
+    """Finds the motions under which two scans look alike from above.
+
+    Each scan is first turned until its ground is level; the ground of both then has one height.
+
+    Args:
+        source: surface of a scan.
+        target: the other.
+        config: resolution and extent.
+
+    Returns:
+        T_target_source, best first; at most `config.num_motions`, none where a scan has no upright surface.
+    """
+    if len(source.points) == 0 or len(target.points) == 0:
+        return np.zeros((0, 4, 4))
+    levels = _T_level_lidar(source), _T_level_lidar(target)
+    config = replace(config, cell_m=config.cell_m * _extent_share(source, target, config))
+    turns = np.arange(config.num_turns) * (2 * np.pi / config.num_turns)
+    images = _images(source, levels[0], turns, config)
+    fixed = _images(target, levels[1], np.zeros(1), config)[0]
+    fixed = gaussian_filter(fixed, (0, BLUR_CELLS, BLUR_CELLS), mode="wrap")
+    norms = np.sqrt(np.sum(images[0] ** 2, axis=(1, 2)) * np.sum(fixed**2, axis=(1, 2)))
+    if not norms.any():
+        return np.zeros((0, 4, 4))
+    # Each direction counts alike: walls along a street do not outvote those across.
+    fixed /= np.where(norms > 0, norms, 1)[:, None, None]
+    spectra = np.conj(fft.rfft2(images)) * fft.rfft2(fixed)
+    scores = fft.irfft2(spectra.sum(axis=1), s=images.shape[2:])
+    found = _best_peaks(scores, turns, config)
+    return np.stack([rigid.inverse(levels[1]) @ _planar(*row) @ levels[0] for row in found])
+
+
+def _extent_share(source: Surface, target: Surface, config: ViewCorrelationConfig) -> float:
+    extents = [np.percentile(np.hypot(*surface.points[:, :2].T), EXTENT_PERCENT) for surface in (source, target)]
+    return float(np.clip(max(extents) / config.full_extent_m, MIN_EXTENT_SHARE, 1))
+
+
+def _T_level_lidar(surface: Surface) -> Float[np.ndarray, "4 4"]:
+    """Returns the turn that makes the ground level, and the shift that puts it at height 0."""
+    T, up = np.eye(4), np.array([0.0, 0.0, 1.0])
+    is_flat = surface.flatness > MIN_FLATNESS
+    points, normals = surface.points[is_flat], surface.normals[is_flat]
+    normals = normals * np.where(normals[:, 2:] < 0, -1, 1)
+    is_ground = np.zeros(len(points), bool)
+    for _ in range(LEVEL_ROUNDS):
+        is_ground = (normals @ up > LEVEL_COSINE) & (points @ up < 0)
+        if is_ground.sum() < MIN_LEVEL_POINTS:
+            return T
+        up = normals[is_ground].sum(axis=0)
+        up /= np.linalg.norm(up)
+    T[:3, :3] = Rotation.align_vectors([[0, 0, 1.0]], [up])[0].as_matrix()
+    T[2, 3] = -np.median(points[is_ground] @ up)
+    return T
+
+
+def _images(
+    surface: Surface,
+    T_level_lidar: Float[np.ndarray, "4 4"],
+    turns: Float[np.ndarray, " t"],
+    config: ViewCorrelationConfig,
+) -> Float[np.ndarray, "t c n n"]:
+    R = T_level_lidar[:3, :3]
+    x, y, _ = (surface.points @ R.T).T
+    normals = surface.normals @ R.T
+    is_flat = surface.flatness > MIN_FLATNESS
+    is_used = (np.hypot(x, y) < config.max_range_m) & (~is_flat | (np.abs(normals[:, 2]) < STEEP_COSINE))
+    x, y, is_flat = x[is_used], y[is_used], is_flat[is_used]
+    angles = np.arctan2(normals[is_used, 1], normals[is_used, 0])
+    size, num = config.num_cells, config.num_directions
+    shape = (len(turns), num + 1, size, size)
+    cosine, sine = np.cos(turns)[:, None], np.sin(turns)[:, None]
+    turned = cosine * x - sine * y, sine * x + cosine * y
+    columns = [np.round(part / config.cell_m).astype(np.int64) % size for part in turned]
+    channel = np.floor((angles + turns[:, None]) * (num / np.pi)).astype(np.int64) % num
+    channel = np.where(is_flat, channel, num)
+    number = np.arange(len(turns))[:, None]
+    cells = ((number * (num + 1) + channel) * size + columns[0]) * size + columns[1]
+    # A cell counts once: dense surfaces near the lidar must not outvote far ones.
+    images = np.zeros(int(np.prod(shape)), np.float32)
+    images[cells.ravel()] = 1
+    return images.reshape(shape)
+
+
+def _best_peaks(
+    scores: Float[np.ndarray, "t n n"], turns: Float[np.ndarray, " t"], config: ViewCorrelationConfig
+) -> list[tuple[float, float, float]]:
+    """Returns turn and shift of the best peaks after non-maximum suppression."""
+    shifts = fft.fftfreq(config.num_cells, 1 / config.num_cells) * config.cell_m
+    is_near = np.hypot(shifts[:, None], shifts) <= config.max_shift_m
+    flat = np.flatnonzero(is_near)
+    within = scores.reshape(len(turns), -1)[:, flat]
+    best = np.argpartition(-within, min(NUM_PEAKS, within.size - 1), axis=None)[:NUM_PEAKS]
+    best = best[np.argsort(-within.ravel()[best], kind="stable")]
+    turn, cell = np.unravel_index(best, within.shape)
+    x, y = (shifts[part] for part in np.unravel_index(flat[cell], is_near.shape))
+    remaining, found = np.ones(len(best), bool), list[tuple[float, float, float]]()
+    while remaining.any() and len(found) < config.num_motions:
+        k = int(np.argmax(remaining))
+        found.append((float(turns[turn[k]]), float(x[k]), float(y[k])))
+        steps = np.abs(turn - turn[k])
+        is_same = np.minimum(steps, len(turns) - steps) <= config.distinct_turns
+        remaining &= ~(is_same & (np.hypot(x - x[k], y - y[k]) <= config.distinct_cells * config.cell_m))
+    return found
+
+
+def _planar(turn: float, x: float, y: float) -> Float[np.ndarray, "4 4"]:
+    T = np.eye(4)
+    T[:2, :2] = [[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]]
+    T[:2, 3] = x, y
+    return T

@@ -1,0 +1,60 @@
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from dpmjax.scans.surfaces import scan_surface
+from dpmjax.scans.view_correlation import ViewCorrelationConfig, correlate_views
+from tests.scans.surface_scenes import motion, seen_from, street
+
+CONFIG = ViewCorrelationConfig()
+
+
+def errors(T: np.ndarray, T_true: np.ndarray) -> tuple[float, float]:
+    turn = (np.linalg.inv(T_true) @ T)[:3, :3]
+    degrees = np.degrees(np.arccos(np.clip((np.trace(turn) - 1) / 2, -1, 1)))
+    return float(np.linalg.norm(T[:3, 3] - T_true[:3, 3])), float(degrees)
+
+
+@pytest.mark.parametrize(
+    ("yaw", "shift", "tilt"), [(0, (0, 0, 0), 0), (130, (-4, 3, 0), 0), (-75, (8, -3, 0.3), 0), (200, (3, 2, 0), 12)]
+)
+def test_one_of_the_best_motions_is_true_whatever_turn_shift_and_tilt(yaw: float, shift: tuple, tilt: float) -> None:
+    T_world_a, T_world_b = motion(5, (1, -2, 0), tilt), motion(yaw, shift)
+    surfaces = [scan_surface(seen_from(street(seed), T)) for seed, T in enumerate((T_world_a, T_world_b))]
+    found = correlate_views(*surfaces, CONFIG)
+    T_true = np.linalg.inv(T_world_b) @ T_world_a
+    best = min(errors(T, T_true) for T in found[:4])
+    assert best[0] < 1.5
+    assert best[1] < 6
+    for T in found:
+        np.testing.assert_allclose(T[:3, :3] @ T[:3, :3].T, np.eye(3), atol=1e-9)
+
+
+def test_a_scan_looks_like_itself() -> None:
+    surface = scan_surface(seen_from(street(0), np.eye(4)))
+    np.testing.assert_allclose(correlate_views(surface, surface, CONFIG)[0], np.eye(4), atol=1e-9)
+
+
+def test_motions_are_distinct_and_as_many_as_asked_for() -> None:
+    surfaces = [scan_surface(seen_from(street(seed), np.eye(4))) for seed in range(2)]
+    found = correlate_views(*surfaces, replace(CONFIG, num_motions=5))
+    assert len(found) == 5
+    apart = [errors(found[a], found[b]) for a in range(5) for b in range(a)]
+    assert all(metres > 1.5 or degrees > 8 for metres, degrees in apart)
+
+
+def test_what_has_no_upright_surface_gives_no_motion() -> None:
+    ground = scan_surface(
+        np.stack([*np.mgrid[-20:20:0.35, -20:20:0.4]], -1).reshape(-1, 2) @ np.eye(2, 3) - [0, 0, 1.7]
+    )
+    empty = scan_surface(np.zeros((0, 3)))
+    for pair in ((ground, ground), (empty, ground), (ground, empty)):
+        assert correlate_views(*pair, CONFIG).shape == (0, 4, 4)
+
+
+def test_settings_out_of_range_are_named() -> None:
+    with pytest.raises(ValueError, match="cell_m"):
+        ViewCorrelationConfig(cell_m=0)
