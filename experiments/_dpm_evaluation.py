@@ -1,16 +1,15 @@
-"""Rows of `dpm_evaluate`: registrations, KISS-Matcher and overlap on the pairs of a drive; their table and summary."""
+"""Rows of `dpm_evaluate`: registrations by the model and by KISS-Matcher on the pairs of a drive; table and summary."""
 
 from __future__ import annotations
 
 import importlib.util
 from collections.abc import Callable, Iterator, Sequence
-from functools import cache
 from typing import Any
 
 import numpy as np
 from tqdm import tqdm
 
-from dpmjax import encode, overlap, registration_recall
+from dpmjax import registration_recall
 from dpmjax.deeppointmap import Model
 from dpmjax.deeppointmap.confidence import probability
 from dpmjax.io import LidarSequence
@@ -19,10 +18,6 @@ from experiments._dpm_pairs import Clock, ScanPair, draw_pairs, median_seconds, 
 
 # KISS-Matcher's voxels, metres; indoors is where half of the points are nearer than INDOORS_M.
 VOXEL_M, INDOOR_VOXEL_M, INDOORS_M = 0.3, 0.2, 5.0
-OVERLAP_M, NO_OVERLAP_M = 20.0, 40.0
-# Scans seen again after so many metres of driving are revisits.
-REVISIT_PATH_M = 100.0
-REVISIT_STREAM = 4133
 Matcher = Callable[[np.ndarray, np.ndarray], np.ndarray]
 
 
@@ -89,35 +84,6 @@ def evaluate_kiss(
         true.append(pair.T_target_source)
     row = _errors(motions, true, "_refined")
     return {**row, "is_right": row.pop("is_right_refined"), **median_seconds(seconds)}
-
-
-def evaluate_overlap(model: Model, drive: LidarSequence, num_pairs: int, seed: int, bar: tqdm) -> dict[str, Any]:
-    """Returns the AUC of the overlap probability: pairs nearer than 20 m against pairs farther than 40 m.
-
-    Where the drive comes back to places, the near pairs are revisits.
-    """
-    assert drive.T_world_lidar is not None
-    positions = drive.T_world_lidar[:, :3, 3]
-    distances = np.linalg.norm(positions[:, None] - positions[None], axis=2)
-    path = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(positions, axis=0), axis=1))])
-    is_near = (distances < OVERLAP_M) & (distances > 0)
-    is_revisit = is_near & (np.abs(path[:, None] - path[None]) > REVISIT_PATH_M)
-    has_revisits = bool(is_revisit.any())
-    rng = np.random.default_rng([REVISIT_STREAM, seed])
-    classes = [np.argwhere(is_revisit if has_revisits else is_near), np.argwhere(distances > NO_OVERLAP_M)]
-    if min(map(len, classes)) == 0:
-        return {"auc": None, "has_revisits": has_revisits, "num_pairs": 0}
-    chosen = [pairs[rng.choice(len(pairs), min(num_pairs, len(pairs)), replace=False)] for pairs in classes]
-    encoded = cache(lambda row: encode(model, drive.read_scan(row)))
-    found = []
-    for pairs in chosen:
-        found.append([])
-        for a, b in pairs:
-            found[-1].append(float(overlap(model, encoded(int(a)), encoded(int(b)))))
-            bar.update(1)
-    near, far = map(np.array, found)
-    wins = (near[:, None] > far[None]) + 0.5 * (near[:, None] == far[None])
-    return {"auc": float(wins.mean()), "has_revisits": has_revisits, "num_pairs": len(near) + len(far)}
 
 
 def calibration_numbers(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:

@@ -30,7 +30,7 @@ from dpmjax.deeppointmap import (
 from dpmjax.deeppointmap.curriculum import CurriculumStage
 from dpmjax.deeppointmap.evaluation import EvaluationPairs
 from dpmjax.deeppointmap.training import TrainingState
-from dpmjax.deeppointmap.training_loop import StepRecord, Trained, TrainingProgress, begin_training, stage_of
+from dpmjax.deeppointmap.training_loop import StepRecord, Trained, TrainingProgress, begin_training
 from dpmjax.io import open_lidar_sequence
 from dpmjax.simulation import HDL32E, HDL64E, OS1_64
 from experiments._dpm_data import HELD_OUT_SEED, SELECTION_SEED, town_drive
@@ -41,7 +41,7 @@ from experiments._run_folder import CHECKPOINTS, HISTORY, RunFolder
 SAVE_EVERY_S = 300.0
 VALIDATION_PAIRS = 60
 SELECTION_SCENES = (("suburb", HDL64E), ("canyon", OS1_64), ("country", HDL32E), ("campus", OS1_64))
-SHOWN = ("loss", "overlap_accuracy", "pairing", "offset", "top1_accuracy", "score")
+SHOWN = ("loss", "pairing", "offset", "top1_accuracy", "score")
 MEASURES = (*SHOWN, "coarse", "gradient_norm", "learning_rate")
 KINDS = (PairKind(2.0, 10.0), PairKind(10.0, 20.0), PairKind(2.0, 10.0, 4), PairKind(10.0, 20.0, 4))
 """Pairs that models are selected and reported by: scans and maps of four scans, near and far."""
@@ -106,11 +106,11 @@ class Records:
         first = int(self.start.state.step)
         self._history = HistoryFile(folder / HISTORY, COLUMNS, keep_until=first if folder.is_resumed else None)
         self.earlier_s = max((float(row["run_s"]) for row in read_history(folder / HISTORY)), default=0.0)
-        total = int(self.start.state.registration_end) + settings.overlap_steps
+        total = int(self.start.state.end)
         self._bar = tqdm(total=total, initial=first, desc="train", unit=" steps", dynamic_ncols=True)
         self._last_saved, self._recalls = time.perf_counter(), dict.fromkeys(RECALLS, math.nan)
         self.run_s = self.earlier_s
-        self._seen: set[CurriculumStage | None] = set()
+        self._seen: set[CurriculumStage] = set()
         self._tell_compilation(self.start.state)
 
     def evaluate(self, model: Model) -> float:
@@ -144,9 +144,8 @@ class Records:
         self._checkpoints.save(int(progress.state.step), progress)
 
     def _tell_compilation(self, state: TrainingState) -> None:
-        is_done = int(state.step) >= int(state.registration_end) + self._settings.overlap_steps
-        stage = stage_of(state, self._settings)
-        if not is_done and stage not in self._seen:
+        stage = self._settings.stage_at(int(state.step))
+        if int(state.step) < int(state.end) and stage not in self._seen:
             self._seen.add(stage)
             self._bar.set_postfix_str(f"compiling {_stage_name(stage)}")
 
@@ -208,8 +207,8 @@ def _without_decay(stopped_by: int) -> int:
     return 0 if stopped_by == BEGIN_DECAY else stopped_by
 
 
-def _stage_name(stage: CurriculumStage | None) -> str:
-    return "overlap" if stage is None else f"K={stage.max_group}"
+def _stage_name(stage: CurriculumStage) -> str:
+    return f"K={stage.max_group}"
 
 
 def _values(record: StepRecord) -> dict[str, Any]:

@@ -1,11 +1,13 @@
-"""Calibrates the confidence of a DeepPointMap model on towns that it was not trained on.
+"""Calibrates a DeepPointMap model on towns that it was not trained on: its confidence, and its overlap probability.
 
     python -m experiments.dpm_calibrate results/dpm_train/latest/model.safetensors
 
 Pairs of scans of held-out towns, overlapping and not, are registered; a logistic regression on a few features of each
 registration (consensus support, share of points that meet surfaces, share in free space ...) then predicts whether the
-motion is right within 2 m and 5 degrees. Results go to results/dpm_calibrate/<time>/: model.safetensors, which is the
-model with its calibration; metrics.json, with the Brier scores of towns that were left out of the fit; reliability.png.
+motion is right within 2 m and 5 degrees. Overlap is another regression, on the evidence of the match (similarities of
+descriptors, consensus support ...) of pairs of further towns, half of them less than 20 m apart. Results go to
+results/dpm_calibrate/<time>/: model.safetensors, which is the model with both; metrics.json, with the Brier scores, and
+the AUC of overlap, of towns that were left out of the fits; reliability.png and reliability_overlap.png.
 """
 
 from __future__ import annotations
@@ -25,8 +27,9 @@ from experiments._run_folder import RunOptions, open_run_folder, recording, writ
 
 EXPERIMENT = "dpm_calibrate"
 MODEL = "model.safetensors"
+OVERLAP_LABELS = ("overlap probability", "share of overlapping pairs")
 # Far from the seeds of the towns of dpm_train, also of its held-out one.
-FIRST_TOWN = 3_000_000
+FIRST_TOWN, FIRST_OVERLAP_TOWN = 3_000_000, 3_500_000
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,34 +44,54 @@ class Config(RunOptions):
     """Pairs of each town that are 2 to 10 m apart, as many 10 to 20 m apart, and as many without overlap."""
     town_length_m: Annotated[float, arg(metavar="M")] = 400.0
     """Length of the drive through each town."""
+    overlap_towns: Annotated[int, arg(metavar="N")] = 24
+    """Number of towns for overlap."""
+    overlap_pairs: Annotated[int, arg(metavar="N")] = 96
+    """Pairs of each of them."""
 
     def __post_init__(self) -> None:
         """Checks ranges."""
-        check_least(self, towns=2, pairs=5, town_length_m=150, seed=0)
+        check_least(self, towns=2, pairs=5, overlap_towns=2, overlap_pairs=16, town_length_m=150, seed=0)
 
 
 def main(config: Config) -> dict[str, Any]:
-    """Registers the pairs, fits, and writes the model."""
+    """Registers and compares the pairs, fits, and writes the model."""
     from dpmjax import load_model, save_model, viz
     from dpmjax.weights import read_card
+    from experiments import _dpm_overlap
     from experiments._dpm_pairs import BANDS
 
     model = load_model(config.model)
     folder = open_run_folder(config, EXPERIMENT)
-    rows = []
-    with recording(folder), tqdm(total=config.towns * len(BANDS) * config.pairs, unit=" pairs") as bar:
+    rows, overlap_rows = [], []
+    total = config.towns * len(BANDS) * config.pairs + config.overlap_towns * config.overlap_pairs
+    with recording(folder), tqdm(total=total, unit=" pairs") as bar:
         for town in range(FIRST_TOWN, FIRST_TOWN + config.towns):
             work = partial(_town, config, model, town, bar)
             rows.append(do_row(folder.path, {"town": town}, work, seed=config.seed))
             bar.update(sum(len(row["is_right"]) for row in rows) - bar.n)
+        num_done = sum(len(row["is_right"]) for row in rows)
+        for town in range(FIRST_OVERLAP_TOWN, FIRST_OVERLAP_TOWN + config.overlap_towns):
+            work = partial(_overlap_town, config, model, town, bar)
+            overlap_rows.append(do_row(folder.path, {"overlap_town": town}, work, seed=config.seed))
+            bar.update(num_done + sum(len(row["is_overlap"]) for row in overlap_rows) - bar.n)
         calibration, numbers, held_out = fit(rows)
-        calibrated = model.replace(config=replace(model.config, calibration=calibration))
+        overlap, overlap_numbers, overlap_held_out = _dpm_overlap.fit(overlap_rows)
+        numbers |= overlap_numbers
+        calibrated = model.replace(config=replace(model.config, calibration=calibration, overlap=overlap))
         card = read_card(Path(config.model)) if config.model.endswith(".safetensors") else config.model
-        note = f"Confidence calibrated on {config.towns} towns, {numbers['num_pairs']} pairs."
+        note = (
+            f"Confidence calibrated on {config.towns} towns, {numbers['num_pairs']} pairs; overlap fitted on "
+            f"{config.overlap_towns} towns, {numbers['num_overlap_pairs']} pairs."
+        )
         save_model(calibrated, folder / MODEL, card=f"{card} {note}".strip())
         write_metrics(folder, {"model": config.model, **numbers}, seed=config.seed)
-        figure = viz.reliability_figure(held_out["confidence"], held_out["is_right"], title="towns left out of the fit")
+        title = "towns left out of the fit"
+        figure = viz.reliability_figure(held_out["confidence"], held_out["is_right"], title=title)
         viz.save_figure(figure, folder / "reliability.png")
+        values = overlap_held_out["probability"], overlap_held_out["is_overlap"]
+        figure = viz.reliability_figure(*values, title=f"overlap, {title}", labels=OVERLAP_LABELS)
+        viz.save_figure(figure, folder / "reliability_overlap.png")
     print(", ".join(f"{name} {value:.3f}" for name, value in numbers.items() if isinstance(value, float)))
     print(f"results in {folder.path}")
     return numbers
@@ -94,9 +117,19 @@ def _town(config: Config, model: Any, town: int, bar: tqdm) -> dict[str, Any]:
     return found
 
 
+def _overlap_town(config: Config, model: Any, town: int, bar: tqdm) -> dict[str, Any]:
+    from experiments._dpm_data import town_drive
+    from experiments._dpm_overlap import measure_town
+
+    # The other town is that of the next row.
+    drives = [town_drive(seed, length_m=config.town_length_m) for seed in (town, town + 1)]
+    return measure_town(model, drives, config.overlap_pairs, config.seed, bar)
+
+
 def fit(rows: list[dict[str, Any]]) -> tuple[Any, dict[str, Any], dict[str, np.ndarray]]:
     """Returns the calibration of all towns, its numbers, and the confidence of each town when it is left out."""
-    from dpmjax.deeppointmap.confidence import CLOUD_FEATURES, SCAN_FEATURES, Calibration, fit_logistic, probability
+    from dpmjax.deeppointmap.confidence import CLOUD_FEATURES, SCAN_FEATURES, Calibration, fit_logistic
+    from experiments._dpm_overlap import held_out_probability
 
     kinds = {"of_clouds": (CLOUD_FEATURES, "is_right_of_clouds"), "of_scans": (SCAN_FEATURES, "is_right")}
     towns = np.concatenate([np.full(len(row["is_right"]), row["town"]) for row in rows])
@@ -105,10 +138,7 @@ def fit(rows: list[dict[str, Any]]) -> tuple[Any, dict[str, Any], dict[str, np.n
         features = np.concatenate([np.asarray(row[kind], float).reshape(-1, len(names)) for row in rows])
         is_right = np.concatenate([np.asarray(row[label], bool) for row in rows])
         models[kind] = fit_logistic(names, features, is_right)
-        confidence = np.empty(len(towns))
-        for town in np.unique(towns):
-            part = towns == town
-            confidence[part] = probability(fit_logistic(names, features[~part], is_right[~part]), features[part])
+        confidence = held_out_probability(names, features, is_right, towns)
         numbers |= {
             f"share_right_{kind}": float(is_right.mean()),
             f"brier_{kind}": float(np.mean((confidence - is_right) ** 2)),

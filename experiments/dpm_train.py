@@ -11,8 +11,8 @@
 Results go to results/dpm_train/<time>/ (latest links to the newest): model.safetensors for dpmjax.load_model,
 metrics.csv, metrics.json, checkpoints, and pictures: loss.png, matches.png. Recall is the share of pairs of a held-out
 town, turned by any yaw, that are registered within 2 m and 5 degrees: of scans and of maps, 2 to 10 and 10 to 20 m
-apart. The model is the one of the step with the best mean recall on other towns (metrics.json: best_step), and the
-overlap head is trained on that one.
+apart. The model is the one of the step with the best mean recall on other towns (metrics.json: best_step). Its overlap
+and its confidence are fitted afterwards: experiments.dpm_calibrate.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ EXPERIMENT = "dpm_train"
 MODEL = "model.safetensors"
 # More bad scans than this are counted only.
 MAX_LISTED = 10
-SHOWN_CURVES = ("loss", "pairing", "offset", "top1_accuracy", "recall", "recall_far", "real_recall", "overlap_accuracy")
+SHOWN_CURVES = ("loss", "pairing", "offset", "top1_accuracy", "recall", "recall_far", "real_recall")
 
 
 @dataclass(frozen=True)
@@ -201,8 +201,8 @@ def training_settings(config: Config) -> TrainingConfig:
 
 
 def measure(trained: Trained, records: Records) -> tuple[Evaluation, dict[str, Any]]:
-    """Returns recall, errors and overlap accuracy of the trained and of the untrained network, and times."""
-    from dpmjax.deeppointmap import evaluate_registration, overlap_accuracy
+    """Returns recall and errors of the trained and of the untrained network, and times."""
+    from dpmjax.deeppointmap import evaluate_registration
     from experiments._dpm_run import KIND_NAMES
 
     pairs = records.sets.held_out
@@ -224,7 +224,6 @@ def measure(trained: Trained, records: Records) -> tuple[Evaluation, dict[str, A
         metrics |= {
             f"translation_error_median{suffix}_m": float(np.median(near.translation_errors_m)),
             f"rotation_error_median{suffix}_deg": float(np.median(near.rotation_errors_deg)),
-            f"overlap_accuracy{suffix}": overlap_accuracy(models[suffix], evaluation, pairs),
         }
     return evaluations[""], metrics
 
@@ -254,8 +253,6 @@ def draw(folder: RunFolder, evaluation: Evaluation, pairs: EvaluationPairs) -> N
         names = {name: name.replace("_", " ") for name in SHOWN_CURVES}
         curves = {label: np.array([float(row[name] or "nan") for row in rows]) for name, label in names.items()}
         curves = {label: curve for label, curve in curves.items() if np.isfinite(curve).any()}
-        # The loss of the overlap part is another one.
-        curves["loss"][[row["stage"] == "overlap" for row in rows]] = np.nan
         steps = [int(row["step"]) for row in rows]
         viz.save_figure(viz.curves_figure(steps, curves), folder / "loss.png")
     # The held-out pair of scans of median error.

@@ -5,11 +5,11 @@ from .deeppointmap.batches import overlap_pairs as overlap_pairs
 from .deeppointmap.batches import register_pairs as register_pairs
 from .deeppointmap.encoding import encode as encode
 from .deeppointmap.model import Model as Model
-from .deeppointmap.model import ModelConfig as ModelConfig
 from .deeppointmap.model import correlate as correlate
 from .deeppointmap.model import encode_pyramid as encode_pyramid
 from .deeppointmap.model import init_model as init_model
-from .deeppointmap.model import model_preset as model_preset
+from .deeppointmap.model_config import ModelConfig as ModelConfig
+from .deeppointmap.model_config import model_preset as model_preset
 from .deeppointmap.scan_registration import overlap as overlap
 from .deeppointmap.scan_registration import register as register
 from .geometry.alignment import weighted_svd as weighted_svd

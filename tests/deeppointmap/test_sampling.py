@@ -7,7 +7,7 @@ import pytest
 
 from dpmjax.deeppointmap import CurriculumStage, SamplingConfig, TrainingConfig, training_preset
 from dpmjax.deeppointmap.layouts import stage_layouts
-from dpmjax.deeppointmap.sampling import Group, ScanTable, arrange_groups, draw_groups, draw_overlap_pairs
+from dpmjax.deeppointmap.sampling import Group, ScanTable, arrange_groups, draw_groups
 
 
 def table(num: int = 60, step_m: float = 2.0) -> ScanTable:
@@ -72,16 +72,6 @@ def test_a_lonely_scan_has_no_group() -> None:
         draw_groups(table(step_m=100.0), 0, ((1, 1),), SamplingConfig(), np.random.default_rng(0))
 
 
-def test_overlap_pairs_are_half_near_a_quarter_apart_a_quarter_far() -> None:
-    scans, config = table(), SamplingConfig(num_overlap_pairs=800)
-    pairs = draw_overlap_pairs(scans, config, np.random.default_rng(0))
-    distances = np.abs(scans.positions[pairs.first, 0] - scans.positions[pairs.second, 0])
-    np.testing.assert_array_equal(pairs.is_overlap, distances <= 20.0)
-    np.testing.assert_array_equal(scans.scene[pairs.first], scans.scene[pairs.second])
-    assert abs(np.mean(distances <= 20) - 0.5) < 0.06
-    assert abs(np.mean(distances > 40) - 0.25) < 0.06
-
-
 def test_draws_depend_on_the_generator_alone() -> None:
     layout = ((1, 1), (2, 4))
     first, second = (draw_groups(table(), 3, layout, SamplingConfig(), np.random.default_rng(4)) for _ in range(2))
@@ -90,10 +80,10 @@ def test_draws_depend_on_the_generator_alone() -> None:
 
 
 def test_stages_follow_each_other() -> None:
-    config = TrainingConfig(curriculum=(CurriculumStage(2, 3), CurriculumStage(4, 2)), overlap_steps=1)
-    assert [config.stage_at(step).max_group for step in range(config.num_steps)] == [2, 2, 2, 4, 4, 4]
+    config = TrainingConfig(curriculum=(CurriculumStage(2, 3), CurriculumStage(4, 2)))
+    assert [config.stage_at(step).max_group for step in range(7)] == [2, 2, 2, 4, 4, 4, 4]
     assert config.with_steps(60).num_steps == 60
-    assert config.with_steps(1).num_steps == 3
+    assert config.with_steps(1).num_steps == 2
 
 
 @pytest.mark.parametrize("name", ["tiny", "small", "paper"])
@@ -107,7 +97,6 @@ def test_presets_double_the_groups(name) -> None:
     [
         (lambda: CurriculumStage(1, 3), "max_group"),
         (lambda: SamplingConfig(min_distance_m=30.0), "min_distance_m"),
-        (lambda: SamplingConfig(far_distance_m=10.0), "far_distance_m"),
         (lambda: TrainingConfig(sampling=SamplingConfig(num_scans=16)), "num_scans"),
         (lambda: TrainingConfig(learning_rate=0.0), "learning_rate"),
         (lambda: ScanTable(np.zeros((3, 4, 4)), np.zeros(2, int)), "T_world_lidar"),

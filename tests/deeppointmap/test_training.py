@@ -63,19 +63,11 @@ def test_loss_falls_on_one_batch_and_all_parts_but_the_overlap_head_learn(maker,
     assert all(moved.values()), moved
 
 
-def test_the_overlap_part_changes_the_overlap_head_alone(maker, step, start) -> None:
-    batch = maker(toy.TRAINING.registration_steps)
-    state, report = step(start, batch)
-    assert changed(start, state) == {name: name == "overlap_head" for name in changed(start, state)}
-    assert 0 <= report.overlap_accuracy <= 1
-    assert np.isnan(report.terms.pairing)
-
-
 @pytest.mark.slow
 def test_a_step_compiles_once_for_each_layout(maker, start, assert_compiles_nothing) -> None:
     step, other = make_step(toy.TRAINING), SampleMaker(toy.store(), toy.TRAINING, seed=1)
     state = start
-    for number in (0, 3, 5):
+    for number in (0, 3):
         state, _ = step(state, maker(number))
         following = other(number)
         with assert_compiles_nothing():
@@ -121,17 +113,16 @@ def test_devices_begin_with_different_anchors(maker) -> None:
 def test_the_learning_rate_falls_at_the_end_or_when_it_is_asked_to(start) -> None:
     config = replace(toy.TRAINING, curriculum=(CurriculumStage(2, 100),), warmup_steps=4)
     state = init_training(jax.random.key(0), config)
-    assert (int(state.decay_start), int(state.registration_end)) == (80, 100)
+    assert (int(state.decay_start), int(state.end)) == (80, 100)
 
-    def rate(state: TrainingState, step: int, *, is_overlap: bool = False) -> float:
-        return float(_learning_rate(replace(state, step=jax.numpy.asarray(step)), config, is_overlap=is_overlap))
+    def rate(state: TrainingState, step: int) -> float:
+        return float(_learning_rate(replace(state, step=jax.numpy.asarray(step)), config))
 
     np.testing.assert_allclose([rate(state, step) for step in (0, 3, 50, 80)], [2.5e-4, 1e-3, 1e-3, 1e-3], rtol=1e-5)
     np.testing.assert_allclose([rate(state, 90), rate(state, 100)], [5.05e-4, 1e-5], rtol=1e-4)
     early = finish(replace(state, step=jax.numpy.asarray(40)), config)
-    assert (int(early.decay_start), int(early.registration_end)) == (40, 50)
+    assert (int(early.decay_start), int(early.end)) == (40, 50)
     np.testing.assert_allclose([rate(early, 40), rate(early, 50)], [1e-3, 1e-5], rtol=1e-4)
-    np.testing.assert_allclose(rate(early, 50, is_overlap=True), 1e-4, rtol=1e-4)
     late = replace(state, step=jax.numpy.asarray(85))
     assert finish(late, config) is late
 

@@ -32,8 +32,7 @@ MODEL = ModelConfig(
 TRAINING = TrainingConfig(
     model=MODEL,
     curriculum=(CurriculumStage(2, 3), CurriculumStage(4, 2)),
-    overlap_steps=2,
-    sampling=SamplingConfig(num_scans=6, num_overlap_pairs=4, max_side=2),
+    sampling=SamplingConfig(num_scans=6, max_side=2),
     objective=ObjectiveConfig(max_close=4, positive_radius_m=3.0, offset_radius_m=5.0),
 )
 

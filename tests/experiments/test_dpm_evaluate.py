@@ -5,9 +5,11 @@ from __future__ import annotations
 import jax
 import numpy as np
 import pytest
+from tqdm import tqdm
 
 import dpmjax
-from experiments import _dpm_data, _dpm_evaluation, _dpm_pairs, dpm_calibrate, dpm_evaluate
+from dpmjax.deeppointmap.confidence import OVERLAP_FEATURES
+from experiments import _dpm_data, _dpm_evaluation, _dpm_overlap, _dpm_pairs, dpm_calibrate, dpm_evaluate
 from experiments._command import EXIT_BAD_INPUT, EXIT_OK, run_command
 from experiments._result_files import load_json
 from tests.deeppointmap import toy
@@ -79,13 +81,48 @@ def test_calibration_is_stored_in_a_copy_of_the_model(weights, tmp_path, monkeyp
         return _dpm_pairs.PairResult(motions, evidence, {})
 
     monkeypatch.setattr(_dpm_pairs, "register_pair", found)
-    assert run(dpm_calibrate, [weights, "--towns", 3, "--pairs", 20, "-o", tmp_path / "out"]) == EXIT_OK
+    sizes = ["--towns", 3, "--pairs", 20, "--overlap-towns", 2, "--overlap-pairs", 16]
+    assert run(dpm_calibrate, [weights, *sizes, "-o", tmp_path / "out"]) == EXIT_OK
     model = dpmjax.load_model(tmp_path / "out" / "model.safetensors")
     assert model.config.calibration is not None
     assert max(model.config.calibration.of_scans.weights[4:]) > 0
     metrics = load_json(tmp_path / "out" / "metrics.json")
     assert metrics["brier_of_scans"] < metrics["brier_of_clouds"] < metrics["brier_of_a_constant_of_clouds"]
-    assert "Confidence calibrated on 3 towns" in dpmjax.weights.read_card(tmp_path / "out" / "model.safetensors")
+    assert model.config.overlap is not None
+    assert metrics["num_overlap_pairs"] == 32
+    assert 0 <= metrics["auc_overlap"] <= 1
+    assert (tmp_path / "out" / "reliability_overlap.png").stat().st_size > 0
+    assert (
+        "Confidence calibrated on 3 towns, 180 pairs; overlap fitted on 2 towns, 32 pairs"
+        in dpmjax.weights.read_card(tmp_path / "out" / "model.safetensors")
+    )
+
+
+def test_half_of_the_overlap_pairs_of_a_town_overlap(weights) -> None:
+    with tqdm(disable=True) as bar:
+        drives = [toy.drive(1), toy.drive(2)]
+        row = _dpm_overlap.measure_town(dpmjax.load_model(weights), drives, 32, 0, bar)
+    assert sum(row["is_overlap"]) == 16
+    assert np.shape(row["evidence"]) == (32, len(OVERLAP_FEATURES))
+
+
+def test_the_auc_is_one_for_a_model_that_knows_and_a_half_for_one_that_guesses(weights, monkeypatch) -> None:
+    drive, model, known = toy.drive(), dpmjax.load_model(weights), {}
+    for is_perfect, expected in ((True, 1.0), (False, 0.5)):
+
+        def encoded(model, points):
+            """A cloud that carries what its scan sees first."""
+            return dpmjax.types.DescriptorCloud(points[:1], points[:1], np.ones(1, bool))
+
+        def probability(model, sources, targets, is_perfect=is_perfect):
+            known["num"] = len(sources)
+            return np.arange(len(sources)) < 10 if is_perfect else np.full(len(sources), 0.3)
+
+        monkeypatch.setattr(_dpm_overlap, "encode", encoded)
+        monkeypatch.setattr(_dpm_overlap, "overlap_pairs", probability)
+        with tqdm(disable=True) as bar:
+            row = _dpm_overlap.evaluate_overlap(model, drive, 10, 0, bar)
+        assert (row["auc"], row["num_pairs"], known["num"]) == (expected, 20, 20)
 
 
 def test_pairs_have_the_motion_of_their_poses() -> None:

@@ -22,7 +22,7 @@ from experiments._run_folder import CHECKPOINTS, HISTORY
 from tests.deeppointmap import toy
 
 REPOSITORY = Path(__file__).parents[2]
-TRAINING = replace(toy.TRAINING, curriculum=(CurriculumStage(2, 4),), overlap_steps=0)
+TRAINING = replace(toy.TRAINING, curriculum=(CurriculumStage(2, 4),))
 
 # The second process gets a signal before its third step of four.
 PROCESS = """
@@ -105,7 +105,7 @@ def test_two_processes_train_as_one_and_stop_as_one(tmp_path: Path) -> None:
         state, _ = step(state, maker(number))
     assert progress.state.step == progress.best_step == 2
     # Of the gradients, not of the parameters: Adam makes a whole step of the rounding of a gradient that is zero.
-    found, expected = (tree_get(s.registration_optimizer, "mu") for s in (progress.state, state))
+    found, expected = (tree_get(s.optimizer, "mu") for s in (progress.state, state))
     largest = max(float(np.abs(leaf).max()) for leaf in jax.tree.leaves(expected))
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-4 * largest), found, expected)
 

@@ -15,7 +15,6 @@ from dpmjax.simulation import (
     make_town,
     scan_town,
     simulate_scene,
-    simulate_scenes,
 )
 from dpmjax.simulation.town.cast import cast_turn
 from dpmjax.simulation.town.culling import CastConfig, near_world

@@ -10,15 +10,14 @@ from .encoding import scene_scale as scene_scale
 from .evaluation import PairKind as PairKind
 from .evaluation import draw_evaluation_pairs as draw_evaluation_pairs
 from .evaluation import evaluate_registration as evaluate_registration
-from .evaluation import overlap_accuracy as overlap_accuracy
 from .matching import MatchConfig as MatchConfig
 from .matching import merge_clouds as merge_clouds
 from .model import Model as Model
-from .model import ModelConfig as ModelConfig
 from .model import correlate as correlate
 from .model import encode_pyramid as encode_pyramid
 from .model import init_model as init_model
-from .model import model_preset as model_preset
+from .model_config import ModelConfig as ModelConfig
+from .model_config import model_preset as model_preset
 from .objective import ObjectiveConfig as ObjectiveConfig
 from .processes import join_processes as join_processes
 from .sampling import SamplingConfig as SamplingConfig

@@ -13,7 +13,8 @@ from jaxtyping import Array, Float
 
 from dpmjax.deeppointmap.encoding import pyramid_of_scan
 from dpmjax.deeppointmap.matching import MatchConfig
-from dpmjax.deeppointmap.model import Model, encode_pyramid, overlap_probability
+from dpmjax.deeppointmap.model import Model, encode_pyramid
+from dpmjax.deeppointmap.overlap import overlap_evidence, overlap_probability
 from dpmjax.deeppointmap.scan_registration import PreparedScan, Scale, ScanOrCloud, register_each
 from dpmjax.types import AnyArray, DescriptorCloud, PointCloud, Registration
 
@@ -86,10 +87,31 @@ def overlap_pairs(model: Model, sources: Sequence[ScanOrCloud], targets: Sequenc
     Returns:
         The probabilities.
     """
+    return _of_pairs(_overlap_chunk, model, sources, targets)
+
+
+def evidence_pairs(model: Model, sources: Sequence[ScanOrCloud], targets: Sequence[ScanOrCloud]) -> Float[Array, "n f"]:
+    """Computes what the overlap probability of many pairs rests on.
+
+    A `ValueError` says if the lengths differ or are 0.
+
+    Args:
+        model: encoder and decoder.
+        sources: as in `overlap_pairs`.
+        targets: the same, one for each source.
+
+    Returns:
+        A row for each pair, in the order of `confidence.OVERLAP_FEATURES`.
+    """
+    return _of_pairs(_evidence_chunk, model, sources, targets)
+
+
+def _of_pairs(chunk: Any, model: Model, sources: Sequence[ScanOrCloud], targets: Sequence[ScanOrCloud]) -> Any:
+    """Applies the function of a chunk of pairs to all of them; each scan is encoded once."""
     _require_pairs(sources, targets)
     scans = {id(scan): scan for scan in (*sources, *targets)}
     raw = [scan for scan in scans.values() if not isinstance(scan, DescriptorCloud | PreparedScan)]
-    encoded = encode_scans(model, raw) if raw else None
+    encoded = jax.device_get(encode_scans(model, raw)) if raw else None
     numbers = {id(scan): number for number, scan in enumerate(raw)}
 
     def cloud(scan: ScanOrCloud) -> Any:
@@ -100,7 +122,7 @@ def overlap_pairs(model: Model, sources: Sequence[ScanOrCloud], targets: Sequenc
     clouds = {key: cloud(scan) for key, scan in scans.items()}
     pairs = [(clouds[id(source)], clouds[id(target)]) for source, target in zip(sources, targets, strict=True)]
     chunks = (_stacked(pairs[start : start + CHUNK]) for start in range(0, len(pairs), CHUNK))
-    return _joined([_overlap_chunk(model, chunk) for chunk in chunks], len(pairs))
+    return _joined([chunk(model, some) for some in chunks], len(pairs))
 
 
 @jax.jit
@@ -111,6 +133,11 @@ def _encode_chunk(model: Model, pyramids: Any) -> DescriptorCloud:
 @jax.jit
 def _overlap_chunk(model: Model, pairs: Any) -> Float[Array, " n"]:
     return jax.vmap(lambda pair: overlap_probability(model, *pair))(pairs)
+
+
+@jax.jit
+def _evidence_chunk(model: Model, pairs: Any) -> Float[Array, "n f"]:
+    return jnp.stack(jax.vmap(lambda pair: overlap_evidence(model, *pair))(pairs), axis=1)
 
 
 def _stacked(items: list[Any]) -> Any:

@@ -1,4 +1,4 @@
-"""Confidence of a registration: the probability that it is right, by logistic regression on a few features.
+"""Confidence of a registration, and of an overlap: probabilities by logistic regression on a few features.
 
 Platt (1999): a score becomes a probability by a logistic function that is fitted on held-out examples. It is fitted by
 `python -m experiments.dpm_calibrate` and stored in the configuration of the model.
@@ -19,6 +19,26 @@ from dpmjax.types import Registration, Verification
 
 CLOUD_FEATURES = ("support", "mean_score", "rmse_m", "support_gap")
 SCAN_FEATURES = (*CLOUD_FEATURES, "visible_share", "matched_share", "contradicted_share", "score_gap")
+OVERLAP_FEATURES = (
+    "scan_similarity",
+    "similarity_median",
+    "similarity_high",
+    "score_median",
+    "score_high",
+    "mutual_share",
+    "support",
+    "near_support",
+    "support_second",
+    "offset_disagreement_m",
+    "distance_m",
+    "met_share",
+    "met_similarity",
+    "spread_m",
+    "log_radius",
+    "log_radius_ratio",
+)
+"""`deeppointmap.overlap` computes them."""
+
 MAX_RMSE_M = 5.0
 RIDGE = 1e-3
 
@@ -40,7 +60,7 @@ class LogisticModel:
     def __post_init__(self) -> None:
         if len(self.features) != len(self.weights):
             raise ValueError(f"weights: expected {len(self.features)}, one for each feature, got {len(self.weights)}")
-        if self.features not in (CLOUD_FEATURES, SCAN_FEATURES):
+        if self.features not in (CLOUD_FEATURES, SCAN_FEATURES, OVERLAP_FEATURES):
             raise ValueError(f"features: expected those that this version computes, got {', '.join(self.features)}")
 
 

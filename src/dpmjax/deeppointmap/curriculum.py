@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 
 from dpmjax.checks import require_count, require_fields, require_one_of, require_positive_fields
-from dpmjax.deeppointmap.model import ModelConfig, Preset, model_preset
+from dpmjax.deeppointmap.model_config import ModelConfig, Preset, model_preset
 from dpmjax.deeppointmap.objective import ObjectiveConfig
 from dpmjax.scans.augment import AugmentConfig
 
@@ -39,10 +39,6 @@ class SamplingConfig:
         pair_probability: probability that a group is one pair of scans, in every stage.
         max_side: largest number of scans of one map. Half of the groups up to this size are split into one scan
             against all others.
-        num_overlap_pairs: pairs of one sample of the overlap part.
-        overlap_distance_m: scans nearer to each other than this overlap.
-        far_distance_m: a quarter of the overlap pairs is farther apart than this, a quarter lies between the two
-            distances.
     """
 
     num_scans: int = 32
@@ -50,18 +46,13 @@ class SamplingConfig:
     max_distance_m: float = 20.0
     pair_probability: float = 0.34
     max_side: int = 16
-    num_overlap_pairs: int = 32
-    overlap_distance_m: float = 20.0
-    far_distance_m: float = 40.0
 
     def __post_init__(self) -> None:
-        require_fields(self, "max_side", "num_overlap_pairs", low=1)
+        require_fields(self, "max_side", low=1)
         require_fields(self, "num_scans", low=2)
         require_fields(self, "pair_probability", low=0, high=1)
         if not 0 <= self.min_distance_m < self.max_distance_m:
             raise ValueError(f"min_distance_m: expected 0 to below {self.max_distance_m}, got {self.min_distance_m}")
-        if not 0 < self.overlap_distance_m <= self.far_distance_m:
-            raise ValueError(f"far_distance_m: expected {self.overlap_distance_m} at least, got {self.far_distance_m}")
 
 
 @dataclass(frozen=True)
@@ -70,19 +61,17 @@ class TrainingConfig:
 
     Attributes:
         model: configuration of the model.
-        curriculum: stages of the registration part.
-        overlap_steps: steps of the second part, in which only the overlap head learns; may be 0.
+        curriculum: stages, one after the other.
         sampling: choice of the scans of a sample.
         augment: augmentation of each scan. Each step draws a new motion for each scan.
         num_variants: number of times that a scan is thinned, occluded and jittered; steps choose among these variants.
-        objective: losses of the registration part.
+        objective: losses.
         learning_rate: learning rate after the warm-up and before the decay.
         final_learning_rate: learning rate at the end of the decay.
-        decay_ratio: share of the registration part in which the learning rate falls, at its end.
+        decay_ratio: share of the steps in which the learning rate falls, at the end.
         weight_decay: weight decay of AdamW.
         warmup_steps: number of steps in which the learning rate rises from 0.
         max_gradient_norm: longer gradients are scaled down to this norm.
-        overlap_ratio: learning rates and weight decay of the overlap part, relative to those above.
         scans_at_once: about this many scans of a sample are encoded at the same time. More scans need more memory and
             keep a large device busy; the results change by rounding only.
         group_scans_at_once: groups of about this many scans are decoded at the same time.
@@ -92,7 +81,6 @@ class TrainingConfig:
     curriculum: tuple[CurriculumStage, ...] = tuple(
         map(CurriculumStage, (2, 4, 8, 16, 32), (20000, 20000, 30000, 30000, 20000))
     )
-    overlap_steps: int = 20000
     sampling: SamplingConfig = field(default_factory=SamplingConfig)
     augment: AugmentConfig = field(default_factory=AugmentConfig)
     num_variants: int = 4
@@ -103,13 +91,12 @@ class TrainingConfig:
     weight_decay: float = 1e-4
     warmup_steps: int = 0
     max_gradient_norm: float = 35.0
-    overlap_ratio: float = 0.1
     scans_at_once: int = 8
     group_scans_at_once: int = 16
 
     def __post_init__(self) -> None:
-        require_positive_fields(self, "learning_rate", "final_learning_rate", "max_gradient_norm", "overlap_ratio")
-        require_fields(self, "overlap_steps", "weight_decay", "warmup_steps", low=0)
+        require_positive_fields(self, "learning_rate", "final_learning_rate", "max_gradient_norm")
+        require_fields(self, "weight_decay", "warmup_steps", low=0)
         require_fields(self, "scans_at_once", "group_scans_at_once", "num_variants", low=1)
         require_fields(self, "decay_ratio", low=0, high=1)
         require_count("len(curriculum)", len(self.curriculum))
@@ -120,17 +107,12 @@ class TrainingConfig:
             )
 
     @property
-    def registration_steps(self) -> int:
+    def num_steps(self) -> int:
         """Number of steps of all stages of the curriculum."""
         return sum(stage.num_steps for stage in self.curriculum)
 
-    @property
-    def num_steps(self) -> int:
-        """Number of steps of both parts."""
-        return self.registration_steps + self.overlap_steps
-
     def stage_at(self, step: int) -> CurriculumStage:
-        """Finds the stage of a step of the registration part.
+        """Finds the stage of a step.
 
         Args:
             step: number of the step, from 0.
@@ -145,7 +127,7 @@ class TrainingConfig:
         return self.curriculum[-1]
 
     def with_steps(self, num_steps: int) -> TrainingConfig:
-        """Shortens or stretches all parts in proportion, none to less than one step.
+        """Shortens or stretches all stages in proportion, none to less than one step.
 
         Args:
             num_steps: about this many steps in all.
@@ -155,9 +137,8 @@ class TrainingConfig:
         """
         ratio = num_steps / self.num_steps
         stages = tuple(replace(stage, num_steps=max(1, round(stage.num_steps * ratio))) for stage in self.curriculum)
-        overlap = max(1, round(self.overlap_steps * ratio)) if self.overlap_steps > 0 else 0
         warmup = min(round(self.warmup_steps * min(ratio, 1)), sum(stage.num_steps for stage in stages) - 1)
-        return replace(self, curriculum=stages, overlap_steps=overlap, warmup_steps=warmup)
+        return replace(self, curriculum=stages, warmup_steps=warmup)
 
 
 def training_preset(name: Preset) -> TrainingConfig:
@@ -182,8 +163,7 @@ PRESETS = {
     "tiny": TrainingConfig(
         model=model_preset("tiny"),
         curriculum=(CurriculumStage(2, 700), CurriculumStage(4, 40)),
-        overlap_steps=60,
-        sampling=SamplingConfig(num_scans=16, num_overlap_pairs=8),
+        sampling=SamplingConfig(num_scans=16),
         # So few steps need weaker augmentation, more positives, and a direct loss on the encoder.
         augment=replace(NEAR_THE_LIDAR, max_drop_ratio=0.3),
         objective=ObjectiveConfig(coarse_weight=1.0, positive_radius_m=1.5, max_close=4),
@@ -194,7 +174,6 @@ PRESETS = {
     "small": TrainingConfig(
         model=model_preset("small"),
         curriculum=tuple(map(CurriculumStage, (2, 4, 8, 16), (6000, 3000, 3000, 3000))),
-        overlap_steps=3000,
         sampling=SamplingConfig(num_scans=16),
         # Sparse lidars leave 2,000 points of a scan, dense ones 16,000.
         augment=replace(NEAR_THE_LIDAR, max_drop_ratio=0.7),

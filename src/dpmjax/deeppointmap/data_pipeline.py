@@ -11,18 +11,13 @@ from collections.abc import Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 
 import numpy as np
-from jaxtyping import Float, Int
 
 from dpmjax.deeppointmap.curriculum import TrainingConfig
 from dpmjax.deeppointmap.layouts import stage_layouts
 from dpmjax.deeppointmap.sampling import (
-    OverlapSample,
     RegistrationSample,
-    Sample,
-    SampleScans,
     arrange_groups,
     draw_groups,
-    draw_overlap_pairs,
     stack,
 )
 from dpmjax.deeppointmap.scan_store import ScanStore
@@ -42,7 +37,6 @@ class SampleMaker:
         seed: int,
         num_samples: int = 1,
         first_sample: int = 0,
-        registration_steps: int | None = None,
     ) -> None:
         """Starts the thread.
 
@@ -52,11 +46,9 @@ class SampleMaker:
             seed: seed of the run.
             num_samples: samples of one batch: the number of devices of this process.
             first_sample: number of the first of them among those of all processes.
-            registration_steps: steps of the registration part, where it ends earlier than the configuration says.
         """
         self._store, self._config, self._seed = store, config, seed
         self._numbers = range(first_sample, first_sample + num_samples)
-        self._registration_steps = config.registration_steps if registration_steps is None else registration_steps
         self._thread = ThreadPoolExecutor(1)
 
     def __enter__(self) -> SampleMaker:
@@ -65,7 +57,7 @@ class SampleMaker:
     def __exit__(self, *error: object) -> None:
         self._thread.shutdown(wait=True, cancel_futures=True)
 
-    def __call__(self, step: int) -> Sample:
+    def __call__(self, step: int) -> RegistrationSample:
         """Makes the batch of a step, the same one every time.
 
         Args:
@@ -76,7 +68,7 @@ class SampleMaker:
         """
         return stack([self._sample(step, number) for number in self._numbers])
 
-    def batches(self, start: int, stop: int) -> Iterator[Sample]:
+    def batches(self, start: int, stop: int) -> Iterator[RegistrationSample]:
         """Makes the batches of the steps from `start` to `stop - 1`, each some steps before it is needed.
 
         Args:
@@ -86,32 +78,25 @@ class SampleMaker:
         Yields:
             The batches in order.
         """
-        ahead: deque[Future[Sample]] = deque()
+        ahead: deque[Future[RegistrationSample]] = deque()
         for step in range(start, stop + STEPS_AHEAD):
             if step < stop:
                 ahead.append(self._thread.submit(self, step))
             if step >= start + STEPS_AHEAD:
                 yield ahead.popleft().result()
 
-    def _sample(self, step: int, number: int) -> Sample:
+    def _sample(self, step: int, number: int) -> RegistrationSample:
         rng = np.random.default_rng([SAMPLE_STREAM, self._seed, step, number])
         table, sampling = self._store.table, self._config.sampling
-        if step >= self._registration_steps:
-            pairs = draw_overlap_pairs(table, sampling, rng)
-            return OverlapSample(self._read(np.concatenate([pairs.first, pairs.second]), rng)[0], pairs.is_overlap)
         layouts = stage_layouts(self._config.stage_at(step).max_group, sampling)
         layout = layouts[step % len(layouts)]
         groups = draw_groups(table, self._anchor(step, number), layout, sampling, rng)
         rows = np.concatenate([group.rows for group in groups if group is not None])
         # Always as many scans as the layout has: another number would be compiled again.
         num_spare = sum(map(sum, layout)) - len(rows)
-        scans, T_world_scan = self._read(np.concatenate([rows, np.full(num_spare, rows[0])]), rng)
+        padded = np.concatenate([rows, np.full(num_spare, rows[0])])
+        scans, T_world_scan = self._store.read(padded, self._config, rng)
         return RegistrationSample(scans, arrange_groups(groups, layout, T_world_scan[: len(rows)]))
-
-    def _read(
-        self, rows: Int[np.ndarray, " s"], rng: np.random.Generator
-    ) -> tuple[SampleScans, Float[np.ndarray, "s 4 4"]]:
-        return self._store.read(rows, self._config, rng)
 
     def _anchor(self, step: int, number: int) -> int:
         # Every scan is the first anchor once in an epoch, in another order for each device.

@@ -18,9 +18,10 @@ from jaxtyping import Array, Float, Int
 
 from dpmjax.deeppointmap.curriculum import TrainingConfig
 from dpmjax.deeppointmap.matching import merge_clouds
-from dpmjax.deeppointmap.model import Model, ModelConfig, encode_stored
+from dpmjax.deeppointmap.model import Model, encode_stored
+from dpmjax.deeppointmap.model_config import ModelConfig
 from dpmjax.deeppointmap.sampling import SampleScans
-from dpmjax.deeppointmap.scan_registration import overlap, trace_match
+from dpmjax.deeppointmap.scan_registration import trace_match
 from dpmjax.deeppointmap.scan_store import ScanStore, prepare_drive
 from dpmjax.geometry import rigid
 from dpmjax.metrics.poses import RegistrationRecall, registration_recall
@@ -29,9 +30,6 @@ from dpmjax.sequences import LidarSequence
 from dpmjax.types import DescriptorCloud, Registration
 
 PAIR_STREAM = 3103
-FAR_M = 40.0
-"""Scans farther apart than this do not overlap."""
-
 MAP_RADIUS_M = 10.0
 """A map of an evaluation holds scans so near to its first one."""
 
@@ -203,33 +201,6 @@ def evaluate_registration(model: Model, pairs: EvaluationPairs) -> Evaluation:
         matches.append(jax.device_get(_register_all(model, *sides)))
         recalls.append(registration_recall(matches[-1].T_target_source, pairs.true_motions(some)))
     return Evaluation(tuple(recalls), tuple(matches), clouds)
-
-
-def overlap_accuracy(model: Model, evaluation: Evaluation, pairs: EvaluationPairs) -> float:
-    """Measures the overlap prediction on the pairs of the first kind, and on as many that are over 40 m apart.
-
-    Args:
-        model: the model of the evaluation.
-        evaluation: from `evaluate_registration`.
-        pairs: the pairs of the evaluation.
-
-    Returns:
-        Share of correct predictions.
-    """
-
-    def cloud(row: int) -> DescriptorCloud:
-        one: DescriptorCloud = jax.tree.map(lambda leaf: leaf[row], evaluation.clouds)
-        return one
-
-    positions, some = pairs.T_world_scan[:, :3, 3], pairs.pairs[0]
-    is_right = []
-    for a, b in zip(some.sources[:, 0], some.targets[:, 0], strict=True):
-        is_right.append(float(overlap(model, cloud(a), cloud(b))) > 0.5)
-        far = np.flatnonzero(np.linalg.norm(positions - positions[a], axis=1) > FAR_M)
-        if len(far) > 0:
-            other = int(far[(7 * int(a)) % len(far)])
-            is_right.append(float(overlap(model, cloud(a), cloud(other))) <= 0.5)
-    return float(np.mean(is_right))
 
 
 @jax.jit

@@ -1,123 +1,27 @@
-"""The model: its configuration, three presets, its parameters, and the functions that apply its networks.
+"""The model: its parameters, and the functions that apply its networks.
 
 All functions take one scan or one pair; `vmap` over the clouds batches them.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
-from typing import Any, Literal
+from typing import Any
 
 import flax.struct
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
-from dpmjax.checks import require_one_of, require_positive, require_shape
-from dpmjax.deeppointmap.confidence import Calibration
-from dpmjax.deeppointmap.matching import MatchConfig
-from dpmjax.deeppointmap.verification import VerificationConfig
+from dpmjax.checks import require_shape
+from dpmjax.deeppointmap.model_config import ModelConfig
 from dpmjax.geometry.bearing import from_ray_frame, ray_directions
-from dpmjax.geometry.consensus import ConsensusConfig
-from dpmjax.geometry.pyramid import PyramidConfig, PyramidStage
 from dpmjax.geometry.pyramid_host import build_pyramid_on_host
 from dpmjax.geometry.pyramid_storage import StoredPyramid, moved_pyramid
-from dpmjax.nets.decoder import DecoderConfig, DescriptorDecoder
-from dpmjax.nets.layers import ComputeDtype
-from dpmjax.nets.point_encoder import EncoderConfig, PointEncoder
-from dpmjax.scans.preprocess import PreprocessConfig
+from dpmjax.nets.decoder import DescriptorDecoder
+from dpmjax.nets.point_encoder import PointEncoder
 from dpmjax.types import AnyArray, DescriptorCloud, PointPyramid
-
-Preset = Literal["tiny", "small", "paper"]
-
-
-@dataclass(frozen=True)
-class ModelConfig:
-    """Configuration of a model (defaults: DeepPointMap's published configuration).
-
-    Attributes:
-        pyramid: sampled points and neighbourhoods.
-        encoder: widths of the encoder.
-        decoder: widths of the decoder.
-        scale_m: metres in one unit of the pyramid's normalised coordinates.
-        preprocess: filters of raw scans, in training and inference alike.
-        matching: choice of descriptor pairs and inliers.
-        verification: verification of hypotheses by the scans, and the final alignment.
-        calibration: of the confidence; None where it was not fitted.
-    """
-
-    pyramid: PyramidConfig = field(default_factory=PyramidConfig)
-    encoder: EncoderConfig = field(default_factory=EncoderConfig)
-    decoder: DecoderConfig = field(default_factory=DecoderConfig)
-    scale_m: float = 60.0
-    preprocess: PreprocessConfig = field(default_factory=PreprocessConfig)
-    matching: MatchConfig = field(default_factory=MatchConfig)
-    verification: VerificationConfig = field(default_factory=VerificationConfig)
-    calibration: Calibration | None = None
-
-    def __post_init__(self) -> None:
-        require_positive("scale_m", self.scale_m)
-        if self.decoder.input_channels != self.encoder.output_channels:
-            expected = f"expected the encoder's output_channels {self.encoder.output_channels}"
-            raise ValueError(f"decoder.input_channels: {expected}, got {self.decoder.input_channels}")
-
-    @property
-    def num_descriptors(self) -> int:
-        """Number of descriptors of a scan."""
-        return self.pyramid.stages[-1 - self.pyramid.num_interpolations].num_points
-
-    def with_compute_dtype(self, compute_dtype: ComputeDtype) -> ModelConfig:
-        """Changes the type of the matrix products; geometry stays in float32.
-
-        Args:
-            compute_dtype: "float32" or "bfloat16".
-
-        Returns:
-            A new configuration.
-        """
-        encoder = replace(self.encoder, compute_dtype=compute_dtype)
-        return replace(self, encoder=encoder, decoder=replace(self.decoder, compute_dtype=compute_dtype))
-
-
-def model_preset(name: str) -> ModelConfig:
-    """Returns the configuration of a preset.
-
-    Args:
-        name: "tiny" for trials on a CPU, "small" for real time, or "paper".
-
-    Returns:
-        The configuration.
-
-    A name that no preset has is a `ValueError`.
-    """
-    require_one_of("name", name, PRESETS)
-    return PRESETS[name]
-
-
-def _pyramid(
-    num_points: tuple[int, ...], num_neighbours: tuple[int, ...], last_radii: tuple[float, ...]
-) -> PyramidConfig:
-    radii = ((0.05, 0.1), (0.1, 0.2), (0.2, 0.4), (0.4, 0.8), last_radii)
-    return PyramidConfig(tuple(map(PyramidStage, num_points, radii, num_neighbours)))
-
-
-PRESETS: dict[str, ModelConfig] = {
-    "tiny": ModelConfig(
-        pyramid=_pyramid((1024, 512, 256, 64, 16), (16, 16, 16, 16, 8), (0.8,)),
-        encoder=EncoderConfig(stem_channels=8, expansion=2, output_channels=64, frame="bearing"),
-        decoder=DecoderConfig(input_channels=64, model_channels=64, num_heads=2),
-        preprocess=PreprocessConfig(capacity=4096),
-        matching=MatchConfig(pair_ratio=2.0, consensus=ConsensusConfig()),
-    ),
-    "small": ModelConfig(
-        pyramid=_pyramid((1536, 512, 256, 64, 16), (16, 16, 16, 16, 16), (0.8, 1.6)),
-        encoder=EncoderConfig(stem_channels=16, expansion=2, output_channels=128, frame="bearing"),
-        decoder=DecoderConfig(input_channels=128, model_channels=128, num_heads=4),
-        matching=MatchConfig(pair_ratio=2.0, consensus=ConsensusConfig()),
-    ),
-    "paper": ModelConfig(),
-}
 
 
 @flax.struct.dataclass
@@ -239,25 +143,6 @@ def correlate(model: Model, a: DescriptorCloud, b: DescriptorCloud) -> tuple[Des
 
 
 @jax.jit
-def overlap_probability(model: Model, a: DescriptorCloud, b: DescriptorCloud) -> Float[Array, ""]:
-    """Predicts the probability that two clouds overlap: less than 20 m apart (DeepPointMap section 3.2).
-
-    A `ValueError` says if the features have another width than the model.
-
-    Args:
-        model: encoder and decoder.
-        a: uncorrelated descriptors.
-        b: the same; the order matters a little.
-
-    Returns:
-        The probability. It is 0 where a cloud is empty or holds a feature that is not finite.
-    """
-    logit = overlap_logit(model, *correlate(model, a, b))
-    is_known = jnp.any(a.mask) & jnp.any(b.mask) & jnp.isfinite(logit)
-    return jnp.where(is_known, jax.nn.sigmoid(jnp.where(is_known, logit, 0)), 0)
-
-
-@jax.jit
 def overlap_logit(model: Model, a: DescriptorCloud, b: DescriptorCloud) -> Float[Array, ""]:
     """Predicts the logit of the overlap probability.
 
@@ -284,6 +169,35 @@ def similarity_features(model: Model, correlated: DescriptorCloud) -> Float[Arra
         One row for each descriptor.
     """
     return _decode(model, correlated.features, part="similarity_head")
+
+
+@jax.jit
+def descriptor_similarity(model: Model, a: DescriptorCloud, b: DescriptorCloud) -> Float[Array, "m n"]:
+    """Computes the similarity of all pairs of descriptors (DeepPointMap section 3.2).
+
+    Args:
+        model: encoder and decoder.
+        a: a correlated cloud.
+        b: the other correlated cloud.
+
+    Returns:
+        Cosines in [-1, 1]; 0 for a descriptor whose features are 0.
+    """
+    first, second = (unit_rows(similarity_features(model, cloud)) for cloud in (a, b))
+    return jnp.matmul(first, second.T, precision=lax.Precision.HIGHEST)
+
+
+def unit_rows(features: Float[Array, "m c"]) -> Float[Array, "m c"]:
+    """Scales rows to length one.
+
+    Args:
+        features: any rows.
+
+    Returns:
+        The rows; those of length 0 stay.
+    """
+    squared = jnp.sum(features.astype(jnp.float32) ** 2, axis=1, keepdims=True)
+    return features / jnp.sqrt(jnp.where(squared > 0, squared, 1))
 
 
 @jax.jit

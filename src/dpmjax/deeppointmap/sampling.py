@@ -1,4 +1,4 @@
-"""Sampling for training, on the host: which scans form two maps, which pairs overlap, and both as arrays.
+"""Sampling for training, on the host: which scans form two maps, and the maps as arrays.
 
 Scans are drawn by their true poses, before augmentation, and from the given generator only, so that the sample of a
 step does not depend on the steps before. A batch is samples stacked along a new first axis, which is spread over
@@ -83,14 +83,6 @@ class Group(NamedTuple):
         return np.concatenate([self.source, self.target])
 
 
-class OverlapPairs(NamedTuple):
-    """Numbers of the scans of each pair, and whether they are closer than `overlap_distance_m`."""
-
-    first: Int[np.ndarray, " p"]
-    second: Int[np.ndarray, " p"]
-    is_overlap: Bool[np.ndarray, " p"]
-
-
 def draw_groups(
     table: ScanTable, first_anchor: int, layout: Layout, config: SamplingConfig, rng: np.random.Generator
 ) -> tuple[Group | None, ...]:
@@ -121,36 +113,6 @@ def draw_groups(
         limits = f"{config.min_distance_m} to {config.max_distance_m} m"
         raise ValueError(f"table: expected scans with others {limits} from them, found none in {NUM_ATTEMPTS} draws")
     return tuple(groups)
-
-
-def draw_overlap_pairs(table: ScanTable, config: SamplingConfig, rng: np.random.Generator) -> OverlapPairs:
-    """Draws the pairs of the overlap part: half overlap, a quarter lies just beyond that, a quarter is far apart.
-
-    Where a scene has no pair of one kind (a short drive), scans of other scenes replace it, or the next nearer kind.
-
-    Args:
-        table: the scans.
-        config: number of pairs, and distances.
-        rng: source of the draws.
-
-    Returns:
-        `config.num_overlap_pairs` pairs.
-    """
-    bands = ((0.0, config.overlap_distance_m), (config.overlap_distance_m, config.far_distance_m))
-    first, second = [], []
-    for _ in range(config.num_overlap_pairs):
-        anchor = int(rng.integers(len(table)))
-        kind = int(rng.choice(3, p=(0.5, 0.25, 0.25)))
-        distances = table.distances_from(anchor)
-        choices = [np.flatnonzero((distances > low) & (distances <= high)) for low, high in bands]
-        choices.append(np.flatnonzero(np.isfinite(distances) & (distances > config.far_distance_m)))
-        elsewhere = np.flatnonzero(np.isinf(distances))
-        usable = [rows for rows in (choices[kind], elsewhere, *choices[::-1]) if len(rows) > 0]
-        first.append(anchor)
-        second.append(int(rng.choice(usable[0])) if usable else anchor)
-    a, b = np.array(first), np.array(second)
-    distances = np.linalg.norm(table.positions[a] - table.positions[b], axis=1)
-    return OverlapPairs(a, b, (table.scene[a] == table.scene[b]) & (distances <= config.overlap_distance_m))
 
 
 def _group_at(
@@ -223,23 +185,6 @@ class RegistrationSample:
 
     scans: SampleScans
     groups: tuple[GroupBatch, ...]
-
-
-@flax.struct.dataclass
-class OverlapSample:
-    """Pairs of scans; a batch has one more axis in front.
-
-    Attributes:
-        scans: first the first scan of each pair, then the second of each.
-        is_overlap: whether the two overlap in truth.
-    """
-
-    scans: SampleScans
-    is_overlap: Bool[AnyArray, "*b p"]
-
-
-Sample = RegistrationSample | OverlapSample
-"""What a step trains on; a batch has one more axis in front, which is spread over devices."""
 
 
 def arrange_groups(

@@ -11,7 +11,6 @@ from typing import Literal, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import lax
 from jaxtyping import Array, Float
 
 from dpmjax.deeppointmap.confidence import gather_evidence, with_confidence
@@ -20,11 +19,11 @@ from dpmjax.deeppointmap.matching import MatchConfig, match_hypotheses
 from dpmjax.deeppointmap.model import (
     Model,
     correlate,
+    descriptor_similarity,
     encode_pyramid,
-    overlap_probability,
     predict_offsets,
-    similarity_features,
 )
+from dpmjax.deeppointmap.overlap import overlap_probability
 from dpmjax.deeppointmap.verification import (
     MeasuredScan,
     VerificationConfig,
@@ -204,13 +203,18 @@ def match_clouds(
 
 
 def overlap(model: Model, source: ScanOrCloud, target: ScanOrCloud) -> Float[Array, ""]:
-    """Predicts the probability that two scans or maps overlap: less than 20 m apart (DeepPointMap section 3.2).
+    """Predicts the probability that two scans or maps overlap: that their origins are less than 20 m apart.
+
+    A calibrated model (`model.config.overlap`, from `python -m experiments.dpm_calibrate`) rests it on the match of the
+    descriptors. It is fitted on simulated towns and buildings, where half of the pairs overlapped, a quarter was 20 to
+    40 m apart, and the rest farther or of other places: where overlap is rarer, the probability is too high. A model
+    without it answers with the decoder's head (DeepPointMap section 3.2), which is right for published weights only.
 
     A `ValueError` says if the points are no real numbers (n, 3), or if features have another width than the model.
 
     Args:
         model: encoder and decoder.
-        source: a raw scan (n, 3) in metres, or a descriptor cloud.
+        source: a raw scan (n, 3) in metres, a scan from `prepare_scan`, or a descriptor cloud.
         target: the same; the order matters a little.
 
     Returns:
@@ -341,8 +345,7 @@ def trace_match(model: Model, source: DescriptorCloud, target: DescriptorCloud, 
         All hypotheses, with a leading axis.
     """
     source, target = correlate(model, source, target)
-    directions = [_unit(similarity_features(model, cloud)) for cloud in (source, target)]
-    similarity = jnp.matmul(directions[0], directions[1].T, precision=lax.Precision.HIGHEST)
+    similarity = descriptor_similarity(model, source, target)
 
     def offsets(source_rows: Array, target_rows: Array) -> tuple[Array, Array]:
         a, b = source.features[source_rows], target.features[target_rows]
@@ -350,8 +353,3 @@ def trace_match(model: Model, source: DescriptorCloud, target: DescriptorCloud, 
         return predict_offsets(model, a, b, of_source), predict_offsets(model, b, a, of_target)
 
     return match_hypotheses(source, target, similarity, offsets, config=config)
-
-
-def _unit(features: Float[Array, "m c"]) -> Float[Array, "m c"]:
-    squared = jnp.sum(features.astype(jnp.float32) ** 2, axis=1, keepdims=True)
-    return features / jnp.sqrt(jnp.where(squared > 0, squared, 1))

@@ -4,8 +4,8 @@
     step = make_step(config)
     state, report = step(state, batch)
 
-The step is deterministic: samples and their augmentation are drawn when a batch is made. A batch of
-`RegistrationSample` trains all parts except the overlap head; a batch of `OverlapSample` trains the overlap head only.
+The step is deterministic: samples and their augmentation are drawn when a batch is made. All parts learn except the
+overlap head: overlap is fitted afterwards (`deeppointmap.overlap`).
 """
 
 from __future__ import annotations
@@ -31,7 +31,6 @@ from dpmjax.deeppointmap.model import (
     correlate,
     encode_stored,
     init_model,
-    overlap_logit,
     predict_offsets,
     similarity_features,
 )
@@ -46,13 +45,10 @@ from dpmjax.deeppointmap.objective import (
 from dpmjax.deeppointmap.sampling import (
     GroupBatch,
     MapOfScans,
-    OverlapSample,
     RegistrationSample,
-    Sample,
     SampleScans,
 )
 from dpmjax.geometry.bearing import directions_of
-from dpmjax.losses.descriptors import overlap_loss
 from dpmjax.nets.neighbourhood import WINNERS
 from dpmjax.types import AnyArray, DescriptorCloud
 
@@ -63,40 +59,36 @@ class TrainingState:
 
     Attributes:
         params: parameters of the model.
-        registration_optimizer: state of the optimiser of all parameters.
-        overlap_optimizer: state of the optimiser of the overlap head.
-        step: number of steps done, both parts together.
-        decay_start: step from which on the learning rate of the registration part falls.
-        registration_end: step after the last of the registration part.
+        optimizer: state of the optimiser.
+        step: number of steps done.
+        decay_start: step from which on the learning rate falls.
+        end: step after the last.
     """
 
     params: dict[str, Any]
-    registration_optimizer: optax.OptState
-    overlap_optimizer: optax.OptState
+    optimizer: optax.OptState
     step: Int[AnyArray, ""]
     decay_start: Int[AnyArray, ""]
-    registration_end: Int[AnyArray, ""]
+    end: Int[AnyArray, ""]
 
 
 class TrainingReport(NamedTuple):
-    """Measures of one step, at the parameters before it; NaN for those that its part does not have.
+    """Measures of one step, at the parameters before it.
 
     Attributes:
         loss: loss of the batch.
         terms: terms of the matching loss, means over all groups.
-        overlap_accuracy: share of the overlap pairs that are classified correctly.
         gradient_norm: norm of the gradient before it is scaled down.
         learning_rate: learning rate of the step.
     """
 
     loss: Float[Array, ""]
     terms: ObjectiveTerms
-    overlap_accuracy: Float[Array, ""]
     gradient_norm: Float[Array, ""]
     learning_rate: Float[Array, ""]
 
 
-Step = Callable[[TrainingState, Sample], tuple[TrainingState, TrainingReport]]
+Step = Callable[[TrainingState, RegistrationSample], tuple[TrainingState, TrainingReport]]
 
 
 def init_training(key: PRNGKeyArray, config: TrainingConfig) -> TrainingState:
@@ -110,19 +102,18 @@ def init_training(key: PRNGKeyArray, config: TrainingConfig) -> TrainingState:
         The state.
     """
     params = init_model(key, config.model).params
-    num_steps = config.registration_steps
+    num_steps = config.num_steps
     return TrainingState(
         params=params,
-        registration_optimizer=_optimizer(config, is_overlap=False).init(params),
-        overlap_optimizer=_optimizer(config, is_overlap=True).init(params["decoder"]["overlap_head"]),
+        optimizer=_optimizer(config).init(params),
         step=jnp.zeros((), jnp.int32),
         decay_start=jnp.asarray(num_steps - round(config.decay_ratio * num_steps), jnp.int32),
-        registration_end=jnp.asarray(num_steps, jnp.int32),
+        end=jnp.asarray(num_steps, jnp.int32),
     )
 
 
 def finish(state: TrainingState, config: TrainingConfig) -> TrainingState:
-    """Begins the decay of the learning rate at once, so that the registration part ends early.
+    """Begins the decay of the learning rate at once, so that training ends early.
 
     The decay then has the share of the steps that `config.decay_ratio` says.
 
@@ -135,14 +126,14 @@ def finish(state: TrainingState, config: TrainingConfig) -> TrainingState:
     """
     step = int(state.step)
     num_decay = max(1, math.ceil(step * config.decay_ratio / max(1 - config.decay_ratio, 1e-6)))
-    if step >= int(state.decay_start) or step + num_decay >= int(state.registration_end):
+    if step >= int(state.decay_start) or step + num_decay >= int(state.end):
         return state
     end = jnp.asarray(step + num_decay, jnp.int32)
-    return replace(state, decay_start=jnp.asarray(step, jnp.int32), registration_end=end)
+    return replace(state, decay_start=jnp.asarray(step, jnp.int32), end=end)
 
 
 def make_step(config: TrainingConfig, mesh: Mesh | None = None) -> Step:
-    """Makes the jitted step, which compiles once for each layout of the curriculum and once for the overlap part.
+    """Makes the jitted step, which compiles once for each layout of the curriculum.
 
     Batches carry samples along their first axis and may be spread over devices by `place`. The loss is the mean
     over all groups of all samples, so the number of devices changes the speed only.
@@ -159,29 +150,17 @@ def make_step(config: TrainingConfig, mesh: Mesh | None = None) -> Step:
     return jax.jit(functools.partial(_one_step, config=config), out_shardings=NamedSharding(mesh, PartitionSpec()))
 
 
-def _one_step(state: TrainingState, batch: Sample, *, config: TrainingConfig) -> tuple[TrainingState, TrainingReport]:
-    is_overlap = isinstance(batch, OverlapSample)
-    if isinstance(batch, OverlapSample):
-        learned, optimizer_state = state.params["decoder"]["overlap_head"], state.overlap_optimizer
-        loss_of = _overlap_loss_of(state, batch, config)
-    else:
-        learned, optimizer_state = state.params, state.registration_optimizer
-
-        def loss_of(params: dict[str, Any]) -> tuple[Array, tuple[ObjectiveTerms, Array]]:
-            loss, terms = batch_loss(params, batch, config)
-            return loss, (terms, jnp.asarray(jnp.nan))
-
-    (loss, (terms, accuracy)), gradient = jax.value_and_grad(loss_of, has_aux=True)(learned)
-    learning_rate = _learning_rate(state, config, is_overlap=is_overlap)
+def _one_step(
+    state: TrainingState, batch: RegistrationSample, *, config: TrainingConfig
+) -> tuple[TrainingState, TrainingReport]:
+    loss_of = jax.value_and_grad(batch_loss, has_aux=True)
+    (loss, terms), gradient = loss_of(state.params, batch, config)
+    learning_rate = _learning_rate(state, config)
     gradient_norm = jnp.sqrt(sum(jnp.sum(leaf**2) for leaf in jax.tree.leaves(gradient)))
-    report = TrainingReport(loss, terms, accuracy, gradient_norm, learning_rate)
-    updates, optimizer_state = _optimizer(config, is_overlap=is_overlap).update(gradient, optimizer_state, learned)
-    learned = jax.tree.map(lambda value, update: value - learning_rate * update, learned, updates)
-    if is_overlap:
-        state = replace(state, params=_with_head(state.params, learned), overlap_optimizer=optimizer_state)
-    else:
-        state = replace(state, params=learned, registration_optimizer=optimizer_state)
-    return replace(state, step=state.step + 1), report
+    report = TrainingReport(loss, terms, gradient_norm, learning_rate)
+    updates, optimizer = _optimizer(config).update(gradient, state.optimizer, state.params)
+    params = jax.tree.map(lambda value, update: value - learning_rate * update, state.params, updates)
+    return replace(state, params=params, optimizer=optimizer, step=state.step + 1), report
 
 
 _step = jax.jit(_one_step, static_argnames="config")
@@ -278,57 +257,19 @@ def _merged(clouds: DescriptorCloud, scans: MapOfScans) -> DescriptorCloud:
     return merge_clouds(replace(chosen, mask=chosen.mask & scans.mask[:, None]), scans.T_map_scan)
 
 
-def _overlap_loss_of(
-    state: TrainingState, batch: OverlapSample, config: TrainingConfig
-) -> Callable[[dict[str, Any]], tuple[Array, tuple[ObjectiveTerms, Array]]]:
-    correlated = _correlated_pairs(Model(state.params, config.model), batch, config.scans_at_once // 2)
-    labels = batch.is_overlap.reshape(-1)
-
-    def loss_of(head: dict[str, Any]) -> tuple[Array, tuple[ObjectiveTerms, Array]]:
-        model = Model(_with_head(state.params, head), config.model)
-        logits = jax.vmap(overlap_logit, (None, 0, 0))(model, *correlated)
-        terms = ObjectiveTerms(*[jnp.asarray(jnp.nan)] * len(ObjectiveTerms._fields))
-        return overlap_loss(logits, labels), (terms, jnp.mean((logits > 0) == labels))
-
-    return loss_of
-
-
-def _correlated_pairs(
-    model: Model, batch: OverlapSample, pairs_at_once: int
-) -> tuple[DescriptorCloud, DescriptorCloud]:
-    # All pairs of all samples along one axis; they need no gradient.
-
-    def of_sample(scans: SampleScans) -> tuple[DescriptorCloud, DescriptorCloud]:
-        clouds = _in_parts(functools.partial(_encoded, model), scans, 2 * pairs_at_once)
-        pairs = jax.tree.map(lambda x: x.reshape(2, -1, *x.shape[1:]), clouds)
-        sides = (jax.tree.map(lambda x, side=side: x[side], pairs) for side in (0, 1))
-        return _in_parts(lambda pair: correlate(model, *pair), tuple(sides), pairs_at_once)
-
-    clouds = _over_samples(of_sample, batch.scans)
-    return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), clouds)
-
-
-def _with_head(params: dict[str, Any], head: Any) -> dict[str, Any]:
-    return {**params, "decoder": {**params["decoder"], "overlap_head": head}}
-
-
-def _learning_rate(state: TrainingState, config: TrainingConfig, *, is_overlap: bool) -> Float[Array, ""]:
-    # Registration: warm-up, constant, half a cosine at the end. Overlap: half a cosine.
-    begin = state.registration_end if is_overlap else state.decay_start
-    length = config.overlap_steps if is_overlap else state.registration_end - state.decay_start
-    progress = jnp.clip((state.step - begin) / jnp.maximum(length, 1), 0, 1)
+def _learning_rate(state: TrainingState, config: TrainingConfig) -> Float[Array, ""]:
+    # Warm-up, constant, half a cosine at the end.
+    length = state.end - state.decay_start
+    progress = jnp.clip((state.step - state.decay_start) / jnp.maximum(length, 1), 0, 1)
     share = (1 + jnp.cos(jnp.pi * progress)) / 2
     rate = config.final_learning_rate + share * (config.learning_rate - config.final_learning_rate)
-    if is_overlap:
-        return config.overlap_ratio * rate
     return rate * jnp.minimum(1, (state.step + 1) / max(1, config.warmup_steps))
 
 
-def _optimizer(config: TrainingConfig, *, is_overlap: bool) -> optax.GradientTransformation:
+def _optimizer(config: TrainingConfig) -> optax.GradientTransformation:
     # AdamW without its learning rate, which the state decides about.
-    ratio = config.overlap_ratio if is_overlap else 1.0
     return optax.chain(
         optax.clip_by_global_norm(config.max_gradient_norm),
         optax.scale_by_adam(),
-        optax.add_decayed_weights(ratio * config.weight_decay),
+        optax.add_decayed_weights(config.weight_decay),
     )

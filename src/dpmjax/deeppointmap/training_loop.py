@@ -69,14 +69,14 @@ class StepRecord(NamedTuple):
 
     Attributes:
         step: number of steps done.
-        stage: stage of the step; None in the overlap part.
+        stage: stage of the step.
         report: measures of the step.
         score: score of an evaluation after this step; NaN without one.
         speed: seconds of the steps of this call.
     """
 
     step: int
-    stage: CurriculumStage | None
+    stage: CurriculumStage
     report: TrainingReport
     score: float
     speed: Speed
@@ -106,7 +106,7 @@ class Trained(NamedTuple):
     """Result of training.
 
     Attributes:
-        model: the model with the best score, with the trained overlap head; the last one without an evaluation.
+        model: the model with the best score; the last one without an evaluation.
         progress: progress after the last step.
         stopped_by: the number that `stop` returned; 0 after the last step.
         speed: seconds of the steps of this call.
@@ -150,16 +150,12 @@ def train(
     step = make_step(config, mesh if jax.device_count() > 1 else None)
     clock, stopped_by = _Clock(config.sampling.num_scans * jax.device_count()), 0
     first_sample = jax.process_index() * num_local
-    last = int(start.state.registration_end)
-    with SampleMaker(
-        store, config, seed=seed, num_samples=num_local, first_sample=first_sample, registration_steps=last
-    ) as maker:
-        batches = maker.batches(int(progress.state.step), last + config.overlap_steps)
+    with SampleMaker(store, config, seed=seed, num_samples=num_local, first_sample=first_sample) as maker:
+        batches = maker.batches(int(progress.state.step), int(start.state.end))
         with together():
             batch = next(batches, None)
         while batch is not None and not (stopped_by := largest(int(hooks.stop()))):
-            progress = before_step(progress)
-            stage = stage_of(progress.state, config)
+            stage = config.stage_at(int(progress.state.step))
             begun = time.perf_counter()
             state, report = step(progress.state, place(batch, mesh, BATCH_AXIS))
             with together():  # the next batch is prepared while the device computes
@@ -170,11 +166,12 @@ def train(
             number = int(state.step)
             if not math.isfinite(report.loss):
                 raise TrainingLostError(f"the loss of step {number} is {report.loss}; resume from an older checkpoint")
-            progress, score = _evaluate_when_due(progress, stage, config, hooks)
+            progress, score = _evaluate_when_due(progress, config, hooks)
             with together():
                 if hooks.on_report is not None and is_first():
                     hooks.on_report(StepRecord(number, stage, report, score, clock.speed), progress)
-    model = _local(Model(params_to_use(progress), config.model))
+    params = progress.best_params if int(progress.best_step) > 0 else progress.state.params
+    model = _local(Model(params, config.model))
     return Trained(model, progress, stopped_by, clock.speed)
 
 
@@ -206,51 +203,11 @@ def after_evaluation(progress: TrainingProgress, score: float) -> TrainingProgre
     return TrainingProgress(state, state.params, np.asarray(score, np.float32), np.asarray(state.step, np.int32))
 
 
-def stage_of(state: TrainingState, config: TrainingConfig) -> CurriculumStage | None:
-    """Finds the stage of the next step.
-
-    Args:
-        state: state before the step.
-        config: settings of training.
-
-    Returns:
-        The stage; None in the overlap part.
-    """
-    return config.stage_at(int(state.step)) if int(state.step) < int(state.registration_end) else None
-
-
-def before_step(progress: TrainingProgress) -> TrainingProgress:
-    """Restores the best parameters at the beginning of the overlap part, whose head is trained on them.
-
-    Args:
-        progress: progress before a step.
-
-    Returns:
-        The progress to take the step from.
-    """
-    if int(progress.state.step) != int(progress.state.registration_end) or int(progress.best_step) == 0:
-        return progress
-    return replace(progress, state=replace(progress.state, params=progress.best_params))
-
-
-def params_to_use(progress: TrainingProgress) -> dict[str, Any]:
-    """Selects the parameters of the result.
-
-    Args:
-        progress: progress after any step.
-
-    Returns:
-        The best parameters. In the overlap part these are the parameters of the state, with a new head.
-    """
-    is_over = int(progress.state.step) > int(progress.state.registration_end)
-    return progress.state.params if is_over or int(progress.best_step) == 0 else progress.best_params
-
-
 def _evaluate_when_due(
-    progress: TrainingProgress, stage: CurriculumStage | None, config: TrainingConfig, hooks: TrainingHooks
+    progress: TrainingProgress, config: TrainingConfig, hooks: TrainingHooks
 ) -> tuple[TrainingProgress, float]:
     done = int(progress.state.step)
-    if stage is None or (done % hooks.evaluate_every and done != int(progress.state.registration_end)):
+    if done % hooks.evaluate_every and done != int(progress.state.end):
         return progress, math.nan
     score = math.nan
     with together():
@@ -269,9 +226,9 @@ class _Clock:
 
     def __init__(self, scans_per_step: int) -> None:
         self.speed, self._scans, self._scans_per_step = Speed(0.0, 0.0, 0.0), 0, scans_per_step
-        self._seen: set[CurriculumStage | None] = set()
+        self._seen: set[CurriculumStage] = set()
 
-    def add(self, stage: CurriculumStage | None, seconds: float) -> None:
+    def add(self, stage: CurriculumStage, seconds: float) -> None:
         if stage not in self._seen:
             self._seen.add(stage)
             self.speed = self.speed._replace(compile_s=self.speed.compile_s + seconds)

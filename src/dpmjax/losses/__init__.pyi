@@ -1,5 +1,4 @@
 from .descriptors import info_nce as info_nce
 from .descriptors import offset_loss as offset_loss
-from .descriptors import overlap_loss as overlap_loss
 from .mapping import chamfer_distance as chamfer_distance
 from .mapping import occupancy_loss as occupancy_loss

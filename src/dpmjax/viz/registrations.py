@@ -35,13 +35,20 @@ class RegisteredPair(NamedTuple):
     T_true: NDArray[np.float64]
 
 
-def reliability_figure(confidence: ArrayLike, is_right: ArrayLike, *, title: str) -> Figure:
-    """Draws the share of right registrations against their confidence, in ten bins; calibrated ones lie on the line.
+def reliability_figure(
+    confidence: ArrayLike,
+    is_right: ArrayLike,
+    *,
+    title: str,
+    labels: tuple[str, str] = ("confidence", "share of right registrations"),
+) -> Figure:
+    """Draws how often a probability comes true, in ten bins; calibrated ones lie on the line.
 
     Args:
         confidence: (n,) in [0, 1].
-        is_right: (n,) which registrations are right.
+        is_right: (n,) which of them are right.
         title: title of the picture.
+        labels: of both axes.
 
     Returns:
         The figure.
@@ -61,8 +68,8 @@ def reliability_figure(confidence: ArrayLike, is_right: ArrayLike, *, title: str
         axes.annotate(str(count), (left, up), xytext=(5, -10), textcoords="offset points", fontsize=7, color=MUTED)
     brier = float(np.mean((confidence - right) ** 2)) if len(right) else float("nan")
     axes.set_title(f"{title}\n{len(right)} pairs, Brier score {brier:.3f}", fontsize=10, color=INK)
-    axes.set_xlabel("confidence", color=INK)
-    axes.set_ylabel("share of right registrations", color=INK)
+    axes.set_xlabel(labels[0], color=INK)
+    axes.set_ylabel(labels[1], color=INK)
     figure.tight_layout()
     return figure
 

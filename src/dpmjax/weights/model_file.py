@@ -14,7 +14,8 @@ import numpy as np
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save_file
 
-from dpmjax.deeppointmap.model import Model, ModelConfig, model_shapes
+from dpmjax.deeppointmap.model import Model, model_shapes
+from dpmjax.deeppointmap.model_config import ModelConfig
 from dpmjax.weights.config_json import config_from_json
 
 SHIPPED = Path(__file__).parent

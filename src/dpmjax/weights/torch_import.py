@@ -20,7 +20,8 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from dpmjax.deeppointmap.model import Model, ModelConfig
+from dpmjax.deeppointmap.model import Model
+from dpmjax.deeppointmap.model_config import ModelConfig
 from dpmjax.geometry.pyramid import PyramidConfig, PyramidStage
 from dpmjax.nets.decoder import DecoderConfig
 from dpmjax.nets.point_encoder import EncoderConfig

@@ -1,0 +1,218 @@
+"""Overlap: the probability that two scans or maps are less than 20 m apart, from how well their descriptors match.
+
+The published head sees the mean of the correlated features alone. What tells overlap is in the match: how alike the
+best pairs are, and how many of them agree on one motion. These numbers, the evidence, come from descriptors only, so
+that thousands of candidates can be compared. A logistic regression, fitted by `python -m experiments.dpm_calibrate`,
+turns them into a probability. A model without one, as a published one, answers with its head.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from dpmjax.deeppointmap.matching import MatchConfig, best_pairs
+from dpmjax.deeppointmap.model import (
+    Model,
+    correlate,
+    descriptor_similarity,
+    overlap_logit,
+    predict_offsets,
+    unit_rows,
+)
+from dpmjax.geometry import rigid
+from dpmjax.geometry.bearing import directions_of
+from dpmjax.geometry.consensus import ConsensusConfig, find_consensus
+from dpmjax.types import DescriptorCloud
+
+OVERLAP_M = 20.0
+"""Scans that are nearer to each other overlap."""
+
+MATCHING = MatchConfig(pair_ratio=1.0)
+CONSENSUS = ConsensusConfig(num_seeds=48, num_rounds=3, num_motions=2)
+"""A quarter of the work of a registration: only the two best motions count."""
+
+GATE_M = 2.0
+"""How sharply `near_support` falls at `OVERLAP_M`."""
+
+MET_M = 2.0
+"""Descriptors of two clouds meet where they are nearer than this under the motion."""
+
+HIGH = 0.9
+"""Quantile of the good pairs."""
+
+MAX_DISTANCE_M, MAX_DISAGREEMENT_M = 100.0, 5.0
+
+
+class OverlapEvidence(NamedTuple):
+    """Numbers that tell overlap; similarities are cosines, shares are in [0, 1].
+
+    Attributes:
+        scan_similarity: of the mean encoder features of both clouds.
+        similarity_median: median, over descriptors, of the similarity to the best descriptor of the other cloud.
+        similarity_high: a high quantile of the same.
+        score_median: median of the dual softmax with the best descriptor of the other cloud.
+        score_high: a high quantile of the same.
+        mutual_share: share of the descriptors whose best ones choose them in turn.
+        support: consensus support of the best motion, as a share of the pairs.
+        near_support: the same where the motion is shorter than 20 m, falling to 0 beyond.
+        support_second: support of the best other motion.
+        offset_disagreement_m: mean difference, over inliers, of the two offsets that are predicted from both sides.
+        distance_m: length of the motion.
+        met_share: share of the descriptors that meet a descriptor of the other cloud under the motion.
+        met_similarity: mean similarity of those that meet.
+        spread_m: spread of the inliers in the horizontal plane.
+        log_radius: logarithm of the smaller of the mean distances of the descriptors from both origins.
+        log_radius_ratio: logarithm of their ratio.
+    """
+
+    scan_similarity: Float[Array, ""]
+    similarity_median: Float[Array, ""]
+    similarity_high: Float[Array, ""]
+    score_median: Float[Array, ""]
+    score_high: Float[Array, ""]
+    mutual_share: Float[Array, ""]
+    support: Float[Array, ""]
+    near_support: Float[Array, ""]
+    support_second: Float[Array, ""]
+    offset_disagreement_m: Float[Array, ""]
+    distance_m: Float[Array, ""]
+    met_share: Float[Array, ""]
+    met_similarity: Float[Array, ""]
+    spread_m: Float[Array, ""]
+    log_radius: Float[Array, ""]
+    log_radius_ratio: Float[Array, ""]
+
+
+@jax.jit
+def overlap_evidence(model: Model, a: DescriptorCloud, b: DescriptorCloud) -> OverlapEvidence:
+    """Matches two clouds and measures how well that went.
+
+    Args:
+        model: encoder and decoder.
+        a: uncorrelated descriptors of a scan or a map.
+        b: the same.
+
+    Returns:
+        The numbers; finite for finite features, also where a cloud is empty.
+    """
+    correlated = correlate(model, a, b)
+    is_pair = a.mask[:, None] & b.mask[None, :]
+    similarity = jnp.where(is_pair, descriptor_similarity(model, *correlated), -1)
+    logits = jnp.where(is_pair, similarity / MATCHING.temperature, jnp.finfo(similarity.dtype).min)
+    scores = jnp.where(is_pair, jax.nn.softmax(logits, axis=1) * jax.nn.softmax(logits, axis=0), 0)
+    best = jnp.argmax(scores, axis=1)
+    is_mutual = a.mask & (jnp.argmax(scores, axis=0)[best] == jnp.arange(len(best)))
+    motion = _best_motion(model, correlated, similarity)
+    gate = jax.nn.sigmoid((OVERLAP_M - motion.distance_m) / GATE_M)
+    radii = [_mean(jnp.linalg.norm(cloud.positions, axis=1), cloud.mask) + 1 for cloud in (a, b)]
+    return OverlapEvidence(
+        scan_similarity=jnp.dot(_mean_direction(a), _mean_direction(b)),
+        similarity_median=_quantile_of_best(similarity, a.mask, b.mask, 0.5),
+        similarity_high=_quantile_of_best(similarity, a.mask, b.mask, HIGH),
+        score_median=_quantile_of_best(scores, a.mask, b.mask, 0.5),
+        score_high=_quantile_of_best(scores, a.mask, b.mask, HIGH),
+        mutual_share=jnp.sum(is_mutual) / jnp.maximum(jnp.minimum(jnp.sum(a.mask), jnp.sum(b.mask)), 1),
+        near_support=motion.support * gate,
+        log_radius=jnp.log(jnp.minimum(*radii)),
+        log_radius_ratio=jnp.abs(jnp.log(radii[0] / radii[1])),
+        **motion._asdict(),
+    )
+
+
+@jax.jit
+def overlap_probability(model: Model, a: DescriptorCloud, b: DescriptorCloud) -> Float[Array, ""]:
+    """Predicts the probability that two clouds are less than 20 m apart.
+
+    A `ValueError` says if the features have another width than the model.
+
+    Args:
+        model: encoder and decoder.
+        a: uncorrelated descriptors.
+        b: the same; the order matters a little.
+
+    Returns:
+        The probability (see `dpmjax.overlap`). It is 0 where a cloud is empty or holds a feature that is not finite.
+    """
+    fitted = model.config.overlap
+    if fitted is None:
+        logit = overlap_logit(model, *correlate(model, a, b))
+    else:
+        evidence = jnp.stack(overlap_evidence(model, a, b))
+        logit = jnp.sum(evidence * np.asarray(fitted.weights, np.float32)) + fitted.bias
+    is_known = jnp.any(a.mask) & jnp.any(b.mask) & jnp.isfinite(logit)
+    return jnp.where(is_known, jax.nn.sigmoid(jnp.where(is_known, logit, 0)), 0)
+
+
+class _BestMotion(NamedTuple):
+    # The fields of `OverlapEvidence` that the best motion gives.
+    support: Float[Array, ""]
+    support_second: Float[Array, ""]
+    offset_disagreement_m: Float[Array, ""]
+    distance_m: Float[Array, ""]
+    met_share: Float[Array, ""]
+    met_similarity: Float[Array, ""]
+    spread_m: Float[Array, ""]
+
+
+def _best_motion(
+    model: Model, correlated: tuple[DescriptorCloud, DescriptorCloud], similarity: Float[Array, "m n"]
+) -> _BestMotion:
+    a, b = correlated
+    pairs = best_pairs(similarity, a.mask, b.mask, config=MATCHING)
+    rows, columns = pairs.source_indices, pairs.target_indices
+    features_a, features_b = a.features[rows], b.features[columns]
+    offsets = predict_offsets(model, features_a, features_b, directions_of(a)[rows])
+    returning = predict_offsets(model, features_b, features_a, directions_of(b)[columns])
+    is_used = pairs.mask & (jnp.sum(offsets**2, axis=1) <= MATCHING.max_offset_m**2)
+    points = a.positions[rows]
+    found = find_consensus(points + offsets, b.positions[columns], is_used, config=CONSENSUS)
+    T, is_inlier = found.T_target_source[0], found.is_inlier[0]
+    disagreement = jnp.linalg.norm(offsets @ T[:3, :3].T + returning, axis=1)
+    support = found.support / jnp.maximum(jnp.sum(pairs.mask), 1)
+    is_pair = a.mask[:, None] & b.mask[None]
+    moved = rigid.transform_points(T, a.positions)
+    apart = jnp.where(is_pair, jnp.sum((moved[:, None] - b.positions[None]) ** 2, axis=2), jnp.inf)
+    meets = [jnp.min(apart, axis=axis) < MET_M**2 for axis in (1, 0)]
+    similarity_there = jnp.take_along_axis(similarity, jnp.argmin(apart, axis=1)[:, None], axis=1)[:, 0]
+    return _BestMotion(
+        support=support[0],
+        support_second=support[1],
+        offset_disagreement_m=_mean(jnp.minimum(disagreement, MAX_DISAGREEMENT_M), is_inlier),
+        distance_m=jnp.minimum(jnp.linalg.norm(T[:3, 3]), MAX_DISTANCE_M),
+        met_share=(_mean(meets[0], a.mask) + _mean(meets[1], b.mask)) / 2,
+        met_similarity=_mean(similarity_there, meets[0]),
+        spread_m=_spread(points[:, :2], is_inlier),
+    )
+
+
+def _mean(values: Array, mask: Bool[Array, " n"]) -> Float[Array, ""]:
+    return jnp.sum(jnp.where(mask, values, 0)) / jnp.maximum(jnp.sum(mask), 1)
+
+
+def _spread(points: Float[Array, "n d"], mask: Bool[Array, " n"]) -> Float[Array, ""]:
+    centre = jnp.stack([_mean(column, mask) for column in points.T])
+    return jnp.sqrt(_mean(jnp.sum((points - centre) ** 2, axis=1), mask))
+
+
+def _mean_direction(cloud: DescriptorCloud) -> Float[Array, " c"]:
+    total = jnp.sum(jnp.where(cloud.mask[:, None], unit_rows(cloud.features), 0), axis=0)
+    return unit_rows(total[None])[0]
+
+
+def _quantile_of_best(
+    values: Float[Array, "m n"], rows: Bool[Array, " m"], columns: Bool[Array, " n"], quantile: float
+) -> Float[Array, ""]:
+    """Returns a quantile of the row maxima and of the column maxima, the mean of both."""
+    sides = ((jnp.max(values, axis=1), rows), (jnp.max(values, axis=0), columns))
+    return (_quantile(*sides[0], quantile) + _quantile(*sides[1], quantile)) / 2
+
+
+def _quantile(values: Float[Array, " n"], mask: Bool[Array, " n"], quantile: float) -> Float[Array, ""]:
+    ordered = jnp.sort(jnp.where(mask, values, jnp.inf))
+    place = jnp.floor(quantile * (jnp.sum(mask) - 1)).astype(int)
+    return jnp.where(jnp.any(mask), ordered[jnp.maximum(place, 0)], 0)

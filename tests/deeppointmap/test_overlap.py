@@ -1,0 +1,123 @@
+"""What overlap rests on, and how it becomes a probability."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import dpmjax
+from dpmjax.deeppointmap import correlate
+from dpmjax.deeppointmap.confidence import OVERLAP_FEATURES, LogisticModel, probability
+from dpmjax.deeppointmap.model import overlap_logit, similarity_features
+from dpmjax.deeppointmap.overlap import HIGH, MATCHING, OverlapEvidence, overlap_evidence, overlap_probability
+from dpmjax.types import DescriptorCloud
+from tests.deeppointmap import toy
+from tests.tolerances import ACCUMULATED
+
+NUM = 9
+
+
+@pytest.fixture(scope="module")
+def model() -> dpmjax.Model:
+    return dpmjax.init_model(jax.random.key(0), toy.MODEL)
+
+
+@pytest.fixture(scope="module")
+def fitted(model) -> dpmjax.Model:
+    """A model of overlap with any weights."""
+    weights = np.random.default_rng(0).normal(size=len(OVERLAP_FEATURES))
+    overlap = LogisticModel(OVERLAP_FEATURES, tuple(weights.tolist()), 0.3)
+    return model.replace(config=replace(model.config, overlap=overlap))
+
+
+def cloud(seed: int, num_padded: int = 0) -> DescriptorCloud:
+    """Random descriptors; padded ones hold NaN."""
+    rng = np.random.default_rng(seed)
+    positions, features = rng.normal(0, 10, (NUM, 3)), rng.normal(size=(NUM, 8))
+    rows = [(0, num_padded), (0, 0)]
+    padded = [np.pad(array, rows, constant_values=np.nan).astype(np.float32) for array in (positions, features)]
+    return DescriptorCloud(*map(jnp.asarray, padded), jnp.arange(NUM + num_padded) < NUM)
+
+
+def test_evidence_has_the_names_that_the_probability_is_fitted_on() -> None:
+    assert OverlapEvidence._fields == OVERLAP_FEATURES
+
+
+def test_evidence_of_the_descriptors_is_that_of_numpy(model) -> None:
+    a, b = cloud(1), cloud(2)
+    features = [np.asarray(similarity_features(model, one), float) for one in correlate(model, a, b)]
+    unit = [x / np.linalg.norm(x, axis=1, keepdims=True) for x in features]
+    similarity = unit[0] @ unit[1].T
+    exponential = np.exp(similarity / MATCHING.temperature)
+    scores = exponential**2 / (exponential.sum(axis=1, keepdims=True) * exponential.sum(axis=0))
+
+    def quantile(values: np.ndarray, share: float) -> float:
+        best = [np.sort(values.max(axis=axis))[int(share * (NUM - 1))] for axis in (0, 1)]
+        return float(np.mean(best))
+
+    mutual = sum(scores[:, column].argmax() == row for row, column in enumerate(scores.argmax(axis=1)))
+    means = [np.asarray(one.features, float) for one in (a, b)]
+    means = [(x / np.linalg.norm(x, axis=1, keepdims=True)).sum(axis=0) for x in means]
+    radii = [np.linalg.norm(one.positions, axis=1).mean() + 1 for one in (a, b)]
+    expected = {
+        "scan_similarity": means[0] @ means[1] / np.linalg.norm(means[0]) / np.linalg.norm(means[1]),
+        "similarity_median": quantile(similarity, 0.5),
+        "similarity_high": quantile(similarity, HIGH),
+        "score_median": quantile(scores, 0.5),
+        "score_high": quantile(scores, HIGH),
+        "mutual_share": mutual / NUM,
+        "log_radius": np.log(min(radii)),
+        "log_radius_ratio": abs(np.log(radii[0] / radii[1])),
+    }
+    found = overlap_evidence(model, a, b)
+    for name, value in expected.items():
+        np.testing.assert_allclose(getattr(found, name), value, err_msg=name, **ACCUMULATED)
+    assert 0 <= found.support_second <= found.support <= 1
+    assert 0 <= found.near_support <= found.support
+
+
+def test_a_scan_is_as_similar_to_itself_as_can_be(model) -> None:
+    found = overlap_evidence(model, cloud(1), cloud(1))
+    same = (found.scan_similarity, found.similarity_median, found.mutual_share)
+    np.testing.assert_allclose(same, 1, rtol=1e-5)
+    assert found.log_radius_ratio == 0
+
+
+def test_padded_equals_unpadded(model) -> None:
+    found, expected = overlap_evidence(model, cloud(1, 3), cloud(2, 5)), overlap_evidence(model, cloud(1), cloud(2))
+    np.testing.assert_allclose(found, expected, **ACCUMULATED)
+
+
+@pytest.mark.parametrize("side", [0, 1])
+def test_an_empty_or_broken_cloud_overlaps_nothing(fitted, side: int) -> None:
+    some = cloud(1)
+    empty = replace(some, mask=jnp.zeros(NUM, bool))
+    pairs = [
+        [other, some] if side == 0 else [some, other]
+        for other in (empty, replace(some, features=some.features.at[2].set(jnp.nan)))
+    ]
+    assert np.isfinite(overlap_evidence(fitted, *pairs[0])).all()
+    assert [float(overlap_probability(fitted, *pair)) for pair in pairs] == [0, 0]
+
+
+def test_the_probability_is_the_logistic_function_of_the_evidence(fitted, assert_compiles_nothing) -> None:
+    a, b = cloud(1), cloud(2)
+    expected = probability(fitted.config.overlap, np.asarray(overlap_evidence(fitted, a, b), float))
+    np.testing.assert_allclose(overlap_probability(fitted, a, b), expected, **ACCUMULATED)
+    with assert_compiles_nothing():
+        overlap_probability(fitted, b, cloud(3))
+
+
+def test_a_model_without_a_fit_answers_with_the_published_head(model) -> None:
+    a, b = cloud(1), cloud(2)
+    expected = jax.nn.sigmoid(overlap_logit(model, *correlate(model, a, b)))
+    np.testing.assert_allclose(overlap_probability(model, a, b), expected, **ACCUMULATED)
+
+
+def test_the_fit_is_stored_with_the_model(fitted, tmp_path) -> None:
+    dpmjax.save_model(fitted, tmp_path / "m.safetensors")
+    assert dpmjax.load_model(tmp_path / "m.safetensors").config == fitted.config
