@@ -30,11 +30,10 @@ from dpmjax import deepmapping, io, registration, simulation, viz
 from dpmjax import metrics as trajectory_metrics
 from experiments import _deepmapping_methods as shared
 from experiments._command import StopFlag, check_least, run_command
-from experiments._deepmapping_fit import FitRun, run_fit
+from experiments._deepmapping_fit import FitRun, draw_loss, run_fit
 from experiments._deepmapping_methods import Candidates, Floats, Task
 from experiments._machine import peak_rss_gb
-from experiments._result_files import read_history
-from experiments._run_folder import HISTORY, RunFolder, RunOptions, open_run_folder, recording, write_metrics
+from experiments._run_folder import RunFolder, RunOptions, open_run_folder, recording, write_metrics
 
 if TYPE_CHECKING:
     from dpmjax.deepmapping import DeepMappingConfig
@@ -238,17 +237,6 @@ def draw_occupancy(folder: RunFolder, sequence: ScanSequence, run: FitRun, kept:
     T_view_fit = trajectory_metrics.align_rigid(trajectory, anchor[:, :2])
     figure = viz.occupancy_figure(picture, trajectory, sequence.unit, T_view_world=T_view_fit, limits=limits)
     viz.save_figure(figure, folder / "occupancy.png")
-
-
-def draw_loss(folder: RunFolder, unit: str) -> None:
-    """Draws loss.png: loss and error of the fit over its run time."""
-    rows = read_history(folder / HISTORY)
-    if rows:
-        seconds, loss, ate = (
-            np.array([float(row[name] or "nan") for row in rows]) for name in ("run_s", "loss", f"ate_{unit}")
-        )
-        history = viz.History(seconds, loss, [row["phase"] for row in rows], ate)
-        viz.save_figure(viz.history_figure(history, unit), folder / "loss.png")
 
 
 def report(unit: str, metrics: Mapping[str, Any]) -> str:

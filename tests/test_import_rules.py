@@ -21,7 +21,7 @@ ALLOWED: dict[str, set[str]] = {
     "losses": {"geometry"},
     "pose_graph": {"geometry"},
     "registration": {"geometry", "losses", "pose_graph"},
-    "deepmapping": {"geometry", "nets", "losses"},
+    "deepmapping": {"geometry", "nets", "losses", "scans"},
     "deeppointmap": {"geometry", "nets", "losses", "scans", "metrics"},
     "slam": {"deeppointmap", "registration", "pose_graph", "geometry", "scans", "deepmapping"},
     "metrics": {"geometry"},

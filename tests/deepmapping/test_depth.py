@@ -11,10 +11,11 @@ import pytest
 
 from dpmjax import deepmapping as dm
 from dpmjax import io, simulation
-from dpmjax.deepmapping.depth import depth_problem, motion_matrices
+from dpmjax.deepmapping.depth import depth_problem
 from dpmjax.deepmapping.fit import init
 from dpmjax.deepmapping.problem import MappingData
 from dpmjax.deepmapping.projective_consistency import PixelSample, fit_pinhole, image_consistency
+from dpmjax.deepmapping.spatial import motion_matrices
 from dpmjax.metrics import absolute_trajectory_error
 from dpmjax.nets.localization import LocalizationConfig
 from dpmjax.nets.occupancy import OccupancyConfig

@@ -13,9 +13,10 @@ import pytest
 
 from dpmjax import deepmapping as dm
 from dpmjax.checkpoints import Checkpoints
+from dpmjax.deepmapping.batches import draw_offsets
 from dpmjax.deepmapping.fit import Progress, fit, init, is_finished, resume, step, steps_per_call
 from dpmjax.deepmapping.planar import planar_problem
-from dpmjax.deepmapping.problem import MappingData, Problem, draw_offsets
+from dpmjax.deepmapping.problem import MappingData, Problem
 from dpmjax.nets.localization import LocalizationConfig
 from dpmjax.nets.occupancy import OccupancyConfig
 from tests.tolerances import ACCUMULATED, DOUBLE

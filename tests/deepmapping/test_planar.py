@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 
 from dpmjax import deepmapping as dm
+from dpmjax.deepmapping.batches import draw_rows
 from dpmjax.deepmapping.fit import fit, init
-from dpmjax.deepmapping.planar import as_scan_set, draw_rows, planar_problem
+from dpmjax.deepmapping.planar import as_scan_set, planar_problem
 from dpmjax.deepmapping.problem import MappingData
 from dpmjax.geometry import se2
 from dpmjax.metrics import absolute_trajectory_error

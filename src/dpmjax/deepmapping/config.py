@@ -1,4 +1,4 @@
-"""Settings of DeepMapping for planar scans and depth images: the phases of a fit, the networks, the presets."""
+"""Settings of DeepMapping: the phases of a fit, the networks and presets of planar scans, what all presets share."""
 
 from __future__ import annotations
 
@@ -42,6 +42,9 @@ class PhaseConfig:
         projection_tolerance: for depth images. Images are compared by projection instead of by the Chamfer distance:
             share of the depth by which matching points may differ, at the start and at the end of the phase. The
             images after the last are then the first ones, so that any two can meet. None: Chamfer distance.
+        plane_width: for clouds. Scans are compared by the distance of points to planes instead of by the Chamfer
+            distance: width of the robust kernel, at the start and at the end of the phase. None: Chamfer distance.
+        num_revisits: for clouds compared by planes: scans near in space but not in time that each scan is compared to.
     """
 
     name: str
@@ -63,6 +66,8 @@ class PhaseConfig:
     map_decay: float = 0.0
     chamfer_limit: tuple[float, float] | None = None
     projection_tolerance: tuple[float, float] | None = None
+    plane_width: tuple[float, float] | None = None
+    num_revisits: int = 0
 
     def __post_init__(self) -> None:
         if not 0.0 <= self.occupancy_weight <= 1.0:
@@ -117,41 +122,6 @@ JOINT = PhaseConfig(
 """The paper: 3000 epochs of two batches for 256 scans, all beams, 19 free samples, gamma 0.1, windows of 4 scans."""
 
 
-LOCALIZE_DEPTH = replace(LOCALIZE, num_steps=400, learning_rate=1e-3, beams_per_step=400, num_offsets=2, max_offset=3)
-"""Cold start of depth images."""
-
-UNROLL_DEPTH = replace(
-    LOCALIZE_DEPTH,
-    name="free poses, Chamfer",
-    poses="free",
-    num_steps=300,
-    learning_rate=1e-2,
-    final_learning_rate=0.02,
-    chamfer_limit=(0.5, 0.05),
-)
-"""The Chamfer distance pulls views of low overlap onto each other; with its falling limit, that pull vanishes."""
-
-REFINE_DEPTH = replace(
-    REFINE,
-    name="free poses and map",
-    num_steps=150,
-    occupancy_weight=0.1,
-    learning_rate=2e-3,
-    beams_per_step=200,
-    num_offsets=3,
-    max_offset=1 << 30,
-    surface_distance=(0.05, 0.01),
-    projection_tolerance=(0.05, 0.005),
-)
-"""Free poses and a map that sharpens from coarse to fine. The nearest point of another image is some centimetres beside
-the surface between its pixels, and it pulls where only one image has seen; a projection does neither."""
-
-JOINT_DEPTH = replace(
-    JOINT, num_steps=3000, occupancy_weight=0.9, scans_per_step=256, num_offsets=1, max_offset=1, num_free=35
-)
-"""The paper: all pixels, 35 free samples a ray, gamma 0.9, windows of 2."""
-
-
 @dataclass(frozen=True)
 class DeepMappingConfig:
     """Settings of the fit of planar scans.
@@ -180,24 +150,14 @@ class DeepMappingConfig:
 
 
 @dataclass(frozen=True)
-class DepthMappingConfig(DeepMappingConfig):
-    """Settings of the fit of depth images; attributes as in DeepMappingConfig.
+class SpatialMappingConfig(DeepMappingConfig):
+    """Settings of a fit in space, of depth images or clouds; attributes as in DeepMappingConfig.
 
     Attributes:
-        motion: degrees of freedom of the camera.
+        motion: degrees of freedom of the sensor.
     """
 
-    cold_phases: tuple[PhaseConfig, ...] = (LOCALIZE_DEPTH, UNROLL_DEPTH, REFINE_DEPTH)
-    warm_phases: tuple[PhaseConfig, ...] = (REFINE_DEPTH,)
-    localization: LocalizationConfig = field(
-        default_factory=lambda: LocalizationConfig(features=(32, 64, 128), strides=(2, 2, 1), hidden=(128, 64))
-    )
-    occupancy: OccupancyConfig = field(
-        default_factory=lambda: OccupancyConfig(kind="grid", resolutions=(8, 16, 32, 64))
-    )
-    steps_per_call: int = 50
-    map_margin: float = 1.2
-    motion: Motion = "planar"
+    motion: Motion = "full"
 
 
 def preset(name: Literal["fast", "paper"], *, is_organised: bool = True) -> DeepMappingConfig:
@@ -213,45 +173,32 @@ def preset(name: Literal["fast", "paper"], *, is_organised: bool = True) -> Deep
     Raises:
         ValueError: the name is unknown.
     """
-    _check_preset(name)
+    check_preset(name)
     config = DeepMappingConfig()
     if name == "paper":
-        config = _as_published(config, JOINT, LocalizationConfig())
+        config = as_published(config, JOINT, LocalizationConfig())
     if not is_organised:
         config = replace(config, localization=replace(config.localization, kind="point"))
     return config
 
 
-def depth_preset(name: Literal["fast", "paper"], *, motion: Motion = "planar") -> DepthMappingConfig:
-    """The settings of a preset for depth images.
+def as_published(config: ConfigT, phase: PhaseConfig, localization: LocalizationConfig) -> ConfigT:
+    """The settings with the paper's networks.
 
     Args:
-        name: "fast" (seconds to a minute on two cores) or "paper" (its networks and sampling).
-        motion: degrees of freedom of the camera.
+        config: settings of a fit.
+        phase: its only phase.
+        localization: shape of L-Net.
 
     Returns:
         The settings.
-
-    Raises:
-        ValueError: the name is unknown.
     """
-    _check_preset(name)
-    config = DepthMappingConfig(motion=motion)
-    if name == "paper":
-        return _as_published(config, JOINT_DEPTH, LocalizationConfig(features=(64, 128, 256, 1024), strides=(1,) * 4))
-    if motion == "planar":
-        return config
-    # Real depth images in SE(3) do not agree to half a percent of the depth, and their first poses are rougher.
-    refine = replace(REFINE_DEPTH, projection_tolerance=(0.1, 0.02))
-    return replace(config, cold_phases=(*config.cold_phases[:-1], refine), warm_phases=(refine,))
-
-
-def _as_published(config: ConfigT, phase: PhaseConfig, localization: LocalizationConfig) -> ConfigT:
     config = replace(config, localization=localization, occupancy=OccupancyConfig(), steps_per_call=1)
     return replace(config, cold_phases=(phase,), warm_phases=(phase,))
 
 
-def _check_preset(name: str) -> None:
+def check_preset(name: str) -> None:
+    """Raises a ValueError where the name of a preset is unknown."""
     if name not in ("fast", "paper"):
         raise ValueError(f"preset: expected 'fast' or 'paper', got {name!r}")
 

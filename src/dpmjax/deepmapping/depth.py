@@ -1,7 +1,6 @@
 """DeepMapping of depth images (section 4.2): the problem, and `fit_depth` around the engine.
 
-Poses are T_start @ motion. The start is kept as it is given; L-Net's output, or what is optimised freely, is a motion
-after it.
+`spatial` has the poses; here are the images, and how they are compared.
 """
 
 from __future__ import annotations
@@ -15,25 +14,23 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 from numpy.typing import ArrayLike, NDArray
 
-from dpmjax.deepmapping.config import DepthMappingConfig, PhaseConfig
+from dpmjax.deepmapping.batches import draw_offsets
+from dpmjax.deepmapping.config import PhaseConfig
+from dpmjax.deepmapping.depth_config import DepthMappingConfig
 from dpmjax.deepmapping.fit import Report, fit
 from dpmjax.deepmapping.objective import Terms, WorldBatch, chamfer_term, interpolate_log
 from dpmjax.deepmapping.problem import (
-    MapFrame,
     MappingData,
     MappingFunctions,
     Params,
     Problem,
-    choose_frame,
-    draw_offsets,
     mapping_loss,
     mapping_problem,
 )
 from dpmjax.deepmapping.projective_consistency import DepthScans, PixelSample, consistency_of_pairs, fit_pinhole
-from dpmjax.geometry import rigid, se3
+from dpmjax.deepmapping.spatial import fitted_poses, init_spatial, next_spatial_phase, spatial_poses, start_poses
+from dpmjax.geometry import rigid
 from dpmjax.geometry.rays import typical_range
-from dpmjax.nets.localization import LocalizationNet
-from dpmjax.nets.occupancy import init_map_net
 
 
 class DepthFitted(NamedTuple):
@@ -85,23 +82,6 @@ def as_depth_scans(points: ArrayLike, mask: ArrayLike | None = None) -> DepthSca
     return DepthScans(jnp.asarray(np.where(valid[..., None], cloud, 0.0)), jnp.asarray(valid), pinhole)
 
 
-def motion_matrices(values: Float[Array, "n k"]) -> Float[Array, "n 4 4"]:
-    """Motions as matrices.
-
-    Args:
-        values: k = 3 are x, z and the angle about y (section 4.2), k = 6 is a twist (v, w).
-
-    Returns:
-        (n, 4, 4) rigid motions.
-    """
-    if values.shape[-1] == 6:
-        return se3.exp(values)
-    x, z, cos, sin = values[:, 0], values[:, 1], jnp.cos(values[:, 2]), jnp.sin(values[:, 2])
-    zero, one = jnp.zeros_like(x), jnp.ones_like(x)
-    rows = ((cos, zero, sin, x), (zero, one, zero, zero), (-sin, zero, cos, z), (zero, zero, zero, one))
-    return jnp.stack([jnp.stack(row, axis=-1) for row in rows], axis=-2)
-
-
 def fit_depth(
     scans: DepthScans | ArrayLike,
     config: DepthMappingConfig | None = None,
@@ -128,69 +108,10 @@ def fit_depth(
     config = config or DepthMappingConfig()
     scans = scans if isinstance(scans, DepthScans) else as_depth_scans(scans)
     unit = typical_range(scans.points, scans.mask)
-    start = None if init is None else _start_poses(init, len(scans.points), unit)
+    start = None if init is None else start_poses(init, len(scans.points), unit)
     data = MappingData(replace(scans, points=scans.points / unit), start)
     fitted = fit(depth_problem(config, data), data, key=key, num_starts=num_starts)
-    T = np.array(fitted.poses, np.float64)
-    T[:, :3, 3] *= unit
-    return DepthFitted(T, fitted.state.params, fitted.report, unit)
-
-
-def _start_poses(poses: ArrayLike, num_scans: int, unit: float) -> Float[Array, "n 4 4"]:
-    """Checked poses to start from, in typical ranges."""
-    T = np.array(poses, np.float64)
-    if T.shape != (num_scans, 4, 4) or not np.isfinite(T).all():
-        raise ValueError(f"init: expected finite numbers of shape ({num_scans}, 4, 4), got {T.shape}")
-    T[:, :3, 3] /= unit
-    return jnp.asarray(T, jnp.float32)
-
-
-def _net(config: DepthMappingConfig) -> LocalizationNet:
-    return LocalizationNet(config.localization, 3 if config.motion == "planar" else 6)
-
-
-def _motions(config: DepthMappingConfig, phase: PhaseConfig, params: Params, scans: DepthScans) -> Float[Array, "n k"]:
-    if phase.poses == "free":
-        return params.poses
-    return jax.vmap(_net(config).apply, in_axes=(None, 0, 0))(params.localization, scans.points, scans.mask)  # type: ignore[return-value]
-
-
-def _poses(config: DepthMappingConfig, phase: PhaseConfig, params: Params, data: MappingData) -> Float[Array, "n 4 4"]:
-    motions = motion_matrices(_motions(config, phase, params, data.scans))
-    return jnp.matmul(params.start, motions, precision=jax.lax.Precision.HIGHEST)
-
-
-def _choose_frame(config: DepthMappingConfig, scans: DepthScans, T: Float[Array, "n 4 4"]) -> MapFrame:
-    """The cube that the images cover at these poses."""
-    count = scans.mask.shape[0]
-    world = rigid.transform_points(T, scans.points.reshape(count, -1, 3))
-    return choose_frame(world, scans.mask.reshape(count, -1), config.map_margin)
-
-
-def _init(config: DepthMappingConfig, key: jax.Array, data: MappingData) -> Params:
-    """Without a start all cameras are at one place."""
-    net_key, map_key = jax.random.split(key)
-    scans, start = data
-    count, net = scans.mask.shape[0], _net(config)
-    T_start = jnp.tile(jnp.eye(4), (count, 1, 1)) if start is None else start
-    params = Params(
-        localization=net.init(net_key, scans.points[0], scans.mask[0]),
-        poses=jnp.zeros((count, net.num_outputs)),
-        occupancy=init_map_net(config.occupancy, key=map_key, num_dimensions=3),
-        start=T_start,
-        frame=_choose_frame(config, scans, T_start),
-    )
-    first = config.cold_phases[0]
-    if first.poses == "free" and start is None:
-        # The paper's direct baseline starts where L-Net's first forward pass puts the cameras.
-        params = replace(params, poses=_motions(config, replace(first, poses="network"), params, scans))
-    return params
-
-
-def _next_phase(config: DepthMappingConfig, phase: PhaseConfig, params: Params, data: MappingData) -> Params:
-    """The poses reached are the new start, in a map frame around them."""
-    T = _poses(config, phase, params, data)
-    return replace(params, poses=jnp.zeros_like(params.poses), start=T, frame=_choose_frame(config, data.scans, T))
+    return DepthFitted(fitted_poses(fitted.poses, unit), fitted.state.params, fitted.report, unit)
 
 
 def _draw_pixels(scans: DepthScans, count: int, *, key: jax.Array) -> PixelSample:
@@ -218,7 +139,7 @@ def _loss(
     scans, progress = data.scans, step / phase.num_steps
     count = scans.mask.shape[0]
     sample = _draw_pixels(scans, phase.beams_per_step, key=batch_key)
-    T = _poses(config, phase, params, data)
+    T = spatial_poses(config, phase, params, data)
     rows = jnp.arange(count)
     points = rigid.transform_points(T, sample.points)
     world = WorldBatch(points, T[:, :3, 3], sample.mask, rows, jnp.zeros_like(rows), progress)
@@ -243,4 +164,4 @@ def depth_problem(config: DepthMappingConfig, data: MappingData) -> Problem:
     Returns:
         The problem.
     """
-    return mapping_problem(config, data, MappingFunctions(_init, _loss, _poses, _next_phase))
+    return mapping_problem(config, data, MappingFunctions(init_spatial, _loss, spatial_poses, next_spatial_phase))

@@ -17,7 +17,6 @@ from jaxtyping import Array, Float
 from numpy.typing import NDArray
 
 from dpmjax.deepmapping.config import Motion
-from dpmjax.deepmapping.depth import motion_matrices
 from dpmjax.deepmapping.projective_consistency import (
     DepthScans,
     Pinhole,
@@ -25,6 +24,7 @@ from dpmjax.deepmapping.projective_consistency import (
     both_ways,
     projective_consistency,
 )
+from dpmjax.deepmapping.spatial import motion_matrices
 from dpmjax.geometry import rigid
 
 

@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 from numpy.typing import ArrayLike, NDArray
 
+from dpmjax.deepmapping.batches import draw_offsets, draw_rows, scans_in_block
 from dpmjax.deepmapping.config import DeepMappingConfig, PhaseConfig
 from dpmjax.deepmapping.fit import Fit, Report, fit
 from dpmjax.deepmapping.objective import Terms, WorldBatch, chamfer_term, interpolate_log
@@ -21,7 +22,6 @@ from dpmjax.deepmapping.problem import (
     Params,
     Problem,
     choose_frame,
-    draw_offsets,
     mapping_loss,
     mapping_problem,
 )
@@ -30,9 +30,6 @@ from dpmjax.geometry.rays import typical_range
 from dpmjax.nets.localization import LocalizationNet
 from dpmjax.nets.occupancy import init_map_net
 from dpmjax.types import ScanSet
-
-# Scans that are drawn together where a set is too large for one step.
-_BLOCK = 32
 
 
 class Fitted(NamedTuple):
@@ -265,40 +262,6 @@ def _loss(
     world = WorldBatch(se2.transform_points(poses, points), poses[:, :2], mask, rows, block, progress)
     free_key, offset_key = jax.random.split(loss_key)
     limit = None if phase.chamfer_limit is None else interpolate_log(phase.chamfer_limit, progress)
-    offsets = draw_offsets(phase, _scans_in_block(phase, scans.mask.shape[0]) - 1, key=offset_key)
+    offsets = draw_offsets(phase, scans_in_block(phase, scans.mask.shape[0]) - 1, key=offset_key)
     chamfer = chamfer_term(world, offsets, limit)
     return mapping_loss(config, phase, params, world, chamfer, key=free_key)
-
-
-def _scans_in_block(phase: PhaseConfig, num_scans: int) -> int:
-    """Neighbours in time that a step sees together."""
-    if num_scans <= phase.scans_per_step:
-        return num_scans
-    return phase.scans_per_step if phase.is_free_factor_shared else _BLOCK
-
-
-def draw_rows(
-    phase: PhaseConfig, num_scans: int, step: Int[Array, ""], *, key: jax.Array
-) -> tuple[Int[Array, " m"], Int[Array, " m"]]:
-    """Scans of a step: all where they are few enough, else blocks of neighbours in time.
-
-    Args:
-        phase: of the fit.
-        num_scans: of the set.
-        step: steps done in the phase.
-        key: of the step.
-
-    Returns:
-        Index of each scan in the set, and the block it belongs to.
-    """
-    if num_scans <= phase.scans_per_step:
-        return jnp.arange(num_scans), jnp.zeros(num_scans, jnp.int32)
-    if phase.is_free_factor_shared:
-        # The published order: batches follow each other in time, none is mixed.
-        # The last one reaches back, so that it is as long as the others and no scan is left out.
-        first = step % -(-num_scans // phase.scans_per_step) * phase.scans_per_step
-        first = jnp.minimum(first, num_scans - phase.scans_per_step)
-        return first + jnp.arange(phase.scans_per_step), jnp.zeros(phase.scans_per_step, jnp.int32)
-    num_blocks = phase.scans_per_step // _BLOCK
-    first = jax.random.randint(key, (num_blocks, 1), 0, num_scans - _BLOCK + 1)
-    return (first + jnp.arange(_BLOCK)).reshape(-1), jnp.repeat(jnp.arange(num_blocks), _BLOCK)

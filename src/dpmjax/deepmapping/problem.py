@@ -10,7 +10,7 @@ import flax.struct
 import jax
 import jax.numpy as jnp
 import optax
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float
 
 from dpmjax.deepmapping.config import DeepMappingConfig, PhaseConfig
 from dpmjax.deepmapping.objective import MapLogits, Terms, WorldBatch, free_factors, interpolate_log, occupancy_term
@@ -211,23 +211,6 @@ def level_weights(phase: PhaseConfig, num_levels: int, progress: Float[Array, ""
     if phase.anneal_until == 0.0:
         return jnp.ones(num_levels)
     return jnp.clip(progress / phase.anneal_until * num_levels - jnp.arange(num_levels) + 1.5, 0.0, 1.0)
-
-
-def draw_offsets(phase: PhaseConfig, furthest: int, *, key: jax.Array) -> Int[Array, " o"]:
-    """Distances in time of the scans that are compared: 1, so that neighbours always meet, and others at random.
-
-    Args:
-        phase: of the fit; `num_offsets` and `max_offset` are clamped to what there is.
-        furthest: the largest distance that there is.
-        key: of this step.
-
-    Returns:
-        Different whole numbers, 1 to `furthest`.
-    """
-    largest = max(1, min(phase.max_offset, furthest))
-    count = min(phase.num_offsets, largest) - 1
-    others = jax.random.choice(key, jnp.arange(2, max(largest, 2) + 1), (count,), replace=False)
-    return jnp.concatenate([jnp.ones(1, others.dtype), others])
 
 
 def mapping_loss(

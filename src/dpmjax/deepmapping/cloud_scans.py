@@ -1,0 +1,155 @@
+"""Lidar scans as the fit of clouds has them: evenly thinned points with their planes, and who meets whom again."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import flax.struct
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+from numpy.typing import ArrayLike, NDArray
+from scipy.spatial import cKDTree
+
+from dpmjax.scans import SurfaceConfig, scan_surface
+from dpmjax.scans.preprocess import first_of_each_voxel
+
+# In typical ranges: the vehicle, what is too far, side of the voxels and reach of the neighbours for the normals.
+_NEAREST, _FARTHEST, _VOXEL, _NEIGHBOURS = 0.03, 3.0, 0.01, 0.1
+_NUM_NEIGHBOURS = 24
+# Scans with more than so many others between them meet again, if they are nearer than so many typical ranges.
+_REVISIT_GAP, _REVISIT_DISTANCE = 8, 0.5
+_NUM_PARTNERS = 8
+
+
+@flax.struct.dataclass
+class CloudScans:
+    """Lidar scans of equal capacity; the rows of each are in random order, those that are not there at the end.
+
+    Attributes:
+        points: in the lidar frames, any unit; in typical ranges inside of the fit.
+        mask: False for rows that are not there.
+        normals: unit normals of the planes around the points, on the side of the lidar.
+        flatness: in [0, 1], how much the neighbourhood is a plane.
+        spacing: median distance of a point to the nearest other one of its scan.
+        partners: scans near in space, though not in time, at the poses to start from; -1: none.
+    """
+
+    points: Float[Array, "n c 3"]
+    mask: Bool[Array, "n c"]
+    normals: Float[Array, "n c 3"]
+    flatness: Float[Array, "n c"]
+    spacing: Float[Array, ""]
+    partners: Int[Array, "n p"]
+
+
+def as_cloud_scans(
+    scans: Sequence[ArrayLike], num_points: int = 2048, *, on_scan: Callable[[], object] | None = None
+) -> CloudScans:
+    """Thins lidar scans evenly, and estimates the plane around each point from the denser scan.
+
+    Args:
+        scans: (m_i, 3) points in the lidar frames, any unit, any number; points that are not finite are left out.
+        num_points: capacity of each scan.
+        on_scan: called after each scan.
+
+    Returns:
+        The scans, in the unit of the points, without partners.
+
+    Raises:
+        ValueError: there are fewer than two scans, one is not (m, 3), or one has no point.
+    """
+    if len(scans) < 2:
+        raise ValueError(f"scans: expected at least 2, got {len(scans)}")
+    clouds = [_checked(scan, number) for number, scan in enumerate(scans)]
+    unit = float(np.median([np.percentile(np.linalg.norm(cloud, axis=1), 90) for cloud in clouds]))
+    config = SurfaceConfig(
+        min_range_m=_NEAREST * unit, max_range_m=_FARTHEST * unit, voxel_size_m=_VOXEL * unit,
+        num_neighbours=_NUM_NEIGHBOURS, neighbour_radius_m=_NEIGHBOURS * unit,
+    )  # fmt: skip
+    rows = []
+    for number, cloud in enumerate(clouds):
+        rows.append(_thinned(cloud, number, config, num_points))
+        if on_scan is not None:
+            on_scan()
+    points, normals, flatness, mask = (jnp.asarray(np.stack(field)) for field in zip(*rows, strict=True))
+    partners = jnp.full((len(scans), _NUM_PARTNERS), -1, jnp.int32)
+    spacing = np.median([_spacing(np.asarray(p)[np.asarray(m)]) for p, m in zip(points, mask, strict=True)])
+    return CloudScans(points, mask, normals, flatness, jnp.asarray(spacing, jnp.float32), partners)
+
+
+def _checked(scan: ArrayLike, number: int) -> NDArray[np.float32]:
+    points = np.asarray(scan, np.float32)
+    if points.ndim != 2 or points.shape[1] != 3:
+        raise ValueError(f"scans: expected shape (m, 3) of scan {number}, got {points.shape}")
+    points = points[np.isfinite(points).all(axis=1) & points.any(axis=1)]
+    if not len(points):
+        raise ValueError(f"scans: scan {number} has no valid point; leave it out")
+    return points
+
+
+def _thinned(
+    cloud: NDArray[np.float32], number: int, config: SurfaceConfig, num_points: int
+) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_]]:
+    """Points, normals, flatness and mask of one scan."""
+    surface = scan_surface(cloud, config)
+    if not len(surface.points):
+        raise ValueError(f"scans: scan {number} has no point near the ranges of the others; leave it out")
+    rows = np.random.default_rng(number).permutation(_evenly(surface.points, config.voxel_size_m, num_points))
+    count = len(rows)
+    points, normals = np.zeros((2, num_points, 3), np.float32)
+    flatness, mask = np.zeros(num_points, np.float32), np.arange(num_points) < count
+    points[:count], normals[:count], flatness[:count] = (
+        surface.points[rows], surface.normals[rows], surface.flatness[rows]
+    )  # fmt: skip
+    # Both sides of a wall are surfaces of their own: the lidar has seen the side that faces it.
+    normals[np.sum(normals * points, axis=1) > 0.0] *= -1.0
+    return points, normals, flatness, mask
+
+
+def _spacing(points: NDArray[np.float32]) -> float:
+    """Median distance to the nearest other point; 0 of a single one."""
+    if len(points) < 2:
+        return 0.0
+    distances, _ = cKDTree(points).query(points, 2)
+    return float(np.median(np.asarray(distances)[:, 1]))
+
+
+def _evenly(points: NDArray[np.float64], voxel: float, num_points: int) -> NDArray[np.int64]:
+    """Rows of one point for each of at most `num_points` voxels, whose side is as small as that allows."""
+    if len(points) <= num_points:
+        return np.arange(len(points))
+    low, high = voxel, voxel
+    rows = np.arange(len(points))
+    while len(rows) > num_points:
+        low, high = high, 2.0 * high
+        rows = first_of_each_voxel(points, high)
+    for _ in range(6):
+        middle = float(np.sqrt(low * high))
+        tried = first_of_each_voxel(points, middle)
+        if len(tried) > num_points:
+            low = middle
+        else:
+            high, rows = middle, tried
+    return rows
+
+
+def find_partners(T: NDArray[np.floating], unit: float) -> Int[Array, "n p"]:
+    """Scans that come near each other again, at given poses.
+
+    Args:
+        T: (n, 4, 4) poses.
+        unit: the typical range, unit of the poses.
+
+    Returns:
+        Up to eight others of each scan, nearest first; -1 where there are fewer.
+    """
+    count = len(T)
+    partners = np.full((count, _NUM_PARTNERS), -1, np.int32)
+    tree = cKDTree(T[:, :3, 3])
+    for row, near in enumerate(tree.query_ball_point(T[:, :3, 3], _REVISIT_DISTANCE * unit)):
+        others = np.array([other for other in near if abs(other - row) > _REVISIT_GAP], int)
+        order = np.argsort(np.linalg.norm(T[others, :3, 3] - T[row, :3, 3], axis=1), kind="stable")
+        chosen = others[order][:_NUM_PARTNERS]
+        partners[row, : len(chosen)] = chosen
+    return jnp.asarray(partners)

@@ -1,0 +1,199 @@
+"""DeepMapping of 3-D lidar clouds: the problem, and `fit_clouds` around the engine (sections 3.2 to 3.4, in SE(3)).
+
+`spatial` has the poses, `cloud_scans` the scans, `plane_distance` how they are compared.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Literal, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+from numpy.typing import ArrayLike, NDArray
+
+from dpmjax.deepmapping.batches import draw_offsets, draw_rows, scans_in_block
+from dpmjax.deepmapping.cloud_config import CloudMappingConfig
+from dpmjax.deepmapping.cloud_scans import CloudScans, as_cloud_scans, find_partners
+from dpmjax.deepmapping.config import PhaseConfig
+from dpmjax.deepmapping.fit import Fit, Report, fit
+from dpmjax.deepmapping.objective import Terms, WorldBatch, chamfer_term, interpolate_log
+from dpmjax.deepmapping.plane_distance import Cloud, clouds_of, misfit_of_pairs, take_rows, trajectory_misfit
+from dpmjax.deepmapping.problem import MappingData, MappingFunctions, Params, Problem, mapping_loss, mapping_problem
+from dpmjax.deepmapping.spatial import (
+    fitted_poses,
+    init_spatial,
+    next_spatial_phase,
+    poses_of_scans,
+    spatial_poses,
+    start_poses,
+)
+from dpmjax.geometry import rigid
+from dpmjax.geometry.rays import typical_range
+
+# Width of the kernel, in typical ranges, by which the start and the fit are compared.
+_JUDGED_WIDTH = 0.004
+
+
+class CloudFitted(NamedTuple):
+    """Result of `fit_clouds`.
+
+    Attributes:
+        T_world_scan: (n, 4, 4) float64, unit of the points: of the fit, or the start where that fits better.
+        params: of L-Net and M-Net.
+        report: of the last call of the step.
+        unit: the length that the parameters count in, unit of the points.
+        kept: which poses these are.
+        misfit: share of planes that do not meet the planes of other scans, 0 to 1, at the poses of the fit.
+        start_misfit: the same at the start; None after a cold start.
+    """
+
+    T_world_scan: NDArray[np.float64]
+    params: Params
+    report: Report | None
+    unit: float
+    kept: Literal["fit", "start"]
+    misfit: float
+    start_misfit: float | None
+
+
+def cloud_data(
+    scans: CloudScans | Sequence[ArrayLike], init: ArrayLike | None = None, *, num_points: int = 2048
+) -> tuple[MappingData, float]:
+    """Scans and poses with the typical range of the scans as the unit of length, as the problem takes them.
+
+    Args:
+        scans: (m_i, 3) points in the lidar frames; or CloudScans.
+        init: (n, 4, 4) T_world_scan to start from; None: cold start.
+        num_points: capacity of each scan where they are thinned.
+
+    Returns:
+        The data, and the typical range in the unit of the scans.
+
+    Raises:
+        ValueError: as `as_cloud_scans`, or `init` has a wrong shape or is not finite.
+    """
+    scans = scans if isinstance(scans, CloudScans) else as_cloud_scans(scans, num_points)
+    unit = typical_range(scans.points, scans.mask)
+    start = None if init is None else start_poses(init, len(scans.points), unit)
+    scaled = replace(scans, points=scans.points / unit, spacing=scans.spacing / unit)
+    if start is not None:
+        scaled = replace(scaled, partners=find_partners(np.asarray(start), 1.0))
+    return MappingData(scaled, start), unit
+
+
+def cloud_problem(config: CloudMappingConfig, data: MappingData) -> Problem:
+    """DeepMapping of lidar clouds; poses are (n, 4, 4) T_world_scan.
+
+    Args:
+        config: settings of the fit.
+        data: of `cloud_data`.
+
+    Returns:
+        The problem.
+    """
+    return mapping_problem(config, data, MappingFunctions(init_spatial, _loss, spatial_poses, next_spatial_phase))
+
+
+def fit_clouds(
+    scans: CloudScans | Sequence[ArrayLike],
+    config: CloudMappingConfig | None = None,
+    *,
+    key: jax.Array,
+    init: ArrayLike | None = None,
+    num_starts: int = 1,
+) -> CloudFitted:
+    """Registers 3-D lidar scans by optimising L-Net and M-Net on them alone (DeepMapping eq. 6, in SE(3)).
+
+    Args:
+        scans: (m_i, 3) points in the lidar frames, any unit, in the order of time; or CloudScans.
+        config: settings; None: `cloud_preset("fast")`.
+        key: of the whole run.
+        init: (n, 4, 4) T_world_scan to start from; None: cold start.
+        num_starts: starts with other weights, side by side; the worse half by the loss is dropped again and again.
+
+    Returns:
+        CloudFitted, in the world of `init`, or an arbitrary one after a cold start.
+
+    Raises:
+        ValueError: as `cloud_data`.
+    """
+    config = config or CloudMappingConfig()
+    data, unit = cloud_data(scans, init, num_points=config.num_points)
+    return as_fitted(fit(cloud_problem(config, data), data, key=key, num_starts=num_starts), data, unit)
+
+
+def as_fitted(done: Fit, data: MappingData, unit: float) -> CloudFitted:
+    """The result of a fit in the unit of the points; of the fit and the start, what fits better by the scans.
+
+    Args:
+        done: a fit of `cloud_problem`.
+        data: of the fit.
+        unit: the typical range.
+
+    Returns:
+        CloudFitted.
+    """
+    misfit, start_misfit = float(trajectory_misfit(data.scans, done.poses, _JUDGED_WIDTH)), None
+    T, kept = fitted_poses(done.poses, unit), "fit"
+    if data.start is not None:
+        start_misfit = float(trajectory_misfit(data.scans, data.start, _JUDGED_WIDTH))
+        # A fit that is not finite is not better.
+        if not misfit < start_misfit:
+            T, kept = fitted_poses(data.start, unit), "start"
+    return CloudFitted(T, done.state.params, done.report, unit, kept, misfit, start_misfit)  # type: ignore[arg-type]
+
+
+def _draw_points(scans: Cloud, count: int, *, key: jax.Array) -> Cloud:
+    """Other points of each scan in every step."""
+    num_scans, capacity = scans.mask.shape
+    if count >= capacity:
+        return scans
+    first = jax.random.randint(key, (num_scans, 1), 0, capacity)
+    rows = (first + jnp.arange(count)) % capacity
+    return Cloud(*(jax.vmap(lambda leaf, row: leaf[row])(leaf, rows) for leaf in scans))
+
+
+def _draw_partners(scans: CloudScans, rows: Int[Array, " m"], count: int, *, key: jax.Array) -> Int[Array, "r m"]:
+    """Scans near in space of each scan; -1: none."""
+    columns = jax.random.choice(key, scans.partners.shape[1], (count,), replace=False)
+    return scans.partners[rows][:, columns].T
+
+
+def _loss(
+    config: CloudMappingConfig,
+    phase: PhaseConfig,
+    params: Params,
+    data: MappingData,
+    step: Int[Array, ""],
+    key: jax.Array,
+) -> tuple[Float[Array, ""], Terms]:
+    """DeepMapping eq. 6 of a batch of scans and points; scans are compared by planes or by the Chamfer distance."""
+    row_key, point_key, partner_key, free_key, offset_key = jax.random.split(key, 5)
+    scans, progress = data.scans, step / phase.num_steps
+    count = scans.mask.shape[0]
+    rows, block = draw_rows(phase, count, step, key=row_key)
+    offsets = draw_offsets(phase, scans_in_block(phase, count) - 1, key=offset_key)
+    partners = _draw_partners(scans, rows, phase.num_revisits, key=partner_key)
+    seen = jnp.concatenate([rows, jnp.maximum(partners, 0).reshape(-1)])
+    T = poses_of_scans(config, phase, params, scans, seen)
+    clouds = take_rows(clouds_of(scans), seen)
+    samples = _draw_points(clouds, phase.beams_per_step, key=point_key)
+    own = jnp.arange(len(rows))
+    points = rigid.transform_points(T[own], samples.points[own])
+    world = WorldBatch(points, T[own, :3, 3], samples.mask[own], rows, block, progress)
+    if phase.plane_width is None:
+        limit = None if phase.chamfer_limit is None else interpolate_log(phase.chamfer_limit, progress)
+        pair_term = chamfer_term(world, offsets, limit)
+    else:
+        later = jnp.minimum(own + offsets[:, None], len(rows) - 1)
+        is_later = (rows[later] == rows + offsets[:, None]) & (block[later] == block)
+        others = jnp.concatenate([later.reshape(-1), jnp.arange(len(rows), len(seen))])
+        pairs = jnp.stack([jnp.resize(own, others.shape), others], axis=-1)
+        is_pair = jnp.concatenate([is_later.reshape(-1), partners.reshape(-1) >= 0])
+        width = interpolate_log(phase.plane_width, progress)
+        pair_term = misfit_of_pairs(T, samples, clouds, pairs, is_pair, (width, scans.spacing))
+    return mapping_loss(config, phase, params, world, pair_term, key=free_key)
