@@ -177,11 +177,6 @@ def test_broken_files_are_named(model: Model, tmp_path: Path) -> None:
         load_model(tmp_path / "none.pth")
 
 
-def test_unknown_name_lists_what_is_shipped() -> None:
-    with pytest.raises(ValueError, match="name of a shipped model .*got 'dpm_huge'"):
-        load_model("dpm_huge")
-
-
 def test_parameters_that_half_precision_cannot_hold_are_refused(model: Model, tmp_path: Path) -> None:
     large = Model(jax.tree.map(lambda leaf: leaf + 1e6, model.params), model.config)
     with pytest.raises(ValueError, match="not finite in float16"):
