@@ -13,7 +13,7 @@ from dpmjax import encode, overlap_pairs
 from dpmjax.deeppointmap import Model
 from dpmjax.deeppointmap.batches import evidence_pairs
 from dpmjax.deeppointmap.confidence import OVERLAP_FEATURES, LogisticModel, fit_logistic, probability
-from dpmjax.deeppointmap.overlap import OVERLAP_M
+from dpmjax.deeppointmap.overlap_prediction import OVERLAP_M
 from dpmjax.geometry import se2
 from dpmjax.io import LidarSequence
 from dpmjax.types import DescriptorCloud

@@ -1,10 +1,13 @@
 from __future__ import annotations
 
+import importlib
+import pkgutil
 import re
 import subprocess
 import sys
 import tomllib
 from pathlib import Path
+from types import ModuleType
 
 import jax
 import jax.numpy as jnp
@@ -12,6 +15,8 @@ import pytest
 
 import dpmjax
 from dpmjax import deeppointmap, geometry, losses, metrics, nets, slam, weights
+
+PACKAGES = [dpmjax, deeppointmap, geometry, losses, metrics, nets, slam, weights]
 
 
 def test_import_loads_no_jax_and_is_fast() -> None:
@@ -25,15 +30,20 @@ def test_import_loads_no_jax_and_is_fast() -> None:
     assert float(result.stdout) < 0.5
 
 
-@pytest.mark.parametrize(
-    "package",
-    [dpmjax, deeppointmap, geometry, losses, metrics, nets, slam, weights],
-    ids=lambda package: package.__name__,
-)
+@pytest.mark.parametrize("package", PACKAGES, ids=lambda package: package.__name__)
 def test_every_listed_name_resolves(package) -> None:
     assert package.__all__
     for name in package.__all__:
         assert getattr(package, name) is not None
+
+
+@pytest.mark.parametrize("package", PACKAGES, ids=lambda package: package.__name__)
+def test_no_module_hides_a_public_name(package) -> None:
+    # A module with the name of a function of its package takes its place as soon as anybody imports the module.
+    for module in pkgutil.iter_modules(package.__path__):
+        if module.name != "__main__":
+            importlib.import_module(f"{package.__name__}.{module.name}")
+    assert not [name for name in package.__all__ if isinstance(getattr(package, name), ModuleType)]
 
 
 def test_version_is_the_one_of_the_distribution() -> None:

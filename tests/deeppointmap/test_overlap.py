@@ -13,7 +13,13 @@ import dpmjax
 from dpmjax.deeppointmap import correlate
 from dpmjax.deeppointmap.confidence import OVERLAP_FEATURES, LogisticModel, probability
 from dpmjax.deeppointmap.model import overlap_logit, similarity_features
-from dpmjax.deeppointmap.overlap import HIGH, MATCHING, OverlapEvidence, overlap_evidence, overlap_probability
+from dpmjax.deeppointmap.overlap_prediction import (
+    HIGH,
+    MATCHING,
+    OverlapEvidence,
+    overlap_evidence,
+    overlap_probability,
+)
 from dpmjax.types import DescriptorCloud
 from tests.deeppointmap import toy
 from tests.tolerances import ACCUMULATED

@@ -14,7 +14,7 @@ from jaxtyping import Array, Float
 from dpmjax.deeppointmap.encoding import pyramid_of_scan
 from dpmjax.deeppointmap.matching import MatchConfig
 from dpmjax.deeppointmap.model import Model, encode_pyramid
-from dpmjax.deeppointmap.overlap import overlap_evidence, overlap_probability
+from dpmjax.deeppointmap.overlap_prediction import overlap_evidence, overlap_probability
 from dpmjax.deeppointmap.scan_registration import PreparedScan, Scale, ScanOrCloud, register_each
 from dpmjax.types import AnyArray, DescriptorCloud, PointCloud, Registration
 

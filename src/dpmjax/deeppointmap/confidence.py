@@ -37,7 +37,7 @@ OVERLAP_FEATURES = (
     "log_radius",
     "log_radius_ratio",
 )
-"""`deeppointmap.overlap` computes them."""
+"""`deeppointmap.overlap_prediction` computes them."""
 
 MAX_RMSE_M = 5.0
 RIDGE = 1e-3

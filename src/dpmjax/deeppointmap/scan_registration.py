@@ -23,7 +23,7 @@ from dpmjax.deeppointmap.model import (
     encode_pyramid,
     predict_offsets,
 )
-from dpmjax.deeppointmap.overlap import overlap_probability
+from dpmjax.deeppointmap.overlap_prediction import overlap_probability
 from dpmjax.deeppointmap.verification import (
     MeasuredScan,
     VerificationConfig,
