@@ -142,6 +142,23 @@ class BestPairs(NamedTuple):
     mask: Bool[Array, " k"]
 
 
+def dual_softmax(
+    similarity: Float[Array, "m n"], is_pair: Bool[Array, "m n"], temperature: float
+) -> Float[Array, "m n"]:
+    """Computes the product of the softmaxes over rows and over columns (DeepPointMap section 3.2).
+
+    Args:
+        similarity: cosine of each pair of descriptors.
+        is_pair: False for pairs that are not there.
+        temperature: of both softmaxes.
+
+    Returns:
+        In [0, 1]; 0 for pairs that are not there.
+    """
+    logits = jnp.where(is_pair, similarity / temperature, jnp.finfo(similarity.dtype).min)
+    return jnp.where(is_pair, jax.nn.softmax(logits, axis=1) * jax.nn.softmax(logits, axis=0), 0)
+
+
 @functools.partial(jax.jit, static_argnames="config")
 def best_pairs(
     similarity: Float[Array, "m n"],
@@ -165,8 +182,7 @@ def best_pairs(
     # floor(floor(ratio * (m + n)) / 2): the count of the published configuration.
     capacity = min(int(config.pair_ratio * (num_source + num_target)) // 2, num_source * num_target)
     is_pair = source_mask[:, None] & target_mask[None, :]
-    logits = jnp.where(is_pair, similarity / config.temperature, jnp.finfo(similarity.dtype).min)
-    scores = jax.nn.softmax(logits, axis=1) * jax.nn.softmax(logits, axis=0)
+    scores = dual_softmax(similarity, is_pair, config.temperature)
     scores, flat = lax.top_k(jnp.where(is_pair, scores, -1).ravel(), capacity)
     num_valid = jnp.sum(source_mask) + jnp.sum(target_mask)
     num_pairs = jnp.floor(config.pair_ratio * num_valid).astype(int) // 2

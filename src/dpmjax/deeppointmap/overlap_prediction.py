@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from dpmjax.deeppointmap.matching import MatchConfig, best_pairs
+from dpmjax.deeppointmap.matching import MatchConfig, best_pairs, dual_softmax
 from dpmjax.deeppointmap.model import (
     Model,
     correlate,
@@ -103,8 +103,7 @@ def overlap_evidence(model: Model, a: DescriptorCloud, b: DescriptorCloud) -> Ov
     correlated = correlate(model, a, b)
     is_pair = a.mask[:, None] & b.mask[None, :]
     similarity = jnp.where(is_pair, descriptor_similarity(model, *correlated), -1)
-    logits = jnp.where(is_pair, similarity / MATCHING.temperature, jnp.finfo(similarity.dtype).min)
-    scores = jnp.where(is_pair, jax.nn.softmax(logits, axis=1) * jax.nn.softmax(logits, axis=0), 0)
+    scores = dual_softmax(similarity, is_pair, MATCHING.temperature)
     best = jnp.argmax(scores, axis=1)
     is_mutual = a.mask & (jnp.argmax(scores, axis=0)[best] == jnp.arange(len(best)))
     motion = _best_motion(model, correlated, similarity)

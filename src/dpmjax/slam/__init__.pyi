@@ -1,3 +1,6 @@
+from .alignment import Alignment as Alignment
+from .alignment import Geometry as Geometry
+from .alignment import PosePrior as PosePrior
 from .config import FrontEndConfig as FrontEndConfig
 from .config import LoopClosureConfig as LoopClosureConfig
 from .config import OdometryConfig as OdometryConfig
@@ -8,9 +11,6 @@ from .matcher import Match as Match
 from .matcher import Matcher as Matcher
 from .matcher import NetworkMatcher as NetworkMatcher
 from .methods import SlamMethods as SlamMethods
-from .odometry import Alignment as Alignment
-from .odometry import Geometry as Geometry
-from .odometry import PosePrior as PosePrior
 from .odometry import SurfaceGeometry as SurfaceGeometry
 from .reports import Loop as Loop
 from .reports import ScanReport as ScanReport

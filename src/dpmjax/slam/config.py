@@ -83,13 +83,11 @@ class FrontEndConfig:
     Attributes:
         min_score_share: a pose with a lower share of the usual score is not believed.
         min_score: nor one with a lower score.
-        min_probability: a registration by the network is believed from this P(correct) on, where the geometry agrees.
         num_submap: at most so many keyframes are merged for a registration (attention is quadratic in their number).
         submap_radius_m: keyframes farther away are not merged (DeepPointMap's published configuration).
-        num_lost: after this many scans without a believed pose, the scan is looked for in the whole map.
-        num_relocation: number of keyframes that are tried then.
-        keyframe_share: a keyframe is made where the nearest one is farther than this share of the extent ...
-        keyframe_rad: ... or the last one is turned by more than this.
+        num_lost: after this many scans without a believed pose a new segment begins, which loops join to the map.
+        keyframe_share: a keyframe is made where the last one is farther than this share of the extent ...
+        keyframe_rad: ... or turned by more than this.
         max_keyframe_m: upper bound of the distance of keyframes (DeepPointMap: 3 to 10 m).
         min_keyframe_m: lower bound of it.
         usual_window: the usual score is the median over this many scans.
@@ -99,11 +97,9 @@ class FrontEndConfig:
 
     min_score_share: float = 0.6
     min_score: float = 0.2
-    min_probability: float = 0.5
     num_submap: int = 4
     submap_radius_m: float = 20.0
     num_lost: int = 3
-    num_relocation: int = 3
     keyframe_share: float = 0.3
     keyframe_rad: float = 0.6
     max_keyframe_m: float = 5.0
@@ -113,8 +109,8 @@ class FrontEndConfig:
     guess_rad: float = 0.2
 
     def __post_init__(self) -> None:
-        require_fields(self, "min_score_share", "min_probability", low=0, high=1)
-        require_fields(self, "num_submap", "num_lost", "num_relocation", "usual_window", low=1)
+        require_fields(self, "min_score_share", low=0, high=1)
+        require_fields(self, "num_submap", "num_lost", "usual_window", low=1)
         require_positive_fields(self, "submap_radius_m", "keyframe_share", "keyframe_rad", "guess_m", "guess_rad")
         require_fields(self, "min_keyframe_m", low=1e-3, high=self.max_keyframe_m)
 

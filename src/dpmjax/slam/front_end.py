@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from dpmjax.geometry import rigid
+from dpmjax.slam.alignment import PosePrior
 from dpmjax.slam.keyframes import (
     EdgeKind,
     Keyframe,
@@ -26,7 +27,6 @@ from dpmjax.slam.keyframes import (
     turn_rad,
 )
 from dpmjax.slam.methods import SlamMethods
-from dpmjax.slam.odometry import PosePrior
 from dpmjax.slam.reports import ScanReport, ScanStatus
 
 

@@ -142,20 +142,6 @@ def with_poses(slam_map: KeyframeMap, T_world_keyframe: Float[np.ndarray, "k 4 4
     return replace(slam_map, T_world_keyframe=np.asarray(T_world_keyframe, np.float64))
 
 
-def nearest_keyframes(slam_map: KeyframeMap, position_world: Float[np.ndarray, " 3"], count: int) -> np.ndarray:
-    """Finds the keyframes nearest to a position.
-
-    Args:
-        slam_map: the map.
-        position_world: metres.
-        count: at most so many.
-
-    Returns:
-        Rows, nearest first.
-    """
-    return np.argsort(distances_to(slam_map, position_world), kind="stable")[:count]
-
-
 def distances_to(slam_map: KeyframeMap, position_world: Float[np.ndarray, " 3"]) -> Float[np.ndarray, " k"]:
     """Computes the distances of all keyframes to a position.
 

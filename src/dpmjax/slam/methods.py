@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+from dpmjax.slam.alignment import Geometry
 from dpmjax.slam.config import SlamConfig
 from dpmjax.slam.matcher import Matcher
-from dpmjax.slam.odometry import Geometry
 
 
 class SlamMethods(NamedTuple):

@@ -6,7 +6,7 @@ are tried: the robot stood still, went faster, or turned.
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple, Protocol
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -17,113 +17,14 @@ from dpmjax.deeppointmap.verification import MeasuredScan
 from dpmjax.geometry import rigid
 from dpmjax.scans.free_space import range_image, view_points
 from dpmjax.scans.preprocess import first_of_each_voxel
-from dpmjax.scans.surface_alignment import AlignmentLevel, align_surfaces, pair_with_planes
+from dpmjax.scans.surface_alignment import AlignmentLevel, PlanePairs, align_surfaces, pair_with_planes
 from dpmjax.scans.surfaces import MIN_FLATNESS, Surface, SurfaceConfig, scan_surface
+from dpmjax.slam.alignment import Alignment, PosePrior
 from dpmjax.slam.config import OdometryConfig
 from dpmjax.slam.keyframes import Pose, diagonal_information, orthonormal, turn_rad
 
 MAX_LOCAL_POINTS = 4000
 """Points of the local map that are compared with the free space of a scan."""
-
-
-class Alignment(NamedTuple):
-    """A scan in the frame of the local map.
-
-    Attributes:
-        T_map_scan: float64.
-        matched_share: share of the scan's points that meet planes of the map.
-        contradicted_share: share of the map's visible points that lie in the scan's free space.
-        score: `matched_share` less the weighted `contradicted_share`.
-        information: (6, 6) inverse covariance in the tangent of the scan, translation first: weak along a corridor.
-        num_starts: number of starts that were tried.
-    """
-
-    T_map_scan: Pose
-    matched_share: float
-    contradicted_share: float
-    score: float
-    information: Float[np.ndarray, "6 6"]
-    num_starts: int = 1
-
-
-class Geometry(Protocol):
-    """Measures scans and aligns them with the recent ones."""
-
-    def measure(self, points: Float[np.ndarray, "n 3"]) -> Any | None:
-        """Prepares a scan.
-
-        Args:
-            points: metres, in the frame of the lidar; may hold NaN.
-
-        Returns:
-            A record that the geometry and the matcher read; None for a scan without enough points.
-        """
-        ...
-
-    def extent_m(self, measured: Any) -> float:
-        """Returns the median range of a scan.
-
-        Args:
-            measured: from `measure`.
-
-        Returns:
-            Metres.
-        """
-        ...
-
-    def insert(self, local_map: Any | None, measured: Any, T_map_scan: Pose) -> Any:
-        """Adds a scan to the local map, where it tells something new.
-
-        Args:
-            local_map: None for an empty one.
-            measured: the scan.
-            T_map_scan: its pose.
-
-        Returns:
-            The local map after.
-        """
-        ...
-
-    def move(self, local_map: Any, T_new_map: Pose) -> Any:
-        """Changes the frame of the local map.
-
-        Args:
-            local_map: the map.
-            T_new_map: the old frame in the new one.
-
-        Returns:
-            The map in its new frame.
-        """
-        ...
-
-    def align(self, local_map: Any, measured: Any, starts: PosePrior) -> Alignment:
-        """Aligns a scan with the local map.
-
-        Args:
-            local_map: the map.
-            measured: the scan.
-            starts: the predicted pose and what is usual.
-
-        Returns:
-            The best pose.
-        """
-        ...
-
-
-class PosePrior(NamedTuple):
-    """Where the search for a pose begins.
-
-    Attributes:
-        T_map_last: pose of the last scan.
-        T_last_scan: predicted motion since.
-        usual_score: of recent alignments; 1 where there is none yet.
-        is_sure: whether only small errors of the prediction are searched.
-    """
-
-    T_map_last: Pose
-    T_last_scan: Pose
-    usual_score: float = 1.0
-    is_sure: bool = False
 
 
 class MapFrame(NamedTuple):
@@ -251,7 +152,9 @@ class SurfaceGeometry:
         for T_last_scan in _other_motions(starts.T_last_scan, self.extent_m(measured), config):
             start = starts.T_map_last @ T_last_scan
             T = align_surfaces(measured.surface, local_map.surface, start, config.wide).T_target_source
-            coarse.append((self._matched(local_map, measured, T, config.num_samples // 3), tried, T))
+            num_samples = config.num_samples // 3
+            pairs = self._pairs(local_map, measured, T, num_samples)
+            coarse.append((self._matched_share(pairs, measured, num_samples), tried, T))
             tried += 1
         for _, _, T in sorted(coarse, key=lambda entry: (-entry[0], entry[1]))[:3]:
             best = max(best, self._aligned(local_map, measured, T), key=lambda found: found.score)
@@ -264,23 +167,24 @@ class SurfaceGeometry:
     def _aligned(self, local_map: LocalMap, measured: MeasuredScan, start: Pose) -> Alignment:
         config = self.config
         T = align_surfaces(measured.surface, local_map.surface, orthonormal(start), config.narrow).T_target_source
-        matched = self._matched(local_map, measured, T, config.num_samples)
+        pairs = self._pairs(local_map, measured, T, config.num_samples)
+        matched = self._matched_share(pairs, measured, config.num_samples)
         contradicted = _contradicted_share(local_map, measured, T)
         score = matched - config.contradiction_weight * contradicted
-        return Alignment(T, matched, contradicted, score, self._information(local_map, measured, T))
+        return Alignment(T, matched, contradicted, score, self._information(pairs, T))
 
-    def _matched(self, local_map: LocalMap, measured: MeasuredScan, T_map_scan: Pose, num_samples: int) -> float:
-        config = self.config
+    def _pairs(self, local_map: LocalMap, measured: MeasuredScan, T_map_scan: Pose, num_samples: int) -> PlanePairs:
         level = AlignmentLevel(5 * local_map.voxel_m, num_samples, 1)
-        pairs = pair_with_planes(measured.surface, local_map.surface, T_map_scan, level)
+        return pair_with_planes(measured.surface, local_map.surface, T_map_scan, level)
+
+    def _matched_share(self, pairs: PlanePairs, measured: MeasuredScan, num_samples: int) -> float:
+        config = self.config
         meets = (np.abs(pairs.residuals) < config.plane_distance_m) & (pairs.cosines > config.min_cosine)
         return float(meets.sum()) / max(min(num_samples, len(measured.surface.samples)), 1)
 
-    def _information(self, local_map: LocalMap, measured: MeasuredScan, T_map_scan: Pose) -> Float[np.ndarray, "6 6"]:
+    def _information(self, pairs: PlanePairs, T_map_scan: Pose) -> Float[np.ndarray, "6 6"]:
         """Returns the inverse of (covariance of the plane distances, as of few independent points, and a floor)."""
         config = self.config
-        level = AlignmentLevel(5 * local_map.voxel_m, config.num_samples, 1)
-        pairs = pair_with_planes(measured.surface, local_map.surface, T_map_scan, level)
         is_used = np.abs(pairs.residuals) < config.plane_distance_m
         if is_used.sum() < 6:
             return diagonal_information(10.0, 1.0)
