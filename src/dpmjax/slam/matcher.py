@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
+from scipy.spatial import cKDTree
 
 from dpmjax.deeppointmap.batches import overlap_pairs
 from dpmjax.deeppointmap.encoding import encode
@@ -17,6 +18,9 @@ from dpmjax.deeppointmap.matching import merge_clouds
 from dpmjax.deeppointmap.model import Model
 from dpmjax.deeppointmap.scan_registration import PreparedScan, register_each
 from dpmjax.deeppointmap.verification import MeasuredScan
+from dpmjax.scans.free_space import RangeImage
+from dpmjax.scans.surfaces import Surface
+from dpmjax.slam.columns import Arrays
 from dpmjax.slam.keyframes import Pose, Submap
 from dpmjax.slam.retrieval import pooled_vector
 from dpmjax.types import DescriptorCloud, Verification
@@ -50,6 +54,28 @@ class Matcher(Protocol):
 
         Returns:
             A record that only the matcher reads.
+        """
+        ...
+
+    def pack(self, description: Any) -> Arrays:
+        """Turns a description into arrays for a file.
+
+        Args:
+            description: from `describe`.
+
+        Returns:
+            Arrays by name.
+        """
+        ...
+
+    def unpack(self, arrays: Arrays) -> Any:
+        """Makes a description again, bit for bit.
+
+        Args:
+            arrays: from `pack`.
+
+        Returns:
+            The description.
         """
         ...
 
@@ -109,6 +135,36 @@ class NetworkMatcher:
             The prepared scan.
         """
         return PreparedScan(jax.device_get(encode(self._model, points)), measured)
+
+    def pack(self, description: PreparedScan) -> Arrays:
+        """Keeps descriptors and surface; see `Matcher`.
+
+        Args:
+            description: from `describe`.
+
+        Returns:
+            Arrays by name.
+        """
+        cloud, surface, image = description.descriptors, description.measured.surface, description.measured.image
+        arrays = {"positions": cloud.positions, "features": cloud.features, "mask": cloud.mask}
+        arrays |= {} if cloud.directions is None else {"directions": cloud.directions}
+        arrays |= surface._replace(tree=np.zeros(0))._asdict() | image._asdict()
+        return {name: np.asarray(value) for name, value in arrays.items()}
+
+    def unpack(self, arrays: Arrays) -> PreparedScan:
+        """Makes the tree again; see `Matcher`.
+
+        Args:
+            arrays: from `pack`.
+
+        Returns:
+            The prepared scan.
+        """
+        tree = cKDTree(arrays["points"], leafsize=16, balanced_tree=False, compact_nodes=False)
+        surface = Surface(*(arrays[name] for name in Surface._fields[:-1]), tree)
+        image = RangeImage(arrays["nearest_m"], arrays["farthest_m"])
+        cloud = DescriptorCloud(arrays["positions"], arrays["features"], arrays["mask"], arrays.get("directions"))
+        return PreparedScan(cloud, MeasuredScan(surface, image))
 
     def vector(self, description: PreparedScan) -> Float[np.ndarray, " c"]:
         """Pools the descriptors; see `Matcher`.
