@@ -18,7 +18,7 @@ import numpy as np
 
 from dpmjax.slam.columns import Arrays, from_columns, part_of, prefixed, to_columns
 from dpmjax.slam.front_end import AnyScan, FrontEndState, corrected_points
-from dpmjax.slam.keyframes import Keyframe, KeyframeMap, MapEdge
+from dpmjax.slam.keyframes import Keyframe, KeyframeMap, MapEdge, MapOrigin
 from dpmjax.slam.loop_closure import LoopState
 from dpmjax.slam.methods import SlamMethods
 from dpmjax.slam.reports import Loop, ScanReport
@@ -96,13 +96,16 @@ def read_journal(
         The state after the last whole record.
 
     Raises:
-        ValueError: the file is missing or no journal.
+        ValueError: the file is missing or no journal, or its run had other weights.
     """
     content = path.read_bytes() if path.is_file() else b""
     if not content.startswith(MAGIC):
         raise ValueError(f"{path}: no journal of this version; start the run again without --resume")
     state, reports, num_bytes, record = start or init_slam(), [], len(MAGIC), None
     for record, end in _records(content):
+        made_by, given = str(record["fingerprint"]), methods.matcher.fingerprint
+        if made_by != given:
+            raise ValueError(f"{path}: made with weights {made_by}, these are {given}; give those, or start again")
         state = _apply(methods, state, record)
         reports += from_columns(ScanReport, record, "report")
         num_bytes = end
@@ -133,7 +136,7 @@ def _records(content: bytes) -> Iterator[tuple[Arrays, int]]:
 def _changes(methods: SlamMethods, before: SlamState, after: SlamState, reports: Sequence[ScanReport]) -> Arrays:
     old, new, front = before.slam_map, after.slam_map, after.front_end
     added = new.keyframes[len(old) :]
-    arrays = to_columns(reports, "report")
+    arrays = {"fingerprint": np.array(methods.matcher.fingerprint), **to_columns(reports, "report")}
     arrays |= to_columns([keyframe._replace(description=None) for keyframe in added], "keyframe")
     for number, keyframe in enumerate(added):
         arrays |= prefixed(methods.matcher.pack(keyframe.description), f"description.{number}")
@@ -165,6 +168,7 @@ def _apply(methods: SlamMethods, state: SlamState, record: Arrays) -> SlamState:
         np.concatenate([kept, record["T_world_keyframe"]]),
         np.concatenate([old.vectors, vectors]) if len(old) else vectors,
         _apply_list(old.edges, record, "edge", MapEdge),
+        MapOrigin(methods.matcher.fingerprint, methods.config) if keyframes else old.origin,
     )
     (loops,) = from_columns(LoopState, record, "loops")
     (front,) = from_columns(FrontEndState, record, "front_end")

@@ -10,17 +10,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
-from scipy.spatial import cKDTree
 
 from dpmjax.deeppointmap.batches import overlap_pairs
+from dpmjax.deeppointmap.compact_scans import CompactScan, compact_scan, expand_scan
 from dpmjax.deeppointmap.encoding import encode
 from dpmjax.deeppointmap.matching import merge_clouds
-from dpmjax.deeppointmap.model import Model
+from dpmjax.deeppointmap.model import Model, model_fingerprint
 from dpmjax.deeppointmap.scan_registration import PreparedScan, register_each
 from dpmjax.deeppointmap.verification import MeasuredScan
-from dpmjax.scans.free_space import RangeImage
-from dpmjax.scans.surfaces import Surface
-from dpmjax.slam.columns import Arrays
+from dpmjax.scans.compact import CompactImage, CompactSurface
+from dpmjax.slam.columns import Arrays, from_columns, to_columns
 from dpmjax.slam.keyframes import Pose, Submap
 from dpmjax.slam.retrieval import pooled_vector
 from dpmjax.types import DescriptorCloud, Verification
@@ -43,7 +42,14 @@ class Match(NamedTuple):
 
 
 class Matcher(Protocol):
-    """Recognises places and registers scans and maps without a first guess."""
+    """Recognises places and registers scans and maps without a first guess.
+
+    Attributes:
+        fingerprint: descriptions are compared only with those of a matcher of the same fingerprint.
+    """
+
+    @property
+    def fingerprint(self) -> str: ...  # noqa: D102
 
     def describe(self, points: Float[np.ndarray, "n 3"], measured: Any) -> Any:
         """Prepares a scan for any number of registrations.
@@ -123,21 +129,22 @@ class NetworkMatcher:
 
     def __init__(self, model: Model) -> None:
         self._model = model
+        self.fingerprint = model_fingerprint(model)
 
-    def describe(self, points: Float[np.ndarray, "n 3"], measured: MeasuredScan) -> PreparedScan:
-        """Encodes a scan; see `Matcher`.
+    def describe(self, points: Float[np.ndarray, "n 3"], measured: MeasuredScan) -> CompactScan:
+        """Encodes a scan, and keeps of it what a map needs; see `Matcher`.
 
         Args:
             points: metres, in the frame of the lidar.
             measured: surface and free space of the scan.
 
         Returns:
-            The prepared scan.
+            The compact scan.
         """
-        return PreparedScan(jax.device_get(encode(self._model, points)), measured)
+        return compact_scan(jax.device_get(encode(self._model, points)), measured)
 
-    def pack(self, description: PreparedScan) -> Arrays:
-        """Keeps descriptors and surface; see `Matcher`.
+    def pack(self, description: CompactScan) -> Arrays:
+        """Keeps all arrays of a scan; see `Matcher`.
 
         Args:
             description: from `describe`.
@@ -145,28 +152,24 @@ class NetworkMatcher:
         Returns:
             Arrays by name.
         """
-        cloud, surface, image = description.descriptors, description.measured.surface, description.measured.image
-        arrays = {"positions": cloud.positions, "features": cloud.features, "mask": cloud.mask}
-        arrays |= {} if cloud.directions is None else {"directions": cloud.directions}
-        arrays |= surface._replace(tree=np.zeros(0))._asdict() | image._asdict()
-        return {name: np.asarray(value) for name, value in arrays.items()}
+        cloud = to_columns([description._replace(surface=None, image=None)], "scan")
+        return cloud | to_columns([description.surface], "surface") | to_columns([description.image], "image")
 
-    def unpack(self, arrays: Arrays) -> PreparedScan:
-        """Makes the tree again; see `Matcher`.
+    def unpack(self, arrays: Arrays) -> CompactScan:
+        """Makes the scan again; see `Matcher`.
 
         Args:
             arrays: from `pack`.
 
         Returns:
-            The prepared scan.
+            The compact scan.
         """
-        tree = cKDTree(arrays["points"], leafsize=16, balanced_tree=False, compact_nodes=False)
-        surface = Surface(*(arrays[name] for name in Surface._fields[:-1]), tree)
-        image = RangeImage(arrays["nearest_m"], arrays["farthest_m"])
-        cloud = DescriptorCloud(arrays["positions"], arrays["features"], arrays["mask"], arrays.get("directions"))
-        return PreparedScan(cloud, MeasuredScan(surface, image))
+        (scan,) = from_columns(CompactScan, arrays, "scan")
+        (surface,) = from_columns(CompactSurface, arrays, "surface")
+        (image,) = from_columns(CompactImage, arrays, "image")
+        return scan._replace(surface=surface, image=image)
 
-    def vector(self, description: PreparedScan) -> Float[np.ndarray, " c"]:
+    def vector(self, description: CompactScan) -> Float[np.ndarray, " c"]:
         """Pools the descriptors; see `Matcher`.
 
         Args:
@@ -198,22 +201,23 @@ class NetworkMatcher:
             for match in found
         ]
 
-    def overlaps(self, source: PreparedScan, targets: Sequence[PreparedScan]) -> Float[np.ndarray, " n"]:
+    def overlaps(self, source: CompactScan, targets: Sequence[CompactScan]) -> Float[np.ndarray, " n"]:
         """Asks the overlap head; see `Matcher`.
 
         Args:
-            source: a prepared scan.
+            source: a scan.
             targets: the others.
 
         Returns:
             The probabilities.
         """
-        return np.asarray(overlap_pairs(self._model, [source] * len(targets), targets))
+        clouds = [target.descriptors for target in targets]
+        return np.asarray(overlap_pairs(self._model, [source.descriptors] * len(targets), clouds))
 
 
 def _merged(submap: Submap) -> PreparedScan:
     """Merges descriptors; the number of scans is filled up to a power of two, so that few programs are compiled."""
-    first: PreparedScan = submap.descriptions[0]
+    first = expand_scan(submap.descriptions[0])
     num = len(submap.descriptions)
     if num == 1:
         return first
