@@ -12,6 +12,7 @@ and metrics.json. Ctrl-C writes all of it. docs/slam.md explains the stages and 
 
 from __future__ import annotations
 
+import logging
 import time
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -29,6 +30,7 @@ if TYPE_CHECKING:
     from experiments._slam_run import SlamRun
 
 EXPERIMENT = "dpm_slam"
+LOGGER = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -63,6 +65,7 @@ def main(config: Config) -> dict[str, Any]:
     """Reads, maps, writes; returns the content of `metrics.json`."""
     from dpmjax.slam import finish_slam
     from experiments._slam_input import ScanReader, open_drive
+    from experiments._slam_numbers import summary
     from experiments._slam_run import run_scans
 
     started = time.perf_counter()
@@ -72,14 +75,15 @@ def main(config: Config) -> dict[str, Any]:
     folder = open_run_folder(config, EXPERIMENT)
     earlier = earlier_run(folder, methods, reader)
     with recording(folder), StopFlag() as stop:
-        print(f"{sequence.name}: {len(sequence)} scans" + (f", {len(earlier.reports)} done before" if earlier else ""))
+        done = f", {len(earlier.reports)} done before" if earlier else ""
+        tell(f"{sequence.name}: {len(sequence)} scans{done}")
         run = run_scans(folder, sequence, reader, methods, earlier, lambda: stop.is_requested)
         result = finish_slam(run.state, run.reports, methods.config)
         metrics = write_results(folder, config, sequence, run, result)
         metrics |= {"is_interrupted": stop.is_requested or run.failure is not None, "peak_rss_gb": peak_rss_gb()}
         metrics["wall_s"] = time.perf_counter() - started
         write_metrics(folder, metrics, seed=config.seed)
-        print(summary_of(metrics, folder))
+        tell(f"{summary(metrics)}\nresults in {folder.path}")
         if run.failure is not None:
             raise run.failure
     return metrics
@@ -131,11 +135,10 @@ def write_results(
     return metrics | {"map_points": len(cloud.points), "map_voxel_m": cloud.voxel_m}
 
 
-def summary_of(metrics: dict[str, Any], folder: RunFolder) -> str:
-    """Returns the last lines on the console."""
-    from experiments._slam_numbers import summary
-
-    return f"{summary(metrics)}\nresults in {folder.path}"
+def tell(text: str) -> None:
+    """Prints, and writes to the log."""
+    print(text, flush=True)
+    LOGGER.info("%s", text)
 
 
 if __name__ == "__main__":
