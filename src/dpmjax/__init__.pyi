@@ -38,6 +38,8 @@ from .pose_graph.optimize import optimize_pose_graph as optimize_pose_graph
 from .registration.icp import icp as icp
 from .slam.config import SlamConfig as SlamConfig
 from .slam.keyframes import KeyframeMap as KeyframeMap
+from .slam.localization import Localization as Localization
+from .slam.localization import localize as localize
 from .slam.system import SlamResult as SlamResult
 from .slam.system import run_slam as run_slam
 from .types import DescriptorCloud as DescriptorCloud
