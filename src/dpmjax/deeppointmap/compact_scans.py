@@ -19,7 +19,7 @@ from dpmjax.scans.compact import (
 )
 from dpmjax.types import DescriptorCloud
 
-MAX_SURFACE_POINTS = 4000
+MAX_SURFACE_POINTS = 8000
 
 
 class CompactScan(NamedTuple):

@@ -211,8 +211,9 @@ def run_slam(
     if isinstance(model, SlamMethods) and config is not None:
         raise ValueError("config: expected None with methods, which carry their own")
     methods = model if isinstance(model, SlamMethods) else make_methods(model, config)
-    state, reports = init_slam(map_), []
-    for state, report in iterate_slam(methods, scans, state):  # noqa: B007 (the last one is used)
+    start = state = init_slam(map_)
+    reports = []
+    for state, report in iterate_slam(methods, scans, start):  # noqa: B007 (the last one is used)
         reports.append(report)
     return finish_slam(state, reports, methods.config)
 
