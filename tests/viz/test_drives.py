@@ -21,17 +21,17 @@ def test_a_trajectory_is_drawn_with_what_is_known() -> None:
     ours, errors = circle(), np.linspace(0, 1, 50)
     loops = np.stack([ours[:3], ours[-3:]], axis=1)
     odometry = viz.Track("odometry alone", ours * 1.1, errors)
-    figure = viz.trajectory_figure("town", viz.Track("SLAM", ours, errors), odometry, ours, loops)
+    figure = viz.trajectory_figure("town", [odometry, viz.Track("SLAM", ours, errors)], ours, loops)
     assert labels(figure) == ["reference", "odometry alone", "SLAM", "3 loops", "start"]
     assert len(figure.axes) == 2
-    figure = viz.trajectory_figure("town", viz.Track("SLAM", ours), None, None, np.zeros((0, 2, 3)))
+    figure = viz.trajectory_figure("town", [viz.Track("SLAM", ours)], None, np.zeros((0, 2, 3)))
     assert labels(figure) == ["SLAM", "start"]
     assert len(figure.axes) == 1
 
 
 @pytest.mark.parametrize("positions", [np.zeros((1, 3)), circle()[:2], np.column_stack([np.arange(9.0)] * 3)])
 def test_short_and_straight_drives_are_drawn(positions, tmp_path) -> None:
-    figure = viz.trajectory_figure("a", viz.Track("SLAM", positions), None, None, np.zeros((0, 2, 3)))
+    figure = viz.trajectory_figure("a", [viz.Track("SLAM", positions)], None, np.zeros((0, 2, 3)))
     viz.save_figure(figure, tmp_path / "a.png", dpi=40)
     viz.save_figure(viz.height_map_figure("a", np.zeros((0, 3)), np.zeros(0), positions), tmp_path / "b.png", dpi=40)
 
