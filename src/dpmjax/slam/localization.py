@@ -253,8 +253,8 @@ def _decided(map_: KeyframeMap, tried: list[Evidence], extent_m: float, config: 
     places = sorted(_places(tried, config), key=lambda place: -place.total)
     evidence = tuple(tried)
     if not places:
-        best = max((one.match.probability for one in tried), default=0.0)
-        return Localization("not in this map", None, 0.0, None, f"best P {best:.2f} of {len(tried)}", evidence)
+        highest = max((one.match.probability for one in tried), default=0.0)
+        return Localization("not in this map", None, 0.0, None, f"best P {highest:.2f} of {len(tried)}", evidence)
     best, rival = places[0], places[1].total if len(places) > 1 else 0.0
     first = best.members[0]
     numbers = f"{len(best.members)} of {len(tried)} agree, P {first.match.probability:.2f}, sum {best.total:.2f}"
