@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from dpmjax.geometry import rigid
 from dpmjax.pose_graph.graph import Edges, PoseGraph
+from dpmjax.slam.config import SlamConfig
 
 Pose = Float[np.ndarray, "4 4"]
 EdgeKind = Literal["odometry", "loop", "guess"]
@@ -56,6 +57,18 @@ class MapEdge(NamedTuple):
     kind: EdgeKind
 
 
+class MapOrigin(NamedTuple):
+    """What made a map.
+
+    Attributes:
+        fingerprint: of the matcher; its descriptions cannot be compared with those of another one.
+        config: settings of SLAM.
+    """
+
+    fingerprint: str
+    config: SlamConfig
+
+
 @dataclass(frozen=True, eq=False)
 class KeyframeMap:
     """Keyframes (k of them), poses and edges.
@@ -65,12 +78,14 @@ class KeyframeMap:
         T_world_keyframe: (k, 4, 4) float64, corrected by loops.
         vectors: (k, c) unit vectors for retrieval, float32.
         edges: all relative poses.
+        origin: what made it; None for an empty map.
     """
 
     keyframes: tuple[Keyframe, ...] = ()
     T_world_keyframe: Float[np.ndarray, "k 4 4"] = field(default_factory=lambda: np.zeros((0, 4, 4)))
     vectors: Float[np.ndarray, "k c"] = field(default_factory=lambda: np.zeros((0, 0), np.float32))
     edges: tuple[MapEdge, ...] = ()
+    origin: MapOrigin | None = None
 
     def __len__(self) -> int:
         return len(self.keyframes)
@@ -108,12 +123,33 @@ def add_keyframe(
         The map after.
     """
     unit = np.asarray(vector, np.float32)[None] / np.float32(max(float(np.linalg.norm(vector)), 1e-12))
-    return KeyframeMap(
-        (*slam_map.keyframes, keyframe),
-        np.concatenate([slam_map.T_world_keyframe, T_world_keyframe[None]]),
-        np.concatenate([slam_map.vectors.reshape(len(slam_map), -1 if len(slam_map) else unit.shape[1]), unit]),
-        slam_map.edges if edge is None else (*slam_map.edges, edge),
+    return replace(
+        slam_map,
+        keyframes=(*slam_map.keyframes, keyframe),
+        T_world_keyframe=np.concatenate([slam_map.T_world_keyframe, T_world_keyframe[None]]),
+        vectors=np.concatenate([slam_map.vectors.reshape(len(slam_map), -1 if len(slam_map) else unit.shape[1]), unit]),
+        edges=slam_map.edges if edge is None else (*slam_map.edges, edge),
     )
+
+
+def with_origin(slam_map: KeyframeMap, origin: MapOrigin) -> KeyframeMap:
+    """Notes what makes a map; one that another matcher has made is refused.
+
+    Args:
+        slam_map: the map.
+        origin: what is about to read or extend it.
+
+    Returns:
+        The map after.
+
+    Raises:
+        ValueError: if its descriptions are those of another matcher.
+    """
+    made_by = slam_map.origin
+    if made_by is not None and made_by.fingerprint != origin.fingerprint:
+        advice = "load the weights that made the map, or map again"
+        raise ValueError(f"map_: made with weights {made_by.fingerprint}, these are {origin.fingerprint}; {advice}")
+    return replace(slam_map, origin=origin)
 
 
 def with_edges(slam_map: KeyframeMap, edges: Iterable[MapEdge]) -> KeyframeMap:

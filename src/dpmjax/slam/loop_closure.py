@@ -47,6 +47,20 @@ class LoopState(NamedTuple):
     is_stale: bool = False
 
 
+def loops_of_map(slam_map: KeyframeMap) -> LoopState:
+    """Lists the loops that an earlier run has accepted, so that they can still be taken back.
+
+    Args:
+        slam_map: of the earlier run.
+
+    Returns:
+        The loops.
+    """
+    edges = [edge for edge in slam_map.edges if edge.kind == "loop"]
+    loops = (Loop(e.source, e.target, "map", "accepted", 1.0, T_target_source=e.T_target_source) for e in edges)
+    return LoopState(tuple(loops), len(slam_map), False)
+
+
 def close_loops(methods: SlamMethods, slam_map: KeyframeMap, state: LoopState) -> tuple[KeyframeMap, LoopState]:
     """Looks for loops of the newest keyframe, and optimises where consistent ones were found.
 
