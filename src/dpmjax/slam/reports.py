@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from typing import Literal, NamedTuple
 
+import numpy as np
+from jaxtyping import Float
+
 from dpmjax.slam.keyframes import Pose
 
 ScanStatus = Literal["first", "tracked", "network", "predicted", "empty", "restarted"]
@@ -65,6 +68,7 @@ class Loop(NamedTuple):
         probability: P(correct) of the registration; None without one.
         rmse_m: of the registration; None without one.
         T_target_source: the registration; None without one.
+        information: (6, 6) inverse covariance by the planes of the scans, as in `MapEdge`; None where it is not known.
     """
 
     source: int
@@ -75,3 +79,4 @@ class Loop(NamedTuple):
     probability: float | None = None
     rmse_m: float | None = None
     T_target_source: Pose | None = None
+    information: Float[np.ndarray, "6 6"] | None = None

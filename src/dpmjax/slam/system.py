@@ -15,7 +15,9 @@ from dpmjax.slam import front_end
 from dpmjax.slam.config import SlamConfig
 from dpmjax.slam.front_end import FrontEndState
 from dpmjax.slam.keyframes import KeyframeMap, as_pose_graph
-from dpmjax.slam.loop_closure import LoopState, close_loops, loops_of_map, optimize_map
+from dpmjax.slam.loop_closure import close_loops, num_accepted
+from dpmjax.slam.loop_state import LoopState, loops_of_map
+from dpmjax.slam.map_optimization import optimize_map
 from dpmjax.slam.matcher import NetworkMatcher
 from dpmjax.slam.methods import SlamMethods
 from dpmjax.slam.odometry import SurfaceGeometry
@@ -109,9 +111,9 @@ def step_slam(methods: SlamMethods, state: SlamState, points: Float[AnyArray, "n
     front, slam_map, report = front_end.step(methods, state.front_end, state.slam_map, points)
     loops = state.loops
     if report.is_keyframe:
-        num_before = _num_accepted(loops)
+        num_before = num_accepted(loops.loops)
         slam_map, loops = close_loops(methods, slam_map, loops)
-        report = report._replace(num_accepted=_num_accepted(loops) - num_before)
+        report = report._replace(num_accepted=num_accepted(loops.loops) - num_before)
     return SlamState(front, slam_map, loops), report
 
 
@@ -191,7 +193,3 @@ def run_slam(
     for state, report in iterate_slam(methods, scans, state):  # noqa: B007 (the last one is used)
         reports.append(report)
     return finish_slam(state, reports, methods.config)
-
-
-def _num_accepted(loops: LoopState) -> int:
-    return sum(loop.status == "accepted" for loop in loops.loops)
