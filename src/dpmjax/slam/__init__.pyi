@@ -1,3 +1,8 @@
+from .agents import AgentsResult as AgentsResult
+from .agents import MergedMaps as MergedMaps
+from .agents import Traffic as Traffic
+from .agents import merge_maps as merge_maps
+from .agents import run_agents as run_agents
 from .alignment import Alignment as Alignment
 from .alignment import Geometry as Geometry
 from .alignment import PosePrior as PosePrior
@@ -7,6 +12,8 @@ from .config import OdometryConfig as OdometryConfig
 from .config import SlamConfig as SlamConfig
 from .keyframes import KeyframeMap as KeyframeMap
 from .keyframes import Submap as Submap
+from .map_joining import JoinedMaps as JoinedMaps
+from .map_joining import take_component as take_component
 from .matcher import Match as Match
 from .matcher import Matcher as Matcher
 from .matcher import NetworkMatcher as NetworkMatcher

@@ -1,4 +1,4 @@
-"""Optimisation of a map: odometry and loops agree as well as they can; loops that contradict the rest are taken back."""
+"""Optimisation of a map: odometry and loops agree as well as they can; loops that contradict the rest go."""
 
 from __future__ import annotations
 

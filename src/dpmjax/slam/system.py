@@ -74,6 +74,26 @@ def make_methods(model: Model, config: SlamConfig | None = None) -> SlamMethods:
     return SlamMethods(NetworkMatcher(model), SurfaceGeometry(config.odometry), config)
 
 
+def as_methods(model: Model | SlamMethods, config: SlamConfig | None) -> SlamMethods:
+    """Returns methods as they are, and makes those of a model.
+
+    Args:
+        model: a trained model, or methods.
+        config: settings for a model; methods carry their own.
+
+    Returns:
+        The methods.
+
+    Raises:
+        ValueError: if methods come with a configuration.
+    """
+    if isinstance(model, SlamMethods):
+        if config is not None:
+            raise ValueError("config: expected None with methods, which carry their own")
+        return model
+    return make_methods(model, config)
+
+
 def init_slam(map_: KeyframeMap | None = None) -> SlamState:
     """Begins an empty map, or a new part of one that was made before.
 
@@ -186,9 +206,7 @@ def run_slam(
         ValueError: if a scan is not (n, 3), if methods come with another configuration, or if the map was made with
             other weights.
     """
-    if isinstance(model, SlamMethods) and config is not None:
-        raise ValueError("config: expected None with methods, which carry their own")
-    methods = model if isinstance(model, SlamMethods) else make_methods(model, config)
+    methods = as_methods(model, config)
     state, reports = init_slam(map_), []
     for state, report in iterate_slam(methods, scans, state):  # noqa: B007 (the last one is used)
         reports.append(report)
