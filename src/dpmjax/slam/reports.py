@@ -12,9 +12,10 @@ from dpmjax.slam.keyframes import Pose
 ScanStatus = Literal["first", "tracked", "network", "predicted", "empty", "restarted"]
 """How the pose of a scan was found.
 
-"first": the scan starts the map, or a new part of a loaded one. "tracked": geometry, from the predicted pose. "network": geometry failed there, and
-agreed from the network's pose. "predicted": nothing agreed, the motion goes on as before. "empty": the scan has too few
-points. "restarted": nothing agreed for a while, a new part of the map begins here, and loops may join it.
+"first": the scan starts the map, or a new part of a loaded one. "tracked": geometry, from the predicted pose.
+"network": geometry failed there, and agreed from the network's pose. "predicted": nothing agreed, the motion goes on as
+before. "empty": the scan has too few points. "restarted": nothing agreed for a while, a new part of the map begins
+here, and loops may join it.
 """
 
 LoopStatus = Literal[

@@ -207,7 +207,8 @@ def run_slam(
             other weights.
     """
     methods = as_methods(model, config)
-    state, reports = init_slam(map_), []
-    for state, report in iterate_slam(methods, scans, state):  # noqa: B007 (the last one is used)
+    start = state = init_slam(map_)
+    reports = []
+    for state, report in iterate_slam(methods, scans, start):  # noqa: B007 (the last one is used)
         reports.append(report)
     return finish_slam(state, reports, methods.config)
