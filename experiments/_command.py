@@ -15,6 +15,7 @@ from typing import Any, Self, TypeVar
 
 import tyro
 
+from dpmjax.sequences import InputError
 from experiments._machine import enable_compilation_cache, select_device
 from experiments._run_folder import FolderOptions, RunFailedError, check_run_folder, find_run, load_config
 
@@ -154,7 +155,8 @@ def run_command(
     except ValueError as error:
         return _say(f"error: {error}", EXIT_BAD_INPUT)
     except RunFailedError as error:
-        traceback.print_exception(error.__cause__)
+        if not isinstance(error.__cause__, InputError):
+            traceback.print_exception(error.__cause__)
         return _say(f"error: {error}; what was finished is in {error.path}", EXIT_FAILED)
     except Exception as error:
         traceback.print_exception(error)

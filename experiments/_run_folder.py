@@ -15,6 +15,7 @@ from typing import Annotated, Any, ClassVar, Literal, TypeVar
 
 from tyro.conf import FlagCreatePairsOff, arg
 
+from dpmjax.sequences import InputError
 from experiments._machine import environment
 from experiments._result_files import as_json, commits_note, load_json, write_json
 
@@ -22,7 +23,7 @@ CONFIG, METRICS, HISTORY, LOG = "config.json", "metrics.json", "metrics.csv", "l
 CHECKPOINTS, BEST = "checkpoints", "checkpoints_best"
 # --force removes these folders and kinds of files only: a mistyped -o must not cost a user anything else.
 RESULT_FOLDERS = (CHECKPOINTS, BEST, "rows")
-RESULT_SUFFIXES = (".json", ".csv", ".txt", ".npy", ".npz", ".png", ".ply", ".g2o")
+RESULT_SUFFIXES = (".json", ".csv", ".txt", ".npy", ".npz", ".png", ".ply", ".g2o", ".journal", ".rrd")
 LOGGERS = ("dpmjax", "experiments", "__main__")
 # Options that do not change what is computed.
 FREE_OPTIONS = frozenset({"output", "resume", "force", "device", "coordinator", "num_processes", "process_id"})
@@ -65,7 +66,8 @@ class RunFailedError(RuntimeError):
     """A run broke off after its folder was made; what it had written is in `path`, the traceback in its log."""
 
     def __init__(self, path: Path, error: Exception) -> None:
-        super().__init__(f"{type(error).__name__}: {error}")
+        is_input = isinstance(error, InputError)
+        super().__init__(str(error).removesuffix(".") if is_input else f"{type(error).__name__}: {error}")
         self.path = path
 
 

@@ -36,6 +36,10 @@ class InputError(ValueError):
         super().__init__(" ".join(f"{source}: {found}; {advice}.".split()))
 
 
+class EmptyScanError(InputError):
+    """A scan without any point: the lidar measured nothing, or the file is empty. A drive goes on without it."""
+
+
 def require(is_good: bool | np.bool_, source: str | Path, found: str, advice: str) -> None:
     """Raises an `InputError` unless the input is good.
 

@@ -44,7 +44,7 @@ def geometry() -> SurfaceGeometry:
 def test_a_scan_finds_its_pose(geometry, x, y, heading_deg) -> None:
     rng = np.random.default_rng(0)
     true = motion(x, y, heading_deg)
-    local_map = geometry.insert(None, geometry.measure(planes(rng)), np.eye(4))
+    local_map = geometry.insert(None, geometry.measure(planes(rng)), np.eye(4), 0)
     found = geometry.align(local_map, geometry.measure(seen_from(planes(rng), true)), PosePrior(np.eye(4), np.eye(4)))
     apart = rigid.inverse(true) @ found.T_map_scan
     assert np.linalg.norm(apart[:3, 3]) < 0.03
@@ -57,7 +57,7 @@ def test_a_corridor_is_weak_along_its_axis(geometry) -> None:
     weakness = []
     for is_corridor in (False, True):
         scans = [geometry.measure(planes(rng, is_corridor=is_corridor)) for _ in range(2)]
-        local_map = geometry.insert(None, scans[0], np.eye(4))
+        local_map = geometry.insert(None, scans[0], np.eye(4), 0)
         found = geometry.align(local_map, scans[1], PosePrior(np.eye(4), np.eye(4)))
         covariance = np.linalg.inv(found.information)
         weakness.append(covariance[0, 0] / covariance[1, 1])
@@ -67,7 +67,7 @@ def test_a_corridor_is_weak_along_its_axis(geometry) -> None:
 
 def test_a_scan_of_another_place_scores_low(geometry) -> None:
     rng = np.random.default_rng(0)
-    local_map = geometry.insert(None, geometry.measure(planes(rng)), np.eye(4))
+    local_map = geometry.insert(None, geometry.measure(planes(rng)), np.eye(4), 0)
     elsewhere = geometry.measure(rng.uniform(-8, 8, (4000, 3)))
     assert geometry.align(local_map, elsewhere, PosePrior(np.eye(4), np.eye(4))).score < 0.3
 
@@ -81,7 +81,7 @@ def test_empty_scans_are_none(geometry) -> None:
 def test_a_moved_map_gives_the_moved_pose(geometry) -> None:
     rng = np.random.default_rng(0)
     scans = [geometry.measure(planes(rng)) for _ in range(2)]
-    local_map = geometry.insert(None, scans[0], np.eye(4))
+    local_map = geometry.insert(None, scans[0], np.eye(4), 0)
     T_new_map = motion(2.0, 1.0, 50.0)
     found = geometry.align(local_map, scans[1], PosePrior(np.eye(4), np.eye(4)))
     moved = geometry.align(geometry.move(local_map, T_new_map), scans[1], PosePrior(T_new_map, np.eye(4)))
@@ -90,10 +90,10 @@ def test_a_moved_map_gives_the_moved_pose(geometry) -> None:
 
 def test_a_scan_that_tells_nothing_new_does_not_join(geometry) -> None:
     measured = geometry.measure(planes(np.random.default_rng(0)))
-    local_map = geometry.insert(None, measured, np.eye(4))
-    assert geometry.insert(local_map, measured, motion(0.01, 0, 0)) is local_map
+    local_map = geometry.insert(None, measured, np.eye(4), 0)
+    assert geometry.insert(local_map, measured, motion(0.01, 0, 0), 1) is local_map
     for step in range(1, 30):
-        local_map = geometry.insert(local_map, measured, motion(3 * step, 0, 0))
+        local_map = geometry.insert(local_map, measured, motion(3 * step, 0, 0), step)
     assert len(local_map.frames) == geometry.config.num_frames
 
 

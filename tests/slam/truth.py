@@ -73,7 +73,7 @@ class TruthGeometry:
     def extent_m(self, measured: int) -> float:
         return 10.0
 
-    def insert(self, local_map: TruthMap | None, measured: int, T_map_scan: np.ndarray) -> TruthMap:
+    def insert(self, local_map: TruthMap | None, measured: int, T_map_scan: np.ndarray, scan: int) -> TruthMap:
         return TruthMap(measured, T_map_scan)
 
     def move(self, local_map: TruthMap, T_new_map: np.ndarray) -> TruthMap:
@@ -91,6 +91,12 @@ class TruthGeometry:
             return Alignment(start, 0.0, 0.5, -1.0, information)
         return Alignment(T, 0.9, 0.0, 0.9, information)
 
+    def pack(self, local_map: TruthMap) -> dict[str, np.ndarray]:
+        return {"number": np.array(local_map.number), "T_map_scan": local_map.T_map_scan}
+
+    def unpack(self, arrays: dict[str, np.ndarray], measure_again: Any) -> TruthMap:
+        return TruthMap(int(arrays["number"]), arrays["T_map_scan"])
+
 
 @dataclass(frozen=True)
 class TruthMatcher:
@@ -106,6 +112,12 @@ class TruthMatcher:
 
     def describe(self, points: np.ndarray, measured: int) -> int:
         return measured
+
+    def pack(self, description: int) -> dict[str, np.ndarray]:
+        return {"number": np.array(description)}
+
+    def unpack(self, arrays: dict[str, np.ndarray]) -> int:
+        return int(arrays["number"])
 
     def vector(self, description: int) -> np.ndarray:
         # Random Fourier features: the cosine of two places falls with their distance.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -159,12 +159,13 @@ def read_ply(path: str | Path) -> NDArray[np.float32]:
     return np.stack([to_float32(columns[axis]) for axis in "xyz"], axis=1)
 
 
-def write_ply(path: str | Path, points: ArrayLike) -> Path:
-    """Writes points as binary little-endian PLY with float x, y, z.
+def write_ply(path: str | Path, points: ArrayLike, *, colors: ArrayLike | None = None) -> Path:
+    """Writes points as binary little-endian PLY with float x, y, z, and colours where they are given.
 
     Args:
         path: file to write, atomically.
         points: (n, 3).
+        colors: (n, 3) red, green, blue from 0 to 255; None for points without colour.
 
     Returns:
         The path.
@@ -176,8 +177,16 @@ def write_ply(path: str | Path, points: ArrayLike) -> Path:
     if values.ndim != 2 or values.shape[1] != 3:
         raise ValueError(f"points must be (n, 3), got {values.shape}")
     properties = "".join(f"property float {name}\n" for name in "xyz")
+    content: NDArray[Any] = values
+    if colors is not None:
+        rgb = np.asarray(colors, np.uint8)
+        if rgb.shape != values.shape:
+            raise ValueError(f"colors must be {values.shape}, got {rgb.shape}")
+        properties += "".join(f"property uchar {name}\n" for name in ("red", "green", "blue"))
+        content = np.empty(len(values), [("points", "<f4", 3), ("colors", "u1", 3)])
+        content["points"], content["colors"] = values, rgb
     header = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(values)}\n{properties}end_header\n"
-    return write_atomically(path, header.encode("ascii") + values.tobytes())
+    return write_atomically(path, header.encode("ascii") + content.tobytes())
 
 
 def _parse_ply_header(content: bytes, source: str) -> _Header:

@@ -14,7 +14,7 @@ from dpmjax.io.clouds import read_pcd, read_ply
 from dpmjax.io.drives import SCAN_SUFFIXES, Drive3D, read_learned_folder, read_plain_folder, scan_files
 from dpmjax.io.files import load_arrays, natural_key, read_bytes, to_float32
 from dpmjax.io.lidar_datasets import read_kitti_360, read_kitti_carla, read_kitti_odometry, read_kitti_raw, read_mulran
-from dpmjax.sequences import InputError, LidarSequence, require
+from dpmjax.sequences import EmptyScanError, InputError, LidarSequence, require
 
 _log = logging.getLogger(__name__)
 _NPZ_KEYS = ("lidar_pcd", "points", "xyz", "arr_0")
@@ -100,7 +100,8 @@ def _check_scan(points: NDArray[np.float32], source: Path) -> NDArray[np.float32
         found = f"{bad.sum()} of {len(points)} points are NaN or infinite, the first is point {int(np.argmax(bad))}"
         raise InputError(source, found, "write beams that met nothing as 0 0 0, or leave them out")
     kept = np.ascontiguousarray(points[(points != 0).any(axis=1)], np.float32)
-    require(len(kept) > 0, source, "no point in the scan", "remove the file, or copy it again")
+    if not len(kept):
+        raise EmptyScanError(source, "no point in the scan", "remove the file, or copy it again")
     # In float64, for garbage reaches 1e38.
     ranges = np.linalg.norm(kept.astype(np.float64), axis=1)
     median = float(np.median(ranges))

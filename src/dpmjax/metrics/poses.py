@@ -63,7 +63,7 @@ def align_rigid(estimated: Float[AnyArray, "n d"], reference: Float[AnyArray, "n
     """
     estimated = _checked_positions("estimated", estimated)
     reference = _checked_positions("reference", reference)
-    _require_same_shape("reference", reference, estimated)
+    require_same_shape("reference", reference, estimated)
     mean_estimated, mean_reference = estimated.mean(axis=0), reference.mean(axis=0)
     covariance = (estimated - mean_estimated).T @ (reference - mean_reference)
     dim = covariance.shape[0]
@@ -116,15 +116,15 @@ def relative_pose_error(
         ValueError: the shapes differ, are not (n, 3, 3) or (n, 4, 4), a number is not finite, or `delta` is not in
             [1, n - 1].
     """
-    estimated, reference = _checked_poses("estimated", estimated), _checked_poses("reference", reference)
-    _require_same_shape("reference", reference, estimated)
+    estimated, reference = checked_poses("estimated", estimated), checked_poses("reference", reference)
+    require_same_shape("reference", reference, estimated)
     num_poses = len(estimated)
     if not 1 <= delta < num_poses:
         raise ValueError(f"delta: expected 1 <= delta < {num_poses}, the number of poses, got {delta}")
     moved_estimated = rigid.inverse(estimated[:-delta]) @ estimated[delta:]
     moved_reference = rigid.inverse(reference[:-delta]) @ reference[delta:]
     error = rigid.inverse(moved_reference) @ moved_estimated
-    angles = _rotation_angle(error[:, :-1, :-1])
+    angles = rotation_angle(error[:, :-1, :-1])
     squared_lengths = np.sum(error[:, :-1, -1] ** 2, axis=1)
     return RelativePoseError(
         translation_rmse=float(np.sqrt(np.mean(squared_lengths))),
@@ -153,8 +153,8 @@ def point_distance(
     Raises:
         ValueError: the shapes do not match, a number is not finite, or no point is valid.
     """
-    estimated, reference = _checked_poses("T_estimated", T_estimated), _checked_poses("T_reference", T_reference)
-    _require_same_shape("T_reference", reference, estimated)
+    estimated, reference = checked_poses("T_estimated", T_estimated), checked_poses("T_reference", T_reference)
+    require_same_shape("T_reference", reference, estimated)
     points, mask = np.asarray(points, np.float64), np.asarray(mask)
     dim = estimated.shape[1] - 1
     if points.ndim != 3 or points.shape[0] != len(estimated) or points.shape[2] != dim:
@@ -198,7 +198,7 @@ def registration_recall(
             raise ValueError(f"{name}: expected shape ({len(true)}, 4, 4), got {value.shape}")
     translation = np.linalg.norm(estimated[:, :3, 3] - true[:, :3, 3], axis=1)
     difference = np.swapaxes(true[:, :3, :3], 1, 2) @ estimated[:, :3, :3]
-    rotation = np.degrees(_rotation_angle(difference))
+    rotation = np.degrees(rotation_angle(difference))
     with np.errstate(invalid="ignore"):
         is_right = (translation <= max_translation_m) & (rotation <= max_rotation_deg)
     return RegistrationRecall(float(is_right.mean()) if len(true) > 0 else 0.0, translation, rotation, is_right)
@@ -211,7 +211,8 @@ def _checked_positions(name: str, value: AnyArray) -> NDArray[np.float64]:
     return _checked_finite(name, array)
 
 
-def _checked_poses(name: str, value: AnyArray) -> NDArray[np.float64]:
+def checked_poses(name: str, value: AnyArray) -> NDArray[np.float64]:
+    """Returns poses as float64; a ValueError names what is no (n, 3, 3) or (n, 4, 4) or not finite."""
     array = np.asarray(value, np.float64)
     if array.ndim != 3 or array.shape[0] < 1 or array.shape[1:] not in ((3, 3), (4, 4)):
         raise ValueError(f"{name}: expected poses of shape (n, 3, 3) or (n, 4, 4), n >= 1, got {array.shape}")
@@ -228,7 +229,8 @@ def _first_bad_row(array: NDArray[np.float64]) -> int:
     return int(np.argmin(np.isfinite(array).reshape(len(array), -1).all(axis=1)))
 
 
-def _require_same_shape(name: str, array: NDArray[np.float64], other: NDArray[np.float64]) -> None:
+def require_same_shape(name: str, array: NDArray[np.float64], other: NDArray[np.float64]) -> None:
+    """Raises a ValueError where two arrays have different shapes."""
     if array.shape != other.shape:
         raise ValueError(f"{name}: expected shape {other.shape} like the estimated, got {array.shape}")
 
@@ -238,7 +240,7 @@ def _transform(T: NDArray[np.float64], points: NDArray[np.float64]) -> NDArray[n
     return points @ np.swapaxes(T[..., :dim, :dim], -1, -2) + T[..., None, :dim, dim]
 
 
-def _rotation_angle(R: NDArray[np.float64]) -> NDArray[np.float64]:
+def rotation_angle(R: NDArray[np.float64]) -> NDArray[np.float64]:
     """Returns the angle of rotation matrices in [0, pi], exact for small angles (an arc cosine is not)."""
     skew = (R - np.swapaxes(R, 1, 2)) / 2
     sin = np.sqrt(np.sum(skew**2, axis=(1, 2)) / 2)

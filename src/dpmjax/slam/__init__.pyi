@@ -10,6 +10,10 @@ from .config import FrontEndConfig as FrontEndConfig
 from .config import LoopClosureConfig as LoopClosureConfig
 from .config import OdometryConfig as OdometryConfig
 from .config import SlamConfig as SlamConfig
+from .front_end import TimedScan as TimedScan
+from .journal import Journal as Journal
+from .journal import JournalContent as JournalContent
+from .journal import read_journal as read_journal
 from .keyframes import KeyframeMap as KeyframeMap
 from .keyframes import Submap as Submap
 from .map_joining import JoinedMaps as JoinedMaps

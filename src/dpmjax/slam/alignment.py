@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from jaxtyping import Float
 
+from dpmjax.slam.columns import Arrays
 from dpmjax.slam.keyframes import Pose
 
 
@@ -71,13 +73,14 @@ class Geometry(Protocol):
         """
         ...
 
-    def insert(self, local_map: Any | None, measured: Any, T_map_scan: Pose) -> Any:
+    def insert(self, local_map: Any | None, measured: Any, T_map_scan: Pose, scan: int) -> Any:
         """Adds a scan to the local map, where it tells something new.
 
         Args:
             local_map: None for an empty one.
             measured: the scan.
             T_map_scan: its pose.
+            scan: its number.
 
         Returns:
             The local map after.
@@ -106,5 +109,28 @@ class Geometry(Protocol):
 
         Returns:
             The best pose.
+        """
+        ...
+
+    def pack(self, local_map: Any) -> Arrays:
+        """Turns the local map into arrays for a file; numbers of scans stand for the scans.
+
+        Args:
+            local_map: the map.
+
+        Returns:
+            Arrays by name.
+        """
+        ...
+
+    def unpack(self, arrays: Arrays, measure_again: Callable[[int], Any]) -> Any:
+        """Makes the local map again, bit for bit.
+
+        Args:
+            arrays: from `pack`.
+            measure_again: gives the measured scan of a number.
+
+        Returns:
+            The local map.
         """
         ...

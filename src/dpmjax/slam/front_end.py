@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from dpmjax.geometry import rigid
+from dpmjax.scans.deskew import deskew
 from dpmjax.slam.alignment import PosePrior
 from dpmjax.slam.keyframes import (
     EdgeKind,
@@ -30,6 +31,7 @@ from dpmjax.slam.keyframes import (
 )
 from dpmjax.slam.methods import SlamMethods
 from dpmjax.slam.reports import ScanReport, ScanStatus
+from dpmjax.types import AnyArray
 
 UNKNOWN_M = 1000.0
 """Standard deviation of a place that nothing is known of."""
@@ -75,8 +77,23 @@ class Located(NamedTuple):
     probability: float | None = None
 
 
+class TimedScan(NamedTuple):
+    """A raw scan with the time of each point, to be deskewed by the predicted motion.
+
+    Attributes:
+        points: (n, 3) metres, each in the frame of the lidar at its own moment.
+        offsets: (n,) times since the scan's pose, as shares of the time between scans; see `scans.deskew`.
+    """
+
+    points: Float[AnyArray, "n 3"]
+    offsets: Float[AnyArray, " n"]
+
+
+AnyScan = Float[AnyArray, "n 3"] | TimedScan
+
+
 def step(
-    methods: SlamMethods, state: FrontEndState, slam_map: KeyframeMap, points: Float[np.ndarray, "n 3"]
+    methods: SlamMethods, state: FrontEndState, slam_map: KeyframeMap, scan: AnyScan
 ) -> tuple[FrontEndState, KeyframeMap, ScanReport]:
     """Places a scan.
 
@@ -84,25 +101,45 @@ def step(
         methods: matcher, geometry, settings.
         state: after the scan before.
         slam_map: the map so far.
-        points: the scan, metres, in the frame of the lidar.
+        scan: points in metres, in the frame of the lidar, perhaps with times.
 
     Returns:
         The state and the map after, and how the scan was placed.
     """
+    T_turn = state.T_before_last if isinstance(scan, TimedScan) else None
+    points = corrected_points(scan, T_turn)
     measured = methods.geometry.measure(points)
     if measured is None:
         return _pass_over(state, slam_map)
+    prepared = Scan(points, measured, T_turn)
     if state.local_map is None:
         reason = "a new part of the map begins here" if len(slam_map) else "the map begins here"
         located = Located(np.eye(4), "first", reason, 1.0, diagonal_information(UNKNOWN_M, np.pi))
-        return _make_keyframe(methods, state, slam_map, Scan(points, measured), located)
-    located = _locate(methods, state, slam_map, Scan(points, measured))
+        return _make_keyframe(methods, state, slam_map, prepared, located)
+    located = _locate(methods, state, slam_map, prepared)
     # The next prediction uses this pose three times, so a rounding error would triple from scan to scan.
     located = located._replace(T_keyframe_scan=orthonormal(located.T_keyframe_scan))
     if located.status == "restarted" or _is_keyframe(methods, located, measured):
-        return _make_keyframe(methods, state, slam_map, Scan(points, measured), located)
+        return _make_keyframe(methods, state, slam_map, prepared, located)
     after = _advanced(methods, state, located, measured)
-    return after, slam_map, _report(state, slam_map, located, is_keyframe=False)
+    return after, slam_map, _report(state, slam_map, located, is_keyframe=False)._replace(T_turn=T_turn)
+
+
+def corrected_points(scan: AnyScan, T_turn: Pose | None) -> Float[np.ndarray, "n 3"]:
+    """Returns the finite points of a scan, and undoes the motion of the lidar where the scan has times.
+
+    Args:
+        scan: points in metres, in the frame of the lidar, perhaps with times.
+        T_turn: motion from one scan to the next; None leaves the points as they are.
+
+    Returns:
+        The points.
+    """
+    points = np.asarray(scan.points if isinstance(scan, TimedScan) else scan)
+    is_finite = np.isfinite(points).all(axis=1)
+    if not isinstance(scan, TimedScan) or T_turn is None:
+        return points[is_finite]
+    return deskew(points[is_finite], np.asarray(scan.offsets)[is_finite], T_turn)
 
 
 class Scan(NamedTuple):
@@ -111,10 +148,12 @@ class Scan(NamedTuple):
     Attributes:
         points: metres, in the frame of the lidar.
         measured: what the geometry has measured of it.
+        T_turn: motion that its points were corrected by; None for none.
     """
 
     points: Float[np.ndarray, "n 3"]
     measured: Any
+    T_turn: Pose | None = None
 
 
 def _pass_over(state: FrontEndState, slam_map: KeyframeMap) -> tuple[FrontEndState, KeyframeMap, ScanReport]:
@@ -175,11 +214,12 @@ def _make_keyframe(
     slam_map = add_keyframe(slam_map, keyframe, T_world, matcher.vector(description), edge)
     after = _advanced(methods, state, located, scan.measured)
     if is_guess or row == 0:
-        local_map = geometry.insert(None, scan.measured, np.eye(4))
+        local_map = geometry.insert(None, scan.measured, np.eye(4), state.num_scans)
     else:
         local_map = geometry.move(after.local_map, rigid.inverse(T))
     after = after._replace(local_map=local_map, T_keyframe_last=np.eye(4))
-    return after, slam_map, _report(state, slam_map, located._replace(T_keyframe_scan=np.eye(4)), is_keyframe=True)
+    report = _report(state, slam_map, located._replace(T_keyframe_scan=np.eye(4)), is_keyframe=True)
+    return after, slam_map, report._replace(T_turn=scan.T_turn)
 
 
 def _advanced(methods: SlamMethods, state: FrontEndState, located: Located, measured: Any) -> FrontEndState:
@@ -191,7 +231,7 @@ def _advanced(methods: SlamMethods, state: FrontEndState, located: Located, meas
     if located.status in ("first", "restarted"):
         return after._replace(num_lost=0, scores=())
     return after._replace(
-        local_map=methods.geometry.insert(state.local_map, measured, T),
+        local_map=methods.geometry.insert(state.local_map, measured, T, state.num_scans),
         T_before_last=rigid.inverse(state.T_keyframe_last) @ T,
         scores=(*state.scores, located.score)[-methods.config.front_end.usual_window :],
         num_lost=0,

@@ -18,7 +18,9 @@ from dpmjax.deeppointmap.matching import merge_clouds
 from dpmjax.deeppointmap.model import Model, model_fingerprint
 from dpmjax.deeppointmap.scan_registration import PreparedScan, register_each
 from dpmjax.deeppointmap.verification import MeasuredScan
+from dpmjax.scans.compact import CompactImage, CompactSurface
 from dpmjax.scans.surface_alignment import AlignmentLevel, pair_with_planes
+from dpmjax.slam.columns import Arrays, from_columns, to_columns
 from dpmjax.slam.keyframes import Pose, Submap
 from dpmjax.slam.plane_information import plane_information
 from dpmjax.slam.retrieval import pooled_vector
@@ -63,6 +65,28 @@ class Matcher(Protocol):
 
         Returns:
             A record that only the matcher reads.
+        """
+        ...
+
+    def pack(self, description: Any) -> Arrays:
+        """Turns a description into arrays for a file.
+
+        Args:
+            description: from `describe`.
+
+        Returns:
+            Arrays by name.
+        """
+        ...
+
+    def unpack(self, arrays: Arrays) -> Any:
+        """Makes a description again, bit for bit.
+
+        Args:
+            arrays: from `pack`.
+
+        Returns:
+            The description.
         """
         ...
 
@@ -123,6 +147,32 @@ class NetworkMatcher:
             The compact scan.
         """
         return compact_scan(jax.device_get(encode(self._model, points)), measured)
+
+    def pack(self, description: CompactScan) -> Arrays:
+        """Keeps all arrays of a scan; see `Matcher`.
+
+        Args:
+            description: from `describe`.
+
+        Returns:
+            Arrays by name.
+        """
+        cloud = to_columns([description._replace(surface=None, image=None)], "scan")
+        return cloud | to_columns([description.surface], "surface") | to_columns([description.image], "image")
+
+    def unpack(self, arrays: Arrays) -> CompactScan:
+        """Makes the scan again; see `Matcher`.
+
+        Args:
+            arrays: from `pack`.
+
+        Returns:
+            The compact scan.
+        """
+        (scan,) = from_columns(CompactScan, arrays, "scan")
+        (surface,) = from_columns(CompactSurface, arrays, "surface")
+        (image,) = from_columns(CompactImage, arrays, "image")
+        return scan._replace(surface=surface, image=image)
 
     def vector(self, description: CompactScan) -> Float[np.ndarray, " c"]:
         """Pools the descriptors; see `Matcher`.

@@ -6,6 +6,7 @@ are tried: the robot stood still, went faster, or turned.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -20,6 +21,7 @@ from dpmjax.scans.preprocess import first_of_each_voxel
 from dpmjax.scans.surface_alignment import AlignmentLevel, PlanePairs, align_surfaces, pair_with_planes
 from dpmjax.scans.surfaces import MIN_FLATNESS, Surface, SurfaceConfig, scan_surface
 from dpmjax.slam.alignment import Alignment, PosePrior
+from dpmjax.slam.columns import Arrays
 from dpmjax.slam.config import OdometryConfig
 from dpmjax.slam.keyframes import Pose, orthonormal, turn_rad
 from dpmjax.slam.plane_information import plane_information, with_least_covariance
@@ -34,10 +36,12 @@ class MapFrame(NamedTuple):
     Attributes:
         T_map_scan: its pose.
         measured: the scan.
+        scan: its number.
     """
 
     T_map_scan: Pose
     measured: MeasuredScan
+    scan: int
 
 
 class LocalMap(NamedTuple):
@@ -98,19 +102,20 @@ class SurfaceGeometry:
         """
         return float(np.median(np.linalg.norm(measured.surface.points, axis=1)))
 
-    def insert(self, local_map: LocalMap | None, measured: MeasuredScan, T_map_scan: Pose) -> LocalMap:
+    def insert(self, local_map: LocalMap | None, measured: MeasuredScan, T_map_scan: Pose, scan: int) -> LocalMap:
         """Adds a scan that is far enough from the last one; see `Geometry`.
 
         Args:
             local_map: None for an empty one.
             measured: the scan.
             T_map_scan: its pose.
+            scan: its number.
 
         Returns:
             The local map.
         """
         config, extent_m = self.config, self.extent_m(measured)
-        frame = MapFrame(T_map_scan, measured)
+        frame = MapFrame(T_map_scan, measured, scan)
         if local_map is None:
             return _local_map((frame,), self._voxel_m(extent_m))
         T_last_scan = rigid.inverse(local_map.frames[-1].T_map_scan) @ T_map_scan
@@ -160,6 +165,34 @@ class SurfaceGeometry:
         for _, _, T in sorted(coarse, key=lambda entry: (-entry[0], entry[1]))[:3]:
             best = max(best, self._aligned(local_map, measured, T), key=lambda found: found.score)
         return best._replace(num_starts=tried)
+
+    def pack(self, local_map: LocalMap) -> Arrays:
+        """Keeps numbers and poses of the frames; see `Geometry`.
+
+        Args:
+            local_map: the map.
+
+        Returns:
+            Arrays by name.
+        """
+        return {
+            "scan": np.array([frame.scan for frame in local_map.frames]),
+            "T_map_scan": np.array([frame.T_map_scan for frame in local_map.frames]),
+            "voxel_m": np.array(local_map.voxel_m),
+        }
+
+    def unpack(self, arrays: Arrays, measure_again: Callable[[int], MeasuredScan]) -> LocalMap:
+        """Merges the frames again; see `Geometry`.
+
+        Args:
+            arrays: from `pack`.
+            measure_again: gives the measured scan of a number.
+
+        Returns:
+            The local map.
+        """
+        rows = zip(arrays["T_map_scan"], arrays["scan"].tolist(), strict=True)
+        return _local_map(tuple(MapFrame(T, measure_again(scan), scan) for T, scan in rows), float(arrays["voxel_m"]))
 
     def _voxel_m(self, extent_m: float) -> float:
         sizes = [size for size in self.config.voxel_sizes_m if size <= self.config.voxel_share * extent_m]

@@ -44,6 +44,7 @@ class ScanReport(NamedTuple):
         score: agreement of the scan with the local map.
         probability: P(correct) of the network; None where it was not asked.
         num_accepted: number of loops that were accepted at this scan.
+        T_turn: predicted motion that a scan with times was deskewed by; None for a scan without times.
     """
 
     scan: int
@@ -55,6 +56,7 @@ class ScanReport(NamedTuple):
     score: float = 0.0
     probability: float | None = None
     num_accepted: int = 0
+    T_turn: Pose | None = None
 
 
 class Loop(NamedTuple):

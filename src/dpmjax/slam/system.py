@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -13,7 +13,7 @@ from dpmjax.geometry import rigid
 from dpmjax.pose_graph.graph import PoseGraph
 from dpmjax.slam import front_end
 from dpmjax.slam.config import SlamConfig
-from dpmjax.slam.front_end import FrontEndState
+from dpmjax.slam.front_end import AnyScan, FrontEndState, TimedScan
 from dpmjax.slam.keyframes import KeyframeMap, as_pose_graph
 from dpmjax.slam.loop_closure import close_loops, num_accepted
 from dpmjax.slam.loop_state import LoopState, loops_of_map
@@ -22,7 +22,6 @@ from dpmjax.slam.matcher import NetworkMatcher
 from dpmjax.slam.methods import SlamMethods
 from dpmjax.slam.odometry import SurfaceGeometry
 from dpmjax.slam.reports import Loop, ScanReport
-from dpmjax.types import AnyArray
 
 
 class SlamState(NamedTuple):
@@ -50,6 +49,7 @@ class SlamResult(NamedTuple):
         graph: poses of the keyframes and the edges that were kept, with ids of scans; None without any keyframe.
         reports: how each scan was placed.
         state: goes on with `step_slam`.
+        T_odometry_scan: (n, 4, 4) every scan by odometry alone, which no loop has corrected.
     """
 
     T_world_scan: Float[np.ndarray, "n 4 4"]
@@ -58,6 +58,7 @@ class SlamResult(NamedTuple):
     graph: PoseGraph | None
     reports: tuple[ScanReport, ...]
     state: SlamState
+    T_odometry_scan: Float[np.ndarray, "n 4 4"]
 
 
 def make_methods(model: Model, config: SlamConfig | None = None) -> SlamMethods:
@@ -110,13 +111,14 @@ def init_slam(map_: KeyframeMap | None = None) -> SlamState:
     return SlamState(FrontEndState(num_scans=map_.keyframes[-1].scan + 1), map_, loops_of_map(map_))
 
 
-def step_slam(methods: SlamMethods, state: SlamState, points: Float[AnyArray, "n 3"]) -> tuple[SlamState, ScanReport]:
+def step_slam(methods: SlamMethods, state: SlamState, scan: AnyScan) -> tuple[SlamState, ScanReport]:
     """Places a scan; a new keyframe is compared with the map.
 
     Args:
         methods: from `make_methods`.
         state: after the scan before.
-        points: metres, in the frame of the lidar; points that are not finite are dropped.
+        scan: (n, 3) points in metres, in the frame of the lidar, or a `TimedScan`, which is deskewed by the predicted
+            motion; points that are not finite are dropped.
 
     Returns:
         The state after, and how the scan was placed.
@@ -124,11 +126,10 @@ def step_slam(methods: SlamMethods, state: SlamState, points: Float[AnyArray, "n
     Raises:
         ValueError: if the shape is not (n, 3).
     """
-    points = np.asarray(points)
-    if points.ndim != 2 or points.shape[1] != 3:
-        raise ValueError(f"points: expected shape (n, 3), got {points.shape}")
-    points = points[np.isfinite(points).all(axis=1)]
-    front, slam_map, report = front_end.step(methods, state.front_end, state.slam_map, points)
+    shape = np.shape(scan.points if isinstance(scan, TimedScan) else scan)
+    if len(shape) != 2 or shape[1] != 3:
+        raise ValueError(f"points: expected shape (n, 3), got {shape}")
+    front, slam_map, report = front_end.step(methods, state.front_end, state.slam_map, scan)
     loops = state.loops
     if report.is_keyframe:
         num_before = num_accepted(loops.loops)
@@ -151,39 +152,61 @@ def finish_slam(state: SlamState, reports: Iterable[ScanReport], config: SlamCon
     reports, slam_map, loops = tuple(reports), state.slam_map, state.loops
     if loops.is_stale:
         slam_map, loops = optimize_map(slam_map, loops, config.loops)
-    T_world_scan = np.tile(np.eye(4), (len(reports), 1, 1))
-    if len(slam_map):
-        T_keyframe_scan = np.array([report.T_keyframe_scan for report in reports]).reshape(-1, 4, 4)
-        T_world_scan = slam_map.T_world_keyframe[[report.keyframe for report in reports]] @ T_keyframe_scan
-        if reports[0].scan == 0:
-            T_world_scan = rigid.inverse(T_world_scan[0]) @ T_world_scan
+    T_odometry_keyframe = [keyframe.T_odometry_keyframe for keyframe in slam_map.keyframes]
     keyframes = np.array([keyframe.scan for keyframe in slam_map.keyframes], np.int64)
     graph = as_pose_graph(slam_map) if len(slam_map) else None
     state = SlamState(state.front_end, slam_map, loops)
-    return SlamResult(T_world_scan, keyframes, loops.loops, graph, reports, state)
+    return SlamResult(
+        T_world_scan=place_scans(slam_map.T_world_keyframe, reports),
+        keyframes=keyframes,
+        loops=loops.loops,
+        graph=graph,
+        reports=reports,
+        state=state,
+        T_odometry_scan=place_scans(np.array(T_odometry_keyframe).reshape(-1, 4, 4), reports),
+    )
+
+
+def place_scans(
+    T_world_keyframe: Float[np.ndarray, "k 4 4"], reports: Sequence[ScanReport]
+) -> Float[np.ndarray, "n 4 4"]:
+    """Puts every scan where its keyframe says.
+
+    Args:
+        T_world_keyframe: poses of the keyframes; none where all scans were empty.
+        reports: of all scans.
+
+    Returns:
+        Poses of the scans; the world is the frame of the first one, or of the map that was extended.
+    """
+    if not len(T_world_keyframe) or not reports:
+        return np.tile(np.eye(4), (len(reports), 1, 1))
+    T_keyframe_scan = np.array([report.T_keyframe_scan for report in reports])
+    T_world_scan = T_world_keyframe[[report.keyframe for report in reports]] @ T_keyframe_scan
+    return rigid.inverse(T_world_scan[0]) @ T_world_scan if reports[0].scan == 0 else T_world_scan
 
 
 def iterate_slam(
-    methods: SlamMethods, scans: Iterable[Float[AnyArray, "_n 3"]], state: SlamState | None = None
+    methods: SlamMethods, scans: Iterable[AnyScan], state: SlamState | None = None
 ) -> Iterator[tuple[SlamState, ScanReport]]:
     """Places scans one after the other, for progress and for files that grow.
 
     Args:
         methods: from `make_methods`.
-        scans: points in metres, each in the frame of the lidar; a scan may be empty.
+        scans: see `step_slam`; a scan may be empty.
         state: goes on from there; None begins an empty map.
 
     Yields:
         The state after each scan and how the scan was placed.
     """
     state = state or init_slam()
-    for points in scans:
-        state, report = step_slam(methods, state, points)
+    for scan in scans:
+        state, report = step_slam(methods, state, scan)
         yield state, report
 
 
 def run_slam(
-    scans: Iterable[Float[AnyArray, "_n 3"]],
+    scans: Iterable[AnyScan],
     model: Model | SlamMethods,
     config: SlamConfig | None = None,
     *,
@@ -194,7 +217,8 @@ def run_slam(
     Every scan gets a pose, also an empty one. What is uncertain is flagged in `reports`.
 
     Args:
-        scans: points in metres, each in the frame of the lidar, in the order of time; any iterable.
+        scans: points in metres, each in the frame of the lidar, in the order of time; any iterable. `TimedScan`s are
+            deskewed.
         model: a trained model; or methods of your own.
         config: settings; None takes the defaults. Methods of your own carry theirs.
         map_: from `load_map`, to be extended; None begins an empty one.

@@ -1,0 +1,94 @@
+"""The numbers of a SLAM run: errors against the reference, statuses and seconds; and the lines on the console."""
+
+from __future__ import annotations
+
+import collections
+import math
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from dpmjax.sequences import LidarSequence
+    from dpmjax.slam import SlamResult
+    from experiments._slam_run import SlamRun
+
+
+def trajectory_errors(T_world_scan: np.ndarray, reference: np.ndarray | None, suffix: str = "") -> dict[str, Any]:
+    """Returns ATE, RPE and KITTI's errors of a trajectory; none without a reference."""
+    from dpmjax.metrics import absolute_trajectory_error, relative_pose_error, segment_error
+
+    if reference is None or len(T_world_scan) < 2:
+        return {}
+    relative, segments = relative_pose_error(T_world_scan, reference), segment_error(T_world_scan, reference)
+    return {
+        f"ate{suffix}_m": absolute_trajectory_error(T_world_scan[:, :3, 3], reference[:, :3, 3]),
+        f"rpe{suffix}_m": relative.translation_rmse,
+        f"rpe{suffix}_deg": math.degrees(relative.rotation_rmse),
+        f"t_rel{suffix}_percent": segments.translation_percent,
+        f"r_rel{suffix}_deg_per_100m": segments.rotation_deg_per_100m,
+    }
+
+
+def distances_to_reference(T_world_scan: np.ndarray, reference: np.ndarray | None) -> np.ndarray | None:
+    """Returns the distance of each scan to the reference after the best rigid alignment."""
+    from dpmjax.metrics import align_rigid
+
+    if reference is None or not len(T_world_scan):
+        return None
+    T = align_rigid(T_world_scan[:, :3, 3], reference[:, :3, 3])
+    moved = T_world_scan[:, :3, 3] @ T[:3, :3].T + T[:3, 3]
+    return np.asarray(np.linalg.norm(moved - reference[:, :3, 3], axis=1))
+
+
+def run_numbers(run: SlamRun, result: SlamResult, sequence: LidarSequence) -> dict[str, Any]:
+    """Returns what `metrics.json` says of a run."""
+    T, num = result.T_world_scan, len(result.reports)
+    reference = None if sequence.T_world_lidar is None else sequence.T_world_lidar[:num]
+    statuses = collections.Counter(report.status for report in result.reports)
+    loops = collections.Counter(loop.status for loop in result.loops)
+    return {
+        "sequence": sequence.name,
+        "num_scans": num,
+        "path_m": float(np.linalg.norm(np.diff(T[:, :3, 3], axis=0), axis=1).sum()),
+        "num_keyframes": len(result.keyframes),
+        "num_segments": 1 + statuses["restarted"],
+        "num_loops": loops["accepted"],
+        **trajectory_errors(T, reference),
+        **trajectory_errors(result.T_odometry_scan, reference, "_odometry"),
+        "scan_statuses": dict(statuses),
+        "loop_statuses": dict(loops),
+        "scans_per_s": run.num_done / run.run_s if run.run_s > 0 else None,
+        "run_s": run.run_s,
+        "compile_s": run.compile_s,
+        "stages_s": run.stages_s,
+        "stages_ms_per_scan": {name: 1000 * s / max(run.num_done, 1) for name, s in run.stages_s.items()},
+    }
+
+
+def summary(metrics: dict[str, Any]) -> str:
+    """Returns the last lines on the console."""
+    lines = [
+        f"{metrics['num_scans']} scans, {metrics['path_m']:.0f} m, {metrics['num_keyframes']} keyframes, "
+        f"{metrics['num_loops']} loops",
+    ]
+    statuses = {name: count for name, count in metrics["scan_statuses"].items() if name not in ("first", "tracked")}
+    if statuses:
+        found = ", ".join(f"{count} {name}" for name, count in statuses.items())
+        lines.append(f"not tracked by geometry alone: {found} (scans.csv has the reasons)")
+    if metrics["num_segments"] > 1:
+        lines.append(
+            f"the track was lost: {metrics['num_segments']} parts, joined by loops where a place is seen again"
+        )
+    for suffix, name in (("_odometry", "odometry alone"), ("", "SLAM"), ("_refined", "refined")):
+        if f"ate{suffix}_m" in metrics:
+            line = f"{name:14}  ATE {metrics[f'ate{suffix}_m']:.3f} m, RPE {metrics[f'rpe{suffix}_m']:.3f} m"
+            t_rel, r_rel = metrics.get(f"t_rel{suffix}_percent"), metrics.get(f"r_rel{suffix}_deg_per_100m")
+            is_long = t_rel is not None and math.isfinite(t_rel)
+            lines.append(line + (f", {t_rel:.2f} %, {r_rel:.2f} degrees/100 m" if is_long else ""))
+    speed = metrics["scans_per_s"]
+    if speed is not None:
+        slowest = sorted(metrics["stages_ms_per_scan"].items(), key=lambda entry: -entry[1])[:4]
+        stages = ", ".join(f"{name} {ms:.0f}" for name, ms in slowest)
+        lines.append(f"{speed:.1f} scans/s (ms a scan: {stages}); compilation took {metrics['compile_s']:.0f} s more")
+    return "\n".join(lines)

@@ -1,0 +1,83 @@
+"""Deskewing: points that a lidar measured while it moved are brought into one frame, by a constant motion."""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Float
+from scipy.spatial.transform import Rotation
+
+from dpmjax.types import AnyArray
+
+
+def deskew(
+    points: Float[AnyArray, "n 3"], offsets: Float[AnyArray, " n"], T_last_scan: Float[AnyArray, "4 4"]
+) -> Float[np.ndarray, "n 3"]:
+    """Moves each point into the frame of the lidar at the time of the scan's pose.
+
+    The lidar moves on a screw of constant velocity, p' = exp(offset log(T)) p.
+
+    Args:
+        points: metres, each in the frame of the lidar at its own moment.
+        offsets: time of each point since the scan's pose, as a share of the time between two scans: a scan whose pose
+            is that of the middle of the turn has offsets from -0.5 to 0.5, if a turn ends where the next begins.
+        T_last_scan: motion of the lidar from one scan to the next.
+
+    Returns:
+        (n, 3) float32 points as a lidar that stands still measures them.
+
+    Raises:
+        ValueError: other shapes, or a motion that is not finite.
+    """
+    points, offsets = np.asarray(points, np.float64), np.asarray(offsets, np.float64)
+    T = np.asarray(T_last_scan, np.float64)
+    if points.ndim != 2 or points.shape[1] != 3 or offsets.shape != points.shape[:1]:
+        raise ValueError(f"points: expected (n, 3) with n offsets, got {points.shape} and {offsets.shape}")
+    if T.shape != (4, 4) or not np.isfinite(T).all():
+        raise ValueError(f"T_last_scan: expected a finite motion (4, 4), got {T.shape}")
+    turn = Rotation.from_matrix(T[:3, :3]).as_rotvec()
+    angle = float(np.linalg.norm(turn))
+    if angle < 1e-9:
+        return np.asarray(points + offsets[:, None] * T[:3, 3], np.float32)
+    axis = turn / angle
+    shift_of_velocity = np.stack([_shifts(unit, axis, angle, np.ones(1))[0] for unit in np.eye(3)], axis=1)
+    velocity = np.linalg.solve(shift_of_velocity, T[:3, 3])
+    turned = _rotated(points, axis, angle * offsets)
+    return np.asarray(turned + _shifts(velocity, axis, angle, offsets), np.float32)
+
+
+def offsets_by_azimuth(
+    points: Float[AnyArray, "n 3"], turn_share: float = 1.0, *, is_clockwise: bool = True
+) -> Float[np.ndarray, " n"]:
+    """Estimates when a spinning lidar measured each point: it begins and ends its turn straight behind, as on KITTI.
+
+    Args:
+        points: metres, x forward, y left.
+        turn_share: time of a turn as a share of the time between scans; 1 for a lidar that never pauses.
+        is_clockwise: sense of the turn, seen from above.
+
+    Returns:
+        Offsets for `deskew`: 0 straight ahead.
+    """
+    points = np.asarray(points)
+    azimuth = np.arctan2(points[:, 1], points[:, 0]) / (2 * np.pi)
+    return np.asarray(turn_share * (-azimuth if is_clockwise else azimuth), np.float64)
+
+
+def _rotated(
+    points: Float[np.ndarray, "n 3"], axis: Float[np.ndarray, " 3"], angles: Float[np.ndarray, " n"]
+) -> Float[np.ndarray, "n 3"]:
+    """Rodrigues' formula, an angle a point."""
+    across = np.cross(axis, points)
+    sin, cos = np.sin(angles)[:, None], np.cos(angles)[:, None]
+    return points + sin * across + (1 - cos) * np.cross(axis, across)
+
+
+def _shifts(
+    velocity: Float[np.ndarray, " 3"], axis: Float[np.ndarray, " 3"], angle: float, offsets: Float[np.ndarray, " n"]
+) -> Float[np.ndarray, "n 3"]:
+    """Translations of exp(offset (velocity, angle axis))."""
+    angles = angle * offsets
+    across = np.cross(axis, velocity)
+    rest = np.cross(axis, across)
+    parts = (offsets, (1 - np.cos(angles)) / angle, (angles - np.sin(angles)) / angle)
+    return np.outer(parts[0], velocity) + np.outer(parts[1], across) + np.outer(parts[2], rest)

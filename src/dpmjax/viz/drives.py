@@ -1,0 +1,209 @@
+"""Pictures of a SLAM run from above: trajectories with their loops, and the map by height."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from dpmjax.viz.figures import (
+    ACCENT,
+    INK,
+    MUTED,
+    Limits,
+    add_scale_bar,
+    annotate_corner,
+    frame_map,
+    new_figure,
+    style_axes,
+)
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.colors import Colormap
+    from matplotlib.figure import Figure
+
+OURS, ODOMETRY, LOOP = "#1f4e8c", "#e08a1e", "#2a9d5c"
+HEIGHTS_M = (-2.5, 5.5)
+"""Heights above the lidar that the colours of maps span."""
+
+_LONGER_SIDE_IN, _SHORTER_SIDE_IN = 6.4, 2.6
+
+
+class Track(NamedTuple):
+    """One trajectory of a picture.
+
+    Attributes:
+        label: for the legend.
+        positions: (n, 3) metres; all tracks of a picture are in one frame.
+        errors_m: (n,) distance of each scan to the reference; None where there is none.
+    """
+
+    label: str
+    positions: Float[np.ndarray, "n 3"]
+    errors_m: Float[np.ndarray, " n"] | None = None
+
+
+def trajectory_figure(
+    title: str,
+    estimated: Track,
+    odometry: Track | None,
+    reference: Float[np.ndarray, "n 3"] | None,
+    loops: Float[np.ndarray, "m 2 3"],
+) -> Figure:
+    """Draws the trajectory from above, with odometry alone, the reference and the loops; and the errors beside it.
+
+    Args:
+        title: of the picture.
+        estimated: of the whole system.
+        odometry: without loops; None where there were none to correct it.
+        reference: positions in the same frame; None where there is none.
+        loops: positions of both ends of each accepted loop.
+
+    Returns:
+        The figure; without errors it has no second panel.
+    """
+    tracks = [estimated] if odometry is None else [odometry, estimated]
+    shown = [track.positions for track in tracks] + ([] if reference is None else [reference])
+    limits = _limits(np.concatenate(shown)[:, :2], 0.06)
+    width_in, height_in = _size_in(limits)
+    has_errors = estimated.errors_m is not None
+    figure = new_figure(width_in + (3.6 if has_errors else 0.3), max(height_in, 3.0) + 0.9)
+    columns = [width_in, 3.0] if has_errors else [width_in]
+    axes_row = figure.subplots(1, len(columns), squeeze=False, width_ratios=columns)[0]
+    axes = axes_row[0]
+    if reference is not None:
+        axes.plot(*reference[:, :2].T, color="#b9c0c8", lw=4.2, solid_capstyle="round", label="reference", zorder=2)
+    for track in tracks:
+        axes.plot(*track.positions[:, :2].T, label=track.label, zorder=4, **_style(track, tracks))
+    _draw_loops(axes, loops)
+    axes.plot(*estimated.positions[:1, :2].T, "o", ms=6, color=INK, mec="white", zorder=7, label="start")
+    frame_map(axes, limits)
+    add_scale_bar(axes, limits, "m")
+    axes.set_title(f"{title}\n", fontsize=11, color=INK, loc="left", fontweight="bold")
+    axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.02), ncols=5, frameon=False, fontsize=8, labelcolor=MUTED)
+    if has_errors:
+        _draw_errors(axes_row[1], tracks)
+    figure.tight_layout()
+    return figure
+
+
+def height_map_figure(
+    title: str, points: Float[np.ndarray, "n 3"], heights_m: Float[np.ndarray, " n"], path: Float[np.ndarray, "k 3"]
+) -> Figure:
+    """Draws a map from above: what stands highest in each pixel, by its height above the lidar that passed there.
+
+    Args:
+        title: of the picture.
+        points: metres, in the world.
+        heights_m: of each point above the lidar.
+        path: positions of the lidar.
+
+    Returns:
+        The figure.
+    """
+    from matplotlib.cm import ScalarMappable
+    from matplotlib.colors import Normalize
+
+    # A few far points must not make the map small.
+    low, high = np.quantile(points[:, :2], [0.005, 0.995], axis=0) if len(points) else (np.zeros(2), np.ones(2))
+    limits = _limits(np.vstack([path[:, :2], [low, high]]), 0.03)
+    width_in, height_in = _size_in(limits)
+    figure = new_figure(width_in + 0.9, height_in + 0.6)
+    axes = figure.add_axes((0.02, 0.03, width_in / (width_in + 0.9), height_in / (height_in + 0.6)))
+    axes.imshow(
+        _raster(points, heights_m, limits, int(160 * width_in), int(160 * height_in)),
+        origin="lower",
+        extent=limits,
+        interpolation="nearest",
+    )
+    axes.plot(*path[:, :2].T, color=ACCENT, lw=1.0, zorder=4)
+    frame_map(axes, limits)
+    add_scale_bar(axes, limits, "m")
+    axes.set_title(title, fontsize=11, color=INK, loc="left", fontweight="bold")
+    bar = figure.add_axes((1 - 0.72 / (width_in + 0.9), 0.12, 0.13 / (width_in + 0.9), 0.6))
+    shown = figure.colorbar(ScalarMappable(Normalize(*HEIGHTS_M), _colormap()), cax=bar, extend="both")
+    shown.set_label("height above the lidar, m", fontsize=8, color=MUTED)
+    bar.tick_params(labelsize=7, colors=MUTED)
+    return figure
+
+
+def height_colors(heights_m: Float[np.ndarray, " n"]) -> UInt8[np.ndarray, "n 3"]:
+    """Returns the colours of heights above the lidar, for maps.
+
+    Args:
+        heights_m: metres.
+
+    Returns:
+        Red, green, blue from 0 to 255.
+    """
+    share = (np.asarray(heights_m, np.float64) - HEIGHTS_M[0]) / (HEIGHTS_M[1] - HEIGHTS_M[0])
+    return np.asarray(_colormap()(np.clip(share, 0, 1), bytes=True))[:, :3]
+
+
+def _colormap() -> Colormap:
+    import matplotlib
+    from matplotlib.colors import LinearSegmentedColormap
+
+    # The ground is pale on white paper; what stands on it goes from blue over violet to amber.
+    high = matplotlib.colormaps["plasma"](np.linspace(0.05, 0.85, 8))
+    colors = [(0.0, "#e3e7ec"), (0.15, "#cfd6de"), *zip(np.linspace(0.24, 1.0, 8), high, strict=True)]
+    return LinearSegmentedColormap.from_list("dpmjax_height", colors)
+
+
+def _raster(
+    points: Float[np.ndarray, "n 3"], heights_m: Float[np.ndarray, " n"], limits: Limits, columns: int, rows: int
+) -> UInt8[np.ndarray, "r c 3"]:
+    """The picture: the highest point of each pixel; pixels without points are white."""
+    place = (points[:, :2] - [limits.x_min, limits.y_min]) / [limits.width / columns, limits.height / rows]
+    column, row = np.floor(place).astype(np.int64).T
+    is_inside = (column >= 0) & (column < columns) & (row >= 0) & (row < rows)
+    highest = np.full(rows * columns, -np.inf)
+    np.maximum.at(highest, row[is_inside] * columns + column[is_inside], heights_m[is_inside])
+    picture = np.full((rows * columns, 3), 255, np.uint8)
+    is_seen = np.isfinite(highest)
+    picture[is_seen] = height_colors(highest[is_seen])
+    return picture.reshape(rows, columns, 3)
+
+
+def _limits(positions: Float[np.ndarray, "n 2"], margin_share: float) -> Limits:
+    low, high = positions.min(axis=0), positions.max(axis=0)
+    margin = max(margin_share * float((high - low).max()), 1.0)
+    # A straight road still gets a picture of a useful height.
+    narrow = np.maximum((high - low).max() * 0.35 - (high - low), 0) / 2
+    (x_min, y_min), (x_max, y_max) = low - narrow - margin, high + narrow + margin
+    return Limits(float(x_min), float(x_max), float(y_min), float(y_max))
+
+
+def _size_in(limits: Limits) -> tuple[float, float]:
+    scale = _LONGER_SIDE_IN / max(limits.width, limits.height)
+    return max(limits.width * scale, _SHORTER_SIDE_IN), max(limits.height * scale, _SHORTER_SIDE_IN)
+
+
+def _draw_loops(axes: Axes, loops: Float[np.ndarray, "m 2 3"]) -> None:
+    from matplotlib.collections import LineCollection
+
+    if len(loops):
+        lines = LineCollection(loops[:, :, :2], colors=LOOP, linewidths=1.0, alpha=0.9, zorder=5)
+        lines.set_label(f"{len(loops)} loops")
+        axes.add_collection(lines)
+        axes.plot(*loops[:, 0, :2].T, ".", ms=3.2, color=LOOP, zorder=6)
+
+
+def _draw_errors(axes: Axes, tracks: Sequence[Track]) -> None:
+    for track in tracks:
+        if track.errors_m is not None:
+            way = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(track.positions, axis=0), axis=1))])
+            axes.plot(way, track.errors_m, **_style(track, tracks))
+    style_axes(axes)
+    axes.set_ylim(bottom=0)
+    axes.set_xlim(left=0)
+    axes.set_xlabel("way, m", fontsize=8, color=MUTED)
+    annotate_corner(axes, "distance to the reference after alignment, m", (0, 6))
+
+
+def _style(track: Track, tracks: Sequence[Track]) -> dict[str, Any]:
+    """The last track is the one that counts."""
+    return {"color": OURS, "lw": 1.5} if track is tracks[-1] else {"color": ODOMETRY, "lw": 1.1, "ls": (0, (4, 2))}
