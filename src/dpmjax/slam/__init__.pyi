@@ -1,6 +1,7 @@
 from .agents import AgentsResult as AgentsResult
 from .agents import MergedMaps as MergedMaps
 from .agents import Traffic as Traffic
+from .agents import join_agents as join_agents
 from .agents import merge_maps as merge_maps
 from .agents import run_agents as run_agents
 from .alignment import Alignment as Alignment
@@ -16,6 +17,7 @@ from .journal import JournalContent as JournalContent
 from .journal import read_journal as read_journal
 from .keyframes import KeyframeMap as KeyframeMap
 from .keyframes import Submap as Submap
+from .keyframes import as_pose_graph as as_pose_graph
 from .map_joining import JoinedMaps as JoinedMaps
 from .map_joining import take_component as take_component
 from .matcher import Match as Match

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 import jax
@@ -12,14 +12,13 @@ from jaxtyping import Float
 from dpmjax.deeppointmap.model import Model
 from dpmjax.geometry import rigid
 from dpmjax.slam.config import SlamConfig
+from dpmjax.slam.front_end import AnyScan
 from dpmjax.slam.keyframes import KeyframeMap
 from dpmjax.slam.map_joining import JoinedMaps, OnKeyframe, join_maps, take_component
 from dpmjax.slam.methods import SlamMethods
-from dpmjax.slam.reports import Loop, ScanReport
-from dpmjax.slam.system import SlamResult, as_methods, finish_slam, init_slam, iterate_slam
-from dpmjax.types import AnyArray
+from dpmjax.slam.reports import Loop
+from dpmjax.slam.system import SlamResult, as_methods, place_scans, run_slam
 
-Scans = Iterable[Float[AnyArray, "_n 3"]]
 BYTES_A_POINT = 12
 """Three float32 numbers."""
 
@@ -77,12 +76,7 @@ class MergedMaps(NamedTuple):
 
 
 def run_agents(
-    sequences: Sequence[Scans],
-    model: Model | SlamMethods,
-    config: SlamConfig | None = None,
-    *,
-    on_scan: Callable[[int, ScanReport], None] | None = None,
-    on_keyframe: OnKeyframe | None = None,
+    sequences: Sequence[Iterable[AnyScan]], model: Model | SlamMethods, config: SlamConfig | None = None
 ) -> AgentsResult:
     """Maps with several agents: each runs alone, and what they have in common joins them.
 
@@ -90,11 +84,9 @@ def run_agents(
     agents does not change who meets whom.
 
     Args:
-        sequences: scans of each agent, points in metres, each in the frame of its lidar, in the order of time.
+        sequences: scans of each agent as `run_slam` takes them.
         model: a trained model; or methods of your own.
         config: settings; None takes the defaults. Methods of your own carry theirs.
-        on_scan: called with the number of the agent and the report, after each scan.
-        on_keyframe: called while keyframes of agents are compared.
 
     Returns:
         Trajectories, who has met whom, the joined graph, bytes sent.
@@ -105,20 +97,26 @@ def run_agents(
     if not sequences:
         raise ValueError("sequences: expected the scans of at least one agent, got none")
     methods = as_methods(model, config)
-    agents, num_points = [], []
-    for number, scans in enumerate(sequences):
-        counts: list[int] = []
-        state, reports = init_slam(), []
-        for state, report in iterate_slam(methods, _counted(scans, counts)):  # noqa: B007 (the last one is used)
-            reports.append(report)
-            if on_scan is not None:
-                on_scan(number, report)
-        agents.append(finish_slam(state, reports, methods.config))
-        num_points.append(counts)
+    return join_agents(methods, [run_slam(scans, methods) for scans in sequences])
+
+
+def join_agents(
+    methods: SlamMethods, agents: Sequence[SlamResult], *, on_keyframe: OnKeyframe | None = None
+) -> AgentsResult:
+    """Joins what agents have mapped alone; `run_agents` does both.
+
+    Args:
+        methods: of all agents.
+        agents: at least one.
+        on_keyframe: for progress, while keyframes are compared.
+
+    Returns:
+        Trajectories, who has met whom, the joined graph, bytes sent.
+    """
     joined = join_maps(methods, [agent.state.slam_map for agent in agents], on_keyframe=on_keyframe)
-    traffic = [_traffic(agent, counts) for agent, counts in zip(agents, num_points, strict=True)]
     trajectories = _trajectories(joined, agents)
-    return AgentsResult(trajectories, joined.component_of_map, joined, tuple(agents), tuple(traffic))
+    traffic = tuple(map(_traffic, agents))
+    return AgentsResult(trajectories, joined.component_of_map, joined, tuple(agents), traffic)
 
 
 def merge_maps(
@@ -144,23 +142,16 @@ def merge_maps(
     return MergedMaps((take_component(joined, 0),), joined.loops)
 
 
-def _counted(scans: Scans, counts: list[int]) -> Iterator[Float[AnyArray, "_n 3"]]:
-    for points in scans:
-        counts.append(len(points))
-        yield points
-
-
-def _traffic(agent: SlamResult, num_points: Sequence[int]) -> Traffic:
+def _traffic(agent: SlamResult) -> Traffic:
     slam_map = agent.state.slam_map
     descriptions = [keyframe.description for keyframe in slam_map.keyframes]
-    poses = slam_map.T_world_keyframe.nbytes + slam_map.vectors.nbytes
-    descriptors = sum(_num_bytes(getattr(description, "descriptors", ())) for description in descriptions)
-    keyframe_points = sum(num_points[keyframe.scan] for keyframe in slam_map.keyframes)
+    vectors_and_poses = slam_map.vectors.nbytes + slam_map.T_world_keyframe.nbytes
+    scan_bytes = [BYTES_A_POINT * report.num_points for report in agent.reports]
     return Traffic(
-        sum(map(_num_bytes, descriptions)) + poses,
-        descriptors,
-        BYTES_A_POINT * keyframe_points,
-        BYTES_A_POINT * sum(num_points),
+        keyframe_bytes=sum(map(_num_bytes, descriptions)) + vectors_and_poses,
+        descriptor_bytes=sum(_num_bytes(getattr(description, "descriptors", ())) for description in descriptions),
+        keyframe_scan_bytes=sum(scan_bytes[keyframe.scan] for keyframe in slam_map.keyframes),
+        scan_bytes=sum(scan_bytes),
     )
 
 
@@ -173,13 +164,13 @@ def _trajectories(joined: JoinedMaps, agents: Sequence[SlamResult]) -> tuple[Flo
     found: list[Float[np.ndarray, "_n 4 4"]] = []
     origins: dict[int, Float[np.ndarray, "4 4"]] = {}
     for number, agent in enumerate(agents):
-        rows = np.flatnonzero(joined.map_of_keyframe == number)
-        T_world = np.tile(np.eye(4), (len(agent.reports), 1, 1))
-        if len(rows):
-            T_keyframe_scan = np.array([report.T_keyframe_scan for report in agent.reports])
-            row = rows[[report.keyframe for report in agent.reports]]
-            T_world = joined.slam_map.T_world_keyframe[row] @ T_keyframe_scan
-            T_origin = origins.setdefault(joined.component_of_map[number], rigid.inverse(T_world[0]))
-            T_world = T_origin @ T_world
-        found.append(T_world)
+        T_world_keyframe = joined.slam_map.T_world_keyframe[joined.map_of_keyframe == number]
+        T_agent_scan = place_scans(T_world_keyframe, agent.reports)
+        if len(T_world_keyframe):
+            # `place_scans` has the first scan as its origin.
+            first = agent.reports[0]
+            T_world_agent = T_world_keyframe[first.keyframe] @ first.T_keyframe_scan
+            T_origin_world = origins.setdefault(joined.component_of_map[number], rigid.inverse(T_world_agent))
+            T_agent_scan = T_origin_world @ T_world_agent @ T_agent_scan
+        found.append(T_agent_scan)
     return tuple(found)

@@ -44,6 +44,7 @@ class ScanReport(NamedTuple):
         score: agreement of the scan with the local map.
         probability: P(correct) of the network; None where it was not asked.
         num_accepted: number of loops that were accepted at this scan.
+        num_points: number of points of the scan.
         T_turn: predicted motion that a scan with times was deskewed by; None for a scan without times.
     """
 
@@ -56,6 +57,7 @@ class ScanReport(NamedTuple):
     score: float = 0.0
     probability: float | None = None
     num_accepted: int = 0
+    num_points: int = 0
     T_turn: Pose | None = None
 
 

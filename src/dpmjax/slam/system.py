@@ -130,7 +130,7 @@ def step_slam(methods: SlamMethods, state: SlamState, scan: AnyScan) -> tuple[Sl
     if len(shape) != 2 or shape[1] != 3:
         raise ValueError(f"points: expected shape (n, 3), got {shape}")
     front, slam_map, report = front_end.step(methods, state.front_end, state.slam_map, scan)
-    loops = state.loops
+    report, loops = report._replace(num_points=shape[0]), state.loops
     if report.is_keyframe:
         num_before = num_accepted(loops.loops)
         slam_map, loops = close_loops(methods, slam_map, loops)

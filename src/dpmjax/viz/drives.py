@@ -67,8 +67,8 @@ def trajectory_figure(
     """
     tracks = [estimated] if odometry is None else [odometry, estimated]
     shown = [track.positions for track in tracks] + ([] if reference is None else [reference])
-    limits = _limits(np.concatenate(shown)[:, :2], 0.06)
-    width_in, height_in = _size_in(limits)
+    limits = plane_limits(np.concatenate(shown)[:, :2], 0.06)
+    width_in, height_in = size_in(limits)
     has_errors = estimated.errors_m is not None
     figure = new_figure(width_in + (3.6 if has_errors else 0.3), max(height_in, 3.0) + 0.9)
     columns = [width_in, 3.0] if has_errors else [width_in]
@@ -109,8 +109,8 @@ def height_map_figure(
 
     # A few far points must not make the map small.
     low, high = np.quantile(points[:, :2], [0.005, 0.995], axis=0) if len(points) else (np.zeros(2), np.ones(2))
-    limits = _limits(np.vstack([path[:, :2], [low, high]]), 0.03)
-    width_in, height_in = _size_in(limits)
+    limits = plane_limits(np.vstack([path[:, :2], [low, high]]), 0.03)
+    width_in, height_in = size_in(limits)
     figure = new_figure(width_in + 0.9, height_in + 0.6)
     axes = figure.add_axes((0.02, 0.03, width_in / (width_in + 0.9), height_in / (height_in + 0.6)))
     axes.imshow(
@@ -168,16 +168,32 @@ def _raster(
     return picture.reshape(rows, columns, 3)
 
 
-def _limits(positions: Float[np.ndarray, "n 2"], margin_share: float) -> Limits:
+def plane_limits(positions: Float[np.ndarray, "n 2"], margin_share: float) -> Limits:
+    """Returns a rectangle round positions; that of a straight road has a useful height too.
+
+    Args:
+        positions: at least one.
+        margin_share: of the longer side, added on all sides.
+
+    Returns:
+        The limits.
+    """
     low, high = positions.min(axis=0), positions.max(axis=0)
     margin = max(margin_share * float((high - low).max()), 1.0)
-    # A straight road still gets a picture of a useful height.
     narrow = np.maximum((high - low).max() * 0.35 - (high - low), 0) / 2
     (x_min, y_min), (x_max, y_max) = low - narrow - margin, high + narrow + margin
     return Limits(float(x_min), float(x_max), float(y_min), float(y_max))
 
 
-def _size_in(limits: Limits) -> tuple[float, float]:
+def size_in(limits: Limits) -> tuple[float, float]:
+    """Returns width and height of the panel of a map.
+
+    Args:
+        limits: of the map.
+
+    Returns:
+        Inches.
+    """
     scale = _LONGER_SIDE_IN / max(limits.width, limits.height)
     return max(limits.width * scale, _SHORTER_SIDE_IN), max(limits.height * scale, _SHORTER_SIDE_IN)
 
