@@ -123,7 +123,7 @@ def test_rounded_surfaces_are_thinned(tmp_path) -> None:
     scan_ = keyframe.description._replace(surface=compact_surface(dense, 4000))
     keyframes = (keyframe._replace(description=scan_), *MAP.keyframes[1:])
     found = load_map(save_map(tmp_path / "map.npz", replace(MAP, keyframes=keyframes), "int8"))
-    assert 500 < len(found.keyframes[0].description.surface.points) <= 1500
+    assert len(found.keyframes[0].description.surface.points) == 2000
 
 
 def test_wrong_arguments_are_refused(as_user, tmp_path) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -19,7 +19,7 @@ from dpmjax.scans.compact import (
 )
 from dpmjax.types import DescriptorCloud
 
-MAX_SURFACE_POINTS = 4000
+MAX_SURFACE_POINTS = 8000
 
 
 class CompactScan(NamedTuple):
@@ -42,7 +42,8 @@ class CompactScan(NamedTuple):
     @property
     def descriptors(self) -> DescriptorCloud:
         """The descriptors, as arrays of NumPy."""
-        return DescriptorCloud(self.positions, self.features, self.mask)
+        arrays: tuple[Any, ...] = (self.positions, self.features, self.mask)
+        return DescriptorCloud(*arrays)
 
 
 def compact_scan(

@@ -22,7 +22,7 @@ STEP_SHARE = 0.5
 """Step of the coefficients, as a share of the standard deviation of a channel."""
 
 POINT_STEP_M, POSITION_STEP_M = 0.02, 0.05
-MAX_STORED_POINTS = 1500
+MAX_STORED_POINTS = 2000
 FLATNESS_STEP = 17
 MAX_CODE = np.iinfo(np.int8).max
 

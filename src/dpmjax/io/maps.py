@@ -34,7 +34,7 @@ def save_map(path: str | Path, map_: KeyframeMap, precision: Precision = "float3
         path: must end in `.npz`; an existing file is replaced.
         map_: of a run, `result.state.slam_map`, with at least one keyframe.
         precision: "float32" keeps everything exactly: a run that goes on from the file equals an unbroken one.
-            "float16" rounds features and poses. "int8" rounds features to codes, and thins surfaces to 1,500 points.
+            "float16" rounds features and poses. "int8" rounds features to codes, and thins surfaces to 2,000 points.
 
     Returns:
         The path.

@@ -18,8 +18,13 @@ from .journal import read_journal as read_journal
 from .keyframes import KeyframeMap as KeyframeMap
 from .keyframes import Submap as Submap
 from .keyframes import as_pose_graph as as_pose_graph
+from .localization import Localization as Localization
+from .localization import LocalizationConfig as LocalizationConfig
+from .localization import localize as localize
+from .localization import localize_each as localize_each
 from .map_joining import JoinedMaps as JoinedMaps
 from .map_joining import take_component as take_component
+from .map_thinning import thin_map as thin_map
 from .matcher import Match as Match
 from .matcher import Matcher as Matcher
 from .matcher import NetworkMatcher as NetworkMatcher

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import scipy.sparse as sp
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from scipy.spatial.transform import Rotation
 
 from dpmjax.geometry import rigid
@@ -208,6 +208,21 @@ def graph_steps(slam_map: KeyframeMap, row: int, max_steps: int) -> Float[np.nda
     joined = sp.coo_array((np.ones(len(sources)), (sources, targets)), (len(slam_map), len(slam_map))).tocsr()
     found = sp.csgraph.dijkstra(joined, directed=False, indices=[row], unweighted=True, limit=max_steps)
     return np.asarray(found)[0]
+
+
+def connected_parts(num_keyframes: int, edges: Sequence[MapEdge]) -> Int[np.ndarray, " k"]:
+    """Numbers the connected parts of a graph.
+
+    Args:
+        num_keyframes: number of nodes.
+        edges: what joins them.
+
+    Returns:
+        The number of the part of each keyframe.
+    """
+    rows = np.array([(edge.source, edge.target) for edge in edges], np.int64).reshape(-1, 2).T
+    joined = sp.coo_array((np.ones(rows.shape[1]), (rows[0], rows[1])), (num_keyframes, num_keyframes))
+    return np.asarray(sp.csgraph.connected_components(joined, directed=False)[1], np.int64)
 
 
 def submap_around(slam_map: KeyframeMap, row: int, num_keyframes: int, radius_m: float) -> Submap:

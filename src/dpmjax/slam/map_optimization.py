@@ -5,13 +5,20 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-import scipy.sparse as sp
 from jaxtyping import Float, Int
 
 from dpmjax.geometry import rigid
 from dpmjax.pose_graph.optimize import PoseGraphConfig, optimize_pose_graph
 from dpmjax.slam.config import LoopClosureConfig
-from dpmjax.slam.keyframes import KeyframeMap, MapEdge, as_pose_graph, diagonal_information, with_edges, with_poses
+from dpmjax.slam.keyframes import (
+    KeyframeMap,
+    MapEdge,
+    as_pose_graph,
+    connected_parts,
+    diagonal_information,
+    with_edges,
+    with_poses,
+)
 from dpmjax.slam.loop_state import LoopState
 from dpmjax.slam.reports import Loop
 
@@ -56,21 +63,6 @@ def optimize_map(slam_map: KeyframeMap, state: LoopState, config: LoopClosureCon
             kept.append(edge)
     slam_map = with_poses(with_edges(slam_map, [*measured, *guesses, *kept]), solved.graph.poses)
     return slam_map, LoopState(tuple(loops), len(slam_map), False)
-
-
-def connected_parts(num_keyframes: int, edges: Sequence[MapEdge]) -> Int[np.ndarray, " k"]:
-    """Finds the keyframes that edges join.
-
-    Args:
-        num_keyframes: number of rows.
-        edges: between them.
-
-    Returns:
-        Number of the connected part of each keyframe.
-    """
-    rows = np.array([(edge.source, edge.target) for edge in edges], np.int64).reshape(-1, 2).T
-    joined = sp.coo_matrix((np.ones(rows.shape[1]), (rows[0], rows[1])), (num_keyframes, num_keyframes))
-    return np.asarray(sp.csgraph.connected_components(joined, directed=False)[1])
 
 
 def _joined_poses(
