@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -15,7 +15,7 @@ from dpmjax.io.files import write_atomically
 
 if TYPE_CHECKING:
     from dpmjax.sequences import LidarSequence
-    from dpmjax.slam import Loop, ScanReport, SlamResult
+    from dpmjax.slam import KeyframeMap, Loop, ScanReport, SlamResult
 
 MAP_VOXEL_M, MAX_MAP_POINTS = 0.2, 3_000_000
 MAP_RANGES_M = (2.0, 60.0)
@@ -119,33 +119,53 @@ def _number(value: float | None) -> str:
     return "" if value is None else f"{value:.6g}"
 
 
-def gather_map(scans: Sequence[int], T_world_scan: np.ndarray, read_points: Callable[[int], np.ndarray]) -> Cloud:
-    """Reads scans again and puts them into the world, one point a voxel; larger voxels where the map gets too large.
+def gather_map(views: Iterable[tuple[np.ndarray, np.ndarray]]) -> Cloud:
+    """Puts scans into the world, one point a voxel; voxels grow where the map gets too large.
 
     Args:
-        scans: numbers of the scans.
-        T_world_scan: (n, 4, 4) poses of all scans.
-        read_points: reads a scan by its number.
+        views: points of a scan and its pose, one after the other.
     """
     from dpmjax.scans.preprocess import first_of_each_voxel
 
-    voxel_m, kept, num_thinned = MAP_VOXEL_M, [np.zeros((0, 4), np.float32)], 0
-    for number, scan in enumerate(tqdm(scans, desc="map", unit=" keyframes", dynamic_ncols=True)):
-        points, T = read_points(scan).astype(np.float64), T_world_scan[scan]
+    voxel_m, parts, num_thinned = MAP_VOXEL_M, [np.zeros((0, 4), np.float32)], 0
+
+    def thinned() -> np.ndarray:
+        whole = np.concatenate(parts)
+        return whole[first_of_each_voxel(whole[:, :3], voxel_m)]
+
+    for scan, T in views:
+        points = scan.astype(np.float64)
         ranges = np.linalg.norm(points, axis=1)
         points = points[(ranges > MAP_RANGES_M[0]) & (ranges < MAP_RANGES_M[1])]
         turned = points[first_of_each_voxel(points, voxel_m)] @ T[:3, :3].T
-        kept.append(np.column_stack([turned + T[:3, 3], turned[:, 2]]).astype(np.float32))
+        parts.append(np.column_stack([turned + T[:3, 3], turned[:, 2]]).astype(np.float32))
         # The larger the map, the rarer it is thinned: the work grows with the map only.
-        if sum(map(len, kept)) > 2 * num_thinned + 200_000 or number == len(scans) - 1:
-            whole = np.concatenate(kept)
-            whole = whole[first_of_each_voxel(whole[:, :3], voxel_m)]
-            while len(whole) > MAX_MAP_POINTS:
+        if sum(map(len, parts)) > 2 * num_thinned + 200_000:
+            parts = [thinned()]
+            while len(parts[0]) > MAX_MAP_POINTS:
                 voxel_m *= 1.5
-                whole = whole[first_of_each_voxel(whole[:, :3], voxel_m)]
-            kept, num_thinned = [whole], len(whole)
-    whole = np.concatenate(kept)
+                parts = [thinned()]
+            num_thinned = len(parts[0])
+    whole = thinned()
     return Cloud(whole[:, :3], whole[:, 3], voxel_m)
+
+
+def keyframe_views(
+    slam_map: KeyframeMap, read_keyframe: Callable[[int], np.ndarray]
+) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """Reads keyframes again, with progress; yields points and pose."""
+    for row in tqdm(range(len(slam_map)), desc="map", unit=" keyframes", dynamic_ncols=True):
+        yield read_keyframe(row), slam_map.T_world_keyframe[row]
+
+
+def write_map_file(path: Path, slam_map: KeyframeMap) -> dict[str, int]:
+    """Writes the map that later runs extend and scans are localised in; returns its size at each precision."""
+    import dpmjax
+    from dpmjax.io.maps import map_bytes
+
+    dpmjax.save_map(path, slam_map)
+    sizes = {name: len(map_bytes(slam_map, name)) for name in ("float16", "int8")}
+    return {"map_bytes": path.stat().st_size, **{f"map_bytes_{name}": size for name, size in sizes.items()}}
 
 
 def write_map(path: Path, cloud: Cloud) -> None:
@@ -156,32 +176,39 @@ def write_map(path: Path, cloud: Cloud) -> None:
     dpm_io.write_ply(path, cloud.points, colors=viz.height_colors(cloud.heights_m))
 
 
-def draw_pictures(folder: Path, sequence: LidarSequence, result: SlamResult, cloud: Cloud) -> None:
+def draw_pictures(
+    folder: Path, sequence: LidarSequence, result: SlamResult, cloud: Cloud, num_keyframes_before: int = 0
+) -> None:
     """Draws trajectory.png and map.png."""
     from dpmjax import viz
+    from dpmjax.geometry import rigid
     from dpmjax.metrics import align_rigid
-    from experiments._slam_numbers import distances_to_reference
 
-    T, odometry = result.T_world_scan, result.T_odometry_scan
+    T, slam_map, num_old = result.T_world_scan, result.state.slam_map, num_keyframes_before
+    # Odometry alone begins where the drive begins, also in a map that was there before.
+    odometry = T[0] @ rigid.inverse(result.T_odometry_scan[0]) @ result.T_odometry_scan
     reference = None if sequence.T_world_lidar is None else sequence.T_world_lidar[: len(T)]
-    errors = [distances_to_reference(poses, reference) for poses in (T, odometry)]
-    labels = [
-        name if distance is None else f"{name}, ATE {np.sqrt(np.mean(distance**2)):.2f} m"
-        for name, distance in zip(("SLAM", "odometry alone"), errors, strict=True)
-    ]
+    accepted = [loop for loop in result.loops if loop.status == "accepted"]
+    ends = np.array([(loop.source, loop.target) for loop in accepted], np.int64).reshape(-1, 2)
+    tracks = [_track("odometry alone", odometry, reference)] if len(ends) else []
+    if num_old:
+        tracks = [viz.Track("the map before", slam_map.T_world_keyframe[:num_old, :3, 3]), *tracks]
+    tracks.append(_track("SLAM", T, reference))
     shown = None
     if reference is not None:
         T_map_reference = align_rigid(reference[:, :3, 3], T[:, :3, 3])
         shown = reference[:, :3, 3] @ T_map_reference[:3, :3].T + T_map_reference[:3, 3]
-    accepted = [loop for loop in result.loops if loop.status == "accepted"]
-    ends = np.array([result.keyframes[[loop.source, loop.target]] for loop in accepted], np.int64).reshape(-1, 2)
-    figure = viz.trajectory_figure(
-        f"{sequence.name}: {len(T)} scans",
-        viz.Track(labels[0], T[:, :3, 3], errors[0]),
-        viz.Track(labels[1], odometry[:, :3, 3], errors[1]) if len(ends) else None,
-        shown,
-        T[ends, :3, 3],
-    )
+    title = f"{sequence.name}: {len(T)} scans"
+    figure = viz.trajectory_figure(title, tracks, shown, slam_map.T_world_keyframe[ends, :3, 3])
     viz.save_figure(figure, folder / "trajectory.png")
     title = f"{sequence.name}: {len(result.keyframes)} keyframes"
     viz.save_figure(viz.height_map_figure(title, cloud.points, cloud.heights_m, T[:, :3, 3]), folder / "map.png")
+
+
+def _track(name: str, T_world_scan: np.ndarray, reference: np.ndarray | None) -> Any:
+    from dpmjax import viz
+    from experiments._slam_numbers import distances_to_reference
+
+    errors = distances_to_reference(T_world_scan, reference)
+    label = name if errors is None else f"{name}, ATE {np.sqrt(np.mean(errors**2)):.2f} m"
+    return viz.Track(label, T_world_scan[:, :3, 3], errors)

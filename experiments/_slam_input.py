@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from dpmjax.slam.front_end import AnyScan
     from experiments.dpm_slam import Config
 
-TOWN_ROUTE_M, TOWN_DRIVE_M, TOWN_RATE_HZ, TOWN_AZIMUTHS = 400.0, 480.0, 3.5, 900
+TOWN_ROUTE_M, TOWN_DRIVE_M, TOWN_RATE_HZ, TOWN_AZIMUTHS = 400.0, 480.0, 3.0, 900
 TURN_S = 0.1
 _FLOAT32_ROW_BYTES = 16
 

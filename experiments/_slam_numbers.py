@@ -10,7 +10,7 @@ import numpy as np
 
 if TYPE_CHECKING:
     from dpmjax.sequences import LidarSequence
-    from dpmjax.slam import SlamResult
+    from dpmjax.slam import KeyframeMap, SlamResult
     from experiments._slam_run import SlamRun
 
 
@@ -52,7 +52,7 @@ def run_numbers(run: SlamRun, result: SlamResult, sequence: LidarSequence) -> di
         "num_scans": num,
         "path_m": float(np.linalg.norm(np.diff(T[:, :3, 3], axis=0), axis=1).sum()),
         "num_keyframes": len(result.keyframes),
-        "num_segments": 1 + statuses["restarted"],
+        "num_parts": count_parts(result.state.slam_map),
         "num_loops": loops["accepted"],
         **trajectory_errors(T, reference),
         **trajectory_errors(result.T_odometry_scan, reference, "_odometry"),
@@ -66,6 +66,14 @@ def run_numbers(run: SlamRun, result: SlamResult, sequence: LidarSequence) -> di
     }
 
 
+def count_parts(slam_map: KeyframeMap) -> int:
+    """Returns the number of parts of a map that measured motions join."""
+    from dpmjax.slam.keyframes import connected_parts
+
+    measured = [edge for edge in slam_map.edges if edge.kind != "guess"]
+    return len(set(connected_parts(len(slam_map), measured).tolist()))
+
+
 def summary(metrics: dict[str, Any]) -> str:
     """Returns the last lines on the console."""
     lines = [
@@ -76,10 +84,8 @@ def summary(metrics: dict[str, Any]) -> str:
     if statuses:
         found = ", ".join(f"{count} {name}" for name, count in statuses.items())
         lines.append(f"not tracked by geometry alone: {found} (scans.csv has the reasons)")
-    if metrics["num_segments"] > 1:
-        lines.append(
-            f"the track was lost: {metrics['num_segments']} parts, joined by loops where a place is seen again"
-        )
+    if metrics["num_parts"] > 1:
+        lines.append(f"the map has {metrics['num_parts']} parts that no loop joins; where they lie is a guess")
     for suffix, name in (("_odometry", "odometry alone"), ("", "SLAM"), ("_refined", "refined")):
         if f"ate{suffix}_m" in metrics:
             line = f"{name:14}  ATE {metrics[f'ate{suffix}_m']:.3f} m, RPE {metrics[f'rpe{suffix}_m']:.3f} m"

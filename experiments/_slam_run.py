@@ -12,19 +12,31 @@ import jax
 from tqdm import tqdm
 
 from dpmjax.sequences import LidarSequence
-from dpmjax.slam import Journal, JournalContent, SlamMethods, init_slam, step_slam
+from dpmjax.slam import Journal, JournalContent, SlamMethods, SlamState, step_slam
 from dpmjax.slam.system import place_scans
 from experiments._run_folder import RunFolder
 from experiments._slam_files import write_scans, write_trajectory
 from experiments._slam_input import ScanReader
 
 if TYPE_CHECKING:
-    from dpmjax.slam import ScanReport, SlamState
+    from dpmjax.slam import ScanReport
 
 JOURNAL = "slam.journal"
 # Seconds between interim results, for those who look at a run that goes on.
 FLUSH_EVERY_S = 30.0
 _STAGES = {"measure": "surface", "align": "odometry", "describe": "encode", "register": "loops", "overlaps": "loops"}
+
+
+class Beginning(NamedTuple):
+    """Where a run goes on.
+
+    Attributes:
+        start: state before the first scan of the drive.
+        earlier: what the journal of a resumed run holds; None for a new one.
+    """
+
+    start: SlamState
+    earlier: JournalContent | None = None
 
 
 class SlamRun(NamedTuple):
@@ -91,15 +103,16 @@ def run_scans(
     sequence: LidarSequence,
     reader: ScanReader,
     methods: SlamMethods,
-    earlier: JournalContent | None,
+    beginning: Beginning,
     is_stopped: Callable[[], bool],
 ) -> SlamRun:
     """Places all scans that are left; what ends it early is in the result, and what was found is in the journal."""
     watch = Stopwatch()
     timed = methods._replace(matcher=Timed(methods.matcher, watch), geometry=Timed(methods.geometry, watch))
-    state = earlier.state if earlier else init_slam()
+    earlier, state = beginning.earlier, beginning.start
     reports, fresh = list(earlier.reports if earlier else ()), []
-    journal = Journal(folder / JOURNAL, earlier)
+    journal = Journal(folder / JOURNAL, earlier, state)
+    state = earlier.state if earlier else state
     first, failure, started, flushed = len(reports), None, time.perf_counter(), time.perf_counter()
     bar = tqdm(total=len(sequence), initial=first, desc=sequence.name, unit=" scans", dynamic_ncols=True)
     scans = reader.iterate(first)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from dpmjax import PoseGraph, optimize_pose_graph, read_g2o, write_g2o
+from dpmjax import Edges, PoseGraph, optimize_pose_graph, read_g2o, write_g2o
 from dpmjax.io import InputError
 
 PLANAR = """# two nodes and a loop
@@ -114,3 +114,11 @@ def test_missing_file_and_bytes_are_refused(tmp_path: Path) -> None:
     path.write_bytes(np.random.default_rng(0).bytes(500))
     with pytest.raises(InputError):
         read_g2o(path)
+
+
+def test_a_graph_of_one_pose_is_written_and_read(tmp_path: Path) -> None:
+    nothing = Edges(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, 4, 4)), np.zeros((0, 6, 6)))
+    path = write_g2o(tmp_path / "one.g2o", PoseGraph.create(np.eye(4)[None], nothing, ids=[7]))
+    found = read_g2o(path)
+    np.testing.assert_array_equal(found.ids, [7])
+    assert len(found.edges.source) == 0

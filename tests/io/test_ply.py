@@ -70,3 +70,14 @@ def test_a_missing_file_is_named(tmp_path):
 def test_other_shapes_are_not_written(tmp_path):
     with pytest.raises(ValueError, match="points"):
         write_ply(tmp_path / "a.ply", POINTS[:, :2])
+
+
+def test_colours_are_written_and_the_points_stay(tmp_path):
+    colors = np.array([[1, 2, 3], [255, 0, 9], [7, 7, 7]], np.uint8)
+    path = write_ply(tmp_path / "a.ply", POINTS, colors=colors)
+    np.testing.assert_array_equal(read_ply(path), POINTS)
+    plyfile = pytest.importorskip("plyfile", reason="plyfile is not installed")
+    vertices = plyfile.PlyData.read(str(path))["vertex"]
+    np.testing.assert_array_equal(np.column_stack([vertices[name] for name in ("red", "green", "blue")]), colors)
+    with pytest.raises(ValueError, match="colors must be"):
+        write_ply(tmp_path / "a.ply", POINTS, colors=colors[:2])

@@ -136,7 +136,7 @@ def _poses(numbers: FloatArray) -> FloatArray:
 def _numbers(poses: FloatArray) -> FloatArray:
     """Numbers of the file from poses of the graph."""
     if poses.ndim == 2 or not len(poses):
-        return poses.reshape(len(poses), -1)
+        return poses if poses.ndim == 2 else np.zeros((0, 7))
     return np.column_stack([poses[:, :3, 3], Rotation.from_matrix(poses[:, :3, :3]).as_quat()])
 
 

@@ -14,7 +14,6 @@ from dpmjax.viz.figures import (
     MUTED,
     Limits,
     add_scale_bar,
-    annotate_corner,
     frame_map,
     new_figure,
     style_axes,
@@ -48,45 +47,48 @@ class Track(NamedTuple):
 
 def trajectory_figure(
     title: str,
-    estimated: Track,
-    odometry: Track | None,
+    tracks: Sequence[Track],
     reference: Float[np.ndarray, "n 3"] | None,
     loops: Float[np.ndarray, "m 2 3"],
 ) -> Figure:
-    """Draws the trajectory from above, with odometry alone, the reference and the loops; and the errors beside it.
+    """Draws trajectories from above with the reference and the loops; and the errors beside them.
 
     Args:
         title: of the picture.
-        estimated: of the whole system.
-        odometry: without loops; None where there were none to correct it.
+        tracks: the last one is the result; those before are drawn thinner.
         reference: positions in the same frame; None where there is none.
         loops: positions of both ends of each accepted loop.
 
     Returns:
         The figure; without errors it has no second panel.
+
+    Raises:
+        ValueError: no track.
     """
-    tracks = [estimated] if odometry is None else [odometry, estimated]
+    if not tracks:
+        raise ValueError("tracks: expected at least one")
     shown = [track.positions for track in tracks] + ([] if reference is None else [reference])
     limits = plane_limits(np.concatenate(shown)[:, :2], 0.06)
-    width_in, height_in = size_in(limits)
-    has_errors = estimated.errors_m is not None
-    figure = new_figure(width_in + (3.6 if has_errors else 0.3), max(height_in, 3.0) + 0.9)
-    columns = [width_in, 3.0] if has_errors else [width_in]
-    axes_row = figure.subplots(1, len(columns), squeeze=False, width_ratios=columns)[0]
-    axes = axes_row[0]
+    (width_in, height_in), has_errors = size_in(limits), any(track.errors_m is not None for track in tracks)
+    total_in = (width_in + (4.1 if has_errors else 0.3), height_in + 1.05)
+    figure = new_figure(*total_in)
+    axes = _add_axes(figure, (0.15, 0.65, width_in, height_in))
     if reference is not None:
         axes.plot(*reference[:, :2].T, color="#b9c0c8", lw=4.2, solid_capstyle="round", label="reference", zorder=2)
     for track in tracks:
         axes.plot(*track.positions[:, :2].T, label=track.label, zorder=4, **_style(track, tracks))
     _draw_loops(axes, loops)
-    axes.plot(*estimated.positions[:1, :2].T, "o", ms=6, color=INK, mec="white", zorder=7, label="start")
+    axes.plot(*tracks[-1].positions[:1, :2].T, "o", ms=6, color=INK, mec="white", zorder=7, label="start")
     frame_map(axes, limits)
     add_scale_bar(axes, limits, "m")
-    axes.set_title(f"{title}\n", fontsize=11, color=INK, loc="left", fontweight="bold")
-    axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.02), ncols=5, frameon=False, fontsize=8, labelcolor=MUTED)
+    axes.set_title(title, fontsize=11, color=INK, loc="left", fontweight="bold")
+    axes.legend(
+        loc="upper left", bbox_to_anchor=(-0.01, -0.01), ncols=3, frameon=False, fontsize=8, labelcolor=MUTED,
+        borderaxespad=0.2,
+    )  # fmt: skip
     if has_errors:
-        _draw_errors(axes_row[1], tracks)
-    figure.tight_layout()
+        panel_in = min(height_in, 3.0)
+        _draw_errors(_add_axes(figure, (width_in + 0.75, 0.65 + height_in - panel_in, 3.1, panel_in)), tracks)
     return figure
 
 
@@ -111,8 +113,8 @@ def height_map_figure(
     low, high = np.quantile(points[:, :2], [0.005, 0.995], axis=0) if len(points) else (np.zeros(2), np.ones(2))
     limits = plane_limits(np.vstack([path[:, :2], [low, high]]), 0.03)
     width_in, height_in = size_in(limits)
-    figure = new_figure(width_in + 0.9, height_in + 0.6)
-    axes = figure.add_axes((0.02, 0.03, width_in / (width_in + 0.9), height_in / (height_in + 0.6)))
+    figure = new_figure(width_in + 1.05, height_in + 0.5)
+    axes = _add_axes(figure, (0.12, 0.12, width_in, height_in))
     axes.imshow(
         _raster(points, heights_m, limits, int(160 * width_in), int(160 * height_in)),
         origin="lower",
@@ -123,7 +125,8 @@ def height_map_figure(
     frame_map(axes, limits)
     add_scale_bar(axes, limits, "m")
     axes.set_title(title, fontsize=11, color=INK, loc="left", fontweight="bold")
-    bar = figure.add_axes((1 - 0.72 / (width_in + 0.9), 0.12, 0.13 / (width_in + 0.9), 0.6))
+    bar_in = min(height_in, 3.0)
+    bar = _add_axes(figure, (width_in + 0.27, 0.12 + (height_in - bar_in) / 2, 0.13, bar_in))
     shown = figure.colorbar(ScalarMappable(Normalize(*HEIGHTS_M), _colormap()), cax=bar, extend="both")
     shown.set_label("height above the lidar, m", fontsize=8, color=MUTED)
     bar.tick_params(labelsize=7, colors=MUTED)
@@ -141,6 +144,12 @@ def height_colors(heights_m: Float[np.ndarray, " n"]) -> UInt8[np.ndarray, "n 3"
     """
     share = (np.asarray(heights_m, np.float64) - HEIGHTS_M[0]) / (HEIGHTS_M[1] - HEIGHTS_M[0])
     return np.asarray(_colormap()(np.clip(share, 0, 1), bytes=True))[:, :3]
+
+
+def _add_axes(figure: Figure, place_in: tuple[float, float, float, float]) -> Axes:
+    """Adds axes at left, bottom, with width and height in inches."""
+    (left, bottom, width, height), (whole, high) = place_in, figure.get_size_inches()
+    return figure.add_axes((left / whole, bottom / high, width / whole, height / high))
 
 
 def _colormap() -> Colormap:
@@ -217,7 +226,7 @@ def _draw_errors(axes: Axes, tracks: Sequence[Track]) -> None:
     axes.set_ylim(bottom=0)
     axes.set_xlim(left=0)
     axes.set_xlabel("way, m", fontsize=8, color=MUTED)
-    annotate_corner(axes, "distance to the reference after alignment, m", (0, 6))
+    axes.set_title("distance to the aligned reference, m", fontsize=8.5, color=MUTED, loc="left")
 
 
 def _style(track: Track, tracks: Sequence[Track]) -> dict[str, Any]:

@@ -1,0 +1,371 @@
+"""The command dpm_slam: options, bad input, its files as others read them, stops, kills and resumed runs.
+
+Matcher and geometry know the truth; a scan is one point, whose x is the number of its pose.
+"""
+
+from __future__ import annotations
+
+import csv
+import itertools
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from types import SimpleNamespace
+
+import jax
+import numpy as np
+import pytest
+
+import dpmjax
+from dpmjax.geometry import rigid
+from dpmjax.io import read_poses, write_tum
+from dpmjax.metrics import absolute_trajectory_error
+from dpmjax.slam import SlamConfig, SlamMethods, run_slam
+from experiments import _slam_files, _slam_input, _slam_refine, dpm_slam
+from experiments._command import EXIT_BAD_INPUT, EXIT_FAILED, EXIT_OK, run_command
+from experiments._result_files import load_json
+from tests.deeppointmap import toy
+from tests.slam.test_odometry import motion, planes, seen_from
+from tests.slam.truth import TruthGeometry, TruthMatcher, laps, scans_of
+
+REPOSITORY = Path(__file__).parents[2]
+TRUTH = laps(2, side_m=40.0, step_m=2.0)
+SAME_FILES = (
+    "trajectory.npy", "trajectory_tum.txt", "trajectory_kitti.txt", "odometry.npy", "keyframes.txt", "graph.g2o",
+    "loops.csv", "scans.csv", "map.ply",
+)  # fmt: skip
+
+
+def truth_methods(config) -> SlamMethods:
+    return SlamMethods(TruthMatcher(TRUTH), TruthGeometry(TRUTH, sigma_m=0.02), SlamConfig())
+
+
+def run(*options) -> int:
+    return run_command(
+        dpm_slam.main,
+        dpm_slam.Config,
+        experiment=dpm_slam.EXPERIMENT,
+        description=dpm_slam.__doc__,
+        args=list(map(str, options)),
+    )
+
+
+def write_drive(folder: Path, *, with_poses: bool = True) -> Path:
+    folder.mkdir(parents=True)
+    for number in range(len(TRUTH)):
+        np.save(folder / f"{number:03}.npy", np.float32([[number, 1, 0]]))
+    if with_poses:
+        write_tum(folder / "poses_lidar.txt", TRUTH)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def drive(tmp_path_factory) -> Path:
+    return write_drive(tmp_path_factory.mktemp("input") / "drive")
+
+
+def use_truth(patch: pytest.MonkeyPatch) -> None:
+    """Truth in place of the networks; a map file needs their descriptors."""
+    patch.setattr(dpm_slam, "slam_methods", truth_methods)
+    patch.setattr(_slam_files, "write_map_file", lambda path, slam_map: {})
+
+
+@pytest.fixture
+def with_truth(monkeypatch) -> None:
+    use_truth(monkeypatch)
+
+
+@pytest.fixture(scope="module")
+def whole(drive, tmp_path_factory) -> Path:
+    """The folder of a run that nothing has stopped."""
+    folder = tmp_path_factory.mktemp("output") / "whole"
+    with pytest.MonkeyPatch.context() as patch:
+        use_truth(patch)
+        assert run(drive, "-o", folder) == EXIT_OK
+    return folder
+
+
+def assert_same_results(folder: Path, other: Path) -> None:
+    for name in SAME_FILES:
+        assert (folder / name).read_bytes() == (other / name).read_bytes(), name
+
+
+def table(path: Path) -> list[dict[str, str]]:
+    return list(csv.DictReader(path.read_text().splitlines()))
+
+
+def test_help_shows_examples(capsys) -> None:
+    assert run("--help") == 0
+    assert "python -m experiments.dpm_slam path/to/drive -o out" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["-n", 0], "--n-scans"),
+        (["-j", 0], "--jump"),
+        (["--sequence", "00"], "--sequence"),
+        (["/no/such/folder"], "no such folder"),
+        (["--weights", "no_such_model"], "no_such_model"),
+        (["--resume", "-o", "/no/such/run"], "nothing to resume"),
+    ],
+)
+def test_wrong_usage_is_one_line(options, message, capsys) -> None:
+    assert run(*options) == EXIT_BAD_INPUT
+    errors = capsys.readouterr().err
+    assert message in errors
+    assert "Traceback" not in errors
+
+
+def test_what_is_known_to_be_bad_is_told_before_the_run(with_truth, tmp_path, capsys) -> None:
+    drive = tmp_path / "drive"
+    drive.mkdir()
+    for number in range(4):
+        np.full((8, 4), number + 1, np.float32).tofile(drive / f"{number}.bin")
+    (drive / "2.bin").write_bytes((drive / "2.bin").read_bytes()[:-3])
+    assert run(drive, "-o", tmp_path / "out") == EXIT_BAD_INPUT
+    errors = capsys.readouterr().err.strip().splitlines()
+    assert len(errors) == 1
+    assert "2.bin" in errors[0]
+    assert not (tmp_path / "out").exists()
+
+
+def test_results_say_what_was_done(whole, drive) -> None:
+    metrics = load_json(whole / "metrics.json")
+    assert metrics["num_scans"] == len(TRUTH)
+    assert metrics["num_loops"] > 0
+    assert metrics["ate_m"] < 0.5 * metrics["ate_odometry_m"]
+    assert metrics["t_rel_percent"] < 1.0
+    assert metrics["seed"] == 0
+    assert metrics["is_interrupted"] is False
+    assert {"surface", "odometry", "encode", "loops", "read", "journal"} <= set(metrics["stages_s"])
+    scans, loops = table(whole / "scans.csv"), table(whole / "loops.csv")
+    assert [int(row["scan"]) for row in scans] == list(range(len(TRUTH)))
+    assert {row["status"] for row in scans} == {"first", "tracked"}
+    assert all(row["reason"] for row in scans)
+    assert Path(scans[7]["source"]).name == "007.npy"
+    assert sum(row["status"] == "accepted" for row in loops) == metrics["num_loops"]
+    assert {row["found_by"] for row in loops} <= {"distance", "retrieval"}
+    assert metrics["num_parts"] == 1
+    for name in ("config.json", "log.txt", "trajectory.png", "map.png", "map.ply", "slam.journal"):
+        assert (whole / name).stat().st_size > 0
+
+
+def test_evo_reads_the_trajectories(whole) -> None:
+    file_interface = pytest.importorskip("evo.tools.file_interface")
+    expected = np.load(whole / "trajectory.npy")
+    for read, name in (("read_tum_trajectory_file", "trajectory_tum"), ("read_kitti_poses_file", "trajectory_kitti")):
+        found = getattr(file_interface, read)(str(whole / f"{name}.txt"))
+        np.testing.assert_allclose(found.positions_xyz, expected[:, :3, 3], atol=1e-6)
+    assert file_interface.read_tum_trajectory_file(str(whole / "keyframes.txt")).num_poses > 10
+    np.testing.assert_allclose(read_poses(whole / "trajectory_tum.txt"), expected, atol=1e-6)
+
+
+def test_gtsam_reads_the_graph(whole) -> None:
+    gtsam = pytest.importorskip("gtsam", reason="gtsam is not installed (pip install dpmjax[gtsam])")
+    factors, values = gtsam.readG2o(str(whole / "graph.g2o"), True)
+    metrics = load_json(whole / "metrics.json")
+    assert values.size() == metrics["num_keyframes"]
+    assert factors.size() >= metrics["num_keyframes"] - 1 + metrics["num_loops"]
+
+
+def test_plyfile_reads_the_map(whole) -> None:
+    plyfile = pytest.importorskip("plyfile", reason="plyfile is not installed (pip install plyfile)")
+    vertices = plyfile.PlyData.read(str(whole / "map.ply"))["vertex"]
+    assert vertices.count > 10
+    assert {"x", "y", "z", "red", "green", "blue"} == {entry.name for entry in vertices.properties}
+    positions = np.column_stack([vertices[axis] for axis in "xyz"])
+    # Each scan is one point, and keyframes alone are in the map.
+    T = np.load(whole / "trajectory.npy")
+    world = T[:, :3, 0] * np.arange(len(T))[:, None] + T[:, :3, 1] + T[:, :3, 3]
+    apart = np.linalg.norm(positions[:, None] - world[None], axis=2).min(axis=1)
+    assert apart.max() < 1e-3
+
+
+def test_a_bad_scan_on_the_way_keeps_what_was_found(whole, drive, with_truth, tmp_path, capsys) -> None:
+    out, path = tmp_path / "out", drive / "060.npy"
+    good = path.read_bytes()
+    path.write_bytes(good[: len(good) // 2])
+    assert run(drive, "-o", out) == EXIT_FAILED
+    errors = capsys.readouterr().err
+    assert "Traceback" not in errors
+    last = errors.strip().splitlines()[-1]
+    assert "060.npy" in last
+    assert str(out) in last
+    assert len(np.load(out / "trajectory.npy")) == 60
+    assert load_json(out / "metrics.json")["is_interrupted"] is True
+    path.write_bytes(good)
+    assert run("--resume", "-o", out) == EXIT_OK
+    assert_same_results(out, whole)
+
+
+def test_a_scan_without_points_is_passed_over(with_truth, tmp_path) -> None:
+    drive = write_drive(tmp_path / "drive")
+    np.save(drive / "030.npy", np.zeros((5, 3), np.float32))
+    assert run(drive, "-o", tmp_path / "out") == EXIT_OK
+    assert table(tmp_path / "out" / "scans.csv")[30]["status"] == "empty"
+    assert len(np.load(tmp_path / "out" / "trajectory.npy")) == len(TRUTH)
+
+
+def test_an_interrupted_run_writes_all_and_goes_on(whole, drive, with_truth, tmp_path, monkeypatch) -> None:
+    out, read = tmp_path / "out", _slam_input.read_points
+
+    def interrupting(sequence, index):
+        if index == 77 and not out.with_suffix(".stopped").exists():
+            out.with_suffix(".stopped").touch()
+            os.kill(os.getpid(), signal.SIGINT)
+        return read(sequence, index)
+
+    monkeypatch.setattr(_slam_input, "read_points", interrupting)
+    assert run(drive, "-o", out) == 130
+    num_done = len(np.load(out / "trajectory.npy"))
+    assert 70 < num_done < 85
+    assert (out / "map.png").stat().st_size > 0
+    assert run("--resume", "-o", out) == EXIT_OK
+    assert_same_results(out, whole)
+    # A finished run that is resumed writes the same again.
+    assert run("--resume", "-o", out) == EXIT_OK
+    assert_same_results(out, whole)
+
+
+def test_a_run_of_the_first_scans_can_be_continued(whole, drive, with_truth, tmp_path) -> None:
+    assert run(drive, "-o", tmp_path / "out", "-n", 40) == EXIT_OK
+    assert len(np.load(tmp_path / "out" / "trajectory.npy")) == 40
+    assert run("--resume", "-o", tmp_path / "out", "-n", len(TRUTH)) == EXIT_OK
+    assert_same_results(tmp_path / "out", whole)
+
+
+def test_every_nth_scan_keeps_its_reference(drive, with_truth, tmp_path) -> None:
+    assert run(drive, "-o", tmp_path / "out", "-j", 2, "-n", 50) == EXIT_OK
+    T = np.load(tmp_path / "out" / "trajectory.npy")
+    true = rigid.inverse(TRUTH[0]) @ TRUTH[:100:2]
+    assert np.linalg.norm((T - true)[:, :3, 3], axis=1).max() < 2.0
+
+
+PROCESS = """
+import sys, time
+from pathlib import Path
+import pytest
+from experiments import _slam_input
+from tests.experiments.test_dpm_slam import run, use_truth
+
+use_truth(pytest.MonkeyPatch())
+read = _slam_input.read_points
+
+def slowly(sequence, index):
+    time.sleep(0.02)
+    return read(sequence, index)
+
+_slam_input.read_points = slowly
+sys.exit(run(*sys.argv[1:]))
+"""
+
+
+def start(*options) -> subprocess.Popen:
+    environment = os.environ | {"JAX_PLATFORMS": "cpu"}
+    environment["PYTHONPATH"] = os.pathsep.join([str(REPOSITORY / "src"), str(REPOSITORY)])
+    return subprocess.Popen(
+        [sys.executable, "-c", PROCESS, *map(str, options)], cwd=REPOSITORY, env=environment, stderr=subprocess.DEVNULL
+    )
+
+
+@pytest.mark.slow
+def test_a_killed_run_equals_an_unbroken_one(whole, drive, tmp_path) -> None:
+    rng, out = np.random.default_rng(0), tmp_path / "out"
+    for _ in range(5):
+        process = start(*(["--resume"] if out.exists() else [drive]), "-o", out)
+        deadline = time.monotonic() + 120
+        while not (out / "slam.journal").exists() and time.monotonic() < deadline:
+            time.sleep(0.05)
+        time.sleep(rng.uniform(0, 4))
+        process.kill()
+        process.wait()
+    assert start("--resume", "-o", out).wait(timeout=300) == EXIT_OK
+    assert_same_results(out, whole)
+
+
+@pytest.fixture(scope="module")
+def room(tmp_path_factory) -> tuple[Path, Path]:
+    """A walk through a room, with a corner and back, and a network that compiles in seconds."""
+    folder = tmp_path_factory.mktemp("room")
+    rng = np.random.default_rng(0)
+    (folder / "drive").mkdir()
+    truth = np.array([motion(0.5 * step, 0.0, 3.0 * step) for step in [*range(12), *range(11, 3, -1)]])
+    for number, T in enumerate(truth):
+        np.save(folder / "drive" / f"{number}.npy", seen_from(planes(rng), T).astype(np.float32))
+    write_tum(folder / "drive" / "poses_lidar.txt", truth)
+    dpmjax.save_model(dpmjax.init_model(jax.random.key(0), toy.MODEL), folder / "toy.safetensors", card="toy")
+    return folder / "drive", folder / "toy.safetensors"
+
+
+def test_a_saved_map_is_extended(room, tmp_path, capsys) -> None:
+    drive, weights = room
+    first, second = tmp_path / "first", tmp_path / "second"
+    assert run(drive, "--weights", weights, "-n", 8, "-o", first) == EXIT_OK
+    before = dpmjax.load_map(first / "map.npz")
+    assert load_json(first / "metrics.json")["map_bytes_int8"] < load_json(first / "metrics.json")["map_bytes"]
+    assert run(drive, "--weights", weights, "--map", first / "map.npz", "-o", second) == EXIT_OK
+    after = dpmjax.load_map(second / "map.npz")
+    assert len(after) > len(before)
+    assert [keyframe.scan for keyframe in after.keyframes][: len(before)] == [k.scan for k in before.keyframes]
+    assert len(np.load(second / "trajectory.npy")) == 20
+    # The journal of the second run holds what came after the map.
+    for name in ("trajectory.npy", "map.npz", "loops.csv"):
+        (tmp_path / name).write_bytes((second / name).read_bytes())
+    assert run("--resume", "-o", second) == EXIT_OK
+    for name in ("trajectory.npy", "map.npz", "loops.csv"):
+        assert (tmp_path / name).read_bytes() == (second / name).read_bytes()
+    capsys.readouterr()
+    other = tmp_path / "other.safetensors"
+    dpmjax.save_model(dpmjax.init_model(jax.random.key(1), toy.MODEL), other, card="toy")
+    for options, message in (
+        (["--map", first / "map.npz", "--weights", other], "made with weights"),
+        (["--map", first / "config.json", "--weights", weights], "config.json"),
+        (["--map", tmp_path / "none.npz", "--weights", weights], "no such file"),
+    ):
+        assert run(drive, *options, "-o", tmp_path / "out") == EXIT_BAD_INPUT
+        errors = capsys.readouterr().err.strip().splitlines()
+        assert len(errors) == 1
+        assert message in errors[0]
+    assert not (tmp_path / "out").exists()
+
+
+def test_deskewing_and_odometry_alone_are_options(room, tmp_path) -> None:
+    drive, weights = room
+    assert run(drive, "--weights", weights, "--deskew", "--no-loop", "-n", 6, "-o", tmp_path / "out") == EXIT_OK
+    metrics = load_json(tmp_path / "out" / "metrics.json")
+    assert metrics["loop_statuses"] == {}
+    assert metrics["ate_m"] == pytest.approx(metrics["ate_odometry_m"])
+
+
+@pytest.mark.parametrize("num", [1, 2, 31, 32, 33, 56, 57, 200])
+def test_windows_of_the_refinement_cover_all_keyframes(num: int) -> None:
+    parts = _slam_refine.windows(num)
+    assert sorted({row for rows in parts for row in rows}) == list(range(num))
+    assert all(b.start == a.stop - _slam_refine.OVERLAP for a, b in itertools.pairwise(parts))
+
+
+def test_refined_motions_and_loops_make_one_map(monkeypatch) -> None:
+    """A fit that knows the truth brings the drifted map to the truth, over the borders of windows."""
+    truth = laps(1, side_m=60.0, step_m=2.0)
+    methods = SlamMethods(TruthMatcher(truth), TruthGeometry(truth, sigma_m=0.05), SlamConfig())
+    result = run_slam(scans_of(range(len(truth))), methods)
+    slam_map, true = result.state.slam_map, rigid.inverse(truth[0]) @ truth[result.keyframes]
+
+    def fit(clouds, *, key, init):
+        rows = [int(cloud[0, 0]) for cloud in clouds]
+        return SimpleNamespace(T_world_scan=init[0] @ rigid.inverse(true[rows[0]]) @ true[rows], kept="fit")
+
+    monkeypatch.setattr(_slam_refine.deepmapping, "fit_clouds", fit)
+    refined = _slam_refine.refine_keyframes(
+        slam_map, lambda row: np.array([[row, 0.0, 0.0]]), seed=0, is_stopped=lambda: False
+    )
+    before, after = (
+        absolute_trajectory_error(T[:, :3, 3], true[:, :3, 3])
+        for T in (slam_map.T_world_keyframe, refined.T_world_keyframe)
+    )
+    assert refined.numbers["refine_windows"] > 1
+    assert after < 0.1 * before

@@ -1,0 +1,75 @@
+"""Laws of the segment errors of KITTI, against a slow oracle."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from dpmjax.metrics import segment_error
+
+
+def path(rng: np.random.Generator, num: int = 300, step_m: float = 1.3) -> np.ndarray:
+    poses = np.tile(np.eye(4), (num, 1, 1))
+    for row in range(1, num):
+        move = np.eye(4)
+        move[:3, :3] = Rotation.from_rotvec(rng.normal(0, 0.03, 3)).as_matrix()
+        move[0, 3] = step_m
+        poses[row] = poses[row - 1] @ move
+    return poses
+
+
+def oracle(estimated: np.ndarray, reference: np.ndarray, lengths, stride: int) -> tuple[float, float, int]:
+    way = [0.0]
+    for a, b in itertools.pairwise(reference):
+        way.append(way[-1] + float(np.linalg.norm(b[:3, 3] - a[:3, 3])))
+    shifts, turns = [], []
+    for first in range(0, len(way), stride):
+        for length in lengths:
+            last = next((row for row in range(first, len(way)) if way[row] > way[first] + length), None)
+            if last is None:
+                continue
+            true = np.linalg.inv(reference[first]) @ reference[last]
+            error = np.linalg.inv(np.linalg.inv(estimated[first]) @ estimated[last]) @ true
+            shifts.append(np.linalg.norm(error[:3, 3]) / length)
+            turns.append(np.degrees(Rotation.from_matrix(error[:3, :3]).magnitude()) / length)
+    return 100 * float(np.mean(shifts)), 100 * float(np.mean(turns)), len(shifts)
+
+
+@pytest.mark.parametrize("stride", [1, 10])
+def test_errors_are_those_of_the_definition(stride: int) -> None:
+    reference, estimated = path(np.random.default_rng(0)), path(np.random.default_rng(1))
+    found = segment_error(estimated, reference, lengths_m=(100.0, 200.0), stride=stride)
+    np.testing.assert_allclose(found, oracle(estimated, reference, (100.0, 200.0), stride), rtol=1e-9)
+
+
+def test_a_scale_of_one_percent_is_one_percent() -> None:
+    reference = path(np.random.default_rng(0), num=200, step_m=1.0)
+    reference[:, :3, :3], reference[:, 1:3, 3] = np.eye(3), 0.0
+    reference[:, 0, 3] = np.arange(200)
+    estimated = reference.copy()
+    estimated[:, :3, 3] *= 1.01
+    found = segment_error(estimated, reference, lengths_m=(100.0,))
+    assert found.translation_percent == pytest.approx(1.01, abs=0.01)
+    assert found.rotation_deg_per_100m == pytest.approx(0.0, abs=1e-9)
+
+
+def test_the_frames_do_not_matter() -> None:
+    reference, estimated = path(np.random.default_rng(0)), path(np.random.default_rng(1))
+    T = path(np.random.default_rng(2))[50]
+    np.testing.assert_allclose(segment_error(T @ estimated, reference), segment_error(estimated, reference), rtol=1e-9)
+
+
+def test_a_short_path_has_no_segment() -> None:
+    found = segment_error(path(np.random.default_rng(0), 20), path(np.random.default_rng(0), 20))
+    assert found.num_segments == 0
+    assert np.isnan(found.translation_percent)
+
+
+def test_other_shapes_are_refused(as_user) -> None:
+    with pytest.raises(ValueError, match="reference"):
+        segment_error(np.tile(np.eye(4), (4, 1, 1)), np.tile(np.eye(4), (3, 1, 1)))
+    with pytest.raises(ValueError, match="stride"):
+        segment_error(np.tile(np.eye(4), (4, 1, 1)), np.tile(np.eye(4), (4, 1, 1)), stride=0)
