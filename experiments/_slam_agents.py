@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from experiments._run_folder import RunFolder
-from experiments._slam_files import gather_map, write_table, write_trajectory
+from experiments import _slam_files as files
+from experiments._run_folder import AGENTS, RunFolder
 from experiments._slam_input import read_points
 from experiments._slam_numbers import trajectory_errors
 
@@ -39,16 +39,27 @@ def cut_sequence(sequence: LidarSequence, num_agents: int, overlap: float) -> li
     return parts
 
 
-def write_agents(folder: RunFolder, result: AgentsResult, sequences: Sequence[LidarSequence]) -> None:
-    """Writes trajectories, graph and loops."""
+def write_agents(folder: RunFolder, result: AgentsResult, sequences: Sequence[LidarSequence]) -> list[dict[str, int]]:
+    """Writes trajectories, graph, loops and maps; returns the bytes that each agent sends at each precision."""
     import dpmjax
-    from dpmjax.slam import as_pose_graph
+    from dpmjax.slam import as_pose_graph, take_component
 
-    for number, (T_world_scan, sequence) in enumerate(zip(result.T_world_scan, sequences, strict=True), start=1):
-        write_trajectory(folder.path, T_world_scan, sequence.times, f"agent_{number}")
+    sizes = []
+    for number, (T_world_scan, agent, sequence) in enumerate(
+        zip(result.T_world_scan, result.agents, sequences, strict=True), start=1
+    ):
+        files.write_trajectory(folder.path, T_world_scan, sequence.times, f"agent_{number}")
+        slam_map = agent.state.slam_map
+        path = folder / AGENTS / f"agent_{number}" / "map.npz"
+        sizes.append(files.write_map_file(path, slam_map) if len(slam_map) else {})
+    for component in range(max(result.component) + 1):
+        slam_map = take_component(result.joined, component)
+        if len(slam_map):
+            files.write_map_file(folder / f"map_{component + 1}.npz", slam_map)
     if len(result.joined.slam_map):
         dpmjax.write_g2o(folder / "graph.g2o", as_pose_graph(result.joined.slam_map))
-    write_table(folder / "loops.csv", LOOP_COLUMNS, _loop_rows(result))
+    files.write_table(folder / "loops.csv", LOOP_COLUMNS, _loop_rows(result))
+    return sizes
 
 
 def _loop_rows(result: AgentsResult) -> list[dict[str, Any]]:
@@ -147,7 +158,7 @@ def agent_panels(result: AgentsResult, sequences: Sequence[LidarSequence]) -> li
             reference = None
             if alignment is not None and sequence.T_world_lidar is not None:
                 reference = sequence.T_world_lidar[:, :3, 3] @ alignment[:3, :3].T + alignment[:3, 3]
-            cloud = gather_map(agent.keyframes, T, lambda scan, drive=sequence: read_points(drive, scan))
+            cloud = files.gather_map((read_points(sequence, scan), T[scan]) for scan in agent.keyframes)
             label = f"agent {number + 1}: {sequence.name}, {len(T)} scans"
             color = viz.COLORS[number % len(viz.COLORS)]
             tracks.append(viz.AgentTrack(label, color, T[:, :3, 3], reference, cloud.points, cloud.heights_m))
@@ -191,7 +202,7 @@ def summary(metrics: dict[str, Any]) -> str:
     """Returns the lines on the console."""
     lines = []
     for agent in metrics["agents"]:
-        sent, scans = agent["keyframe_bytes"] / 1e6, agent["scan_bytes"] / 1e6
+        sent, scans = agent.get("map_bytes_int8", agent["keyframe_bytes"]) / 1e6, agent["scan_bytes"] / 1e6
         line = f"agent {agent['agent']}: {agent['num_scans']} scans, {agent['num_keyframes']} keyframes, "
         line += f"{sent:.1f} MB sent instead of {scans:.1f} MB of points"
         if "ate_m" in agent:

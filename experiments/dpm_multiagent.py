@@ -7,7 +7,8 @@
 
 Agents exchange keyframes. Loops between them are found by what places look like; no position is given. Agents that meet
 share one frame, others keep their own. Results go to results/dpm_multiagent/<time>/ (latest links to the newest):
-agent_1 ... as TUM, KITTI and npy, graph.g2o, loops.csv, metrics.json with errors and bytes, agents.png.
+agent_1 ... as TUM, KITTI and npy, graph.g2o, loops.csv, map_1.npz ... for those that met, metrics.json with errors and
+bytes, agents.png.
 """
 
 from __future__ import annotations
@@ -60,12 +61,11 @@ class Config(RunOptions):
 
 def main(config: Config) -> dict[str, Any]:
     """Lets the agents run, joins their maps, writes; returns the content of `metrics.json`."""
-    from dpmjax import load_model
-    from dpmjax.slam import make_methods
     from experiments._slam_agents import summary
+    from experiments.dpm_slam import tell
 
     started = time.perf_counter()
-    methods = make_methods(load_model(config.weights))
+    methods = agent_methods(config)
     sequences = open_agents(config)
     folder = open_run_folder(config, EXPERIMENT)
     with recording(folder), StopFlag() as stop:
@@ -80,8 +80,16 @@ def main(config: Config) -> dict[str, Any]:
         metrics = write_results(folder, config, result, sequences)
         metrics |= {"is_interrupted": stop.is_requested, "wall_s": time.perf_counter() - started}
         write_metrics(folder, metrics, seed=config.seed)
-        print(f"{summary(metrics)}\nresults in {folder.path}")
+        tell(f"{summary(metrics)}\nresults in {folder.path}")
     return metrics
+
+
+def agent_methods(config: Config) -> SlamMethods:
+    """Returns the methods of the model, which all agents share."""
+    from dpmjax import load_model
+    from dpmjax.slam import make_methods
+
+    return make_methods(load_model(config.weights))
 
 
 def open_agents(config: Config) -> list[LidarSequence]:
@@ -104,14 +112,14 @@ def agent_folder(folder: RunFolder, number: int) -> RunFolder:
 
 def run_agent(folder: RunFolder, sequence: LidarSequence, methods: SlamMethods, stop: StopFlag) -> SlamResult:
     """Lets one agent map alone, or go on."""
-    from dpmjax.slam import finish_slam
+    from dpmjax.slam import finish_slam, init_slam
     from experiments._slam_input import ScanReader
     from experiments._slam_run import run_scans
-    from experiments.dpm_slam import earlier_run
+    from experiments.dpm_slam import find_beginning
 
     reader = ScanReader(sequence)
-    earlier = earlier_run(folder, methods, reader)
-    run = run_scans(folder, sequence, reader, methods, earlier, lambda: stop.is_requested)
+    beginning = find_beginning(folder, methods, init_slam(), reader)
+    run = run_scans(folder, sequence, reader, methods, beginning, lambda: stop.is_requested)
     if run.failure is not None:
         raise run.failure
     return finish_slam(run.state, run.reports, methods.config)
@@ -138,7 +146,9 @@ def write_results(
     from experiments._slam_agents import agent_panels, agents_numbers, write_agents
 
     metrics = {"weights": config.weights, "overlap": config.overlap, **agents_numbers(result, sequences)}
-    write_agents(folder, result, sequences)
+    sizes = write_agents(folder, result, sequences)
+    for agent, size in zip(metrics["agents"], sizes, strict=True):
+        agent |= size
     write_metrics(folder, metrics, seed=config.seed)  # numbers first: a picture that fails must not cost them
     figure = viz.agents_figure(f"{len(sequences)} agents", agent_panels(result, sequences))
     viz.save_figure(figure, folder / "agents.png")
