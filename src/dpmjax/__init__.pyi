@@ -36,6 +36,9 @@ from .pose_graph.graph import PoseGraph as PoseGraph
 from .pose_graph.optimize import PoseGraphConfig as PoseGraphConfig
 from .pose_graph.optimize import optimize_pose_graph as optimize_pose_graph
 from .registration.icp import icp as icp
+from .slam.agents import AgentsResult as AgentsResult
+from .slam.agents import merge_maps as merge_maps
+from .slam.agents import run_agents as run_agents
 from .slam.config import SlamConfig as SlamConfig
 from .slam.keyframes import KeyframeMap as KeyframeMap
 from .slam.localization import Localization as Localization

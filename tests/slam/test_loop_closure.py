@@ -10,7 +10,9 @@ from dpmjax.metrics import absolute_trajectory_error
 from dpmjax.slam import KeyframeMap, LoopClosureConfig
 from dpmjax.slam.keyframes import Keyframe, MapEdge, add_keyframe, diagonal_information, submap_around
 from dpmjax.slam.loop_candidates import find_candidates
-from dpmjax.slam.loop_closure import LoopState, are_consistent, optimize_map
+from dpmjax.slam.loop_consistency import are_consistent
+from dpmjax.slam.loop_state import LoopState
+from dpmjax.slam.map_optimization import optimize_map
 from dpmjax.slam.reports import Loop
 from dpmjax.slam.retrieval import most_similar, pooled_vector
 from dpmjax.types import DescriptorCloud

@@ -1,3 +1,9 @@
+from .agents import AgentsResult as AgentsResult
+from .agents import MergedMaps as MergedMaps
+from .agents import Traffic as Traffic
+from .agents import join_agents as join_agents
+from .agents import merge_maps as merge_maps
+from .agents import run_agents as run_agents
 from .alignment import Alignment as Alignment
 from .alignment import Geometry as Geometry
 from .alignment import PosePrior as PosePrior
@@ -11,10 +17,13 @@ from .journal import JournalContent as JournalContent
 from .journal import read_journal as read_journal
 from .keyframes import KeyframeMap as KeyframeMap
 from .keyframes import Submap as Submap
+from .keyframes import as_pose_graph as as_pose_graph
 from .localization import Localization as Localization
 from .localization import LocalizationConfig as LocalizationConfig
 from .localization import localize as localize
 from .localization import localize_each as localize_each
+from .map_joining import JoinedMaps as JoinedMaps
+from .map_joining import take_component as take_component
 from .map_thinning import thin_map as thin_map
 from .matcher import Match as Match
 from .matcher import Matcher as Matcher

@@ -37,8 +37,6 @@ class OdometryConfig:
         step_factors: starts of the search: the predicted step, times these numbers; ...
         ahead_shares: ... steps along the x axis of the lidar, as shares of the extent; ...
         turns_deg: ... and turns by these angles about its vertical.
-        num_independent: the information of a pose counts as that of this many independent points, for residuals are
-            correlated.
         floor_m: standard deviation of the translation that no number of points undercuts ...
         floor_rad: ... and of the rotation.
     """
@@ -61,14 +59,13 @@ class OdometryConfig:
     step_factors: tuple[float, ...] = (0.0, 0.5, 1.0, 1.5, 2.0, 3.0, 4.0)
     ahead_shares: tuple[float, ...] = (-0.08, 0.08, 0.16)
     turns_deg: tuple[float, ...] = (-10.0, 10.0, -20.0, 20.0, -35.0, 35.0, -50.0, 50.0)
-    num_independent: int = 200
     floor_m: float = 0.01
     floor_rad: float = 0.001
 
     def __post_init__(self) -> None:
         require_positive_fields(self, "voxel_share", "frame_share", "frame_rad", "plane_distance_m", "floor_m")
         require_positive_fields(self, "floor_rad")
-        require_fields(self, "min_num_points", "num_frames", "num_samples", "num_independent", low=1)
+        require_fields(self, "min_num_points", "num_frames", "num_samples", low=1)
         require_fields(self, "min_range_m", "contradiction_weight", low=0)
         require_fields(self, "min_cosine", "good_share", low=0, high=1)
         require_fields(self, "max_range_m", low=self.min_range_m)

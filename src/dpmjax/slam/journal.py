@@ -19,7 +19,7 @@ import numpy as np
 from dpmjax.slam.columns import Arrays, from_columns, part_of, prefixed, to_columns
 from dpmjax.slam.front_end import AnyScan, FrontEndState, corrected_points
 from dpmjax.slam.keyframes import Keyframe, KeyframeMap, MapEdge, MapOrigin
-from dpmjax.slam.loop_closure import LoopState
+from dpmjax.slam.loop_state import LoopState
 from dpmjax.slam.methods import SlamMethods
 from dpmjax.slam.reports import Loop, ScanReport
 from dpmjax.slam.system import SlamState, init_slam

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal, NamedTuple
@@ -274,7 +275,9 @@ def turn_rad(T_a_b: Pose) -> float:
     Returns:
         Radians, from 0 to pi.
     """
-    return float(Rotation.from_matrix(T_a_b[:3, :3]).magnitude())
+    R = T_a_b[:3, :3]
+    sine = math.hypot(R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1])
+    return math.atan2(sine, R[0, 0] + R[1, 1] + R[2, 2] - 1)
 
 
 def orthonormal(T_a_b: Pose) -> Pose:

@@ -48,20 +48,46 @@ def find_candidates(slam_map: KeyframeMap, row: int, config: LoopClosureConfig) 
     is_near = is_old & (apart_m <= np.minimum(radius_m, config.max_radius_m))
     near = np.argsort(np.where(is_near, apart_m, np.inf), kind="stable")[: int(is_near.sum())]
     near = _spread(near, slam_map, keyframe.extent_m / 2, config.num_near)
-    similar, cosines = most_similar(slam_map.vectors, slam_map.vectors[row], 5 * config.num_similar, is_allowed=is_old)
-    similar = _spread(similar[cosines >= config.min_cosine], slam_map, keyframe.extent_m / 2, config.num_similar)
+    similar = _similar(slam_map, row, is_old, config)
     found = [LoopCandidate(int(other), "distance") for other in near]
     return found + [LoopCandidate(int(other), "retrieval") for other in similar if other not in near]
 
 
+def find_meetings(
+    slam_map: KeyframeMap, row: int, is_other: Bool[np.ndarray, " k"], config: LoopClosureConfig
+) -> list[LoopCandidate]:
+    """Finds keyframes of other maps that may show the place of a keyframe, by retrieval alone: no position is known.
+
+    Args:
+        slam_map: several maps in one record.
+        row: of the keyframe.
+        is_other: the keyframes of the other maps.
+        config: numbers.
+
+    Returns:
+        Candidates, most similar first.
+    """
+    return [LoopCandidate(int(other), "retrieval") for other in _similar(slam_map, row, is_other, config)]
+
+
+def _similar(
+    slam_map: KeyframeMap, row: int, is_allowed: Bool[np.ndarray, " k"], config: LoopClosureConfig
+) -> Int[np.ndarray, " m"]:
+    found = most_similar(slam_map.vectors, slam_map.vectors[row], 5 * config.num_similar, is_allowed=is_allowed)
+    rows, cosines = found
+    spacing_m = slam_map.keyframes[row].extent_m / 2
+    return _spread(rows[cosines >= config.min_cosine], slam_map, spacing_m, config.num_similar)
+
+
 def _spread(rows: Int[np.ndarray, " n"], slam_map: KeyframeMap, spacing_m: float, count: int) -> Int[np.ndarray, " m"]:
-    """Returns the first rows that are not within `spacing_m` of one taken before."""
+    """Returns the first rows that are not within `spacing_m` of one taken before, of the same segment."""
     positions = slam_map.T_world_keyframe[rows, :3, 3]
+    segments = np.array([slam_map.keyframes[row].segment for row in rows])
     is_free: Bool[np.ndarray, " n"] = np.ones(len(rows), bool)
     taken: list[int] = []
     for number in range(len(rows)):
         if is_free[number] and len(taken) < count:
             taken.append(number)
             distance: Float[np.ndarray, " n"] = np.linalg.norm(positions - positions[number], axis=1)
-            is_free &= distance > spacing_m
+            is_free &= (distance > spacing_m) | (segments != segments[number])
     return rows[taken]

@@ -19,10 +19,12 @@ from dpmjax.deeppointmap.model import Model, model_fingerprint
 from dpmjax.deeppointmap.scan_registration import PreparedScan, register_each
 from dpmjax.deeppointmap.verification import MeasuredScan
 from dpmjax.scans.compact import CompactImage, CompactSurface
+from dpmjax.scans.surface_alignment import AlignmentLevel, pair_with_planes
 from dpmjax.slam.columns import Arrays, from_columns, to_columns
 from dpmjax.slam.keyframes import Pose, Submap
+from dpmjax.slam.plane_information import plane_information
 from dpmjax.slam.retrieval import pooled_vector
-from dpmjax.types import DescriptorCloud, Verification
+from dpmjax.types import DescriptorCloud, Registration, Verification
 
 
 class Match(NamedTuple):
@@ -33,12 +35,15 @@ class Match(NamedTuple):
         probability: that it is right within 2 m and 5 degrees, if the matcher is calibrated; else a score in [0, 1].
         rmse_m: of the pairs that it rests on.
         verification: how well the scans agree under it; None where the matcher has no scans.
+        information: (6, 6) inverse covariance by the planes of the scans, in the tangent of the source, translation
+            first; None where it is not known.
     """
 
     T_target_source: Pose
     probability: float
     rmse_m: float
     verification: Verification | None = None
+    information: Float[np.ndarray, "6 6"] | None = None
 
 
 class Matcher(Protocol):
@@ -191,15 +196,7 @@ class NetworkMatcher:
         """
         prepared = [(_merged(source), _merged(target)) for source, target in pairs]
         found = register_each(self._model, prepared, refine=True)
-        return [
-            Match(
-                np.asarray(match.T_target_source, np.float64),
-                float(match.confidence),
-                float(match.rmse_m),
-                match.verification,
-            )
-            for match in found
-        ]
+        return [self._match(*scans, match) for scans, match in zip(prepared, found, strict=True)]
 
     def overlaps(self, source: CompactScan, targets: Sequence[CompactScan]) -> Float[np.ndarray, " n"]:
         """Asks the overlap head; see `Matcher`.
@@ -213,6 +210,13 @@ class NetworkMatcher:
         """
         clouds = [target.descriptors for target in targets]
         return np.asarray(overlap_pairs(self._model, [source.descriptors] * len(targets), clouds))
+
+    def _match(self, source: PreparedScan, target: PreparedScan, found: Registration) -> Match:
+        T, config = np.asarray(found.T_target_source, np.float64), self._model.config.verification
+        level = AlignmentLevel(config.plane_radius_m, config.num_samples, 1)
+        pairs = pair_with_planes(source.measured.surface, target.measured.surface, T, level)
+        information = plane_information(pairs, T, max_residual_m=config.plane_distance_m)
+        return Match(T, float(found.confidence), float(found.rmse_m), found.verification, information)
 
 
 def _merged(submap: Submap) -> PreparedScan:

@@ -23,7 +23,8 @@ from dpmjax.scans.surfaces import MIN_FLATNESS, Surface, SurfaceConfig, scan_sur
 from dpmjax.slam.alignment import Alignment, PosePrior
 from dpmjax.slam.columns import Arrays
 from dpmjax.slam.config import OdometryConfig
-from dpmjax.slam.keyframes import Pose, diagonal_information, orthonormal, turn_rad
+from dpmjax.slam.keyframes import Pose, orthonormal, turn_rad
+from dpmjax.slam.plane_information import plane_information, with_least_covariance
 
 MAX_LOCAL_POINTS = 4000
 """Points of the local map that are compared with the free space of a scan."""
@@ -204,7 +205,9 @@ class SurfaceGeometry:
         matched = self._matched_share(pairs, measured, config.num_samples)
         contradicted = _contradicted_share(local_map, measured, T)
         score = matched - config.contradiction_weight * contradicted
-        return Alignment(T, matched, contradicted, score, self._information(pairs, T))
+        information = plane_information(pairs, T, max_residual_m=config.plane_distance_m)
+        information = with_least_covariance(information, config.floor_m, config.floor_rad)
+        return Alignment(T, matched, contradicted, score, information)
 
     def _pairs(self, local_map: LocalMap, measured: MeasuredScan, T_map_scan: Pose, num_samples: int) -> PlanePairs:
         level = AlignmentLevel(5 * local_map.voxel_m, num_samples, 1)
@@ -214,24 +217,6 @@ class SurfaceGeometry:
         config = self.config
         meets = (np.abs(pairs.residuals) < config.plane_distance_m) & (pairs.cosines > config.min_cosine)
         return float(meets.sum()) / max(min(num_samples, len(measured.surface.samples)), 1)
-
-    def _information(self, pairs: PlanePairs, T_map_scan: Pose) -> Float[np.ndarray, "6 6"]:
-        """Returns the inverse of (covariance of the plane distances, as of few independent points, and a floor)."""
-        config = self.config
-        is_used = np.abs(pairs.residuals) < config.plane_distance_m
-        if is_used.sum() < 6:
-            return diagonal_information(10.0, 1.0)
-        normals = pairs.normals[is_used] @ T_map_scan[:3, :3]
-        points = (pairs.points[is_used] - T_map_scan[:3, 3]) @ T_map_scan[:3, :3]
-        jacobian = np.concatenate([normals, np.cross(points, normals)], axis=1)
-        variance = max(float(np.mean(pairs.residuals[is_used] ** 2)), config.floor_m**2)
-        share = config.num_independent / len(jacobian)
-        system = share / variance * jacobian.T @ jacobian
-        # A direction that no plane holds is known to 10 m and 1 rad.
-        covariance = np.linalg.inv(system + diagonal_information(10.0, 1.0))
-        covariance += np.diag(np.repeat([config.floor_m**2, config.floor_rad**2], 3))
-        information = np.linalg.inv(covariance)
-        return (information + information.T) / 2
 
 
 def _local_map(frames: tuple[MapFrame, ...], voxel_m: float) -> LocalMap:

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from typing import Literal, NamedTuple
 
+import numpy as np
+from jaxtyping import Float
+
 from dpmjax.slam.keyframes import Pose
 
 ScanStatus = Literal["first", "tracked", "network", "predicted", "empty", "restarted"]
@@ -41,6 +44,7 @@ class ScanReport(NamedTuple):
         score: agreement of the scan with the local map.
         probability: P(correct) of the network; None where it was not asked.
         num_accepted: number of loops that were accepted at this scan.
+        num_points: number of points of the scan.
         T_turn: predicted motion that a scan with times was deskewed by; None for a scan without times.
     """
 
@@ -53,6 +57,7 @@ class ScanReport(NamedTuple):
     score: float = 0.0
     probability: float | None = None
     num_accepted: int = 0
+    num_points: int = 0
     T_turn: Pose | None = None
 
 
@@ -68,6 +73,7 @@ class Loop(NamedTuple):
         probability: P(correct) of the registration; None without one.
         rmse_m: of the registration; None without one.
         T_target_source: the registration; None without one.
+        information: (6, 6) inverse covariance by the planes of the scans, as in `MapEdge`; None where it is not known.
     """
 
     source: int
@@ -78,3 +84,4 @@ class Loop(NamedTuple):
     probability: float | None = None
     rmse_m: float | None = None
     T_target_source: Pose | None = None
+    information: Float[np.ndarray, "6 6"] | None = None

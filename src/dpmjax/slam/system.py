@@ -15,7 +15,9 @@ from dpmjax.slam import front_end
 from dpmjax.slam.config import SlamConfig
 from dpmjax.slam.front_end import AnyScan, FrontEndState, TimedScan
 from dpmjax.slam.keyframes import KeyframeMap, as_pose_graph
-from dpmjax.slam.loop_closure import LoopState, close_loops, loops_of_map, optimize_map
+from dpmjax.slam.loop_closure import close_loops, num_accepted
+from dpmjax.slam.loop_state import LoopState, loops_of_map
+from dpmjax.slam.map_optimization import optimize_map
 from dpmjax.slam.matcher import NetworkMatcher
 from dpmjax.slam.methods import SlamMethods
 from dpmjax.slam.odometry import SurfaceGeometry
@@ -73,6 +75,26 @@ def make_methods(model: Model, config: SlamConfig | None = None) -> SlamMethods:
     return SlamMethods(NetworkMatcher(model), SurfaceGeometry(config.odometry), config)
 
 
+def as_methods(model: Model | SlamMethods, config: SlamConfig | None) -> SlamMethods:
+    """Returns methods as they are, and makes those of a model.
+
+    Args:
+        model: a trained model, or methods.
+        config: settings for a model; methods carry their own.
+
+    Returns:
+        The methods.
+
+    Raises:
+        ValueError: if methods come with a configuration.
+    """
+    if isinstance(model, SlamMethods):
+        if config is not None:
+            raise ValueError("config: expected None with methods, which carry their own")
+        return model
+    return make_methods(model, config)
+
+
 def init_slam(map_: KeyframeMap | None = None) -> SlamState:
     """Begins an empty map, or a new part of one that was made before.
 
@@ -108,11 +130,11 @@ def step_slam(methods: SlamMethods, state: SlamState, scan: AnyScan) -> tuple[Sl
     if len(shape) != 2 or shape[1] != 3:
         raise ValueError(f"points: expected shape (n, 3), got {shape}")
     front, slam_map, report = front_end.step(methods, state.front_end, state.slam_map, scan)
-    loops = state.loops
+    report, loops = report._replace(num_points=shape[0]), state.loops
     if report.is_keyframe:
-        num_before = _num_accepted(loops)
+        num_before = num_accepted(loops.loops)
         slam_map, loops = close_loops(methods, slam_map, loops)
-        report = report._replace(num_accepted=_num_accepted(loops) - num_before)
+        report = report._replace(num_accepted=num_accepted(loops.loops) - num_before)
     return SlamState(front, slam_map, loops), report
 
 
@@ -208,15 +230,9 @@ def run_slam(
         ValueError: if a scan is not (n, 3), if methods come with another configuration, or if the map was made with
             other weights.
     """
-    if isinstance(model, SlamMethods) and config is not None:
-        raise ValueError("config: expected None with methods, which carry their own")
-    methods = model if isinstance(model, SlamMethods) else make_methods(model, config)
+    methods = as_methods(model, config)
     start = state = init_slam(map_)
     reports = []
     for state, report in iterate_slam(methods, scans, start):  # noqa: B007 (the last one is used)
         reports.append(report)
     return finish_slam(state, reports, methods.config)
-
-
-def _num_accepted(loops: LoopState) -> int:
-    return sum(loop.status == "accepted" for loop in loops.loops)

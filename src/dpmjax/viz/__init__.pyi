@@ -1,3 +1,7 @@
+from .agents import COLORS as COLORS
+from .agents import AgentPanel as AgentPanel
+from .agents import AgentTrack as AgentTrack
+from .agents import agents_figure as agents_figure
 from .comparison import MatchedScans as MatchedScans
 from .comparison import endings_figure as endings_figure
 from .comparison import error_boxes_figure as error_boxes_figure

@@ -69,8 +69,8 @@ def trajectory_figure(
     if not tracks:
         raise ValueError("tracks: expected at least one")
     shown = [track.positions for track in tracks] + ([] if reference is None else [reference])
-    limits = _limits(np.concatenate(shown)[:, :2], 0.06)
-    (width_in, height_in), has_errors = _size_in(limits), any(track.errors_m is not None for track in tracks)
+    limits = plane_limits(np.concatenate(shown)[:, :2], 0.06)
+    (width_in, height_in), has_errors = size_in(limits), any(track.errors_m is not None for track in tracks)
     total_in = (width_in + (4.1 if has_errors else 0.3), height_in + 1.05)
     figure = new_figure(*total_in)
     axes = _add_axes(figure, (0.15, 0.65, width_in, height_in))
@@ -116,8 +116,8 @@ def height_map_figure(
         points, heights_m = points[heights_m < _ROOF_M], heights_m[heights_m < _ROOF_M]
     # A few far points must not make the map small.
     low, high = np.quantile(points[:, :2], [0.005, 0.995], axis=0) if len(points) else (np.zeros(2), np.ones(2))
-    limits = _limits(np.vstack([path[:, :2], [low, high]]), 0.03)
-    width_in, height_in = _size_in(limits)
+    limits = plane_limits(np.vstack([path[:, :2], [low, high]]), 0.03)
+    width_in, height_in = size_in(limits)
     figure = new_figure(width_in + 1.05, height_in + 0.5)
     axes = _add_axes(figure, (0.12, 0.12, width_in, height_in))
     axes.imshow(
@@ -192,16 +192,32 @@ def _raster(
     return picture.reshape(rows, columns, 3)
 
 
-def _limits(positions: Float[np.ndarray, "n 2"], margin_share: float) -> Limits:
+def plane_limits(positions: Float[np.ndarray, "n 2"], margin_share: float) -> Limits:
+    """Returns a rectangle round positions; that of a straight road has a useful height too.
+
+    Args:
+        positions: at least one.
+        margin_share: of the longer side, added on all sides.
+
+    Returns:
+        The limits.
+    """
     low, high = positions.min(axis=0), positions.max(axis=0)
     margin = max(margin_share * float((high - low).max()), 1.0)
-    # A straight road still gets a picture of a useful height.
     narrow = np.maximum((high - low).max() * 0.35 - (high - low), 0) / 2
     (x_min, y_min), (x_max, y_max) = low - narrow - margin, high + narrow + margin
     return Limits(float(x_min), float(x_max), float(y_min), float(y_max))
 
 
-def _size_in(limits: Limits) -> tuple[float, float]:
+def size_in(limits: Limits) -> tuple[float, float]:
+    """Returns width and height of the panel of a map.
+
+    Args:
+        limits: of the map.
+
+    Returns:
+        Inches.
+    """
     scale = _LONGER_SIDE_IN / max(limits.width, limits.height)
     return max(limits.width * scale, _SHORTER_SIDE_IN), max(limits.height * scale, _SHORTER_SIDE_IN)
 

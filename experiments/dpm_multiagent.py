@@ -1,0 +1,159 @@
+"""Makes one map of the drives of several agents, each of which maps alone (DeepPointMap, sections 4 and 5.3).
+
+    python -m experiments.dpm_multiagent                         a simulated town, cut into three parts
+    python -m experiments.dpm_multiagent path/to/drive           a drive of your own, cut into three parts
+    python -m experiments.dpm_multiagent monday tuesday friday   one agent a folder
+    python -m experiments.dpm_multiagent --resume                go on where the last run stopped, or was killed
+
+Agents exchange keyframes. Loops between them are found by what places look like; no position is given. Agents that meet
+share one frame, others keep their own. Results go to results/dpm_multiagent/<time>/ (latest links to the newest):
+agent_1 ... as TUM, KITTI and npy, graph.g2o, loops.csv, map_1.npz ... for those that met, metrics.json with errors and
+bytes, agents.png.
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+from tqdm import tqdm
+from tyro.conf import Positional, arg
+
+from experiments._command import StopFlag, check_least, run_command
+from experiments._run_folder import AGENTS, RunFolder, RunOptions, open_run_folder, recording, write_metrics
+
+if TYPE_CHECKING:
+    from dpmjax.sequences import LidarSequence
+    from dpmjax.slam import AgentsResult, SlamMethods, SlamResult
+
+EXPERIMENT = "dpm_multiagent"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Config(RunOptions):
+    """Options of the run."""
+
+    data: Annotated[Positional[tuple[Path, ...]], arg(metavar="[DATA ...]")] = ()
+    """Folders of scans: one is cut into parts, of several each is an agent. Without any: a simulated town."""
+    sequence: Annotated[str | None, arg(aliases=["-s"], metavar="NAME")] = None
+    """Which drive, where DATA holds several."""
+    agents: Annotated[int, arg(metavar="N")] = 3
+    """Number of parts that one drive is cut into."""
+    overlap: Annotated[float, arg(metavar="SHARE")] = 0.05
+    """By this share of its length a part is longer at each end."""
+    weights: Annotated[str, arg(metavar="NAME|FILE")] = "dpm_small"
+    """Name of a shipped model, or a .safetensors file."""
+    n_scans: Annotated[int | None, arg(aliases=["-n"], metavar="N")] = None
+    """Number of scans of each folder."""
+    jump: Annotated[int, arg(aliases=["-j"], metavar="N")] = 1
+    """Use every Nth scan."""
+
+    def __post_init__(self) -> None:
+        """Checks ranges."""
+        check_least(self, n_scans=1, jump=1, seed=0, agents=1, overlap=0)
+        if self.overlap > 1:
+            raise ValueError(f"--overlap: expected a share from 0 to 1, got {self.overlap:g}")
+        if self.sequence is not None and len(self.data) != 1:
+            raise ValueError("--sequence chooses a drive of DATA: give one folder")
+
+
+def main(config: Config) -> dict[str, Any]:
+    """Lets the agents run, joins their maps, writes; returns the content of `metrics.json`."""
+    from experiments._slam_agents import summary
+    from experiments.dpm_slam import tell
+
+    started = time.perf_counter()
+    methods = agent_methods(config)
+    sequences = open_agents(config)
+    folder = open_run_folder(config, EXPERIMENT)
+    with recording(folder), StopFlag() as stop:
+        agents: list[SlamResult] = []
+        for number, sequence in enumerate(sequences, start=1):
+            if not stop.is_requested:
+                agents.append(run_agent(agent_folder(folder, number), sequence, methods, stop))
+        sequences = [
+            sequence.take(slice(0, len(agent.reports))) for sequence, agent in zip(sequences, agents, strict=False)
+        ]
+        result = join(methods, agents)
+        metrics = write_results(folder, config, result, sequences)
+        metrics |= {"is_interrupted": stop.is_requested, "wall_s": time.perf_counter() - started}
+        write_metrics(folder, metrics, seed=config.seed)
+        tell(f"{summary(metrics)}\nresults in {folder.path}")
+    return metrics
+
+
+def agent_methods(config: Config) -> SlamMethods:
+    """Returns the methods of the model, which all agents share."""
+    from dpmjax import load_model
+    from dpmjax.slam import make_methods
+
+    return make_methods(load_model(config.weights))
+
+
+def open_agents(config: Config) -> list[LidarSequence]:
+    """Opens the scans of each agent; bad input that can be known before the run is a `ValueError`."""
+    from experiments._slam_agents import cut_sequence
+    from experiments._slam_input import open_drive
+    from experiments.dpm_slam import Config as DriveOptions
+
+    options = {"seed": config.seed, "n_scans": config.n_scans, "jump": config.jump, "sequence": config.sequence}
+    drives = [open_drive(DriveOptions(data=data, **options)) for data in config.data or (None,)]
+    return drives if len(drives) > 1 else cut_sequence(drives[0], config.agents, config.overlap)
+
+
+def agent_folder(folder: RunFolder, number: int) -> RunFolder:
+    """Makes the folder of an agent's own run."""
+    path = folder / AGENTS / f"agent_{number}"
+    path.mkdir(parents=True, exist_ok=True)
+    return RunFolder(path, is_resumed=folder.is_resumed)
+
+
+def run_agent(folder: RunFolder, sequence: LidarSequence, methods: SlamMethods, stop: StopFlag) -> SlamResult:
+    """Lets one agent map alone, or go on."""
+    from dpmjax.slam import finish_slam, init_slam
+    from experiments._slam_input import ScanReader
+    from experiments._slam_run import run_scans
+    from experiments.dpm_slam import find_beginning
+
+    reader = ScanReader(sequence)
+    beginning = find_beginning(folder, methods, init_slam(), reader)
+    run = run_scans(folder, sequence, reader, methods, beginning, lambda: stop.is_requested)
+    if run.failure is not None:
+        raise run.failure
+    return finish_slam(run.state, run.reports, methods.config)
+
+
+def join(methods: SlamMethods, agents: list[SlamResult]) -> AgentsResult:
+    """Joins what the agents have mapped."""
+    from dpmjax.slam import join_agents
+
+    with tqdm(desc="loops between agents", unit=" keyframes", dynamic_ncols=True) as bar:
+
+        def on_keyframe(num_done: int, num_all: int) -> None:
+            bar.total = num_all
+            bar.update(num_done - bar.n)
+
+        return join_agents(methods, agents, on_keyframe=on_keyframe)
+
+
+def write_results(
+    folder: RunFolder, config: Config, result: AgentsResult, sequences: list[LidarSequence]
+) -> dict[str, Any]:
+    """Writes all files but metrics.json, and returns its numbers; the picture comes last."""
+    from dpmjax import viz
+    from experiments._slam_agents import agent_panels, agents_numbers, write_agents
+
+    metrics = {"weights": config.weights, "overlap": config.overlap, **agents_numbers(result, sequences)}
+    sizes = write_agents(folder, result, sequences)
+    for agent, size in zip(metrics["agents"], sizes, strict=True):
+        agent |= size
+    write_metrics(folder, metrics, seed=config.seed)  # numbers first: a picture that fails must not cost them
+    figure = viz.agents_figure(f"{len(sequences)} agents", agent_panels(result, sequences))
+    viz.save_figure(figure, folder / "agents.png")
+    return metrics
+
+
+if __name__ == "__main__":
+    raise SystemExit(run_command(main, Config, experiment=EXPERIMENT, description=__doc__))

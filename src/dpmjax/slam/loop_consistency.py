@@ -1,0 +1,130 @@
+"""Which registrations of loop candidates are believed: by their own numbers, by odometry, and by one another.
+
+A single registration may be wrong in a place that looks like another. It becomes an edge only together with others, of
+other keyframes, that agree with it over the odometry between them (pairwise consistency, Mangelson et al. 2018).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from dpmjax.geometry import rigid
+from dpmjax.slam.config import LoopClosureConfig
+from dpmjax.slam.keyframes import KeyframeMap, turn_rad
+from dpmjax.slam.matcher import Match
+from dpmjax.slam.reports import Loop, LoopStatus
+
+MAX_WITNESSES = 6
+"""So many accepted loops are asked whether they agree with a new one."""
+
+
+def status_of(slam_map: KeyframeMap, loop: Loop, match: Match, config: LoopClosureConfig) -> LoopStatus:
+    """Decides about a registration by itself.
+
+    Args:
+        slam_map: the map.
+        loop: the candidate.
+        match: its registration.
+        config: thresholds.
+
+    Returns:
+        "waits for support", or why the registration is not believed.
+    """
+    if match.probability < config.min_probability:
+        return "improbable"
+    shares = match.verification
+    if shares is not None and (
+        shares.matched_share < config.min_matched_share or shares.contradicted_share > config.max_contradicted_share
+    ):
+        return "scans disagree"
+    source, target = slam_map.keyframes[loop.source], slam_map.keyframes[loop.target]
+    if source.segment == target.segment:
+        path_m = abs(source.path_m - target.path_m)
+        T_world = slam_map.T_world_keyframe
+        predicted = rigid.inverse(T_world[loop.target]) @ T_world[loop.source]
+        apart = rigid.inverse(predicted) @ match.T_target_source
+        sigma_m, sigma_rad = _drift(path_m, config)
+        most_m = config.consistent_sigmas * sigma_m + config.min_drift_share * path_m
+        most_rad = config.consistent_sigmas * sigma_rad + config.min_drift_share
+        if np.linalg.norm(apart[:3, 3]) > most_m or turn_rad(apart) > most_rad:
+            return "against odometry"
+    return "waits for support"
+
+
+def accept_consistent(
+    slam_map: KeyframeMap, loops: tuple[Loop, ...], number: int, config: LoopClosureConfig
+) -> tuple[Loop, ...]:
+    """Accepts a loop, and those that waited for it, if enough of them agree pairwise (greedy by probability).
+
+    Args:
+        slam_map: the map.
+        loops: all candidates.
+        number: of the loop, which is registered.
+        config: uncertainties and the number that is enough.
+
+    Returns:
+        All candidates after.
+    """
+    others, num_witnesses = [], 0
+    for other in range(len(loops) - 1, -1, -1):
+        if not _is_near_along(slam_map, loops[number].source, loops[other].source, config):
+            break
+        is_witness = loops[other].status == "accepted"
+        if other == number or not (is_witness or loops[other].status == "waits for support"):
+            continue
+        if num_witnesses < MAX_WITNESSES or not is_witness:
+            others.append(other)
+            num_witnesses += is_witness
+    others = [other for other in others if are_consistent(slam_map, loops[number], loops[other], config)]
+    members = [number]
+    for other in sorted(others, key=lambda other: -(loops[other].probability or 0.0)):
+        if all(are_consistent(slam_map, loops[member], loops[other], config) for member in members[1:]):
+            members.append(other)
+    if len(members) < config.min_support:
+        return loops
+    after = list(loops)
+    for member in members:
+        after[member] = loops[member]._replace(status="accepted")
+    return tuple(after)
+
+
+def are_consistent(slam_map: KeyframeMap, loop: Loop, other: Loop, config: LoopClosureConfig) -> bool:
+    """Whether two loops of different keyframes and the odometry between their ends make a cycle that closes.
+
+    Args:
+        slam_map: the map.
+        loop: a registered candidate.
+        other: another one.
+        config: uncertainties.
+
+    Returns:
+        False also where the loops are too far from each other to tell.
+    """
+    if loop.source == other.source or loop.T_target_source is None or other.T_target_source is None:
+        return False
+    rows = list(zip(loop[:2], other[:2], strict=True))
+    if not all(_is_near_along(slam_map, a, b, config) for a, b in rows):
+        return False
+    ends = [(slam_map.keyframes[a], slam_map.keyframes[b]) for a, b in rows]
+    paths_m = [abs(a.path_m - b.path_m) for a, b in ends]
+    T_source_other, T_target_other = (rigid.inverse(a.T_odometry_keyframe) @ b.T_odometry_keyframe for a, b in ends)
+    around = rigid.inverse(loop.T_target_source @ T_source_other) @ T_target_other @ other.T_target_source
+    sigma_m, sigma_rad = _drift(sum(paths_m), config)
+    # A turn of either registration moves the other end by the length of the odometry between them.
+    sigma_m = float(np.hypot(sigma_m, config.sigma_rad * max(paths_m)))
+    is_near = np.linalg.norm(around[:3, 3]) <= config.consistent_sigmas * sigma_m
+    return bool(is_near) and turn_rad(around) <= config.consistent_sigmas * sigma_rad
+
+
+def _is_near_along(slam_map: KeyframeMap, row: int, other: int, config: LoopClosureConfig) -> bool:
+    """Whether two keyframes are near each other along one unbroken path."""
+    a, b = slam_map.keyframes[row], slam_map.keyframes[other]
+    return a.segment == b.segment and abs(a.path_m - b.path_m) <= config.pending_path_m
+
+
+def _drift(path_m: float, config: LoopClosureConfig) -> tuple[float, float]:
+    """Returns standard deviations of a cycle of two registrations and a path of odometry: metres, radians."""
+    return (
+        float(np.sqrt(2 * config.sigma_m**2 + config.drift_m**2 * path_m)),
+        float(np.sqrt(2 * config.sigma_rad**2 + config.drift_rad**2 * path_m)),
+    )

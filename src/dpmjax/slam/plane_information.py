@@ -1,0 +1,57 @@
+"""Information of an alignment by the planes that points meet: a corridor is weak along its axis."""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Float
+
+from dpmjax.scans.surface_alignment import PlanePairs
+from dpmjax.slam.keyframes import Pose, diagonal_information
+
+UNKNOWN_M, UNKNOWN_RAD = 10.0, 1.0
+"""A direction that no plane holds is known so well."""
+
+NUM_INDEPENDENT = 200
+"""The pairs count as that many independent ones, for their residuals are correlated."""
+
+MIN_SIGMA_M = 0.01
+
+
+def plane_information(pairs: PlanePairs, T_target_source: Pose, *, max_residual_m: float) -> Float[np.ndarray, "6 6"]:
+    """Computes the normal equations of point-to-plane residuals.
+
+    Args:
+        pairs: under the motion.
+        T_target_source: the motion.
+        max_residual_m: pairs with a larger residual meet no plane.
+
+    Returns:
+        Inverse covariance in the tangent of the source, translation first.
+    """
+    is_used = np.abs(pairs.residuals) < max_residual_m
+    if is_used.sum() < 6:
+        return diagonal_information(UNKNOWN_M, UNKNOWN_RAD)
+    normals = pairs.normals[is_used] @ T_target_source[:3, :3]
+    points = (pairs.points[is_used] - T_target_source[:3, 3]) @ T_target_source[:3, :3]
+    jacobian = np.concatenate([normals, np.cross(points, normals)], axis=1)
+    variance = max(float(np.mean(pairs.residuals[is_used] ** 2)), MIN_SIGMA_M**2)
+    system = NUM_INDEPENDENT / len(jacobian) / variance * jacobian.T @ jacobian
+    return np.asarray(system + diagonal_information(UNKNOWN_M, UNKNOWN_RAD))
+
+
+def with_least_covariance(
+    information: Float[np.ndarray, "6 6"], sigma_m: float, sigma_rad: float
+) -> Float[np.ndarray, "6 6"]:
+    """Adds a covariance that no number of points undercuts.
+
+    Args:
+        information: inverse covariance.
+        sigma_m: standard deviation of each translation that is added.
+        sigma_rad: of each rotation.
+
+    Returns:
+        The inverse of the sum.
+    """
+    covariance = np.linalg.inv(information) + np.diag(np.repeat([sigma_m**2, sigma_rad**2], 3))
+    after = np.linalg.inv(covariance)
+    return np.asarray((after + after.T) / 2)

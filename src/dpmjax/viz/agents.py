@@ -1,0 +1,135 @@
+"""Pictures of several agents that map together (DeepPointMap figure 5): each agent has a colour."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from dpmjax.viz.drives import plane_limits, size_in
+from dpmjax.viz.figures import INK, MUTED, Limits, add_scale_bar, frame_map, new_figure
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+COLORS = ("#1f4e8c", "#d1495b", "#2a9d5c", "#e08a1e", "#7b4fa3", "#0f8b8d", "#8d6b3f", "#c04a9b")
+"""Of the agents, in turn."""
+
+MIN_HEIGHT_M = -1.0
+"""Lower points, below the lidar, are ground, which would hide everything."""
+
+
+class AgentTrack(NamedTuple):
+    """What one agent has seen and where it went.
+
+    Attributes:
+        label: for the legend.
+        color: of the agent.
+        positions: (n, 3) metres.
+        reference: (n, 3) in the same frame; None where there is none.
+        points: (m, 3) what it saw.
+        heights_m: (m,) of the points above the lidar.
+    """
+
+    label: str
+    color: str
+    positions: Float[np.ndarray, "n 3"]
+    reference: Float[np.ndarray, "n 3"] | None
+    points: Float[np.ndarray, "m 3"]
+    heights_m: Float[np.ndarray, " m"]
+
+
+class AgentPanel(NamedTuple):
+    """Agents that share one frame.
+
+    Attributes:
+        title: of the panel.
+        agents: at least one.
+        loops: (l, 2, 3) positions of both ends of each loop between agents.
+    """
+
+    title: str
+    agents: Sequence[AgentTrack]
+    loops: Float[np.ndarray, "l 2 3"]
+
+
+def agents_figure(title: str, panels: Sequence[AgentPanel]) -> Figure:
+    """Draws what agents have mapped, from above; agents that never met have panels of their own.
+
+    Args:
+        title: of the picture.
+        panels: one for each component.
+
+    Returns:
+        The figure.
+    """
+    limits = [_limits_of(panel) for panel in panels]
+    sizes = [size_in(each) for each in limits]
+    width_in, height_in = sum(size[0] for size in sizes), max(size[1] for size in sizes)
+    figure = new_figure(width_in + 0.3 * len(panels), height_in + 1.0)
+    row = figure.subplots(1, len(panels), squeeze=False, width_ratios=[size[0] for size in sizes])[0]
+    for axes, panel, size, each in zip(row, panels, sizes, limits, strict=True):
+        _draw_panel(axes, panel, each, size)
+    figure.suptitle(title, fontsize=11, color=INK, x=0.02, ha="left", fontweight="bold")
+    figure.tight_layout()
+    return figure
+
+
+def _draw_panel(axes: Axes, panel: AgentPanel, limits: Limits, size: tuple[float, float]) -> None:
+    from matplotlib.collections import LineCollection
+
+    axes.imshow(
+        _raster(panel, limits, int(160 * size[0]), int(160 * size[1])),
+        origin="lower",
+        extent=limits,
+        interpolation="nearest",
+    )
+    references = [agent.reference for agent in panel.agents if agent.reference is not None]
+    for number, reference in enumerate(references):
+        label = None if number else "reference"
+        axes.plot(*reference[:, :2].T, color=INK, lw=0.7, ls=(0, (3, 2)), label=label, zorder=6)
+    for agent in panel.agents:
+        axes.plot(*agent.positions[:, :2].T, color="white", lw=3.2, zorder=3, solid_capstyle="round")
+        axes.plot(*agent.positions[:, :2].T, color=agent.color, lw=1.8, label=agent.label, zorder=4)
+        axes.plot(*agent.positions[:1, :2].T, "o", ms=5.5, color=agent.color, mec="white", zorder=8)
+    if len(panel.loops):
+        lines = LineCollection(list(panel.loops[:, :, :2]), colors=INK, linewidths=0.9, zorder=7)
+        lines.set_label(f"{len(panel.loops)} loops between agents")
+        axes.add_collection(lines)
+        axes.plot(*panel.loops.reshape(-1, 3)[:, :2].T, ".", ms=3.5, color=INK, zorder=7)
+    frame_map(axes, limits)
+    add_scale_bar(axes, limits, "m")
+    axes.set_title(panel.title, fontsize=9, color=MUTED, loc="left")
+    axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.01), ncols=3, frameon=False, fontsize=8, labelcolor=MUTED)
+
+
+def _limits_of(panel: AgentPanel) -> Limits:
+    """The trajectories, and most of what was seen: a few far points must not make the map small."""
+    shown = [agent.positions[:, :2] for agent in panel.agents]
+    points = np.concatenate([agent.points[:, :2] for agent in panel.agents])
+    if len(points):
+        shown.append(np.quantile(points, [0.01, 0.99], axis=0))
+    return plane_limits(np.concatenate(shown), 0.03)
+
+
+def _raster(panel: AgentPanel, limits: Limits, columns: int, rows: int) -> UInt8[np.ndarray, "r c 3"]:
+    """The picture: each pixel has the colour of those who have seen something there, stronger for more points."""
+    from matplotlib.colors import to_rgb
+
+    color, total = np.zeros((rows * columns, 3)), np.zeros(rows * columns)
+    for agent in panel.agents:
+        points = agent.points[agent.heights_m > MIN_HEIGHT_M, :2]
+        place = (points - [limits.x_min, limits.y_min]) / [limits.width / columns, limits.height / rows]
+        column, row = np.floor(place).astype(np.int64).T
+        is_inside = (column >= 0) & (column < columns) & (row >= 0) & (row < rows)
+        count = np.bincount(row[is_inside] * columns + column[is_inside], minlength=rows * columns)
+        color += count[:, None] * np.array(to_rgb(agent.color))
+        total += count
+    is_seen = total > 0
+    strong = np.quantile(total[is_seen], 0.9) if is_seen.any() else 1.0
+    alpha = np.where(is_seen, 0.25 + 0.6 * np.clip(total / max(strong, 1.0), 0, 1), 0.0)[:, None]
+    mixed = alpha * color / np.maximum(total, 1)[:, None] + 1 - alpha
+    return np.asarray(np.round(255 * mixed), np.uint8).reshape(rows, columns, 3)

@@ -1,0 +1,190 @@
+"""Laws of several agents: maps that meet become one graph, and strangers stay apart."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+
+import dpmjax
+from dpmjax.geometry import rigid
+from dpmjax.metrics import absolute_trajectory_error
+from dpmjax.slam import AgentsResult, SlamConfig, SlamMethods, run_agents, take_component
+from tests.slam.truth import EMPTY, TruthGeometry, TruthMatcher, laps, pose, scans_of
+
+CONFIG = SlamConfig()
+TRUTH = laps(1, side_m=80.0, step_m=2.0)
+"""160 poses along a square."""
+PARTS = (range(70), range(55, 120), [*range(105, 160), *range(15)])
+"""Each begins where the one before still drives, and the last meets the first."""
+
+
+@dataclass(frozen=True)
+class ConfusedMatcher(TruthMatcher):
+    """Everything looks alike, all overlaps, and no registration is right."""
+
+    gross_share: float = 1.0
+
+    def vector(self, description: int) -> np.ndarray:
+        return np.ones(4) + 0.01 * np.random.default_rng(description).normal(size=4)
+
+    def overlaps(self, source: int, targets: list[int]) -> np.ndarray:
+        return np.ones(len(targets))
+
+
+def methods_of(truth: np.ndarray, matcher: TruthMatcher | None = None, seed: int = 0) -> SlamMethods:
+    return SlamMethods(matcher or TruthMatcher(truth, seed=seed), TruthGeometry(truth, seed=seed), CONFIG)
+
+
+def run(parts=PARTS, *, truth: np.ndarray = TRUTH, matcher: TruthMatcher | None = None, seed: int = 0) -> AgentsResult:
+    return run_agents([scans_of(part) for part in parts], methods_of(truth, matcher, seed))
+
+
+def joint_error_m(result: AgentsResult, parts, agents, truth: np.ndarray = TRUTH) -> float:
+    """ATE of several agents in one frame."""
+    found = np.concatenate([result.T_world_scan[agent][:, :3, 3] for agent in agents])
+    expected = np.concatenate([truth[list(parts[agent])][:, :3, 3] for agent in agents])
+    return absolute_trajectory_error(found, expected)
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_three_agents_that_meet_make_one_graph(seed) -> None:
+    result = run(seed=seed)
+    assert result.component == (0, 0, 0)
+    assert joint_error_m(result, PARTS, (0, 1, 2)) < 1.0
+    np.testing.assert_allclose(result.T_world_scan[0][0], np.eye(4), atol=1e-9)
+    accepted = [loop for loop in result.joined.loops if loop.status == "accepted"]
+    ends = {frozenset(result.joined.map_of_keyframe[list(loop[:2])].tolist()) for loop in accepted}
+    assert ends == {frozenset({0, 1}), frozenset({1, 2}), frozenset({0, 2})}
+    for loop in accepted:
+        scans = [numbers_of(result)[row] for row in loop[:2]]
+        true = rigid.inverse(TRUTH[scans[1]]) @ TRUTH[scans[0]]
+        assert np.linalg.norm((rigid.inverse(true) @ loop.T_target_source)[:3, 3]) < 1.0
+
+
+def numbers_of(result: AgentsResult) -> list[int]:
+    """The number of the pose of each keyframe; descriptions of the truth are numbers."""
+    return [keyframe.description for keyframe in result.joined.slam_map.keyframes]
+
+
+def test_agents_that_never_meet_stay_apart() -> None:
+    far = TRUTH.copy()
+    far[:, :3, 3] += [1000.0, 0.0, 0.0]
+    truth = np.concatenate([TRUTH, far])
+    parts = (range(60), range(200, 260), range(40, 100))
+    result = run(parts, truth=truth)
+    assert result.component == (0, 1, 0)
+    assert joint_error_m(result, parts, (0, 2), truth) < 1.0
+    # The stranger has the frame of its own first scan, and the trajectory that it has found alone.
+    np.testing.assert_allclose(result.T_world_scan[1], result.agents[1].T_world_scan, atol=1e-9)
+    assert len(take_component(result.joined, 1)) == len(result.agents[1].keyframes)
+
+
+def test_the_order_of_agents_does_not_matter() -> None:
+    first, second = run(PARTS), run(PARTS[::-1])
+    for agent in range(3):
+        a, b = first.T_world_scan[agent], second.T_world_scan[2 - agent]
+        # Another agent gives the frame.
+        T_b_a = second.T_world_scan[2][0] @ rigid.inverse(first.T_world_scan[0][0])
+        np.testing.assert_allclose(T_b_a @ a, b, atol=1e-3)
+    counts = [sum(loop.status == "accepted" for loop in each.joined.loops) for each in (first, second)]
+    assert counts[0] == counts[1]
+
+
+def test_same_agents_give_the_same_result() -> None:
+    first, second = run(), run()
+    for a, b in zip(first.T_world_scan, second.T_world_scan, strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_gross_errors_do_not_join_strangers(seed) -> None:
+    far = TRUTH.copy()
+    far[:, :3, 3] += [1000.0, 0.0, 0.0]
+    truth = np.concatenate([TRUTH, far])
+    matcher = ConfusedMatcher(truth, seed=seed)
+    result = run((range(60), range(200, 260)), truth=truth, matcher=matcher, seed=seed)
+    assert any(loop.T_target_source is not None for loop in result.joined.loops)
+    assert result.component == (0, 1)
+
+
+def test_an_agent_without_scans_is_alone() -> None:
+    scans = [scans_of(range(30)), [EMPTY, EMPTY], [], scans_of(range(10, 40))]
+    result = run_agents(scans, methods_of(TRUTH))
+    assert result.component == (0, 1, 2, 0)
+    assert [len(T_world_scan) for T_world_scan in result.T_world_scan] == [30, 2, 0, 30]
+    with pytest.raises(ValueError, match="sequences: expected"):
+        run_agents([], methods_of(TRUTH))
+
+
+def test_an_agent_alone_finds_what_it_finds_alone() -> None:
+    methods = methods_of(TRUTH)
+    alone = dpmjax.run_slam(scans_of(range(60)), methods)
+    result = run_agents([scans_of(range(60))], methods)
+    np.testing.assert_allclose(result.T_world_scan[0], alone.T_world_scan, atol=1e-9)
+    assert result.component == (0,)
+
+
+def test_bytes_are_counted() -> None:
+    result = run()
+    for part, traffic in zip(PARTS, result.traffic, strict=True):
+        # A scan of the truth is one point.
+        assert traffic.scan_bytes == 12 * len(list(part))
+        assert 0 < traffic.keyframe_scan_bytes < traffic.scan_bytes
+        assert traffic.keyframe_bytes > 0
+
+
+def test_maps_of_different_days_are_merged() -> None:
+    methods = methods_of(TRUTH)
+    a, b = (dpmjax.run_slam(scans_of(part), methods).state.slam_map for part in PARTS[:2])
+    merged = dpmjax.merge_maps(a, b, methods)
+    assert merged.is_joined
+    (both,) = merged.maps
+    assert len(both) == len(a) + len(b)
+    # The frame of the first map is kept.
+    np.testing.assert_allclose(both.T_world_keyframe[0], a.T_world_keyframe[0], atol=1e-9)
+    rows = [keyframe.description for keyframe in both.keyframes]
+    assert absolute_trajectory_error(both.T_world_keyframe[:, :3, 3], TRUTH[rows][:, :3, 3]) < 1.0
+    # A third drive extends what was merged.
+    extended = dpmjax.run_slam(scans_of(PARTS[2]), methods, map_=both)
+    rows = [keyframe.description for keyframe in extended.state.slam_map.keyframes]
+    found = extended.state.slam_map.T_world_keyframe[:, :3, 3]
+    assert absolute_trajectory_error(found, TRUTH[rows][:, :3, 3]) < 1.0
+    assert len({keyframe.scan for keyframe in extended.state.slam_map.keyframes}) == len(rows)
+
+
+def test_maps_that_do_not_meet_are_returned_as_they_were() -> None:
+    methods = methods_of(TRUTH)
+    a, b = (dpmjax.run_slam(scans_of(part), methods).state.slam_map for part in (range(30), range(80, 110)))
+    merged = dpmjax.merge_maps(a, b, methods)
+    assert not merged.is_joined
+    assert merged.maps == (a, b)
+
+
+def test_maps_of_other_weights_are_refused(as_user) -> None:
+    a, b = (
+        dpmjax.run_slam(scans_of(range(10)), methods_of(TRUTH, TruthMatcher(TRUTH, fingerprint=name))).state.slam_map
+        for name in ("one", "other")
+    )
+    with pytest.raises(ValueError, match="made with weights one, these are other"):
+        dpmjax.merge_maps(a, b, methods_of(TRUTH))
+
+
+def test_a_lost_agent_is_joined_as_a_whole() -> None:
+    # The second agent is kidnapped on its way: its two parts hang together by loops with the first agent alone.
+    parts = (range(160), [*range(20, 50), *range(110, 140)])
+    result = run(parts)
+    assert "restarted" in {report.status for report in result.agents[1].reports}
+    assert result.component == (0, 0)
+    T_new_old = result.T_world_scan[0][0] @ rigid.inverse(TRUTH[0])
+    apart = np.linalg.norm((T_new_old @ TRUTH[list(parts[1])])[:, :3, 3] - result.T_world_scan[1][:, :3, 3], axis=1)
+    assert np.median(apart[:30]) < 1.0
+    assert np.median(apart[36:]) < 1.0
+
+
+def test_poses_are_those_of_a_moved_world() -> None:
+    moved = pose(40.0, -20.0, 1.0) @ TRUTH
+    a, b = run(PARTS), run(PARTS, truth=moved)
+    assert a.component == b.component
+    assert joint_error_m(b, PARTS, (0, 1, 2), moved) < 1.0
