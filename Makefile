@@ -11,7 +11,7 @@ BIN    := $(VENV)/bin
 STAMP  := $(VENV)/.installed
 
 .DEFAULT_GOAL := help
-.PHONY: help venv check test slow demo bench clean
+.PHONY: help venv check test slow demo slam bench clean
 
 help:  ## list the targets
 	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "  make %-8s %s\n", $$1, $$2 }' Makefile
@@ -41,6 +41,10 @@ slow: $(STAMP)  ## the tests that train or start processes
 demo: $(STAMP)  ## register the built-in 2-D world; pictures in results/demo
 	$(BIN)/python -m experiments.deepmapping_2d --init odometry --force -o results/demo
 	@echo "Pictures:"; find results/demo/ -name '*.png' | sort | sed 's/^/  /'
+
+slam: $(STAMP)  ## map a simulated town from 3-D scans; pictures in results/slam
+	$(BIN)/python -m experiments.dpm_slam --force -o results/slam
+	@echo "Pictures:"; find results/slam/ -name '*.png' | sort | sed 's/^/  /'
 
 bench: $(STAMP)  ## speed and accuracy of everything that is measured
 	$(BIN)/python -m benchmarks
