@@ -23,4 +23,5 @@ from .poses import read_poses as read_poses
 from .poses import write_kitti as write_kitti
 from .poses import write_poses_npy as write_poses_npy
 from .poses import write_tum as write_tum
+from .relations import read_relations as read_relations
 from .scans2d import read_sequence as read_sequence

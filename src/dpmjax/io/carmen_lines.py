@@ -40,7 +40,7 @@ class ScanLine(NamedTuple):
         angles: directions of the beams, radians, counter-clockwise from straight ahead.
         pose: x, y, theta of the laser.
         odometry: x, y, theta of the robot by its wheels.
-        time: when it was logged; 0 where the line does not tell.
+        time: when it was measured (ipc_timestamp); 0 where the line does not tell.
     """
 
     ranges: FloatArray
@@ -115,7 +115,7 @@ def _parse_older(words: list[str], source: str) -> ScanLine:
     with refusing(source, "not a FLASER line ({error})", _FLASER, (ValueError, IndexError, OverflowError)):
         count = int(words[1])
         values = np.array(words[2 : 2 + count + 6], np.float64)
-        time = float(words[-1]) if len(words) > count + 8 else 0.0
+        time = float(words[count + 8]) if len(words) > count + 8 else 0.0
     found = f"{len(words) - 2} values after n = {count}, at least {count + 6} expected"
     require(count >= 1 and len(values) >= count + 6, source, found, _FLASER)
     _check_numbers(values[:count], [*values[count:], time], source)
@@ -128,7 +128,7 @@ def _parse_newer(words: list[str], source: str) -> ScanLine:
         ranges: FloatArray = np.array(words[_HEAD : _HEAD + count], np.float64)
         first = _HEAD + count + 1 + int(words[_HEAD + count])
         poses = np.array(words[first : first + 6], np.float64)
-        time = float(words[-1]) if len(words) >= first + 6 + _TAIL else 0.0
+        time = float(words[first + 6 + 5]) if len(words) >= first + 6 + _TAIL else 0.0
     found = f"{len(words)} words for {count} ranges"
     require(count >= 1 and len(ranges) == count and len(poses) == 6, source, found, _ROBOTLASER1)
     require(step > 0 and abs(start) < 7, source, f"angles from {start} by {step} radians", _ROBOTLASER1)
@@ -140,10 +140,10 @@ def _parse_newer(words: list[str], source: str) -> ScanLine:
 def _parse_odometry(words: list[str]) -> list[float] | None:
     """Time and pose; None for a damaged line, for the scans have the odometry that is needed."""
     try:
-        values = [float(words[-1]), *map(float, words[1:4])]
+        values = [float(words[7]), *map(float, words[1:4])]
     except (ValueError, IndexError):
         return None
-    return values if len(words) >= 5 and np.isfinite(values).all() else None
+    return values if np.isfinite(values).all() else None
 
 
 def _check_numbers(ranges: FloatArray, others: Sequence[float], source: str) -> None:
