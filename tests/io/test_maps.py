@@ -50,7 +50,7 @@ def scan(seed: int, num_points: int) -> CompactScan:
 
 def make_map(num_keyframes: int = 4) -> KeyframeMap:
     config = replace(SlamConfig(), loops=replace(SlamConfig().loops, num_near=3))
-    slam_map = with_origin(KeyframeMap(), MapOrigin("0123456789abcdef", config))
+    slam_map = with_origin(KeyframeMap(), MapOrigin("0123456789abcdef", config, "dpm_small"))
     rng = np.random.default_rng(1)
     for row in range(num_keyframes):
         T = noise(rng, 100.0, 1.0)

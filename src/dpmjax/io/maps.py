@@ -83,7 +83,8 @@ def map_bytes(map_: KeyframeMap, precision: Precision = "float32") -> bytes:
         "format": FORMAT,
         "version": VERSION,
         "precision": precision,
-        "weights": map_.origin.fingerprint,
+        "fingerprint": map_.origin.fingerprint,
+        "weights": map_.origin.weights,
         "config": dataclasses.asdict(map_.origin.config),
     }
     content = io.BytesIO()
@@ -111,12 +112,12 @@ def load_map(path: str | Path) -> KeyframeMap:
     with refusing(path, "its header cannot be read ({error})", ADVICE, (Exception,)):
         header = json.loads(arrays["header"].tobytes())
         found, version, precision = header["format"], header["version"], header["precision"]
-        weights = str(header["weights"])
+        fingerprint, weights = str(header["fingerprint"]), str(header["weights"])
     require(found == FORMAT, path, "not a dpmjax map", "give a file of dpmjax.save_map")
     require(version == VERSION, path, f"format version {version}, this dpmjax reads {VERSION}", "update dpmjax")
     require(precision in get_args(Precision), path, f"precision {precision}", ADVICE)
     with refusing(path, "{error}", ADVICE, (ValueError, TypeError)):
-        origin = MapOrigin(weights, config_from_json(header["config"], SlamConfig))
+        origin = MapOrigin(fingerprint, config_from_json(header["config"], SlamConfig), weights)
     for name, array in arrays.items():
         is_good = array.dtype.kind in "iub" or (array.dtype.kind == "f" and bool(np.isfinite(array).all()))
         require(is_good, path, f"{name} holds values that are not finite numbers", ADVICE)

@@ -58,18 +58,19 @@ class SlamResult(NamedTuple):
     state: SlamState
 
 
-def make_methods(model: Model, config: SlamConfig | None = None) -> SlamMethods:
+def make_methods(model: Model, config: SlamConfig | None = None, *, weights: str = "") -> SlamMethods:
     """Makes the methods of a trained model: its networks, and point-to-plane geometry.
 
     Args:
         model: encoder and decoder.
         config: settings of all stages.
+        weights: name of the weights, noted in the map.
 
     Returns:
         The methods.
     """
     config = config or SlamConfig()
-    return SlamMethods(NetworkMatcher(model), SurfaceGeometry(config.odometry), config)
+    return SlamMethods(NetworkMatcher(model), SurfaceGeometry(config.odometry), config, weights)
 
 
 def init_slam(map_: KeyframeMap | None = None) -> SlamState:
