@@ -1,4 +1,4 @@
-"""Rows of `dpm_evaluate`: registrations by the model and by KISS-Matcher on the pairs of a drive; table and summary."""
+"""Rows of `dpm_evaluate`: registrations by the model, without it and by KISS-Matcher on the same pairs; the table."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from tqdm import tqdm
 from dpmjax import registration_recall
 from dpmjax.deeppointmap import Model
 from dpmjax.deeppointmap.confidence import probability
+from dpmjax.deeppointmap.verification import VerificationConfig, choose_motion, measure_scan, refine_motion
 from dpmjax.io import LidarSequence
 from dpmjax.viz import RegisteredPair
 from experiments._dpm_pairs import Clock, ScanPair, draw_pairs, median_seconds, read_pairs, register_pair
@@ -71,7 +72,14 @@ def kiss_matcher(source: np.ndarray, target: np.ndarray) -> np.ndarray:
     return T
 
 
-def evaluate_kiss(
+def search_alone(source: np.ndarray, target: np.ndarray, config: VerificationConfig) -> np.ndarray:
+    """Returns `T_target_source` of what `register` does around the network: it searches among the views from above."""
+    measured = measure_scan(source, config), measure_scan(target, config)
+    chosen = choose_motion(*measured, np.eye(4)[None], config)
+    return refine_motion(*measured, chosen, config).T_target_source
+
+
+def evaluate_matcher(
     matcher: Matcher, drive: LidarSequence, band: str, num_pairs: int, seed: int, bar: tqdm
 ) -> dict[str, Any]:
     """Returns errors and seconds of another matcher on the same pairs."""
@@ -102,22 +110,24 @@ def calibration_numbers(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
 def table(rows: Sequence[dict[str, Any]]) -> str:
     """Returns the table as Markdown: a row for each sequence and distance."""
     lines = [
-        "| sequence | distance | pairs | recall, descriptors | recall, verified | recall, refined | KISS-Matcher "
+        "| sequence | distance | pairs | recall, descriptors | recall, verified | recall, refined "
+        "| search without network | KISS-Matcher "
         "| median error, descriptors | median error, refined | s / pair | KISS, s | overlap AUC |",
-        "|---|---|---|---|---|---|---|---|---|---|---|---|",
+        "|---|---|---|---|---|---|---|---|---|---|---|---|---|",
     ]
     by_case = {(row["method"], row["sequence"], row["band"]): row for row in rows}
     names = {"near": "2-10 m", "middle": "10-20 m"}
     for (method, sequence, band), row in by_case.items():
         if method != "DeepPointMap" or band not in names or not row["num_pairs"]:
             continue
-        kiss = by_case.get(("KISS-Matcher", sequence, band), {})
+        kiss, search = (by_case.get((other, sequence, band), {}) for other in ("KISS-Matcher", "search"))
         auc = by_case.get(("overlap", sequence, "all"), {}).get("auc") if band == "near" else None
         errors = " | ".join(_length(row[f"median_error_{stage}_m"]) for stage in ("descriptors", "refined"))
         recalls = " | ".join(f"{row[f'recall_{stage}']:.2f}" for stage in ("descriptors", "verified", "refined"))
+        others = " | ".join(_number(other.get("recall_refined")) for other in (search, kiss))
         lines.append(
-            f"| {sequence} | {names[band]} | {row['num_pairs']} | {recalls} | {_number(kiss.get('recall_refined'))} "
-            f"| {errors} | {_number(row['pair_s'])} | {_number(kiss.get('pair_s'))} | {_number(auc, 3)} |"
+            f"| {sequence} | {names[band]} | {row['num_pairs']} | {recalls} | {others} | {errors} "
+            f"| {_number(row['pair_s'])} | {_number(kiss.get('pair_s'))} | {_number(auc, 3)} |"
         )
     return "\n".join(lines)
 
@@ -159,7 +169,7 @@ def _errors(motions: Sequence[np.ndarray], true: Sequence[np.ndarray], suffix: s
     metres, degrees = np.median(errors, axis=0) if len(errors) else (np.nan, np.nan)
     return {
         "num_pairs": len(is_right),
-        f"recall{suffix}": recall.recall,
+        f"recall{suffix}": recall.recall if len(is_right) else None,
         f"median_error{suffix}_m": float(metres),
         f"median_error{suffix}_deg": float(degrees),
         f"translation_errors{suffix}_m": recall.translation_errors_m,

@@ -35,7 +35,7 @@ from dpmjax.io import open_lidar_sequence
 from dpmjax.simulation import HDL32E, HDL64E, OS1_64
 from experiments._dpm_data import HELD_OUT_SEED, SELECTION_SEED, town_drive
 from experiments._result_files import HistoryFile, read_history
-from experiments._run_folder import CHECKPOINTS, HISTORY, RunFolder
+from experiments._run_folder import BEST, CHECKPOINTS, HISTORY, RunFolder
 
 # Seconds between checkpoints; Ctrl-C and the end write one too.
 SAVE_EVERY_S = 300.0
@@ -98,11 +98,11 @@ class Records:
 
     def __init__(self, folder: RunFolder, settings: TrainingConfig, sets: EvaluationSets, *, seed: int) -> None:
         self.folder, self.sets, self._settings = folder, sets, settings
-        self._checkpoints = Checkpoints(folder / CHECKPOINTS)
+        self._checkpoints, self._best = Checkpoints(folder / CHECKPOINTS), Checkpoints(folder / BEST)
         self.start = begin_training(init_training(jax.random.key(seed), settings))
         self.untrained = Model(self.start.state.params, settings.model)
         if folder.is_resumed:
-            self.start = self._checkpoints.restore_latest(self.start, fallback=self.start)
+            self.start = self._restored(self.start)
         first = int(self.start.state.step)
         self._history = HistoryFile(folder / HISTORY, COLUMNS, keep_until=first if folder.is_resumed else None)
         self.earlier_s = max((float(row["run_s"]) for row in read_history(folder / HISTORY)), default=0.0)
@@ -140,8 +140,20 @@ class Records:
             self._last_saved = time.perf_counter()
 
     def save(self, progress: TrainingProgress) -> None:
-        """Writes a checkpoint."""
-        self._checkpoints.save(int(progress.state.step), progress)
+        """Writes a checkpoint, and the best parameters where they are others than at the last one."""
+        if int(progress.best_step):
+            self._best.save(int(progress.best_step), progress.best_params)
+        self._checkpoints.save(int(progress.state.step), replace(progress, best_params={}))
+
+    def _restored(self, start: TrainingProgress) -> TrainingProgress:
+        found = self._checkpoints.restore_latest(replace(start, best_params={}), fallback=None)
+        if found is None:
+            return start
+        if int(found.best_step):
+            params = self._best.restore(int(found.best_step), start.best_params)
+            if params is not None:
+                return replace(found, best_params=params)
+        return begin_training(found.state)
 
     def _tell_compilation(self, state: TrainingState) -> None:
         stage = self._settings.stage_at(int(state.step))

@@ -6,14 +6,16 @@
 
 A path is any folder of scans with poses (KITTI, KITTI-360, MulRan, plain ...). Random pairs of scans, 2 to 10 m and 10
 to 20 m apart and turned by any yaw, are registered; a registration within 2 m and 5 degrees is right. Results go to
-results/dpm_evaluate/<time>/: table.md, metrics.json, reliability.png, failures.png (the worst pairs from above). The
-extra `kiss` adds KISS-Matcher on the same pairs.
+results/dpm_evaluate/<time>/: table.md, metrics.json, reliability.png, failures.png (the worst pairs from above). Two
+more methods see the same pairs: the search and the verification of `register` without the network, and KISS-Matcher
+(extra `kiss`).
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -63,14 +65,16 @@ def main(config: Config) -> list[dict[str, Any]]:
     """Registers the pairs that are missing, and writes table, numbers and pictures."""
     from dpmjax import load_model
     from experiments._dpm_evaluation import (
-        evaluate_kiss,
+        evaluate_matcher,
         evaluate_registrations,
         kiss_matcher,
+        search_alone,
         why_no_kiss,
     )
     from experiments._dpm_overlap import evaluate_overlap
 
     model = load_model(config.weights)
+    search = partial(search_alone, config=model.config.verification)
     drives = open_drives(config)
     num_overlap = OVERLAP_FACTOR * config.pairs
     no_kiss = why_no_kiss() if not config.no_kiss else "left out by --no-kiss"
@@ -88,8 +92,11 @@ def main(config: Config) -> list[dict[str, Any]]:
             for band in ("near", "middle", "far"):
                 pairs = (drive, band, config.pairs, config.seed)
                 add("DeepPointMap", drive, band, lambda p=pairs: evaluate_registrations(model, *p, bar))
-                if band != "far" and no_kiss is None:
-                    add("KISS-Matcher", drive, band, lambda p=pairs: evaluate_kiss(kiss_matcher, *p, bar))
+                if band == "far":
+                    continue
+                add("search", drive, band, lambda p=pairs: evaluate_matcher(search, *p, bar))
+                if no_kiss is None:
+                    add("KISS-Matcher", drive, band, lambda p=pairs: evaluate_matcher(kiss_matcher, *p, bar))
             add("overlap", drive, "all", lambda d=drive: evaluate_overlap(model, d, num_overlap, config.seed, bar))
         text = write_results(folder, config, rows, no_kiss)
         draw(folder, config, drives, rows)

@@ -39,9 +39,8 @@ class Checkpoints:
             step: number of steps done.
             state: any pytree of arrays.
         """
-        logging.getLogger("absl").setLevel(logging.ERROR)
         self._folder.mkdir(parents=True, exist_ok=True)
-        with ocp.CheckpointManager(self._folder, options=self._options) as manager:
+        with self._manager() as manager:
             if step not in manager.all_steps():
                 manager.save(step, args=ocp.args.StandardSave(_numbered(state)))
                 manager.wait_until_finished()
@@ -56,19 +55,41 @@ class Checkpoints:
         Returns:
             The state.
         """
-        if not self._folder.is_dir():
-            return fallback
-        logging.getLogger("absl").setLevel(logging.ERROR)
-        target, structure = _numbered(like), jax.tree.structure(like)
-        with ocp.CheckpointManager(self._folder, options=self._options) as manager:
-            for step in sorted(manager.all_steps(), reverse=True):
-                try:
-                    restored = manager.restore(step, args=ocp.args.StandardRestore(target))
-                except (ValueError, OSError, KeyError) as error:
-                    LOGGER.warning("checkpoint %d cannot be read (%s); the one before is taken", step, error)
-                    continue
-                return jax.tree.unflatten(structure, [jax.numpy.asarray(restored[name]) for name in target])
+        for step in self._steps():
+            restored = self.restore(step, like)
+            if restored is not None:
+                return restored
         return fallback
+
+    def restore(self, step: int, like: StateT) -> StateT | None:
+        """Reads the state of a step.
+
+        Args:
+            step: number of steps done.
+            like: a state of the same structure, shapes and types.
+
+        Returns:
+            The state; None, with a warning, where it is missing or broken.
+        """
+        target = _numbered(like)
+        try:
+            with self._manager() as manager:
+                restored = manager.restore(step, args=ocp.args.StandardRestore(target))
+        except (ValueError, OSError, KeyError) as error:
+            LOGGER.warning("checkpoint %d cannot be read (%s: %s)", step, self._folder, error)
+            return None
+        leaves = [jax.numpy.asarray(restored[name]) for name in target]
+        return jax.tree.unflatten(jax.tree.structure(like), leaves)
+
+    def _steps(self) -> list[int]:
+        if not self._folder.is_dir():
+            return []
+        with self._manager() as manager:
+            return sorted(manager.all_steps(), reverse=True)
+
+    def _manager(self) -> ocp.CheckpointManager:
+        logging.getLogger("absl").setLevel(logging.ERROR)
+        return ocp.CheckpointManager(self._folder, options=self._options)
 
 
 def _numbered(state: object) -> dict[str, np.ndarray]:

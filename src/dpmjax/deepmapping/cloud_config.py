@@ -16,7 +16,6 @@ from dpmjax.deepmapping.config import (
 )
 from dpmjax.deepmapping.depth_config import UNROLL_DEPTH
 from dpmjax.nets.localization import LocalizationConfig
-from dpmjax.nets.occupancy import OccupancyConfig
 
 LOCALIZE_CLOUDS = replace(LOCALIZE, num_steps=300, learning_rate=1e-3, beams_per_step=256, num_offsets=2, max_offset=3)
 """Cold start of clouds."""
@@ -58,9 +57,6 @@ class CloudMappingConfig(SpatialMappingConfig):
     warm_phases: tuple[PhaseConfig, ...] = (REFINE_CLOUDS,)
     localization: LocalizationConfig = field(
         default_factory=lambda: LocalizationConfig(kind="point", features=(32, 64, 128), hidden=(128, 64))
-    )
-    occupancy: OccupancyConfig = field(
-        default_factory=lambda: OccupancyConfig(kind="grid", resolutions=(8, 16, 32, 64))
     )
     steps_per_call: int = 25
     map_margin: float = 1.05

@@ -158,6 +158,9 @@ class SpatialMappingConfig(DeepMappingConfig):
     """
 
     motion: Motion = "full"
+    occupancy: OccupancyConfig = field(
+        default_factory=lambda: OccupancyConfig(kind="grid", resolutions=(8, 16, 32, 64))
+    )
 
 
 def preset(name: Literal["fast", "paper"], *, is_organised: bool = True) -> DeepMappingConfig:

@@ -16,7 +16,6 @@ from dpmjax.deepmapping.config import (
     check_preset,
 )
 from dpmjax.nets.localization import LocalizationConfig
-from dpmjax.nets.occupancy import OccupancyConfig
 
 LOCALIZE_DEPTH = replace(LOCALIZE, num_steps=400, learning_rate=1e-3, beams_per_step=400, num_offsets=2, max_offset=3)
 """Cold start of depth images."""
@@ -61,9 +60,6 @@ class DepthMappingConfig(SpatialMappingConfig):
     warm_phases: tuple[PhaseConfig, ...] = (REFINE_DEPTH,)
     localization: LocalizationConfig = field(
         default_factory=lambda: LocalizationConfig(features=(32, 64, 128), strides=(2, 2, 1), hidden=(128, 64))
-    )
-    occupancy: OccupancyConfig = field(
-        default_factory=lambda: OccupancyConfig(kind="grid", resolutions=(8, 16, 32, 64))
     )
     steps_per_call: int = 50
     map_margin: float = 1.2
