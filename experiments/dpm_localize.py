@@ -28,7 +28,7 @@ from experiments._run_folder import RunFolder, RunOptions, open_run_folder, reco
 if TYPE_CHECKING:
     from dpmjax import KeyframeMap, Localization
     from dpmjax.io import LidarSequence
-    from dpmjax.slam.keyframes import MapOrigin
+    from dpmjax.slam.config import MapOrigin
 
 EXPERIMENT = "dpm_localize"
 TABLE = "localizations.csv"

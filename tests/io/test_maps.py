@@ -18,11 +18,11 @@ from dpmjax.scans.compact import compact_surface, expand_surface
 from dpmjax.scans.free_space import range_image
 from dpmjax.scans.surfaces import SurfaceConfig, scan_surface
 from dpmjax.slam import SlamConfig
+from dpmjax.slam.config import MapOrigin
 from dpmjax.slam.keyframes import (
     Keyframe,
     KeyframeMap,
     MapEdge,
-    MapOrigin,
     add_keyframe,
     diagonal_information,
     with_origin,

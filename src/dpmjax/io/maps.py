@@ -19,8 +19,8 @@ from dpmjax.io.files import load_arrays, refusing, write_atomically
 from dpmjax.io.map_arrays import ArrayReader, pack_graph, pack_scans, unpack_graph, unpack_scans
 from dpmjax.io.map_coding import Precision
 from dpmjax.sequences import require
-from dpmjax.slam.config import SlamConfig
-from dpmjax.slam.keyframes import KeyframeMap, MapOrigin
+from dpmjax.slam.config import MapOrigin, SlamConfig
+from dpmjax.slam.keyframes import KeyframeMap
 from dpmjax.slam.map_thinning import thin_map
 from dpmjax.weights.config_json import config_from_json
 

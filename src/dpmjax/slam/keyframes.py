@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from dpmjax.geometry import rigid
 from dpmjax.pose_graph.graph import Edges, PoseGraph
-from dpmjax.slam.config import SlamConfig
+from dpmjax.slam.config import MapOrigin
 
 Pose = Float[np.ndarray, "4 4"]
 EdgeKind = Literal["odometry", "loop", "guess"]
@@ -55,23 +55,6 @@ class MapEdge(NamedTuple):
     T_target_source: Pose
     information: Float[np.ndarray, "6 6"]
     kind: EdgeKind
-
-
-class MapOrigin(NamedTuple):
-    """What made a map.
-
-    Attributes:
-        fingerprint: of the matcher; its descriptions cannot be compared with those of another one.
-        config: settings of SLAM.
-        weights: name of the weights, for messages; may be empty.
-    """
-
-    fingerprint: str
-    config: SlamConfig
-    weights: str = ""
-
-    def __str__(self) -> str:
-        return f"{self.weights} ({self.fingerprint})" if self.weights else self.fingerprint
 
 
 @dataclass(frozen=True, eq=False)

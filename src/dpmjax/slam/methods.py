@@ -5,8 +5,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 from dpmjax.slam.alignment import Geometry
-from dpmjax.slam.config import SlamConfig
-from dpmjax.slam.keyframes import MapOrigin
+from dpmjax.slam.config import MapOrigin, SlamConfig
 from dpmjax.slam.matcher import Matcher
 
 
