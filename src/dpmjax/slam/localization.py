@@ -21,6 +21,7 @@ from dpmjax.slam.keyframes import (
     Pose,
     Submap,
     distances_to,
+    orthonormal,
     submap_around,
     turn_rad,
     with_origin,
@@ -213,7 +214,7 @@ def _registered(
     targets = [submap_around(map_, row, config.num_submap, radius_m) for row in rows]
     matches = methods.matcher.register([(source, target) for target in targets]) if rows else []
     return [
-        Evidence(row, map_.T_world_keyframe[row] @ match.T_target_source, match)
+        Evidence(row, orthonormal(map_.T_world_keyframe[row] @ match.T_target_source), match)
         for row, match in zip(rows, matches, strict=True)
     ]
 
