@@ -21,7 +21,8 @@ from dpmjax.io.map_coding import (
     rounded_to,
 )
 from dpmjax.scans.compact import CompactImage, CompactSurface
-from dpmjax.slam.keyframes import EdgeKind, Keyframe, KeyframeMap, MapEdge, MapOrigin, orthonormal
+from dpmjax.slam.config import MapOrigin
+from dpmjax.slam.keyframes import EdgeKind, Keyframe, KeyframeMap, MapEdge, orthonormal
 
 KINDS: tuple[EdgeKind, ...] = get_args(EdgeKind)
 TRIANGLE = np.triu_indices(6)

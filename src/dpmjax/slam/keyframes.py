@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from dpmjax.geometry import rigid
 from dpmjax.pose_graph.graph import Edges, PoseGraph
-from dpmjax.slam.config import SlamConfig
+from dpmjax.slam.config import MapOrigin
 
 Pose = Float[np.ndarray, "4 4"]
 EdgeKind = Literal["odometry", "loop", "guess"]
@@ -56,18 +56,6 @@ class MapEdge(NamedTuple):
     T_target_source: Pose
     information: Float[np.ndarray, "6 6"]
     kind: EdgeKind
-
-
-class MapOrigin(NamedTuple):
-    """What made a map.
-
-    Attributes:
-        fingerprint: of the matcher; its descriptions cannot be compared with those of another one.
-        config: settings of SLAM.
-    """
-
-    fingerprint: str
-    config: SlamConfig
 
 
 @dataclass(frozen=True, eq=False)
@@ -149,7 +137,7 @@ def with_origin(slam_map: KeyframeMap, origin: MapOrigin) -> KeyframeMap:
     made_by = slam_map.origin
     if made_by is not None and made_by.fingerprint != origin.fingerprint:
         advice = "load the weights that made the map, or map again"
-        raise ValueError(f"map_: made with weights {made_by.fingerprint}, these are {origin.fingerprint}; {advice}")
+        raise ValueError(f"map_: made with weights {made_by}, these are {origin}; {advice}")
     return replace(slam_map, origin=origin)
 
 

@@ -18,10 +18,10 @@ from dpmjax.deeppointmap.model import Model
 from dpmjax.geometry import rigid
 from dpmjax.slam.keyframes import (
     KeyframeMap,
-    MapOrigin,
     Pose,
     Submap,
     distances_to,
+    orthonormal,
     submap_around,
     turn_rad,
     with_origin,
@@ -169,7 +169,7 @@ def localize_each(
     if map_.origin is None:
         raise ValueError("map_: expected keyframes, got an empty map")
     methods = model if isinstance(model, SlamMethods) else make_methods(model, map_.origin.config)
-    with_origin(map_, MapOrigin(methods.matcher.fingerprint, methods.config))
+    with_origin(map_, methods.origin)
     for points in scans:
         yield _localized(map_, np.asarray(points), methods, config or LocalizationConfig())
 
@@ -214,7 +214,7 @@ def _registered(
     targets = [submap_around(map_, row, config.num_submap, radius_m) for row in rows]
     matches = methods.matcher.register([(source, target) for target in targets]) if rows else []
     return [
-        Evidence(row, map_.T_world_keyframe[row] @ match.T_target_source, match)
+        Evidence(row, orthonormal(map_.T_world_keyframe[row] @ match.T_target_source), match)
         for row, match in zip(rows, matches, strict=True)
     ]
 
