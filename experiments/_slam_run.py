@@ -20,6 +20,7 @@ from experiments._slam_input import ScanReader
 
 if TYPE_CHECKING:
     from dpmjax.slam import ScanReport
+    from dpmjax.slam.front_end import AnyScan
 
 JOURNAL = "slam.journal"
 # Seconds between interim results, for those who look at a run that goes on.
@@ -37,6 +38,18 @@ class Beginning(NamedTuple):
 
     start: SlamState
     earlier: JournalContent | None = None
+
+
+class Hooks(NamedTuple):
+    """What a run asks and tells.
+
+    Attributes:
+        is_stopped: whether to end before the next scan.
+        on_scan: is told every scan, the state after it and its report; None for nobody.
+    """
+
+    is_stopped: Callable[[], bool]
+    on_scan: Callable[[AnyScan, SlamState, ScanReport], None] | None = None
 
 
 class SlamRun(NamedTuple):
@@ -104,7 +117,7 @@ def run_scans(
     reader: ScanReader,
     methods: SlamMethods,
     beginning: Beginning,
-    is_stopped: Callable[[], bool],
+    hooks: Hooks,
 ) -> SlamRun:
     """Places all scans that are left; what ends it early is in the result, and what was found is in the journal."""
     watch = Stopwatch()
@@ -118,7 +131,7 @@ def run_scans(
     scans = reader.iterate(first)
     try:
         for _ in range(first, len(sequence)):
-            if is_stopped():
+            if hooks.is_stopped():
                 break
             scan = watch.timed("read", next, scans)
             state, report = step_slam(timed, state, scan)
@@ -127,6 +140,8 @@ def run_scans(
             if report.is_keyframe:
                 watch.timed("journal", journal.append, methods, state, fresh)
                 fresh = []
+            if hooks.on_scan is not None:
+                watch.timed("viewer", hooks.on_scan, scan, state, report)
             bar.set_postfix_str(_progress(state, reports, watch), refresh=False)
             bar.update(1)
             if time.perf_counter() - flushed > FLUSH_EVERY_S:

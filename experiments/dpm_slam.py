@@ -14,6 +14,7 @@ docs/slam.md explains the stages and the files.
 
 from __future__ import annotations
 
+import importlib.util
 import logging
 import time
 from collections.abc import Callable
@@ -41,7 +42,7 @@ LOGGER = logging.getLogger(__name__)
 class Config(RunOptions):
     """Options of the run."""
 
-    may_change: ClassVar[frozenset[str]] = frozenset({"n_scans", "refine"})
+    may_change: ClassVar[frozenset[str]] = frozenset({"n_scans", "refine", "visualize"})
 
     data: Annotated[Positional[Path | None], arg(metavar="[DATA]")] = None
     """Folder of scans. Without it: a simulated town of the seed."""
@@ -61,12 +62,16 @@ class Config(RunOptions):
     """Number of scans; a resumed run may take more."""
     jump: Annotated[int, arg(aliases=["-j"], metavar="N")] = 1
     """Use every Nth scan."""
+    visualize: Annotated[FlagCreatePairsOff[bool], arg(aliases=["-v"])] = False
+    """Show the run in the live viewer (extra viewer); without a screen, OUT gets a recording, slam.rrd."""
 
     def __post_init__(self) -> None:
         """Checks ranges."""
         check_least(self, n_scans=1, jump=1, seed=0)
         if self.sequence is not None and self.data is None:
             raise ValueError("--sequence chooses a drive of DATA: give its folder too")
+        if self.visualize and importlib.util.find_spec("rerun") is None:
+            raise ValueError("-v needs the live viewer: pip install 'dpmjax[viewer]', or leave it out")
 
 
 def main(config: Config) -> dict[str, Any]:
@@ -74,7 +79,8 @@ def main(config: Config) -> dict[str, Any]:
     from dpmjax.slam import finish_slam
     from experiments._slam_input import ScanReader, open_drive
     from experiments._slam_numbers import summary
-    from experiments._slam_run import run_scans
+    from experiments._slam_run import Hooks, run_scans
+    from experiments._slam_viewer import live_viewer
 
     started = time.perf_counter()
     methods = slam_methods(config)
@@ -86,7 +92,9 @@ def main(config: Config) -> dict[str, Any]:
     with recording(folder), StopFlag() as stop:
         done = f", {len(beginning.earlier.reports)} done before" if beginning.earlier else ""
         tell(f"{sequence.name}: {len(sequence)} scans{done}")
-        run = run_scans(folder, sequence, reader, methods, beginning, lambda: stop.is_requested)
+        with live_viewer(folder, sequence.name, is_on=config.visualize) as on_scan:
+            hooks = Hooks(lambda: stop.is_requested, on_scan)
+            run = run_scans(folder, sequence, reader, methods, beginning, hooks)
         result = finish_slam(run.state, run.reports, methods.config)
         drive = Drive(sequence, start.front_end.num_scans, len(start.slam_map))
         metrics = write_results(folder, config, drive, run, result)

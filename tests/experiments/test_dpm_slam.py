@@ -6,6 +6,7 @@ Matcher and geometry know the truth; a scan is one point, whose x is the number 
 from __future__ import annotations
 
 import csv
+import importlib.util
 import itertools
 import os
 import signal
@@ -369,3 +370,14 @@ def test_refined_motions_and_loops_make_one_map(monkeypatch) -> None:
     )
     assert refined.numbers["refine_windows"] > 1
     assert after < 0.1 * before
+
+
+def test_the_viewer_records_where_there_is_no_screen(tmp_path, monkeypatch, with_truth, drive, capsys) -> None:
+    monkeypatch.delenv("DISPLAY", raising=False)
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    if importlib.util.find_spec("rerun") is None:
+        assert run(drive, "-v", "-n", 30, "-o", tmp_path / "out") == EXIT_BAD_INPUT
+        assert "dpmjax[viewer]" in capsys.readouterr().err
+        return
+    assert run(drive, "-v", "-n", 30, "-o", tmp_path / "out") == EXIT_OK
+    assert (tmp_path / "out" / "slam.rrd").stat().st_size > 1000

@@ -40,7 +40,7 @@ def test_the_highest_point_of_a_pixel_is_seen() -> None:
     points = np.repeat(circle(), 2, axis=0)
     heights = np.tile([-2.0, 5.0], 50)
     for order in (slice(None), slice(None, None, -1)):
-        figure = viz.height_map_figure("a", points[order], heights[order], circle())
+        figure = viz.height_map_figure("a", points[order], heights[order], circle(radius_m=30.0))
         picture = np.asarray(figure.axes[0].images[0].get_array())
         seen = np.unique(picture[(picture != 255).any(axis=2)], axis=0)
         np.testing.assert_array_equal(seen, viz.height_colors(np.array([5.0])))
@@ -51,3 +51,13 @@ def test_colours_rise_with_height_and_end_at_the_bounds() -> None:
     np.testing.assert_array_equal(colors[0], colors[1])
     np.testing.assert_array_equal(colors[2], colors[3])
     assert colors.dtype == np.uint8
+
+
+def test_a_roof_over_the_path_is_left_out() -> None:
+    path, rng = circle(), np.random.default_rng(0)
+    roof, walls = rng.uniform(-25, 25, (20000, 3)), rng.uniform(-25, 25, (500, 3))
+    points = np.vstack([roof, walls])
+    heights = np.r_[np.full(20000, 3.0), np.zeros(500)]
+    picture = np.asarray(viz.height_map_figure("a", points, heights, path).axes[0].images[0].get_array())
+    seen = np.unique(picture[(picture != 255).any(axis=2)], axis=0)
+    np.testing.assert_array_equal(seen, viz.height_colors(np.zeros(1)))

@@ -44,6 +44,7 @@ class LocalizationConfig:
         num_registered: number of them that are registered at most, in order of their overlap; ...
         num_at_once: ... so many at once: the next are tried only if the place is not clear.
         num_neighbours: number of further keyframes near the best place that are registered.
+        num_submap: number of keyframes whose descriptors are merged for a registration.
         same_place_m: two registrations agree within this distance ...
         same_place_rad: ... and this turn.
         min_probability: a registration supports a place from this P(correct) on.
@@ -53,10 +54,11 @@ class LocalizationConfig:
         max_rival_share: another place may have this share of the sum of the best one.
     """
 
-    num_similar: int = 24
+    num_similar: int = 16
     num_registered: int = 8
-    num_at_once: int = 4
-    num_neighbours: int = 3
+    num_at_once: int = 2
+    num_neighbours: int = 2
+    num_submap: int = 1
     same_place_m: float = 1.5
     same_place_rad: float = 0.06
     min_probability: float = 0.2
@@ -66,7 +68,7 @@ class LocalizationConfig:
     max_rival_share: float = 0.5
 
     def __post_init__(self) -> None:
-        require_fields(self, "num_similar", "num_registered", "num_at_once", "min_support", low=1)
+        require_fields(self, "num_similar", "num_registered", "num_at_once", "num_submap", "min_support", low=1)
         require_fields(self, "num_neighbours", "min_total", low=0)
         require_fields(self, "min_probability", "min_alone", "max_rival_share", low=0, high=1)
         require_positive_fields(self, "same_place_m", "same_place_rad")
@@ -77,13 +79,11 @@ class Evidence(NamedTuple):
 
     Attributes:
         keyframe: row of the keyframe.
-        overlap: probability of overlap; 1 where it was not asked.
         T_world_scan: where it puts the scan.
         match: the registration.
     """
 
     keyframe: int
-    overlap: float
     T_world_scan: Pose
     match: Match
 
@@ -183,42 +183,39 @@ def _localized(map_: KeyframeMap, points: np.ndarray, methods: SlamMethods, conf
         return Localization("empty", None, 0.0, None, "too few points")
     description = methods.matcher.describe(points, measured)
     extent_m = methods.geometry.extent_m(measured)
-    rows, overlaps = _candidates(map_, description, methods, config)
+    rows = _candidates(map_, description, methods, config)
     tried: list[Evidence] = []
     for start in range(0, len(rows), config.num_at_once):
-        some = slice(start, start + config.num_at_once)
-        tried += _registered(map_, rows[some], overlaps[some], description, methods)
+        tried += _registered(map_, rows[start : start + config.num_at_once], description, methods, config)
         place = max(_places(tried, config), key=lambda place: place.total, default=None)
-        if place is not None:
+        if place is not None and not _is_supported(place, config):
             near = _neighbours(map_, place.members[0], tried, extent_m, config)
-            tried += _registered(map_, near, [1.0] * len(near), description, methods)
+            tried += _registered(map_, near, description, methods, config)
         found = _decided(map_, tried, extent_m, config)
         if found.status == "found":
             return found
     return found
 
 
-def _candidates(
-    map_: KeyframeMap, description: Any, methods: SlamMethods, config: LocalizationConfig
-) -> tuple[list[int], list[float]]:
-    """Returns the keyframes to register and their overlaps, the most promising first."""
+def _candidates(map_: KeyframeMap, description: Any, methods: SlamMethods, config: LocalizationConfig) -> list[int]:
+    """Returns the keyframes to register, the most probable overlap first."""
     vector = methods.matcher.vector(description)
     vector = vector / max(float(np.linalg.norm(vector)), 1e-12)
     rows, _ = most_similar(map_.vectors, vector, config.num_similar)
     overlaps = methods.matcher.overlaps(description, [map_.keyframes[row].description for row in rows])
     order = np.argsort(-overlaps, kind="stable")[: config.num_registered]
-    return [int(rows[number]) for number in order], [float(overlaps[number]) for number in order]
+    return [int(rows[number]) for number in order]
 
 
 def _registered(
-    map_: KeyframeMap, rows: list[int], overlaps: list[float], description: Any, methods: SlamMethods
+    map_: KeyframeMap, rows: list[int], description: Any, methods: SlamMethods, config: LocalizationConfig
 ) -> list[Evidence]:
-    front, source = methods.config.front_end, Submap((description,), np.eye(4)[None])
-    targets = [submap_around(map_, row, front.num_submap, front.submap_radius_m) for row in rows]
+    source, radius_m = Submap((description,), np.eye(4)[None]), methods.config.front_end.submap_radius_m
+    targets = [submap_around(map_, row, config.num_submap, radius_m) for row in rows]
     matches = methods.matcher.register([(source, target) for target in targets]) if rows else []
     return [
-        Evidence(row, overlap, map_.T_world_keyframe[row] @ match.T_target_source, match)
-        for row, overlap, match in zip(rows, overlaps, matches, strict=True)
+        Evidence(row, map_.T_world_keyframe[row] @ match.T_target_source, match)
+        for row, match in zip(rows, matches, strict=True)
     ]
 
 
@@ -237,6 +234,10 @@ def _places(tried: list[Evidence], config: LocalizationConfig) -> list[_Place]:
 def _agree(one: Evidence, other: Evidence, config: LocalizationConfig) -> bool:
     apart = rigid.inverse(one.T_world_scan) @ other.T_world_scan
     return bool(np.linalg.norm(apart[:3, 3]) <= config.same_place_m) and turn_rad(apart) <= config.same_place_rad
+
+
+def _is_supported(place: _Place, config: LocalizationConfig) -> bool:
+    return len(place.members) >= config.min_support and place.total >= config.min_total
 
 
 def _neighbours(
@@ -260,8 +261,7 @@ def _decided(map_: KeyframeMap, tried: list[Evidence], extent_m: float, config: 
     numbers = f"{len(best.members)} of {len(tried)} agree, P {first.match.probability:.2f}, sum {best.total:.2f}"
     numbers += f", next place {rival:.2f}"
     is_alone = int((distances_to(map_, first.T_world_scan[:3, 3]) <= extent_m).sum()) <= 1
-    is_supported = len(best.members) >= config.min_support and best.total >= config.min_total
-    is_clear = is_supported or (is_alone and first.match.probability >= config.min_alone)
+    is_clear = _is_supported(best, config) or (is_alone and first.match.probability >= config.min_alone)
     if not is_clear or rival > config.max_rival_share * best.total:
         return Localization("not in this map", None, 0.0, None, numbers, evidence)
     probability = first.match.probability

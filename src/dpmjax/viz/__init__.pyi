@@ -18,6 +18,7 @@ from .drives import height_map_figure as height_map_figure
 from .drives import trajectory_figure as trajectory_figure
 from .figures import Limits as Limits
 from .figures import save_figure as save_figure
+from .live_viewer import LiveViewer as LiveViewer
 from .localization import localization_figure as localization_figure
 from .maps import Panel as Panel
 from .maps import registered_scans_figure as registered_scans_figure

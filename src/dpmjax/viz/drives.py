@@ -28,6 +28,7 @@ OURS, ODOMETRY, LOOP = "#1f4e8c", "#e08a1e", "#2a9d5c"
 HEIGHTS_M = (-2.5, 5.5)
 """Heights above the lidar that the colours of maps span."""
 
+_ROOF_M = 1.0
 _LONGER_SIDE_IN, _SHORTER_SIDE_IN = 6.4, 2.6
 
 
@@ -97,6 +98,8 @@ def height_map_figure(
 ) -> Figure:
     """Draws a map from above: what stands highest in each pixel, by its height above the lidar that passed there.
 
+    Where the path is under a roof, what is more than a metre above the lidar is left out, so that the walls are seen.
+
     Args:
         title: of the picture.
         points: metres, in the world.
@@ -109,6 +112,8 @@ def height_map_figure(
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import Normalize
 
+    if _is_roofed(points, heights_m, path):
+        points, heights_m = points[heights_m < _ROOF_M], heights_m[heights_m < _ROOF_M]
     # A few far points must not make the map small.
     low, high = np.quantile(points[:, :2], [0.005, 0.995], axis=0) if len(points) else (np.zeros(2), np.ones(2))
     limits = plane_limits(np.vstack([path[:, :2], [low, high]]), 0.03)
@@ -160,6 +165,16 @@ def _colormap() -> Colormap:
     high = matplotlib.colormaps["plasma"](np.linspace(0.05, 0.85, 8))
     colors = [(0.0, "#e3e7ec"), (0.15, "#cfd6de"), *zip(np.linspace(0.24, 1.0, 8), high, strict=True)]
     return LinearSegmentedColormap.from_list("dpmjax_height", colors)
+
+
+def _is_roofed(
+    points: Float[np.ndarray, "n 3"], heights_m: Float[np.ndarray, " n"], path: Float[np.ndarray, "k 3"]
+) -> bool:
+    """Whether there is something above most of the path, within a metre."""
+    above = np.unique(np.floor(points[heights_m > _ROOF_M, :2]).astype(np.int64), axis=0)
+    cells = np.unique(np.floor(path[:, :2]).astype(np.int64), axis=0)
+    num_below = len(cells) + len(above) - len(np.unique(np.vstack([cells, above]), axis=0))
+    return num_below > 0.7 * len(cells)
 
 
 def _raster(

@@ -1,0 +1,184 @@
+"""Broken drives: dpm_slam ends with results, or with one line and an exit code, never with a traceback."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from dpmjax.io import write_kitti, write_pcd, write_ply, write_tum
+from dpmjax.slam import Match, SlamConfig, SlamMethods, SurfaceGeometry
+from experiments import _slam_files, dpm_slam
+from experiments._command import EXIT_BAD_INPUT, EXIT_FAILED, EXIT_OK
+from tests.experiments.test_dpm_slam import run
+from tests.slam.test_odometry import motion, planes, seen_from
+
+NUM_FUZZED = int(os.environ.get("DPMJAX_NUM_FUZZED_DRIVES", "40"))
+NUM_SCANS = 5
+
+
+@dataclass(frozen=True)
+class NoMatcher:
+    """Recognises nothing."""
+
+    fingerprint: str = "none"
+
+    def describe(self, points, measured):
+        return 0
+
+    def vector(self, description):
+        return np.ones(4, np.float32)
+
+    def register(self, pairs):
+        return [Match(np.eye(4), 0.0, 1.0) for _ in pairs]
+
+    def overlaps(self, source, targets):
+        return np.zeros(len(targets))
+
+    def pack(self, description):
+        return {}
+
+    def unpack(self, arrays):
+        return 0
+
+
+@pytest.fixture
+def without_networks(monkeypatch) -> None:
+    methods = SlamMethods(NoMatcher(), SurfaceGeometry(), SlamConfig())
+    monkeypatch.setattr(dpm_slam, "slam_methods", lambda config: methods)
+    monkeypatch.setattr(_slam_files, "write_map_file", lambda path, slam_map: {})
+    monkeypatch.setattr(_slam_files, "draw_pictures", lambda *_: None)
+
+
+def write_scan(path: Path, points: np.ndarray) -> None:
+    points = points.astype(np.float32)
+    if path.suffix == ".bin":
+        path.write_bytes(np.column_stack([points, np.zeros(len(points), np.float32)]).astype("<f4").tobytes())
+    elif path.suffix == ".npy":
+        np.save(path, points)
+    elif path.suffix == ".npz":
+        np.savez(path, lidar_pcd=points)
+    else:
+        (write_ply if path.suffix == ".ply" else write_pcd)(path, points)
+
+
+def write_drive(folder: Path, rng: np.random.Generator) -> None:
+    """A good drive of random kind."""
+    suffix = str(rng.choice([".bin", ".npy", ".npz", ".ply", ".pcd"]))
+    scans = folder / "velodyne" if rng.random() < 0.5 else folder
+    scans.mkdir(parents=True)
+    world, truth = planes(rng, num=300), np.array([motion(0.4 * step, 0, 0) for step in range(NUM_SCANS)])
+    for number, T in enumerate(truth):
+        write_scan(scans / f"{number:06}{suffix}", seen_from(world, T))
+    if rng.random() < 0.7:
+        write_tum(folder / "poses_lidar.txt", truth) if rng.random() < 0.5 else write_kitti(
+            folder / "poses_lidar.txt", truth
+        )
+    if rng.random() < 0.7:
+        (folder / "times.txt").write_text("".join(f"{0.1 * number:.6f}\n" for number in range(NUM_SCANS)))
+
+
+def cut(path: Path, rng: np.random.Generator) -> None:
+    content = path.read_bytes()
+    path.write_bytes(content[: int(rng.integers(0, len(content) + 1))])
+
+
+def flip(path: Path, rng: np.random.Generator) -> None:
+    content = bytearray(path.read_bytes())
+    for place in rng.integers(0, len(content), int(rng.integers(1, 30))) if content else ():
+        content[place] = int(rng.integers(256))
+    path.write_bytes(content)
+
+
+def empty(path: Path, rng: np.random.Generator) -> None:
+    path.write_bytes(b"")
+
+
+def foreign(path: Path, rng: np.random.Generator) -> None:
+    heads = [b"\x89PNG\r\n", b"PK\3\4", b"%PDF-1.4", b"ply\nformat", b"\x93NUMPY\1\0", b"# .PCD v0.7\n", b""]
+    path.write_bytes(heads[rng.integers(len(heads))] + rng.bytes(int(rng.integers(0, 400))))
+
+
+def wrong_text(path: Path, rng: np.random.Generator) -> None:
+    words = ["nan", "inf", "1e400", "abc", "0", "-1", "\n", "1 2 3\n", ",", "é", "1e308", "\0"]
+    path.write_text(" ".join(rng.choice(words, int(rng.integers(1, 40)))), encoding="utf-8")
+
+
+def bad_numbers(path: Path, rng: np.random.Generator) -> None:
+    values = np.array([np.nan, np.inf, -np.inf, 1e38, 0.0, 1e-40, 1e6], np.float32)
+    points = rng.normal(size=(200, 3)).astype(np.float32) * 10
+    share = rng.choice([0.01, 0.5, 1.0])
+    spoilt = rng.random(points.shape) < share
+    points[spoilt] = rng.choice(values, int(spoilt.sum()))
+    if path.suffix in (".bin", ".npy", ".npz", ".ply", ".pcd"):
+        write_scan(path, points)
+    else:
+        np.savetxt(path, points)
+
+
+def few_points(path: Path, rng: np.random.Generator) -> None:
+    points = rng.normal(size=(int(rng.integers(0, 4)), 3)) * rng.choice([0.0, 1.0, 20.0])
+    if path.suffix in (".bin", ".npy", ".npz", ".ply", ".pcd"):
+        write_scan(path, points)
+    else:
+        path.write_text("")
+
+
+def missing(path: Path, rng: np.random.Generator) -> None:
+    path.unlink()
+
+
+def a_folder(path: Path, rng: np.random.Generator) -> None:
+    path.unlink()
+    path.mkdir()
+
+
+def another_name(path: Path, rng: np.random.Generator) -> None:
+    path.rename(path.with_name(str(rng.choice(["scan", "-1", "9" * 30, "x y"])) + path.suffix))
+
+
+DAMAGES: tuple[Callable[[Path, np.random.Generator], None], ...] = (
+    cut, flip, empty, foreign, wrong_text, bad_numbers, few_points, missing, a_folder, another_name,
+)  # fmt: skip
+
+
+def damage(folder: Path, rng: np.random.Generator) -> list[str]:
+    """Damages one to three files; returns what was done."""
+    done = []
+    for _ in range(int(rng.integers(1, 4))):
+        files = sorted(path for path in folder.rglob("*") if path.is_file())
+        texts = [path for path in files if path.suffix == ".txt"]
+        chosen = texts if texts and rng.random() < 0.4 else files
+        if chosen:
+            path, spoil = chosen[rng.integers(len(chosen))], DAMAGES[rng.integers(len(DAMAGES))]
+            spoil(path, rng)
+            done.append(f"{spoil.__name__} {path.name}")
+    return done
+
+
+@pytest.mark.parametrize("seed", range(NUM_FUZZED))
+def test_a_broken_drive_ends_with_results_or_one_line(seed, without_networks, tmp_path, capsys) -> None:
+    rng = np.random.default_rng(seed)
+    drive, out = tmp_path / "drive", tmp_path / "out"
+    write_drive(drive, rng)
+    done = damage(drive, rng)
+    options = [*(["--deskew"] if rng.random() < 0.3 else []), *(["-j", 2] if rng.random() < 0.2 else [])]
+    code = run(drive, "-o", out, *options)
+    errors = capsys.readouterr().err
+    told = [line for line in errors.replace("\r", "\n").splitlines() if line.startswith("dpmjax: error:")]
+    assert "Traceback" not in errors, done
+    assert code in (EXIT_OK, EXIT_FAILED, EXIT_BAD_INPUT)
+    assert len(told) == (code != EXIT_OK), (done, errors)
+    if code == EXIT_BAD_INPUT:
+        assert not out.exists(), done
+        assert str(drive) in told[0] or drive.name in told[0], (done, told)
+    else:
+        for name in ("trajectory.npy", "trajectory_tum.txt", "scans.csv", "graph.g2o", "metrics.json"):
+            assert (out / name).is_file(), (done, name)
+        assert np.isfinite(np.load(out / "trajectory.npy")).all()
+    shutil.rmtree(tmp_path)
