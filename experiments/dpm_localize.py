@@ -28,6 +28,7 @@ from experiments._run_folder import RunFolder, RunOptions, open_run_folder, reco
 if TYPE_CHECKING:
     from dpmjax import KeyframeMap, Localization
     from dpmjax.io import LidarSequence
+    from dpmjax.slam.keyframes import MapOrigin
 
 EXPERIMENT = "dpm_localize"
 TABLE = "localizations.csv"
@@ -91,8 +92,8 @@ def main(config: Config) -> list[dict[str, str]]:
     map_ = load_map(config.map)
     drive = open_scans(config)
     T_reference_keyframe = reference_of(config, map_, drive)
-    methods = make_methods(load_model(config.weights), map_.origin.config)
-    check_weights(config, map_, methods.matcher.fingerprint)
+    methods = make_methods(load_model(config.weights), map_.origin.config, weights=config.weights)
+    check_weights(config, map_, methods.origin)
     folder = open_run_folder(config, EXPERIMENT)
     path = folder / TABLE
     earlier = read_history(path) if folder.is_resumed and path.exists() else []
@@ -156,11 +157,11 @@ def reference_of(config: Config, map_: KeyframeMap, drive: LidarSequence) -> np.
     return poses[numbers]
 
 
-def check_weights(config: Config, map_: KeyframeMap, fingerprint: str) -> None:
+def check_weights(config: Config, map_: KeyframeMap, origin: MapOrigin) -> None:
     """Raises a `ValueError` where other weights made the map."""
-    if map_.origin.fingerprint != fingerprint:
-        made_by = f"made with weights {map_.origin.fingerprint}, {config.weights} is {fingerprint}"
-        raise ValueError(f"{config.map}: {made_by}; name the weights that made it with --weights")
+    if map_.origin.fingerprint != origin.fingerprint:
+        found = f"made with weights {map_.origin}, these are {origin}"
+        raise ValueError(f"{config.map}: {found}; name the weights that made it with --weights")
 
 
 def as_row(

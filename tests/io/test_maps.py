@@ -50,7 +50,7 @@ def scan(seed: int, num_points: int) -> CompactScan:
 
 def make_map(num_keyframes: int = 4) -> KeyframeMap:
     config = replace(SlamConfig(), loops=replace(SlamConfig().loops, num_near=3))
-    slam_map = with_origin(KeyframeMap(), MapOrigin("0123456789abcdef", config))
+    slam_map = with_origin(KeyframeMap(), MapOrigin("0123456789abcdef", config, "dpm_small"))
     rng = np.random.default_rng(1)
     for row in range(num_keyframes):
         T = noise(rng, 100.0, 1.0)
@@ -110,6 +110,18 @@ def test_other_precisions_have_small_errors(tmp_path, precision) -> None:
         np.testing.assert_allclose(a.flatness, b.flatness, atol=0.04)
         is_flat = b.flatness > 0
         assert np.abs(np.sum(a.normals * b.normals, axis=1))[is_flat].min(initial=1) > np.cos(np.radians(2.0))
+
+
+def test_int8_leaves_out_keyframes_that_others_cover(tmp_path) -> None:
+    apart = MAP.T_world_keyframe.copy()
+    apart[:, :3, 3] = [[0, 0, 0], [3, 0, 0], [8, 0, 0], [9, 0, 0]]  # the extent is 7.3 m
+    joined = replace(MAP, T_world_keyframe=apart, edges=tuple(edge._replace(kind="odometry") for edge in MAP.edges))
+    path = tmp_path / "map.npz"
+    scans = [keyframe.scan for keyframe in load_map(save_map(path, joined, "int8")).keyframes]
+    assert scans == [MAP.keyframes[0].scan, MAP.keyframes[2].scan]
+    assert len(load_map(save_map(path, joined, "int8", spacing_share=0.0))) == 4
+    assert len(load_map(save_map(path, joined))) == 4
+    assert len(load_map(save_map(path, joined, spacing_share=0.8))) == 2
 
 
 def test_fewer_bytes_at_lower_precision() -> None:

@@ -21,20 +21,27 @@ from dpmjax.io.map_coding import Precision
 from dpmjax.sequences import require
 from dpmjax.slam.config import SlamConfig
 from dpmjax.slam.keyframes import KeyframeMap, MapOrigin
+from dpmjax.slam.map_thinning import thin_map
 from dpmjax.weights.config_json import config_from_json
 
 FORMAT, VERSION = "dpmjax map", 1
+SPACING_SHARE = 0.8
 ADVICE = "save it again with dpmjax.save_map"
 
 
-def save_map(path: str | Path, map_: KeyframeMap, precision: Precision = "float32") -> Path:
+def save_map(
+    path: str | Path, map_: KeyframeMap, precision: Precision = "float32", *, spacing_share: float | None = None
+) -> Path:
     """Writes a map to a file that `load_map` reads; an interruption never leaves half of it.
 
     Args:
         path: must end in `.npz`; an existing file is replaced.
         map_: of a run, `result.state.slam_map`, with at least one keyframe.
         precision: "float32" keeps everything exactly: a run that goes on from the file equals an unbroken one.
-            "float16" rounds features and poses. "int8" rounds features to codes, and thins surfaces to 2,000 points.
+            "float16" rounds features and poses. "int8" is the smallest, for localisation: it rounds features to codes,
+            thins surfaces to 2,000 points, and leaves out keyframes that others cover (`slam.thin_map`).
+        spacing_share: keyframes nearer to others than this share of their extent are left out; 0 keeps all. None takes
+            0.8 for "int8" and 0 for the others.
 
     Returns:
         The path.
@@ -48,11 +55,15 @@ def save_map(path: str | Path, map_: KeyframeMap, precision: Precision = "float3
         raise ValueError(f"path: expected a file that ends in .npz, got {str(path)!r}")
     if precision not in get_args(Precision):
         raise ValueError(f"precision: expected one of {', '.join(get_args(Precision))}, got {precision!r}")
+    if spacing_share is None:
+        spacing_share = SPACING_SHARE if precision == "int8" else 0.0
+    if spacing_share != 0:
+        map_ = thin_map(map_, spacing_share=spacing_share)
     return write_atomically(path, map_bytes(map_, precision))
 
 
 def map_bytes(map_: KeyframeMap, precision: Precision = "float32") -> bytes:
-    """Makes the content of the file of a map; its length is what the map costs.
+    """Makes the content of the file of a map with all its keyframes; its length is what the map costs.
 
     Args:
         map_: see `save_map`.
@@ -72,7 +83,8 @@ def map_bytes(map_: KeyframeMap, precision: Precision = "float32") -> bytes:
         "format": FORMAT,
         "version": VERSION,
         "precision": precision,
-        "weights": map_.origin.fingerprint,
+        "fingerprint": map_.origin.fingerprint,
+        "weights": map_.origin.weights,
         "config": dataclasses.asdict(map_.origin.config),
     }
     content = io.BytesIO()
@@ -100,12 +112,12 @@ def load_map(path: str | Path) -> KeyframeMap:
     with refusing(path, "its header cannot be read ({error})", ADVICE, (Exception,)):
         header = json.loads(arrays["header"].tobytes())
         found, version, precision = header["format"], header["version"], header["precision"]
-        weights = str(header["weights"])
+        fingerprint, weights = str(header["fingerprint"]), str(header["weights"])
     require(found == FORMAT, path, "not a dpmjax map", "give a file of dpmjax.save_map")
     require(version == VERSION, path, f"format version {version}, this dpmjax reads {VERSION}", "update dpmjax")
     require(precision in get_args(Precision), path, f"precision {precision}", ADVICE)
     with refusing(path, "{error}", ADVICE, (ValueError, TypeError)):
-        origin = MapOrigin(weights, config_from_json(header["config"], SlamConfig))
+        origin = MapOrigin(fingerprint, config_from_json(header["config"], SlamConfig), weights)
     for name, array in arrays.items():
         is_good = array.dtype.kind in "iub" or (array.dtype.kind == "f" and bool(np.isfinite(array).all()))
         require(is_good, path, f"{name} holds values that are not finite numbers", ADVICE)

@@ -19,7 +19,6 @@ from dpmjax.slam.keyframes import (
     Keyframe,
     KeyframeMap,
     MapEdge,
-    MapOrigin,
     Pose,
     Submap,
     add_keyframe,
@@ -210,7 +209,7 @@ def _make_keyframe(
         kind: EdgeKind = "guess" if is_guess else "odometry"
         edge = MapEdge(row, row - 1, T, located.information, kind)
     keyframe = Keyframe(state.num_scans, T_odometry, path_m, segment, geometry.extent_m(scan.measured), description)
-    slam_map = with_origin(slam_map, MapOrigin(matcher.fingerprint, methods.config))
+    slam_map = with_origin(slam_map, methods.origin)
     slam_map = add_keyframe(slam_map, keyframe, T_world, matcher.vector(description), edge)
     after = _advanced(methods, state, located, scan.measured)
     if is_guess or row == 0:

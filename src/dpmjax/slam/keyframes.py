@@ -64,10 +64,15 @@ class MapOrigin(NamedTuple):
     Attributes:
         fingerprint: of the matcher; its descriptions cannot be compared with those of another one.
         config: settings of SLAM.
+        weights: name of the weights, for messages; may be empty.
     """
 
     fingerprint: str
     config: SlamConfig
+    weights: str = ""
+
+    def __str__(self) -> str:
+        return f"{self.weights} ({self.fingerprint})" if self.weights else self.fingerprint
 
 
 @dataclass(frozen=True, eq=False)
@@ -149,7 +154,7 @@ def with_origin(slam_map: KeyframeMap, origin: MapOrigin) -> KeyframeMap:
     made_by = slam_map.origin
     if made_by is not None and made_by.fingerprint != origin.fingerprint:
         advice = "load the weights that made the map, or map again"
-        raise ValueError(f"map_: made with weights {made_by.fingerprint}, these are {origin.fingerprint}; {advice}")
+        raise ValueError(f"map_: made with weights {made_by}, these are {origin}; {advice}")
     return replace(slam_map, origin=origin)
 
 

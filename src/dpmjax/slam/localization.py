@@ -18,7 +18,6 @@ from dpmjax.deeppointmap.model import Model
 from dpmjax.geometry import rigid
 from dpmjax.slam.keyframes import (
     KeyframeMap,
-    MapOrigin,
     Pose,
     Submap,
     distances_to,
@@ -169,7 +168,7 @@ def localize_each(
     if map_.origin is None:
         raise ValueError("map_: expected keyframes, got an empty map")
     methods = model if isinstance(model, SlamMethods) else make_methods(model, map_.origin.config)
-    with_origin(map_, MapOrigin(methods.matcher.fingerprint, methods.config))
+    with_origin(map_, methods.origin)
     for points in scans:
         yield _localized(map_, np.asarray(points), methods, config or LocalizationConfig())
 

@@ -61,18 +61,19 @@ class SlamResult(NamedTuple):
     T_odometry_scan: Float[np.ndarray, "n 4 4"]
 
 
-def make_methods(model: Model, config: SlamConfig | None = None) -> SlamMethods:
+def make_methods(model: Model, config: SlamConfig | None = None, *, weights: str = "") -> SlamMethods:
     """Makes the methods of a trained model: its networks, and point-to-plane geometry.
 
     Args:
         model: encoder and decoder.
         config: settings of all stages.
+        weights: name of the weights, noted in the map.
 
     Returns:
         The methods.
     """
     config = config or SlamConfig()
-    return SlamMethods(NetworkMatcher(model), SurfaceGeometry(config.odometry), config)
+    return SlamMethods(NetworkMatcher(model), SurfaceGeometry(config.odometry), config, weights)
 
 
 def as_methods(model: Model | SlamMethods, config: SlamConfig | None) -> SlamMethods:
