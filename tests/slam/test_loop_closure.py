@@ -7,12 +7,14 @@ import pytest
 
 from dpmjax.geometry import rigid
 from dpmjax.metrics import absolute_trajectory_error
+from dpmjax.scans.surface_alignment import PlanePairs
 from dpmjax.slam import KeyframeMap, LoopClosureConfig
 from dpmjax.slam.keyframes import Keyframe, MapEdge, add_keyframe, diagonal_information, submap_around
 from dpmjax.slam.loop_candidates import find_candidates
 from dpmjax.slam.loop_consistency import are_consistent
 from dpmjax.slam.loop_state import LoopState
 from dpmjax.slam.map_optimization import optimize_map
+from dpmjax.slam.plane_information import plane_information, with_least_covariance
 from dpmjax.slam.reports import Loop
 from dpmjax.slam.retrieval import most_similar, pooled_vector
 from dpmjax.types import DescriptorCloud
@@ -114,6 +116,37 @@ def test_a_wrong_loop_is_taken_back() -> None:
         absolute_trajectory_error(each.T_world_keyframe[:, :3, 3], truth[:, :3, 3]) for each in (slam_map, after)
     )
     assert found < 0.8 * before
+
+
+def test_an_alignment_is_as_exact_as_its_planes_and_the_configuration_say() -> None:
+    rng = np.random.default_rng(0)
+    points = rng.uniform(-10, 10, (300, 3))
+    normals = np.eye(3)[rng.integers(1, 3, 300)]  # walls and floor of a corridor along x
+    ones = np.ones(300)
+    pairs = PlanePairs(points, rng.normal(0, 0.02, 300), normals, ones, ones)
+    T = pose(3.0, -1.0, 0.4)
+    information = with_least_covariance(plane_information(pairs, T, max_residual_m=0.15), 0.1, 0.02)
+    covariance = np.linalg.inv(information)
+    # The axis of the corridor in the frame of the source.
+    along, across = (T[:3, :3].T @ np.eye(3)[axis] for axis in (0, 1))
+    assert np.sqrt(along @ covariance[:3, :3] @ along) > 5.0
+    np.testing.assert_allclose(np.sqrt(across @ covariance[:3, :3] @ across), 0.1, atol=0.01)
+    assert (np.linalg.eigvalsh(covariance - np.diag([0.01] * 3 + [0.0004] * 3)) > -1e-9).all()
+    few = PlanePairs(points[:3], np.zeros(3), normals[:3], ones[:3], ones[:3])
+    assert np.linalg.inv(plane_information(few, T, max_residual_m=0.15))[0, 0] > 50.0
+
+
+def test_a_part_starts_where_a_loop_says() -> None:
+    truth = laps(1, side_m=40.0, step_m=2.0)
+    slam_map = map_of(truth, segments=[0] * 40 + [1] * 40)
+    edges = [edge for edge in slam_map.edges if edge.source != 40]
+    T_world_keyframe = slam_map.T_world_keyframe.copy()
+    T_world_keyframe[40:] = pose(3000.0, -800.0, 3.0) @ T_world_keyframe[40:]
+    apart = KeyframeMap(slam_map.keyframes, T_world_keyframe, slam_map.vectors, tuple(edges))
+    loops = tuple(loop_between(truth, 79 - row, row) for row in (0, 3))
+    after, state = optimize_map(apart, LoopState(loops), CONFIG)
+    assert all(loop.status == "accepted" for loop in state.loops)
+    np.testing.assert_allclose(after.T_world_keyframe, truth, atol=1e-3)
 
 
 def test_a_guess_gives_way_to_loops() -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -46,6 +46,33 @@ def test_gross_errors_of_the_matcher_do_no_harm(seed) -> None:
     ate = absolute_trajectory_error(closed.T_world_scan[:, :3, 3], truth[:, :3, 3])
     assert ate < 1.0
     assert ate < 0.5 * absolute_trajectory_error(drifted.T_world_scan[:, :3, 3], truth[:, :3, 3])
+
+
+@dataclass(frozen=True)
+class MistakenMatcher(TruthMatcher):
+    """Overlap is wrong as often as registrations are."""
+
+    def overlaps(self, source: int, targets: list[int]) -> np.ndarray:
+        rng = np.random.default_rng([self.seed, source, len(targets), 5])
+        is_wrong = rng.random(len(targets)) < self.gross_share
+        return np.where(is_wrong, rng.random(len(targets)), super().overlaps(source, targets))
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_streets_that_are_driven_back_are_recognised(seed) -> None:
+    there = laps(1, side_m=80.0, step_m=2.0)
+    truth = np.concatenate([there, there[::-1] @ pose(0.0, 3.0, np.pi)])
+    geometry = TruthGeometry(truth, sigma_m=0.03, sigma_rad=0.004, seed=seed)
+    closed = run(truth, geometry=geometry, matcher=MistakenMatcher(truth, seed=seed))
+    errors = errors_of_loops(closed, truth)
+    assert len(errors) >= 20
+    assert errors.max() < 1.0
+    # Each keyframe of the way back has an accepted loop nearby.
+    found = closed.keyframes[[loop.source for loop in closed.loops if loop.status == "accepted"]]
+    back = closed.keyframes[closed.keyframes > len(there) + 25]
+    is_found = np.abs(back[:, None] - found).min(axis=1) <= 5
+    assert is_found.mean() > 0.8
+    assert absolute_trajectory_error(closed.T_world_scan[:, :3, 3], truth[:, :3, 3]) < 1.0
 
 
 def test_exact_parts_give_the_exact_trajectory() -> None:
