@@ -226,7 +226,7 @@ def _draw_loops(axes: Axes, loops: Float[np.ndarray, "m 2 3"]) -> None:
     from matplotlib.collections import LineCollection
 
     if len(loops):
-        lines = LineCollection(loops[:, :, :2], colors=LOOP, linewidths=1.0, alpha=0.9, zorder=5)
+        lines = LineCollection(list(loops[:, :, :2]), colors=LOOP, linewidths=1.0, alpha=0.9, zorder=5)
         lines.set_label(f"{len(loops)} loops")
         axes.add_collection(lines)
         axes.plot(*loops[:, 0, :2].T, ".", ms=3.2, color=LOOP, zorder=6)
