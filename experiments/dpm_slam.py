@@ -147,7 +147,8 @@ def starting_state(config: Config, methods: SlamMethods) -> SlamState:
     """Returns the state before the first scan; a `ValueError` for a map of other weights."""
     from dpmjax import load_map
     from dpmjax.slam import init_slam
-    from dpmjax.slam.keyframes import MapOrigin, with_origin
+    from dpmjax.slam.config import MapOrigin
+    from dpmjax.slam.keyframes import with_origin
 
     if config.map is None:
         return init_slam()

@@ -201,3 +201,16 @@ def test_a_map_of_other_weights_is_refused(as_user) -> None:
     other = SlamMethods(TruthMatcher(truth, fingerprint="other"), TruthGeometry(truth), CONFIG)
     with pytest.raises(ValueError, match="map_: made with weights truth, these are other"):
         run_slam(scans_of([0]), other, map_=first.state.slam_map)
+
+
+class SparseGeometry(TruthGeometry):
+    """Scans of so few points that a right pose never scores high."""
+
+    def align(self, local_map, measured, starts):
+        return super().align(local_map, measured, starts)._replace(score=0.4)
+
+
+def test_sparse_scans_are_tracked_from_the_first_one_on() -> None:
+    truth = laps(1, side_m=20.0)
+    result = run(truth, geometry=SparseGeometry(truth))
+    assert {report.status for report in result.reports[1:]} == {"tracked"}

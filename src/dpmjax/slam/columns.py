@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -10,18 +10,19 @@ import numpy as np
 Arrays = dict[str, np.ndarray]
 
 
-def to_columns(records: Sequence[Any], name: str) -> Arrays:
+def to_columns(records: Sequence[Any], name: str, *, without: Collection[str] = ()) -> Arrays:
     """Turns records of one type into one array a field.
 
     Args:
         records: named tuples of numbers, texts, arrays of one shape, or None.
         name: what the names of the arrays begin with.
+        without: fields that are left out.
 
     Returns:
         The arrays. What is None takes no room; a mask beside it says where.
     """
     columns = {name: np.array(len(records))}
-    for field in records[0]._fields if records else ():
+    for field in [field for field in records[0]._fields if field not in without] if records else ():
         values = [getattr(record, field) for record in records]
         is_there = np.array([value is not None for value in values])
         if is_there.any():
@@ -40,14 +41,14 @@ def from_columns(record_type: Any, columns: Mapping[str, np.ndarray], name: str)
         name: as given there.
 
     Returns:
-        The records: numbers and texts of Python, arrays of NumPy.
+        The records: numbers and texts of Python, arrays of NumPy; None for a field that was left out.
     """
     num = int(columns[name])
     fields = []
     for field in record_type._fields:
         column = columns.get(f"{name}.{field}", np.zeros(0))
         found = iter(column.tolist() if column.ndim == 1 else column)
-        is_there = columns.get(f"{name}.{field}.is_there", np.ones(num, bool))
+        is_there = columns.get(f"{name}.{field}.is_there", np.full(num, f"{name}.{field}" in columns))
         fields.append([next(found) if there else None for there in is_there])
     return [record_type(*values) for values in zip(*fields, strict=True)] if num else []
 

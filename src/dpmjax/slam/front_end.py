@@ -165,7 +165,8 @@ def _pass_over(state: FrontEndState, slam_map: KeyframeMap) -> tuple[FrontEndSta
 def _locate(methods: SlamMethods, state: FrontEndState, slam_map: KeyframeMap, scan: Scan) -> Located:
     config = methods.config.front_end
     usual = float(np.median(state.scores)) if state.scores else 1.0
-    wanted = max(config.min_score, config.min_score_share * usual)
+    # Nothing is usual yet where a part of the map begins: sparse scans never score high.
+    wanted = max(config.min_score, config.min_score_share * usual if state.scores else 0.0)
     prior = PosePrior(state.T_keyframe_last, state.T_before_last, usual)
     found = methods.geometry.align(state.local_map, scan.measured, prior)
     if found.score >= wanted:

@@ -17,8 +17,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from dpmjax.slam.columns import Arrays, from_columns, part_of, prefixed, to_columns
+from dpmjax.slam.config import MapOrigin
 from dpmjax.slam.front_end import AnyScan, FrontEndState, corrected_points
-from dpmjax.slam.keyframes import Keyframe, KeyframeMap, MapEdge, MapOrigin
+from dpmjax.slam.keyframes import Keyframe, KeyframeMap, MapEdge
 from dpmjax.slam.loop_state import LoopState
 from dpmjax.slam.methods import SlamMethods
 from dpmjax.slam.reports import Loop, ScanReport
@@ -71,7 +72,7 @@ class Journal:
             reports: of the scans since the last record.
         """
         buffer = io.BytesIO()
-        np.savez(buffer, **_changes(methods, self._last, state, reports))
+        np.savez(buffer, allow_pickle=False, **_changes(methods, self._last, state, reports))
         payload = buffer.getvalue()
         self._file.write(_HEAD.pack(len(payload), zlib.crc32(payload)) + payload)
         self._last = state
@@ -137,7 +138,7 @@ def _changes(methods: SlamMethods, before: SlamState, after: SlamState, reports:
     old, new, front = before.slam_map, after.slam_map, after.front_end
     added = new.keyframes[len(old) :]
     arrays = {"fingerprint": np.array(methods.matcher.fingerprint), **to_columns(reports, "report")}
-    arrays |= to_columns([keyframe._replace(description=None) for keyframe in added], "keyframe")
+    arrays |= to_columns(added, "keyframe", without=("description",))
     for number, keyframe in enumerate(added):
         arrays |= prefixed(methods.matcher.pack(keyframe.description), f"description.{number}")
     is_grown = np.array_equal(new.T_world_keyframe[: len(old)], old.T_world_keyframe)
@@ -146,8 +147,8 @@ def _changes(methods: SlamMethods, before: SlamState, after: SlamState, reports:
     arrays["vectors"] = new.vectors[len(old) :]
     arrays |= _list_changes(old.edges, new.edges, "edge")
     arrays |= _list_changes(before.loops.loops, after.loops.loops, "loop")
-    arrays |= to_columns([after.loops._replace(loops=None)], "loops")
-    arrays |= to_columns([front._replace(local_map=None, scores=None)], "front_end")
+    arrays |= to_columns([after.loops], "loops", without=("loops",))
+    arrays |= to_columns([front], "front_end", without=("local_map", "scores"))
     arrays["scores"] = np.array(front.scores)
     if front.local_map is not None:
         arrays["local_map"] = np.array(1)

@@ -157,7 +157,7 @@ class NetworkMatcher:
         Returns:
             Arrays by name.
         """
-        cloud = to_columns([description._replace(surface=None, image=None)], "scan")
+        cloud = to_columns([description], "scan", without=("surface", "image"))
         return cloud | to_columns([description.surface], "surface") | to_columns([description.image], "image")
 
     def unpack(self, arrays: Arrays) -> CompactScan:
