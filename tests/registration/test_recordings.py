@@ -8,7 +8,9 @@ import numpy as np
 import pytest
 
 from dpmjax.geometry import se2
-from dpmjax.registration.recordings import choose_by_motion, fill_between
+from dpmjax.registration import planar_scans
+from dpmjax.registration.recordings import align_between, choose_by_motion, fill_between
+from dpmjax.simulation import simulate_sequence
 
 
 def drive(num_scans: int = 60, *, seed: int = 0) -> np.ndarray:
@@ -82,3 +84,24 @@ def test_a_single_scan_is_a_recording() -> None:
     np.testing.assert_array_equal(
         fill_between(chosen, np.array([[1.0, 2.0, 3.0]]), np.zeros((1, 3))), [[1.0, 2.0, 3.0]]
     )
+
+
+def test_scans_between_are_aligned_with_the_chosen_ones() -> None:
+    """A dense walk whose odometry wanders between the chosen scans, which are right."""
+    sequence = simulate_sequence(0, 21, seed=5)
+    scans, true = planar_scans(sequence.points, sequence.mask), np.asarray(sequence.reference_poses)
+    chosen = np.array([0, 10, 20])
+    poses = true + np.random.default_rng(0).normal(size=true.shape) * [0.8, 0.8, 0.004]
+    poses[chosen] = true[chosen]
+    aligned = align_between(scans, chosen, poses)
+    np.testing.assert_array_equal(aligned[chosen], true[chosen])
+    before, after = (np.hypot(*(some - true)[:, :2].T)[1:-1].mean() for some in (poses, aligned))
+    assert after < 0.2 * before
+
+
+def test_a_scan_that_does_not_fit_keeps_its_pose() -> None:
+    sequence = simulate_sequence(0, 5, seed=5)
+    points, true = np.array(sequence.points), np.asarray(sequence.reference_poses)
+    points[2] = 30.0 * points[2] / np.linalg.norm(points[2], axis=-1, keepdims=True)  # a crowd around the robot
+    aligned = align_between(planar_scans(points, sequence.mask), np.array([0, 4]), true)
+    np.testing.assert_array_equal(aligned[2], true[2])

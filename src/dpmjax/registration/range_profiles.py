@@ -201,3 +201,9 @@ def compare_pairs(
         found = _compare(profiles, pairs, tolerances, stride=stride)
         result[:, part] = stride * np.stack(found).astype(np.float64)[:, : part.stop - part.start]
     return ViewComparison(*result)
+
+
+def contradicted_share(profiles: RangeProfiles, source: Indices, target: Indices, poses: Floats) -> Floats:
+    """(p,) share of the visible beams of two scans that contradict each other; of few beams a low one."""
+    views = compare_pairs(profiles, source, target, poses, stride=1)
+    return np.asarray(views.contradicted, np.float64) / np.maximum(np.asarray(views.visible, np.float64), 20.0)

@@ -1,7 +1,8 @@
 """Whole recordings: the scans that are registered, and poses for all the others.
 
 A robot's log has thousands of scans, most of them a hand's breadth from the one before. Only those are registered that
-lie some way or turn apart; each other scan follows the odometry between the two around it.
+lie some way or turn apart. Each other scan follows the odometry between the two around it, and is then aligned with the
+nearer one of them.
 """
 
 from __future__ import annotations
@@ -11,7 +12,16 @@ from jaxtyping import Float
 
 from dpmjax.checks import require_positive
 from dpmjax.geometry import se2
-from dpmjax.registration.planar_scans import Floats, Indices
+from dpmjax.registration.pair_alignment import FINE, PosePrior, match_pairs
+from dpmjax.registration.planar_scans import Floats, Indices, PlanarScans
+from dpmjax.registration.range_profiles import contradicted_share, make_profiles
+
+# Standard deviation of odometry from one chosen scan to the next: translation in typical ranges, radians.
+_ODOMETRY_SIGMA = (0.005, 0.01)
+# A scan keeps to odometry where a lower share of its beams fits, or where more of them contradict the chosen scan.
+_MIN_FITNESS, _MAX_CONTRADICTED = 0.5, 0.05
+# Scans that are aligned at a time.
+_BLOCK = 1024
 
 
 def choose_by_motion(odometry: Float[np.ndarray, "n 3"], min_distance: float, min_turn: float) -> Indices:
@@ -73,6 +83,38 @@ def fill_between(chosen: Indices, poses: Float[np.ndarray, "k 3"], odometry: Flo
     filled = np.asarray(se2.compose(poses[before], T_before_scan), np.float64)
     filled[chosen] = poses
     return filled
+
+
+def align_between(scans: PlanarScans, chosen: Indices, poses: Float[np.ndarray, "n 3"]) -> Floats:
+    """Aligns each scan with the nearest one of the chosen scans before and after it, point to line.
+
+    Args:
+        scans: n scans in the order of time.
+        chosen: rows of k scans in order, the first and the last scan among them.
+        poses: T_world_scan of all scans, right at `chosen`, as `fill_between` makes them.
+
+    Returns:
+        (n, 3) T_world_scan; those at `chosen`, and of scans that fit badly, as they were.
+    """
+    aligned = poses.copy()
+    others = np.setdiff1d(np.arange(len(poses)), chosen)
+    after = np.searchsorted(chosen, others)
+    ends = np.stack([chosen[after - 1], chosen[after]])
+    apart = np.abs(se2.relative(poses[ends], poses[others]))
+    nearest = np.take_along_axis(ends, (apart @ [1.0, 1.0, scans.typical_range]).argmin(axis=0)[None], axis=0)[0]
+    sigma = np.array(_ODOMETRY_SIGMA)[[0, 0, 1]] * [scans.typical_range, scans.typical_range, 1.0]
+    information = (3.0 * scans.noise / sigma) ** 2
+    for start in range(0, len(others), _BLOCK):
+        source, target = others[start : start + _BLOCK], nearest[start : start + _BLOCK]
+        expected = np.asarray(se2.relative(poses[target], poses[source]))
+        prior = PosePrior(expected, np.broadcast_to(information, expected.shape))
+        found = match_pairs(scans.take(source), scans.take(target), expected[:, None], FINE, prior)
+        both = np.concatenate([source, target])
+        profiles, rows = make_profiles(scans.take(both)), np.arange(len(source))
+        contradicted = contradicted_share(profiles, rows, len(source) + rows, found.poses)
+        fits = (found.fitness > _MIN_FITNESS) & (contradicted < _MAX_CONTRADICTED)
+        aligned[source[fits]] = se2.compose(poses[target], found.poses)[fits]
+    return aligned
 
 
 def _share_of_way(odometry: Floats, start: Indices, end: Indices) -> Floats:
