@@ -159,7 +159,7 @@ def agent_panels(result: AgentsResult, sequences: Sequence[LidarSequence]) -> li
             if alignment is not None and sequence.T_world_lidar is not None:
                 reference = sequence.T_world_lidar[:, :3, 3] @ alignment[:3, :3].T + alignment[:3, 3]
             cloud = files.gather_map((read_points(sequence, scan), T[scan]) for scan in agent.keyframes)
-            label = f"agent {number + 1}: {sequence.name}, {len(T)} scans"
+            label = f"agent {number + 1}, {len(T)} scans"
             color = viz.COLORS[number % len(viz.COLORS)]
             tracks.append(viz.AgentTrack(label, color, T[:, :3, 3], reference, cloud.points, cloud.heights_m))
         # Rows lie in the frame of the map, trajectories begin at their own origin.
@@ -168,8 +168,8 @@ def agent_panels(result: AgentsResult, sequences: Sequence[LidarSequence]) -> li
         accepted = [loop for loop in accepted if map_of_row[loop.source] in members]
         ends = np.array([[loop.source, loop.target] for loop in accepted], np.int64).reshape(-1, 2)
         loops = T_keyframe[ends][..., :3, 3] @ T_shown_map[:3, :3].T + T_shown_map[:3, 3]
-        names = " and ".join(str(number + 1) for number in members)
-        title = f"agent{'s' if len(members) > 1 else ''} {names}" + (" in one frame" if len(members) > 1 else ", alone")
+        drives = ", ".join(dict.fromkeys(sequences[number].name for number in members))
+        title = drives + (", in one frame" if len(members) > 1 else ", in a frame of its own")
         panels.append(viz.AgentPanel(title, tracks, loops))
     return panels
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from dpmjax.viz.drives import plane_limits, size_in
+from dpmjax.viz.drives import add_axes, plane_limits, size_in
 from dpmjax.viz.figures import INK, MUTED, Limits, add_scale_bar, frame_map, new_figure
 
 if TYPE_CHECKING:
@@ -17,6 +17,8 @@ if TYPE_CHECKING:
 
 COLORS = ("#1f4e8c", "#d1495b", "#2a9d5c", "#e08a1e", "#7b4fa3", "#0f8b8d", "#8d6b3f", "#c04a9b")
 """Of the agents, in turn."""
+
+GAP_IN, TITLE_IN, LEGEND_IN, DOTS_PER_IN = 0.2, 0.6, 0.8, 100
 
 MIN_HEIGHT_M = -1.0
 """Lower points, below the lidar, are ground, which would hide everything."""
@@ -68,13 +70,16 @@ def agents_figure(title: str, panels: Sequence[AgentPanel]) -> Figure:
     """
     limits = [_limits_of(panel) for panel in panels]
     sizes = [size_in(each) for each in limits]
-    width_in, height_in = sum(size[0] for size in sizes), max(size[1] for size in sizes)
-    figure = new_figure(width_in + 0.3 * len(panels), height_in + 1.0)
-    row = figure.subplots(1, len(panels), squeeze=False, width_ratios=[size[0] for size in sizes])[0]
-    for axes, panel, size, each in zip(row, panels, sizes, limits, strict=True):
+    width_in = sum(size[0] + GAP_IN for size in sizes) + GAP_IN
+    height_in = max(size[1] for size in sizes)
+    figure = new_figure(width_in, height_in + TITLE_IN + LEGEND_IN)
+    left_in = GAP_IN
+    for panel, size, each in zip(panels, sizes, limits, strict=True):
+        axes = add_axes(figure, (left_in, LEGEND_IN + height_in - size[1], *size))
         _draw_panel(axes, panel, each, size)
-    figure.suptitle(title, fontsize=11, color=INK, x=0.02, ha="left", fontweight="bold")
-    figure.tight_layout()
+        left_in += size[0] + GAP_IN
+    place = (GAP_IN / width_in, 1 - 0.1 / (height_in + TITLE_IN + LEGEND_IN))
+    figure.text(*place, title, fontsize=11, color=INK, ha="left", va="top", fontweight="bold")
     return figure
 
 
@@ -82,7 +87,7 @@ def _draw_panel(axes: Axes, panel: AgentPanel, limits: Limits, size: tuple[float
     from matplotlib.collections import LineCollection
 
     axes.imshow(
-        _raster(panel, limits, int(160 * size[0]), int(160 * size[1])),
+        _raster(panel, limits, int(DOTS_PER_IN * size[0]), int(DOTS_PER_IN * size[1])),
         origin="lower",
         extent=limits,
         interpolation="nearest",
@@ -90,10 +95,10 @@ def _draw_panel(axes: Axes, panel: AgentPanel, limits: Limits, size: tuple[float
     references = [agent.reference for agent in panel.agents if agent.reference is not None]
     for number, reference in enumerate(references):
         label = None if number else "reference"
-        axes.plot(*reference[:, :2].T, color=INK, lw=0.7, ls=(0, (3, 2)), label=label, zorder=6)
+        axes.plot(*reference[:, :2].T, color=INK, lw=0.6, ls=(0, (5, 3)), label=label, zorder=6)
     for agent in panel.agents:
-        axes.plot(*agent.positions[:, :2].T, color="white", lw=3.2, zorder=3, solid_capstyle="round")
-        axes.plot(*agent.positions[:, :2].T, color=agent.color, lw=1.8, label=agent.label, zorder=4)
+        axes.plot(*agent.positions[:, :2].T, color="white", lw=4.4, zorder=3, solid_capstyle="round")
+        axes.plot(*agent.positions[:, :2].T, color=agent.color, lw=2.6, label=agent.label, zorder=4)
         axes.plot(*agent.positions[:1, :2].T, "o", ms=5.5, color=agent.color, mec="white", zorder=8)
     if len(panel.loops):
         lines = LineCollection(list(panel.loops[:, :, :2]), colors=INK, linewidths=0.9, zorder=7)
@@ -103,7 +108,10 @@ def _draw_panel(axes: Axes, panel: AgentPanel, limits: Limits, size: tuple[float
     frame_map(axes, limits)
     add_scale_bar(axes, limits, "m")
     axes.set_title(panel.title, fontsize=9, color=MUTED, loc="left")
-    axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.01), ncols=3, frameon=False, fontsize=8, labelcolor=MUTED)
+    columns = max(int(size[0] / 1.6), 1)
+    axes.legend(
+        loc="upper left", bbox_to_anchor=(-0.02, -0.01), ncols=columns, frameon=False, fontsize=8, labelcolor=MUTED
+    )
 
 
 def _limits_of(panel: AgentPanel) -> Limits:
@@ -130,6 +138,6 @@ def _raster(panel: AgentPanel, limits: Limits, columns: int, rows: int) -> UInt8
         total += count
     is_seen = total > 0
     strong = np.quantile(total[is_seen], 0.9) if is_seen.any() else 1.0
-    alpha = np.where(is_seen, 0.25 + 0.6 * np.clip(total / max(strong, 1.0), 0, 1), 0.0)[:, None]
+    alpha = np.where(is_seen, 0.35 + 0.6 * np.clip(total / max(strong, 1.0), 0, 1), 0.0)[:, None]
     mixed = alpha * color / np.maximum(total, 1)[:, None] + 1 - alpha
     return np.asarray(np.round(255 * mixed), np.uint8).reshape(rows, columns, 3)

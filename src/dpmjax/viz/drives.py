@@ -73,7 +73,7 @@ def trajectory_figure(
     (width_in, height_in), has_errors = size_in(limits), any(track.errors_m is not None for track in tracks)
     total_in = (width_in + (4.1 if has_errors else 0.3), height_in + 1.05)
     figure = new_figure(*total_in)
-    axes = _add_axes(figure, (0.15, 0.65, width_in, height_in))
+    axes = add_axes(figure, (0.15, 0.65, width_in, height_in))
     if reference is not None:
         axes.plot(*reference[:, :2].T, color="#b9c0c8", lw=4.2, solid_capstyle="round", label="reference", zorder=2)
     for track in tracks:
@@ -89,7 +89,7 @@ def trajectory_figure(
     )  # fmt: skip
     if has_errors:
         panel_in = min(height_in, 3.0)
-        _draw_errors(_add_axes(figure, (width_in + 0.75, 0.65 + height_in - panel_in, 3.1, panel_in)), tracks)
+        _draw_errors(add_axes(figure, (width_in + 0.75, 0.65 + height_in - panel_in, 3.1, panel_in)), tracks)
     return figure
 
 
@@ -119,7 +119,7 @@ def height_map_figure(
     limits = plane_limits(np.vstack([path[:, :2], [low, high]]), 0.03)
     width_in, height_in = size_in(limits)
     figure = new_figure(width_in + 1.05, height_in + 0.5)
-    axes = _add_axes(figure, (0.12, 0.12, width_in, height_in))
+    axes = add_axes(figure, (0.12, 0.12, width_in, height_in))
     axes.imshow(
         _raster(points, heights_m, limits, int(160 * width_in), int(160 * height_in)),
         origin="lower",
@@ -131,7 +131,7 @@ def height_map_figure(
     add_scale_bar(axes, limits, "m")
     axes.set_title(title, fontsize=11, color=INK, loc="left", fontweight="bold")
     bar_in = min(height_in, 3.0)
-    bar = _add_axes(figure, (width_in + 0.27, 0.12 + (height_in - bar_in) / 2, 0.13, bar_in))
+    bar = add_axes(figure, (width_in + 0.27, 0.12 + (height_in - bar_in) / 2, 0.13, bar_in))
     shown = figure.colorbar(ScalarMappable(Normalize(*HEIGHTS_M), _colormap()), cax=bar, extend="both")
     shown.set_label("height above the lidar, m", fontsize=8, color=MUTED)
     bar.tick_params(labelsize=7, colors=MUTED)
@@ -151,7 +151,7 @@ def height_colors(heights_m: Float[np.ndarray, " n"]) -> UInt8[np.ndarray, "n 3"
     return np.asarray(_colormap()(np.clip(share, 0, 1), bytes=True))[:, :3]
 
 
-def _add_axes(figure: Figure, place_in: tuple[float, float, float, float]) -> Axes:
+def add_axes(figure: Figure, place_in: tuple[float, float, float, float]) -> Axes:
     """Adds axes at left, bottom, with width and height in inches."""
     (left, bottom, width, height), (whole, high) = place_in, figure.get_size_inches()
     return figure.add_axes((left / whole, bottom / high, width / whole, height / high))
