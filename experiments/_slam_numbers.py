@@ -58,7 +58,7 @@ def run_numbers(run: SlamRun, result: SlamResult, sequence: LidarSequence) -> di
         **trajectory_errors(result.T_odometry_scan, reference, "_odometry"),
         "scan_statuses": dict(statuses),
         "loop_statuses": dict(loops),
-        "scans_per_s": run.num_done / run.run_s if run.run_s > 0 else None,
+        "scans_per_s": run.num_done / run.run_s if run.num_done else None,
         "run_s": run.run_s,
         "compile_s": run.compile_s,
         "stages_s": run.stages_s,

@@ -1,8 +1,9 @@
-"""Runs deepmapping_2d on every CARMEN log of a folder, from ICP and from raw odometry, and writes one table.
+"""Runs deepmapping_2d on every CARMEN log of a folder, from several starts, and writes one table.
 
     python -m experiments.deepmapping_logs path/to/logs -o out
 
-Each run keeps its own folder below OUT, with its pictures; a run that is finished already is not done again.
+Each run keeps its own folder below OUT, with its pictures; a run that is finished already is not done again. A log that
+has hand-checked relations beside it (aces.clf.gz, aces.relations) is measured by them too.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ from experiments._result_files import load_json
 from experiments._run_folder import METRICS, RunFolder, write_metrics
 
 EXPERIMENT = "deepmapping_logs"
+ENDINGS = (".log", ".clf", ".log.gz", ".clf.gz")
 
 
 @dataclass(frozen=True)
@@ -28,10 +30,10 @@ class Config:
     """Options of the table."""
 
     logs: Positional[Path]
-    """Folder of .log, .log.gz or .clf files."""
+    """Folder of .log or .clf files, plain or .gz."""
     output: Annotated[Path, arg(aliases=["-o"], metavar="OUT")] = Path("results/deepmapping_logs")
     """Folder for the runs and metrics.json."""
-    inits: tuple[str, ...] = ("icp-plane", "odometry")
+    inits: tuple[str, ...] = ("odometry", "icp-plane", "global")
     """Starts to try."""
     steps: int | None = None
     """Steps of each fit; without it, the preset decides."""
@@ -41,9 +43,9 @@ class Config:
 
 def main(config: Config) -> list[dict[str, Any]]:
     """Runs what is missing and prints the table."""
-    logs = sorted(p for p in config.logs.glob("*") if p.name.endswith((".log", ".log.gz", ".clf")))
+    logs = sorted(p for p in config.logs.glob("*") if p.name.endswith(ENDINGS))
     if not logs:
-        raise ValueError(f"{config.logs}: no .log, .log.gz or .clf file there; name a folder of CARMEN logs")
+        raise ValueError(f"{config.logs}: no {', '.join(ENDINGS)} file there; name a folder of CARMEN logs")
     rows: list[dict[str, Any]] = []
     for log, init in itertools.product(logs, config.inits):
         if (metrics := _run(log, init, config)) is not None:
@@ -61,6 +63,8 @@ def _run(log: Path, init: str, config: Config) -> dict[str, Any] | None:
         command = [sys.executable, "-m", "experiments.deepmapping_2d", str(log), "-o", str(folder), "--force"]
         command += ["--init", init, "--seed", str(config.seed)]
         command += [] if config.steps is None else ["--steps", str(config.steps)]
+        relations = log.with_name(log.name.split(".")[0] + ".relations")
+        command += ["--relations", str(relations)] if relations.exists() else []
         code = subprocess.run(command).returncode
         if code == EXIT_BAD_INPUT:
             return None
@@ -70,10 +74,32 @@ def _run(log: Path, init: str, config: Config) -> dict[str, Any] | None:
 
 
 def markdown(rows: list[dict[str, Any]]) -> str:
-    """Returns the table as Markdown."""
-    head = "| log | scans | start | ATE before, m | ATE after, m | kept |\n|---|---|---|---|---|---|\n"
-    line = "| {log} | {num_scans} | {init} | {ate_initial_m:.2f} | {ate_m:.2f} | {kept} |"
-    return head + "\n".join(line.format_map(row) for row in rows)
+    """Returns the table as Markdown; an empty cell is a number that the log has no reference for."""
+    lines = [
+        "| log | scans (registered) | start | ATE before, m | ATE after, m | relations before | relations after "
+        "| kept | trusted | s | GB |",
+        "|---|---|---|---|---|---|---|---|---|---|---|",
+    ]
+    for row in rows:
+        relations = (
+            f"{row[f'relations{when}_m']:.3f} m, {row[f'relations{when}_deg']:.2f} deg" if "relations_m" in row else ""
+            for when in ("_initial", "")
+        )
+        ates = (f"{row[name]:.2f}" if name in row else "" for name in ("ate_initial_m", "ate_m"))
+        trusted = "yes" if row["assessment"]["is_trusted"] else "no"
+        cells = (
+            row["log"],
+            f"{row['num_scans']} ({row['num_registered']})",
+            row["init"],
+            *ates,
+            *relations,
+            row["kept"],
+            trusted,
+            f"{row['wall_s']:.0f}",
+            f"{row['peak_rss_gb']:.1f}",
+        )
+        lines.append(f"| {' | '.join(cells)} |")
+    return "\n".join(lines)
 
 
 if __name__ == "__main__":

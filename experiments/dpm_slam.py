@@ -140,21 +140,20 @@ def slam_methods(config: Config) -> SlamMethods:
     settings = SlamConfig()
     if config.no_loop:
         settings = replace(settings, loops=replace(settings.loops, is_on=False))
-    return make_methods(load_model(config.weights), settings)
+    return make_methods(load_model(config.weights), settings, weights=config.weights)
 
 
 def starting_state(config: Config, methods: SlamMethods) -> SlamState:
     """Returns the state before the first scan; a `ValueError` for a map of other weights."""
     from dpmjax import load_map
     from dpmjax.slam import init_slam
-    from dpmjax.slam.config import MapOrigin
     from dpmjax.slam.keyframes import with_origin
 
     if config.map is None:
         return init_slam()
     slam_map = load_map(config.map)
     try:
-        with_origin(slam_map, MapOrigin(methods.matcher.fingerprint, methods.config))
+        with_origin(slam_map, methods.origin)
     except ValueError as error:
         raise ValueError(f"--map {config.map}: {error}") from error
     return init_slam(slam_map)

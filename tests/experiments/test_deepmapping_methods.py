@@ -10,6 +10,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from dpmjax.geometry import se2
 from dpmjax.simulation import simulate_sequence
 from experiments import _deepmapping_methods, deepmapping_limits, deepmapping_logs, deepmapping_suite
 from experiments._command import run_command
@@ -180,24 +181,54 @@ def test_suite_writes_its_table_its_picture_and_the_bound(tmp_path, monkeypatch,
     assert printed.splitlines()[0] == (tmp_path / "out" / "table.md").read_text().splitlines()[0]
 
 
+def flaser_lines(walk, poses, odometry) -> list[str]:
+    """The half of each scan that lies ahead, 2 cm a pixel, one second after the other."""
+    bearings = np.arctan2(walk.points[0, :, 1], walk.points[0, :, 0])
+    ahead = np.argsort(bearings)[90:270]
+    lines = []
+    for points, pose, wheels in zip(walk.points[:, ahead], poses, odometry, strict=True):
+        ranges = " ".join(f"{0.02 * reading:.3f}" for reading in np.linalg.norm(points, axis=1))
+        x, y = (" ".join(f"{value:.5f}" for value in p * [0.02, 0.02, 1.0]) for p in (pose, wheels))
+        lines.append(f"FLASER 180 {ranges} {x} {y} {len(lines)} robot {len(lines)}")
+    return lines
+
+
+@pytest.mark.slow
+def test_a_whole_recording_has_a_pose_for_every_scan_and_is_measured_by_its_relations(tmp_path, capsys) -> None:
+    """The poses of a recording are its odometry; half of them are those of a robot that stands still."""
+    walk = simulate_sequence(0, 24, num_beams=360, seed=4, with_odometry=True)
+    walk = walk.take(np.repeat(np.arange(24), 2))
+    metres = np.array([0.02, 0.02, 1.0])
+    wheels = walk.odometry_poses * metres
+    odom = [f"ODOM {x} {y} {heading} 0 0 0 {time} robot {time}" for time, (x, y, heading) in enumerate(wheels)]
+    scans = flaser_lines(walk, walk.odometry_poses, walk.odometry_poses)
+    (tmp_path / "robot.clf").write_text("\n".join([*odom, *scans]) + "\n")
+    true = se2.relative(walk.reference_poses[0], walk.reference_poses[41]) * metres
+    (tmp_path / "robot.relations").write_text(f"0 41 {true[0]} {true[1]} 0 0 0 {true[2]}\n")
+    options = [str(tmp_path), "-o", str(tmp_path / "out"), "--inits", "odometry", "--steps", "2"]
+    main, config = deepmapping_logs.main, deepmapping_logs.Config
+    assert run_command(main, config, experiment="logs", description=None, args=options) == 0
+    capsys.readouterr()
+    (row,) = json.loads((tmp_path / "out" / "metrics.json").read_text())["rows"]
+    assert row["num_scans"] == 48
+    assert row["num_registered"] < 24
+    assert "ate_m" not in row
+    assert row["num_relations"] == 1
+    assert row["relations_m"] < min(0.05, row["relations_initial_m"])
+    assert len((tmp_path / "out" / "robot_odometry" / "trajectory_tum.txt").read_text().splitlines()) >= 48
+
+
 @pytest.mark.slow
 def test_logs_keep_finished_runs_and_leave_out_lost_odometry(tmp_path, capsys) -> None:
     """The corrected poses of the second log are its odometry, so it has none of its own."""
     walk = simulate_sequence(0, 12, num_beams=360, seed=4, with_odometry=True)
-    bearings = np.arctan2(walk.points[0, :, 1], walk.points[0, :, 0])
-    ahead = np.argsort(bearings)[90:270]
     for name, odometry in (("good", walk.odometry_poses), ("lost", walk.reference_poses)):
-        lines = []
-        for points, pose, wheels in zip(walk.points[:, ahead], walk.reference_poses, odometry, strict=True):
-            ranges = " ".join(f"{0.02 * reading:.3f}" for reading in np.linalg.norm(points, axis=1))
-            x, y = (" ".join(f"{value:.5f}" for value in p * [0.02, 0.02, 1.0]) for p in (pose, wheels))
-            lines.append(f"FLASER 180 {ranges} {x} {y} {len(lines)} robot {len(lines)}")
-        (tmp_path / f"{name}.log").write_text("\n".join(lines) + "\n")
+        (tmp_path / f"{name}.log").write_text("\n".join(flaser_lines(walk, walk.reference_poses, odometry)) + "\n")
     options = [str(tmp_path), "-o", str(tmp_path / "out"), "--inits", "odometry", "--steps", "2"]
     for _ in range(2):
         main, config = deepmapping_logs.main, deepmapping_logs.Config
         assert run_command(main, config, experiment="logs", description=None, args=options) == 0
         printed = capsys.readouterr().out.splitlines()
-        assert [line.split(" | ")[:3] for line in printed if "good" in line] == [["| good", "12", "odometry"]]
+        assert [line.split(" | ")[:3] for line in printed if "good" in line] == [["| good", "12 (5)", "odometry"]]
     (row,) = json.loads((tmp_path / "out" / "metrics.json").read_text())["rows"]
     assert row["candidates"][row["kept"]]["ate_m"] == row["ate_m"]

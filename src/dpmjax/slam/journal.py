@@ -17,7 +17,6 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from dpmjax.slam.columns import Arrays, from_columns, part_of, prefixed, to_columns
-from dpmjax.slam.config import MapOrigin
 from dpmjax.slam.front_end import AnyScan, FrontEndState, corrected_points
 from dpmjax.slam.keyframes import Keyframe, KeyframeMap, MapEdge
 from dpmjax.slam.loop_state import LoopState
@@ -169,7 +168,7 @@ def _apply(methods: SlamMethods, state: SlamState, record: Arrays) -> SlamState:
         np.concatenate([kept, record["T_world_keyframe"]]),
         np.concatenate([old.vectors, vectors]) if len(old) else vectors,
         _apply_list(old.edges, record, "edge", MapEdge),
-        MapOrigin(methods.matcher.fingerprint, methods.config) if keyframes else old.origin,
+        methods.origin if keyframes else old.origin,
     )
     (loops,) = from_columns(LoopState, record, "loops")
     (front,) = from_columns(FrontEndState, record, "front_end")

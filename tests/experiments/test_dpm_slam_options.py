@@ -1,0 +1,122 @@
+"""Options of dpm_slam: saved maps are extended, trajectories refined, scans deskewed, and the viewer records."""
+
+from __future__ import annotations
+
+import importlib.util
+import itertools
+from pathlib import Path
+from types import SimpleNamespace
+
+import jax
+import numpy as np
+import pytest
+
+import dpmjax
+from dpmjax.geometry import rigid
+from dpmjax.io import write_tum
+from dpmjax.metrics import absolute_trajectory_error
+from dpmjax.slam import SlamConfig, SlamMethods, run_slam
+from experiments import _slam_refine
+from experiments._command import EXIT_BAD_INPUT, EXIT_OK
+from experiments._result_files import load_json
+from tests.deeppointmap import toy
+from tests.experiments.test_dpm_slam import run, use_truth, write_drive
+from tests.slam.test_odometry import motion, planes, seen_from
+from tests.slam.truth import TruthGeometry, TruthMatcher, laps, scans_of
+
+
+@pytest.fixture(scope="module")
+def room(tmp_path_factory) -> tuple[Path, Path]:
+    """A walk through a room, with a corner and back, and a network that compiles in seconds."""
+    folder = tmp_path_factory.mktemp("room")
+    rng = np.random.default_rng(0)
+    (folder / "drive").mkdir()
+    truth = np.array([motion(0.5 * step, 0.0, 3.0 * step) for step in [*range(12), *range(11, 3, -1)]])
+    for number, T in enumerate(truth):
+        np.save(folder / "drive" / f"{number}.npy", seen_from(planes(rng), T).astype(np.float32))
+    write_tum(folder / "drive" / "poses_lidar.txt", truth)
+    dpmjax.save_model(dpmjax.init_model(jax.random.key(0), toy.MODEL), folder / "toy.safetensors", card="toy")
+    return folder / "drive", folder / "toy.safetensors"
+
+
+def test_a_saved_map_is_extended(room, tmp_path, capsys) -> None:
+    drive, weights = room
+    first, second = tmp_path / "first", tmp_path / "second"
+    assert run(drive, "--weights", weights, "-n", 8, "-o", first) == EXIT_OK
+    before = dpmjax.load_map(first / "map.npz")
+    assert load_json(first / "metrics.json")["map_bytes_int8"] < load_json(first / "metrics.json")["map_bytes"]
+    assert run(drive, "--weights", weights, "--map", first / "map.npz", "-o", second) == EXIT_OK
+    after = dpmjax.load_map(second / "map.npz")
+    assert len(after) > len(before)
+    assert [keyframe.scan for keyframe in after.keyframes][: len(before)] == [k.scan for k in before.keyframes]
+    assert len(np.load(second / "trajectory.npy")) == 20
+    # The journal of the second run holds what came after the map.
+    for name in ("trajectory.npy", "map.npz", "loops.csv"):
+        (tmp_path / name).write_bytes((second / name).read_bytes())
+    assert run("--resume", "-o", second) == EXIT_OK
+    for name in ("trajectory.npy", "map.npz", "loops.csv"):
+        assert (tmp_path / name).read_bytes() == (second / name).read_bytes()
+    capsys.readouterr()
+    other = tmp_path / "other.safetensors"
+    dpmjax.save_model(dpmjax.init_model(jax.random.key(1), toy.MODEL), other, card="toy")
+    for options, message in (
+        (["--map", first / "map.npz", "--weights", other], "made with weights"),
+        (["--map", first / "config.json", "--weights", weights], "config.json"),
+        (["--map", tmp_path / "none.npz", "--weights", weights], "no such file"),
+    ):
+        assert run(drive, *options, "-o", tmp_path / "out") == EXIT_BAD_INPUT
+        errors = capsys.readouterr().err.strip().splitlines()
+        assert len(errors) == 1
+        assert message in errors[0]
+    assert not (tmp_path / "out").exists()
+
+
+def test_deskewing_and_odometry_alone_are_options(room, tmp_path) -> None:
+    drive, weights = room
+    assert run(drive, "--weights", weights, "--deskew", "--no-loop", "-n", 6, "-o", tmp_path / "out") == EXIT_OK
+    metrics = load_json(tmp_path / "out" / "metrics.json")
+    assert metrics["loop_statuses"] == {}
+    assert metrics["ate_m"] == pytest.approx(metrics["ate_odometry_m"])
+
+
+@pytest.mark.parametrize("num", [1, 2, 31, 32, 33, 56, 57, 200])
+def test_windows_of_the_refinement_cover_all_keyframes(num: int) -> None:
+    parts = _slam_refine.windows(num)
+    assert sorted({row for rows in parts for row in rows}) == list(range(num))
+    assert all(b.start == a.stop - _slam_refine.OVERLAP for a, b in itertools.pairwise(parts))
+
+
+def test_refined_motions_and_loops_make_one_map(monkeypatch) -> None:
+    """A fit that knows the truth brings the drifted map to the truth, over the borders of windows."""
+    truth = laps(1, side_m=60.0, step_m=2.0)
+    methods = SlamMethods(TruthMatcher(truth), TruthGeometry(truth, sigma_m=0.05), SlamConfig())
+    result = run_slam(scans_of(range(len(truth))), methods)
+    slam_map, true = result.state.slam_map, rigid.inverse(truth[0]) @ truth[result.keyframes]
+
+    def fit(clouds, *, key, init):
+        rows = [int(cloud[0, 0]) for cloud in clouds]
+        return SimpleNamespace(T_world_scan=init[0] @ rigid.inverse(true[rows[0]]) @ true[rows], kept="fit")
+
+    monkeypatch.setattr(_slam_refine.deepmapping, "fit_clouds", fit)
+    refined = _slam_refine.refine_keyframes(
+        slam_map, lambda row: np.array([[row, 0.0, 0.0]]), seed=0, is_stopped=lambda: False
+    )
+    before, after = (
+        absolute_trajectory_error(T[:, :3, 3], true[:, :3, 3])
+        for T in (slam_map.T_world_keyframe, refined.T_world_keyframe)
+    )
+    assert refined.numbers["refine_windows"] > 1
+    assert after < 0.1 * before
+
+
+def test_the_viewer_records_where_there_is_no_screen(tmp_path, monkeypatch, capsys) -> None:
+    use_truth(monkeypatch)
+    drive = write_drive(tmp_path / "drive")
+    monkeypatch.delenv("DISPLAY", raising=False)
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    if importlib.util.find_spec("rerun") is None:
+        assert run(drive, "-v", "-n", 30, "-o", tmp_path / "out") == EXIT_BAD_INPUT
+        assert "dpmjax[viewer]" in capsys.readouterr().err
+        return
+    assert run(drive, "-v", "-n", 30, "-o", tmp_path / "out") == EXIT_OK
+    assert (tmp_path / "out" / "slam.rrd").stat().st_size > 1000
