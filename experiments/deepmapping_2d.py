@@ -2,15 +2,16 @@
 
     python -m experiments.deepmapping_2d                              the built-in world
     python -m experiments.deepmapping_2d scans.tar -o out             a folder or .tar of .pcd + gt_pose.mat
-    python -m experiments.deepmapping_2d robot.log.gz --init odometry a CARMEN log
+    python -m experiments.deepmapping_2d robot.log.gz                 a CARMEN log, as recorded or thinned
     python -m experiments.deepmapping_2d scans.npz --seconds 60       arrays (n, b, 2)
     python -m experiments.deepmapping_2d --jump 8 --init global       large steps: no first guess is needed
     python -m experiments.deepmapping_2d --resume                     continue the latest run
 
 Results go to results/deepmapping_2d/<time>/ (latest links to the newest): metrics.json, trajectories as TUM, KITTI and
-npy, and pictures: map.png, occupancy.png, loss.png. Without --init the start is incremental point-to-line ICP. Of the
-start, DeepMapping and both after refinement, the candidate is kept whose map describes the beams best, judged without
-ground truth; metrics.json and map.png name it.
+npy, and pictures: map.png, occupancy.png, loss.png. Without --init the start is the odometry, where there is one, else
+incremental point-to-line ICP. Of the start, DeepMapping and both after refinement, the candidate is kept whose map
+describes the beams best, judged without ground truth; metrics.json and map.png name it. Of a whole recording, scans
+half a metre or 20 degrees apart are registered, and all others follow the odometry between them.
 """
 
 from __future__ import annotations
@@ -33,6 +34,7 @@ from experiments._command import StopFlag, check_least, run_command
 from experiments._deepmapping_fit import FitRun, draw_loss, run_fit
 from experiments._deepmapping_methods import Candidates, Floats, Task
 from experiments._machine import peak_rss_gb
+from experiments._recordings import Recording, choose_scans
 from experiments._run_folder import RunFolder, RunOptions, open_run_folder, recording, write_metrics
 
 if TYPE_CHECKING:
@@ -41,6 +43,7 @@ if TYPE_CHECKING:
 
 EXPERIMENT = "deepmapping_2d"
 LOGGER = logging.getLogger("dpmjax.deepmapping_2d")
+UNITS = ("m", "deg")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,8 +57,9 @@ class Config(RunOptions):
     """Scans: a folder or .tar of .pcd, a CARMEN log, .npy or .npz. Without it: the built-in world."""
     preset: Literal["fast", "paper"] = "fast"
     """fast: minutes on two cores; paper: architecture, losses and sampling of the paper."""
-    init: Annotated[str, arg(metavar="icp-plane|icp-point|global|odometry|zero|FILE")] = "icp-plane"
-    """Where the poses start; global: an exhaustive search of scan pairs, needs no guess; FILE is a trajectory."""
+    init: Annotated[str, arg(metavar="auto|odometry|icp-plane|icp-point|global|zero|FILE")] = "auto"
+    """Where the poses start; auto: odometry where there is one, else icp-plane; global: an exhaustive search of scan
+    pairs, needs no guess; FILE is a trajectory."""
     ordered: bool = True
     """Scans lie in the order of time; --no-ordered makes no use of it, and needs --init global."""
     refine: bool = True
@@ -66,6 +70,8 @@ class Config(RunOptions):
     """Stop the fit after S seconds of run time, compile time not counted."""
     start: Annotated[int, arg(metavar="N")] = 0
     """First scan to use."""
+    relations: Annotated[Path | None, arg(metavar="FILE")] = None
+    """Hand-checked relations of a log, to measure the result by."""
     n_scans: Annotated[int | None, arg(aliases=["-n"], metavar="N")] = None
     """Use N scans; without it, all."""
     jump: Annotated[int, arg(aliases=["-j"], metavar="N")] = 1
@@ -87,14 +93,16 @@ class Config(RunOptions):
 def main(config: Config) -> dict[str, Any]:
     """Reads, starts, fits, refines, keeps the best candidate, writes; returns the content of `metrics.json`."""
     started = time.perf_counter()
-    sequence = read_scans(config)
+    log = choose_scans(read_scans(config), is_ordered=config.ordered)
+    relations = None if config.relations is None else io.read_relations(config.relations)
+    sequence = log.registered
     planar = registration.planar_scans(sequence.points, sequence.mask, is_ordered=config.ordered)
     task = Task(sequence, planar, is_ordered=config.ordered, seed=config.seed)
-    start_name, start = starting_poses(config, task)
+    start_name, start = starting_poses(config, task, log)
     settings = fit_settings(config, sequence)
     folder = open_run_folder(config, EXPERIMENT)
     with recording(folder), StopFlag() as stop:
-        print(f"{sequence.name}: {len(sequence)} scans of {sequence.points.shape[1]} beams, from {start_name}")
+        print(f"{sequence.name}: {log.title}, from {start_name}")
         run = _fit(folder, task, settings, start, config, stop)
         candidates = {start_name: start, shared.DEEPMAPPING: run.fitted.poses}
         if config.refine and not stop.is_requested:
@@ -105,9 +113,11 @@ def main(config: Config) -> dict[str, Any]:
             }
         kept, compared = shared.choose(task, candidates)
         metrics = {
-            "num_scans": len(sequence),
+            "num_scans": len(log.whole),
+            "num_registered": len(sequence),
             "steps": run.steps,
             **before_and_after(sequence, start, candidates[kept]),
+            **log.relation_numbers(relations, {"": candidates[kept], "_initial": start}),
             "start": start_name,
             "kept": kept,
             "candidates": compared,
@@ -118,7 +128,7 @@ def main(config: Config) -> dict[str, Any]:
             "is_interrupted": stop.is_requested,
         }
         # Numbers first: a picture that fails must not cost them.
-        write_trajectories(folder, sequence, candidates[kept])
+        write_trajectories(folder, log.whole, log.all_poses(candidates[kept]))
         write_metrics(folder, metrics | {"wall_s": time.perf_counter() - started}, seed=config.seed)
         limits = draw_map(folder, task, candidates, metrics)
         draw_occupancy(folder, sequence, run, candidates[kept], limits)
@@ -158,16 +168,19 @@ def read_scans(config: Config) -> ScanSequence:
     return sequence.take(slice(config.start, stop, config.jump))
 
 
-def starting_poses(config: Config, task: Task) -> tuple[str, Floats]:
+def starting_poses(config: Config, task: Task, log: Recording) -> tuple[str, Floats]:
     """Returns the name of the start and its (n, 3) poses; other words than those of `START_NAMES` name a file."""
-    sequence, name = task.sequence, shared.START_NAMES.get(config.init, f"poses of {Path(config.init).name}")
-    match config.init:
+    sequence, init = task.sequence, config.init
+    if init == "auto":
+        init = "icp-plane" if sequence.odometry_poses is None else "odometry"
+    name = shared.START_NAMES.get(init, f"poses of {Path(init).name}")
+    match init:
         case "zero":
             return name, np.zeros((len(sequence), 3))
         case "global":
             return name, shared.search(task)
         case "icp-plane" | "icp-point":
-            return name, shared.incremental(task, "plane" if config.init == "icp-plane" else "point")
+            return name, shared.incremental(task, "plane" if init == "icp-plane" else "point")
         case "odometry" if sequence.odometry_poses is None:
             raise ValueError(
                 f"{sequence.name}: has no odometry of its own (its odometry column repeats the corrected pose, or is "
@@ -175,9 +188,9 @@ def starting_poses(config: Config, task: Task) -> tuple[str, Floats]:
             )
         case "odometry":
             return name, sequence.odometry_poses
-        case _ if not Path(config.init).exists():
-            raise ValueError(f"--init {config.init}: no such file, and none of {', '.join(shared.START_NAMES)}")
-    return name, io.read_planar_poses(config.init, len(sequence), sequence.unit)
+        case _ if not Path(init).exists():
+            raise ValueError(f"--init {init}: no such file, and none of auto, {', '.join(shared.START_NAMES)}")
+    return name, io.read_planar_poses(init, len(log.whole), sequence.unit)[log.chosen]
 
 
 def fit_settings(config: Config, sequence: ScanSequence) -> DeepMappingConfig:
@@ -253,6 +266,9 @@ def report(unit: str, metrics: Mapping[str, Any]) -> str:
         f"kept: {metrics['kept']} (chosen by the scans alone)",
         f"{trust}: weakest connection {weakest:.0%} of the beams, {contradiction:.1%} contradict others",
     ]
+    if "num_relations" in metrics:
+        kinds = (f"{metrics[f'relations_initial_{kind}']:.3g} -> {metrics[f'relations_{kind}']:.3g}" for kind in UNITS)
+        lines.append(f"mean error of {metrics['num_relations']} hand-checked relations: {' m, '.join(kinds)} degrees")
     return "\n".join(lines)
 
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -109,6 +109,20 @@ class ScanSequence:
         """The selected scans with their poses and times; arrays are views where `selection` is a slice."""
         names = ("points", "mask", "reference_poses", "odometry_poses", "times")
         return replace(self, **_select(self, names, selection))
+
+
+class Relations(NamedTuple):
+    """Relative poses of a robot at pairs of times, checked by hand.
+
+    Attributes:
+        times_from: (r,) seconds.
+        times_to: (r,) seconds.
+        T_from_to: (r, 3) x, y in metres, heading; where the robot is at `times_to`, seen from `times_from`.
+    """
+
+    times_from: FloatArray
+    times_to: FloatArray
+    T_from_to: FloatArray
 
 
 def has_angular_order(points: NDArray[np.float32], mask: BoolArray) -> bool:

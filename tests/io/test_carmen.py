@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from dpmjax.io import InputError
-from dpmjax.io.carmen import read_carmen_log, scan_angles
+from dpmjax.io.carmen import read_carmen_log
+from dpmjax.io.carmen_lines import scan_angles
 
 
 def flaser(ranges, corrected=(0, 0, 0), odometry=(9, 9, 1), time=0.0):
@@ -59,6 +60,50 @@ def test_equal_columns_mean_no_odometry_and_equal_stamps_no_times(tmp_path):
     assert log.times is None
 
 
+def odom(pose, time):
+    return f"ODOM {' '.join(map(str, pose))} 0 0 0 {time} host {time}"
+
+
+def test_a_log_as_recorded_has_odometry_and_no_reference(tmp_path):
+    poses = [(0.1 * i, 2, 0.3) for i in range(5)]
+    lines = [flaser([1, 2], pose, pose, 1.0 + i) for i, pose in enumerate(poses)]
+    wheels = [odom(pose, 0.9 + i) for i, pose in enumerate(poses)]
+    log = read_carmen_log(write(tmp_path, *wheels, *lines))
+    assert log.reference_poses is None
+    np.testing.assert_allclose(log.odometry_poses, poses)
+    # Where the wheels say something else, or a SLAM program has written the log, the poses are corrected ones.
+    elsewhere = [odom((pose[0] + 5, *pose[1:]), 0.9 + i) for i, pose in enumerate(poses)]
+    for others in (elsewhere, [*wheels, "NEFF 30"]):
+        log = read_carmen_log(write(tmp_path, *others, *lines))
+        assert log.odometry_poses is None
+        np.testing.assert_allclose(log.reference_poses, poses)
+
+
+def robotlaser(ranges, laser, robot, time, start=-np.pi / 2, step=np.pi / 2):
+    head = ["ROBOTLASER1", 0, start, np.pi, step, 80.0, 0.01, 0, len(ranges), *ranges, 2, 7, 8]
+    return " ".join(map(str, [*head, *laser, *robot, 0, 0, 0.5, 0.5, 1e6, time, "host", time]))
+
+
+def test_newer_lines_tell_their_angles_and_the_pose_of_the_laser(tmp_path):
+    """The laser is 0.2 m ahead of the robot's centre."""
+    lines = [
+        robotlaser([1, 2, 3], (i + 0.2, 0, 0), (i, 0, 0), 1.0 + i, step=np.pi / 4 if i else np.pi / 2) for i in range(3)
+    ]
+    log = read_carmen_log(write(tmp_path, *lines))
+    np.testing.assert_allclose(log.points[0], [[0, -1], [2, 0], [0, 3]], atol=1e-6)
+    np.testing.assert_allclose(log.points[1][1], np.array([1, -1]) * np.sqrt(2), atol=1e-6)
+    assert log.reference_poses is None
+    np.testing.assert_allclose(log.odometry_poses, [[0.2, 0, 0], [1.2, 0, 0], [2.2, 0, 0]])
+    np.testing.assert_array_equal(log.times, [1, 2, 3])
+
+
+def test_corrected_newer_lines_have_reference_and_odometry(tmp_path):
+    lines = [robotlaser([1, 2, 3], (i, 0.1 * i * i, 0), (i, 0, 0), 1.0 + i) for i in range(3)]
+    log = read_carmen_log(write(tmp_path, *lines))
+    np.testing.assert_allclose(log.reference_poses[:, 1], [0, 0.1, 0.4])
+    np.testing.assert_allclose(np.diff(log.odometry_poses[:, 1]), 0, atol=1e-12)
+
+
 def test_no_echo_is_masked(tmp_path):
     path = write(tmp_path, flaser([1.0, 81.91, 0.0, 20.0]), flaser([2.0, 81.87, -1.0, 60.0]))
     np.testing.assert_array_equal(read_carmen_log(path).mask, [[1, 0, 0, 1], [1, 0, 0, 1]])
@@ -99,10 +144,12 @@ def test_bad_line_is_named_with_its_number(tmp_path, line, found):
 
 
 def test_logs_without_front_laser_are_refused(tmp_path):
-    with pytest.raises(InputError, match="no FLASER line"):
+    with pytest.raises(InputError, match="no FLASER and no ROBOTLASER1 line"):
         read_carmen_log(write(tmp_path))
-    with pytest.raises(InputError, match="ROBOTLASER1"):
+    with pytest.raises(InputError, match="a.log:5: not a ROBOTLASER1 line"):
         read_carmen_log(write(tmp_path, "ROBOTLASER1 0 1 2"))
+    with pytest.raises(InputError, match="not a ROBOTLASER1 line"):
+        read_carmen_log(write(tmp_path, "ROBOTLASER1 0 -1.5 3 1.5 80 0.01 0 4 1 2"))
     with pytest.raises(InputError, match="no such file"):
         read_carmen_log(tmp_path / "none.log")
     (tmp_path / "cut.log.gz").write_bytes(gzip.compress(b"FLASER 1 1" * 99)[:-12])
@@ -131,3 +178,11 @@ def test_published_logs_read_as_they_are_known(real_data, name, shape, has_odome
         true = np.linalg.norm(np.diff(log.reference_poses[:, :2], axis=0), axis=1)
         assert np.abs(step - true).max() < 1.0  # Entries of another moment were metres off.
         assert (np.diff(log.times) >= 0).all()
+
+
+@pytest.mark.parametrize(("name", "num_scans"), [("aces", 7374), ("intel", 13631), ("fr079", 4934)])
+def test_recorded_logs_have_odometry_and_no_reference(real_data, name, num_scans):
+    log = read_carmen_log(real_data / "carmen_raw" / f"{name}.clf.gz")
+    assert len(log) == num_scans
+    assert log.reference_poses is None
+    assert np.hypot(*np.diff(log.odometry_poses[:, :2], axis=0).T).max() < 0.5

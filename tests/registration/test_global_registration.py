@@ -15,7 +15,8 @@ from dpmjax.registration import GlobalConfig, PlanarScans, nearest_tour, planar_
 from dpmjax.registration.global_registration import _prior_between, _Task, find_unregistered, place_others
 from dpmjax.registration.map_assembly import PoseScorer, PositionPrior, add_up, assemble, move_blocks, weakest_cuts
 from dpmjax.registration.pair_search import Candidates, CorrelativeConfig, Hypotheses, agreeing_edges, search_pairs
-from dpmjax.registration.range_profiles import RangeProfiles, compare_pairs, make_profiles, view_similarity
+from dpmjax.registration.range_profiles import RangeProfiles, compare_pairs, make_profiles
+from dpmjax.registration.wall_directions import WallDirections
 from dpmjax.simulation import simulate_sequence
 
 # Coarse, so that a test takes a second: what is law does not depend on it.
@@ -166,7 +167,7 @@ def test_refinement_without_order_is_exact(truth) -> None:
 
 
 def task_of(profiles: RangeProfiles, keyframes: list[int], config: GlobalConfig = CONFIG) -> _Task:
-    return _Task(profiles, view_similarity(profiles), np.array(keyframes), False, config)
+    return _Task(profiles, WallDirections(profiles.scans), np.array(keyframes), False, config)
 
 
 def test_the_prior_of_scans_between_keyframes_is_between_them(profiles) -> None:

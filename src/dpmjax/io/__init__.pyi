@@ -1,8 +1,8 @@
-from .carmen import ScanSequence as ScanSequence
 from .clouds import read_pcd as read_pcd
 from .clouds import read_ply as read_ply
 from .clouds import write_pcd as write_pcd
 from .clouds import write_ply as write_ply
+from .deepmapping_folder import ScanSequence as ScanSequence
 from .deepmapping_folder import write_deepmapping_folder as write_deepmapping_folder
 from .depth import DepthSequence as DepthSequence
 from .depth import is_active_vision as is_active_vision
@@ -26,4 +26,5 @@ from .poses import read_poses as read_poses
 from .poses import write_kitti as write_kitti
 from .poses import write_poses_npy as write_poses_npy
 from .poses import write_tum as write_tum
+from .relations import read_relations as read_relations
 from .scans2d import read_sequence as read_sequence

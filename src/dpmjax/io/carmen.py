@@ -1,41 +1,34 @@
-"""CARMEN logs: planar scans of a front laser with the pose a SLAM program gave them and the robot's odometry.
+"""CARMEN logs: planar scans of a front laser, the robot's odometry, and the poses that a SLAM program gave them.
 
-A line is `FLASER n r1 .. rn x y theta odom_x odom_y odom_theta ipc_timestamp host timestamp`: ranges in metres over 180
-degrees from right to left, the corrected pose, the raw odometry. Other lines are ignored.
+A scan has two poses (`carmen_lines`). A log as recorded has both at the places of its ODOM lines: they are the raw
+odometry, and there is no reference. In a log that a SLAM program has corrected, the first pose is the reference and the
+second the raw odometry; where both are equal, the raw odometry is lost.
 
-Published logs have two faults. Some lines carry the time stamp and odometry of another moment: the time stamps are out
-of order there, and the odometry jumps by metres there and back. Those entries are interpolated. And where odometry
-equals the corrected pose throughout, the raw odometry is lost: the sequence has none.
+Some published logs have lines with the time stamp and odometry of another moment: the time stamps are out of order
+there, and the odometry jumps by metres there and back. Those entries are interpolated.
 """
 
 from __future__ import annotations
 
 import bisect
-import gzip
 import logging
-import zlib
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from dpmjax.io.files import read_bytes, refusing
-from dpmjax.sequences import FloatArray, ScanSequence, require
+from dpmjax.geometry import se2
+from dpmjax.io.carmen_lines import CarmenLines, ScanLine, read_carmen_lines
+from dpmjax.sequences import FloatArray, ScanSequence
 
 _log = logging.getLogger(__name__)
 _SHORTEST_SCALE_M = 7.9  # No laser of these logs has a shorter scale: a log that ends before has no code for "no echo".
-_LONGEST_RANGE_M, _LARGEST_NUMBER = 1e6, 1e18
+_LONGEST_RANGE_M = 1e6
+# Poses of a log as recorded are those of its ODOM lines, within the way from one such line to the next.
+_SAME_PLACE_M = 0.5
+# Equal poses, metres and radians.
+_SAME_POSE = 1e-4
 _CODE_BAND_M = 0.1  # Codes for "no echo" scatter by a few centimetres (81.87 to 81.91 m on a SICK LMS).
-
-
-class _Line(NamedTuple):
-    """One FLASER line: ranges, m; corrected pose, odometry (x, y, theta); time stamp, s."""
-
-    ranges: FloatArray
-    corrected: FloatArray
-    odometry: FloatArray
-    time: float
 
 
 def read_carmen_log(path: str | Path, *, max_range: float | None = None) -> ScanSequence:
@@ -48,75 +41,55 @@ def read_carmen_log(path: str | Path, *, max_range: float | None = None) -> Scan
             below are always masked.
 
     Returns:
-        The scans in metres; scans with fewer beams than the longest are padded with masked beams. The corrected poses
-        are the reference. No times where the log's stand still.
+        The scans in metres; scans with fewer beams than the longest are padded with masked beams. Poses are those of
+        the laser; the corrected ones are the reference. No times where the log's stand still.
 
     Raises:
-        InputError: the file cannot be read, has no FLASER line, or a FLASER line lacks values or holds words that
-            are no numbers.
+        InputError: the file cannot be read, has no FLASER and no ROBOTLASER1 line, or one lacks values or holds words
+            that are no numbers.
     """
-    lines = [_parse_line(words, f"{path}:{number}") for number, words in _flaser_lines(path)]
+    log = read_carmen_lines(path)
+    lines = log.scans
     capacity = max(len(line.ranges) for line in lines)
     points = np.zeros((len(lines), capacity, 2), np.float32)
     mask = np.zeros((len(lines), capacity), bool)
     limit = _no_echo_limit(lines) if max_range is None else max_range
     for row, valid, line in zip(points, mask, lines, strict=True):
         count = len(line.ranges)
-        angles = scan_angles(count)
         valid[:count] = (line.ranges > 0) & (line.ranges < min(limit, _LONGEST_RANGE_M))
         ranges = np.where(valid[:count], line.ranges, 0.0)
-        row[:count] = ranges[:, None] * np.column_stack([np.cos(angles), np.sin(angles)])
+        row[:count] = ranges[:, None] * np.column_stack([np.cos(line.angles), np.sin(line.angles)])
     points[~mask] = 0  # no -0.0
-    corrected, odometry = np.array([line.corrected for line in lines]), np.array([line.odometry for line in lines])
-    has_odometry = not np.allclose(corrected, odometry, atol=1e-6)
-    times, odometry = _repair(np.array([line.time for line in lines]), odometry, path)
-    name, raw = Path(path).name.split(".")[0], odometry if has_odometry else None
-    return ScanSequence(name, points, mask, "m", True, corrected, raw, times)
+    reference, odometry = _reference_and_odometry(log)
+    stamps = np.array([line.time for line in lines])
+    times, repaired = _repair(stamps, np.zeros((len(lines), 3)) if odometry is None else odometry, path)
+    raw = None if odometry is None else repaired
+    return ScanSequence(Path(path).name.split(".")[0], points, mask, "m", True, reference, raw, times)
 
 
-def scan_angles(num_beams: int) -> FloatArray:
-    """Directions of the beams of a scan over 180 degrees, from right to left.
-
-    An odd number of beams (181, 361) includes both ends; an even one (180, 360) has the step 180 / n and leaves out the
-    left end. Consecutive scans of real logs agree best this way.
-
-    Args:
-        num_beams: number of beams.
-
-    Returns:
-        (num_beams,) radians in the sensor frame, from -pi/2 upwards.
-    """
-    step = np.pi / max(num_beams - 1 if num_beams % 2 else num_beams, 1)
-    return -np.pi / 2 + step * np.arange(num_beams, dtype=np.float64)
+def _reference_and_odometry(log: CarmenLines) -> tuple[FloatArray | None, FloatArray | None]:
+    poses, odometry = np.array([line.pose for line in log.scans]), np.array([line.odometry for line in log.scans])
+    if log.is_newer:
+        # The second pose is that of the robot, on which the laser is fixed somewhere.
+        mounting = np.median(se2.relative(odometry, poses), axis=0)
+        odometry = np.asarray(se2.compose(odometry, np.broadcast_to(mounting, odometry.shape)))
+    are_equal = bool(np.abs(poses - odometry).max() < _SAME_POSE)
+    if not log.is_of_slam and ((are_equal and log.is_newer) or _is_at_wheels(log, poses)):
+        return None, odometry
+    return poses, None if are_equal else odometry
 
 
-def _flaser_lines(path: str | Path) -> list[tuple[int, list[str]]]:
-    """Line numbers and words of the FLASER lines."""
-    content = read_bytes(path)
-    with refusing(path, "cannot be unpacked ({error})", "copy the file again", (OSError, EOFError, zlib.error)):
-        text = (gzip.decompress(content) if content[:2] == b"\x1f\x8b" else content).decode("latin-1")
-    lines = text.splitlines()
-    found = [(number, line.split()) for number, line in enumerate(lines, 1) if line.startswith("FLASER")]
-    is_newer = any(line.startswith("ROBOTLASER1") for line in lines)
-    what = "ROBOTLASER1 lines but no FLASER line" if is_newer else "no FLASER line"
-    require(len(found) > 0, path, what, "give a CARMEN log with FLASER lines")
-    return found
+def _is_at_wheels(log: CarmenLines, poses: FloatArray) -> bool:
+    """Whether most poses lie where the ODOM line next in time is."""
+    if not len(log.odometry):
+        return False
+    ordered = log.odometry[np.argsort(log.odometry[:, 0], kind="stable")]
+    after = np.searchsorted(ordered[:, 0], [line.time for line in log.scans])
+    nearest = ordered[np.clip(after, 0, len(ordered) - 1)]
+    return float(np.median(np.hypot(*(nearest[:, 1:3] - poses[:, :2]).T))) < _SAME_PLACE_M
 
 
-def _parse_line(words: list[str], source: str) -> _Line:
-    advice = "a line reads FLASER n r1..rn x y theta odom_x odom_y odom_theta timestamp host timestamp"
-    with refusing(source, "not a FLASER line ({error})", advice, (ValueError, IndexError, OverflowError)):
-        count = int(words[1])
-        values = np.array(words[2 : 2 + count + 6], np.float64)
-        time = float(words[count + 8]) if len(words) > count + 8 else 0.0
-    found = f"{len(words) - 2} values after n = {count}, at least {count + 6} expected"
-    require(count >= 1 and len(values) >= count + 6, source, found, advice)
-    is_good = not np.isnan(values).any() and (np.abs([*values[count:], time]) < _LARGEST_NUMBER).all()
-    require(is_good, source, "NaN, infinite or huge values", "remove the line")
-    return _Line(values[:count], values[count : count + 3], values[count + 3 :], time)
-
-
-def _no_echo_limit(lines: list[_Line]) -> float:
+def _no_echo_limit(lines: list[ScanLine]) -> float:
     largest = max(float(line.ranges.max()) for line in lines)
     return largest - _CODE_BAND_M if largest >= _SHORTEST_SCALE_M else np.inf
 

@@ -105,7 +105,7 @@ def _detect(path: Path) -> str:
     if head[:6] == b"\x93NUMPY" or head[:2] == b"PK":
         return "arrays"
     found = "no known format" if head else "an empty file"
-    require(b"FLASER" in head, path, found, f"give {_FORMATS}")
+    require(b"FLASER" in head or b"ROBOTLASER1" in head, path, found, f"give {_FORMATS}")
     return "carmen"
 
 

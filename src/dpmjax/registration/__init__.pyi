@@ -9,5 +9,8 @@ from .planar_scans import PlanarScans as PlanarScans
 from .planar_scans import planar_scans as planar_scans
 from .quality import assess_trajectory as assess_trajectory
 from .quality import choose_trajectory as choose_trajectory
+from .recordings import align_between as align_between
+from .recordings import choose_by_motion as choose_by_motion
+from .recordings import fill_between as fill_between
 from .refinement import RefinementConfig as RefinementConfig
 from .refinement import refine as refine

@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 import scipy.sparse.csgraph
 import scipy.spatial
+from jaxtyping import Float
 from numpy.typing import NDArray
 
 from dpmjax.geometry import se2
@@ -30,13 +31,14 @@ from dpmjax.registration.pair_search import (
     search_pairs,
 )
 from dpmjax.registration.planar_scans import Floats, Indices, PlanarScans
-from dpmjax.registration.range_profiles import RangeProfiles, compare_pairs, make_profiles, view_similarity
+from dpmjax.registration.range_profiles import RangeProfiles, compare_pairs, make_profiles
+from dpmjax.registration.wall_directions import WallDirections
 
 # Every scan that is no keyframe is searched against the keyframes with the so many most similar views, and without an
 # order against so many scans with the most similar views ...
 _NUM_ANCHORS, _NUM_NEAREST_VIEWS = 2, 3
-# ... at so many headings, by similarity, and their neighbours.
-_NUM_LIKELY_TURNS = 3
+# ... around so many likely headings; and keyframes against each other around so many.
+_NUM_LIKELY_TURNS, _NUM_KEYFRAME_TURNS = 3, 6
 # Where there is an order, its heading is within this of a linear one between the keyframes around it, radians.
 _MAX_BEND = 0.7
 # A scan whose best neighbour matches less than this share of the usual beams is unregistered; scans are of one cluster
@@ -73,10 +75,10 @@ class GlobalRegistration(NamedTuple):
 
 
 class _Task(NamedTuple):
-    """The scans to be registered, the same for all stages; `similarity` is `view_similarity` of their profiles."""
+    """The scans to be registered, the same for all stages."""
 
     profiles: RangeProfiles
-    similarity: Floats
+    walls: WallDirections
     keyframes: Indices
     is_ordered: bool
     config: GlobalConfig
@@ -89,6 +91,10 @@ class _Task(NamedTuple):
     def search(self, source: Indices, target: Indices, turns: NDArray[np.bool_] | None = None) -> Candidates:
         """Candidates of pairs."""
         return search_pairs(self.profiles, source, target, self.config.search, turns=turns)
+
+    def likely_turns(self, source: Indices, target: Indices, num_peaks: int) -> NDArray[np.bool_]:
+        """Headings of T_target_source that the walls of both scans suggest."""
+        return self.walls.likely_turns(source, target, self.config.search.num_turns, num_peaks)
 
 
 def register_globally(scans: PlanarScans, config: GlobalConfig | None = None) -> GlobalRegistration:
@@ -103,11 +109,16 @@ def register_globally(scans: PlanarScans, config: GlobalConfig | None = None) ->
         GlobalRegistration.
     """
     config, profiles = config or GlobalConfig(), make_profiles(scans)
-    similarity, unit = view_similarity(profiles), scans.typical_range
-    keyframes = choose_keyframes(similarity.max(-1), config.max_keyframes, is_ordered=scans.is_ordered)
-    task = _Task(profiles, similarity, keyframes, scans.is_ordered, config)
+    walls, unit = WallDirections(scans), scans.typical_range
+    if scans.is_ordered:
+        keyframes = evenly_in_time(len(scans), config.max_keyframes)
+    else:
+        everyone = np.arange(len(scans))
+        keyframes = most_typical(walls.best_similarity(everyone, everyone), config.max_keyframes)
+    task = _Task(profiles, walls, keyframes, scans.is_ordered, config)
     first, second = np.tril_indices(len(keyframes), k=-1)
-    found = task.search(keyframes[first], keyframes[second])
+    pairs = keyframes[first], keyframes[second]
+    found = task.search(*pairs, task.likely_turns(*pairs, _NUM_KEYFRAME_TURNS))
     inside = found._replace(source=first, target=second)
     poses = np.zeros((len(scans), 3))
     poses[keyframes] = assemble(profiles.take(keyframes), inside, is_ordered=scans.is_ordered)
@@ -119,11 +130,14 @@ def register_globally(scans: PlanarScans, config: GlobalConfig | None = None) ->
     return GlobalRegistration(se2.relative(poses[0], poses), keyframes)
 
 
-def choose_keyframes(similarity: Floats, count: int, *, is_ordered: bool) -> Indices:
-    """Scans that cover the place: evenly in time where there is an order, else those most similar to all others."""
+def evenly_in_time(num_scans: int, count: int) -> Indices:
+    """At most `count` scans, the first and the last among them."""
+    return np.unique(np.round(np.linspace(0, num_scans - 1, min(num_scans, count))).astype(np.int64))
+
+
+def most_typical(similarity: Float[np.ndarray, "n n"], count: int) -> Indices:
+    """Scans that together are most similar to all others."""
     count = min(len(similarity), count)
-    if is_ordered:
-        return np.unique(np.round(np.linspace(0, len(similarity) - 1, count)).astype(np.int64))
     chosen: list[int] = []
     # Similarity of each scan to the most similar chosen one; each choice adds as much to that as it can.
     covered = np.full(len(similarity), -1.0)
@@ -173,27 +187,18 @@ def _search_others(task: _Task, poses: Floats) -> Candidates:
 
 def _similar_pairs(task: _Task) -> tuple[Indices, Indices, NDArray[np.bool_]]:
     """Pairs of similar views, of each other scan with keyframes and with any scans; and the turns to try for each."""
-    best, others = task.similarity.max(-1), task.others
-    order = np.argsort(-best[np.ix_(others, task.keyframes)], axis=1)[:, :_NUM_ANCHORS]
-    # Neighbours in time are better partners than any similar view.
-    num_views = 0 if task.is_ordered else _NUM_NEAREST_VIEWS
-    nearest_views = np.argsort(-(best - 2.0 * np.eye(len(best)))[others], axis=1)[:, :num_views]
-    pairs = np.concatenate([task.keyframes[order], nearest_views], axis=1)
+    others = task.others
+    order = np.argsort(-task.walls.best_similarity(others, task.keyframes), axis=1)[:, :_NUM_ANCHORS]
+    pairs = task.keyframes[order]
+    if not task.is_ordered:  # Neighbours in time are better partners than any similar view.
+        best = task.walls.best_similarity(others, np.arange(len(task.profiles)))
+        best[np.arange(len(others)), others] = -np.inf
+        pairs = np.concatenate([pairs, np.argsort(-best, axis=1)[:, :_NUM_NEAREST_VIEWS]], axis=1)
     # Each pair once, with one scan that is turned for all its partners.
     ends = np.stack([pairs.reshape(-1), np.repeat(others, pairs.shape[1])], axis=-1)
     _, first = np.unique(np.sort(ends, axis=1), axis=0, return_index=True)
     source, target = ends[np.sort(first)].T
-    # T_target_source of a keyframe in the frame of the other scan.
-    curve = task.similarity[target, source]
-    num_turns, count = task.config.search.num_turns, curve.shape[-1]
-    turns = np.zeros((len(source), num_turns), bool)
-    row = np.arange(len(source))[:, None]
-    for _ in range(_NUM_LIKELY_TURNS):
-        peak = curve.argmax(axis=1)[:, None]
-        middle = np.round(peak * num_turns / count).astype(int)
-        turns[row, (middle + np.arange(-2, 3)) % num_turns] = True
-        curve[row, (peak + np.arange(-6, 7)) % count] = -np.inf
-    return source, target, turns
+    return source, target, task.likely_turns(source, target, _NUM_LIKELY_TURNS)
 
 
 def _neighbour_pairs(task: _Task, headings: Floats) -> tuple[Indices, Indices, NDArray[np.bool_]]:
@@ -234,7 +239,7 @@ def place_others(task: _Task, poses: Floats, found: Candidates, more: Candidates
         if not len(lost):
             break
         # Similarity has misled these, so all turns are tried, with the partners of the most similar views.
-        similarity = np.where(lost[:, None] == partners, -np.inf, task.similarity[np.ix_(lost, partners)].max(-1))
+        similarity = np.where(lost[:, None] == partners, -np.inf, task.walls.best_similarity(lost, partners))
         order = np.argsort(-similarity, axis=1, kind="stable")[:, : len(task.keyframes)]
         source, target = partners[order].reshape(-1), np.repeat(lost, order.shape[1])
         is_pair = source != target

@@ -11,7 +11,7 @@ import scipy.sparse.csgraph
 from dpmjax.geometry import se2
 from dpmjax.registration.pair_alignment import COARSE, FINE, Metric, PairMatches, PosePrior, match_pairs
 from dpmjax.registration.planar_scans import Floats, Indices, PlanarScans
-from dpmjax.registration.range_profiles import RangeProfiles, compare_pairs, make_profiles
+from dpmjax.registration.range_profiles import contradicted_share, make_profiles
 
 # Share of the typical range that a coarse match is off by; and that of a direction that the scans leave open.
 _COARSE_RESIDUAL = 0.015
@@ -144,12 +144,6 @@ def _predict_open_steps(matches: PairMatches, typical_range: float) -> PosePrior
             spread = 1.4826 * np.median(np.abs(alike[:, :2] - mean[row, :2]), axis=0) / typical_range
             information[row, :2] = (_COARSE_RESIDUAL / (spread + 0.015)) ** 2
     return PosePrior(mean, information)
-
-
-def contradicted_share(profiles: RangeProfiles, source: Indices, target: Indices, poses: Floats) -> Floats:
-    """(p,) share of the visible beams of two scans that contradict each other; of few beams a low one."""
-    views = compare_pairs(profiles, source, target, poses, stride=1)
-    return np.asarray(views.contradicted, np.float64) / np.maximum(np.asarray(views.visible, np.float64), 20.0)
 
 
 def _bridge_bad_scans(scans: PlanarScans, steps: PairMatches, metric: Metric) -> Floats:

@@ -30,10 +30,6 @@ _MAX_AVERTED = 0.1
 _ARCTANGENT = (-0.01171913, 0.05264734, -0.11642647, 0.19354037, -0.33262283, 0.99997722)
 # Bearings of a profile.
 _NUM_BEARINGS = 512
-# Bearings at which profiles are compared for similarity.
-_SIMILARITY_BEARINGS = 128
-# Ranges below this part of the typical range count about alike in similarity.
-_NEAR_RANGE = 0.15
 # Pairs that are compared at a time, all batches of one shape; many calls have but a few hundred.
 _BATCH = 256
 
@@ -207,21 +203,7 @@ def compare_pairs(
     return ViewComparison(*result)
 
 
-def view_similarity(profiles: RangeProfiles) -> Floats:
-    """Correlation of the range profiles of all pairs of scans at all turns, -1 to 1, by FFT.
-
-    Args:
-        profiles: n scans.
-
-    Returns:
-        (n, n, 128); turn k of pair (i, j) is the heading 2 pi k / 128 of T_i_j.
-    """
-    stride = profiles.surface.shape[1] // _SIMILARITY_BEARINGS
-    ranges = np.asarray(profiles.surface, np.float64).reshape(-1, _SIMILARITY_BEARINGS, stride).mean(-1)
-    # Near surfaces move most between two views of one place, so far ones are worth less.
-    seen = np.asarray(profiles.is_seen).reshape(-1, _SIMILARITY_BEARINGS, stride).any(-1)
-    view = np.where(seen, np.log1p(ranges / (_NEAR_RANGE * profiles.scans.typical_range)), 0.0)
-    view = view - view.mean(axis=1, keepdims=True)
-    view /= np.maximum(np.linalg.norm(view, axis=1, keepdims=True), 1e-9)
-    spectrum = np.fft.rfft(view, axis=1)
-    return np.fft.irfft(spectrum[:, None] * np.conj(spectrum[None]), n=_SIMILARITY_BEARINGS, axis=-1)
+def contradicted_share(profiles: RangeProfiles, source: Indices, target: Indices, poses: Floats) -> Floats:
+    """(p,) share of the visible beams of two scans that contradict each other; of few beams a low one."""
+    views = compare_pairs(profiles, source, target, poses, stride=1)
+    return np.asarray(views.contradicted, np.float64) / np.maximum(np.asarray(views.visible, np.float64), 20.0)

@@ -1,0 +1,129 @@
+"""Whole recordings: the scans that are registered, and poses for all the others.
+
+A robot's log has thousands of scans, most of them a hand's breadth from the one before. Only those are registered that
+lie some way or turn apart. Each other scan follows the odometry between the two around it, and is then aligned with the
+nearer one of them.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Float
+
+from dpmjax.checks import require_positive
+from dpmjax.geometry import se2
+from dpmjax.registration.pair_alignment import FINE, PosePrior, match_pairs
+from dpmjax.registration.planar_scans import Floats, Indices, PlanarScans
+from dpmjax.registration.range_profiles import contradicted_share, make_profiles
+
+# Standard deviation of odometry from one chosen scan to the next: translation in typical ranges, radians.
+_ODOMETRY_SIGMA = (0.005, 0.01)
+# A scan keeps to odometry where a lower share of its beams fits, or where more of them contradict the chosen scan.
+_MIN_FITNESS, _MAX_CONTRADICTED = 0.5, 0.05
+# Scans that are aligned at a time.
+_BLOCK = 1024
+
+
+def choose_by_motion(odometry: Float[np.ndarray, "n 3"], min_distance: float, min_turn: float) -> Indices:
+    """Chooses scans that lie apart; a robot that stands still adds none.
+
+    Args:
+        odometry: poses x, y, heading of all scans, in the order of time.
+        min_distance: a scan is chosen where it lies at least so far from the one chosen before ...
+        min_turn: ... or is turned at least so far against it, radians.
+
+    Returns:
+        Rows of the chosen scans in order; the first and the last scan are among them.
+
+    Raises:
+        ValueError: if there is no scan, or if a limit is not positive.
+    """
+    require_positive("min_distance", min_distance)
+    require_positive("min_turn", min_turn)
+    if len(odometry) == 0:
+        raise ValueError("odometry: expected at least one pose, got none")
+    chosen = [0]
+    for row in range(1, len(odometry)):
+        x, y, heading = odometry[row] - odometry[chosen[-1]]
+        if np.hypot(x, y) >= min_distance or abs(se2.wrap_angle(heading)) >= min_turn:
+            chosen.append(row)
+    if chosen[-1] != len(odometry) - 1:
+        chosen.append(len(odometry) - 1)
+    return np.array(chosen, np.int64)
+
+
+def fill_between(chosen: Indices, poses: Float[np.ndarray, "k 3"], odometry: Float[np.ndarray, "n 3"]) -> Floats:
+    """Returns poses of all scans: those of the chosen ones, and odometry in between, corrected at both ends.
+
+    What odometry is off by at the next chosen scan is spread over the scans before it, in proportion to the way and the
+    turns until there.
+
+    Args:
+        chosen: rows of k scans in order, the first and the last scan among them.
+        poses: T_world_scan of these, x, y, heading.
+        odometry: of all n scans.
+
+    Returns:
+        (n, 3) T_world_scan; the given ones at `chosen`, to rounding.
+
+    Raises:
+        ValueError: if the rows do not begin at the first scan, end at the last one, and increase.
+    """
+    if chosen[0] != 0 or chosen[-1] != len(odometry) - 1 or (np.diff(chosen) < 1).any():
+        raise ValueError(f"chosen: expected increasing rows from 0 to {len(odometry) - 1}")
+    before = np.clip(np.searchsorted(chosen, np.arange(len(odometry)), side="right") - 1, 0, max(len(chosen) - 2, 0))
+    after = np.minimum(before + 1, len(chosen) - 1)
+    start, end = chosen[before], chosen[after]
+    # All in the frame of the chosen scan before: where odometry puts the next one, and how far off that is.
+    T_before_after = se2.relative(odometry[start], odometry[end])
+    error = se2.relative(T_before_after, se2.relative(poses[before], poses[after]))
+    part = _exp(_share_of_way(odometry, start, end)[:, None] * np.asarray(se2.log(error), np.float64))
+    correction = se2.compose(se2.compose(T_before_after, part), se2.inverse(T_before_after))
+    T_before_scan = se2.compose(correction, se2.relative(odometry[start], odometry))
+    filled = np.asarray(se2.compose(poses[before], T_before_scan), np.float64)
+    filled[chosen] = poses
+    return filled
+
+
+def align_between(scans: PlanarScans, chosen: Indices, poses: Float[np.ndarray, "n 3"]) -> Floats:
+    """Aligns each scan with the nearest one of the chosen scans before and after it, point to line.
+
+    Args:
+        scans: n scans in the order of time.
+        chosen: rows of k scans in order, the first and the last scan among them.
+        poses: T_world_scan of all scans, right at `chosen`, as `fill_between` makes them.
+
+    Returns:
+        (n, 3) T_world_scan; those at `chosen`, and of scans that fit badly, as they were.
+    """
+    aligned = poses.copy()
+    others = np.setdiff1d(np.arange(len(poses)), chosen)
+    after = np.searchsorted(chosen, others)
+    ends = np.stack([chosen[after - 1], chosen[after]])
+    apart = np.abs(se2.relative(poses[ends], poses[others]))
+    nearest = np.take_along_axis(ends, (apart @ [1.0, 1.0, scans.typical_range]).argmin(axis=0)[None], axis=0)[0]
+    sigma = np.array(_ODOMETRY_SIGMA)[[0, 0, 1]] * [scans.typical_range, scans.typical_range, 1.0]
+    information = (3.0 * scans.noise / sigma) ** 2
+    for start in range(0, len(others), _BLOCK):
+        source, target = others[start : start + _BLOCK], nearest[start : start + _BLOCK]
+        expected = np.asarray(se2.relative(poses[target], poses[source]))
+        prior = PosePrior(expected, np.broadcast_to(information, expected.shape))
+        found = match_pairs(scans.take(source), scans.take(target), expected[:, None], FINE, prior)
+        both = np.concatenate([source, target])
+        profiles, rows = make_profiles(scans.take(both)), np.arange(len(source))
+        contradicted = contradicted_share(profiles, rows, len(source) + rows, found.poses)
+        fits = (found.fitness > _MIN_FITNESS) & (contradicted < _MAX_CONTRADICTED)
+        aligned[source[fits]] = se2.compose(poses[target], found.poses)[fits]
+    return aligned
+
+
+def _share_of_way(odometry: Floats, start: Indices, end: Indices) -> Floats:
+    """Returns how much of the way from `start` to `end` each scan has behind it; turns count as a metre a radian."""
+    steps = se2.relative(odometry[:-1], odometry[1:])
+    lengths = np.hypot(steps[:, 0], steps[:, 1]) + np.abs(se2.wrap_angle(steps[:, 2])) + 1e-9
+    way = np.append(0.0, np.cumsum(lengths))
+    return np.asarray((way - way[start]) / np.maximum(way[end] - way[start], 1e-9), np.float64)
+
+
+def _exp(tangent: Floats) -> Floats:
+    return np.asarray(se2.from_matrix(np.asarray(se2.exp(tangent), np.float64)), np.float64)
