@@ -25,7 +25,7 @@ ALLOWED: dict[str, set[str]] = {
     "deeppointmap": {"geometry", "nets", "losses", "scans", "metrics"},
     "slam": {"deeppointmap", "registration", "pose_graph", "geometry", "scans", "deepmapping"},
     "metrics": {"geometry"},
-    "io": {"geometry", "pose_graph"},
+    "io": {"geometry", "pose_graph", "scans", "deeppointmap", "slam", "weights"},
     "simulation": {"geometry"},
     "viz": {"geometry"},
     "weights": {"geometry", "nets", "deeppointmap"},

@@ -21,6 +21,8 @@ from .geometry.sampling import farthest_point_sample as farthest_point_sample
 from .geometry.sampling import voxel_sample as voxel_sample
 from .io.g2o import read_g2o as read_g2o
 from .io.g2o import write_g2o as write_g2o
+from .io.maps import load_map as load_map
+from .io.maps import save_map as save_map
 from .losses.descriptors import info_nce as info_nce
 from .losses.mapping import chamfer_distance as chamfer_distance
 from .losses.mapping import occupancy_loss as occupancy_loss
@@ -35,6 +37,9 @@ from .pose_graph.optimize import PoseGraphConfig as PoseGraphConfig
 from .pose_graph.optimize import optimize_pose_graph as optimize_pose_graph
 from .registration.icp import icp as icp
 from .slam.config import SlamConfig as SlamConfig
+from .slam.keyframes import KeyframeMap as KeyframeMap
+from .slam.localization import Localization as Localization
+from .slam.localization import localize as localize
 from .slam.system import SlamResult as SlamResult
 from .slam.system import run_slam as run_slam
 from .types import DescriptorCloud as DescriptorCloud

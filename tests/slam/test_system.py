@@ -147,3 +147,30 @@ def test_a_scan_of_another_shape_is_refused(as_user) -> None:
         step_slam(methods, init_slam(), np.zeros((5, 4)))
     with pytest.raises(ValueError, match="config: expected None"):
         run_slam([], methods, CONFIG)
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_a_map_is_extended_by_a_later_drive(seed) -> None:
+    # The second drive begins elsewhere and meets the first one on its way.
+    truth = laps(2, side_m=60.0, step_m=2.0)
+    methods = SlamMethods(TruthMatcher(truth, seed=seed), TruthGeometry(truth, seed=seed), CONFIG)
+    first = run_slam(scans_of(range(70)), methods)
+    second = run_slam(scans_of(range(90, 200)), methods, map_=first.state.slam_map)
+    assert [report.scan for report in second.reports][:2] == [69, 70]
+    assert second.reports[0].status == "first"
+    assert second.T_world_scan.shape == (110, 4, 4)
+    expected = (rigid.inverse(truth[0]) @ truth[90:200])[:, :3, 3]
+    apart = np.linalg.norm(second.T_world_scan[:, :3, 3] - expected, axis=1)
+    assert apart.max() < 1.0
+    # The first part keeps its frame and its loops.
+    rows = len(first.keyframes)
+    kept = second.state.slam_map.T_world_keyframe[:rows, :3, 3] - first.state.slam_map.T_world_keyframe[:, :3, 3]
+    assert np.abs(kept).max() < 0.5
+
+
+def test_a_map_of_other_weights_is_refused(as_user) -> None:
+    truth = laps(1, side_m=20.0)
+    first = run(truth, range(10))
+    other = SlamMethods(TruthMatcher(truth, fingerprint="other"), TruthGeometry(truth), CONFIG)
+    with pytest.raises(ValueError, match="map_: made with weights truth, these are other"):
+        run_slam(scans_of([0]), other, map_=first.state.slam_map)

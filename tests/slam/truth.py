@@ -102,6 +102,7 @@ class TruthMatcher:
     sigma_rad: float = 0.01
     seed: int = 0
     reach_m: float = 15.0
+    fingerprint: str = "truth"
 
     def describe(self, points: np.ndarray, measured: int) -> int:
         return measured

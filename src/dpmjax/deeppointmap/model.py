@@ -5,6 +5,7 @@ All functions take one scan or one pair; `vmap` over the clouds batches them.
 
 from __future__ import annotations
 
+import hashlib
 from typing import Any
 
 import flax.struct
@@ -78,6 +79,22 @@ def model_shapes(config: ModelConfig) -> dict[str, Any]:
     encoder = jax.eval_shape(_encoder(config).init, key, pyramid)
     decoder = jax.eval_shape(DescriptorDecoder(config.decoder).init, key, cloud, cloud)
     return {"encoder": encoder["params"], "decoder": decoder["params"]}
+
+
+def model_fingerprint(model: Model) -> str:
+    """Identifies the parameters of a model.
+
+    Args:
+        model: the model.
+
+    Returns:
+        The first 16 hexadecimal digits of a hash of all parameters in float32, the same on every machine.
+    """
+    digest = hashlib.sha256()
+    for path, leaf in jax.tree_util.tree_leaves_with_path(jax.device_get(model.params)):
+        digest.update(jax.tree_util.keystr(path).encode())
+        digest.update(np.ascontiguousarray(leaf, "<f4").tobytes())
+    return digest.hexdigest()[:16]
 
 
 @jax.jit

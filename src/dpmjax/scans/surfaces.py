@@ -85,9 +85,29 @@ def scan_surface(points: Float[np.ndarray, "n 3"], config: SurfaceConfig = Surfa
         is_within = (squared >= config.min_range_m**2) & (squared <= config.max_range_m**2)
     points = points.take(np.flatnonzero(is_within), axis=0)
     points = points[first_of_each_voxel(points, config.voxel_size_m)].astype(np.float64)
-    tree = cKDTree(points, leafsize=16, balanced_tree=False, compact_nodes=False)
+    tree = _tree(points)
     normals, flatness = _normals(points, tree, config)
     return Surface(points, normals, flatness, _samples(normals, flatness), tree)
+
+
+def surface_of_points(
+    points: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"], flatness: Float[np.ndarray, " n"]
+) -> Surface:
+    """Makes a surface of points whose normals are known.
+
+    Args:
+        points: metres, in the frame of the lidar.
+        normals: unit normals.
+        flatness: of their neighbourhoods.
+
+    Returns:
+        The surface, with samples and tree.
+    """
+    return Surface(points, normals, flatness, _samples(normals, flatness), _tree(points))
+
+
+def _tree(points: Float[np.ndarray, "n 3"]) -> cKDTree:
+    return cKDTree(points, leafsize=16, balanced_tree=False, compact_nodes=False)
 
 
 def _normals(

@@ -7,6 +7,11 @@ from .config import OdometryConfig as OdometryConfig
 from .config import SlamConfig as SlamConfig
 from .keyframes import KeyframeMap as KeyframeMap
 from .keyframes import Submap as Submap
+from .localization import Localization as Localization
+from .localization import LocalizationConfig as LocalizationConfig
+from .localization import localize as localize
+from .localization import localize_each as localize_each
+from .map_thinning import thin_map as thin_map
 from .matcher import Match as Match
 from .matcher import Matcher as Matcher
 from .matcher import NetworkMatcher as NetworkMatcher

@@ -25,16 +25,20 @@ from dpmjax.slam.keyframes import (
     orthonormal,
     submap_around,
     turn_rad,
+    with_origin,
 )
 from dpmjax.slam.methods import SlamMethods
 from dpmjax.slam.reports import ScanReport, ScanStatus
+
+UNKNOWN_M = 1000.0
+"""Standard deviation of a place that nothing is known of."""
 
 
 class FrontEndState(NamedTuple):
     """What the next scan needs of those before. The frame is that of the last keyframe.
 
     Attributes:
-        num_scans: number of scans so far.
+        num_scans: number of scans so far, those of a loaded map among them.
         local_map: recent scans; None before the first.
         T_keyframe_last: pose of the last scan.
         T_before_last: its motion since the scan before.
@@ -87,8 +91,9 @@ def step(
     measured = methods.geometry.measure(points)
     if measured is None:
         return _pass_over(state, slam_map)
-    if len(slam_map) == 0:
-        located = Located(np.eye(4), "first", "the map begins here", 1.0, np.eye(6))
+    if state.local_map is None:
+        reason = "a new part of the map begins here" if len(slam_map) else "the map begins here"
+        located = Located(np.eye(4), "first", reason, 1.0, diagonal_information(UNKNOWN_M, np.pi))
         return _make_keyframe(methods, state, slam_map, Scan(points, measured), located)
     located = _locate(methods, state, slam_map, Scan(points, measured))
     # The next prediction uses this pose three times, so a rounding error would triple from scan to scan.
@@ -154,7 +159,8 @@ def _make_keyframe(
     methods: SlamMethods, state: FrontEndState, slam_map: KeyframeMap, scan: Scan, located: Located
 ) -> tuple[FrontEndState, KeyframeMap, ScanReport]:
     matcher, geometry, T = methods.matcher, methods.geometry, located.T_keyframe_scan
-    row, is_guess = len(slam_map), located.status == "restarted"
+    row = len(slam_map)
+    is_guess = row > 0 and located.status in ("first", "restarted")
     description = matcher.describe(scan.points, scan.measured)
     T_odometry, T_world, path_m, segment, edge = T, T, 0.0, 0, None
     if row:
@@ -164,6 +170,7 @@ def _make_keyframe(
         kind: EdgeKind = "guess" if is_guess else "odometry"
         edge = MapEdge(row, row - 1, T, located.information, kind)
     keyframe = Keyframe(state.num_scans, T_odometry, path_m, segment, geometry.extent_m(scan.measured), description)
+    slam_map = with_origin(slam_map, methods.origin)
     slam_map = add_keyframe(slam_map, keyframe, T_world, matcher.vector(description), edge)
     after = _advanced(methods, state, located, scan.measured)
     if is_guess or row == 0:

@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import scipy.sparse as sp
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from scipy.spatial.transform import Rotation
 
 from dpmjax.geometry import rigid
 from dpmjax.pose_graph.graph import Edges, PoseGraph
+from dpmjax.slam.config import MapOrigin
 
 Pose = Float[np.ndarray, "4 4"]
 EdgeKind = Literal["odometry", "loop", "guess"]
@@ -65,12 +66,14 @@ class KeyframeMap:
         T_world_keyframe: (k, 4, 4) float64, corrected by loops.
         vectors: (k, c) unit vectors for retrieval, float32.
         edges: all relative poses.
+        origin: what made it; None for an empty map.
     """
 
     keyframes: tuple[Keyframe, ...] = ()
     T_world_keyframe: Float[np.ndarray, "k 4 4"] = field(default_factory=lambda: np.zeros((0, 4, 4)))
     vectors: Float[np.ndarray, "k c"] = field(default_factory=lambda: np.zeros((0, 0), np.float32))
     edges: tuple[MapEdge, ...] = ()
+    origin: MapOrigin | None = None
 
     def __len__(self) -> int:
         return len(self.keyframes)
@@ -108,12 +111,33 @@ def add_keyframe(
         The map after.
     """
     unit = np.asarray(vector, np.float32)[None] / np.float32(max(float(np.linalg.norm(vector)), 1e-12))
-    return KeyframeMap(
-        (*slam_map.keyframes, keyframe),
-        np.concatenate([slam_map.T_world_keyframe, T_world_keyframe[None]]),
-        np.concatenate([slam_map.vectors.reshape(len(slam_map), -1 if len(slam_map) else unit.shape[1]), unit]),
-        slam_map.edges if edge is None else (*slam_map.edges, edge),
+    return replace(
+        slam_map,
+        keyframes=(*slam_map.keyframes, keyframe),
+        T_world_keyframe=np.concatenate([slam_map.T_world_keyframe, T_world_keyframe[None]]),
+        vectors=np.concatenate([slam_map.vectors.reshape(len(slam_map), -1 if len(slam_map) else unit.shape[1]), unit]),
+        edges=slam_map.edges if edge is None else (*slam_map.edges, edge),
     )
+
+
+def with_origin(slam_map: KeyframeMap, origin: MapOrigin) -> KeyframeMap:
+    """Notes what makes a map; one that another matcher has made is refused.
+
+    Args:
+        slam_map: the map.
+        origin: what is about to read or extend it.
+
+    Returns:
+        The map after.
+
+    Raises:
+        ValueError: if its descriptions are those of another matcher.
+    """
+    made_by = slam_map.origin
+    if made_by is not None and made_by.fingerprint != origin.fingerprint:
+        advice = "load the weights that made the map, or map again"
+        raise ValueError(f"map_: made with weights {made_by}, these are {origin}; {advice}")
+    return replace(slam_map, origin=origin)
 
 
 def with_edges(slam_map: KeyframeMap, edges: Iterable[MapEdge]) -> KeyframeMap:
@@ -171,6 +195,21 @@ def graph_steps(slam_map: KeyframeMap, row: int, max_steps: int) -> Float[np.nda
     joined = sp.coo_array((np.ones(len(sources)), (sources, targets)), (len(slam_map), len(slam_map))).tocsr()
     found = sp.csgraph.dijkstra(joined, directed=False, indices=[row], unweighted=True, limit=max_steps)
     return np.asarray(found)[0]
+
+
+def connected_parts(num_keyframes: int, edges: Sequence[MapEdge]) -> Int[np.ndarray, " k"]:
+    """Numbers the connected parts of a graph.
+
+    Args:
+        num_keyframes: number of nodes.
+        edges: what joins them.
+
+    Returns:
+        The number of the part of each keyframe.
+    """
+    rows = np.array([(edge.source, edge.target) for edge in edges], np.int64).reshape(-1, 2).T
+    joined = sp.coo_array((np.ones(rows.shape[1]), (rows[0], rows[1])), (num_keyframes, num_keyframes))
+    return np.asarray(sp.csgraph.connected_components(joined, directed=False)[1], np.int64)
 
 
 def submap_around(slam_map: KeyframeMap, row: int, num_keyframes: int, radius_m: float) -> Submap:

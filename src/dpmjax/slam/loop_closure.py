@@ -9,7 +9,6 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-import scipy.sparse as sp
 
 from dpmjax.geometry import rigid
 from dpmjax.pose_graph.optimize import PoseGraphConfig, optimize_pose_graph
@@ -18,6 +17,7 @@ from dpmjax.slam.keyframes import (
     KeyframeMap,
     MapEdge,
     as_pose_graph,
+    connected_parts,
     diagonal_information,
     submap_around,
     turn_rad,
@@ -45,6 +45,20 @@ class LoopState(NamedTuple):
     loops: tuple[Loop, ...] = ()
     num_optimized: int = 0
     is_stale: bool = False
+
+
+def loops_of_map(slam_map: KeyframeMap) -> LoopState:
+    """Lists the loops that an earlier run has accepted, so that they can still be taken back.
+
+    Args:
+        slam_map: of the earlier run.
+
+    Returns:
+        The loops.
+    """
+    edges = [edge for edge in slam_map.edges if edge.kind == "loop"]
+    loops = (Loop(e.source, e.target, "map", "accepted", 1.0, T_target_source=e.T_target_source) for e in edges)
+    return LoopState(tuple(loops), len(slam_map), False)
 
 
 def close_loops(methods: SlamMethods, slam_map: KeyframeMap, state: LoopState) -> tuple[KeyframeMap, LoopState]:
@@ -94,7 +108,7 @@ def optimize_map(slam_map: KeyframeMap, state: LoopState, config: LoopClosureCon
     information = diagonal_information(config.sigma_m, config.sigma_rad)
     accepted = [number for number, loop in enumerate(state.loops) if loop.status == "accepted"]
     edges = [_loop_edge(state.loops[number], information) for number in accepted]
-    part = _parts(len(slam_map), [*measured, *edges])
+    part = connected_parts(len(slam_map), [*measured, *edges])
     guesses = [edge for edge in slam_map.edges if edge.kind == "guess"]
     held = [edge for edge in guesses if part[edge.source] != part[edge.target]]
     graph = as_pose_graph(with_edges(slam_map, [*edges, *measured, *held]))
@@ -245,10 +259,3 @@ def _loop_edge(loop: Loop, information: np.ndarray) -> MapEdge:
     if loop.T_target_source is None:
         raise ValueError("loop: expected a registered one, got a candidate")
     return MapEdge(loop.source, loop.target, loop.T_target_source, information, "loop")
-
-
-def _parts(num_keyframes: int, edges: list[MapEdge]) -> np.ndarray:
-    """Returns the number of the connected part of each keyframe."""
-    rows = np.array([(edge.source, edge.target) for edge in edges], np.int64).reshape(-1, 2).T
-    joined = sp.coo_matrix((np.ones(rows.shape[1]), (rows[0], rows[1])), (num_keyframes, num_keyframes))
-    return np.asarray(sp.csgraph.connected_components(joined, directed=False)[1])

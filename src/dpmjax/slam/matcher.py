@@ -12,9 +12,10 @@ import numpy as np
 from jaxtyping import Float
 
 from dpmjax.deeppointmap.batches import overlap_pairs
+from dpmjax.deeppointmap.compact_scans import CompactScan, compact_scan, expand_scan
 from dpmjax.deeppointmap.encoding import encode
 from dpmjax.deeppointmap.matching import merge_clouds
-from dpmjax.deeppointmap.model import Model
+from dpmjax.deeppointmap.model import Model, model_fingerprint
 from dpmjax.deeppointmap.scan_registration import PreparedScan, register_each
 from dpmjax.deeppointmap.verification import MeasuredScan
 from dpmjax.slam.keyframes import Pose, Submap
@@ -39,7 +40,14 @@ class Match(NamedTuple):
 
 
 class Matcher(Protocol):
-    """Recognises places and registers scans and maps without a first guess."""
+    """Recognises places and registers scans and maps without a first guess.
+
+    Attributes:
+        fingerprint: descriptions are compared only with those of a matcher of the same fingerprint.
+    """
+
+    @property
+    def fingerprint(self) -> str: ...  # noqa: D102
 
     def describe(self, points: Float[np.ndarray, "n 3"], measured: Any) -> Any:
         """Prepares a scan for any number of registrations.
@@ -97,20 +105,21 @@ class NetworkMatcher:
 
     def __init__(self, model: Model) -> None:
         self._model = model
+        self.fingerprint = model_fingerprint(model)
 
-    def describe(self, points: Float[np.ndarray, "n 3"], measured: MeasuredScan) -> PreparedScan:
-        """Encodes a scan; see `Matcher`.
+    def describe(self, points: Float[np.ndarray, "n 3"], measured: MeasuredScan) -> CompactScan:
+        """Encodes a scan, and keeps of it what a map needs; see `Matcher`.
 
         Args:
             points: metres, in the frame of the lidar.
             measured: surface and free space of the scan.
 
         Returns:
-            The prepared scan.
+            The compact scan.
         """
-        return PreparedScan(jax.device_get(encode(self._model, points)), measured)
+        return compact_scan(jax.device_get(encode(self._model, points)), measured)
 
-    def vector(self, description: PreparedScan) -> Float[np.ndarray, " c"]:
+    def vector(self, description: CompactScan) -> Float[np.ndarray, " c"]:
         """Pools the descriptors; see `Matcher`.
 
         Args:
@@ -142,22 +151,23 @@ class NetworkMatcher:
             for match in found
         ]
 
-    def overlaps(self, source: PreparedScan, targets: Sequence[PreparedScan]) -> Float[np.ndarray, " n"]:
+    def overlaps(self, source: CompactScan, targets: Sequence[CompactScan]) -> Float[np.ndarray, " n"]:
         """Asks the overlap head; see `Matcher`.
 
         Args:
-            source: a prepared scan.
+            source: a scan.
             targets: the others.
 
         Returns:
             The probabilities.
         """
-        return np.asarray(overlap_pairs(self._model, [source] * len(targets), targets))
+        clouds = [target.descriptors for target in targets]
+        return np.asarray(overlap_pairs(self._model, [source.descriptors] * len(targets), clouds))
 
 
 def _merged(submap: Submap) -> PreparedScan:
     """Merges descriptors; the number of scans is filled up to a power of two, so that few programs are compiled."""
-    first: PreparedScan = submap.descriptions[0]
+    first = expand_scan(submap.descriptions[0])
     num = len(submap.descriptions)
     if num == 1:
         return first

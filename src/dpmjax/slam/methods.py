@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 from dpmjax.slam.alignment import Geometry
-from dpmjax.slam.config import SlamConfig
+from dpmjax.slam.config import MapOrigin, SlamConfig
 from dpmjax.slam.matcher import Matcher
 
 
@@ -16,8 +16,15 @@ class SlamMethods(NamedTuple):
         matcher: recognises places and registers scans without a first guess.
         geometry: aligns a scan with recent ones.
         config: settings of all stages.
+        weights: name of the weights, noted in the map; may be empty.
     """
 
     matcher: Matcher
     geometry: Geometry
     config: SlamConfig
+    weights: str = ""
+
+    @property
+    def origin(self) -> MapOrigin:
+        """What maps note of these methods."""
+        return MapOrigin(self.matcher.fingerprint, self.config, self.weights)

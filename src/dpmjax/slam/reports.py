@@ -9,9 +9,10 @@ from dpmjax.slam.keyframes import Pose
 ScanStatus = Literal["first", "tracked", "network", "predicted", "empty", "restarted"]
 """How the pose of a scan was found.
 
-"first": the scan starts the map. "tracked": geometry, from the predicted pose. "network": geometry failed there, and
-agreed from the network's pose. "predicted": nothing agreed, the motion goes on as before. "empty": the scan has too few
-points. "restarted": nothing agreed for a while, a new part of the map begins here, and loops may join it.
+"first": the scan starts the map, or a new part of a loaded one. "tracked": geometry, from the predicted pose.
+"network": geometry failed there, and agreed from the network's pose. "predicted": nothing agreed, the motion goes on as
+before. "empty": the scan has too few points. "restarted": nothing agreed for a while, a new part of the map begins
+here, and loops may join it.
 """
 
 LoopStatus = Literal[
@@ -59,7 +60,7 @@ class Loop(NamedTuple):
     Attributes:
         source: row of the new keyframe.
         target: row of an older one.
-        found_by: how it became a candidate.
+        found_by: how it became a candidate; "map" is a loop of the map that was extended.
         status: what became of it.
         overlap: probability of overlap; 1 where no network was asked.
         probability: P(correct) of the registration; None without one.
@@ -69,7 +70,7 @@ class Loop(NamedTuple):
 
     source: int
     target: int
-    found_by: Literal["distance", "retrieval"]
+    found_by: Literal["distance", "retrieval", "map"]
     status: LoopStatus
     overlap: float
     probability: float | None = None

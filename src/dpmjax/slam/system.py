@@ -15,7 +15,7 @@ from dpmjax.slam import front_end
 from dpmjax.slam.config import SlamConfig
 from dpmjax.slam.front_end import FrontEndState
 from dpmjax.slam.keyframes import KeyframeMap, as_pose_graph
-from dpmjax.slam.loop_closure import LoopState, close_loops, optimize_map
+from dpmjax.slam.loop_closure import LoopState, close_loops, loops_of_map, optimize_map
 from dpmjax.slam.matcher import NetworkMatcher
 from dpmjax.slam.methods import SlamMethods
 from dpmjax.slam.odometry import SurfaceGeometry
@@ -41,7 +41,8 @@ class SlamResult(NamedTuple):
     """What `run_slam` returns.
 
     Attributes:
-        T_world_scan: (n, 4, 4) float64, of every scan; the world is the frame of the first one.
+        T_world_scan: (n, 4, 4) float64, of every scan; the world is the frame of the first one, or of the map that was
+            extended.
         keyframes: (k,) numbers of the scans that are keyframes.
         loops: every candidate and what became of it; rows are those of `keyframes`.
         graph: poses of the keyframes and the edges that were kept, with ids of scans; None without any keyframe.
@@ -57,27 +58,35 @@ class SlamResult(NamedTuple):
     state: SlamState
 
 
-def make_methods(model: Model, config: SlamConfig | None = None) -> SlamMethods:
+def make_methods(model: Model, config: SlamConfig | None = None, *, weights: str = "") -> SlamMethods:
     """Makes the methods of a trained model: its networks, and point-to-plane geometry.
 
     Args:
         model: encoder and decoder.
         config: settings of all stages.
+        weights: name of the weights, noted in the map.
 
     Returns:
         The methods.
     """
     config = config or SlamConfig()
-    return SlamMethods(NetworkMatcher(model), SurfaceGeometry(config.odometry), config)
+    return SlamMethods(NetworkMatcher(model), SurfaceGeometry(config.odometry), config, weights)
 
 
-def init_slam() -> SlamState:
-    """Begins an empty map.
+def init_slam(map_: KeyframeMap | None = None) -> SlamState:
+    """Begins an empty map, or a new part of one that was made before.
+
+    Scans are numbered on from those of the map. Nothing is known of where the new part lies until a loop joins it.
+
+    Args:
+        map_: from `load_map` or of an earlier run; None for an empty one.
 
     Returns:
         The state before the first scan.
     """
-    return SlamState(FrontEndState(), KeyframeMap(), LoopState())
+    if map_ is None or len(map_) == 0:
+        return SlamState(FrontEndState(), KeyframeMap(), LoopState())
+    return SlamState(FrontEndState(num_scans=map_.keyframes[-1].scan + 1), map_, loops_of_map(map_))
 
 
 def step_slam(methods: SlamMethods, state: SlamState, points: Float[AnyArray, "n 3"]) -> tuple[SlamState, ScanReport]:
@@ -125,7 +134,8 @@ def finish_slam(state: SlamState, reports: Iterable[ScanReport], config: SlamCon
     if len(slam_map):
         T_keyframe_scan = np.array([report.T_keyframe_scan for report in reports]).reshape(-1, 4, 4)
         T_world_scan = slam_map.T_world_keyframe[[report.keyframe for report in reports]] @ T_keyframe_scan
-        T_world_scan = rigid.inverse(T_world_scan[0]) @ T_world_scan
+        if reports[0].scan == 0:
+            T_world_scan = rigid.inverse(T_world_scan[0]) @ T_world_scan
     keyframes = np.array([keyframe.scan for keyframe in slam_map.keyframes], np.int64)
     graph = as_pose_graph(slam_map) if len(slam_map) else None
     state = SlamState(state.front_end, slam_map, loops)
@@ -152,7 +162,11 @@ def iterate_slam(
 
 
 def run_slam(
-    scans: Iterable[Float[AnyArray, "_n 3"]], model: Model | SlamMethods, config: SlamConfig | None = None
+    scans: Iterable[Float[AnyArray, "_n 3"]],
+    model: Model | SlamMethods,
+    config: SlamConfig | None = None,
+    *,
+    map_: KeyframeMap | None = None,
 ) -> SlamResult:
     """Makes one map of a drive: odometry, loops, and a graph that agrees with both (DeepPointMap section 4).
 
@@ -162,18 +176,21 @@ def run_slam(
         scans: points in metres, each in the frame of the lidar, in the order of time; any iterable.
         model: a trained model; or methods of your own.
         config: settings; None takes the defaults. Methods of your own carry theirs.
+        map_: from `load_map`, to be extended; None begins an empty one.
 
     Returns:
         `T_world_scan` of every scan, keyframes, loops, graph and reports.
 
     Raises:
-        ValueError: if a scan is not (n, 3), or if methods come with another configuration.
+        ValueError: if a scan is not (n, 3), if methods come with another configuration, or if the map was made with
+            other weights.
     """
     if isinstance(model, SlamMethods) and config is not None:
         raise ValueError("config: expected None with methods, which carry their own")
     methods = model if isinstance(model, SlamMethods) else make_methods(model, config)
-    state, reports = init_slam(), []
-    for state, report in iterate_slam(methods, scans):  # noqa: B007 (the last one is used)
+    start = state = init_slam(map_)
+    reports = []
+    for state, report in iterate_slam(methods, scans, start):  # noqa: B007 (the last one is used)
         reports.append(report)
     return finish_slam(state, reports, methods.config)
 

@@ -10,6 +10,7 @@ from .curves import history_figure as history_figure
 from .curves import size_figure as size_figure
 from .figures import Limits as Limits
 from .figures import save_figure as save_figure
+from .localization import localization_figure as localization_figure
 from .maps import Panel as Panel
 from .maps import registered_scans_figure as registered_scans_figure
 from .rasters import ErrorMap as ErrorMap

@@ -1,0 +1,285 @@
+"""A keyframe map as named arrays, and back. Ragged arrays stand one after the other, with the rows of each keyframe."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from typing import Any, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dpmjax.deeppointmap.compact_scans import CompactScan
+from dpmjax.io.map_coding import (
+    POSITION_STEP_M,
+    FeatureCodes,
+    Precision,
+    SurfaceCodes,
+    decode_features,
+    decode_surface,
+    encode_features,
+    encode_surface,
+    rounded_to,
+)
+from dpmjax.scans.compact import CompactImage, CompactSurface
+from dpmjax.slam.config import MapOrigin
+from dpmjax.slam.keyframes import EdgeKind, Keyframe, KeyframeMap, MapEdge, orthonormal
+
+KINDS: tuple[EdgeKind, ...] = get_args(EdgeKind)
+TRIANGLE = np.triu_indices(6)
+MAX_ROTATION_ERROR = 1e-4
+Arrays = dict[str, NDArray[Any]]
+
+
+class ArrayReader:
+    """Arrays of a file, taken with a check of shape and kind.
+
+    Args:
+        arrays: by name.
+    """
+
+    def __init__(self, arrays: Arrays) -> None:
+        self._arrays = arrays
+
+    def take(self, name: str, *shape: int | None, kind: str = "f") -> NDArray[Any]:
+        """Returns an array.
+
+        Args:
+            name: of the array.
+            *shape: expected sizes; None for any.
+            kind: expected kind of its numbers, as NumPy abbreviates it; several letters allow several.
+
+        Returns:
+            The array.
+
+        Raises:
+            ValueError: if it is missing, or of another shape or kind.
+        """
+        if name not in self._arrays:
+            raise ValueError(f"{name} is missing")
+        array = self._arrays[name]
+        is_right = array.ndim == len(shape) and array.dtype.kind in kind
+        if not is_right or any(a is not None and a != b for a, b in zip(shape, array.shape, strict=True)):
+            expected = ", ".join("any" if size is None else str(size) for size in shape)
+            raise ValueError(f"{name}: expected shape ({expected}), got {array.shape} {array.dtype}")
+        return array
+
+    def take_rows(self, name: str, num_keyframes: int) -> list[slice]:
+        """Returns the rows of each keyframe in ragged arrays.
+
+        Args:
+            name: of the array of their numbers.
+            num_keyframes: number of keyframes.
+
+        Returns:
+            One slice a keyframe.
+
+        Raises:
+            ValueError: if a number is negative.
+        """
+        counts = self.take(name, num_keyframes, kind="iu").astype(np.int64)
+        if counts.min(initial=0) < 0 or counts.max(initial=0) > 1 << 32:
+            raise ValueError(f"{name}: expected numbers of rows, got {counts.min()} to {counts.max()}")
+        ends = np.cumsum(counts)
+        return [slice(int(end - count), int(end)) for end, count in zip(ends, counts, strict=True)]
+
+
+def pack_graph(map_: KeyframeMap, precision: Precision) -> Arrays:
+    """Makes the arrays of poses and edges.
+
+    Args:
+        map_: the map.
+        precision: "float32" keeps float64 poses exactly; others round them to float32.
+
+    Returns:
+        The arrays by name.
+    """
+    dtype = np.float64 if precision == "float32" else np.float32
+    keyframes, edges = map_.keyframes, map_.edges
+
+    def poses(of_all: Iterable[NDArray[Any]]) -> NDArray[Any]:
+        return np.array([T[:3] for T in of_all], dtype).reshape(-1, 3, 4)
+
+    return {
+        "scan": np.array([keyframe.scan for keyframe in keyframes], np.int64),
+        "segment": np.array([keyframe.segment for keyframe in keyframes], np.int32),
+        "path_m": np.array([keyframe.path_m for keyframe in keyframes], np.float64),
+        "extent_m": np.array([keyframe.extent_m for keyframe in keyframes], np.float64),
+        "T_odometry_keyframe": poses(keyframe.T_odometry_keyframe for keyframe in keyframes),
+        "T_world_keyframe": poses(map_.T_world_keyframe),
+        "vectors": map_.vectors.astype(np.float32 if precision == "float32" else np.float16),
+        "edge_rows": np.array([edge[:2] for edge in edges], np.int32).reshape(-1, 2),
+        "edge_kind": np.array([KINDS.index(edge.kind) for edge in edges], np.uint8),
+        "edge_T": poses(edge.T_target_source for edge in edges),
+        "edge_information": np.array([edge.information[TRIANGLE] for edge in edges], dtype).reshape(-1, 21),
+    }
+
+
+def unpack_graph(reader: ArrayReader, scans: Sequence[CompactScan], origin: MapOrigin) -> KeyframeMap:
+    """Makes the map.
+
+    Args:
+        reader: of arrays from `pack_graph`.
+        scans: of the keyframes.
+        origin: what made the map.
+
+    Returns:
+        The map.
+
+    Raises:
+        ValueError: if arrays are missing or do not fit together.
+    """
+    k = len(scans)
+    numbers = [reader.take(name, k, kind=kind) for name, kind in (("scan", "i"), ("path_m", "f"), ("segment", "i"))]
+    extents = reader.take("extent_m", k)
+    if extents.min() <= 0 or numbers[0].min() < 0:
+        raise ValueError("extent_m and scan: expected numbers above 0")
+    T_odometry, T_world = (_poses(reader, name, k) for name in ("T_odometry_keyframe", "T_world_keyframe"))
+    described = zip(*(array.tolist() for array in numbers), extents.tolist(), T_odometry, scans, strict=True)
+    keyframes = (Keyframe(scan, T, path_m, seg, extent, found) for scan, path_m, seg, extent, T, found in described)
+    rows = reader.take("edge_rows", None, 2, kind="i")
+    kinds = reader.take("edge_kind", len(rows), kind="u")
+    triangles = reader.take("edge_information", len(rows), 21).astype(np.float64)
+    if rows.min(initial=0) < 0 or rows.max(initial=-1) >= k or kinds.max(initial=0) >= len(KINDS):
+        raise ValueError(f"edge_rows and edge_kind: expected rows of {k} keyframes and {len(KINDS)} kinds")
+    information = np.zeros((len(rows), 6, 6))
+    for one, other in (TRIANGLE, TRIANGLE[::-1]):
+        information[:, one, other] = triangles
+    T_edges = _poses(reader, "edge_T", len(rows))
+    edges = (
+        MapEdge(int(source), int(target), T, matrix, KINDS[kind])
+        for (source, target), T, matrix, kind in zip(rows, T_edges, information, kinds.tolist(), strict=True)
+    )
+    vectors = reader.take("vectors", k, None).astype(np.float32)
+    return KeyframeMap(tuple(keyframes), T_world, vectors, tuple(edges), origin)
+
+
+def _poses(reader: ArrayReader, name: str, count: int) -> NDArray[np.float64]:
+    stored = reader.take(name, count, 3, 4)
+    T = np.tile(np.eye(4), (count, 1, 1))
+    T[:, :3] = stored
+    products = T[:, :3, :3] @ T[:, :3, :3].transpose(0, 2, 1)
+    if np.abs(products - np.eye(3)).max(initial=0) > MAX_ROTATION_ERROR or (np.linalg.det(T) < 0).any():
+        raise ValueError(f"{name}: expected rotations")
+    if stored.dtype == np.float64:
+        return T
+    return np.array([orthonormal(pose) for pose in T]).reshape(-1, 4, 4)
+
+
+def pack_scans(scans: Sequence[CompactScan], precision: Precision) -> Arrays:
+    """Makes the arrays of the compact scans.
+
+    Args:
+        scans: at least one, of one number of descriptors and channels.
+        precision: see `save_map`.
+
+    Returns:
+        The arrays by name.
+    """
+    features = np.stack([scan.features for scan in scans])
+    positions = np.stack([scan.positions for scan in scans])
+    arrays: Arrays = {"mask": np.stack([scan.mask for scan in scans]), **_pack_images([scan.image for scan in scans])}
+    if precision == "int8":
+        codes = encode_features(features.reshape(-1, features.shape[-1]))
+        arrays |= {f"feature_{name}": np.asarray(value) for name, value in codes._asdict().items()}
+        arrays["positions"] = rounded_to(positions, POSITION_STEP_M)
+        return arrays | _joined([encode_surface(scan.surface) for scan in scans])
+    dtype = np.float32 if precision == "float32" else np.float16
+    arrays |= {"features": features.astype(dtype), "positions": positions}
+    return arrays | _joined([scan.surface for scan in scans])
+
+
+def unpack_scans(reader: ArrayReader, precision: Precision) -> list[CompactScan]:
+    """Makes the compact scans.
+
+    Args:
+        reader: of arrays from `pack_scans`.
+        precision: that was given to `pack_scans`.
+
+    Returns:
+        The scans.
+
+    Raises:
+        ValueError: if arrays are missing or do not fit together.
+    """
+    mask = reader.take("mask", None, None, kind="b")
+    k, m = mask.shape
+    if k == 0:
+        raise ValueError("mask: expected at least one keyframe")
+    if precision == "int8":
+        positions = (reader.take("positions", k, m, 3, kind="i") * POSITION_STEP_M).astype(np.float32)
+        features = decode_features(_feature_codes(reader, k * m)).reshape(k, m, -1)
+        surfaces = [decode_surface(codes) for codes in _surface_codes(reader, k)]
+    else:
+        positions = reader.take("positions", k, m, 3).astype(np.float32)
+        features = reader.take("features", k, m, None).astype(np.float32)
+        surfaces = _surfaces(reader, k)
+    images = _unpack_images(reader, k)
+    return [CompactScan(*parts) for parts in zip(positions, features, mask, surfaces, images, strict=True)]
+
+
+def _joined(surfaces: Sequence[CompactSurface | SurfaceCodes]) -> Arrays:
+    """Returns the arrays of all surfaces side by side."""
+    axis = 1 if isinstance(surfaces[0], SurfaceCodes) else 0
+    arrays: Arrays = {
+        "surface_count": np.array([len(surface.flatness) for surface in surfaces], np.int32),
+        "surface_unit_m": np.array([surface.unit_m for surface in surfaces], np.float64),
+    }
+    for name in surfaces[0]._fields[1:]:
+        parts = [getattr(surface, name) for surface in surfaces]
+        arrays[f"surface_{name}"] = np.concatenate(parts, axis=-1 if name == "flatness" else axis)
+    return arrays
+
+
+def _feature_codes(reader: ArrayReader, num_descriptors: int) -> FeatureCodes:
+    codes = reader.take("feature_codes", None, num_descriptors, kind="i")
+    mean = reader.take("feature_mean", None)
+    basis = reader.take("feature_basis", len(codes), len(mean)).astype(np.float32)
+    return FeatureCodes(mean, basis, float(reader.take("feature_step")), codes)
+
+
+def _surfaces(reader: ArrayReader, k: int) -> list[CompactSurface]:
+    rows, units_m = reader.take_rows("surface_count", k), reader.take("surface_unit_m", k).tolist()
+    total = rows[-1].stop
+    points = reader.take("surface_points", total, 3, kind="i")
+    normals = reader.take("surface_normals", total, 3, kind="i")
+    flatness = reader.take("surface_flatness", total, kind="u")
+    return [
+        CompactSurface(unit_m, points[part], normals[part], flatness[part])
+        for unit_m, part in zip(units_m, rows, strict=True)
+    ]
+
+
+def _surface_codes(reader: ArrayReader, k: int) -> list[SurfaceCodes]:
+    rows, units_m = reader.take_rows("surface_count", k), reader.take("surface_unit_m", k).tolist()
+    total = rows[-1].stop
+    steps = reader.take("surface_steps", 3, total, kind="i")
+    normals = reader.take("surface_normals", 2, total, kind="i")
+    flatness = reader.take("surface_flatness", total, kind="u")
+    return [
+        SurfaceCodes(unit_m, steps[:, part], normals[:, part], flatness[part])
+        for unit_m, part in zip(units_m, rows, strict=True)
+    ]
+
+
+def _pack_images(images: Sequence[CompactImage]) -> Arrays:
+    return {
+        "image_count": np.array([len(image.nearest) for image in images], np.int32),
+        "image_num_rows": np.array([image.num_rows for image in images], np.int32),
+        "image_first_row": np.array([image.first_row for image in images], np.int32),
+        "image_nearest": np.concatenate([image.nearest for image in images]),
+        "image_farthest": np.concatenate([image.farthest for image in images]),
+    }
+
+
+def _unpack_images(reader: ArrayReader, k: int) -> list[CompactImage]:
+    rows = reader.take_rows("image_count", k)
+    num_rows, first_rows = (reader.take(f"image_{name}", k, kind="i").tolist() for name in ("num_rows", "first_row"))
+    nearest = reader.take("image_nearest", rows[-1].stop, None, kind="u")
+    farthest = reader.take("image_farthest", *nearest.shape, kind="u")
+    for part, num, first in zip(rows, num_rows, first_rows, strict=True):
+        if not 0 <= first <= first + part.stop - part.start <= num <= 1 << 16:
+            raise ValueError("image_first_row: expected rows within the image")
+    return [
+        CompactImage(num, first, nearest[part], farthest[part])
+        for num, first, part in zip(num_rows, first_rows, rows, strict=True)
+    ]

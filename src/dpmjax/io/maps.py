@@ -1,0 +1,126 @@
+"""Saved maps: one `.npz` file of plain arrays, checked on load.
+
+Ragged arrays stand one after the other, with the number of rows of each keyframe. `header` is JSON in UTF-8: format,
+version, precision, fingerprint of the weights, and the settings of SLAM.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import io
+import json
+from pathlib import Path
+from typing import get_args
+
+import numpy as np
+
+from dpmjax.deeppointmap.compact_scans import CompactScan
+from dpmjax.io.files import load_arrays, refusing, write_atomically
+from dpmjax.io.map_arrays import ArrayReader, pack_graph, pack_scans, unpack_graph, unpack_scans
+from dpmjax.io.map_coding import Precision
+from dpmjax.sequences import require
+from dpmjax.slam.config import MapOrigin, SlamConfig
+from dpmjax.slam.keyframes import KeyframeMap
+from dpmjax.slam.map_thinning import thin_map
+from dpmjax.weights.config_json import config_from_json
+
+FORMAT, VERSION = "dpmjax map", 1
+SPACING_SHARE = 0.8
+ADVICE = "save it again with dpmjax.save_map"
+
+
+def save_map(
+    path: str | Path, map_: KeyframeMap, precision: Precision = "float32", *, spacing_share: float | None = None
+) -> Path:
+    """Writes a map to a file that `load_map` reads; an interruption never leaves half of it.
+
+    Args:
+        path: must end in `.npz`; an existing file is replaced.
+        map_: of a run, `result.state.slam_map`, with at least one keyframe.
+        precision: "float32" keeps everything exactly: a run that goes on from the file equals an unbroken one.
+            "float16" rounds features and poses. "int8" is the smallest, for localisation: it rounds features to codes,
+            thins surfaces to 2,000 points, and leaves out keyframes that others cover (`slam.thin_map`).
+        spacing_share: keyframes nearer to others than this share of their extent are left out; 0 keeps all. None takes
+            0.8 for "int8" and 0 for the others.
+
+    Returns:
+        The path.
+
+    Raises:
+        ValueError: if the path has another ending, the precision is unknown, the map is empty, or its keyframes are not
+            those of a network.
+    """
+    path = Path(path)
+    if path.suffix != ".npz":
+        raise ValueError(f"path: expected a file that ends in .npz, got {str(path)!r}")
+    if precision not in get_args(Precision):
+        raise ValueError(f"precision: expected one of {', '.join(get_args(Precision))}, got {precision!r}")
+    if spacing_share is None:
+        spacing_share = SPACING_SHARE if precision == "int8" else 0.0
+    if spacing_share != 0:
+        map_ = thin_map(map_, spacing_share=spacing_share)
+    return write_atomically(path, map_bytes(map_, precision))
+
+
+def map_bytes(map_: KeyframeMap, precision: Precision = "float32") -> bytes:
+    """Makes the content of the file of a map with all its keyframes; its length is what the map costs.
+
+    Args:
+        map_: see `save_map`.
+        precision: see `save_map`.
+
+    Returns:
+        The bytes.
+
+    Raises:
+        ValueError: if the map is empty, or its keyframes are not those of a network.
+    """
+    if map_.origin is None:
+        raise ValueError("map_: expected keyframes, got an empty map")
+    if not all(isinstance(keyframe.description, CompactScan) for keyframe in map_.keyframes):
+        raise ValueError("map_: expected keyframes of a network, got those of another matcher")
+    header = {
+        "format": FORMAT,
+        "version": VERSION,
+        "precision": precision,
+        "fingerprint": map_.origin.fingerprint,
+        "weights": map_.origin.weights,
+        "config": dataclasses.asdict(map_.origin.config),
+    }
+    content = io.BytesIO()
+    named = {"header": np.frombuffer(json.dumps(header).encode(), np.uint8)}
+    named |= pack_graph(map_, precision)
+    named |= pack_scans([keyframe.description for keyframe in map_.keyframes], precision)
+    np.savez_compressed(content, allow_pickle=False, **named)
+    return content.getvalue()
+
+
+def load_map(path: str | Path) -> KeyframeMap:
+    """Reads a map that `save_map` wrote.
+
+    Args:
+        path: the file.
+
+    Returns:
+        The map.
+
+    Raises:
+        InputError: no such file, no map, one of a newer version, or a damaged one.
+    """
+    arrays = load_arrays(path)
+    require("header" in arrays, path, "a NumPy file, but not one of a dpmjax map", "give a file of dpmjax.save_map")
+    with refusing(path, "its header cannot be read ({error})", ADVICE, (Exception,)):
+        header = json.loads(arrays["header"].tobytes())
+        found, version, precision = header["format"], header["version"], header["precision"]
+        fingerprint, weights = str(header["fingerprint"]), str(header["weights"])
+    require(found == FORMAT, path, "not a dpmjax map", "give a file of dpmjax.save_map")
+    require(version == VERSION, path, f"format version {version}, this dpmjax reads {VERSION}", "update dpmjax")
+    require(precision in get_args(Precision), path, f"precision {precision}", ADVICE)
+    with refusing(path, "{error}", ADVICE, (ValueError, TypeError)):
+        origin = MapOrigin(fingerprint, config_from_json(header["config"], SlamConfig), weights)
+    for name, array in arrays.items():
+        is_good = array.dtype.kind in "iub" or (array.dtype.kind == "f" and bool(np.isfinite(array).all()))
+        require(is_good, path, f"{name} holds values that are not finite numbers", ADVICE)
+    with refusing(path, "damaged: {error}", ADVICE, (Exception,)):
+        reader = ArrayReader(arrays)
+        return unpack_graph(reader, unpack_scans(reader, precision), origin)

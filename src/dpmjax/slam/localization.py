@@ -1,0 +1,268 @@
+"""Re-localisation: single scans are found in a map without a first guess, or are said not to be in it.
+
+The keyframes that look most alike are registered one by one. Registrations that put the scan at the same place support
+each other: two wrong ones hardly ever do. Then the neighbours of that place are asked too.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from dpmjax.checks import require_fields, require_positive_fields
+from dpmjax.deeppointmap.model import Model
+from dpmjax.geometry import rigid
+from dpmjax.slam.keyframes import (
+    KeyframeMap,
+    Pose,
+    Submap,
+    distances_to,
+    orthonormal,
+    submap_around,
+    turn_rad,
+    with_origin,
+)
+from dpmjax.slam.matcher import Match
+from dpmjax.slam.methods import SlamMethods
+from dpmjax.slam.retrieval import most_similar
+from dpmjax.slam.system import make_methods
+from dpmjax.types import AnyArray
+
+LocalizationStatus = Literal["found", "not in this map", "empty"]
+
+
+@dataclass(frozen=True)
+class LocalizationConfig:
+    """Which keyframes are tried, and when a place is believed.
+
+    Attributes:
+        num_similar: number of keyframes by retrieval whose overlap is estimated.
+        num_registered: number of them that are registered at most, in order of their overlap; ...
+        num_at_once: ... so many at once: the next are tried only if the place is not clear.
+        num_neighbours: number of further keyframes near the best place that are registered.
+        num_submap: number of keyframes whose descriptors are merged for a registration.
+        same_place_m: two registrations agree within this distance ...
+        same_place_rad: ... and this turn.
+        min_probability: a registration supports a place from this P(correct) on.
+        min_support: number of registrations that must agree, ...
+        min_total: ... and sum of their P(correct).
+        min_alone: P(correct) that suffices where no other keyframe is near.
+        max_rival_share: another place may have this share of the sum of the best one.
+    """
+
+    num_similar: int = 16
+    num_registered: int = 8
+    num_at_once: int = 2
+    num_neighbours: int = 2
+    num_submap: int = 1
+    same_place_m: float = 1.5
+    same_place_rad: float = 0.06
+    min_probability: float = 0.2
+    min_support: int = 2
+    min_total: float = 1.0
+    min_alone: float = 0.95
+    max_rival_share: float = 0.5
+
+    def __post_init__(self) -> None:
+        require_fields(self, "num_similar", "num_registered", "num_at_once", "num_submap", "min_support", low=1)
+        require_fields(self, "num_neighbours", "min_total", low=0)
+        require_fields(self, "min_probability", "min_alone", "max_rival_share", low=0, high=1)
+        require_positive_fields(self, "same_place_m", "same_place_rad")
+
+
+class Evidence(NamedTuple):
+    """One registration of the scan.
+
+    Attributes:
+        keyframe: row of the keyframe.
+        T_world_scan: where it puts the scan.
+        match: the registration.
+    """
+
+    keyframe: int
+    T_world_scan: Pose
+    match: Match
+
+
+class Localization(NamedTuple):
+    """Where a scan is.
+
+    Attributes:
+        status: "found", "not in this map", or "empty": the scan has too few points.
+        T_world_scan: pose in the frame of the map; None where it was not found.
+        probability: P(correct) of the place; 0 where it was not found.
+        keyframe: row of the keyframe that it was found by; None where it was not found.
+        reason: the numbers that decided.
+        evidence: all registrations.
+    """
+
+    status: LocalizationStatus
+    T_world_scan: Pose | None
+    probability: float
+    keyframe: int | None
+    reason: str
+    evidence: tuple[Evidence, ...] = ()
+
+    @property
+    def is_in_map(self) -> bool:
+        """Whether the scan was found."""
+        return self.status == "found"
+
+
+class _Place(NamedTuple):
+    # Registrations that agree, the most probable first.
+    members: tuple[Evidence, ...]
+
+    @property
+    def total(self) -> float:
+        return sum(member.match.probability for member in self.members)
+
+
+def localize(
+    map_: KeyframeMap,
+    points: Float[AnyArray, "n 3"],
+    model: Model | SlamMethods,
+    config: LocalizationConfig | None = None,
+) -> Localization:
+    """Finds a scan in a map without a first guess.
+
+    Args:
+        map_: from `load_map` or of a run.
+        points: metres, in the frame of the lidar; points that are not finite are dropped.
+        model: the model that made the map; or methods of your own.
+        config: what is tried and believed; None takes the defaults.
+
+    Returns:
+        The pose in the frame of the map, or that the scan is not in it.
+
+    Raises:
+        ValueError: if the shape is not (n, 3), the map is empty, or it was made with other weights.
+    """
+    (found,) = localize_each(map_, [points], model, config)
+    return found
+
+
+def localize_each(
+    map_: KeyframeMap,
+    scans: Iterable[Float[AnyArray, "_n 3"]],
+    model: Model | SlamMethods,
+    config: LocalizationConfig | None = None,
+) -> Iterator[Localization]:
+    """Finds scans in a map, each by itself.
+
+    Args:
+        map_: see `localize`.
+        scans: points of each; any iterable.
+        model: see `localize`.
+        config: see `localize`.
+
+    Yields:
+        One result a scan.
+
+    Raises:
+        ValueError: see `localize`.
+    """
+    if map_.origin is None:
+        raise ValueError("map_: expected keyframes, got an empty map")
+    methods = model if isinstance(model, SlamMethods) else make_methods(model, map_.origin.config)
+    with_origin(map_, methods.origin)
+    for points in scans:
+        yield _localized(map_, np.asarray(points), methods, config or LocalizationConfig())
+
+
+def _localized(map_: KeyframeMap, points: np.ndarray, methods: SlamMethods, config: LocalizationConfig) -> Localization:
+    if points.ndim != 2 or points.shape[1] != 3:
+        raise ValueError(f"points: expected shape (n, 3), got {points.shape}")
+    points = points[np.isfinite(points).all(axis=1)]
+    measured = methods.geometry.measure(points)
+    if measured is None:
+        return Localization("empty", None, 0.0, None, "too few points")
+    description = methods.matcher.describe(points, measured)
+    extent_m = methods.geometry.extent_m(measured)
+    rows = _candidates(map_, description, methods, config)
+    tried: list[Evidence] = []
+    for start in range(0, len(rows), config.num_at_once):
+        tried += _registered(map_, rows[start : start + config.num_at_once], description, methods, config)
+        place = max(_places(tried, config), key=lambda place: place.total, default=None)
+        if place is not None and not _is_supported(place, config):
+            near = _neighbours(map_, place.members[0], tried, extent_m, config)
+            tried += _registered(map_, near, description, methods, config)
+        found = _decided(map_, tried, extent_m, config)
+        if found.status == "found":
+            return found
+    return found
+
+
+def _candidates(map_: KeyframeMap, description: Any, methods: SlamMethods, config: LocalizationConfig) -> list[int]:
+    """Returns the keyframes to register, the most probable overlap first."""
+    vector = methods.matcher.vector(description)
+    vector = vector / max(float(np.linalg.norm(vector)), 1e-12)
+    rows, _ = most_similar(map_.vectors, vector, config.num_similar)
+    overlaps = methods.matcher.overlaps(description, [map_.keyframes[row].description for row in rows])
+    order = np.argsort(-overlaps, kind="stable")[: config.num_registered]
+    return [int(rows[number]) for number in order]
+
+
+def _registered(
+    map_: KeyframeMap, rows: list[int], description: Any, methods: SlamMethods, config: LocalizationConfig
+) -> list[Evidence]:
+    source, radius_m = Submap((description,), np.eye(4)[None]), methods.config.front_end.submap_radius_m
+    targets = [submap_around(map_, row, config.num_submap, radius_m) for row in rows]
+    matches = methods.matcher.register([(source, target) for target in targets]) if rows else []
+    return [
+        Evidence(row, orthonormal(map_.T_world_keyframe[row] @ match.T_target_source), match)
+        for row, match in zip(rows, matches, strict=True)
+    ]
+
+
+def _places(tried: list[Evidence], config: LocalizationConfig) -> list[_Place]:
+    """Groups registrations that agree with the most probable one of the group."""
+    left = sorted(tried, key=lambda one: -one.match.probability)
+    left = [one for one in left if one.match.probability >= config.min_probability]
+    places = []
+    while left:
+        members = [one for one in left if _agree(left[0], one, config)]
+        places.append(_Place(tuple(members)))
+        left = [one for one in left if not any(one is member for member in members)]
+    return places
+
+
+def _agree(one: Evidence, other: Evidence, config: LocalizationConfig) -> bool:
+    apart = rigid.inverse(one.T_world_scan) @ other.T_world_scan
+    return bool(np.linalg.norm(apart[:3, 3]) <= config.same_place_m) and turn_rad(apart) <= config.same_place_rad
+
+
+def _is_supported(place: _Place, config: LocalizationConfig) -> bool:
+    return len(place.members) >= config.min_support and place.total >= config.min_total
+
+
+def _neighbours(
+    map_: KeyframeMap, best: Evidence, tried: list[Evidence], extent_m: float, config: LocalizationConfig
+) -> list[int]:
+    """Returns keyframes near the place that were not tried yet, nearest first."""
+    apart_m = distances_to(map_, best.T_world_scan[:3, 3])
+    done = {one.keyframe for one in tried}
+    near = [int(row) for row in np.argsort(apart_m, kind="stable") if apart_m[row] <= extent_m]
+    return [row for row in near if row not in done][: config.num_neighbours]
+
+
+def _decided(map_: KeyframeMap, tried: list[Evidence], extent_m: float, config: LocalizationConfig) -> Localization:
+    places = sorted(_places(tried, config), key=lambda place: -place.total)
+    evidence = tuple(tried)
+    if not places:
+        highest = max((one.match.probability for one in tried), default=0.0)
+        return Localization("not in this map", None, 0.0, None, f"best P {highest:.2f} of {len(tried)}", evidence)
+    best, rival = places[0], places[1].total if len(places) > 1 else 0.0
+    first = best.members[0]
+    numbers = f"{len(best.members)} of {len(tried)} agree, P {first.match.probability:.2f}, sum {best.total:.2f}"
+    numbers += f", next place {rival:.2f}"
+    is_alone = int((distances_to(map_, first.T_world_scan[:3, 3]) <= extent_m).sum()) <= 1
+    is_clear = _is_supported(best, config) or (is_alone and first.match.probability >= config.min_alone)
+    if not is_clear or rival > config.max_rival_share * best.total:
+        return Localization("not in this map", None, 0.0, None, numbers, evidence)
+    probability = first.match.probability
+    return Localization("found", first.T_world_scan, probability, first.keyframe, numbers, evidence)

@@ -1,0 +1,113 @@
+"""The command that finds scans in a saved map, on a network that compiles in seconds."""
+
+from __future__ import annotations
+
+import jax
+import numpy as np
+import pytest
+
+import dpmjax
+from dpmjax.io import open_lidar_sequence, read_poses, write_kitti_sequence
+from experiments import dpm_localize
+from experiments._command import EXIT_BAD_INPUT, EXIT_OK, run_command
+from experiments._result_files import load_json, read_history
+from tests.deeppointmap import toy
+
+
+@pytest.fixture(scope="module")
+def case(tmp_path_factory):
+    """Weights, a map of the first scans of a drive, and a folder with all of them."""
+    folder = tmp_path_factory.mktemp("case")
+    drive = toy.drive(num_scans=6)
+    model = dpmjax.init_model(jax.random.key(0), toy.MODEL)
+    dpmjax.save_model(model, folder / "model.safetensors")
+    result = dpmjax.run_slam([drive.read_scan(number) for number in range(4)], model)
+    dpmjax.save_map(folder / "map.npz", result.state.slam_map)
+    write_kitti_sequence(folder / "kitti", "00", drive)
+    np.save(folder / "poses.npy", drive.T_world_lidar)
+    return folder
+
+
+def run(*arguments) -> int:
+    command = dpm_localize
+    arguments = list(map(str, arguments))
+    return run_command(
+        command.main, command.Config, experiment=command.EXPERIMENT, description=command.__doc__, args=arguments
+    )
+
+
+def scans_of(case):
+    return next(path.parent for path in case.glob("**/velodyne"))
+
+
+def test_every_scan_gets_a_row_and_a_resumed_run_equals_an_unbroken_one(case, tmp_path, capsys) -> None:
+    weights = ("--weights", case / "model.safetensors")
+    out = tmp_path / "out"
+    arguments = (case / "map.npz", scans_of(case), *weights, "--map-poses", case / "poses.npy", "-o", out)
+    assert run(*arguments) == EXIT_OK
+    assert "of 6 scans found" in capsys.readouterr().out
+    table = out / "localizations.csv"
+    rows = read_history(table)
+    assert [row["scan"] for row in rows] == list(map(str, range(6)))
+    metrics = load_json(out / "metrics.json")
+    assert metrics["num_inside"] == 6
+    assert metrics["num_right"] + metrics["num_wrong"] == metrics["num_found"]
+    assert (out / "map.png").stat().st_size > 0
+    num_found = sum(row["status"] == "found" for row in rows)
+    if num_found:
+        assert len(read_poses(out / "trajectory_tum.txt")) == num_found
+    # The run is cut off in the middle of a row.
+    text = table.read_text()
+    cut = text.splitlines(keepends=True)
+    table.write_text("".join(cut[:4]) + cut[4][:9])
+    assert run("--resume", "-o", out) == EXIT_OK
+    without_time = [{**row, "seconds": ""} for row in read_history(table)]
+    assert without_time == [{**row, "seconds": ""} for row in rows]
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"map": "none.npz"}, "none.npz: no such file"),
+        ({"map": "poses.npy"}, "not one of a dpmjax map"),
+        ({"scans": "nowhere"}, "nowhere"),
+        ({"weights": "no_such_model"}, "no_such_model"),
+        ({"map_poses": "none.npy"}, "none.npy"),
+        ({"weights": "other.safetensors"}, "name the weights that made it with --weights"),
+    ],
+)
+def test_bad_input_is_told_in_one_line(case, tmp_path, capsys, changes, message) -> None:
+    other = case / "other.safetensors"
+    if not other.exists():
+        dpmjax.save_model(dpmjax.init_model(jax.random.key(1), toy.MODEL), other)
+    given = {"map": "map.npz", "weights": "model.safetensors", "map_poses": "poses.npy", **changes}
+    scans = case / given["scans"] if "scans" in given else scans_of(case)
+    weights = given["weights"] if given["weights"] == "no_such_model" else case / given["weights"]
+    arguments = (case / given["map"], scans, "--weights", weights, "--map-poses", case / given["map_poses"])
+    assert run(*arguments, "-o", tmp_path / "out") == EXIT_BAD_INPUT
+    captured = capsys.readouterr()
+    assert message in captured.err
+    assert captured.err.count("\n") == 1
+    assert not (tmp_path / "out").exists()
+
+
+def test_errors_are_those_of_the_keyframes_frames(case) -> None:
+    map_ = dpmjax.load_map(case / "map.npz")
+    drive = open_lidar_sequence(scans_of(case), poses=case / "poses.npy")
+    reference = np.load(case / "poses.npy")[[keyframe.scan for keyframe in map_.keyframes]]
+    where = dpm_localize.Case(map_, drive, reference)
+    T = map_.T_world_keyframe[0] @ np.linalg.inv(reference[0]) @ drive.T_world_lidar[1]
+    rows = []
+    for shift_m, found in ((0.0, True), (3.0, True), (0.5, True), (0.0, False)):
+        moved = T.copy()
+        moved[0, 3] += shift_m
+        evidence = (0.9, 0, "numbers") if found else (0.0, None, "numbers")
+        status = "found" if found else "not in this map"
+        result = dpmjax.Localization(status, moved if found else None, *evidence)
+        rows.append(dpm_localize.as_row(1, drive, map_, result, 0.1))
+    moved_drive = drive.take(np.array([1, 1, 1, 1]))
+    errors = dpm_localize.measure_errors(where._replace(drive=moved_drive), rows)
+    np.testing.assert_array_equal(errors.is_right, [True, False, True, False])
+    np.testing.assert_array_equal(errors.is_found, [True, True, True, False])
+    np.testing.assert_allclose(errors.translation_m[:3], [0, 3, 0.5], atol=1e-6)
+    assert errors.is_inside.all()

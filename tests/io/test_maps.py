@@ -1,0 +1,227 @@
+"""Laws of saved maps: what is saved is loaded again, and anything else is refused in one line."""
+
+from __future__ import annotations
+
+import io
+import json
+import zipfile
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from dpmjax import load_map, save_map
+from dpmjax.deeppointmap.compact_scans import CompactScan, compact_scan
+from dpmjax.deeppointmap.verification import MeasuredScan
+from dpmjax.io import InputError, map_bytes
+from dpmjax.scans.compact import compact_surface, expand_surface
+from dpmjax.scans.free_space import range_image
+from dpmjax.scans.surfaces import SurfaceConfig, scan_surface
+from dpmjax.slam import SlamConfig
+from dpmjax.slam.config import MapOrigin
+from dpmjax.slam.keyframes import (
+    Keyframe,
+    KeyframeMap,
+    MapEdge,
+    add_keyframe,
+    diagonal_information,
+    with_origin,
+)
+from dpmjax.types import DescriptorCloud
+from tests.scans.test_compact import room
+from tests.slam.truth import noise
+
+RNG = np.random.default_rng(3)
+NUM_DESCRIPTORS, CHANNELS = 24, 16
+
+
+def scan(seed: int, num_points: int) -> CompactScan:
+    rng = np.random.default_rng(seed)
+    surface = scan_surface(room(num_points, seed), SurfaceConfig(voxel_size_m=0.15))
+    # Features as networks make them: few components carry nearly all.
+    features = rng.normal(size=(NUM_DESCRIPTORS, 4)) @ np.random.default_rng(7).normal(size=(4, CHANNELS))
+    features += 0.01 * rng.normal(size=features.shape)
+    positions = rng.uniform(-50, 50, (NUM_DESCRIPTORS, 3))
+    cloud = DescriptorCloud(
+        positions.astype(np.float32), features.astype(np.float32), rng.random(NUM_DESCRIPTORS) > 0.2
+    )
+    return compact_scan(cloud, MeasuredScan(surface, range_image(surface.points)), max_points=400)
+
+
+def make_map(num_keyframes: int = 4) -> KeyframeMap:
+    config = replace(SlamConfig(), loops=replace(SlamConfig().loops, num_near=3))
+    slam_map = with_origin(KeyframeMap(), MapOrigin("0123456789abcdef", config, "dpm_small"))
+    rng = np.random.default_rng(1)
+    for row in range(num_keyframes):
+        T = noise(rng, 100.0, 1.0)
+        keyframe = Keyframe(3 * row, noise(rng, 9.0, 1.0), 1.1 * row, row // 2, 7.3, scan(row, 0 if row == 2 else 3000))
+        information = diagonal_information(0.1, 0.3) + 0.1
+        edge = MapEdge(row, row - 1, noise(rng, 3.0, 0.2), information, ("odometry", "loop", "guess")[row % 3])
+        slam_map = add_keyframe(slam_map, keyframe, T, rng.normal(size=8), edge if row else None)
+    return slam_map
+
+
+MAP = make_map()
+
+
+def assert_equal_maps(found: KeyframeMap, expected: KeyframeMap) -> None:
+    np.testing.assert_array_equal(found.T_world_keyframe, expected.T_world_keyframe)
+    np.testing.assert_array_equal(found.vectors, expected.vectors)
+    assert found.vectors.dtype == expected.vectors.dtype
+    assert found.origin == expected.origin
+    assert len(found.edges) == len(expected.edges)
+    for edge, other in zip(found.edges, expected.edges, strict=True):
+        assert (edge.source, edge.target, edge.kind) == (other.source, other.target, other.kind)
+        np.testing.assert_array_equal(edge.T_target_source, other.T_target_source)
+        np.testing.assert_array_equal(edge.information, other.information)
+    for keyframe, other in zip(found.keyframes, expected.keyframes, strict=True):
+        assert keyframe[0] == other[0]
+        assert keyframe[2:5] == other[2:5]
+        np.testing.assert_array_equal(keyframe.T_odometry_keyframe, other.T_odometry_keyframe)
+        ours, theirs = keyframe.description, other.description
+        for a, b in zip(
+            [*ours[:3], *ours.surface, *ours.image], [*theirs[:3], *theirs.surface, *theirs.image], strict=True
+        ):
+            np.testing.assert_array_equal(a, b)
+            assert np.asarray(a).dtype == np.asarray(b).dtype
+
+
+def test_full_precision_is_exact(tmp_path) -> None:
+    path = save_map(tmp_path / "deeper" / "map.npz", MAP)
+    assert_equal_maps(load_map(path), MAP)
+
+
+@pytest.mark.parametrize("precision", ["float16", "int8"])
+def test_other_precisions_have_small_errors(tmp_path, precision) -> None:
+    found = load_map(save_map(tmp_path / "map.npz", MAP, precision))
+    np.testing.assert_allclose(found.T_world_keyframe, MAP.T_world_keyframe, atol=1e-4)
+    np.testing.assert_allclose(found.vectors, MAP.vectors, atol=1e-3)
+    for keyframe, expected in zip(found.keyframes, MAP.keyframes, strict=True):
+        ours, theirs = keyframe.description, expected.description
+        np.testing.assert_array_equal(ours.mask, theirs.mask)
+        np.testing.assert_allclose(ours.positions, theirs.positions, atol=0.026)
+        spread = theirs.features.std()
+        np.testing.assert_allclose(
+            ours.features, theirs.features, atol=(0.01 if precision == "float16" else 1.5) * spread
+        )
+        assert np.sqrt(np.mean((ours.features - theirs.features) ** 2)) < 0.3 * spread
+        a, b = expand_surface(ours.surface), expand_surface(theirs.surface)
+        np.testing.assert_allclose(a.points, b.points, atol=0.011)
+        np.testing.assert_allclose(a.flatness, b.flatness, atol=0.04)
+        is_flat = b.flatness > 0
+        assert np.abs(np.sum(a.normals * b.normals, axis=1))[is_flat].min(initial=1) > np.cos(np.radians(2.0))
+
+
+def test_int8_leaves_out_keyframes_that_others_cover(tmp_path) -> None:
+    apart = MAP.T_world_keyframe.copy()
+    apart[:, :3, 3] = [[0, 0, 0], [3, 0, 0], [8, 0, 0], [9, 0, 0]]  # the extent is 7.3 m
+    joined = replace(MAP, T_world_keyframe=apart, edges=tuple(edge._replace(kind="odometry") for edge in MAP.edges))
+    path = tmp_path / "map.npz"
+    scans = [keyframe.scan for keyframe in load_map(save_map(path, joined, "int8")).keyframes]
+    assert scans == [MAP.keyframes[0].scan, MAP.keyframes[2].scan]
+    assert len(load_map(save_map(path, joined, "int8", spacing_share=0.0))) == 4
+    assert len(load_map(save_map(path, joined))) == 4
+    assert len(load_map(save_map(path, joined, spacing_share=0.8))) == 2
+
+
+def test_fewer_bytes_at_lower_precision() -> None:
+    sizes = [len(map_bytes(MAP, precision)) for precision in ("float32", "float16", "int8")]
+    assert sizes[0] > sizes[1] > sizes[2]
+
+
+def test_rounded_surfaces_are_thinned(tmp_path) -> None:
+    dense = scan_surface(room(20000), SurfaceConfig(voxel_size_m=0.15))
+    keyframe = MAP.keyframes[0]
+    scan_ = keyframe.description._replace(surface=compact_surface(dense, 4000))
+    keyframes = (keyframe._replace(description=scan_), *MAP.keyframes[1:])
+    found = load_map(save_map(tmp_path / "map.npz", replace(MAP, keyframes=keyframes), "int8"))
+    assert len(found.keyframes[0].description.surface.points) == 2000
+
+
+def test_wrong_arguments_are_refused(as_user, tmp_path) -> None:
+    with pytest.raises(ValueError, match="path: expected a file that ends in .npz"):
+        save_map(tmp_path / "map.bin", MAP)
+    with pytest.raises(ValueError, match="precision: expected one of float32"):
+        save_map(tmp_path / "map.npz", MAP, "int4")
+    with pytest.raises(ValueError, match="got an empty map"):
+        save_map(tmp_path / "map.npz", KeyframeMap())
+    foreign = replace(MAP, keyframes=(MAP.keyframes[0]._replace(description=1), *MAP.keyframes[1:]))
+    with pytest.raises(ValueError, match="got those of another matcher"):
+        save_map(tmp_path / "map.npz", foreign)
+    assert not list(tmp_path.iterdir())
+
+
+def changed(arrays: dict, **changes) -> dict:
+    return {name: array for name, array in {**arrays, **changes}.items() if array is not None}
+
+
+def header(arrays: dict, **changes) -> np.ndarray:
+    return np.frombuffer(json.dumps({**json.loads(arrays["header"].tobytes()), **changes}).encode(), np.uint8)
+
+
+BROKEN = {
+    "no map": lambda a: {"points": np.zeros(3)},
+    "version 2": lambda a: changed(a, header=header(a, version=2)),
+    "not a dpmjax map": lambda a: changed(a, header=header(a, format="other")),
+    "precision int4": lambda a: changed(a, header=header(a, precision="int4")),
+    "unknown field": lambda a: changed(a, header=header(a, config={"wrong": 1})),
+    "header cannot be read": lambda a: changed(a, header=a["header"][:-5]),
+    "features holds": lambda a: changed(a, features=a["features"] * np.nan),
+    "T_world_keyframe holds": lambda a: changed(a, T_world_keyframe=a["T_world_keyframe"] * np.inf),
+    "scan is missing": lambda a: changed(a, scan=None),
+    "positions: expected shape": lambda a: changed(a, positions=a["positions"][:, :5]),
+    "mask: expected shape": lambda a: changed(a, mask=a["mask"].astype(np.int8)),
+    "expected rotations": lambda a: changed(a, T_world_keyframe=2 * a["T_world_keyframe"]),
+    "expected rows of 4 keyframes": lambda a: changed(a, edge_rows=a["edge_rows"] + 9),
+    "surface_points: expected shape": lambda a: changed(a, surface_count=a["surface_count"] + 1),
+    "image_first_row": lambda a: changed(a, image_first_row=a["image_first_row"] - 900),
+    "expected at least one keyframe": lambda a: changed(a, mask=np.zeros((0, 3), bool)),
+    "holds values": lambda a: changed(a, scan=np.array(["a"] * 4)),
+}
+
+
+@pytest.mark.parametrize("found", BROKEN)
+def test_foreign_and_broken_files_are_refused(as_user, tmp_path, found) -> None:
+    with np.load(io.BytesIO(map_bytes(MAP))) as archive:
+        arrays = dict(archive)
+    path = tmp_path / "map.npz"
+    np.savez(path, **BROKEN[found](arrays))
+    expected = "not one of a dpmjax map" if found == "no map" else found
+    with pytest.raises(InputError, match=expected) as error:
+        load_map(path)
+    assert str(error.value).startswith(f"{path}: ")
+    assert "\n" not in str(error.value)
+
+
+def test_files_that_are_none_are_refused(as_user, tmp_path) -> None:
+    with pytest.raises(InputError, match="no such file"):
+        load_map(tmp_path / "none.npz")
+    for name, content in (("empty.npz", b""), ("text.npz", b"a map\n"), ("folder.npz", None)):
+        path = tmp_path / name
+        path.mkdir() if content is None else path.write_bytes(content)
+        with pytest.raises(InputError, match="not a readable NumPy file"):
+            load_map(path)
+
+
+@pytest.mark.parametrize("precision", ["float32", "int8"])
+def test_flipped_and_cut_files_load_equal_or_are_refused(tmp_path, precision) -> None:
+    content = map_bytes(make_map(2), precision)
+    path = tmp_path / "map.npz"
+    path.write_bytes(content)
+    whole = load_map(path)
+    names = [info.header_offset for info in zipfile.ZipFile(io.BytesIO(content)).infolist()]
+    rng = np.random.default_rng(0)
+    for number in range(100):
+        damaged = bytearray(content)
+        if number % 4 == 0:
+            damaged = damaged[: rng.integers(len(content))]
+        else:
+            # Half of the flips go into the headers of the archive, which are short.
+            start = names[rng.integers(len(names))] if number % 2 else rng.integers(len(content))
+            damaged[min(start + rng.integers(60), len(content) - 1)] ^= 1 << rng.integers(8)
+        path.write_bytes(bytes(damaged))
+        try:
+            found = load_map(path)
+        except InputError:
+            continue
+        assert_equal_maps(found, whole)
