@@ -25,7 +25,7 @@ from dpmjax.slam.map_thinning import thin_map
 from dpmjax.weights.config_json import config_from_json
 
 FORMAT, VERSION = "dpmjax map", 1
-SPACING_SHARE = 1.0
+SPACING_SHARE = 0.8
 ADVICE = "save it again with dpmjax.save_map"
 
 
@@ -41,7 +41,7 @@ def save_map(
             "float16" rounds features and poses. "int8" is the smallest, for localisation: it rounds features to codes,
             thins surfaces to 2,000 points, and leaves out keyframes that others cover (`slam.thin_map`).
         spacing_share: keyframes nearer to others than this share of their extent are left out; 0 keeps all. None takes
-            1 for "int8" and 0 for the others.
+            0.8 for "int8" and 0 for the others.
 
     Returns:
         The path.

@@ -10,7 +10,7 @@ from dpmjax.geometry import rigid
 from dpmjax.slam.keyframes import KeyframeMap, MapEdge, connected_parts, distances_to
 
 
-def thin_map(map_: KeyframeMap, *, spacing_share: float = 1.0) -> KeyframeMap:
+def thin_map(map_: KeyframeMap, *, spacing_share: float = 0.8) -> KeyframeMap:
     """Leaves out keyframes near others, also of other laps, so that the map does not grow where it is driven again.
 
     The poses are those of the map. An edge between keyframes that were left out joins those that cover them; its
