@@ -114,12 +114,12 @@ def run_agent(folder: RunFolder, sequence: LidarSequence, methods: SlamMethods, 
     """Lets one agent map alone, or go on."""
     from dpmjax.slam import finish_slam, init_slam
     from experiments._slam_input import ScanReader
-    from experiments._slam_run import run_scans
+    from experiments._slam_run import Hooks, run_scans
     from experiments.dpm_slam import find_beginning
 
     reader = ScanReader(sequence)
     beginning = find_beginning(folder, methods, init_slam(), reader)
-    run = run_scans(folder, sequence, reader, methods, beginning, lambda: stop.is_requested)
+    run = run_scans(folder, sequence, reader, methods, beginning, Hooks(lambda: stop.is_requested))
     if run.failure is not None:
         raise run.failure
     return finish_slam(run.state, run.reports, methods.config)

@@ -68,7 +68,8 @@ def join_maps(
         raise ValueError("maps: expected at least one, got none")
     joined = _side_by_side(maps)
     map_of_row = np.repeat(np.arange(len(maps)), [len(each) for each in maps])
-    inner, loops = loops_of_map(joined).loops, ()
+    inner = loops_of_map(joined).loops
+    loops: tuple[Loop, ...] = ()
     order = sorted(range(len(maps)), key=lambda number: (-len(maps[number]), maps[number].vectors.tobytes()))
     num_compared, num_all = 0, len(joined) - len(maps[order[0]])
     for place, number in enumerate(order[1:], start=1):
