@@ -161,7 +161,7 @@ def keyframe_views(
 def write_map_file(path: Path, slam_map: KeyframeMap) -> dict[str, int]:
     """Writes the map that later runs extend and scans are localised in; returns its size at each precision."""
     import dpmjax
-    from dpmjax.io.maps import map_bytes
+    from dpmjax.saved_maps import map_bytes
 
     dpmjax.save_map(path, slam_map)
     sizes = {name: len(map_bytes(slam_map, name)) for name in ("float16", "int8")}

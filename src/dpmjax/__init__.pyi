@@ -21,8 +21,6 @@ from .geometry.sampling import farthest_point_sample as farthest_point_sample
 from .geometry.sampling import voxel_sample as voxel_sample
 from .io.g2o import read_g2o as read_g2o
 from .io.g2o import write_g2o as write_g2o
-from .io.maps import load_map as load_map
-from .io.maps import save_map as save_map
 from .losses.descriptors import info_nce as info_nce
 from .losses.mapping import chamfer_distance as chamfer_distance
 from .losses.mapping import occupancy_loss as occupancy_loss
@@ -36,6 +34,8 @@ from .pose_graph.graph import PoseGraph as PoseGraph
 from .pose_graph.optimize import PoseGraphConfig as PoseGraphConfig
 from .pose_graph.optimize import optimize_pose_graph as optimize_pose_graph
 from .registration.icp import icp as icp
+from .saved_maps.map_file import load_map as load_map
+from .saved_maps.map_file import save_map as save_map
 from .slam.agents import AgentsResult as AgentsResult
 from .slam.agents import merge_maps as merge_maps
 from .slam.agents import run_agents as run_agents

@@ -16,9 +16,6 @@ from .lidar import LidarSequence as LidarSequence
 from .lidar import list_lidar_sequences as list_lidar_sequences
 from .lidar import open_lidar_sequence as open_lidar_sequence
 from .lidar import read_lidar_file as read_lidar_file
-from .maps import load_map as load_map
-from .maps import map_bytes as map_bytes
-from .maps import save_map as save_map
 from .pictures import read_world_png as read_world_png
 from .pictures import write_world_png as write_world_png
 from .poses import read_planar_poses as read_planar_poses

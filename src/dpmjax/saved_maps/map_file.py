@@ -16,8 +16,8 @@ import numpy as np
 
 from dpmjax.deeppointmap.compact_scans import CompactScan
 from dpmjax.io.files import load_arrays, refusing, write_atomically
-from dpmjax.io.map_arrays import ArrayReader, pack_graph, pack_scans, unpack_graph, unpack_scans
-from dpmjax.io.map_coding import Precision
+from dpmjax.saved_maps.map_arrays import ArrayReader, pack_graph, pack_scans, unpack_graph, unpack_scans
+from dpmjax.saved_maps.map_coding import Precision
 from dpmjax.sequences import require
 from dpmjax.slam.config import MapOrigin, SlamConfig
 from dpmjax.slam.keyframes import KeyframeMap

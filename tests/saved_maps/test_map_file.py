@@ -13,7 +13,8 @@ import pytest
 from dpmjax import load_map, save_map
 from dpmjax.deeppointmap.compact_scans import CompactScan, compact_scan
 from dpmjax.deeppointmap.verification import MeasuredScan
-from dpmjax.io import InputError, map_bytes
+from dpmjax.io import InputError
+from dpmjax.saved_maps import map_bytes
 from dpmjax.scans.compact import compact_surface, expand_surface
 from dpmjax.scans.free_space import range_image
 from dpmjax.scans.surfaces import SurfaceConfig, scan_surface

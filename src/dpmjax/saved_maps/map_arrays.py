@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dpmjax.deeppointmap.compact_scans import CompactScan
-from dpmjax.io.map_coding import (
+from dpmjax.saved_maps.map_coding import (
     POSITION_STEP_M,
     FeatureCodes,
     Precision,

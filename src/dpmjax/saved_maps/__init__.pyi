@@ -1,0 +1,3 @@
+from .map_file import load_map as load_map
+from .map_file import map_bytes as map_bytes
+from .map_file import save_map as save_map
