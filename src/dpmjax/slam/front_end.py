@@ -88,7 +88,7 @@ class TimedScan(NamedTuple):
     offsets: Float[AnyArray, " n"]
 
 
-AnyScan = Float[AnyArray, "n 3"] | TimedScan
+AnyScan = Float[AnyArray, "_n 3"] | TimedScan
 
 
 def step(
