@@ -117,7 +117,7 @@ def _normals(
     if num_neighbours < MIN_NEIGHBOURS:
         return np.zeros((len(points), 3)), np.zeros(len(points))
     order = tree.indices  # queries in the order of the tree find what they need in the cache
-    distances, rows = map(np.asarray, tree.query(points[order], num_neighbours))
+    distances, rows = map(np.asarray, tree.query(points[order], num_neighbours, workers=2))
     is_near = distances <= config.neighbour_radius_m
     counts = is_near.sum(axis=1)[:, None]
     apart = np.where(is_near[..., None], points[rows] - points[order, None], 0)
