@@ -1,11 +1,8 @@
-"""Planar logs of which a part is registered: which scans, poses of all the others, errors by hand-checked relations."""
+"""Planar logs of which a part is registered: which scans, poses of all the others, and their errors."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
-from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,10 +15,10 @@ if TYPE_CHECKING:
 Floats = NDArray[np.float64]
 # Scans so far apart are registered, where that leaves out more than every other one.
 MIN_DISTANCE_M, MIN_TURN_RAD = 0.5, 0.35
+MIN_COMMON = 10
 
 
-@dataclass(frozen=True)
-class Recording:
+class Recording(NamedTuple):
     """The scans of a run.
 
     Attributes:
@@ -43,32 +40,25 @@ class Recording:
         count = f"{len(self.chosen)} scans of {self.whole.points.shape[1]} beams"
         return count if self._is_all else f"{count}, chosen of {len(self.whole)} by their motion"
 
-    def all_poses(self, poses: Floats) -> Floats:
-        """Returns poses of all scans, by those of the registered ones."""
+    def between(self, poses: Floats) -> Floats:
+        """Returns poses of all scans, by those of the registered ones and the odometry between them."""
         if self._is_all:
             return poses
         assert self.whole.odometry_poses is not None
-        between = registration.fill_between(self.chosen, poses, self.whole.odometry_poses)
-        return registration.align_between(self.planar, self.chosen, between)
+        return registration.fill_between(self.chosen, poses, self.whole.odometry_poses)
 
-    def relation_numbers(self, relations: Relations | None, candidates: Mapping[str, Floats]) -> dict[str, float]:
-        """Returns the mean errors of poses, by their suffix, against hand-checked relations, if there are any."""
-        numbers: dict[str, float] = {}
-        if relations is None:
-            return numbers
+    def aligned(self, poses: Floats) -> Floats:
+        """Returns the same, each scan aligned with the nearest registered one."""
+        if self._is_all:
+            return poses
+        planar = registration.planar_scans(self.whole.points, self.whole.mask)
+        return registration.align_between(planar, self.chosen, self.between(poses))
+
+    def times(self) -> Floats:
+        """Returns the times of all scans; a `ValueError` if the log has none."""
         if self.whole.times is None:
-            raise ValueError(f"{self.whole.name}: its scans have no times, which relations need")
-        for suffix, poses in candidates.items():
-            found = metrics.relation_errors(relations, self.whole.times, self.all_poses(poses))
-            numbers[f"relations{suffix}_m"] = float(found.translation_m.mean())
-            numbers[f"relations{suffix}_deg"] = float(found.rotation_deg.mean())
-            numbers["num_relations"] = int(found.is_used.sum())
-        return numbers
-
-    @cached_property
-    def planar(self) -> registration.PlanarScans:
-        """Returns all scans with a line at every beam."""
-        return registration.planar_scans(self.whole.points, self.whole.mask)
+            raise ValueError(f"{self.whole.name}: its scans have no times, which relations and a corrected log need")
+        return self.whole.times
 
     @property
     def _is_all(self) -> bool:
@@ -82,3 +72,29 @@ def choose_scans(whole: ScanSequence, *, is_ordered: bool = True) -> Recording:
         return Recording(whole, everything)
     chosen = registration.choose_by_motion(whole.odometry_poses, MIN_DISTANCE_M, MIN_TURN_RAD)
     return Recording(whole, chosen if 2 * len(chosen) < len(whole) else everything)
+
+
+def relation_numbers(times: Floats, poses: Floats, relations: Relations, suffix: str = "") -> dict[str, float]:
+    """Returns the mean errors of the poses of all scans against hand-checked relations."""
+    found = metrics.relation_errors(relations, times, poses)
+    return {
+        f"relations{suffix}_m": float(found.translation_m.mean()),
+        f"relations{suffix}_deg": float(found.rotation_deg.mean()),
+        "num_relations": int(found.is_used.sum()),
+    }
+
+
+def corrected_numbers(times: Floats, poses: Floats, corrected: ScanSequence, suffix: str = "") -> dict[str, float]:
+    """Returns the ATE of the poses of all scans at those that a corrected log of the same drive has too."""
+    if corrected.reference_poses is None or corrected.times is None:
+        raise ValueError(f"{corrected.name}: has no corrected poses with times")
+    _, mine, theirs = np.intersect1d(np.round(times, 3), np.round(corrected.times, 3), return_indices=True)
+    if len(mine) < MIN_COMMON:
+        raise ValueError(
+            f"{corrected.name}: {len(mine)} scans have the time of a scan of the recording, not {MIN_COMMON}"
+        )
+    reference = corrected.reference_poses[theirs, :2]
+    return {
+        f"ate_corrected{suffix}_m": metrics.absolute_trajectory_error(poses[mine, :2], reference),
+        "num_corrected": len(mine),
+    }

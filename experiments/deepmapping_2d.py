@@ -19,7 +19,7 @@ from __future__ import annotations
 import logging
 import math
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
@@ -34,7 +34,7 @@ from experiments._command import StopFlag, check_least, run_command
 from experiments._deepmapping_fit import FitRun, draw_loss, run_fit
 from experiments._deepmapping_methods import Candidates, Floats, Task
 from experiments._machine import peak_rss_gb
-from experiments._recordings import Recording, choose_scans
+from experiments._recordings import Recording, choose_scans, corrected_numbers, relation_numbers
 from experiments._run_folder import RunFolder, RunOptions, open_run_folder, recording, write_metrics
 
 if TYPE_CHECKING:
@@ -72,6 +72,8 @@ class Config(RunOptions):
     """First scan to use."""
     relations: Annotated[Path | None, arg(metavar="FILE")] = None
     """Hand-checked relations of a log, to measure the result by."""
+    corrected: Annotated[Path | None, arg(metavar="LOG")] = None
+    """A log of the same drive with corrected poses, to measure the result by at scans of the same time."""
     n_scans: Annotated[int | None, arg(aliases=["-n"], metavar="N")] = None
     """Use N scans; without it, all."""
     jump: Annotated[int, arg(aliases=["-j"], metavar="N")] = 1
@@ -94,11 +96,12 @@ def main(config: Config) -> dict[str, Any]:
     """Reads, starts, fits, refines, keeps the best candidate, writes; returns the content of `metrics.json`."""
     started = time.perf_counter()
     log = choose_scans(read_scans(config), is_ordered=config.ordered)
-    relations = None if config.relations is None else io.read_relations(config.relations)
     sequence = log.registered
     planar = registration.planar_scans(sequence.points, sequence.mask, is_ordered=config.ordered)
     task = Task(sequence, planar, is_ordered=config.ordered, seed=config.seed)
     start_name, start = starting_poses(config, task, log)
+    measure = measures_of(config, log)
+    measured_before = measure(log.between(start), "_initial")
     settings = fit_settings(config, sequence)
     folder = open_run_folder(config, EXPERIMENT)
     with recording(folder), StopFlag() as stop:
@@ -112,12 +115,14 @@ def main(config: Config) -> dict[str, Any]:
                 for name, poses in list(candidates.items())[config.init == "zero" :]
             }
         kept, compared = shared.choose(task, candidates)
+        trajectory = log.aligned(candidates[kept])
         metrics = {
             "num_scans": len(log.whole),
             "num_registered": len(sequence),
             "steps": run.steps,
             **before_and_after(sequence, start, candidates[kept]),
-            **log.relation_numbers(relations, {"": candidates[kept], "_initial": start}),
+            **measured_before,
+            **measure(trajectory, ""),
             "start": start_name,
             "kept": kept,
             "candidates": compared,
@@ -128,7 +133,7 @@ def main(config: Config) -> dict[str, Any]:
             "is_interrupted": stop.is_requested,
         }
         # Numbers first: a picture that fails must not cost them.
-        write_trajectories(folder, log.whole, log.all_poses(candidates[kept]))
+        write_trajectories(folder, log.whole, trajectory)
         write_metrics(folder, metrics | {"wall_s": time.perf_counter() - started}, seed=config.seed)
         limits = draw_map(folder, task, candidates, metrics)
         draw_occupancy(folder, sequence, run, candidates[kept], limits)
@@ -155,6 +160,21 @@ def _fit(
         stop=lambda run_s: stop.is_requested or (config.seconds is not None and run_s >= config.seconds),
     )
     return run._replace(fitted=run.fitted._replace(poses=run.fitted.poses[np.argsort(order)]))
+
+
+def measures_of(config: Config, log: Recording) -> Callable[[Floats, str], dict[str, float]]:
+    """Reads what the result is measured by, beside its own reference; returns the numbers of poses of all scans."""
+    relations = None if config.relations is None else io.read_relations(config.relations)
+    corrected = None if config.corrected is None else io.read_sequence(config.corrected)
+    if relations is None and corrected is None:
+        return lambda _poses, _suffix: {}
+    times = log.times()
+
+    def measure(poses: Floats, suffix: str) -> dict[str, float]:
+        by_relations = {} if relations is None else relation_numbers(times, poses, relations, suffix)
+        return by_relations | ({} if corrected is None else corrected_numbers(times, poses, corrected, suffix))
+
+    return measure
 
 
 def read_scans(config: Config) -> ScanSequence:
@@ -269,6 +289,9 @@ def report(unit: str, metrics: Mapping[str, Any]) -> str:
     if "num_relations" in metrics:
         kinds = (f"{metrics[f'relations_initial_{kind}']:.3g} -> {metrics[f'relations_{kind}']:.3g}" for kind in UNITS)
         lines.append(f"mean error of {metrics['num_relations']} hand-checked relations: {' m, '.join(kinds)} degrees")
+    if "num_corrected" in metrics:
+        before, after = metrics["ate_corrected_initial_m"], metrics["ate_corrected_m"]
+        lines.append(f"ATE at {metrics['num_corrected']} scans of the corrected log: {before:.3g} -> {after:.3g} m")
     return "\n".join(lines)
 
 
