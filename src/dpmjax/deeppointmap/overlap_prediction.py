@@ -107,7 +107,7 @@ def overlap_evidence(model: Model, a: DescriptorCloud, b: DescriptorCloud) -> Ov
     best = jnp.argmax(scores, axis=1)
     is_mutual = a.mask & (jnp.argmax(scores, axis=0)[best] == jnp.arange(len(best)))
     motion = _best_motion(model, correlated, similarity)
-    gate = jax.nn.sigmoid((OVERLAP_M - motion.distance_m) / GATE_M)
+    gate = jax.nn.sigmoid((OVERLAP_M - motion["distance_m"]) / GATE_M)
     radii = [_mean(jnp.linalg.norm(cloud.positions, axis=1), cloud.mask) + 1 for cloud in (a, b)]
     return OverlapEvidence(
         scan_similarity=jnp.dot(_mean_direction(a), _mean_direction(b)),
@@ -116,10 +116,10 @@ def overlap_evidence(model: Model, a: DescriptorCloud, b: DescriptorCloud) -> Ov
         score_median=_quantile_of_best(scores, a.mask, b.mask, 0.5),
         score_high=_quantile_of_best(scores, a.mask, b.mask, HIGH),
         mutual_share=jnp.sum(is_mutual) / jnp.maximum(jnp.minimum(jnp.sum(a.mask), jnp.sum(b.mask)), 1),
-        near_support=motion.support * gate,
+        near_support=motion["support"] * gate,
         log_radius=jnp.log(jnp.minimum(*radii)),
         log_radius_ratio=jnp.abs(jnp.log(radii[0] / radii[1])),
-        **motion._asdict(),
+        **motion,
     )
 
 
@@ -147,20 +147,10 @@ def overlap_probability(model: Model, a: DescriptorCloud, b: DescriptorCloud) ->
     return jnp.where(is_known, jax.nn.sigmoid(jnp.where(is_known, logit, 0)), 0)
 
 
-class _BestMotion(NamedTuple):
-    # The fields of `OverlapEvidence` that the best motion gives.
-    support: Float[Array, ""]
-    support_second: Float[Array, ""]
-    offset_disagreement_m: Float[Array, ""]
-    distance_m: Float[Array, ""]
-    met_share: Float[Array, ""]
-    met_similarity: Float[Array, ""]
-    spread_m: Float[Array, ""]
-
-
 def _best_motion(
     model: Model, correlated: tuple[DescriptorCloud, DescriptorCloud], similarity: Float[Array, "m n"]
-) -> _BestMotion:
+) -> dict[str, Float[Array, ""]]:
+    # The fields of `OverlapEvidence` that the best motion gives.
     a, b = correlated
     pairs = best_pairs(similarity, a.mask, b.mask, config=MATCHING)
     rows, columns = pairs.source_indices, pairs.target_indices
@@ -178,15 +168,15 @@ def _best_motion(
     apart = jnp.where(is_pair, jnp.sum((moved[:, None] - b.positions[None]) ** 2, axis=2), jnp.inf)
     meets = [jnp.min(apart, axis=axis) < MET_M**2 for axis in (1, 0)]
     similarity_there = jnp.take_along_axis(similarity, jnp.argmin(apart, axis=1)[:, None], axis=1)[:, 0]
-    return _BestMotion(
-        support=support[0],
-        support_second=support[1],
-        offset_disagreement_m=_mean(jnp.minimum(disagreement, MAX_DISAGREEMENT_M), is_inlier),
-        distance_m=jnp.minimum(jnp.linalg.norm(T[:3, 3]), MAX_DISTANCE_M),
-        met_share=(_mean(meets[0], a.mask) + _mean(meets[1], b.mask)) / 2,
-        met_similarity=_mean(similarity_there, meets[0]),
-        spread_m=_spread(points[:, :2], is_inlier),
-    )
+    return {
+        "support": support[0],
+        "support_second": support[1],
+        "offset_disagreement_m": _mean(jnp.minimum(disagreement, MAX_DISAGREEMENT_M), is_inlier),
+        "distance_m": jnp.minimum(jnp.linalg.norm(T[:3, 3]), MAX_DISTANCE_M),
+        "met_share": (_mean(meets[0], a.mask) + _mean(meets[1], b.mask)) / 2,
+        "met_similarity": _mean(similarity_there, meets[0]),
+        "spread_m": _spread(points[:, :2], is_inlier),
+    }
 
 
 def _mean(values: Array, mask: Bool[Array, " n"]) -> Float[Array, ""]:

@@ -66,6 +66,7 @@ class Located(NamedTuple):
         score: agreement with the local map.
         information: (6, 6) in the tangent of the scan.
         probability: P(correct) of the network; None where it was not asked.
+        description: of the scan, by the matcher; None where it was not asked.
     """
 
     T_keyframe_scan: Pose
@@ -74,6 +75,7 @@ class Located(NamedTuple):
     score: float
     information: Float[np.ndarray, "6 6"]
     probability: float | None = None
+    description: Any | None = None
 
 
 class TimedScan(NamedTuple):
@@ -172,18 +174,20 @@ def _locate(methods: SlamMethods, state: FrontEndState, slam_map: KeyframeMap, s
     if found.score >= wanted:
         reason = f"score {found.score:.2f} of usually {usual:.2f}"
         return Located(found.T_map_scan, "tracked", reason, found.score, found.information)
-    source = Submap((methods.matcher.describe(scan.points, scan.measured),), np.eye(4)[None])
+    description = methods.matcher.describe(scan.points, scan.measured)
+    source = Submap((description,), np.eye(4)[None])
     target = submap_around(slam_map, len(slam_map) - 1, config.num_submap, config.submap_radius_m)
     match = methods.matcher.register([(source, target)])[0]
     start = PosePrior(match.T_target_source, np.eye(4), usual, is_sure=True)
     other = methods.geometry.align(state.local_map, scan.measured, start)
     numbers = f"score {found.score:.2f} by geometry, {other.score:.2f} by the network with P {match.probability:.2f}"
     if other.score >= wanted and other.score > found.score:
-        return Located(other.T_map_scan, "network", numbers, other.score, other.information, match.probability)
+        agreed = other.score, other.information, match.probability
+        return Located(other.T_map_scan, "network", numbers, *agreed, description)
     status: ScanStatus = "restarted" if state.num_lost + 1 >= config.num_lost else "predicted"
     guess = diagonal_information(config.guess_m, config.guess_rad)
     predicted = state.T_keyframe_last @ state.T_before_last
-    return Located(predicted, status, numbers, max(found.score, other.score), guess, match.probability)
+    return Located(predicted, status, numbers, max(found.score, other.score), guess, match.probability, description)
 
 
 def _is_keyframe(methods: SlamMethods, located: Located, measured: Any) -> bool:
@@ -201,7 +205,9 @@ def _make_keyframe(
     matcher, geometry, T = methods.matcher, methods.geometry, located.T_keyframe_scan
     row = len(slam_map)
     is_guess = row > 0 and located.status in ("first", "restarted")
-    description = matcher.describe(scan.points, scan.measured)
+    description = located.description
+    if description is None:
+        description = matcher.describe(scan.points, scan.measured)
     T_odometry, T_world, path_m, segment, edge = T, T, 0.0, 0, None
     if row:
         last = slam_map.keyframes[-1]
