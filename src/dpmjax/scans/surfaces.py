@@ -42,7 +42,7 @@ class SurfaceConfig:
     voxel_size_m: float = 0.3
     num_neighbours: int = 12
     neighbour_radius_m: float = 1.5
-    sparse_radius_share: float = 1.5
+    sparse_radius_share: float = 0.0
 
     def __post_init__(self) -> None:
         if not 0 <= self.min_range_m < self.max_range_m:

@@ -24,6 +24,7 @@ class OdometryConfig:
         max_range_m: farther points are too sparse and are dropped.
         voxel_share: side of the voxels that thin a scan, as a share of its extent ...
         voxel_sizes_m: ... rounded down to one of these.
+        sparse_radius_share: see `SurfaceConfig`.
         min_num_points: a scan with fewer surface points counts as empty.
         narrow: alignment from a prior that is nearly right.
         wide: alignment from any other start.
@@ -47,6 +48,7 @@ class OdometryConfig:
     max_range_m: float = 80.0
     voxel_share: float = 0.025
     voxel_sizes_m: tuple[float, ...] = (0.1, 0.15, 0.2, 0.3)
+    sparse_radius_share: float = 1.5
     min_num_points: int = 100
     narrow: AlignmentConfig = NARROW
     wide: AlignmentConfig = WIDE
@@ -69,7 +71,7 @@ class OdometryConfig:
         require_positive_fields(self, "voxel_share", "frame_share", "frame_rad", "plane_distance_m", "floor_m")
         require_positive_fields(self, "floor_rad")
         require_fields(self, "min_num_points", "num_frames", "num_samples", low=1)
-        require_fields(self, "min_range_m", "contradiction_weight", low=0)
+        require_fields(self, "min_range_m", "contradiction_weight", "sparse_radius_share", low=0)
         require_fields(self, "min_cosine", "good_share", low=0, high=1)
         require_fields(self, "max_range_m", low=self.min_range_m)
         if not self.voxel_sizes_m or min(self.voxel_sizes_m) <= 0:

@@ -88,7 +88,13 @@ class SurfaceGeometry:
         radius_m = 5 * voxel_m
         surface = scan_surface(
             points,
-            SurfaceConfig(config.min_range_m, config.max_range_m, voxel_m, neighbour_radius_m=radius_m),
+            SurfaceConfig(
+                config.min_range_m,
+                config.max_range_m,
+                voxel_m,
+                neighbour_radius_m=radius_m,
+                sparse_radius_share=config.sparse_radius_share,
+            ),
         )
         if len(surface.samples) < config.min_num_points:
             return None
