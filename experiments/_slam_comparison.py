@@ -20,6 +20,7 @@ from experiments._result_files import do_row
 from experiments._run_folder import RunFolder
 from experiments._slam_evaluation import ODOMETRY, OURS, PRECISIONS, Drive, StoppedError
 from experiments._slam_input import read_points, require_whole_files
+from experiments._slam_localization import evaluate_localization
 from experiments._slam_peers import PEERS, why_missing
 
 if TYPE_CHECKING:
@@ -43,6 +44,9 @@ SIZES = {
     "map_bytes_float16": "ours, float16",
     "map_bytes_int8": "ours, int8",
 }
+
+
+Task = tuple[Drive, str, Callable[[], dict[str, Any]]]
 
 
 def open_drives(config: Config, first_town: int) -> list[LidarSequence]:
@@ -84,31 +88,36 @@ def compare(
     """Makes the rows that are missing; ends early where a signal came."""
     methods = make_methods(load_model(config.weights), weights=config.weights)
     missing = missing_peers()
-    for sequence in sequences:
-        drive = evaluation.open_folder(folder, sequence, is_stopped)
-        done: dict[str, dict[str, Any]] = {}
-        for method, work in _works(config, drive, methods, done):
-            if method in missing:
-                continue
-            case = {"sequence": sequence.name, "method": method}
-            try:
-                done[method] = do_row(folder.path, case, work, seed=config.seed)
-            except StoppedError:
-                return
-            yield drive, done[method]
+    drives = [evaluation.open_folder(folder, sequence, is_stopped) for sequence in sequences]
+    ours: dict[str, dict[str, Any]] = {}
+    # Trajectories of all drives come first: an early end leaves a whole table.
+    for drive, method, work in (*_runs(drives, methods, ours), *_localizations(config, drives, methods)):
+        if method in missing:
+            continue
+        case = {"sequence": drive.sequence.name, "method": method}
+        try:
+            row = do_row(folder.path, case, work, seed=config.seed)
+        except StoppedError:
+            return
+        if method == OURS:
+            ours[drive.sequence.name] = row
+        yield drive, row
 
 
-def _works(
-    config: Config, drive: Drive, methods: SlamMethods, done: dict[str, dict[str, Any]]
-) -> Iterator[tuple[str, Callable[[], dict[str, Any]]]]:
-    for name in PEERS:
-        yield name, partial(evaluation.evaluate_peer, drive, name)
-    yield OURS, partial(evaluation.evaluate_ours, drive, methods)
-    yield ODOMETRY, lambda: evaluation.odometry_row(drive, done[OURS])
-    if config.localize and drive.reference is not None:
-        for precision in PRECISIONS:
-            arguments = (drive, methods, precision, config.localize, config.seed)
-            yield f"localization, {precision}", partial(evaluation.evaluate_localization, *arguments)
+def _runs(drives: Sequence[Drive], methods: SlamMethods, ours: dict[str, dict[str, Any]]) -> Iterator[Task]:
+    for drive in drives:
+        for name in PEERS:
+            yield drive, name, partial(evaluation.evaluate_peer, drive, name)
+        yield drive, OURS, partial(evaluation.evaluate_ours, drive, methods)
+        yield drive, ODOMETRY, lambda drive=drive: evaluation.odometry_row(drive, ours[drive.sequence.name])
+
+
+def _localizations(config: Config, drives: Sequence[Drive], methods: SlamMethods) -> Iterator[Task]:
+    for drive in drives:
+        if config.localize and drive.reference is not None:
+            for precision in PRECISIONS:
+                work = partial(evaluate_localization, drive, methods, precision)
+                yield drive, f"localization, {precision}", partial(work, config.localize, config.seed)
 
 
 def tables(rows: Sequence[dict[str, Any]]) -> str:

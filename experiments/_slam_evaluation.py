@@ -9,7 +9,7 @@ A loop is wrong beyond 2 m or 5 degrees. A scan comes back where it is within 5 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from tqdm import tqdm
 
-from dpmjax import load_map, save_map
+from dpmjax import save_map
 from dpmjax.geometry import rigid
 from dpmjax.metrics import find_revisits, loop_recall, registration_recall
 from dpmjax.metrics.loops import path_lengths
@@ -270,52 +270,3 @@ def first_keyframes(slam_map: KeyframeMap, num: int) -> KeyframeMap:
         vectors=slam_map.vectors[:num],
         edges=edges,
     )
-
-
-def evaluate_localization(drive: Drive, methods: SlamMethods, precision: str, num: int, seed: int) -> dict[str, Any]:
-    """Looks for random scans of the drive in the map of its first half, saved and loaded at a precision.
-
-    The map is that of the SLAM run. No scan is one of its keyframes. A scan is in the map where a keyframe of the whole
-    first half is near; elsewhere the right answer is that it is not.
-    """
-    from dpmjax.slam import localize_each
-    from experiments.dpm_localize import Case, as_row, measure_errors
-
-    assert drive.reference is not None
-    whole = load_map(map_path(drive.folder.path, "float32"))
-    half = first_keyframes(whole, sum(keyframe.scan < len(drive.sequence) / 2 for keyframe in whole.keyframes))
-    path = save_map(drive.folder / f"first_half_{precision}.npz", half, precision)
-    map_, taken = load_map(path), {keyframe.scan for keyframe in half.keyframes}
-    others = [scan for scan in range(len(drive.sequence)) if scan not in taken]
-    chosen = np.sort(np.random.default_rng(seed).choice(others, min(num, len(others)), replace=False))
-    part = drive.sequence.take(chosen)
-    known = drive.reference[[keyframe.scan for keyframe in map_.keyframes]]
-    case, rows, clock = Case(map_, part, known), [], time.perf_counter()
-    scans = tqdm(_points_of(part, drive), desc=f"{part.name}, {precision}", total=len(part), unit=" scans")
-    for number, found in enumerate(localize_each(map_, scans, methods)):
-        rows.append(as_row(number, part, map_, found, time.perf_counter() - clock))
-        clock = time.perf_counter()
-    errors = measure_errors(case, rows)
-    keyframes = drive.reference[sorted(taken), :3, 3]
-    apart = np.linalg.norm(drive.reference[chosen][:, None, :3, 3] - keyframes[None], axis=2).min(axis=1)
-    is_inside, is_found, is_right = apart <= drive.scale.reach_m, errors.is_found, errors.is_right
-    return {
-        "num_scans": len(rows),
-        "num_keyframes": len(map_),
-        "map_bytes": path.stat().st_size,
-        "num_inside": int(is_inside.sum()),
-        "num_right": int((is_inside & is_right).sum()),
-        "num_wrong": int((is_inside & is_found & ~is_right).sum()),
-        "num_outside": int((~is_inside).sum()),
-        "num_outside_right": int((~is_inside & is_right).sum()),
-        "num_outside_wrong": int((~is_inside & is_found & ~is_right).sum()),
-        "median_error_m": float(np.median(errors.translation_m[is_right])) if is_right.any() else None,
-        "scan_s": float(np.median([float(row["seconds"]) for row in rows])),
-    }
-
-
-def _points_of(part: LidarSequence, drive: Drive) -> Iterator[np.ndarray]:
-    for number in range(len(part)):
-        if drive.is_stopped():
-            raise StoppedError
-        yield read_points(part, number)
