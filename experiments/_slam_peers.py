@@ -45,9 +45,6 @@ class Peer(Protocol):
     def finish(self) -> tuple[np.ndarray, list[FoundLoop]]:
         """Returns (n, 4, 4) poses of all scans, and the loops."""
 
-    def map_bytes(self) -> int | None:
-        """Returns the size of the map of all scans so far; None where the peer is not asked."""
-
 
 class KissIcp:
     """KISS-ICP (Vizzo et al. 2023), and its voxel map of the whole way: the program itself forgets what is far away."""
@@ -77,6 +74,7 @@ class KissIcp:
         return np.array(self._poses), []
 
     def map_bytes(self) -> int:
+        """Returns the size of the map of the whole way so far."""
         return POINT_BYTES * len(self._whole.point_cloud())
 
 
@@ -111,9 +109,6 @@ class KissSlam:
         ]
         return np.array(poses), loops
 
-    def map_bytes(self) -> None:
-        return None
-
 
 class SmallGicp:
     """Odometry by small_gicp (Koide 2024): each scan onto its incremental Gaussian voxel map, from a steady motion."""
@@ -138,9 +133,6 @@ class SmallGicp:
 
     def finish(self) -> tuple[np.ndarray, list[FoundLoop]]:
         return np.array(self._poses), []
-
-    def map_bytes(self) -> None:
-        return None
 
 
 PEERS: dict[str, tuple[str, Callable[..., Any]]] = {

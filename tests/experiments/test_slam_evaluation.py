@@ -46,9 +46,6 @@ class SteadyPeer:
         T[:, 0, 3] = STEP_M * np.arange(self.num)
         return T, []
 
-    def map_bytes(self) -> None:
-        return None
-
 
 @pytest.fixture
 def with_toys(monkeypatch, tmp_path) -> Path:
