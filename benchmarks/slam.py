@@ -16,7 +16,6 @@ import pickle
 import sys
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -27,23 +26,13 @@ from dpmjax.metrics import absolute_trajectory_error, registration_recall
 from dpmjax.simulation.town.streets import arc_lengths, at_way, lane_of, make_streets, tangents
 from dpmjax.slam import SlamConfig, SlamMethods, SlamResult, finish_slam, init_slam, step_slam
 from experiments._machine import peak_rss_gb
-from tests.slam.truth import TruthGeometry, TruthMatcher, pose, scans_of
+from tests.slam.truth import MistakenMatcher, TruthGeometry, pose, scans_of
 
 NAME = "slam"
 ROUTE_STREAM = 77
 LENGTH_M, BLOCK_M, STEP_M = 4000.0, 100.0, 1.0
 EARLY, LATE, WINDOW = 500, 5000, 200
 REPLACED_MS = 200.0
-
-
-@dataclass(frozen=True)
-class MistakenMatcher(TruthMatcher):
-    """Overlap is wrong as often as registrations are."""
-
-    def overlaps(self, source: int, targets: list[int]) -> np.ndarray:
-        rng = np.random.default_rng([self.seed, source, len(targets), 5])
-        is_wrong = rng.random(len(targets)) < self.gross_share
-        return np.where(is_wrong, rng.random(len(targets)), super().overlaps(source, targets))
 
 
 class Proof(NamedTuple):

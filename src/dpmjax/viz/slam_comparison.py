@@ -15,12 +15,13 @@ from dpmjax.viz.figures import INK, MUTED, add_scale_bar, frame_map, new_figure,
 
 if TYPE_CHECKING:
     from matplotlib.artist import Artist
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 _COLUMNS = 4
 _CURVE_COLORS = ("#8a929b", "#e08a1e", "#1f4e8c", "#4f8fcf", "#2a9d5c")
 _MARGIN = 0.12
-_PANEL_IN, _LEGEND_IN = 3.1, 0.6
+_PANEL_IN, _LEGEND_IN, _ENTRY_IN = 3.1, 0.6, 1.9
 # A method that is lost must not make the others small.
 _SHARE_OUTSIDE = 0.5
 
@@ -53,11 +54,8 @@ def trajectories_figure(panels: Mapping[str, TrackPanel], colors: Mapping[str, s
     methods = {method for panel in panels.values() for method in panel.tracks}
     if not panels or not methods <= set(colors):
         raise ValueError(f"expected panels, and colours of {sorted(methods)}; got colours of {sorted(colors)}")
-    columns = min(len(panels), _COLUMNS)
-    num_rows = math.ceil(len(panels) / columns)
-    figure = new_figure(_PANEL_IN * columns, _PANEL_IN * num_rows + _LEGEND_IN)
-    grid = figure.subplots(num_rows, columns, squeeze=False).ravel()
-    for axes, (name, panel) in zip(grid, panels.items(), strict=False):
+    figure, grid = _panels(len(panels), _PANEL_IN)
+    for axes, (name, panel) in zip(grid, panels.items(), strict=True):
         if panel.reference is not None:
             axes.plot(*panel.reference[:, :2].T, color="#b9c0c8", lw=3.6, solid_capstyle="round", label="reference")
         for method in [method for method in colors if method in panel.tracks]:
@@ -65,20 +63,30 @@ def trajectories_figure(panels: Mapping[str, TrackPanel], colors: Mapping[str, s
         frame_map(axes, plane_limits(_shown(panel), _MARGIN))
         add_scale_bar(axes, plane_limits(_shown(panel), _MARGIN), "m")
         axes.set_title(name, fontsize=8.5, color=INK)
-    for axes in grid[len(panels) :]:
-        axes.set_axis_off()
-    shown = [zip(*axes.get_legend_handles_labels(), strict=True) for axes in grid[: len(panels)]]
+    shown = [zip(*axes.get_legend_handles_labels(), strict=True) for axes in grid]
     entries = {label: handle for handles in shown for handle, label in handles}
-    _add_legend(figure, entries, columns)
+    _add_legend(figure, entries)
     return figure
 
 
-def _add_legend(figure: Figure, entries: Mapping[str, Artist], columns: int) -> None:
+def _panels(num: int, height_in: float, *, is_y_shared: bool = False) -> tuple[Figure, list[Axes]]:
+    """Makes a figure of so many panels, with space for a legend below them."""
+    columns = min(num, _COLUMNS)
+    num_rows = math.ceil(num / columns)
+    figure = new_figure(_PANEL_IN * columns, height_in * num_rows + _LEGEND_IN)
+    grid = figure.subplots(num_rows, columns, squeeze=False, sharey=is_y_shared).ravel().tolist()
+    for axes in grid[num:]:
+        axes.set_axis_off()
+    return figure, grid[:num]
+
+
+def _add_legend(figure: Figure, entries: Mapping[str, Artist]) -> None:
     """Adds one legend for all panels, below them."""
     figure.tight_layout(rect=(0, _LEGEND_IN / figure.get_figheight(), 1, 1))
+    num_columns = max(int(figure.get_figwidth() / _ENTRY_IN), 1)
     figure.legend(
-        entries.values(), entries.keys(), loc="lower center", ncols=min(len(entries), 1 + columns), frameon=False,
-        fontsize=8, labelcolor=MUTED,
+        entries.values(), entries.keys(), loc="lower center", ncols=num_columns, frameon=False, fontsize=8,
+        labelcolor=MUTED,
     )  # fmt: skip
 
 
@@ -108,14 +116,11 @@ def growth_figure(
     """
     if not panels:
         raise ValueError("panels: expected at least one")
-    columns = min(len(panels), _COLUMNS)
-    num_rows = math.ceil(len(panels) / columns)
-    figure = new_figure(_PANEL_IN * columns, 0.85 * _PANEL_IN * num_rows + _LEGEND_IN)
-    grid = figure.subplots(num_rows, columns, squeeze=False, sharey=True).ravel()
+    figure, grid = _panels(len(panels), 0.85 * _PANEL_IN, is_y_shared=True)
     names = list(dict.fromkeys(name for curves in panels.values() for name in curves))
     colors = {name: _CURVE_COLORS[number % len(_CURVE_COLORS)] for number, name in enumerate(names)}
     entries: dict[str, Artist] = {}
-    for axes, (drive, curves) in zip(grid, panels.items(), strict=False):
+    for axes, (drive, curves) in zip(grid, panels.items(), strict=True):
         for name, (metres, sizes) in curves.items():
             (entries[name],) = axes.plot(metres, sizes / 1e6, "-o", ms=2.5, lw=1.3, color=colors[name])
         axes.set_yscale("log")
@@ -123,9 +128,6 @@ def growth_figure(
         axes.set_title(drive, fontsize=8.5, color=INK)
         axes.set_xlabel("way, m", fontsize=8, color=MUTED)
         style_axes(axes)
-    for axes in grid[len(panels) :]:
-        axes.set_axis_off()
-    for axes in grid[::columns]:
-        axes.set_ylabel("map, MB", fontsize=8, color=MUTED)
-    _add_legend(figure, entries, columns)
+    grid[0].set_ylabel("map, MB", fontsize=8, color=MUTED)
+    _add_legend(figure, entries)
     return figure
