@@ -104,17 +104,16 @@ def evaluate_slam(config: Config) -> list[dict[str, Any]]:
     opened = {}
     with recording(folder), StopFlag() as stop:
         missing = comparison.missing_peers()
+        numbers = {"weights": config.weights, "peers_left_out": missing}
+        note = write_metrics(folder, numbers, seed=config.seed, rows=rows)
         for drive, row in comparison.compare(config, folder, drives, lambda: stop.is_requested):
             opened[drive.sequence.name] = drive
             rows.append(row)
-            write_metrics(folder, {"weights": config.weights, "peers_left_out": missing}, seed=config.seed, rows=rows)
+            note = write_metrics(folder, numbers, seed=config.seed, rows=rows)
         text = "\n\n".join([comparison.tables(rows), *(f"{name} was not run: {why}." for name, why in missing.items())])
-        note = write_metrics(
-            folder, {"weights": config.weights, "peers_left_out": missing}, seed=config.seed, rows=rows
-        )
         (folder / "table.md").write_text(text + (f"\n\n{note}.\n" if note else "\n"), encoding="utf-8")
+        print(f"{text}\nresults in {folder.path}")
         comparison.draw(folder, list(opened.values()), rows)
-    print(f"{text}\nresults in {folder.path}")
     return rows
 
 
