@@ -36,7 +36,7 @@ TOWNS: tuple[tuple[str, str, LidarSensor], ...] = (
     ("car_park", "wander", OS1_64),
 )
 TOWN_RATE_HZ, TOWN_BLOCK_M = 4.0, 90.0
-COLORS = {OURS: "#1f4e8c", ODOMETRY: "#6fa3d8", "KISS-ICP": "#e08a1e", "KISS-SLAM": "#b5432e", "small_gicp": "#7a5aa6"}
+COLORS = {"KISS-ICP": "#e08a1e", "KISS-SLAM": "#b5432e", "small_gicp": "#7a5aa6", ODOMETRY: "#6fa3d8", OURS: "#1f4e8c"}
 SIZES = {
     "map_bytes_points": "points of all scans",
     "map_bytes_voxels": "voxel map of KISS-ICP",

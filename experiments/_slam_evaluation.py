@@ -27,7 +27,7 @@ from experiments import _slam_files as files
 from experiments._run_folder import DRIVES, RunFolder
 from experiments._slam_input import read_points
 from experiments._slam_numbers import trajectory_errors
-from experiments._slam_peers import PEERS, POINT_BYTES, FoundLoop, KissIcp, Peer, is_indoors
+from experiments._slam_peers import PEERS, POINT_BYTES, FoundLoop, KissIcp, Peer, is_indoors, peer_version
 from experiments._slam_run import SlamRun, run_alone
 
 OURS, ODOMETRY = "DeepPointMap", "DeepPointMap without loops"
@@ -165,7 +165,8 @@ def evaluate_peer(drive: Drive, name: str) -> dict[str, Any]:
         for loop in loops
     ]
     row = common_numbers(drive, name, T[rows], loops)
-    return {**row, "scan_s": seconds / num_scans, **(sizes if isinstance(peer, KissIcp) else {})}
+    row |= {"scan_s": seconds / num_scans, "peer_version": peer_version(name)}
+    return {**row, **(sizes if isinstance(peer, KissIcp) else {})}
 
 
 def common_numbers(drive: Drive, method: str, T_world_scan: np.ndarray, loops: Sequence[FoundLoop]) -> dict[str, Any]:

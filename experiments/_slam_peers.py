@@ -9,11 +9,14 @@ from __future__ import annotations
 
 import contextlib
 import importlib
+import importlib.metadata
 import os
 from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
+
+from experiments._result_files import UNKNOWN
 
 MAX_RANGE_M, INDOOR_MAX_RANGE_M = 60.0, 30.0
 # Where half of the points are nearer, the place is indoors.
@@ -153,6 +156,14 @@ def why_missing(name: str) -> str | None:
     except ImportError as error:  # a system library is missing
         return f"it cannot be imported ({str(error).splitlines()[0]})"
     return None
+
+
+def peer_version(name: str) -> str:
+    """Returns the version of a peer."""
+    try:
+        return importlib.metadata.version(name)
+    except importlib.metadata.PackageNotFoundError:
+        return UNKNOWN
 
 
 def is_indoors(points: np.ndarray) -> bool:
