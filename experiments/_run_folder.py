@@ -20,9 +20,9 @@ from experiments._machine import environment
 from experiments._result_files import as_json, commits_note, load_json, write_json
 
 CONFIG, METRICS, HISTORY, LOG = "config.json", "metrics.json", "metrics.csv", "log.txt"
-CHECKPOINTS, BEST, AGENTS = "checkpoints", "checkpoints_best", "agents"
+CHECKPOINTS, BEST, AGENTS, DRIVES = "checkpoints", "checkpoints_best", "agents", "drives"
 # --force removes these folders and kinds of files only: a mistyped -o must not cost a user anything else.
-RESULT_FOLDERS = (CHECKPOINTS, BEST, AGENTS, "rows")
+RESULT_FOLDERS = (CHECKPOINTS, BEST, AGENTS, DRIVES, "rows")
 RESULT_SUFFIXES = (".json", ".csv", ".txt", ".npy", ".npz", ".png", ".ply", ".g2o", ".journal", ".rrd")
 LOGGERS = ("dpmjax", "experiments", "__main__")
 # Options that do not change what is computed.

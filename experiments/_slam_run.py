@@ -12,7 +12,17 @@ import jax
 from tqdm import tqdm
 
 from dpmjax.sequences import LidarSequence
-from dpmjax.slam import Journal, JournalContent, SlamMethods, SlamState, step_slam
+from dpmjax.slam import (
+    Journal,
+    JournalContent,
+    SlamMethods,
+    SlamResult,
+    SlamState,
+    finish_slam,
+    init_slam,
+    read_journal,
+    step_slam,
+)
 from dpmjax.slam.system import place_scans
 from experiments._run_folder import RunFolder
 from experiments._slam_files import write_scans, write_trajectory
@@ -109,6 +119,26 @@ class Timed:
     def __getattr__(self, name: str) -> Any:
         found = getattr(self._wrapped, name)
         return partial(self._watch.timed, _STAGES[name], found) if name in _STAGES else found
+
+
+def find_beginning(folder: RunFolder, methods: SlamMethods, start: SlamState, reader: ScanReader) -> Beginning:
+    """Reads what a run has done that is resumed."""
+    if not folder.is_resumed or not (folder / JOURNAL).is_file():
+        return Beginning(start)
+    first = start.front_end.num_scans
+    return Beginning(start, read_journal(folder / JOURNAL, methods, lambda scan: reader(scan - first), start))
+
+
+def run_alone(
+    folder: RunFolder, sequence: LidarSequence, methods: SlamMethods, is_stopped: Callable[[], bool]
+) -> tuple[SlamRun, SlamResult]:
+    """Maps a drive from its beginning, or goes on; what ends it early is raised."""
+    reader = ScanReader(sequence)
+    beginning = find_beginning(folder, methods, init_slam(), reader)
+    run = run_scans(folder, sequence, reader, methods, beginning, Hooks(is_stopped))
+    if run.failure is not None:
+        raise run.failure
+    return run, finish_slam(run.state, run.reports, methods.config)
 
 
 def run_scans(

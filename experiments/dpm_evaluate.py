@@ -1,7 +1,9 @@
-"""Measures how well a DeepPointMap model registers the scans of drives with known poses, beside KISS-Matcher.
+"""Measures how well a DeepPointMap model registers scans, and SLAM with it, beside other programs on the same scans.
 
     python -m experiments.dpm_evaluate path/to/drive another/drive --weights model.safetensors
     python -m experiments.dpm_evaluate town                             towns that no training has seen
+    python -m experiments.dpm_evaluate --slam path/to/drive another/drive
+    python -m experiments.dpm_evaluate --slam town --num-towns 5 --town-length-m 1000 4000
     python -m experiments.dpm_evaluate --resume                         go on where the last run stopped
 
 A path is any folder of scans with poses (KITTI, KITTI-360, MulRan, plain ...). Random pairs of scans, 2 to 10 m and 10
@@ -9,6 +11,12 @@ to 20 m apart and turned by any yaw, are registered; a registration within 2 m a
 results/dpm_evaluate/<time>/: table.md, metrics.json, reliability.png, failures.png (the worst pairs from above). Two
 more methods see the same pairs: the search and the verification of `register` without the network, and KISS-Matcher
 (extra `kiss`).
+
+With --slam, the whole system and its odometry run beside KISS-ICP, KISS-SLAM and odometry by small_gicp (extra
+`peers`); then random scans are looked for in the map of each drive's first half. Poses are needed for the errors only.
+table.md has ATE, KITTI's t_rel, loops, their recall, seconds a scan, bytes of maps and localisations; trajectories.png
+and map_sizes.png show them, and drives/ holds the trajectories of every method and the files of our run.
+experiments/_slam_evaluation.py says how loops are counted.
 """
 
 from __future__ import annotations
@@ -36,7 +44,6 @@ FIRST_TOWN = 5_000_000
 NUM_SHOWN = 4
 # Overlap is cheap: more pairs, of each kind.
 OVERLAP_FACTOR = 4
-TOWN_LENGTH_M = 400.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -47,21 +54,70 @@ class Config(RunOptions):
     """Folders of scans with poses, or simulated towns."""
     weights: Annotated[str, arg(metavar="NAME|FILE")] = "dpm_small"
     """Name of a shipped model, or a .safetensors file."""
+    slam: FlagCreatePairsOff[bool] = False
+    """Compare SLAM on whole drives instead of registrations of pairs."""
     pairs: Annotated[int, arg(metavar="N")] = 30
     """Pairs for each distance."""
     num_towns: Annotated[int, arg(metavar="N")] = 3
     """Number of towns, where town is among the paths."""
+    town_length_m: Annotated[tuple[float, ...], arg(metavar="M")] = (400.0,)
+    """Length of the towns' routes; two numbers with --slam: from that of the first town to that of the last."""
     no_kiss: FlagCreatePairsOff[bool] = False
     """Leave KISS-Matcher out."""
+    n_scans: Annotated[int | None, arg(aliases=["-n"], metavar="N")] = None
+    """With --slam: the first N scans of each drive."""
+    jump: Annotated[int, arg(aliases=["-j"], metavar="N")] = 1
+    """With --slam: every Nth scan."""
+    localize: Annotated[int, arg(metavar="N")] = 50
+    """With --slam: number of scans that are looked for in the map of the first half; 0 leaves it out."""
 
     def __post_init__(self) -> None:
         """Checks ranges."""
-        check_least(self, pairs=1, num_towns=1, seed=0)
+        check_least(self, pairs=1, num_towns=1, seed=0, n_scans=1, jump=1, localize=0, town_length_m=100)
         if not self.paths:
             raise ValueError("give at least one folder of scans, or town")
+        if not 1 <= len(self.town_length_m) <= (2 if self.slam else 1):
+            raise ValueError("--town-length-m: expected one length, or two with --slam")
+        if not self.slam and (self.n_scans is not None or self.jump != 1):
+            raise ValueError("--n-scans, --jump: only with --slam; pairs are drawn from the whole drive")
+
+    @property
+    def town_length_range(self) -> tuple[float, float]:
+        """Returns the lengths of the first and of the last town."""
+        return self.town_length_m[0], self.town_length_m[-1]
 
 
 def main(config: Config) -> list[dict[str, Any]]:
+    """Compares SLAM, or registers pairs."""
+    return evaluate_slam(config) if config.slam else evaluate_pairs(config)
+
+
+def evaluate_slam(config: Config) -> list[dict[str, Any]]:
+    """Makes the rows of drives and methods that are missing, and writes tables, numbers and pictures."""
+    from dpmjax import load_model
+    from experiments import _slam_comparison as comparison
+
+    load_model(config.weights)
+    drives = comparison.open_drives(config, FIRST_TOWN)
+    folder = open_run_folder(config, EXPERIMENT)
+    rows: list[dict[str, Any]] = []
+    opened = {}
+    with recording(folder), StopFlag() as stop:
+        missing = comparison.missing_peers()
+        numbers = {"weights": config.weights, "peers_left_out": missing}
+        note = write_metrics(folder, numbers, seed=config.seed, rows=rows)
+        for drive, row in comparison.compare(config, folder, drives, lambda: stop.is_requested):
+            opened[drive.sequence.name] = drive
+            rows.append(row)
+            note = write_metrics(folder, numbers, seed=config.seed, rows=rows)
+        text = "\n\n".join([comparison.tables(rows), *(f"{name} was not run: {why}." for name, why in missing.items())])
+        (folder / "table.md").write_text(text + (f"\n\n{note}.\n" if note else "\n"), encoding="utf-8")
+        print(f"{text}\nresults in {folder.path}")
+        comparison.draw(folder, list(opened.values()), rows)
+    return rows
+
+
+def evaluate_pairs(config: Config) -> list[dict[str, Any]]:
     """Registers the pairs that are missing, and writes table, numbers and pictures."""
     from dpmjax import load_model
     from experiments._dpm_evaluation import (
@@ -111,7 +167,7 @@ def open_drives(config: Config) -> list[LidarSequence]:
     from experiments._dpm_pairs import draw_pairs
 
     towns = range(FIRST_TOWN, FIRST_TOWN + config.num_towns)
-    drives = [source.open() for source in find_sources(config.paths, towns, TOWN_LENGTH_M)]
+    drives = [source.open() for source in find_sources(config.paths, towns, config.town_length_m[0])]
     for drive in drives:
         if not len(draw_pairs(drive, "near", 1, 0)):
             raise ValueError(f"{drive.name}: no two scans are 2 to 10 m apart; are the poses in metres?")

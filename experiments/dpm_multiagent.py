@@ -62,6 +62,7 @@ class Config(RunOptions):
 def main(config: Config) -> dict[str, Any]:
     """Lets the agents run, joins their maps, writes; returns the content of `metrics.json`."""
     from experiments._slam_agents import summary
+    from experiments._slam_run import run_alone
     from experiments.dpm_slam import tell
 
     started = time.perf_counter()
@@ -72,7 +73,8 @@ def main(config: Config) -> dict[str, Any]:
         agents: list[SlamResult] = []
         for number, sequence in enumerate(sequences, start=1):
             if not stop.is_requested:
-                agents.append(run_agent(agent_folder(folder, number), sequence, methods, stop))
+                _, agent = run_alone(agent_folder(folder, number), sequence, methods, lambda: stop.is_requested)
+                agents.append(agent)
         sequences = [
             sequence.take(slice(0, len(agent.reports))) for sequence, agent in zip(sequences, agents, strict=False)
         ]
@@ -108,21 +110,6 @@ def agent_folder(folder: RunFolder, number: int) -> RunFolder:
     path = folder / AGENTS / f"agent_{number}"
     path.mkdir(parents=True, exist_ok=True)
     return RunFolder(path, is_resumed=folder.is_resumed)
-
-
-def run_agent(folder: RunFolder, sequence: LidarSequence, methods: SlamMethods, stop: StopFlag) -> SlamResult:
-    """Lets one agent map alone, or go on."""
-    from dpmjax.slam import finish_slam, init_slam
-    from experiments._slam_input import ScanReader
-    from experiments._slam_run import Hooks, run_scans
-    from experiments.dpm_slam import find_beginning
-
-    reader = ScanReader(sequence)
-    beginning = find_beginning(folder, methods, init_slam(), reader)
-    run = run_scans(folder, sequence, reader, methods, beginning, Hooks(lambda: stop.is_requested))
-    if run.failure is not None:
-        raise run.failure
-    return finish_slam(run.state, run.reports, methods.config)
 
 
 def join(methods: SlamMethods, agents: list[SlamResult]) -> AgentsResult:

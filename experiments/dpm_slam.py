@@ -31,8 +31,7 @@ from experiments._run_folder import RunFolder, RunOptions, open_run_folder, reco
 if TYPE_CHECKING:
     from dpmjax.sequences import LidarSequence
     from dpmjax.slam import KeyframeMap, SlamMethods, SlamResult, SlamState
-    from experiments._slam_input import ScanReader
-    from experiments._slam_run import Beginning, SlamRun
+    from experiments._slam_run import SlamRun
 
 EXPERIMENT = "dpm_slam"
 LOGGER = logging.getLogger(__name__)
@@ -79,7 +78,7 @@ def main(config: Config) -> dict[str, Any]:
     from dpmjax.slam import finish_slam
     from experiments._slam_input import ScanReader, open_drive
     from experiments._slam_numbers import summary
-    from experiments._slam_run import Hooks, run_scans
+    from experiments._slam_run import Hooks, find_beginning, run_scans
     from experiments._slam_viewer import live_viewer
 
     started = time.perf_counter()
@@ -157,17 +156,6 @@ def starting_state(config: Config, methods: SlamMethods) -> SlamState:
     except ValueError as error:
         raise ValueError(f"--map {config.map}: {error}") from error
     return init_slam(slam_map)
-
-
-def find_beginning(folder: RunFolder, methods: SlamMethods, start: SlamState, reader: ScanReader) -> Beginning:
-    """Reads what a run has done that is resumed."""
-    from dpmjax.slam import read_journal
-    from experiments._slam_run import JOURNAL, Beginning
-
-    if not folder.is_resumed or not (folder / JOURNAL).is_file():
-        return Beginning(start)
-    first = start.front_end.num_scans
-    return Beginning(start, read_journal(folder / JOURNAL, methods, lambda scan: reader(scan - first), start))
 
 
 def write_results(folder: RunFolder, config: Config, drive: Drive, run: SlamRun, result: SlamResult) -> dict[str, Any]:

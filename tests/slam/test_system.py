@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,7 +10,7 @@ import pytest
 from dpmjax.geometry import rigid
 from dpmjax.metrics import absolute_trajectory_error
 from dpmjax.slam import SlamConfig, SlamMethods, SlamResult, init_slam, run_slam, step_slam
-from tests.slam.truth import EMPTY, TruthGeometry, TruthMatcher, laps, pose, scans_of
+from tests.slam.truth import EMPTY, MistakenMatcher, TruthGeometry, TruthMatcher, laps, pose, scans_of
 
 CONFIG = SlamConfig()
 
@@ -46,16 +46,6 @@ def test_gross_errors_of_the_matcher_do_no_harm(seed) -> None:
     ate = absolute_trajectory_error(closed.T_world_scan[:, :3, 3], truth[:, :3, 3])
     assert ate < 1.0
     assert ate < 0.5 * absolute_trajectory_error(drifted.T_world_scan[:, :3, 3], truth[:, :3, 3])
-
-
-@dataclass(frozen=True)
-class MistakenMatcher(TruthMatcher):
-    """Overlap is wrong as often as registrations are."""
-
-    def overlaps(self, source: int, targets: list[int]) -> np.ndarray:
-        rng = np.random.default_rng([self.seed, source, len(targets), 5])
-        is_wrong = rng.random(len(targets)) < self.gross_share
-        return np.where(is_wrong, rng.random(len(targets)), super().overlaps(source, targets))
 
 
 @pytest.mark.parametrize("seed", [0, 1])

@@ -138,3 +138,13 @@ class TruthMatcher:
         if rng.random() < self.gross_share or np.linalg.norm(T[:3, 3]) > 2 * self.reach_m:
             T = noise(rng, 20.0, 1.0) @ T
         return Match(T @ noise(rng, self.sigma_m, self.sigma_rad), float(rng.uniform(0.6, 1.0)), 0.3)
+
+
+@dataclass(frozen=True)
+class MistakenMatcher(TruthMatcher):
+    """Overlap is wrong as often as registrations are."""
+
+    def overlaps(self, source: int, targets: list[int]) -> np.ndarray:
+        rng = np.random.default_rng([self.seed, source, len(targets), 5])
+        is_wrong = rng.random(len(targets)) < self.gross_share
+        return np.where(is_wrong, rng.random(len(targets)), super().overlaps(source, targets))

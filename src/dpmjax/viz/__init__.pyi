@@ -29,3 +29,6 @@ from .rasters import occupancy_figure as occupancy_figure
 from .registrations import RegisteredPair as RegisteredPair
 from .registrations import registered_pairs_figure as registered_pairs_figure
 from .registrations import reliability_figure as reliability_figure
+from .slam_comparison import TrackPanel as TrackPanel
+from .slam_comparison import growth_figure as growth_figure
+from .slam_comparison import trajectories_figure as trajectories_figure

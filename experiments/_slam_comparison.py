@@ -1,0 +1,226 @@
+"""`dpm_evaluate --slam`: which drives, the loop over drives and methods, the table and the pictures."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from dpmjax import io, load_model, viz
+from dpmjax.metrics import align_rigid
+from dpmjax.metrics.loops import path_lengths
+from dpmjax.sequences import LidarSequence
+from dpmjax.simulation import HDL64E, OS1_64, DriveConfig, LidarSensor, Scene, TownConfig, simulate_scene
+from dpmjax.slam import SlamMethods, make_methods
+from experiments import _slam_evaluation as evaluation
+from experiments._result_files import do_row
+from experiments._run_folder import RunFolder
+from experiments._slam_evaluation import ODOMETRY, OURS, PRECISIONS, Drive, StoppedError
+from experiments._slam_input import read_points, require_whole_files
+from experiments._slam_localization import evaluate_localization
+from experiments._slam_peers import PEERS, why_missing
+
+if TYPE_CHECKING:
+    from experiments.dpm_evaluate import Config
+
+TOWN = "town"
+# Kind of place, kind of route, lidar: taken in turn. Each route drives some streets in both directions.
+TOWNS: tuple[tuple[str, str, LidarSensor], ...] = (
+    ("suburb", "there_and_back", HDL64E),
+    ("canyon", "wander", OS1_64),
+    ("campus", "there_and_back", OS1_64),
+    ("suburb", "wander", HDL64E),
+    ("car_park", "wander", OS1_64),
+)
+TOWN_RATE_HZ, TOWN_BLOCK_M = 4.0, 90.0
+COLORS = {"KISS-ICP": "#e08a1e", "KISS-SLAM": "#b5432e", "small_gicp": "#7a5aa6", ODOMETRY: "#6fa3d8", OURS: "#1f4e8c"}
+SIZES = {
+    "map_bytes_points": "points of all scans",
+    "map_bytes_voxels": "voxel map of KISS-ICP",
+    "map_bytes_float32": "ours, float32",
+    "map_bytes_float16": "ours, float16",
+    "map_bytes_int8": "ours, int8",
+}
+
+
+Task = tuple[Drive, str, Callable[[], dict[str, Any]]]
+
+
+def open_drives(config: Config, first_town: int) -> list[LidarSequence]:
+    """Opens the drives; bad input that can be known before the run is a `ValueError`."""
+    drives: list[LidarSequence] = []
+    for entry in config.paths:
+        if entry == TOWN and not Path(entry).exists():
+            lengths = np.linspace(*config.town_length_range, config.num_towns)
+            drives += [town_drive(first_town + number, number, length) for number, length in enumerate(lengths)]
+        else:
+            names: Sequence[str | None] = io.list_lidar_sequences(entry) or [None]
+            drives += [io.open_lidar_sequence(entry, sequence=name) for name in names]
+    drives = [drive.take(np.arange(len(drive))[:: config.jump][: config.n_scans]) for drive in drives]
+    for drive in drives:
+        require_whole_files(drive)
+        read_points(drive, 0)
+    names = [drive.name for drive in drives]
+    if len(set(names)) < len(names):
+        raise ValueError(f"two drives have the same name ({', '.join(sorted(names))}); evaluate them one by one")
+    return drives
+
+
+def town_drive(seed: int, number: int, length_m: float) -> LidarSequence:
+    """Returns the drive through a town, once along its route; scans are cast when they are read."""
+    kind, route, sensor = TOWNS[number % len(TOWNS)]
+    driving = DriveConfig(rate_hz=TOWN_RATE_HZ, sensor_height_m=sensor.height_m)
+    return simulate_scene(Scene(seed, TownConfig(kind, route, length_m, TOWN_BLOCK_M), driving, sensor))
+
+
+def missing_peers() -> dict[str, str]:
+    """Returns the peers that cannot run, and why."""
+    reasons = {name: why_missing(name) for name in PEERS}
+    return {name: reason for name, reason in reasons.items() if reason is not None}
+
+
+def compare(
+    config: Config, folder: RunFolder, sequences: Sequence[LidarSequence], is_stopped: Callable[[], bool]
+) -> Iterator[tuple[Drive, dict[str, Any]]]:
+    """Makes the rows that are missing; ends early where a signal came."""
+    methods = make_methods(load_model(config.weights), weights=config.weights)
+    missing = missing_peers()
+    drives = [evaluation.open_folder(folder, sequence, is_stopped) for sequence in sequences]
+    ours: dict[str, dict[str, Any]] = {}
+    # Trajectories of all drives come first: an early end leaves a whole table.
+    for drive, method, work in (*_runs(drives, methods, ours), *_localizations(config, drives, methods)):
+        if method in missing:
+            continue
+        case = {"sequence": drive.sequence.name, "method": method}
+        try:
+            row = do_row(folder.path, case, work, seed=config.seed)
+        except StoppedError:
+            return
+        if method == OURS:
+            ours[drive.sequence.name] = row
+        yield drive, row
+
+
+def _runs(drives: Sequence[Drive], methods: SlamMethods, ours: dict[str, dict[str, Any]]) -> Iterator[Task]:
+    for drive in drives:
+        for name in PEERS:
+            yield drive, name, partial(evaluation.evaluate_peer, drive, name)
+        yield drive, OURS, partial(evaluation.evaluate_ours, drive, methods)
+        yield drive, ODOMETRY, lambda drive=drive: evaluation.odometry_row(drive, ours[drive.sequence.name])
+
+
+def _localizations(config: Config, drives: Sequence[Drive], methods: SlamMethods) -> Iterator[Task]:
+    for drive in drives:
+        if config.localize and drive.reference is not None:
+            for precision in PRECISIONS:
+                work = partial(evaluate_localization, drive, methods, precision)
+                yield drive, f"localization, {precision}", partial(work, config.localize, config.seed)
+
+
+def tables(rows: Sequence[dict[str, Any]]) -> str:
+    """Returns the tables as Markdown: trajectories and loops, sizes of maps, localisation."""
+    tracks = [row for row in rows if "path_m" in row]
+    places = [row for row in rows if "num_inside" in row]
+    text = "\n".join(
+        [
+            "| drive | scans, way | method | ATE, m | t_rel, % | loops (wrong) "
+            "| recall of loops: all; same way; opposite | s / scan |",
+            "|---|---|---|---|---|---|---|---|",
+            *map(_track_line, tracks),
+            "",
+            f"| drive | way | {' | '.join(f'{name}, MB' for name in SIZES.values())} |",
+            "|---|---|---|---|---|---|---|",
+            *map(partial(_size_line, tracks), dict.fromkeys(row["sequence"] for row in tracks)),
+        ]
+    )
+    if not places:
+        return text
+    lines = [
+        "| drive | map of the first half | scans in it: right, not found, wrong | other scans: refused, right, wrong "
+        "| median error, m | s / scan |",
+        "|---|---|---|---|---|---|",
+    ]
+    return "\n".join([text, "", *lines, *map(_place_line, places)])
+
+
+def _track_line(row: dict[str, Any]) -> str:
+    loops = f"{row['num_loops']}" + (f" ({row['num_wrong_loops']})" if "num_wrong_loops" in row else "")
+    shares = [row.get(f"loop_recall{suffix}") for suffix in ("", "_same_way", "_opposite")]
+    recall = "; ".join(_number(share) for share in shares) if row.get("num_revisits") else "no scan comes back"
+    if "num_known_pairs" in row:
+        loops += f", {row['num_known_pairs_found']} of {row['num_known_pairs']} known pairs"
+    if row["method"] not in (OURS, "KISS-SLAM"):
+        loops = recall = ""
+    return (
+        f"| {row['sequence']} | {row['num_scans']}, {row['path_m']:.0f} m | {row['method']} "
+        f"| {_number(row.get('ate_m'), 3)} | {_number(row.get('t_rel_percent'))} | {loops} | {recall} "
+        f"| {_number(row['scan_s'], 3)} |"
+    )
+
+
+def _size_line(rows: Sequence[dict[str, Any]], sequence: str) -> str:
+    of_drive = {row["method"]: row for row in rows if row["sequence"] == sequence}
+    merged = {**of_drive.get("KISS-ICP", {}), **of_drive.get(OURS, {})}
+    sizes = [merged[name][-1] / 1e6 if merged.get(name) else None for name in SIZES]
+    cells = " | ".join(_number(size) for size in sizes)
+    return f"| {sequence} | {next(iter(of_drive.values()))['path_m']:.0f} m | {cells} |"
+
+
+def _place_line(row: dict[str, Any]) -> str:
+    inside, outside = ([row[f"num_{name}{kind}"] for kind in ("right", "wrong")] for name in ("", "outside_"))
+    counts = [
+        f"{asked}: {', '.join(map(str, order))}"
+        for asked, order in (
+            (row["num_inside"], (inside[0], row["num_inside"] - sum(inside), inside[1])),
+            (row["num_outside"], (row["num_outside"] - sum(outside), *outside)),
+        )
+    ]
+    return (
+        f"| {row['sequence']} | {row['method'].partition(', ')[2]}, {row['map_bytes'] / 1e6:.2f} MB "
+        f"| {' | '.join(counts)} | {_number(row['median_error_m'], 3)} | {_number(row['scan_s'])} |"
+    )
+
+
+def _number(value: float | None, decimals: int = 2) -> str:
+    return "-" if value is None or not np.isfinite(value) else f"{value:.{decimals}f}"
+
+
+def draw(folder: RunFolder, drives: Sequence[Drive], rows: Sequence[dict[str, Any]]) -> None:
+    """Draws trajectories.png, a panel a drive with all methods, and map_sizes.png, bytes against metres (figure 4)."""
+    tracks, sizes = {}, {}
+    for drive in drives:
+        of_drive = {row["method"]: row for row in rows if row["sequence"] == drive.sequence.name and "path_m" in row}
+        tracks[drive.sequence.name] = _panel(drive, of_drive)
+        sizes[drive.sequence.name] = _growth(drive, of_drive)
+    if tracks:
+        viz.save_figure(viz.trajectories_figure(tracks, COLORS), folder / "trajectories.png")
+    sizes = {name: curves for name, curves in sizes.items() if curves}
+    if sizes:
+        viz.save_figure(viz.growth_figure(sizes), folder / "map_sizes.png")
+
+
+def _panel(drive: Drive, rows: dict[str, dict[str, Any]]) -> viz.TrackPanel:
+    """All trajectories in the frame of the reference; without one, in that of the first scan."""
+    reference = None if drive.reference is None else drive.reference[:, :3, 3]
+    shown = {}
+    for method in [name for name in COLORS if name in rows]:
+        positions = drive.trajectory(method)[:, :3, 3]
+        if reference is not None:
+            T = align_rigid(positions, reference)
+            positions = positions @ T[:3, :3].T + T[:3, 3]
+        shown[method] = positions
+    return viz.TrackPanel(shown, reference)
+
+
+def _growth(drive: Drive, rows: dict[str, dict[str, Any]]) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    """Metres driven, and bytes, of each form of a map."""
+    curves = {}
+    for row in rows.values():
+        poses = drive.trajectory(row["method"]) if drive.reference is None else drive.reference
+        for name in [name for name in SIZES if row.get(name)]:
+            driven = path_lengths(poses)[np.array(row["map_scans"]) - 1]
+            curves[SIZES[name]] = (driven, np.array(row[name], float))
+    return {name: curves[name] for name in SIZES.values() if name in curves}

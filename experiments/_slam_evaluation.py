@@ -1,0 +1,273 @@
+"""The rows of `dpm_evaluate --slam`: ours, its odometry, and other programs on the same scans, one row each.
+
+A loop is wrong beyond 2 m or 5 degrees. A scan comes back where it is within 5 m (indoors 2 m) of an earlier one after
+50 m (15 m) of way. The recall of loops is the share of these scans that have a right loop whose newer end is within
+10 m (3 m) along the path; it is the recall at 100 % precision where no loop is wrong. KISS-SLAM joins local maps of
+100 m, and each of its loops counts for all scans of the newer one.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from tqdm import tqdm
+
+from dpmjax import save_map
+from dpmjax.geometry import rigid
+from dpmjax.metrics import find_revisits, loop_recall, registration_recall
+from dpmjax.metrics.loops import path_lengths
+from dpmjax.sequences import LidarSequence
+from dpmjax.slam import KeyframeMap, SlamMethods, SlamResult
+from experiments import _slam_files as files
+from experiments._run_folder import DRIVES, RunFolder
+from experiments._slam_input import read_points
+from experiments._slam_numbers import trajectory_errors
+from experiments._slam_peers import PEERS, POINT_BYTES, FoundLoop, KissIcp, Peer, is_indoors, peer_version
+from experiments._slam_run import SlamRun, run_alone
+
+OURS, ODOMETRY = "DeepPointMap", "DeepPointMap without loops"
+PRECISIONS = ("float32", "float16", "int8")
+# Sizes of maps are taken so many times on the way.
+NUM_SIZES = 8
+# Stages of a run that no other program's time has.
+_FILE_STAGES = ("read", "journal", "write", "viewer")
+_ODOMETRY_STAGES = ("surface", "odometry")
+
+
+class StoppedError(Exception):
+    """A signal has stopped a row."""
+
+
+class Scale(NamedTuple):
+    """Lengths of the recall of loops, metres; see the module."""
+
+    distance_m: float = 5.0
+    min_path_m: float = 50.0
+    reach_m: float = 10.0
+
+
+INDOOR_SCALE = Scale(2.0, 15.0, 3.0)
+
+
+class Drive(NamedTuple):
+    """A drive and the folder of its results.
+
+    Attributes:
+        sequence: the scans.
+        folder: of this drive.
+        is_indoors: whether its first scan is one of a room.
+        is_stopped: whether to end.
+    """
+
+    sequence: LidarSequence
+    folder: RunFolder
+    is_indoors: bool
+    is_stopped: Callable[[], bool]
+
+    @property
+    def reference(self) -> np.ndarray | None:
+        """Returns the reference poses."""
+        return self.sequence.T_world_lidar
+
+    @property
+    def scale(self) -> Scale:
+        """Returns the lengths of the recall of loops."""
+        return INDOOR_SCALE if self.is_indoors else Scale()
+
+    def trajectory(self, method: str) -> np.ndarray:
+        """Reads what a method has written."""
+        return np.load(self.folder / f"{file_name(method)}.npy")
+
+
+def open_folder(folder: RunFolder, sequence: LidarSequence, is_stopped: Callable[[], bool]) -> Drive:
+    """Makes the folder of a drive."""
+    path = folder / DRIVES / sequence.name.replace("/", "-")
+    path.mkdir(parents=True, exist_ok=True)
+    # A drive that was begun goes on, whatever the command was told.
+    return Drive(sequence, RunFolder(path, is_resumed=True), is_indoors(read_points(sequence, 0)), is_stopped)
+
+
+def file_name(method: str) -> str:
+    """Returns the name of the files of a method."""
+    return method.lower().replace(" ", "_").replace("-", "_")
+
+
+def evaluate_ours(drive: Drive, methods: SlamMethods) -> dict[str, Any]:
+    """Runs the whole system, and writes its files."""
+    run, result = run_alone(drive.folder, drive.sequence, methods, drive.is_stopped)
+    if len(run.reports) < len(drive.sequence):
+        raise StoppedError
+    loops = [loop for loop in result.loops if loop.status == "accepted"]
+    ends = result.keyframes
+    found = [
+        FoundLoop((ends[loop.source],) * 2, (ends[loop.target],) * 2, loop.T_target_source)
+        for loop in loops
+        if loop.T_target_source is not None
+    ]
+    files.write_loops(drive.folder / "loops.csv", result.loops, result.keyframes)
+    files.write_scans(drive.folder / "scans.csv", result.reports, result.keyframes, drive.sequence.sources)
+    write_trajectory(drive, ODOMETRY, result.T_odometry_scan)
+    odometry_s = sum(run.stages_s.get(stage, 0.0) for stage in _ODOMETRY_STAGES)
+    return {
+        **common_numbers(drive, OURS, result.T_world_scan, found),
+        "num_keyframes": len(result.keyframes),
+        "scan_s": _per_scan(run, run.run_s - sum(run.stages_s.get(stage, 0.0) for stage in _FILE_STAGES)),
+        "scan_odometry_s": _per_scan(run, odometry_s),
+        **map_sizes(drive.folder.path, result),
+    }
+
+
+def _per_scan(run: SlamRun, seconds: float) -> float | None:
+    """Of a run that was resumed at its end, no time is known."""
+    return seconds / run.num_done if run.num_done else None
+
+
+def odometry_row(drive: Drive, ours: dict[str, Any]) -> dict[str, Any]:
+    """Measures our odometry in the same run, before any loop: its time is that of its stages."""
+    numbers = common_numbers(drive, ODOMETRY, drive.trajectory(ODOMETRY), [])
+    return {**numbers, "scan_s": ours["scan_odometry_s"]}
+
+
+def evaluate_peer(drive: Drive, name: str) -> dict[str, Any]:
+    """Runs another program; reading is not timed. A scan without points stays where the last one was."""
+    peer: Peer = PEERS[name][1](is_indoors=drive.is_indoors)
+    taken: list[int] = []
+    seconds = 0.0
+    num_scans = len(drive.sequence)
+    sizes: dict[str, list[int]] = {"map_scans": [], "map_bytes_voxels": []}
+    at = set(size_marks(num_scans))
+    for number in tqdm(range(num_scans), desc=f"{drive.sequence.name}, {name}", unit=" scans", dynamic_ncols=True):
+        if drive.is_stopped():
+            raise StoppedError
+        points = read_points(drive.sequence, number).astype(np.float64)
+        if len(points):
+            clock = time.perf_counter()
+            peer.step(points)
+            seconds += time.perf_counter() - clock
+            taken.append(number)
+            if isinstance(peer, KissIcp):
+                peer.grow_map(points)
+        if isinstance(peer, KissIcp) and number + 1 in at:
+            sizes["map_scans"].append(number + 1)
+            sizes["map_bytes_voxels"].append(peer.map_bytes())
+    clock = time.perf_counter()
+    T, loops = peer.finish()
+    seconds += time.perf_counter() - clock
+    rows = np.maximum(np.searchsorted(taken, np.arange(num_scans), side="right") - 1, 0)
+    numbers = np.array(taken)
+    loops = [
+        FoundLoop(tuple(numbers[list(loop.newer)]), tuple(numbers[list(loop.older)]), loop.T_older_newer)
+        for loop in loops
+    ]
+    row = common_numbers(drive, name, T[rows], loops)
+    row |= {"scan_s": seconds / num_scans, "peer_version": peer_version(name)}
+    return {**row, **(sizes if isinstance(peer, KissIcp) else {})}
+
+
+def common_numbers(drive: Drive, method: str, T_world_scan: np.ndarray, loops: Sequence[FoundLoop]) -> dict[str, Any]:
+    """Writes the trajectory of a method, and returns its errors and those of its loops."""
+    write_trajectory(drive, method, T_world_scan)
+    known = T_world_scan if drive.reference is None else drive.reference
+    return {
+        "num_scans": len(T_world_scan),
+        "path_m": float(path_lengths(known)[-1]),
+        **trajectory_errors(T_world_scan, drive.reference),
+        "num_loops": len(loops),
+        **(loop_numbers(drive, loops) if drive.reference is not None else {}),
+    }
+
+
+def write_trajectory(drive: Drive, method: str, T_world_scan: np.ndarray) -> None:
+    """Writes the trajectory of a method."""
+    files.write_trajectory(drive.folder.path, T_world_scan, drive.sequence.times, file_name(method))
+
+
+def loop_numbers(drive: Drive, loops: Sequence[FoundLoop]) -> dict[str, Any]:
+    """Returns how many loops are wrong, and the recall of the right ones."""
+    poses, scale = drive.reference, drive.scale
+    assert poses is not None
+    newer, older = (np.array([getattr(loop, end)[0] for loop in loops], int) for end in ("newer", "older"))
+    found = np.reshape([loop.T_older_newer for loop in loops], (-1, 4, 4))
+    is_right = registration_recall(found, rigid.inverse(poses[older]) @ poses[newer]).is_right
+    revisits = find_revisits(poses, distance_m=scale.distance_m, min_path_m=scale.min_path_m)
+    right = [loop for loop, good in zip(loops, is_right, strict=True) if good]
+    ends = np.reshape([loop.newer for loop in right], (-1, 2)).astype(int)
+    recall = loop_recall(poses, ends, revisits, reach_m=scale.reach_m)
+    return {
+        "num_wrong_loops": int((~is_right).sum()),
+        "loop_recall": recall.recall,
+        "loop_recall_same_way": recall.same_way,
+        "loop_recall_opposite": recall.opposite,
+        "num_revisits": recall.num_revisits,
+        "num_revisits_opposite": recall.num_opposite,
+        **pair_numbers(drive, right),
+    }
+
+
+def pair_numbers(drive: Drive, right: Sequence[FoundLoop]) -> dict[str, Any]:
+    """Returns how many pairs of `loops.txt`, beside the scans' folder, have a right loop near both ends."""
+    pairs = read_pairs(drive.sequence)
+    if not len(pairs):
+        return {}
+    assert drive.reference is not None
+    path, reach_m = path_lengths(drive.reference), drive.scale.reach_m
+
+    def is_near(scan: int, ends: tuple[int, int]) -> bool:
+        return bool(path[ends[0]] - reach_m <= path[scan] <= path[ends[1]] + reach_m)
+
+    found = [any(is_near(max(pair), loop.newer) and is_near(min(pair), loop.older) for loop in right) for pair in pairs]
+    return {"num_known_pairs": len(pairs), "num_known_pairs_found": sum(found)}
+
+
+def read_pairs(sequence: LidarSequence) -> np.ndarray:
+    """Reads (m, 2) pairs of scans that see the same place; none where no file lists them, or scans were left out."""
+    first, last = Path(sequence.sources[0]), Path(sequence.sources[-1])
+    path = next((folder / "loops.txt" for folder in first.parents[:2] if (folder / "loops.txt").is_file()), None)
+    if path is None or len(list(last.parent.iterdir())) != len(sequence):
+        return np.zeros((0, 2), int)
+    return np.loadtxt(path, int, ndmin=2)
+
+
+def size_marks(num: int) -> np.ndarray:
+    """Returns at which counts the size of a map is taken."""
+    return np.unique(np.linspace(0, num, NUM_SIZES + 1).round().astype(int)[1:])
+
+
+def map_sizes(folder: Path, result: SlamResult) -> dict[str, Any]:
+    """Returns the bytes of all points and of map files at each precision, on the way; the whole maps stay as files."""
+    whole = result.state.slam_map
+    points = np.cumsum([report.num_points for report in result.reports])
+    marks = [int(mark) for mark in size_marks(len(whole)) if mark]
+    scans = [int(whole.keyframes[mark - 1].scan) + 1 for mark in marks[:-1]] + ([len(points)] if marks else [])
+    sizes: dict[str, list[int]] = {
+        "map_scans": scans,
+        "map_bytes_points": [POINT_BYTES * int(points[s - 1]) for s in scans],
+    }
+    for precision in PRECISIONS:
+        path = map_path(folder, precision)
+        sizes[f"map_bytes_{precision}"] = [
+            save_map(path, first_keyframes(whole, mark), precision).stat().st_size for mark in marks
+        ]
+    return sizes
+
+
+def map_path(folder: Path, precision: str) -> Path:
+    """Returns the file of the map at a precision."""
+    return folder / f"map_{precision}.npz"
+
+
+def first_keyframes(slam_map: KeyframeMap, num: int) -> KeyframeMap:
+    """Returns the map as it was: the first keyframes, and the edges between them."""
+    edges = tuple(edge for edge in slam_map.edges if max(edge.source, edge.target) < num)
+    return replace(
+        slam_map,
+        keyframes=slam_map.keyframes[:num],
+        T_world_keyframe=slam_map.T_world_keyframe[:num],
+        vectors=slam_map.vectors[:num],
+        edges=edges,
+    )

@@ -1,0 +1,205 @@
+"""Other programs on the same scans: KISS-ICP, KISS-SLAM, odometry by small_gicp. Extra `peers`; imported when used.
+
+Each has its own settings as they come. Only what must fit the place is set: the largest range, 60 m outdoors and 30 m
+indoors, with voxels of a hundredth of it (KISS-ICP's own rule); small_gicp's voxels are those of its documentation, and
+half as large indoors. None of them corrects scans for the motion of the lidar, as ours does not either.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import importlib
+import importlib.metadata
+import os
+from collections.abc import Callable, Iterator
+from typing import Any, NamedTuple, Protocol
+
+import numpy as np
+
+from experiments._result_files import UNKNOWN
+
+MAX_RANGE_M, INDOOR_MAX_RANGE_M = 60.0, 30.0
+# Where half of the points are nearer, the place is indoors.
+INDOORS_M = 5.0
+POINT_BYTES = 12
+_UNLIMITED_M = 1e9
+
+
+class FoundLoop(NamedTuple):
+    """A loop that a method has accepted.
+
+    Attributes:
+        newer: first and last scan of the newer end: the same scan twice, or those of a whole local map.
+        older: the same of the older end.
+        T_older_newer: relative pose of the first scans.
+    """
+
+    newer: tuple[int, int]
+    older: tuple[int, int]
+    T_older_newer: np.ndarray
+
+
+class Peer(Protocol):
+    """A program that takes scans one after the other."""
+
+    def step(self, points: np.ndarray) -> None:
+        """Takes a scan, (n, 3) float64, not empty."""
+
+    def finish(self) -> tuple[np.ndarray, list[FoundLoop]]:
+        """Returns (n, 4, 4) poses of all scans, and the loops."""
+
+
+class KissIcp:
+    """KISS-ICP (Vizzo et al. 2023), and its voxel map of the whole way: the program itself forgets what is far away."""
+
+    def __init__(self, *, is_indoors: bool) -> None:
+        from kiss_icp.config import load_config
+        from kiss_icp.kiss_icp import KissICP
+        from kiss_icp.mapping import VoxelHashMap
+
+        config = load_config(None)
+        _set_range(config.data, config.mapping, is_indoors)
+        mapping = config.mapping
+        self._odometry = KissICP(config)
+        self._whole = VoxelHashMap(mapping.voxel_size, _UNLIMITED_M, mapping.max_points_per_voxel)
+        self._poses: list[np.ndarray] = []
+
+    def step(self, points: np.ndarray) -> None:
+        self._odometry.register_frame(points, np.zeros(0))
+        self._poses.append(self._odometry.last_pose)
+
+    def grow_map(self, points: np.ndarray) -> None:
+        """Adds the last scan to the map of the whole way; it is no part of the program, and not timed."""
+        frame = self._odometry.preprocessor.preprocess(points, np.zeros(0), np.eye(4))
+        self._whole.update(self._odometry.voxelize(frame)[1], self._poses[-1])
+
+    def finish(self) -> tuple[np.ndarray, list[FoundLoop]]:
+        return np.array(self._poses), []
+
+    def map_bytes(self) -> int:
+        """Returns the size of the map of the whole way so far."""
+        return POINT_BYTES * len(self._whole.point_cloud())
+
+
+class KissSlam:
+    """KISS-SLAM (Guadagnino et al. 2025): the same odometry, local maps of 100 m, loops between them, a pose graph."""
+
+    def __init__(self, *, is_indoors: bool) -> None:
+        from kiss_slam.config import load_config
+        from kiss_slam.slam import KissSLAM
+
+        config = load_config(None)
+        _set_range(config.odometry.preprocessing, config.odometry.mapping, is_indoors)
+        self._slam = KissSLAM(config)
+        self._slam.closer = self._closer = _RecordedCloser(self._slam.closer)
+
+    def step(self, points: np.ndarray) -> None:
+        with _silence():
+            self._slam.process_scan(points, np.zeros(0))
+
+    def finish(self) -> tuple[np.ndarray, list[FoundLoop]]:
+        with _silence():
+            self._slam.generate_new_node()
+            graph = self._slam.local_map_graph
+            graph.erase_last_local_map()
+            poses, _ = self._slam.fine_grained_optimization()
+        # A local map begins with the last scan of the one before.
+        lengths = [len(local_map.local_trajectory) for local_map in graph.local_maps()]
+        first = np.concatenate([[0], np.cumsum(np.array(lengths) - 1)])
+        loops = [
+            FoundLoop((first[newer], first[newer + 1]), (first[older], first[older + 1]), np.linalg.inv(T_newer_older))
+            for older, newer, T_newer_older in self._closer.found
+        ]
+        return np.array(poses), loops
+
+
+class SmallGicp:
+    """Odometry by small_gicp (Koide 2024): each scan onto its incremental Gaussian voxel map, from a steady motion."""
+
+    def __init__(self, *, is_indoors: bool) -> None:
+        import small_gicp
+
+        self._library, self._threads = small_gicp, os.cpu_count() or 1
+        self._point_m, voxel_m = (0.125, 0.5) if is_indoors else (0.25, 1.0)
+        self._map = small_gicp.GaussianVoxelMap(voxel_m)
+        self._poses: list[np.ndarray] = []
+
+    def step(self, points: np.ndarray) -> None:
+        scan, _ = self._library.preprocess_points(points, self._point_m, num_threads=self._threads)
+        T = np.eye(4)
+        if self._poses:
+            before, last = (self._poses * 2)[-2:]
+            start = last @ np.linalg.inv(before) @ last if len(self._poses) > 1 else last
+            T = self._library.align(self._map, scan, start, num_threads=self._threads).T_target_source
+        self._map.insert(scan, T)
+        self._poses.append(T)
+
+    def finish(self) -> tuple[np.ndarray, list[FoundLoop]]:
+        return np.array(self._poses), []
+
+
+PEERS: dict[str, tuple[str, Callable[..., Any]]] = {
+    "KISS-ICP": ("kiss_icp.kiss_icp", KissIcp),
+    "KISS-SLAM": ("kiss_slam.slam", KissSlam),
+    "small_gicp": ("small_gicp", SmallGicp),
+}
+"""The peers by name: the module that must be there, and the class."""
+
+
+def why_missing(name: str) -> str | None:
+    """Returns why a peer cannot run; None where it can."""
+    module = PEERS[name][0]
+    try:
+        importlib.import_module(module)
+    except ModuleNotFoundError as error:
+        return f"{error.name} is not installed (pip install dpmjax[peers])"
+    except ImportError as error:  # a system library is missing
+        return f"it cannot be imported ({str(error).splitlines()[0]})"
+    return None
+
+
+def peer_version(name: str) -> str:
+    """Returns the version of a peer."""
+    try:
+        return importlib.metadata.version(name)
+    except importlib.metadata.PackageNotFoundError:
+        return UNKNOWN
+
+
+def is_indoors(points: np.ndarray) -> bool:
+    """Whether a scan is one of a room."""
+    return bool(len(points) and np.median(np.linalg.norm(points, axis=1)) < INDOORS_M)
+
+
+@contextlib.contextmanager
+def _silence() -> Iterator[None]:
+    """Takes away what a program prints, also its compiled part."""
+    saved = [(number, os.dup(number)) for number in (1, 2)]
+    try:
+        with open(os.devnull, "w") as nowhere, contextlib.redirect_stdout(nowhere):
+            for number, _ in saved:
+                os.dup2(nowhere.fileno(), number)
+            yield
+    finally:
+        for number, copy in saved:
+            os.dup2(copy, number)
+            os.close(copy)
+
+
+class _RecordedCloser:
+    """The loop closer of KISS-SLAM, which keeps what it accepts."""
+
+    def __init__(self, closer: Any) -> None:
+        self._closer = closer
+        self.found: list[tuple[int, int, np.ndarray]] = []
+
+    def compute(self, *arguments: Any) -> Any:
+        is_good, older, newer, T_newer_older = answer = self._closer.compute(*arguments)
+        if is_good:
+            self.found.append((int(older), int(newer), np.asarray(T_newer_older)))
+        return answer
+
+
+def _set_range(data: Any, mapping: Any, is_indoors: bool) -> None:
+    data.max_range = INDOOR_MAX_RANGE_M if is_indoors else MAX_RANGE_M
+    mapping.voxel_size, data.deskew = data.max_range / 100.0, False
