@@ -22,7 +22,7 @@ from dpmjax.registration.line_adjustment import adjust_to_lines
 from dpmjax.registration.loop_closure import LoopConfig, close_loops, matched_steps, pose_steps
 from dpmjax.registration.pair_alignment import FINE, PairSystem, Schedule, linearise_pair, match_pairs
 from dpmjax.registration.planar_scans import Floats, Indices, PlanarScans
-from dpmjax.registration.sequence_search import fitting_scans, interpolate
+from dpmjax.registration.step_scores import fitting_scans, interpolate
 
 # Distances of one round are kept below this by leaving out beams of the sources: about two seconds on two cores.
 _ROUND_DISTANCES = 1.5e9

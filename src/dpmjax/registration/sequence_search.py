@@ -12,40 +12,43 @@ from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
-import scipy.sparse
-import scipy.sparse.csgraph
 from numpy.typing import NDArray
 
 from dpmjax.geometry import se2
 from dpmjax.registration.pair_alignment import FINE, PairMatches, match_pairs
 from dpmjax.registration.pair_search import CorrelativeConfig, search_pairs
 from dpmjax.registration.planar_scans import Floats, Indices, PlanarScans
-from dpmjax.registration.range_profiles import RangeProfiles, compare_pairs, make_profiles
-from dpmjax.registration.recordings import fill_between
+from dpmjax.registration.range_profiles import RangeProfiles, contradicted_share, make_profiles
+from dpmjax.registration.sequence_joining import join_parts
+from dpmjax.registration.step_scores import (
+    LEAST_VISIBLE,
+    WEAK_SCORE,
+    MotionPrior,
+    distinct_rows,
+    find_evidence,
+    interpolate,
+    pair_scores,
+    weak_steps,
+)
 
 # Turns of a step that are searched, radians for each scan that it spans.
 _MAX_TURN = 1.7
-# Matched beams that make up for a contradicting one; the share of visible beams that seem to contradict by noise.
-_CONTRADICTION_WEIGHT, _NOISY_SHARE = 2.5, 0.02
-# A step is clear where its score, fitness and the weakest eigenvalue (share of the beams) are above these.
-_CLEAR_SCORE, _CLEAR_FITNESS, _CLEAR_EIGENVALUE = 0.45, 0.5, 0.02
-# Steps with a lower score are also searched from the scans before and behind it, up to so many scans apart; those below
-# the second one, farther.
-_DOUBTFUL_SCORE, _DOUBTFUL_SPAN, _BAD_SCORE, _BAD_SPAN = 0.25, 3, 0.12, 5
-# Two scans fit each other above this score; a group of at most so many that fits no other scan is left out.
-_FITTING_SCORE, _SMALL_GROUP = 0.0, 3
-# Range noise, in typical ranges, above which no two scans are equal.
-_LEAST_NOISE = 1.5e-4
+# A step is clear where its score, fitness and the weakest eigenvalue (share of the beams) are above these, and the
+# share of visible beams that contradict is below the last one.
+_CLEAR_SCORE, _CLEAR_FITNESS, _CLEAR_EIGENVALUE, _CLEAR_CONTRADICTION = 0.45, 0.5, 0.02, 0.05
+# Weak steps are also searched from the scans before and behind them, up to so many scans apart; those with a score
+# below the second number, farther.
+_WEAK_SPAN, _BAD_SCORE, _BAD_SPAN = 3, 0.12, 5
+# So many scans between two weak steps are left out.
+_NUM_ALONE = 2
 # Hypotheses of a scan that are nearer to each other, in typical ranges and radians, are one.
 _SAME = (0.02, 0.02)
 # Two sequences whose last so many scans agree within this are one.
 _NUM_SAME, _SAME_SHAPE = 4, (0.05, 0.05)
 # Score of a scan that is left out; and of one that is placed by the motion before it, after too many were left out.
 _LEFT_OUT, _GUESSED = 0.05, -1.0
-# Visible beams, as a share of all, that are added where few are visible: agreement of few beams says little.
-_LEAST_VISIBLE = 0.3
-# Weight of the motion prior, and its scales: median steps that a step is shorter, longer or off to the side; radians.
-_PRIOR_WEIGHT, _PRIOR_SHORT, _PRIOR_LONG, _PRIOR_SIDEWAYS, _PRIOR_TURN = 0.1, 0.6, 1.5, 0.5, 0.8
+# Weight of the motion prior.
+_PRIOR_WEIGHT = 0.1
 
 
 @dataclass(frozen=True)
@@ -97,68 +100,26 @@ def search_sequence(scans: PlanarScans, steps: PairMatches, config: SequenceConf
     Returns:
         SequenceResult.
     """
-    config, rows = config or SequenceConfig(), _distinct_rows(scans)
+    config, rows = config or SequenceConfig(), distinct_rows(scans)
     some, profiles = scans.take(rows), make_profiles(scans.take(rows))
     # The scans between two of these rows are the first of the two.
     matched = PairMatches(*(x[rows[1:] - 1] for x in steps))
-    found = _Beam(profiles, _find_hypotheses(some, profiles, matched, config), config).run()
+    hypotheses = _find_hypotheses(some, profiles, matched, config)
+    is_clear = (hypotheses.source == hypotheses.target + 1) & (hypotheses.scores > _CLEAR_SCORE)
+    prior = MotionPrior.of(hypotheses.poses[is_clear], scans.typical_range)
+    found = _Beam(profiles, hypotheses, prior, config).run()
+    kept = np.flatnonzero(found.is_registered)
+    kept = kept[~_is_alone(weak_steps(profiles, found.poses, kept))]
+    poses = join_parts(profiles, found.poses, kept, prior, config.search)
     is_registered = np.zeros(len(scans), bool)
-    is_registered[rows[found.is_registered]] = True
-    return SequenceResult(interpolate(len(scans), rows[found.is_registered], found.poses[found.is_registered]), is_registered)
+    is_registered[rows[kept]] = True
+    return SequenceResult(interpolate(len(scans), rows[kept], poses[kept]), is_registered)
 
 
-def interpolate(num_scans: int, rows: Indices, poses: Floats) -> Floats:
-    """Poses of all scans, those of `rows` given; before the first and after the last of these the robot stands still."""
-    ends = [0] * int(rows[0] > 0), [num_scans - 1] * int(rows[-1] < num_scans - 1)
-    chosen = np.concatenate([np.array(ends[0], np.int64), rows, np.array(ends[1], np.int64)])
-    known = np.concatenate([poses[: len(ends[0])], poses, poses[len(poses) - len(ends[1]) :]])
-    return fill_between(chosen, known, np.zeros((num_scans, 3)))
-
-
-def fitting_scans(scans: PlanarScans, poses: Floats) -> NDArray[np.bool_]:
-    """Tells which scans fit some of the scans around them in time, beyond a small group that fits nothing else.
-
-    Args:
-        scans: n scans in time order.
-        poses: (n, 3) T_world_scan.
-
-    Returns:
-        (n,) False for scans of another moment, repeated ones, and those that were taken through a covered lens.
-    """
-    num_scans, profiles = len(scans), make_profiles(scans)
-    span = range(1, min(_DOUBTFUL_SPAN + 1, num_scans))
-    source = np.concatenate([np.arange(k, num_scans) for k in span]).astype(np.int64)
-    target = np.concatenate([np.arange(num_scans - k) for k in span]).astype(np.int64)
-    score = pair_scores(profiles, source, target, se2.relative(poses[target], poses[source]))
-    fits = score > _FITTING_SCORE
-    links = scipy.sparse.coo_matrix((fits, (source, target)), shape=(num_scans, num_scans))
-    group = scipy.sparse.csgraph.connected_components(links, directed=False)[1]
-    size = np.bincount(group)[group]
-    return np.asarray((size > min(_SMALL_GROUP, num_scans // 4)) & np.isin(np.arange(num_scans), _distinct_rows(scans)))
-
-
-def _distinct_rows(scans: PlanarScans) -> Indices:
-    """Rows of the scans that differ from the one before; no sensor with noise measures the same twice."""
-    points = np.asarray(scans.points)
-    is_new = (np.abs(np.diff(points, axis=0)) > 0).any(axis=(1, 2))
-    if scans.noise < _LEAST_NOISE * scans.typical_range:
-        is_new[:] = True
-    return np.flatnonzero(np.append(True, is_new))
-
-
-def pair_scores(profiles: RangeProfiles, source: Indices, target: Indices, poses: Floats) -> Floats:
-    """(p,) scores of pairs at T_target_source: matched less weighted contradicting beams of the visible ones."""
-    evidence, visible = _evidence(profiles, source, target, poses)
-    return evidence / (visible + _LEAST_VISIBLE)
-
-
-def _evidence(profiles: RangeProfiles, source: Indices, target: Indices, poses: Floats) -> tuple[Floats, Floats]:
-    """(p,) matched less weighted contradicting beams, and visible ones, as shares of all beams."""
-    views = compare_pairs(profiles, source, target, poses, stride=4)
-    contradicted = np.maximum(views.contradicted - _NOISY_SHARE * views.visible, 0.0)
-    num_beams = np.asarray(profiles.scans.mask.sum(1), np.float64)
-    beams = np.maximum(num_beams[source] + num_beams[target], 1.0)
-    return (views.matched - _CONTRADICTION_WEIGHT * contradicted) / beams, np.asarray(views.visible, np.float64) / beams
+def _is_alone(is_weak: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """(k,) scans between two weak steps, one or two of them."""
+    part = np.append(0, np.cumsum(is_weak))
+    return np.asarray(np.bincount(part)[part] <= min(_NUM_ALONE, len(part) // 4))
 
 
 def _find_hypotheses(
@@ -170,10 +131,11 @@ def _find_hypotheses(
     best = pair_scores(profiles, later, later - 1, steps.poses)
     num_beams = np.maximum(np.asarray(scans.is_on_line.sum(1))[1:], 1)
     is_clear = (best > _CLEAR_SCORE) & (steps.fitness > _CLEAR_FITNESS)
+    is_clear &= contradicted_share(profiles, later, later - 1, steps.poses) < _CLEAR_CONTRADICTION
     is_clear &= steps.weakest_eigenvalue() > _CLEAR_EIGENVALUE * num_beams
     found = [_Hypotheses(later, later - 1, steps.poses, best)]
     open_steps, searched = later[~is_clear], set[tuple[int, int]]()
-    for span, limit in ((1, np.inf), (_DOUBTFUL_SPAN, _DOUBTFUL_SCORE), (_BAD_SPAN, _BAD_SCORE)):
+    for span, limit in ((1, np.inf), (_WEAK_SPAN, WEAK_SCORE), (_BAD_SPAN, _BAD_SCORE)):
         open_steps = open_steps[best[open_steps - 1] < limit]
         pairs = {(a, a - k) for i in open_steps.tolist() for k in range(1, span + 1) for a in range(i, i + k)}
         new = np.array(sorted(p for p in pairs - searched if p[1] >= 0 and p[0] < num_scans), np.int64).reshape(-1, 2)
@@ -242,16 +204,11 @@ class _Beam:
     """The beam search over the hypotheses of a sequence."""
 
     def __init__(
-        self, profiles: RangeProfiles, hypotheses: _Hypotheses, config: SequenceConfig
+        self, profiles: RangeProfiles, hypotheses: _Hypotheses, prior: MotionPrior, config: SequenceConfig
     ) -> None:
-        self.profiles, self.hypotheses, self.config = profiles, hypotheses, config
-        self.unit, num_scans = profiles.scans.typical_range, len(profiles)
-        self.width = config.num_compared + _BAD_SPAN
-        self.starts = np.searchsorted(hypotheses.source, np.arange(num_scans + 1))
-        is_step = (hypotheses.source == hypotheses.target + 1) & (hypotheses.scores > _CLEAR_SCORE)
-        clear = hypotheses.poses[is_step] if is_step.any() else np.zeros((1, 3))
-        self.step = max(float(np.median(np.hypot(clear[:, 0], clear[:, 1]))), 0.05 * self.unit)
-        self.forward = float(np.median(clear[:, 0])) / self.step
+        self.profiles, self.hypotheses, self.prior, self.config = profiles, hypotheses, prior, config
+        self.unit, self.width = profiles.scans.typical_range, config.num_compared + _BAD_SPAN
+        self.starts = np.searchsorted(hypotheses.source, np.arange(len(profiles) + 1))
 
     def run(self) -> SequenceResult:
         """Goes through all scans, then back along the best sequence."""
@@ -330,24 +287,14 @@ class _Beam:
         relative = np.asarray(se2.relative(placed, np.broadcast_to(pose[:, None], placed.shape)))
         row, column = np.nonzero(is_used)
         pairs = np.full(len(row), scan), scan - self.width + column
-        evidence, visible = _evidence(self.profiles, *pairs, relative[row, column])
+        evidence, visible = find_evidence(self.profiles, *pairs, relative[row, column])
         # The newest scan counts most: a pose is not better for having moved less and so overlapping with older scans.
         weight = 1.0 / rank[parent][row, column]
         total, seen = (np.bincount(row, weight * x, len(parent)) for x in (evidence, visible))
-        agreement = total / (seen + _LEAST_VISIBLE)
+        agreement = total / (seen + LEAST_VISIBLE)
         newest = is_used.shape[1] - 1 - is_used[:, ::-1].argmax(axis=1)
         step, gap = relative[np.arange(len(parent)), newest], self.width - newest
-        return agreement - _PRIOR_WEIGHT * self.surprise(step, gap)
-
-    def surprise(self, step: Floats, gap: Indices) -> Floats:
-        """(m,) heavy-tailed cost of motions over `gap` scans, from the usual motion of this sequence."""
-        share, turn = step[:, :2] / self.step, np.abs(se2.wrap_angle(step[:, 2]))
-        # A robot that turns may stand still; one that does not goes on.
-        expected = self.forward * np.cos(np.minimum(turn, 0.5 * np.pi))
-        ahead = share[:, 0] / gap - expected
-        excess = (np.where(ahead < 0, ahead / _PRIOR_SHORT, ahead / _PRIOR_LONG)) ** 2
-        excess += (share[:, 1] / gap / _PRIOR_SIDEWAYS) ** 2 + (turn / (_PRIOR_TURN * gap**0.5)) ** 2
-        return np.log1p(excess)
+        return np.asarray(agreement - _PRIOR_WEIGHT * self.prior.surprise(step, gap), np.float64)
 
     def is_same(self, now: _Sequences, ways: _Ways, row: int, other: int) -> bool:
         """Whether two ways to go on agree about the last scans, so that no later scan can tell them apart."""
