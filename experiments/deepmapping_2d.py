@@ -109,11 +109,7 @@ def main(config: Config) -> dict[str, Any]:
         run = _fit(folder, task, settings, start, config, stop)
         candidates = {start_name: start, shared.DEEPMAPPING: run.fitted.poses}
         if config.refine and not stop.is_requested:
-            # The fit is sharper near a good start; the start keeps what a robot's odometry knows.
-            candidates |= {
-                f"{name}, refined": shared.refined(task, poses, is_ordered=config.init != "global")
-                for name, poses in list(candidates.items())[config.init == "zero" :]
-            }
+            candidates |= shared.refined_candidates(task, candidates, config.init)
         kept, compared = shared.choose(task, candidates)
         trajectory = log.aligned(candidates[kept])
         metrics = {

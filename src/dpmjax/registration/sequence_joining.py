@@ -113,7 +113,7 @@ def _search_across(sequence: _Sequence, steps: Indices, config: CorrelativeConfi
     found = search_pairs(profiles, target + 1, target, config, turns=np.broadcast_to(turns, (len(target), len(turns))))
     for number, step in enumerate(steps):
         before, after = rows[step], rows[step + 1]
-        gap, here = after - before, se2.relative(poses[before], poses[after])
+        gap, here = int(after - before), se2.relative(poses[before], poses[after])
         candidates = found.poses[number][np.isfinite(found.scores[number])]
         ways = np.concatenate([[here, sequence.prior.expected(gap)], candidates])
         pairs = np.full(len(ways), 2 * number + 1), np.full(len(ways), 2 * number)
@@ -170,7 +170,7 @@ def _follow_votes(sequence: _Sequence, submaps: _Submaps, votes: _Votes, step: i
     """Moves what is behind a weak step to the pose that most loops across it agree on."""
     poses, unit, prior = sequence.poses, sequence.profiles.scans.typical_range, sequence.prior
     before, after = sequence.rows[step], sequence.rows[step + 1]
-    here, gap = se2.relative(poses[before], poses[after]), after - before
+    here, gap = se2.relative(poses[before], poses[after]), int(after - before)
     across = (submaps.centres[votes.later] >= after) & (submaps.centres[votes.earlier] <= before)
     later, earlier = submaps.centres[votes.later[across]], submaps.centres[votes.earlier[across]]
     motion = se2.compose(se2.compose(poses[earlier], votes.poses[across]), se2.inverse(poses[later]))

@@ -39,6 +39,8 @@ _CLEAR_SCORE, _CLEAR_FITNESS, _CLEAR_EIGENVALUE, _CLEAR_CONTRADICTION = 0.45, 0.
 # Weak steps are also searched from the scans before and behind them, up to so many scans apart; those with a score
 # below the second number, farther.
 _WEAK_SPAN, _BAD_SCORE, _BAD_SPAN = 3, 0.12, 5
+# Where neither step of a scan has a better score, the scans before and behind it are searched against each other.
+_SURE_SCORE = 0.5
 # So many scans between two weak steps are left out.
 _NUM_ALONE = 2
 # Hypotheses of a scan that are nearer to each other, in typical ranges and radians, are one.
@@ -128,16 +130,22 @@ def _find_hypotheses(
     """The steps, and the candidates of a search where they are not clear."""
     num_scans = len(scans)
     later = np.arange(1, num_scans)
-    best = pair_scores(profiles, later, later - 1, steps.poses)
+    scores = pair_scores(profiles, later, later - 1, steps.poses)
+    best = scores.copy()
     num_beams = np.maximum(np.asarray(scans.is_on_line.sum(1))[1:], 1)
     is_clear = (best > _CLEAR_SCORE) & (steps.fitness > _CLEAR_FITNESS)
     is_clear &= contradicted_share(profiles, later, later - 1, steps.poses) < _CLEAR_CONTRADICTION
     is_clear &= steps.weakest_eigenvalue() > _CLEAR_EIGENVALUE * num_beams
-    found = [_Hypotheses(later, later - 1, steps.poses, best)]
+    found = [_Hypotheses(later, later - 1, steps.poses, scores)]
     open_steps, searched = later[~is_clear], set[tuple[int, int]]()
     for span, limit in ((1, np.inf), (_WEAK_SPAN, WEAK_SCORE), (_BAD_SPAN, _BAD_SCORE)):
         open_steps = open_steps[best[open_steps - 1] < limit]
         pairs = {(a, a - k) for i in open_steps.tolist() for k in range(1, span + 1) for a in range(i, i + k)}
+        if span == 1:
+            # A scan that no clear step reaches may be one to leave out.
+            pairs |= {
+                (i + 1, i - 1) for i in later[:-1][(scores[:-1] < _SURE_SCORE) & (scores[1:] < _SURE_SCORE)].tolist()
+            }
         new = np.array(sorted(p for p in pairs - searched if p[1] >= 0 and p[0] < num_scans), np.int64).reshape(-1, 2)
         searched |= pairs
         if not len(new):

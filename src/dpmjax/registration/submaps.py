@@ -6,6 +6,7 @@ on either side together see most of both places.
 
 from __future__ import annotations
 
+import jax.numpy as jnp
 import numpy as np
 
 from dpmjax.geometry import se2
@@ -38,7 +39,7 @@ def submap_scans(scans: PlanarScans, poses: Floats, centres: Indices, members: l
         beams, first = np.unique(beam[order], return_index=True)
         points[row, beams], mask[row, beams] = seen[order[first]], True
     made = planar_scans(points, mask, is_ordered=False)
-    ones = np.ones(len(centres), np.float32)
+    ones = jnp.ones(len(centres))
     return made.replace(noises=scans.noise * ones, typical_ranges=scans.typical_range * ones)
 
 
