@@ -193,7 +193,7 @@ def _near_pairs(poses: Floats, typical_range: float) -> tuple[Indices, Indices]:
     return source, target
 
 
-def _weakest_connection(tree: scipy.sparse.csr_matrix) -> tuple[int, float]:
+def _weakest_connection(tree: scipy.sparse.csr_array) -> tuple[int, float]:
     """Scans of the largest connected tree, and the lowest score between two of its parts that are no single scans."""
     label = scipy.sparse.csgraph.connected_components(tree, directed=False)[1]
     root = int(np.flatnonzero(label == np.bincount(label).argmax())[0])

@@ -155,9 +155,10 @@ def _find_hypotheses(
         for source, target, score in zip(found[-1].source, found[-1].target, found[-1].scores, strict=True):
             across = slice(target, source)
             best[across] = np.maximum(best[across], score)
-    joined = _Hypotheses(*(np.concatenate(parts) for parts in zip(*found, strict=True)))
-    order = np.lexsort((-joined.scores, joined.source))
-    return _Hypotheses(*(x[order] for x in joined))
+    source, target = (np.concatenate([getattr(x, name) for x in found]) for name in ("source", "target"))
+    poses, scores = (np.concatenate([getattr(x, name) for x in found]) for name in ("poses", "scores"))
+    order = np.lexsort((-scores, source))
+    return _Hypotheses(source[order], target[order], poses[order], scores[order])
 
 
 def _search(

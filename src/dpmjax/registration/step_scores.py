@@ -46,7 +46,8 @@ def find_evidence(profiles: RangeProfiles, source: Indices, target: Indices, pos
     contradicted = np.maximum(views.contradicted - _NOISY_SHARE * views.visible, 0.0)
     num_beams = np.asarray(profiles.scans.mask.sum(1), np.float64)
     beams = np.maximum(num_beams[source] + num_beams[target], 1.0)
-    return Evidence((views.matched - _CONTRADICTION_WEIGHT * contradicted) / beams, np.asarray(views.visible) / beams)
+    agreement = np.asarray(views.matched - _CONTRADICTION_WEIGHT * contradicted, np.float64)
+    return Evidence(agreement / beams, np.asarray(views.visible, np.float64) / beams)
 
 
 def pair_scores(profiles: RangeProfiles, source: Indices, target: Indices, poses: Floats) -> Floats:
@@ -109,7 +110,8 @@ def fitting_scans(scans: PlanarScans, poses: Floats) -> NDArray[np.bool_]:
     source = np.concatenate([np.arange(k, num_scans) for k in spans]).astype(np.int64)
     target = np.concatenate([np.arange(num_scans - k) for k in spans]).astype(np.int64)
     score = pair_scores(profiles, source, target, se2.relative(poses[target], poses[source]))
-    links = scipy.sparse.coo_matrix((score > _FITTING_SCORE, (source, target)), shape=(num_scans, num_scans))
+    fits = (score > _FITTING_SCORE).astype(np.float64)
+    links = scipy.sparse.csr_matrix((fits, (source, target)), shape=(num_scans, num_scans))
     group = scipy.sparse.csgraph.connected_components(links, directed=False)[1]
     size = np.bincount(group)[group]
     is_new = np.isin(np.arange(num_scans), distinct_rows(scans))
@@ -118,9 +120,8 @@ def fitting_scans(scans: PlanarScans, poses: Floats) -> NDArray[np.bool_]:
 
 def distinct_rows(scans: PlanarScans) -> Indices:
     """Rows of the scans that differ from the one before; no sensor with noise measures the same twice."""
-    is_new = (np.abs(np.diff(np.asarray(scans.points), axis=0)) > 0).any(axis=(1, 2))
-    if scans.noise < _LEAST_NOISE * scans.typical_range:
-        is_new[:] = True
+    is_new = np.asarray((np.abs(np.diff(np.asarray(scans.points), axis=0)) > 0).any(axis=(1, 2)))
+    is_new = is_new | (scans.noise < _LEAST_NOISE * scans.typical_range)
     return np.flatnonzero(np.append(True, is_new))
 
 
