@@ -280,7 +280,7 @@ def report(unit: str, metrics: Mapping[str, Any]) -> str:
     weakest, contradiction = assessment["weakest_connection"], assessment["contradiction"]
     lines += [
         f"kept: {metrics['kept']} (chosen by the scans alone)",
-        f"{trust}: weakest connection {weakest:.2f}, {contradiction:.1%} of the beams contradict others beyond what is usual",
+        f"{trust}: weakest connection {weakest:.2f}, {contradiction:.1%} of the beams contradict beyond the usual",
     ]
     if "num_relations" in metrics:
         kinds = (f"{metrics[f'relations_initial_{kind}']:.3g} -> {metrics[f'relations_{kind}']:.3g}" for kind in UNITS)
