@@ -44,6 +44,9 @@ START_NAMES = {
 }
 """Starts of a fit: the word on the command line, and the name of the candidate."""
 
+# A fit whose map takes so many times the nats of the refined start is not refined.
+_LEAST_PROMISING = 1.15
+
 NOT_RUN = {
     "go-icp": "its packages on PyPI search the turns of 3-D clouds, which may turn a flat scan over; py-goicp does not "
     "build with today's setuptools, py-simple-go-icp-interface took 20 s for one pair of flat scans and gave up",
@@ -99,6 +102,21 @@ def search(task: Task) -> Floats:
 def refined(task: Task, poses: Floats, *, is_ordered: bool) -> Floats:
     """Returns the poses after the alignment of all scans together."""
     return registration.refine(task.planar.replace(is_ordered=is_ordered), poses).poses
+
+
+def refined_candidates(task: Task, candidates: Candidates, init: str) -> Candidates:
+    """Returns the start and the fit, each refined; a fit that is a worse map than the refined start is left out.
+
+    The fit is sharper near a good start; the start keeps what a robot's odometry knows.
+    """
+    (start, start_poses), (fit, fit_poses) = candidates.items()
+    is_ordered = init != "global"
+    found = {} if init == "zero" else {f"{start}, refined": refined(task, start_poses, is_ordered=is_ordered)}
+    scores = registration.choose_trajectory(task.planar, {fit: fit_poses, **found})[1]
+    nats = [score.code_length for score in scores.values()]
+    if nats[0] <= _LEAST_PROMISING * nats[-1]:
+        found[f"{fit}, refined"] = refined(task, fit_poses, is_ordered=is_ordered)
+    return found
 
 
 def choose(task: Task, candidates: Mapping[str, Floats]) -> tuple[str, dict[str, dict[str, float]]]:

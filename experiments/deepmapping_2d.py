@@ -109,11 +109,7 @@ def main(config: Config) -> dict[str, Any]:
         run = _fit(folder, task, settings, start, config, stop)
         candidates = {start_name: start, shared.DEEPMAPPING: run.fitted.poses}
         if config.refine and not stop.is_requested:
-            # The fit is sharper near a good start; the start keeps what a robot's odometry knows.
-            candidates |= {
-                f"{name}, refined": shared.refined(task, poses, is_ordered=config.init != "global")
-                for name, poses in list(candidates.items())[config.init == "zero" :]
-            }
+            candidates |= shared.refined_candidates(task, candidates, config.init)
         kept, compared = shared.choose(task, candidates)
         trajectory = log.aligned(candidates[kept])
         metrics = {
@@ -284,7 +280,7 @@ def report(unit: str, metrics: Mapping[str, Any]) -> str:
     weakest, contradiction = assessment["weakest_connection"], assessment["contradiction"]
     lines += [
         f"kept: {metrics['kept']} (chosen by the scans alone)",
-        f"{trust}: weakest connection {weakest:.0%} of the beams, {contradiction:.1%} contradict others",
+        f"{trust}: weakest connection {weakest:.2f}, {contradiction:.1%} of the beams contradict beyond the usual",
     ]
     if "num_relations" in metrics:
         kinds = (f"{metrics[f'relations_initial_{kind}']:.3g} -> {metrics[f'relations_{kind}']:.3g}" for kind in UNITS)

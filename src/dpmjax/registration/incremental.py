@@ -5,13 +5,11 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-import scipy.sparse
-import scipy.sparse.csgraph
 
 from dpmjax.geometry import se2
 from dpmjax.registration.pair_alignment import COARSE, FINE, Metric, PairMatches, PosePrior, match_pairs
-from dpmjax.registration.planar_scans import Floats, Indices, PlanarScans
-from dpmjax.registration.range_profiles import contradicted_share, make_profiles
+from dpmjax.registration.planar_scans import Floats, PlanarScans
+from dpmjax.registration.sequence_search import search_sequence
 
 # Share of the typical range that a coarse match is off by; and that of a direction that the scans leave open.
 _COARSE_RESIDUAL = 0.015
@@ -25,8 +23,6 @@ _TURN_STEP, _MAX_TURN = 15.0, 90.0
 _GOOD_FITNESS, _POOR_FITNESS = 0.75, 0.4
 # Clear steps predict the translation of an open one if their turns differ by less, in radians.
 _SIMILAR_TURN = 0.15
-# Steps whose fitness less twice the contradicted share is below this are bridged.
-_POOR_QUALITY = 0.2
 # A step is open if its weakest eigenvalue is below this share of the beams.
 _MIN_EIGENVALUE = 0.01
 # Standard deviation of a step of the odometry: of its translation in typical ranges, and of its turn as the weight of a
@@ -39,7 +35,7 @@ class IncrementalResult(NamedTuple):
 
     Attributes:
         poses: (n, 3) T_world_scan, the first one zero.
-        steps: the n - 1 matched steps T_scan_next.
+        steps: the n - 1 matched steps T_scan_next, each by itself.
     """
 
     poses: Floats
@@ -51,8 +47,8 @@ def incremental_icp(
 ) -> IncrementalResult:
     """Registers each scan to the one before and chains the steps.
 
-    Without odometry, scans that fit no neighbour (a passer-by, a swapped line of the log) are bridged: the poses follow
-    the best matches around them.
+    Without odometry, steps that are not clear are searched, and the poses are those of the best sequence of hypotheses
+    (`sequence_search.py`); scans that fit none around them (a swapped line of the log) are interpolated.
 
     Args:
         scans: n scans in time order.
@@ -78,7 +74,7 @@ def incremental_icp(
     predicted = np.concatenate([np.asarray(prior.mean)[:, :2], rough.poses[:, 2:]], axis=1)
     guesses = np.stack([rough.poses, np.where(is_open[:, None], predicted, rough.poses)], axis=1)
     steps = match_pairs(source, target, guesses, FINE, prior, metric=metric)
-    poses = se2.chain(steps.poses) if odometry is not None else _bridge_bad_scans(scans, steps, metric)
+    poses = se2.chain(steps.poses) if odometry is not None else search_sequence(scans, steps).poses
     return IncrementalResult(poses, steps)
 
 
@@ -144,49 +140,3 @@ def _predict_open_steps(matches: PairMatches, typical_range: float) -> PosePrior
             spread = 1.4826 * np.median(np.abs(alike[:, :2] - mean[row, :2]), axis=0) / typical_range
             information[row, :2] = (_COARSE_RESIDUAL / (spread + 0.015)) ** 2
     return PosePrior(mean, information)
-
-
-def _bridge_bad_scans(scans: PlanarScans, steps: PairMatches, metric: Metric) -> Floats:
-    """Poses through the best matches, around scans that fit no neighbour.
-
-    Where a step is poor, the scans on either side are matched across it, two and three apart. The poses then follow the
-    spanning tree of the most trustworthy matches instead of the plain chain, so that a bad scan is a leaf.
-
-    Returns:
-        (n, 3) poses, the first one zero.
-    """
-    later, profiles = np.arange(1, len(scans)), make_profiles(scans)
-
-    def quality(source: Indices, target: Indices, matches: PairMatches) -> Floats:
-        return matches.fitness - 2.0 * contradicted_share(profiles, source, target, matches.poses)
-
-    links = [(later, later - 1, steps.poses, quality(later, later - 1, steps))]
-    poor = np.flatnonzero(links[0][3] < _POOR_QUALITY)
-    if not len(poor):
-        return se2.chain(steps.poses)
-    fan = _fan(scans.typical_range, (0.0, 0.225, 0.45), 8)
-    for apart in (2, 3):
-        # All pairs that span a poor step.
-        target = np.unique(np.concatenate([poor - k for k in range(apart)]))
-        target = target[(target >= 0) & (target + apart < len(scans))]
-        one, other = scans.take(target + apart), scans.take(target)
-        guesses = np.broadcast_to(fan, (len(target), *fan.shape))
-        for schedule in (COARSE, FINE):
-            found = match_pairs(one, other, guesses, schedule, metric=metric)
-            guesses = found.poses[:, None]
-        links.append((target + apart, target, found.poses, quality(target + apart, target, found)))
-    return _follow_tree(len(scans), *(np.concatenate(x) for x in zip(*links, strict=True)))
-
-
-def _follow_tree(num_scans: int, source: Indices, target: Indices, poses: Floats, quality: Floats) -> Floats:
-    """Poses from the first scan on, along the spanning tree of the best links, T_target_source each."""
-    cost = 2.0 - np.clip(quality, -0.9, 1.0)
-    graph = scipy.sparse.csr_matrix((cost, (source, target)), shape=(num_scans, num_scans))
-    tree = scipy.sparse.csgraph.minimum_spanning_tree(graph)
-    order, parents = scipy.sparse.csgraph.breadth_first_order(tree, 0, directed=False)
-    step_of = dict(zip(zip(source.tolist(), target.tolist(), strict=True), poses, strict=True))
-    step_of |= {(j, i): se2.inverse(pose) for (i, j), pose in step_of.items()}
-    world = np.zeros((num_scans, 3))
-    for scan in order[1:].tolist():
-        world[scan] = se2.compose(world[parents[scan]], step_of[scan, int(parents[scan])])
-    return world

@@ -22,6 +22,7 @@ from dpmjax.pose_graph.optimize import ROBUST, optimize_pose_graph
 from dpmjax.registration.pair_alignment import PairMatches, PosePrior, Schedule, match_pairs
 from dpmjax.registration.planar_scans import Floats, Indices, PlanarScans, batches
 from dpmjax.registration.range_profiles import contradicted_share, make_profiles
+from dpmjax.registration.step_scores import weak_steps
 
 _SEARCH = Schedule(gate=(0.18, 0.045), kernel=(0.09, 0.0225), num_iterations=7, source_stride=5, target_stride=3)
 _REFINE = Schedule(gate=(0.075, 0.0225), kernel=(0.0225, 0.0045), num_iterations=10, target_stride=2)
@@ -92,11 +93,14 @@ def close_loops(
     """
     config = config or LoopConfig()
     steps = steps or pose_steps(poses, scans.typical_range)
+    # A step that its own scans do not support may be torn like a loop.
+    is_weak = weak_steps(make_profiles(scans), poses, np.arange(len(poses)))
+    step_trust = np.where(is_weak, 1.0, _STEP_TRUST)
     for _ in range(config.num_rounds):
         loops, weights = _find_loops(scans, poses, config), np.zeros(0)
         if not len(loops.source):
             break
-        trust = np.repeat([_STEP_TRUST, 1.0], [len(steps.source), len(loops.source)])
+        trust = np.append(step_trust, np.ones(len(loops.source)))
         solved = optimize_pose_graph(PoseGraph.create(poses, join_edges(steps, loops)), ROBUST, trust=trust)
         poses, weights = solved.graph.poses, solved.weights[len(steps.source) :]
     return LoopResult(poses, loops, weights)

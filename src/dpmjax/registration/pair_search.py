@@ -48,6 +48,7 @@ class CorrelativeConfig:
         num_candidates: poses that are kept of each pair.
         apart: two candidates of a pair differ by more than this: translation, radians.
         num_levels: local grids, each half as coarse as the one before.
+        max_shift: longer shifts are not searched; None: all within half the images.
     """
 
     num_cells: int = 128
@@ -59,6 +60,7 @@ class CorrelativeConfig:
     num_candidates: int = 4
     apart: tuple[float, float] = (0.12, 0.12)
     num_levels: int = 4
+    max_shift: float | None = None
 
     def __post_init__(self) -> None:
         if self.num_cells % self.block or self.num_cells % 4:
@@ -173,11 +175,15 @@ def _search_turn(
     """Best scores and shifts (x, y in cells) of pairs of spectra, each from another block of cells."""
     size, block = config.num_cells, config.block
     num_blocks = size // block
+    apart = jnp.minimum(jnp.arange(size), size - jnp.arange(size)) * config.cell
+    is_far = jnp.hypot(apart, apart[:, None]) > (jnp.inf if config.max_shift is None else config.max_shift)
+    outside = jnp.where(is_far, -jnp.inf, 0.0)
 
     def search(pair: tuple[Array, Array]) -> tuple[Array, Array]:
         i, j = pair
         spectrum = jnp.conj(sources[0][i]) * targets[1][j] + jnp.conj(sources[1][i]) * targets[0][j]
-        score = jnp.fft.irfft2(spectrum, s=(size, size)).reshape(num_blocks, block, num_blocks, block)
+        score = jnp.fft.irfft2(spectrum, s=(size, size)) + outside
+        score = score.reshape(num_blocks, block, num_blocks, block)
         value, which = jax.lax.top_k(score.max((1, 3)).reshape(-1), config.num_peaks)
         # Where in its block each maximum lies; a search of all blocks for it would take longer than the rest.
         best_blocks = score[which // num_blocks, :, which % num_blocks].reshape(config.num_peaks, -1)

@@ -2,8 +2,8 @@
 
 A map is as good as few nats write all its beams down (`map_code_length`) and as its surfaces agree (`surface_misfit`).
 It is wrong where a weak connection holds it together, or where beams pass through what others have hit; so trust rests
-on the beams of the weakest connection, if every scan hangs on the best chain of others, and on the share of beams that
-contradict another scan (`assess_trajectory`).
+on the weakest connection of the best tree of pairs, and on how much more all other pairs contradict each other than
+those of the tree (`assess_trajectory`).
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ from dpmjax.geometry import se2
 from dpmjax.registration.planar_scans import Floats, Indices, PlanarScans
 from dpmjax.registration.range_profiles import compare_pairs, make_profiles
 from dpmjax.registration.refinement import surface_misfit
+from dpmjax.registration.step_scores import pair_scores
 
 # Maps whose code lengths differ by less than this part are equally good as maps (how walls lie in the cells is worth
 # some percent); then their surfaces decide.
@@ -31,14 +32,17 @@ _SAMPLES_A_BEAM = 32
 _GRID_TURNS = (0.2, 0.5, 0.9, 1.3)
 # Side of a cell in typical ranges: some thicknesses of a wall. Finer agreement is the business of `surface_misfit`.
 _CELL = 0.015
-# Calibrated on right and wrong maps of simulated worlds (docs/deepmapping_notes.md).
-# The share of beams that the weakest connection of a right map holds by, each scan compared with so many nearest ones.
-_MIN_CONNECTION, _NUM_NEIGHBOURS = 0.36, 12
-# Share of beams that may contradict others in a right map: without noise, and so much more at the noisy end.
-_MAX_CONTRADICTION, _NOISY_CONTRADICTION = 0.01, 0.03
-# Range noise in typical ranges at which that allowance is full, and above which right and wrong maps look alike: no map
-# is trusted there.
-_NOISY, _MAX_NOISE = 0.015, 0.0225
+# Calibrated on right and wrong maps of simulated worlds and of thinned logs (docs/deepmapping_notes.md).
+# Each scan is compared with so many nearest ones, by position and by position and heading (a radian as so many typical
+# ranges). Scans whose best score is lower than the second number belong to no map; at most a share of them may.
+_NUM_NEAREST, _HEADING_WEIGHT, _LEAST_SCORE, _LEAST_REGISTERED = 12, 0.5, 0.1, 0.9
+# The least score of the weakest connection of two parts of a map; a part has so many scans, or this share of them.
+_MIN_CONNECTION, _PART_SCANS, _PART_SHARE, _FEW_SCANS = 0.1, 3, 0.02, 60
+# Share of beams that may contradict beyond those of the pairs that hold the map, which sensor and people cause: a part
+# that is always allowed, a multiple of that share, and the most.
+_CONTRADICTION_FLOOR, _CONTRADICTION_FACTOR, _MAX_CONTRADICTION = 0.02, 1.6, 0.055
+# Range noise in typical ranges above which right and wrong maps look alike: no map is trusted there.
+_MAX_NOISE = 0.0225
 
 
 class Score(NamedTuple):
@@ -130,8 +134,9 @@ class Assessment(NamedTuple):
     """How far a registration can be trusted, without the truth.
 
     Attributes:
-        weakest_connection: share of beams, 0 to 1, that hold the weakest connection of the best chain.
-        contradiction: share of beams, 0 to 1, that end in the free space of another scan.
+        weakest_connection: score, at most 1, of the weakest connection that holds two parts of the map together.
+        contradiction: share of beams that end in the free space of another scan, beyond that of the connections that
+            hold the map: scans that meet again by the poses alone must not contradict more than those.
         is_trusted: both are within what right maps reach, and there is not too much noise to tell.
     """
 
@@ -143,6 +148,10 @@ class Assessment(NamedTuple):
 def assess_trajectory(scans: PlanarScans, poses: Floats) -> Assessment:
     """Tells whether the registration of scans can be trusted.
 
+    The best pairs of scans make a tree that holds the map together. It must have no weak connection between two parts,
+    and the other pairs must contradict hardly more than those of the tree. Scans that fit no other are left out, if
+    they are few.
+
     Args:
         scans: n scans, two at least.
         poses: (n, 3) x, y, heading.
@@ -150,20 +159,52 @@ def assess_trajectory(scans: PlanarScans, poses: Floats) -> Assessment:
     Returns:
         Assessment.
     """
-    num_scans = len(poses)
-    num_nearest = min(_NUM_NEIGHBOURS + 1, num_scans)
-    nearest = scipy.spatial.cKDTree(poses[:, :2]).query(poses[:, :2], k=num_nearest)[1]
-    row = np.repeat(np.arange(num_scans), num_nearest)
-    pairs = np.unique(np.sort(np.stack([row, nearest.reshape(-1)], -1), axis=1), axis=0)
-    target, source = pairs[pairs[:, 0] < pairs[:, 1]].astype(np.int64).T
-    views = compare_pairs(make_profiles(scans), source, target, se2.relative(poses[target], poses[source]))
-    num_beams = np.maximum(np.asarray(scans.mask).sum(axis=1), 1)
-    share = np.clip(views.matched / (num_beams[source] + num_beams[target]), 1e-6, 1.0)
-    graph = scipy.sparse.csr_matrix((2.0 - share, (source, target)), shape=(num_scans, num_scans))
-    tree = scipy.sparse.csgraph.minimum_spanning_tree(graph)
-    connection = 2.0 - float(tree.data.max()) if tree.nnz == num_scans - 1 else 0.0
-    contradiction = float(np.sum(views.contradicted)) / max(float(np.sum(views.visible)), 1.0)
-    noise = scans.noise / scans.typical_range
-    limit = _MAX_CONTRADICTION + min(1.0, noise / _NOISY) * _NOISY_CONTRADICTION
-    is_clear = contradiction <= limit and noise <= _MAX_NOISE
-    return Assessment(connection, contradiction, is_clear and connection >= _MIN_CONNECTION)
+    profiles, (source, target) = make_profiles(scans), _near_pairs(poses, scans.typical_range)
+    relative = se2.relative(poses[target], poses[source])
+    scores = pair_scores(profiles, source, target, relative)
+    views = compare_pairs(profiles, source, target, relative)
+    best = np.full(len(poses), -np.inf)
+    np.maximum.at(best, np.concatenate([source, target]), np.concatenate([scores, scores]))
+    is_used = (best[source] > _LEAST_SCORE) & (best[target] > _LEAST_SCORE)
+    source, target, scores = source[is_used], target[is_used], scores[is_used]
+    contradicted, visible = (np.asarray(x)[is_used] for x in (views.contradicted, views.visible))
+    size = (len(poses), len(poses))
+    tree = scipy.sparse.csgraph.minimum_spanning_tree(scipy.sparse.csr_matrix((2.0 - scores, (source, target)), size))
+    holding = tree.tocoo()
+    holds = np.isin(source * len(poses) + target, holding.row.astype(np.int64) * len(poses) + holding.col)
+    shares = [contradicted[rows].sum() / max(visible[rows].sum(), 1.0) for rows in (holds, ~holds)]
+    excess, num_connected, weakest = shares[1] - shares[0], *_weakest_connection(tree)
+    limit = min(_CONTRADICTION_FLOOR + _CONTRADICTION_FACTOR * shares[0], _MAX_CONTRADICTION)
+    is_clear = excess <= limit and scans.noise <= _MAX_NOISE * scans.typical_range
+    is_whole = num_connected >= _LEAST_REGISTERED * len(poses) and weakest >= _MIN_CONNECTION
+    return Assessment(weakest, float(excess), bool(is_clear and is_whole))
+
+
+def _near_pairs(poses: Floats, typical_range: float) -> tuple[Indices, Indices]:
+    """Source and target of each scan and its nearest ones, each pair once."""
+    heading = _HEADING_WEIGHT * typical_range * np.column_stack([np.cos(poses[:, 2]), np.sin(poses[:, 2])])
+    count, row = min(_NUM_NEAREST + 1, len(poses)), np.arange(len(poses))
+    pairs = []
+    for place in (poses[:, :2], np.concatenate([poses[:, :2], heading], axis=1)):
+        nearest = scipy.spatial.cKDTree(place).query(place, k=count)[1]
+        pairs.append(np.stack([np.repeat(row, count), nearest.reshape(-1)], axis=-1))
+    found = np.unique(np.sort(np.concatenate(pairs), axis=1), axis=0)
+    target, source = found[found[:, 0] < found[:, 1]].astype(np.int64).T
+    return source, target
+
+
+def _weakest_connection(tree: scipy.sparse.csr_array) -> tuple[int, float]:
+    """Scans of the largest connected tree, and the lowest score between two of its parts that are no single scans."""
+    label = scipy.sparse.csgraph.connected_components(tree, directed=False)[1]
+    root = int(np.flatnonzero(label == np.bincount(label).argmax())[0])
+    order, parent = scipy.sparse.csgraph.breadth_first_order(tree, root, directed=False)
+    size = np.ones(tree.shape[0], np.int64)
+    for scan in order[:0:-1]:
+        size[parent[scan]] += size[scan]
+    count, below = len(order), order[1:]
+    if not len(below):
+        return count, 0.0
+    cost = np.asarray((tree + tree.T)[below, parent[below]]).reshape(-1)
+    smaller = np.minimum(size[below], count - size[below])
+    is_part = smaller >= (1 if count <= _FEW_SCANS else max(_PART_SCANS, _PART_SHARE * count))
+    return count, float(2.0 - cost[is_part].max()) if is_part.any() else 1.0

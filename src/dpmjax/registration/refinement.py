@@ -22,6 +22,7 @@ from dpmjax.registration.line_adjustment import adjust_to_lines
 from dpmjax.registration.loop_closure import LoopConfig, close_loops, matched_steps, pose_steps
 from dpmjax.registration.pair_alignment import FINE, PairSystem, Schedule, linearise_pair, match_pairs
 from dpmjax.registration.planar_scans import Floats, Indices, PlanarScans
+from dpmjax.registration.step_scores import fitting_scans, interpolate
 
 # Distances of one round are kept below this by leaving out beams of the sources: about two seconds on two cores.
 _ROUND_DISTANCES = 1.5e9
@@ -88,6 +89,10 @@ def refine(scans: PlanarScans, poses: Floats, config: RefinementConfig | None = 
     if scans.is_ordered and config.loops is not None and not _is_sound(scans, poses):
         # The steps again, with those of the start as guess and as prior, where the scans leave a direction open.
         chained, steps = incremental_icp(scans, odometry=poses)
+        rows = np.flatnonzero(fitting_scans(scans, chained))
+        if len(rows) < len(scans):
+            fitting = refine(scans.take(rows).replace(is_ordered=True), poses[rows], config)
+            return fitting._replace(poses=interpolate(len(scans), rows, fitting.poses))
         matched = matched_steps(steps, scans.typical_range)
         poses, _, weights = close_loops(scans, chained, config.loops, steps=matched)
         num_loops = int((weights > 0.25).sum())
