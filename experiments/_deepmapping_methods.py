@@ -50,6 +50,8 @@ NOT_RUN = {
 }
 """Baselines of the paper that have no column, and why."""
 
+_LBFGS_ITERATIONS = 150
+
 
 @dataclass(frozen=True)
 class Task:
@@ -59,14 +61,14 @@ class Task:
         sequence: the scans; methods do not look at its reference.
         planar: the same scans with a line at every beam.
         is_ordered: the scans lie in the order of time.
-        steps: steps of an optimiser.
+        steps: of the fit; None: the preset decides.
         seed: seed of everything random.
     """
 
     sequence: ScanSequence
     planar: PlanarScans
     is_ordered: bool = True
-    steps: int = 600
+    steps: int | None = None
     seed: int = 0
 
     @property
@@ -77,7 +79,7 @@ class Task:
         return ScanSet(self.sequence.points, self.sequence.mask)
 
 
-def make_task(sequence: ScanSequence, *, is_ordered: bool = True, steps: int = 600, seed: int = 0) -> Task:
+def make_task(sequence: ScanSequence, *, is_ordered: bool = True, steps: int | None = None, seed: int = 0) -> Task:
     """Prepares scans for the methods; where they are not ordered, they are shuffled first."""
     if not is_ordered:
         order = np.random.default_rng([seed, 77]).permutation(len(sequence))
@@ -135,7 +137,8 @@ def _fit(task: Task, start: Floats | None, config: DeepMappingConfig | None = No
     """Returns poses by DeepMapping from a start, or from zero poses."""
     import jax
 
-    settings = deepmapping.with_steps(config or deepmapping.preset("fast"), task.steps)
+    settings = config or deepmapping.preset("fast")
+    settings = settings if task.steps is None else deepmapping.with_steps(settings, task.steps)
     order = np.arange(len(task.sequence)) if start is None else in_fitting_order(task, start)
     scans = replace(task, sequence=task.sequence.take(order)).scans
     fitted = deepmapping.fit_deepmapping(
@@ -151,7 +154,29 @@ def _direct_lbfgs(task: Task) -> Floats:
     from experiments.baselines.direct import optimize_directly
 
     key = jax.random.key(task.seed)
-    return optimize_directly(task.scans, deepmapping.preset("fast"), num_iterations=max(1, task.steps // 4), key=key)
+    num_iterations = _LBFGS_ITERATIONS if task.steps is None else max(1, task.steps // 4)
+    return optimize_directly(task.scans, deepmapping.preset("fast"), num_iterations=num_iterations, key=key)
+
+
+def _lnet_from_icp(task: Task) -> Candidates:
+    """Returns incremental ICP, and DeepMapping from it by the phases of a cold start, L-Net's among them."""
+    start, config = incremental(task), deepmapping.preset("fast")
+    return {START_NAMES["icp-plane"]: start, DEEPMAPPING: _fit(task, start, _with_cold_phases(config))}
+
+
+def _with_cold_phases(config: DeepMappingConfig) -> DeepMappingConfig:
+    return replace(config, warm_phases=config.cold_phases)
+
+
+def _without_windows(config: DeepMappingConfig) -> DeepMappingConfig:
+    """Returns the settings with one registration of the whole set from the first phase on."""
+    return replace(config, cold_phases=tuple(replace(phase, scans_per_window=None) for phase in config.cold_phases))
+
+
+def _direct(task: Task, *, has_windows: bool) -> Floats:
+    """Returns poses by DeepMapping's loss without L-Net, from zero by Adam."""
+    config = deepmapping.as_direct(deepmapping.preset("fast"))
+    return _fit(task, None, config if has_windows else _without_windows(config))
 
 
 def _multiway(task: Task) -> Floats:
@@ -216,10 +241,14 @@ METHODS: dict[str, Method] = {
     "icp-refined": Method("incremental ICP, refined", lambda task: refined(task, incremental(task), is_ordered=True)),
     "multiway": Method("multiway registration of Open3D", _multiway, "open3d"),
     "particle-swarm": Method("particle swarms, each scan onto the one before", _swarm, "evosax"),
-    "direct-adam": Method(
-        "direct optimisation from zero, Adam",
-        lambda task: _fit(task, None, deepmapping.as_direct(deepmapping.preset("fast"))),
+    "lnet-zero": Method("L-Net and M-Net from zero", lambda task: {DEEPMAPPING: _fit(task, None)}),
+    "lnet-icp": Method("L-Net and M-Net from incremental ICP", _lnet_from_icp),
+    "search": Method(START_NAMES["global"], search),
+    "search-refined": Method(
+        "global registration, refined", lambda task: refined(task, search(task), is_ordered=False)
     ),
+    "direct-adam": Method("direct optimisation from zero, Adam", partial(_direct, has_windows=False)),
+    "direct-windows": Method("direct optimisation from zero in windows, Adam", partial(_direct, has_windows=True)),
     "direct-lbfgs": Method("direct optimisation from zero, L-BFGS", _direct_lbfgs),
     "global-deepmapping": Method("global registration, then DeepMapping", _global_deepmapping),
     "refined-deepmapping": Method("ICP or global registration, then DeepMapping, refined", _refined_deepmapping),
@@ -232,8 +261,8 @@ class TableOptions(RunOptions):
 
     methods: tuple[str, ...] = tuple(METHODS)
     """Columns."""
-    steps: int = 600
-    """Steps of the fit."""
+    steps: int | None = None
+    """Steps of the fit; without it, the preset decides."""
 
     def __post_init__(self) -> None:
         """Checks names and ranges."""

@@ -27,7 +27,10 @@ from experiments._deepmapping_methods import Task
 from experiments._run_folder import RunFolder, write_metrics
 
 EXPERIMENT = "deepmapping_limits"
-COLUMNS = ("icp-plane", "icp-refined", "direct-adam", "global-deepmapping", "refined-deepmapping")
+COLUMNS = (
+    "icp-plane", "icp-refined", "lnet-zero", "lnet-icp", "direct-adam", "search", "search-refined",
+    "global-deepmapping", "refined-deepmapping",
+)  # fmt: skip
 ORDERS = ("ordered", "shuffled")
 NUM_SCANS, NUM_WORLDS = 256, 3
 

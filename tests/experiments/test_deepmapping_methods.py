@@ -32,7 +32,12 @@ LARGEST_ATE_PX = {
     "icp-refined": 0.01,
     "multiway": 3.0,
     "particle-swarm": 10.0,
+    "lnet-zero": 30.0,
+    "lnet-icp": 0.1,
+    "search": 1.0,
+    "search-refined": 0.01,
     "direct-adam": 30.0,
+    "direct-windows": 30.0,
     "direct-lbfgs": 30.0,
     "global-deepmapping": 1.0,
     "refined-deepmapping": 0.1,
@@ -58,7 +63,7 @@ def test_method_registers_a_tiny_walk(name, task) -> None:
     assert row["ate_px"] < LARGEST_ATE_PX[name]
     assert row["ate_px"] == row["candidates"][row["kept"]]["ate_px"]
     assert row["success"] == (row["ate_px"] < 20.0)
-    assert (DEEPMAPPING in row["candidates"]) == ("deepmapping" in name)
+    assert (DEEPMAPPING in row["candidates"]) == ("deepmapping" in name or "lnet" in name)
     for numbers in row["candidates"].values():
         assert {"ate_px", "point_distance_px", "code_length", "misfit"} == set(numbers)
 
