@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import pairwise
 
 import jax
 import jax.numpy as jnp
@@ -37,7 +38,7 @@ def test_windows_hold_every_motion_between_neighbours(num_scans: int, length: in
     rows = window_rows(num_scans, length)
     assert rows.shape[1] == min(num_scans, length)
     assert (np.diff(rows, axis=1) == 1).all()
-    pairs = {pair for row in rows.tolist() for pair in zip(row[:-1], row[1:], strict=True)}
+    pairs = {pair for row in rows.tolist() for pair in pairwise(row)}
     assert pairs == {(k, k + 1) for k in range(num_scans - 1)}
     phase = replace(dm.preset("fast").cold_phases[0], scans_per_window=length)
     drawn, block = draw_rows(phase, num_scans, jnp.int32(0), key=KEY)

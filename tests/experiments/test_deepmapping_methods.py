@@ -12,7 +12,13 @@ import pytest
 
 from dpmjax.geometry import se2
 from dpmjax.simulation import simulate_sequence
-from experiments import _deepmapping_methods, deepmapping_limits, deepmapping_logs, deepmapping_suite
+from experiments import (
+    _deepmapping_methods,
+    _deepmapping_tables,
+    deepmapping_limits,
+    deepmapping_logs,
+    deepmapping_suite,
+)
 from experiments._command import run_command
 from experiments._deepmapping_methods import (
     DEEPMAPPING,
@@ -20,8 +26,8 @@ from experiments._deepmapping_methods import (
     Task,
     in_fitting_order,
     make_task,
-    run_method,
 )
+from experiments._deepmapping_tables import run_method
 from experiments._recordings import corrected_numbers
 
 # ATE in px that each method stays below on the tiny walk; the start of all poses at zero has 14 px there. The direct
@@ -135,7 +141,7 @@ def test_limits_are_resumed_without_doing_a_row_twice(tmp_path, monkeypatch, cap
 
     monkeypatch.setattr(deepmapping_limits.simulation, "simulate_sequence", simulate)
     monkeypatch.setattr(_deepmapping_methods, "make_task", lambda sequence, **_: Task(sequence, planar=None))
-    monkeypatch.setattr(_deepmapping_methods, "run_method", lambda name, task: a_row(name, len(task.sequence)))
+    monkeypatch.setattr(_deepmapping_tables, "run_method", lambda name, task: a_row(name, len(task.sequence)))
     absent = METHODS["multiway"]._replace(package="no_such_package")
     monkeypatch.setitem(METHODS, "multiway", absent)
     first = run("--limit", "1", "--methods", "icp-plane", "icp-point")
