@@ -1,13 +1,12 @@
 """Time to accuracy of DeepMapping: ATE after 15, 30, 60 s of run time, beside ICP, the refinement and the paper.
 
-Six walks from zero tell success, error and seconds of the whole call. The authors' trajectory (v1_pose0) and its poor
-start are used where they lie in `$DPMJAX_DATA/deepmapping_2d` (default `../shared/data`); the built-in world always.
+The authors' trajectory (v1_pose0) and its poor start are used where they lie in `$DPMJAX_DATA/deepmapping_2d`
+(default `../shared/data`); the built-in world always.
 """
 
 from __future__ import annotations
 
 import os
-import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -29,11 +28,10 @@ from dpmjax.types import ScanSet
 NAME = "deepmapping"
 DATA = Path(os.environ.get("DPMJAX_DATA", "../shared/data")) / "deepmapping_2d"
 _MARKS_S = (15.0, 30.0, 60.0, 120.0, 180.0)
-_SUCCESS_PX, _FIRST_WALK = 20.0, 700
 
 
 def run(quick: bool) -> list[Row]:
-    """ICP and refinement with and without noise, fits from a poor start and from zero, six walks, the paper's step."""
+    """ICP and refinement with and without noise, the fit from a poor start and from zero, the paper's step."""
     rows: list[Row] = []
     sequences = [simulate_sequence(0, 64 if quick else 256, seed=0)]
     if DATA.is_dir():
@@ -44,7 +42,6 @@ def run(quick: bool) -> list[Row]:
     for sequence in sequences:
         rows += _fit(sequence, None, f"{sequence.name}, cold", quick)
         rows += _fit(sequence, _poor_start(sequence), f"{sequence.name}, poor start", quick)
-    rows += _from_zero(2 if quick else 6)
     rows += _paper_step(sequences[0])
     return rows
 
@@ -123,24 +120,6 @@ def _fit(sequence: ScanSequence, start: NDArray[np.float64] | None, case: str, q
     ]
     refined = refine(_lines(sequence), poses)
     return [*rows, Row(f"{case}: refined", "ate", _ate(sequence, refined.poses), "px")]
-
-
-def _from_zero(num_walks: int) -> list[Row]:
-    """L-Net and M-Net from zero on walks of 128 scans: success and seconds of each call, that compiles among them."""
-    ates, seconds = [], []
-    for walk in range(num_walks):
-        sequence = simulate_sequence(walk % 3, 128, seed=_FIRST_WALK + walk)
-        begun = time.perf_counter()
-        fitted = dm.fit_deepmapping(ScanSet(sequence.points, sequence.mask), key=jax.random.key(0))
-        seconds.append(time.perf_counter() - begun)
-        ates.append(_ate(sequence, fitted.poses))
-    case = f"{num_walks} walks of 128 scans, from zero"
-    return [
-        Row(case, "success (ATE < 20 px)", float(np.mean(np.array(ates) < _SUCCESS_PX)), ""),
-        Row(case, "median ate", float(np.median(ates)), "px"),
-        Row(case, "median seconds", float(np.median(seconds)), "s"),
-        Row(case, "seconds of the first, with compilation", seconds[0], "s"),
-    ]
 
 
 def _paper_step(sequence: ScanSequence) -> list[Row]:
