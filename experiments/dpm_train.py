@@ -55,6 +55,8 @@ class Config:
     """Folder for the results, instead of results/dpm_train/<time>."""
     preset: Literal["tiny", "small", "paper"] = "tiny"
     """Size of the network and length of its training."""
+    without: tuple[Literal["offset-head", "coarse-loss", "curriculum", "occlusion"], ...] = ()
+    """Leave these out, to see what each is worth (the paper's Table 2)."""
     steps: Annotated[int | None, arg(metavar="N")] = None
     """Train for about N steps in all, stages in proportion; without it, the preset decides."""
     num_towns: Annotated[int, arg(metavar="N")] = 4
@@ -192,9 +194,11 @@ def training_settings(config: Config) -> TrainingConfig:
     """Returns the preset, with the options applied."""
     from dataclasses import replace
 
-    from dpmjax.deeppointmap import training_preset
+    from dpmjax.deeppointmap import training_preset, without
 
     settings = training_preset(config.preset)
+    for part in config.without:
+        settings = without(settings, part)
     if config.bfloat16:
         settings = replace(settings, model=settings.model.with_compute_dtype("bfloat16"))
     return settings if config.steps is None else settings.with_steps(config.steps)

@@ -12,7 +12,17 @@ import jax
 import numpy as np
 import pytest
 
-from dpmjax.deeppointmap import CurriculumStage, SampleMaker, finish, init_training, make_step
+from dpmjax.deeppointmap import (
+    CurriculumStage,
+    Model,
+    SampleMaker,
+    finish,
+    init_training,
+    make_step,
+    training_preset,
+    without,
+)
+from dpmjax.deeppointmap.model import predict_offsets
 from dpmjax.deeppointmap.sampling import RegistrationSample
 from dpmjax.deeppointmap.training import TrainingState, _learning_rate, batch_loss
 from tests.deeppointmap import toy
@@ -61,6 +71,30 @@ def test_loss_falls_on_one_batch_and_all_parts_but_the_overlap_head_learn(maker,
     moved = changed(start, state)
     del moved["overlap_head"]  # by weight decay alone
     assert all(moved.values()), moved
+
+
+@pytest.mark.slow
+def test_without_the_offset_head_it_does_not_learn_and_a_pair_is_registered_by_positions(maker, start) -> None:
+    config = without(toy.TRAINING, "offset-head")
+    after, report = make_step(config)(start, maker(0))
+    head = (state.params["decoder"]["offset_head"] for state in (start, after))
+    kept = 1 - float(report.learning_rate) * config.weight_decay  # AdamW's decay, no gradient
+    for before, now in zip(*map(jax.tree.leaves, head), strict=True):
+        np.testing.assert_allclose(now, kept * before, atol=1e-7)
+    model = Model(start.params, config.model)
+    features = np.ones((5, 1, config.model.decoder.model_channels), np.float32)
+    rows = np.zeros((5, 3), np.int32)
+    assert not np.any(predict_offsets(model, features, features[:, 0], None, rows))
+    assert predict_offsets(model, features, features[:, 0], None, rows).shape == (5, 3, 3)
+
+
+def test_parts_of_the_training_can_be_left_out() -> None:
+    config = training_preset("small")
+    assert without(config, "curriculum").curriculum == (CurriculumStage(16, config.num_steps),)
+    assert without(config, "coarse-loss").objective.coarse_weight == 0
+    bare = without(config, "occlusion").augment
+    assert (bare.sector_probability, bare.box_probability, bare.max_drop_ratio) == (0, 0, 0.7)
+    assert not without(config, "offset-head").model.decoder.predicts_offsets
 
 
 @pytest.mark.slow

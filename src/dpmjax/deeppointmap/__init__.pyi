@@ -4,6 +4,7 @@ from .batches import register_pairs as register_pairs
 from .curriculum import CurriculumStage as CurriculumStage
 from .curriculum import TrainingConfig as TrainingConfig
 from .curriculum import training_preset as training_preset
+from .curriculum import without as without
 from .data_pipeline import SampleMaker as SampleMaker
 from .encoding import encode as encode
 from .encoding import scene_scale as scene_scale

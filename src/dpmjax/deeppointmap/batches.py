@@ -18,7 +18,7 @@ from dpmjax.deeppointmap.overlap_prediction import overlap_evidence, overlap_pro
 from dpmjax.deeppointmap.scan_registration import PreparedScan, Scale, ScanOrCloud, register_each
 from dpmjax.types import AnyArray, DescriptorCloud, PointCloud, Registration
 
-CHUNK = 8
+CHUNK = 4
 
 
 def encode_scans(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from typing import Literal, get_args
 
 from dpmjax.checks import require_count, require_fields, require_one_of, require_positive_fields
 from dpmjax.deeppointmap.model_config import ModelConfig, Preset, model_preset
@@ -139,6 +140,36 @@ class TrainingConfig:
         stages = tuple(replace(stage, num_steps=max(1, round(stage.num_steps * ratio))) for stage in self.curriculum)
         warmup = min(round(self.warmup_steps * min(ratio, 1)), sum(stage.num_steps for stage in stages) - 1)
         return replace(self, curriculum=stages, warmup_steps=warmup)
+
+
+TrainingPart = Literal["offset-head", "coarse-loss", "curriculum", "occlusion"]
+"""What DeepPointMap's Table 2 leaves out."""
+
+
+def without(config: TrainingConfig, part: TrainingPart) -> TrainingConfig:
+    """Leaves a part of the training out (DeepPointMap Table 2).
+
+    Args:
+        config: settings of training.
+        part: "curriculum" trains with the largest groups from the first step on.
+
+    Returns:
+        A new configuration of as many steps.
+
+    Raises:
+        ValueError: an unknown part.
+    """
+    require_one_of("part", part, get_args(TrainingPart))
+    if part == "offset-head":
+        decoder = replace(config.model.decoder, predicts_offsets=False)
+        objective = replace(config.objective, offset_weight=0.0)
+        return replace(config, model=replace(config.model, decoder=decoder), objective=objective)
+    if part == "coarse-loss":
+        return replace(config, objective=replace(config.objective, coarse_weight=0.0))
+    if part == "curriculum":
+        largest = max(stage.max_group for stage in config.curriculum)
+        return replace(config, curriculum=(CurriculumStage(largest, config.num_steps),))
+    return replace(config, augment=replace(config.augment, sector_probability=0.0, box_probability=0.0))
 
 
 def training_preset(name: Preset) -> TrainingConfig:

@@ -39,7 +39,8 @@ class MatchConfig:
 
     Attributes:
         temperature: temperature of both softmaxes.
-        pair_ratio: number of pairs per direction, as a share of the mean size of the two clouds.
+        pair_ratio: number of pairs per direction, as a share of the mean size of the two clouds; ...
+        max_num_pairs: ... at most this many: more tell no more about one motion, and the consensus takes their cube.
         max_offset_m: pairs with longer offsets are dropped.
         min_inlier_score: pairs with higher scores are the first inliers ...
         min_num_first: ... or this many of the best pairs, where those are fewer.
@@ -53,6 +54,7 @@ class MatchConfig:
 
     temperature: float = 0.1
     pair_ratio: float = 0.5
+    max_num_pairs: int = 512
     max_offset_m: float = 2.0
     min_inlier_score: float = 0.5
     min_num_first: int = 64
@@ -65,6 +67,7 @@ class MatchConfig:
     def __post_init__(self) -> None:
         require_positive_fields(self, "temperature", "pair_ratio", "max_offset_m", "inlier_sigmas")
         require_fields(self, "min_num_first", "num_rounds", "min_num_inliers", "num_confident", low=1)
+        require_fields(self, "max_num_pairs", low=1)
         require_fields(self, "pair_ratio", low=0, high=4)
 
 
@@ -180,7 +183,8 @@ def best_pairs(
     """
     num_source, num_target = similarity.shape
     # floor(floor(ratio * (m + n)) / 2): the count of the published configuration.
-    capacity = min(int(config.pair_ratio * (num_source + num_target)) // 2, num_source * num_target)
+    wanted = int(config.pair_ratio * (num_source + num_target)) // 2
+    capacity = min(wanted, config.max_num_pairs, num_source * num_target)
     is_pair = source_mask[:, None] & target_mask[None, :]
     scores = dual_softmax(similarity, is_pair, config.temperature)
     scores, flat = lax.top_k(jnp.where(is_pair, scores, -1).ravel(), capacity)

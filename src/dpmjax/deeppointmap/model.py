@@ -252,8 +252,12 @@ def predict_offsets(
         partner_rows: if given, the partners are `partners[partner_rows]`; cheaper where partners are in several pairs.
 
     Returns:
-        Offsets in metres, in the frame of the first cloud; in the frames of the rays without directions.
+        Offsets in metres, in the frame of the first cloud; in the frames of the rays without directions. All are 0
+        where the decoder predicts none.
     """
+    if not model.config.decoder.predicts_offsets:
+        others = partners.shape[:-1] if partner_rows is None else partner_rows.shape
+        return jnp.zeros((*jnp.broadcast_shapes(features.shape[:-1], others), 3), features.dtype)
     offsets = _decode(model, features, partners, partner_rows, part="offset_head")
     if directions is None or model.config.encoder.frame == "lidar":
         return offsets

@@ -27,6 +27,7 @@ class DecoderConfig:
         num_layers: number of attention layers.
         num_heads: heads of each attention; divides `model_channels`.
         shares_layers: whether all layers have the same weights, as the paper says; the published networks do not.
+        predicts_offsets: whether offsets are predicted; False leaves all at 0, for the ablation of Table 2.
         compute_dtype: type of the matrix products.
     """
 
@@ -35,6 +36,7 @@ class DecoderConfig:
     num_layers: int = 3
     num_heads: int = 8
     shares_layers: bool = False
+    predicts_offsets: bool = True
     compute_dtype: ComputeDtype = "float32"
 
     def __post_init__(self) -> None:

@@ -19,6 +19,9 @@ from dpmjax.scans.surfaces import Surface
 MIN_PAIRS = 20
 """Fewer pairs tell nothing about a motion."""
 
+MIN_POINTS_FOR_THREADS = 2000
+"""To start threads takes longer than to find the neighbours of fewer points."""
+
 
 @dataclass(frozen=True)
 class AlignmentLevel:
@@ -165,7 +168,8 @@ def pair_with_planes(
     if len(rows) == 0 or len(target.points) == 0:
         empty = np.zeros((0, 3))
         return PlanePairs(empty, np.zeros(0), empty, np.zeros(0), np.zeros(0))
-    found = target.tree.query(moved, distance_upper_bound=level.radius_m, workers=num_threads)
+    workers = num_threads if len(moved) >= MIN_POINTS_FOR_THREADS else 1
+    found = target.tree.query(moved, distance_upper_bound=level.radius_m, workers=workers)
     distances, nearest = map(np.asarray, found)
     is_paired = np.isfinite(distances)
     rows, moved, nearest = rows[is_paired], moved[is_paired], nearest[is_paired]

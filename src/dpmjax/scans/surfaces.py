@@ -10,6 +10,7 @@ from jaxtyping import Float, Int
 from scipy.spatial import cKDTree
 
 from dpmjax.checks import require_count, require_positive_fields
+from dpmjax.scans.plane_fits import fit_planes
 from dpmjax.scans.preprocess import first_of_each_voxel
 
 MIN_NEIGHBOURS = 4
@@ -117,16 +118,14 @@ def _normals(
     if num_neighbours < MIN_NEIGHBOURS:
         return np.zeros((len(points), 3)), np.zeros(len(points))
     order = tree.indices  # queries in the order of the tree find what they need in the cache
-    distances, rows = map(np.asarray, tree.query(points[order], num_neighbours, workers=2))
-    is_near = distances <= config.neighbour_radius_m
-    counts = is_near.sum(axis=1)[:, None]
-    apart = np.where(is_near[..., None], points[rows] - points[order, None], 0)
-    centred = np.where(is_near[..., None], apart - (apart.sum(axis=1) / counts)[:, None], 0)
-    spread, axes = np.linalg.eigh(np.matmul(centred.transpose(0, 2, 1), centred) / counts[..., None])
-    flatness = np.clip((spread[:, 1] - spread[:, 0]) / np.maximum(spread[:, 2], np.finfo(float).tiny), 0, 1)
+    found = tree.query(points[order], num_neighbours, distance_upper_bound=config.neighbour_radius_m, workers=2)
+    distances, rows = map(np.asarray, found)
+    is_near = np.isfinite(distances)
+    x, y, z = (np.take(column, rows, mode="clip") - column[order, None] for column in points.T)
+    fit = fit_planes((x, y, z), is_near)
     found_normals, found_flatness = np.empty_like(points), np.empty(len(points))
-    found_normals[order] = axes[:, :, 0]
-    found_flatness[order] = np.where(counts[:, 0] >= MIN_NEIGHBOURS, flatness, 0)
+    found_normals[order] = fit.normals
+    found_flatness[order] = np.where(is_near.sum(axis=1) >= MIN_NEIGHBOURS, fit.flatness, 0)
     return found_normals, found_flatness
 
 

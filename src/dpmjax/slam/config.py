@@ -127,7 +127,9 @@ class LoopClosureConfig:
         num_similar: at most so many candidates by retrieval.
         min_cosine: candidates by retrieval are at least this similar.
         min_overlap: a candidate is registered from this overlap probability on; 0 asks no network.
-        num_registered: at most so many candidates are registered.
+        num_asked: so many candidates are asked at a time, those by distance and by retrieval in turn, ...
+        sure_overlap: ... until one has at least this overlap probability.
+        num_registered: at most so many candidates are registered, until one is believed.
         min_probability: a registration is believed from this P(correct) on.
         min_matched_share: share of the points that must meet planes, where the scans verify a registration.
         max_contradicted_share: share of the points that may lie in free space.
@@ -155,6 +157,8 @@ class LoopClosureConfig:
     num_similar: int = 6
     min_cosine: float = 0.8
     min_overlap: float = 0.3
+    num_asked: int = 4
+    sure_overlap: float = 0.9
     num_registered: int = 2
     min_probability: float = 0.5
     min_matched_share: float = 0.35
@@ -174,9 +178,9 @@ class LoopClosureConfig:
     every_share: float = 0.05
 
     def __post_init__(self) -> None:
-        require_fields(self, "min_overlap", "min_probability", low=0, high=1)
+        require_fields(self, "min_overlap", "sure_overlap", "min_probability", low=0, high=1)
         require_fields(self, "min_matched_share", "max_contradicted_share", "taken_back_weight", low=0, high=1)
-        require_fields(self, "min_support", "every_keyframes", "num_registered", low=1)
+        require_fields(self, "min_support", "every_keyframes", "num_registered", "num_asked", low=1)
         require_fields(self, "num_near", "num_similar", "min_path_share", "drift_share", "min_drift_share", low=0)
         require_fields(self, "rest_share", "every_share", low=0)
         require_positive_fields(self, "radius_share", "max_radius_m", "pending_path_m", "consistent_sigmas")

@@ -24,7 +24,7 @@ from dpmjax.slam.methods import SlamMethods
 from dpmjax.slam.reports import Loop, ScanReport
 from dpmjax.slam.system import SlamState, init_slam
 
-MAGIC = b"dpmjax SLAM journal 1\n"
+MAGIC = b"dpmjax SLAM journal 2\n"
 _HEAD = struct.Struct("<QI")
 
 ReadScan = Callable[[int], AnyScan]

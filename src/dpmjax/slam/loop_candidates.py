@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -36,7 +37,7 @@ def find_candidates(slam_map: KeyframeMap, row: int, config: LoopClosureConfig) 
         config: radii and numbers.
 
     Returns:
-        Candidates by distance, nearest first, then those by retrieval, most similar first; each row once.
+        Candidates by distance, nearest first, and those by retrieval, most similar first, in turn; each row once.
     """
     keyframe = slam_map.keyframes[row]
     path_m = np.array([other.path_m for other in slam_map.keyframes])
@@ -49,8 +50,10 @@ def find_candidates(slam_map: KeyframeMap, row: int, config: LoopClosureConfig) 
     near = np.argsort(np.where(is_near, apart_m, np.inf), kind="stable")[: int(is_near.sum())]
     near = _spread(near, slam_map, keyframe.extent_m / 2, config.num_near)
     similar = _similar(slam_map, row, is_old, config)
-    found = [LoopCandidate(int(other), "distance") for other in near]
-    return found + [LoopCandidate(int(other), "retrieval") for other in similar if other not in near]
+    by_distance = [LoopCandidate(int(other), "distance") for other in near]
+    by_retrieval = [LoopCandidate(int(other), "retrieval") for other in similar if other not in near]
+    in_turn = itertools.chain.from_iterable(itertools.zip_longest(by_distance, by_retrieval))
+    return [candidate for candidate in in_turn if candidate is not None]
 
 
 def find_meetings(

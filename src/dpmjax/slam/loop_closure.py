@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from dpmjax.slam.config import LoopClosureConfig
-from dpmjax.slam.keyframes import KeyframeMap, diagonal_information, submap_around
+from dpmjax.slam.keyframes import KeyframeMap, Submap, diagonal_information, submap_around
 from dpmjax.slam.loop_candidates import LoopCandidate, find_candidates
 from dpmjax.slam.loop_consistency import accept_consistent, status_of
 from dpmjax.slam.loop_state import LoopState
@@ -101,36 +101,53 @@ def num_accepted(loops: Iterable[Loop]) -> int:
 def _register_candidates(
     methods: SlamMethods, slam_map: KeyframeMap, row: int, candidates: list[LoopCandidate]
 ) -> list[Loop]:
-    if not candidates:
-        return []
+    """Registers the candidates that most probably overlap, one after the other, until one is believed."""
     config, front = methods.config.loops, methods.config.front_end
-    targets = [slam_map.keyframes[candidate.row].description for candidate in candidates]
-    overlaps = np.ones(len(candidates))
-    if config.min_overlap > 0:
-        overlaps = methods.matcher.overlaps(slam_map.keyframes[row].description, targets)
-    order = [int(number) for number in np.argsort(-overlaps, kind="stable") if overlaps[number] >= config.min_overlap]
-    chosen = order[: config.num_registered]
-    submaps = [
-        submap_around(slam_map, other, front.num_submap, front.submap_radius_m)
-        for other in (row, *(candidates[number].row for number in chosen))
+    loops = [
+        Loop(row, candidate.row, candidate.found_by, _unregistered(overlap, config), overlap)
+        for candidate, overlap in zip(candidates, _overlaps(methods, slam_map, row, candidates), strict=True)
     ]
-    matches = methods.matcher.register([(submaps[0], target) for target in submaps[1:]]) if chosen else []
-    loops = []
-    for number, candidate in enumerate(candidates):
-        overlap = float(overlaps[number])
-        status: LoopStatus = "no overlap" if overlap < config.min_overlap else "not registered"
-        loop = Loop(row, candidate.row, candidate.found_by, status, overlap)
-        if number in chosen:
-            match = matches[chosen.index(number)]
-            loop = loop._replace(
-                status=status_of(slam_map, loop, match, config),
-                probability=match.probability,
-                rmse_m=match.rmse_m,
-                T_target_source=match.T_target_source,
-                information=_edge_information(match, config),
-            )
-        loops.append(loop)
+    overlapping = [number for number, loop in enumerate(loops) if loop.status == "not registered"]
+    overlapping.sort(key=lambda number: -(loops[number].overlap or 0.0))
+
+    def submap(center: int) -> Submap:
+        return submap_around(slam_map, center, front.num_submap, front.submap_radius_m)
+
+    for number in overlapping[: config.num_registered]:
+        (match,) = methods.matcher.register([(submap(row), submap(loops[number].target))])
+        loops[number] = loops[number]._replace(
+            status=status_of(slam_map, loops[number], match, config),
+            probability=match.probability,
+            rmse_m=match.rmse_m,
+            T_target_source=match.T_target_source,
+            information=_edge_information(match, config),
+        )
+        if loops[number].status == "waits for support":
+            break
     return loops
+
+
+def _overlaps(
+    methods: SlamMethods, slam_map: KeyframeMap, row: int, candidates: list[LoopCandidate]
+) -> list[float | None]:
+    """Asks for the overlap of some candidates at a time, until one surely overlaps; None for those not asked."""
+    config = methods.config.loops
+    if config.min_overlap == 0:
+        return [1.0] * len(candidates)
+    descriptions = [slam_map.keyframes[candidate.row].description for candidate in candidates]
+    found: list[float | None] = []
+    for start in range(0, len(candidates), config.num_asked):
+        some = descriptions[start : start + config.num_asked]
+        found += methods.matcher.overlaps(slam_map.keyframes[row].description, some).tolist()
+        if max(filter(None, found), default=0.0) >= config.sure_overlap:
+            break
+    return found + [None] * (len(candidates) - len(found))
+
+
+def _unregistered(overlap: float | None, config: LoopClosureConfig) -> LoopStatus:
+    if overlap is None:
+        return "not asked"
+    return "no overlap" if overlap < config.min_overlap else "not registered"
 
 
 def _edge_information(match: Match, config: LoopClosureConfig) -> Float[np.ndarray, "6 6"]:

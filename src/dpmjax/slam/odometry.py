@@ -10,7 +10,7 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
@@ -34,28 +34,30 @@ class MapFrame(NamedTuple):
     """A scan of the local map.
 
     Attributes:
-        T_map_scan: its pose.
-        measured: the scan.
+        T_start_scan: its pose where the local map began.
         scan: its number.
     """
 
-    T_map_scan: Pose
-    measured: MeasuredScan
+    T_start_scan: Pose
     scan: int
 
 
 class LocalMap(NamedTuple):
-    """Recent scans and their common surface.
+    """Recent scans and their common surface, which stays in the frame of the scan that the local map began with.
 
     Attributes:
         frames: oldest first.
-        surface: flat points of all, in the frame of the map.
-        voxel_m: side of the voxels that thin them.
+        surface: flat points of all, of each voxel the first of the newest scan.
+        scans: (n,) number of the scan of each point.
+        voxel_m: side of the voxels.
+        T_map_start: the frame of the surface in that of the map, which `move` changes.
     """
 
     frames: tuple[MapFrame, ...]
     surface: Surface
+    scans: Int[np.ndarray, " n"]
     voxel_m: float
+    T_map_start: Pose
 
 
 class SurfaceGeometry:
@@ -115,17 +117,18 @@ class SurfaceGeometry:
             The local map.
         """
         config, extent_m = self.config, self.extent_m(measured)
-        frame = MapFrame(T_map_scan, measured, scan)
         if local_map is None:
-            return _local_map((frame,), self._voxel_m(extent_m))
-        T_last_scan = rigid.inverse(local_map.frames[-1].T_map_scan) @ T_map_scan
-        apart_m = float(np.linalg.norm(T_last_scan[:3, 3]))
-        if apart_m < config.frame_share * extent_m and turn_rad(T_last_scan) < config.frame_rad:
-            return local_map
-        return _local_map((*local_map.frames, frame)[-config.num_frames :], local_map.voxel_m)
+            local_map = _empty_map(self._voxel_m(extent_m), T_map_scan)
+        T_start_scan = orthonormal(rigid.inverse(local_map.T_map_start) @ T_map_scan)
+        if local_map.frames:
+            T_last_scan = rigid.inverse(local_map.frames[-1].T_start_scan) @ T_start_scan
+            apart_m = float(np.linalg.norm(T_last_scan[:3, 3]))
+            if apart_m < config.frame_share * extent_m and turn_rad(T_last_scan) < config.frame_rad:
+                return local_map
+        return _with_frame(local_map, MapFrame(T_start_scan, scan), measured, config.num_frames)
 
     def move(self, local_map: LocalMap, T_new_map: Pose) -> LocalMap:
-        """Moves all frames; see `Geometry`.
+        """Changes the frame in which poses are told, and moves no point; see `Geometry`.
 
         Args:
             local_map: the map.
@@ -134,8 +137,7 @@ class SurfaceGeometry:
         Returns:
             The map in its new frame.
         """
-        frames = tuple(frame._replace(T_map_scan=T_new_map @ frame.T_map_scan) for frame in local_map.frames)
-        return _local_map(frames, local_map.voxel_m)
+        return local_map._replace(T_map_start=orthonormal(T_new_map @ local_map.T_map_start))
 
     def align(self, local_map: LocalMap, measured: MeasuredScan, starts: PosePrior) -> Alignment:
         """Aligns from the prediction, and from other starts where the result is worse than usual; see `Geometry`.
@@ -148,6 +150,12 @@ class SurfaceGeometry:
         Returns:
             The best pose by points that meet planes and points in free space.
         """
+        T_start_last = rigid.inverse(local_map.T_map_start) @ starts.T_map_last
+        found = self._align_in_start(local_map, measured, starts._replace(T_map_last=T_start_last))
+        return found._replace(T_map_scan=local_map.T_map_start @ found.T_map_scan)
+
+    def _align_in_start(self, local_map: LocalMap, measured: MeasuredScan, starts: PosePrior) -> Alignment:
+        """Aligns where the map frame is that of the surface."""
         config = self.config
         best = self._aligned(local_map, measured, starts.T_map_last @ starts.T_last_scan)
         wanted = config.good_share * starts.usual_score
@@ -177,7 +185,8 @@ class SurfaceGeometry:
         """
         return {
             "scan": np.array([frame.scan for frame in local_map.frames]),
-            "T_map_scan": np.array([frame.T_map_scan for frame in local_map.frames]),
+            "T_start_scan": np.array([frame.T_start_scan for frame in local_map.frames]),
+            "T_map_start": local_map.T_map_start,
             "voxel_m": np.array(local_map.voxel_m),
         }
 
@@ -191,8 +200,10 @@ class SurfaceGeometry:
         Returns:
             The local map.
         """
-        rows = zip(arrays["T_map_scan"], arrays["scan"].tolist(), strict=True)
-        return _local_map(tuple(MapFrame(T, measure_again(scan), scan) for T, scan in rows), float(arrays["voxel_m"]))
+        local_map = _empty_map(float(arrays["voxel_m"]), arrays["T_map_start"])
+        for T, scan in zip(arrays["T_start_scan"], arrays["scan"].tolist(), strict=True):
+            local_map = _with_frame(local_map, MapFrame(T, scan), measure_again(scan), len(arrays["scan"]))
+        return local_map
 
     def _voxel_m(self, extent_m: float) -> float:
         sizes = [size for size in self.config.voxel_sizes_m if size <= self.config.voxel_share * extent_m]
@@ -219,25 +230,29 @@ class SurfaceGeometry:
         return float(meets.sum()) / max(min(num_samples, len(measured.surface.samples)), 1)
 
 
-def _local_map(frames: tuple[MapFrame, ...], voxel_m: float) -> LocalMap:
-    points, normals, flatness = [], [], []
-    for frame in frames[::-1]:
-        surface, R = frame.measured.surface, frame.T_map_scan[:3, :3]
-        is_flat = surface.flatness > MIN_FLATNESS
-        points.append(surface.points[is_flat] @ R.T + frame.T_map_scan[:3, 3])
-        normals.append(surface.normals[is_flat] @ R.T)
-        flatness.append(surface.flatness[is_flat])
-    all_points = np.concatenate(points)
-    kept = first_of_each_voxel(all_points, voxel_m)
-    all_points = all_points[kept]
+def _empty_map(voxel_m: float, T_map_start: Pose) -> LocalMap:
+    nothing = np.zeros((0, 3))
+    surface = Surface(nothing, nothing, np.zeros(0), np.zeros(0, np.int64), cKDTree(nothing))
+    return LocalMap((), surface, np.zeros(0, np.int64), voxel_m, T_map_start)
+
+
+def _with_frame(local_map: LocalMap, frame: MapFrame, measured: MeasuredScan, num_frames: int) -> LocalMap:
+    """Adds the flat points of a scan, and drops those of scans before the last `num_frames`."""
+    frames = (*local_map.frames, frame)[-num_frames:]
+    old, new, R = local_map.surface, measured.surface, frame.T_start_scan[:3, :3]
+    is_flat, is_recent = new.flatness > MIN_FLATNESS, local_map.scans >= frames[0].scan
+    points = np.concatenate([new.points[is_flat] @ R.T + frame.T_start_scan[:3, 3], old.points[is_recent]])
+    kept = first_of_each_voxel(points, local_map.voxel_m)
+    points = points[kept]
+    scans = np.concatenate([np.full(int(is_flat.sum()), frame.scan), local_map.scans[is_recent]])
     surface = Surface(
-        points=all_points,
-        normals=np.concatenate(normals)[kept],
-        flatness=np.concatenate(flatness)[kept],
-        samples=np.random.default_rng(0).permutation(len(all_points)),
-        tree=cKDTree(all_points, leafsize=16, balanced_tree=False, compact_nodes=False),
+        points=points,
+        normals=np.concatenate([new.normals[is_flat] @ R.T, old.normals[is_recent]])[kept],
+        flatness=np.concatenate([new.flatness[is_flat], old.flatness[is_recent]])[kept],
+        samples=np.random.default_rng(0).permutation(len(points)),
+        tree=cKDTree(points, leafsize=16, balanced_tree=False, compact_nodes=False),
     )
-    return LocalMap(frames, surface, voxel_m)
+    return LocalMap(frames, surface, scans[kept], local_map.voxel_m, local_map.T_map_start)
 
 
 def _contradicted_share(local_map: LocalMap, measured: MeasuredScan, T_map_scan: Pose) -> float:

@@ -19,6 +19,7 @@ here, and loops may join it.
 """
 
 LoopStatus = Literal[
+    "not asked",
     "no overlap",
     "not registered",
     "improbable",
@@ -69,7 +70,7 @@ class Loop(NamedTuple):
         target: row of an older one.
         found_by: how it became a candidate; "map" is a loop of the map that was extended.
         status: what became of it.
-        overlap: probability of overlap; 1 where no network was asked.
+        overlap: probability of overlap; 1 where no network is asked, None where another candidate surely overlaps.
         probability: P(correct) of the registration; None without one.
         rmse_m: of the registration; None without one.
         T_target_source: the registration; None without one.
@@ -80,7 +81,7 @@ class Loop(NamedTuple):
     target: int
     found_by: Literal["distance", "retrieval", "map"]
     status: LoopStatus
-    overlap: float
+    overlap: float | None
     probability: float | None = None
     rmse_m: float | None = None
     T_target_source: Pose | None = None
