@@ -20,6 +20,16 @@ def test_normals_are_those_of_the_device() -> None:
     np.testing.assert_allclose(surface.flatness, expected.flatness, atol=1e-2)
 
 
+def test_a_sparse_scan_has_normals_too() -> None:
+    """Of 240 points on the street, hardly any has four neighbours within 1.5 m."""
+    sparse = street(0, 240, noise_m=0.0)
+    fixed, adapted = (scan_surface(sparse, SurfaceConfig(sparse_radius_share=share)) for share in (0.0, 1.5))
+    assert len(fixed.samples) < 0.3 * len(sparse)
+    is_ground = (adapted.points[:, 2] < -1.69) & (np.abs(adapted.points[:, 1]) < 5)
+    assert len(adapted.samples) > 0.7 * len(sparse)
+    assert np.median(np.abs(adapted.normals[is_ground, 2])) > 0.99
+
+
 def test_points_are_thinned_and_within_range() -> None:
     points = np.concatenate([street(1), [[0.1, 0, 0], [500, 0, 0], [np.nan, 0, 0]]])
     surface = scan_surface(points, SurfaceConfig(voxel_size_m=1.0, max_range_m=20))

@@ -52,6 +52,21 @@ def test_a_scan_finds_its_pose(geometry, x, y, heading_deg) -> None:
     assert found.score > 0.5
 
 
+@pytest.mark.parametrize("axis", ["x", "y"])
+def test_a_sparse_scan_of_a_robot_that_tilts_finds_its_pose(geometry, axis) -> None:
+    # A lidar of few beams on a vehicle that balances: 1,200 points, 12 degrees from one scan to the next.
+    rng = np.random.default_rng(1)
+    true = motion(1.0, 0.1, 3.0)
+    true[:3, :3] = true[:3, :3] @ Rotation.from_euler(axis, 12.0, degrees=True).as_matrix()
+    local_map = geometry.insert(None, geometry.measure(planes(rng, num=1500)), np.eye(4), 0)
+    sparse = seen_from(planes(rng, num=300), true)
+    prior = PosePrior(np.eye(4), motion(1.0, 0.0, 0.0))
+    found = geometry.align(local_map, geometry.measure(sparse), prior)
+    apart = rigid.inverse(true) @ found.T_map_scan
+    assert np.linalg.norm(apart[:3, 3]) < 0.1
+    assert turn_rad(apart) < 0.02
+
+
 def test_a_corridor_is_weak_along_its_axis(geometry) -> None:
     rng = np.random.default_rng(0)
     weakness = []
@@ -92,7 +107,7 @@ def test_a_scan_that_tells_nothing_new_does_not_join(geometry) -> None:
     measured = geometry.measure(planes(np.random.default_rng(0)))
     local_map = geometry.insert(None, measured, np.eye(4), 0)
     assert geometry.insert(local_map, measured, motion(0.01, 0, 0), 1) is local_map
-    for step in range(1, 30):
+    for step in range(1, geometry.config.num_frames + 8):
         local_map = geometry.insert(local_map, measured, motion(3 * step, 0, 0), step)
     assert len(local_map.frames) == geometry.config.num_frames
 

@@ -16,6 +16,9 @@ from dpmjax.scans.preprocess import first_of_each_voxel
 MIN_NEIGHBOURS = 4
 """A normal needs this many neighbours, the point itself among them."""
 
+NUM_PROBED = 200
+"""Points by which the density of a scan is judged."""
+
 MIN_FLATNESS = 0.1
 """Less flat neighbourhoods are no part of a surface: foliage, wires, edges."""
 
@@ -29,7 +32,9 @@ class SurfaceConfig:
         max_range_m: farther points are too sparse and are dropped.
         voxel_size_m: the first point of each voxel is kept.
         num_neighbours: number of neighbours of a normal, the point itself among them.
-        neighbour_radius_m: neighbours farther away do not count.
+        neighbour_radius_m: neighbours farther away do not count, ...
+        sparse_radius_share: ... unless the scan is so sparse that this share of the median distance of the last
+            neighbour is more.
     """
 
     min_range_m: float = 1.0
@@ -37,6 +42,7 @@ class SurfaceConfig:
     voxel_size_m: float = 0.3
     num_neighbours: int = 12
     neighbour_radius_m: float = 1.5
+    sparse_radius_share: float = 1.5
 
     def __post_init__(self) -> None:
         if not 0 <= self.min_range_m < self.max_range_m:
@@ -118,7 +124,9 @@ def _normals(
     if num_neighbours < MIN_NEIGHBOURS:
         return np.zeros((len(points), 3)), np.zeros(len(points))
     order = tree.indices  # queries in the order of the tree find what they need in the cache
-    found = tree.query(points[order], num_neighbours, distance_upper_bound=config.neighbour_radius_m, workers=2)
+    typical_m = np.median(tree.query(points[:: max(1, len(points) // NUM_PROBED)], [num_neighbours])[0])
+    radius_m = max(config.neighbour_radius_m, config.sparse_radius_share * typical_m)
+    found = tree.query(points[order], num_neighbours, distance_upper_bound=radius_m, workers=2)
     distances, rows = map(np.asarray, found)
     is_near = np.isfinite(distances)
     x, y, z = (np.take(column, rows, mode="clip") - column[order, None] for column in points.T)

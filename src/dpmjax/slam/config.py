@@ -37,7 +37,8 @@ class OdometryConfig:
         good_share: no other start is tried for a pose of this share of the usual score.
         step_factors: starts of the search: the predicted step, times these numbers; ...
         ahead_shares: ... steps along the x axis of the lidar, as shares of the extent; ...
-        turns_deg: ... and turns by these angles about its vertical.
+        turns_deg: ... turns by these angles about its vertical; ...
+        tilts_deg: ... and by these about its two other axes.
         floor_m: standard deviation of the translation that no number of points undercuts ...
         floor_rad: ... and of the rotation.
     """
@@ -49,7 +50,7 @@ class OdometryConfig:
     min_num_points: int = 100
     narrow: AlignmentConfig = NARROW
     wide: AlignmentConfig = WIDE
-    num_frames: int = 16
+    num_frames: int = 32
     frame_share: float = 0.08
     frame_rad: float = 0.17
     num_samples: int = 1000
@@ -60,6 +61,7 @@ class OdometryConfig:
     step_factors: tuple[float, ...] = (0.0, 0.5, 1.0, 1.5, 2.0, 3.0, 4.0)
     ahead_shares: tuple[float, ...] = (-0.08, 0.08, 0.16)
     turns_deg: tuple[float, ...] = (-10.0, 10.0, -20.0, 20.0, -35.0, 35.0, -50.0, 50.0)
+    tilts_deg: tuple[float, ...] = (-8.0, 8.0)
     floor_m: float = 0.01
     floor_rad: float = 0.001
 
@@ -80,7 +82,11 @@ class FrontEndConfig:
 
     Attributes:
         min_score_share: a pose with a lower share of the usual score is not believed.
-        min_score: nor one with a lower score.
+        min_score: nor one with a lower score. A lower share is believed where the network, asked without the
+            prediction, has this P(correct) ...
+        min_probability: ... or more, and its pose and that of geometry differ by ...
+        near_m: ... less than this (the distance that P(correct) is about) ...
+        near_rad: ... and this.
         num_submap: at most so many keyframes are merged for a registration (attention is quadratic in their number).
         submap_radius_m: keyframes farther away are not merged (DeepPointMap's published configuration).
         num_lost: after this many scans without a believed pose a new segment begins, which loops join to the map.
@@ -95,9 +101,12 @@ class FrontEndConfig:
 
     min_score_share: float = 0.6
     min_score: float = 0.2
+    min_probability: float = 0.5
+    near_m: float = 2.0
+    near_rad: float = 0.087
     num_submap: int = 4
     submap_radius_m: float = 20.0
-    num_lost: int = 3
+    num_lost: int = 6
     keyframe_share: float = 0.3
     keyframe_rad: float = 0.6
     max_keyframe_m: float = 5.0
@@ -107,7 +116,8 @@ class FrontEndConfig:
     guess_rad: float = 0.2
 
     def __post_init__(self) -> None:
-        require_fields(self, "min_score_share", low=0, high=1)
+        require_fields(self, "min_score_share", "min_probability", low=0, high=1)
+        require_fields(self, "near_m", "near_rad", low=0)
         require_fields(self, "num_submap", "num_lost", "usual_window", low=1)
         require_positive_fields(self, "submap_radius_m", "keyframe_share", "keyframe_rad", "guess_m", "guess_rad")
         require_fields(self, "min_keyframe_m", low=1e-3, high=self.max_keyframe_m)
@@ -160,8 +170,8 @@ class LoopClosureConfig:
     num_asked: int = 4
     sure_overlap: float = 0.9
     num_registered: int = 2
-    min_probability: float = 0.5
-    min_matched_share: float = 0.35
+    min_probability: float = 0.2
+    min_matched_share: float = 0.25
     max_contradicted_share: float = 0.1
     min_support: int = 2
     pending_path_m: float = 40.0

@@ -1,7 +1,7 @@
 """The front end: one scan after the other gets a pose, and some become keyframes (DeepPointMap section 4).
 
 Geometry comes first, because it is more accurate than descriptors of 0.3 m voxels. Where it fails, the network gives
-another start, and the scans themselves decide between the two. Where nothing agrees, the motion is predicted.
+another start, and the scans themselves decide between the two. Where nothing agrees, the pose is a guess.
 """
 
 from __future__ import annotations
@@ -181,13 +181,27 @@ def _locate(methods: SlamMethods, state: FrontEndState, slam_map: KeyframeMap, s
     start = PosePrior(match.T_target_source, np.eye(4), usual, is_sure=True)
     other = methods.geometry.align(state.local_map, scan.measured, start)
     numbers = f"score {found.score:.2f} by geometry, {other.score:.2f} by the network with P {match.probability:.2f}"
-    if other.score >= wanted and other.score > found.score:
+    is_confirmed = (
+        match.probability >= config.min_probability
+        and other.score >= config.min_score
+        and _are_near(found.T_map_scan, other.T_map_scan, config.near_m, config.near_rad)
+        and _are_near(match.T_target_source, other.T_map_scan, config.near_m, config.near_rad)
+    )
+    if is_confirmed or (other.score >= wanted and other.score > found.score):
         agreed = other.score, other.information, match.probability
         return Located(other.T_map_scan, "network", numbers, *agreed, description)
     status: ScanStatus = "restarted" if state.num_lost + 1 >= config.num_lost else "predicted"
     guess = diagonal_information(config.guess_m, config.guess_rad)
     predicted = state.T_keyframe_last @ state.T_before_last
-    return Located(predicted, status, numbers, max(found.score, other.score), guess, match.probability, description)
+    # What geometry prefers is the better guess, unless a robot hardly moves like that.
+    is_likely = _are_near(predicted, found.T_map_scan, 3 * config.guess_m, 3 * config.guess_rad)
+    T = found.T_map_scan if is_likely else predicted
+    return Located(T, status, numbers, max(found.score, other.score), guess, match.probability, description)
+
+
+def _are_near(T_a: Pose, T_b: Pose, most_m: float, most_rad: float) -> bool:
+    apart = rigid.inverse(T_a) @ T_b
+    return bool(np.linalg.norm(apart[:3, 3]) <= most_m) and turn_rad(apart) <= most_rad
 
 
 def _is_keyframe(methods: SlamMethods, located: Located, measured: Any) -> bool:

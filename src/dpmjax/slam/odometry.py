@@ -6,6 +6,7 @@ are tried: the robot stood still, went faster, or turned.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -271,6 +272,11 @@ def _other_motions(T_last_scan: Pose, extent_m: float, config: OdometryConfig) -
     for turn_deg in config.turns_deg:
         turned = R @ Rotation.from_euler("z", turn_deg, degrees=True).as_matrix()
         motions += [(turned, np.zeros(3)), (turned, T_last_scan[:3, 3])]
+    # A vehicle that rocks does not turn on: its tilt comes back.
+    motions.append((np.eye(3), T_last_scan[:3, 3]))
+    for axis, tilt_deg in itertools.product("xy", config.tilts_deg):
+        tilt = Rotation.from_euler(axis, tilt_deg, degrees=True).as_matrix()
+        motions += [(R @ tilt, T_last_scan[:3, 3]), (tilt, T_last_scan[:3, 3])]
     found = np.tile(np.eye(4), (len(motions), 1, 1))
     for T, (rotation, translation) in zip(found, motions, strict=True):
         T[:3, :3], T[:3, 3] = rotation, translation

@@ -13,9 +13,9 @@ ScanStatus = Literal["first", "tracked", "network", "predicted", "empty", "resta
 """How the pose of a scan was found.
 
 "first": the scan starts the map, or a new part of a loaded one. "tracked": geometry, from the predicted pose.
-"network": geometry failed there, and agreed from the network's pose. "predicted": nothing agreed, the motion goes on as
-before. "empty": the scan has too few points. "restarted": nothing agreed for a while, a new part of the map begins
-here, and loops may join it.
+"network": geometry failed there, and agreed from the network's pose, or both agree on a pose of a low score.
+"predicted": nothing agreed, the pose is a guess: what geometry prefers, or the motion of before. "empty": the scan has
+too few points. "restarted": nothing agreed for a while, a new part of the map begins here, and loops may join it.
 """
 
 LoopStatus = Literal[
