@@ -6,21 +6,15 @@ a search, an ICP or a refinement is called that.
 
 from __future__ import annotations
 
-import importlib.util
-import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from functools import cache, partial
+from functools import partial
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from tqdm import tqdm
 
 from dpmjax import deepmapping, metrics, registration
-from experiments._command import StopFlag, check_least, check_names
-from experiments._result_files import do_row
-from experiments._run_folder import RunFolder, RunOptions, open_run_folder, recording
 
 if TYPE_CHECKING:
     from dpmjax.deepmapping import DeepMappingConfig
@@ -47,11 +41,7 @@ START_NAMES = {
 # A fit whose map takes so many times the nats of the refined start is not refined.
 _LEAST_PROMISING = 1.15
 
-NOT_RUN = {
-    "go-icp": "its packages on PyPI search the turns of 3-D clouds, which may turn a flat scan over; py-goicp does not "
-    "build with today's setuptools, py-simple-go-icp-interface took 20 s for one pair of flat scans and gave up",
-}
-"""Baselines of the paper that have no column, and why."""
+_LBFGS_ITERATIONS = 150
 
 
 @dataclass(frozen=True)
@@ -62,14 +52,14 @@ class Task:
         sequence: the scans; methods do not look at its reference.
         planar: the same scans with a line at every beam.
         is_ordered: the scans lie in the order of time.
-        steps: steps of an optimiser.
+        steps: of the fit; None: the preset decides.
         seed: seed of everything random.
     """
 
     sequence: ScanSequence
     planar: PlanarScans
     is_ordered: bool = True
-    steps: int = 600
+    steps: int | None = None
     seed: int = 0
 
     @property
@@ -80,7 +70,7 @@ class Task:
         return ScanSet(self.sequence.points, self.sequence.mask)
 
 
-def make_task(sequence: ScanSequence, *, is_ordered: bool = True, steps: int = 600, seed: int = 0) -> Task:
+def make_task(sequence: ScanSequence, *, is_ordered: bool = True, steps: int | None = None, seed: int = 0) -> Task:
     """Prepares scans for the methods; where they are not ordered, they are shuffled first."""
     if not is_ordered:
         order = np.random.default_rng([seed, 77]).permutation(len(sequence))
@@ -153,7 +143,8 @@ def _fit(task: Task, start: Floats | None, config: DeepMappingConfig | None = No
     """Returns poses by DeepMapping from a start, or from zero poses."""
     import jax
 
-    settings = deepmapping.with_steps(config or deepmapping.preset("fast"), task.steps)
+    settings = config or deepmapping.preset("fast")
+    settings = settings if task.steps is None else deepmapping.with_steps(settings, task.steps)
     order = np.arange(len(task.sequence)) if start is None else in_fitting_order(task, start)
     scans = replace(task, sequence=task.sequence.take(order)).scans
     fitted = deepmapping.fit_deepmapping(
@@ -169,7 +160,29 @@ def _direct_lbfgs(task: Task) -> Floats:
     from experiments.baselines.direct import optimize_directly
 
     key = jax.random.key(task.seed)
-    return optimize_directly(task.scans, deepmapping.preset("fast"), num_iterations=max(1, task.steps // 4), key=key)
+    num_iterations = _LBFGS_ITERATIONS if task.steps is None else max(1, task.steps // 4)
+    return optimize_directly(task.scans, deepmapping.preset("fast"), num_iterations=num_iterations, key=key)
+
+
+def _lnet_from_icp(task: Task) -> Candidates:
+    """Returns incremental ICP, and DeepMapping from it by the phases of a cold start, L-Net's among them."""
+    start, config = incremental(task), deepmapping.preset("fast")
+    return {START_NAMES["icp-plane"]: start, DEEPMAPPING: _fit(task, start, _with_cold_phases(config))}
+
+
+def _with_cold_phases(config: DeepMappingConfig) -> DeepMappingConfig:
+    return replace(config, warm_phases=config.cold_phases)
+
+
+def _without_windows(config: DeepMappingConfig) -> DeepMappingConfig:
+    """Returns the settings with one registration of the whole set from the first phase on."""
+    return replace(config, cold_phases=tuple(replace(phase, scans_per_window=None) for phase in config.cold_phases))
+
+
+def _direct(task: Task, *, has_windows: bool) -> Floats:
+    """Returns poses by DeepMapping's loss without L-Net, from zero by Adam."""
+    config = deepmapping.as_direct(deepmapping.preset("fast"))
+    return _fit(task, None, config if has_windows else _without_windows(config))
 
 
 def _multiway(task: Task) -> Floats:
@@ -234,101 +247,15 @@ METHODS: dict[str, Method] = {
     "icp-refined": Method("incremental ICP, refined", lambda task: refined(task, incremental(task), is_ordered=True)),
     "multiway": Method("multiway registration of Open3D", _multiway, "open3d"),
     "particle-swarm": Method("particle swarms, each scan onto the one before", _swarm, "evosax"),
-    "direct-adam": Method(
-        "direct optimisation from zero, Adam",
-        lambda task: _fit(task, None, deepmapping.as_direct(deepmapping.preset("fast"))),
+    "lnet-zero": Method("L-Net and M-Net from zero", lambda task: {DEEPMAPPING: _fit(task, None)}),
+    "lnet-icp": Method("L-Net and M-Net from incremental ICP", _lnet_from_icp),
+    "search": Method(START_NAMES["global"], search),
+    "search-refined": Method(
+        "global registration, refined", lambda task: refined(task, search(task), is_ordered=False)
     ),
+    "direct-adam": Method("direct optimisation from zero, Adam", partial(_direct, has_windows=False)),
+    "direct-windows": Method("direct optimisation from zero in windows, Adam", partial(_direct, has_windows=True)),
     "direct-lbfgs": Method("direct optimisation from zero, L-BFGS", _direct_lbfgs),
     "global-deepmapping": Method("global registration, then DeepMapping", _global_deepmapping),
     "refined-deepmapping": Method("ICP or global registration, then DeepMapping, refined", _refined_deepmapping),
 }
-
-
-@dataclass(frozen=True, kw_only=True)
-class TableOptions(RunOptions):
-    """Options of a comparison of methods."""
-
-    methods: tuple[str, ...] = tuple(METHODS)
-    """Columns."""
-    steps: int = 600
-    """Steps of the fit."""
-
-    def __post_init__(self) -> None:
-        """Checks names and ranges."""
-        check_names("--methods", self.methods, METHODS)
-        check_least(self, steps=2)
-
-
-def run_method(name: str, task: Task) -> dict[str, Any]:
-    """Returns one row: errors, time and assessment of the kept candidate, and the numbers of every candidate."""
-    method = METHODS[name]
-    begun, begun_cpu = time.perf_counter(), time.process_time()
-    found = method.run(task)
-    candidates = found if isinstance(found, dict) else {method.title: found}
-    # The choice belongs to a method that has several candidates, and to its time.
-    chosen = choose(task, candidates) if len(candidates) > 1 else None
-    seconds, cpu_seconds = time.perf_counter() - begun, time.process_time() - begun_cpu
-    kept, measured = chosen or choose(task, candidates)
-    return {
-        **errors(task.sequence, candidates[kept]),
-        "success": measured[kept]["ate_px"] < SUCCESS_PX,
-        "seconds": seconds,
-        "cpu_s": cpu_seconds,
-        "kept": kept,
-        "candidates": measured,
-        **assess(task, candidates[kept]),
-    }
-
-
-def success_of_trusted(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Returns how many maps were trusted, and the share of these that are right."""
-    trusted = [row["success"] for row in rows if row["is_trusted"]]
-    return {"num_trusted": len(trusted), "success_of_trusted": float(np.mean(trusted)) if trusted else None}
-
-
-def run_table(
-    config: TableOptions,
-    experiment: str,
-    cells: Sequence[dict[str, Any]],
-    prepare: Callable[[dict[str, Any]], tuple[Task, dict[str, Any]]],
-    write: Callable[[RunFolder, list[dict[str, Any]], dict[str, str]], str],
-) -> list[dict[str, Any]]:
-    """Runs every method on every cell; what an earlier run has done is read from its files.
-
-    Args:
-        config: options.
-        experiment: name of the experiment.
-        cells: what identifies each set of scans.
-        prepare: makes the task of a cell, and what its rows carry besides the results.
-        write: writes the rows so far, and why some methods were not run, after each cell; returns a summary to print.
-
-    Returns:
-        All rows.
-    """
-    folder = open_run_folder(config, experiment)
-    not_run = NOT_RUN | {
-        name: f"needs {package}: pip install dpmjax[baselines]"
-        for name in config.methods
-        if (package := METHODS[name].package) is not None and importlib.util.find_spec(package) is None
-    }
-
-    def work(method: str, prepared: Callable[[], tuple[Task, dict[str, Any]]]) -> dict[str, Any]:
-        task, extra = prepared()
-        return run_method(method, task) | extra
-
-    rows: list[dict[str, Any]] = []
-    summary = ""
-    with recording(folder), StopFlag() as stop:
-        for cell in tqdm(cells, unit=" sets"):
-            # The scans are made once for all methods, and not at all where all rows exist.
-            prepared = cache(partial(prepare, cell))
-            for method in config.methods:
-                if stop.is_requested:
-                    return rows
-                if method not in not_run:
-                    case = {"method": method, **cell}
-                    rows.append(do_row(folder.path, case, partial(work, method, prepared), seed=config.seed))
-            summary = write(folder, rows, not_run)
-    print(summary, *(f"{name}: not run ({reason})" for name, reason in not_run.items()), sep="\n")
-    print(f"results in {folder.path}")
-    return rows

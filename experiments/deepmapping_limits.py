@@ -22,18 +22,22 @@ from tyro.conf import arg
 
 from dpmjax import simulation, viz
 from experiments import _deepmapping_methods as shared
+from experiments import _deepmapping_tables as tables
 from experiments._command import check_least, check_names, run_command
 from experiments._deepmapping_methods import Task
 from experiments._run_folder import RunFolder, write_metrics
 
 EXPERIMENT = "deepmapping_limits"
-COLUMNS = ("icp-plane", "icp-refined", "direct-adam", "global-deepmapping", "refined-deepmapping")
+COLUMNS = (
+    "icp-plane", "icp-refined", "lnet-zero", "lnet-icp", "direct-adam", "search", "search-refined",
+    "global-deepmapping", "refined-deepmapping",
+)  # fmt: skip
 ORDERS = ("ordered", "shuffled")
 NUM_SCANS, NUM_WORLDS = 256, 3
 
 
 @dataclass(frozen=True, kw_only=True)
-class Config(shared.TableOptions):
+class Config(tables.TableOptions):
     """Options of the grid."""
 
     may_change: ClassVar[frozenset[str]] = frozenset({"limit", "methods", "strides", "noises_px", "orders"})
@@ -62,7 +66,7 @@ def main(config: Config) -> list[dict[str, Any]]:
     """Runs what is missing, cell by cell."""
     grid = itertools.product(config.strides, range(config.limit), config.noises_px, config.orders)
     cells = [{"stride": stride, "noise_px": noise, "order": order, "walk": walk} for stride, walk, noise, order in grid]
-    return shared.run_table(config, EXPERIMENT, cells, partial(_prepare, config), partial(_write, config))
+    return tables.run_table(config, EXPERIMENT, cells, partial(_prepare, config), partial(_write, config))
 
 
 def _prepare(config: Config, cell: dict[str, Any]) -> tuple[Task, dict[str, Any]]:
@@ -99,7 +103,7 @@ def _write(config: Config, folder: RunFolder, rows: list[dict[str, Any]], not_ru
     """Writes metrics.json and one picture an order; returns the summary."""
     lines = summary(rows)
     metrics = {"success_threshold_px": shared.SUCCESS_PX, "summary": lines, "not_run": not_run}
-    write_metrics(folder, metrics | shared.success_of_trusted(rows), seed=config.seed, rows=rows)
+    write_metrics(folder, metrics | tables.success_of_trusted(rows), seed=config.seed, rows=rows)
     methods = dict.fromkeys(row["method"] for row in rows)
     for order in config.orders:
         figure = viz.success_grids_figure(

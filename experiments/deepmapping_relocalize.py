@@ -4,8 +4,8 @@
     python -m experiments.deepmapping_relocalize run
 
 RUN is a folder of deepmapping_2d on a built-in world. Written beside its results: relocalization.png and
-relocalization.json, for L-Net as the fit left it (cold starts only; after a warm start it knows corrections only) and
-for L-Net trained on the poses that the run found.
+relocalization.json, for L-Net as the fit left it (only where one L-Net has learned all scans from zero poses: not with
+windows, nor after a warm start) and for L-Net trained on the poses that the run found.
 """
 
 from __future__ import annotations
@@ -63,6 +63,7 @@ def main(config: Config) -> dict[str, Any]:
     import jax
 
     from dpmjax.deepmapping import LocalizationTrainingConfig, relocalize, train_localization
+    from dpmjax.deepmapping.relocalization import has_windows
     from dpmjax.simulation import make_world, scan_world
     from dpmjax.types import ScanSet
 
@@ -75,7 +76,7 @@ def main(config: Config) -> dict[str, Any]:
     truth = free_poses(grid, sequence, config)
     points, mask = scan_world(grid, truth, num_beams=sequence.points.shape[1])
     nets: dict[str, Fitted] = {}
-    if not np.any(np.asarray(fitted.params.start)):
+    if not has_windows(fitted) and not np.any(np.asarray(fitted.params.start)):
         nets["L-Net as fitted"] = fitted
     begun = time.perf_counter()
     scans = ScanSet(sequence.points, sequence.mask)

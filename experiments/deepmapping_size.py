@@ -130,7 +130,9 @@ def measure(num_scans: int, num_calls: int, seed: int, output: str) -> None:
             raise RuntimeError(f"poses of {num_scans} scans are not finite")
         phase = problem.phases[0]
         step_s = float(np.diff(run_s).min()) / steps_per_call(problem, phase)
-        epoch_s = step_s * len(sequence) / min(len(sequence), phase.scans_per_step)
+        # All windows are in each step.
+        num_in_step = len(sequence) if phase.scans_per_window else min(len(sequence), phase.scans_per_step)
+        epoch_s = step_s * len(sequence) / num_in_step
         phases[name] = {"compile_s": done.compile_s, "step_s": step_s, "epoch_s": epoch_s}
     result = {"num_scans": len(sequence), **phases, "data_gb": before_gb, "peak_rss_gb": peak_rss_gb(), **environment()}
     write_json(Path(output), result)

@@ -22,6 +22,7 @@ from tyro.conf import arg
 
 from dpmjax import metrics, simulation, viz
 from experiments import _deepmapping_methods as shared
+from experiments import _deepmapping_tables as tables
 from experiments._command import check_least, run_command
 from experiments._deepmapping_methods import Task
 from experiments._run_folder import RunFolder, write_metrics
@@ -31,7 +32,7 @@ NUM_WORLDS, NUM_SHORT, NUM_LONG = 3, 50, 25
 
 
 @dataclass(frozen=True, kw_only=True)
-class Config(shared.TableOptions):
+class Config(tables.TableOptions):
     """Options of the suite."""
 
     may_change: ClassVar[frozenset[str]] = frozenset({"limit", "methods"})
@@ -58,7 +59,7 @@ def list_trajectories() -> list[dict[str, int]]:
 def main(config: Config) -> list[dict[str, Any]]:
     """Runs what is missing, writes the table after every trajectory."""
     cells = list_trajectories()[: config.limit]
-    return shared.run_table(config, EXPERIMENT, cells, partial(_prepare, config), partial(_write, config.seed))
+    return tables.run_table(config, EXPERIMENT, cells, partial(_prepare, config), partial(_write, config.seed))
 
 
 def _prepare(config: Config, cell: dict[str, Any]) -> tuple[Task, dict[str, Any]]:
@@ -81,7 +82,7 @@ def summarise(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
     return {
         **_medians(rows),
         **{name: float(np.median([row[key] for row in rows])) for name, key in medians.items() if key in rows[0]},
-        **shared.success_of_trusted(rows),
+        **tables.success_of_trusted(rows),
         "candidates": {
             name: {
                 **_medians([row["candidates"][name] for row in rows if name in row["candidates"]]),

@@ -112,7 +112,7 @@ def test_every_scan_is_in_some_batch_of_the_published_order() -> None:
 
 
 def test_large_sets_are_drawn_in_blocks_of_neighbours() -> None:
-    rows, block = map(np.asarray, draw_rows(dm.preset("fast").cold_phases[0], 1000, jnp.int32(0), key=KEY))
+    rows, block = map(np.asarray, draw_rows(dm.preset("fast").warm_phases[0], 1000, jnp.int32(0), key=KEY))
     assert len(rows) == 256
     for number in range(8):
         assert (np.diff(rows[block == number]) == 1).all()

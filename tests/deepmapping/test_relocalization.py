@@ -31,6 +31,7 @@ def fitted(tiny_walk) -> dm.Fitted:
         dm.preset("fast"),
         occupancy=OccupancyConfig(kind="grid", resolutions=(4,)),
         localization=LocalizationConfig(features=(16, 32), strides=(1, 2), is_circular=True, hidden=(32,)),
+        cold_phases=(replace(dm.preset("fast").cold_phases[0], scans_per_window=None),),
     )
     data, unit = planar_data(ScanSet(tiny_walk.points, tiny_walk.mask))
     params = init(planar_problem(config, data), data, key=KEY).params

@@ -12,7 +12,13 @@ import pytest
 
 from dpmjax.geometry import se2
 from dpmjax.simulation import simulate_sequence
-from experiments import _deepmapping_methods, deepmapping_limits, deepmapping_logs, deepmapping_suite
+from experiments import (
+    _deepmapping_methods,
+    _deepmapping_tables,
+    deepmapping_limits,
+    deepmapping_logs,
+    deepmapping_suite,
+)
 from experiments._command import run_command
 from experiments._deepmapping_methods import (
     DEEPMAPPING,
@@ -20,8 +26,8 @@ from experiments._deepmapping_methods import (
     Task,
     in_fitting_order,
     make_task,
-    run_method,
 )
+from experiments._deepmapping_tables import run_method
 from experiments._recordings import corrected_numbers
 
 # ATE in px that each method stays below on the tiny walk; the start of all poses at zero has 14 px there. The direct
@@ -32,7 +38,12 @@ LARGEST_ATE_PX = {
     "icp-refined": 0.01,
     "multiway": 3.0,
     "particle-swarm": 10.0,
+    "lnet-zero": 30.0,
+    "lnet-icp": 0.1,
+    "search": 1.0,
+    "search-refined": 0.01,
     "direct-adam": 30.0,
+    "direct-windows": 30.0,
     "direct-lbfgs": 30.0,
     "global-deepmapping": 1.0,
     "refined-deepmapping": 0.1,
@@ -58,7 +69,7 @@ def test_method_registers_a_tiny_walk(name, task) -> None:
     assert row["ate_px"] < LARGEST_ATE_PX[name]
     assert row["ate_px"] == row["candidates"][row["kept"]]["ate_px"]
     assert row["success"] == (row["ate_px"] < 20.0)
-    assert (DEEPMAPPING in row["candidates"]) == ("deepmapping" in name)
+    assert (DEEPMAPPING in row["candidates"]) == ("deepmapping" in name or "lnet" in name)
     for numbers in row["candidates"].values():
         assert {"ate_px", "point_distance_px", "code_length", "misfit"} == set(numbers)
 
@@ -130,7 +141,7 @@ def test_limits_are_resumed_without_doing_a_row_twice(tmp_path, monkeypatch, cap
 
     monkeypatch.setattr(deepmapping_limits.simulation, "simulate_sequence", simulate)
     monkeypatch.setattr(_deepmapping_methods, "make_task", lambda sequence, **_: Task(sequence, planar=None))
-    monkeypatch.setattr(_deepmapping_methods, "run_method", lambda name, task: a_row(name, len(task.sequence)))
+    monkeypatch.setattr(_deepmapping_tables, "run_method", lambda name, task: a_row(name, len(task.sequence)))
     absent = METHODS["multiway"]._replace(package="no_such_package")
     monkeypatch.setitem(METHODS, "multiway", absent)
     first = run("--limit", "1", "--methods", "icp-plane", "icp-point")

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Int
 
 from dpmjax.deepmapping.config import PhaseConfig
+from dpmjax.deepmapping.windows import window_rows
 
 # Scans that are drawn together where a set is too large for one step.
 _BLOCK = 32
@@ -22,6 +23,8 @@ def scans_in_block(phase: PhaseConfig, num_scans: int) -> int:
     Returns:
         Their number.
     """
+    if phase.scans_per_window is not None:
+        return min(num_scans, phase.scans_per_window)
     if num_scans <= phase.scans_per_step:
         return num_scans
     return phase.scans_per_step if phase.is_free_factor_shared else _BLOCK
@@ -30,7 +33,7 @@ def scans_in_block(phase: PhaseConfig, num_scans: int) -> int:
 def draw_rows(
     phase: PhaseConfig, num_scans: int, step: Int[Array, ""], *, key: jax.Array
 ) -> tuple[Int[Array, " m"], Int[Array, " m"]]:
-    """Scans of a step: all where they are few enough, else blocks of neighbours in time.
+    """Scans of a step: all windows, or all scans where they are few enough, else blocks of neighbours in time.
 
     Args:
         phase: of the fit.
@@ -41,6 +44,9 @@ def draw_rows(
     Returns:
         Index of each scan in the set, and the block it belongs to.
     """
+    if phase.scans_per_window is not None:
+        rows = window_rows(num_scans, phase.scans_per_window)
+        return jnp.asarray(rows.reshape(-1)), jnp.repeat(jnp.arange(len(rows)), rows.shape[1])
     if num_scans <= phase.scans_per_step:
         return jnp.arange(num_scans), jnp.zeros(num_scans, jnp.int32)
     if phase.is_free_factor_shared:

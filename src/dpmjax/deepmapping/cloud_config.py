@@ -17,7 +17,9 @@ from dpmjax.deepmapping.config import (
 from dpmjax.deepmapping.depth_config import UNROLL_DEPTH
 from dpmjax.nets.localization import LocalizationConfig
 
-LOCALIZE_CLOUDS = replace(LOCALIZE, num_steps=300, learning_rate=1e-3, beams_per_step=256, num_offsets=2, max_offset=3)
+LOCALIZE_CLOUDS = replace(
+    LOCALIZE, num_steps=300, learning_rate=1e-3, beams_per_step=256, num_offsets=2, max_offset=3, scans_per_window=None
+)
 """Cold start of clouds."""
 
 UNROLL_CLOUDS = replace(UNROLL_DEPTH, num_steps=200, beams_per_step=256, scans_per_step=64)

@@ -45,6 +45,9 @@ class PhaseConfig:
         plane_width: for clouds. Scans are compared by the distance of points to planes instead of by the Chamfer
             distance: width of the robust kernel, at the start and at the end of the phase. None: Chamfer distance.
         num_revisits: for clouds compared by planes: scans near in space but not in time that each scan is compared to.
+        scans_per_window: for planar scans. The set is cut into windows of so many neighbours in time, each with its
+            own L-Net (or free poses), and joined at the scans that windows share. A step holds all windows.
+            None: one L-Net for the whole set.
     """
 
     name: str
@@ -68,6 +71,7 @@ class PhaseConfig:
     projection_tolerance: tuple[float, float] | None = None
     plane_width: tuple[float, float] | None = None
     num_revisits: int = 0
+    scans_per_window: int | None = None
 
     def __post_init__(self) -> None:
         if not 0.0 <= self.occupancy_weight <= 1.0:
@@ -76,20 +80,24 @@ class PhaseConfig:
             raise ValueError(f"num_offsets: expected 1 to max_offset = {self.max_offset}, got {self.num_offsets}")
         if self.num_steps < 1:
             raise ValueError(f"num_steps: expected at least 1, got {self.num_steps}")
+        if self.scans_per_window is not None and self.scans_per_window < 2:
+            raise ValueError(f"scans_per_window: expected at least 2, got {self.scans_per_window}")
 
 
 LOCALIZE = PhaseConfig(
     name="L-Net",
     poses="network",
-    num_steps=600,
+    num_steps=400,
     occupancy_weight=0.0,
     learning_rate=3e-3,
     final_learning_rate=0.05,
     adam_decay=(0.9, 0.99),
+    beams_per_step=128,
     num_offsets=3,
     max_offset=8,
+    scans_per_window=17,
 )
-"""Cold start: L-Net moves all poses together; the map comes later, it would freeze the first bad guess."""
+"""Cold start: an L-Net a window moves its poses together; the map comes later, it would freeze the first bad guess."""
 
 REFINE = PhaseConfig(
     name="free poses",
@@ -140,13 +148,19 @@ class DeepMappingConfig:
     warm_phases: tuple[PhaseConfig, ...] = (REFINE,)
     localization: LocalizationConfig = field(
         default_factory=lambda: LocalizationConfig(
-            features=(32, 64, 128), strides=(1, 2, 2), is_circular=True, hidden=(128, 64)
+            features=(32, 64, 128), strides=(1, 2, 2), is_circular=True, hidden=(128, 64), output_scale=0.1
         )
     )
     occupancy: OccupancyConfig = field(default_factory=lambda: OccupancyConfig(kind="grid"))
     steps_per_call: int = 25
     map_margin: float = 1.15
     halve_at: tuple[float, ...] = (0.25, 0.5, 0.75)
+
+    def __post_init__(self) -> None:
+        for phases in (self.cold_phases, self.warm_phases):
+            lengths = {phase.scans_per_window for phase in phases if phase.poses == "network"}
+            if len(lengths) > 1:
+                raise ValueError(f"scans_per_window: phases with L-Net share its weights, got windows of {lengths}")
 
 
 @dataclass(frozen=True)

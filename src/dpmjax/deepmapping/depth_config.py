@@ -17,7 +17,9 @@ from dpmjax.deepmapping.config import (
 )
 from dpmjax.nets.localization import LocalizationConfig
 
-LOCALIZE_DEPTH = replace(LOCALIZE, num_steps=400, learning_rate=1e-3, beams_per_step=400, num_offsets=2, max_offset=3)
+LOCALIZE_DEPTH = replace(
+    LOCALIZE, num_steps=400, learning_rate=1e-3, beams_per_step=400, num_offsets=2, max_offset=3, scans_per_window=None
+)
 """Cold start of depth images."""
 
 UNROLL_DEPTH = replace(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -24,7 +25,9 @@ from dpmjax.deepmapping.problem import (
     choose_frame,
     mapping_loss,
     mapping_problem,
+    phases_of,
 )
+from dpmjax.deepmapping.windows import in_windows, join_windows, window_rows
 from dpmjax.geometry import se2
 from dpmjax.geometry.rays import typical_range
 from dpmjax.nets.localization import LocalizationNet
@@ -205,14 +208,21 @@ def choose_beams(num_beams: int, phase: PhaseConfig, first: Int[Array, ""] | int
 
 def _init(config: DeepMappingConfig, key: jax.Array, data: MappingData) -> Params:
     net_key, map_key = jax.random.split(key)
-    net, scans = LocalizationNet(config.localization), data.scans
-    poses = jnp.zeros((scans.mask.shape[0], 3)) if data.start is None else data.start
+    scans, phase = data.scans, phases_of(config, data)[0]
+    poses = start = jnp.zeros((scans.mask.shape[0], 3)) if data.start is None else data.start
+    make_net = partial(LocalizationNet(config.localization).init, points=scans.points[0], mask=scans.mask[0])
+    if phase.scans_per_window is None:
+        localization = make_net(net_key)
+    else:
+        rows = window_rows(len(start), phase.scans_per_window)
+        localization = jax.vmap(make_net)(jax.random.split(net_key, len(rows)))
+        poses = start[rows] if phase.poses == "free" else start
     return Params(
-        localization=net.init(net_key, scans.points[0], scans.mask[0]),
+        localization=localization,
         poses=poses,
         occupancy=init_map_net(config.occupancy, key=map_key),
-        start=poses,
-        frame=_choose_frame(config, scans, poses),
+        start=start,
+        frame=_choose_frame(config, scans, start),
     )
 
 
@@ -231,13 +241,28 @@ def _next_phase(config: DeepMappingConfig, phase: PhaseConfig, params: Params, d
 
 def _poses(config: DeepMappingConfig, phase: PhaseConfig, params: Params, data: MappingData) -> Float[Array, "n 3"]:
     """Poses of all scans; L-Net sees the same number of beams as in training."""
-    if phase.poses == "free":
-        return params.poses
-    scans = data.scans
-    beams = choose_beams(scans.mask.shape[1], phase)
-    return se2.compose(
-        params.start, localize_scans(params.localization, scans.points[:, beams], scans.mask[:, beams], config)
-    )
+    scans, count = data.scans, data.scans.mask.shape[0]
+    rows = np.arange(count) if phase.scans_per_window is None else window_rows(count, phase.scans_per_window)
+    poses = params.poses
+    if phase.poses == "network":
+        beams = choose_beams(scans.mask.shape[1], phase)
+        some = ScanSet(scans.points[:, beams], scans.mask[:, beams])
+        poses = in_windows(_localize(config, phase, params, some, rows.reshape(-1)), rows)
+    return poses if phase.scans_per_window is None else join_windows(poses, count)
+
+
+def _localize(
+    config: DeepMappingConfig, phase: PhaseConfig, params: Params, scans: ScanSet, rows: Array | NDArray[np.intp]
+) -> Float[Array, "m 3"]:
+    """Poses of the scans `rows` by L-Net, or by the L-Net of each window, of which `rows` has all."""
+    points, mask = scans.points[rows], scans.mask[rows]
+    if phase.scans_per_window is None:
+        outputs = localize_scans(params.localization, points, mask, config)
+    else:
+        windows = window_rows(len(scans.points), phase.scans_per_window)
+        of_window = jax.vmap(partial(localize_scans, config=config))
+        outputs = of_window(params.localization, in_windows(points, windows), in_windows(mask, windows)).reshape(-1, 3)
+    return se2.compose(params.start[rows], outputs)
 
 
 def _loss(
@@ -254,11 +279,12 @@ def _loss(
     beam_key, row_key = jax.random.split(batch_key)
     beams = choose_beams(scans.mask.shape[1], phase, jax.random.randint(beam_key, (), 0, scans.mask.shape[1]))
     rows, block = draw_rows(phase, scans.mask.shape[0], step, key=row_key)
-    points, mask = scans.points[rows][:, beams], scans.mask[rows][:, beams]
+    some = ScanSet(scans.points[:, beams], scans.mask[:, beams])
     if phase.poses == "network":
-        poses = se2.compose(params.start[rows], localize_scans(params.localization, points, mask, config))
+        poses = _localize(config, phase, params, some, rows)
     else:
-        poses = params.poses[rows]
+        poses = params.poses[rows] if phase.scans_per_window is None else params.poses.reshape(-1, 3)
+    points, mask = some.points[rows], some.mask[rows]
     world = WorldBatch(se2.transform_points(poses, points), poses[:, :2], mask, rows, block, progress)
     free_key, offset_key = jax.random.split(loss_key)
     limit = None if phase.chamfer_limit is None else interpolate_log(phase.chamfer_limit, progress)

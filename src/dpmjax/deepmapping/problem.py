@@ -84,15 +84,15 @@ class Params:
     """Parameters of a fit; lengths in typical ranges, angles in radians.
 
     Attributes:
-        localization: weights of L-Net.
-        poses: free poses, or free motions after `start`.
+        localization: weights of L-Net; with windows, of one for each along a leading axis.
+        poses: free poses, or free motions after `start`; in a phase of windows with free poses, of each window.
         occupancy: weights of M-Net.
         start: poses that L-Net's outputs are relative to; not trained.
         frame: of the map; not trained.
     """
 
     localization: Any
-    poses: Float[Array, "n k"]
+    poses: Float[Array, "*rows k"]
     occupancy: Any
     start: Float[Array, "n ..."]
     frame: MapFrame
@@ -109,11 +109,23 @@ def mapping_problem(config: DeepMappingConfig, data: MappingData, functions: Map
     Returns:
         The problem.
     """
-    phases = config.cold_phases if data.start is None else config.warm_phases
     return Problem(
-        config, phases, optimizer=make_optimizer, **functions._asdict(),
+        config, phases_of(config, data), optimizer=make_optimizer, **functions._asdict(),
         steps_per_call=config.steps_per_call, halve_at=config.halve_at,
     )  # fmt: skip
+
+
+def phases_of(config: DeepMappingConfig, data: MappingData) -> tuple[PhaseConfig, ...]:
+    """The phases of a fit: from zero or from given poses.
+
+    Args:
+        config: settings of the fit.
+        data: with the start, or without.
+
+    Returns:
+        The phases.
+    """
+    return config.cold_phases if data.start is None else config.warm_phases
 
 
 def make_optimizer(config: DeepMappingConfig, phase: PhaseConfig) -> optax.GradientTransformation:

@@ -77,7 +77,7 @@ def relocalize(fitted: Fitted, scan: ScanSet | ArrayLike) -> Relocalized:
     it back to them.
 
     Args:
-        fitted: result of `fit_deepmapping` from zero poses, or of `train_localization`.
+        fitted: result of `fit_deepmapping` from zero poses with one L-Net for all scans, or of `train_localization`.
         scan: (b, 2) one scan, or (m, b, 2), in the sensor frame, unit and order of the beams as in the fit; beams with
             coordinates that are not finite, or both zero, measured nothing.
 
@@ -85,9 +85,11 @@ def relocalize(fitted: Fitted, scan: ScanSet | ArrayLike) -> Relocalized:
         Relocalized, in the world of `fitted.poses`.
 
     Raises:
-        ValueError: the shape is another one, a scan has no valid beam, or L-Net's outputs are corrections of given
-            start poses.
+        ValueError: the shape is another one, a scan has no valid beam, each window of the fit has an L-Net of its own,
+            or L-Net's outputs are corrections of given start poses.
     """
+    if has_windows(fitted):
+        raise ValueError("fitted: each of its L-Nets knows one window of the walk; call train_localization first")
     if np.any(np.asarray(fitted.params.start) != 0.0):
         raise ValueError(
             "fitted: its L-Net corrects given start poses, which a new scan has not; call train_localization first"
@@ -102,6 +104,19 @@ def relocalize(fitted: Fitted, scan: ScanSet | ArrayLike) -> Relocalized:
     poses[:, :2] *= fitted.unit
     poses[:, 2] = se2.wrap_angle(poses[:, 2])
     return Relocalized(poses[0] if is_one else poses)
+
+
+def has_windows(fitted: Fitted) -> bool:
+    """Whether the fit has an L-Net for each of several windows instead of one for all scans.
+
+    Args:
+        fitted: result of `fit_deepmapping` or of `train_localization`.
+
+    Returns:
+        True if a leading axis of L-Net's weights is that of the windows.
+    """
+    biases = fitted.params.localization["params"]["Dense_0"]["bias"]
+    return biases.ndim > 1
 
 
 def train_localization(
@@ -129,7 +144,10 @@ def train_localization(
         raise ValueError(f"scans: expected the {len(fitted.poses)} scans of the fit, got {len(scans.points)}")
     poses = jnp.asarray(fitted.poses / [fitted.unit, fitted.unit, 1.0], jnp.float32)
     scaled = replace(scans, points=scans.points / fitted.unit)
-    net = _train(fitted.params.localization, scaled, poses, key, fit_config=fitted.config, config=config)
+    begin = fitted.params.localization
+    if has_windows(fitted):
+        begin = jax.tree.map(lambda weights: weights[0], begin)
+    net = _train(begin, scaled, poses, key, fit_config=fitted.config, config=config)
     params = replace(fitted.params, localization=net, start=jnp.zeros_like(fitted.params.start))
     return fitted._replace(params=params)
 

@@ -25,6 +25,7 @@ class LocalizationConfig:
         dilation: distance of the three taps of a convolution along each axis, in beams or pixels.
         is_circular: the last beam is the neighbour of the first (a full turn); else zeros follow.
         hidden: channels of the layers after the maximum.
+        output_scale: factor on the initial weights of the last layer; a small one lets all poses begin near zero.
     """
 
     kind: Literal["conv", "point"] = "conv"
@@ -33,6 +34,7 @@ class LocalizationConfig:
     dilation: int = 3
     is_circular: bool = False
     hidden: tuple[int, ...] = (512, 256)
+    output_scale: float = 1.0
 
     def __post_init__(self) -> None:
         if self.kind == "conv" and len(self.strides) != len(self.features):
@@ -104,4 +106,5 @@ class LocalizationNet(nn.Module):
         x = jnp.where(mask.any(), x, 0.0)
         for features in config.hidden:
             x = nn.relu(nn.Dense(features, kernel_init=HE_LIKE)(x))
-        return nn.Dense(self.num_outputs, kernel_init=HE_LIKE)(x)
+        last = nn.initializers.variance_scaling(2.0 * config.output_scale**2, "fan_avg", "uniform")
+        return nn.Dense(self.num_outputs, kernel_init=last)(x)

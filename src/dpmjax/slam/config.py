@@ -172,8 +172,8 @@ class LoopClosureConfig:
     num_asked: int = 4
     sure_overlap: float = 0.9
     num_registered: int = 2
-    min_probability: float = 0.2
-    min_matched_share: float = 0.25
+    min_probability: float = 0.5
+    min_matched_share: float = 0.35
     max_contradicted_share: float = 0.1
     min_support: int = 2
     pending_path_m: float = 40.0

@@ -26,6 +26,7 @@ from dpmjax.slam.keyframes import (
     turn_rad,
     with_origin,
 )
+from dpmjax.slam.loop_consistency import scans_agree
 from dpmjax.slam.matcher import Match
 from dpmjax.slam.methods import SlamMethods
 from dpmjax.slam.retrieval import most_similar
@@ -47,7 +48,7 @@ class LocalizationConfig:
         num_submap: number of keyframes whose descriptors are merged for a registration.
         same_place_m: two registrations agree within this distance ...
         same_place_rad: ... and this turn.
-        min_probability: a registration supports a place from this P(correct) on.
+        min_probability: a registration supports a place from this P(correct) on, if the scans agree.
         min_support: number of registrations that must agree, ...
         min_total: ... and sum of their P(correct).
         min_alone: P(correct) that suffices where no other keyframe is near.
@@ -81,11 +82,13 @@ class Evidence(NamedTuple):
         keyframe: row of the keyframe.
         T_world_scan: where it puts the scan.
         match: the registration.
+        do_scans_agree: whether enough points meet planes, by the limits of loop closure; streets look alike.
     """
 
     keyframe: int
     T_world_scan: Pose
     match: Match
+    do_scans_agree: bool
 
 
 class Localization(NamedTuple):
@@ -213,8 +216,9 @@ def _registered(
     source, radius_m = Submap((description,), np.eye(4)[None]), methods.config.front_end.submap_radius_m
     targets = [submap_around(map_, row, config.num_submap, radius_m) for row in rows]
     matches = methods.matcher.register([(source, target) for target in targets]) if rows else []
+    loops = methods.config.loops
     return [
-        Evidence(row, orthonormal(map_.T_world_keyframe[row] @ match.T_target_source), match)
+        Evidence(row, orthonormal(map_.T_world_keyframe[row] @ match.T_target_source), match, scans_agree(match, loops))
         for row, match in zip(rows, matches, strict=True)
     ]
 
@@ -222,7 +226,7 @@ def _registered(
 def _places(tried: list[Evidence], config: LocalizationConfig) -> list[_Place]:
     """Groups registrations that agree with the most probable one of the group."""
     left = sorted(tried, key=lambda one: -one.match.probability)
-    left = [one for one in left if one.match.probability >= config.min_probability]
+    left = [one for one in left if one.do_scans_agree and one.match.probability >= config.min_probability]
     places = []
     while left:
         members = [one for one in left if _agree(left[0], one, config)]

@@ -32,10 +32,7 @@ def status_of(slam_map: KeyframeMap, loop: Loop, match: Match, config: LoopClosu
     """
     if match.probability < config.min_probability:
         return "improbable"
-    shares = match.verification
-    if shares is not None and (
-        shares.matched_share < config.min_matched_share or shares.contradicted_share > config.max_contradicted_share
-    ):
+    if not scans_agree(match, config):
         return "scans disagree"
     source, target = slam_map.keyframes[loop.source], slam_map.keyframes[loop.target]
     if source.segment == target.segment:
@@ -49,6 +46,23 @@ def status_of(slam_map: KeyframeMap, loop: Loop, match: Match, config: LoopClosu
         if np.linalg.norm(apart[:3, 3]) > most_m or turn_rad(apart) > most_rad:
             return "against odometry"
     return "waits for support"
+
+
+def scans_agree(match: Match, config: LoopClosureConfig) -> bool:
+    """Whether enough points of the scans meet planes under a registration, and few lie in free space.
+
+    Args:
+        match: the registration.
+        config: both limits.
+
+    Returns:
+        True also where the matcher has no scans.
+    """
+    shares = match.verification
+    if shares is None:
+        return True
+    is_matched = shares.matched_share >= config.min_matched_share
+    return is_matched and shares.contradicted_share <= config.max_contradicted_share
 
 
 def accept_consistent(
