@@ -169,7 +169,8 @@ def assess_trajectory(scans: PlanarScans, poses: Floats) -> Assessment:
     source, target, scores = source[is_used], target[is_used], scores[is_used]
     contradicted, visible = (np.asarray(x)[is_used] for x in (views.contradicted, views.visible))
     size = (len(poses), len(poses))
-    tree = scipy.sparse.csgraph.minimum_spanning_tree(scipy.sparse.csr_matrix((2.0 - scores, (source, target)), size))
+    costs = scipy.sparse.csr_array((2.0 - scores, (source, target)), size)
+    tree = scipy.sparse.csr_array(scipy.sparse.csgraph.minimum_spanning_tree(costs))
     holding = tree.tocoo()
     holds = np.isin(source * len(poses) + target, holding.row.astype(np.int64) * len(poses) + holding.col)
     shares = [contradicted[rows].sum() / max(visible[rows].sum(), 1.0) for rows in (holds, ~holds)]

@@ -101,7 +101,7 @@ class FrontEndConfig:
         guess_rad: ... and of its rotation.
     """
 
-    min_score_share: float = 0.6
+    min_score_share: float = 0.4
     min_score: float = 0.2
     min_probability: float = 0.5
     near_m: float = 2.0
