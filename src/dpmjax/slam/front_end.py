@@ -22,6 +22,7 @@ from dpmjax.slam.keyframes import (
     Pose,
     Submap,
     add_keyframe,
+    are_near,
     diagonal_information,
     orthonormal,
     submap_around,
@@ -184,8 +185,8 @@ def _locate(methods: SlamMethods, state: FrontEndState, slam_map: KeyframeMap, s
     is_confirmed = (
         match.probability >= config.min_probability
         and other.score >= config.min_score
-        and _are_near(found.T_map_scan, other.T_map_scan, config.near_m, config.near_rad)
-        and _are_near(match.T_target_source, other.T_map_scan, config.near_m, config.near_rad)
+        and are_near(found.T_map_scan, other.T_map_scan, config.near_m, config.near_rad)
+        and are_near(match.T_target_source, other.T_map_scan, config.near_m, config.near_rad)
     )
     if is_confirmed or (other.score >= wanted and other.score > found.score):
         agreed = other.score, other.information, match.probability
@@ -194,14 +195,9 @@ def _locate(methods: SlamMethods, state: FrontEndState, slam_map: KeyframeMap, s
     guess = diagonal_information(config.guess_m, config.guess_rad)
     predicted = state.T_keyframe_last @ state.T_before_last
     # What geometry prefers is the better guess, unless a robot hardly moves like that.
-    is_likely = _are_near(predicted, found.T_map_scan, 3 * config.guess_m, 3 * config.guess_rad)
+    is_likely = are_near(predicted, found.T_map_scan, 3 * config.guess_m, 3 * config.guess_rad)
     T = found.T_map_scan if is_likely else predicted
     return Located(T, status, numbers, max(found.score, other.score), guess, match.probability, description)
-
-
-def _are_near(T_a: Pose, T_b: Pose, most_m: float, most_rad: float) -> bool:
-    apart = rigid.inverse(T_a) @ T_b
-    return bool(np.linalg.norm(apart[:3, 3]) <= most_m) and turn_rad(apart) <= most_rad
 
 
 def _is_keyframe(methods: SlamMethods, located: Located, measured: Any) -> bool:

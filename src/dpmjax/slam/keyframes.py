@@ -268,6 +268,22 @@ def turn_rad(T_a_b: Pose) -> float:
     return math.atan2(sine, R[0, 0] + R[1, 1] + R[2, 2] - 1)
 
 
+def are_near(T_a: Pose, T_b: Pose, most_m: float, most_rad: float) -> bool:
+    """Whether two poses of one thing differ by at most a distance and a turn.
+
+    Args:
+        T_a: a pose.
+        T_b: the other, in the same frame.
+        most_m: distance.
+        most_rad: turn.
+
+    Returns:
+        True at the limits, too.
+    """
+    apart = rigid.inverse(T_a) @ T_b
+    return bool(np.linalg.norm(apart[:3, 3]) <= most_m) and turn_rad(apart) <= most_rad
+
+
 def orthonormal(T_a_b: Pose) -> Pose:
     """Removes the rounding errors of a rotation, which would grow from scan to scan.
 

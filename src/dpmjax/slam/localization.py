@@ -15,15 +15,14 @@ from jaxtyping import Float
 
 from dpmjax.checks import require_fields, require_positive_fields
 from dpmjax.deeppointmap.model import Model
-from dpmjax.geometry import rigid
 from dpmjax.slam.keyframes import (
     KeyframeMap,
     Pose,
     Submap,
+    are_near,
     distances_to,
     orthonormal,
     submap_around,
-    turn_rad,
     with_origin,
 )
 from dpmjax.slam.loop_consistency import scans_agree
@@ -236,8 +235,7 @@ def _places(tried: list[Evidence], config: LocalizationConfig) -> list[_Place]:
 
 
 def _agree(one: Evidence, other: Evidence, config: LocalizationConfig) -> bool:
-    apart = rigid.inverse(one.T_world_scan) @ other.T_world_scan
-    return bool(np.linalg.norm(apart[:3, 3]) <= config.same_place_m) and turn_rad(apart) <= config.same_place_rad
+    return are_near(one.T_world_scan, other.T_world_scan, config.same_place_m, config.same_place_rad)
 
 
 def _is_supported(place: _Place, config: LocalizationConfig) -> bool:

@@ -10,7 +10,7 @@ import numpy as np
 
 from dpmjax.geometry import rigid
 from dpmjax.slam.config import LoopClosureConfig
-from dpmjax.slam.keyframes import KeyframeMap, turn_rad
+from dpmjax.slam.keyframes import KeyframeMap, are_near
 from dpmjax.slam.matcher import Match
 from dpmjax.slam.reports import Loop, LoopStatus
 
@@ -39,11 +39,10 @@ def status_of(slam_map: KeyframeMap, loop: Loop, match: Match, config: LoopClosu
         path_m = abs(source.path_m - target.path_m)
         T_world = slam_map.T_world_keyframe
         predicted = rigid.inverse(T_world[loop.target]) @ T_world[loop.source]
-        apart = rigid.inverse(predicted) @ match.T_target_source
         sigma_m, sigma_rad = _drift(path_m, config)
         most_m = config.consistent_sigmas * sigma_m + config.min_drift_share * path_m
         most_rad = config.consistent_sigmas * sigma_rad + config.min_drift_share
-        if np.linalg.norm(apart[:3, 3]) > most_m or turn_rad(apart) > most_rad:
+        if not are_near(predicted, match.T_target_source, most_m, most_rad):
             return "against odometry"
     return "waits for support"
 
@@ -122,12 +121,11 @@ def are_consistent(slam_map: KeyframeMap, loop: Loop, other: Loop, config: LoopC
     ends = [(slam_map.keyframes[a], slam_map.keyframes[b]) for a, b in rows]
     paths_m = [abs(a.path_m - b.path_m) for a, b in ends]
     T_source_other, T_target_other = (rigid.inverse(a.T_odometry_keyframe) @ b.T_odometry_keyframe for a, b in ends)
-    around = rigid.inverse(loop.T_target_source @ T_source_other) @ T_target_other @ other.T_target_source
+    one_way, other_way = loop.T_target_source @ T_source_other, T_target_other @ other.T_target_source
     sigma_m, sigma_rad = _drift(sum(paths_m), config)
     # A turn of either registration moves the other end by the length of the odometry between them.
     sigma_m = float(np.hypot(sigma_m, config.sigma_rad * max(paths_m)))
-    is_near = np.linalg.norm(around[:3, 3]) <= config.consistent_sigmas * sigma_m
-    return bool(is_near) and turn_rad(around) <= config.consistent_sigmas * sigma_rad
+    return are_near(one_way, other_way, config.consistent_sigmas * sigma_m, config.consistent_sigmas * sigma_rad)
 
 
 def _is_near_along(slam_map: KeyframeMap, row: int, other: int, config: LoopClosureConfig) -> bool:
