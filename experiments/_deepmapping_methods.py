@@ -38,6 +38,9 @@ START_NAMES = {
 }
 """Starts of a fit: the word on the command line, and the name of the candidate."""
 
+STARTS_FROM_SCANS = ("icp-plane", "icp-point", "global")
+"""Starts that know nothing but the scans."""
+
 # A fit whose map takes so many times the nats of the refined start is not refined.
 _LEAST_PROMISING = 1.15
 
@@ -100,12 +103,11 @@ def refined_candidates(task: Task, candidates: Candidates, init: str) -> Candida
     The fit is sharper near a good start; the start keeps what a robot's odometry knows.
     """
     (start, start_poses), (fit, fit_poses) = candidates.items()
-    is_ordered = init != "global"
-    found = {} if init == "zero" else {f"{start}, refined": refined(task, start_poses, is_ordered=is_ordered)}
+    found = {} if init == "zero" else {f"{start}, refined": refined(task, start_poses, is_ordered=task.is_ordered)}
     scores = registration.choose_trajectory(task.planar, {fit: fit_poses, **found})[1]
     nats = [score.code_length for score in scores.values()]
     if nats[0] <= _LEAST_PROMISING * nats[-1]:
-        found[f"{fit}, refined"] = refined(task, fit_poses, is_ordered=is_ordered)
+        found[f"{fit}, refined"] = refined(task, fit_poses, is_ordered=task.is_ordered)
     return found
 
 

@@ -15,6 +15,8 @@ if TYPE_CHECKING:
 Floats = NDArray[np.float64]
 # Scans so far apart are registered, where that leaves out more than every other one.
 MIN_DISTANCE_M, MIN_TURN_RAD = 0.5, 0.35
+MAX_WHOLE = 256
+"""Up to so many scans are all registered where there is no odometry to tell which lie apart."""
 MIN_COMMON = 10
 
 
@@ -24,10 +26,13 @@ class Recording(NamedTuple):
     Attributes:
         whole: all scans.
         chosen: rows of those that are registered.
+        motion: (n, 3) poses of all scans that tell how they move from one registered scan to the next; None where all
+            are registered.
     """
 
     whole: ScanSequence
     chosen: NDArray[np.integer]
+    motion: Floats | None = None
 
     @property
     def registered(self) -> ScanSequence:
@@ -41,11 +46,8 @@ class Recording(NamedTuple):
         return count if self._is_all else f"{count}, chosen of {len(self.whole)} by their motion"
 
     def between(self, poses: Floats) -> Floats:
-        """Returns poses of all scans, by those of the registered ones and the odometry between them."""
-        if self._is_all:
-            return poses
-        assert self.whole.odometry_poses is not None
-        return registration.fill_between(self.chosen, poses, self.whole.odometry_poses)
+        """Returns poses of all scans, by those of the registered ones and the motion between them."""
+        return poses if self.motion is None else registration.fill_between(self.chosen, poses, self.motion)
 
     def aligned(self, poses: Floats) -> Floats:
         """Returns the same, each scan aligned with the nearest registered one."""
@@ -65,13 +67,27 @@ class Recording(NamedTuple):
         return len(self.chosen) == len(self.whole)
 
 
-def choose_scans(whole: ScanSequence, *, is_ordered: bool = True) -> Recording:
-    """Returns which scans are registered: all, where most lie apart or where there is no odometry to tell."""
-    everything = np.arange(len(whole))
-    if whole.odometry_poses is None or whole.unit != "m" or not is_ordered:
-        return Recording(whole, everything)
-    chosen = registration.choose_by_motion(whole.odometry_poses, MIN_DISTANCE_M, MIN_TURN_RAD)
-    return Recording(whole, chosen if 2 * len(chosen) < len(whole) else everything)
+def choose_scans(whole: ScanSequence, *, is_ordered: bool = True, by_scans: bool = False) -> Recording:
+    """Returns which scans are registered: those that lie apart, or all where most do.
+
+    Args:
+        whole: all scans.
+        is_ordered: they lie in the order of time; else all are registered.
+        by_scans: odometry is not looked at, only the scans.
+
+    Returns:
+        Recording; all scans where they are not in metres, or few and without odometry.
+    """
+    everything = Recording(whole, np.arange(len(whole)))
+    if whole.unit != "m" or not is_ordered:
+        return everything
+    motion = None if by_scans else whole.odometry_poses
+    if motion is None and len(whole) > MAX_WHOLE:
+        motion = registration.scan_odometry(registration.planar_scans(whole.points, whole.mask))
+    if motion is None:
+        return everything
+    chosen = registration.choose_by_motion(motion, MIN_DISTANCE_M, MIN_TURN_RAD)
+    return Recording(whole, chosen, motion) if 2 * len(chosen) < len(whole) else everything
 
 
 def relation_numbers(times: Floats, poses: Floats, relations: Relations, suffix: str = "") -> dict[str, float]:

@@ -95,7 +95,8 @@ class Config(RunOptions):
 def main(config: Config) -> dict[str, Any]:
     """Reads, starts, fits, refines, keeps the best candidate, writes; returns the content of `metrics.json`."""
     started = time.perf_counter()
-    log = choose_scans(read_scans(config), is_ordered=config.ordered)
+    by_scans = config.init in shared.STARTS_FROM_SCANS
+    log = choose_scans(read_scans(config), is_ordered=config.ordered, by_scans=by_scans)
     sequence = log.registered
     planar = registration.planar_scans(sequence.points, sequence.mask, is_ordered=config.ordered)
     task = Task(sequence, planar, is_ordered=config.ordered, seed=config.seed)

@@ -3,6 +3,7 @@ from .global_registration import nearest_tour as nearest_tour
 from .global_registration import register_globally as register_globally
 from .icp import icp as icp
 from .incremental import incremental_icp as incremental_icp
+from .incremental import scan_odometry as scan_odometry
 from .loop_closure import LoopConfig as LoopConfig
 from .loop_closure import close_loops as close_loops
 from .planar_scans import PlanarScans as PlanarScans

@@ -1,7 +1,8 @@
-"""Global registration: poses of all scans without a first guess, without ICP, and if need be without an order.
+"""Global registration: poses of all scans without a first guess, and if need be without an order.
 
-A few dozen scans that differ most, the keyframes, are searched against each other exhaustively and assembled into one
-map. The other scans are then searched against some of them and placed in it.
+Scans in the order of time are registered as a sequence (`sequence_search.py`). Without an order, or where steps are
+weak or noisy, a few dozen scans that are most like all others, the keyframes, are searched against each other
+exhaustively and assembled into one map; the other scans are then searched against some of them and placed in it.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
+import scipy.sparse
 import scipy.sparse.csgraph
 import scipy.spatial
 from jaxtyping import Float
@@ -18,9 +20,9 @@ from numpy.typing import NDArray
 from dpmjax.geometry import se2
 from dpmjax.pose_graph.graph import PoseGraph, join_edges
 from dpmjax.pose_graph.optimize import ROBUST, optimize_pose_graph
-from dpmjax.registration.map_assembly import PoseScorer, PositionPrior, assemble, settle
+from dpmjax.registration.incremental import incremental_icp
+from dpmjax.registration.map_assembly import PoseScorer, assemble, settle
 from dpmjax.registration.pair_search import (
-    AGREEMENT,
     Candidates,
     CorrelativeConfig,
     Hypotheses,
@@ -32,15 +34,19 @@ from dpmjax.registration.pair_search import (
 )
 from dpmjax.registration.planar_scans import Floats, Indices, PlanarScans
 from dpmjax.registration.range_profiles import RangeProfiles, compare_pairs, make_profiles
+from dpmjax.registration.step_scores import weak_steps
 from dpmjax.registration.wall_directions import WallDirections
 
-# Every scan that is no keyframe is searched against the keyframes with the so many most similar views, and without an
-# order against so many scans with the most similar views ...
+# Every scan that is no keyframe is searched against the keyframes with the so many most similar views, and against the
+# keyframes before and after it, or without an order against so many scans with the most similar views ...
 _NUM_ANCHORS, _NUM_NEAREST_VIEWS = 2, 3
 # ... around so many likely headings; and keyframes against each other around so many.
 _NUM_LIKELY_TURNS, _NUM_KEYFRAME_TURNS = 3, 6
-# Where there is an order, its heading is within this of a linear one between the keyframes around it, radians.
-_MAX_BEND = 0.7
+# A sequence is registered like a set where more than this share of its steps is weak, or where the range noise is more
+# than this in typical ranges: a chain of steps drifts then.
+_MAX_WEAK, _MAX_NOISE = 0.25, 0.0225
+# Keyframes are chosen among so many scans, spread evenly.
+_MAX_ELIGIBLE = 1024
 # A scan whose best neighbour matches less than this share of the usual beams is unregistered; scans are of one cluster
 # if they match more than this share.
 _MIN_SUPPORT, _MIN_LINK = 0.6, 0.3
@@ -67,7 +73,7 @@ class GlobalRegistration(NamedTuple):
 
     Attributes:
         poses: (n, 3) T_world_scan, the first one zero.
-        keyframes: rows of the scans that were searched all against all.
+        keyframes: rows of the scans that were searched all against all; none where a sequence needs no such search.
     """
 
     poses: Floats
@@ -102,19 +108,25 @@ def register_globally(scans: PlanarScans, config: GlobalConfig | None = None) ->
 
     Args:
         scans: n scans. Where they are ordered, neighbours in the array are taken as neighbours in time; else no order
-            is used, and shuffled scans give the same map.
+            is used, and shuffled scans give the same map, up to 1,024 of them.
         config: settings.
 
     Returns:
         GlobalRegistration.
     """
-    config, profiles = config or GlobalConfig(), make_profiles(scans)
-    walls, unit = WallDirections(scans), scans.typical_range
+    config, profiles, everyone = config or GlobalConfig(), make_profiles(scans), np.arange(len(scans))
+    if scans.is_ordered and scans.noise <= _MAX_NOISE * scans.typical_range:
+        poses = incremental_icp(scans).poses
+        # Few scans are searched all against all as soon as one step is weak.
+        allowed = _MAX_WEAK if len(scans) > config.max_keyframes else 0.0
+        if weak_steps(profiles, poses, everyone).sum() <= allowed * len(scans):
+            return GlobalRegistration(poses, everyone[:0])
+    walls = WallDirections(scans)
     if scans.is_ordered:
-        keyframes = evenly_in_time(len(scans), config.max_keyframes)
+        keyframes = spread_evenly(len(scans), config.max_keyframes)
     else:
-        everyone = np.arange(len(scans))
-        keyframes = most_typical(walls.best_similarity(everyone, everyone), config.max_keyframes)
+        eligible = spread_evenly(len(scans), _MAX_ELIGIBLE)
+        keyframes = eligible[most_typical(walls.best_similarity(everyone, eligible), config.max_keyframes)]
     task = _Task(profiles, walls, keyframes, scans.is_ordered, config)
     first, second = np.tril_indices(len(keyframes), k=-1)
     pairs = keyframes[first], keyframes[second]
@@ -123,24 +135,24 @@ def register_globally(scans: PlanarScans, config: GlobalConfig | None = None) ->
     poses = np.zeros((len(scans), 3))
     poses[keyframes] = assemble(profiles.take(keyframes), inside, is_ordered=scans.is_ordered)
     if len(keyframes) < len(scans):
-        key_edges = agreeing_edges(poses, found, unit)
-        poses, more = place_others(task, poses, found, _search_others(task, poses))
-        edges = join_edges(key_edges, agreeing_edges(poses, more, unit))
+        key_edges = agreeing_edges(poses, found, profiles)
+        poses, more = place_others(task, poses, found, task.search(*_similar_pairs(task)))
+        edges = join_edges(key_edges, agreeing_edges(poses, more, profiles))
         poses = optimize_pose_graph(PoseGraph.create(poses, edges), ROBUST).graph.poses
     return GlobalRegistration(se2.relative(poses[0], poses), keyframes)
 
 
-def evenly_in_time(num_scans: int, count: int) -> Indices:
+def spread_evenly(num_scans: int, count: int) -> Indices:
     """At most `count` scans, the first and the last among them."""
     return np.unique(np.round(np.linspace(0, num_scans - 1, min(num_scans, count))).astype(np.int64))
 
 
-def most_typical(similarity: Float[np.ndarray, "n n"], count: int) -> Indices:
-    """Scans that together are most similar to all others."""
-    count = min(len(similarity), count)
+def most_typical(similarity: Float[np.ndarray, "n m"], count: int) -> Indices:
+    """Columns of the scans that together are most similar to all of the n scans, of those with m columns."""
+    count = min(similarity.shape[1], count)
     chosen: list[int] = []
     # Similarity of each scan to the most similar chosen one; each choice adds as much to that as it can.
-    covered = np.full(len(similarity), -1.0)
+    covered = np.full(len(similarity), -1.0, similarity.dtype)
     for _ in range(count):
         gain = np.maximum(similarity - covered[:, None], 0.0).sum(axis=0)
         gain[chosen] = -1.0
@@ -176,40 +188,20 @@ def place_in_map(poses: Floats, placed: Indices, hypotheses: Hypotheses, scorer:
     return settle(poses, hypotheses, scorer)
 
 
-def _search_others(task: _Task, poses: Floats) -> Candidates:
-    """Candidates of the scans that are no keyframes, against some keyframes each."""
-    source, target, turns = _similar_pairs(task)
-    if task.is_ordered:
-        near = _neighbour_pairs(task, poses[task.keyframes, 2])
-        source, target, turns = (np.concatenate(x) for x in zip((source, target, turns), near, strict=True))
-    return task.search(source, target, turns)
-
-
 def _similar_pairs(task: _Task) -> tuple[Indices, Indices, NDArray[np.bool_]]:
-    """Pairs of similar views, of each other scan with keyframes and with any scans; and the turns to try for each."""
-    others = task.others
-    order = np.argsort(-task.walls.best_similarity(others, task.keyframes), axis=1)[:, :_NUM_ANCHORS]
-    pairs = task.keyframes[order]
-    if not task.is_ordered:  # Neighbours in time are better partners than any similar view.
-        best = task.walls.best_similarity(others, np.arange(len(task.profiles)))
-        best[np.arange(len(others)), others] = -np.inf
-        pairs = np.concatenate([pairs, np.argsort(-best, axis=1)[:, :_NUM_NEAREST_VIEWS]], axis=1)
+    """Pairs of each other scan with similar keyframes and with near scans; and the turns to try for each."""
+    others, keyframes = task.others, task.keyframes
+    if task.is_ordered:
+        after = np.clip(np.searchsorted(keyframes, others), 1, len(keyframes) - 1)
+        near = np.stack([keyframes[after - 1], keyframes[after]], axis=1)
+    else:  # Those with the most similar views of all are likely to be near.
+        near = task.walls.most_similar(others, np.arange(len(task.profiles)), _NUM_NEAREST_VIEWS)
+    pairs = np.concatenate([task.walls.most_similar(others, keyframes, _NUM_ANCHORS), near], axis=1)
     # Each pair once, with one scan that is turned for all its partners.
     ends = np.stack([pairs.reshape(-1), np.repeat(others, pairs.shape[1])], axis=-1)
     _, first = np.unique(np.sort(ends, axis=1), axis=0, return_index=True)
     source, target = ends[np.sort(first)].T
     return source, target, task.likely_turns(source, target, _NUM_LIKELY_TURNS)
-
-
-def _neighbour_pairs(task: _Task, headings: Floats) -> tuple[Indices, Indices, NDArray[np.bool_]]:
-    """The same of the keyframes before and after each other scan, whose heading lies about between theirs."""
-    keyframes, others, num_turns = task.keyframes, task.others, task.config.search.num_turns
-    after = np.clip(np.searchsorted(keyframes, others), 1, len(keyframes) - 1)
-    between = np.interp(others, keyframes, np.unwrap(headings))
-    source, target = np.concatenate([keyframes[after - 1], keyframes[after]]), np.concatenate([others, others])
-    expected = np.concatenate([headings[after - 1], headings[after]]) - np.concatenate([between, between])
-    turn = 2 * np.pi * np.arange(num_turns) / num_turns
-    return source, target, np.abs(se2.wrap_angle(turn - expected[:, None])) < _MAX_BEND
 
 
 def place_others(task: _Task, poses: Floats, found: Candidates, more: Candidates) -> tuple[Floats, Candidates]:
@@ -224,12 +216,11 @@ def place_others(task: _Task, poses: Floats, found: Candidates, more: Candidates
     Returns:
         (n, 3) poses, and `more` with the candidates of scans that had to be searched again.
     """
-    prior = _prior_between(poses, task) if task.is_ordered else None
 
     def place(poses: Floats, more: Candidates) -> Floats:
         candidates = join_candidates(found, more)
         share = noisy_share(task.profiles, candidates)
-        scorer = PoseScorer(task.profiles, chance_level(found), share, task.is_ordered, prior)
+        scorer = PoseScorer(task.profiles, chance_level(found), share, task.is_ordered)
         return place_in_map(poses, task.keyframes, Hypotheses.of(candidates), scorer)
 
     poses = place(poses, more)
@@ -239,23 +230,11 @@ def place_others(task: _Task, poses: Floats, found: Candidates, more: Candidates
         if not len(lost):
             break
         # Similarity has misled these, so all turns are tried, with the partners of the most similar views.
-        similarity = np.where(lost[:, None] == partners, -np.inf, task.walls.best_similarity(lost, partners))
-        order = np.argsort(-similarity, axis=1, kind="stable")[:, : len(task.keyframes)]
-        source, target = partners[order].reshape(-1), np.repeat(lost, order.shape[1])
-        is_pair = source != target
-        more = join_candidates(more, task.search(source[is_pair], target[is_pair]))
+        similar = task.walls.most_similar(lost, partners, len(task.keyframes))
+        source, target = similar.reshape(-1), np.repeat(lost, similar.shape[1])
+        more = join_candidates(more, task.search(source, target))
         poses = place(poses, more)
     return poses, more
-
-
-def _prior_between(poses: Floats, task: _Task) -> PositionPrior:
-    """Scans are between the keyframes before and after them, within the way from one to the other."""
-    keyframes, scans = task.keyframes, np.arange(len(poses))
-    centre = np.stack([np.interp(scans, keyframes, poses[keyframes, axis]) for axis in (0, 1)], axis=-1)
-    step = np.hypot(*np.diff(poses[keyframes, :2], axis=0).T)
-    gap = step[np.clip(np.searchsorted(keyframes, scans) - 1, 0, len(step) - 1)]
-    slack = AGREEMENT[0] * task.profiles.scans.typical_range
-    return PositionPrior(centre, np.where(np.isin(scans, keyframes), slack, gap + slack))
 
 
 def find_unregistered(profiles: RangeProfiles, poses: Floats, config: GlobalConfig) -> Indices:
@@ -279,8 +258,9 @@ def find_unregistered(profiles: RangeProfiles, poses: Floats, config: GlobalConf
     views = compare_pairs(profiles, scan, other, se2.relative(poses[other], poses[scan]))
     matched = np.where(scan == other, 0.0, views.matched)
     usual = float(np.median(matched.reshape(near.shape).max(axis=1)))
-    is_linked = np.zeros((num_scans, num_scans), bool)
-    is_linked[scan, other] = matched > _MIN_LINK * usual
+    links = (matched > _MIN_LINK * usual).astype(np.float64)
+    is_linked = scipy.sparse.csr_array((links, (scan, other)), shape=(num_scans, num_scans))
+    is_linked.eliminate_zeros()
     cluster = scipy.sparse.csgraph.connected_components(is_linked, directed=False)[1]
     is_small = np.bincount(cluster)[cluster] <= config.max_unregistered // 2
     matched = np.where(is_small[scan] & (cluster[scan] == cluster[other]), 0.0, matched)

@@ -78,6 +78,27 @@ def incremental_icp(
     return IncrementalResult(poses, steps)
 
 
+def scan_odometry(scans: PlanarScans) -> Floats:
+    """Chains coarse alignments of each scan with the one before, from no motion: about how far the robot has gone.
+
+    It tells which scans of a dense recording lie apart, where a robot has no odometry; steps that are long or open in
+    some direction are wrong.
+
+    Args:
+        scans: n scans in time order.
+
+    Returns:
+        (n, 3) T_world_scan, the first one zero.
+    """
+    return se2.chain(_match_near(scans.take(slice(1, None)), scans.take(slice(len(scans) - 1)), "plane").poses)
+
+
+def _match_near(source: PlanarScans, target: PlanarScans, metric: Metric) -> PairMatches:
+    """Coarse matches from no motion and small turns."""
+    fan = np.radians(_TURN_STEP) * np.outer([0.0, -0.5, 0.5], [0.0, 0.0, 1.0])
+    return match_pairs(source, target, np.broadcast_to(fan, (len(source), 3, 3)), COARSE, metric=metric)
+
+
 def _match_odometry(
     source: PlanarScans, target: PlanarScans, guess: Floats, metric: Metric
 ) -> tuple[PairMatches, PosePrior]:
@@ -90,9 +111,7 @@ def _match_odometry(
 
 def _search_steps(source: PlanarScans, target: PlanarScans, metric: Metric) -> tuple[PairMatches, PosePrior]:
     """Coarse matches from small motions, then from larger ones where the fitness is poor; and the prior of them all."""
-    unit = source.typical_range
-    fan = np.radians(_TURN_STEP) * np.outer([0.0, -0.5, 0.5], [0.0, 0.0, 1.0])
-    rough = match_pairs(source, target, np.broadcast_to(fan, (len(source), 3, 3)), COARSE, metric=metric)
+    unit, rough = source.typical_range, _match_near(source, target, metric)
     prior = _predict_open_steps(rough, unit)
     # Around the predicted translations, then far from zero.
     near, far = _fan(unit, (0.0, 0.15), 4), _fan(unit, (0.3, 0.525), 8, turn_share=0.5)

@@ -31,26 +31,14 @@ _CONTRADICTION_WEIGHT = 4.0
 _NEXT_WEIGHT = 4.0
 # Scans farther apart than this, in typical ranges, do not score each other, and of the others so many nearest ones do.
 _RADIUS, _NUM_SCORERS = 1.2, 32
-# Score of an impossible pose, below any real score.
-_IMPOSSIBLE = -1e6
+# Poses times placed scans that are compared at a time: 8 MB a table.
+_BLOCK = 1 << 20
 # Maps grown from so many different pairs; the best one is kept.
 _NUM_SEEDS = 6
 # Rounds in which scans may change their pose.
 _NUM_REVISIONS = 3
 # Weakest connections at which a block is cut off, and poses that are tried for a block.
 _NUM_CUTS, _NUM_BLOCK_POSES = 6, 48
-
-
-class PositionPrior(NamedTuple):
-    """Discs outside of which scans cannot be.
-
-    Attributes:
-        centre: (n, 2).
-        radius: (n,).
-    """
-
-    centre: Floats
-    radius: Floats
 
 
 class PoseScorer(NamedTuple):
@@ -61,14 +49,12 @@ class PoseScorer(NamedTuple):
         chance: beams that two scans of different places match by chance; they do not count.
         noisy_share: share of visible beams that seem to contradict where all is right; they do not count.
         is_ordered: neighbours in the array are neighbours in time.
-        prior: where scans can be; None: anywhere.
     """
 
     profiles: RangeProfiles
     chance: float
     noisy_share: float
     is_ordered: bool
-    prior: PositionPrior | None = None
 
     @property
     def radius(self) -> float:
@@ -77,10 +63,10 @@ class PoseScorer(NamedTuple):
 
     def score(self, scan: Indices, candidates: Floats, placed: Indices, poses: Floats) -> Floats:
         """(m,) score of each `scan` at its candidate pose (m, 3) against all of `placed`, which are at `poses`."""
-        total = add_up(self.pairwise_scores(scan, candidates, placed, poses))
-        if self.prior is not None:
-            off = candidates[:, :2] - self.prior.centre[scan]
-            total += np.where(np.hypot(off[:, 0], off[:, 1]) > self.prior.radius[scan], _IMPOSSIBLE, 0.0)
+        total, height = np.zeros(len(scan)), max(1, _BLOCK // max(len(placed), 1))
+        for start in range(0, len(scan), height):
+            part = slice(start, start + height)
+            total[part] = add_up(self.pairwise_scores(scan[part], candidates[part], placed, poses))
         return total
 
     def pairwise_scores(self, scan: Indices, candidates: Floats, placed: Indices, poses: Floats) -> Floats:
@@ -155,7 +141,7 @@ def assemble(profiles: RangeProfiles, candidates: Candidates, *, is_ordered: boo
     poses = maps[int(np.argmax(scores))] if maps else np.zeros((len(profiles), 3))
     poses, num_moved = move_blocks(poses, hypotheses, scorer)
     poses = settle(poses, hypotheses, scorer) if num_moved else poses
-    edges = agreeing_edges(poses, candidates, profiles.scans.typical_range)
+    edges = agreeing_edges(poses, candidates, profiles)
     poses = optimize_pose_graph(PoseGraph.create(poses, edges), ROBUST).graph.poses
     return np.asarray(se2.relative(poses[0], poses))
 

@@ -28,8 +28,11 @@ _SMALLEST = 32
 _REFINE_BATCH = 32
 # A pair agrees with a map within this: translation in typical ranges, radians.
 AGREEMENT = (0.06, 0.1)
-# Beams that a pair must hold by to be an edge; and the accuracy of a pair with all its beams: typical ranges, radians.
-_MIN_SCORE, _SIGMA = 40.0, (0.0045, 0.01)
+# Share of its beams that a pair must hold by to be an edge; and the accuracy of a pair with all its beams: typical
+# ranges, radians.
+_MIN_SHARE, _SIGMA = 0.08, (0.0045, 0.01)
+# Pairs that are searched at a time: their spectra and peaks take less than 300 MB.
+_SEARCH_BATCH = 1024
 # Matched beams that make up for a contradicting one.
 _CONTRADICTION_WEIGHT = 2.0
 
@@ -88,19 +91,21 @@ def join_candidates(*candidates: Candidates) -> Candidates:
     return Candidates(*(np.concatenate(parts) for parts in zip(*candidates, strict=True)))
 
 
-def agreeing_edges(poses: Floats, candidates: Candidates, typical_range: float) -> Edges:
+def agreeing_edges(poses: Floats, candidates: Candidates, profiles: RangeProfiles) -> Edges:
     """Edges of the pairs with a candidate that agrees with the map; of each pair the nearest one."""
+    typical_range, num_beams = profiles.scans.typical_range, np.asarray(profiles.scans.mask.sum(1), np.float64)
+    beams = num_beams[candidates.source] + num_beams[candidates.target]
+    shares = candidates.scores / np.maximum(beams, 1.0)[:, None]
     here = se2.relative(poses[candidates.target], poses[candidates.source])
     off = se2.relative(here[:, None], candidates.poses)
     distance = np.hypot(off[..., 0], off[..., 1]) / (AGREEMENT[0] * typical_range)
     turn = np.abs(se2.wrap_angle(off[..., 2])) / AGREEMENT[1]
-    mismatch = np.where(candidates.scores > _MIN_SCORE, np.maximum(distance, turn), np.inf)
+    mismatch = np.where(shares > _MIN_SHARE, np.maximum(distance, turn), np.inf)
     best = mismatch.argmin(axis=1)
     row = np.arange(len(best))
     keep = mismatch[row, best] < 1.0
     sigma = np.array(_SIGMA)[[0, 0, 1]] * [typical_range, typical_range, 1.0]
-    share = candidates.scores[row, best][keep] / 500.0
-    information = share[:, None, None] * np.diag(1.0 / sigma**2)
+    information = shares[row, best][keep][:, None, None] * np.diag(1.0 / sigma**2)
     return Edges(candidates.source[keep], candidates.target[keep], candidates.poses[row, best][keep], information)
 
 
@@ -215,12 +220,29 @@ def search_pairs(
     Returns:
         Candidates.
     """
-    config = config or CorrelativeConfig()
-    unit = profiles.scans.typical_range
+    config, found = config or CorrelativeConfig(), []
+    # Pairs with one source lie side by side, so that few scans are turned for a batch.
+    order = np.lexsort((target, source))
+    for start in range(0, max(len(order), 1), _SEARCH_BATCH):
+        rows = order[start : start + _SEARCH_BATCH]
+        tried = None if turns is None else turns[rows]
+        found.append(_search_batch(profiles, (source[rows], target[rows]), config, tried))
+    joined, back = join_candidates(*found), np.argsort(order)
+    return Candidates(joined.source[back], joined.target[back], joined.poses[back], joined.scores[back])
+
+
+def _search_batch(
+    profiles: RangeProfiles, pairs: tuple[Indices, Indices], config: CorrelativeConfig, turns: NDArray[np.bool_] | None
+) -> Candidates:
+    """Candidates of some pairs."""
+    unit, (source, target) = profiles.scans.typical_range, pairs
     cell = config.cell * unit
-    used, compact = np.unique(source, return_inverse=True)
-    sources, cell_side = profiles.take(used), jnp.asarray(cell, jnp.float32)
-    still = _spectra(profiles, jnp.zeros(()), cell_side, config=config)
+    (sources, compact_source), (targets, compact_target) = (
+        _used_profiles(profiles, source),
+        _used_profiles(profiles, target),
+    )
+    cell_side = jnp.asarray(cell, jnp.float32)
+    still = _spectra(targets, jnp.zeros(()), cell_side, config=config)
     poses = np.zeros((len(source), config.num_turns, config.num_peaks, 3))
     scores = np.full(poses.shape[:-1], -np.inf)
     for number in range(config.num_turns):
@@ -230,13 +252,19 @@ def search_pairs(
         turn = 2 * np.pi * number / config.num_turns
         turned = _spectra(sources, jnp.asarray(turn, jnp.float32), cell_side, config=config)
         filled = np.resize(rows, max(_SMALLEST, 1 << (len(rows) - 1).bit_length()))
-        score, shift = _search_turn(turned, still, (compact[filled], target[filled]), config=config)
+        score, shift = _search_turn(turned, still, (compact_source[filled], compact_target[filled]), config=config)
         scores[rows, number] = score[: len(rows)]
         poses[rows, number, :, :2] = cell * np.asarray(shift, np.float64)[: len(rows)]
         poses[rows, number, :, 2] = se2.wrap_angle(turn)
     found = Candidates(source, target, poses.reshape(len(source), -1, 3), scores.reshape(len(source), -1))
     # After the refinement two may have met at one pose.
     return _keep_apart(_refine(profiles, _keep_apart(found, config, unit), config), config, unit)
+
+
+def _used_profiles(profiles: RangeProfiles, rows: Indices) -> tuple[RangeProfiles, Indices]:
+    """The profiles of these rows, each once, filled up to a power of two; and where each row is among them."""
+    used, compact = np.unique(rows, return_inverse=True)
+    return profiles.take(np.resize(used, 1 << max(len(used) - 1, 0).bit_length())), compact
 
 
 def _keep_apart(found: Candidates, config: CorrelativeConfig, typical_range: float) -> Candidates:

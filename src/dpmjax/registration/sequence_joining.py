@@ -21,8 +21,9 @@ from dpmjax.registration.step_scores import MotionPrior, pair_scores, weak_steps
 from dpmjax.registration.submaps import along_way, submap_scans
 from dpmjax.registration.wall_directions import WallDirections
 
-# The largest turn of a step between two submaps, and candidates of each.
-_MAX_TURN, _NUM_CANDIDATES = 2.2, 24
+# The submaps on either side of a weak step reach so far along the way, typical ranges: what both see may be the end of
+# a corridor. The largest turn of such a step, its longest shift, cells of the images and candidates of each.
+_SIDE_LENGTH, _MAX_TURN, _MAX_SHIFT, _NUM_CELLS, _NUM_CANDIDATES = 2.0, 2.2, 1.6, 256, 24
 # Weight of the motion prior beside the agreement of two submaps, and beside the votes of loops.
 _PRIOR_WEIGHT, _LOOP_PRIOR_WEIGHT = 0.1, 0.3
 # Submaps lie a typical range apart, or farther if they were more than this.
@@ -102,13 +103,13 @@ def _search_across(sequence: _Sequence, steps: Indices, config: CorrelativeConfi
     sides = []
     for number, step in enumerate(steps):
         head, tail = rows[ends[number] + 1 : step + 1], rows[step + 1 : ends[number + 2] + 1]
-        sides += [along_way(poses, head[::-1], unit), along_way(poses, tail, unit)]
+        sides += [along_way(poses, side, _SIDE_LENGTH * unit) for side in (head[::-1], tail)]
     centres = np.array([side[0] for side in sides])
     profiles, target = (
         make_profiles(submap_scans(sequence.profiles.scans, poses, centres, sides)),
         2 * np.arange(len(steps)),
     )
-    config = replace(config, num_candidates=_NUM_CANDIDATES)
+    config = replace(config, num_cells=_NUM_CELLS, max_shift=_MAX_SHIFT, num_candidates=_NUM_CANDIDATES)
     turns = np.abs(se2.wrap_angle(2 * np.pi * np.arange(config.num_turns) / config.num_turns)) < _MAX_TURN
     found = search_pairs(profiles, target + 1, target, config, turns=np.broadcast_to(turns, (len(target), len(turns))))
     for number, step in enumerate(steps):

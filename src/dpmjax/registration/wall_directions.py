@@ -65,6 +65,25 @@ class WallDirections:
             best[start : start + height] = self.similarity(first, second).max(-1).reshape(len(block), -1)
         return best
 
+    def most_similar(self, rows: Indices, others: Indices, count: int) -> Indices:
+        """Finds the most similar scans of each scan, by blocks: memory grows with the rows, not with all pairs.
+
+        Args:
+            rows: (r,) rows.
+            others: (o,) rows; a scan is not compared with itself.
+            count: of partners at most.
+
+        Returns:
+            (r, k) rows of `others`, the most similar first; k is `count`, or one less than all where they are fewer.
+        """
+        num_kept = min(count, len(others) - int(np.isin(rows, others).any()))
+        chosen, height = np.empty((len(rows), num_kept), np.int64), max(1, _BLOCK // max(len(others), 1))
+        for start in range(0, len(rows), height):
+            block = rows[start : start + height]
+            similarity = np.where(block[:, None] == others, -np.inf, self.best_similarity(block, others))
+            chosen[start : start + height] = others[np.argsort(-similarity, axis=1, kind="stable")[:, :num_kept]]
+        return chosen
+
     def likely_turns(self, source: Indices, target: Indices, num_turns: int, num_peaks: int) -> Bool[np.ndarray, "p t"]:
         """Chooses the headings at which a pair is worth searching.
 
