@@ -224,7 +224,7 @@ def _best_start(task: Task) -> tuple[str, Floats]:
     if task.is_ordered:
         starts.append(assessed(START_NAMES["icp-plane"], refined(task, incremental(task), is_ordered=True)))
     if not starts or not starts[0][0]["is_trusted"]:
-        starts.append(assessed(START_NAMES["global"], refined(task, search(task), is_ordered=False)))
+        starts.append(assessed(START_NAMES["global"], refined(task, search(task), is_ordered=task.is_ordered)))
     # Between two different maps the sharper one may be wrong, so `choose` does not decide here.
     return max(starts, key=lambda start: start[0]["weakest_connection"])[1:]
 
@@ -253,7 +253,7 @@ METHODS: dict[str, Method] = {
     "lnet-icp": Method("L-Net and M-Net from incremental ICP", _lnet_from_icp),
     "search": Method(START_NAMES["global"], search),
     "search-refined": Method(
-        "global registration, refined", lambda task: refined(task, search(task), is_ordered=False)
+        "global registration, refined", lambda task: refined(task, search(task), is_ordered=task.is_ordered)
     ),
     "direct-adam": Method("direct optimisation from zero, Adam", partial(_direct, has_windows=False)),
     "direct-windows": Method("direct optimisation from zero in windows, Adam", partial(_direct, has_windows=True)),

@@ -22,7 +22,8 @@ from dpmjax.pose_graph.graph import Edges
 from dpmjax.registration.planar_scans import Floats, Indices, Tolerances, batches
 from dpmjax.registration.range_profiles import RangeProfiles, compare_pair, compare_pairs
 
-# Pairs of one turn are filled up to a power of two, at least this, so that few shapes are compiled.
+# Pairs of one turn are filled up to a power of two, at least this, so that few shapes are compiled; more scans than
+# this to a multiple of it.
 # Small, as the last batch is filled up; larger ones are no quicker, for `lax.map` goes through them piece by piece.
 _SMALLEST = 32
 _REFINE_BATCH = 32
@@ -31,8 +32,8 @@ AGREEMENT = (0.06, 0.1)
 # Share of its beams that a pair must hold by to be an edge; and the accuracy of a pair with all its beams: typical
 # ranges, radians.
 _MIN_SHARE, _SIGMA = 0.08, (0.0045, 0.01)
-# Pairs that are searched at a time: their spectra and peaks take less than 300 MB.
-_SEARCH_BATCH = 1024
+# Pairs that are searched at a time: their spectra and images take at most 250 MB at 128 cells.
+_SEARCH_BATCH = 512
 # Matched beams that make up for a contradicting one.
 _CONTRADICTION_WEIGHT = 2.0
 
@@ -263,9 +264,12 @@ def _search_batch(
 
 
 def _used_profiles(profiles: RangeProfiles, rows: Indices) -> tuple[RangeProfiles, Indices]:
-    """The profiles of these rows, each once, filled up to a power of two; and where each row is among them."""
+    """The profiles of these rows, each once, filled up so that few shapes compile; and where each row is among them."""
     used, compact = np.unique(rows, return_inverse=True)
-    return profiles.take(np.resize(used, 1 << max(len(used) - 1, 0).bit_length())), compact
+    filled = (
+        1 << max(len(used) - 1, 0).bit_length() if len(used) < _SMALLEST else _SMALLEST * -(-len(used) // _SMALLEST)
+    )
+    return profiles.take(np.resize(used, filled)), compact
 
 
 def _keep_apart(found: Candidates, config: CorrelativeConfig, typical_range: float) -> Candidates:
