@@ -88,7 +88,7 @@ def incremental(task: Task, metric: Literal["point", "plane"] = "plane") -> Floa
 
 
 def search(task: Task) -> Floats:
-    """Returns poses by global registration: an exhaustive search of scan pairs, without a first guess."""
+    """Returns poses by global registration, from nothing but the scans: no odometry, no first guess, no refinement."""
     return registration.register_globally(task.planar).poses
 
 
@@ -202,7 +202,7 @@ def _swarm(task: Task) -> Floats:
 
 
 def _global_deepmapping(task: Task) -> Candidates:
-    """Returns global registration and DeepMapping from it: no ICP, no refinement."""
+    """Returns global registration and DeepMapping from it: no refinement."""
     start = search(task)
     return {START_NAMES["global"]: start, DEEPMAPPING: _fit(task, start)}
 
