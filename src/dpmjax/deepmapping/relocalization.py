@@ -1,8 +1,12 @@
-"""Re-localisation: L-Net estimates the poses of scans that it was not fitted to (DeepMapping figure 7)."""
+"""Re-localisation of scans that a fit has not seen: L-Net proposes poses, M-Net chooses (DeepMapping figure 7).
+
+L-Net knows the headings of the walk only. So each scan is turned all round, L-Net proposes a pose for every turn, and
+the one stays around which the map of M-Net explains the scan best. What the map explains badly was never seen.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -15,6 +19,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from dpmjax.checks import require_count
 from dpmjax.deepmapping.config import DeepMappingConfig
+from dpmjax.deepmapping.map_raster import make_raster, render_scans
+from dpmjax.deepmapping.map_search import MapSearchConfig, map_fields, search_map
 from dpmjax.deepmapping.planar import Fitted, as_scan_set, choose_beams, localize_scans
 from dpmjax.geometry import se2
 from dpmjax.types import ScanSet
@@ -28,14 +34,40 @@ class Relocalized(NamedTuple):
 
     Attributes:
         pose: (3,) or (m, 3) x, y, heading in (-pi, pi], unit of the points.
+        nats: () or (m,) what a beam costs by the map at this pose: 0 where M-Net explains it fully, log 4 where it
+            knows nothing.
+        is_known: () or (m,) False where the map does not explain the scan: its view was never seen, or the pose is
+            wrong.
     """
 
     pose: NDArray[np.float64]
+    nats: NDArray[np.float64]
+    is_known: NDArray[np.bool_]
 
     @property
     def T_world_scan(self) -> NDArray[np.float64]:
         """(3, 3), or (m, 3, 3) for m scans: the poses as matrices."""
         return se2.to_matrix(self.pose)
+
+
+@dataclass(frozen=True)
+class RelocalizationConfig:
+    """Settings of `relocalize`.
+
+    Attributes:
+        num_turns: headings at which L-Net sees each scan, evenly all round.
+        max_nats: a scan whose beams cost more is not known.
+        search: settings of the search around L-Net's proposals.
+    """
+
+    num_turns: int = 24
+    max_nats: float = 0.7
+    search: MapSearchConfig = field(default_factory=MapSearchConfig)
+
+    def __post_init__(self) -> None:
+        require_count("num_turns", self.num_turns)
+        if not self.max_nats > 0.0:
+            raise ValueError(f"max_nats: expected a positive number, got {self.max_nats}")
 
 
 @dataclass(frozen=True)
@@ -46,8 +78,10 @@ class LocalizationTrainingConfig:
         num_steps: steps of Adam.
         learning_rate: at the start; it falls to a hundredth (cosine).
         scans_per_step: drawn with replacement.
-        max_turn_deg: scans are turned by a random angle up to this, heading with them, so that L-Net depends less on
-            the orientations that the sensor happened to have.
+        num_rendered: scans that are rendered from the map at random free places; they make up half of each step, so
+            that L-Net knows the places that the trajectory has seen but not passed.
+        max_turn_deg: scans are turned to random headings up to this: `relocalize` tries all turns, and L-Net needs to
+            know but one of them.
         max_shift: scans are re-projected to points around their own (`shift_scan`), up to this distance in typical
             ranges, so that L-Net learns the surroundings of the trajectory.
         drop: largest share of the beams that is hidden from L-Net; the share differs from scan to scan.
@@ -56,6 +90,7 @@ class LocalizationTrainingConfig:
     num_steps: int = 5000
     learning_rate: float = 2e-3
     scans_per_step: int = 64
+    num_rendered: int = 4096
     max_turn_deg: float = 20.0
     max_shift: float = 0.2
     drop: float = 0.2
@@ -63,31 +98,36 @@ class LocalizationTrainingConfig:
     def __post_init__(self) -> None:
         require_count("num_steps", self.num_steps)
         require_count("scans_per_step", self.scans_per_step)
+        if self.num_rendered < 0:
+            raise ValueError(f"num_rendered: expected zero or more, got {self.num_rendered}")
         if not self.max_shift >= 0.0:
             raise ValueError(f"max_shift: expected zero or more, got {self.max_shift}")
         if not 0.0 <= self.drop < 1.0:
             raise ValueError(f"drop: expected 0 to below 1, got {self.drop}")
 
 
-def relocalize(fitted: Fitted, scan: ScanSet | ArrayLike) -> Relocalized:
-    """Estimates poses of new scans by one forward pass of L-Net (DeepMapping section 4.1, figure 7).
+def relocalize(fitted: Fitted, scan: ScanSet | ArrayLike, config: RelocalizationConfig | None = None) -> Relocalized:
+    """Estimates poses of new scans, and tells which of them the fit does not know (DeepMapping section 4.1, figure 7).
 
-    The estimate is coarse: right near the trajectory of the fit and at similar orientations, wrong elsewhere, without
-    a sign of which. After the free poses of the fast preset L-Net lags behind the poses; `train_localization` brings
-    it back to them.
+    Nothing is assumed about the heading. L-Net proposes a pose for each of several turns of the scan; a search around
+    the proposals takes the pose at which M-Net explains the scan best. After the free poses of the fast preset L-Net
+    lags behind the poses; `train_localization` brings it back to them.
 
     Args:
-        fitted: result of `fit_deepmapping` from zero poses with one L-Net for all scans, or of `train_localization`.
+        fitted: result of `fit_deepmapping` from zero poses with one L-Net for all scans, or of `train_localization`;
+            M-Net must have been trained, as all presets do, or no scan is known.
         scan: (b, 2) one scan, or (m, b, 2), in the sensor frame, unit and order of the beams as in the fit; beams with
             coordinates that are not finite, or both zero, measured nothing.
+        config: settings.
 
     Returns:
-        Relocalized, in the world of `fitted.poses`.
+        Relocalized, in the world of the fit's own poses.
 
     Raises:
         ValueError: the shape is another one, a scan has no valid beam, each window of the fit has an L-Net of its own,
             or L-Net's outputs are corrections of given start poses.
     """
+    config = config or RelocalizationConfig()
     if has_windows(fitted):
         raise ValueError("fitted: each of its L-Nets knows one window of the walk; call train_localization first")
     if np.any(np.asarray(fitted.params.start) != 0.0):
@@ -96,14 +136,43 @@ def relocalize(fitted: Fitted, scan: ScanSet | ArrayLike) -> Relocalized:
         )
     is_one = not isinstance(scan, ScanSet) and np.ndim(scan) == 2
     scans = as_scan_set(np.asarray(scan)[None] if is_one else scan, min_scans=1)
-    beams = choose_beams(scans.mask.shape[1], fitted.config.cold_phases[0])
-    points, mask = scans.points[:, beams] / fitted.unit, scans.mask[:, beams]
-    chunks = [slice(k, k + _CHUNK) for k in range(0, len(points), _CHUNK)]
-    parts = [_localize(fitted.params.localization, points[c], mask[c], config=fitted.config) for c in chunks]
-    poses = np.concatenate([np.asarray(part, np.float64) for part in parts])
+    fields = map_fields(make_raster(fitted.params, fitted.config), config=config.search)
+    parts = []
+    for k in range(0, len(scans.points), _CHUNK):
+        part = ScanSet(scans.points[k : k + _CHUNK] / fitted.unit, scans.mask[k : k + _CHUNK])
+        turned = partial(propose_poses, fitted.params.localization, part, num_turns=config.num_turns)
+        parts.append(search_map(part, turned(fit_config=fitted.config), fields, config=config.search))
+    poses, nats = (np.concatenate([np.asarray(x, np.float64) for x in each]) for each in zip(*parts, strict=True))
     poses[:, :2] *= fitted.unit
     poses[:, 2] = se2.wrap_angle(poses[:, 2])
-    return Relocalized(poses[0] if is_one else poses)
+    found = Relocalized(poses, nats, nats <= config.max_nats)
+    return Relocalized(*(x[0] for x in found)) if is_one else found
+
+
+@partial(jax.jit, static_argnames=("num_turns", "fit_config"))
+def propose_poses(
+    params: Any, scans: ScanSet, *, num_turns: int, fit_config: DeepMappingConfig
+) -> Float[Array, "m t 3"]:
+    """L-Net's poses of scans, one for each turn of the scan.
+
+    Args:
+        params: weights of L-Net.
+        scans: (m, b, 2) in typical ranges.
+        num_turns: evenly all round; the first is none.
+        fit_config: settings of the fit.
+
+    Returns:
+        x, y, heading of the scans as they are, in typical ranges and radians.
+    """
+    beams = choose_beams(scans.mask.shape[1], fit_config.cold_phases[0])
+    mask, turns = scans.mask[:, beams], 2.0 * jnp.pi * jnp.arange(num_turns) / num_turns
+
+    def propose(turn: Float[Array, ""]) -> Float[Array, "m 3"]:
+        points = jax.vmap(turn_scan, in_axes=(0, None))(scans.points[:, beams], turn)
+        found = localize_scans(params, points, mask, fit_config)
+        return found - turn * jnp.array([0.0, 0.0, 1.0])
+
+    return jnp.swapaxes(jax.lax.map(propose, turns), 0, 1)
 
 
 def has_windows(fitted: Fitted) -> bool:
@@ -124,7 +193,8 @@ def train_localization(
 ) -> Fitted:
     """Trains L-Net on the poses that the fit has found, so that `relocalize` answers in the same world.
 
-    The labels are the fit's own: no ground truth enters. Scans are turned, shifted and partly hidden.
+    The labels are the fit's own: no ground truth enters. Scans are turned, shifted and partly hidden, and others are
+    rendered from the map of M-Net at places where none was taken.
 
     Args:
         fitted: any fit, also from given poses.
@@ -143,11 +213,16 @@ def train_localization(
     if len(scans.points) != len(fitted.poses):
         raise ValueError(f"scans: expected the {len(fitted.poses)} scans of the fit, got {len(scans.points)}")
     poses = jnp.asarray(fitted.poses / [fitted.unit, fitted.unit, 1.0], jnp.float32)
-    scaled = replace(scans, points=scans.points / fitted.unit)
+    measured = replace(scans, points=scans.points / fitted.unit)
+    render_key, train_key = jax.random.split(key)
+    raster = make_raster(fitted.params, fitted.config)
+    rendered = render_scans(raster, measured, config.num_rendered, key=render_key)
     begin = fitted.params.localization
     if has_windows(fitted):
         begin = jax.tree.map(lambda weights: weights[0], begin)
-    net = _train(begin, scaled, poses, key, fit_config=fitted.config, config=config)
+    sources = ((measured, poses), rendered) if len(rendered[1]) else ((measured, poses),)
+    share = replace(config, scans_per_step=max(1, config.scans_per_step // len(sources)))
+    net = _train(begin, sources, train_key, fit_config=fitted.config, config=share)
     params = replace(fitted.params, localization=net, start=jnp.zeros_like(fitted.params.start))
     return fitted._replace(params=params)
 
@@ -155,8 +230,7 @@ def train_localization(
 @partial(jax.jit, static_argnames=("fit_config", "config"))
 def _train(
     params: Any,
-    scans: ScanSet,
-    poses: Float[Array, "n 3"],
+    sources: tuple[tuple[ScanSet, Float[Array, "n 3"]], ...],
     key: jax.Array,
     *,
     fit_config: DeepMappingConfig,
@@ -165,7 +239,11 @@ def _train(
     optimizer = optax.adam(optax.cosine_decay_schedule(config.learning_rate, config.num_steps, 0.01))
 
     def loss_of(params: Any, step_key: jax.Array) -> Array:
-        batch, labels = _draw_training_batch(scans, poses, fit_config, config, key=step_key)
+        parts = [
+            _draw_training_batch(*source, fit_config, config, key=jax.random.fold_in(step_key, index))
+            for index, source in enumerate(sources)
+        ]
+        batch, labels = jax.tree.map(lambda *x: jnp.concatenate(x), *parts)
         error = localize_scans(params, batch.points, batch.mask, fit_config) - labels
         return jnp.mean(jnp.sum(jnp.abs(error[:, :2]), -1) + jnp.abs(se2.wrap_angle(error[:, 2])))
 
@@ -193,7 +271,7 @@ def _draw_training_batch(
     beams = choose_beams(num_beams, fit_config.cold_phases[0], jax.random.randint(first_key, (), 0, num_beams))
     points, mask = scans.points[rows][:, beams], scans.mask[rows][:, beams]
     limit = np.deg2rad(config.max_turn_deg)
-    turn = jax.random.uniform(turn_key, rows.shape, minval=-limit, maxval=limit)
+    turn = jax.random.uniform(turn_key, rows.shape, minval=-limit, maxval=limit) - poses[rows, 2]
     shift = _draw_shifts(shift_key, len(rows), config.max_shift)
     points = jax.vmap(shift_scan)(points, mask, shift)
     moved = jax.vmap(turn_scan)(shift[:, None], -poses[rows, 2])[:, 0]
@@ -252,6 +330,3 @@ def shift_scan(points: Float[Array, "b 2"], mask: Bool[Array, " b"], shift: Floa
     ranges = 1.0 / jnp.interp(target, known, jnp.where(known < 4.0, inverse[order], inverse[order][last]))
     seen = ranges[:, None] * jnp.stack([jnp.cos(target), jnp.sin(target)], -1)
     return jnp.where(mask[:, None], jnp.where((shift == 0).all(), points, seen), points)
-
-
-_localize = jax.jit(localize_scans, static_argnames="config")

@@ -181,7 +181,13 @@ def _compare(
 
 
 def compare_pairs(
-    profiles: RangeProfiles, source: Indices, target: Indices, poses: Floats, *, stride: int = 2
+    profiles: RangeProfiles,
+    source: Indices,
+    target: Indices,
+    poses: Floats,
+    *,
+    stride: int = 2,
+    match_tolerance: float | None = None,
 ) -> ViewComparison:
     """Compares p pairs of scans at given relative poses, at the tolerances of the scans.
 
@@ -191,11 +197,14 @@ def compare_pairs(
         target: (p,) rows.
         poses: (p, 3) T_target_source.
         stride: every `stride`-th beam is compared.
+        match_tolerance: of a hit about its surface, instead of that of the scans.
 
     Returns:
         ViewComparison with float64 arrays (p,) on the host.
     """
     tolerances, result = profiles.scans.tolerances, np.zeros((3, len(source)))
+    if match_tolerance is not None:
+        tolerances = tolerances._replace(match=match_tolerance)
     for part, rows in batches(len(source), _BATCH):
         pairs = source[rows], target[rows], poses[rows].astype(np.float32)
         found = _compare(profiles, pairs, tolerances, stride=stride)
