@@ -28,7 +28,7 @@ from tests.tolerances import ROUNDING
 KEY = jax.random.key(0)
 
 
-CELLS = 256
+CELLS = 512
 
 
 @pytest.fixture(scope="module")
@@ -47,7 +47,7 @@ def fitted(tiny_walk) -> dm.Fitted:
 
 def with_true_map(params, walk, unit: float):
     """Log odds of 4 or -4 at the nodes within reach of the walk, 0 elsewhere."""
-    half = 1.3
+    half = 2.2
     centre = walk.reference_poses[:, :2].mean(axis=0) / unit
     axis = np.linspace(-half, half, CELLS + 1)
     nodes = unit * (centre + np.stack(np.meshgrid(axis, axis, indexing="ij"), axis=-1))

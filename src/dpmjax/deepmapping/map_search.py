@@ -55,9 +55,7 @@ class MapSearchConfig:
 
 
 class MapFields(NamedTuple):
-    """What hits and free samples cost at the nodes of a raster over the frame of the map.
-
-    One raster a level of the search, and one that is blurred by a node, for the score of what was found.
+    """What hits and free samples cost at the nodes of a raster over the frame of the map, one raster a level.
 
     Attributes:
         hit: nats of a hit.
@@ -94,8 +92,8 @@ def map_fields(raster: MapRaster, *, config: MapSearchConfig) -> MapFields:
     Returns:
         MapFields.
     """
-    radii = 0.5 * config.first_step * 0.5 ** np.arange(config.num_levels) / raster.spacing
-    radii = jnp.append(radii, 1.0)
+    # A hit on a surface lies between a free and an occupied node, so one node is the least.
+    radii = jnp.maximum(0.5 * config.first_step * 0.5 ** np.arange(config.num_levels) / raster.spacing, 1.0)
     highest = jnp.stack([largest_nearby(raster.logits, radius) for radius in radii])
     lowest = -jnp.stack([largest_nearby(-raster.logits, radius) for radius in radii])
     hit, free = jax.nn.softplus(-highest), jax.nn.softplus(lowest)

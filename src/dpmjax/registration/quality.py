@@ -33,6 +33,8 @@ _GRID_TURNS = (0.2, 0.5, 0.9, 1.3)
 _CELL = 0.015
 # Least tolerance of that agreement, in typical ranges; with range noise it is the noise.
 _LEAST_TOLERANCE = 0.001
+# Bearings of the profiles that it is measured by: exact to less than that tolerance.
+_NUM_BEARINGS = 4096
 # Calibrated on right and wrong maps of simulated worlds and of thinned logs (docs/deepmapping_notes.md).
 # Each scan is compared with so many nearest ones, by position and by position and heading (a radian as so many typical
 # ranges). Scans whose best score is lower than the second number belong to no map; at most a share of them may.
@@ -147,9 +149,8 @@ def view_misfit(scans: PlanarScans, poses: Floats) -> float:
     """
     tolerance = max(scans.noise, _LEAST_TOLERANCE * scans.typical_range)
     source, target = _near_pairs(poses, scans.typical_range)
-    views = compare_pairs(
-        make_profiles(scans), source, target, se2.relative(poses[target], poses[source]), match_tolerance=tolerance
-    )
+    profiles, relative = make_profiles(scans, _NUM_BEARINGS), se2.relative(poses[target], poses[source])
+    views = compare_pairs(profiles, source, target, relative, match_tolerance=tolerance)
     return 1.0 - float(np.sum(views.matched) / max(float(np.sum(views.visible)), 1.0))
 
 
