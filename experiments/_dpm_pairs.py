@@ -11,6 +11,7 @@ import numpy as np
 
 from dpmjax.deeppointmap import Model, encode
 from dpmjax.deeppointmap.confidence import Evidence, gather_evidence
+from dpmjax.deeppointmap.evaluation import draw_rows_apart
 from dpmjax.deeppointmap.scan_registration import distinct_motions, match_clouds
 from dpmjax.deeppointmap.verification import choose_motion, measure_scan, refine_motion
 from dpmjax.geometry import rigid, se2
@@ -54,10 +55,8 @@ def draw_pairs(drive: LidarSequence, band: str, num_pairs: int, seed: int) -> np
     assert drive.T_world_lidar is not None
     positions = drive.T_world_lidar[:, :3, 3]
     distances = np.linalg.norm(positions[:, None] - positions[None], axis=2)
-    low, high = BANDS[band]
-    pairs = np.argwhere((distances >= low) & (distances <= high))
     rng = np.random.default_rng([PAIR_STREAM, list(BANDS).index(band), seed])
-    return pairs[rng.choice(len(pairs), min(num_pairs, len(pairs)), replace=False)] if len(pairs) else pairs
+    return draw_rows_apart(distances, *BANDS[band], num_pairs, rng)
 
 
 def read_pairs(drive: LidarSequence, pairs: np.ndarray, seed: int) -> Iterator[ScanPair]:

@@ -19,7 +19,7 @@ from experiments import _slam_evaluation as evaluation
 from experiments._result_files import do_row
 from experiments._run_folder import RunFolder
 from experiments._slam_evaluation import ODOMETRY, OURS, PRECISIONS, Drive, StoppedError
-from experiments._slam_input import read_points, require_whole_files
+from experiments._slam_input import corrected, read_points, require_whole_files
 from experiments._slam_localization import evaluate_localization
 from experiments._slam_peers import PEERS, why_missing
 
@@ -58,7 +58,8 @@ def open_drives(config: Config, first_town: int) -> list[LidarSequence]:
             drives += [town_drive(first_town + number, number, length) for number, length in enumerate(lengths)]
         else:
             names: Sequence[str | None] = io.list_lidar_sequences(entry) or [None]
-            drives += [io.open_lidar_sequence(entry, sequence=name) for name in names]
+            opened = (io.open_lidar_sequence(entry, sequence=name) for name in names)
+            drives += [corrected(drive, config.kitti_angle_correction) for drive in opened]
     drives = [drive.take(np.arange(len(drive))[:: config.jump][: config.n_scans]) for drive in drives]
     for drive in drives:
         require_whole_files(drive)

@@ -29,12 +29,23 @@ def open_drive(config: Config) -> LidarSequence:
     if config.data is None:
         drive = simulated_drive(config.seed)
     else:
-        drive = io.open_lidar_sequence(config.data, sequence=config.sequence)
+        drive = corrected(io.open_lidar_sequence(config.data, sequence=config.sequence), config.kitti_angle_correction)
     numbers = np.arange(len(drive))[:: config.jump][: config.n_scans]
     part = drive.take(numbers)
     require_whole_files(part)
     read_points(part, 0)
     return part
+
+
+def corrected(sequence: LidarSequence, is_kitti: bool) -> LidarSequence:
+    """The sequence as it is, or with the beams of KITTI's lidar raised to where they point."""
+    from dpmjax.scans import raise_beams
+    from dpmjax.scans.elevation import KITTI_ELEVATION_DEG
+
+    def read_scan(index: int) -> np.ndarray:
+        return raise_beams(sequence.read_scan(index), KITTI_ELEVATION_DEG)
+
+    return replace(sequence, read_scan=read_scan) if is_kitti else sequence
 
 
 def simulated_drive(seed: int) -> LidarSequence:
@@ -86,9 +97,10 @@ class ScanReader:
         from dpmjax.slam import TimedScan
 
         points = read_points(self._sequence, index)
-        if not self._is_deskewed:
+        if not self._is_deskewed or not len(points):
             return points
-        return TimedScan(points, offsets_by_azimuth(points, self._turn_share(index)))
+        offsets = self._offsets_by_times(index)
+        return TimedScan(points, offsets_by_azimuth(points, self._turn_share(index)) if offsets is None else offsets)
 
     def iterate(self, start: int) -> Iterator[AnyScan]:
         """Reads scan after scan, the next one while the caller works on this one."""
@@ -100,13 +112,29 @@ class ScanReader:
                 assert done is not None
                 yield done.result()
 
+    def _offsets_by_times(self, index: int) -> np.ndarray | None:
+        """What the file says of its points, if anything that can be used."""
+        from dpmjax.scans import offsets_by_times
+
+        times = None if self._sequence.read_times is None else self._sequence.read_times(index)
+        if times is None:
+            return None
+        interval_s = self._interval_s(index)
+        offsets = offsets_by_times(times, interval_s)
+        return offsets if offsets is None or interval_s is not None else offsets / self._jump
+
     def _turn_share(self, index: int) -> float:
-        """Time of a turn, as a share of the time between the two scans before, whose motion predicts this one."""
+        """Time of a turn, as a share of the time between the two scans before."""
+        interval_s = self._interval_s(index)
+        return 1.0 / self._jump if interval_s is None else min(TURN_S / interval_s, 1.0)
+
+    def _interval_s(self, index: int) -> float | None:
+        """Time between the two scans before, whose motion predicts this one; None where it is not known."""
         times = self._sequence.times
         if times is None or index < 2:
-            return 1.0 / self._jump
+            return None
         interval_s = float(times[index - 1] - times[index - 2])
-        return min(TURN_S / interval_s, 1.0) if interval_s > 0 else 1.0 / self._jump
+        return interval_s if interval_s > 0 else None
 
 
 def reference_of(sequence: LidarSequence) -> LidarSequence:

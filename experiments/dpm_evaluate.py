@@ -68,6 +68,8 @@ class Config(RunOptions):
     """With --slam: the first N scans of each drive."""
     jump: Annotated[int, arg(aliases=["-j"], metavar="N")] = 1
     """With --slam: every Nth scan."""
+    kitti_angle_correction: FlagCreatePairsOff[bool] = False
+    """With --slam: raise the beams of all drives by 0.205 degrees, as KITTI's HDL-64E needs, for all methods."""
     localize: Annotated[int, arg(metavar="N")] = 50
     """With --slam: number of scans that are looked for in the map of the first half; 0 leaves it out."""
 
@@ -78,8 +80,8 @@ class Config(RunOptions):
             raise ValueError("give at least one folder of scans, or town")
         if not 1 <= len(self.town_length_m) <= (2 if self.slam else 1):
             raise ValueError("--town-length-m: expected one length, or two with --slam")
-        if not self.slam and (self.n_scans is not None or self.jump != 1):
-            raise ValueError("--n-scans, --jump: only with --slam; pairs are drawn from the whole drive")
+        if not self.slam and (self.n_scans is not None or self.jump != 1 or self.kitti_angle_correction):
+            raise ValueError("--n-scans, --jump, --kitti-angle-correction: only with --slam")
 
     @property
     def town_length_range(self) -> tuple[float, float]:

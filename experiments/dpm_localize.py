@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import numpy as np
 from tqdm import tqdm
-from tyro.conf import Positional, arg
+from tyro.conf import FlagCreatePairsOff, Positional, arg
 
 from experiments._command import StopFlag, check_least, run_command
 from experiments._result_files import HistoryFile, read_history
@@ -52,6 +52,8 @@ class Config(RunOptions):
     """Which drive of a folder that holds several."""
     weights: Annotated[str, arg(metavar="NAME|FILE")] = "dpm_small"
     """The weights that made the map: a shipped name or a .safetensors file."""
+    kitti_angle_correction: FlagCreatePairsOff[bool] = False
+    """Raise the beams by 0.205 degrees, as KITTI's HDL-64E needs."""
     n_scans: Annotated[int | None, arg(aliases=["-n"], metavar="N")] = None
     """Use the first N scans."""
     jump: Annotated[int, arg(aliases=["-j"], metavar="J")] = 1
@@ -136,9 +138,10 @@ class Case(NamedTuple):
 def open_scans(config: Config) -> LidarSequence:
     """Opens the scans that are asked for, and reads the first one."""
     from dpmjax.io import open_lidar_sequence
+    from experiments._slam_input import corrected
 
     drive = open_lidar_sequence(config.scans, sequence=config.sequence, selection=slice(None, None, config.jump))
-    drive = drive.take(slice(0, config.n_scans))
+    drive = corrected(drive.take(slice(0, config.n_scans)), config.kitti_angle_correction)
     drive.read_scan(0)
     return drive
 

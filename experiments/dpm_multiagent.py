@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 from tqdm import tqdm
-from tyro.conf import Positional, arg
+from tyro.conf import FlagCreatePairsOff, Positional, arg
 
 from experiments._command import StopFlag, check_least, run_command
 from experiments._run_folder import AGENTS, RunFolder, RunOptions, open_run_folder, recording, write_metrics
@@ -45,6 +45,8 @@ class Config(RunOptions):
     """By this share of its length a part is longer at each end."""
     weights: Annotated[str, arg(metavar="NAME|FILE")] = "dpm_small"
     """Name of a shipped model, or a .safetensors file."""
+    kitti_angle_correction: FlagCreatePairsOff[bool] = False
+    """Raise the beams by 0.205 degrees, as KITTI's HDL-64E needs."""
     n_scans: Annotated[int | None, arg(aliases=["-n"], metavar="N")] = None
     """Number of scans of each folder."""
     jump: Annotated[int, arg(aliases=["-j"], metavar="N")] = 1
@@ -100,7 +102,8 @@ def open_agents(config: Config) -> list[LidarSequence]:
     from experiments._slam_input import open_drive
     from experiments.dpm_slam import Config as DriveOptions
 
-    options = {"seed": config.seed, "n_scans": config.n_scans, "jump": config.jump, "sequence": config.sequence}
+    names = ("seed", "n_scans", "jump", "sequence", "kitti_angle_correction")
+    options = {name: getattr(config, name) for name in names}
     drives = [open_drive(DriveOptions(data=data, **options)) for data in config.data or (None,)]
     return drives if len(drives) > 1 else cut_sequence(drives[0], config.agents, config.overlap)
 

@@ -56,7 +56,9 @@ class Config(RunOptions):
     refine: FlagCreatePairsOff[bool] = False
     """Polish the keyframes by DeepMapping afterwards; takes a minute for each window of 32."""
     deskew: FlagCreatePairsOff[bool] = False
-    """Undo the motion of the lidar during its turn; for raw scans of a spinning lidar."""
+    """Undo the motion of the lidar during its turn, by the times of the points (of .pcd .ply .npz) or their azimuth."""
+    kitti_angle_correction: FlagCreatePairsOff[bool] = False
+    """Raise the beams by 0.205 degrees, as KITTI's HDL-64E needs."""
     n_scans: Annotated[int | None, arg(aliases=["-n"], metavar="N")] = None
     """Number of scans; a resumed run may take more."""
     jump: Annotated[int, arg(aliases=["-j"], metavar="N")] = 1
@@ -69,6 +71,8 @@ class Config(RunOptions):
         check_least(self, n_scans=1, jump=1, seed=0)
         if self.sequence is not None and self.data is None:
             raise ValueError("--sequence chooses a drive of DATA: give its folder too")
+        if self.kitti_angle_correction and self.data is None:
+            raise ValueError("--kitti-angle-correction is for the scans of KITTI's car: give their folder, DATA")
         if self.visualize and importlib.util.find_spec("rerun") is None:
             raise ValueError("-v needs the live viewer: pip install 'dpmjax[viewer]', or leave it out")
 

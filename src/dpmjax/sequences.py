@@ -287,6 +287,8 @@ class LidarSequence:
             raises an InputError that names the file where the scan is bad.
         T_world_lidar: (num_scans, 4, 4) float64 reference poses, or None.
         times: (num_scans,) float64 s, or None.
+        read_times: read_times(i) gives when each point of scan i was measured, (n,) float64 in the unit of its file, or
+            None where the file does not say; the same errors. None: no scan says.
 
     Raises:
         ValueError: poses or times that are not one a scan.
@@ -297,6 +299,7 @@ class LidarSequence:
     read_scan: Callable[[int], NDArray[np.float32]] = field(repr=False)
     T_world_lidar: FloatArray | None = field(default=None, repr=False)
     times: FloatArray | None = field(default=None, repr=False)
+    read_times: Callable[[int], FloatArray | None] | None = field(default=None, repr=False)
 
     def __post_init__(self) -> None:
         _require_shapes(self, {"T_world_lidar": (self.num_scans, 4, 4), "times": (self.num_scans,)})
@@ -313,4 +316,11 @@ class LidarSequence:
         """The selected scans with their poses and times, in the same world; nothing is read."""
         numbers = [int(i) for i in np.arange(self.num_scans)[selection]]
         sources, chosen = tuple(self.sources[i] for i in numbers), _select(self, ("T_world_lidar", "times"), selection)
-        return replace(self, sources=sources, read_scan=lambda index: self.read_scan(numbers[index]), **chosen)
+        read_times = self.read_times
+        return replace(
+            self,
+            sources=sources,
+            read_scan=lambda index: self.read_scan(numbers[index]),
+            read_times=None if read_times is None else lambda index: read_times(numbers[index]),
+            **chosen,
+        )

@@ -15,8 +15,9 @@ import dpmjax
 from dpmjax.geometry import rigid
 from dpmjax.io import write_tum
 from dpmjax.metrics import absolute_trajectory_error
+from dpmjax.scans import offsets_by_azimuth
 from dpmjax.slam import SlamConfig, SlamMethods, run_slam
-from experiments import _slam_refine
+from experiments import _slam_input, _slam_refine
 from experiments._command import EXIT_BAD_INPUT, EXIT_OK
 from experiments._result_files import load_json
 from tests.deeppointmap import toy
@@ -77,6 +78,27 @@ def test_deskewing_and_odometry_alone_are_options(room, tmp_path) -> None:
     metrics = load_json(tmp_path / "out" / "metrics.json")
     assert metrics["loop_statuses"] == {}
     assert metrics["ate_m"] == pytest.approx(metrics["ate_odometry_m"])
+
+
+@pytest.mark.parametrize("times", [None, (0.0, 0.2, 0.4, 0.8)])
+def test_times_of_points_come_before_their_azimuths(tmp_path, times) -> None:
+    points = np.random.default_rng(0).normal(size=(30, 3)) * 10
+    for number in range(4):
+        np.savez(tmp_path / f"{number}.npz", points=points, times=np.linspace(0.0, 0.1, 30))
+    if times:
+        (tmp_path / "times.txt").write_text("".join(f"{time}\n" for time in times))
+    reader = _slam_input.ScanReader(dpmjax.io.open_lidar_sequence(tmp_path), is_deskewed=True)
+    # Shares of the time between the two scans before: 0.2 s where it is known, else that of the turn.
+    share = 0.5 if times else 1.0
+    np.testing.assert_allclose(reader(3).offsets, share * np.linspace(-0.5, 0.5, 30), atol=1e-6)
+    np.savez(tmp_path / "3.npz", points=points, times=np.zeros(30))
+    np.testing.assert_allclose(reader(3).offsets, offsets_by_azimuth(reader(3).points, share), atol=1e-6)
+
+
+def test_kittis_beams_are_raised(tmp_path) -> None:
+    np.save(tmp_path / "0.npy", [[10.0, 0.0, 0.0], [0.0, 20.0, 1.0]])
+    sequence = _slam_input.corrected(dpmjax.io.open_lidar_sequence(tmp_path), True)
+    np.testing.assert_allclose(sequence.read_scan(0)[0], [10.0, 0.0, 10 * np.radians(0.205)], atol=1e-3)
 
 
 @pytest.mark.parametrize("num", [1, 2, 31, 32, 33, 56, 57, 200])

@@ -300,6 +300,45 @@ def test_organised_clouds_may_hold_nan(tmp_path, clouds):
     np.testing.assert_allclose(read_lidar_file(tmp_path / "0.pcd"), np.delete(clouds[0], [2, 5], axis=0))
 
 
+def write_timed(folder, kind, points, times):
+    """A scan with times, as drivers write them: relative nanoseconds, absolute seconds, an array of its own."""
+    if kind == "npz":
+        np.savez(folder / "0.npz", points=points, times=times)
+    elif kind == "pcd":
+        rows = "".join(f"{x} {y} {z} {round(1e9 * t)}\n" for (x, y, z), t in zip(points, times, strict=True))
+        header = (
+            f"VERSION 0.7\nFIELDS x y z t\nSIZE 4 4 4 4\nTYPE F F F U\nCOUNT 1 1 1 1\nWIDTH {len(points)}\nHEIGHT 1\n"
+        )
+        (folder / "0.pcd").write_text(f"{header}POINTS {len(points)}\nDATA ascii\n{rows}")
+    else:
+        names = "".join(f"property double {name}\n" for name in ("x", "y", "z", "timestamp"))
+        header = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(points)}\n{names}end_header\n"
+        (folder / "0.ply").write_bytes(
+            header.encode() + np.column_stack([points, 1.7e9 + times]).astype("<f8").tobytes()
+        )
+
+
+@pytest.mark.parametrize("kind", ["npz", "pcd", "ply"])
+def test_times_of_points_are_read_and_belong_to_the_points(tmp_path, clouds, kind):
+    points, times = clouds[0].copy(), np.linspace(0.0, 0.1, len(clouds[0]))
+    points[[0, 7]] = 0  # beams that met nothing are left out, with their times
+    write_timed(tmp_path, kind, points, times)
+    sequence = open_lidar_sequence(tmp_path).take(slice(None))
+    kept = np.delete(times, [0, 7])
+    np.testing.assert_allclose(sequence.read_scan(0), np.delete(points, [0, 7], axis=0), rtol=1e-6)
+    found = sequence.read_times(0)
+    unit = 1e9 if kind == "pcd" else 1.0
+    np.testing.assert_allclose((found - found[0]) / unit, kept - kept[0], atol=1e-6)
+
+
+def test_files_without_times_say_so(tmp_path, clouds):
+    write_bin(tmp_path / "0.bin", clouds[0])
+    assert open_lidar_sequence(tmp_path).read_times(0) is None
+    np.savez(tmp_path / "bad.npz", points=clouds[0], times=np.zeros(3))
+    with pytest.raises(InputError, match=r"bad\.npz: times \(3,\).*one time a point"):
+        read_lidar_file(tmp_path / "bad.npz")
+
+
 def test_folders_without_scans_are_refused(tmp_path):
     with pytest.raises(InputError, match=r"without scans"):
         open_lidar_sequence(tmp_path)

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import importlib
 from dataclasses import replace
+from unittest.mock import Mock
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -14,7 +16,14 @@ from dpmjax.metrics import absolute_trajectory_error
 from dpmjax.registration import GlobalConfig, PlanarScans, nearest_tour, planar_scans, refine, register_globally
 from dpmjax.registration.global_registration import _prior_between, _Task, find_unregistered, place_others
 from dpmjax.registration.map_assembly import PoseScorer, PositionPrior, add_up, assemble, move_blocks, weakest_cuts
-from dpmjax.registration.pair_search import Candidates, CorrelativeConfig, Hypotheses, agreeing_edges, search_pairs
+from dpmjax.registration.pair_search import (
+    Candidates,
+    CorrelativeConfig,
+    Hypotheses,
+    _spectra,
+    agreeing_edges,
+    search_pairs,
+)
 from dpmjax.registration.range_profiles import RangeProfiles, compare_pairs, make_profiles
 from dpmjax.registration.wall_directions import WallDirections
 from dpmjax.simulation import simulate_sequence
@@ -93,6 +102,14 @@ def test_only_the_given_turns_are_searched(profiles) -> None:
     headings = found.poses[0, np.isfinite(found.scores[0]), 2]
     # Refinement moves a heading by less than a turn.
     np.testing.assert_allclose(headings, np.pi / 2, atol=2 * 2 * np.pi / COARSE.num_turns)
+
+
+def test_a_program_has_one_fourier_transform(profiles, monkeypatch: pytest.MonkeyPatch) -> None:
+    # Two at once may wait for each other's threads for ever (CPU, JAX 0.11).
+    transform = Mock(wraps=jnp.fft.rfft2)
+    monkeypatch.setattr(jnp.fft, "rfft2", transform)
+    _spectra.__wrapped__(profiles, jnp.zeros(()), jnp.ones(()), COARSE)
+    assert transform.call_count == 1
 
 
 def test_assembly_rejects_a_wrong_pair(sequence, profiles, found) -> None:

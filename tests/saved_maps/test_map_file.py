@@ -123,6 +123,8 @@ def test_int8_leaves_out_keyframes_that_others_cover(tmp_path) -> None:
     assert len(load_map(save_map(path, joined, "int8", spacing_share=0.0))) == 4
     assert len(load_map(save_map(path, joined))) == 4
     assert len(load_map(save_map(path, joined, spacing_share=0.8))) == 2
+    # What is counted is what is written.
+    assert len(map_bytes(joined, "int8")) == save_map(path, joined, "int8").stat().st_size
 
 
 def test_fewer_bytes_at_lower_precision() -> None:

@@ -11,7 +11,7 @@ from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 
 from dpmjax.geometry import rigid, se3
-from dpmjax.scans import deskew, offsets_by_azimuth, scan_surface
+from dpmjax.scans import deskew, offsets_by_azimuth, offsets_by_times, scan_surface
 from dpmjax.simulation import HDL64E, TownConfig, drive, make_town, scan_town
 
 
@@ -50,6 +50,19 @@ def test_a_turn_begins_and_ends_behind() -> None:
     np.testing.assert_allclose(
         offsets_by_azimuth(points, 0.2, is_clockwise=False), [0.1, 0.05, 0, -0.05, -0.1], atol=1e-3
     )
+
+
+@pytest.mark.parametrize("unit", [1.0, 1e3, 1e6, 1e9])
+@pytest.mark.parametrize("start", [0.0, 1.7e5])
+def test_times_are_understood_in_any_unit_from_any_start(unit: float, start: float) -> None:
+    times = unit * (start + np.array([0.0, 0.025, 0.05, 0.1]))
+    np.testing.assert_allclose(offsets_by_times(times, 0.2), [-0.25, -0.125, 0.0, 0.25], atol=1e-6)
+    np.testing.assert_allclose(offsets_by_times(times), [-0.5, -0.25, 0.0, 0.5], atol=1e-6)
+
+
+@pytest.mark.parametrize("times", [[], [3.0, 3.0], [0.0, 7.0], [0.0, np.nan, 0.1]])
+def test_what_are_no_times_of_a_turn_is_not_used(times: list[float]) -> None:
+    assert offsets_by_times(np.array(times), 0.1) is None
 
 
 def test_a_scan_of_a_moving_lidar_equals_that_of_a_resting_one() -> None:

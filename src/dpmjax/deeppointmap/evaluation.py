@@ -168,20 +168,38 @@ def draw_evaluation_pairs(
     return EvaluationPairs(scans, T_world_scan, pairs, config.scale_m)
 
 
+def draw_rows_apart(
+    distances_m: Float[np.ndarray, "n n"], least_m: float, most_m: float, num_pairs: int, rng: np.random.Generator
+) -> Int[np.ndarray, "p 2"]:
+    """Draws pairs of scans at a distance of each other, without repetition.
+
+    Args:
+        distances_m: between all scans, metres.
+        least_m: smallest distance of a pair, metres.
+        most_m: largest one.
+        num_pairs: number of pairs.
+        rng: draws them.
+
+    Returns:
+        Rows of the scans; fewer pairs where there are fewer.
+    """
+    pairs = np.argwhere((distances_m >= least_m) & (distances_m <= most_m))
+    return pairs[rng.choice(len(pairs), min(num_pairs, len(pairs)), replace=False)] if len(pairs) else pairs
+
+
 def _draw(drive: LidarSequence, num_pairs: int, kind: PairKind, rng: np.random.Generator) -> Pairs:
     positions = np.asarray(drive.T_world_lidar)[:, :3, 3]
     distances = np.linalg.norm(positions[:, None] - positions, axis=2)
-    first, second = np.nonzero((distances >= kind.min_distance_m) & (distances <= kind.max_distance_m))
-    if len(first) == 0:
+    pairs = draw_rows_apart(distances, kind.min_distance_m, kind.max_distance_m, num_pairs, rng)
+    if len(pairs) == 0:
         raise ValueError(f"drive: expected scans {kind.min_distance_m} to {kind.max_distance_m} m apart, got none")
-    chosen = rng.choice(len(first), min(num_pairs, len(first)), replace=False)
 
     def maps(rows: Int[np.ndarray, " p"]) -> Int[np.ndarray, "p s"]:
         near = [np.flatnonzero(distances[row] <= MAP_RADIUS_M) for row in rows]
         others = [rng.choice(around, kind.num_scans - 1, len(around) < kind.num_scans) for around in near]
         return np.concatenate([rows[:, None], np.stack(others)], axis=1).astype(int)
 
-    return Pairs(kind, maps(first[chosen]), maps(second[chosen]))
+    return Pairs(kind, maps(pairs[:, 0]), maps(pairs[:, 1]))
 
 
 def evaluate_registration(model: Model, pairs: EvaluationPairs) -> Evaluation:

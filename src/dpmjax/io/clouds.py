@@ -19,6 +19,8 @@ _PLY_TYPES = {
     "double": "f8", "float64": "f8",
 }  # fmt: skip
 _PLY_ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
+# Columns in which lidar drivers and data sets write when a point was measured.
+_TIME_FIELDS = ("t", "time", "timestamp", "timestamps", "time_stamp", "time_offset", "offset_time")
 
 
 class _Header(NamedTuple):
@@ -29,6 +31,18 @@ class _Header(NamedTuple):
     num_points: int
     encoding: str
     size: int
+
+
+class TimedCloud(NamedTuple):
+    """The points of a file, and when each was measured.
+
+    Attributes:
+        points: (m, 3) float32 x, y, z in the file's unit.
+        times: (m,) in the unit and from the start that the file has; None where it has no column of a known name.
+    """
+
+    points: NDArray[np.float32]
+    times: NDArray[np.float64] | None
 
 
 def read_pcd(path: str | Path, *, drop_nan: bool = False) -> NDArray[np.float32]:
@@ -44,10 +58,10 @@ def read_pcd(path: str | Path, *, drop_nan: bool = False) -> NDArray[np.float32]
     Raises:
         InputError: the file is missing, or `parse_pcd` refuses it.
     """
-    return parse_pcd(read_bytes(path), str(path), drop_nan=drop_nan)
+    return parse_pcd(read_bytes(path), str(path), drop_nan=drop_nan).points
 
 
-def parse_pcd(content: bytes, source: str, *, drop_nan: bool = False) -> NDArray[np.float32]:
+def parse_pcd(content: bytes, source: str, *, drop_nan: bool = False) -> TimedCloud:
     """Reads the points out of the bytes of a PCD file (DATA ascii or binary, fields in any order).
 
     Args:
@@ -56,7 +70,7 @@ def parse_pcd(content: bytes, source: str, *, drop_nan: bool = False) -> NDArray
         drop_nan: leaves out points whose coordinates are all NaN.
 
     Returns:
-        (m, 3) float32 x, y, z in the file's unit; z is zero where the file has none.
+        The points, with their times where the file has them; z is zero where it has none.
 
     Raises:
         InputError: a broken header, no x or y column, a truncated body, NaN or infinite coordinates, or the compressed
@@ -70,14 +84,15 @@ def parse_pcd(content: bytes, source: str, *, drop_nan: bool = False) -> NDArray
     require(header.encoding in ("ascii", "binary"), source, found, "save the cloud as ascii or binary PCD")
     columns = _read_columns(content, header, source)
     zeros = np.zeros(header.num_points, np.float32)
-    points = np.stack([to_float32(columns.get(name, zeros)) for name in "xyz"], axis=1)
+    points, times = np.stack([to_float32(columns.get(name, zeros)) for name in "xyz"], axis=1), _times(columns)
     if drop_nan:
-        points = points[~np.isnan(points).all(axis=1)]
+        is_there = ~np.isnan(points).all(axis=1)
+        points, times = points[is_there], None if times is None else times[is_there]
     bad = ~np.isfinite(points).all(axis=1)
     if bad.any():
         found = f"{bad.sum()} of {len(points)} points are NaN or infinite, the first at row {int(np.argmax(bad))}"
         raise InputError(source, found, "write invalid beams as 0 0 0")
-    return points
+    return TimedCloud(points, times)
 
 
 def write_pcd(path: str | Path, points: ArrayLike) -> Path:
@@ -142,6 +157,12 @@ def _read_columns(content: bytes, header: _Header, source: str) -> dict[str, NDA
     return dict(zip(header.fields, columns, strict=True))
 
 
+def _times(columns: dict[str, NDArray[np.generic]]) -> NDArray[np.float64] | None:
+    """The column of times, if there is one."""
+    name = next((name for name in columns if name.lower() in _TIME_FIELDS), None)
+    return None if name is None else np.asarray(columns[name], np.float64)
+
+
 def read_ply(path: str | Path) -> NDArray[np.float32]:
     """Reads the points of a PLY file.
 
@@ -154,9 +175,24 @@ def read_ply(path: str | Path) -> NDArray[np.float32]:
     Raises:
         InputError: the file is missing, has a broken header or no x, y, z, or is truncated.
     """
-    content = read_bytes(path)
-    columns = _read_columns(content, _parse_ply_header(content, str(path)), str(path))
-    return np.stack([to_float32(columns[axis]) for axis in "xyz"], axis=1)
+    return parse_ply(read_bytes(path), str(path)).points
+
+
+def parse_ply(content: bytes, source: str) -> TimedCloud:
+    """Reads the points out of the bytes of a PLY file.
+
+    Args:
+        content: the whole file.
+        source: its name, for messages.
+
+    Returns:
+        The points, with their times where the file has them; NaN is left as it is.
+
+    Raises:
+        InputError: see `read_ply`.
+    """
+    columns = _read_columns(content, _parse_ply_header(content, source), source)
+    return TimedCloud(np.stack([to_float32(columns[axis]) for axis in "xyz"], axis=1), _times(columns))
 
 
 def write_ply(path: str | Path, points: ArrayLike, *, colors: ArrayLike | None = None) -> Path:

@@ -43,7 +43,7 @@ def read_deepmapping_folder(path: str | Path, *, unit: Unit | None = None) -> Sc
     files = _list_files(Path(path))
     names = sorted((name for name in files if name.lower().endswith(".pcd")), key=natural_key)
     require(len(names) > 0, path, "no .pcd file in it", "give the authors' folder or .tar of .pcd files")
-    scans = [parse_pcd(files[name], f"{path}/{name}")[:, :2] for name in names]
+    scans = [parse_pcd(files[name], f"{path}/{name}").points[:, :2] for name in names]
     points = np.zeros((len(scans), max(len(scan) for scan in scans), 2), np.float32)
     for row, scan in zip(points, scans, strict=True):
         row[: len(scan)] = scan

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from dpmjax.io.clouds import read_pcd, read_ply
+from dpmjax.io.clouds import TimedCloud, parse_pcd, parse_ply
 from dpmjax.io.drives import SCAN_SUFFIXES, Drive3D, read_learned_folder, read_plain_folder, scan_files
 from dpmjax.io.files import load_arrays, natural_key, read_bytes, to_float32
 from dpmjax.io.lidar_datasets import read_kitti_360, read_kitti_carla, read_kitti_odometry, read_kitti_raw, read_mulran
@@ -18,6 +18,7 @@ from dpmjax.sequences import EmptyScanError, InputError, LidarSequence, require
 
 _log = logging.getLogger(__name__)
 _NPZ_KEYS = ("lidar_pcd", "points", "xyz", "arr_0")
+_NPZ_TIMES = "times"
 # No lidar on the ground measures outside of these, in metres; nearly all points of a scan lie within the usual range.
 _NEAREST_M, _USUAL_M, _FARTHEST_M = 0.1, 120.0, 400.0
 _LEAST_USUAL_SHARE = 0.05
@@ -63,22 +64,52 @@ def read_points(path: str | Path, *, bin_columns: int = 4) -> NDArray[np.float32
     Raises:
         InputError: see `read_lidar_file`.
     """
+    return _read_scan_file(Path(path), bin_columns).points
+
+
+def read_point_times(path: str | Path) -> NDArray[np.float64] | None:
+    """Reads when each point of a scan was measured.
+
+    Args:
+        path: a `.pcd` or `.ply` with a column t, time, timestamp, timestamps, time_stamp, time_offset or offset_time,
+            or a `.npz` with an array `times`.
+
+    Returns:
+        (n,) one for each point of `read_points`, in the unit and from the start that the file has; None where it has
+        none, as all other kinds of files.
+
+    Raises:
+        InputError: see `read_lidar_file`.
+    """
     path = Path(path)
+    return _read_scan_file(path, 4).times if path.suffix.lower() in (".pcd", ".ply", ".npz") else None
+
+
+def _read_scan_file(path: Path, bin_columns: int) -> TimedCloud:
+    """Points and times of any kind of scan, checked."""
     suffix = path.suffix.lower()
     if suffix == ".bin":
-        return _check_scan(_read_bin(path, bin_columns), path)
+        return _check_scan(TimedCloud(_read_bin(path, bin_columns), None), path)
     if suffix in (".pcd", ".ply"):
-        return _check_scan(read_pcd(path, drop_nan=True) if suffix == ".pcd" else read_ply(path), path)
+        content, source = read_bytes(path), str(path)
+        is_pcd = suffix == ".pcd"
+        return _check_scan(parse_pcd(content, source, drop_nan=True) if is_pcd else parse_ply(content, source), path)
     found = f"an unknown kind of scan, {suffix or 'without ending'}"
     require(suffix in SCAN_SUFFIXES, path, found, f"give one of {' '.join(SCAN_SUFFIXES)}")
-    table = load_arrays(path, None if suffix == ".npy" else _NPZ_KEYS)
+    table = load_arrays(path, None if suffix == ".npy" else (*_NPZ_KEYS, _NPZ_TIMES))
     values = next((table[key] for key in _NPZ_KEYS if key in table), None)
     if values is None:
         raise InputError(path, "no array of points", "call it lidar_pcd or points")
     is_good = values.ndim == 2 and values.shape[1] >= 3 and values.dtype.kind in "fiu"
     found = f"an array of {values.shape} {values.dtype}"
     require(is_good, path, found, "give points (n, 3): x, y and z in metres")
-    return _check_scan(to_float32(values[:, :3]), path)
+    times = None
+    if _NPZ_TIMES in table:
+        column = table[_NPZ_TIMES]
+        found = f"times {column.shape} {column.dtype} of {len(values)} points"
+        require(column.shape == values.shape[:1] and column.dtype.kind in "fiu", path, found, "give one time a point")
+        times = np.asarray(column, np.float64)
+    return _check_scan(TimedCloud(to_float32(values[:, :3]), times), path)
 
 
 def warn_of_unit(points: NDArray[np.float32], source: str | Path) -> None:
@@ -93,13 +124,15 @@ def warn_of_unit(points: NDArray[np.float32], source: str | Path) -> None:
         _log.warning("%s: %.1f %% of the points lie within %g m; are these millimetres?", source, 100 * share, _USUAL_M)
 
 
-def _check_scan(points: NDArray[np.float32], source: Path) -> NDArray[np.float32]:
+def _check_scan(cloud: TimedCloud, source: Path) -> TimedCloud:
     """Refuses what is no scan in metres, and takes points at the origin away."""
+    points, times = cloud
     bad = ~np.isfinite(points).all(axis=1)
     if bad.any():
         found = f"{bad.sum()} of {len(points)} points are NaN or infinite, the first is point {int(np.argmax(bad))}"
         raise InputError(source, found, "write beams that met nothing as 0 0 0, or leave them out")
-    kept = np.ascontiguousarray(points[(points != 0).any(axis=1)], np.float32)
+    is_kept = (points != 0).any(axis=1)
+    kept = np.ascontiguousarray(points[is_kept], np.float32)
     if not len(kept):
         raise EmptyScanError(source, "no point in the scan", "remove the file, or copy it again")
     # In float64, for garbage reaches 1e38.
@@ -109,7 +142,7 @@ def _check_scan(points: NDArray[np.float32], source: Path) -> NDArray[np.float32
     require(median <= _FARTHEST_M, source, f"the median range is {median:.4g} m", advice)
     is_near = ((ranges > _NEAREST_M) & (ranges < _FARTHEST_M)).any()
     require(is_near, source, f"all {len(kept)} points are out of range", "give metres in the lidar's own frame")
-    return kept
+    return TimedCloud(kept, None if times is None else times[is_kept])
 
 
 def _read_bin(path: Path, columns: int) -> NDArray[np.float32]:
@@ -150,7 +183,9 @@ def open_lidar_sequence(
     drive = _read(_choose(path, sequence), None if poses is None else Path(poses))
     require(len(drive.files) > 0, path, "a folder without scans", f"give {_FORMATS}")
     sources, read_scan = tuple(map(str, drive.files)), partial(_read_scan, drive.files, bin_columns)
-    whole = LidarSequence(drive.name, sources, read_scan, drive.T_world_lidar, drive.times)
+    whole = LidarSequence(
+        drive.name, sources, read_scan, drive.T_world_lidar, drive.times, lambda index: read_point_times(sources[index])
+    )
     part = whole.take(selection)
     require(part.num_scans > 0, path, f"{selection} chooses 0 of {whole.num_scans} scans", "choose others")
     return part

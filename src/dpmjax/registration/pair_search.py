@@ -165,7 +165,9 @@ def _spectra(
     hit = jnp.where(usable, jnp.exp(-0.5 * (off / (0.6 * cell)) ** 2), 0.0)
     is_free = usable & (distance < profiles.near[:, k] - cell / slant)
     evidence = hit - jnp.where(is_free, config.free_weight, 0.0)
-    return jnp.fft.rfft2(hit), jnp.fft.rfft2(evidence)
+    # One transform of both: two that run at once wait for each other's threads for ever on a CPU (XLA of JAX 0.11).
+    spectra = jnp.fft.rfft2(jnp.stack([hit, evidence]))
+    return spectra[0], spectra[1]
 
 
 @partial(jax.jit, static_argnames="config")
@@ -220,7 +222,8 @@ def search_pairs(
     cell = config.cell * unit
     used, compact = np.unique(source, return_inverse=True)
     sources, cell_side = profiles.take(used), jnp.asarray(cell, jnp.float32)
-    still = _spectra(profiles, jnp.zeros(()), cell_side, config=config)
+    # Finished before the next transform starts, as above.
+    still = jax.block_until_ready(_spectra(profiles, jnp.zeros(()), cell_side, config=config))
     poses = np.zeros((len(source), config.num_turns, config.num_peaks, 3))
     scores = np.full(poses.shape[:-1], -np.inf)
     for number in range(config.num_turns):

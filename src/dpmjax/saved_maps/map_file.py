@@ -53,39 +53,41 @@ def save_map(
     path = Path(path)
     if path.suffix != ".npz":
         raise ValueError(f"path: expected a file that ends in .npz, got {str(path)!r}")
-    if precision not in get_args(Precision):
-        raise ValueError(f"precision: expected one of {', '.join(get_args(Precision))}, got {precision!r}")
-    if spacing_share is None:
-        spacing_share = SPACING_SHARE if precision == "int8" else 0.0
-    if spacing_share != 0:
-        map_ = thin_map(map_, spacing_share=spacing_share)
-    return write_atomically(path, map_bytes(map_, precision))
+    return write_atomically(path, map_bytes(map_, precision, spacing_share=spacing_share))
 
 
-def map_bytes(map_: KeyframeMap, precision: Precision = "float32") -> bytes:
-    """Makes the content of the file of a map with all its keyframes; its length is what the map costs.
+def map_bytes(map_: KeyframeMap, precision: Precision = "float32", *, spacing_share: float | None = None) -> bytes:
+    """Makes the content of the file of a map; its length is what the map costs.
 
     Args:
         map_: see `save_map`.
         precision: see `save_map`.
+        spacing_share: see `save_map`.
 
     Returns:
         The bytes.
 
     Raises:
-        ValueError: if the map is empty, or its keyframes are not those of a network.
+        ValueError: if the precision is unknown, the map is empty, or its keyframes are not those of a network.
     """
-    if map_.origin is None:
+    if precision not in get_args(Precision):
+        raise ValueError(f"precision: expected one of {', '.join(get_args(Precision))}, got {precision!r}")
+    origin = map_.origin
+    if origin is None:
         raise ValueError("map_: expected keyframes, got an empty map")
     if not all(isinstance(keyframe.description, CompactScan) for keyframe in map_.keyframes):
         raise ValueError("map_: expected keyframes of a network, got those of another matcher")
+    if spacing_share is None:
+        spacing_share = SPACING_SHARE if precision == "int8" else 0.0
+    if spacing_share != 0:
+        map_ = thin_map(map_, spacing_share=spacing_share)
     header = {
         "format": FORMAT,
         "version": VERSION,
         "precision": precision,
-        "fingerprint": map_.origin.fingerprint,
-        "weights": map_.origin.weights,
-        "config": dataclasses.asdict(map_.origin.config),
+        "fingerprint": origin.fingerprint,
+        "weights": origin.weights,
+        "config": dataclasses.asdict(origin.config),
     }
     content = io.BytesIO()
     named = {"header": np.frombuffer(json.dumps(header).encode(), np.uint8)}

@@ -4,6 +4,8 @@ from .augment import SectorConfig as SectorConfig
 from .augment import augment_scan as augment_scan
 from .deskew import deskew as deskew
 from .deskew import offsets_by_azimuth as offsets_by_azimuth
+from .deskew import offsets_by_times as offsets_by_times
+from .elevation import raise_beams as raise_beams
 from .preprocess import PreprocessConfig as PreprocessConfig
 from .preprocess import preprocess_scan as preprocess_scan
 from .preprocess import preprocess_scan_on_host as preprocess_scan_on_host

@@ -8,6 +8,10 @@ from scipy.spatial.transform import Rotation
 
 from dpmjax.types import AnyArray
 
+_UNITS_S = (1.0, 1e-3, 1e-6, 1e-9)
+# Shortest and longest turn of a lidar.
+_TURN_S = (0.02, 0.5)
+
 
 def deskew(
     points: Float[AnyArray, "n 3"], offsets: Float[AnyArray, " n"], T_last_scan: Float[AnyArray, "4 4"]
@@ -61,6 +65,28 @@ def offsets_by_azimuth(
     points = np.asarray(points)
     azimuth = np.arctan2(points[:, 1], points[:, 0]) / (2 * np.pi)
     return np.asarray(turn_share * (-azimuth if is_clockwise else azimuth), np.float64)
+
+
+def offsets_by_times(times: Float[AnyArray, " n"], interval_s: float | None = None) -> Float[np.ndarray, " n"] | None:
+    """Takes the times of points as files have them, in s, ms, us or ns, from any start.
+
+    The unit is that in which the points of a scan were measured within 0.02 to 0.5 s.
+
+    Args:
+        times: of the points of one scan.
+        interval_s: time between two scans, s; None takes the time of this one.
+
+    Returns:
+        Offsets for `deskew`: 0 in the middle of the scan. None where no unit fits, as where all times are equal.
+    """
+    times = np.asarray(times, np.float64)
+    if not len(times) or not np.isfinite(times).all():
+        return None
+    first, last = times.min(), times.max()
+    unit = next((unit for unit in _UNITS_S if _TURN_S[0] <= unit * (last - first) <= _TURN_S[1]), None)
+    if unit is None:
+        return None
+    return (times - (first + last) / 2) * (unit / interval_s if interval_s else 1 / (last - first))
 
 
 def _rotated(
