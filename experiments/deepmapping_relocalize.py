@@ -5,7 +5,7 @@
 
 RUN is a folder of deepmapping_2d on a built-in world. L-Net is trained on the poses that the fit has found; it proposes
 poses of each scan, and M-Net chooses. Headings are random and unknown. Written beside the results of RUN:
-relocalization.png and relocalization.json.
+relocalization.png, relocalization.json, and relocalization.npz with the numbers of each scan.
 """
 
 from __future__ import annotations
@@ -95,6 +95,7 @@ def main(config: Config) -> dict[str, Any]:
         **environment(),
     }
     write_json(config.run / "relocalization.json", report)
+    np.savez(config.run / "relocalization.npz", truth=truth, **queries._asdict())
     draw(config, sequence, grid.shape, truth, queries)
     tell(report)
     print(f"results in {config.run}")

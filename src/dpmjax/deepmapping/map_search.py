@@ -149,7 +149,7 @@ def search_map(
     """
     stride = -(-scans.mask.shape[1] // config.num_beams)
     thinned = ScanSet(scans.points[:, ::stride], scans.mask[:, ::stride])
-    poses = jax.lax.map(lambda one: _search_one(*one, fields, config), (thinned, proposals), batch_size=8)
+    poses = jax.lax.map(lambda one: _search_one(one[0], one[1], fields, config), (thinned, proposals), batch_size=8)
     cost = partial(_nats, hit=fields.hit[-1], free=fields.free[-1], frame=fields.frame)
     return FoundPoses(poses, jax.lax.map(lambda one: cost(*one), (scans, poses), batch_size=64))
 

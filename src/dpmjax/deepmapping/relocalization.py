@@ -61,7 +61,7 @@ class RelocalizationConfig:
     """
 
     num_turns: int = 24
-    max_nats: float = 0.7
+    max_nats: float = 0.4
     search: MapSearchConfig = field(default_factory=MapSearchConfig)
 
     def __post_init__(self) -> None:

@@ -51,7 +51,7 @@ class Tolerances(NamedTuple):
     jump: float | Float[Array, ""]
 
     @classmethod
-    def of(cls, match: float, contradict: float) -> Tolerances:
+    def of(cls, match: float | Float[Array, ""], contradict: float | Float[Array, ""]) -> Tolerances:
         """The tolerances with the usual jump."""
         return cls(match, contradict, 10.0 * match)
 

@@ -142,7 +142,7 @@ def _furnish(
         row, col = (int(v) for v in centre[::-1])
         if grid[max(row - reach, 0) : row + reach, max(col - reach, 0) : col + reach].any():
             continue
-        painters[rng.integers(len(painters))](grid, centre, size, rng.uniform(0, np.pi))
+        painters[int(rng.integers(len(painters)))](grid, centre, size, rng.uniform(0, np.pi))
 
 
 def _paint_frame(grid: BoolArray) -> None:
