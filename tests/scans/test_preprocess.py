@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from dpmjax.scans import PreprocessConfig, preprocess_scan, preprocess_scan_on_host
-from dpmjax.scans import preprocess as preprocess_module
+from dpmjax.scans.preprocess import first_of_each_voxel
 from dpmjax.types import PointCloud
 
 CONFIG = PreprocessConfig(max_range_m=30.0, num_outlier_neighbours=5, capacity=512)
@@ -88,11 +88,16 @@ def test_both_forms_agree_on_real_scans(sequence: str) -> None:
     assert host.mask.sum() > 200
 
 
-def test_voxels_too_many_for_a_table_are_sorted_to_the_same(monkeypatch) -> None:
-    points = np.random.default_rng(5).uniform(-20, 20, (1000, 3)).astype(np.float32)
-    expected = preprocess_scan_on_host(points, None, CONFIG)
-    monkeypatch.setattr(preprocess_module, "MAX_TABLE_ENTRIES", 0)
-    jax.tree.map(np.testing.assert_array_equal, preprocess_scan_on_host(points, None, CONFIG), expected)
+# The second cloud has more voxels in its bounding box than fit one integer together with the rows.
+@pytest.mark.parametrize("farthest", [20.0, 9e5])
+def test_the_first_point_of_each_voxel_is_kept(farthest: float) -> None:
+    points = np.random.default_rng(5).integers(-3, 3, (1000, 3)) + np.float32(0.25)
+    points[[0, 700]] = farthest
+    points[1] = -farthest
+    seen: dict[tuple[float, ...], int] = {}
+    for row, point in enumerate(np.floor(points)):
+        seen.setdefault(tuple(point), row)
+    np.testing.assert_array_equal(first_of_each_voxel(points, 1.0), sorted(seen.values()))
 
 
 @BUILDERS

@@ -27,9 +27,6 @@ MAX_VOXELS = 1 << 20
 OUTLIER_SLACK = 1 + 1e-5
 """Relative tolerance: rounding must not drop points that are all equally far from their neighbours."""
 
-MAX_TABLE_ENTRIES = 1 << 24
-"""Largest voxel table on the host. A scan of 60 m at 0.3 m has 6 million voxels in its bounding box."""
-
 MIN_COUNT_TO_WARN, MIN_SHARE_IN_RANGE = 20, 0.01
 
 
@@ -212,19 +209,20 @@ def first_of_each_voxel(points: Float[np.ndarray, "n 3"], voxel_size: float) -> 
     Returns:
         Rows of the points, in order.
     """
-    rows = np.arange(len(points))
     if len(points) == 0:
-        return rows
+        return np.zeros(0, np.int64)
     voxels = np.floor(points / np.float32(voxel_size)).astype(np.int64)
     columns = [column - column.min() for column in voxels.T]
-    num_x, num_y, num_z = (int(column.max()) + 1 for column in columns)
+    num_y, num_z = (int(column.max()) + 1 for column in columns[1:])
     packed = (columns[0] * num_y + columns[1]) * num_z + columns[2]  # below 2^63, because MAX_VOXELS bounds each factor
-    if num_x * num_y * num_z > MAX_TABLE_ENTRIES:
+    num_bits = len(points).bit_length()
+    if int(packed.max()).bit_length() + num_bits > 63:
         return np.sort(np.unique(packed, return_index=True)[1])
-    # Only written entries are read. In reverse order, the first row of a voxel is written last and stays.
-    table = np.empty(num_x * num_y * num_z, np.int32)
-    table[packed[::-1]] = rows[::-1]
-    return np.flatnonzero(table[packed] == rows)
+    # Voxel and row in one integer: sorting values is several times faster than sorting rows by values.
+    both = np.sort(packed << num_bits | np.arange(len(points)))
+    sorted_voxels = both >> num_bits
+    is_first = np.append(True, sorted_voxels[1:] != sorted_voxels[:-1])
+    return np.sort(both[is_first] & ((1 << num_bits) - 1))
 
 
 def _evenly_spaced(num_kept: int, capacity: int) -> Int[np.ndarray, " r"]:
