@@ -214,6 +214,14 @@ def _refined_deepmapping(task: Task) -> Candidates:
     return {name: start, DEEPMAPPING: fitted, f"{DEEPMAPPING}, refined": refined(task, fitted, is_ordered=False)}
 
 
+def _all_candidates(task: Task) -> Candidates:
+    """Returns ICP (of ordered scans), global registration and DeepMapping from it, and each of them refined."""
+    starts = {START_NAMES["icp-plane"]: incremental(task)} if task.is_ordered else {}
+    start = search(task)
+    found = starts | {START_NAMES["global"]: start, DEEPMAPPING: _fit(task, start)}
+    return found | {f"{name}, refined": refined(task, x, is_ordered=name in starts) for name, x in found.items()}
+
+
 def _best_start(task: Task) -> tuple[str, Floats]:
     """Returns refined ICP if trusted; else of it and refined global registration the more strongly connected one."""
 
@@ -259,5 +267,6 @@ METHODS: dict[str, Method] = {
     "direct-windows": Method("direct optimisation from zero in windows, Adam", partial(_direct, has_windows=True)),
     "direct-lbfgs": Method("direct optimisation from zero, L-BFGS", _direct_lbfgs),
     "global-deepmapping": Method("global registration, then DeepMapping", _global_deepmapping),
+    "all": Method("ICP, global registration, DeepMapping from it, and each refined", _all_candidates),
     "refined-deepmapping": Method("ICP or global registration, then DeepMapping, refined", _refined_deepmapping),
 }

@@ -22,6 +22,8 @@ NOT_RUN = {
     "build with today's setuptools, py-simple-go-icp-interface took 20 s for one pair of flat scans and gave up",
 }
 """Baselines of the paper that have no column, and why."""
+# A candidate whose ATE is larger than the least by no more than this is as good.
+_AS_GOOD_PX = 0.1
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -64,6 +66,16 @@ def success_of_trusted(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """Returns how many maps were trusted, and the share of these that are right."""
     trusted = [row["success"] for row in rows if row["is_trusted"]]
     return {"num_trusted": len(trusted), "success_of_trusted": float(np.mean(trusted)) if trusted else None}
+
+
+def best_kept(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Returns how many rows have several candidates, and of how many the best one was kept, or one nearly as good."""
+    regrets = [
+        row["ate_px"] - min(numbers["ate_px"] for numbers in row["candidates"].values())
+        for row in rows
+        if len(row["candidates"]) > 1
+    ]
+    return {"num_choices": len(regrets), "num_best_kept": sum(regret <= _AS_GOOD_PX for regret in regrets)}
 
 
 def run_table(

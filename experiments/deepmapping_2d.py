@@ -78,8 +78,9 @@ class Config(RunOptions):
     """Use N scans; without it, all."""
     jump: Annotated[int, arg(aliases=["-j"], metavar="N")] = 1
     """Use every Nth scan."""
-    world: Literal[0, 1, 2] = 0
-    """Which built-in world, where no DATA is given."""
+    world: Literal[0, 1, 2, "grove", "crowd"] = 0
+    """Which built-in world, where no DATA is given: three with walls; grove: trees, bushes and rocks, no straight wall;
+    crowd: an office in which people walk about."""
     range_noise_px: Annotated[float, arg(metavar="PX")] = 0.0
     """Standard deviation of the range noise in the built-in world."""
 

@@ -4,7 +4,9 @@
     python -m experiments.deepmapping_limits --resume        go on where the last run stopped
 
 Trajectories of 256 poses in the built-in worlds, thinned to every 1st, 2nd, 4th, 8th and 16th scan, with range noise of
-0, 1, 3 and 10 px, in order and shuffled. The hard cells come first. Results: metrics.json, ordered.png, shuffled.png.
+0, 1, 3 and 10 px, in order and shuffled. The hard cells come first. With --worlds grove crowd they lead through worlds
+without straight walls, and through offices in which people walk. Results: metrics.json, table.md (every candidate, and
+how often the best one was kept or one within 0.1 px), and a picture for each world and order (rooms_ordered.png).
 """
 
 from __future__ import annotations
@@ -33,14 +35,15 @@ COLUMNS = (
     "global-deepmapping", "refined-deepmapping",
 )  # fmt: skip
 ORDERS = ("ordered", "shuffled")
-NUM_SCANS, NUM_WORLDS = 256, 3
+WORLDS = ("rooms", "grove", "crowd")
+NUM_SCANS, NUM_ROOMS = 256, 3
 
 
 @dataclass(frozen=True, kw_only=True)
 class Config(tables.TableOptions):
     """Options of the grid."""
 
-    may_change: ClassVar[frozenset[str]] = frozenset({"limit", "methods", "strides", "noises_px", "orders"})
+    may_change: ClassVar[frozenset[str]] = frozenset({"limit", "methods", "strides", "noises_px", "orders", "worlds"})
 
     limit: Annotated[int, arg(metavar="N")] = 3
     """Trajectories in a cell."""
@@ -48,6 +51,8 @@ class Config(tables.TableOptions):
     """Every stride-th scan is used."""
     noises_px: tuple[float, ...] = (0.0, 1.0, 3.0, 10.0)
     """Standard deviations of the range noise."""
+    worlds: tuple[str, ...] = WORLDS[:1]
+    """rooms: the three built-in worlds in turn; grove, crowd: a world of that kind for each walk."""
     orders: tuple[str, ...] = ORDERS
     """With the order of time, or without."""
     methods: tuple[str, ...] = COLUMNS
@@ -57,6 +62,7 @@ class Config(tables.TableOptions):
         """Checks names and ranges."""
         super().__post_init__()
         check_names("--orders", self.orders, ORDERS)
+        check_names("--worlds", self.worlds, WORLDS)
         check_least(self, limit=1, strides=1, noises_px=0)
         if max(self.strides) > NUM_SCANS // 4:
             raise ValueError(f"--strides: expected at most {NUM_SCANS // 4}, got {max(self.strides)}")
@@ -64,54 +70,92 @@ class Config(tables.TableOptions):
 
 def main(config: Config) -> list[dict[str, Any]]:
     """Runs what is missing, cell by cell."""
-    grid = itertools.product(config.strides, range(config.limit), config.noises_px, config.orders)
-    cells = [{"stride": stride, "noise_px": noise, "order": order, "walk": walk} for stride, walk, noise, order in grid]
+    axes = {
+        "world": config.worlds,
+        "stride": config.strides,
+        "walk": range(config.limit),
+        "noise_px": config.noises_px,
+        "order": config.orders,
+    }
+    cells = [dict(zip(axes, cell, strict=True)) for cell in itertools.product(*axes.values())]
     return tables.run_table(config, EXPERIMENT, cells, partial(_prepare, config), partial(_write, config))
 
 
 def _prepare(config: Config, cell: dict[str, Any]) -> tuple[Task, dict[str, Any]]:
-    walk = cell["walk"]
-    sequence = simulation.simulate_sequence(
-        walk % NUM_WORLDS, NUM_SCANS, seed=200 + walk, range_noise_px=cell["noise_px"]
-    )
+    walk, kind = cell["walk"], cell["world"]
+    world = walk % NUM_ROOMS if kind == "rooms" else f"{kind}-{walk}"
+    sequence = simulation.simulate_sequence(world, NUM_SCANS, seed=200 + walk, range_noise_px=cell["noise_px"])
     scans = sequence.take(slice(None, None, cell["stride"]))
     return shared.make_task(scans, is_ordered=cell["order"] == "ordered", steps=config.steps, seed=config.seed), {}
 
 
-def success_grid(rows: list[dict[str, Any]], method: str, order: str, config: Config) -> NDArray[np.float64]:
+def success_grid(rows: list[dict[str, Any]], method: str, config: Config) -> NDArray[np.float64]:
     """Returns (strides, noises) success rates, smallest stride first; NaN where nothing was run."""
     cells: dict[tuple[Any, ...], list[bool]] = defaultdict(list)
     for row in rows:
-        cells[row["method"], row["order"], row["stride"], row["noise_px"]].append(row["success"])
+        cells[row["method"], row["stride"], row["noise_px"]].append(row["success"])
     means = {cell: np.mean(successes) for cell, successes in cells.items()}
     strides = sorted(config.strides)
-    return np.array([[means.get((method, order, i, j), np.nan) for j in config.noises_px] for i in strides])
+    return np.array([[means.get((method, i, j), np.nan) for j in config.noises_px] for i in strides])
 
 
 def summary(rows: Sequence[dict[str, Any]]) -> list[str]:
-    """Returns one line for each order and method: mean success of all cells that were run, and at every 8th scan."""
+    """Returns a line for each world, order and method: mean success of all cells run, and at every 8th scan."""
     lines = []
-    for order, method in dict.fromkeys((row["order"], row["method"]) for row in rows):
-        mine = [row for row in rows if (row["order"], row["method"]) == (order, method)]
+    for (world, order, method), mine in _grouped(rows, "world", "order", "method").items():
         eighth = [row["success"] for row in mine if row["stride"] == 8]
         at_eighth = f", at every 8th scan {np.mean(eighth):.0%} of {len(eighth)}" if eighth else ""
-        lines.append(f"{order}, {method}: {np.mean([row['success'] for row in mine]):.0%} of {len(mine)}{at_eighth}")
+        success = np.mean([row["success"] for row in mine])
+        lines.append(f"{world}, {order}, {method}: {success:.0%} of {len(mine)}{at_eighth}")
     return lines
 
 
+def table(rows: Sequence[dict[str, Any]]) -> str:
+    """Returns the median ATE of every method and candidate in every cell, as Markdown; what was kept is named last."""
+    columns = dict.fromkeys(_column(row, name) for row in rows for name in row["candidates"])
+    lines = [
+        f"| world | order | every | noise, px | {' | '.join(columns)} | best kept |",
+        f"|{'---|' * (len(columns) + 5)}",
+    ]
+    for cell, mine in _grouped(rows, "world", "order", "stride", "noise_px").items():
+        ates: dict[str, list[float]] = defaultdict(list)
+        for row in mine:
+            for name, numbers in row["candidates"].items():
+                ates[_column(row, name)].append(numbers["ate_px"])
+        medians = (f"{np.median(ates[column]):.3g}" if column in ates else "" for column in columns)
+        kept = tables.best_kept(mine)
+        shares = f"{kept['num_best_kept']} of {kept['num_choices']}"
+        lines.append(f"| {' | '.join([*(f'{value}' for value in cell), *medians, shares])} |")
+    return "\n".join(lines)
+
+
+def _column(row: dict[str, Any], candidate: str) -> str:
+    """Returns the heading of a candidate: that of its method where it is the only one."""
+    return row["method"] if len(row["candidates"]) == 1 else f"{row['method']}: {candidate}"
+
+
+def _grouped(rows: Sequence[dict[str, Any]], *keys: str) -> dict[tuple[Any, ...], list[dict[str, Any]]]:
+    """Returns the rows by the values of some keys, in the order in which they first appear."""
+    groups: dict[tuple[Any, ...], list[dict[str, Any]]] = defaultdict(list)
+    for row in rows:
+        groups[tuple(row[key] for key in keys)].append(row)
+    return groups
+
+
 def _write(config: Config, folder: RunFolder, rows: list[dict[str, Any]], not_run: dict[str, str]) -> str:
-    """Writes metrics.json and one picture an order; returns the summary."""
+    """Writes metrics.json, table.md and a picture for each world and order; returns the summary."""
     lines = summary(rows)
     metrics = {"success_threshold_px": shared.SUCCESS_PX, "summary": lines, "not_run": not_run}
-    write_metrics(folder, metrics | tables.success_of_trusted(rows), seed=config.seed, rows=rows)
-    methods = dict.fromkeys(row["method"] for row in rows)
-    for order in config.orders:
+    numbers = tables.success_of_trusted(rows) | tables.best_kept(rows)
+    write_metrics(folder, metrics | numbers, seed=config.seed, rows=rows)
+    (folder / "table.md").write_text(table(rows) + "\n", encoding="utf-8")
+    for (world, order), mine in _grouped(rows, "world", "order").items():
         figure = viz.success_grids_figure(
-            {method: success_grid(rows, method, order, config) for method in methods},
+            {method: success_grid(mine, method, config) for method in dict.fromkeys(row["method"] for row in mine)},
             {"scans used": [f"1/{stride}" for stride in sorted(config.strides)]},
             {"range noise, px": [f"{noise:g}" for noise in config.noises_px]},
         )
-        viz.save_figure(figure, folder / f"{order}.png")
+        viz.save_figure(figure, folder / f"{world}_{order}.png")
     return "\n".join(lines)
 
 

@@ -1,11 +1,11 @@
-"""Draws how well L-Net re-localises unseen scans, at every free pixel of a world (DeepMapping figure 7).
+"""Draws how well a fit re-localises unseen scans, at every free pixel of a world (DeepMapping figure 7).
 
     python -m experiments.deepmapping_2d --world 1 --init zero -o run
     python -m experiments.deepmapping_relocalize run
 
-RUN is a folder of deepmapping_2d on a built-in world. Written beside its results: relocalization.png and
-relocalization.json, for L-Net as the fit left it (only where one L-Net has learned all scans from zero poses: not with
-windows, nor after a warm start) and for L-Net trained on the poses that the run found.
+RUN is a folder of deepmapping_2d on a built-in world. L-Net is trained on the poses that the fit has found; it proposes
+poses of each scan, and M-Net chooses. Headings are random and unknown. Written beside the results of RUN:
+relocalization.png, relocalization.json, and relocalization.npz with the numbers of each scan.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import itertools
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -44,8 +44,8 @@ class Config:
     """Folder of a run of deepmapping_2d on a built-in world."""
     stride_px: Annotated[int, arg(metavar="PX")] = 6
     """A scan is taken at the centre of every square of so many pixels that is free."""
-    heading: Literal["nearest", "east"] = "nearest"
-    """Orientation of these scans: that of the nearest scan of the fit, or along x everywhere."""
+    heading: Literal["random", "nearest", "east"] = "random"
+    """Orientation of these scans, which is not told: random, that of the nearest scan of the fit, or along x."""
     steps: Annotated[int, arg(metavar="N")] = 5000
     """Training steps of L-Net on the poses of the run."""
     seed: int = 0
@@ -63,7 +63,6 @@ def main(config: Config) -> dict[str, Any]:
     import jax
 
     from dpmjax.deepmapping import LocalizationTrainingConfig, relocalize, train_localization
-    from dpmjax.deepmapping.relocalization import has_windows
     from dpmjax.simulation import make_world, scan_world
     from dpmjax.types import ScanSet
 
@@ -75,55 +74,65 @@ def main(config: Config) -> dict[str, Any]:
     grid = make_world(options.world).is_obstacle
     truth = free_poses(grid, sequence, config)
     points, mask = scan_world(grid, truth, num_beams=sequence.points.shape[1])
-    nets: dict[str, Fitted] = {}
-    if not has_windows(fitted) and not np.any(np.asarray(fitted.params.start)):
-        nets["L-Net as fitted"] = fitted
     begun = time.perf_counter()
-    scans = ScanSet(sequence.points, sequence.mask)
     training = LocalizationTrainingConfig(num_steps=config.steps)
-    nets["L-Net trained"] = train_localization(fitted, scans, training, key=jax.random.key(config.seed))
-    jax.block_until_ready(nets["L-Net trained"].params)
-    training_s = time.perf_counter() - begun
-    errors = {
-        name: errors_at(relocalize(net, ScanSet(points, mask)).pose, truth, fitted, sequence)
-        for name, net in nets.items()
-    }
-    results = {name: summarise(far, turns, truth, sequence) for name, (far, turns) in errors.items()}
-    draw(config, sequence, grid.shape, truth, {name: far for name, (far, _) in errors.items()}, results)
+    scans = ScanSet(sequence.points, sequence.mask)
+    trained = train_localization(fitted, scans, training, key=jax.random.key(config.seed))
+    jax.block_until_ready(trained.params)
+    training_s, begun = time.perf_counter() - begun, time.perf_counter()
+    found = relocalize(trained, ScanSet(points, mask))
+    errors, turns = errors_at(found.pose, truth, fitted, sequence)
+    queries = Queries(errors, turns, found.is_known, is_mapped(truth, fitted, sequence), found.nats)
     report = {
         "world": sequence.name,
         "num_scans": len(sequence),
         "num_poses": len(truth),
         "heading": config.heading,
-        "nets": results,
+        **summarise(queries, truth, sequence),
         "training_s": training_s,
+        "relocalization_s": time.perf_counter() - begun,
         "seed": config.seed,
         **environment(),
     }
     write_json(config.run / "relocalization.json", report)
+    np.savez(config.run / "relocalization.npz", truth=truth, **queries._asdict())
+    draw(config, sequence, grid.shape, truth, queries)
     tell(report)
     print(f"results in {config.run}")
     return report
 
 
+class Queries(NamedTuple):
+    """What became of the scans, (m,) each.
+
+    Attributes:
+        errors: distance to the truth, px.
+        turns: error of the heading, degrees.
+        is_known: the fit says that it knows the view.
+        is_mapped: taken where some beam of the fit's scans has passed.
+        nats: cost of a beam by the map.
+    """
+
+    errors: NDArray[np.float64]
+    turns: NDArray[np.float64]
+    is_known: NDArray[np.bool_]
+    is_mapped: NDArray[np.bool_]
+    nats: NDArray[np.float64]
+
+
 def draw(
-    config: Config,
-    sequence: ScanSequence,
-    shape: tuple[int, ...],
-    truth: NDArray[np.float64],
-    errors: dict[str, NDArray[np.float64]],
-    results: dict[str, dict[str, Any]],
+    config: Config, sequence: ScanSequence, shape: tuple[int, ...], truth: NDArray[np.float64], queries: Queries
 ) -> None:
-    """relocalization.png: a map of the errors a net."""
+    """relocalization.png: maps of the errors, of all scans and of those that are known."""
     from dpmjax import viz
 
     panels = []
-    for name, far in errors.items():
+    everywhere = np.ones(len(truth), bool)
+    for name, rows in (("all scans", everywhere), ("scans that are known", queries.is_known)):
         image = np.full(shape, np.nan)[:: config.stride_px, :: config.stride_px]
-        image[tuple((truth[:, 1::-1] // config.stride_px).astype(int).T)] = far
-        share = 100 * results[name]["share_below_20_px"]
-        median = f"median {results[name]['median_px']:.0f} px"
-        panels.append(viz.ErrorMap(name, f"{median}; {share:.0f} % of the free space below 20 px", image))
+        image[tuple((truth[rows, 1::-1] // config.stride_px).astype(int).T)] = queries.errors[rows]
+        share = float((queries.errors[rows] < _RIGHT_PX).mean()) if rows.any() else 0.0
+        panels.append(viz.ErrorMap(name, f"{share:.0%} of {rows.sum()} below {_RIGHT_PX:.0f} px", image))
     side = config.stride_px * np.array(panels[0].error.shape)
     assert sequence.reference_poses is not None
     extent = (0.0, side[1], 0.0, side[0])
@@ -132,7 +141,7 @@ def draw(
 
 
 def load_fit(run: Path, options: deepmapping_2d.Config, sequence: ScanSequence) -> Fitted:
-    """The fit of a run folder; its poses are those that the run kept.
+    """The fit of a run folder, with its own poses: those that its map belongs to.
 
     Args:
         run: the folder.
@@ -143,7 +152,7 @@ def load_fit(run: Path, options: deepmapping_2d.Config, sequence: ScanSequence) 
         The fit.
 
     Raises:
-        ValueError: the folder holds no checkpoint or no trajectory.
+        ValueError: the folder holds no checkpoint or no trajectory, or its scans had no order.
     """
     import jax
 
@@ -156,14 +165,20 @@ def load_fit(run: Path, options: deepmapping_2d.Config, sequence: ScanSequence) 
     trajectory = run / "trajectory.npy"
     if not trajectory.is_file():
         raise ValueError(f"{run} holds no trajectory.npy: let the run end, or resume it")
+    if not options.ordered:
+        raise ValueError(
+            f"{run} is a run with --no-ordered, whose fit has another order of the scans; use an ordered one"
+        )
     settings = deepmapping_2d.fit_settings(options, sequence)
-    poses = np.load(trajectory)
-    data, unit = planar_data(ScanSet(sequence.points, sequence.mask), None if options.init == "zero" else poses)
-    like = init(planar_problem(settings, data), data, key=jax.random.key(0))
+    start = None if options.init == "zero" else np.load(trajectory)
+    data, unit = planar_data(ScanSet(sequence.points, sequence.mask), start)
+    problem = planar_problem(settings, data)
+    like = init(problem, data, key=jax.random.key(0))
     state = Checkpoints((run / CHECKPOINTS).resolve()).restore_latest(like, fallback=None)
     if state is None:
         raise ValueError(f"{run} holds no checkpoint that can be read")
-    return Fitted(poses, state.params, None, unit, settings)
+    poses = np.asarray(problem.poses(settings, problem.phases[int(state.phase)], state.params, data), np.float64)
+    return Fitted(poses * [unit, unit, 1.0], state.params, None, unit, settings)
 
 
 def free_poses(grid: NDArray[np.bool_], sequence: ScanSequence, config: Config) -> NDArray[np.float64]:
@@ -173,10 +188,29 @@ def free_poses(grid: NDArray[np.bool_], sequence: ScanSequence, config: Config) 
     half = config.stride_px // 2
     rows, columns = np.nonzero(~grid[half :: config.stride_px, half :: config.stride_px])
     places = np.column_stack([columns, rows]) * config.stride_px + half + 0.5
-    if config.heading == "east":
-        return np.column_stack([places, np.zeros(len(places))])
-    _, nearest = KDTree(sequence.reference_poses[:, :2]).query(places)
-    return np.column_stack([places, sequence.reference_poses[nearest, 2]])
+    if config.heading == "nearest":
+        _, nearest = KDTree(sequence.reference_poses[:, :2]).query(places)
+        headings = sequence.reference_poses[nearest, 2]
+    else:
+        rng = np.random.default_rng([config.seed, 7])
+        headings = rng.uniform(-np.pi, np.pi, len(places)) if config.heading == "random" else np.zeros(len(places))
+    return np.column_stack([places, headings])
+
+
+def is_mapped(truth: NDArray[np.float64], fitted: Fitted, sequence: ScanSequence) -> NDArray[np.bool_]:
+    """Whether some beam of the fit's scans has passed the places of true poses."""
+    from dpmjax.deepmapping import draw_map
+    from dpmjax.metrics import align_rigid
+
+    picture = draw_map(fitted, sequence.points, sequence.mask)
+    T_fit_world = align_rigid(sequence.reference_poses[:, :2], fitted.poses[:, :2])
+    places = truth[:, :2] @ T_fit_world[:2, :2].T + T_fit_world[:2, 2]
+    x_min, x_max, y_min, y_max = picture.extent
+    height, width = picture.explored.shape
+    cells = np.floor((places - [x_min, y_min]) / [x_max - x_min, y_max - y_min] * [width, height]).astype(int)
+    is_inside = ((cells >= 0) & (cells < [width, height])).all(axis=1)
+    column, row = np.where(is_inside[:, None], cells, 0).T
+    return is_inside & picture.explored[row, column]
 
 
 def errors_at(
@@ -192,37 +226,45 @@ def errors_at(
     return np.linalg.norm(moved - truth[:, :2], axis=1), np.degrees(np.abs(turn))
 
 
-def summarise(
-    errors: NDArray[np.float64], turns: NDArray[np.float64], truth: NDArray[np.float64], sequence: ScanSequence
-) -> dict[str, Any]:
-    """Medians, overall and by the distance from the trajectory."""
+def summarise(queries: Queries, truth: NDArray[np.float64], sequence: ScanSequence) -> dict[str, Any]:
+    """Numbers of all mapped free space, of what is called known, and by the distance from the trajectory."""
     from scipy.spatial import KDTree
 
     distance, _ = KDTree(sequence.reference_poses[:, :2]).query(truth[:, :2])
-    bins = []
-    for low, high in itertools.pairwise(_BINS_PX):
-        inside = (distance >= low) & (distance < high)
-        if inside.any():
-            row = {"from_px": low, "to_px": high, "num_poses": int(inside.sum())}
-            row |= {"median_px": float(np.median(errors[inside])), "median_deg": float(np.median(turns[inside]))}
-            bins.append({**row, "share_below_20_px": float((errors[inside] < _RIGHT_PX).mean())})
+    known, mapped, is_right = queries.is_known, queries.is_mapped, queries.errors < _RIGHT_PX
+    groups = [("mapped", mapped), ("mapped and known", mapped & known), ("known", known), ("not mapped", ~mapped)]
+    groups += [
+        (f"mapped, {low:.0f} to {high:.0f} px from the trajectory", mapped & (distance >= low) & (distance < high))
+        for low, high in itertools.pairwise(_BINS_PX)
+    ]
     return {
-        "median_px": float(np.median(errors)),
-        "median_deg": float(np.median(turns)),
-        "share_below_20_px": float((errors < _RIGHT_PX).mean()),
-        "by_distance_from_trajectory": bins,
+        "groups": {name: _numbers(queries, rows) for name, rows in groups if rows.any()},
+        "precision_of_known": float(is_right[known].mean()) if known.any() else None,
+        "share_of_mapped_known": float(known[mapped].mean()),
+        "share_of_unmapped_known": float(known[~mapped].mean()),
+    }
+
+
+def _numbers(queries: Queries, rows: NDArray[np.bool_]) -> dict[str, Any]:
+    return {
+        "num_poses": int(rows.sum()),
+        "median_px": float(np.median(queries.errors[rows])),
+        "median_deg": float(np.median(queries.turns[rows])),
+        "share_below_20_px": float((queries.errors[rows] < _RIGHT_PX).mean()),
+        "share_known": float(queries.is_known[rows].mean()),
     }
 
 
 def tell(report: dict[str, Any]) -> None:
-    """The medians by distance as a table."""
-    for name, result in report["nets"].items():
-        print(f"{name}: median {result['median_px']:.1f} px, {100 * result['share_below_20_px']:.0f} % below 20 px")
-        for row in result["by_distance_from_trajectory"]:
-            print(
-                f"  {row['from_px']:5.0f} to {row['to_px']:5.0f} px from the trajectory: median {row['median_px']:6.1f}"
-                f" px, {row['median_deg']:5.1f} degrees, {100 * row['share_below_20_px']:3.0f} % below 20 px"
-            )
+    """Prints the numbers of each group of scans."""
+    for name, row in report["groups"].items():
+        print(
+            f"{name}: {row['num_poses']} scans, median {row['median_px']:.1f} px, {row['median_deg']:.1f} degrees, "
+            f"{row['share_below_20_px']:.0%} below {_RIGHT_PX:.0f} px, {row['share_known']:.0%} called known"
+        )
+    precision = report["precision_of_known"]
+    answer = "none is called known" if precision is None else f"{precision:.1%} of those called known are right"
+    print(f"{answer}; {report['share_of_mapped_known']:.0%} of the mapped ones are called known")
 
 
 if __name__ == "__main__":

@@ -161,6 +161,7 @@ class World:
     Attributes:
         name: for titles.
         is_obstacle: (h, w) bool, True where a pixel is solid; row 0 is the lowest.
+        num_people: people who walk about in it while a sequence of scans is taken.
 
     Raises:
         ValueError: another shape or dtype, or no free space.
@@ -168,6 +169,7 @@ class World:
 
     name: str
     is_obstacle: BoolArray = field(repr=False)
+    num_people: int = 0
 
     def __post_init__(self) -> None:
         if self.is_obstacle.ndim != 2 or self.is_obstacle.dtype != np.bool_:

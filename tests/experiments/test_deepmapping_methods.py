@@ -27,7 +27,7 @@ from experiments._deepmapping_methods import (
     in_fitting_order,
     make_task,
 )
-from experiments._deepmapping_tables import run_method
+from experiments._deepmapping_tables import best_kept, run_method
 from experiments._recordings import corrected_numbers
 
 # ATE in px that each method stays below on the tiny walk; the start of all poses at zero has 14 px there. The direct
@@ -42,6 +42,7 @@ LARGEST_ATE_PX = {
     "lnet-icp": 0.1,
     "search": 1.0,
     "search-refined": 0.01,
+    "all": 0.01,
     "direct-adam": 30.0,
     "direct-windows": 30.0,
     "direct-lbfgs": 30.0,
@@ -69,7 +70,7 @@ def test_method_registers_a_tiny_walk(name, task) -> None:
     assert row["ate_px"] < LARGEST_ATE_PX[name]
     assert row["ate_px"] == row["candidates"][row["kept"]]["ate_px"]
     assert row["success"] == (row["ate_px"] < 20.0)
-    assert (DEEPMAPPING in row["candidates"]) == ("deepmapping" in name or "lnet" in name)
+    assert (DEEPMAPPING in row["candidates"]) == (name == "all" or "deepmapping" in name or "lnet" in name)
     for numbers in row["candidates"].values():
         assert {"ate_px", "point_distance_px", "code_length", "misfit"} == set(numbers)
 
@@ -153,21 +154,57 @@ def test_limits_are_resumed_without_doing_a_row_twice(tmp_path, monkeypatch, cap
     assert simulated == [(0, 200), (1, 201)]
     assert second["note"] is None
     assert "no_such_package" in second["not_run"]["multiway"]
-    assert "ordered, icp-plane: 100% of 2" in capsys.readouterr().out
-    assert (tmp_path / "out" / "ordered.png").exists()
+    assert "rooms, ordered, icp-plane: 100% of 2" in capsys.readouterr().out
+    assert (tmp_path / "out" / "rooms_ordered.png").exists()
 
 
 def test_success_grid_leaves_open_what_was_not_run() -> None:
     config = deepmapping_limits.Config(strides=(8, 4), noises_px=(0.0, 1.0))
-    row = {"method": "m", "order": "ordered", "stride": 8, "noise_px": 1.0}
-    grid = deepmapping_limits.success_grid(
-        [{**row, "success": True}, {**row, "success": False}], "m", "ordered", config
-    )
+    row = {"method": "m", "stride": 8, "noise_px": 1.0}
+    grid = deepmapping_limits.success_grid([{**row, "success": True}, {**row, "success": False}], "m", config)
     np.testing.assert_array_equal(grid, [[np.nan, np.nan], [np.nan, 0.5]])
 
 
+def test_limits_tell_every_candidate_and_how_often_the_best_was_kept() -> None:
+    cell = {"world": "grove", "order": "ordered", "stride": 8, "noise_px": 1.0}
+    rows = [
+        cell | a_row("all", 0.5, "fit", search=3.0, fit=0.5),
+        cell | a_row("all", 2.05, "search", search=2.05, fit=2.0),
+        cell | a_row("all", 4.0, "search", search=4.0, fit=1.0),
+        cell | a_row("icp-plane", 0.25),
+    ]
+    lines = deepmapping_limits.table(rows).splitlines()
+    assert lines[0] == "| world | order | every | noise, px | all: search | all: fit | icp-plane | best kept |"
+    assert lines[2:] == ["| grove | ordered | 8 | 1.0 | 3 | 1 | 0.25 | 2 of 3 |"]
+    assert best_kept(rows) == {"num_choices": 3, "num_best_kept": 2}
+
+
+@pytest.mark.parametrize(("world", "expected"), [("rooms", 1), ("grove", "grove-4"), ("crowd", "crowd-4")])
+def test_limits_have_a_world_for_each_walk(world: str, expected: int | str, monkeypatch) -> None:
+    found = []
+
+    def simulate(name: int | str, *_, **options):
+        found.append((name, options["seed"], options["range_noise_px"]))
+        return simulate_sequence(0, 8, num_beams=64)
+
+    monkeypatch.setattr(deepmapping_limits.simulation, "simulate_sequence", simulate)
+    monkeypatch.setattr(_deepmapping_methods, "make_task", lambda sequence, **_: Task(sequence, planar=None))
+    cell = {"world": world, "stride": 4, "walk": 4, "noise_px": 3.0, "order": "ordered"}
+    task, _ = deepmapping_limits._prepare(deepmapping_limits.Config(), cell)
+    assert found == [(expected, 204, 3.0)]
+    assert len(task.sequence) == 2
+
+
 @pytest.mark.parametrize(
-    "options", [{"methods": ("nonsense",)}, {"methods": ()}, {"limit": 0}, {"steps": 1}, {"orders": ("sideways",)}]
+    "options",
+    [
+        {"worlds": ("moon",)},
+        {"methods": ("nonsense",)},
+        {"methods": ()},
+        {"limit": 0},
+        {"steps": 1},
+        {"orders": ("sideways",)},
+    ],
 )
 def test_bad_options_are_named(options) -> None:
     with pytest.raises(ValueError, match="--"):

@@ -8,6 +8,7 @@ import math
 import numpy as np
 import pytest
 
+from dpmjax.simulation import simulate_sequence
 from experiments import deepmapping_ablations, deepmapping_relocalize, deepmapping_rgbd, deepmapping_size, toy_1d
 from experiments._command import run_command
 
@@ -118,3 +119,25 @@ def test_exponents_are_those_of_full_steps() -> None:
     assert found["epoch, free poses (s)"] == pytest.approx(1.0)
     assert found["peak memory (GB)"] == pytest.approx(0.5)
     assert deepmapping_size.exponents([row(64)])["peak memory (GB)"] is None
+
+
+def test_relocalization_tells_known_from_right_and_mapped() -> None:
+    walk = simulate_sequence(0, 4, num_beams=16)
+    truth = walk.reference_poses + np.array([0.0, 15.0, 0.0])
+    queries = deepmapping_relocalize.Queries(
+        errors=np.array([1.0, 3.0, 90.0, 500.0]),
+        turns=np.array([0.1, 0.3, 9.0, 50.0]),
+        is_known=np.array([True, False, True, False]),
+        is_mapped=np.array([True, True, False, False]),
+        nats=np.array([0.1, 0.8, 0.6, 1.2]),
+    )
+    found = deepmapping_relocalize.summarise(queries, truth, walk)
+    assert found["precision_of_known"] == 0.5
+    assert (found["share_of_mapped_known"], found["share_of_unmapped_known"]) == (0.5, 0.5)
+    groups = found["groups"]
+    assert groups["mapped"] == {
+        "num_poses": 2, "median_px": 2.0, "median_deg": 0.2, "share_below_20_px": 1.0, "share_known": 0.5
+    }  # fmt: skip
+    assert groups["mapped and known"]["median_px"] == 1.0
+    assert groups["not mapped"]["share_below_20_px"] == 0.0
+    assert sum(row["num_poses"] for name, row in groups.items() if name.startswith("mapped, ")) == 2

@@ -7,8 +7,8 @@ import pytest
 
 from dpmjax.geometry import se2
 from dpmjax.registration import assess_trajectory, choose_trajectory, planar_scans
-from dpmjax.registration.quality import map_code_length
-from dpmjax.simulation import simulate_sequence
+from dpmjax.registration.quality import map_code_length, view_misfit
+from dpmjax.simulation import scan_world, simulate_sequence
 
 
 def shaken(poses: np.ndarray, px: float, seed: int = 0) -> np.ndarray:
@@ -56,6 +56,28 @@ def test_the_sharper_map_is_not_chosen_where_it_is_the_wrong_map(walk, walk_scan
     true = walk.reference_poses
     scattered = true + 5000.0 * np.arange(len(true))[:, None] * [1.0, 0.0, 0.0]
     assert choose_trajectory(walk_scans, {"scattered": scattered, "shaken": shaken(true, 1.0)})[0] == "shaken"
+
+
+@pytest.mark.parametrize("world", ["grove", "crowd", 0])
+def test_the_sharper_of_two_near_maps_is_chosen_with_and_without_walls(world) -> None:
+    sequence = simulate_sequence(world, 41, seed=2, num_beams=128, range_noise_px=2.0).take(slice(0, None, 4))
+    scans, true = planar_scans(sequence.points, sequence.mask), sequence.reference_poses
+    misfits = [view_misfit(scans, shaken(true, px)) for px in (0.0, 1.0, 3.0, 9.0)]
+    assert misfits == sorted(misfits)
+    assert choose_trajectory(scans, {"shaken": shaken(true, 1.0), "true": true})[0] == "true"
+
+
+def test_misfit_is_the_share_of_the_visible_beams_in_a_square_room() -> None:
+    room = np.ones((202, 202), bool)
+    room[1:-1, 1:-1] = False
+    poses = np.array([[101.0, 101.0, 0.0], [101.0, 101.0, 0.5]])
+    scans = planar_scans(*scan_world(room, poses))
+    assert view_misfit(scans, poses) < 0.1
+    moved = poses + np.array([[0.0, 0.0, 0.0], [5.0, 0.0, 0.0]])
+    # A quarter of the beams ends 5 px before a wall, and a quarter behind one, where the other scan cannot see.
+    assert view_misfit(scans, moved) == pytest.approx(1 / 3, abs=0.05)
+    # A scan a world away sees nothing of the other.
+    assert view_misfit(scans, poses + np.array([[0.0, 0.0, 0.0], [5000.0, 0.0, 0.0]])) == pytest.approx(1.0)
 
 
 def test_a_choice_needs_a_candidate(walk_scans) -> None:

@@ -1,5 +1,6 @@
-"""Laws of the worlds, of the walk through them, and of the simulated sequence."""
+"""Laws of the worlds, of the walk through them, of the people in them, and of the simulated sequence."""
 
+from dataclasses import replace
 from functools import lru_cache
 
 import numpy as np
@@ -9,10 +10,12 @@ from scipy.stats import kstest
 
 from dpmjax.io import InputError, read_world_png, write_world_png
 from dpmjax.simulation import World, cast_rays, make_world, simulate_sequence, simulate_trajectory
+from dpmjax.simulation.people2d import simulate_people, stop_at_people
 from dpmjax.simulation.raycast2d import beam_angles
 from dpmjax.simulation.trajectory2d import simulate_odometry
 
 WORLDS = [0, 1, 2]
+NAMED = ["grove", "grove-4", "crowd"]
 world = lru_cache(make_world)
 
 
@@ -21,12 +24,12 @@ def walk(index):
     return simulate_trajectory(world(index), 256, rng=np.random.default_rng([index, 0]))
 
 
-@pytest.mark.parametrize("index", WORLDS)
+@pytest.mark.parametrize("index", WORLDS + NAMED)
 def test_world_is_the_papers_size_and_one_free_space(index):
     grid = world(index).is_obstacle
     assert grid.shape == (1024, 1024)
     assert label(~grid)[1] == 1
-    assert 0.05 < grid.mean() < 0.5
+    assert 0.05 < grid.mean() < 0.6
     np.testing.assert_array_equal(make_world(index).is_obstacle, grid)
 
 
@@ -35,9 +38,72 @@ def test_worlds_differ():
     assert all((a != b).mean() > 0.02 for i, a in enumerate(grids) for b in grids[:i])
 
 
-def test_negative_index_is_refused():
-    with pytest.raises(ValueError, match="index"):
-        make_world(-1)
+def test_a_name_is_a_kind_with_a_seed():
+    for name, index in (("office-3", 3), ("yard-1", 1), ("office", 0)):
+        np.testing.assert_array_equal(make_world(name).is_obstacle, make_world(index).is_obstacle)
+        assert make_world(name).name == make_world(index).name
+    assert (world("grove").is_obstacle != world("grove-4").is_obstacle).mean() > 0.02
+
+
+@pytest.mark.parametrize("bad", [-1, "forest", "grove-", "grove--1", "grove-1x", ""])
+def test_what_is_no_world_is_refused(bad):
+    with pytest.raises(ValueError, match=r"index|world: expected"):
+        make_world(bad)
+
+
+def longest_straight_edge(grid):
+    """Pixels of the longest edge along a row or a column."""
+    edges = [grid[1:] != grid[:-1], (grid[:, 1:] != grid[:, :-1]).T]
+    starts = [np.flatnonzero(np.diff(np.pad(line, 1).astype(int))) for edge in edges for line in edge]
+    return max((int((run[1::2] - run[::2]).max()) for run in starts if len(run)), default=0)
+
+
+def test_a_grove_has_no_straight_wall_and_no_view_of_the_border():
+    for name in ("grove", "grove-4"):
+        grid = world(name).is_obstacle
+        assert longest_straight_edge(grid) < 60 < 300 < longest_straight_edge(world(0).is_obstacle)
+        assert grid[[0, -1]].all()
+        assert grid[:, [0, -1]].all()
+
+
+def test_beams_end_on_people_and_nothing_else_changes():
+    crowd = world("crowd")
+    with_people, empty = (
+        simulate_sequence(crowd, 12, seed=1),
+        simulate_sequence(replace(crowd, num_people=0), 12, seed=1),
+    )
+    np.testing.assert_array_equal(with_people.reference_poses, empty.reference_poses)
+    ranges, free = (np.linalg.norm(s.points, axis=2) for s in (with_people, empty))
+    is_met = ranges < free - 1e-3
+    assert 0.02 < is_met.mean() < 0.4
+    np.testing.assert_array_equal(with_people.points[~is_met], empty.points[~is_met])
+
+
+def test_a_person_is_a_disc_in_front_of_what_is_farther():
+    poses, angles = np.array([[10.0, 20.0, 0.5]]), beam_angles(360)
+    people = np.array([[[110.0, 20.0]], [[10.0, 320.0]], [[20.0, 20.0]]])
+    ranges = stop_at_people(np.full((1, 360), 200.0), poses, angles, people)
+    bearing = angles + 0.5
+    hits = poses[0, :2] + ranges[0, :, None] * np.column_stack([np.cos(bearing), np.sin(bearing)])
+    is_met = ranges[0] < 200.0
+    # Only the first: the second is behind what the beams have met, the third has stepped out of the way.
+    np.testing.assert_allclose(np.linalg.norm(hits[is_met] - people[0, 0], axis=1), 11.0, atol=1e-9)
+    assert (ranges[0, is_met] < 100.0).all()
+    width = np.rad2deg(2 * np.arcsin(11.0 / 100.0))
+    assert abs(is_met.sum() - width) <= 1
+    np.testing.assert_array_equal(stop_at_people(ranges, poses, angles, people[:0]), ranges)
+
+
+def test_people_walk_in_free_space():
+    crowd = world("crowd")
+    people = simulate_people(replace(crowd, num_people=3), 20, rng=np.random.default_rng(0))
+    assert people.shape == (3, 20, 2)
+    cells = people.astype(int)
+    assert not crowd.is_obstacle[cells[..., 1], cells[..., 0]].any()
+    steps = np.linalg.norm(np.diff(people, axis=1), axis=2)
+    assert (steps > 1.0).all()
+    assert len(np.unique(people[:, 0], axis=0)) == 3
+    assert simulate_people(replace(crowd, num_people=0), 20, rng=np.random.default_rng(0)).shape == (0, 20, 2)
 
 
 def test_world_survives_its_picture(tmp_path):

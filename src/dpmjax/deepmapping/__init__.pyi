@@ -16,6 +16,9 @@ from .depth_config import DepthMappingConfig as DepthMappingConfig
 from .depth_config import depth_preset as depth_preset
 from .depth_initialization import DepthInitializationConfig as DepthInitializationConfig
 from .depth_initialization import initialize_depth as initialize_depth
+from .localization_training import LocalizationTrainingConfig as LocalizationTrainingConfig
+from .localization_training import train_localization as train_localization
+from .map_search import MapSearchConfig as MapSearchConfig
 from .occupancy_map import MapPicture as MapPicture
 from .occupancy_map import draw_map as draw_map
 from .planar import Fitted as Fitted
@@ -23,7 +26,6 @@ from .planar import fit_deepmapping as fit_deepmapping
 from .problem import Problem as Problem
 from .projective_consistency import DepthScans as DepthScans
 from .projective_consistency import projective_consistency as projective_consistency
-from .relocalization import LocalizationTrainingConfig as LocalizationTrainingConfig
+from .relocalization import RelocalizationConfig as RelocalizationConfig
 from .relocalization import Relocalized as Relocalized
 from .relocalization import relocalize as relocalize
-from .relocalization import train_localization as train_localization

@@ -1,20 +1,26 @@
-"""Re-localisation: L-Net estimates the poses of scans that it was not fitted to (DeepMapping figure 7)."""
+"""Re-localisation of scans that a fit has not seen: L-Net proposes poses, M-Net chooses (DeepMapping figure 7).
+
+L-Net knows the headings of the walk only. So each scan is turned all round, L-Net proposes a pose for every turn, and
+the one stays around which the map of M-Net explains the scan best. What the map explains badly was never seen.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field
 from functools import partial
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optax
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 from numpy.typing import ArrayLike, NDArray
 
 from dpmjax.checks import require_count
 from dpmjax.deepmapping.config import DeepMappingConfig
+from dpmjax.deepmapping.localization_training import has_windows, turn_scan
+from dpmjax.deepmapping.map_raster import make_raster
+from dpmjax.deepmapping.map_search import MapSearchConfig, map_fields, search_map
 from dpmjax.deepmapping.planar import Fitted, as_scan_set, choose_beams, localize_scans
 from dpmjax.geometry import se2
 from dpmjax.types import ScanSet
@@ -28,9 +34,15 @@ class Relocalized(NamedTuple):
 
     Attributes:
         pose: (3,) or (m, 3) x, y, heading in (-pi, pi], unit of the points.
+        nats: () or (m,) what a beam costs by the map at this pose: 0 where M-Net explains it fully, log 4 where it
+            knows nothing.
+        is_known: () or (m,) False where the map does not explain the scan: its view was never seen, or the pose is
+            wrong.
     """
 
     pose: NDArray[np.float64]
+    nats: NDArray[np.float64]
+    is_known: NDArray[np.bool_]
 
     @property
     def T_world_scan(self) -> NDArray[np.float64]:
@@ -39,55 +51,47 @@ class Relocalized(NamedTuple):
 
 
 @dataclass(frozen=True)
-class LocalizationTrainingConfig:
-    """Settings of the training of L-Net on the poses of a fit.
+class RelocalizationConfig:
+    """Settings of `relocalize`.
 
     Attributes:
-        num_steps: steps of Adam.
-        learning_rate: at the start; it falls to a hundredth (cosine).
-        scans_per_step: drawn with replacement.
-        max_turn_deg: scans are turned by a random angle up to this, heading with them, so that L-Net depends less on
-            the orientations that the sensor happened to have.
-        max_shift: scans are re-projected to points around their own (`shift_scan`), up to this distance in typical
-            ranges, so that L-Net learns the surroundings of the trajectory.
-        drop: largest share of the beams that is hidden from L-Net; the share differs from scan to scan.
+        num_turns: headings at which L-Net sees each scan, evenly all round.
+        max_nats: a scan whose beams cost more is not known.
+        search: settings of the search around L-Net's proposals.
     """
 
-    num_steps: int = 5000
-    learning_rate: float = 2e-3
-    scans_per_step: int = 64
-    max_turn_deg: float = 20.0
-    max_shift: float = 0.2
-    drop: float = 0.2
+    num_turns: int = 24
+    max_nats: float = 0.4
+    search: MapSearchConfig = field(default_factory=MapSearchConfig)
 
     def __post_init__(self) -> None:
-        require_count("num_steps", self.num_steps)
-        require_count("scans_per_step", self.scans_per_step)
-        if not self.max_shift >= 0.0:
-            raise ValueError(f"max_shift: expected zero or more, got {self.max_shift}")
-        if not 0.0 <= self.drop < 1.0:
-            raise ValueError(f"drop: expected 0 to below 1, got {self.drop}")
+        require_count("num_turns", self.num_turns)
+        if not self.max_nats > 0.0:
+            raise ValueError(f"max_nats: expected a positive number, got {self.max_nats}")
 
 
-def relocalize(fitted: Fitted, scan: ScanSet | ArrayLike) -> Relocalized:
-    """Estimates poses of new scans by one forward pass of L-Net (DeepMapping section 4.1, figure 7).
+def relocalize(fitted: Fitted, scan: ScanSet | ArrayLike, config: RelocalizationConfig | None = None) -> Relocalized:
+    """Estimates poses of new scans, and tells which of them the fit does not know (DeepMapping section 4.1, figure 7).
 
-    The estimate is coarse: right near the trajectory of the fit and at similar orientations, wrong elsewhere, without
-    a sign of which. After the free poses of the fast preset L-Net lags behind the poses; `train_localization` brings
-    it back to them.
+    Nothing is assumed about the heading. L-Net proposes a pose for each of several turns of the scan; a search around
+    the proposals takes the pose at which M-Net explains the scan best. After the free poses of the fast preset L-Net
+    lags behind the poses; `train_localization` brings it back to them.
 
     Args:
-        fitted: result of `fit_deepmapping` from zero poses with one L-Net for all scans, or of `train_localization`.
+        fitted: result of `fit_deepmapping` from zero poses with one L-Net for all scans, or of `train_localization`;
+            M-Net must have been trained, as all presets do, or no scan is known.
         scan: (b, 2) one scan, or (m, b, 2), in the sensor frame, unit and order of the beams as in the fit; beams with
             coordinates that are not finite, or both zero, measured nothing.
+        config: settings.
 
     Returns:
-        Relocalized, in the world of `fitted.poses`.
+        Relocalized, in the world of the fit's own poses.
 
     Raises:
         ValueError: the shape is another one, a scan has no valid beam, each window of the fit has an L-Net of its own,
             or L-Net's outputs are corrections of given start poses.
     """
+    config = config or RelocalizationConfig()
     if has_windows(fitted):
         raise ValueError("fitted: each of its L-Nets knows one window of the walk; call train_localization first")
     if np.any(np.asarray(fitted.params.start) != 0.0):
@@ -96,162 +100,40 @@ def relocalize(fitted: Fitted, scan: ScanSet | ArrayLike) -> Relocalized:
         )
     is_one = not isinstance(scan, ScanSet) and np.ndim(scan) == 2
     scans = as_scan_set(np.asarray(scan)[None] if is_one else scan, min_scans=1)
-    beams = choose_beams(scans.mask.shape[1], fitted.config.cold_phases[0])
-    points, mask = scans.points[:, beams] / fitted.unit, scans.mask[:, beams]
-    chunks = [slice(k, k + _CHUNK) for k in range(0, len(points), _CHUNK)]
-    parts = [_localize(fitted.params.localization, points[c], mask[c], config=fitted.config) for c in chunks]
-    poses = np.concatenate([np.asarray(part, np.float64) for part in parts])
+    fields = map_fields(make_raster(fitted.params, fitted.config), config=config.search)
+    parts = []
+    for k in range(0, len(scans.points), _CHUNK):
+        part = ScanSet(scans.points[k : k + _CHUNK] / fitted.unit, scans.mask[k : k + _CHUNK])
+        turned = partial(propose_poses, fitted.params.localization, part, num_turns=config.num_turns)
+        parts.append(search_map(part, turned(fit_config=fitted.config), fields, config=config.search))
+    poses, nats = (np.concatenate([np.asarray(x, np.float64) for x in each]) for each in zip(*parts, strict=True))
     poses[:, :2] *= fitted.unit
     poses[:, 2] = se2.wrap_angle(poses[:, 2])
-    return Relocalized(poses[0] if is_one else poses)
+    found = Relocalized(poses, nats, nats <= config.max_nats)
+    return Relocalized(*(x[0] for x in found)) if is_one else found
 
 
-def has_windows(fitted: Fitted) -> bool:
-    """Whether the fit has an L-Net for each of several windows instead of one for all scans.
-
-    Args:
-        fitted: result of `fit_deepmapping` or of `train_localization`.
-
-    Returns:
-        True if a leading axis of L-Net's weights is that of the windows.
-    """
-    biases = fitted.params.localization["params"]["Dense_0"]["bias"]
-    return biases.ndim > 1
-
-
-def train_localization(
-    fitted: Fitted, scans: ScanSet | ArrayLike, config: LocalizationTrainingConfig | None = None, *, key: jax.Array
-) -> Fitted:
-    """Trains L-Net on the poses that the fit has found, so that `relocalize` answers in the same world.
-
-    The labels are the fit's own: no ground truth enters. Scans are turned, shifted and partly hidden.
+@partial(jax.jit, static_argnames=("num_turns", "fit_config"))
+def propose_poses(
+    params: Any, scans: ScanSet, *, num_turns: int, fit_config: DeepMappingConfig
+) -> Float[Array, "m t 3"]:
+    """L-Net's poses of scans, one for each turn of the scan.
 
     Args:
-        fitted: any fit, also from given poses.
-        scans: (n, b, 2) the scans of the fit.
-        config: settings.
-        key: of the batches.
+        params: weights of L-Net.
+        scans: (m, b, 2) in typical ranges.
+        num_turns: evenly all round; the first is none.
+        fit_config: settings of the fit.
 
     Returns:
-        The fit with another L-Net and with zero start poses; poses and map are the same.
-
-    Raises:
-        ValueError: the number of scans is not that of the fit.
+        x, y, heading of the scans as they are, in typical ranges and radians.
     """
-    config = config or LocalizationTrainingConfig()
-    scans = as_scan_set(scans)
-    if len(scans.points) != len(fitted.poses):
-        raise ValueError(f"scans: expected the {len(fitted.poses)} scans of the fit, got {len(scans.points)}")
-    poses = jnp.asarray(fitted.poses / [fitted.unit, fitted.unit, 1.0], jnp.float32)
-    scaled = replace(scans, points=scans.points / fitted.unit)
-    begin = fitted.params.localization
-    if has_windows(fitted):
-        begin = jax.tree.map(lambda weights: weights[0], begin)
-    net = _train(begin, scaled, poses, key, fit_config=fitted.config, config=config)
-    params = replace(fitted.params, localization=net, start=jnp.zeros_like(fitted.params.start))
-    return fitted._replace(params=params)
+    beams = choose_beams(scans.mask.shape[1], fit_config.cold_phases[0])
+    mask, turns = scans.mask[:, beams], 2.0 * jnp.pi * jnp.arange(num_turns) / num_turns
 
+    def propose(turn: Float[Array, ""]) -> Float[Array, "m 3"]:
+        points = jax.vmap(turn_scan, in_axes=(0, None))(scans.points[:, beams], turn)
+        found = localize_scans(params, points, mask, fit_config)
+        return found - turn * jnp.array([0.0, 0.0, 1.0])
 
-@partial(jax.jit, static_argnames=("fit_config", "config"))
-def _train(
-    params: Any,
-    scans: ScanSet,
-    poses: Float[Array, "n 3"],
-    key: jax.Array,
-    *,
-    fit_config: DeepMappingConfig,
-    config: LocalizationTrainingConfig,
-) -> Any:
-    optimizer = optax.adam(optax.cosine_decay_schedule(config.learning_rate, config.num_steps, 0.01))
-
-    def loss_of(params: Any, step_key: jax.Array) -> Array:
-        batch, labels = _draw_training_batch(scans, poses, fit_config, config, key=step_key)
-        error = localize_scans(params, batch.points, batch.mask, fit_config) - labels
-        return jnp.mean(jnp.sum(jnp.abs(error[:, :2]), -1) + jnp.abs(se2.wrap_angle(error[:, 2])))
-
-    def one_step(carry: tuple[Any, Any], step: Array) -> tuple[tuple[Any, Any], None]:
-        params, state = carry
-        gradient = jax.grad(loss_of)(params, jax.random.fold_in(key, step))
-        updates, state = optimizer.update(gradient, state, params)
-        return (optax.apply_updates(params, updates), state), None
-
-    return jax.lax.scan(one_step, (params, optimizer.init(params)), jnp.arange(config.num_steps))[0][0]
-
-
-def _draw_training_batch(
-    scans: ScanSet,
-    poses: Float[Array, "n 3"],
-    fit_config: DeepMappingConfig,
-    config: LocalizationTrainingConfig,
-    *,
-    key: jax.Array,
-) -> tuple[ScanSet, Float[Array, "m 3"]]:
-    """Scans turned, shifted and partly hidden, and their poses."""
-    row_key, first_key, turn_key, share_key, drop_key, shift_key = jax.random.split(key, 6)
-    num_scans, num_beams = scans.mask.shape
-    rows = jax.random.randint(row_key, (config.scans_per_step,), 0, num_scans)
-    beams = choose_beams(num_beams, fit_config.cold_phases[0], jax.random.randint(first_key, (), 0, num_beams))
-    points, mask = scans.points[rows][:, beams], scans.mask[rows][:, beams]
-    limit = np.deg2rad(config.max_turn_deg)
-    turn = jax.random.uniform(turn_key, rows.shape, minval=-limit, maxval=limit)
-    shift = _draw_shifts(shift_key, len(rows), config.max_shift)
-    points = jax.vmap(shift_scan)(points, mask, shift)
-    moved = jax.vmap(turn_scan)(shift[:, None], -poses[rows, 2])[:, 0]
-    points = jax.vmap(turn_scan)(points, turn)
-    share = config.drop * jax.random.uniform(share_key, (*rows.shape, 1))
-    hidden = jax.random.uniform(drop_key, mask.shape) < share
-    # A scan of one beam must keep it.
-    seen = jnp.where((mask & ~hidden).any(-1, keepdims=True), mask & ~hidden, mask)
-    return ScanSet(points, seen), poses[rows] + jnp.concatenate([moved, turn[:, None]], axis=-1)
-
-
-def _draw_shifts(key: jax.Array, count: int, largest: float) -> Float[Array, "n 2"]:
-    """Shifts of random sides and lengths; half of the scans stay where they are, which are the only true ones."""
-    length_key, side_key = jax.random.split(key)
-    length = largest * jax.random.uniform(length_key, (count,), minval=-1.0).clip(0.0)
-    side = jax.random.uniform(side_key, (count,), maxval=2.0 * jnp.pi)
-    return length[:, None] * jnp.stack([jnp.cos(side), jnp.sin(side)], axis=-1)
-
-
-def turn_scan(points: Float[Array, "b 2"], turn: Float[Array, ""]) -> Float[Array, "b 2"]:
-    """The scan of a sensor whose heading is larger by `turn`: every point turned back by it.
-
-    Args:
-        points: in the sensor frame.
-        turn: radians.
-
-    Returns:
-        Points in the frame of the turned sensor.
-    """
-    cos, sin = jnp.cos(turn), jnp.sin(turn)
-    return jnp.stack([cos * points[:, 0] + sin * points[:, 1], cos * points[:, 1] - sin * points[:, 0]], axis=-1)
-
-
-def shift_scan(points: Float[Array, "b 2"], mask: Bool[Array, " b"], shift: Float[Array, " 2"]) -> Float[Array, "b 2"]:
-    """An approximate scan of a sensor nearby, at the same angles.
-
-    Occlusion is ignored: the points are sorted by their new angles, and ranges are interpolated between them.
-
-    Args:
-        points: in the sensor frame.
-        mask: beams that measured something; the others keep their points.
-        shift: position of the new sensor in the frame of the old one.
-
-    Returns:
-        Points in the frame of the new sensor; without a shift the points themselves.
-    """
-    safe = jnp.where(mask[:, None], points, 1.0)
-    moved = safe - shift
-    angle = jnp.where(mask, jnp.arctan2(moved[:, 1], moved[:, 0]), jnp.inf)
-    order = jnp.argsort(angle)
-    # The inverse range along a straight wall is nearly linear in the angle.
-    inverse = 1.0 / jnp.maximum(jnp.linalg.norm(moved, axis=-1), 1e-6)
-    target = jnp.arctan2(safe[:, 1], safe[:, 0])
-    last = jnp.maximum(mask.sum() - 1, 0)
-    known = jnp.where(jnp.arange(len(order)) <= last, angle[order], 4.0)
-    ranges = 1.0 / jnp.interp(target, known, jnp.where(known < 4.0, inverse[order], inverse[order][last]))
-    seen = ranges[:, None] * jnp.stack([jnp.cos(target), jnp.sin(target)], -1)
-    return jnp.where(mask[:, None], jnp.where((shift == 0).all(), points, seen), points)
-
-
-_localize = jax.jit(localize_scans, static_argnames="config")
+    return jnp.swapaxes(jax.lax.map(propose, turns), 0, 1)

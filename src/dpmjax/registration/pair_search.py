@@ -310,11 +310,11 @@ def _refine(profiles: RangeProfiles, found: Candidates, config: CorrelativeConfi
     cell = config.cell * profiles.scans.typical_range
     first, which = np.nonzero(np.isfinite(found.scores))
     poses, scores = found.poses.copy(), np.full(found.scores.shape, -np.inf)
-    match, contradict = profiles.scans.tolerances
+    match, contradict, _ = profiles.scans.tolerances
     for level in range(config.num_levels):
         share = 0.5 ** (level + 1)
         step = jnp.asarray(share * np.array([cell, cell, 2 * np.pi / config.num_turns]), jnp.float32)
-        blurred = Tolerances(max(match, 0.7 * share * cell), max(contradict, 2.1 * share * cell))
+        blurred = Tolerances.of(max(match, 0.7 * share * cell), max(contradict, 2.1 * share * cell))
         for _, part in batches(len(first), _REFINE_BATCH):
             row, at = first[part], (first[part], which[part])
             pairs = found.source[row], found.target[row], poses[at].astype(np.float32)

@@ -43,10 +43,17 @@ class Tolerances(NamedTuple):
     Attributes:
         match: standard deviation of a hit about the surface that it belongs to.
         contradict: a hit farther than this in front of a surface contradicts it.
+        jump: two neighbouring beams whose ranges differ by more end on two surfaces.
     """
 
     match: float | Float[Array, ""]
     contradict: float | Float[Array, ""]
+    jump: float | Float[Array, ""]
+
+    @classmethod
+    def of(cls, match: float | Float[Array, ""], contradict: float | Float[Array, ""]) -> Tolerances:
+        """The tolerances with the usual jump."""
+        return cls(match, contradict, 10.0 * match)
 
 
 class PlanarScans(flax.struct.PyTreeNode):
@@ -89,7 +96,7 @@ class PlanarScans(flax.struct.PyTreeNode):
     def tolerances(self) -> Tolerances:
         """How exactly hits of these scans can be compared: by the typical range, or by the noise if that is more."""
         reach, noise = self.typical_range, self.noise
-        return Tolerances(match=max(0.006 * reach, 0.5 * noise), contradict=max(0.018 * reach, 5.0 * noise))
+        return Tolerances.of(match=max(0.006 * reach, 0.5 * noise), contradict=max(0.018 * reach, 5.0 * noise))
 
     def take(self, rows: Any) -> PlanarScans:
         """The scans of these rows (an index, a slice, a list or an array); a selection has no order in time."""

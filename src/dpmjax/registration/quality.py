@@ -1,6 +1,6 @@
 """Quality of a registration without the truth: scores of trajectories, the choice among them, and trust in one.
 
-A map is as good as few nats write all its beams down (`map_code_length`) and as its surfaces agree (`surface_misfit`).
+A map is as good as few nats write all its beams down (`map_code_length`) and as near scans agree (`view_misfit`).
 It is wrong where a weak connection holds it together, or where beams pass through what others have hit; so trust rests
 on the weakest connection of the best tree of pairs, and on how much more all other pairs contradict each other than
 those of the tree (`assess_trajectory`).
@@ -20,7 +20,6 @@ import scipy.special
 from dpmjax.geometry import se2
 from dpmjax.registration.planar_scans import Floats, Indices, PlanarScans
 from dpmjax.registration.range_profiles import compare_pairs, make_profiles
-from dpmjax.registration.refinement import surface_misfit
 from dpmjax.registration.step_scores import pair_scores
 
 # Maps whose code lengths differ by less than this part are equally good as maps (how walls lie in the cells is worth
@@ -30,8 +29,12 @@ _SAME_MAP = 0.1
 _MAX_BEAMS = 40_000
 _SAMPLES_A_BEAM = 32
 _GRID_TURNS = (0.2, 0.5, 0.9, 1.3)
-# Side of a cell in typical ranges: some thicknesses of a wall. Finer agreement is the business of `surface_misfit`.
+# Side of a cell in typical ranges: some thicknesses of a wall. Finer agreement is the business of `view_misfit`.
 _CELL = 0.015
+# Least tolerance of that agreement, in typical ranges; with range noise it is the noise.
+_LEAST_TOLERANCE = 0.001
+# Bearings of the profiles that it is measured by: exact to less than that tolerance.
+_NUM_BEARINGS = 4096
 # Calibrated on right and wrong maps of simulated worlds and of thinned logs (docs/deepmapping_notes.md).
 # Each scan is compared with so many nearest ones, by position and by position and heading (a radian as so many typical
 # ranges). Scans whose best score is lower than the second number belong to no map; at most a share of them may.
@@ -50,7 +53,7 @@ class Score(NamedTuple):
 
     Attributes:
         code_length: nats a beam for the map (`map_code_length`): whether the map is right as a whole.
-        misfit: share of beams off their surface in scans nearby (`surface_misfit`): how sharp it is.
+        misfit: share of beams off the surfaces of near scans (`view_misfit`): how sharp it is.
     """
 
     code_length: float
@@ -73,7 +76,7 @@ def choose_trajectory(scans: PlanarScans, candidates: Mapping[str, Floats]) -> t
     if not candidates:
         raise ValueError("candidates: expected at least one trajectory")
     scores = {
-        name: Score(map_code_length(scans, poses), surface_misfit(scans, poses)) for name, poses in candidates.items()
+        name: Score(map_code_length(scans, poses), view_misfit(scans, poses)) for name, poses in candidates.items()
     }
     shortest = min(score.code_length for score in scores.values())
     as_short = [name for name, score in scores.items() if score.code_length <= (1.0 + _SAME_MAP) * shortest]
@@ -128,6 +131,27 @@ def _code_length(hits: Floats, sensors: Floats, cell: float) -> float:
     # Only cells that were hit are coded: how much is seen free depends on the room, not on the poses.
     nats = np.log(np.pi) - scipy.special.betaln(num_hits + 0.5, passages + 0.5)
     return float(nats.sum() / len(hits))
+
+
+def view_misfit(scans: PlanarScans, poses: Floats) -> float:
+    """How badly near scans agree at these poses; lower is better.
+
+    Each scan predicts the ranges of the scans near it, straight between its own beams. So it needs no walls: between
+    two beams the outline of a tree is straight enough. What one of them cannot see does not count.
+
+    Args:
+        scans: n scans.
+        poses: (n, 3) x, y, heading.
+
+    Returns:
+        The share of visible beams, 0 to 1, that do not end on the other scan's surface within the range noise;
+        fractions for near misses. 1 where no scan sees what another has seen.
+    """
+    tolerance = max(scans.noise, _LEAST_TOLERANCE * scans.typical_range)
+    source, target = _near_pairs(poses, scans.typical_range)
+    profiles, relative = make_profiles(scans, _NUM_BEARINGS), se2.relative(poses[target], poses[source])
+    views = compare_pairs(profiles, source, target, relative, match_tolerance=tolerance)
+    return 1.0 - float(np.sum(views.matched) / max(float(np.sum(views.visible)), 1.0))
 
 
 class Assessment(NamedTuple):

@@ -86,25 +86,26 @@ def _smooth_ranges(scans: PlanarScans) -> Float[Array, "n b 2"]:
     return beam * jnp.where(usable, on_line, reach)[..., None]
 
 
-def make_profiles(scans: PlanarScans) -> RangeProfiles:
+def make_profiles(scans: PlanarScans, num_bearings: int = _NUM_BEARINGS) -> RangeProfiles:
     """Range profiles of planar scans.
 
     Args:
         scans: n scans.
+        num_bearings: c; more of them make comparisons of exact scans more exact.
 
     Returns:
-        RangeProfiles with arrays (n, 512).
+        RangeProfiles with arrays (n, c).
     """
     # Profiles do not depend on the order of the scans; one program serves both.
-    return _make_profiles(scans.replace(is_ordered=False))
+    return _make_profiles(scans.replace(is_ordered=False), num_bearings=num_bearings)
 
 
-@jax.jit
-def _make_profiles(scans: PlanarScans) -> RangeProfiles:
-    return jax.vmap(_profile)(scans.replace(points=_smooth_ranges(scans)))
+@partial(jax.jit, static_argnames="num_bearings")
+def _make_profiles(scans: PlanarScans, *, num_bearings: int) -> RangeProfiles:
+    return jax.vmap(partial(_profile, num_bearings=num_bearings))(scans.replace(points=_smooth_ranges(scans)))
 
 
-def _profile(scan: PlanarScans) -> RangeProfiles:
+def _profile(scan: PlanarScans, num_bearings: int) -> RangeProfiles:
     """The profile of one scan."""
     points, valid = scan.points, scan.mask
     reach = jnp.maximum(jnp.linalg.norm(points, axis=-1), 1e-9)
@@ -114,7 +115,7 @@ def _profile(scan: PlanarScans) -> RangeProfiles:
     order = jnp.argsort(angle)
     sorted_angle, sorted_points, sorted_slant = angle[order], points[order], slant[order]
     count = jnp.maximum(valid.sum(), 1)
-    bearing = 2 * jnp.pi * (jnp.arange(_NUM_BEARINGS) + 0.5) / _NUM_BEARINGS
+    bearing = 2 * jnp.pi * (jnp.arange(num_bearings) + 0.5) / num_bearings
     index = jnp.searchsorted(sorted_angle, bearing)
     before, after = (index - 1) % count, index % count
     gap = jnp.mod(jnp.where(valid.any(), sorted_angle[after] - sorted_angle[before], 0.0), 2 * jnp.pi)
@@ -147,7 +148,7 @@ def _view(scan: PlanarScans, pose: Float[Array, " 3"], viewer: RangeProfiles, to
     k = jnp.minimum((_bearing(points) * (count / (2 * jnp.pi))).astype(jnp.int32), count - 1)
     distance = jnp.linalg.norm(points, axis=-1)
     near, far, slant = viewer.near[k], viewer.far[k], viewer.slant[k]
-    is_jump = far - near > 10.0 * tolerances.match
+    is_jump = far - near > tolerances.jump
     to_edge = jnp.minimum(jnp.abs(distance - near), jnp.abs(distance - far))
     off = jnp.where(is_jump, to_edge, jnp.abs(distance - viewer.surface[k])) * slant
     counts = (scan.mask & viewer.is_seen[k]).astype(points.dtype)
@@ -181,7 +182,13 @@ def _compare(
 
 
 def compare_pairs(
-    profiles: RangeProfiles, source: Indices, target: Indices, poses: Floats, *, stride: int = 2
+    profiles: RangeProfiles,
+    source: Indices,
+    target: Indices,
+    poses: Floats,
+    *,
+    stride: int = 2,
+    match_tolerance: float | None = None,
 ) -> ViewComparison:
     """Compares p pairs of scans at given relative poses, at the tolerances of the scans.
 
@@ -191,11 +198,14 @@ def compare_pairs(
         target: (p,) rows.
         poses: (p, 3) T_target_source.
         stride: every `stride`-th beam is compared.
+        match_tolerance: of a hit about its surface, instead of that of the scans.
 
     Returns:
         ViewComparison with float64 arrays (p,) on the host.
     """
     tolerances, result = profiles.scans.tolerances, np.zeros((3, len(source)))
+    if match_tolerance is not None:
+        tolerances = tolerances._replace(match=match_tolerance)
     for part, rows in batches(len(source), _BATCH):
         pairs = source[rows], target[rows], poses[rows].astype(np.float32)
         found = _compare(profiles, pairs, tolerances, stride=stride)

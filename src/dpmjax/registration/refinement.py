@@ -197,20 +197,3 @@ def _is_sound(scans: PlanarScans, poses: Floats) -> bool:
     steps = match_pairs(scans.take(slice(1, None)), scans.take(slice(len(poses) - 1)), guesses, FINE)
     share = steps.weakest_eigenvalue() / np.maximum(np.asarray(scans.is_on_line.sum(1))[1:], 1)
     return bool((steps.fitness > _MIN_FITNESS).all() and (share > _MIN_EIGENVALUE).all())
-
-
-def surface_misfit(scans: PlanarScans, poses: Floats) -> float:
-    """How badly neighbouring scans agree at these poses, without knowing the truth.
-
-    Args:
-        scans: n scans.
-        poses: (n, 3) x, y, heading.
-
-    Returns:
-        The share of beams, 0 to 1, that do not find their surface in the scans nearby; fractions for near misses.
-    """
-    gates, kernels = _ROUNDS.gates_and_kernels(scans.typical_range, 1.25 * scans.noise)
-    source, target = choose_pairs(scans, poses, RefinementConfig())
-    _, system = _linearise(scans, source, target, poses, (gates[-1], kernels[-1]))
-    num_beams = np.asarray(scans.is_on_line.sum(1), np.float64)
-    return 1.0 - float(np.sum(system.weight) / np.maximum(num_beams[source].sum(), 1.0))

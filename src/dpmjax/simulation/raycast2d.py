@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from dpmjax.sequences import BoolArray, FloatArray, ScanSequence, World
+from dpmjax.simulation.people2d import simulate_people, stop_at_people
 from dpmjax.simulation.trajectory2d import simulate_odometry, simulate_trajectory
 from dpmjax.simulation.world2d import make_world
 
@@ -142,18 +143,22 @@ def scan_world(
     """
     if range_noise_px > 0 and rng is None:
         raise ValueError("range_noise_px needs an rng")
-    pose = np.asarray(poses, np.float64).reshape(-1, 3)
-    angles = beam_angles(num_beams)
-    ranges = cast_scans(is_obstacle, pose, num_beams=num_beams)
+    ranges = cast_scans(is_obstacle, poses, num_beams=num_beams)
     mask = np.ones(ranges.shape, bool) if max_range is None else ranges <= max_range
+    return np.where(mask[..., None], _measured_points(ranges, range_noise_px, rng), np.float32(0.0)), mask
+
+
+def _measured_points(ranges: FloatArray, range_noise_px: float, rng: np.random.Generator | None) -> NDArray[np.float32]:
+    """(n, b, 2) beam end points in the sensor frame, with range noise."""
+    angles = beam_angles(ranges.shape[1])
     if rng is not None and range_noise_px > 0:
         ranges = np.maximum(ranges + rng.normal(0.0, range_noise_px, ranges.shape), 0.0)
     points = ranges[..., None] * np.stack([np.cos(angles), np.sin(angles)], axis=1)
-    return np.where(mask[..., None], points, 0.0).astype(np.float32), mask
+    return np.asarray(points, np.float32)
 
 
 def simulate_sequence(
-    world: int | World = 0,
+    world: int | str | World = 0,
     num_scans: int = 256,
     *,
     num_beams: int = 256,
@@ -163,10 +168,10 @@ def simulate_sequence(
 ) -> ScanSequence:
     """Simulates a drive through a planar world (DeepMapping section 4.1).
 
-    Walk, noise and odometry have separate random streams: a seed gives the same walk with and without noise.
+    Walk, noise, odometry and people have separate random streams: a seed gives the same walk with and without noise.
 
     Args:
-        world: index for `make_world`, or a world.
+        world: index or name for `make_world`, or a world. The people of a world walk while it is scanned.
         num_scans: number of scans; the paper has 128 and 256.
         num_beams: beams per scan over 360 degrees.
         range_noise_px: standard deviation of Gaussian noise on the ranges, px.
@@ -183,12 +188,13 @@ def simulate_sequence(
         raise ValueError(f"num_scans must be at least 2, got {num_scans}")
     scene = world if isinstance(world, World) else make_world(world)
     # The name takes part, so that walks through two worlds are two walks and not one bent by other walls.
-    streams = ([seed, zlib.crc32(scene.name.encode()), stream] for stream in range(3))
-    walk_rng, noise_rng, odometry_rng = map(np.random.default_rng, streams)
+    streams = ([seed, zlib.crc32(scene.name.encode()), stream] for stream in range(4))
+    walk_rng, noise_rng, odometry_rng, people_rng = map(np.random.default_rng, streams)
     poses = simulate_trajectory(scene, num_scans, rng=walk_rng)
-    points, mask = scan_world(
-        scene.is_obstacle, poses, num_beams=num_beams, range_noise_px=range_noise_px, rng=noise_rng
-    )
+    ranges = cast_scans(scene.is_obstacle, poses, num_beams=num_beams)
+    people = simulate_people(scene, num_scans, rng=people_rng)
+    ranges = stop_at_people(ranges, poses, beam_angles(num_beams), people)
+    points, mask = _measured_points(ranges, range_noise_px, noise_rng), np.ones(ranges.shape, bool)
     odometry = simulate_odometry(poses, rng=odometry_rng) if with_odometry else None
     return ScanSequence(scene.name, points, mask, "px", reference_poses=poses, odometry_poses=odometry)
 

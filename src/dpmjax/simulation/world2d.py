@@ -2,12 +2,16 @@
 
 Three kinds, one after the other as the index grows: 0 an office (rooms cut out of rooms), 1 a yard (free-standing
 blocks, open to the border of the image), 2 a clinic (a corridor between two rows of rooms). All are furnished with
-round, square and three-cornered obstacles, so that no two places look alike. The frame is that of `raycast`: row 0 is
-the lowest.
+round, square and three-cornered obstacles, so that no two places look alike. Two more kinds have names only: a grove
+(trees, bushes and rocks within the edge of a forest, no straight wall anywhere) and a crowd (an office in which people
+walk about). The frame is that of `raycast`: row 0 is the lowest.
 """
 
 from __future__ import annotations
 
+import re
+from collections.abc import Callable, Sequence
+from functools import partial
 from itertools import pairwise
 
 import numpy as np
@@ -17,28 +21,41 @@ from dpmjax.sequences import BoolArray, FloatArray, World
 SIZE_PX = 1024
 _WALL_PX = 10
 _DOOR_PX = 72
+# Deviations of an outline as shares of its radius, two numbers a wave: 2, 3 ... waves round the outline.
+_BLOB_WAVES = 0.3 / np.arange(2, 9)
+_EDGE_WAVES = 0.08 / np.arange(2, 60) ** 0.8
+# People in a crowd.
+_NUM_PEOPLE = 15
+
+_Painter = Callable[[BoolArray, FloatArray, FloatArray, float], None]
 
 
-def make_world(index: int) -> World:
-    """Builds the world of an index; the same one every time.
+def make_world(world: int | str) -> World:
+    """Builds the world of an index or of a name; the same one every time.
 
     Args:
-        index: 0, 1 and 2 are the three worlds of the demo; any other non-negative number is the seed of a further one
-            of the kind `index % 3`.
+        world: 0, 1 and 2 are the three worlds of the demo; any other non-negative number is the seed of a further one
+            of the kind `world % 3`. Or a kind (office, yard, clinic, grove, crowd), alone or with a seed: "grove-7".
 
     Returns:
         The world; its free space is connected.
 
     Raises:
-        ValueError: a negative index.
+        ValueError: a negative index, or a name that is no kind with a number.
     """
-    if index < 0:
-        raise ValueError(f"index must not be negative, got {index}")
-    kind, build = (("office", _build_office), ("yard", _build_yard), ("clinic", _build_clinic))[index % 3]
+    if isinstance(world, int) and world < 0:
+        raise ValueError(f"index must not be negative, got {world}")
+    name = f"{list(_KINDS)[world % 3]}-{world}" if isinstance(world, int) else world
+    found = re.fullmatch(rf"({'|'.join(_KINDS)})(?:-(\d+))?", name)
+    if found is None:
+        raise ValueError(
+            f"world: expected a number or one of {', '.join(_KINDS)}, with a seed as in grove-7; got {world!r}"
+        )
+    kind, index = found[1], int(found[2] or 0)
     rng = np.random.default_rng([2024, index])
     grid = np.zeros((SIZE_PX, SIZE_PX), bool)
-    build(grid, rng)
-    return World(f"{kind}-{index}", grid).fill_pockets()
+    _KINDS[kind](grid, rng)
+    return World(f"{kind}-{index}", grid, _NUM_PEOPLE if kind == "crowd" else 0).fill_pockets()
 
 
 def _build_office(grid: BoolArray, rng: np.random.Generator) -> None:
@@ -75,6 +92,16 @@ def _build_clinic(grid: BoolArray, rng: np.random.Generator) -> None:
     _furnish(grid, rng, num_tries=320, gap=38)
 
 
+def _build_grove(grid: BoolArray, rng: np.random.Generator) -> None:
+    """A clearing within the uneven edge of a forest; round trunks, bushes and rocks stand in it."""
+    middle = np.full(2, SIZE_PX / 2)
+    clearing = np.zeros_like(grid)
+    _paint_outline(clearing, middle, 0.39 * SIZE_PX, _EDGE_WAVES * rng.normal(size=(2, len(_EDGE_WAVES))))
+    grid |= ~clearing
+    blob = partial(_paint_blob, rng=rng)
+    _furnish(grid, rng, num_tries=500, gap=36, painters=(_paint_disc, blob, blob))
+
+
 def _divide(grid: BoolArray, rng: np.random.Generator, room: tuple[int, int, int, int], depth: int) -> None:
     """Cuts a room (x, y, width, height) in two by a wall with one or two doors, and goes on with both halves."""
     x, y, width, height = room
@@ -104,15 +131,18 @@ def _clear_door(grid: BoolArray, along: int, at: float, door: float) -> None:
     grid[(width, reach) if along else (reach, width)] = False
 
 
-def _furnish(grid: BoolArray, rng: np.random.Generator, num_tries: int, gap: int) -> None:
+def _furnish(
+    grid: BoolArray, rng: np.random.Generator, num_tries: int, gap: int, painters: Sequence[_Painter] | None = None
+) -> None:
     """Puts obstacles of different shapes wherever a passage of `gap` pixels is left all round."""
+    painters = painters or (_paint_box, _paint_disc, _paint_triangle)
     for _ in range(num_tries):
         centre, size = rng.uniform(40, SIZE_PX - 40, 2), rng.uniform(9, 34, 2)
         reach = int(np.hypot(*size)) + gap
         row, col = (int(v) for v in centre[::-1])
         if grid[max(row - reach, 0) : row + reach, max(col - reach, 0) : col + reach].any():
             continue
-        (_paint_box, _paint_disc, _paint_triangle)[rng.integers(3)](grid, centre, size, rng.uniform(0, np.pi))
+        painters[int(rng.integers(len(painters)))](grid, centre, size, rng.uniform(0, np.pi))
 
 
 def _paint_frame(grid: BoolArray) -> None:
@@ -150,3 +180,31 @@ def _paint_disc(grid: BoolArray, centre: FloatArray, size: FloatArray, angle: fl
 def _paint_triangle(grid: BoolArray, centre: FloatArray, size: FloatArray, angle: float) -> None:
     (u, v), (half_u, half_v) = _local(centre, angle), size
     grid |= (v > -half_v) & (np.abs(u) / half_u < (half_v - v) / (2 * half_v))
+
+
+def _paint_blob(
+    grid: BoolArray, centre: FloatArray, size: FloatArray, _angle: float, *, rng: np.random.Generator
+) -> None:
+    """A bush or a rock."""
+    _paint_outline(grid, centre, float(np.mean(size)), _BLOB_WAVES * rng.normal(size=(2, len(_BLOB_WAVES))))
+
+
+def _paint_outline(grid: BoolArray, centre: FloatArray, radius: float, waves: FloatArray) -> None:
+    """What lies within a radius that varies with the direction: cosines and sines (2, k) of 2, 3 ... waves round."""
+    turn = np.linspace(-np.pi, np.pi, 4096)
+    phase = turn[:, None] * np.arange(2, 2 + waves.shape[1])
+    outline = radius * np.exp(np.cos(phase) @ waves[0] + np.sin(phase) @ waves[1])
+    (left, bottom), size = np.maximum(centre - outline.max(), 0).astype(int), int(2 * outline.max()) + 2
+    box = slice(bottom, bottom + size), slice(left, left + size)
+    u, v = (x[box] for x in np.broadcast_arrays(*_local(centre, 0.0)))
+    grid[box] |= np.hypot(u, v) < np.interp(np.arctan2(v, u), turn, outline)
+
+
+_KINDS: dict[str, Callable[[BoolArray, np.random.Generator], None]] = {
+    "office": _build_office,
+    "yard": _build_yard,
+    "clinic": _build_clinic,
+    "grove": _build_grove,
+    "crowd": _build_office,
+}
+"""How each kind is built; the first three are those of numbers."""

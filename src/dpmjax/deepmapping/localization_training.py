@@ -1,0 +1,214 @@
+"""Training of L-Net on the poses of a fit: scans that are turned, shifted and partly hidden, and rendered ones."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from jaxtyping import Array, Bool, Float
+from numpy.typing import ArrayLike
+
+from dpmjax.checks import require_count
+from dpmjax.deepmapping.config import DeepMappingConfig
+from dpmjax.deepmapping.map_raster import make_raster, render_scans
+from dpmjax.deepmapping.planar import Fitted, as_scan_set, choose_beams, localize_scans
+from dpmjax.geometry import se2
+from dpmjax.types import ScanSet
+
+
+@dataclass(frozen=True)
+class LocalizationTrainingConfig:
+    """Settings of the training of L-Net on the poses of a fit.
+
+    Attributes:
+        num_steps: steps of Adam.
+        learning_rate: at the start; it falls to a hundredth (cosine).
+        scans_per_step: drawn with replacement.
+        num_rendered: scans that are rendered from the map at random free places; they make up half of each step, so
+            that L-Net knows the places that the trajectory has seen but not passed.
+        max_turn_deg: scans are turned to random headings up to this: `relocalize` tries all turns, and L-Net needs to
+            know but one of them.
+        max_shift: scans are re-projected to points around their own (`shift_scan`), up to this distance in typical
+            ranges, so that L-Net learns the surroundings of the trajectory.
+        drop: largest share of the beams that is hidden from L-Net; the share differs from scan to scan.
+    """
+
+    num_steps: int = 5000
+    learning_rate: float = 2e-3
+    scans_per_step: int = 64
+    num_rendered: int = 4096
+    max_turn_deg: float = 20.0
+    max_shift: float = 0.2
+    drop: float = 0.2
+
+    def __post_init__(self) -> None:
+        require_count("num_steps", self.num_steps)
+        require_count("scans_per_step", self.scans_per_step)
+        if self.num_rendered < 0:
+            raise ValueError(f"num_rendered: expected zero or more, got {self.num_rendered}")
+        if not self.max_shift >= 0.0:
+            raise ValueError(f"max_shift: expected zero or more, got {self.max_shift}")
+        if not 0.0 <= self.drop < 1.0:
+            raise ValueError(f"drop: expected 0 to below 1, got {self.drop}")
+
+
+def has_windows(fitted: Fitted) -> bool:
+    """Whether the fit has an L-Net for each of several windows instead of one for all scans.
+
+    Args:
+        fitted: result of `fit_deepmapping` or of `train_localization`.
+
+    Returns:
+        True if a leading axis of L-Net's weights is that of the windows.
+    """
+    biases = fitted.params.localization["params"]["Dense_0"]["bias"]
+    return biases.ndim > 1
+
+
+def train_localization(
+    fitted: Fitted, scans: ScanSet | ArrayLike, config: LocalizationTrainingConfig | None = None, *, key: jax.Array
+) -> Fitted:
+    """Trains L-Net on the poses that the fit has found, so that `relocalize` answers in the same world.
+
+    The labels are the fit's own: no ground truth enters. Scans are turned, shifted and partly hidden, and others are
+    rendered from the map of M-Net at places where none was taken.
+
+    Args:
+        fitted: any fit, also from given poses.
+        scans: (n, b, 2) the scans of the fit.
+        config: settings.
+        key: of the batches.
+
+    Returns:
+        The fit with another L-Net and with zero start poses; poses and map are the same.
+
+    Raises:
+        ValueError: the number of scans is not that of the fit.
+    """
+    config = config or LocalizationTrainingConfig()
+    scans = as_scan_set(scans)
+    if len(scans.points) != len(fitted.poses):
+        raise ValueError(f"scans: expected the {len(fitted.poses)} scans of the fit, got {len(scans.points)}")
+    poses = jnp.asarray(fitted.poses / [fitted.unit, fitted.unit, 1.0], jnp.float32)
+    measured = replace(scans, points=scans.points / fitted.unit)
+    render_key, train_key = jax.random.split(key)
+    raster = make_raster(fitted.params, fitted.config)
+    rendered = render_scans(raster, measured, config.num_rendered, key=render_key)
+    begin = fitted.params.localization
+    if has_windows(fitted):
+        begin = jax.tree.map(lambda weights: weights[0], begin)
+    sources = ((measured, poses), rendered) if len(rendered[1]) else ((measured, poses),)
+    share = replace(config, scans_per_step=max(1, config.scans_per_step // len(sources)))
+    net = _train(begin, sources, train_key, fit_config=fitted.config, config=share)
+    params = replace(fitted.params, localization=net, start=jnp.zeros_like(fitted.params.start))
+    return fitted._replace(params=params)
+
+
+@partial(jax.jit, static_argnames=("fit_config", "config"))
+def _train(
+    params: Any,
+    sources: tuple[tuple[ScanSet, Float[Array, "n 3"]], ...],
+    key: jax.Array,
+    *,
+    fit_config: DeepMappingConfig,
+    config: LocalizationTrainingConfig,
+) -> Any:
+    optimizer = optax.adam(optax.cosine_decay_schedule(config.learning_rate, config.num_steps, 0.01))
+
+    def loss_of(params: Any, step_key: jax.Array) -> Array:
+        parts = [
+            _draw_training_batch(*source, fit_config, config, key=jax.random.fold_in(step_key, index))
+            for index, source in enumerate(sources)
+        ]
+        batch, labels = jax.tree.map(lambda *x: jnp.concatenate(x), *parts)
+        error = localize_scans(params, batch.points, batch.mask, fit_config) - labels
+        return jnp.mean(jnp.sum(jnp.abs(error[:, :2]), -1) + jnp.abs(se2.wrap_angle(error[:, 2])))
+
+    def one_step(carry: tuple[Any, Any], step: Array) -> tuple[tuple[Any, Any], None]:
+        params, state = carry
+        gradient = jax.grad(loss_of)(params, jax.random.fold_in(key, step))
+        updates, state = optimizer.update(gradient, state, params)
+        return (optax.apply_updates(params, updates), state), None
+
+    return jax.lax.scan(one_step, (params, optimizer.init(params)), jnp.arange(config.num_steps))[0][0]
+
+
+def _draw_training_batch(
+    scans: ScanSet,
+    poses: Float[Array, "n 3"],
+    fit_config: DeepMappingConfig,
+    config: LocalizationTrainingConfig,
+    *,
+    key: jax.Array,
+) -> tuple[ScanSet, Float[Array, "m 3"]]:
+    """Scans turned, shifted and partly hidden, and their poses."""
+    row_key, first_key, turn_key, share_key, drop_key, shift_key = jax.random.split(key, 6)
+    num_scans, num_beams = scans.mask.shape
+    rows = jax.random.randint(row_key, (config.scans_per_step,), 0, num_scans)
+    beams = choose_beams(num_beams, fit_config.cold_phases[0], jax.random.randint(first_key, (), 0, num_beams))
+    points, mask = scans.points[rows][:, beams], scans.mask[rows][:, beams]
+    limit = np.deg2rad(config.max_turn_deg)
+    turn = jax.random.uniform(turn_key, rows.shape, minval=-limit, maxval=limit) - poses[rows, 2]
+    shift = _draw_shifts(shift_key, len(rows), config.max_shift)
+    points = jax.vmap(shift_scan)(points, mask, shift)
+    moved = jax.vmap(turn_scan)(shift[:, None], -poses[rows, 2])[:, 0]
+    points = jax.vmap(turn_scan)(points, turn)
+    share = config.drop * jax.random.uniform(share_key, (*rows.shape, 1))
+    hidden = jax.random.uniform(drop_key, mask.shape) < share
+    # A scan of one beam must keep it.
+    seen = jnp.where((mask & ~hidden).any(-1, keepdims=True), mask & ~hidden, mask)
+    return ScanSet(points, seen), poses[rows] + jnp.concatenate([moved, turn[:, None]], axis=-1)
+
+
+def _draw_shifts(key: jax.Array, count: int, largest: float) -> Float[Array, "n 2"]:
+    """Shifts of random sides and lengths; half of the scans stay where they are, which are the only true ones."""
+    length_key, side_key = jax.random.split(key)
+    length = largest * jax.random.uniform(length_key, (count,), minval=-1.0).clip(0.0)
+    side = jax.random.uniform(side_key, (count,), maxval=2.0 * jnp.pi)
+    return length[:, None] * jnp.stack([jnp.cos(side), jnp.sin(side)], axis=-1)
+
+
+def turn_scan(points: Float[Array, "b 2"], turn: Float[Array, ""]) -> Float[Array, "b 2"]:
+    """The scan of a sensor whose heading is larger by `turn`: every point turned back by it.
+
+    Args:
+        points: in the sensor frame.
+        turn: radians.
+
+    Returns:
+        Points in the frame of the turned sensor.
+    """
+    cos, sin = jnp.cos(turn), jnp.sin(turn)
+    return jnp.stack([cos * points[:, 0] + sin * points[:, 1], cos * points[:, 1] - sin * points[:, 0]], axis=-1)
+
+
+def shift_scan(points: Float[Array, "b 2"], mask: Bool[Array, " b"], shift: Float[Array, " 2"]) -> Float[Array, "b 2"]:
+    """An approximate scan of a sensor nearby, at the same angles.
+
+    Occlusion is ignored: the points are sorted by their new angles, and ranges are interpolated between them.
+
+    Args:
+        points: in the sensor frame.
+        mask: beams that measured something; the others keep their points.
+        shift: position of the new sensor in the frame of the old one.
+
+    Returns:
+        Points in the frame of the new sensor; without a shift the points themselves.
+    """
+    safe = jnp.where(mask[:, None], points, 1.0)
+    moved = safe - shift
+    angle = jnp.where(mask, jnp.arctan2(moved[:, 1], moved[:, 0]), jnp.inf)
+    order = jnp.argsort(angle)
+    # The inverse range along a straight wall is nearly linear in the angle.
+    inverse = 1.0 / jnp.maximum(jnp.linalg.norm(moved, axis=-1), 1e-6)
+    target = jnp.arctan2(safe[:, 1], safe[:, 0])
+    last = jnp.maximum(mask.sum() - 1, 0)
+    known = jnp.where(jnp.arange(len(order)) <= last, angle[order], 4.0)
+    ranges = 1.0 / jnp.interp(target, known, jnp.where(known < 4.0, inverse[order], inverse[order][last]))
+    seen = ranges[:, None] * jnp.stack([jnp.cos(target), jnp.sin(target)], -1)
+    return jnp.where(mask[:, None], jnp.where((shift == 0).all(), points, seen), points)

@@ -1,0 +1,125 @@
+"""M-Net evaluated once on a raster, and scans rendered from it at places where none was taken."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from dpmjax.deepmapping.config import DeepMappingConfig
+from dpmjax.deepmapping.problem import MapFrame, Params, bind_map
+from dpmjax.types import ScanSet
+
+NUM_NODES = 513
+"""Nodes of the raster along each side of the map's frame."""
+# Log odds beyond which a node counts as seen, free or occupied; M-Net leaves at zero what it has never seen.
+_SEEN = 0.3
+# Nodes on the way of a rendered beam that may be unseen, as a share of all.
+_MAX_UNSEEN = 0.1
+# Longest rendered beam in nodes.
+_MAX_NODES = 400
+# A rendered scan needs so many of its beams, as a share.
+_LEAST_BEAMS = 0.5
+
+
+class MapRaster(NamedTuple):
+    """Log odds of the map at the nodes of a raster.
+
+    Attributes:
+        logits: rows along x, columns along y.
+        frame: of the map, which the raster fills.
+    """
+
+    logits: Float[Array, "r r"]
+    frame: MapFrame
+
+    @property
+    def spacing(self) -> Float[Array, ""]:
+        """Distance of two nodes, in typical ranges."""
+        return 2.0 * self.frame.half_side / (NUM_NODES - 1)
+
+
+@partial(jax.jit, static_argnames="config")
+def make_raster(params: Params, config: DeepMappingConfig) -> MapRaster:
+    """Evaluates M-Net at all nodes.
+
+    Args:
+        params: of a fit.
+        config: settings of the fit.
+
+    Returns:
+        MapRaster.
+    """
+    axis = jnp.linspace(-1.0, 1.0, NUM_NODES)
+    local = jnp.stack(jnp.meshgrid(axis, axis, indexing="ij"), axis=-1).reshape(-1, 2)
+    logits = bind_map(params, config)(params.frame.centre + params.frame.half_side * local)
+    return MapRaster(logits.reshape(NUM_NODES, NUM_NODES), params.frame)
+
+
+def nearest_nodes(frame: MapFrame, points: Float[Array, "... 2"]) -> tuple[Int[Array, "..."], Bool[Array, "..."]]:
+    """Finds the nodes that points lie at.
+
+    Args:
+        frame: of the map.
+        points: in the world, typical ranges.
+
+    Returns:
+        Index of the nearest node in the flat raster, and whether the point is inside of it.
+    """
+    position = (0.5 * (points - frame.centre) / frame.half_side + 0.5) * (NUM_NODES - 1)
+    index = jnp.clip(jnp.round(position).astype(jnp.int32), 0, NUM_NODES - 1)
+    is_inside = ((position >= 0.0) & (position <= NUM_NODES - 1)).all(-1)
+    return index[..., 0] * NUM_NODES + index[..., 1], is_inside
+
+
+def render_scans(
+    raster: MapRaster, scans: ScanSet, count: int, *, key: jax.Array
+) -> tuple[ScanSet, Float[Array, "m 3"]]:
+    """Renders scans at random free places of the map, at heading zero.
+
+    Args:
+        raster: of the map.
+        scans: (n, b, 2) in typical ranges; rendered scans have their beams.
+        count: places that are tried.
+        key: of the places.
+
+    Returns:
+        Scans and poses; of the places those where enough beams meet something that M-Net knows.
+    """
+    place_key, row_key = jax.random.split(key)
+    free = np.flatnonzero(np.asarray(raster.logits) < -_SEEN)
+    chosen = free[np.asarray(jax.random.randint(place_key, (count if len(free) else 0,), 0, max(len(free), 1)))]
+    nodes = np.stack(np.divmod(chosen, NUM_NODES), axis=-1).astype(np.float32)
+    places = raster.frame.centre - raster.frame.half_side + raster.spacing * nodes
+    rows = jax.random.randint(row_key, (len(chosen),), 0, len(scans.points))
+    ranges, is_met = _follow_beams(raster, places, scans.points[rows])
+    mask = is_met & scans.mask[rows]
+    reach = jnp.linalg.norm(jnp.where(mask[..., None], scans.points[rows], 1.0), axis=-1)
+    points = jnp.where(mask[..., None], scans.points[rows] * (ranges / reach)[..., None], 0.0)
+    kept = np.flatnonzero(np.asarray(mask.mean(axis=1)) >= _LEAST_BEAMS)
+    poses = jnp.concatenate([places, jnp.zeros((len(chosen), 1))], axis=1)
+    return ScanSet(points[kept], mask[kept]), poses[kept]
+
+
+@jax.jit
+def _follow_beams(
+    raster: MapRaster, places: Float[Array, "m 2"], towards: Float[Array, "m b 2"]
+) -> tuple[Float[Array, "m b"], Bool[Array, "m b"]]:
+    """Ranges to the first occupied node towards points of the sensor frame, and whether there is one that is known."""
+    ranges = raster.spacing * jnp.arange(1, _MAX_NODES + 1)
+
+    def follow(beams: tuple[Float[Array, " 2"], Float[Array, "b 2"]]) -> tuple[Array, Array]:
+        place, points = beams
+        direction = points / jnp.maximum(jnp.linalg.norm(points, axis=-1, keepdims=True), 1e-9)
+        row, is_inside = nearest_nodes(raster.frame, place + ranges[:, None, None] * direction)
+        logits = jnp.where(is_inside, raster.logits.reshape(-1)[row], 0.0)
+        first = jnp.argmax(logits > _SEEN, axis=0)
+        is_before = jnp.arange(_MAX_NODES)[:, None] < first
+        unseen = jnp.sum(is_before & (logits > -_SEEN), axis=0)
+        return ranges[first], (logits.max(axis=0) > _SEEN) & (unseen <= 1 + _MAX_UNSEEN * first)
+
+    return jax.lax.map(follow, (places, towards), batch_size=16)
