@@ -81,7 +81,7 @@ class Config(RunOptions):
         if not 1 <= len(self.town_length_m) <= (2 if self.slam else 1):
             raise ValueError("--town-length-m: expected one length, or two with --slam")
         if not self.slam and (self.n_scans is not None or self.jump != 1 or self.kitti_angle_correction):
-            raise ValueError("--n-scans, --jump, --kitti-angle-correction: only with --slam")
+            raise ValueError("only with --slam: --n-scans, --jump, --kitti-angle-correction")
 
     @property
     def town_length_range(self) -> tuple[float, float]:
