@@ -30,3 +30,11 @@ def test_files_that_a_page_names_exist(page) -> None:
     for name in named - {"slam/"}:
         pattern = re.compile(f"(.*/)?{re.escape(name.rstrip('/')).replace(re.escape('*'), '[^/]*')}")
         assert any(map(pattern.fullmatch, FILES)) or (ROOT / name).exists(), f"{page} names {name}"
+
+
+def test_result_files_name_no_path_of_a_machine() -> None:
+    files = sorted((ROOT / "docs" / "results").glob("*.json"))
+    assert files
+    for path in files:
+        found = re.search(r'"(?:/[\w.-]+){2,}|"[A-Z]:\\', path.read_text(encoding="utf-8"))
+        assert found is None, f"{path.name}: {found}"
