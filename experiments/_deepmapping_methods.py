@@ -92,9 +92,9 @@ def search(task: Task) -> Floats:
     return registration.register_globally(task.planar).poses
 
 
-def refined(task: Task, poses: Floats, *, is_ordered: bool) -> Floats:
+def refined(task: Task, poses: Floats) -> Floats:
     """Returns the poses after the alignment of all scans together."""
-    return registration.refine(task.planar.replace(is_ordered=is_ordered), poses).poses
+    return registration.refine(task.planar, poses).poses
 
 
 def refined_candidates(task: Task, candidates: Candidates, init: str) -> Candidates:
@@ -103,11 +103,11 @@ def refined_candidates(task: Task, candidates: Candidates, init: str) -> Candida
     The fit is sharper near a good start; the start keeps what a robot's odometry knows.
     """
     (start, start_poses), (fit, fit_poses) = candidates.items()
-    found = {} if init == "zero" else {f"{start}, refined": refined(task, start_poses, is_ordered=task.is_ordered)}
+    found = {} if init == "zero" else {f"{start}, refined": refined(task, start_poses)}
     scores = registration.choose_trajectory(task.planar, {fit: fit_poses, **found})[1]
     nats = [score.code_length for score in scores.values()]
     if nats[0] <= _LEAST_PROMISING * nats[-1]:
-        found[f"{fit}, refined"] = refined(task, fit_poses, is_ordered=task.is_ordered)
+        found[f"{fit}, refined"] = refined(task, fit_poses)
     return found
 
 
@@ -211,15 +211,15 @@ def _refined_deepmapping(task: Task) -> Candidates:
     """Returns refined ICP or refined global registration, DeepMapping from it, and that refined."""
     name, start = _best_start(task)
     fitted = _fit(task, start)
-    return {name: start, DEEPMAPPING: fitted, f"{DEEPMAPPING}, refined": refined(task, fitted, is_ordered=False)}
+    return {name: start, DEEPMAPPING: fitted, f"{DEEPMAPPING}, refined": refined(task, fitted)}
 
 
 def _all_candidates(task: Task) -> Candidates:
     """Returns ICP (of ordered scans), global registration and DeepMapping from it, and each of them refined."""
-    starts = {START_NAMES["icp-plane"]: incremental(task)} if task.is_ordered else {}
+    found = {START_NAMES["icp-plane"]: incremental(task)} if task.is_ordered else {}
     start = search(task)
-    found = starts | {START_NAMES["global"]: start, DEEPMAPPING: _fit(task, start)}
-    return found | {f"{name}, refined": refined(task, x, is_ordered=name in starts) for name, x in found.items()}
+    found |= {START_NAMES["global"]: start, DEEPMAPPING: _fit(task, start)}
+    return found | {f"{name}, refined": refined(task, x) for name, x in found.items()}
 
 
 def _best_start(task: Task) -> tuple[str, Floats]:
@@ -230,9 +230,9 @@ def _best_start(task: Task) -> tuple[str, Floats]:
 
     starts = []
     if task.is_ordered:
-        starts.append(assessed(START_NAMES["icp-plane"], refined(task, incremental(task), is_ordered=True)))
+        starts.append(assessed(START_NAMES["icp-plane"], refined(task, incremental(task))))
     if not starts or not starts[0][0]["is_trusted"]:
-        starts.append(assessed(START_NAMES["global"], refined(task, search(task), is_ordered=task.is_ordered)))
+        starts.append(assessed(START_NAMES["global"], refined(task, search(task))))
     # Between two different maps the sharper one may be wrong, so `choose` does not decide here.
     return max(starts, key=lambda start: start[0]["weakest_connection"])[1:]
 
@@ -254,15 +254,13 @@ class Method(NamedTuple):
 METHODS: dict[str, Method] = {
     "icp-point": Method(START_NAMES["icp-point"], partial(incremental, metric="point")),
     "icp-plane": Method(START_NAMES["icp-plane"], incremental),
-    "icp-refined": Method("incremental ICP, refined", lambda task: refined(task, incremental(task), is_ordered=True)),
+    "icp-refined": Method("incremental ICP, refined", lambda task: refined(task, incremental(task))),
     "multiway": Method("multiway registration of Open3D", _multiway, "open3d"),
     "particle-swarm": Method("particle swarms, each scan onto the one before", _swarm, "evosax"),
     "lnet-zero": Method("L-Net and M-Net from zero", lambda task: {DEEPMAPPING: _fit(task, None)}),
     "lnet-icp": Method("L-Net and M-Net from incremental ICP", _lnet_from_icp),
     "search": Method(START_NAMES["global"], search),
-    "search-refined": Method(
-        "global registration, refined", lambda task: refined(task, search(task), is_ordered=task.is_ordered)
-    ),
+    "search-refined": Method("global registration, refined", lambda task: refined(task, search(task))),
     "direct-adam": Method("direct optimisation from zero, Adam", partial(_direct, has_windows=False)),
     "direct-windows": Method("direct optimisation from zero in windows, Adam", partial(_direct, has_windows=True)),
     "direct-lbfgs": Method("direct optimisation from zero, L-BFGS", _direct_lbfgs),

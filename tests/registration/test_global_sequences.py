@@ -11,22 +11,14 @@ import pytest
 
 from dpmjax.geometry import se2
 from dpmjax.io import ScanSequence
-from dpmjax.metrics import absolute_trajectory_error
 from dpmjax.registration import GlobalConfig, PlanarScans, incremental_icp, planar_scans, register_globally
 from dpmjax.registration.pair_search import CorrelativeConfig, search_pairs
 from dpmjax.registration.range_profiles import make_profiles
 from dpmjax.registration.wall_directions import WallDirections
 from dpmjax.simulation import simulate_sequence
+from tests.registration.conftest import ate, scans_of
 
 COARSE = CorrelativeConfig(num_cells=64, cell=0.075, num_turns=72, block=8, num_levels=5, num_candidates=3)
-
-
-def scans_of(sequence: ScanSequence) -> PlanarScans:
-    return planar_scans(sequence.points, sequence.mask)
-
-
-def ate(poses: np.ndarray, truth: np.ndarray) -> float:
-    return absolute_trajectory_error(poses[:, :2], truth[:, :2])
 
 
 @pytest.fixture(scope="module")
