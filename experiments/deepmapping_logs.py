@@ -1,9 +1,11 @@
-"""Runs deepmapping_2d on every CARMEN log of a folder, from several starts, and writes one table.
+"""Runs deepmapping_2d on every CARMEN log of some folders, from several starts, and writes one table.
 
     python -m experiments.deepmapping_logs path/to/logs -o out
+    python -m experiments.deepmapping_logs path/to/recordings --inits odometry --corrected path/to/logs
 
 Each run keeps its own folder below OUT, with its pictures; a run that is finished already is not done again. A log that
-has hand-checked relations beside it (aces.clf.gz, aces.relations) is measured by them too.
+has hand-checked relations beside it (aces.clf.gz, aces.relations) is measured by them too, and one of whose name there
+is a corrected log in `--corrected` by that.
 """
 
 from __future__ import annotations
@@ -29,12 +31,14 @@ ENDINGS = (".log", ".clf", ".log.gz", ".clf.gz")
 class Config:
     """Options of the table."""
 
-    logs: Positional[Path]
-    """Folder of .log or .clf files, plain or .gz."""
+    logs: Positional[tuple[Path, ...]]
+    """Folders of .log or .clf files, plain or .gz."""
     output: Annotated[Path, arg(aliases=["-o"], metavar="OUT")] = Path("results/deepmapping_logs")
     """Folder for the runs and metrics.json."""
     inits: tuple[str, ...] = ("odometry", "icp-plane", "global")
     """Starts to try."""
+    corrected: Annotated[Path | None, arg(metavar="FOLDER")] = None
+    """A folder of logs with corrected poses; one of the same name measures a log, at scans of the same time."""
     steps: int | None = None
     """Steps of each fit; without it, the preset decides."""
     seed: int = 0
@@ -43,28 +47,42 @@ class Config:
 
 def main(config: Config) -> list[dict[str, Any]]:
     """Runs what is missing and prints the table."""
-    logs = sorted(p for p in config.logs.glob("*") if p.name.endswith(ENDINGS))
-    if not logs:
-        raise ValueError(f"{config.logs}: no {', '.join(ENDINGS)} file there; name a folder of CARMEN logs")
+    logs = [log for folder in config.logs for log in logs_of(folder)]
+    if len(names := {log.name.removesuffix(".gz") for log in logs}) < len(logs):
+        raise ValueError(f"{len(logs)} logs have {len(names)} different names; a name has one row for each start")
+    corrected = {} if config.corrected is None else {drive_of(log): log for log in logs_of(config.corrected)}
     rows: list[dict[str, Any]] = []
     for log, init in itertools.product(logs, config.inits):
-        if (metrics := _run(log, init, config)) is not None:
+        if (metrics := _run(log, init, corrected.get(drive_of(log)), config)) is not None:
             # A row has the commit of its own run, which may be an earlier one.
-            rows.append({"log": log.name.split(".")[0], "init": init, **metrics})
+            rows.append({"log": log.name.removesuffix(".gz"), "init": init, **metrics})
             write_metrics(RunFolder(config.output, is_resumed=True), {}, seed=config.seed, rows=rows)
     print(markdown(rows))
     return rows
 
 
-def _run(log: Path, init: str, config: Config) -> dict[str, Any] | None:
+def logs_of(folder: Path) -> list[Path]:
+    """Returns the CARMEN logs of a folder, by name."""
+    if not (logs := sorted(p for p in folder.glob("*") if p.name.endswith(ENDINGS))):
+        raise ValueError(f"{folder}: no {', '.join(ENDINGS)} file there; name a folder of CARMEN logs")
+    return logs
+
+
+def drive_of(log: Path) -> str:
+    """Returns the name of a log without its endings."""
+    return log.name.split(".")[0]
+
+
+def _run(log: Path, init: str, corrected: Path | None, config: Config) -> dict[str, Any] | None:
     """Returns the metrics of one run, in a process with a peak memory of its own; None where the log lacks odometry."""
-    folder = config.output / f"{log.name.split('.')[0]}_{init}"
+    folder = config.output / f"{log.name.removesuffix('.gz')}_{init}"
     if not (folder / METRICS).exists():
         command = [sys.executable, "-m", "experiments.deepmapping_2d", str(log), "-o", str(folder), "--force"]
         command += ["--init", init, "--seed", str(config.seed)]
         command += [] if config.steps is None else ["--steps", str(config.steps)]
-        relations = log.with_name(log.name.split(".")[0] + ".relations")
+        relations = log.with_name(drive_of(log) + ".relations")
         command += ["--relations", str(relations)] if relations.exists() else []
+        command += [] if corrected in (None, log) else ["--corrected", str(corrected)]
         code = subprocess.run(command).returncode
         if code == EXIT_BAD_INPUT:
             return None
@@ -85,7 +103,8 @@ def markdown(rows: list[dict[str, Any]]) -> str:
             f"{row[f'relations{when}_m']:.3f} m, {row[f'relations{when}_deg']:.2f} deg" if "relations_m" in row else ""
             for when in ("_initial", "")
         )
-        ates = (f"{row[name]:.2f}" if name in row else "" for name in ("ate_initial_m", "ate_m"))
+        kind = "ate_corrected" if "ate_corrected_m" in row else "ate"
+        ates = (f"{row[name]:.2f}" if name in row else "" for name in (f"{kind}_initial_m", f"{kind}_m"))
         trusted = "yes" if row["assessment"]["is_trusted"] else "no"
         cells = (
             row["log"],

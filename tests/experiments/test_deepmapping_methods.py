@@ -243,7 +243,7 @@ def flaser_lines(walk, poses, odometry) -> list[str]:
 
 
 @pytest.mark.slow
-def test_a_whole_recording_has_a_pose_for_every_scan_and_is_measured_by_its_relations(tmp_path, capsys) -> None:
+def test_a_whole_recording_is_measured_by_its_relations_and_its_corrected_log(tmp_path, capsys) -> None:
     """The poses of a recording are its odometry; half of them are those of a robot that stands still."""
     walk = simulate_sequence(0, 24, num_beams=360, seed=4, with_odometry=True)
     walk = walk.take(np.repeat(np.arange(24), 2))
@@ -254,7 +254,11 @@ def test_a_whole_recording_has_a_pose_for_every_scan_and_is_measured_by_its_rela
     (tmp_path / "robot.clf").write_text("\n".join([*odom, *scans]) + "\n")
     true = se2.relative(walk.reference_poses[0], walk.reference_poses[41]) * metres
     (tmp_path / "robot.relations").write_text(f"0 41 {true[0]} {true[1]} 0 0 0 {true[2]}\n")
-    options = [str(tmp_path), "-o", str(tmp_path / "out"), "--inits", "odometry", "--steps", "2"]
+    (tmp_path / "corrected").mkdir()
+    lines = flaser_lines(walk, walk.reference_poses, walk.odometry_poses)
+    (tmp_path / "corrected" / "robot.log").write_text("\n".join(lines) + "\n")
+    options = [str(tmp_path), "--corrected", str(tmp_path / "corrected"), "-o", str(tmp_path / "out")]
+    options += ["--inits", "odometry", "--steps", "2"]
     main, config = deepmapping_logs.main, deepmapping_logs.Config
     assert run_command(main, config, experiment="logs", description=None, args=options) == 0
     capsys.readouterr()
@@ -264,7 +268,9 @@ def test_a_whole_recording_has_a_pose_for_every_scan_and_is_measured_by_its_rela
     assert "ate_m" not in row
     assert row["num_relations"] == 1
     assert row["relations_m"] < min(0.05, row["relations_initial_m"])
-    assert len((tmp_path / "out" / "robot_odometry" / "trajectory_tum.txt").read_text().splitlines()) >= 48
+    assert row["num_corrected"] == 48
+    assert row["ate_corrected_m"] < min(0.1, row["ate_corrected_initial_m"])
+    assert len((tmp_path / "out" / "robot.clf_odometry" / "trajectory_tum.txt").read_text().splitlines()) >= 48
 
 
 def test_a_corrected_log_measures_the_scans_that_both_have() -> None:
@@ -293,6 +299,9 @@ def test_logs_keep_finished_runs_and_leave_out_lost_odometry(tmp_path, capsys) -
         main, config = deepmapping_logs.main, deepmapping_logs.Config
         assert run_command(main, config, experiment="logs", description=None, args=options) == 0
         printed = capsys.readouterr().out.splitlines()
-        assert [line.split(" | ")[:3] for line in printed if "good" in line] == [["| good", "12 (5)", "odometry"]]
+        assert [line.split(" | ")[:3] for line in printed if "good" in line] == [["| good.log", "12 (5)", "odometry"]]
     (row,) = json.loads((tmp_path / "out" / "metrics.json").read_text())["rows"]
     assert row["candidates"][row["kept"]]["ate_m"] == row["ate_m"]
+    options[:1] = [str(tmp_path), str(tmp_path)]
+    assert run_command(main, config, experiment="logs", description=None, args=options) == 2
+    assert "4 logs have 2 different names" in capsys.readouterr().err
