@@ -158,21 +158,24 @@ def _spectra(
     profiles: RangeProfiles, turn: Float[Array, ""], cell: Float[Array, ""], config: CorrelativeConfig
 ) -> tuple[Complex[Array, "n g f"], Complex[Array, "n g f"]]:
     """Spectra of the two images of each scan, turned by `turn`, its sensor in the middle."""
-    size = config.num_cells
-    axis = (jnp.arange(size) - size // 2) * cell
+    inner = config.num_cells // 2
+    axis = (jnp.arange(inner) - inner // 2) * cell
     x, y = jnp.meshgrid(axis, axis)
     distance = jnp.hypot(x, y)
     count = profiles.surface.shape[-1]
     bearing = jnp.mod(jnp.arctan2(y, x) - turn, 2 * jnp.pi)
     k = jnp.minimum((bearing * count / (2 * jnp.pi)).astype(jnp.int32), count - 1)
-    usable = profiles.is_seen[:, k] & (distance < (size // 4) * cell)
+    usable = profiles.is_seen[:, k] & (distance < (inner // 2) * cell)
     slant = profiles.slant[:, k]
     off = (distance - profiles.surface[:, k]) * slant
     hit = jnp.where(usable, jnp.exp(-0.5 * (off / (0.6 * cell)) ** 2), 0.0)
     is_free = usable & (distance < profiles.near[:, k] - cell / slant)
     evidence = hit - jnp.where(is_free, config.free_weight, 0.0)
+    # Scans fill the inner half alone, and drawing takes longer than the transform.
+    margin = (config.num_cells - inner) // 2
+    images = jnp.pad(jnp.stack([hit, evidence]), ((0, 0), (0, 0), (margin, margin), (margin, margin)))
     # One transform of both: two that run at once wait for each other's threads for ever on a CPU (XLA of JAX 0.11).
-    spectra = jnp.fft.rfft2(jnp.stack([hit, evidence]))
+    spectra = jnp.fft.rfft2(images)
     return spectra[0], spectra[1]
 
 
