@@ -97,6 +97,11 @@ def refined(task: Task, poses: Floats) -> Floats:
     return registration.refine(task.planar, poses).poses
 
 
+def refined_icp(task: Task) -> Candidates:
+    """Returns incremental ICP, refined."""
+    return {f"{START_NAMES['icp-plane']}, refined": refined(task, incremental(task))}
+
+
 def refined_candidates(task: Task, candidates: Candidates, init: str) -> Candidates:
     """Returns the start and the fit, each refined; a fit that is a worse map than the refined start is left out.
 
@@ -254,7 +259,7 @@ class Method(NamedTuple):
 METHODS: dict[str, Method] = {
     "icp-point": Method(START_NAMES["icp-point"], partial(incremental, metric="point")),
     "icp-plane": Method(START_NAMES["icp-plane"], incremental),
-    "icp-refined": Method("incremental ICP, refined", lambda task: refined(task, incremental(task))),
+    "icp-refined": Method("incremental ICP, refined", refined_icp),
     "multiway": Method("multiway registration of Open3D", _multiway, "open3d"),
     "particle-swarm": Method("particle swarms, each scan onto the one before", _swarm, "evosax"),
     "lnet-zero": Method("L-Net and M-Net from zero", lambda task: {DEEPMAPPING: _fit(task, None)}),

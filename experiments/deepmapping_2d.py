@@ -58,8 +58,8 @@ class Config(RunOptions):
     preset: Literal["fast", "paper"] = "fast"
     """fast: minutes on two cores; paper: architecture, losses and sampling of the paper."""
     init: Annotated[str, arg(metavar="auto|odometry|icp-plane|icp-point|global|zero|FILE")] = "auto"
-    """Where the poses start; auto: odometry where there is one, else icp-plane; global: an exhaustive search of scan
-    pairs, needs no guess; FILE is a trajectory."""
+    """Where the poses start; auto: odometry where there is one, else icp-plane, which is tried, too, where the map from
+    odometry cannot be trusted; global: an exhaustive search of scan pairs, needs no guess; FILE is a trajectory."""
     ordered: bool = True
     """Scans lie in the order of time; --no-ordered makes no use of it, and needs --init global."""
     refine: bool = True
@@ -113,6 +113,13 @@ def main(config: Config) -> dict[str, Any]:
         if config.refine and not stop.is_requested:
             candidates |= shared.refined_candidates(task, candidates, config.init)
         kept, compared = shared.choose(task, candidates)
+        assessment = shared.assess(task, candidates[kept])
+        has_other = config.init == "auto" and config.refine and sequence.odometry_poses is not None
+        if has_other and not assessment["is_trusted"] and not stop.is_requested:
+            print("The map from odometry cannot be trusted: the scans are registered without it, too ...", flush=True)
+            candidates |= shared.refined_icp(task)
+            kept, compared = shared.choose(task, candidates)
+            assessment = shared.assess(task, candidates[kept])
         trajectory = log.aligned(candidates[kept])
         metrics = {
             "num_scans": len(log.whole),
@@ -124,7 +131,7 @@ def main(config: Config) -> dict[str, Any]:
             "start": start_name,
             "kept": kept,
             "candidates": compared,
-            "assessment": shared.assess(task, candidates[kept]),
+            "assessment": assessment,
             "fit_s": run.run_s,
             "compile_s": run.compile_s,
             "peak_rss_gb": peak_rss_gb(),

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -146,6 +147,19 @@ def refused(tmp_path: Path, capsys, *options: object) -> str:
     assert not out.exists()
     assert len(error.splitlines()) == 1, error
     return error
+
+
+@pytest.mark.slow
+def test_odometry_that_leads_astray_is_not_the_only_start(tmp_path, monkeypatch) -> None:
+    drive = simulate_sequence(0, 24, num_beams=128, with_odometry=True)
+    astray = np.random.default_rng(0).normal(size=(24, 3)) * [200.0, 200.0, 1.0]
+    drive = replace(drive, odometry_poses=astray)
+    monkeypatch.setattr("experiments.deepmapping_2d.read_scans", lambda _config: drive)
+    found = main(Config(steps=2, output=tmp_path / "out"))
+    assert found["start"] == "odometry"
+    assert found["kept"] == "incremental ICP, point to line, refined"
+    assert found["assessment"]["is_trusted"]
+    assert found["ate_px"] < 0.1
 
 
 def test_a_missing_file_is_named(as_user, tmp_path, capsys) -> None:

@@ -10,7 +10,7 @@ from dpmjax.io import ScanSequence
 from dpmjax.metrics import absolute_trajectory_error
 from dpmjax.pose_graph.graph import Edges
 from dpmjax.registration import LoopConfig, RefinementConfig, close_loops, planar_scans, refine
-from dpmjax.registration.loop_closure import count_support, find_candidates
+from dpmjax.registration.loop_closure import LoopResult, count_support, find_candidates
 from dpmjax.registration.refinement import choose_pairs
 from dpmjax.simulation import simulate_sequence
 
@@ -103,6 +103,19 @@ def test_a_trajectory_without_revisits_is_left_alone(walk_scans) -> None:
     closed, loops, weight = close_loops(walk_scans, line)
     np.testing.assert_array_equal(closed, line)
     assert len(loops.source) == len(weight) == 0
+
+
+@pytest.mark.parametrize("are_loops_right", [False, True])
+def test_the_better_of_start_and_loops_is_kept(walk, walk_scans, monkeypatch, are_loops_right) -> None:
+    right, wrong = walk.reference_poses, walk.reference_poses * [1.2, 1.2, 1.0]
+    start, closed = (wrong, right) if are_loops_right else (right, wrong)
+    nothing = np.zeros(0, np.int64)
+    loops = LoopResult(closed, Edges(nothing, nothing, np.zeros((0, 3)), np.zeros((0, 3, 3))), np.ones(5))
+    monkeypatch.setattr("dpmjax.registration.refinement._is_sound", lambda *_: False)
+    monkeypatch.setattr("dpmjax.registration.refinement.close_loops", lambda *_args, **_named: loops)
+    found = refine(walk_scans, start)
+    assert ate(found.poses, right) < 0.01
+    assert found.num_loops == (5 if are_loops_right else 0)
 
 
 def test_candidates_are_near_in_space_and_far_along_the_way() -> None:

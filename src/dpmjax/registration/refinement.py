@@ -22,6 +22,7 @@ from dpmjax.registration.line_adjustment import adjust_to_lines
 from dpmjax.registration.loop_closure import LoopConfig, close_loops, matched_steps, pose_steps
 from dpmjax.registration.pair_alignment import FINE, PairSystem, Schedule, linearise_pair, match_pairs
 from dpmjax.registration.planar_scans import Floats, Indices, PlanarScans
+from dpmjax.registration.quality import choose_trajectory
 from dpmjax.registration.step_scores import fitting_scans, interpolate
 
 # Distances of one round are kept below this by leaving out beams of the sources: about two seconds on two cores.
@@ -73,8 +74,9 @@ class Refined(NamedTuple):
 def refine(scans: PlanarScans, poses: Floats, config: RefinementConfig | None = None) -> Refined:
     """Closes loops where the start leaves doubt, then aligns all scans together, and to common lines if there is noise.
 
-    Of scans that are not ordered only neighbours in space count, the steps of the start mean nothing, and no loops are
-    searched.
+    Loops are searched from a chain of the start's steps, which forgets what else the start knows; so the start is
+    aligned without loops too, and the better map counts. Of scans that are not ordered only neighbours in space count,
+    the steps of the start mean nothing, and no loops are searched.
 
     Args:
         scans: n scans.
@@ -82,10 +84,10 @@ def refine(scans: PlanarScans, poses: Floats, config: RefinementConfig | None = 
         config: settings.
 
     Returns:
-        Refined; the first pose is that of the start, unless loops were closed.
+        Refined; the first pose is that of the start, unless loops are kept.
     """
     config = config or RefinementConfig()
-    num_loops = 0
+    candidates, num_loops = {"start": poses}, {"start": 0}
     if scans.is_ordered and config.loops is not None and not _is_sound(scans, poses):
         # The steps again, with those of the start as guess and as prior, where the scans leave a direction open.
         chained, steps = incremental_icp(scans, odometry=poses)
@@ -94,12 +96,14 @@ def refine(scans: PlanarScans, poses: Floats, config: RefinementConfig | None = 
             fitting = refine(scans.take(rows).replace(is_ordered=True), poses[rows], config)
             return fitting._replace(poses=interpolate(len(scans), rows, fitting.poses))
         matched = matched_steps(steps, scans.typical_range)
-        poses, _, weights = close_loops(scans, chained, config.loops, steps=matched)
-        num_loops = int((weights > 0.25).sum())
-    poses = _align_all(scans, poses, config)
+        candidates["loops"], _, weights = close_loops(scans, chained, config.loops, steps=matched)
+        num_loops["loops"] = int((weights > 0.25).sum())
+    aligned = {name: _align_all(scans, start, config) for name, start in candidates.items()}
+    kept = "start" if len(aligned) == 1 else choose_trajectory(scans, aligned)[0]
+    poses = aligned[kept]
     if scans.noise > _MIN_NOISE * scans.typical_range:
         poses = adjust_to_lines(scans, poses)
-    return Refined(poses, num_loops)
+    return Refined(poses, num_loops[kept])
 
 
 def _align_all(scans: PlanarScans, poses: Floats, config: RefinementConfig) -> Floats:
