@@ -11,6 +11,7 @@ from dpmjax.geometry import se2
 from dpmjax.registration import planar_scans
 from dpmjax.registration.recordings import align_between, choose_by_motion, fill_between
 from dpmjax.simulation import simulate_sequence
+from tests.registration.conftest import scans_of
 
 
 def drive(num_scans: int = 60, *, seed: int = 0) -> np.ndarray:
@@ -97,6 +98,15 @@ def test_scans_between_are_aligned_with_the_chosen_ones() -> None:
     np.testing.assert_array_equal(aligned[chosen], true[chosen])
     before, after = (np.hypot(*(some - true)[:, :2].T)[1:-1].mean() for some in (poses, aligned))
     assert after < 0.2 * before
+
+
+def test_a_scan_whose_wheels_were_read_in_another_moment_of_a_turn_is_turned_back() -> None:
+    sequence = simulate_sequence(0, 21, num_beams=128, seed=5, range_noise_px=0.5)
+    true = np.asarray(sequence.reference_poses)
+    poses, turned = true.copy(), np.array([3, 8, 13, 18])
+    poses[turned, 2] += [0.12, -0.12, 0.1, -0.1]
+    aligned = align_between(scans_of(sequence), np.array([0, 5, 10, 15, 20]), poses)
+    np.testing.assert_allclose(aligned[turned, 2], true[turned, 2], atol=0.01)
 
 
 def test_a_scan_that_does_not_fit_keeps_its_pose() -> None:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 from jaxtyping import Float
+from numpy.typing import NDArray
 
 from dpmjax.checks import require_positive
 from dpmjax.geometry import se2
@@ -18,6 +19,9 @@ from dpmjax.registration.range_profiles import contradicted_share, make_profiles
 
 # Standard deviation of odometry from one chosen scan to the next: translation in typical ranges, radians.
 _ODOMETRY_SIGMA = (0.005, 0.01)
+# The same of a scan that does not fit: a robot that turns fast has read its wheels at another moment than its scans.
+# Such a scan is turned by these angles first, radians.
+_LOOSE_SIGMA, _TURNS = (0.01, 0.1), (-0.15, -0.1, -0.05, 0.0, 0.05, 0.1, 0.15)
 # A scan keeps to odometry where a lower share of its beams fits, or where more of them contradict the chosen scan.
 _MIN_FITNESS, _MAX_CONTRADICTED = 0.5, 0.05
 # Scans that are aligned at a time.
@@ -101,20 +105,41 @@ def align_between(scans: PlanarScans, chosen: Indices, poses: Float[np.ndarray, 
     after = np.searchsorted(chosen, others)
     ends = np.stack([chosen[after - 1], chosen[after]])
     apart = np.abs(se2.relative(poses[ends], poses[others]))
-    nearest = np.take_along_axis(ends, (apart @ [1.0, 1.0, scans.typical_range]).argmin(axis=0)[None], axis=0)[0]
-    sigma = np.array(_ODOMETRY_SIGMA)[[0, 0, 1]] * [scans.typical_range, scans.typical_range, 1.0]
-    information = (3.0 * scans.noise / sigma) ** 2
-    for start in range(0, len(others), _BLOCK):
-        source, target = others[start : start + _BLOCK], nearest[start : start + _BLOCK]
-        expected = np.asarray(se2.relative(poses[target], poses[source]))
-        prior = PosePrior(expected, np.broadcast_to(information, expected.shape))
-        found = match_pairs(scans.take(source), scans.take(target), expected[:, None], FINE, prior)
-        both = np.concatenate([source, target])
-        profiles, rows = make_profiles(scans.take(both)), np.arange(len(source))
-        contradicted = contradicted_share(profiles, rows, len(source) + rows, found.poses)
-        fits = (found.fitness > _MIN_FITNESS) & (contradicted < _MAX_CONTRADICTED)
-        aligned[source[fits]] = se2.compose(poses[target], found.poses)[fits]
+    order = (apart @ [1.0, 1.0, scans.typical_range]).argsort(axis=0)
+    nearest, farther = np.take_along_axis(ends, order, axis=0)
+    is_left = np.ones(len(others), bool)
+    for target, turns, sigma in (
+        (nearest, (0.0,), _ODOMETRY_SIGMA),
+        (nearest, _TURNS, _LOOSE_SIGMA),
+        (farther, _TURNS, _LOOSE_SIGMA),
+    ):
+        rows = np.flatnonzero(is_left)
+        for start in range(0, len(rows), _BLOCK):
+            some = rows[start : start + _BLOCK]
+            found, fits = _align_with(scans, poses, (others[some], target[some]), turns, sigma)
+            aligned[others[some[fits]]] = found[fits]
+            is_left[some[fits]] = False
     return aligned
+
+
+def _align_with(
+    scans: PlanarScans,
+    poses: Floats,
+    pairs: tuple[Indices, Indices],
+    turns: tuple[float, ...],
+    sigma: tuple[float, float],
+) -> tuple[Floats, NDArray[np.bool_]]:
+    """Poses of the sources aligned with their targets, and whether they fit; from some turns of what is expected."""
+    source, target = pairs
+    expected = np.asarray(se2.relative(poses[target], poses[source]))
+    spread = np.array(sigma)[[0, 0, 1]] * [scans.typical_range, scans.typical_range, 1.0]
+    prior = PosePrior(expected, np.broadcast_to((3.0 * scans.noise / spread) ** 2, expected.shape))
+    guesses = expected[:, None] + np.outer(turns, [0.0, 0.0, 1.0])
+    found = match_pairs(scans.take(source), scans.take(target), guesses, FINE, prior)
+    profiles, rows = make_profiles(scans.take(np.concatenate([source, target]))), np.arange(len(source))
+    contradicted = contradicted_share(profiles, rows, len(source) + rows, found.poses)
+    fits = (found.fitness > _MIN_FITNESS) & (contradicted < _MAX_CONTRADICTED)
+    return np.asarray(se2.compose(poses[target], found.poses)), fits
 
 
 def _share_of_way(odometry: Floats, start: Indices, end: Indices) -> Floats:
