@@ -18,6 +18,7 @@ import scipy.spatial
 from jaxtyping import Array, Bool, Float, Int
 
 from dpmjax.geometry import se2
+from dpmjax.geometry.neighbours import k_nearest
 from dpmjax.pose_graph.normal_equations import solve_blocks
 from dpmjax.registration.planar_scans import Floats, Indices, PlanarScans
 
@@ -165,11 +166,10 @@ def _find_nearest(scans: PlanarScans, around: Int[Array, "n s"], poses: Float[Ar
 
     def find(one: tuple[Array, Array]) -> Array:
         rows, relative = one
-        own, others = scans.points[rows[0]], scans.points[rows]
-        points = se2.transform_points(relative, others)
-        # The square of a beam's own range is the same for all others.
-        squared = (points**2).sum(-1) - 2.0 * _einsum("bi,ski->bsk", own, points)
-        return jnp.argmin(jnp.where(scans.is_on_line[rows], squared, jnp.inf), axis=2)
+        points = se2.transform_points(relative, scans.points[rows])
+        own = scans.points[rows[0]]
+        search = jax.vmap(lambda some, mask: k_nearest(own, some, 1, mask=mask).indices[:, 0], out_axes=1)
+        return search(points, scans.is_on_line[rows])
 
     return jax.lax.map(find, (around, poses))
 
