@@ -1,11 +1,11 @@
 """Runs deepmapping_2d on every CARMEN log of some folders, from several starts, and writes one table.
 
     python -m experiments.deepmapping_logs path/to/logs -o out
-    python -m experiments.deepmapping_logs path/to/recordings --inits odometry --corrected path/to/logs
+    python -m experiments.deepmapping_logs path/to/recordings --inits auto --corrected path/to/logs
 
 Each run keeps its own folder below OUT, with its pictures; a run that is finished already is not done again. A log that
-has hand-checked relations beside it (aces.clf.gz, aces.relations) is measured by them too, and one of whose name there
-is a corrected log in `--corrected` by that.
+has hand-checked relations beside it (aces.clf.gz, aces.relations) is measured by them too, and a recording by the log
+of the same name in `--corrected`.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ class Config:
     inits: tuple[str, ...] = ("odometry", "icp-plane", "global")
     """Starts to try."""
     corrected: Annotated[Path | None, arg(metavar="FOLDER")] = None
-    """A folder of logs with corrected poses; one of the same name measures a log, at scans of the same time."""
+    """Folder of logs with corrected poses, which measure recordings of the same name at scans of the same time."""
     steps: int | None = None
     """Steps of each fit; without it, the preset decides."""
     seed: int = 0

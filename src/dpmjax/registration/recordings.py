@@ -90,7 +90,7 @@ def fill_between(chosen: Indices, poses: Float[np.ndarray, "k 3"], odometry: Flo
 
 
 def align_between(scans: PlanarScans, chosen: Indices, poses: Float[np.ndarray, "n 3"]) -> Floats:
-    """Aligns each scan with the nearest one of the chosen scans before and after it, point to line.
+    """Aligns each scan with one of the chosen scans before and after it, point to line: the nearer one if it fits.
 
     Args:
         scans: n scans in the order of time.
