@@ -8,9 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dpmjax import metrics, registration
+from dpmjax.sequences import Relations
 
 if TYPE_CHECKING:
-    from dpmjax.sequences import Relations, ScanSequence
+    from dpmjax.sequences import ScanSequence
 
 Floats = NDArray[np.float64]
 # Scans so far apart are registered, where that leaves out more than every other one.
@@ -101,7 +102,12 @@ def relation_numbers(times: Floats, poses: Floats, relations: Relations, suffix:
 
 
 def corrected_numbers(times: Floats, poses: Floats, corrected: ScanSequence, suffix: str = "") -> dict[str, float]:
-    """Returns the ATE of the poses of all scans at those that a corrected log of the same drive has too."""
+    """Returns the ATE at scans that a corrected log of the same drive has too, and errors from one to the next.
+
+    The latter are measured like hand-checked relations: the relative poses of successive scans of the corrected log.
+    """
+    from dpmjax.geometry import se2
+
     if corrected.reference_poses is None or corrected.times is None:
         raise ValueError(f"{corrected.name}: has no corrected poses with times")
     _, mine, theirs = np.intersect1d(np.round(times, 3), np.round(corrected.times, 3), return_indices=True)
@@ -109,8 +115,13 @@ def corrected_numbers(times: Floats, poses: Floats, corrected: ScanSequence, suf
         raise ValueError(
             f"{corrected.name}: {len(mine)} scans have the time of a scan of the recording, not {MIN_COMMON}"
         )
-    reference = corrected.reference_poses[theirs, :2]
+    reference, at = corrected.reference_poses[theirs], times[mine]
+    steps = metrics.relation_errors(
+        Relations(at[:-1], at[1:], se2.relative(reference[:-1], reference[1:])), at, poses[mine]
+    )
     return {
-        f"ate_corrected{suffix}_m": metrics.absolute_trajectory_error(poses[mine, :2], reference),
+        f"ate_corrected{suffix}_m": metrics.absolute_trajectory_error(poses[mine, :2], reference[:, :2]),
+        f"relations_corrected{suffix}_m": float(steps.translation_m.mean()),
+        f"relations_corrected{suffix}_deg": float(steps.rotation_deg.mean()),
         "num_corrected": len(mine),
     }

@@ -297,6 +297,8 @@ def report(unit: str, metrics: Mapping[str, Any]) -> str:
     if "num_corrected" in metrics:
         before, after = metrics["ate_corrected_initial_m"], metrics["ate_corrected_m"]
         lines.append(f"ATE at {metrics['num_corrected']} scans of the corrected log: {before:.3g} -> {after:.3g} m")
+        errors = metrics["relations_corrected_m"], metrics["relations_corrected_deg"]
+        lines.append("mean error from each of these scans to the next: {:.3g} m, {:.3g} degrees".format(*errors))
     return "\n".join(lines)
 
 

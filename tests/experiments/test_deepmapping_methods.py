@@ -281,9 +281,13 @@ def test_a_corrected_log_measures_the_scans_that_both_have() -> None:
     found = corrected_numbers(times, moved, corrected, "_initial")
     assert found["num_corrected"] == 12
     assert found["ate_corrected_initial_m"] < 1e-9
+    assert found["relations_corrected_initial_m"] < 1e-9
     moved[2, 0] += 12.0
     # One of twelve is off by 12; the best alignment takes at most a part of that.
-    assert 2.0 < corrected_numbers(times, moved, corrected)["ate_corrected_m"] < np.sqrt(12.0)
+    found = corrected_numbers(times, moved, corrected)
+    assert 2.0 < found["ate_corrected_m"] < np.sqrt(12.0)
+    # Two of the eleven ways from scan to scan lead to it or away from it.
+    assert found["relations_corrected_m"] == pytest.approx(24.0 / 11.0)
     with pytest.raises(ValueError, match="0 scans have the time"):
         corrected_numbers(times + 0.3, moved, corrected)
 
