@@ -13,6 +13,7 @@ from dpmjax.deeppointmap.verification import (
     refine_motion,
     verify_motion,
 )
+from dpmjax.scans.compact import compact_surface, expand_surface
 from tests.scans.surface_scenes import motion, seen_from, street
 
 CONFIG = VerificationConfig()
@@ -36,6 +37,17 @@ def test_the_true_motion_is_better_than_any_other(scans) -> None:
     for yaw, translation in ((180, (0, 0, 0)), (0, (6, 0, 0)), (60, (0, 0, 0)), (0, (0, 0, 3))):
         wrong = verify_motion(*scans, T_TRUE @ motion(yaw, translation), CONFIG)
         assert wrong.score < right.score - 0.2
+
+
+@pytest.mark.parametrize("is_target_thin", [True, False])
+def test_a_thinned_surface_meets_as_many_planes_as_the_whole_one(scans, is_target_thin) -> None:
+    whole = verify_motion(*scans, T_TRUE, CONFIG).matched_share
+    source, target = scans
+    if is_target_thin:
+        target = target._replace(surface=expand_surface(compact_surface(target.surface, 600)))
+    else:
+        source = source._replace(surface=expand_surface(compact_surface(source.surface, 600)))
+    assert verify_motion(source, target, T_TRUE, CONFIG).matched_share == pytest.approx(whole, abs=0.05)
 
 
 def test_verification_of_a_scan_on_itself_is_perfect(scans) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 import pytest
 
@@ -9,6 +11,9 @@ from dpmjax import localize
 from dpmjax.geometry import rigid
 from dpmjax.slam import SlamConfig, SlamMethods, localize_each, run_slam
 from dpmjax.slam.keyframes import KeyframeMap
+from dpmjax.slam.map_thinning import thin_map
+from dpmjax.slam.matcher import Match
+from dpmjax.types import Verification
 from tests.slam.truth import EMPTY, TruthGeometry, TruthMatcher, laps, pose, scans_of
 
 # The second half of the poses is beside the first, and the last ten are far away.
@@ -52,6 +57,35 @@ def test_scans_of_another_place_are_not_found(map_, seed) -> None:
     found = list(localize_each(map_, scans_of(STRANGERS), methods(1.0, seed)))
     assert [one.status for one in found] == ["not in this map"] * len(STRANGERS)
     assert all(one.reason and one.evidence for one in found)
+
+
+@dataclass(frozen=True)
+class SeeingMatcher(TruthMatcher):
+    """The share of points that meet planes falls with the distance of the two scans."""
+
+    nearest_share: float = 0.6
+    share_per_m: float = 0.03
+
+    def _match(self, source: int, target: int) -> Match:
+        apart_m = np.linalg.norm(self.T_world_scan[source][:3, 3] - self.T_world_scan[target][:3, 3])
+        matched = max(self.nearest_share - self.share_per_m * float(apart_m), 0.0)
+        return super()._match(source, target)._replace(verification=Verification(1.0, matched, 0.0, matched))
+
+
+@pytest.mark.parametrize(("nearest_share", "is_found"), [(0.6, True), (0.3, False)])
+def test_one_registration_whose_scans_agree_is_supported_by_those_farther_off(map_, nearest_share, is_found) -> None:
+    thin = thin_map(map_, spacing_share=0.8)
+    matcher = SeeingMatcher(TRUTH, gross_share=0.0, nearest_share=nearest_share)
+    found = list(localize_each(thin, scans_of(QUERIES), SlamMethods(matcher, TruthGeometry(TRUTH), SlamConfig())))
+    assert [one.is_in_map for one in found] == [is_found] * len(QUERIES)
+    assert any(not evidence.do_scans_agree for one in found for evidence in one.evidence)
+
+
+def test_no_keyframe_is_registered_twice(map_) -> None:
+    matcher = SeeingMatcher(TRUTH, gross_share=0.5, nearest_share=0.4)
+    for one in localize_each(map_, scans_of(QUERIES), SlamMethods(matcher, TruthGeometry(TRUTH), SlamConfig())):
+        rows = [evidence.keyframe for evidence in one.evidence]
+        assert len(set(rows)) == len(rows)
 
 
 def test_an_empty_scan_is_said_to_be_empty(map_) -> None:

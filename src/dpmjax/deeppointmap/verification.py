@@ -23,6 +23,9 @@ from dpmjax.scans.view_correlation import ViewCorrelationConfig, correlate_views
 from dpmjax.types import Verification
 
 HYPOTHESES_AT_ONCE = 4
+SPARSE_SHARE = 0.5
+"""With fewer points than this share of the other's, a surface is thinned (`saved_maps`): its points meet the planes of
+the other, for the points of the other find too few of it within reach."""
 
 DISTINCT_M, DISTINCT_RAD = 2.0, np.radians(5.0)
 """Motions that differ by less end in the same place."""
@@ -130,10 +133,13 @@ def verify_motion(
     """
     num_samples = config.num_samples
     level = AlignmentLevel(config.plane_radius_m, num_samples, 1)
-    pairs = pair_with_planes(source.surface, target.surface, T_target_source, level)
+    sides = [(source, target, T_target_source), (target, source, rigid.inverse(T_target_source))]
+    if len(target.surface.points) < SPARSE_SHARE * len(source.surface.points):
+        sides.reverse()
+    scan, other, T_other_scan = sides[0]
+    pairs = pair_with_planes(scan.surface, other.surface, T_other_scan, level)
     meets = (np.abs(pairs.residuals) < config.plane_distance_m) & (pairs.cosines > config.min_cosine)
     views = []
-    sides = ((source, target, T_target_source), (target, source, rigid.inverse(T_target_source)))
     for scan, other, T_other_scan in sides:
         points = scan.surface.points[scan.surface.samples[:num_samples]]
         moved = points @ T_other_scan[:3, :3].T + T_other_scan[:3, 3]

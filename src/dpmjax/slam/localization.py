@@ -48,7 +48,7 @@ class LocalizationConfig:
         same_place_m: two registrations agree within this distance ...
         same_place_rad: ... and this turn.
         min_probability: a registration supports a place from this P(correct) on, if the scans agree.
-        min_support: number of registrations that must agree, ...
+        min_support: number of registrations that must end at the same place, the scans of one of them agreeing, ...
         min_total: ... and sum of their P(correct).
         min_alone: P(correct) that suffices where no other keyframe is near.
         max_rival_share: another place may have this share of the sum of the best one.
@@ -188,7 +188,9 @@ def _localized(map_: KeyframeMap, points: np.ndarray, methods: SlamMethods, conf
     rows = _candidates(map_, description, methods, config)
     tried: list[Evidence] = []
     for start in range(0, len(rows), config.num_at_once):
-        tried += _registered(map_, rows[start : start + config.num_at_once], description, methods, config)
+        done = {one.keyframe for one in tried}
+        left = [row for row in rows[start : start + config.num_at_once] if row not in done]
+        tried += _registered(map_, left, description, methods, config)
         place = max(_places(tried, config), key=lambda place: place.total, default=None)
         if place is not None and not _is_supported(place, config):
             near = _neighbours(map_, place.members[0], tried, extent_m, config)
@@ -223,14 +225,17 @@ def _registered(
 
 
 def _places(tried: list[Evidence], config: LocalizationConfig) -> list[_Place]:
-    """Groups registrations that agree with the most probable one of the group."""
+    """Groups registrations around the most probable ones whose scans agree.
+
+    In a member farther off fewer points meet planes. That it ends at the same place is enough.
+    """
     left = sorted(tried, key=lambda one: -one.match.probability)
-    left = [one for one in left if one.do_scans_agree and one.match.probability >= config.min_probability]
+    left = [one for one in left if one.match.probability >= config.min_probability]
     places = []
-    while left:
-        members = [one for one in left if _agree(left[0], one, config)]
-        places.append(_Place(tuple(members)))
-        left = [one for one in left if not any(one is member for member in members)]
+    while first := next((one for one in left if one.do_scans_agree), None):
+        others = [one for one in left if one is not first and _agree(first, one, config)]
+        places.append(_Place((first, *others)))
+        left = [one for one in left if not any(one is member for member in places[-1].members)]
     return places
 
 
