@@ -225,10 +225,8 @@ def _registered(
 
 
 def _places(tried: list[Evidence], config: LocalizationConfig) -> list[_Place]:
-    """Groups registrations around the most probable ones whose scans agree.
-
-    In a member farther off fewer points meet planes. That it ends at the same place is enough.
-    """
+    """Groups registrations around the most probable ones whose scans agree."""
+    # Fewer points meet planes of a keyframe farther off: that it puts the scan at the same place is enough.
     left = sorted(tried, key=lambda one: -one.match.probability)
     left = [one for one in left if one.match.probability >= config.min_probability]
     places = []
