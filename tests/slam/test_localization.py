@@ -63,19 +63,25 @@ def test_scans_of_another_place_are_not_found(map_, seed) -> None:
 class SeeingMatcher(TruthMatcher):
     """The share of points that meet planes falls with the distance of the two scans."""
 
+    probability: float = 0.9
     nearest_share: float = 0.6
     share_per_m: float = 0.03
 
     def _match(self, source: int, target: int) -> Match:
         apart_m = np.linalg.norm(self.T_world_scan[source][:3, 3] - self.T_world_scan[target][:3, 3])
         matched = max(self.nearest_share - self.share_per_m * float(apart_m), 0.0)
-        return super()._match(source, target)._replace(verification=Verification(1.0, matched, 0.0, matched))
+        found = super()._match(source, target)
+        return found._replace(probability=self.probability, verification=Verification(1.0, matched, 0.0, matched))
 
 
-@pytest.mark.parametrize(("nearest_share", "is_found"), [(0.6, True), (0.3, False)])
-def test_one_registration_whose_scans_agree_is_supported_by_those_farther_off(map_, nearest_share, is_found) -> None:
+@pytest.mark.parametrize(
+    ("nearest_share", "probability", "is_found"), [(0.6, 0.9, True), (0.3, 0.9, False), (0.6, 0.6, False)]
+)
+def test_a_clear_registration_whose_scans_agree_is_supported_by_those_farther_off(
+    map_, nearest_share, probability, is_found
+) -> None:
     thin = thin_map(map_, spacing_share=0.8)
-    matcher = SeeingMatcher(TRUTH, gross_share=0.0, nearest_share=nearest_share)
+    matcher = SeeingMatcher(TRUTH, gross_share=0.0, nearest_share=nearest_share, probability=probability)
     found = list(localize_each(thin, scans_of(QUERIES), SlamMethods(matcher, TruthGeometry(TRUTH), SlamConfig())))
     assert [one.is_in_map for one in found] == [is_found] * len(QUERIES)
     assert any(not evidence.do_scans_agree for one in found for evidence in one.evidence)

@@ -49,7 +49,7 @@ class LocalizationConfig:
         same_place_rad: ... and this turn.
         min_probability: a registration supports a place from this P(correct) on, if the scans agree.
         min_support: number of registrations that must end at the same place, the scans of one of them agreeing, ...
-        min_total: ... and sum of their P(correct).
+        min_best: ... and P(correct) of the best of them. Streets look alike: several may agree on a wrong place.
         min_alone: P(correct) that suffices where no other keyframe is near.
         max_rival_share: another place may have this share of the sum of the best one.
     """
@@ -63,14 +63,14 @@ class LocalizationConfig:
     same_place_rad: float = 0.06
     min_probability: float = 0.2
     min_support: int = 2
-    min_total: float = 1.0
+    min_best: float = 0.8
     min_alone: float = 0.95
     max_rival_share: float = 0.5
 
     def __post_init__(self) -> None:
         require_fields(self, "num_similar", "num_registered", "num_at_once", "num_submap", "min_support", low=1)
-        require_fields(self, "num_neighbours", "min_total", low=0)
-        require_fields(self, "min_probability", "min_alone", "max_rival_share", low=0, high=1)
+        require_fields(self, "num_neighbours", low=0)
+        require_fields(self, "min_probability", "min_best", "min_alone", "max_rival_share", low=0, high=1)
         require_positive_fields(self, "same_place_m", "same_place_rad")
 
 
@@ -242,7 +242,7 @@ def _agree(one: Evidence, other: Evidence, config: LocalizationConfig) -> bool:
 
 
 def _is_supported(place: _Place, config: LocalizationConfig) -> bool:
-    return len(place.members) >= config.min_support and place.total >= config.min_total
+    return len(place.members) >= config.min_support and place.members[0].match.probability >= config.min_best
 
 
 def _neighbours(
