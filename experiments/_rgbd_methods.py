@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -13,7 +14,17 @@ if TYPE_CHECKING:
     from dpmjax.deepmapping import DepthMappingConfig
     from dpmjax.io import DepthSequence
 
-METHODS = ("zero", "placed", "deepmapping", "deepmapping-cold", "direct", "icp", "deepmapping-icp")
+METHODS = (
+    "zero",
+    "placed",
+    "placed-no-prior",
+    "deepmapping",
+    "deepmapping-cold",
+    "direct",
+    "icp",
+    "deepmapping-icp",
+    "multiway",
+)
 _ICP_POINTS = 800
 
 
@@ -28,10 +39,11 @@ def run_method(
     """(n, 4, 4) T_world_camera by one method.
 
     Args:
-        name: one of `METHODS`. "zero": all cameras at one place. "placed": the search for first poses. "deepmapping":
-            from there. "deepmapping-cold": L-Net from zero. "direct": its losses without L-Net, from L-Net's first
-            forward pass, as in the paper. "icp": each image onto the one before; "deepmapping-icp": from there. Of a
-            start and the fit from it, the one of the larger projective consistency is kept.
+        name: one of `METHODS`. "zero": all cameras at one place. "placed": the search for first poses;
+            "placed-no-prior": the same without a cost of translations. "deepmapping": from "placed".
+            "deepmapping-cold": L-Net from zero. "direct": its losses without L-Net, from L-Net's first forward pass, as
+            in the paper. "icp": each image onto the one before; "deepmapping-icp": from there. "multiway": Open3D's
+            multiway registration. Of a start and the fit from it, the one of the larger projective consistency is kept.
         sequence: depth images.
         settings: of DeepMapping.
         found: results of other methods for this sequence: a start that is there is not computed again.
@@ -43,12 +55,18 @@ def run_method(
     import jax
 
     from dpmjax import deepmapping as dm
+    from experiments.baselines.multiway import multiway_images
 
     scans, key = dm.as_depth_scans(sequence.points, sequence.mask), jax.random.key(seed)
     if name == "zero":
         return np.tile(np.eye(4), (len(sequence), 1, 1))
     if name == "placed":
         return dm.initialize_depth(scans, motion=settings.motion, key=key)
+    if name == "placed-no-prior":
+        search = dm.FULL_SEARCH if settings.motion == "full" else dm.PLANAR_SEARCH
+        return dm.initialize_depth(scans, replace(search, translation_weight=0.0), motion=settings.motion, key=key)
+    if name == "multiway":
+        return multiway_images(sequence.points, sequence.mask)
     if name == "icp":
         return chain_icp(sequence, seed=seed)
     used = dm.as_direct(settings) if name == "direct" else settings
@@ -74,6 +92,13 @@ def chain_icp(sequence: DepthSequence, *, seed: int) -> NDArray[np.float64]:
     for before, after in itertools.pairwise(clouds):
         T.append(T[-1] @ np.asarray(icp(after, before, metric="plane").T_target_source, np.float64))
     return np.stack(T)
+
+
+def spread_of(sequence: DepthSequence) -> float:
+    """Root mean square distance of the cameras from their mean, mm: the ATE of not moving at all."""
+    assert sequence.T_world_camera is not None
+    positions = sequence.T_world_camera[:, :3, 3]
+    return 1e3 * float(np.sqrt(np.mean(np.sum((positions - positions.mean(axis=0)) ** 2, axis=1))))
 
 
 def errors_of(T: NDArray[np.float64], sequence: DepthSequence) -> dict[str, float]:

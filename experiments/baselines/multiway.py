@@ -1,4 +1,4 @@
-"""Multiway registration of planar scans by Open3D, a baseline of DeepMapping: `pip install dpmjax[baselines]`.
+"""Multiway registration by Open3D, a baseline of DeepMapping: `pip install dpmjax[baselines]`.
 
 Pairs by iterated closest points, neighbours in time as sure and others as doubtful edges of a pose graph, whose line
 process lets the wrong ones go (Choi, Zhou and Koltun, Robust Reconstruction of Indoor Scenes, CVPR 2015).
@@ -10,11 +10,12 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from jaxtyping import Bool, Float
 from numpy.typing import NDArray
 
 from dpmjax.geometry import se2
 from dpmjax.geometry.rays import typical_range
-from dpmjax.types import ScanSet
+from dpmjax.types import AnyArray, ScanSet
 
 Floats = NDArray[np.float64]
 
@@ -46,17 +47,52 @@ def multiway(scans: ScanSet, config: MultiwayConfig | None = None) -> Floats:
     Returns:
         (n, 3) T_world_scan, x, y, heading; the first one zero.
     """
+    unit = typical_range(scans.points, scans.mask)
+    points = [p[m] for p, m in zip(np.asarray(scans.points), np.asarray(scans.mask), strict=True)]
+    flat = [np.concatenate([p, np.zeros((len(p), 1))], axis=1) for p in points]
+    clouds = [_cloud(p) for p in flat]
+    poses = _registered(clouds, unit, config or MultiwayConfig(), is_planar=True)
+    planar = np.stack([poses[:, 0, 3], poses[:, 1, 3], np.arctan2(poses[:, 1, 0], poses[:, 0, 0])], -1)
+    return se2.relative(planar[0], planar)
+
+
+def multiway_images(
+    points: Float[AnyArray, "n h w 3"], mask: Bool[AnyArray, "n h w"], config: MultiwayConfig | None = None
+) -> Float[NDArray[np.float64], "n 4 4"]:
+    """Poses of depth images by Open3D's multiway registration; a ModuleNotFoundError without Open3D.
+
+    Args:
+        points: of n images in order of time, each in the frame of its camera.
+        mask: True where something was measured.
+        config: settings.
+
+    Returns:
+        T_world_camera, the first one the identity.
+    """
+    unit = typical_range(points, mask)
+    clouds = [_cloud(p[m]) for p, m in zip(np.asarray(points), np.asarray(mask), strict=True)]
+    for cloud in clouds:
+        cloud.estimate_normals()
+    return _registered(clouds, unit, config or MultiwayConfig(), is_planar=False)
+
+
+def _registered(clouds: list[Any], unit: float, config: MultiwayConfig, *, is_planar: bool) -> Floats:
+    """Returns the poses of clouds, (n, 4, 4), the first one the identity; flat ones by points, others by planes."""
     import open3d
 
-    config = config or MultiwayConfig()
-    unit = typical_range(scans.points, scans.mask)
-    clouds = [_cloud(p[m]) for p, m in zip(np.asarray(scans.points), np.asarray(scans.mask), strict=True)]
     coarse, fine = config.coarse * unit, config.fine * unit
-    graph = open3d.pipelines.registration.PoseGraph()
+    registration = open3d.pipelines.registration
+    by_points, by_planes = (
+        registration.TransformationEstimationPointToPoint,
+        registration.TransformationEstimationPointToPlane,
+    )
+    # Planes of flat clouds leave three directions open.
+    estimation = by_points() if is_planar else by_planes()
+    graph = registration.PoseGraph()
     T_world = [np.eye(4)]
     graph.nodes.append(_node(T_world[0]))
     for scan in range(1, len(clouds)):
-        graph.edges.append(_edge(clouds, scan - 1, scan, np.eye(4), (coarse, fine), is_doubtful=False))
+        graph.edges.append(_edge(clouds, (scan - 1, scan), np.eye(4), (coarse, fine), estimation, is_doubtful=False))
         # An edge maps its source, the earlier scan, into the later one.
         T_world.append(T_world[-1] @ np.linalg.inv(graph.edges[-1].transformation))
         graph.nodes.append(_node(T_world[-1]))
@@ -64,8 +100,7 @@ def multiway(scans: ScanSet, config: MultiwayConfig | None = None) -> Floats:
     apart = np.linalg.norm(chain[:, None, :3, 3] - chain[None, :, :3, 3], axis=-1)
     for source, target in np.argwhere(np.triu(apart < config.radius * unit, k=2)).tolist():
         guess = np.linalg.inv(chain[target]) @ chain[source]
-        graph.edges.append(_edge(clouds, source, target, guess, (coarse, fine), is_doubtful=True))
-    registration = open3d.pipelines.registration
+        graph.edges.append(_edge(clouds, (source, target), guess, (coarse, fine), estimation, is_doubtful=True))
     with open3d.utility.VerbosityContextManager(open3d.utility.VerbosityLevel.Error):
         registration.global_optimization(
             graph,
@@ -75,16 +110,13 @@ def multiway(scans: ScanSet, config: MultiwayConfig | None = None) -> Floats:
                 max_correspondence_distance=fine, edge_prune_threshold=config.prune, reference_node=0
             ),
         )
-    poses = np.stack([node.pose for node in graph.nodes])
-    planar = np.stack([poses[:, 0, 3], poses[:, 1, 3], np.arctan2(poses[:, 1, 0], poses[:, 0, 0])], -1)
-    return se2.relative(planar[0], planar)
+    return np.stack([node.pose for node in graph.nodes])
 
 
 def _cloud(points: NDArray[np.floating]) -> Any:
     import open3d
 
-    flat = np.concatenate([points, np.zeros((len(points), 1))], axis=1).astype(np.float64)
-    return open3d.geometry.PointCloud(open3d.utility.Vector3dVector(flat))
+    return open3d.geometry.PointCloud(open3d.utility.Vector3dVector(points.astype(np.float64)))
 
 
 def _node(T_world_scan: Floats) -> Any:
@@ -94,18 +126,21 @@ def _node(T_world_scan: Floats) -> Any:
 
 
 def _edge(
-    clouds: list[Any], source: int, target: int, T_guess: Floats, distances: tuple[float, float], *, is_doubtful: bool
+    clouds: list[Any],
+    pair: tuple[int, int],
+    T_guess: Floats,
+    distances: tuple[float, float],
+    estimation: Any,
+    *,
+    is_doubtful: bool,
 ) -> Any:
-    """T_target_source by points to points (planes of flat clouds leave three directions open), with its information."""
+    """Returns the motion of a pair of source and target, with its information."""
     import open3d
 
     registration = open3d.pipelines.registration
+    source, target = (clouds[row] for row in pair)
     T = T_guess
     for distance in distances:
-        T = registration.registration_icp(
-            clouds[source], clouds[target], distance, T, registration.TransformationEstimationPointToPoint()
-        ).transformation
-    information = registration.get_information_matrix_from_point_clouds(
-        clouds[source], clouds[target], distances[-1], T
-    )
-    return registration.PoseGraphEdge(source, target, T, information, uncertain=is_doubtful)
+        T = registration.registration_icp(source, target, distance, T, estimation).transformation
+    information = registration.get_information_matrix_from_point_clouds(source, target, distances[-1], T)
+    return registration.PoseGraphEdge(*pair, T, information, uncertain=is_doubtful)

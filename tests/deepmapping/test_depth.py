@@ -26,7 +26,7 @@ KEY = jax.random.key(0)
 
 @pytest.fixture(scope="module")
 def walk() -> io.DepthSequence:
-    config = simulation.GridWalkConfig(height=12, width=16)
+    config = simulation.DepthWalkConfig(height=12, width=16)
     return simulation.simulate_depth_sequence(0, 4, seed=1, config=config)
 
 

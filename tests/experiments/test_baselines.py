@@ -10,9 +10,9 @@ import pytest
 
 from dpmjax.io import ScanSequence
 from dpmjax.metrics import absolute_trajectory_error
-from dpmjax.simulation import simulate_sequence
+from dpmjax.simulation import simulate_depth_sequence, simulate_sequence
 from dpmjax.types import ScanSet
-from experiments.baselines.multiway import multiway
+from experiments.baselines.multiway import multiway, multiway_images
 from experiments.baselines.swarm import SwarmConfig, swarm_chain
 
 QUICK = SwarmConfig(num_particles=24, num_iterations=30, num_rounds=1, num_beams=64)
@@ -66,6 +66,16 @@ def test_multiway_finds_a_short_walk(walk) -> None:
     poses = multiway(scans_of(walk))
     assert np.all(poses[0] == 0.0)
     assert ate(poses, walk) < 1.0
+
+
+@pytest.mark.usefixtures("with_open3d")
+def test_multiway_finds_small_motions_of_depth_images() -> None:
+    view = simulate_depth_sequence(0, 2, seed=1)
+    T_world_camera = np.tile(np.eye(4), (3, 1, 1))
+    T_world_camera[1:, 0, 3] = 0.03, 0.06
+    points = np.stack([view.points[0] - T[:3, 3].astype(np.float32) for T in T_world_camera])
+    found = multiway_images(points, np.stack([view.mask[0]] * 3))
+    np.testing.assert_allclose(found, T_world_camera, atol=1e-3)
 
 
 def test_a_swarm_has_particles() -> None:

@@ -94,6 +94,17 @@ def test_rgbd_resumes_trajectory_by_trajectory(tmp_path) -> None:
     assert (out / "errors.png").exists()
 
 
+def test_not_moving_is_never_right_on_hard_walks(tmp_path) -> None:
+    out = tmp_path / "out"
+    assert run(deepmapping_rgbd, "--walks", "hard", "--limit", 2, "--methods", "zero", "-o", out, "--pictures", 0) == 0
+    metrics = json.loads((out / "metrics.json").read_text())
+    assert [row["views"] for row in metrics["rows"]] == [16, 16]
+    for row in metrics["rows"]:
+        assert row["zero"]["ate_mm"] == pytest.approx(row["spread_mm"])
+        assert row["spread_mm"] >= 450
+    assert (metrics["methods"]["zero"]["success"], metrics["methods"]["zero"]["right"]) == (0, 0)
+
+
 def test_ablations_change_one_thing_each() -> None:
     config = deepmapping_ablations.Config()
     basis = deepmapping_ablations.settings_of("lnet", "CNN", config)

@@ -82,6 +82,36 @@ def test_all_images_of_a_walk_see_the_same_walls():
     np.testing.assert_allclose([inside[:, 1].min(), inside[:, 1].max()], [-1.5, 1.1], atol=1e-3)
 
 
+def test_hard_walks_move_and_turn_at_once_and_are_wide():
+    sequence = simulation.simulate_depth_sequence(3, 16, seed=5, config=simulation.HARD_WALK)
+    T = sequence.T_world_camera
+    moved = np.linalg.norm(np.diff(T[:, :3, 3], axis=0), axis=1)
+    turned = np.arccos(np.clip((np.einsum("nij,nij->n", T[:-1, :3, :3], T[1:, :3, :3]) - 1) / 2, -1, 1))
+    assert ((moved > 0.15) & (turned > np.radians(15))).sum() > 5
+    assert (moved < 0.7).all()
+    spread = np.sqrt(np.mean(np.sum((T[:, :3, 3] - T[:, :3, 3].mean(axis=0)) ** 2, axis=1)))
+    assert spread >= 0.45
+    assert simulation.make_apartment(3).is_free(T[:, [0, 2], 3], 0.09).all()
+
+
+def test_noise_and_missing_pixels_grow_with_the_square_of_the_depth():
+    clean = simulation.simulate_depth_sequence(3, 16, seed=5)
+    config = simulation.DepthWalkConfig(depth_noise_m=0.01, dropout_share=0.1)
+    noisy = simulation.simulate_depth_sequence(3, 16, seed=5, config=config)
+    depth = clean.points[..., 2]
+    noise = (noisy.points[..., 2] - depth)[noisy.mask] / depth[noisy.mask] ** 2
+    assert noise.std() == pytest.approx(0.01, rel=0.05)
+    for low, high in ((1.0, 2.0), (2.0, 3.0), (3.0, 4.0)):
+        among = clean.mask & (depth > low) & (depth < high)
+        expected = 0.1 * np.mean((depth[among] / 3.0) ** 2)
+        assert (~noisy.mask[among]).mean() == pytest.approx(expected, rel=0.2)
+
+
+def test_a_walk_that_no_apartment_has_room_for_is_refused():
+    with pytest.raises(ValueError, match="min_spread_m: no walk of 2 views"):
+        simulation.simulate_depth_sequence(0, 2, config=simulation.DepthWalkConfig(min_spread_m=2.0))
+
+
 def write_png(path, depth_mm):
     path.parent.mkdir(parents=True, exist_ok=True)
     Image.fromarray(np.asarray(depth_mm, np.uint16)).save(path)
@@ -183,5 +213,7 @@ def test_bad_arguments_are_named():
         simulation.simulate_depth_sequence(0, 1)
     with pytest.raises(ValueError, match="seed"):
         simulation.make_apartment(-1)
+    with pytest.raises(ValueError, match="dropout_share"):
+        simulation.DepthWalkConfig(dropout_share=2.0)
     with pytest.raises(ValueError, match="depth_m: expected"):
         back_project(np.ones((3, 3)), CAMERA, height=2, width=2, max_depth_m=5.0)

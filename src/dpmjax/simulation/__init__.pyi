@@ -1,7 +1,8 @@
 from .apartment import Apartment as Apartment
-from .apartment import GridWalkConfig as GridWalkConfig
 from .apartment import make_apartment as make_apartment
-from .apartment import simulate_depth_sequence as simulate_depth_sequence
+from .depth_walks import HARD_WALK as HARD_WALK
+from .depth_walks import DepthWalkConfig as DepthWalkConfig
+from .depth_walks import simulate_depth_sequence as simulate_depth_sequence
 from .indoors.building import Building as Building
 from .indoors.building import BuildingConfig as BuildingConfig
 from .indoors.building import make_building as make_building

@@ -1,7 +1,6 @@
-"""Furnished apartments of boxes, made by seed, and depth images of a random walk through them.
+"""Furnished apartments of boxes, made by seed, and the depth that a ray from a camera meets.
 
-World frame: x and z span the floor, y points down; the camera travels in the plane y = 0. Views follow the protocol of
-the Active Vision Dataset: a grid of places, views in steps of 30 degrees (DeepMapping section 4.2).
+World frame: x and z span the floor, y points down; the camera travels in the plane y = 0.
 """
 
 from __future__ import annotations
@@ -14,14 +13,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from dpmjax.sequences import ACTIVE_VISION, BoolArray, DepthSequence, FloatArray
+from dpmjax.sequences import BoolArray, FloatArray
 from dpmjax.types import AnyArray
 
 _CAMERA_HEIGHT_M, _ROOM_HEIGHT_M, _WALL_M, _DOOR_M = 1.1, 2.6, 0.12, 0.95
-# The walk (DeepMapping section 4.2): neighbouring places and views, share of the steps that move; the others turn.
-_GRID_M, _TURN_DEG, _MOVE_SHARE = 0.3, 30.0, 0.5
-_CLEARANCE_M = 0.2  # Places keep this distance from walls and furniture.
-_FARTHEST_M = 6.0  # Deeper pixels are masked.
 _PARALLEL = 1e-9
 _KINDS, _KIND_SHARES = ("cupboard", "table", "picture", "shelf", "bench"), (0.26, 0.16, 0.26, 0.16, 0.16)
 _Box = tuple[list[float], list[float], float]  # centre, half sizes, yaw
@@ -68,66 +63,6 @@ class Apartment:
         half = self.half_sizes[kept] + clearance_m
         is_apart = (np.abs(cos * dx - sin * dz) > half[:, 0]) | (np.abs(sin * dx + cos * dz) > half[:, 2])
         return inside & is_apart.all(axis=1)
-
-
-@dataclass(frozen=True)
-class GridWalkConfig:
-    """What the clouds of a walk are like.
-
-    Attributes:
-        height: rows of a cloud.
-        width: columns of a cloud.
-        depth_noise_m: standard deviation of the depth at one metre; it grows with the square of the depth, as a
-            structured-light camera's does.
-
-    Raises:
-        ValueError: negative noise.
-    """
-
-    height: int = 27
-    width: int = 48
-    depth_noise_m: float = 0.0
-
-    def __post_init__(self) -> None:
-        if self.depth_noise_m < 0.0:
-            raise ValueError(f"depth_noise_m: expected 0 or more, got {self.depth_noise_m}")
-
-
-def simulate_depth_sequence(
-    apartment: int | Apartment = 0, num_views: int = 16, *, seed: int = 0, config: GridWalkConfig | None = None
-) -> DepthSequence:
-    """A random walk over the grid of an apartment, seen by a depth camera that looks level.
-
-    Args:
-        apartment: seed for `make_apartment`, or an apartment.
-        num_views: 8 or 16 in the paper.
-        seed: of walk and noise.
-        config: of the clouds; those of the paper's size without noise where None.
-
-    Returns:
-        The sequence; its motion is planar.
-
-    Raises:
-        ValueError: fewer than two views, or an apartment without free places.
-    """
-    if num_views < 2:
-        raise ValueError(f"num_views: expected at least 2, got {num_views}")
-    config = config or GridWalkConfig()
-    home = apartment if isinstance(apartment, Apartment) else make_apartment(apartment)
-    rng = np.random.default_rng([seed, 11])
-    T_world_camera = _planar_to_matrices(_walk(home, num_views, rng))
-    rows, columns = ACTIVE_VISION.sample_pixels(config.height, config.width)
-    rays = ACTIVE_VISION.rays(columns.astype(np.float64), rows.astype(np.float64))
-    # One capacity for all apartments, so that the caster compiles once.
-    spare = -len(home.centres) % 32
-    boxes = (np.pad(home.centres, ((0, spare), (0, 0))), np.pad(home.half_sizes, ((0, spare), (0, 0))))
-    cast = jax.vmap(cast_depth, in_axes=(0, None, None, None, None))
-    depth = np.asarray(cast(T_world_camera, rays, *boxes, np.pad(home.yaws, (0, spare))), np.float64)
-    mask = np.isfinite(depth) & (depth <= _FARTHEST_M) & (depth > 0.05)
-    depth = np.where(mask, depth, 0.0)
-    depth += config.depth_noise_m * depth**2 * rng.standard_normal(depth.shape)
-    points = np.where(mask[..., None], rays * depth[..., None], 0.0).astype(np.float32)
-    return DepthSequence(f"{home.name}, walk {seed}", points, mask, is_planar=True, T_world_camera=T_world_camera)
 
 
 def make_apartment(seed: int) -> Apartment:
@@ -257,36 +192,3 @@ def cast_depth(
         return jnp.where((leave > jnp.maximum(enter, 0.0)) & (half > 0.0).all(), depth, jnp.inf)
 
     return jax.vmap(meet)(jnp.asarray(centres), jnp.asarray(half_sizes), jnp.asarray(yaws)).min(0)
-
-
-def _walk(home: Apartment, num_views: int, rng: np.random.Generator) -> FloatArray:
-    """(n, 3) x, z and angle about y: one step to a neighbouring place, or one turn, from view to view."""
-    x, z = np.arange(0.0, home.size_x_m, _GRID_M), np.arange(0.0, home.size_z_m, _GRID_M)
-    places = np.stack(np.meshgrid(x, z, indexing="ij"), axis=-1)
-    is_free = home.is_free(places.reshape(-1, 2), _CLEARANCE_M).reshape(places.shape[:2])
-    free = np.argwhere(is_free)
-    if len(free) == 0:
-        raise ValueError(f"{home.name} has no free place with {_CLEARANCE_M} m of clearance")
-    at, view = free[rng.integers(len(free))], int(rng.integers(round(360.0 / _TURN_DEG)))
-    turn_sign = int(rng.choice([-1, 1]))
-    poses = []
-    for _ in range(num_views):
-        poses.append([*places[tuple(at)], np.deg2rad(view * _TURN_DEG)])
-        neighbours = at + np.array([[1, 0], [-1, 0], [0, 1], [0, -1]])
-        inside = ((neighbours >= 0) & (neighbours < is_free.shape)).all(1)
-        reachable = [n for n, ok in zip(neighbours, inside, strict=True) if ok and is_free[tuple(n)]]
-        if reachable and rng.random() < _MOVE_SHARE:
-            at = reachable[rng.integers(len(reachable))]
-        else:
-            turn_sign = -turn_sign if rng.random() < 0.2 else turn_sign
-            view += turn_sign
-    return np.array(poses)
-
-
-def _planar_to_matrices(poses: FloatArray) -> FloatArray:
-    """(n, 4, 4) T_world_camera of x, z and the angle about y."""
-    cos, sin = np.cos(poses[:, 2]), np.sin(poses[:, 2])
-    T = np.tile(np.eye(4), (len(poses), 1, 1))
-    T[:, 0, 0], T[:, 0, 2], T[:, 2, 0], T[:, 2, 2] = cos, sin, -sin, cos
-    T[:, 0, 3], T[:, 2, 3] = poses[:, 0], poses[:, 1]
-    return T
