@@ -57,6 +57,9 @@ class Config:
     """Size of the network and length of its training."""
     without: tuple[Literal["offset-head", "coarse-loss", "curriculum", "occlusion"], ...] = ()
     """Leave these out, to see what each is worth (the paper's Table 2)."""
+    frame: Literal["lidar", "bearing", "local"] | None = None
+    """Frame of the encoder's features: of the lidar, of the ray to each point, or of the wall at it; without it, the
+    preset decides."""
     steps: Annotated[int | None, arg(metavar="N")] = None
     """Train for about N steps in all, stages in proportion; without it, the preset decides."""
     num_towns: Annotated[int, arg(metavar="N")] = 4
@@ -197,6 +200,9 @@ def training_settings(config: Config) -> TrainingConfig:
     from dpmjax.deeppointmap import training_preset, without
 
     settings = training_preset(config.preset)
+    if config.frame is not None:
+        encoder = replace(settings.model.encoder, frame=config.frame)
+        settings = replace(settings, model=replace(settings.model, encoder=encoder))
     for part in config.without:
         settings = without(settings, part)
     if config.bfloat16:

@@ -65,8 +65,9 @@ class DescriptorCloud:
         positions: metres, in the frame of the lidar or of the map.
         features: what the network says of the surroundings of each.
         mask: True for descriptors that are there.
-        directions: cosine and sine of the azimuth of the ray from the lidar to each descriptor, in the frame of the
-            cloud; a map keeps those of its scans. None for a single scan, whose positions give them.
+        directions: cosine and sine of the azimuth of the frame of each descriptor (`EncoderConfig.frame`), in the
+            frame of the cloud; a map keeps those of its scans. None for a single scan with frames along its rays, whose
+            positions give them.
     """
 
     positions: Float[Array, "m 3"]

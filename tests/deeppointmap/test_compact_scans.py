@@ -35,7 +35,7 @@ def test_thinned_scans_find_the_same_motion() -> None:
 
 def test_descriptors_are_kept_exactly() -> None:
     compact = compact_scan(CLOUD, measure_scan(seen_from(street(0), T_WORLD_A), CONFIG))
-    for name in ("positions", "features", "mask"):
+    for name in ("positions", "features", "mask", "directions"):
         np.testing.assert_array_equal(getattr(compact.descriptors, name), getattr(CLOUD, name))
 
 

@@ -1,4 +1,4 @@
-"""Features and offsets are relative to the ray of each descriptor, in scans and in maps."""
+"""Features and offsets are relative to the frame of each descriptor, in scans and in maps."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ from scipy.spatial.transform import Rotation
 from dpmjax.deeppointmap import Model, encode_pyramid, init_model, merge_clouds
 from dpmjax.deeppointmap.encoding import pyramid_of_scan
 from dpmjax.deeppointmap.model import predict_offsets
-from dpmjax.geometry.bearing import directions_of
+from dpmjax.geometry.bearing import directions_of, wall_normals
 from dpmjax.types import DescriptorCloud
 from tests.deeppointmap import toy
 from tests.tolerances import ACCUMULATED
 
 
-@pytest.fixture(scope="module")
-def model() -> Model:
-    model = init_model(jax.random.key(0), replace(toy.MODEL, encoder=replace(toy.MODEL.encoder, frame="bearing")))
+@pytest.fixture(scope="module", params=["bearing", "local"])
+def model(request) -> Model:
+    model = init_model(jax.random.key(0), replace(toy.MODEL, encoder=replace(toy.MODEL.encoder, frame=request.param)))
     # Of so narrow a head, most units are silent; a bias wakes them.
     head = jax.tree.map(lambda leaf: leaf + 0.5, model.params["decoder"]["offset_head"])
     return model.replace(params={**model.params, "decoder": {**model.params["decoder"], "offset_head": head}})
@@ -69,6 +69,27 @@ def test_a_map_predicts_the_offsets_of_its_scans(model, clouds, turn) -> None:
         part = jax.tree.map(lambda leaf, rows=rows: leaf[rows], merged)
         np.testing.assert_allclose(part.positions, clouds[0].positions, atol=1e-4)
         np.testing.assert_allclose(offsets(model, part), offsets(model, clouds[0]), atol=1e-3)
+
+
+def test_a_wall_has_one_frame_wherever_the_lidar_stands() -> None:
+    rng = np.random.default_rng(0)
+    along, height = rng.uniform(-1, 1, (2, 40))
+    for angle in (0.3, 1.9, -2.5):
+        normal, tangent = (np.array([np.cos(angle + turn), np.sin(angle + turn)]) for turn in (0, np.pi / 2))
+        wall = np.column_stack([along[:, None] * tangent + 0.01 * rng.normal(size=(40, 1)) * normal, height])
+        ground = np.column_stack([rng.uniform(-1, 1, (200, 2)), np.full(200, 0.0)])
+        for seen_from in (0.0, 0.7, -1.2):  # angle of the ray to the normal
+            ray = -np.array([np.cos(angle + seen_from), np.sin(angle + seen_from)])
+            found = np.asarray(wall_normals(np.concatenate([wall, ground]).astype(np.float32), ray.astype(np.float32)))
+            np.testing.assert_allclose(found, normal, atol=0.02)
+
+
+def test_without_a_wall_the_frame_is_that_of_the_ray() -> None:
+    angles = np.linspace(0, 2 * np.pi, 13)[:-1]
+    ring = np.column_stack([np.cos(angles), np.sin(angles), np.ones(12)]).astype(np.float32)
+    ray = np.array([0.6, -0.8], np.float32)
+    for offsets_of in (ring, np.zeros((5, 3), np.float32)):
+        np.testing.assert_allclose(wall_normals(offsets_of, ray), -ray, atol=1e-4)
 
 
 def test_in_the_frame_of_the_lidar_nothing_is_turned(model, clouds) -> None:

@@ -43,8 +43,12 @@ def scan(seed: int, num_points: int) -> CompactScan:
     features = rng.normal(size=(NUM_DESCRIPTORS, 4)) @ np.random.default_rng(7).normal(size=(4, CHANNELS))
     features += 0.01 * rng.normal(size=features.shape)
     positions = rng.uniform(-50, 50, (NUM_DESCRIPTORS, 3))
+    angles = rng.uniform(-np.pi, np.pi, NUM_DESCRIPTORS)
     cloud = DescriptorCloud(
-        positions.astype(np.float32), features.astype(np.float32), rng.random(NUM_DESCRIPTORS) > 0.2
+        positions.astype(np.float32),
+        features.astype(np.float32),
+        rng.random(NUM_DESCRIPTORS) > 0.2,
+        np.stack([np.cos(angles), np.sin(angles)], axis=-1).astype(np.float32),
     )
     return compact_scan(cloud, MeasuredScan(surface, range_image(surface.points)), max_points=400)
 
@@ -101,6 +105,7 @@ def test_other_precisions_have_small_errors(tmp_path, precision) -> None:
         ours, theirs = keyframe.description, expected.description
         np.testing.assert_array_equal(ours.mask, theirs.mask)
         np.testing.assert_allclose(ours.positions, theirs.positions, atol=0.026)
+        np.testing.assert_allclose(ours.directions, theirs.directions, atol=0.013)
         spread = theirs.features.std()
         np.testing.assert_allclose(
             ours.features, theirs.features, atol=(0.01 if precision == "float16" else 1.5) * spread
@@ -164,7 +169,7 @@ def header(arrays: dict, **changes) -> np.ndarray:
 
 BROKEN = {
     "no map": lambda a: {"points": np.zeros(3)},
-    "version 2": lambda a: changed(a, header=header(a, version=2)),
+    "version 3": lambda a: changed(a, header=header(a, version=3)),
     "not a dpmjax map": lambda a: changed(a, header=header(a, format="other")),
     "precision int4": lambda a: changed(a, header=header(a, precision="int4")),
     "unknown field": lambda a: changed(a, header=header(a, config={"wrong": 1})),
@@ -172,6 +177,7 @@ BROKEN = {
     "features holds": lambda a: changed(a, features=a["features"] * np.nan),
     "T_world_keyframe holds": lambda a: changed(a, T_world_keyframe=a["T_world_keyframe"] * np.inf),
     "scan is missing": lambda a: changed(a, scan=None),
+    "directions: expected shape": lambda a: changed(a, directions=a["directions"][:, :5]),
     "positions: expected shape": lambda a: changed(a, positions=a["positions"][:, :5]),
     "mask: expected shape": lambda a: changed(a, mask=a["mask"].astype(np.int8)),
     "expected rotations": lambda a: changed(a, T_world_keyframe=2 * a["T_world_keyframe"]),

@@ -9,6 +9,7 @@ from jaxtyping import Bool, Float
 
 from dpmjax.deeppointmap.scan_registration import PreparedScan
 from dpmjax.deeppointmap.verification import MeasuredScan
+from dpmjax.geometry.bearing import directions_of
 from dpmjax.scans.compact import (
     CompactImage,
     CompactSurface,
@@ -28,6 +29,7 @@ class CompactScan(NamedTuple):
     Attributes:
         positions: (m, 3) float32, of the descriptors, metres, in the frame of the lidar.
         features: (m, c) float32.
+        directions: (m, 2) float32, of their frames.
         mask: (m,) True for descriptors that are there.
         surface: thinned points.
         image: range image.
@@ -35,6 +37,7 @@ class CompactScan(NamedTuple):
 
     positions: Float[np.ndarray, "m 3"]
     features: Float[np.ndarray, "m c"]
+    directions: Float[np.ndarray, "m 2"]
     mask: Bool[np.ndarray, " m"]
     surface: CompactSurface
     image: CompactImage
@@ -42,7 +45,7 @@ class CompactScan(NamedTuple):
     @property
     def descriptors(self) -> DescriptorCloud:
         """The descriptors, as arrays of NumPy."""
-        arrays: tuple[Any, ...] = (self.positions, self.features, self.mask)
+        arrays: tuple[Any, ...] = (self.positions, self.features, self.mask, self.directions)
         return DescriptorCloud(*arrays)
 
 
@@ -62,6 +65,7 @@ def compact_scan(
     return CompactScan(
         np.asarray(descriptors.positions, np.float32),
         np.asarray(descriptors.features, np.float32),
+        np.asarray(directions_of(descriptors), np.float32),
         np.asarray(descriptors.mask, bool),
         compact_surface(measured.surface, max_points),
         compact_image(measured.image),

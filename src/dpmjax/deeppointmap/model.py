@@ -21,7 +21,7 @@ from dpmjax.geometry.bearing import from_ray_frame, ray_directions
 from dpmjax.geometry.pyramid_host import build_pyramid_on_host
 from dpmjax.geometry.pyramid_storage import StoredPyramid, moved_pyramid
 from dpmjax.nets.decoder import DescriptorDecoder
-from dpmjax.nets.point_encoder import PointEncoder
+from dpmjax.nets.point_encoder import PointEncoder, frame_directions, without_masked
 from dpmjax.types import AnyArray, DescriptorCloud, PointPyramid
 
 
@@ -119,9 +119,13 @@ def encode_pyramid(model: Model, pyramid: PointPyramid) -> DescriptorCloud:
             expected = f"expected {len(stage.radii)} neighbourhoods"
             raise ValueError(f"pyramid.levels[{number}]: {expected}, got {len(level.neighbours)}")
     features: Any = _encoder(model.config).apply({"params": model.params["encoder"]}, pyramid)
-    level = pyramid.levels[-1 - len(pyramid.interpolation)]
-    positions = jnp.where(level.mask[:, None], level.positions, 0) * model.config.scale_m
-    return DescriptorCloud(positions, features, jnp.asarray(level.mask), ray_directions(positions))
+    row = len(pyramid.levels) - 1 - len(pyramid.interpolation)
+    finer, level = (without_masked(pyramid.levels[number]) for number in (row - 1, row))
+    directions = frame_directions(model.config.encoder.frame, finer, level)
+    if directions is None:
+        directions = ray_directions(level.positions)
+    positions = jnp.asarray(level.positions) * model.config.scale_m
+    return DescriptorCloud(positions, features, jnp.asarray(level.mask), directions)
 
 
 def encode_stored(model: Model, stored: StoredPyramid, T_new_lidar: Float[AnyArray, "4 4"]) -> DescriptorCloud:
@@ -241,18 +245,18 @@ def predict_offsets(
 ) -> Float[Array, "... 3"]:
     """Predicts the offset from each descriptor to its partner (DeepPointMap section 3.2).
 
-    The head predicts in the frame of the features: that of each descriptor's ray with `EncoderConfig.frame` "bearing".
+    The head predicts in the frame of the features (`EncoderConfig.frame`).
 
     Args:
         model: encoder and decoder.
         features: correlated features of the first cloud, one row for each pair.
         partners: correlated features of the second cloud, row for row.
-        directions: directions of the rays of the first cloud, row for row (`geometry.bearing.directions_of`). With
-            None, and in the frame "lidar", offsets stay as the head predicts them.
+        directions: of the frames of the first cloud, row for row (`geometry.bearing.directions_of`). With None, and
+            in the frame "lidar", offsets stay as the head predicts them.
         partner_rows: if given, the partners are `partners[partner_rows]`; cheaper where partners are in several pairs.
 
     Returns:
-        Offsets in metres, in the frame of the first cloud; in the frames of the rays without directions. All are 0
+        Offsets in metres, in the frame of the first cloud; in those of the descriptors without directions. All are 0
         where the decoder predicts none.
     """
     if not model.config.decoder.predicts_offsets:

@@ -1,6 +1,7 @@
-"""The frame of a ray: x along the horizontal direction of the ray from the lidar, y to the left of it, z up.
+"""Frames of single points: x along a horizontal direction, y to the left of it, z up.
 
-Vectors in it do not change if the scan turns about the vertical.
+The direction is that of the ray from the lidar to the point, or the normal of the wall that the point is part of.
+Vectors in such a frame do not change if the scan turns about the vertical.
 """
 
 from __future__ import annotations
@@ -10,6 +11,12 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from dpmjax.types import AnyArray, DescriptorCloud
+
+MIN_HEIGHT_WEIGHT = 1e-8
+"""Weight of a neighbour at the height of the point, in normalised coordinates: that of 6 mm."""
+
+RAY_WEIGHT = 1e-2
+"""Weight of the ray beside the spread of the neighbours, which is between 0 and 1."""
 
 
 def ray_directions(positions: Float[AnyArray, "... d"]) -> Float[Array, "... 2"]:
@@ -29,16 +36,43 @@ def ray_directions(positions: Float[AnyArray, "... d"]) -> Float[Array, "... 2"]
     return jnp.stack([cosine, sine], axis=-1)
 
 
-def directions_of(cloud: DescriptorCloud) -> Float[Array, "*b m 2"]:
-    """Returns the directions of the rays of a cloud.
+def wall_normals(offsets: Float[AnyArray, "... k 3"], rays: Float[AnyArray, "... 2"]) -> Float[Array, "... 2"]:
+    """Estimates the horizontal normal of the wall through each point, on the side of the lidar.
+
+    It is the direction in which the neighbours spread least. Each neighbour counts by the square of its height above
+    or below the point, so that the ground does not count. Where all directions are alike, it is that of the ray.
 
     Args:
-        cloud: descriptors; without directions it is one scan, and its positions are the ends of its rays.
+        offsets: of the neighbours from each point, any unit.
+        rays: unit directions of the rays to the points, same frame.
+
+    Returns:
+        Unit directions, without a derivative.
+    """
+    offsets, rays = lax.stop_gradient(jnp.asarray(offsets)), lax.stop_gradient(jnp.asarray(rays))
+    x, y, z = offsets[..., 0], offsets[..., 1], offsets[..., 2]
+    weights = z**2 + MIN_HEIGHT_WEIGHT
+    xx, xy, yy = (jnp.sum(weights * product, axis=-1) for product in (x * x, x * y, y * y))
+    # Twice the angle of the normal, as a vector: the direction of the smaller eigenvalue of the 2 x 2 covariance.
+    spread = jnp.stack([yy - xx, -2 * xy], axis=-1) / jnp.maximum(xx + yy, jnp.finfo(xx.dtype).tiny)[..., None]
+    along_ray = jnp.stack([rays[..., 0] ** 2 - rays[..., 1] ** 2, 2 * rays[..., 0] * rays[..., 1]], axis=-1)
+    doubled = spread + RAY_WEIGHT * along_ray
+    angle = jnp.arctan2(doubled[..., 1], doubled[..., 0]) / 2
+    normal = jnp.stack([jnp.cos(angle), jnp.sin(angle)], axis=-1)
+    is_away = jnp.sum(normal * rays, axis=-1, keepdims=True) > 0
+    return jnp.where(is_away, -normal, normal)
+
+
+def directions_of(cloud: DescriptorCloud) -> Float[Array, "*b m 2"]:
+    """Returns the directions of the frames of descriptors.
+
+    Args:
+        cloud: descriptors; without directions it is one scan, and they are those of the rays to its positions.
 
     Returns:
         Unit vectors in the horizontal plane of the cloud's frame.
     """
-    return ray_directions(cloud.positions) if cloud.directions is None else cloud.directions
+    return ray_directions(cloud.positions) if cloud.directions is None else jnp.asarray(cloud.directions)
 
 
 def to_ray_frame(vectors: Float[AnyArray, "... 3"], directions: Float[AnyArray, "... 2"]) -> Float[Array, "... 3"]:

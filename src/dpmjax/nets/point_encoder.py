@@ -17,12 +17,12 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from dpmjax.checks import require_count, require_one_of
-from dpmjax.geometry.bearing import ray_directions, to_ray_frame
+from dpmjax.geometry.bearing import ray_directions, to_ray_frame, wall_normals
 from dpmjax.nets.layers import ComputeDtype, layer_norm, linear, require_compute_dtype
 from dpmjax.nets.neighbourhood import maximum_of_normalised
 from dpmjax.types import AnyArray, Interpolation, PointPyramid, PyramidLevel
 
-Frame = Literal["lidar", "bearing"]
+Frame = Literal["lidar", "bearing", "local"]
 
 
 @dataclass(frozen=True)
@@ -34,9 +34,10 @@ class EncoderConfig:
         expansion: width of the hidden layer in inverted residual blocks, relative to its input.
         output_channels: channels of a descriptor.
         frame: frame of the offsets between points. "lidar": the axes of the lidar (the published networks, which have
-            to learn that a scan may be rotated). "bearing": along and across the ray from the lidar to each point;
-            descriptors are then invariant to rotations of the scan about the vertical, and the offsets between
-            descriptors are predicted in the frame of their rays, too.
+            to learn that a scan may be rotated). "bearing": along and across the ray from the lidar to each point.
+            "local": along and across the normal of the wall at each point. With the last two, descriptors are
+            invariant to rotations of the scan about the vertical, and the offsets between descriptors are predicted in
+            these frames, too. Local frames do not turn where the lidar moves past a wall.
         compute_dtype: type of the matrix products over features.
     """
 
@@ -74,6 +75,7 @@ class NeighbourhoodMaximum(nn.Module):
         positions: Float[AnyArray, "n 3"],
         queries: Float[AnyArray, "m 3"],
         neighbours: Int[AnyArray, "m k"],
+        directions: Float[Array, "m 2"] | None = None,
     ) -> Float[Array, "m f"]:
         """Pools the neighbourhood of each query.
 
@@ -82,6 +84,7 @@ class NeighbourhoodMaximum(nn.Module):
             positions: positions of that level.
             queries: positions of the queries.
             neighbours: rows of the neighbours of each query.
+            directions: of the frames of the queries; None for that of the lidar.
 
         Returns:
             Features of the queries.
@@ -98,8 +101,8 @@ class NeighbourhoodMaximum(nn.Module):
             features.astype(dtype), kernel[:-3].astype(dtype), preferred_element_type=jnp.float32
         )
         offsets = jnp.asarray(positions[neighbours] - queries[:, None]) / self.radius
-        if self.config.frame == "bearing":
-            offsets = to_ray_frame(offsets, ray_directions(queries)[:, None])
+        if directions is not None:
+            offsets = to_ray_frame(offsets, directions[:, None])
         # relu grows with its argument, so it may follow the maximum.
         maximum = maximum_of_normalised(from_features + bias, offsets, kernel[-3:], neighbours, scale)
         return nn.relu(maximum + norm_bias)
@@ -118,7 +121,11 @@ class InvertedResidual(nn.Module):
 
     @nn.compact
     def __call__(
-        self, features: Float[Array, "m f"], positions: Float[AnyArray, "m 3"], neighbours: Int[AnyArray, "m k"]
+        self,
+        features: Float[Array, "m f"],
+        positions: Float[AnyArray, "m 3"],
+        neighbours: Int[AnyArray, "m k"],
+        directions: Float[Array, "m 2"] | None = None,
     ) -> Float[Array, "m f"]:
         """Refines the features of one level.
 
@@ -126,13 +133,14 @@ class InvertedResidual(nn.Module):
             features: features of the level.
             positions: positions of the level.
             neighbours: rows of the neighbours in the same level.
+            directions: of the frames of the points; None for that of the lidar.
 
         Returns:
             New features of the level.
         """
         num_features = features.shape[1]
         pool = NeighbourhoodMaximum(num_features, self.radius, self.config, name="neighbourhood")
-        x = pool(features, positions, positions, neighbours)
+        x = pool(features, positions, positions, neighbours, directions)
         x = linear(num_features * self.config.expansion, self.config.compute_dtype, "expand")(x)
         x = nn.relu(layer_norm("expand_norm")(x))
         x = linear(num_features, self.config.compute_dtype, "contract")(x)
@@ -165,11 +173,43 @@ class Stage(nn.Module):
             Features of this level.
         """
         abstraction = NeighbourhoodMaximum(self.num_features, self.radii[0], self.config, name="set_abstraction")
-        x = abstraction(features, finer.positions, level.positions, level.neighbours[0])
+        directions = frame_directions(self.config.frame, finer, level)
+        x = abstraction(features, finer.positions, level.positions, level.neighbours[0], directions)
         for block, radius in enumerate(self.radii[1:]):
             residual = InvertedResidual(radius, self.config, name=f"inverted_residual_{block}")
-            x = residual(x, level.positions, level.neighbours[block + 1])
+            x = residual(x, level.positions, level.neighbours[block + 1], directions)
         return x
+
+
+def without_masked(level: PyramidLevel) -> PyramidLevel:
+    """Sets positions of masked points, which may hold anything, to zero: they cannot reach a gradient.
+
+    Args:
+        level: of a pyramid.
+
+    Returns:
+        The level.
+    """
+    return replace(level, positions=jnp.where(level.mask[:, None], level.positions, 0))
+
+
+def frame_directions(frame: Frame, finer: PyramidLevel, level: PyramidLevel) -> Float[Array, "m 2"] | None:
+    """Computes the directions of the frames of the points of a level.
+
+    Args:
+        frame: see `EncoderConfig`.
+        finer: the level before; positions are 0 where its mask is False.
+        level: the level; positions are 0 where its mask is False.
+
+    Returns:
+        Unit horizontal directions in the frame of the lidar; None for that frame itself.
+    """
+    if frame == "lidar":
+        return None
+    rays = ray_directions(level.positions)
+    if frame == "bearing":
+        return rays
+    return wall_normals(jnp.asarray(finer.positions[level.neighbours[0]] - level.positions[:, None]), rays)
 
 
 class FeaturePropagation(nn.Module):
@@ -227,13 +267,12 @@ class PointEncoder(nn.Module):
             float32 features, one row for each point of that level; zero where its mask is False.
         """
         config = self.config
-        # Masked points may hold anything; set to zero, they cannot reach a gradient.
-        levels = [
-            replace(level, positions=jnp.where(level.mask[:, None], level.positions, 0)) for level in pyramid.levels
-        ]
-        positions = levels[0].positions
-        is_bearing = config.frame == "bearing"
-        seen = to_ray_frame(positions, ray_directions(positions)) if is_bearing else jnp.asarray(positions)
+        levels = [without_masked(level) for level in pyramid.levels]
+        seen = jnp.asarray(levels[0].positions)
+        if config.frame == "bearing":
+            seen = to_ray_frame(seen, ray_directions(seen))
+        elif config.frame == "local":
+            seen = seen * jnp.array([0, 0, 1])  # heights
         features = [linear(config.stem_channels, "float32", "stem")(seen)]
         for stage, radii in enumerate(self.radii):
             module = Stage(config.stem_channels * 2 ** (stage + 1), radii, config, name=f"stage_{stage}")

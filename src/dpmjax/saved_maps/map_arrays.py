@@ -14,8 +14,10 @@ from dpmjax.saved_maps.map_coding import (
     FeatureCodes,
     Precision,
     SurfaceCodes,
+    decode_directions,
     decode_features,
     decode_surface,
+    encode_directions,
     encode_features,
     encode_surface,
     rounded_to,
@@ -177,14 +179,16 @@ def pack_scans(scans: Sequence[CompactScan], precision: Precision) -> Arrays:
     """
     features = np.stack([scan.features for scan in scans])
     positions = np.stack([scan.positions for scan in scans])
+    directions = np.stack([scan.directions for scan in scans])
     arrays: Arrays = {"mask": np.stack([scan.mask for scan in scans]), **_pack_images([scan.image for scan in scans])}
     if precision == "int8":
         codes = encode_features(features.reshape(-1, features.shape[-1]))
         arrays |= {f"feature_{name}": np.asarray(value) for name, value in codes._asdict().items()}
         arrays["positions"] = rounded_to(positions, POSITION_STEP_M)
+        arrays["directions"] = encode_directions(directions)
         return arrays | _joined([encode_surface(scan.surface) for scan in scans])
     dtype = np.float32 if precision == "float32" else np.float16
-    arrays |= {"features": features.astype(dtype), "positions": positions}
+    arrays |= {"features": features.astype(dtype), "positions": positions, "directions": directions.astype(dtype)}
     return arrays | _joined([scan.surface for scan in scans])
 
 
@@ -208,13 +212,16 @@ def unpack_scans(reader: ArrayReader, precision: Precision) -> list[CompactScan]
     if precision == "int8":
         positions = (reader.take("positions", k, m, 3, kind="i") * POSITION_STEP_M).astype(np.float32)
         features = decode_features(_feature_codes(reader, k * m)).reshape(k, m, -1)
+        directions = decode_directions(reader.take("directions", k, m, kind="i"))
         surfaces = [decode_surface(codes) for codes in _surface_codes(reader, k)]
     else:
         positions = reader.take("positions", k, m, 3).astype(np.float32)
         features = reader.take("features", k, m, None).astype(np.float32)
+        directions = reader.take("directions", k, m, 2).astype(np.float32)
         surfaces = _surfaces(reader, k)
     images = _unpack_images(reader, k)
-    return [CompactScan(*parts) for parts in zip(positions, features, mask, surfaces, images, strict=True)]
+    parts = zip(positions, features, directions, mask, surfaces, images, strict=True)
+    return [CompactScan(*parts_of_scan) for parts_of_scan in parts]
 
 
 def _joined(surfaces: Sequence[CompactSurface | SurfaceCodes]) -> Arrays:

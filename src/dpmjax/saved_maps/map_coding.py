@@ -139,6 +139,31 @@ def _from_octahedral(stored: Int8[np.ndarray, "2 n"]) -> Int8[np.ndarray, "n 3"]
     return np.rint(normals * MAX_COMPONENT).astype(np.int8)
 
 
+def encode_directions(directions: Float[np.ndarray, "*d 2"]) -> Int8[np.ndarray, "*d"]:
+    """Rounds horizontal directions to angles 1.4 degrees apart.
+
+    Args:
+        directions: unit vectors.
+
+    Returns:
+        Their azimuths, pi as 127.
+    """
+    return np.rint(np.arctan2(directions[..., 1], directions[..., 0]) * (MAX_CODE / np.pi)).astype(np.int8)
+
+
+def decode_directions(codes: Int8[np.ndarray, "*d"]) -> Float[np.ndarray, "*d 2"]:
+    """Makes unit vectors again.
+
+    Args:
+        codes: from `encode_directions`.
+
+    Returns:
+        The directions, float32.
+    """
+    angles = codes.astype(np.float64) * (np.pi / MAX_CODE)
+    return np.stack([np.cos(angles), np.sin(angles)], axis=-1).astype(np.float32)
+
+
 def rounded_to(values: Float[np.ndarray, "..."], step: float) -> NDArray[Any]:
     """Rounds to multiples of a step, as 16-bit integers.
 

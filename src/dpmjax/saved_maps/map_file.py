@@ -24,7 +24,7 @@ from dpmjax.slam.keyframes import KeyframeMap
 from dpmjax.slam.map_thinning import thin_map
 from dpmjax.weights.config_json import config_from_json
 
-FORMAT, VERSION = "dpmjax map", 1
+FORMAT, VERSION = "dpmjax map", 2
 SPACING_SHARE = 0.8
 ADVICE = "save it again with dpmjax.save_map"
 
