@@ -22,6 +22,7 @@ from __future__ import annotations
 import time
 from dataclasses import dataclass, replace
 from functools import partial
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
@@ -85,6 +86,8 @@ class Config(RunOptions):
         unknown = [name for name in self.methods if name not in METHODS]
         if unknown or not self.methods:
             raise ValueError(f"--methods: expected some of {', '.join(METHODS)}, got {', '.join(unknown) or 'none'}")
+        if "multiway" in self.methods and find_spec("open3d") is None:
+            raise ValueError("--methods: multiway needs Open3D (pip install dpmjax[baselines])")
 
 
 def main(config: Config) -> dict[str, Any]:

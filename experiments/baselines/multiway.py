@@ -82,12 +82,9 @@ def _registered(clouds: list[Any], unit: float, config: MultiwayConfig, *, is_pl
 
     coarse, fine = config.coarse * unit, config.fine * unit
     registration = open3d.pipelines.registration
-    by_points, by_planes = (
-        registration.TransformationEstimationPointToPoint,
-        registration.TransformationEstimationPointToPlane,
-    )
-    # Planes of flat clouds leave three directions open.
-    estimation = by_points() if is_planar else by_planes()
+    estimation = registration.TransformationEstimationPointToPlane()
+    if is_planar:  # planes of flat clouds leave three directions open
+        estimation = registration.TransformationEstimationPointToPoint()
     graph = registration.PoseGraph()
     T_world = [np.eye(4)]
     graph.nodes.append(_node(T_world[0]))

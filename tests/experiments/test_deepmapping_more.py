@@ -94,6 +94,13 @@ def test_rgbd_resumes_trajectory_by_trajectory(tmp_path) -> None:
     assert (out / "errors.png").exists()
 
 
+def test_multiway_without_open3d_is_refused_before_the_run(tmp_path, monkeypatch, capsys) -> None:
+    monkeypatch.setattr(deepmapping_rgbd, "find_spec", lambda _: None)
+    assert run(deepmapping_rgbd, "--methods", "multiway", "-o", tmp_path / "out") == 2
+    assert "multiway needs Open3D" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
 def test_not_moving_is_never_right_on_hard_walks(tmp_path) -> None:
     out = tmp_path / "out"
     assert run(deepmapping_rgbd, "--walks", "hard", "--limit", 2, "--methods", "zero", "-o", out, "--pictures", 0) == 0

@@ -24,8 +24,8 @@ from dpmjax.types import Verification
 
 HYPOTHESES_AT_ONCE = 4
 SPARSE_SHARE = 0.5
-"""With fewer points than this share of the other's, a surface is thinned (`saved_maps`): its points meet the planes of
-the other, for the points of the other find too few of it within reach."""
+"""A target with a smaller share of the source's number of points has been thinned (`saved_maps`). Too few of its points
+are near those of the source, so its own points are compared with the planes of the source."""
 
 DISTINCT_M, DISTINCT_RAD = 2.0, np.radians(5.0)
 """Motions that differ by less end in the same place."""

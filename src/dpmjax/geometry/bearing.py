@@ -40,10 +40,11 @@ def wall_normals(offsets: Float[AnyArray, "... k 3"], rays: Float[AnyArray, "...
     """Estimates the horizontal normal of the wall through each point, on the side of the lidar.
 
     It is the direction in which the neighbours spread least. Each neighbour counts by the square of its height above
-    or below the point, so that the ground does not count. Where all directions are alike, it is that of the ray.
+    or below the point, so that the ground does not count. Where all directions are alike, it points along the ray back
+    to the lidar.
 
     Args:
-        offsets: of the neighbours from each point, any unit.
+        offsets: of the neighbours from each point, normalised coordinates.
         rays: unit directions of the rays to the points, same frame.
 
     Returns:
