@@ -14,7 +14,7 @@ from dpmjax import io, simulation
 from dpmjax.deepmapping.depth import depth_problem
 from dpmjax.deepmapping.fit import init
 from dpmjax.deepmapping.problem import MappingData
-from dpmjax.deepmapping.projective_consistency import PixelSample, fit_pinhole, image_consistency
+from dpmjax.deepmapping.projective_consistency import Agreement, PixelSample, fit_pinhole, image_agreement
 from dpmjax.deepmapping.spatial import motion_matrices
 from dpmjax.metrics import absolute_trajectory_error
 from dpmjax.nets.localization import LocalizationConfig
@@ -131,11 +131,15 @@ def test_an_image_matches_itself_and_contradicts_itself_from_elsewhere(walk) -> 
     points, mask = jnp.asarray(walk.points[0].reshape(-1, 3)), jnp.asarray(walk.mask[0].reshape(-1))
     depth = jnp.where(walk.mask[0], walk.points[0, ..., 2], 0.0)
     pinhole, tolerance = fit_pinhole(walk.points, walk.mask), jnp.float32(0.05)
-    assert float(image_consistency(jnp.eye(4), PixelSample(points, mask), depth, pinhole, tolerance)) > 0.8
-    nearer = jnp.eye(4).at[2, 3].set(-0.6)
-    assert float(image_consistency(nearer, PixelSample(points, mask), depth, pinhole, tolerance)) < 0.0
-    hidden = PixelSample(points, jnp.zeros_like(mask))
-    assert float(image_consistency(jnp.eye(4), hidden, depth, pinhole, tolerance)) == 0.0
+
+    def consistency(T_other_camera: jax.Array, mask: jax.Array) -> float:
+        return float(
+            image_agreement(T_other_camera, PixelSample(points, mask), depth, pinhole, tolerance).consistency()
+        )
+
+    assert consistency(jnp.eye(4), mask) > 0.8
+    assert consistency(jnp.eye(4).at[2, 3].set(-0.6), mask) < 0.0
+    assert consistency(jnp.eye(4), jnp.zeros_like(mask)) == 0.0
 
 
 @pytest.mark.parametrize("count", [2, 3, 4])
@@ -145,12 +149,13 @@ def test_every_pair_of_images_counts_once(walk, count: int) -> None:
     T_i_j = np.linalg.inv(T)[:, None] @ T
     sample = [PixelSample(scans.points[i].reshape(-1, 3), scans.mask[i].reshape(-1)) for i in range(count)]
     pairs = [
-        image_consistency(jnp.asarray(T_i_j[i, j], jnp.float32), sample[j], scans.depth[i], scans.pinhole, 0.02)
+        image_agreement(jnp.asarray(T_i_j[i, j], jnp.float32), sample[j], scans.depth[i], scans.pinhole, 0.02)
         for i in range(count)
         for j in range(count)
         if i != j
     ]
-    np.testing.assert_allclose(dm.projective_consistency(scans, T), np.mean(pairs), rtol=1e-3, atol=1e-4)
+    pooled = Agreement(*(jnp.stack(values) for values in zip(*pairs, strict=True))).consistency()
+    np.testing.assert_allclose(dm.projective_consistency(scans, T), pooled, rtol=1e-3, atol=1e-4)
 
 
 @pytest.mark.slow

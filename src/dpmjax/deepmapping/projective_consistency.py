@@ -1,4 +1,4 @@
-"""Projective consistency of depth images at given poses: the share of matching pixels less that of contradictions.
+"""Projective consistency of depth images at given poses: the share of matching pixels less the cost of contradictions.
 
 An organised image is its own nearest-neighbour structure. Two images are compared by one projection each way, and a
 point is compared with the surface between the pixels instead of with the nearest of them.
@@ -19,8 +19,9 @@ from dpmjax.geometry import rigid
 
 # Four pixels whose inverse depths differ by less than this share lie on one surface; else an edge runs between them.
 _EDGE = 0.15
-# Cost of a contradiction in matches: along a bare wall a wrong pose matches nearly everywhere, and overlaps more.
-_CONTRADICTION = 3.0
+# Cost of a contradiction in matches: along a bare wall a wrong pose matches nearly everywhere, and overlaps more. At a
+# coarse tolerance many contradictions only say that the pose is not exact yet, and cost less.
+_CONTRADICTION, _LEAST_CONTRADICTION, _FULL_TOLERANCE = 18.0, 3.0, 0.02
 # Matches count as a share of the visible points, not of all points, or else every image would be pulled onto the
 # others. This share of all points is added to the visible ones, so that a little overlap that matches is worth little.
 _UNSEEN = 0.1
@@ -87,14 +88,30 @@ def fit_pinhole(points: NDArray[np.floating], mask: NDArray[np.bool_]) -> Pinhol
     return Pinhole(*(jnp.asarray(value, jnp.float32) for value in (fx, fy, cx, cy)))
 
 
-def image_consistency(
+class Agreement(NamedTuple):
+    """How far points agree with depth images: `total / comparable` is their consistency, -18 to 1.
+
+    Attributes:
+        total: matches less the cost of contradictions.
+        comparable: visible points, and a share of all points.
+    """
+
+    total: Float[Array, "..."]
+    comparable: Float[Array, "..."]
+
+    def consistency(self) -> Float[Array, ""]:
+        """The consistency of all comparisons together; 0 where nothing is visible."""
+        return self.total.sum() / jnp.maximum(self.comparable.sum(), 1.0)
+
+
+def image_agreement(
     T_other_camera: Float[Array, "4 4"],
     sample: PixelSample,
     depth_other: Float[Array, "h w"],
     pinhole: Pinhole,
     tolerance: Float[Array, ""],
-) -> Float[Array, ""]:
-    """Matches less contradictions of points with the depth image of another camera, per visible point, in [-3, 1].
+) -> Agreement:
+    """Matches less contradictions of points with the depth image of another camera.
 
     A point that lands on the surface that the other camera sees matches it. A point in front of that surface
     contradicts it, because the other camera looked through it (the self-contradictory occupancy of DeepMapping
@@ -108,7 +125,7 @@ def image_consistency(
         tolerance: share of the depth by which matching points may differ.
 
     Returns:
-        The consistency; 0 where no point is visible.
+        The agreement, two numbers.
     """
     seen = rigid.transform_points(T_other_camera, sample.points)
     depth = seen[:, 2]
@@ -120,8 +137,9 @@ def image_consistency(
     # Distance of the point in front of the surface, in shares of the surface's depth, over the tolerance.
     gap = jnp.where(is_visible, 1.0 - depth * inverse, 0.0) / tolerance
     contradicted = jax.nn.sigmoid(3.0 * (gap - 2.0))
-    score = jnp.where(is_visible, jnp.exp(-(gap**2)) - _CONTRADICTION * contradicted, 0.0)
-    return score.sum() / jnp.maximum(is_visible.sum() + _UNSEEN * sample.mask.sum(), 1.0)
+    cost = jnp.clip(_CONTRADICTION * _FULL_TOLERANCE / tolerance, _LEAST_CONTRADICTION, _CONTRADICTION)
+    score = jnp.where(is_visible, jnp.exp(-(gap**2)) - cost * contradicted, 0.0)
+    return Agreement(score.sum(), is_visible.sum() + _UNSEEN * sample.mask.sum())
 
 
 def _inverse_depth_at(
@@ -147,8 +165,8 @@ def both_ways(
     depths: tuple[Float[Array, "h w"], Float[Array, "h w"]],
     pinhole: Pinhole,
     tolerance: Float[Array, ""],
-) -> Float[Array, ""]:
-    """Mean consistency of a pair of images: the first seen by the other, and the other by the first.
+) -> Agreement:
+    """Agreement of a pair of images: the first seen by the other, and the other by the first.
 
     Args:
         T_other_camera: maps points of the first image into the frame of the other camera.
@@ -158,11 +176,11 @@ def both_ways(
         tolerance: share of the depth by which matching points may differ.
 
     Returns:
-        The consistency, -3 to 1.
+        The sum of both agreements.
     """
-    there = image_consistency(T_other_camera, samples[0], depths[1], pinhole, tolerance)
-    back = image_consistency(rigid.inverse(T_other_camera), samples[1], depths[0], pinhole, tolerance)
-    return 0.5 * (there + back)
+    there = image_agreement(T_other_camera, samples[0], depths[1], pinhole, tolerance)
+    back = image_agreement(rigid.inverse(T_other_camera), samples[1], depths[0], pinhole, tolerance)
+    return Agreement(there.total + back.total, there.comparable + back.comparable)
 
 
 def consistency_of_pairs(
@@ -172,7 +190,9 @@ def consistency_of_pairs(
     offsets: Int[Array, " o"],
     tolerance: Float[Array, ""],
 ) -> Float[Array, ""]:
-    """Mean consistency of each image with those `offsets` later, the last followed by the first; each pair once.
+    """Consistency of each image with those `offsets` later, the last followed by the first; each pair once.
+
+    All comparisons are pooled: the mean over pairs would reward images for looking at what many others see.
 
     Args:
         T_world_camera: poses.
@@ -182,32 +202,31 @@ def consistency_of_pairs(
         tolerance: share of the depth by which matching points may differ.
 
     Returns:
-        The mean over all pairs, -3 to 1.
+        The consistency, -18 to 1.
     """
     count, depth = T_world_camera.shape[0], scans.depth
 
-    def compare(offset: Int[Array, ""]) -> tuple[Float[Array, ""], Int[Array, ""]]:
+    def compare(offset: Int[Array, ""]) -> Agreement:
         other = (jnp.arange(count) + offset) % count
         T_other_camera = jnp.matmul(
             rigid.inverse(T_world_camera[other]), T_world_camera, precision=jax.lax.Precision.HIGHEST
         )
         others = PixelSample(sample.points[other], sample.mask[other])
-        scores = jax.vmap(both_ways, in_axes=(0, 0, 0, None, None))(
+        agreements = jax.vmap(both_ways, in_axes=(0, 0, 0, None, None))(
             T_other_camera, (sample, others), (depth, depth[other]), scans.pinhole, tolerance
         )
         # At half the circle the second half of the images repeats the pairs of the first.
         is_new = (2 * offset != count) | (jnp.arange(count) < offset)
-        return jnp.sum(jnp.where(is_new, scores, 0.0)), is_new.sum()
+        return Agreement(*(jnp.sum(jnp.where(is_new, values, 0.0)) for values in agreements))
 
-    totals, counts = jax.lax.map(compare, offsets)
-    return totals.sum() / counts.sum()
+    return Agreement(*jax.lax.map(compare, offsets)).consistency()
 
 
 @jax.jit
 def projective_consistency(
     scans: DepthScans, T_world_camera: Float[Array, "n 4 4"], tolerance: Float[Array, ""] | float = 0.02
 ) -> Float[Array, ""]:
-    """Mean consistency of all pairs of images, all their pixels: compares trajectories without a ground truth.
+    """Consistency of all pairs of images, all their pixels: compares trajectories without a ground truth.
 
     Args:
         scans: depth images.
@@ -215,7 +234,7 @@ def projective_consistency(
         tolerance: share of the depth by which matching points may differ.
 
     Returns:
-        -3 (every point contradicts an image) to 1; images that see nothing of each other count 0.
+        -18 (every point contradicts an image) to 1; 0 where no image sees anything of another one.
     """
     count = scans.mask.shape[0]
     sample = PixelSample(scans.points.reshape(count, -1, 3), scans.mask.reshape(count, -1))
