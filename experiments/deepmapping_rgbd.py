@@ -14,6 +14,8 @@ missing pixels, and only walks on which not moving at all exceeds 450 mm. No set
 Each trajectory is written to rows/ as soon as all methods have done it; metrics.json has the share of walks with an ATE
 below 450 mm (the paper's threshold; on most of its walks not moving at all stays below it), and of walks that are
 right: ATE below a tenth of the spread of the cameras, turns between neighbours within 2 degrees, points within 100 mm.
+Images of bare walls leave open how far the camera moved along them; of hard walks the table also says which share is
+right of those that the surfaces in the images hold to a tenth of the spread (experiments/_rgbd_surfaces.py says how).
 errors.png has the box plots, map_K.png some trajectories from above.
 """
 
@@ -39,6 +41,7 @@ from experiments._run_folder import RunFolder, RunOptions, open_run_folder, reco
 if TYPE_CHECKING:
     from dpmjax.deepmapping import DepthMappingConfig
     from dpmjax.io import DepthSequence
+    from dpmjax.simulation import DepthWalkConfig
 
 EXPERIMENT = "deepmapping_rgbd"
 _SUCCESS_MM = 450.0
@@ -75,6 +78,11 @@ class Config(RunOptions):
     """Depth noise of the simulated camera at one metre; hard walks have their own."""
     pictures: Annotated[int, arg(metavar="N")] = 4
     """Trajectories to draw from above."""
+
+    @property
+    def is_hard(self) -> bool:
+        """Returns whether the walks are the hard ones."""
+        return self.data is None and self.walks == "hard"
 
     def __post_init__(self) -> None:
         """Checks ranges."""
@@ -129,9 +137,8 @@ def read_trajectory(config: Config, index: int) -> DepthSequence:
 
     views = config.views or (8 if index % 2 == 0 else 16)
     seed = 1000 * config.seed + index
-    if config.data is None and config.walks == "hard":
-        apartment, views = _FIRST_HELD_OUT + seed, config.views or _HARD_VIEWS
-        return simulation.simulate_depth_sequence(apartment, views, seed=seed, config=simulation.HARD_WALK)
+    if config.is_hard:
+        return _hard_walk(config, index, simulation.HARD_WALK)
     if config.data is None:
         walk = simulation.DepthWalkConfig(depth_noise_m=config.depth_noise_m)
         return simulation.simulate_depth_sequence(seed % _NUM_APARTMENTS, views, seed=seed, config=walk)
@@ -143,6 +150,24 @@ def read_trajectory(config: Config, index: int) -> DepthSequence:
     begin = index * _window_step(config, views)
     window = sequence.take(slice(begin, begin + views))
     return replace(window, name=f"{sequence.name}, images {begin} to {begin + len(window) - 1}")
+
+
+def walk_surface_spread(config: Config, index: int) -> float:
+    """How well the surfaces hold a hard walk, mm; its images without noise are those of the same seed."""
+    from dpmjax import simulation
+    from experiments._rgbd_surfaces import surface_spread
+
+    hard = simulation.HARD_WALK
+    clean = replace(hard, depth_noise_m=0.0, dropout_share=0.0)
+    return surface_spread(_hard_walk(config, index, clean), hard.depth_noise_m)
+
+
+def _hard_walk(config: Config, index: int, walk: DepthWalkConfig) -> DepthSequence:
+    from dpmjax import simulation
+
+    seed = 1000 * config.seed + index
+    apartment, views = _FIRST_HELD_OUT + seed, config.views or _HARD_VIEWS
+    return simulation.simulate_depth_sequence(apartment, views, seed=seed, config=walk)
 
 
 def fit_settings(config: Config, sequence: DepthSequence) -> DepthMappingConfig:
@@ -170,6 +195,8 @@ def run_one(trajectory: int, *, folder: RunFolder, config: Config, settings: Dep
     sequence = read_trajectory(config, trajectory)
     found: dict[str, NDArray[np.float64]] = {}
     row: dict[str, Any] = {"name": sequence.name, "views": len(sequence), "spread_mm": spread_of(sequence)}
+    if config.is_hard:
+        row["surface_spread_mm"] = walk_surface_spread(config, trajectory)
     for name in config.methods:
         begun = time.perf_counter()
         found[name] = run_method(name, sequence, settings, found, seed=config.seed)
@@ -187,7 +214,8 @@ def run_one(trajectory: int, *, folder: RunFolder, config: Config, settings: Dep
 
 def summarise(rows: list[dict[str, Any]], methods: tuple[str, ...]) -> dict[str, Any]:
     """Success rates and medians by method."""
-    table = {}
+    table: dict[str, dict[str, float | None]] = {}
+    held = {}
     spread_mm = np.array([row["spread_mm"] for row in rows])
     for name in methods:
         values = {key: np.array([row[name][key] for row in rows]) for key in rows[0][name]}
@@ -200,7 +228,11 @@ def summarise(rows: list[dict[str, Any]], methods: tuple[str, ...]) -> dict[str,
             "median_point_distance_mm": float(np.median(values["point_distance_mm"])),
             "median_run_s": float(np.median(values["run_s"])),
         }
-    return {"num_trajectories": len(rows), "methods": table}
+        if "surface_spread_mm" in rows[0]:
+            is_held = np.array([row["surface_spread_mm"] for row in rows]) < _RIGHT_SHARE * spread_mm
+            table[name]["right_of_held"] = float(is_right[is_held].mean()) if is_held.any() else None
+            held = {"num_held_by_surfaces": int(is_held.sum())}
+    return {"num_trajectories": len(rows), **held, "methods": table}
 
 
 def draw_errors(folder: RunFolder, rows: list[dict[str, Any]], methods: tuple[str, ...]) -> None:
@@ -218,9 +250,13 @@ def tell(folder: RunFolder, metrics: dict[str, Any]) -> None:
     """The table."""
     right = f"below {_RIGHT_SHARE:.0%} of the spread, turns {_RIGHT_DEG:g} degrees, points {_RIGHT_MM:g} mm"
     print(f"{metrics['num_trajectories']} trajectories; ATE below 450 mm (the paper's); right: ATE {right}")
+    if "num_held_by_surfaces" in metrics:
+        print(f"the surfaces hold {metrics['num_held_by_surfaces']} of them to a tenth of the spread")
     for name, row in metrics["methods"].items():
+        of_held = row.get("right_of_held")
         print(
-            f"{name:17} {100 * row['success']:5.1f} %  right {100 * row['right']:5.1f} %  median ATE "
+            f"{name:17} {100 * row['success']:5.1f} %  right {100 * row['right']:5.1f} %  "
+            f"{'' if of_held is None else f'({100 * of_held:.0f} % of the held)  '}median ATE "
             f"{row['median_ate_mm']:7.1f} mm, point distance {row['median_point_distance_mm']:7.1f} mm, "
             f"{row['median_run_s']:.1f} s"
         )

@@ -7,6 +7,7 @@ import pytest
 from scipy.spatial import cKDTree
 
 from dpmjax import estimate_normals
+from dpmjax.geometry import image_normals
 from tests.tolerances import ACCUMULATED, ROUNDING
 
 DIMS = pytest.mark.parametrize("dim", [2, 3])
@@ -121,3 +122,18 @@ def test_wrong_arguments_are_named(as_user) -> None:
         estimate_normals(jnp.ones((5, 3)), 2)
     with pytest.raises(ValueError, match="^radius: expected a number above 0"):
         estimate_normals(jnp.ones((5, 3)), 3, radius=-1.0)
+
+
+def test_pixels_of_a_plane_have_its_normal_and_pixels_across_an_edge_none() -> None:
+    rays = np.stack([*np.meshgrid(np.linspace(-0.5, 0.5, 9), np.linspace(-0.3, 0.3, 7)), np.ones((7, 9))], axis=-1)
+    normal = np.array([0.4, -0.2, -1.0]) / np.linalg.norm([0.4, -0.2, -1.0])
+    points = rays * (-2.0 / (rays @ normal))[..., None]
+    points[:, 5:] *= 2.0
+    mask = np.ones((7, 9), bool)
+    mask[0, 0] = False
+    normals, is_surface = image_normals(points.astype(np.float32), mask)
+    expected = np.ones((6, 8), bool)
+    expected[:, 4], expected[0, 0] = False, False
+    np.testing.assert_array_equal(is_surface, expected)
+    np.testing.assert_allclose(np.abs(normals[expected] @ normal), 1.0, atol=1e-5)
+    assert not normals[~expected].any()

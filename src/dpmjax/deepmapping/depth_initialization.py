@@ -29,6 +29,7 @@ from dpmjax.deepmapping.projective_consistency import (
 )
 from dpmjax.deepmapping.spatial import motion_matrices
 from dpmjax.geometry import rigid
+from dpmjax.geometry.normals import image_normals
 
 # Motions differ by such shares of the largest translation and turn: those that are slid, and those that are kept then.
 _DIFFERENT, _SLID_APART = (0.35, 0.1), (0.08, 0.04)
@@ -36,8 +37,6 @@ _DIFFERENT, _SLID_APART = (0.35, 0.1), (0.08, 0.04)
 _SLIDE, _LONGEST = 1.4, 1.5
 # Widths of variations in shares of the limits: in the first round, and after the slides; halved from round to round.
 _FIRST_SPREAD, _SLID_SPREAD = 0.25, 0.04
-# Neighbouring pixels whose depths differ by more than this share have no common surface.
-_SAME_SURFACE = 0.3
 
 
 @dataclass(frozen=True)
@@ -161,16 +160,10 @@ def initialize_depth(
 
 def _surface_directions(scans: DepthScans, motion: Motion) -> NDArray[np.float32]:
     """(n, a, 3) principal axes of the normals of each image, in the plane of the motion: the least held first."""
-    points, mask = np.asarray(scans.points, np.float64), np.asarray(scans.mask)
-    right, below = points[:, :-1, 1:] - points[:, :-1, :-1], points[:, 1:, :-1] - points[:, :-1, :-1]
-    depth = np.stack([points[:, :-1, :-1, 2], points[:, :-1, 1:, 2], points[:, 1:, :-1, 2]])
-    is_surface = mask[:, :-1, :-1] & mask[:, :-1, 1:] & mask[:, 1:, :-1]
-    is_surface &= np.ptp(depth, axis=0) < _SAME_SURFACE * depth.max(axis=0)
-    normals = np.cross(right, below)
-    normals *= (is_surface / np.maximum(np.linalg.norm(normals, axis=-1), 1e-12))[..., None]
+    normals, _ = image_normals(np.asarray(scans.points), np.asarray(scans.mask))
     axes = [0, 2] if motion == "planar" else [0, 1, 2]
     spread = np.einsum("nhwi,nhwj->nij", normals[..., axes], normals[..., axes])
-    directions = np.zeros((len(points), len(axes), 3), np.float32)
+    directions = np.zeros((len(normals), len(axes), 3), np.float32)
     directions[..., axes] = np.swapaxes(np.linalg.eigh(spread)[1], -1, -2)
     return directions
 

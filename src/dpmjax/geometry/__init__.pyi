@@ -6,6 +6,7 @@ from .neighbours import k_nearest as k_nearest
 from .neighbours import radius_search as radius_search
 from .normals import Normals as Normals
 from .normals import estimate_normals as estimate_normals
+from .normals import image_normals as image_normals
 from .pyramid import PyramidConfig as PyramidConfig
 from .pyramid import PyramidStage as PyramidStage
 from .pyramid import build_pyramid as build_pyramid

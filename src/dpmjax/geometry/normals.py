@@ -1,4 +1,4 @@
-"""Surface normals by principal components of the nearest points."""
+"""Surface normals: by principal components of the nearest points, and of neighbouring pixels."""
 
 from __future__ import annotations
 
@@ -7,12 +7,16 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from dpmjax.checks import as_mask, as_points, require_count, require_positive
 from dpmjax.geometry.neighbours import k_nearest
 from dpmjax.types import AnyArray, Neighbours
+
+# Neighbouring pixels whose depths differ by more than this share lie on different surfaces.
+_SAME_SURFACE = 0.3
 
 
 class Normals(NamedTuple):
@@ -28,6 +32,28 @@ class Normals(NamedTuple):
     normals: Float[Array, "n d"]
     flatness: Float[Array, " n"]
     mask: Bool[Array, " n"]
+
+
+def image_normals(
+    points: Float[np.ndarray, "*b h w 3"], mask: Bool[np.ndarray, "*b h w"]
+) -> tuple[Float[np.ndarray, "*b h-1 w-1 3"], Bool[np.ndarray, "*b h-1 w-1"]]:
+    """Normals of organised clouds: of the plane through each pixel, the one right of it and the one below it.
+
+    Args:
+        points: in the camera frame, depth along z.
+        mask: True where something was measured.
+
+    Returns:
+        Unit normals, 0 where the three do not lie on one surface; and where they do.
+    """
+    cloud = np.asarray(points, np.float64)
+    here, right, below = cloud[..., :-1, :-1, :], cloud[..., :-1, 1:, :], cloud[..., 1:, :-1, :]
+    depth = np.stack([here[..., 2], right[..., 2], below[..., 2]])
+    is_surface = mask[..., :-1, :-1] & mask[..., :-1, 1:] & mask[..., 1:, :-1]
+    is_surface = is_surface & (np.ptp(depth, axis=0) < _SAME_SURFACE * depth.max(axis=0))
+    normals = np.cross(right - here, below - here)
+    length = np.maximum(np.linalg.norm(normals, axis=-1), 1e-12)
+    return normals * (is_surface / length)[..., None], is_surface
 
 
 def estimate_normals(
