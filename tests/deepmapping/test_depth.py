@@ -12,6 +12,7 @@ import pytest
 from dpmjax import deepmapping as dm
 from dpmjax import io, simulation
 from dpmjax.deepmapping.depth import depth_problem
+from dpmjax.deepmapping.depth_initialization import surface_directions
 from dpmjax.deepmapping.fit import init
 from dpmjax.deepmapping.problem import MappingData
 from dpmjax.deepmapping.projective_consistency import Agreement, PixelSample, fit_pinhole, image_agreement
@@ -202,3 +203,17 @@ def test_consistency_has_finite_slopes_where_nothing_overlaps(scans) -> None:
 
     assert jnp.isfinite(slope(1.5)).all()
     assert jnp.isfinite(slope(0.1)).all()
+
+
+def test_an_image_of_one_wall_is_slid_along_it_first() -> None:
+    rays = np.stack([*np.meshgrid(np.linspace(-0.7, 0.7, 12), np.linspace(-0.4, 0.4, 8)), np.ones((8, 12))], axis=-1)
+    along = np.array([0.8, 0.0, 0.6])
+    wall = rays * (-2.0 / (rays @ [0.6, 0.0, -0.8]))[..., None]
+    scans = dm.as_depth_scans(np.stack([wall, wall]))
+    for motion in ("planar", "full"):
+        directions = surface_directions(scans, motion)
+        assert directions.shape == (2, 2 if motion == "planar" else 3, 3)
+        # In space the two directions in the wall are equal.
+        in_wall = directions[0, : directions.shape[1] - 1]
+        np.testing.assert_allclose(np.linalg.norm(in_wall @ along), 1.0, atol=1e-3)
+        np.testing.assert_allclose(np.abs(directions[0, -1] @ [0.6, 0.0, -0.8]), 1.0, atol=1e-3)

@@ -145,7 +145,7 @@ def initialize_depth(
         (n, 4, 4) T_world_camera, unit of the points.
     """
     config = config or (PLANAR_SEARCH if motion == "planar" else FULL_SEARCH)
-    directions = _surface_directions(scans, motion)
+    directions = surface_directions(scans, motion)
     tries = [
         _chain_images(scans, directions, config, motion, key=jax.random.fold_in(key, k))
         for k in range(config.num_tries)
@@ -158,8 +158,16 @@ def initialize_depth(
     return max(tries, key=score)
 
 
-def _surface_directions(scans: DepthScans, motion: Motion) -> NDArray[np.float32]:
-    """(n, a, 3) principal axes of the normals of each image, in the plane of the motion: the least held first."""
+def surface_directions(scans: DepthScans, motion: Motion) -> NDArray[np.float32]:
+    """Directions in which the surfaces of an image hold the camera, from the least to the most.
+
+    Args:
+        scans: depth images.
+        motion: "planar": two axes in the plane x, z; "full": three.
+
+    Returns:
+        (n, a, 3) principal axes of the normals, in the camera frames.
+    """
     normals, _ = image_normals(np.asarray(scans.points), np.asarray(scans.mask))
     axes = [0, 2] if motion == "planar" else [0, 1, 2]
     spread = np.einsum("nhwi,nhwj->nij", normals[..., axes], normals[..., axes])
@@ -186,7 +194,7 @@ def _chain_images(
     T = [np.eye(4)]
     num_checked = min(max(config.num_references, config.num_checked), num_scans - 1)
     for scan in range(1, num_scans):
-        # A window of fixed length: where there are fewer images before, the last is repeated without weight.
+        # A window of fixed length: where there are fewer images before, the first is repeated without weight.
         rows = np.maximum(scan - 1 - np.arange(num_checked), 0)
         references = _References(
             jnp.asarray(np.linalg.inv(T[-1]) @ np.stack([T[row] for row in rows]), jnp.float32),
@@ -204,6 +212,7 @@ def _take(tree: Any, rows: Any) -> Any:
 
 
 def _turn_of(T: Float[Array, "... 4 4"]) -> Float[Array, "..."]:
+    """Angle of a motion, radians."""
     return jnp.arccos(jnp.clip(0.5 * (jnp.trace(T[..., :3, :3], axis1=-2, axis2=-1) - 1.0), -1.0, 1.0))
 
 
@@ -225,9 +234,8 @@ def _score_motion(
     agreements = jax.vmap(against)(references.T_last_reference, references.views)
     agreement = Agreement(*(references.weights * values for values in agreements))
     length = jnp.linalg.norm(T_last_scan[:3, 3]) / config.max_translation
-    cost = config.translation_weight * length + config.turn_weight * _turn_of(T_last_scan) / np.deg2rad(
-        config.max_turn_deg
-    )
+    turned = _turn_of(T_last_scan) / np.deg2rad(config.max_turn_deg)
+    cost = config.translation_weight * length + config.turn_weight * turned
     return jnp.where(length > _LONGEST, -jnp.inf, agreement.consistency() - cost)
 
 
@@ -239,7 +247,7 @@ def _distinct(
 
     def pick(left: Float[Array, " m"], _: None) -> tuple[Float[Array, " m"], Array]:
         best = T[jnp.argmax(left)]
-        turned = _turn_of(jnp.matmul(best.T, T, precision=jax.lax.Precision.HIGHEST).at[:, 3, 3].set(1.0))
+        turned = _turn_of(jnp.matmul(rigid.inverse(best), T, precision=jax.lax.Precision.HIGHEST))
         is_near = (jnp.linalg.norm(T[:, :3, 3] - best[:3, 3], axis=-1) < far) & (turned < turn)
         return jnp.where(is_near, -jnp.inf, left), best
 
