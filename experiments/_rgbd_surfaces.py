@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import NDArray
 
-from dpmjax.deepmapping.projective_consistency import fit_pinhole
+from dpmjax.deepmapping.projective_consistency import Pinhole, fit_pinhole
 from dpmjax.geometry.normals import image_normals
 from dpmjax.metrics import absolute_trajectory_error
 from dpmjax.sequences import DepthSequence
@@ -41,10 +41,12 @@ def surface_spread(sequence: DepthSequence, depth_noise_m: float) -> float:
     assert T is not None
     count = len(sequence)
     information = _information_of_moves(count)
+    pinhole = fit_pinhole(sequence.points, sequence.mask)
+    surfaces = image_normals(sequence.points, sequence.mask)
     for one in range(count):
         for other in range(count):
             if one != other:
-                _add_pair(information, sequence, one, other, depth_noise_m)
+                _add_pair(information, sequence, pinhole, surfaces, (one, other), depth_noise_m)
     # The first camera stays: the world has no frame of its own.
     root = np.linalg.cholesky(np.linalg.inv(information[3:, 3:]))
     draws = np.random.default_rng(0).standard_normal((_NUM_DRAWS, len(root))) @ root.T
@@ -67,19 +69,25 @@ def _information_of_moves(count: int) -> Float[np.ndarray, "m m"]:
 
 
 def _add_pair(
-    information: NDArray[np.float64], sequence: DepthSequence, one: int, other: int, depth_noise_m: float
+    information: NDArray[np.float64],
+    sequence: DepthSequence,
+    pinhole: Pinhole,
+    surfaces: tuple[NDArray[np.float64], NDArray[np.bool_]],
+    pair: tuple[int, int],
+    depth_noise_m: float,
 ) -> None:
-    """Adds what the points of one image say on the surfaces of another one."""
+    """Adds what the points of one image say on the surfaces (normals, and where there are some) of another one."""
     T = sequence.T_world_camera
     assert T is not None
-    fx, fy, cx, cy = (float(value) for value in fit_pinhole(sequence.points, sequence.mask))
+    one, other = pair
+    normals, is_surface = (values[other] for values in surfaces)
+    fx, fy, cx, cy = (float(value) for value in pinhole)
     height, width = sequence.mask.shape[1:]
     points = np.asarray(sequence.points[one][sequence.mask[one]], np.float64)
     world = points @ T[one, :3, :3].T + T[one, :3, 3]
     seen = (world - T[other, :3, 3]) @ T[other, :3, :3]
     depth = np.maximum(seen[:, 2], 1e-3)
     row, column = np.rint(fy * seen[:, 1] / depth + cy).astype(int), np.rint(fx * seen[:, 0] / depth + cx).astype(int)
-    normals, is_surface = image_normals(sequence.points[other], sequence.mask[other])
     is_seen = (seen[:, 2] > 0.05) & (row >= 0) & (row < height - 1) & (column >= 0) & (column < width - 1)
     row, column = np.where(is_seen, row, 0), np.where(is_seen, column, 0)
     there = np.asarray(sequence.points[other, row, column, 2], np.float64)

@@ -215,8 +215,10 @@ def run_one(trajectory: int, *, folder: RunFolder, config: Config, settings: Dep
 def summarise(rows: list[dict[str, Any]], methods: tuple[str, ...]) -> dict[str, Any]:
     """Success rates and medians by method."""
     table: dict[str, dict[str, float | None]] = {}
-    held = {}
     spread_mm = np.array([row["spread_mm"] for row in rows])
+    is_held = None
+    if "surface_spread_mm" in rows[0]:
+        is_held = np.array([row["surface_spread_mm"] for row in rows]) < _RIGHT_SHARE * spread_mm
     for name in methods:
         values = {key: np.array([row[name][key] for row in rows]) for key in rows[0][name]}
         is_right = (values["ate_mm"] < _RIGHT_SHARE * spread_mm) & (values["point_distance_mm"] < _RIGHT_MM)
@@ -228,10 +230,9 @@ def summarise(rows: list[dict[str, Any]], methods: tuple[str, ...]) -> dict[str,
             "median_point_distance_mm": float(np.median(values["point_distance_mm"])),
             "median_run_s": float(np.median(values["run_s"])),
         }
-        if "surface_spread_mm" in rows[0]:
-            is_held = np.array([row["surface_spread_mm"] for row in rows]) < _RIGHT_SHARE * spread_mm
+        if is_held is not None:
             table[name]["right_of_held"] = float(is_right[is_held].mean()) if is_held.any() else None
-            held = {"num_held_by_surfaces": int(is_held.sum())}
+    held = {} if is_held is None else {"num_held_by_surfaces": int(is_held.sum())}
     return {"num_trajectories": len(rows), **held, "methods": table}
 
 
