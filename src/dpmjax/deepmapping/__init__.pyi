@@ -12,11 +12,11 @@ from .config import with_steps as with_steps
 from .depth import DepthFitted as DepthFitted
 from .depth import as_depth_scans as as_depth_scans
 from .depth import fit_depth as fit_depth
+from .depth_config import FULL_SEARCH as FULL_SEARCH
+from .depth_config import PLANAR_SEARCH as PLANAR_SEARCH
+from .depth_config import DepthInitializationConfig as DepthInitializationConfig
 from .depth_config import DepthMappingConfig as DepthMappingConfig
 from .depth_config import depth_preset as depth_preset
-from .depth_initialization import FULL_SEARCH as FULL_SEARCH
-from .depth_initialization import PLANAR_SEARCH as PLANAR_SEARCH
-from .depth_initialization import DepthInitializationConfig as DepthInitializationConfig
 from .depth_initialization import initialize_depth as initialize_depth
 from .localization_training import LocalizationTrainingConfig as LocalizationTrainingConfig
 from .localization_training import train_localization as train_localization

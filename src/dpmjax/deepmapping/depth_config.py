@@ -1,4 +1,4 @@
-"""Settings of DeepMapping of depth images: the phases, the networks, the presets."""
+"""Settings of DeepMapping of depth images: the search for first poses, the phases, the networks, the presets."""
 
 from __future__ import annotations
 
@@ -90,3 +90,83 @@ def depth_preset(name: Literal["fast", "paper"], *, motion: Motion = "planar") -
     # Real depth images in SE(3) do not agree to half a percent of the depth, and their first poses are rougher.
     refine = replace(REFINE_DEPTH, projection_tolerance=(0.1, 0.02))
     return replace(config, cold_phases=(*config.cold_phases[:-1], refine), warm_phases=(refine,))
+
+
+@dataclass(frozen=True)
+class DepthInitializationConfig:
+    """Settings of the search. Lengths are in the unit of the points, metres by default.
+
+    Attributes:
+        max_translation: between neighbouring images, along each axis.
+        max_turn_deg: between neighbouring images, about the vertical axis of the camera.
+        max_tilt_deg: about the other axes; full motion only.
+        num_tries: searches for an image, at least, each with other points.
+        num_trajectories: trajectories that go on from image to image, at most.
+        margin: a trajectory whose consistency is less than that of the best one by more is dropped.
+        num_candidates: motions of the first round, spread evenly.
+        num_kept: best motions that go on to the next round, before the slides.
+        num_distinct: motions that are slid, that go on to the next round after it, and that continue a trajectory.
+        num_slides: places of each along each direction of the surfaces.
+        num_varied: new motions around each kept one in a round.
+        num_rounds: each round varies the kept motions half as widely as the round before; half of them are before the
+            slides.
+        num_references: number of earlier images that an image is compared to before the slides.
+        num_checked: number of earlier images that an image is compared to from the slides on.
+        num_points: of each image, in a search.
+        num_compared: points of each image by which trajectories are compared and adjusted.
+        num_window: trajectories are compared and adjusted by so many last images; in the end by all.
+        adjusted_every: poses are adjusted whenever so many images have been added.
+        num_iterations: of an adjustment.
+        tolerance: share of the depth by which matching points may differ, in the first and in the last round; the last
+            one also while trajectories grow.
+        final_tolerance: the same, in the last adjustment and where the best trajectory is chosen.
+        translation_weight: cost of the largest translation, in consistency. Along a bare wall nothing
+            else tells how far the camera has moved, and then the shortest move is taken.
+        turn_weight: cost of the largest turn, likewise.
+    """
+
+    max_translation: float = 0.7
+    max_turn_deg: float = 75.0
+    max_tilt_deg: float = 30.0
+    num_tries: int = 4
+    num_trajectories: int = 16
+    margin: float = 0.15
+    num_candidates: int = 1024
+    num_kept: int = 32
+    num_distinct: int = 8
+    num_slides: int = 51
+    num_varied: int = 20
+    num_rounds: int = 8
+    num_references: int = 4
+    num_checked: int = 8
+    num_points: int = 100
+    num_compared: int = 300
+    num_window: int = 24
+    adjusted_every: int = 1
+    num_iterations: int = 6
+    tolerance: tuple[float, float] = (0.12, 0.02)
+    final_tolerance: float = 0.006
+    translation_weight: float = 0.05
+    turn_weight: float = 0.0
+
+    def __post_init__(self) -> None:
+        counts = (self.num_tries, self.num_candidates, self.num_kept, self.num_varied, self.num_rounds)
+        more = (self.num_distinct, self.num_slides, self.num_references, self.num_checked, self.num_points)
+        growth = (self.num_trajectories, self.num_compared, self.num_window, self.adjusted_every, self.num_iterations)
+        if min(*counts, *more, *growth) < 1:
+            raise ValueError(f"all counts must be at least 1, got {self}")
+
+
+PLANAR_SEARCH = DepthInitializationConfig()
+"""A level camera on wheels."""
+
+FULL_SEARCH = DepthInitializationConfig(
+    num_trajectories=8,
+    num_candidates=16384,
+    num_varied=48,
+    tolerance=(0.12, 0.03),
+    final_tolerance=0.015,
+    translation_weight=0.2,
+    turn_weight=0.3,
+)
+"""A hand-held camera: six numbers to search instead of three, small moves between images, a real sensor's noise."""

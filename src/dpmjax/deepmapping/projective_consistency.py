@@ -36,6 +36,18 @@ class Pinhole(NamedTuple):
     cy: Array
 
 
+class PixelSample(NamedTuple):
+    """Some points of each image, in its camera frame.
+
+    Attributes:
+        points: (n, p, 3), or (p, 3) of one image.
+        mask: False for points that are not there.
+    """
+
+    points: Float[Array, "... p 3"]
+    mask: Bool[Array, "... p"]
+
+
 @flax.struct.dataclass
 class DepthScans:
     """Organised depth images as clouds in their camera frames (x right, y down, z forward).
@@ -51,21 +63,34 @@ class DepthScans:
     pinhole: Pinhole
 
     @property
-    def depth(self) -> Float[Array, "n h w"]:
-        """Depth along z, 0 where nothing was measured."""
-        return jnp.where(self.mask, self.points[..., 2], 0.0)
+    def surfaces(self) -> Float[Array, "n 4 r c"]:
+        """The surface between the pixels of each image; see `image_surface`."""
+        return jax.vmap(image_surface)(jnp.where(self.mask, self.points[..., 2], 0.0))
+
+    @property
+    def pixels(self) -> PixelSample:
+        """All pixels of each image."""
+        count = self.mask.shape[0]
+        return PixelSample(self.points.reshape(count, -1, 3), self.mask.reshape(count, -1))
 
 
-class PixelSample(NamedTuple):
-    """Some points of each image, in its camera frame.
+def image_surface(depth: Float[Array, "h w"]) -> Float[Array, "4 r c"]:
+    """The surface between the pixels of a depth image: one over the depth, bilinear between each four pixels.
 
-    Attributes:
-        points: (n, p, 3), or (p, 3) of one image.
-        mask: False for points that are not there.
+    One over the depth is linear on a plane.
+
+    Args:
+        depth: along z, 0 where nothing was measured.
+
+    Returns:
+        Value at the upper left pixel of each four, slopes along columns and rows, and the twist; all 0 where the four
+        pixels do not lie on one surface. r = h - 1, c = w - 1.
     """
-
-    points: Float[Array, "... p 3"]
-    mask: Bool[Array, "... p"]
+    inverse = jnp.where(depth > 0.0, 1.0 / jnp.where(depth > 0.0, depth, 1.0), 0.0)
+    corners = jnp.stack([inverse[:-1, :-1], inverse[:-1, 1:], inverse[1:, :-1], inverse[1:, 1:]])
+    low, high = corners.min(axis=0), corners.max(axis=0)
+    a, b, c, d = corners
+    return jnp.where((low > 0.0) & (high - low < _EDGE * high), jnp.stack([a, b - a, c - a, a - b - c + d]), 0.0)
 
 
 def fit_pinhole(points: NDArray[np.floating], mask: NDArray[np.bool_]) -> Pinhole:
@@ -107,7 +132,7 @@ class Agreement(NamedTuple):
 def image_agreement(
     T_other_camera: Float[Array, "4 4"],
     sample: PixelSample,
-    depth_other: Float[Array, "h w"],
+    surface_other: Float[Array, "4 r c"],
     pinhole: Pinhole,
     tolerance: Float[Array, ""],
 ) -> Agreement:
@@ -120,49 +145,70 @@ def image_agreement(
     Args:
         T_other_camera: maps the points into the frame of the other camera.
         sample: points of one image.
-        depth_other: depth image of the other camera, 0 where nothing was measured.
+        surface_other: `image_surface` of the other camera.
         pinhole: of the other camera.
         tolerance: share of the depth by which matching points may differ.
 
     Returns:
         The agreement, two numbers.
     """
+    gap, is_visible = surface_gap(T_other_camera, sample, surface_other, pinhole)
+    gap /= tolerance
+    contradicted = jax.nn.sigmoid(3.0 * (gap - 2.0))
+    cost = jnp.clip(_CONTRADICTION * _FULL_TOLERANCE / tolerance, _LEAST_CONTRADICTION, _CONTRADICTION)
+    score = jnp.where(is_visible, jnp.exp(-(gap**2)) - cost * contradicted, 0.0)
+    # Images that show nothing are compared with none.
+    unseen = jnp.where((surface_other[0] > 0.0).any(), _UNSEEN * sample.mask.sum(), 0.0)
+    return Agreement(score.sum(), is_visible.sum() + unseen)
+
+
+def surface_gap(
+    T_other_camera: Float[Array, "4 4"],
+    sample: PixelSample,
+    surface_other: Float[Array, "4 r c"],
+    pinhole: Pinhole,
+) -> tuple[Float[Array, " p"], Bool[Array, " p"]]:
+    """How far points lie in front of the surface that another camera sees.
+
+    Args:
+        T_other_camera: maps the points into the frame of the other camera.
+        sample: points of one image.
+        surface_other: `image_surface` of the other camera.
+        pinhole: of the other camera.
+
+    Returns:
+        The distance in shares of the surface's depth, below 0 behind it; and whether the point lands on a surface,
+        else the distance is 0.
+    """
     seen = rigid.transform_points(T_other_camera, sample.points)
     depth = seen[:, 2]
     safe = jnp.maximum(depth, 1e-3)
     column = pinhole.fx * seen[:, 0] / safe + pinhole.cx
     row = pinhole.fy * seen[:, 1] / safe + pinhole.cy
-    inverse, is_smooth = _inverse_depth_at(depth_other, row, column)
+    inverse, is_smooth = _inverse_depth_at(surface_other, row, column)
     is_visible = sample.mask & (depth > 1e-3) & is_smooth
-    # Distance of the point in front of the surface, in shares of the surface's depth, over the tolerance.
-    gap = jnp.where(is_visible, 1.0 - depth * inverse, 0.0) / tolerance
-    contradicted = jax.nn.sigmoid(3.0 * (gap - 2.0))
-    cost = jnp.clip(_CONTRADICTION * _FULL_TOLERANCE / tolerance, _LEAST_CONTRADICTION, _CONTRADICTION)
-    score = jnp.where(is_visible, jnp.exp(-(gap**2)) - cost * contradicted, 0.0)
-    return Agreement(score.sum(), is_visible.sum() + _UNSEEN * sample.mask.sum())
+    return jnp.where(is_visible, 1.0 - depth * inverse, 0.0), is_visible
 
 
 def _inverse_depth_at(
-    depth: Float[Array, "h w"], row: Float[Array, " p"], column: Float[Array, " p"]
+    surface: Float[Array, "4 r c"], row: Float[Array, " p"], column: Float[Array, " p"]
 ) -> tuple[Float[Array, " p"], Bool[Array, " p"]]:
-    """One over the depth between four pixels, which is linear on a plane; and whether they lie on one surface."""
-    height, width = depth.shape
-    top = jnp.clip(jnp.floor(row).astype(jnp.int32), 0, height - 2)
-    left = jnp.clip(jnp.floor(column).astype(jnp.int32), 0, width - 2)
-    inverse = jnp.where(depth > 0.0, 1.0 / jnp.where(depth > 0.0, depth, 1.0), 0.0)
-    corners = jnp.stack([inverse[top + i, left + j] for i in (0, 1) for j in (0, 1)], axis=-1)
-    v, u = row - top, column - left
-    shares = jnp.stack([(1 - v) * (1 - u), (1 - v) * u, v * (1 - u), v * u], axis=-1)
-    is_inside = (row >= 0.0) & (row <= height - 1) & (column >= 0.0) & (column <= width - 1)
-    low, high = corners.min(-1), corners.max(-1)
-    is_smooth = is_inside & (low > 0.0) & (high - low < _EDGE * high)
-    return jnp.sum(jnp.where(is_inside[:, None], shares, 0.0) * corners, axis=-1), is_smooth
+    """One over the depth between four pixels, and whether they lie on one surface."""
+    num_rows, num_columns = surface.shape[1:]
+    top = jnp.clip(jnp.floor(row).astype(jnp.int32), 0, num_rows - 1)
+    left = jnp.clip(jnp.floor(column).astype(jnp.int32), 0, num_columns - 1)
+    # One look-up in each of four flat arrays takes a seventh of the time of four look-ups in the image.
+    cell = top * num_columns + left
+    value, along_row, along_column, twist = (flat[cell] for flat in surface.reshape(4, -1))
+    is_inside = (row >= 0.0) & (row <= num_rows) & (column >= 0.0) & (column <= num_columns)
+    v, u = jnp.where(is_inside, row - top, 0.0), jnp.where(is_inside, column - left, 0.0)
+    return value + along_row * u + along_column * v + twist * u * v, is_inside & (value > 0.0)
 
 
 def both_ways(
     T_other_camera: Float[Array, "4 4"],
     samples: tuple[PixelSample, PixelSample],
-    depths: tuple[Float[Array, "h w"], Float[Array, "h w"]],
+    surfaces: tuple[Float[Array, "4 r c"], Float[Array, "4 r c"]],
     pinhole: Pinhole,
     tolerance: Float[Array, ""],
 ) -> Agreement:
@@ -171,15 +217,15 @@ def both_ways(
     Args:
         T_other_camera: maps points of the first image into the frame of the other camera.
         samples: points of the first and of the other image.
-        depths: depth images of the first and of the other camera.
+        surfaces: `image_surface` of the first and of the other camera.
         pinhole: of both cameras.
         tolerance: share of the depth by which matching points may differ.
 
     Returns:
         The sum of both agreements.
     """
-    there = image_agreement(T_other_camera, samples[0], depths[1], pinhole, tolerance)
-    back = image_agreement(rigid.inverse(T_other_camera), samples[1], depths[0], pinhole, tolerance)
+    there = image_agreement(T_other_camera, samples[0], surfaces[1], pinhole, tolerance)
+    back = image_agreement(rigid.inverse(T_other_camera), samples[1], surfaces[0], pinhole, tolerance)
     return Agreement(there.total + back.total, there.comparable + back.comparable)
 
 
@@ -204,7 +250,7 @@ def consistency_of_pairs(
     Returns:
         The consistency, -18 to 1.
     """
-    count, depth = T_world_camera.shape[0], scans.depth
+    count, surfaces = T_world_camera.shape[0], scans.surfaces
 
     def compare(offset: Int[Array, ""]) -> Agreement:
         other = (jnp.arange(count) + offset) % count
@@ -213,7 +259,7 @@ def consistency_of_pairs(
         )
         others = PixelSample(sample.points[other], sample.mask[other])
         agreements = jax.vmap(both_ways, in_axes=(0, 0, 0, None, None))(
-            T_other_camera, (sample, others), (depth, depth[other]), scans.pinhole, tolerance
+            T_other_camera, (sample, others), (surfaces, surfaces[other]), scans.pinhole, tolerance
         )
         # At half the circle the second half of the images repeats the pairs of the first.
         is_new = (2 * offset != count) | (jnp.arange(count) < offset)
@@ -236,8 +282,6 @@ def projective_consistency(
     Returns:
         -18 (every point contradicts an image) to 1; 0 where no image sees anything of another one.
     """
-    count = scans.mask.shape[0]
-    sample = PixelSample(scans.points.reshape(count, -1, 3), scans.mask.reshape(count, -1))
-    offsets = jnp.arange(1, count // 2 + 1)
-    T = jnp.asarray(T_world_camera, sample.points.dtype)
-    return consistency_of_pairs(T, sample, scans, offsets, jnp.asarray(tolerance))
+    offsets = jnp.arange(1, scans.mask.shape[0] // 2 + 1)
+    T = jnp.asarray(T_world_camera, scans.points.dtype)
+    return consistency_of_pairs(T, scans.pixels, scans, offsets, jnp.asarray(tolerance))

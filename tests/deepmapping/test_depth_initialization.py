@@ -1,0 +1,117 @@
+"""Laws of the first poses of depth images: proposals, adjustment, trajectories that grow side by side."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from dpmjax import deepmapping as dm
+from dpmjax import io, simulation
+from dpmjax.deepmapping.depth_adjustment import adjust_poses
+from dpmjax.deepmapping.depth_initialization import _best_that_differ, _consistencies, _Images, _window
+from dpmjax.deepmapping.depth_motion_search import surface_directions
+from dpmjax.deepmapping.spatial import motion_matrices
+from dpmjax.geometry.rays import typical_range
+from dpmjax.metrics import absolute_trajectory_error
+from tests.tolerances import ROUNDING
+
+KEY = jax.random.key(0)
+
+
+@pytest.fixture(scope="module")
+def walk() -> io.DepthSequence:
+    config = simulation.DepthWalkConfig(height=18, width=32)
+    return simulation.simulate_depth_sequence(0, 4, seed=3, config=config)
+
+
+@pytest.fixture(scope="module")
+def scans(walk) -> dm.DepthScans:
+    return dm.as_depth_scans(walk.points, walk.mask)
+
+
+def moved(T: np.ndarray, spread: float, motion: str, seed: int = 0) -> np.ndarray:
+    """The poses, each but the first with a random motion after it."""
+    values = spread * np.random.default_rng(seed).standard_normal((len(T), 3 if motion == "planar" else 6))
+    values[0] = 0.0
+    return T @ np.asarray(motion_matrices(jnp.asarray(values, jnp.float32)), np.float64)
+
+
+@pytest.mark.parametrize("motion", ["planar", "full"])
+def test_adjusted_poses_come_back_to_the_truth(walk, scans, motion: str) -> None:
+    truth = walk.T_world_camera
+    start = moved(truth, 0.01, motion)
+    unit = typical_range(scans.points, scans.mask)
+    motions = adjust_poses(
+        jnp.asarray(start, jnp.float32), scans, scans.pixels, unit, 0.02, num_iterations=10, motion=motion
+    )
+    T = start @ np.asarray(motions, np.float64)
+    np.testing.assert_array_equal(T[0], start[0])
+    before, after = (absolute_trajectory_error(X[:, :3, 3], truth[:, :3, 3]) for X in (start, T))
+    assert after < 0.3 * before
+    np.testing.assert_allclose(T[:, :3, :3] @ np.swapaxes(T[:, :3, :3], 1, 2), np.tile(np.eye(3), (4, 1, 1)), atol=1e-5)
+
+
+def test_adjusted_poses_are_never_less_consistent(walk, scans) -> None:
+    unit = typical_range(scans.points, scans.mask)
+    for seed in range(5):
+        start = moved(walk.T_world_camera, 0.2, "planar", seed)
+        motions = adjust_poses(
+            jnp.asarray(start, jnp.float32), scans, scans.pixels, unit, 0.02, num_iterations=4, motion="planar"
+        )
+        before, after = (
+            float(dm.projective_consistency(scans, T, 0.02)) for T in (start, start @ np.asarray(motions, np.float64))
+        )
+        assert after >= before - 1e-4
+
+
+def test_images_without_a_pose_count_nothing(walk, scans) -> None:
+    T = walk.T_world_camera[:3]
+    rows, window = _window(3, _Images(scans, scans.pixels), dm.PLANAR_SEARCH)
+    consistency = _consistencies(jnp.asarray(T[rows], jnp.float32)[None], window, jnp.asarray(0.02))
+    alone = dm.as_depth_scans(walk.points[:3], walk.mask[:3])
+    np.testing.assert_allclose(consistency[0], dm.projective_consistency(alone, T, 0.02), **ROUNDING)
+    last = replace(dm.PLANAR_SEARCH, num_window=2)
+    assert _window(3, _Images(scans, scans.pixels), last)[0].tolist() == [1, 2]
+
+
+def test_of_alike_trajectories_the_best_goes_on(walk, scans) -> None:
+    truth = walk.T_world_camera
+    far, turned, near = truth.copy(), truth.copy(), truth.copy()
+    far[1:, 0, 3] += 0.2
+    turned[3] = turned[3] @ np.asarray(motion_matrices(jnp.array([[0.0, 0.0, 0.3]])))[0]
+    near[1:, 0, 3] += 0.02
+    candidates = np.stack([near, far, turned, truth])[None]
+    images, config = _Images(scans, scans.pixels), replace(dm.PLANAR_SEARCH, margin=100.0)
+    kept = _best_that_differ(candidates, images, config)
+    np.testing.assert_array_equal(kept[0], truth)
+    assert {T.tobytes() for T in kept} == {T.tobytes() for T in (far, turned, truth)}
+    assert len(_best_that_differ(candidates, images, replace(config, num_trajectories=2))) == 2
+    assert len(_best_that_differ(candidates, images, replace(config, margin=1e-6))) == 1
+
+
+@pytest.mark.slow
+def test_images_are_registered_without_a_first_guess(walk, scans) -> None:
+    config = dm.DepthInitializationConfig(num_candidates=512, num_kept=16, num_points=100, num_references=2)
+    T = dm.initialize_depth(scans, config, key=KEY)
+    relative = np.linalg.inv(walk.T_world_camera[0]) @ walk.T_world_camera
+    assert absolute_trajectory_error(T[:, :3, 3], relative[:, :3, 3]) < 0.02
+    assert np.abs(T[:, 0, 2] - relative[:, 0, 2]).max() < 0.02
+    np.testing.assert_array_equal(T[0], np.eye(4))
+
+
+def test_an_image_of_one_wall_is_slid_along_it_first() -> None:
+    rays = np.stack([*np.meshgrid(np.linspace(-0.7, 0.7, 12), np.linspace(-0.4, 0.4, 8)), np.ones((8, 12))], axis=-1)
+    along = np.array([0.8, 0.0, 0.6])
+    wall = rays * (-2.0 / (rays @ [0.6, 0.0, -0.8]))[..., None]
+    scans = dm.as_depth_scans(np.stack([wall, wall]))
+    for motion in ("planar", "full"):
+        directions = surface_directions(scans, motion)
+        assert directions.shape == (2, 2 if motion == "planar" else 3, 3)
+        # In space the two directions in the wall are equal.
+        in_wall = directions[0, : directions.shape[1] - 1]
+        np.testing.assert_allclose(np.linalg.norm(in_wall @ along), 1.0, atol=1e-3)
+        np.testing.assert_allclose(np.abs(directions[0, -1] @ [0.6, 0.0, -0.8]), 1.0, atol=1e-3)
