@@ -17,6 +17,7 @@ from dpmjax.deepmapping.problem import MappingData
 from dpmjax.deepmapping.projective_consistency import (
     Agreement,
     PixelSample,
+    explained_share,
     fit_pinhole,
     image_agreement,
     image_surface,
@@ -202,6 +203,22 @@ def test_the_truth_is_more_consistent_than_a_walk_with_one_wrong_turn(walk, scan
     truth, wrong = (float(dm.projective_consistency(scans, T)) for T in (walk.T_world_camera, turned))
     assert truth > wrong + 0.02
     assert truth <= 1.0
+
+
+def test_a_point_is_explained_once(walk) -> None:
+    def share(rows: list[int], T: np.ndarray) -> float:
+        scans = dm.as_depth_scans(walk.points[rows], walk.mask[rows])
+        return float(explained_share(jnp.asarray(T, jnp.float32), scans.pixels, scans, jnp.float32(0.02)))
+
+    same = np.tile(np.eye(4), (4, 1, 1))
+    np.testing.assert_allclose(share([0, 0, 0, 0], same), share([0, 0], same[:2]), **ROUNDING)
+    assert share([0, 0], same[:2]) > 0.4
+    away = same[:2].copy()
+    away[1, :3, :3] = np.diag([-1.0, 1.0, -1.0])
+    assert share([0, 0], away) == 0.0
+    nearer = same[:2].copy()
+    nearer[1, 2, 3] = -0.6
+    assert share([0, 0], nearer) < 0.0
 
 
 def test_consistency_has_finite_slopes_where_nothing_overlaps(scans) -> None:

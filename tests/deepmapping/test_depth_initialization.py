@@ -12,8 +12,9 @@ import pytest
 from dpmjax import deepmapping as dm
 from dpmjax import io, simulation
 from dpmjax.deepmapping.depth_adjustment import adjust_poses
-from dpmjax.deepmapping.depth_initialization import _best_that_differ, _consistencies, _Images, _window
+from dpmjax.deepmapping.depth_initialization import _best_that_differ, _explained, _Images, _window
 from dpmjax.deepmapping.depth_motion_search import surface_directions
+from dpmjax.deepmapping.projective_consistency import PixelSample
 from dpmjax.deepmapping.spatial import motion_matrices
 from dpmjax.geometry.rays import typical_range
 from dpmjax.metrics import absolute_trajectory_error
@@ -31,6 +32,10 @@ def walk() -> io.DepthSequence:
 @pytest.fixture(scope="module")
 def scans(walk) -> dm.DepthScans:
     return dm.as_depth_scans(walk.points, walk.mask)
+
+
+def take(sample: PixelSample, count: int) -> PixelSample:
+    return PixelSample(sample.points[:count], sample.mask[:count])
 
 
 def moved(T: np.ndarray, spread: float, motion: str, seed: int = 0) -> np.ndarray:
@@ -71,9 +76,11 @@ def test_adjusted_poses_are_never_less_consistent(walk, scans) -> None:
 def test_images_without_a_pose_count_nothing(walk, scans) -> None:
     T = walk.T_world_camera[:3]
     rows, window = _window(3, _Images(scans, scans.pixels), dm.PLANAR_SEARCH)
-    consistency = _consistencies(jnp.asarray(T[rows], jnp.float32)[None], window, jnp.asarray(0.02))
-    alone = dm.as_depth_scans(walk.points[:3], walk.mask[:3])
-    np.testing.assert_allclose(consistency[0], dm.projective_consistency(alone, T, 0.02), **ROUNDING)
+    share = _explained(jnp.asarray(T[rows], jnp.float32)[None], window, jnp.asarray(0.02))
+    alone = _Images(dm.DepthScans(scans.points[:3], scans.mask[:3], scans.pinhole), take(scans.pixels, 3))
+    np.testing.assert_allclose(
+        share, _explained(jnp.asarray(T, jnp.float32)[None], alone, jnp.asarray(0.02)), **ROUNDING
+    )
     last = replace(dm.PLANAR_SEARCH, num_window=2)
     assert _window(3, _Images(scans, scans.pixels), last)[0].tolist() == [1, 2]
 

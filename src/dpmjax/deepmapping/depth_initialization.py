@@ -1,8 +1,8 @@
 """First poses of depth images without a guess: trajectories that grow side by side, image after image.
 
-Each proposes several motions of the next image. The trajectories of the largest projective consistency go on, as far
-as they differ: what one image leaves open, later ones decide. Every few images the poses of each are adjusted to raise
-that consistency; in the end at a finer tolerance, by which the best trajectory is chosen.
+Each proposes several motions of the next image. The trajectories that explain the largest share of the points go on,
+as far as they differ: what one image leaves open, later ones decide. Every few images the poses of each are adjusted;
+in the end at a finer tolerance, by which the best trajectory is chosen.
 """
 
 from __future__ import annotations
@@ -24,8 +24,7 @@ from dpmjax.deepmapping.depth_motion_search import Views, motion_cost, propose_m
 from dpmjax.deepmapping.projective_consistency import (
     DepthScans,
     PixelSample,
-    consistency_of_pairs,
-    projective_consistency,
+    explained_share,
 )
 from dpmjax.geometry.rays import typical_range
 
@@ -80,8 +79,8 @@ def initialize_depth(
     T, whole, images = T[:_NUM_LAST], replace(config, num_window=scans.mask.shape[0]), _Images(scans, scans.pixels)
     for tolerance in np.geomspace(config.tolerance[1], config.final_tolerance, _NUM_TOLERANCES):
         T = _adjusted(T, images, float(tolerance), whole, motion)
-    scores = np.array([float(projective_consistency(scans, one, config.final_tolerance)) for one in T])
-    return T[np.argmax(scores - _mean_cost(T, config))]
+    scores = _explained(jnp.asarray(T, jnp.float32), images, jnp.asarray(config.final_tolerance))
+    return T[np.argmax(np.asarray(scores) - _mean_cost(T, config))]
 
 
 def _sample(scans: DepthScans, count: int, *, key: jax.Array) -> PixelSample:
@@ -117,10 +116,9 @@ def _turns(T: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 @jax.jit
-def _consistencies(T: Float[Array, "m n 4 4"], images: _Images, tolerance: Float[Array, ""]) -> Float[Array, " m"]:
-    """Projective consistency of each trajectory."""
-    offsets = jnp.arange(1, T.shape[1] // 2 + 1)
-    return jax.lax.map(lambda one: consistency_of_pairs(one, images.sample, images.scans, offsets, tolerance), T)
+def _explained(T: Float[Array, "m n 4 4"], images: _Images, tolerance: Float[Array, ""]) -> Float[Array, " m"]:
+    """Explained share of each trajectory."""
+    return jax.lax.map(lambda one: explained_share(one, images.sample, images.scans, tolerance), T)
 
 
 def _best_that_differ(
@@ -129,7 +127,7 @@ def _best_that_differ(
     """The best of (t, k, m, 4, 4) trajectories that differ from all better ones, best first."""
     rows, window = _window(T.shape[2], images, config)
     tolerance = jnp.asarray(config.tolerance[1])
-    scores = np.concatenate([_consistencies(jnp.asarray(t[:, rows], jnp.float32), window, tolerance) for t in T])
+    scores = np.concatenate([_explained(jnp.asarray(t[:, rows], jnp.float32), window, tolerance) for t in T])
     T = T.reshape(-1, *T.shape[2:])
     scores = scores - _mean_cost(T, config)
     far, turn = _APART[0] * config.max_translation, _APART[1] * np.deg2rad(config.max_turn_deg)

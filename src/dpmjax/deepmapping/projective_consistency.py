@@ -22,6 +22,8 @@ _EDGE = 0.15
 # Cost of a contradiction in matches: along a bare wall a wrong pose matches nearly everywhere, and overlaps more. At a
 # coarse tolerance many contradictions only say that the pose is not exact yet, and cost less.
 _CONTRADICTION, _LEAST_CONTRADICTION, _FULL_TOLERANCE = 18.0, 3.0, 0.02
+# Cost of a point that any image contradicts, in explained points.
+_CONTRADICTED_POINT = 3.0
 # Matches count as a share of the visible points, not of all points, or else every image would be pulled onto the
 # others. This share of all points is added to the visible ones, so that a little overlap that matches is worth little.
 _UNSEEN = 0.1
@@ -154,12 +156,17 @@ def image_agreement(
     """
     gap, is_visible = surface_gap(T_other_camera, sample, surface_other, pinhole)
     gap /= tolerance
-    contradicted = jax.nn.sigmoid(3.0 * (gap - 2.0))
+    match, contradiction = _match_and_contradiction(gap)
     cost = jnp.clip(_CONTRADICTION * _FULL_TOLERANCE / tolerance, _LEAST_CONTRADICTION, _CONTRADICTION)
-    score = jnp.where(is_visible, jnp.exp(-(gap**2)) - cost * contradicted, 0.0)
+    score = jnp.where(is_visible, match - cost * contradiction, 0.0)
     # Images that show nothing are compared with none.
     unseen = jnp.where((surface_other[0] > 0.0).any(), _UNSEEN * sample.mask.sum(), 0.0)
     return Agreement(score.sum(), is_visible.sum() + unseen)
+
+
+def _match_and_contradiction(gap: Float[Array, "*n"]) -> tuple[Float[Array, "*n"], Float[Array, "*n"]]:
+    """How far points match a surface, and contradict it; gap in tolerances."""
+    return jnp.exp(-(gap**2)), jax.nn.sigmoid(3.0 * (gap - 2.0))
 
 
 def surface_gap(
@@ -266,6 +273,46 @@ def consistency_of_pairs(
         return Agreement(*(jnp.sum(jnp.where(is_new, values, 0.0)) for values in agreements))
 
     return Agreement(*jax.lax.map(compare, offsets)).consistency()
+
+
+def explained_share(
+    T_world_camera: Float[Array, "n 4 4"],
+    sample: PixelSample,
+    scans: DepthScans,
+    tolerance: Float[Array, ""],
+) -> Float[Array, ""]:
+    """Share of the points that another image explains, less the cost of those that another image contradicts.
+
+    Each point counts once: it is explained as well as by the image that it matches best, and contradicted as much as
+    by the image that contradicts it most. Images that look at one thing together gain nothing by it.
+
+    Args:
+        T_world_camera: poses.
+        sample: some points of each image.
+        scans: depth images, unit of the poses.
+        tolerance: share of the depth by which matching points may differ.
+
+    Returns:
+        -3 to 1.
+    """
+    rows, surfaces = jnp.arange(T_world_camera.shape[0]), scans.surfaces
+
+    def explain(row: Int[Array, ""]) -> Float[Array, ""]:
+        points = PixelSample(sample.points[row], sample.mask[row])
+
+        def by(other: Int[Array, ""]) -> tuple[Float[Array, " p"], Float[Array, " p"]]:
+            T_other_camera = jnp.matmul(
+                rigid.inverse(T_world_camera[other]), T_world_camera[row], precision=jax.lax.Precision.HIGHEST
+            )
+            gap, is_visible = surface_gap(T_other_camera, points, surfaces[other], scans.pinhole)
+            match, contradiction = _match_and_contradiction(gap / tolerance)
+            counts = is_visible & (other != row)
+            return jnp.where(counts, match, 0.0), jnp.where(counts, contradiction, 0.0)
+
+        match, contradiction = jax.vmap(by)(rows)
+        return (match.max(axis=0) - _CONTRADICTED_POINT * contradiction.max(axis=0)).sum()
+
+    return jax.lax.map(explain, rows).sum() / jnp.maximum(sample.mask.sum(), 1)
 
 
 @jax.jit
