@@ -75,14 +75,14 @@ def test_adjusted_poses_are_never_less_consistent(walk, scans) -> None:
 
 def test_images_without_a_pose_count_nothing(walk, scans) -> None:
     T = walk.T_world_camera[:3]
-    rows, window = _window(3, _Images(scans, scans.pixels), dm.PLANAR_SEARCH)
+    rows, window = _window(3, _Images(scans, scans.pixels, 1.0), dm.PLANAR_SEARCH)
     share = _explained(jnp.asarray(T[rows], jnp.float32)[None], window, jnp.asarray(0.02))
-    alone = _Images(dm.DepthScans(scans.points[:3], scans.mask[:3], scans.pinhole), take(scans.pixels, 3))
+    alone = _Images(dm.DepthScans(scans.points[:3], scans.mask[:3], scans.pinhole), take(scans.pixels, 3), 1.0)
     np.testing.assert_allclose(
         share, _explained(jnp.asarray(T, jnp.float32)[None], alone, jnp.asarray(0.02)), **ROUNDING
     )
     last = replace(dm.PLANAR_SEARCH, num_window=2)
-    assert _window(3, _Images(scans, scans.pixels), last)[0].tolist() == [1, 2]
+    assert _window(3, _Images(scans, scans.pixels, 1.0), last)[0].tolist() == [1, 2]
 
 
 def test_of_alike_trajectories_the_best_goes_on(walk, scans) -> None:
@@ -92,7 +92,7 @@ def test_of_alike_trajectories_the_best_goes_on(walk, scans) -> None:
     turned[3] = turned[3] @ np.asarray(motion_matrices(jnp.array([[0.0, 0.0, 0.3]])))[0]
     near[1:, 0, 3] += 0.02
     candidates = np.stack([near, far, turned, truth])[None]
-    images, config = _Images(scans, scans.pixels), replace(dm.PLANAR_SEARCH, margin=100.0)
+    images, config = _Images(scans, scans.pixels, 1.0), replace(dm.PLANAR_SEARCH, margin=100.0)
     kept = _best_that_differ(candidates, images, config)
     np.testing.assert_array_equal(kept[0], truth)
     assert {T.tobytes() for T in kept} == {T.tobytes() for T in (far, turned, truth)}

@@ -102,7 +102,7 @@ class DepthInitializationConfig:
         max_tilt_deg: about the other axes; full motion only.
         num_tries: searches for an image, at least, each with other points.
         num_trajectories: trajectories that go on from image to image, at most.
-        margin: a trajectory whose consistency is less than that of the best one by more is dropped.
+        margin: a trajectory that explains less of the points than the best one by more than this share is dropped.
         num_candidates: motions of the first round, spread evenly.
         num_kept: best motions that go on to the next round, before the slides.
         num_distinct: motions that are slid, that go on to the next round after it, and that continue a trajectory.
@@ -120,7 +120,7 @@ class DepthInitializationConfig:
         tolerance: share of the depth by which matching points may differ, in the first and in the last round; the last
             one also while trajectories grow.
         final_tolerance: the same, in the last adjustment and where the best trajectory is chosen.
-        translation_weight: cost of the largest translation, in consistency. Along a bare wall nothing
+        translation_weight: cost of the largest translation, in matching points. Along a bare wall nothing
             else tells how far the camera has moved, and then the shortest move is taken.
         turn_weight: cost of the largest turn, likewise.
     """

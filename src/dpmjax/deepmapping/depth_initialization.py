@@ -35,10 +35,11 @@ _NUM_LAST, _NUM_TOLERANCES = 4, 3
 
 
 class _Images(NamedTuple):
-    """Depth images, and some points of each by which trajectories are compared and adjusted."""
+    """Depth images, some points of each by which trajectories are compared and adjusted, and their typical range."""
 
     scans: DepthScans
     sample: PixelSample
+    unit: float
 
 
 def initialize_depth(
@@ -58,7 +59,8 @@ def initialize_depth(
     config = config or (PLANAR_SEARCH if motion == "planar" else FULL_SEARCH)
     sample_key, search_key = jax.random.split(key)
     surfaces, directions = scans.surfaces, jnp.asarray(surface_directions(scans, motion))
-    images = _Images(scans, _sample(scans, config.num_compared, key=sample_key))
+    unit = typical_range(scans.points, scans.mask)
+    images = _Images(scans, _sample(scans, config.num_compared, key=sample_key), unit)
     views = [
         Views(_sample(scans, config.num_points, key=jax.random.fold_in(sample_key, k)), surfaces, directions)
         for k in range(config.num_trajectories)
@@ -76,7 +78,11 @@ def initialize_depth(
         T = _best_that_differ(np.stack(continued), images, config)
         if scan % config.adjusted_every == 0:
             T = _adjusted(T, images, config.tolerance[1], config, motion)
-    T, whole, images = T[:_NUM_LAST], replace(config, num_window=scans.mask.shape[0]), _Images(scans, scans.pixels)
+    T, whole, images = (
+        T[:_NUM_LAST],
+        replace(config, num_window=scans.mask.shape[0]),
+        _Images(scans, scans.pixels, unit),
+    )
     for tolerance in np.geomspace(config.tolerance[1], config.final_tolerance, _NUM_TOLERANCES):
         T = _adjusted(T, images, float(tolerance), whole, motion)
     scores = _explained(jnp.asarray(T, jnp.float32), images, jnp.asarray(config.final_tolerance))
@@ -97,11 +103,10 @@ def _window(num_placed: int, images: _Images, config: DepthInitializationConfig)
     length = min(config.num_window, images.scans.mask.shape[0])
     rows = max(num_placed - length, 0) + np.arange(length)
     is_placed = jnp.asarray(rows < num_placed)
-    scans, sample = images
+    scans, sample, unit = images
     seen = DepthScans(scans.points[rows], scans.mask[rows] & is_placed[:, None, None], scans.pinhole)
-    return np.minimum(rows, num_placed - 1), _Images(
-        seen, PixelSample(sample.points[rows], sample.mask[rows] & is_placed[:, None])
-    )
+    some = PixelSample(sample.points[rows], sample.mask[rows] & is_placed[:, None])
+    return np.minimum(rows, num_placed - 1), _Images(seen, some, unit)
 
 
 def _mean_cost(T: NDArray[np.float64], config: DepthInitializationConfig) -> NDArray[np.float64]:
@@ -146,11 +151,10 @@ def _adjusted(
 ) -> NDArray[np.float64]:
     """Trajectories whose last poses are adjusted, where that makes them more consistent; the first of all stays."""
     rows, window = _window(T.shape[1], images, config)
-    unit = typical_range(images.scans.points, images.scans.mask)
-    num_placed = len(np.unique(rows))
+    num_placed = rows[-1] - rows[0] + 1
     T = T.copy()
     for one in T:
         before = jnp.asarray(one[rows], jnp.float32)
-        motions = adjust_poses(before, *window, unit, tolerance, num_iterations=config.num_iterations, motion=motion)
+        motions = adjust_poses(before, *window, tolerance, num_iterations=config.num_iterations, motion=motion)
         one[rows[:num_placed]] @= np.asarray(motions, np.float64)[:num_placed]
     return T
