@@ -208,7 +208,7 @@ def test_the_truth_is_more_consistent_than_a_walk_with_one_wrong_turn(walk, scan
 def test_a_point_is_explained_once(walk) -> None:
     def share(rows: list[int], T: np.ndarray) -> float:
         scans = dm.as_depth_scans(walk.points[rows], walk.mask[rows])
-        return float(explained_share(jnp.asarray(T, jnp.float32), scans.pixels, scans, jnp.float32(0.02)))
+        return float(explained_share(jnp.asarray(T, jnp.float32), scans.pixels, scans, 3.0, jnp.float32(0.02)))
 
     same = np.tile(np.eye(4), (4, 1, 1))
     np.testing.assert_allclose(share([0, 0, 0, 0], same), share([0, 0], same[:2]), **ROUNDING)

@@ -1,4 +1,4 @@
-"""Adjustment of the poses of depth images: all at once, so that points of each lie on the surfaces that others see.
+"""Adjustment of the poses of depth images, so that points of each lie on the surfaces that others see.
 
 Levenberg and Marquardt's steps on the distances of points in front of or behind surfaces. A point belongs to the
 surface that it is projected to, and a large distance weighs little.
@@ -6,6 +6,7 @@ surface that it is projected to, and a large distance weighs little.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import partial
 from typing import NamedTuple
 
@@ -30,11 +31,80 @@ _LONGEST_STEP = 4.0
 
 
 class _Progress(NamedTuple):
-    """Motions after the poses so far, their projective consistency, and the damping of the next step."""
+    """Motions so far, their score, and the damping of the next step."""
 
     motions: Float[Array, "n 4 4"]
     score: Float[Array, ""]
     damping: Float[Array, ""]
+
+
+def motion_scales(motion: Motion, unit: Float[Array, ""] | float, tolerance: Float[Array, ""]) -> Float[Array, " k"]:
+    """Unit of each value of a motion in an adjustment: lengths in tolerances of the typical range, angles in radians.
+
+    Args:
+        motion: degrees of freedom of the camera.
+        unit: typical range of the images, unit of the points.
+        tolerance: share of the depth.
+
+    Returns:
+        Three values, or six of a full motion.
+    """
+    return tolerance * (jnp.array([unit] * 2 + [1.0]) if motion == "planar" else jnp.array([unit] * 3 + [1.0] * 3))
+
+
+def gap_equations(
+    gap: Float[Array, " p"], weight: Float[Array, " p"] | Bool[Array, " p"], slopes: Float[Array, "p *k"]
+) -> tuple[Float[Array, "*kk"], Float[Array, "*k"]]:
+    """Information and slope of half the sum of squared gaps, of which a large one weighs little.
+
+    Args:
+        gap: in tolerances; a gap of 1 weighs 0.6, one of 2 weighs 0.14.
+        weight: of each gap besides, 0 where there is none.
+        slopes: of the gaps over each value.
+
+    Returns:
+        The normal equations, (*k, *k) and (*k).
+    """
+    robust = weight * jnp.exp(-0.5 * gap**2)
+    weighted = robust.reshape(-1, *[1] * (slopes.ndim - 1)) * slopes
+    return jnp.tensordot(weighted, slopes, (0, 0)), jnp.tensordot(gap, weighted, (0, 0))
+
+
+def improve_motions(
+    equations: Callable[[Float[Array, "n 4 4"]], tuple[Float[Array, "nk nk"], Float[Array, " nk"]]],
+    score: Callable[[Float[Array, "n 4 4"]], Float[Array, ""]],
+    scales: Float[Array, " k"],
+    *,
+    count: int,
+    num_iterations: int,
+) -> Float[Array, "n 4 4"]:
+    """Levenberg and Marquardt's steps from no motion; each is kept only if the score grows.
+
+    Args:
+        equations: normal equations of values in `scales`, applied after given motions.
+        score: of motions; more is better.
+        scales: unit of each value of a motion.
+        count: number of motions.
+        num_iterations: of steps.
+
+    Returns:
+        The motions.
+    """
+
+    def iterate(progress: _Progress, _: None) -> tuple[_Progress, None]:
+        matrix, gradient = equations(progress.motions)
+        size = len(gradient)
+        matrix += (progress.damping * jnp.trace(matrix) / size + _LEAST_DAMPING) * jnp.eye(size)
+        values = jnp.linalg.solve(matrix, -gradient).reshape(count, -1)
+        values *= jnp.minimum(1.0, _LONGEST_STEP / jnp.maximum(jnp.abs(values).max(), 1e-6))
+        motions = _times(progress.motions, motion_matrices(scales * values))
+        tried = _Progress(motions, score(motions), jnp.maximum(progress.damping / _BETTER, _LEAST_DAMPING))
+        rejected = progress._replace(damping=progress.damping * _WORSE)
+        return jax.tree.map(partial(jnp.where, tried.score > progress.score), tried, rejected), None
+
+    none = jnp.broadcast_to(jnp.eye(4), (count, 4, 4))
+    start = _Progress(none, score(none), jnp.asarray(_DAMPING))
+    return jax.lax.scan(iterate, start, length=num_iterations)[0].motions
 
 
 @partial(jax.jit, static_argnames=("num_iterations", "motion"))
@@ -55,7 +125,7 @@ def adjust_poses(
         scans: depth images, unit of the poses.
         sample: some points of each image.
         unit: typical range of the images, unit of the points.
-        tolerance: share of the depth at which a gap weighs 0.6; at twice of it 0.14.
+        tolerance: share of the depth; the unit of the gaps in `gap_equations`.
         num_iterations: each one is kept only if the projective consistency grows.
         motion: degrees of freedom of the camera.
 
@@ -63,30 +133,23 @@ def adjust_poses(
         Motions to apply after the poses, T_world_camera @ them; that of the first image is none.
     """
     tolerance, count = jnp.asarray(tolerance), T_world_camera.shape[0]
-    scales = tolerance * (jnp.array([unit] * 2 + [1.0]) if motion == "planar" else jnp.array([unit] * 3 + [1.0] * 3))
-    offsets = jnp.arange(1, count // 2 + 1)
+    scales, offsets = motion_scales(motion, unit, tolerance), jnp.arange(1, count // 2 + 1)
+    # The first image stays.
+    free = slice(len(scales), None)
 
-    def score_of(motions: Float[Array, "n 4 4"]) -> Float[Array, ""]:
-        return consistency_of_pairs(_times(T_world_camera, motions), sample, scans, offsets, tolerance)
+    def with_first(motions: Float[Array, "m 4 4"]) -> Float[Array, "n 4 4"]:
+        return jnp.concatenate([jnp.eye(4)[None], motions])
 
-    def iterate(progress: _Progress, _: None) -> tuple[_Progress, None]:
-        T = _times(T_world_camera, progress.motions)
+    def equations(motions: Float[Array, "m 4 4"]) -> tuple[Float[Array, "mk mk"], Float[Array, " mk"]]:
+        T = _times(T_world_camera, with_first(motions))
         matrix, gradient = _normal_equations(T, scans, sample, scales, tolerance)
-        size = len(gradient)
-        matrix += (progress.damping * jnp.trace(matrix) / size + _LEAST_DAMPING) * jnp.eye(size)
-        # The first image stays.
-        free = slice(len(scales), None)
-        values = jnp.linalg.solve(matrix[free, free], -gradient[free]).reshape(count - 1, -1)
-        values *= jnp.minimum(1.0, _LONGEST_STEP / jnp.maximum(jnp.abs(values).max(), 1e-6))
-        steps = motion_matrices(scales * jnp.pad(values, ((1, 0), (0, 0))))
-        motions = _times(progress.motions, steps)
-        tried = _Progress(motions, score_of(motions), jnp.maximum(progress.damping / _BETTER, _LEAST_DAMPING))
-        rejected = progress._replace(damping=progress.damping * _WORSE)
-        return jax.tree.map(partial(jnp.where, tried.score > progress.score), tried, rejected), None
+        return matrix[free, free], gradient[free]
 
-    none = jnp.broadcast_to(jnp.eye(4), T_world_camera.shape)
-    start = _Progress(none, score_of(none), jnp.asarray(_DAMPING))
-    return jax.lax.scan(iterate, start, length=num_iterations)[0].motions
+    def score(motions: Float[Array, "m 4 4"]) -> Float[Array, ""]:
+        T = _times(T_world_camera, with_first(motions))
+        return consistency_of_pairs(T, sample, scans, offsets, tolerance)
+
+    return with_first(improve_motions(equations, score, scales, count=count - 1, num_iterations=num_iterations))
 
 
 def _times(A: Float[Array, "*n 4 4"], B: Float[Array, "*n 4 4"]) -> Float[Array, "*n 4 4"]:
@@ -113,8 +176,7 @@ def _normal_equations(
         here = jnp.zeros((2, freedom))
         gap, is_visible = gaps(here, pair)
         slopes, _ = jax.jacfwd(gaps, has_aux=True)(here, pair)
-        weighted = jnp.where(is_visible, jnp.exp(-0.5 * gap**2), 0.0)[:, None, None] * slopes
-        return jnp.tensordot(weighted, slopes, (0, 0)), jnp.tensordot(gap, weighted, (0, 0))
+        return gap_equations(gap, is_visible, slopes)
 
     camera, other = jnp.nonzero(~jnp.eye(count, dtype=bool), size=count * (count - 1))
     pairs = jnp.stack([camera, other], axis=-1)

@@ -100,16 +100,19 @@ class DepthInitializationConfig:
         max_translation: between neighbouring images, along each axis.
         max_turn_deg: between neighbouring images, about the vertical axis of the camera.
         max_tilt_deg: about the other axes; full motion only.
-        num_tries: searches for an image, at least, each with other points.
+        num_tries: searches for an image where few trajectories are left, each with other points; where more are left,
+            one for each, and so many more for the best ones.
         num_trajectories: trajectories that go on from image to image, at most.
         margin: a trajectory that explains less of the points than the best one by more than this share is dropped.
         num_candidates: motions of the first round, spread evenly.
         num_kept: best motions that go on to the next round, before the slides.
-        num_distinct: motions that are slid, that go on to the next round after it, and that continue a trajectory.
-        num_slides: places of each along each direction of the surfaces.
         num_varied: new motions around each kept one in a round.
-        num_rounds: each round varies the kept motions half as widely as the round before; half of them are before the
-            slides.
+        num_rounds: of motions, each varied half as widely as in the round before.
+        num_slid: best motions of the last round that differ; they are slid.
+        num_slides: places of each along each direction of the surfaces.
+        num_adjusted: best motions after the slides that differ; they are adjusted.
+        num_distinct: best motions after it that differ, by which a trajectory is continued. Where an image leaves open
+            how far the camera moved along a wall, they lie side by side along it.
         num_references: number of earlier images that an image is compared to before the slides.
         num_checked: number of earlier images that an image is compared to from the slides on.
         num_points: of each image, in a search.
@@ -130,13 +133,15 @@ class DepthInitializationConfig:
     max_tilt_deg: float = 30.0
     num_tries: int = 4
     num_trajectories: int = 16
-    margin: float = 0.15
+    margin: float = 0.25
     num_candidates: int = 1024
     num_kept: int = 32
-    num_distinct: int = 8
-    num_slides: int = 51
     num_varied: int = 20
-    num_rounds: int = 8
+    num_rounds: int = 4
+    num_slid: int = 8
+    num_slides: int = 51
+    num_adjusted: int = 32
+    num_distinct: int = 16
     num_references: int = 4
     num_checked: int = 8
     num_points: int = 100
@@ -151,9 +156,10 @@ class DepthInitializationConfig:
 
     def __post_init__(self) -> None:
         counts = (self.num_tries, self.num_candidates, self.num_kept, self.num_varied, self.num_rounds)
-        more = (self.num_distinct, self.num_slides, self.num_references, self.num_checked, self.num_points)
+        more = (self.num_slid, self.num_slides, self.num_adjusted, self.num_distinct)
+        compared = (self.num_references, self.num_checked, self.num_points)
         growth = (self.num_trajectories, self.num_compared, self.num_window, self.adjusted_every, self.num_iterations)
-        if min(*counts, *more, *growth) < 1:
+        if min(*counts, *more, *compared, *growth) < 1:
             raise ValueError(f"all counts must be at least 1, got {self}")
 
 

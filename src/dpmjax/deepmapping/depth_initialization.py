@@ -30,6 +30,8 @@ from dpmjax.geometry.rays import typical_range
 
 # Trajectories differ by such a share of the largest translation, root mean square, or of the largest turn.
 _APART = (0.085, 0.075)
+# Cost of motions, in explained points: images that look at new things explain less than those that stay.
+_MOTION_COST = 3.0
 # So many trajectories are adjusted in the end, at so many tolerances.
 _NUM_LAST, _NUM_TOLERANCES = 4, 3
 
@@ -63,16 +65,16 @@ def initialize_depth(
     images = _Images(scans, _sample(scans, config.num_compared, key=sample_key), unit)
     views = [
         Views(_sample(scans, config.num_points, key=jax.random.fold_in(sample_key, k)), surfaces, directions)
-        for k in range(config.num_trajectories)
+        for k in range(config.num_trajectories + config.num_tries)
     ]
     T = np.eye(4)[None, None]
     for scan in range(1, scans.mask.shape[0]):
-        # Where few trajectories are left, they are continued several times, each time with other points.
-        num_searches = max(len(T), min(config.num_tries, config.num_trajectories))
+        # One search for each trajectory, and more for the best ones, each with other points.
+        num_searches = config.num_tries if len(T) < config.num_tries else len(T) + config.num_tries
         continued = []
         for k, search_key_k in enumerate(jax.random.split(jax.random.fold_in(search_key, scan), num_searches)):
             before = T[k % len(T)]
-            T_last_next = propose_motions(before, views[k], scans.pinhole, config, motion, key=search_key_k)
+            T_last_next = propose_motions(before, views[k], scans.pinhole, config, motion, unit=unit, key=search_key_k)
             poses = np.broadcast_to(before, (len(T_last_next), *before.shape))
             continued.append(np.concatenate([poses, (before[-1] @ T_last_next)[:, None]], axis=1))
         T = _best_that_differ(np.stack(continued), images, config)
@@ -112,7 +114,8 @@ def _window(num_placed: int, images: _Images, config: DepthInitializationConfig)
 def _mean_cost(T: NDArray[np.float64], config: DepthInitializationConfig) -> NDArray[np.float64]:
     """Cost of the motions of each trajectory."""
     motions = np.linalg.inv(T[:, :-1]) @ T[:, 1:]
-    return motion_cost(np.linalg.norm(motions[..., :3, 3], axis=-1), _turns(motions), config).mean(axis=1)
+    costs = motion_cost(np.linalg.norm(motions[..., :3, 3], axis=-1), _turns(motions), config)
+    return _MOTION_COST * costs.mean(axis=1)
 
 
 def _turns(T: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -123,7 +126,7 @@ def _turns(T: NDArray[np.float64]) -> NDArray[np.float64]:
 @jax.jit
 def _explained(T: Float[Array, "m n 4 4"], images: _Images, tolerance: Float[Array, ""]) -> Float[Array, " m"]:
     """Explained share of each trajectory."""
-    return jax.lax.map(lambda one: explained_share(one, images.sample, images.scans, tolerance), T)
+    return jax.lax.map(lambda one: explained_share(one, images.sample, images.scans, images.unit, tolerance), T)
 
 
 def _best_that_differ(

@@ -1,8 +1,8 @@
 """The motions by which a depth image may follow earlier ones: a search of the largest projective consistency.
 
-It goes from coarse to fine, first against the last images, then against more. Images of walls hardly tell how far a
-camera has moved along them: the best motions that differ are slid along the surfaces of the image, and contradictions
-decide.
+Motions are drawn and varied from coarse to fine against the last images. Images of walls hardly tell how far a camera
+has moved along them: the best motions that differ are slid along the surfaces of the image. The best of those are
+adjusted against more images, and many that differ are proposed: what this image leaves open, later ones decide.
 """
 
 from __future__ import annotations
@@ -13,10 +13,11 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 from numpy.typing import NDArray
 
 from dpmjax.deepmapping.config import Motion
+from dpmjax.deepmapping.depth_adjustment import gap_equations, improve_motions, motion_scales
 from dpmjax.deepmapping.depth_config import DepthInitializationConfig
 from dpmjax.deepmapping.projective_consistency import (
     Agreement,
@@ -24,17 +25,20 @@ from dpmjax.deepmapping.projective_consistency import (
     Pinhole,
     PixelSample,
     both_ways,
+    surface_gap,
 )
 from dpmjax.deepmapping.spatial import motion_matrices
 from dpmjax.geometry import rigid
 from dpmjax.geometry.normals import image_normals
 
 # Motions differ by such shares of the largest translation and turn: those that are slid, and those that are kept then.
-_DIFFERENT, _SLID_APART = (0.35, 0.1), (0.08, 0.04)
+_DIFFERENT, _SLID_APART = (0.35, 0.1), (0.12, 0.06)
 # Motions are slid so many largest translations far, and may then be so long.
 _SLIDE, _LONGEST = 1.4, 1.5
-# Widths of variations in shares of the limits: in the first round, and after the slides; halved from round to round.
-_FIRST_SPREAD, _SLID_SPREAD = 0.25, 0.04
+# Width of the first variations in shares of the limits; halved from round to round.
+_FIRST_SPREAD = 0.25
+# Adjusted at so many tolerances, with so many steps at each.
+_NUM_TOLERANCES, _NUM_ITERATIONS = 4, 2
 
 
 class Views(NamedTuple):
@@ -90,6 +94,7 @@ def propose_motions(
     config: DepthInitializationConfig,
     motion: Motion,
     *,
+    unit: float,
     key: jax.Array,
 ) -> NDArray[np.float64]:
     """The best motions of the next image that differ.
@@ -100,6 +105,7 @@ def propose_motions(
         pinhole: of the camera.
         config: of the search.
         motion: "planar" or "full".
+        unit: typical range of the images, unit of the points.
         key: of the search.
 
     Returns:
@@ -115,7 +121,7 @@ def propose_motions(
         jnp.asarray(before >= 0, jnp.float32),
         _take(views, rows),
     )
-    found = _search(references, _take(views, scan), pinhole, key, config=config, motion=motion)
+    found = _search(references, _take(views, scan), pinhole, unit, key, config=config, motion=motion)
     return np.asarray(found, np.float64)
 
 
@@ -138,6 +144,10 @@ def _take(tree: Any, rows: Any) -> Any:
     return jax.tree.map(lambda leaf: leaf[rows], tree)
 
 
+def _times(A: Float[Array, "*#n 4 4"], B: Float[Array, "*#n 4 4"]) -> Float[Array, "*n 4 4"]:
+    return jnp.matmul(A, B, precision=jax.lax.Precision.HIGHEST)
+
+
 def _turn_of(T: Float[Array, "... 4 4"]) -> Float[Array, "..."]:
     """Angle of a motion, radians."""
     return jnp.arccos(jnp.clip(0.5 * (jnp.trace(T[..., :3, :3], axis1=-2, axis2=-1) - 1.0), -1.0, 1.0))
@@ -154,7 +164,7 @@ def _score_motion(
     """Consistency of an image with its references at a motion, less the cost of the motion."""
 
     def against(T_last_ref: Array, reference: Views) -> Agreement:
-        T_ref_scan = jnp.matmul(rigid.inverse(T_last_ref), T_last_scan, precision=jax.lax.Precision.HIGHEST)
+        T_ref_scan = _times(rigid.inverse(T_last_ref), T_last_scan)
         samples, surfaces = (view.sample, reference.sample), (view.surfaces, reference.surfaces)
         return both_ways(T_ref_scan, samples, surfaces, pinhole, tolerance)
 
@@ -166,18 +176,22 @@ def _score_motion(
 
 
 def _distinct(
-    T: Float[Array, "m 4 4"], scores: Float[Array, " m"], shares: tuple[float, float], config: DepthInitializationConfig
+    T: Float[Array, "m 4 4"],
+    scores: Float[Array, " m"],
+    count: int,
+    shares: tuple[float, float],
+    config: DepthInitializationConfig,
 ) -> Float[Array, "k 4 4"]:
     """The best motions that differ by these shares of the largest translation or turn from all better ones."""
     far, turn = shares[0] * config.max_translation, shares[1] * np.deg2rad(config.max_turn_deg)
 
     def pick(left: Float[Array, " m"], _: None) -> tuple[Float[Array, " m"], Array]:
         best = T[jnp.argmax(left)]
-        turned = _turn_of(jnp.matmul(rigid.inverse(best), T, precision=jax.lax.Precision.HIGHEST))
+        turned = _turn_of(_times(rigid.inverse(best), T))
         is_near = (jnp.linalg.norm(T[:, :3, 3] - best[:3, 3], axis=-1) < far) & (turned < turn)
         return jnp.where(is_near, -jnp.inf, left), best
 
-    return jax.lax.scan(pick, scores, length=config.num_distinct)[1]
+    return jax.lax.scan(pick, scores, length=count)[1]
 
 
 def _slid(
@@ -187,8 +201,46 @@ def _slid(
     lengths = _SLIDE * config.max_translation * jnp.linspace(-1.0, 1.0, config.num_slides)
     moves = (lengths[:, None, None] * directions).reshape(-1, 3)
     T_scan_slid = jnp.tile(jnp.eye(4), (len(moves), 1, 1)).at[:, :3, 3].set(moves)
-    slid = jnp.matmul(T[:, None], T_scan_slid, precision=jax.lax.Precision.HIGHEST).reshape(-1, 4, 4)
+    slid = _times(T[:, None], T_scan_slid).reshape(-1, 4, 4)
     return jnp.concatenate([T, slid])
+
+
+def _adjusted(
+    T_last_scan: Float[Array, "4 4"],
+    references: References,
+    view: Views,
+    pinhole: Pinhole,
+    unit: Float[Array, ""],
+    tolerance: Float[Array, ""],
+    config: DepthInitializationConfig,
+    motion: Motion,
+) -> Float[Array, "4 4"]:
+    """A motion so that points of the image lie on the surfaces of its references, and theirs on its own."""
+    scales = motion_scales(motion, unit, tolerance)
+
+    def gaps(values: Float[Array, " k"], T: Float[Array, "4 4"]) -> tuple[Float[Array, " p"], Float[Array, " p"]]:
+        T_last_moved = _times(T, motion_matrices((scales * values)[None])[0])
+
+        def against(T_last_ref: Array, reference: Views) -> tuple[Float[Array, " q"], Bool[Array, " q"]]:
+            T_ref_scan = _times(rigid.inverse(T_last_ref), T_last_moved)
+            there = surface_gap(T_ref_scan, view.sample, reference.surfaces, pinhole)
+            back = surface_gap(rigid.inverse(T_ref_scan), reference.sample, view.surfaces, pinhole)
+            return jnp.concatenate([there[0], back[0]]) / tolerance, jnp.concatenate([there[1], back[1]])
+
+        gap, is_visible = jax.vmap(against)(references.T_last_reference, references.views)
+        return gap.ravel(), (is_visible * references.weights[:, None]).ravel()
+
+    def equations(motions: Float[Array, "1 4 4"]) -> tuple[Float[Array, "k k"], Float[Array, " k"]]:
+        T, here = _times(T_last_scan, motions[0]), jnp.zeros(len(scales))
+        gap, weight = gaps(here, T)
+        slopes, _ = jax.jacfwd(gaps, has_aux=True)(here, T)
+        return gap_equations(gap, weight, slopes)
+
+    def score(motions: Float[Array, "1 4 4"]) -> Float[Array, ""]:
+        return _score_motion(_times(T_last_scan, motions[0]), references, view, pinhole, tolerance, config)
+
+    motions = improve_motions(equations, score, scales, count=1, num_iterations=_NUM_ITERATIONS)
+    return _times(T_last_scan, motions[0])
 
 
 @partial(jax.jit, static_argnames=("config", "motion"))
@@ -196,6 +248,7 @@ def _search(
     references: References,
     view: Views,
     pinhole: Pinhole,
+    unit: Float[Array, ""],
     key: jax.Array,
     *,
     config: DepthInitializationConfig,
@@ -207,27 +260,35 @@ def _search(
     first_key, round_key = jax.random.split(key)
     values = widths * jax.random.uniform(first_key, (config.num_candidates, len(widths)), minval=-1.0, maxval=1.0)
     T = motion_matrices(values.at[0].set(0.0))
-    first, last = np.log(config.tolerance[0]), np.log(config.tolerance[1])
-    slides_at = config.num_rounds // 2
+    tolerances = jnp.geomspace(*config.tolerance, config.num_rounds + _NUM_TOLERANCES)
     nearest = _take(references, slice(config.num_references))
-    for step in range(config.num_rounds):
-        tolerance = jnp.exp(first + (last - first) * step / max(config.num_rounds - 1, 1))
-        compared = nearest if step < slides_at else references
 
-        def score(T_last_scan: Array, tolerance: Array = tolerance, compared: References = compared) -> Array:
-            return _score_motion(T_last_scan, compared, view, pinhole, tolerance, config)
+    def scores_of(T: Float[Array, "m 4 4"], compared: References, tolerance: Float[Array, ""]) -> Float[Array, " m"]:
+        return jax.lax.map(
+            lambda one: _score_motion(one, compared, view, pinhole, tolerance, config), T, batch_size=128
+        )
 
-        scores = jax.lax.map(score, T, batch_size=128)
-        if step == slides_at - 1:
-            T = _slid(_distinct(T, scores, _DIFFERENT, config), view.directions, config)
-            continue
-        if step < slides_at:
-            best, spread = T[jax.lax.top_k(scores, config.num_kept)[1]], _FIRST_SPREAD * 0.5**step
-        else:
-            best, spread = _distinct(T, scores, _SLID_APART, config), _SLID_SPREAD * 0.5 ** (step - slides_at)
+    for step in range(config.num_rounds - 1):
+        best = T[jax.lax.top_k(scores_of(T, nearest, tolerances[step]), config.num_kept)[1]]
         noise = jax.random.normal(jax.random.fold_in(round_key, step), (config.num_varied, len(best), len(widths)))
         # The kept motions themselves are candidates of the next round.
-        moves = motion_matrices((spread * widths * noise.at[0].set(0.0)).reshape(-1, len(widths)))
-        moves = moves.reshape(config.num_varied, len(best), 4, 4)
-        T = jnp.matmul(best, moves, precision=jax.lax.Precision.HIGHEST).reshape(-1, 4, 4)
-    return best
+        spread = _FIRST_SPREAD * 0.5**step * widths
+        moves = motion_matrices((spread * noise.at[0].set(0.0)).reshape(-1, len(widths)))
+        T = _times(best, moves.reshape(config.num_varied, len(best), 4, 4)).reshape(-1, 4, 4)
+    scores = scores_of(T, nearest, tolerances[config.num_rounds - 1])
+    T = _slid(_distinct(T, scores, config.num_slid, _DIFFERENT, config), view.directions, config)
+    adjusted_at = tolerances[config.num_rounds :]
+    T = _distinct(T, scores_of(T, references, adjusted_at[0]), config.num_adjusted, _SLID_APART, config)
+    for tolerance in adjusted_at:
+        adjust = partial(
+            _adjusted,
+            references=references,
+            view=view,
+            pinhole=pinhole,
+            unit=unit,
+            tolerance=tolerance,
+            config=config,
+            motion=motion,
+        )
+        T = jax.lax.map(adjust, T, batch_size=16)
+    return _distinct(T, scores_of(T, references, adjusted_at[-1]), config.num_distinct, _SLID_APART, config)

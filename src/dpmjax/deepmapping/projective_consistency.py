@@ -22,8 +22,10 @@ _EDGE = 0.15
 # Cost of a contradiction in matches: along a bare wall a wrong pose matches nearly everywhere, and overlaps more. At a
 # coarse tolerance many contradictions only say that the pose is not exact yet, and cost less.
 _CONTRADICTION, _LEAST_CONTRADICTION, _FULL_TOLERANCE = 18.0, 3.0, 0.02
-# Cost of a point that any image contradicts, in explained points.
-_CONTRADICTED_POINT = 3.0
+# Cost of a point that any image contradicts, in explained points. Such a point lies twice this share of its depth in
+# front of a surface: no pose that is nearly right puts it there. Points nearer than this share of the typical range
+# may lie as far in front as one at that distance, because an error of a position weighs more the nearer a point is.
+_CONTRADICTED_POINT, _CLEAR, _NEAR = 20.0, 0.04, 0.25
 # Matches count as a share of the visible points, not of all points, or else every image would be pulled onto the
 # others. This share of all points is added to the visible ones, so that a little overlap that matches is worth little.
 _UNSEEN = 0.1
@@ -279,21 +281,25 @@ def explained_share(
     T_world_camera: Float[Array, "n 4 4"],
     sample: PixelSample,
     scans: DepthScans,
+    unit: Float[Array, ""] | float,
     tolerance: Float[Array, ""],
 ) -> Float[Array, ""]:
     """Share of the points that another image explains, less the cost of those that another image contradicts.
 
     Each point counts once: it is explained as well as by the image that it matches best, and contradicted as much as
-    by the image that contradicts it most. Images that look at one thing together gain nothing by it.
+    by the image that contradicts it most. Images that look at one thing together gain nothing by it. A contradiction
+    is clear at any tolerance: a pose that is off by a tolerance still explains nearly all it should, and contradicts
+    nothing.
 
     Args:
         T_world_camera: poses.
         sample: some points of each image.
         scans: depth images, unit of the poses.
+        unit: typical range of the images, unit of the points.
         tolerance: share of the depth by which matching points may differ.
 
     Returns:
-        -3 to 1.
+        -20 to 1.
     """
     rows, surfaces = jnp.arange(T_world_camera.shape[0]), scans.surfaces
 
@@ -305,7 +311,9 @@ def explained_share(
                 rigid.inverse(T_world_camera[other]), T_world_camera[row], precision=jax.lax.Precision.HIGHEST
             )
             gap, is_visible = surface_gap(T_other_camera, points, surfaces[other], scans.pinhole)
-            match, contradiction = _match_and_contradiction(gap / tolerance)
+            depth = rigid.transform_points(T_other_camera, points.points)[:, 2]
+            leeway = _CLEAR * jnp.maximum(1.0, _NEAR * unit / jnp.maximum(depth, 1e-3))
+            (match, _), (_, contradiction) = (_match_and_contradiction(gap / t) for t in (tolerance, leeway))
             counts = is_visible & (other != row)
             return jnp.where(counts, match, 0.0), jnp.where(counts, contradiction, 0.0)
 
