@@ -218,7 +218,25 @@ def test_a_point_is_explained_once(walk) -> None:
     assert share([0, 0], away) == 0.0
     nearer = same[:2].copy()
     nearer[1, 2, 3] = -0.6
-    assert share([0, 0], nearer) < 0.0
+    assert share([0, 0], nearer) < -1.0
+    # A gap of one to two tolerances explains less and contradicts nothing.
+    off = same[:2].copy()
+    off[1, 2, 3] = -0.03
+    assert 0.0 < share([0, 0], off) < share([0, 0], same[:2])
+
+
+def test_near_points_have_the_leeway_of_farther_ones() -> None:
+    rays = np.stack([*np.meshgrid(np.linspace(-0.7, 0.7, 12), np.linspace(-0.4, 0.4, 8)), np.ones((8, 12))], axis=-1)
+    moved = np.tile(np.eye(4), (2, 1, 1))
+    moved[1, 2, 3] = -0.05
+
+    def share(depth: float, unit: float) -> float:
+        scans = dm.as_depth_scans(np.stack([depth * rays] * 2))
+        return float(explained_share(jnp.asarray(moved, jnp.float32), scans.pixels, scans, unit, jnp.float32(0.02)))
+
+    assert share(0.3, unit=0.3) < -5.0
+    assert abs(share(0.3, unit=4.0)) < 0.5
+    assert share(2.0, unit=4.0) > 0.0
 
 
 def test_consistency_has_finite_slopes_where_nothing_overlaps(scans) -> None:

@@ -13,7 +13,7 @@ from dpmjax import deepmapping as dm
 from dpmjax import io, simulation
 from dpmjax.deepmapping.depth_adjustment import adjust_poses
 from dpmjax.deepmapping.depth_initialization import _best_that_differ, _explained, _Images, _window
-from dpmjax.deepmapping.depth_motion_search import surface_directions
+from dpmjax.deepmapping.depth_motion_search import Views, propose_motions, surface_directions
 from dpmjax.deepmapping.projective_consistency import PixelSample
 from dpmjax.deepmapping.spatial import motion_matrices
 from dpmjax.geometry.rays import typical_range
@@ -21,6 +21,8 @@ from dpmjax.metrics import absolute_trajectory_error
 from tests.tolerances import ROUNDING
 
 KEY = jax.random.key(0)
+ALONG, ACROSS = np.array([0.8, 0.0, 0.6]), np.array([0.6, 0.0, -0.8])
+"""Directions in and across a wall."""
 
 
 @pytest.fixture(scope="module")
@@ -110,15 +112,32 @@ def test_images_are_registered_without_a_first_guess(walk, scans) -> None:
     np.testing.assert_array_equal(T[0], np.eye(4))
 
 
-def test_an_image_of_one_wall_is_slid_along_it_first() -> None:
+def two_views_of_a_wall() -> dm.DepthScans:
+    """The same image twice, of a bare wall with the normal `ACROSS`, two metres away."""
     rays = np.stack([*np.meshgrid(np.linspace(-0.7, 0.7, 12), np.linspace(-0.4, 0.4, 8)), np.ones((8, 12))], axis=-1)
-    along = np.array([0.8, 0.0, 0.6])
-    wall = rays * (-2.0 / (rays @ [0.6, 0.0, -0.8]))[..., None]
-    scans = dm.as_depth_scans(np.stack([wall, wall]))
+    wall = rays * (-2.0 / (rays @ ACROSS))[..., None]
+    return dm.as_depth_scans(np.stack([wall, wall]))
+
+
+def test_an_image_of_one_wall_is_slid_along_it_first() -> None:
+    scans = two_views_of_a_wall()
     for motion in ("planar", "full"):
         directions = surface_directions(scans, motion)
         assert directions.shape == (2, 2 if motion == "planar" else 3, 3)
         # In space the two directions in the wall are equal.
         in_wall = directions[0, : directions.shape[1] - 1]
-        np.testing.assert_allclose(np.linalg.norm(in_wall @ along), 1.0, atol=1e-3)
-        np.testing.assert_allclose(np.abs(directions[0, -1] @ [0.6, 0.0, -0.8]), 1.0, atol=1e-3)
+        np.testing.assert_allclose(np.linalg.norm(in_wall @ ALONG), 1.0, atol=1e-3)
+        np.testing.assert_allclose(np.abs(directions[0, -1] @ ACROSS), 1.0, atol=1e-3)
+
+
+def test_what_a_wall_leaves_open_is_proposed_side_by_side() -> None:
+    scans = two_views_of_a_wall()
+    views = Views(scans.pixels, scans.surfaces, jnp.asarray(surface_directions(scans, "planar")))
+    config = dm.DepthInitializationConfig(num_candidates=256, num_kept=8, num_varied=8, num_distinct=8)
+    T = propose_motions(np.eye(4)[None], views, scans.pinhole, config, "planar", unit=2.0, key=KEY)
+    assert T.shape == (8, 4, 4)
+    np.testing.assert_allclose(T[:, :3, 3] @ ACROSS, 0.0, atol=0.005)
+    np.testing.assert_allclose(T[:, 0, 2], 0.0, atol=0.005)
+    places = np.sort(T[:, :3, 3] @ ALONG)
+    assert np.diff(places).min() > 0.1 * config.max_translation
+    assert np.ptp(places) > config.max_translation
