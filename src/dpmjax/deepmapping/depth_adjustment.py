@@ -97,7 +97,7 @@ def improve_motions(
         matrix += (progress.damping * jnp.trace(matrix) / size + _LEAST_DAMPING) * jnp.eye(size)
         values = jnp.linalg.solve(matrix, -gradient).reshape(count, -1)
         values *= jnp.minimum(1.0, _LONGEST_STEP / jnp.maximum(jnp.abs(values).max(), 1e-6))
-        motions = _times(progress.motions, motion_matrices(scales * values))
+        motions = rigid.compose(progress.motions, motion_matrices(scales * values))
         tried = _Progress(motions, score(motions), jnp.maximum(progress.damping / _BETTER, _LEAST_DAMPING))
         rejected = progress._replace(damping=progress.damping * _WORSE)
         return jax.tree.map(partial(jnp.where, tried.score > progress.score), tried, rejected), None
@@ -141,19 +141,15 @@ def adjust_poses(
         return jnp.concatenate([jnp.eye(4)[None], motions])
 
     def equations(motions: Float[Array, "m 4 4"]) -> tuple[Float[Array, "mk mk"], Float[Array, " mk"]]:
-        T = _times(T_world_camera, with_first(motions))
+        T = rigid.compose(T_world_camera, with_first(motions))
         matrix, gradient = _normal_equations(T, scans, sample, scales, tolerance)
         return matrix[free, free], gradient[free]
 
     def score(motions: Float[Array, "m 4 4"]) -> Float[Array, ""]:
-        T = _times(T_world_camera, with_first(motions))
+        T = rigid.compose(T_world_camera, with_first(motions))
         return consistency_of_pairs(T, sample, scans, offsets, tolerance)
 
     return with_first(improve_motions(equations, score, scales, count=count - 1, num_iterations=num_iterations))
-
-
-def _times(A: Float[Array, "*n 4 4"], B: Float[Array, "*n 4 4"]) -> Float[Array, "*n 4 4"]:
-    return jnp.matmul(A, B, precision=jax.lax.Precision.HIGHEST)
 
 
 def _normal_equations(
@@ -167,9 +163,10 @@ def _normal_equations(
     count, freedom, surfaces = T.shape[0], len(scales), scans.surfaces
 
     def gaps(values: Float[Array, "2 k"], pair: Int[Array, "2"]) -> tuple[Float[Array, " p"], Bool[Array, " p"]]:
-        camera, other = _times(T[pair], motion_matrices(scales * values))
+        camera, other = rigid.compose(T[pair], motion_matrices(scales * values))
         points = PixelSample(sample.points[pair[0]], sample.mask[pair[0]])
-        gap, is_visible = surface_gap(_times(rigid.inverse(other), camera), points, surfaces[pair[1]], scans.pinhole)
+        T_other_camera = rigid.compose(rigid.inverse(other), camera)
+        gap, is_visible = surface_gap(T_other_camera, points, surfaces[pair[1]], scans.pinhole)
         return gap / tolerance, is_visible
 
     def of_pair(pair: Int[Array, "2"]) -> tuple[Float[Array, "2 k 2 k"], Float[Array, "2 k"]]:

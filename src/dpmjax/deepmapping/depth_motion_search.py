@@ -144,10 +144,6 @@ def _take(tree: Any, rows: Any) -> Any:
     return jax.tree.map(lambda leaf: leaf[rows], tree)
 
 
-def _times(A: Float[Array, "*#n 4 4"], B: Float[Array, "*#n 4 4"]) -> Float[Array, "*n 4 4"]:
-    return jnp.matmul(A, B, precision=jax.lax.Precision.HIGHEST)
-
-
 def _turn_of(T: Float[Array, "... 4 4"]) -> Float[Array, "..."]:
     """Angle of a motion, radians."""
     return jnp.arccos(jnp.clip(0.5 * (jnp.trace(T[..., :3, :3], axis1=-2, axis2=-1) - 1.0), -1.0, 1.0))
@@ -164,7 +160,7 @@ def _score_motion(
     """Consistency of an image with its references at a motion, less the cost of the motion."""
 
     def against(T_last_ref: Array, reference: Views) -> Agreement:
-        T_ref_scan = _times(rigid.inverse(T_last_ref), T_last_scan)
+        T_ref_scan = rigid.compose(rigid.inverse(T_last_ref), T_last_scan)
         samples, surfaces = (view.sample, reference.sample), (view.surfaces, reference.surfaces)
         return both_ways(T_ref_scan, samples, surfaces, pinhole, tolerance)
 
@@ -187,7 +183,7 @@ def _distinct(
 
     def pick(left: Float[Array, " m"], _: None) -> tuple[Float[Array, " m"], Array]:
         best = T[jnp.argmax(left)]
-        turned = _turn_of(_times(rigid.inverse(best), T))
+        turned = _turn_of(rigid.compose(rigid.inverse(best), T))
         is_near = (jnp.linalg.norm(T[:, :3, 3] - best[:3, 3], axis=-1) < far) & (turned < turn)
         return jnp.where(is_near, -jnp.inf, left), best
 
@@ -201,7 +197,7 @@ def _slid(
     lengths = _SLIDE * config.max_translation * jnp.linspace(-1.0, 1.0, config.num_slides)
     moves = (lengths[:, None, None] * directions).reshape(-1, 3)
     T_scan_slid = jnp.tile(jnp.eye(4), (len(moves), 1, 1)).at[:, :3, 3].set(moves)
-    slid = _times(T[:, None], T_scan_slid).reshape(-1, 4, 4)
+    slid = rigid.compose(T[:, None], T_scan_slid).reshape(-1, 4, 4)
     return jnp.concatenate([T, slid])
 
 
@@ -219,10 +215,10 @@ def _adjusted(
     scales = motion_scales(motion, unit, tolerance)
 
     def gaps(values: Float[Array, " k"], T: Float[Array, "4 4"]) -> tuple[Float[Array, " p"], Float[Array, " p"]]:
-        T_last_moved = _times(T, motion_matrices((scales * values)[None])[0])
+        T_last_moved = rigid.compose(T, motion_matrices((scales * values)[None])[0])
 
         def against(T_last_ref: Array, reference: Views) -> tuple[Float[Array, " q"], Bool[Array, " q"]]:
-            T_ref_scan = _times(rigid.inverse(T_last_ref), T_last_moved)
+            T_ref_scan = rigid.compose(rigid.inverse(T_last_ref), T_last_moved)
             there = surface_gap(T_ref_scan, view.sample, reference.surfaces, pinhole)
             back = surface_gap(rigid.inverse(T_ref_scan), reference.sample, view.surfaces, pinhole)
             return jnp.concatenate([there[0], back[0]]) / tolerance, jnp.concatenate([there[1], back[1]])
@@ -231,16 +227,16 @@ def _adjusted(
         return gap.ravel(), (is_visible * references.weights[:, None]).ravel()
 
     def equations(motions: Float[Array, "1 4 4"]) -> tuple[Float[Array, "k k"], Float[Array, " k"]]:
-        T, here = _times(T_last_scan, motions[0]), jnp.zeros(len(scales))
+        T, here = rigid.compose(T_last_scan, motions[0]), jnp.zeros(len(scales))
         gap, weight = gaps(here, T)
         slopes, _ = jax.jacfwd(gaps, has_aux=True)(here, T)
         return gap_equations(gap, weight, slopes)
 
     def score(motions: Float[Array, "1 4 4"]) -> Float[Array, ""]:
-        return _score_motion(_times(T_last_scan, motions[0]), references, view, pinhole, tolerance, config)
+        return _score_motion(rigid.compose(T_last_scan, motions[0]), references, view, pinhole, tolerance, config)
 
     motions = improve_motions(equations, score, scales, count=1, num_iterations=_NUM_ITERATIONS)
-    return _times(T_last_scan, motions[0])
+    return rigid.compose(T_last_scan, motions[0])
 
 
 @partial(jax.jit, static_argnames=("config", "motion"))
@@ -274,21 +270,15 @@ def _search(
         # The kept motions themselves are candidates of the next round.
         spread = _FIRST_SPREAD * 0.5**step * widths
         moves = motion_matrices((spread * noise.at[0].set(0.0)).reshape(-1, len(widths)))
-        T = _times(best, moves.reshape(config.num_varied, len(best), 4, 4)).reshape(-1, 4, 4)
+        T = rigid.compose(best, moves.reshape(config.num_varied, len(best), 4, 4)).reshape(-1, 4, 4)
     scores = scores_of(T, nearest, tolerances[config.num_rounds - 1])
     T = _slid(_distinct(T, scores, config.num_slid, _DIFFERENT, config), view.directions, config)
     adjusted_at = tolerances[config.num_rounds :]
     T = _distinct(T, scores_of(T, references, adjusted_at[0]), config.num_adjusted, _SLID_APART, config)
     for tolerance in adjusted_at:
-        adjust = partial(
-            _adjusted,
-            references=references,
-            view=view,
-            pinhole=pinhole,
-            unit=unit,
-            tolerance=tolerance,
-            config=config,
-            motion=motion,
-        )
+
+        def adjust(one: Float[Array, "4 4"], tolerance: Float[Array, ""] = tolerance) -> Float[Array, "4 4"]:
+            return _adjusted(one, references, view, pinhole, unit, tolerance, config, motion)
+
         T = jax.lax.map(adjust, T, batch_size=16)
     return _distinct(T, scores_of(T, references, adjusted_at[-1]), config.num_distinct, _SLID_APART, config)

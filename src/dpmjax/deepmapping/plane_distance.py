@@ -105,7 +105,7 @@ def misfit_of_pairs(
     """
     both = jnp.concatenate([pairs, pairs[:, ::-1]])
     source, target = both[:, 0], both[:, 1]
-    T = jnp.matmul(rigid.inverse(T_world_scan[target]), T_world_scan[source], precision=jax.lax.Precision.HIGHEST)
+    T = rigid.compose(rigid.inverse(T_world_scan[target]), T_world_scan[source])
     sources, targets = take_rows(samples, source), take_rows(scans, target)
     misfits = jax.vmap(plane_misfit, in_axes=(0, 0, 0, None, None))(T, sources, targets, *sizes)
     counts = jnp.tile(is_pair, 2)

@@ -263,9 +263,7 @@ def consistency_of_pairs(
 
     def compare(offset: Int[Array, ""]) -> Agreement:
         other = (jnp.arange(count) + offset) % count
-        T_other_camera = jnp.matmul(
-            rigid.inverse(T_world_camera[other]), T_world_camera, precision=jax.lax.Precision.HIGHEST
-        )
+        T_other_camera = rigid.compose(rigid.inverse(T_world_camera[other]), T_world_camera)
         others = PixelSample(sample.points[other], sample.mask[other])
         agreements = jax.vmap(both_ways, in_axes=(0, 0, 0, None, None))(
             T_other_camera, (sample, others), (surfaces, surfaces[other]), scans.pinhole, tolerance
@@ -307,9 +305,7 @@ def explained_share(
         points = PixelSample(sample.points[row], sample.mask[row])
 
         def by(other: Int[Array, ""]) -> tuple[Float[Array, " p"], Float[Array, " p"]]:
-            T_other_camera = jnp.matmul(
-                rigid.inverse(T_world_camera[other]), T_world_camera[row], precision=jax.lax.Precision.HIGHEST
-            )
+            T_other_camera = rigid.compose(rigid.inverse(T_world_camera[other]), T_world_camera[row])
             gap, is_visible = surface_gap(T_other_camera, points, surfaces[other], scans.pinhole)
             depth = rigid.transform_points(T_other_camera, points.points)[:, 2]
             leeway = _CLEAR * jnp.maximum(1.0, _NEAR * unit / jnp.maximum(depth, 1e-3))

@@ -116,7 +116,7 @@ def poses_of_scans(
     """
     motions = motion_matrices(_motions(config, phase, params, scans, rows))
     start = params.start if rows is None else params.start[rows]
-    return jnp.matmul(start, motions, precision=jax.lax.Precision.HIGHEST)
+    return rigid.compose(start, motions)
 
 
 def spatial_poses(

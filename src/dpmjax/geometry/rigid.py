@@ -29,6 +29,19 @@ def inverse(T_a_b: Any) -> Any:
     return xp.concatenate([top, T_a_b[..., dim:, :]], axis=-2)
 
 
+def compose(T_a_b: Float[AnyArray, "*#n d d"], T_b_c: Float[AnyArray, "*#n d d"]) -> Float[Array, "*n d d"]:
+    """One motion after the other, at full precision on every device.
+
+    Args:
+        T_a_b: maps b to a; its leading axes broadcast with those of the other.
+        T_b_c: maps c to b.
+
+    Returns:
+        `T_a_c`, T_a_b @ T_b_c.
+    """
+    return jnp.matmul(T_a_b, T_b_c, precision=jax.lax.Precision.HIGHEST)
+
+
 @jax.jit
 def transform_points(
     T_a_b: Float[AnyArray, "... d1 d1"], points_b: Float[AnyArray, "... n d"]

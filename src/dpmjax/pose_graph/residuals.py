@@ -84,13 +84,13 @@ def _linearise(poses: Array, step: Array, edges: Edges) -> tuple[Array, Array, A
 def _retract(poses: Float[Array, "n *s"], step: Float[Array, "n d"]) -> Float[Array, "n *s"]:
     if poses.ndim == 2:
         return se2.compose(poses, step)
-    return jnp.matmul(poses, se3.exp(step), precision="highest")
+    return rigid.compose(poses, se3.exp(step))
 
 
 def _relative(target: Float[Array, "e *s"], source: Float[Array, "e *s"]) -> Float[Array, "e *s"]:
     if source.ndim == 2:
         return se2.relative(target, source)
-    return jnp.matmul(rigid.inverse(target), source, precision="highest")
+    return rigid.compose(rigid.inverse(target), source)
 
 
 def _residuals(relative: Array, measured: Array) -> tuple[Float[Array, "e d"], Float[Array, "e d d"]]:

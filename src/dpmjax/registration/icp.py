@@ -107,7 +107,7 @@ def _icp(
             T = weighted_svd(source, target[nearest], weight)
         else:
             step = _step_to_planes(moved, target[nearest], normals.normals[nearest], weight * normals.mask[nearest])
-            T = jnp.matmul(step, T, precision="highest")
+            T = rigid.compose(step, T)
         change = jnp.linalg.norm(rigid.transform_points(T, source) - moved, axis=-1).max()
         return T, change, count + 1
 
