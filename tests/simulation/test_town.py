@@ -106,6 +106,20 @@ def test_poses_are_rigid_and_stand_on_the_ground(town, way):
     assert (np.diff(way.times) > 0).all()
 
 
+def test_a_car_that_turns_slowly_takes_longer_on_the_same_way():
+    town = make_town(3, TownConfig(route="there_and_back", route_length_m=300.0))
+    fast, slow = (drive(town, DriveConfig(sway_m=0.0, max_turn_deg_s=limit)) for limit in (np.inf, 30.0))
+
+    def turns_deg(way):
+        forward = way.T_world_lidar[:, :2, 0] / np.linalg.norm(way.T_world_lidar[:, :2, 0], axis=1, keepdims=True)
+        return np.degrees(np.arccos(np.clip((forward[:-1] * forward[1:]).sum(1), -1.0, 1.0)))
+
+    assert turns_deg(fast).max() > 6.0
+    assert turns_deg(slow).max() < 3.3  # Ten scans a second; directions are interpolated between places half a metre apart.
+    assert slow.times[-1] > fast.times[-1]
+    np.testing.assert_allclose(slow.T_world_lidar[-1, :2, 3], fast.T_world_lidar[-1, :2, 3], atol=1.0)
+
+
 def test_nothing_stands_in_the_lane(town):
     boxes = town.primitives.boxes
     mask = np.asarray(boxes.mask)
@@ -205,6 +219,7 @@ def test_beam_tables_go_down(sensor):
         lambda: LidarSensor("none", (), 100),
         lambda: LidarSensor("near", (0.0,), 100, min_range_m=5, max_range_m=4),
         lambda: DriveConfig(speed_m_s=0),
+        lambda: DriveConfig(max_turn_deg_s=0),
         lambda: make_town(0, trajectory=np.zeros((5, 3))),
         lambda: make_town(0, trajectory=np.tile(np.eye(4), (5, 1, 1))),
     ],

@@ -34,9 +34,10 @@ class DriveConfig:
         is_reversed: the other way round, in the other lane.
         sensor_height_m: above the ground.
         sway_m: standard deviation of the way the car wanders in its lane.
+        max_turn_deg_s: the car slows down in corners until it turns no faster; cars turn at 20 to 40 degrees a second.
 
     Raises:
-        ValueError: speed, rate or length not positive.
+        ValueError: speed, rate, length or turn not positive.
     """
 
     speed_m_s: float = 8.0
@@ -45,10 +46,12 @@ class DriveConfig:
     is_reversed: bool = False
     sensor_height_m: float = 1.73
     sway_m: float = 0.15
+    max_turn_deg_s: float = np.inf
 
     def __post_init__(self) -> None:
-        if not (self.speed_m_s > 0 and self.rate_hz > 0 and (self.length_m is None or self.length_m > 0)):
-            raise ValueError("speed_m_s, rate_hz and length_m must be positive")
+        lengths = () if self.length_m is None else (self.length_m,)
+        if not min(self.speed_m_s, self.rate_hz, self.max_turn_deg_s, *lengths) > 0:
+            raise ValueError("speed_m_s, rate_hz, length_m and max_turn_deg_s must be positive")
 
 
 class Drive(NamedTuple):
@@ -169,11 +172,16 @@ def _timetable(lane: FloatArray, length: float, config: DriveConfig, is_closed: 
     whole = arc_lengths(lane)[-1]
     at = way % whole if is_closed else way
     before, after = _directions(lane, at), _directions(lane, (at + 5.0) % whole if is_closed else at + 5.0)
-    cosine = np.clip((before * after).sum(1), -1.0, 1.0)
-    speed = config.speed_m_s * np.clip(1.0 - 0.9 * np.arccos(cosine), 1 / 3, 1.0)
-    clock = np.concatenate([[0.0], np.cumsum(np.diff(way) / (0.5 * (speed[1:] + speed[:-1])))])
+    speed = config.speed_m_s * np.clip(1.0 - 0.9 * _angles(before, after), 1 / 3, 1.0)
+    seconds = np.diff(way) / (0.5 * (speed[1:] + speed[:-1]))
+    turning = _angles(before[:-1], before[1:]) / np.radians(config.max_turn_deg_s)
+    clock = np.concatenate([[0.0], np.cumsum(np.maximum(seconds, turning))])
     times = np.arange(0.0, clock[-1] + 1e-9, 1.0 / config.rate_hz)
     return np.interp(times, clock, way), times
+
+
+def _angles(a: FloatArray, b: FloatArray) -> FloatArray:
+    return np.arccos(np.clip((a * b).sum(1), -1.0, 1.0))
 
 
 def _directions(lane: FloatArray, way: FloatArray) -> FloatArray:
