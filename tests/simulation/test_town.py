@@ -115,7 +115,8 @@ def test_a_car_that_turns_slowly_takes_longer_on_the_same_way():
         return np.degrees(np.arccos(np.clip((forward[:-1] * forward[1:]).sum(1), -1.0, 1.0)))
 
     assert turns_deg(fast).max() > 6.0
-    assert turns_deg(slow).max() < 3.3  # Ten scans a second; directions are interpolated between places half a metre apart.
+    # Ten scans a second; directions are interpolated between places half a metre apart.
+    assert turns_deg(slow).max() < 3.3
     assert slow.times[-1] > fast.times[-1]
     np.testing.assert_allclose(slow.T_world_lidar[-1, :2, 3], fast.T_world_lidar[-1, :2, 3], atol=1.0)
 
