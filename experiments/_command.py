@@ -9,6 +9,7 @@ import sys
 import threading
 import traceback
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import fields
 from functools import partial
 from types import FrameType
 from typing import Any, Self, TypeVar
@@ -170,13 +171,14 @@ def run_command(
 def _parse(config_type: type[ConfigT], experiment: str, description: str | None, arguments: list[str]) -> ConfigT:
     old_names = getattr(config_type, "old_names", {})
     arguments = [old_names.get(argument, argument) for argument in arguments]
-    parse = partial(
-        tyro.cli, config_type, prog=f"python -m experiments.{experiment}", description=description, args=arguments
-    )
-    config = parse()
+    parse = partial(tyro.cli, config_type, prog=f"python -m experiments.{experiment}", description=description)
+    config = parse(args=arguments)
     if not getattr(config, "resume", False):
         return config
-    return parse(default=load_config(find_run(experiment, getattr(config, "output", None)), config_type))
+    earlier = load_config(find_run(experiment, getattr(config, "output", None)), config_type)
+    # Of a flag that is on, tyro takes --no-FLAG alone; who repeats the command says --FLAG again.
+    on = {f"--{field.name}".replace("_", "-") for field in fields(earlier) if getattr(earlier, field.name) is True}
+    return parse(args=[argument for argument in arguments if argument.replace("_", "-") not in on], default=earlier)
 
 
 def _interrupt(number: int, frame: FrameType | None) -> None:

@@ -26,7 +26,9 @@ RESULT_FOLDERS = (CHECKPOINTS, BEST, AGENTS, DRIVES, "rows")
 RESULT_SUFFIXES = (".json", ".csv", ".txt", ".npy", ".npz", ".png", ".ply", ".g2o", ".journal", ".rrd")
 LOGGERS = ("dpmjax", "experiments", "__main__")
 # Options that do not change what is computed.
-FREE_OPTIONS = frozenset({"output", "resume", "force", "device", "coordinator", "num_processes", "process_id"})
+FREE_OPTIONS = frozenset(
+    {"output", "resume", "force", "device", "coordinator", "num_processes", "process_id", "visualize"}
+)
 RESULTS = Path("results")
 
 ConfigT = TypeVar("ConfigT")

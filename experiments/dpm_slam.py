@@ -41,7 +41,7 @@ LOGGER = logging.getLogger(__name__)
 class Config(RunOptions):
     """Options of the run."""
 
-    may_change: ClassVar[frozenset[str]] = frozenset({"n_scans", "refine", "visualize"})
+    may_change: ClassVar[frozenset[str]] = frozenset({"n_scans", "refine"})
 
     data: Annotated[Positional[Path | None], arg(metavar="[DATA]")] = None
     """Folder of scans. Without it: a simulated town of the seed."""

@@ -37,6 +37,7 @@ class Config(FolderOptions):
     """Scans."""
     steps: int = 3
     fail: bool = False
+    no_loop: tyro.conf.FlagCreatePairsOff[bool] = False
 
 def main(config):
     if config.data is not None and not config.data.exists():
@@ -182,6 +183,16 @@ def test_resumed_run_keeps_the_options_that_are_not_given(toy):
     code, _, errors = finish(toy("-o", "out", "--resume", "--seed", "6"))
     assert code == 2
     assert "--seed was 5" in errors
+
+
+def test_resumed_command_may_repeat_its_flags(toy):
+    assert finish(toy("-o", "out", "--no-loop"))[0] == 0
+    assert finish(toy("-o", "out", "--no-loop", "--resume"))[0] == 0
+    assert finish(toy("-o", "out", "--no_loop", "--resume"))[0] == 0
+    assert finish(toy("-o", "other"))[0] == 0
+    code, _, errors = finish(toy("-o", "other", "--no-loop", "--resume"))
+    assert code == 2
+    assert "--no-loop was False" in errors
 
 
 @pytest.mark.parametrize(
