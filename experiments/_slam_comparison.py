@@ -35,7 +35,9 @@ TOWNS: tuple[tuple[str, str, LidarSensor], ...] = (
     ("suburb", "wander", HDL64E),
     ("car_park", "wander", OS1_64),
 )
-TOWN_RATE_HZ, TOWN_BLOCK_M = 4.0, 90.0
+TOWN_BLOCK_M = 90.0
+# A car turns by at most 6 degrees from scan to scan, so that methods that expect a steady motion are not lost.
+TOWN_RATE_HZ, TOWN_TURN_DEG_S = 5.0, 30.0
 COLORS = {"KISS-ICP": "#e08a1e", "KISS-SLAM": "#b5432e", "small_gicp": "#7a5aa6", ODOMETRY: "#6fa3d8", OURS: "#1f4e8c"}
 SIZES = {
     "map_bytes_points": "points of all scans",
@@ -73,7 +75,7 @@ def open_drives(config: Config, first_town: int) -> list[LidarSequence]:
 def town_drive(seed: int, number: int, length_m: float) -> LidarSequence:
     """Returns the drive through a town, once along its route; scans are cast when they are read."""
     kind, route, sensor = TOWNS[number % len(TOWNS)]
-    driving = DriveConfig(rate_hz=TOWN_RATE_HZ, sensor_height_m=sensor.height_m)
+    driving = DriveConfig(rate_hz=TOWN_RATE_HZ, sensor_height_m=sensor.height_m, max_turn_deg_s=TOWN_TURN_DEG_S)
     return simulate_scene(Scene(seed, TownConfig(kind, route, length_m, TOWN_BLOCK_M), driving, sensor))
 
 
