@@ -101,7 +101,7 @@ PRESETS: dict[str, ModelConfig] = {
     ),
     "small": ModelConfig(
         pyramid=_pyramid((1536, 512, 256, 64, 16), (16, 16, 16, 16, 16), (0.8, 1.6)),
-        encoder=EncoderConfig(stem_channels=16, expansion=2, output_channels=128, frame="bearing"),
+        encoder=EncoderConfig(stem_channels=16, expansion=2, output_channels=128, frame="local"),
         decoder=DecoderConfig(input_channels=128, model_channels=128, num_heads=4),
         matching=MatchConfig(pair_ratio=2.0, consensus=ConsensusConfig()),
     ),
