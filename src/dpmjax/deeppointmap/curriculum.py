@@ -188,7 +188,7 @@ def training_preset(name: Preset) -> TrainingConfig:
 
 
 NEAR_THE_LIDAR = AugmentConfig(max_tilt_rad=0.05, translation_sigma_m=0.3)
-"""For frames that turn with the scan: large motions put the origin of rays beside the lidar, and tilts turn walls over."""
+"""For frames that turn with the scan: large motions put the origin of rays beside the lidar, tilts turn walls over."""
 
 PRESETS = {
     "tiny": TrainingConfig(
