@@ -49,9 +49,8 @@ class LocalizationConfig:
         same_place_rad: ... and this turn.
         min_probability: a registration supports a place from this P(correct) on, if the scans agree.
         min_support: number of registrations that must end at the same place, the scans of one of them agreeing, ...
-        min_each: ... and P(correct) of each of them. Streets look alike: several may agree on a wrong place.
-        min_sure: P(correct) of the best from which on the others support it from `min_probability` on, and from which
-            on it needs no other where no other keyframe is near.
+        min_best: ... and P(correct) of the best of them. Streets look alike: several may agree on a wrong place.
+        min_alone: P(correct) that suffices where no other keyframe is near.
         max_rival_share: another place may have this share of the sum of the best one.
     """
 
@@ -64,14 +63,14 @@ class LocalizationConfig:
     same_place_rad: float = 0.06
     min_probability: float = 0.2
     min_support: int = 2
-    min_each: float = 0.8
-    min_sure: float = 0.95
+    min_best: float = 0.95
+    min_alone: float = 0.95
     max_rival_share: float = 0.5
 
     def __post_init__(self) -> None:
         require_fields(self, "num_similar", "num_registered", "num_at_once", "num_submap", "min_support", low=1)
         require_fields(self, "num_neighbours", low=0)
-        require_fields(self, "min_probability", "min_each", "min_sure", "max_rival_share", low=0, high=1)
+        require_fields(self, "min_probability", "min_best", "min_alone", "max_rival_share", low=0, high=1)
         require_positive_fields(self, "same_place_m", "same_place_rad")
 
 
@@ -243,9 +242,7 @@ def _agree(one: Evidence, other: Evidence, config: LocalizationConfig) -> bool:
 
 
 def _is_supported(place: _Place, config: LocalizationConfig) -> bool:
-    probabilities = [member.match.probability for member in place.members]
-    least = config.min_probability if probabilities[0] >= config.min_sure else config.min_each
-    return sum(probability >= least for probability in probabilities) >= config.min_support
+    return len(place.members) >= config.min_support and place.members[0].match.probability >= config.min_best
 
 
 def _neighbours(
@@ -269,7 +266,7 @@ def _decided(map_: KeyframeMap, tried: list[Evidence], extent_m: float, config: 
     numbers = f"{len(best.members)} of {len(tried)} agree, P {first.match.probability:.2f}, sum {best.total:.2f}"
     numbers += f", next place {rival:.2f}"
     is_alone = int((distances_to(map_, first.T_world_scan[:3, 3]) <= extent_m).sum()) <= 1
-    is_clear = _is_supported(best, config) or (is_alone and first.match.probability >= config.min_sure)
+    is_clear = _is_supported(best, config) or (is_alone and first.match.probability >= config.min_alone)
     if not is_clear or rival > config.max_rival_share * best.total:
         return Localization("not in this map", None, 0.0, None, numbers, evidence)
     probability = first.match.probability
