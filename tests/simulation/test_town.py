@@ -221,6 +221,7 @@ def test_beam_tables_go_down(sensor):
         lambda: LidarSensor("near", (0.0,), 100, min_range_m=5, max_range_m=4),
         lambda: DriveConfig(speed_m_s=0),
         lambda: DriveConfig(max_turn_deg_s=0),
+        lambda: DriveConfig(rate_hz=np.nan),
         lambda: make_town(0, trajectory=np.zeros((5, 3))),
         lambda: make_town(0, trajectory=np.tile(np.eye(4), (5, 1, 1))),
     ],

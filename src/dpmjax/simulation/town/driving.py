@@ -50,7 +50,7 @@ class DriveConfig:
 
     def __post_init__(self) -> None:
         lengths = () if self.length_m is None else (self.length_m,)
-        if not min(self.speed_m_s, self.rate_hz, self.max_turn_deg_s, *lengths) > 0:
+        if not all(value > 0 for value in (self.speed_m_s, self.rate_hz, self.max_turn_deg_s, *lengths)):
             raise ValueError("speed_m_s, rate_hz, length_m and max_turn_deg_s must be positive")
 
 
