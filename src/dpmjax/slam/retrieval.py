@@ -11,8 +11,8 @@ from dpmjax.types import DescriptorCloud
 def pooled_vector(cloud: DescriptorCloud) -> Float[np.ndarray, " d"]:
     """Pools the descriptors of a scan into one unit vector: their mean and their deviation in each channel.
 
-    Neither depends on the order of the descriptors. With features in the frame of the rays, neither changes where
-    the scan turns about the vertical.
+    Neither depends on the order of the descriptors. With features in frames that turn with the scan, neither changes
+    where the scan turns about the vertical.
 
     Args:
         cloud: descriptors of a scan.
