@@ -108,6 +108,7 @@ class TruthMatcher:
     sigma_rad: float = 0.01
     seed: int = 0
     reach_m: float = 15.0
+    least_probability: float = 0.6
     fingerprint: str = "truth"
 
     def describe(self, points: np.ndarray, measured: int) -> int:
@@ -137,7 +138,8 @@ class TruthMatcher:
         T = rigid.inverse(self.T_world_scan[target]) @ self.T_world_scan[source]
         if rng.random() < self.gross_share or np.linalg.norm(T[:3, 3]) > 2 * self.reach_m:
             T = noise(rng, 20.0, 1.0) @ T
-        return Match(T @ noise(rng, self.sigma_m, self.sigma_rad), float(rng.uniform(0.6, 1.0)), 0.3)
+        probability = float(rng.uniform(self.least_probability, 1.0))
+        return Match(T @ noise(rng, self.sigma_m, self.sigma_rad), probability, 0.3)
 
 
 @dataclass(frozen=True)

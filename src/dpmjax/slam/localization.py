@@ -48,9 +48,9 @@ class LocalizationConfig:
         same_place_m: two registrations agree within this distance ...
         same_place_rad: ... and this turn.
         min_probability: a registration supports a place from this P(correct) on, if the scans agree.
-        min_support: number of registrations that must end at the same place, the scans of one of them agreeing, ...
+        min_support: number of registrations that must end at the same place, the scans of one of them agreeing (one
+            suffices where no other keyframe is near), ...
         min_best: ... and P(correct) of the best of them. Streets look alike: several may agree on a wrong place.
-        min_alone: P(correct) that suffices where no other keyframe is near.
         max_rival_share: another place may have this share of the sum of the best one.
     """
 
@@ -63,14 +63,13 @@ class LocalizationConfig:
     same_place_rad: float = 0.06
     min_probability: float = 0.2
     min_support: int = 2
-    min_best: float = 0.8
-    min_alone: float = 0.95
+    min_best: float = 0.95
     max_rival_share: float = 0.5
 
     def __post_init__(self) -> None:
         require_fields(self, "num_similar", "num_registered", "num_at_once", "num_submap", "min_support", low=1)
         require_fields(self, "num_neighbours", low=0)
-        require_fields(self, "min_probability", "min_best", "min_alone", "max_rival_share", low=0, high=1)
+        require_fields(self, "min_probability", "min_best", "max_rival_share", low=0, high=1)
         require_positive_fields(self, "same_place_m", "same_place_rad")
 
 
@@ -192,7 +191,7 @@ def _localized(map_: KeyframeMap, points: np.ndarray, methods: SlamMethods, conf
         left = [row for row in rows[start : start + config.num_at_once] if row not in done]
         tried += _registered(map_, left, description, methods, config)
         place = max(_places(tried, config), key=lambda place: place.total, default=None)
-        if place is not None and not _is_supported(place, config):
+        if place is not None and not _is_supported(place, config, config.min_support):
             near = _neighbours(map_, place.members[0], tried, extent_m, config)
             tried += _registered(map_, near, description, methods, config)
         found = _decided(map_, tried, extent_m, config)
@@ -241,8 +240,8 @@ def _agree(one: Evidence, other: Evidence, config: LocalizationConfig) -> bool:
     return are_near(one.T_world_scan, other.T_world_scan, config.same_place_m, config.same_place_rad)
 
 
-def _is_supported(place: _Place, config: LocalizationConfig) -> bool:
-    return len(place.members) >= config.min_support and place.members[0].match.probability >= config.min_best
+def _is_supported(place: _Place, config: LocalizationConfig, min_support: int) -> bool:
+    return len(place.members) >= min_support and place.members[0].match.probability >= config.min_best
 
 
 def _neighbours(
@@ -266,8 +265,8 @@ def _decided(map_: KeyframeMap, tried: list[Evidence], extent_m: float, config: 
     numbers = f"{len(best.members)} of {len(tried)} agree, P {first.match.probability:.2f}, sum {best.total:.2f}"
     numbers += f", next place {rival:.2f}"
     is_alone = int((distances_to(map_, first.T_world_scan[:3, 3]) <= extent_m).sum()) <= 1
-    is_clear = _is_supported(best, config) or (is_alone and first.match.probability >= config.min_alone)
-    if not is_clear or rival > config.max_rival_share * best.total:
+    is_supported = _is_supported(best, config, 1 if is_alone else config.min_support)
+    if not is_supported or rival > config.max_rival_share * best.total:
         return Localization("not in this map", None, 0.0, None, numbers, evidence)
     probability = first.match.probability
     return Localization("found", first.T_world_scan, probability, first.keyframe, numbers, evidence)
