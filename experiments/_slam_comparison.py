@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
@@ -22,6 +23,7 @@ from experiments._slam_evaluation import ODOMETRY, OURS, PRECISIONS, Drive, Stop
 from experiments._slam_input import corrected, read_points, require_whole_files
 from experiments._slam_localization import evaluate_localization
 from experiments._slam_peers import PEERS, why_missing
+from experiments._slam_refine import MULTIWAY, REFINED, evaluate_refinement, why_no_multiway
 
 if TYPE_CHECKING:
     from experiments.dpm_evaluate import Config
@@ -38,7 +40,15 @@ TOWNS: tuple[tuple[str, str, LidarSensor], ...] = (
 TOWN_BLOCK_M = 90.0
 # A car turns by at most 6 degrees from scan to scan, so that methods that expect a steady motion are not lost.
 TOWN_RATE_HZ, TOWN_TURN_DEG_S = 5.0, 30.0
-COLORS = {"KISS-ICP": "#e08a1e", "KISS-SLAM": "#b5432e", "small_gicp": "#7a5aa6", ODOMETRY: "#6fa3d8", OURS: "#1f4e8c"}
+COLORS = {
+    "KISS-ICP": "#e08a1e",
+    "KISS-SLAM": "#b5432e",
+    "small_gicp": "#7a5aa6",
+    MULTIWAY: "#8c8c8c",
+    ODOMETRY: "#6fa3d8",
+    OURS: "#1f4e8c",
+    REFINED: "#2e8b57",
+}
 SIZES = {
     "map_bytes_points": "points of all scans",
     "map_bytes_voxels": "voxel map of KISS-ICP",
@@ -79,9 +89,9 @@ def town_drive(seed: int, number: int, length_m: float) -> LidarSequence:
     return simulate_scene(Scene(seed, TownConfig(kind, route, length_m, TOWN_BLOCK_M), driving, sensor))
 
 
-def missing_peers() -> dict[str, str]:
+def missing_peers(config: Config) -> dict[str, str]:
     """Returns the peers that cannot run, and why."""
-    reasons = {name: why_missing(name) for name in PEERS}
+    reasons = {name: why_missing(name) for name in PEERS} | ({MULTIWAY: why_no_multiway()} if config.refine else {})
     return {name: reason for name, reason in reasons.items() if reason is not None}
 
 
@@ -90,11 +100,12 @@ def compare(
 ) -> Iterator[tuple[Drive, dict[str, Any]]]:
     """Makes the rows that are missing; ends early where a signal came."""
     methods = make_methods(load_model(config.weights), weights=config.weights)
-    missing = missing_peers()
+    missing = missing_peers(config)
     drives = [evaluation.open_folder(folder, sequence, is_stopped) for sequence in sequences]
     ours: dict[str, dict[str, Any]] = {}
     # Trajectories of all drives come first: an early end leaves a whole table.
-    for drive, method, work in (*_runs(drives, methods, ours), *_localizations(config, drives, methods)):
+    more = (_refinements(config, drives, methods), _localizations(config, drives, methods))
+    for drive, method, work in itertools.chain(_runs(drives, methods, ours), *more):
         if method in missing:
             continue
         case = {"sequence": drive.sequence.name, "method": method}
@@ -113,6 +124,12 @@ def _runs(drives: Sequence[Drive], methods: SlamMethods, ours: dict[str, dict[st
             yield drive, name, partial(evaluation.evaluate_peer, drive, name)
         yield drive, OURS, partial(evaluation.evaluate_ours, drive, methods)
         yield drive, ODOMETRY, lambda drive=drive: evaluation.odometry_row(drive, ours[drive.sequence.name])
+
+
+def _refinements(config: Config, drives: Sequence[Drive], methods: SlamMethods) -> Iterator[Task]:
+    for drive in drives if config.refine else ():
+        for name in (REFINED, MULTIWAY):
+            yield drive, name, partial(evaluate_refinement, drive, methods, name, config.seed)
 
 
 def _localizations(config: Config, drives: Sequence[Drive], methods: SlamMethods) -> Iterator[Task]:

@@ -1,8 +1,13 @@
-"""Refinement of a SLAM trajectory by DeepMapping: keyframes are fitted window by window, and one graph joins them."""
+"""Refinement of a SLAM trajectory by DeepMapping: keyframes are fitted window by window, and one graph joins them.
+
+`dpm_evaluate --slam --refine` measures it beside Open3D's multiway registration, which begins with the same poses.
+"""
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
+from importlib.util import find_spec
 from typing import Any, NamedTuple
 
 import jax
@@ -12,11 +17,18 @@ from tqdm import tqdm
 from dpmjax import deepmapping
 from dpmjax.geometry import rigid
 from dpmjax.pose_graph.optimize import PoseGraphConfig, optimize_pose_graph
-from dpmjax.slam import KeyframeMap
+from dpmjax.slam import KeyframeMap, SlamMethods
 from dpmjax.slam.keyframes import as_pose_graph, with_edges
+from dpmjax.slam.system import place_scans
+from experiments._slam_evaluation import Drive, StoppedError, common_numbers
+from experiments._slam_input import read_points
+from experiments._slam_run import run_alone
 
 WINDOW, OVERLAP = 32, 8
 """Keyframes of a window, and those that it shares with the next one."""
+
+
+REFINED, MULTIWAY = "DeepPointMap refined", "multiway registration"
 
 
 class Refined(NamedTuple):
@@ -87,3 +99,32 @@ def _joined(slam_map: KeyframeMap, motions: dict[int, np.ndarray]) -> np.ndarray
         edges.append(edge)
     graph = as_pose_graph(with_edges(slam_map, edges))
     return np.asarray(optimize_pose_graph(graph, PoseGraphConfig(is_chordal_start=False)).graph.poses)
+
+
+def evaluate_refinement(drive: Drive, methods: SlamMethods, method: str, seed: int) -> dict[str, Any]:
+    """Polishes the keyframes of our run, which is read from its journal, and measures the poses of all scans."""
+    run, result = run_alone(drive.folder, drive.sequence, methods, drive.is_stopped)
+    if len(run.reports) < len(drive.sequence):
+        raise StoppedError
+    slam_map, numbers = result.state.slam_map, {}
+
+    def read_keyframe(row: int) -> np.ndarray:
+        return read_points(drive.sequence, slam_map.keyframes[row].scan)
+
+    clock = time.perf_counter()
+    if method == REFINED:
+        T, numbers = refine_keyframes(slam_map, read_keyframe, seed=seed, is_stopped=drive.is_stopped)
+    else:
+        from experiments.baselines.multiway import multiway_clouds
+
+        T = multiway_clouds([read_keyframe(row) for row in range(len(slam_map))], slam_map.T_world_keyframe)
+    seconds = time.perf_counter() - clock
+    if drive.is_stopped():
+        raise StoppedError
+    row = common_numbers(drive, method, place_scans(T, run.reports), [])
+    return {**row, **numbers, "num_keyframes": len(slam_map), "scan_s": seconds / len(drive.sequence)}
+
+
+def why_no_multiway() -> str | None:
+    """Returns why Open3D cannot run; None where it can."""
+    return None if find_spec("open3d") is not None else "open3d is not installed (pip install dpmjax[baselines])"

@@ -14,6 +14,8 @@ more methods see the same pairs: the search and the verification of `register` w
 
 With --slam, the whole system and its odometry run beside KISS-ICP, KISS-SLAM and odometry by small_gicp (extra
 `peers`); then random scans are looked for in the map of each drive's first half. Poses are needed for the errors only.
+--refine adds two rows: the keyframes of our run polished by DeepMapping, and by multiway registration (Open3D, extra
+`baselines`), from the same poses.
 table.md has ATE, KITTI's t_rel, loops, their recall, seconds a scan, bytes of maps and localisations; trajectories.png
 and map_sizes.png show them, and drives/ holds the trajectories of every method and the files of our run.
 experiments/_slam_evaluation.py says how loops are counted.
@@ -25,7 +27,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 import numpy as np
 from tqdm import tqdm
@@ -50,6 +52,8 @@ OVERLAP_FACTOR = 4
 class Config(RunOptions):
     """Options of the run."""
 
+    may_change: ClassVar[frozenset[str]] = frozenset({"refine"})
+
     paths: Annotated[Positional[tuple[str, ...]], arg(metavar="town|PATH ...")] = ("town",)
     """Folders of scans with poses, or simulated towns."""
     weights: Annotated[str, arg(metavar="NAME|FILE")] = "dpm_small"
@@ -70,6 +74,8 @@ class Config(RunOptions):
     """With --slam: every Nth scan."""
     kitti_angle_correction: FlagCreatePairsOff[bool] = False
     """With --slam: raise the beams of all drives by 0.205 degrees, as KITTI's HDL-64E needs, for all methods."""
+    refine: FlagCreatePairsOff[bool] = False
+    """With --slam: polish the keyframes of our run by DeepMapping, and by Open3D's multiway registration."""
     localize: Annotated[int, arg(metavar="N")] = 50
     """With --slam: number of scans that are looked for in the map of the first half; 0 leaves it out."""
 
@@ -80,8 +86,8 @@ class Config(RunOptions):
             raise ValueError("give at least one folder of scans, or town")
         if not 1 <= len(self.town_length_m) <= (2 if self.slam else 1):
             raise ValueError("--town-length-m: expected one length, or two with --slam")
-        if not self.slam and (self.n_scans is not None or self.jump != 1 or self.kitti_angle_correction):
-            raise ValueError("only with --slam: --n-scans, --jump, --kitti-angle-correction")
+        if not self.slam and (self.n_scans is not None or self.jump != 1 or self.kitti_angle_correction or self.refine):
+            raise ValueError("only with --slam: --n-scans, --jump, --kitti-angle-correction, --refine")
 
     @property
     def town_length_range(self) -> tuple[float, float]:
@@ -105,7 +111,7 @@ def evaluate_slam(config: Config) -> list[dict[str, Any]]:
     rows: list[dict[str, Any]] = []
     opened = {}
     with recording(folder), StopFlag() as stop:
-        missing = comparison.missing_peers()
+        missing = comparison.missing_peers(config)
         numbers = {"weights": config.weights, "peers_left_out": missing}
         note = write_metrics(folder, numbers, seed=config.seed, rows=rows)
         for drive, row in comparison.compare(config, folder, drives, lambda: stop.is_requested):

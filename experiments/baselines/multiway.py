@@ -6,6 +6,7 @@ process lets the wrong ones go (Choi, Zhou and Koltun, Robust Reconstruction of 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,7 +14,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from numpy.typing import NDArray
 
-from dpmjax.geometry import se2
+from dpmjax.geometry import rigid, se2
 from dpmjax.geometry.rays import typical_range
 from dpmjax.types import AnyArray, ScanSet
 
@@ -27,7 +28,7 @@ class MultiwayConfig:
     Attributes:
         coarse: largest distance of matched points, first round.
         fine: second round, and that of the graph.
-        radius: scans that the chain puts nearer than this are matched too.
+        radius: scans that the start puts nearer than this are matched too.
         prune: doubtful edges below this confidence are taken out.
     """
 
@@ -35,6 +36,12 @@ class MultiwayConfig:
     fine: float = 0.0225
     radius: float = 0.3
     prune: float = 0.25
+
+
+POLISH = MultiwayConfig(coarse=0.03, fine=0.01, radius=0.3)
+"""Where the start is good: smaller distances."""
+# Points of a lidar cloud are thinned to this share of the typical range: 0.3 m in a street.
+_VOXEL_SHARE = 0.01
 
 
 def multiway(scans: ScanSet, config: MultiwayConfig | None = None) -> Floats:
@@ -76,8 +83,36 @@ def multiway_images(
     return _registered(clouds, unit, config or MultiwayConfig(), is_planar=False)
 
 
-def _registered(clouds: list[Any], unit: float, config: MultiwayConfig, *, is_planar: bool) -> Floats:
-    """Returns the poses of clouds, (n, 4, 4), the first one the identity; flat ones by points, others by planes."""
+def multiway_clouds(
+    clouds: Sequence[Float[NDArray[np.floating], "_n 3"]],
+    T_world_cloud: Float[NDArray[np.float64], "n 4 4"],
+    config: MultiwayConfig = POLISH,
+) -> Float[NDArray[np.float64], "n 4 4"]:
+    """Polishes the poses of lidar clouds by Open3D's multiway registration; a ModuleNotFoundError without Open3D.
+
+    Args:
+        clouds: points of n clouds in order of time, each in the frame of its lidar.
+        T_world_cloud: where they start.
+        config: settings.
+
+    Returns:
+        T_world_cloud; the first one stays.
+    """
+    unit = float(np.median([np.percentile(np.linalg.norm(points, axis=1), 90) for points in clouds]))
+    thinned = [_cloud(points).voxel_down_sample(_VOXEL_SHARE * unit) for points in clouds]
+    for cloud in thinned:
+        cloud.estimate_normals()
+    T_first_cloud = rigid.inverse(T_world_cloud[0]) @ T_world_cloud
+    return T_world_cloud[0] @ _registered(thinned, unit, config, is_planar=False, start=T_first_cloud)
+
+
+def _registered(
+    clouds: list[Any], unit: float, config: MultiwayConfig, *, is_planar: bool, start: Floats | None = None
+) -> Floats:
+    """Returns the poses of clouds, (n, 4, 4), the first one the identity; flat ones by points, others by planes.
+
+    Without a start, each cloud is matched from where the one before is.
+    """
     import open3d
 
     coarse, fine = config.coarse * unit, config.fine * unit
@@ -89,14 +124,15 @@ def _registered(clouds: list[Any], unit: float, config: MultiwayConfig, *, is_pl
     T_world = [np.eye(4)]
     graph.nodes.append(_node(T_world[0]))
     for scan in range(1, len(clouds)):
-        graph.edges.append(_edge(clouds, (scan - 1, scan), np.eye(4), (coarse, fine), estimation, is_doubtful=False))
+        guess = np.eye(4) if start is None else rigid.inverse(start[scan]) @ start[scan - 1]
+        graph.edges.append(_edge(clouds, (scan - 1, scan), guess, (coarse, fine), estimation, is_doubtful=False))
         # An edge maps its source, the earlier scan, into the later one.
         T_world.append(T_world[-1] @ np.linalg.inv(graph.edges[-1].transformation))
         graph.nodes.append(_node(T_world[-1]))
-    chain = np.stack(T_world)
-    apart = np.linalg.norm(chain[:, None, :3, 3] - chain[None, :, :3, 3], axis=-1)
+    placed = np.stack(T_world) if start is None else start
+    apart = np.linalg.norm(placed[:, None, :3, 3] - placed[None, :, :3, 3], axis=-1)
     for source, target in np.argwhere(np.triu(apart < config.radius * unit, k=2)).tolist():
-        guess = np.linalg.inv(chain[target]) @ chain[source]
+        guess = rigid.inverse(placed[target]) @ placed[source]
         graph.edges.append(_edge(clouds, (source, target), guess, (coarse, fine), estimation, is_doubtful=True))
     with open3d.utility.VerbosityContextManager(open3d.utility.VerbosityLevel.Error):
         registration.global_optimization(

@@ -12,7 +12,7 @@ import pytest
 import dpmjax
 from dpmjax.geometry import rigid
 from dpmjax.io import LidarSequence
-from experiments import _slam_comparison, _slam_evaluation, _slam_peers, dpm_evaluate
+from experiments import _slam_comparison, _slam_evaluation, _slam_peers, _slam_refine, dpm_evaluate
 from experiments._command import EXIT_BAD_INPUT, EXIT_OK, run_command
 from experiments._result_files import load_json
 from experiments._run_folder import RunFolder
@@ -102,6 +102,28 @@ def test_every_method_gets_a_row_and_a_resumed_run_computes_nothing_again(
     monkeypatch.setattr(SteadyPeer, "step", None)
     assert run("--resume", "-o", out) == EXIT_OK
     assert load_json(out / "metrics.json")["rows"] == metrics["rows"]
+
+
+def test_refinements_are_rows_that_a_resumed_run_may_add(with_toys, tmp_path, monkeypatch, capsys) -> None:
+    out, drive = tmp_path / "out", toy.drive(1, num_scans=NUM_SCANS)
+    assert run("--slam", "town", "--weights", with_toys, "--num-towns", 1, "--localize", 0, "-o", out) == EXIT_OK
+
+    def moved(slam_map, read_points, **_):
+        for row, keyframe in enumerate(slam_map.keyframes):
+            np.testing.assert_array_equal(read_points(row), drive.read_scan(keyframe.scan))
+        T = np.array(slam_map.T_world_keyframe)
+        T[:, 1, 3] += 3.0 * np.arange(len(T))
+        return _slam_refine.Refined(T, {"refine_windows": 1})
+
+    monkeypatch.setattr(_slam_refine, "refine_keyframes", moved)
+    monkeypatch.setattr(_slam_refine, "find_spec", lambda name: None)
+    assert run("--slam", "--resume", "--refine", "-o", out) == EXIT_OK
+    assert "multiway registration was not run: open3d is not installed" in capsys.readouterr().out
+    rows = {row["method"]: row for row in load_json(out / "metrics.json")["rows"]}
+    assert list(rows) == ["steady", "DeepPointMap", "DeepPointMap without loops", "DeepPointMap refined"]
+    refined = rows["DeepPointMap refined"]
+    assert (refined["refine_windows"], refined["num_scans"]) == (1, NUM_SCANS)
+    assert refined["ate_m"] > rows["DeepPointMap"]["ate_m"] + 0.5
 
 
 def test_sizes_of_maps_are_those_of_the_files(with_toys, tmp_path) -> None:
