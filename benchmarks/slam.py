@@ -110,7 +110,7 @@ def proof_rows(case: str, proof: Proof) -> list[Row]:
     """The rows of one drive."""
     return [
         Row(case, "ATE", proof.ate_m, "m"),
-        Row(case, "ATE without loops", proof.ate_odometry_m, "m"),
+        Row(case, "ATE of odometry", proof.ate_odometry_m, "m"),
         Row(case, "loops", proof.num_loops, ""),
         Row(case, "loops, other direction", proof.num_opposite, ""),
         Row(case, "wrong loops", proof.num_wrong, ""),

@@ -30,7 +30,7 @@ from experiments._slam_numbers import trajectory_errors
 from experiments._slam_peers import PEERS, POINT_BYTES, FoundLoop, KissIcp, Peer, is_indoors, peer_version
 from experiments._slam_run import SlamRun, run_alone
 
-OURS, ODOMETRY = "DeepPointMap", "DeepPointMap without loops"
+OURS, ODOMETRY = "DeepPointMap", "DeepPointMap odometry"
 PRECISIONS = ("float32", "float16", "int8")
 # Sizes of maps are taken so many times on the way.
 NUM_SIZES = 8
@@ -128,7 +128,7 @@ def _per_scan(run: SlamRun, seconds: float) -> float | None:
 
 
 def odometry_row(drive: Drive, ours: dict[str, Any]) -> dict[str, Any]:
-    """Measures our odometry in the same run, before any loop: its time is that of its stages."""
+    """Measures our odometry in the same run, before neighbours and loops: its time is that of its stages."""
     numbers = common_numbers(drive, ODOMETRY, drive.trajectory(ODOMETRY), [])
     return {**numbers, "scan_s": ours["scan_odometry_s"]}
 

@@ -35,7 +35,14 @@ if TYPE_CHECKING:
 JOURNAL = "slam.journal"
 # Seconds between interim results, for those who look at a run that goes on.
 FLUSH_EVERY_S = 30.0
-_STAGES = {"measure": "surface", "align": "odometry", "describe": "encode", "register": "loops", "overlaps": "loops"}
+_STAGES = {
+    "measure": "surface",
+    "align": "odometry",
+    "align_scans": "neighbours",
+    "describe": "encode",
+    "register": "loops",
+    "overlaps": "loops",
+}
 
 
 class Beginning(NamedTuple):

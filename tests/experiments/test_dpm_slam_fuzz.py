@@ -37,6 +37,9 @@ class NoMatcher:
     def register(self, pairs):
         return [Match(np.eye(4), 0.0, 1.0) for _ in pairs]
 
+    def align_scans(self, source, target, T_target_source):
+        return None
+
     def overlaps(self, source, targets):
         return np.zeros(len(targets))
 

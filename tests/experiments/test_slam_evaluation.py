@@ -24,7 +24,7 @@ PEER = "steady"
 METHODS = [
     PEER,
     "DeepPointMap",
-    "DeepPointMap without loops",
+    "DeepPointMap odometry",
     *(f"localization, {p}" for p in _slam_evaluation.PRECISIONS),
 ]
 STEP_M, NUM_SCANS = 4.0, 6
@@ -120,7 +120,7 @@ def test_refinements_are_rows_that_a_resumed_run_may_add(with_toys, tmp_path, mo
     assert run("--slam", "--resume", "--refine", "-o", out) == EXIT_OK
     assert "multiway registration was not run: open3d is not installed" in capsys.readouterr().out
     rows = {row["method"]: row for row in load_json(out / "metrics.json")["rows"]}
-    assert list(rows) == ["steady", "DeepPointMap", "DeepPointMap without loops", "DeepPointMap refined"]
+    assert list(rows) == ["steady", "DeepPointMap", "DeepPointMap odometry", "DeepPointMap refined"]
     refined = rows["DeepPointMap refined"]
     assert (refined["refine_windows"], refined["num_scans"]) == (1, NUM_SCANS)
     assert refined["ate_m"] > rows["DeepPointMap"]["ate_m"] + 0.5

@@ -129,6 +129,9 @@ class TruthMatcher:
     def register(self, pairs: list[tuple[Submap, Submap]]) -> list[Match]:
         return [self._match(source.descriptions[0], target.descriptions[0]) for source, target in pairs]
 
+    def align_scans(self, source: int, target: int, T_target_source: np.ndarray) -> Alignment | None:
+        return None
+
     def overlaps(self, source: int, targets: list[int]) -> np.ndarray:
         apart = self.T_world_scan[targets][:, :2, 3] - self.T_world_scan[source][:2, 3]
         return 1 / (1 + np.exp((np.linalg.norm(apart, axis=1) - self.reach_m) / 2))

@@ -96,6 +96,8 @@ class FrontEndConfig:
         keyframe_rad: ... or turned by more than this.
         max_keyframe_m: upper bound of the distance of keyframes (DeepPointMap: 3 to 10 m).
         min_keyframe_m: lower bound of it.
+        num_neighbours: a keyframe is also aligned with so many before the last one ...
+        neighbour_share: ... that are within this many extents.
         usual_window: the usual score is the median over this many scans.
         guess_m: standard deviation of a motion that was only predicted ...
         guess_rad: ... and of its rotation.
@@ -113,13 +115,15 @@ class FrontEndConfig:
     keyframe_rad: float = 0.6
     max_keyframe_m: float = 5.0
     min_keyframe_m: float = 0.5
+    num_neighbours: int = 3
+    neighbour_share: float = 1.5
     usual_window: int = 20
     guess_m: float = 1.0
     guess_rad: float = 0.2
 
     def __post_init__(self) -> None:
         require_fields(self, "min_score_share", "min_probability", low=0, high=1)
-        require_fields(self, "near_m", "near_rad", low=0)
+        require_fields(self, "near_m", "near_rad", "num_neighbours", "neighbour_share", low=0)
         require_fields(self, "num_submap", "num_lost", "usual_window", low=1)
         require_positive_fields(self, "submap_radius_m", "keyframe_share", "keyframe_rad", "guess_m", "guess_rad")
         require_fields(self, "min_keyframe_m", low=1e-3, high=self.max_keyframe_m)

@@ -58,10 +58,21 @@ def scans_agree(match: Match, config: LoopClosureConfig) -> bool:
         True also where the matcher has no scans.
     """
     shares = match.verification
-    if shares is None:
-        return True
-    is_matched = shares.matched_share >= config.min_matched_share
-    return is_matched and shares.contradicted_share <= config.max_contradicted_share
+    return shares is None or shares_suffice(shares.matched_share, shares.contradicted_share, config)
+
+
+def shares_suffice(matched_share: float, contradicted_share: float, config: LoopClosureConfig) -> bool:
+    """Whether enough points meet planes, and few lie in free space.
+
+    Args:
+        matched_share: of the points that are compared.
+        contradicted_share: of those that are visible.
+        config: both limits.
+
+    Returns:
+        True at the limits, too.
+    """
+    return matched_share >= config.min_matched_share and contradicted_share <= config.max_contradicted_share
 
 
 def accept_consistent(

@@ -14,7 +14,7 @@ class LoopState(NamedTuple):
     Attributes:
         loops: every candidate, in the order in which they were found.
         num_optimized: number of keyframes at the last optimisation.
-        is_stale: whether loops were accepted since.
+        is_stale: whether edges were added since that do not only lengthen the chain of odometry.
     """
 
     loops: tuple[Loop, ...] = ()

@@ -17,9 +17,10 @@ from dpmjax.deeppointmap.encoding import encode
 from dpmjax.deeppointmap.matching import merge_clouds
 from dpmjax.deeppointmap.model import Model, model_fingerprint
 from dpmjax.deeppointmap.scan_registration import PreparedScan, register_each
-from dpmjax.deeppointmap.verification import MeasuredScan
+from dpmjax.deeppointmap.verification import MeasuredScan, verify_motion
 from dpmjax.scans.compact import CompactImage, CompactSurface
-from dpmjax.scans.surface_alignment import AlignmentLevel, pair_with_planes
+from dpmjax.scans.surface_alignment import AlignmentLevel, align_surfaces, pair_with_planes
+from dpmjax.slam.alignment import Alignment
 from dpmjax.slam.columns import Arrays, from_columns, to_columns
 from dpmjax.slam.keyframes import Pose, Submap
 from dpmjax.slam.plane_information import plane_information
@@ -112,6 +113,19 @@ class Matcher(Protocol):
         """
         ...
 
+    def align_scans(self, source: Any, target: Any, T_target_source: Pose) -> Alignment | None:
+        """Aligns two scans from a motion that is nearly right.
+
+        Args:
+            source: description of a scan.
+            target: of the other.
+            T_target_source: first guess.
+
+        Returns:
+            The scan in the frame of the other; None where descriptions hold no surfaces.
+        """
+        ...
+
     def overlaps(self, source: Any, targets: Sequence[Any]) -> Float[np.ndarray, " n"]:
         """Estimates the probability that scans see the same place, for many scans at once.
 
@@ -198,6 +212,24 @@ class NetworkMatcher:
         found = register_each(self._model, prepared, refine=True)
         return [self._match(*scans, match) for scans, match in zip(prepared, found, strict=True)]
 
+    def align_scans(self, source: CompactScan, target: CompactScan, T_target_source: Pose) -> Alignment:
+        """Aligns the surfaces of two scans point to plane; see `Matcher`.
+
+        Args:
+            source: a scan.
+            target: the other.
+            T_target_source: first guess.
+
+        Returns:
+            The motion, and how well the scans agree under it.
+        """
+        config = self._model.config.verification
+        scans = expand_scan(source).measured, expand_scan(target).measured
+        surfaces = [scan.surface for scan in scans]
+        T = align_surfaces(*surfaces, T_target_source, config.refinement).T_target_source
+        shares, information = verify_motion(*scans, T, config), self._information(*scans, T)
+        return Alignment(T, shares.matched_share, shares.contradicted_share, shares.score, information)
+
     def overlaps(self, source: CompactScan, targets: Sequence[CompactScan]) -> Float[np.ndarray, " n"]:
         """Asks the overlap head; see `Matcher`.
 
@@ -212,11 +244,15 @@ class NetworkMatcher:
         return np.asarray(overlap_pairs(self._model, [source.descriptors] * len(targets), clouds))
 
     def _match(self, source: PreparedScan, target: PreparedScan, found: Registration) -> Match:
-        T, config = np.asarray(found.T_target_source, np.float64), self._model.config.verification
-        level = AlignmentLevel(config.plane_radius_m, config.num_samples, 1)
-        pairs = pair_with_planes(source.measured.surface, target.measured.surface, T, level)
-        information = plane_information(pairs, T, max_residual_m=config.plane_distance_m)
+        T = np.asarray(found.T_target_source, np.float64)
+        information = self._information(source.measured, target.measured, T)
         return Match(T, float(found.confidence), float(found.rmse_m), found.verification, information)
+
+    def _information(self, source: MeasuredScan, target: MeasuredScan, T: Pose) -> Float[np.ndarray, "6 6"]:
+        config = self._model.config.verification
+        level = AlignmentLevel(config.plane_radius_m, config.num_samples, 1)
+        pairs = pair_with_planes(source.surface, target.surface, T, level)
+        return plane_information(pairs, T, max_residual_m=config.plane_distance_m)
 
 
 def _merged(submap: Submap) -> PreparedScan:
