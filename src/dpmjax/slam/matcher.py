@@ -224,10 +224,9 @@ class NetworkMatcher:
             The motion, and how well the scans agree under it.
         """
         config = self._model.config.verification
-        scans = expand_scan(source).measured, expand_scan(target).measured
-        surfaces = [scan.surface for scan in scans]
-        T = align_surfaces(*surfaces, T_target_source, config.refinement).T_target_source
-        shares, information = verify_motion(*scans, T, config), self._information(*scans, T)
+        scan, other = expand_scan(source).measured, expand_scan(target).measured
+        T = align_surfaces(scan.surface, other.surface, T_target_source, config.refinement).T_target_source
+        shares, information = verify_motion(scan, other, T, config), self._information(scan, other, T)
         return Alignment(T, shares.matched_share, shares.contradicted_share, shares.score, information)
 
     def overlaps(self, source: CompactScan, targets: Sequence[CompactScan]) -> Float[np.ndarray, " n"]:
