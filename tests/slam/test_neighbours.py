@@ -11,7 +11,7 @@ import pytest
 import dpmjax
 from dpmjax.geometry import rigid
 from dpmjax.metrics import absolute_trajectory_error
-from dpmjax.slam import Alignment, SlamConfig, SlamMethods, SlamResult, make_methods, run_slam
+from dpmjax.slam import Alignment, SlamConfig, SlamMethods, SlamResult, make_methods, matcher, run_slam
 from dpmjax.slam.keyframes import diagonal_information
 from dpmjax.slam.neighbours import join_neighbours
 from tests.deeppointmap import toy
@@ -89,7 +89,7 @@ def test_chains_that_nothing_measured_joins_stay_apart() -> None:
     assert len(join_neighbours(methods, slam_map).edges) == len(slam_map.edges) + 2
 
 
-def test_surfaces_in_the_map_are_aligned_from_nearby() -> None:
+def test_surfaces_in_the_map_are_aligned_from_nearby(monkeypatch) -> None:
     drive = toy.drive(1, num_scans=3, step_m=2.0)
     methods = make_methods(dpmjax.init_model(jax.random.key(0), toy.MODEL))
     scans = [
@@ -97,6 +97,8 @@ def test_surfaces_in_the_map_are_aligned_from_nearby() -> None:
     ]
     true = rigid.inverse(drive.T_world_lidar[0]) @ drive.T_world_lidar[2]
     start = true @ noise(np.random.default_rng(0), 0.1, 0.01)
+    assert methods.matcher.align_scans(scans[1], scans[0], start) is None  # too sparse
+    monkeypatch.setattr(matcher, "MIN_ALIGNED_POINTS", 500)
     found = methods.matcher.align_scans(scans[1], scans[0], start)
     assert np.linalg.norm((rigid.inverse(true) @ found.T_map_scan)[:3, 3]) < 0.05
     assert found.matched_share > 0.5

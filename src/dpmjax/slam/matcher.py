@@ -27,6 +27,9 @@ from dpmjax.slam.plane_information import plane_information
 from dpmjax.slam.retrieval import pooled_vector
 from dpmjax.types import DescriptorCloud, Registration, Verification
 
+MIN_ALIGNED_POINTS = 4000
+"""Scans with fewer surface points share too few planes: against the local map of many scans they are placed better."""
+
 
 class Match(NamedTuple):
     """A registration without a first guess.
@@ -122,7 +125,7 @@ class Matcher(Protocol):
             T_target_source: first guess.
 
         Returns:
-            The scan in the frame of the other; None where descriptions hold no surfaces.
+            The scan in the frame of the other; None where the descriptions hold too few points for that.
         """
         ...
 
@@ -212,7 +215,7 @@ class NetworkMatcher:
         found = register_each(self._model, prepared, refine=True)
         return [self._match(*scans, match) for scans, match in zip(prepared, found, strict=True)]
 
-    def align_scans(self, source: CompactScan, target: CompactScan, T_target_source: Pose) -> Alignment:
+    def align_scans(self, source: CompactScan, target: CompactScan, T_target_source: Pose) -> Alignment | None:
         """Aligns the surfaces of two scans point to plane; see `Matcher`.
 
         Args:
@@ -221,8 +224,10 @@ class NetworkMatcher:
             T_target_source: first guess.
 
         Returns:
-            The motion, and how well the scans agree under it.
+            The motion, and how well the scans agree under it; None for sparse scans.
         """
+        if min(len(source.surface.points), len(target.surface.points)) < MIN_ALIGNED_POINTS:
+            return None
         config = self._model.config.verification
         scan, other = expand_scan(source).measured, expand_scan(target).measured
         T = align_surfaces(scan.surface, other.surface, T_target_source, config.refinement).T_target_source
