@@ -22,8 +22,8 @@ from experiments._run_folder import RunFolder
 from experiments._slam_evaluation import ODOMETRY, OURS, PRECISIONS, Drive, StoppedError
 from experiments._slam_input import corrected, read_points, require_whole_files
 from experiments._slam_localization import evaluate_localization
-from experiments._slam_peers import PEERS, why_missing
-from experiments._slam_refine import MULTIWAY, REFINED, evaluate_refinement, why_no_multiway
+from experiments._slam_peers import PEERS, why_missing, why_not_importable
+from experiments._slam_refine import MULTIWAY, REFINED, evaluate_refinement
 
 if TYPE_CHECKING:
     from experiments.dpm_evaluate import Config
@@ -91,7 +91,9 @@ def town_drive(seed: int, number: int, length_m: float) -> LidarSequence:
 
 def missing_peers(config: Config) -> dict[str, str]:
     """Returns the peers that cannot run, and why."""
-    reasons = {name: why_missing(name) for name in PEERS} | ({MULTIWAY: why_no_multiway()} if config.refine else {})
+    reasons = {name: why_missing(name) for name in PEERS}
+    if config.refine:
+        reasons[MULTIWAY] = why_not_importable("open3d", "baselines")
     return {name: reason for name, reason in reasons.items() if reason is not None}
 
 

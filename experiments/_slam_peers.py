@@ -148,11 +148,15 @@ PEERS: dict[str, tuple[str, Callable[..., Any]]] = {
 
 def why_missing(name: str) -> str | None:
     """Returns why a peer cannot run; None where it can."""
-    module = PEERS[name][0]
+    return why_not_importable(PEERS[name][0], "peers")
+
+
+def why_not_importable(module: str, extra: str) -> str | None:
+    """Returns why a package of an extra cannot be used; None where it can."""
     try:
         importlib.import_module(module)
     except ModuleNotFoundError as error:
-        return f"{error.name} is not installed (pip install dpmjax[peers])"
+        return f"{error.name} is not installed (pip install dpmjax[{extra}])"
     except ImportError as error:  # a system library is missing
         return f"it cannot be imported ({str(error).splitlines()[0]})"
     return None

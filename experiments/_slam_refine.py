@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from importlib.util import find_spec
 from typing import Any, NamedTuple
 
 import jax
@@ -26,7 +25,6 @@ from experiments._slam_run import run_alone
 
 WINDOW, OVERLAP = 32, 8
 """Keyframes of a window, and those that it shares with the next one."""
-
 
 REFINED, MULTIWAY = "DeepPointMap refined", "multiway registration"
 
@@ -107,6 +105,7 @@ def evaluate_refinement(drive: Drive, methods: SlamMethods, method: str, seed: i
     if len(run.reports) < len(drive.sequence):
         raise StoppedError
     slam_map, numbers = result.state.slam_map, {}
+    T = slam_map.T_world_keyframe
 
     def read_keyframe(row: int) -> np.ndarray:
         return read_points(drive.sequence, slam_map.keyframes[row].scan)
@@ -114,17 +113,12 @@ def evaluate_refinement(drive: Drive, methods: SlamMethods, method: str, seed: i
     clock = time.perf_counter()
     if method == REFINED:
         T, numbers = refine_keyframes(slam_map, read_keyframe, seed=seed, is_stopped=drive.is_stopped)
-    else:
+    elif len(slam_map) > 1:
         from experiments.baselines.multiway import multiway_clouds
 
-        T = multiway_clouds([read_keyframe(row) for row in range(len(slam_map))], slam_map.T_world_keyframe)
+        T = multiway_clouds([read_keyframe(row) for row in range(len(slam_map))], T)
     seconds = time.perf_counter() - clock
     if drive.is_stopped():
         raise StoppedError
     row = common_numbers(drive, method, place_scans(T, run.reports), [])
     return {**row, **numbers, "num_keyframes": len(slam_map), "scan_s": seconds / len(drive.sequence)}
-
-
-def why_no_multiway() -> str | None:
-    """Returns why Open3D cannot run; None where it can."""
-    return None if find_spec("open3d") is not None else "open3d is not installed (pip install dpmjax[baselines])"

@@ -116,7 +116,7 @@ def test_refinements_are_rows_that_a_resumed_run_may_add(with_toys, tmp_path, mo
         return _slam_refine.Refined(T, {"refine_windows": 1})
 
     monkeypatch.setattr(_slam_refine, "refine_keyframes", moved)
-    monkeypatch.setattr(_slam_refine, "find_spec", lambda name: None)
+    monkeypatch.setitem(sys.modules, "open3d", None)
     assert run("--slam", "--resume", "--refine", "-o", out) == EXIT_OK
     assert "multiway registration was not run: open3d is not installed" in capsys.readouterr().out
     rows = {row["method"]: row for row in load_json(out / "metrics.json")["rows"]}
