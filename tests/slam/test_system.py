@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -10,6 +10,7 @@ import pytest
 from dpmjax.geometry import rigid
 from dpmjax.metrics import absolute_trajectory_error
 from dpmjax.slam import SlamConfig, SlamMethods, SlamResult, init_slam, run_slam, step_slam
+from dpmjax.slam.matcher import Match
 from tests.slam.truth import EMPTY, MistakenMatcher, TruthGeometry, TruthMatcher, laps, pose, scans_of
 
 CONFIG = SlamConfig()
@@ -72,6 +73,27 @@ def test_exact_parts_give_the_exact_trajectory() -> None:
     np.testing.assert_allclose(result.T_world_scan, rigid.inverse(truth[0]) @ truth, atol=1e-6)
     assert result.reports[0].status == "first"
     assert {report.status for report in result.reports[1:]} == {"tracked"}
+
+
+@dataclass(frozen=True)
+class AligningMatcher(TruthMatcher):
+    """Says of its registrations, too, how exact they are."""
+
+    def _match(self, source: int, target: int) -> Match:
+        match = super()._match(source, target)
+        information = np.diag(np.repeat([max(self.sigma_m, 1e-3) ** -2, max(self.sigma_rad, 1e-4) ** -2], 3))
+        return match._replace(information=information)
+
+
+def test_loops_that_are_known_to_be_exact_correct_more() -> None:
+    truth = laps(2, side_m=80.0, step_m=2.0)
+    geometry = TruthGeometry(truth, sigma_m=0.005, sigma_rad=0.0002)
+    exact = {"gross_share": 0.0, "sigma_m": 0.0, "sigma_rad": 0.0}
+    matchers = TruthMatcher(truth, **exact), AligningMatcher(truth, **exact)
+    results = [run(truth, geometry=geometry, matcher=matcher) for matcher in matchers]
+    ates = [absolute_trajectory_error(result.T_world_scan[:, :3, 3], truth[:, :3, 3]) for result in results]
+    assert errors_of_loops(results[1], truth).max() < 1e-6
+    assert ates[1] < 0.9 * ates[0]
 
 
 def test_same_input_gives_same_output() -> None:

@@ -151,8 +151,10 @@ class LoopClosureConfig:
         max_contradicted_share: share of the points that may lie in free space.
         min_support: number of consistent registrations, itself among them, that a loop needs to become an edge.
         pending_path_m: registrations support each other if both ends are nearer than this along the path.
-        sigma_m: standard deviation of a registration ...
+        sigma_m: standard deviation of a registration by descriptors ...
         sigma_rad: ... and of its rotation.
+        floor_m: least standard deviation of a loop whose scans were aligned: scans hold walkers and rolling shutter ...
+        floor_rad: ... and of its rotation.
         drift_m: standard deviation of odometry over one metre; it grows with the root of the path ...
         drift_rad: ... and that of its rotation.
         consistent_sigmas: a cycle closes within this many standard deviations.
@@ -183,6 +185,8 @@ class LoopClosureConfig:
     pending_path_m: float = 40.0
     sigma_m: float = 0.2
     sigma_rad: float = 0.02
+    floor_m: float = 0.05
+    floor_rad: float = 0.005
     drift_m: float = 0.05
     drift_rad: float = 0.004
     consistent_sigmas: float = 3.0
@@ -200,7 +204,8 @@ class LoopClosureConfig:
         require_fields(self, "num_near", "num_similar", "min_path_share", "drift_share", "min_drift_share", low=0)
         require_fields(self, "rest_share", "every_share", low=0)
         require_positive_fields(self, "radius_share", "max_radius_m", "pending_path_m", "consistent_sigmas")
-        require_positive_fields(self, "sigma_m", "sigma_rad", "drift_m", "drift_rad", "edge_outlier_chi2")
+        require_positive_fields(self, "sigma_m", "sigma_rad", "floor_m", "floor_rad", "drift_m", "drift_rad")
+        require_positive_fields(self, "edge_outlier_chi2")
 
 
 @dataclass(frozen=True)

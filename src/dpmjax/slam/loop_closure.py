@@ -151,7 +151,7 @@ def _unregistered(overlap: float | None, config: LoopClosureConfig) -> LoopStatu
 
 
 def _edge_information(match: Match, config: LoopClosureConfig) -> Float[np.ndarray, "6 6"]:
-    """Returns what the planes tell; a registration is never more exact than the configuration says."""
+    """Returns what the planes tell, with a floor; descriptors alone are as exact as the configuration says."""
     if match.information is None:
         return diagonal_information(config.sigma_m, config.sigma_rad)
-    return with_least_covariance(match.information, config.sigma_m, config.sigma_rad)
+    return with_least_covariance(match.information, config.floor_m, config.floor_rad)
