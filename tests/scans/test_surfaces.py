@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from dpmjax.geometry import estimate_normals
-from dpmjax.scans.surface_alignment import AlignmentConfig, AlignmentLevel, align_surfaces
+from dpmjax.scans.surface_alignment import AlignmentConfig, AlignmentLevel, align_surfaces, align_surfaces_from
 from dpmjax.scans.surfaces import SurfaceConfig, scan_surface
 from tests.scans.surface_scenes import motion, seen_from, street
 
@@ -80,6 +80,21 @@ def test_what_no_plane_holds_stays() -> None:
     found = align_surfaces(*map(scan_surface, plain), start, num_threads=1).T_target_source
     assert abs(found[2, 3]) < 0.01
     np.testing.assert_allclose(found[:2, 3], start[:2, 3], atol=0.05)
+
+
+def test_starts_that_are_aligned_together_end_as_alone() -> None:
+    a, b = scan_surface(street(6)), scan_surface(street(7))
+    nowhere = motion(0, (500.0, 0, 0))
+    starts = np.array([motion(2, (0.5, 0.3, 0)), nowhere, np.eye(4), motion(-60, (0, 2, 0))])
+    together = align_surfaces_from(a, b, starts)
+    for start, found in zip(starts, together, strict=True):
+        alone = align_surfaces(a, b, start, num_threads=1)
+        np.testing.assert_allclose(found.T_target_source, alone.T_target_source, atol=1e-9)
+        assert found.num_pairs == alone.num_pairs
+        np.testing.assert_allclose(found.rmse_m, alone.rmse_m)
+    np.testing.assert_array_equal(together[1].T_target_source, nowhere)
+    assert np.isinf(together[1].rmse_m)
+    np.testing.assert_allclose(together[0].T_target_source, together[2].T_target_source, atol=0.01)
 
 
 def test_alignment_moves_with_the_frames() -> None:

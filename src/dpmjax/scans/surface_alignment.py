@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from scipy.spatial.transform import Rotation
 
 from dpmjax.checks import require_count, require_fields, require_positive
@@ -124,32 +124,55 @@ def align_surfaces(
     Returns:
         The motion; the first guess where there are too few pairs.
     """
-    T, rmse_m, num_pairs = np.array(T_target_source, np.float64), np.inf, 0
+    (found,) = align_surfaces_from(source, target, np.asarray(T_target_source)[None], config, num_threads=num_threads)
+    return found
+
+
+def align_surfaces_from(
+    source: Surface,
+    target: Surface,
+    T_target_source: Float[np.ndarray, "s 4 4"],
+    config: AlignmentConfig = AlignmentConfig(),
+    *,
+    num_threads: int = 2,
+) -> list[SurfaceAlignment]:
+    """Aligns two surfaces from several first guesses, in step: all of them look up their neighbours together.
+
+    Args:
+        source: surface of a scan.
+        target: the other.
+        T_target_source: first guesses; see `align_surfaces`.
+        config: levels and kernel.
+        num_threads: threads of the neighbour search.
+
+    Returns:
+        What `align_surfaces` returns for each guess.
+    """
+    T = np.array(T_target_source, np.float64)
+    rmse_m, num_pairs = np.full(len(T), np.inf), np.zeros(len(T), int)
+    has_pairs = np.ones(len(T), bool)
     for level in config.levels:
-        width = max(config.min_kernel_m, config.kernel_share * level.radius_m)
+        is_active = has_pairs.copy()
         for _ in range(level.num_iterations):
-            pairs = pair_with_planes(source, target, T, level, num_threads=num_threads)
-            num_pairs = len(pairs.residuals)
-            if num_pairs < MIN_PAIRS:
-                return SurfaceAlignment(T, np.inf, num_pairs)
-            weights = pairs.flatness * np.maximum(pairs.cosines - config.min_cosine, 0)
-            weights *= (width**2 / (width**2 + pairs.residuals**2)) ** 2
-            total = weights.sum()
-            rmse_m = float(np.sqrt(np.sum(weights * pairs.residuals**2) / total)) if total > 0 else np.inf
-            step = _step_to_planes(pairs, weights)
-            T = _motion(step, pairs.points.mean(axis=0)) @ T
-            if np.linalg.norm(step[:3]) < config.converged_m and np.linalg.norm(step[3:]) < config.converged_rad:
+            rows = np.flatnonzero(is_active)
+            if len(rows) == 0:
                 break
-    return SurfaceAlignment(T, rmse_m, num_pairs)
+            pairs = _nearest_planes(source, target, T[rows], level, num_threads)
+            num_pairs[rows] = pairs.is_paired.sum(axis=1)
+            is_enough = num_pairs[rows] >= MIN_PAIRS
+            lost = rows[~is_enough]
+            rmse_m[lost], has_pairs[lost], is_active[lost] = np.inf, False, False
+            if not is_enough.all():
+                rows, pairs = rows[is_enough], pairs.take(is_enough)
+            step, centre, rmse_m[rows] = _step_to_planes(pairs, level, config)
+            T[rows] = _motions(step, centre) @ T[rows]
+            length_m, angle_rad = np.linalg.norm(step[:, :3], axis=1), np.linalg.norm(step[:, 3:], axis=1)
+            is_active[rows] = (length_m >= config.converged_m) | (angle_rad >= config.converged_rad)
+    return [SurfaceAlignment(*found) for found in zip(T, rmse_m.tolist(), num_pairs.tolist(), strict=True)]
 
 
 def pair_with_planes(
-    source: Surface,
-    target: Surface,
-    T_target_source: Float[np.ndarray, "4 4"],
-    level: AlignmentLevel,
-    *,
-    num_threads: int = 1,
+    source: Surface, target: Surface, T_target_source: Float[np.ndarray, "4 4"], level: AlignmentLevel
 ) -> PlanePairs:
     """Pairs the first samples of the source with the nearest planes of the target.
 
@@ -158,44 +181,87 @@ def pair_with_planes(
         target: the other.
         T_target_source: motion of the source.
         level: radius and number of points.
-        num_threads: threads of the neighbour search.
 
     Returns:
         The pairs; points without a neighbour within the radius are left out.
     """
-    rows, R = source.samples[: level.num_points], T_target_source[:3, :3]
-    moved = source.points[rows] @ R.T + T_target_source[:3, 3]
-    if len(rows) == 0 or len(target.points) == 0:
-        empty = np.zeros((0, 3))
-        return PlanePairs(empty, np.zeros(0), empty, np.zeros(0), np.zeros(0))
-    workers = num_threads if len(moved) >= MIN_POINTS_FOR_THREADS else 1
-    found = target.tree.query(moved, distance_upper_bound=level.radius_m, workers=workers)
-    distances, nearest = map(np.asarray, found)
+    pairs = _nearest_planes(source, target, np.asarray(T_target_source)[None], level, num_threads=1)
+    return PlanePairs(*(values[pairs.is_paired] for values in pairs[1:]))
+
+
+class _NearestPlanes(NamedTuple):
+    """Samples of the source under several motions, and the planes nearest to them; what is not paired has any."""
+
+    is_paired: Bool[np.ndarray, "s n"]
+    points: Float[np.ndarray, "s n 3"]
+    residuals: Float[np.ndarray, "s n"]
+    normals: Float[np.ndarray, "s n 3"]
+    cosines: Float[np.ndarray, "s n"]
+    flatness: Float[np.ndarray, "s n"]
+
+    def take(self, rows: Bool[np.ndarray, " s"]) -> _NearestPlanes:
+        return _NearestPlanes(*(values[rows] for values in self))
+
+
+def _nearest_planes(
+    source: Surface,
+    target: Surface,
+    T_target_source: Float[np.ndarray, "s 4 4"],
+    level: AlignmentLevel,
+    num_threads: int,
+) -> _NearestPlanes:
+    rows, R_transposed = source.samples[: level.num_points], T_target_source[:, :3, :3].transpose(0, 2, 1)
+    moved = source.points[rows] @ R_transposed + T_target_source[:, None, :3, 3]
+    if len(target.points) == 0:
+        nothing = np.zeros(moved.shape[:2])
+        return _NearestPlanes(nothing > 0, moved, nothing, np.zeros_like(moved), nothing, nothing)
+    workers = num_threads if moved[..., 0].size >= MIN_POINTS_FOR_THREADS else 1
+    distances, nearest = target.tree.query(moved, distance_upper_bound=level.radius_m, workers=workers)
     is_paired = np.isfinite(distances)
-    rows, moved, nearest = rows[is_paired], moved[is_paired], nearest[is_paired]
+    nearest = np.where(is_paired, nearest, 0)
     normals = target.normals[nearest]
-    return PlanePairs(
+    return _NearestPlanes(
+        is_paired,
         points=moved,
-        residuals=np.sum((moved - target.points[nearest]) * normals, axis=1),
+        residuals=np.einsum("snd,snd->sn", moved - target.points[nearest], normals),
         normals=normals,
-        cosines=np.abs(np.sum((source.normals[rows] @ R.T) * normals, axis=1)),
+        cosines=np.abs(np.einsum("snd,snd->sn", source.normals[rows] @ R_transposed, normals)),
         flatness=target.flatness[nearest],
     )
 
 
-def _step_to_planes(pairs: PlanePairs, weights: Float[np.ndarray, " p"]) -> Float[np.ndarray, " 6"]:
-    """Returns the small translation and rotation, about the points' mean, that brings points onto their planes."""
-    levers = pairs.points - pairs.points.mean(axis=0)
-    jacobian = np.concatenate([pairs.normals, np.cross(levers, pairs.normals)], axis=1)
+def _step_to_planes(
+    pairs: _NearestPlanes, level: AlignmentLevel, config: AlignmentConfig
+) -> tuple[Float[np.ndarray, "s 6"], Float[np.ndarray, "s 3"], Float[np.ndarray, " s"]]:
+    """Returns the small translation and rotation that bring points onto their planes, its centre, and the rmse."""
+    width = max(config.min_kernel_m, config.kernel_share * level.radius_m)
+    weights = pairs.flatness * np.maximum(pairs.cosines - config.min_cosine, 0) * pairs.is_paired
+    weights *= (width**2 / (width**2 + pairs.residuals**2)) ** 2
+    total = weights.sum(axis=1)
+    squares = np.sum(weights * pairs.residuals**2, axis=1)
+    rmse_m = np.sqrt(np.divide(squares, total, out=np.full(len(total), np.inf), where=total > 0))
+    centre = np.einsum("sn,snd->sd", pairs.is_paired.astype(float), pairs.points) / pairs.is_paired.sum(axis=1)[:, None]
+    jacobian = _jacobian(pairs.points - centre[:, None], pairs.normals)
     weighted = weights[:, None] * jacobian
-    system = weighted.T @ jacobian
+    system = weighted @ jacobian.transpose(0, 2, 1)
     # Directions that no plane holds stay as they are.
-    damping = 1e-6 * np.diag(system) + 1e-9 * np.trace(system) + np.finfo(float).tiny
-    return -np.linalg.solve(system + np.diag(damping), weighted.T @ pairs.residuals)
+    diagonal = np.einsum("sii->si", system)
+    damping = 1e-6 * diagonal + 1e-9 * diagonal.sum(axis=1, keepdims=True) + np.finfo(float).tiny
+    system = system + damping[..., None] * np.eye(6)
+    return -np.linalg.solve(system, weighted @ pairs.residuals[..., None])[..., 0], centre, rmse_m
 
 
-def _motion(step: Float[np.ndarray, " 6"], centre: Float[np.ndarray, " 3"]) -> Float[np.ndarray, "4 4"]:
-    T = np.eye(4)
-    T[:3, :3] = Rotation.from_rotvec(step[3:]).as_matrix()
-    T[:3, 3] = step[:3] + centre - T[:3, :3] @ centre
+def _jacobian(levers: Float[np.ndarray, "s n 3"], normals: Float[np.ndarray, "s n 3"]) -> Float[np.ndarray, "s 6 n"]:
+    """Returns the normals, and the levers crossed with them."""
+    jacobian = np.empty((len(normals), 6, normals.shape[1]))
+    (lx, ly, lz), (nx, ny, nz) = np.moveaxis(levers, -1, 0), np.moveaxis(normals, -1, 0)
+    for row, values in enumerate((nx, ny, nz, ly * nz - lz * ny, lz * nx - lx * nz, lx * ny - ly * nx)):
+        jacobian[:, row] = values
+    return jacobian
+
+
+def _motions(step: Float[np.ndarray, "s 6"], centre: Float[np.ndarray, "s 3"]) -> Float[np.ndarray, "s 4 4"]:
+    T = np.tile(np.eye(4), (len(step), 1, 1))
+    T[:, :3, :3] = Rotation.from_rotvec(step[:, 3:]).as_matrix()
+    T[:, :3, 3] = step[:, :3] + centre - np.einsum("sij,sj->si", T[:, :3, :3], centre)
     return T

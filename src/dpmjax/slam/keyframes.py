@@ -284,17 +284,17 @@ def are_near(T_a: Pose, T_b: Pose, most_m: float, most_rad: float) -> bool:
     return bool(np.linalg.norm(apart[:3, 3]) <= most_m) and turn_rad(apart) <= most_rad
 
 
-def orthonormal(T_a_b: Pose) -> Pose:
-    """Removes the rounding errors of a rotation, which would grow from scan to scan.
+def orthonormal(T_a_b: Float[np.ndarray, "*b 4 4"]) -> Float[np.ndarray, "*b 4 4"]:
+    """Removes the rounding errors of rotations, which would grow from scan to scan.
 
     Args:
-        T_a_b: nearly a rigid motion.
+        T_a_b: nearly rigid motions.
 
     Returns:
-        The rigid motion.
+        The rigid motions.
     """
     T = np.array(T_a_b, np.float64)
-    T[:3, :3] = Rotation.from_matrix(T[:3, :3]).as_matrix()
+    T[..., :3, :3] = Rotation.from_matrix(T[..., :3, :3]).as_matrix()
     return T
 
 

@@ -19,7 +19,7 @@ from dpmjax.deeppointmap.verification import MeasuredScan
 from dpmjax.geometry import rigid
 from dpmjax.scans.free_space import range_image, view_points
 from dpmjax.scans.preprocess import first_of_each_voxel
-from dpmjax.scans.surface_alignment import AlignmentLevel, PlanePairs, align_surfaces, pair_with_planes
+from dpmjax.scans.surface_alignment import AlignmentLevel, PlanePairs, align_surfaces_from, pair_with_planes
 from dpmjax.scans.surfaces import MIN_FLATNESS, Surface, SurfaceConfig, scan_surface
 from dpmjax.slam.alignment import Alignment, PosePrior
 from dpmjax.slam.columns import Arrays
@@ -29,6 +29,9 @@ from dpmjax.slam.plane_information import plane_information, with_least_covarian
 
 MAX_LOCAL_POINTS = 4000
 """Points of the local map that are compared with the free space of a scan."""
+
+NUM_FINE = 3
+"""So many of the other starts are aligned finely."""
 
 
 class MapFrame(NamedTuple):
@@ -164,22 +167,19 @@ class SurfaceGeometry:
     def _align_in_start(self, local_map: LocalMap, measured: MeasuredScan, starts: PosePrior) -> Alignment:
         """Aligns where the map frame is that of the surface."""
         config = self.config
-        best = self._aligned(local_map, measured, starts.T_map_last @ starts.T_last_scan)
+        (best,) = self._aligned(local_map, measured, (starts.T_map_last @ starts.T_last_scan)[None])
         wanted = config.good_share * starts.usual_score
         if best.score >= wanted or starts.is_sure:
             return best
-        tried = 1
+        others = starts.T_map_last @ _other_motions(starts.T_last_scan, self.extent_m(measured), config)
         coarse = []
-        for T_last_scan in _other_motions(starts.T_last_scan, self.extent_m(measured), config):
-            start = starts.T_map_last @ T_last_scan
-            T = align_surfaces(measured.surface, local_map.surface, start, config.wide).T_target_source
-            num_samples = config.num_samples // 3
-            pairs = self._pairs(local_map, measured, T, num_samples)
-            coarse.append((self._matched_share(pairs, measured, num_samples), tried, T))
-            tried += 1
-        for _, _, T in sorted(coarse, key=lambda entry: (-entry[0], entry[1]))[:3]:
-            best = max(best, self._aligned(local_map, measured, T), key=lambda found: found.score)
-        return best._replace(num_starts=tried)
+        for found in align_surfaces_from(measured.surface, local_map.surface, others, config.wide):
+            pairs = self._pairs(local_map, measured, found.T_target_source, config.num_samples // 3)
+            coarse.append((self._matched_share(pairs, measured, config.num_samples // 3), found.T_target_source))
+        coarse.sort(key=lambda entry: -entry[0])
+        fine = self._aligned(local_map, measured, np.array([T for _, T in coarse[:NUM_FINE]]))
+        best = max(best, *fine, key=lambda found: found.score)
+        return best._replace(num_starts=1 + len(others))
 
     def pack(self, local_map: LocalMap) -> Arrays:
         """Keeps numbers and poses of the frames; see `Geometry`.
@@ -216,9 +216,15 @@ class SurfaceGeometry:
         sizes = [size for size in self.config.voxel_sizes_m if size <= self.config.voxel_share * extent_m]
         return max(sizes, default=min(self.config.voxel_sizes_m))
 
-    def _aligned(self, local_map: LocalMap, measured: MeasuredScan, start: Pose) -> Alignment:
+    def _aligned(
+        self, local_map: LocalMap, measured: MeasuredScan, starts: Float[np.ndarray, "s 4 4"]
+    ) -> list[Alignment]:
+        surface, map_surface, starts = measured.surface, local_map.surface, orthonormal(starts)
+        found = align_surfaces_from(surface, map_surface, starts, self.config.narrow)
+        return [self._judged(local_map, measured, each.T_target_source) for each in found]
+
+    def _judged(self, local_map: LocalMap, measured: MeasuredScan, T: Pose) -> Alignment:
         config = self.config
-        T = align_surfaces(measured.surface, local_map.surface, orthonormal(start), config.narrow).T_target_source
         pairs = self._pairs(local_map, measured, T, config.num_samples)
         matched = self._matched_share(pairs, measured, config.num_samples)
         contradicted = _contradicted_share(local_map, measured, T)
@@ -270,7 +276,7 @@ def _contradicted_share(local_map: LocalMap, measured: MeasuredScan, T_map_scan:
     return float(views.is_contradicted.sum()) / max(int(views.is_visible.sum()), 1)
 
 
-def _other_motions(T_last_scan: Pose, extent_m: float, config: OdometryConfig) -> list[Pose]:
+def _other_motions(T_last_scan: Pose, extent_m: float, config: OdometryConfig) -> Float[np.ndarray, "s 4 4"]:
     """Returns the predicted step, shorter, longer and turned, and steps straight ahead and back."""
     R = T_last_scan[:3, :3]
     motions = [(R, factor * T_last_scan[:3, 3]) for factor in config.step_factors]
@@ -286,4 +292,4 @@ def _other_motions(T_last_scan: Pose, extent_m: float, config: OdometryConfig) -
     found = np.tile(np.eye(4), (len(motions), 1, 1))
     for T, (rotation, translation) in zip(found, motions, strict=True):
         T[:3, :3], T[:3, 3] = rotation, translation
-    return list(found)
+    return found
