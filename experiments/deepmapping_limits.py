@@ -89,14 +89,23 @@ def _prepare(config: Config, cell: dict[str, Any]) -> tuple[Task, dict[str, Any]
     return shared.make_task(scans, is_ordered=cell["order"] == "ordered", steps=config.steps, seed=config.seed), {}
 
 
-def success_grid(rows: list[dict[str, Any]], method: str, config: Config) -> NDArray[np.float64]:
-    """Returns (strides, noises) success rates, smallest stride first; NaN where nothing was run."""
-    cells: dict[tuple[Any, ...], list[bool]] = defaultdict(list)
+def success_grids(rows: Sequence[dict[str, Any]], config: Config) -> dict[str, NDArray[np.float64]]:
+    """Returns (strides, noises) success rates of every method and candidate, smallest stride first; NaN: not run."""
+    cells: dict[str, dict[tuple[Any, ...], list[bool]]] = defaultdict(lambda: defaultdict(list))
     for row in rows:
-        cells[row["method"], row["stride"], row["noise_px"]].append(row["success"])
-    means = {cell: np.mean(successes) for cell, successes in cells.items()}
-    strides = sorted(config.strides)
-    return np.array([[means.get((method, i, j), np.nan) for j in config.noises_px] for i in strides])
+        for column, is_right in _successes(row).items():
+            cells[column][row["stride"], row["noise_px"]].append(is_right)
+    strides, empty = sorted(config.strides), [np.nan]
+    return {
+        column: np.array([[np.mean(found.get((i, j), empty)) for j in config.noises_px] for i in strides])
+        for column, found in cells.items()
+    }
+
+
+def _successes(row: dict[str, Any]) -> dict[str, bool]:
+    """Whether each candidate of a row is right, and the kept one of several."""
+    found = {_column(row, name): numbers["ate_px"] < shared.SUCCESS_PX for name, numbers in row["candidates"].items()}
+    return found if len(found) == 1 else found | {_column(row, "kept"): row["success"]}
 
 
 def summary(rows: Sequence[dict[str, Any]]) -> list[str]:
@@ -151,7 +160,7 @@ def _write(config: Config, folder: RunFolder, rows: list[dict[str, Any]], not_ru
     (folder / "table.md").write_text(table(rows) + "\n", encoding="utf-8")
     for (world, order), mine in _grouped(rows, "world", "order").items():
         figure = viz.success_grids_figure(
-            {method: success_grid(mine, method, config) for method in dict.fromkeys(row["method"] for row in mine)},
+            success_grids(mine, config),
             {"scans used": [f"1/{stride}" for stride in sorted(config.strides)]},
             {"range noise, px": [f"{noise:g}" for noise in config.noises_px]},
         )

@@ -24,6 +24,14 @@ def test_each_success_rate_stands_in_its_cell_and_open_cells_are_empty():
     assert (icp.get_ylabel(), icp.get_xlabel()) == ("scans used", "range noise, px")
 
 
+def test_many_grids_stand_in_lines_and_each_line_is_labelled():
+    names = [f"method {number} with a long name" for number in range(7)]
+    figure = success_grids_figure({name: np.ones((3, 2)) for name in names}, ROWS, COLUMNS)
+    assert [ax.get_title().replace("\n", " ") for ax in figure.axes] == names
+    assert [number for number, ax in enumerate(figure.axes) if ax.get_ylabel() == "scans used"] == [0, 4]
+    assert [number for number, ax in enumerate(figure.axes) if len(ax.get_yticks())] == [0, 4]
+
+
 def test_rates_can_be_read_on_their_ground():
     figure = success_grids_figure({"icp": np.array([[1.0, 0.0]])}, {"r": ["1"]}, {"c": ["a", "b"]})
     high, low = (text.get_color() for text in figure.axes[0].texts)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -15,6 +16,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 SOURCE, GREEN, DIRECT = "#30638e", "#2a9d6f", "#00a6c8"
+GRIDS_IN_A_LINE, LETTERS_IN_A_LINE = 5, 24
 
 
 def error_boxes_figure(
@@ -50,10 +52,10 @@ def error_boxes_figure(
 def success_grids_figure(
     grids: Mapping[str, NDArray[np.float64]], rows: Mapping[str, Sequence[str]], columns: Mapping[str, Sequence[str]]
 ) -> Figure:
-    """Draws one grid of success rates for each method; cells that were not run are empty.
+    """Draws one grid of success rates for each method, five in a line; cells that were not run are empty.
 
     Args:
-        grids: (r, c) rates from 0 to 1 by method; NaN: not run.
+        grids: (r, c) rates from 0 to 1 by method, at least one; NaN: not run.
         rows: what the rows are, with the name of each.
         columns: what the columns are, with the name of each.
 
@@ -70,19 +72,25 @@ def success_grids_figure(
             raise ValueError(
                 f"{method}: expected {len(row_names)} rows and {len(column_names)} columns, got {rates.shape}"
             )
-    figure = new_figure(1.2 + 2.1 * len(grids), 1.3 + 0.42 * len(row_names))
-    axes = figure.subplots(1, len(grids), sharey=True, squeeze=False)[0]
-    for ax, (method, rates) in zip(axes, grids.items(), strict=True):
+    num_lines = -(-len(grids) // GRIDS_IN_A_LINE)
+    num_in_line = -(-len(grids) // num_lines)
+    figure = new_figure(1.2 + 2.1 * num_in_line, num_lines * (1.3 + 0.42 * len(row_names)))
+    axes = figure.subplots(num_lines, num_in_line, squeeze=False)
+    for ax in axes.flat[len(grids) :]:
+        ax.remove()
+    for ax, (method, rates) in zip(axes.flat, grids.items(), strict=False):
         ax.imshow(rates, vmin=0.0, vmax=1.0, cmap="cividis", aspect="auto")
         for (i, j), rate in np.ndenumerate(rates):
             if np.isfinite(rate):
                 ink = INK if rate > 0.5 else "white"
                 ax.text(j, i, f"{100 * rate:.0f}", ha="center", va="center", fontsize=8, color=ink)
-        ax.set_title(method, fontsize=9, color=INK)
+        ax.set_title(textwrap.fill(method, LETTERS_IN_A_LINE), fontsize=9, color=INK)
         ax.set_xticks(range(len(column_names)), list(column_names), fontsize=8)
-        ax.set_yticks(range(len(row_names)), list(row_names), fontsize=8)
+        ax.set_yticks([])
         ax.set_xlabel(column_label, fontsize=8)
-    axes[0].set_ylabel(row_label, fontsize=8)
+    for ax in axes[:, 0]:
+        ax.set_yticks(range(len(row_names)), list(row_names), fontsize=8)
+        ax.set_ylabel(row_label, fontsize=8)
     figure.tight_layout()
     return figure
 
