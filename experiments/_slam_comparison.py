@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -67,7 +68,8 @@ def open_drives(config: Config, first_town: int) -> list[LidarSequence]:
     for entry in config.paths:
         if entry == TOWN and not Path(entry).exists():
             lengths = np.linspace(*config.town_length_range, config.num_towns)
-            drives += [town_drive(first_town + number, number, length) for number, length in enumerate(lengths)]
+            towns = [town_drive(first_town + number, number, length) for number, length in enumerate(lengths)]
+            drives += _with_kept_scans(towns)
         else:
             names: Sequence[str | None] = io.list_lidar_sequences(entry) or [None]
             opened = (io.open_lidar_sequence(entry, sequence=name) for name in names)
@@ -87,6 +89,22 @@ def town_drive(seed: int, number: int, length_m: float) -> LidarSequence:
     kind, route, sensor = TOWNS[number % len(TOWNS)]
     driving = DriveConfig(rate_hz=TOWN_RATE_HZ, sensor_height_m=sensor.height_m, max_turn_deg_s=TOWN_TURN_DEG_S)
     return simulate_scene(Scene(seed, TownConfig(kind, route, length_m, TOWN_BLOCK_M), driving, sensor))
+
+
+def _with_kept_scans(drives: Sequence[LidarSequence]) -> list[LidarSequence]:
+    """Keeps the scans of the drive that was read last in memory: to cast them again for each method takes long."""
+    kept: dict[str, dict[int, np.ndarray]] = {}
+
+    def read(drive: LidarSequence, index: int) -> np.ndarray:
+        if drive.name not in kept:
+            kept.clear()
+        scans = kept.setdefault(drive.name, {})
+        if index not in scans:
+            scans[index] = drive.read_scan(index)
+            scans[index].flags.writeable = False
+        return scans[index]
+
+    return [replace(drive, read_scan=partial(read, drive)) for drive in drives]
 
 
 def missing_peers(config: Config) -> dict[str, str]:

@@ -104,6 +104,28 @@ def test_every_method_gets_a_row_and_a_resumed_run_computes_nothing_again(
     assert load_json(out / "metrics.json")["rows"] == metrics["rows"]
 
 
+def test_scans_of_a_town_are_cast_once_for_all_methods() -> None:
+    cast: list[tuple[str, int]] = []
+
+    def town(name: str) -> LidarSequence:
+        def read_scan(index: int) -> np.ndarray:
+            cast.append((name, index))
+            return np.full((1, 3), index, np.float32)
+
+        return LidarSequence(name, ("first", "second"), read_scan)
+
+    first, second = _slam_comparison._with_kept_scans([town("a"), town("b")])
+    for _ in range(2):
+        assert [int(first.read_scan(index)[0, 0]) for index in range(2)] == [0, 1]
+    assert cast == [("a", 0), ("a", 1)]
+    with pytest.raises(ValueError, match="read-only"):
+        first.read_scan(0)[:] = 5.0
+    # Only the drive that was read last is kept.
+    for drive in (second, second, first):
+        drive.read_scan(1)
+    assert cast[2:] == [("b", 1), ("a", 1)]
+
+
 def test_refinements_are_rows_that_a_resumed_run_may_add(with_toys, tmp_path, monkeypatch, capsys) -> None:
     out, drive = tmp_path / "out", toy.drive(1, num_scans=NUM_SCANS)
     assert run("--slam", "town", "--weights", with_toys, "--num-towns", 1, "--localize", 0, "-o", out) == EXIT_OK
