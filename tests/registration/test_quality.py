@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from dpmjax.geometry import se2
-from dpmjax.registration import assess_trajectory, choose_trajectory, planar_scans
+from dpmjax.registration import assess_trajectory, choose_trajectory, planar_scans, quality
 from dpmjax.registration.quality import map_code_length, view_misfit
 from dpmjax.simulation import scan_world, simulate_sequence
 
@@ -65,6 +65,21 @@ def test_the_sharper_of_two_near_maps_is_chosen_with_and_without_walls(world) ->
     misfits = [view_misfit(scans, shaken(true, px)) for px in (0.0, 1.0, 3.0, 9.0)]
     assert misfits == sorted(misfits)
     assert choose_trajectory(scans, {"shaken": shaken(true, 1.0), "true": true})[0] == "true"
+
+
+@pytest.mark.parametrize(("noise_px", "expected"), [(1.0, "sharp"), (15.0, "short")])
+def test_surfaces_decide_only_where_the_noise_lets_them(noise_px: float, expected: str, monkeypatch) -> None:
+    sequence = simulate_sequence(0, 21, seed=2, num_beams=128, range_noise_px=noise_px).take(slice(0, None, 4))
+    scans, true = planar_scans(sequence.points, sequence.mask), sequence.reference_poses
+    scores = {0: (1.0, 0.5), 1: (1.05, 0.4), 2: (1.2, 0.3)}
+
+    def score(poses: np.ndarray) -> tuple[float, float]:
+        return scores[round(poses[0, 0] - true[0, 0])]
+
+    monkeypatch.setattr(quality, "map_code_length", lambda _, poses: score(poses)[0])
+    monkeypatch.setattr(quality, "view_misfit", lambda _, poses: score(poses)[1])
+    candidates = {"short": true, "sharp": true + 1.0, "long": true + 2.0}
+    assert choose_trajectory(scans, candidates)[0] == expected
 
 
 def test_misfit_is_the_share_of_the_visible_beams_in_a_square_room() -> None:

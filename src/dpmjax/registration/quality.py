@@ -63,6 +63,8 @@ class Score(NamedTuple):
 def choose_trajectory(scans: PlanarScans, candidates: Mapping[str, Floats]) -> tuple[str, dict[str, Score]]:
     """The best trajectory: among those whose maps are about as short to describe as the shortest, the sharpest.
 
+    With so much range noise that no map can be trusted, surfaces tell nothing, and the shortest is the best.
+
     Args:
         scans: n scans.
         candidates: (n, 3) poses by name.
@@ -79,7 +81,8 @@ def choose_trajectory(scans: PlanarScans, candidates: Mapping[str, Floats]) -> t
         name: Score(map_code_length(scans, poses), view_misfit(scans, poses)) for name, poses in candidates.items()
     }
     shortest = min(score.code_length for score in scores.values())
-    as_short = [name for name, score in scores.items() if score.code_length <= (1.0 + _SAME_MAP) * shortest]
+    more = 0.0 if scans.noise > _MAX_NOISE * scans.typical_range else _SAME_MAP
+    as_short = [name for name, score in scores.items() if score.code_length <= (1.0 + more) * shortest]
     return min(as_short, key=lambda name: scores[name].misfit), scores
 
 
