@@ -155,8 +155,6 @@ def align_surfaces_from(
         is_active = has_pairs.copy()
         for _ in range(level.num_iterations):
             rows = np.flatnonzero(is_active)
-            if len(rows) == 0:
-                break
             pairs = _nearest_planes(source, target, T[rows], level, num_threads)
             num_pairs[rows] = pairs.is_paired.sum(axis=1)
             is_enough = num_pairs[rows] >= MIN_PAIRS
@@ -164,6 +162,8 @@ def align_surfaces_from(
             rmse_m[lost], has_pairs[lost], is_active[lost] = np.inf, False, False
             if not is_enough.all():
                 rows, pairs = rows[is_enough], pairs.take(is_enough)
+            if len(rows) == 0:
+                break
             step, centre, rmse_m[rows] = _step_to_planes(pairs, level, config)
             T[rows] = _motions(step, centre) @ T[rows]
             length_m, angle_rad = np.linalg.norm(step[:, :3], axis=1), np.linalg.norm(step[:, 3:], axis=1)
