@@ -172,12 +172,12 @@ def test_success_grids_show_every_candidate_and_what_was_kept() -> None:
     cell = {"stride": 8, "noise_px": 0.0}
     rows = [
         cell | a_row("all", 2.0, "fit", search=300.0, fit=2.0),
-        cell | a_row("all", 1.0, "search", search=1.0, fit=3.0),
-        cell | a_row("all", 90.0, "fit", search=1.0, fit=90.0),
+        cell | a_row("all", 3.0, "fit", search=300.0, fit=3.0),
+        cell | a_row("all", 1.0, "search", search=1.0, fit=90.0),
         cell | a_row("icp-plane", 90.0),
     ]
     found = {name: round(grid.item(), 2) for name, grid in deepmapping_limits.success_grids(rows, config).items()}
-    assert found == {"all: search": 0.67, "all: fit": 0.67, "all: kept": 0.67, "icp-plane": 0.0}
+    assert found == {"all: search": 0.33, "all: fit": 0.67, "all: kept": 1.0, "icp-plane": 0.0}
 
 
 def test_limits_tell_every_candidate_and_how_often_the_best_was_kept() -> None:

@@ -10,6 +10,7 @@ import pytest
 from dpmjax.geometry import rigid
 from dpmjax.metrics import absolute_trajectory_error
 from dpmjax.slam import SlamConfig, SlamMethods, SlamResult, init_slam, run_slam, step_slam
+from dpmjax.slam.keyframes import diagonal_information
 from dpmjax.slam.matcher import Match
 from tests.slam.truth import EMPTY, MistakenMatcher, TruthGeometry, TruthMatcher, laps, pose, scans_of
 
@@ -80,9 +81,8 @@ class AligningMatcher(TruthMatcher):
     """Says of its registrations, too, how exact they are."""
 
     def _match(self, source: int, target: int) -> Match:
-        match = super()._match(source, target)
-        information = np.diag(np.repeat([max(self.sigma_m, 1e-3) ** -2, max(self.sigma_rad, 1e-4) ** -2], 3))
-        return match._replace(information=information)
+        information = diagonal_information(max(self.sigma_m, 1e-3), max(self.sigma_rad, 1e-4))
+        return super()._match(source, target)._replace(information=information)
 
 
 def test_loops_that_are_known_to_be_exact_correct_more() -> None:

@@ -81,8 +81,8 @@ def choose_trajectory(scans: PlanarScans, candidates: Mapping[str, Floats]) -> t
         name: Score(map_code_length(scans, poses), view_misfit(scans, poses)) for name, poses in candidates.items()
     }
     shortest = min(score.code_length for score in scores.values())
-    more = 0.0 if scans.noise > _MAX_NOISE * scans.typical_range else _SAME_MAP
-    as_short = [name for name, score in scores.items() if score.code_length <= (1.0 + more) * shortest]
+    same_map = 0.0 if scans.noise > _MAX_NOISE * scans.typical_range else _SAME_MAP
+    as_short = [name for name, score in scores.items() if score.code_length <= (1.0 + same_map) * shortest]
     return min(as_short, key=lambda name: scores[name].misfit), scores
 
 

@@ -172,10 +172,10 @@ class SurfaceGeometry:
         if best.score >= wanted or starts.is_sure:
             return best
         others = starts.T_map_last @ _other_motions(starts.T_last_scan, self.extent_m(measured), config)
-        coarse = []
+        coarse, num_samples = [], config.num_samples // 3
         for found in align_surfaces_from(measured.surface, local_map.surface, others, config.wide):
-            pairs = self._pairs(local_map, measured, found.T_target_source, config.num_samples // 3)
-            coarse.append((self._matched_share(pairs, measured, config.num_samples // 3), found.T_target_source))
+            pairs = self._pairs(local_map, measured, found.T_target_source, num_samples)
+            coarse.append((self._matched_share(pairs, measured, num_samples), found.T_target_source))
         coarse.sort(key=lambda entry: -entry[0])
         fine = self._aligned(local_map, measured, np.array([T for _, T in coarse[:NUM_FINE]]))
         best = max(best, *fine, key=lambda found: found.score)
