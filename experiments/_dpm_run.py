@@ -96,10 +96,20 @@ class Records:
         earlier_s: run time of the steps before `start`.
     """
 
-    def __init__(self, folder: RunFolder, settings: TrainingConfig, sets: EvaluationSets, *, seed: int) -> None:
+    def __init__(
+        self,
+        folder: RunFolder,
+        settings: TrainingConfig,
+        sets: EvaluationSets,
+        *,
+        seed: int,
+        weights: Model | None = None,
+    ) -> None:
         self.folder, self.sets, self._settings = folder, sets, settings
         self._checkpoints, self._best = Checkpoints(folder / CHECKPOINTS), Checkpoints(folder / BEST)
-        self.start = begin_training(init_training(jax.random.key(seed), settings))
+        state = init_training(jax.random.key(seed), settings)
+        # The optimiser starts at zero with any weights.
+        self.start = begin_training(state if weights is None else replace(state, params=weights.params))
         self.untrained = Model(self.start.state.params, settings.model)
         if folder.is_resumed:
             self.start = self._restored(self.start)

@@ -4,6 +4,7 @@
     python -m experiments.dpm_train --preset small --num-towns 20 --hours 8   two cores, over night
     python -m experiments.dpm_train --resume --finish                 end a longer run now: the learning rate falls
     python -m experiments.dpm_train --data kitti town --preset paper  drives from files, and towns
+    python -m experiments.dpm_train --data kitti --preset small --weights dpm_small           tune trained weights
     python -m experiments.dpm_train --resume                          continue the latest run
     python -m experiments.dpm_train --coordinator host0:8476 --num-processes 2 --process-id 0     on two hosts, and
                                                                       the same with --process-id 1 on the other
@@ -55,6 +56,8 @@ class Config:
     """Folder for the results, instead of results/dpm_train/<time>."""
     preset: Literal["tiny", "small", "paper"] = "tiny"
     """Size of the network and length of its training."""
+    weights: Annotated[str | None, arg(metavar="NAME|FILE")] = None
+    """Go on from these weights, whose network takes the place of that of the preset; without it, from random ones."""
     without: tuple[Literal["offset-head", "coarse-loss", "curriculum", "occlusion"], ...] = ()
     """Leave these out, to see what each is worth (the paper's Table 2)."""
     frame: Literal["lidar", "bearing", "local"] | None = None
@@ -115,6 +118,8 @@ class Config:
             raise ValueError(f"--hours: expected more than 0, got {self.hours}")
         if not self.data:
             raise ValueError("--data: expected town or a folder of scans")
+        if self.weights is not None and self.frame is not None:
+            raise ValueError("--frame: --weights has a frame already; give one of the two")
 
 
 def main(config: Config) -> None:
@@ -125,18 +130,20 @@ def main(config: Config) -> None:
     join_processes(config.coordinator, config.num_processes, config.process_id)
     select_device(config.device)
     from dpmjax.deeppointmap import ScanStore, TrainingHooks
+    from dpmjax.weights import load_model
     from experiments._dpm_data import find_sources, prepare_sources
     from experiments._dpm_run import run_training
 
     with together():
-        settings = training_settings(config)
+        weights = None if config.weights is None else load_model(config.weights)
+        settings = training_settings(config, weights)
         towns = range(config.seed, config.seed + config.num_towns)
         sources = find_sources(config.data, towns, config.town_length_m)
         folder = open_run_folder(config, EXPERIMENT) if is_first() else None
     with recording(folder) if folder is not None else nullcontext(), StopFlag() as stop:
         with together():
             store = ScanStore(prepare_sources(sources, settings, config.cache, seed=config.seed))
-            records = None if folder is None else _open_records(folder, config, settings, store)
+            records = None if folder is None else _open_records(folder, config, settings, store, weights)
         hooks = TrainingHooks(evaluate_every=config.recall_every, stop=lambda: stop.received or 0)
         plateau_s = plateau_seconds(config, settings)
         trained = run_training(records, store, settings, hooks, seed=config.seed, plateau_s=plateau_s)
@@ -160,7 +167,9 @@ def main(config: Config) -> None:
         print_summary(folder, metrics)
 
 
-def _open_records(folder: RunFolder, config: Config, settings: TrainingConfig, store: Any) -> Records:
+def _open_records(
+    folder: RunFolder, config: Config, settings: TrainingConfig, store: Any, weights: Model | None
+) -> Records:
     from experiments._dpm_run import Records, draw_sets
 
     print(f"{len(store.table)} scans; {config.preset}: {settings.num_steps} steps at most")
@@ -171,7 +180,7 @@ def _open_records(folder: RunFolder, config: Config, settings: TrainingConfig, s
         validate=config.validate,
         length_m=config.town_length_m,
     )
-    return Records(folder, settings, sets, seed=config.seed)
+    return Records(folder, settings, sets, seed=config.seed, weights=weights)
 
 
 def plateau_seconds(config: Config, settings: TrainingConfig) -> float | None:
@@ -193,13 +202,15 @@ def print_summary(folder: RunFolder, metrics: dict[str, Any]) -> None:
     print(f"results in {folder.path}")
 
 
-def training_settings(config: Config) -> TrainingConfig:
-    """Returns the preset, with the options applied."""
+def training_settings(config: Config, weights: Model | None = None) -> TrainingConfig:
+    """Returns the preset, with the options applied; the network is that of the weights, if there are any."""
     from dataclasses import replace
 
     from dpmjax.deeppointmap import training_preset, without
 
     settings = training_preset(config.preset)
+    if weights is not None:
+        settings = replace(settings, model=replace(weights.config, calibration=None, overlap=None))
     if config.frame is not None:
         encoder = replace(settings.model.encoder, frame=config.frame)
         settings = replace(settings, model=replace(settings.model, encoder=encoder))

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from dpmjax.scans import PreprocessConfig, preprocess_scan, preprocess_scan_on_host
-from dpmjax.scans.preprocess import first_of_each_voxel
+from dpmjax.scans.preprocess import TABLE_BITS, first_of_each_voxel
 from dpmjax.types import PointCloud
 
 CONFIG = PreprocessConfig(max_range_m=30.0, num_outlier_neighbours=5, capacity=512)
@@ -88,7 +88,7 @@ def test_both_forms_agree_on_real_scans(sequence: str) -> None:
     assert host.mask.sum() > 200
 
 
-# The second cloud has more voxels in its bounding box than fit one integer together with the rows.
+# The bounding box of the second cloud has nearly 2^63 voxels.
 @pytest.mark.parametrize("farthest", [20.0, 9e5])
 def test_the_first_point_of_each_voxel_is_kept(farthest: float) -> None:
     points = np.random.default_rng(5).integers(-3, 3, (1000, 3)) + np.float32(0.25)
@@ -98,6 +98,13 @@ def test_the_first_point_of_each_voxel_is_kept(farthest: float) -> None:
     for row, point in enumerate(np.floor(points)):
         seen.setdefault(tuple(point), row)
     np.testing.assert_array_equal(first_of_each_voxel(points, 1.0), sorted(seen.values()))
+
+
+def test_first_points_are_found_where_many_voxels_share_a_slot_of_the_table() -> None:
+    points = np.random.default_rng(0).uniform(-50, 50, (600_000, 3)).astype(np.float32)
+    first = np.unique(np.floor(points), axis=0, return_index=True)[1]
+    assert len(first) > 1 << TABLE_BITS
+    np.testing.assert_array_equal(first_of_each_voxel(points, 1.0), np.sort(first))
 
 
 @BUILDERS

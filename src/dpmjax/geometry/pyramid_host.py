@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from concurrent.futures import Future, ThreadPoolExecutor
 from typing import NamedTuple
 
 import jax
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from scipy.spatial import cKDTree
 
 from dpmjax.checks import require_count
+from dpmjax.geometry.host_tree import HostTree
 from dpmjax.geometry.pyramid import RADIUS_SLACK, WEIGHT_EPSILON, PyramidConfig, PyramidStage
 from dpmjax.geometry.sampling import farthest_point_sample
 from dpmjax.types import Interpolation, PointPyramid, PyramidLevel
@@ -53,25 +52,18 @@ def build_pyramid_on_host(
     require_count("num_threads", num_threads)
     points = np.where(mask[:, None], points, np.float32(0))
     order = farthest_points_on_host(points, mask, config.stages[0].num_points).astype(np.int32)
-    # Two searches at a time: what each does besides its tree is then hidden as well.
-    num_workers = max(1, num_threads // 2)
     # Valid points stand in front on every level but the first, where `rows` says which they are.
-    searched = [_Searchable(points[mask], np.flatnonzero(mask).astype(np.int32), num_workers)]
+    searched = [_Searchable(points[mask], np.flatnonzero(mask).astype(np.int32), num_threads)]
+    levels = [PyramidLevel(points, mask, np.zeros(0, np.int32), ())]
     for stage in config.stages:
         sampled = points[order[: stage.num_points]]
-        searched.append(_Searchable(sampled, np.arange(len(sampled), dtype=np.int32), num_workers))
-    levels = [PyramidLevel(points, mask, np.zeros(0, np.int32), ())]
-    with ThreadPoolExecutor(min(num_threads, 2)) as pool:
-        searches = [
-            _Searches(
-                pool.submit(below.nearest, here.points, stage.num_neighbours),
-                pool.submit(here.nearest, here.points, stage.num_neighbours) if len(stage.radii) > 1 else None,
-            )
-            for below, here, stage in zip(searched, searched[1:], config.stages, strict=False)
-        ]
-        for here, found, stage in zip(searched[1:], searches, config.stages, strict=True):
-            chosen = order[: stage.num_points] if len(levels) == 1 else here.rows
-            levels.append(_level(here.points, chosen, found, stage))
+        below, here = searched[-1], _Searchable(sampled, np.arange(len(sampled), dtype=np.int32), num_threads)
+        found = [below.nearest(here.tree.points, stage.num_neighbours)]
+        if len(stage.radii) > 1:
+            found += [here.nearest(here.tree.points, stage.num_neighbours)] * (len(stage.radii) - 1)
+        chosen = order[: stage.num_points] if len(levels) == 1 else here.rows
+        levels.append(_level(sampled, chosen, found, stage))
+        searched.append(here)
     steps = range(config.num_interpolations)
     up = [_interpolate(levels[-2 - step], searched[-2 - step], searched[-1 - step]) for step in steps]
     return PointPyramid(tuple(levels), tuple(up))
@@ -128,28 +120,23 @@ def _sample_by_buckets(points: Float[np.ndarray, "n 3"], num_samples: int) -> In
 
 
 class _Searchable:
-    """Valid points with a tree, and the row of each in the padded level."""
+    """A tree of the valid points of a level, and the row of each in the padded level."""
 
-    def __init__(self, points: Float[np.ndarray, "n 3"], rows: Int[np.ndarray, " n"], num_workers: int):
-        self.points = points.astype(np.float64)
+    def __init__(self, points: Float[np.ndarray, "n 3"], rows: Int[np.ndarray, " n"], num_threads: int) -> None:
+        self.tree = HostTree(points, num_threads=num_threads)
         self.rows = rows
-        self.num_workers = num_workers
-        self.tree = cKDTree(self.points, leafsize=16, balanced_tree=False, compact_nodes=False)
 
     def nearest(self, queries: Float[np.ndarray, "m 3"], k: int) -> _Found:
         """Returns the min(k, n) nearest of each query, nearest first; of equally near ones the lower index first."""
-        num_points = len(self.points)
-        num_found = min(k, num_points)
-        if num_found == 0:
-            return _Found(np.zeros((len(queries), 0), np.int32), np.zeros((len(queries), 0)))
-        num_asked = min(num_found + 1, num_points)  # one more shows whether the last is tied with what was left out
-        answer = self.tree.query(queries, [*range(1, num_asked + 1)], workers=self.num_workers)
-        distances, indices = np.asarray(answer[0]), np.asarray(answer[1])
+        points = self.tree.points
+        num_found = min(k, len(points))
+        # One more shows whether the last is tied with what was left out.
+        indices, distances = self.tree.nearest(queries, min(num_found + 1, len(points)) if num_found > 0 else 0)
         tied = np.flatnonzero(np.any(distances[:, 1:] == distances[:, :-1], axis=1))
         for start in range(0, len(tied), TIED_ROWS_AT_ONCE):
             rows = tied[start : start + TIED_ROWS_AT_ONCE]
-            exact = np.sqrt(np.sum((queries[rows, None] - self.points) ** 2, axis=-1))
-            indices[rows] = np.argsort(exact, axis=1, kind="stable")[:, :num_asked]
+            exact = np.sqrt(np.sum((queries[rows, None] - points) ** 2, axis=-1))
+            indices[rows] = np.argsort(exact, axis=1, kind="stable")[:, : indices.shape[1]]
             distances[rows] = np.take_along_axis(exact, indices[rows], axis=1)
         return _Found(self.rows[indices[:, :num_found]], distances[:, :num_found])
 
@@ -159,20 +146,14 @@ class _Found(NamedTuple):
     distances: Float[np.ndarray, "m k"]
 
 
-class _Searches(NamedTuple):
-    below: Future[_Found]
-    here: Future[_Found] | None
-
-
 def _level(
-    points: Float[np.ndarray, "v 3"], chosen: Int[np.ndarray, " v"], searches: _Searches, stage: PyramidStage
+    points: Float[np.ndarray, "v 3"], chosen: Int[np.ndarray, " v"], searches: list[_Found], stage: PyramidStage
 ) -> PyramidLevel:
     num_rows, num_valid = stage.num_points, len(chosen)
-    positions = _padded(points.astype(np.float32), num_rows)
+    positions = _padded(points, num_rows)
     neighbours = [np.zeros((num_rows, stage.num_neighbours), np.int32) for _ in stage.radii]
     if num_valid > 0:
-        for block, radius in enumerate(stage.radii):
-            found = (searches.below if block == 0 or searches.here is None else searches.here).result()
+        for block, (radius, found) in enumerate(zip(stage.radii, searches, strict=True)):
             is_within = found.distances <= radius * RADIUS_SLACK
             neighbours[block][:num_valid] = found.rows[:, :1]
             neighbours[block][:num_valid, : found.rows.shape[1]] = np.where(is_within, found.rows, found.rows[:, :1])
@@ -187,8 +168,8 @@ def _level(
 def _interpolate(fine_level: PyramidLevel, fine: _Searchable, coarse: _Searchable) -> Interpolation:
     num_rows = len(fine_level.mask)
     indices, weights = np.zeros((num_rows, 3), np.int32), np.zeros((num_rows, 3), np.float32)
-    if len(coarse.points) > 0:
-        found = coarse.nearest(fine.points, 3)
+    if len(coarse.rows) > 0:
+        found = coarse.nearest(fine.tree.points, 3)
         inverse = 1 / (found.distances**2 + WEIGHT_EPSILON)
         num_found = found.rows.shape[1]
         indices[fine.rows, :num_found] = found.rows

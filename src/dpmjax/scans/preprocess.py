@@ -15,9 +15,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
-from scipy.spatial import cKDTree
 
 from dpmjax.checks import as_mask, as_points, require_count, require_fields, require_positive_fields
+from dpmjax.geometry.host_tree import HostTree
 from dpmjax.geometry.neighbours import k_nearest
 from dpmjax.geometry.sampling import voxel_sample
 from dpmjax.types import AnyArray, PointCloud
@@ -26,6 +26,11 @@ MAX_CAPACITY = 1 << 15
 MAX_VOXELS = 1 << 20
 OUTLIER_SLACK = 1 + 1e-5
 """Relative tolerance: rounding must not drop points that are all equally far from their neighbours."""
+
+HASH_FACTOR, TABLE_BITS = np.uint64(0x9E3779B97F4A7C15), 18
+"""A table of 2 MB; a fortieth of the voxels of a large scan share a slot. The factor spreads them (Knuth)."""
+
+SORTED_BY_M = 2.0
 
 MIN_COUNT_TO_WARN, MIN_SHARE_IN_RANGE = 20, 0.01
 
@@ -211,18 +216,24 @@ def first_of_each_voxel(points: Float[np.ndarray, "n 3"], voxel_size: float) -> 
     """
     if len(points) == 0:
         return np.zeros(0, np.int64)
-    voxels = np.floor(points / np.float32(voxel_size)).astype(np.int64)
-    columns = [column - column.min() for column in voxels.T]
-    num_y, num_z = (int(column.max()) + 1 for column in columns[1:])
-    packed = (columns[0] * num_y + columns[1]) * num_z + columns[2]  # below 2^63, because MAX_VOXELS bounds each factor
-    num_bits = len(points).bit_length()
-    if int(packed.max()).bit_length() + num_bits > 63:
-        return np.sort(np.unique(packed, return_index=True)[1])
-    # Voxel and row in one integer: sorting values is several times faster than sorting rows by values.
-    both = np.sort(packed << num_bits | np.arange(len(points)))
-    sorted_voxels = both >> num_bits
-    is_first = np.append(True, sorted_voxels[1:] != sorted_voxels[:-1])
-    return np.sort(both[is_first] & ((1 << num_bits) - 1))
+    voxels = _numbered_voxels(points, voxel_size)
+    # Each slot of a table keeps its first row: several times faster than sorting. A few voxels share their slot.
+    slots = (voxels.astype(np.uint64) * HASH_FACTOR >> np.uint64(64 - TABLE_BITS)).astype(np.intp)
+    rows = np.arange(len(points))
+    table = np.full(1 << TABLE_BITS, len(points))
+    np.minimum.at(table, slots, rows)
+    in_slot = table[slots]
+    is_first = in_slot == rows
+    others = np.flatnonzero(voxels[in_slot] != voxels)
+    is_first[others[np.unique(voxels[others], return_index=True)[1]]] = True
+    return np.flatnonzero(is_first)
+
+
+def _numbered_voxels(points: Float[np.ndarray, "n 3"], voxel_size: float) -> Int[np.ndarray, " n"]:
+    """Returns a number for the voxel of each point, ascending by x, then y, then z."""
+    x, y, z = (np.floor(column / np.float32(voxel_size)).astype(np.int64) for column in points.T)
+    x, y, z = x - x.min(), y - y.min(), z - z.min()
+    return (x * (y.max() + 1) + y) * (z.max() + 1) + z  # below 2^63, because MAX_VOXELS bounds each factor
 
 
 def _evenly_spaced(num_kept: int, capacity: int) -> Int[np.ndarray, " r"]:
@@ -233,11 +244,12 @@ def _evenly_spaced(num_kept: int, capacity: int) -> Int[np.ndarray, " r"]:
 def _is_inlier_on_host(
     points: Float[np.ndarray, "n 3"], config: PreprocessConfig, num_threads: int
 ) -> Bool[np.ndarray, " n"]:
-    tree = cKDTree(points, leafsize=16, balanced_tree=False)
+    # One more neighbour, because each point is its own nearest one.
     num_nearest = min(config.num_outlier_neighbours + 1, len(points))
-    # Queries in the order of the tree find what they need in the cache.
-    queries = tree.data[tree.indices]
-    distances = np.asarray(tree.query(queries, [*range(2, num_nearest + 1)], workers=num_threads)[0])
+    # Neighbours in space stand together in memory: they are found in two thirds of the time.
+    order = np.argsort(_numbered_voxels(points, SORTED_BY_M))
+    points = points[order]
+    distances = HostTree(points, num_threads=num_threads).nearest(points, num_nearest)[1]
     spread = np.empty(len(points))
-    spread[tree.indices] = distances.mean(axis=1)
+    spread[order] = distances[:, 1:].mean(axis=1)
     return spread <= (spread.mean() + config.outlier_sigmas * spread.std()) * OUTLIER_SLACK

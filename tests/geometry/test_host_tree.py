@@ -1,0 +1,27 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.spatial.distance import cdist
+
+from dpmjax.geometry.host_tree import HostTree
+
+
+@pytest.mark.parametrize("num_threads", [1, 3])
+@pytest.mark.parametrize("k", [1, 7, 40])
+@pytest.mark.parametrize("case", ["random", "coinciding", "a line"])
+def test_distances_are_the_smallest_of_all(case: str, k: int, num_threads: int) -> None:
+    points = np.random.default_rng(0).normal(size=(40, 3))
+    points *= {"random": 1, "coinciding": 0, "a line": np.array([1, 0, 0])}[case]
+    queries = np.random.default_rng(1).normal(size=(25, 3)).astype(np.float32)
+    rows, distances = HostTree(points, num_threads=num_threads).nearest(queries, k)
+    exact = cdist(queries, points)
+    np.testing.assert_allclose(distances, np.sort(exact, axis=1)[:, :k], atol=1e-12)
+    np.testing.assert_allclose(np.take_along_axis(exact, rows, axis=1), distances, atol=1e-12)
+    assert all(len(set(row)) == k for row in rows)
+
+
+@pytest.mark.parametrize(("num_points", "num_queries", "k"), [(0, 4, 0), (5, 0, 3), (5, 4, 0)])
+def test_without_points_queries_or_neighbours_nothing_is_found(num_points: int, num_queries: int, k: int) -> None:
+    rows, distances = HostTree(np.ones((num_points, 3)), num_threads=2).nearest(np.ones((num_queries, 3)), k)
+    assert rows.shape == distances.shape == (num_queries, k)
