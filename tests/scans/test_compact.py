@@ -32,20 +32,20 @@ def test_a_thinned_surface_is_of_points_of_the_surface(max_points) -> None:
         return
     is_flat = SURFACE.flatness > 0.1
     assert (found.flatness > 0.1).sum() >= min(0.8 * max_points, is_flat.sum() - 20)
-    distances, rows = SURFACE.tree.query(found.points)
+    rows, distances = (column[:, 0] for column in SURFACE.tree.nearest(found.points, 1))
     assert distances.max() < 10 / 32767 * 2
     np.testing.assert_allclose(found.flatness, SURFACE.flatness[rows], atol=0.5 / 255 + 1e-9)
     cosines = np.abs(np.sum(found.normals * SURFACE.normals[rows], axis=1))
     assert cosines.min() > np.cos(np.radians(1.0))
     np.testing.assert_allclose(np.linalg.norm(found.normals, axis=1), 1, atol=1e-9)
     # The tree and the samples are those of the points.
-    np.testing.assert_array_equal(found.tree.query(found.points)[1], np.arange(len(found.points)))
+    np.testing.assert_array_equal(found.tree.nearest(found.points, 1)[0][:, 0], np.arange(len(found.points)))
     assert (found.flatness[found.samples] > 0.1).all()
 
 
 def test_thinned_points_cover_the_surface() -> None:
     found = expand_surface(compact_surface(SURFACE, 1000))
-    assert found.tree.query(SURFACE.points)[0].max() < 2.0
+    assert found.tree.nearest(SURFACE.points, 1)[1].max() < 2.0
 
 
 def test_an_empty_surface_stays_empty() -> None:

@@ -82,7 +82,7 @@ def test_a_scan_of_a_moving_lidar_equals_that_of_a_resting_one() -> None:
     surface = scan_surface(still)
     apart = []
     for points in (moving, corrected):
-        distances, rows = surface.tree.query(points)
+        rows, distances = (column[:, 0] for column in surface.tree.nearest(points, 1))
         is_near = (distances < 1.5) & (surface.flatness[rows] > 0.5)
         along = np.sum((points - surface.points[rows]) * surface.normals[rows], axis=1)[is_near]
         apart.append(float(np.quantile(np.abs(along), 0.8)))

@@ -65,7 +65,7 @@ def test_two_samplings_of_a_street_are_aligned(seed: int) -> None:
     a, b = seen_from(street(seed), T_world_a), seen_from(street(10 + seed), T_world_b)
     T_b_a = np.linalg.inv(T_world_b) @ T_world_a
     guess = T_b_a @ motion(rng.uniform(-4, 4), tuple(rng.uniform(-1, 1, 3)), 0.5)
-    found = align_surfaces(scan_surface(a), scan_surface(b), guess, num_threads=1)
+    found = align_surfaces(scan_surface(a), scan_surface(b), guess)
     difference = np.linalg.inv(T_b_a) @ found.T_target_source
     assert np.linalg.norm(difference[:3, 3]) < 0.02
     assert np.degrees(np.arccos(np.clip((np.trace(difference[:3, :3]) - 1) / 2, -1, 1))) < 0.1
@@ -77,7 +77,7 @@ def test_what_no_plane_holds_stays() -> None:
     rng = np.random.default_rng(0)
     plain = [np.column_stack([rng.uniform(-20, 20, (3000, 2)), np.full(3000, -2.0)]) for _ in range(2)]
     start = motion(3, (0.5, -0.4, 0.3))
-    found = align_surfaces(*map(scan_surface, plain), start, num_threads=1).T_target_source
+    found = align_surfaces(*map(scan_surface, plain), start).T_target_source
     assert abs(found[2, 3]) < 0.01
     np.testing.assert_allclose(found[:2, 3], start[:2, 3], atol=0.05)
 
@@ -88,7 +88,7 @@ def test_starts_that_are_aligned_together_end_as_alone() -> None:
     starts = np.array([motion(2, (0.5, 0.3, 0)), nowhere, np.eye(4), motion(-60, (0, 2, 0))])
     together = align_surfaces_from(a, b, starts)
     for start, found in zip(starts, together, strict=True):
-        alone = align_surfaces(a, b, start, num_threads=1)
+        alone = align_surfaces(a, b, start)
         np.testing.assert_allclose(found.T_target_source, alone.T_target_source, atol=1e-9)
         assert found.num_pairs == alone.num_pairs
         np.testing.assert_allclose(found.rmse_m, alone.rmse_m)
@@ -100,9 +100,9 @@ def test_starts_that_are_aligned_together_end_as_alone() -> None:
 def test_alignment_moves_with_the_frames() -> None:
     a, b, move = street(4), street(5), motion(40, (3, -2, 0))
     guess = motion(2, (0.5, 0.3, 0))
-    plain = align_surfaces(scan_surface(a), scan_surface(b), guess, num_threads=1).T_target_source
+    plain = align_surfaces(scan_surface(a), scan_surface(b), guess).T_target_source
     moved = align_surfaces(
-        scan_surface(a), scan_surface(seen_from(b, np.linalg.inv(move))), move @ guess, num_threads=1
+        scan_surface(a), scan_surface(seen_from(b, np.linalg.inv(move))), move @ guess
     ).T_target_source
     np.testing.assert_allclose(moved, move @ plain, atol=0.02)
 

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 import dpmjax
+from dpmjax.geometry.host_tree import HostTree
 from dpmjax.slam import (
     Journal,
     SlamConfig,
@@ -54,8 +55,9 @@ def assert_same(found: object, expected: object) -> None:
         assert len(found) == len(expected)
         for a, b in zip(found, expected, strict=True):
             assert_same(a, b)
-    elif hasattr(expected, "query"):  # a tree
-        np.testing.assert_array_equal(found.data, expected.data)
+    elif isinstance(expected, HostTree):
+        assert isinstance(found, HostTree)
+        np.testing.assert_array_equal(found.points, expected.points)
     elif hasattr(expected, "__dataclass_fields__"):
         for name in expected.__dataclass_fields__:
             assert_same(getattr(found, name), getattr(expected, name))

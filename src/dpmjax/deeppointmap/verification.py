@@ -6,8 +6,7 @@ puts most points onto planes of the other scan, and hardly any into its free spa
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -17,7 +16,13 @@ from jaxtyping import Float
 from dpmjax.checks import require_fields
 from dpmjax.geometry import rigid
 from dpmjax.scans.free_space import RangeImage, RangeImageConfig, range_image, view_points
-from dpmjax.scans.surface_alignment import AlignmentConfig, AlignmentLevel, align_surfaces, pair_with_planes
+from dpmjax.scans.surface_alignment import (
+    AlignmentConfig,
+    AlignmentLevel,
+    align_surfaces,
+    align_surfaces_from,
+    pair_with_planes,
+)
 from dpmjax.scans.surfaces import Surface, SurfaceConfig, scan_surface
 from dpmjax.scans.view_correlation import ViewCorrelationConfig, correlate_views
 from dpmjax.types import Verification
@@ -167,19 +172,22 @@ def choose_motion(
         The best hypothesis, aligned.
     """
 
-    def aligned(alignment: AlignmentConfig, row: int | None, start: Float[np.ndarray, "4 4"]) -> VerifiedMotion:
-        T = align_surfaces(source.surface, target.surface, start, alignment, num_threads=1).T_target_source
-        return VerifiedMotion(row, T, verify_motion(source, target, T, config))
+    def aligned(alignment: AlignmentConfig, candidates: Sequence[_Candidate | VerifiedMotion]) -> list[VerifiedMotion]:
+        starts = np.stack([candidate.T_target_source for candidate in candidates])
+        found = align_surfaces_from(source.surface, target.surface, starts, alignment)
+        motions = [alignment.T_target_source for alignment in found]
+        return [
+            VerifiedMotion(candidate.row, T, verify_motion(source, target, T, config))
+            for candidate, T in zip(candidates, motions, strict=True)
+        ]
 
     tried: list[VerifiedMotion] = []
-    with ThreadPoolExecutor(2) as pool:
-        for some in _candidates(source, target, np.asarray(T_target_source, float), config):
-            tried += pool.map(lambda candidate: aligned(config.coarse, *candidate), some)
-            tried.sort(key=lambda motion: -motion.verification.score)
-            if tried[0].verification.score > config.clear_score:
-                break
-        best = tried[: config.num_fine]
-        fine = list(pool.map(lambda motion: aligned(config.fine, motion.row, motion.T_target_source), best))
+    for some in _candidates(source, target, np.asarray(T_target_source, float), config):
+        tried += aligned(config.coarse, some)
+        tried.sort(key=lambda motion: -motion.verification.score)
+        if tried[0].verification.score > config.clear_score:
+            break
+    fine = aligned(config.fine, tried[: config.num_fine])
     chosen = max(fine, key=lambda motion: motion.verification.score)
     others = [*fine, *tried[config.num_fine :]]
     others = [other for other in others if _is_apart(other.T_target_source, chosen.T_target_source)]

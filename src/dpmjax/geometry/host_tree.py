@@ -15,7 +15,7 @@ class HostTree:
         num_threads: threads of building and searching.
     """
 
-    def __init__(self, points: Float[np.ndarray, "n 3"], *, num_threads: int) -> None:
+    def __init__(self, points: Float[np.ndarray, "n 3"], *, num_threads: int = 2) -> None:
         self.points = np.ascontiguousarray(points, np.float64)
         self.num_threads = num_threads
         self._tree = small_gicp.KdTree(self.points, num_threads=num_threads) if len(points) > 0 else None

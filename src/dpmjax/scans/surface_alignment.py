@@ -19,9 +19,6 @@ from dpmjax.scans.surfaces import Surface
 MIN_PAIRS = 20
 """Fewer pairs tell nothing about a motion."""
 
-MIN_POINTS_FOR_THREADS = 2000
-"""To start threads takes longer than to find the neighbours of fewer points."""
-
 
 @dataclass(frozen=True)
 class AlignmentLevel:
@@ -109,8 +106,6 @@ def align_surfaces(
     target: Surface,
     T_target_source: Float[np.ndarray, "4 4"],
     config: AlignmentConfig = AlignmentConfig(),
-    *,
-    num_threads: int = 2,
 ) -> SurfaceAlignment:
     """Aligns two surfaces by the distances of points to planes (Chen and Medioni 1992), with a robust kernel.
 
@@ -119,12 +114,11 @@ def align_surfaces(
         target: the other.
         T_target_source: first guess, within about 3 m and 10 degrees.
         config: levels and kernel.
-        num_threads: threads of the neighbour search.
 
     Returns:
         The motion; the first guess where there are too few pairs.
     """
-    (found,) = align_surfaces_from(source, target, np.asarray(T_target_source)[None], config, num_threads=num_threads)
+    (found,) = align_surfaces_from(source, target, np.asarray(T_target_source)[None], config)
     return found
 
 
@@ -133,8 +127,6 @@ def align_surfaces_from(
     target: Surface,
     T_target_source: Float[np.ndarray, "s 4 4"],
     config: AlignmentConfig = AlignmentConfig(),
-    *,
-    num_threads: int = 2,
 ) -> list[SurfaceAlignment]:
     """Aligns two surfaces from several first guesses, in step: all of them look up their neighbours together.
 
@@ -143,7 +135,6 @@ def align_surfaces_from(
         target: the other.
         T_target_source: first guesses; see `align_surfaces`.
         config: levels and kernel.
-        num_threads: threads of the neighbour search.
 
     Returns:
         What `align_surfaces` returns for each guess.
@@ -155,7 +146,7 @@ def align_surfaces_from(
         is_active = has_pairs.copy()
         for _ in range(level.num_iterations):
             rows = np.flatnonzero(is_active)
-            pairs = _nearest_planes(source, target, T[rows], level, num_threads)
+            pairs = _nearest_planes(source, target, T[rows], level)
             num_pairs[rows] = pairs.is_paired.sum(axis=1)
             is_enough = num_pairs[rows] >= MIN_PAIRS
             lost = rows[~is_enough]
@@ -185,7 +176,7 @@ def pair_with_planes(
     Returns:
         The pairs; points without a neighbour within the radius are left out.
     """
-    pairs = _nearest_planes(source, target, np.asarray(T_target_source)[None], level, num_threads=1)
+    pairs = _nearest_planes(source, target, np.asarray(T_target_source)[None], level)
     return PlanePairs(*(values[pairs.is_paired] for values in pairs[1:]))
 
 
@@ -208,17 +199,14 @@ def _nearest_planes(
     target: Surface,
     T_target_source: Float[np.ndarray, "s 4 4"],
     level: AlignmentLevel,
-    num_threads: int,
 ) -> _NearestPlanes:
     rows, R_transposed = source.samples[: level.num_points], T_target_source[:, :3, :3].transpose(0, 2, 1)
     moved = source.points[rows] @ R_transposed + T_target_source[:, None, :3, 3]
     if len(target.points) == 0:
         nothing = np.zeros(moved.shape[:2])
         return _NearestPlanes(nothing > 0, moved, nothing, np.zeros_like(moved), nothing, nothing)
-    workers = num_threads if moved[..., 0].size >= MIN_POINTS_FOR_THREADS else 1
-    distances, nearest = target.tree.query(moved, distance_upper_bound=level.radius_m, workers=workers)
-    is_paired = np.isfinite(distances)
-    nearest = np.where(is_paired, nearest, 0)
+    found, distances = target.tree.nearest(moved.reshape(-1, 3), 1)
+    nearest, is_paired = found.reshape(moved.shape[:2]), distances.reshape(moved.shape[:2]) < level.radius_m
     normals = target.normals[nearest]
     return _NearestPlanes(
         is_paired,

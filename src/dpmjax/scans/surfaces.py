@@ -7,9 +7,9 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
-from scipy.spatial import cKDTree
 
 from dpmjax.checks import require_count, require_positive_fields
+from dpmjax.geometry.host_tree import HostTree
 from dpmjax.scans.plane_fits import fit_planes
 from dpmjax.scans.preprocess import first_of_each_voxel
 
@@ -68,7 +68,7 @@ class Surface(NamedTuple):
     normals: Float[np.ndarray, "n 3"]
     flatness: Float[np.ndarray, " n"]
     samples: Int[np.ndarray, " s"]
-    tree: cKDTree
+    tree: HostTree
 
 
 def scan_surface(points: Float[np.ndarray, "n 3"], config: SurfaceConfig = SurfaceConfig()) -> Surface:
@@ -92,7 +92,7 @@ def scan_surface(points: Float[np.ndarray, "n 3"], config: SurfaceConfig = Surfa
         is_within = (squared >= config.min_range_m**2) & (squared <= config.max_range_m**2)
     points = points.take(np.flatnonzero(is_within), axis=0)
     points = points[first_of_each_voxel(points, config.voxel_size_m)].astype(np.float64)
-    tree = _tree(points)
+    tree = HostTree(points)
     normals, flatness = _normals(points, tree, config)
     return Surface(points, normals, flatness, _samples(normals, flatness), tree)
 
@@ -110,31 +110,22 @@ def surface_of_points(
     Returns:
         The surface, with samples and tree.
     """
-    return Surface(points, normals, flatness, _samples(normals, flatness), _tree(points))
-
-
-def _tree(points: Float[np.ndarray, "n 3"]) -> cKDTree:
-    return cKDTree(points, leafsize=16, balanced_tree=False, compact_nodes=False)
+    return Surface(points, normals, flatness, _samples(normals, flatness), HostTree(points))
 
 
 def _normals(
-    points: Float[np.ndarray, "n 3"], tree: cKDTree, config: SurfaceConfig
+    points: Float[np.ndarray, "n 3"], tree: HostTree, config: SurfaceConfig
 ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, " n"]]:
     num_neighbours = min(config.num_neighbours, len(points))
     if num_neighbours < MIN_NEIGHBOURS:
         return np.zeros((len(points), 3)), np.zeros(len(points))
-    order = tree.indices  # queries in the order of the tree find what they need in the cache
-    typical_m = np.median(tree.query(points[:: max(1, len(points) // NUM_PROBED)], [num_neighbours])[0])
-    radius_m = max(config.neighbour_radius_m, config.sparse_radius_share * typical_m)
-    found = tree.query(points[order], num_neighbours, distance_upper_bound=radius_m, workers=2)
-    distances, rows = map(np.asarray, found)
-    is_near = np.isfinite(distances)
-    x, y, z = (np.take(column, rows, mode="clip") - column[order, None] for column in points.T)
+    farthest_m = tree.nearest(points[:: max(1, len(points) // NUM_PROBED)], num_neighbours)[1][:, -1]
+    radius_m = max(config.neighbour_radius_m, config.sparse_radius_share * float(np.median(farthest_m)))
+    rows, distances = tree.nearest(points, num_neighbours)
+    is_near = distances < radius_m
+    x, y, z = (column[rows] - column[:, None] for column in points.T)
     fit = fit_planes((x, y, z), is_near)
-    found_normals, found_flatness = np.empty_like(points), np.empty(len(points))
-    found_normals[order] = fit.normals
-    found_flatness[order] = np.where(is_near.sum(axis=1) >= MIN_NEIGHBOURS, fit.flatness, 0)
-    return found_normals, found_flatness
+    return fit.normals, np.where(is_near.sum(axis=1) >= MIN_NEIGHBOURS, fit.flatness, 0)
 
 
 def _samples(normals: Float[np.ndarray, "n 3"], flatness: Float[np.ndarray, " n"]) -> Int[np.ndarray, " s"]:

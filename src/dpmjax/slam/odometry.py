@@ -12,11 +12,11 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
-from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from dpmjax.deeppointmap.verification import MeasuredScan
 from dpmjax.geometry import rigid
+from dpmjax.geometry.host_tree import HostTree
 from dpmjax.scans.free_space import range_image, view_points
 from dpmjax.scans.preprocess import first_of_each_voxel
 from dpmjax.scans.surface_alignment import AlignmentLevel, PlanePairs, align_surfaces_from, pair_with_planes
@@ -245,7 +245,7 @@ class SurfaceGeometry:
 
 def _empty_map(voxel_m: float, T_map_start: Pose) -> LocalMap:
     nothing = np.zeros((0, 3))
-    surface = Surface(nothing, nothing, np.zeros(0), np.zeros(0, np.int64), cKDTree(nothing))
+    surface = Surface(nothing, nothing, np.zeros(0), np.zeros(0, np.int64), HostTree(nothing))
     return LocalMap((), surface, np.zeros(0, np.int64), voxel_m, T_map_start)
 
 
@@ -263,7 +263,7 @@ def _with_frame(local_map: LocalMap, frame: MapFrame, measured: MeasuredScan, nu
         normals=np.concatenate([new.normals[is_flat] @ R.T, old.normals[is_recent]])[kept],
         flatness=np.concatenate([new.flatness[is_flat], old.flatness[is_recent]])[kept],
         samples=np.random.default_rng(0).permutation(len(points)),
-        tree=cKDTree(points, leafsize=16, balanced_tree=False, compact_nodes=False),
+        tree=HostTree(points),
     )
     return LocalMap(frames, surface, scans[kept], local_map.voxel_m, local_map.T_map_start)
 
