@@ -17,15 +17,18 @@ from dpmjax.deeppointmap import (
     SampleMaker,
     TrainingHooks,
     draw_evaluation_pairs,
+    init_model,
     init_training,
+    training_preset,
 )
 from dpmjax.deeppointmap.training_loop import after_evaluation, begin_training
+from dpmjax.weights import load_model
 from experiments import _dpm_run
 from experiments._command import run_command
 from experiments._dpm_run import KINDS, EvaluationSets, Records, run_training
 from experiments._result_files import read_history
 from experiments._run_folder import CHECKPOINTS, HISTORY, RunFolder
-from experiments.dpm_train import EXPERIMENT, Config, main
+from experiments.dpm_train import EXPERIMENT, Config, main, training_settings
 from tests.deeppointmap import toy
 
 REPOSITORY = Path(__file__).parents[2]
@@ -129,11 +132,30 @@ def test_help_needs_no_jax_and_shows_examples() -> None:
 
 @pytest.mark.parametrize(
     ("options", "message"),
-    [({"steps": 1}, "--steps"), ({"num_towns": 0}, "--num-towns"), ({"town_length_m": 5.0}, "--town-length-m")],
+    [
+        ({"steps": 1}, "--steps"),
+        ({"num_towns": 0}, "--num-towns"),
+        ({"town_length_m": 5.0}, "--town-length-m"),
+        ({"weights": "dpm_small", "frame": "local"}, "--frame"),
+    ],
 )
 def test_options_out_of_range_are_refused(options, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         Config(**options)
+
+
+def test_a_run_from_weights_has_their_network_and_begins_with_their_parameters(tmp_path: Path) -> None:
+    weights = load_model("dpm_small")
+    settings = training_settings(Config(weights="dpm_small"), weights)
+    assert settings.model == replace(weights.config, calibration=None, overlap=None)
+    assert settings.curriculum == training_preset("tiny").curriculum
+    some = init_model(jax.random.key(5), toy.MODEL)
+    pairs = draw_evaluation_pairs(toy.drive(seed=9), 2, toy.MODEL, kinds=KINDS)
+    sets = EvaluationSets((pairs,), (), pairs)
+    with Records(RunFolder(tmp_path, False), TRAINING, sets, seed=0, weights=some) as records:
+        toy.assert_trees_equal(records.start.state.params, some.params)
+        toy.assert_trees_equal(records.untrained.params, some.params)
+        assert int(records.start.state.step) == 0
 
 
 def write_drive(folder: Path, *, step_m: float = 2.0, has_poses: bool = True, num: int = 4) -> Path:
@@ -166,6 +188,7 @@ def test_data_that_cannot_be_trained_on_is_named(as_user, tmp_path, capsys) -> N
     assert "empty" in refused(tmp_path, capsys, "--data", tmp_path / "empty")
     without = write_drive(tmp_path / "without", has_poses=False)
     assert "no poses" in refused(tmp_path, capsys, "--data", without)
+    assert "dpm_small" in refused(tmp_path, capsys, "--data", without, "--weights", "nobody")
     wide = write_drive(tmp_path / "wide", step_m=50.0)
     assert "no two of them 0.25 to 20.0 m apart" in refused(tmp_path, capsys, "--data", wide)
     spoiled = write_drive(tmp_path / "spoiled")
