@@ -93,7 +93,7 @@ class Records:
         sets: pairs of evaluations.
         untrained: the model before the first step.
         start: progress to start from: the latest checkpoint of a resumed run.
-        earlier_s: run time of the steps before `start`.
+        earlier_s: run time of the steps of earlier calls of `train`.
     """
 
     def __init__(
@@ -119,7 +119,7 @@ class Records:
         total = int(self.start.state.end)
         self._bar = tqdm(total=total, initial=first, desc="train", unit=" steps", dynamic_ncols=True)
         self._last_saved, self._recalls = time.perf_counter(), dict.fromkeys(RECALLS, math.nan)
-        self.run_s = self.earlier_s
+        self.run_s, self._call_s = self.earlier_s, 0.0
         self._seen: set[CurriculumStage] = set()
         self._tell_compilation(self.start.state)
 
@@ -140,7 +140,11 @@ class Records:
         if math.isfinite(record.score):
             values |= {name: value for name, value in self._recalls.items() if math.isfinite(value)}
         measured = {name: f"{value:.7g}" for name, value in values.items()}
-        self.run_s = self.earlier_s + record.speed.run_s + record.speed.compile_s
+        seconds = record.speed.run_s + record.speed.compile_s
+        if seconds < self._call_s:  # the decay is a call of its own
+            self.earlier_s += self._call_s
+        self._call_s = seconds
+        self.run_s = self.earlier_s + seconds
         self._history.append(step=record.step, stage=_stage_name(record.stage), run_s=round(self.run_s, 3), **measured)
         self._bar.set_postfix_str(_summary(record, self._recalls["recall"]), refresh=False)
         self._bar.update(1)

@@ -84,7 +84,8 @@ class Verification(NamedTuple):
         matched_share: share of the source points that meet a plane of the target; of the target points that meet one of
             the source where the target holds less than half as many points (a map that was saved at int8).
         contradicted_share: share of the visible points that lie in the free space of the other scan.
-        score: `matched_share` less the weighted `contradicted_share`.
+        score: log odds that the motion is right, by walls and level ground that meet and by free space, where the other
+            scan sees.
         gap: how much more it is than the score of the best other hypothesis that was tried, or than 0.
         num_tried: number of hypotheses that were tried.
     """

@@ -66,7 +66,7 @@ def test_features_of_another_version_are_refused() -> None:
 def calibrated() -> dpmjax.Model:
     model = dpmjax.init_model(jax.random.key(0), toy.MODEL)
     calibration = Calibration(
-        LogisticModel(CLOUD_FEATURES, (0.0,) * 4, -1.0), LogisticModel(SCAN_FEATURES, (0.0,) * 8, 2.0)
+        LogisticModel(CLOUD_FEATURES, (0.0,) * 4, -1.0), LogisticModel(SCAN_FEATURES, (0.0,) * 9, 2.0)
     )
     return model.replace(config=dataclasses.replace(model.config, calibration=calibration))
 

@@ -1,6 +1,6 @@
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import astuple, replace
 
 import numpy as np
 import pytest
@@ -9,9 +9,11 @@ from dpmjax.deeppointmap.verification import (
     VerificationConfig,
     VerifiedMotion,
     choose_motion,
+    evidence_shares,
     measure_scan,
     refine_motion,
     verify_motion,
+    verify_motions,
 )
 from dpmjax.scans.compact import compact_surface, expand_surface
 from tests.scans.surface_scenes import motion, seen_from, street
@@ -37,6 +39,28 @@ def test_the_true_motion_is_better_than_any_other(scans) -> None:
     for yaw, translation in ((180, (0, 0, 0)), (0, (6, 0, 0)), (60, (0, 0, 0)), (0, (0, 0, 3))):
         wrong = verify_motion(*scans, T_TRUE @ motion(yaw, translation), CONFIG)
         assert wrong.score < right.score - 0.2
+
+
+def test_two_scans_on_each_other_gain_nothing_by_their_ground() -> None:
+    # 16 m apart, each sees 20 m: half of the truth lies where only one of them sees, and all ground meets anywhere.
+    poses = motion(0, (-8, 0, 0)), motion(0, (8, 0, 0))
+    points = [seen_from(street(seed, 40_000), T) for seed, T in enumerate(poses)]
+    scans = [measure_scan(some[np.linalg.norm(some, axis=1) < 20], CONFIG) for some in points]
+    motions = np.stack([np.linalg.inv(poses[1]) @ poses[0], np.eye(4), motion(180, (0, 0, 0))])
+    right, *wrong = verify_motions(*scans, motions, CONFIG)
+    assert right.matched_share < max(one.matched_share for one in wrong)
+    assert right.score > max(one.score for one in wrong) + 2
+
+
+def test_motions_are_verified_together_as_alone(scans) -> None:
+    motions = np.stack([T_TRUE @ motion(yaw, (0, 0, 0)) for yaw in (0, 30, 200)])
+    together = verify_motions(*scans, motions, CONFIG)
+    for found, T in zip(together, motions, strict=True):
+        np.testing.assert_allclose(found, verify_motion(*scans, T, CONFIG), atol=1e-12)
+    shares = evidence_shares(*scans, motions, CONFIG)
+    bias, *weights = astuple(CONFIG.evidence)
+    np.testing.assert_allclose([found.score for found in together], shares @ weights + bias)
+    assert ((shares >= 0) & (shares <= 1)).all()
 
 
 @pytest.mark.parametrize("is_target_thin", [True, False])

@@ -46,13 +46,12 @@ class StopAfter:
         return int(self._left < 0)
 
 
-def train(folder: Path, *, stop_after: int = 99, is_resumed: bool = False):
+def train(folder: Path, *, stop_after: int = 99, is_resumed: bool = False, plateau_s: float | None = None):
     folder.mkdir(exist_ok=True)
     pairs = draw_evaluation_pairs(toy.drive(seed=9), 2, toy.MODEL, kinds=KINDS)
     records = Records(RunFolder(folder, is_resumed), TRAINING, EvaluationSets((pairs,), (), pairs), seed=0)
-    return run_training(
-        records, toy.store(), TRAINING, TrainingHooks(evaluate_every=2, stop=StopAfter(stop_after)), seed=0
-    )
+    hooks = TrainingHooks(evaluate_every=2, stop=StopAfter(stop_after))
+    return run_training(records, toy.store(), TRAINING, hooks, seed=0, plateau_s=plateau_s)
 
 
 def num_steps(trained) -> int:
@@ -201,6 +200,14 @@ def test_a_folder_that_cannot_be_written_is_named(as_user, tmp_path, capsys) -> 
     good = write_drive(tmp_path / "good")
     (tmp_path / "file").write_text("")
     assert "cannot write to" in refused(tmp_path, capsys, "--data", good, "-o", tmp_path / "file" / "out")
+
+
+@pytest.mark.slow
+def test_seconds_go_on_where_the_decay_begins(tmp_path: Path) -> None:
+    train(tmp_path, plateau_s=0.01)
+    rows = read_history(tmp_path / HISTORY)
+    assert 2 <= len(rows) < TRAINING.num_steps
+    assert np.all(np.diff([float(row["run_s"]) for row in rows]) > 0)
 
 
 @pytest.mark.slow

@@ -18,7 +18,7 @@ from scipy.special import expit
 from dpmjax.types import Registration, Verification
 
 CLOUD_FEATURES = ("support", "mean_score", "rmse_m", "support_gap")
-SCAN_FEATURES = (*CLOUD_FEATURES, "visible_share", "matched_share", "contradicted_share", "score_gap")
+SCAN_FEATURES = (*CLOUD_FEATURES, "visible_share", "matched_share", "contradicted_share", "score", "score_gap")
 OVERLAP_FEATURES = (
     "scan_similarity",
     "similarity_median",
@@ -109,8 +109,8 @@ def gather_evidence(hypotheses: Registration, row: int | None, verification: Ver
         of_clouds = np.array([support[row], float(hypotheses.mean_score[row]), rmse_m, support[row] - second])
     if verification is None:
         return Evidence(of_clouds, None)
-    shares = (verification.visible_share, verification.matched_share, verification.contradicted_share, verification.gap)
-    return Evidence(of_clouds, np.concatenate([of_clouds, shares]))
+    of_scans = verification[: verification._fields.index("num_tried")]
+    return Evidence(of_clouds, np.concatenate([of_clouds, of_scans]))
 
 
 def probability(model: LogisticModel, features: Float[np.ndarray, "*n f"]) -> Float[np.ndarray, "*n"]:
@@ -142,6 +142,25 @@ def fit_logistic(
     Raises:
         ValueError: if all are right, or none.
     """
+    weights, bias = fit_weights(features, is_right)
+    return LogisticModel(names, tuple(map(float, weights)), bias)
+
+
+def fit_weights(
+    features: Float[np.ndarray, "n f"], is_right: Bool[np.ndarray, " n"]
+) -> tuple[Float[np.ndarray, " f"], float]:
+    """Fits the weights and the constant of a logistic model; see `fit_logistic`.
+
+    Args:
+        features: of examples.
+        is_right: which of them are right.
+
+    Returns:
+        Weights and constant.
+
+    Raises:
+        ValueError: if all are right, or none.
+    """
     if is_right.all() or not is_right.any():
         raise ValueError(f"is_right: expected right and wrong registrations, got {is_right.sum()} of {len(is_right)}")
     mean, scale = features.mean(axis=0), np.maximum(features.std(axis=0), 1e-9)
@@ -156,7 +175,7 @@ def fit_logistic(
 
     found = minimize(loss, np.zeros(standard.shape[1]), jac=True, method="L-BFGS-B").x
     weights = found[:-1] / scale
-    return LogisticModel(names, tuple(map(float, weights)), float(found[-1] - weights @ mean))
+    return weights, float(found[-1] - weights @ mean)
 
 
 def with_confidence(match: Registration, evidence: Evidence, calibration: Calibration | None) -> Registration:

@@ -7,11 +7,11 @@ puts most points onto planes of the other scan, and hardly any into its free spa
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import astuple, dataclass, field
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from dpmjax.checks import require_fields
 from dpmjax.geometry import rigid
@@ -21,7 +21,7 @@ from dpmjax.scans.surface_alignment import (
     AlignmentLevel,
     align_surfaces,
     align_surfaces_from,
-    pair_with_planes,
+    nearest_planes,
 )
 from dpmjax.scans.surfaces import Surface, SurfaceConfig, scan_surface
 from dpmjax.scans.view_correlation import ViewCorrelationConfig, correlate_views
@@ -32,6 +32,9 @@ SPARSE_SHARE = 0.5
 """A target with a smaller share of the source's number of points has been thinned (`saved_maps`). Too few of its points
 are near those of the source, so its own points are compared with the planes of the source."""
 
+LEVEL_COSINE = 0.8
+"""Surfaces whose normals are nearer to the vertical are level."""
+
 DISTINCT_M, DISTINCT_RAD = 2.0, np.radians(5.0)
 """Motions that differ by less end in the same place."""
 
@@ -39,6 +42,32 @@ DISTINCT_M, DISTINCT_RAD = 2.0, np.radians(5.0)
 COARSE = AlignmentConfig(levels=(AlignmentLevel(3.0, 600, 5),))
 FINE = AlignmentConfig(levels=(AlignmentLevel(1.0, 1500, 5),))
 REFINEMENT = AlignmentConfig(levels=(AlignmentLevel(1.0, 4000, 8), AlignmentLevel(0.4, 8000, 10)))
+
+
+@dataclass(frozen=True)
+class EvidenceWeights:
+    """Logistic model of P(right within 2 m and 5 degrees) of one motion, by shares of the points of both scans.
+
+    Fitted by `python -m experiments.dpm_evidence` on simulated scenes, dense and sparse, out of doors and inside.
+    Walls are all surfaces that are not level.
+
+    Attributes:
+        bias: the constant.
+        walls_met: points of walls that meet a plane where the other scan sees.
+        walls_visible: points of walls where the other scan sees.
+        walls_contradicted: points of walls in the free space of the other scan.
+        level_met: points of level surfaces that meet a plane where the other scan sees.
+        level_visible: points of level surfaces where the other scan sees.
+        level_contradicted: points of level surfaces in the free space of the other scan.
+    """
+
+    bias: float = -6.6
+    walls_met: float = 14.4
+    walls_visible: float = 9.2
+    walls_contradicted: float = -65.0
+    level_met: float = -0.7
+    level_visible: float = 7.6
+    level_contradicted: float = 5.0
 
 
 @dataclass(frozen=True)
@@ -57,8 +86,8 @@ class VerificationConfig:
         plane_radius_m: a point meets a plane if a point of it is within this distance, ...
         plane_distance_m: ... the plane itself is within this, ...
         min_cosine: ... and the cosine between both normals is larger.
-        contradiction_weight: how much a contradicted point counts against one that meets a plane.
-        clear_score: no further hypothesis is tried after one with a higher score.
+        evidence: what the points of both scans say about a motion.
+        clear_score: no further hypothesis is tried after one with higher log odds.
     """
 
     surface: SurfaceConfig = field(default_factory=SurfaceConfig)
@@ -72,13 +101,13 @@ class VerificationConfig:
     plane_radius_m: float = 1.0
     plane_distance_m: float = 0.15
     min_cosine: float = 0.7
-    contradiction_weight: float = 2.0
-    clear_score: float = 0.5
+    evidence: EvidenceWeights = field(default_factory=EvidenceWeights)
+    clear_score: float = 1.0
 
     def __post_init__(self) -> None:
         require_fields(self, "num_fine", "num_samples", low=1)
         require_fields(self, "plane_radius_m", "plane_distance_m", low=1e-9)
-        require_fields(self, "min_cosine", "contradiction_weight", "clear_score", low=0)
+        require_fields(self, "min_cosine", low=0)
 
 
 class MeasuredScan(NamedTuple):
@@ -134,27 +163,104 @@ def verify_motion(
         config: tolerances.
 
     Returns:
-        Shares of points that are visible, that meet planes and that lie in free space.
+        Shares of points that are visible, that meet planes and that lie in free space, and what they say together.
     """
-    num_samples = config.num_samples
-    level = AlignmentLevel(config.plane_radius_m, num_samples, 1)
-    sides = [(source, target, T_target_source), (target, source, rigid.inverse(T_target_source))]
-    if len(target.surface.points) < SPARSE_SHARE * len(source.surface.points):
-        sides.reverse()
-    scan, other, T_other_scan = sides[0]
-    pairs = pair_with_planes(scan.surface, other.surface, T_other_scan, level)
-    meets = (np.abs(pairs.residuals) < config.plane_distance_m) & (pairs.cosines > config.min_cosine)
-    views = []
-    for scan, other, T_other_scan in sides:
-        points = scan.surface.points[scan.surface.samples[:num_samples]]
-        moved = points @ T_other_scan[:3, :3].T + T_other_scan[:3, 3]
-        views.append(view_points(other.image, moved, config.image))
-    num_visible = sum(int(view.is_visible.sum()) for view in views)
-    num_points = sum(len(view.is_visible) for view in views)
-    matched = int(meets.sum()) / max(len(views[0].is_visible), 1)
-    contradicted = sum(int(view.is_contradicted.sum()) for view in views) / max(num_visible, 1)
-    score = matched - config.contradiction_weight * contradicted
-    return Verification(num_visible / max(num_points, 1), matched, contradicted, score)
+    return verify_motions(source, target, np.asarray(T_target_source)[None], config)[0]
+
+
+def verify_motions(
+    source: MeasuredScan, target: MeasuredScan, T_target_source: Float[np.ndarray, "s 4 4"], config: VerificationConfig
+) -> list[Verification]:
+    """Compares two scans under several motions.
+
+    Args:
+        source: a scan.
+        target: the other.
+        T_target_source: the motions.
+        config: tolerances.
+
+    Returns:
+        What `verify_motion` returns for each motion.
+    """
+    sides = _both_sides(source, target, T_target_source, config)
+    is_thin = len(target.surface.points) < SPARSE_SHARE * len(source.surface.points)
+    matched = _share(sides[1 if is_thin else 0].meets)
+    bias, *weights = astuple(config.evidence)
+    num_visible = sum(side.is_visible.sum(axis=1) for side in sides)
+    num_contradicted = sum(side.is_contradicted.sum(axis=1) for side in sides)
+    shares = (
+        num_visible / max(sum(side.is_visible.shape[1] for side in sides), 1),
+        matched,
+        num_contradicted / np.maximum(num_visible, 1),
+        _evidence(sides) @ np.array(weights) + bias,
+    )
+    return [Verification(*map(float, of_motion)) for of_motion in zip(*shares, strict=True)]
+
+
+class _Compared(NamedTuple):
+    """Samples of a scan under several motions, in the other scan."""
+
+    meets: Bool[np.ndarray, "s n"]
+    is_visible: Bool[np.ndarray, "s n"]
+    is_contradicted: Bool[np.ndarray, "s n"]
+    is_level: Bool[np.ndarray, " n"]
+
+
+def _compared(
+    scan: MeasuredScan, other: MeasuredScan, T_other_scan: Float[np.ndarray, "s 4 4"], config: VerificationConfig
+) -> _Compared:
+    level = AlignmentLevel(config.plane_radius_m, config.num_samples, 1)
+    planes = nearest_planes(scan.surface, other.surface, T_other_scan, level)
+    meets = planes.is_paired & (np.abs(planes.residuals) < config.plane_distance_m)
+    meets &= planes.cosines > config.min_cosine
+    view = view_points(other.image, planes.points.reshape(-1, 3), config.image)
+    is_level = np.abs(scan.surface.normals[scan.surface.samples[: config.num_samples], 2]) > LEVEL_COSINE
+    return _Compared(meets, view.is_visible.reshape(meets.shape), view.is_contradicted.reshape(meets.shape), is_level)
+
+
+def evidence_shares(
+    source: MeasuredScan, target: MeasuredScan, T_target_source: Float[np.ndarray, "s 4 4"], config: VerificationConfig
+) -> Float[np.ndarray, "s 6"]:
+    """Computes what `EvidenceWeights` weighs.
+
+    Only what the other scan sees counts. So a motion that puts two scans onto each other gains nothing by it: level
+    ground meets level ground anywhere, but walls do not.
+
+    Args:
+        source: a scan.
+        target: the other.
+        T_target_source: motions.
+        config: tolerances.
+
+    Returns:
+        Shares in the order of `EvidenceWeights`, means of both scans.
+    """
+    return _evidence(_both_sides(source, target, T_target_source, config))
+
+
+def _both_sides(
+    source: MeasuredScan, target: MeasuredScan, T_target_source: Float[np.ndarray, "s 4 4"], config: VerificationConfig
+) -> tuple[_Compared, _Compared]:
+    return (
+        _compared(source, target, T_target_source, config),
+        _compared(target, source, rigid.inverse(T_target_source), config),
+    )
+
+
+def _evidence(sides: Sequence[_Compared]) -> Float[np.ndarray, "s 6"]:
+    shares = []
+    for is_level in (False, True):
+        of_kind = [side.is_visible & (side.is_level == is_level) for side in sides]
+        shares += [
+            [_share(seen & side.meets) for seen, side in zip(of_kind, sides, strict=True)],
+            [_share(seen) for seen in of_kind],
+            [_share(seen & side.is_contradicted) for seen, side in zip(of_kind, sides, strict=True)],
+        ]
+    return np.mean(shares, axis=1).T
+
+
+def _share(points: Bool[np.ndarray, "s n"]) -> Float[np.ndarray, " s"]:
+    return points.sum(axis=1) / max(points.shape[1], 1)
 
 
 def choose_motion(
@@ -175,11 +281,9 @@ def choose_motion(
     def aligned(alignment: AlignmentConfig, candidates: Sequence[_Candidate | VerifiedMotion]) -> list[VerifiedMotion]:
         starts = np.stack([candidate.T_target_source for candidate in candidates])
         found = align_surfaces_from(source.surface, target.surface, starts, alignment)
-        motions = [alignment.T_target_source for alignment in found]
-        return [
-            VerifiedMotion(candidate.row, T, verify_motion(source, target, T, config))
-            for candidate, T in zip(candidates, motions, strict=True)
-        ]
+        T = np.stack([alignment.T_target_source for alignment in found])
+        verified = verify_motions(source, target, T, config)
+        return [VerifiedMotion(one.row, *rest) for one, *rest in zip(candidates, T, verified, strict=True)]
 
     tried: list[VerifiedMotion] = []
     for some in _candidates(source, target, np.asarray(T_target_source, float), config):

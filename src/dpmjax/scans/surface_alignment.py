@@ -83,6 +83,37 @@ class SurfaceAlignment(NamedTuple):
     num_pairs: int
 
 
+class NearestPlanes(NamedTuple):
+    """Samples of the source under several motions, and the planes of the target nearest to them.
+
+    Attributes:
+        is_paired: (s, n) whether a point of the target is within the radius; the rest means nothing elsewhere.
+        points: (s, n, 3) samples in the frame of the target.
+        residuals: (s, n) signed distances to the planes, metres.
+        normals: (s, n, 3) normals of the planes.
+        cosines: (s, n) absolute cosine between the normals of both surfaces.
+        flatness: (s, n) of the target's neighbourhood.
+    """
+
+    is_paired: Bool[np.ndarray, "s n"]
+    points: Float[np.ndarray, "s n 3"]
+    residuals: Float[np.ndarray, "s n"]
+    normals: Float[np.ndarray, "s n 3"]
+    cosines: Float[np.ndarray, "s n"]
+    flatness: Float[np.ndarray, "s n"]
+
+    def take(self, rows: Bool[np.ndarray, " s"]) -> NearestPlanes:
+        """Returns those of some motions.
+
+        Args:
+            rows: which motions.
+
+        Returns:
+            Their planes.
+        """
+        return NearestPlanes(*(values[rows] for values in self))
+
+
 class PlanePairs(NamedTuple):
     """Source points and the planes of the target nearest to them.
 
@@ -146,7 +177,7 @@ def align_surfaces_from(
         is_active = has_pairs.copy()
         for _ in range(level.num_iterations):
             rows = np.flatnonzero(is_active)
-            pairs = _nearest_planes(source, target, T[rows], level)
+            pairs = nearest_planes(source, target, T[rows], level)
             num_pairs[rows] = pairs.is_paired.sum(axis=1)
             is_enough = num_pairs[rows] >= MIN_PAIRS
             lost = rows[~is_enough]
@@ -160,6 +191,41 @@ def align_surfaces_from(
             length_m, angle_rad = np.linalg.norm(step[:, :3], axis=1), np.linalg.norm(step[:, 3:], axis=1)
             is_active[rows] = (length_m >= config.converged_m) | (angle_rad >= config.converged_rad)
     return [SurfaceAlignment(*found) for found in zip(T, rmse_m.tolist(), num_pairs.tolist(), strict=True)]
+
+
+def nearest_planes(
+    source: Surface,
+    target: Surface,
+    T_target_source: Float[np.ndarray, "s 4 4"],
+    level: AlignmentLevel,
+) -> NearestPlanes:
+    """Finds the planes of the target nearest to the first samples of the source, under several motions.
+
+    Args:
+        source: surface of a scan.
+        target: the other.
+        T_target_source: motions of the source.
+        level: radius and number of points.
+
+    Returns:
+        A plane for each sample under each motion.
+    """
+    rows, R_transposed = source.samples[: level.num_points], T_target_source[:, :3, :3].transpose(0, 2, 1)
+    moved = source.points[rows] @ R_transposed + T_target_source[:, None, :3, 3]
+    if len(target.points) == 0:
+        nothing = np.zeros(moved.shape[:2])
+        return NearestPlanes(nothing > 0, moved, nothing, np.zeros_like(moved), nothing, nothing)
+    found, distances = target.tree.nearest(moved.reshape(-1, 3), 1)
+    nearest, is_paired = found.reshape(moved.shape[:2]), distances.reshape(moved.shape[:2]) < level.radius_m
+    normals = target.normals[nearest]
+    return NearestPlanes(
+        is_paired,
+        points=moved,
+        residuals=np.einsum("snd,snd->sn", moved - target.points[nearest], normals),
+        normals=normals,
+        cosines=np.abs(np.einsum("snd,snd->sn", source.normals[rows] @ R_transposed, normals)),
+        flatness=target.flatness[nearest],
+    )
 
 
 def pair_with_planes(
@@ -176,50 +242,12 @@ def pair_with_planes(
     Returns:
         The pairs; points without a neighbour within the radius are left out.
     """
-    pairs = _nearest_planes(source, target, np.asarray(T_target_source)[None], level)
+    pairs = nearest_planes(source, target, np.asarray(T_target_source)[None], level)
     return PlanePairs(*(values[pairs.is_paired] for values in pairs[1:]))
 
 
-class _NearestPlanes(NamedTuple):
-    """Samples of the source under several motions, and the planes nearest to them; what is not paired has any."""
-
-    is_paired: Bool[np.ndarray, "s n"]
-    points: Float[np.ndarray, "s n 3"]
-    residuals: Float[np.ndarray, "s n"]
-    normals: Float[np.ndarray, "s n 3"]
-    cosines: Float[np.ndarray, "s n"]
-    flatness: Float[np.ndarray, "s n"]
-
-    def take(self, rows: Bool[np.ndarray, " s"]) -> _NearestPlanes:
-        return _NearestPlanes(*(values[rows] for values in self))
-
-
-def _nearest_planes(
-    source: Surface,
-    target: Surface,
-    T_target_source: Float[np.ndarray, "s 4 4"],
-    level: AlignmentLevel,
-) -> _NearestPlanes:
-    rows, R_transposed = source.samples[: level.num_points], T_target_source[:, :3, :3].transpose(0, 2, 1)
-    moved = source.points[rows] @ R_transposed + T_target_source[:, None, :3, 3]
-    if len(target.points) == 0:
-        nothing = np.zeros(moved.shape[:2])
-        return _NearestPlanes(nothing > 0, moved, nothing, np.zeros_like(moved), nothing, nothing)
-    found, distances = target.tree.nearest(moved.reshape(-1, 3), 1)
-    nearest, is_paired = found.reshape(moved.shape[:2]), distances.reshape(moved.shape[:2]) < level.radius_m
-    normals = target.normals[nearest]
-    return _NearestPlanes(
-        is_paired,
-        points=moved,
-        residuals=np.einsum("snd,snd->sn", moved - target.points[nearest], normals),
-        normals=normals,
-        cosines=np.abs(np.einsum("snd,snd->sn", source.normals[rows] @ R_transposed, normals)),
-        flatness=target.flatness[nearest],
-    )
-
-
 def _step_to_planes(
-    pairs: _NearestPlanes, level: AlignmentLevel, config: AlignmentConfig
+    pairs: NearestPlanes, level: AlignmentLevel, config: AlignmentConfig
 ) -> tuple[Float[np.ndarray, "s 6"], Float[np.ndarray, "s 3"], Float[np.ndarray, " s"]]:
     """Returns the small translation and rotation that bring points onto their planes, its centre, and the rmse."""
     width = max(config.min_kernel_m, config.kernel_share * level.radius_m)

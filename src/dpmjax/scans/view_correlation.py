@@ -52,7 +52,7 @@ class ViewCorrelationConfig:
     num_cells: int = 96
     num_turns: int = 60
     num_directions: int = 4
-    num_motions: int = 8
+    num_motions: int = 24
     distinct_cells: float = 2.0
     distinct_turns: float = 1.5
 

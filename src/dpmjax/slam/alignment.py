@@ -19,7 +19,7 @@ class Alignment(NamedTuple):
         T_map_scan: float64.
         matched_share: share of the scan's points that meet planes of the map.
         contradicted_share: share of the map's visible points that lie in the scan's free space.
-        score: `matched_share` less the weighted `contradicted_share`.
+        score: against a map, `matched_share` less the weighted `contradicted_share`; of two scans as in `Verification`.
         information: (6, 6) inverse covariance in the tangent of the scan, translation first: weak along a corridor.
         num_starts: number of starts that were tried.
     """

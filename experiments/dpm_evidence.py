@@ -1,0 +1,218 @@
+"""Fits the weights by which `register` judges motions: what two scans see of each other when a motion is right.
+
+    python -m experiments.dpm_evidence
+
+Pairs of scans of simulated scenes are registered: out of doors and inside, whole and thinned to 1,400 points within
+30 m. All hypotheses of a pair, those of the network and those of the search among views from above, are aligned and
+compared with the truth; a logistic regression on `evidence_shares` predicts which are right. Results go to
+results/dpm_evidence/<time>/: metrics.json with the weights for `dpmjax.deeppointmap.verification.EvidenceWeights`, and
+table.md, the share of pairs whose right hypothesis has the highest score of all, scene by scene, each by a fit on the
+other scenes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass, fields
+from functools import partial
+from typing import Annotated, Any
+
+import numpy as np
+from tyro.conf import arg
+
+from experiments._command import StopFlag, check_least, run_command
+from experiments._result_files import do_rows
+from experiments._run_folder import RunOptions, open_run_folder, recording, write_metrics
+
+EXPERIMENT = "dpm_evidence"
+# Far from the seeds of all other commands.
+FIRST_SCENE = 6_500_000
+WHOLE, THINNED = "whole", "thinned"
+SCENES = (
+    *((kind, sensor, WHOLE) for kind, sensor in (("suburb", "HDL64E"), ("campus", "OS1_64"), ("canyon", "HDL64E"))),
+    *((kind, sensor, WHOLE) for kind, sensor in (("country", "HDL32E"), ("wood", "OS1_64"), ("car_park", "HDL32E"))),
+    *((kind, sensor, WHOLE) for kind, sensor in (("office", "HDL64E"), ("hall", "OS1_64"), ("flat", "OS1_64"))),
+    *((kind, sensor, WHOLE) for kind, sensor in (("office", "OS1_64"), ("hall", "HDL32E"))),
+    *((kind, sensor, THINNED) for kind, sensor in (("suburb", "HDL64E"), ("suburb", "HDL32E"), ("campus", "HDL32E"))),
+    *((kind, sensor, THINNED) for kind, sensor in (("canyon", "HDL64E"), ("country", "HDL32E"), ("hall", "OS1_64"))),
+)
+INDOORS = ("office", "hall", "flat")
+BANDS = {"near": (2.0, 10.0), "far": (10.0, 20.0)}
+BANDS_INDOORS = {"near": (1.0, 5.0), "far": (5.0, 12.0)}
+NUM_POINTS, MAX_RANGE_M = 1400, 30.0
+TILT_DEG = 1.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Config(RunOptions):
+    """Options of the run."""
+
+    weights: Annotated[str, arg(metavar="NAME|FILE")] = "dpm_small"
+    """The network whose hypotheses are judged."""
+    pairs: Annotated[int, arg(metavar="N")] = 20
+    """Pairs of each distance of each scene."""
+    scenes: Annotated[int, arg(metavar="N")] = len(SCENES)
+    """Number of scenes."""
+    length_m: Annotated[float, arg(metavar="M")] = 200.0
+    """Length of the way through each scene."""
+
+    def __post_init__(self) -> None:
+        """Checks ranges."""
+        check_least(self, pairs=1, scenes=2, length_m=100, seed=0)
+        if self.scenes > len(SCENES):
+            raise ValueError(f"--scenes: expected at most {len(SCENES)}, got {self.scenes}")
+
+
+def main(config: Config) -> dict[str, Any]:
+    """Registers the pairs, fits, and writes weights and table."""
+    from dpmjax import load_model
+
+    model = load_model(config.weights)
+    folder = open_run_folder(config, EXPERIMENT)
+    cases = [
+        {"scene": number, "kind": kind, "sensor": sensor, "points": points}
+        for number, (kind, sensor, points) in enumerate(SCENES[: config.scenes])
+    ]
+    with recording(folder), StopFlag() as stop:
+        work = partial(measure_scene, config, model)
+        rows = do_rows(folder.path, cases, work, seed=config.seed, is_stopped=lambda: stop.is_requested)
+        numbers: dict[str, Any] = {"is_interrupted": stop.is_requested, "weights_of": config.weights}
+        if not stop.is_requested:
+            weights, table = fit(rows)
+            numbers |= {"evidence": asdict(weights), "table": table}
+            (folder / "table.md").write_text(as_table(table), encoding="utf-8")
+            print(as_table(table))
+            print(weights)
+        write_metrics(folder, numbers, seed=config.seed)
+    print(f"results in {folder.path}")
+    return numbers
+
+
+def measure_scene(
+    config: Config, model: Any, *, scene: int, kind: str, sensor: str, points: str
+) -> dict[str, list[dict[str, Any]]]:
+    """Returns the pairs of a scene: what each hypothesis is judged by, its present score, and whether it is right."""
+    import dpmjax.simulation
+    from dpmjax.deeppointmap.scan_registration import match_clouds, prepare_scan
+    from experiments._dpm_data import town_drive
+
+    lidar = getattr(dpmjax.simulation, sensor)
+    drive = town_drive(FIRST_SCENE + scene, length_m=config.length_m, kind=kind, sensor=lidar)
+    pairs = []
+    for band, rows in drawn_pairs(drive, BANDS_INDOORS if kind in INDOORS else BANDS, config.pairs, config.seed):
+        scans, poses = [], []
+        for row in rows:
+            rng = np.random.default_rng([config.seed, row])
+            T_lidar_turned = _turn(rng)
+            scan = drive.read_scan(int(row)) @ T_lidar_turned[:3, :3]
+            scans.append(_thinned(scan, rng) if points == THINNED else scan)
+            poses.append(drive.T_world_lidar[row] @ T_lidar_turned)
+        prepared = [prepare_scan(model, scan.astype(np.float32)) for scan in scans]
+        found = match_clouds(model, *(scan.descriptors for scan in prepared), config=model.config.matching)
+        measured = [scan.measured for scan in prepared]
+        pairs.append({"band": band, **judged(model, measured, found, np.linalg.inv(poses[1]) @ poses[0])})
+    return {"pairs": pairs}
+
+
+def drawn_pairs(
+    drive: Any, bands: dict[str, tuple[float, float]], num: int, seed: int
+) -> Iterator[tuple[str, np.ndarray]]:
+    """Yields the band and the rows of pairs of scans."""
+    from dpmjax.deeppointmap.evaluation import draw_rows_apart
+
+    positions = drive.T_world_lidar[:, :3, 3]
+    distances = np.linalg.norm(positions[:, None] - positions[None], axis=2)
+    for number, (band, limits) in enumerate(bands.items()):
+        rng = np.random.default_rng([seed, number])
+        yield from ((band, rows) for rows in draw_rows_apart(distances, *limits, num, rng))
+
+
+def judged(model: Any, measured: list[Any], hypotheses: Any, T_true: np.ndarray) -> dict[str, Any]:
+    """Returns what all hypotheses of a pair are judged by, aligned as `register` aligns them."""
+    from dpmjax.deeppointmap.scan_registration import distinct_motions
+    from dpmjax.deeppointmap.verification import evidence_shares, verify_motions
+    from dpmjax.metrics import registration_recall
+    from dpmjax.scans import correlate_views
+    from dpmjax.scans.surface_alignment import align_surfaces_from
+
+    config, surfaces = model.config.verification, [scan.surface for scan in measured]
+    T = np.concatenate([distinct_motions(hypotheses), correlate_views(*surfaces, config.views)])
+    for alignment in (config.coarse, config.fine):
+        T = np.stack([found.T_target_source for found in align_surfaces_from(*surfaces, T, alignment)])
+    return {
+        "shares": evidence_shares(*measured, T, config).tolist(),
+        "scores": [found.score for found in verify_motions(*measured, T, config)],
+        "is_right": registration_recall(T, np.broadcast_to(T_true, T.shape)).is_right.tolist(),
+    }
+
+
+def fit(rows: list[dict[str, Any]]) -> tuple[Any, list[dict[str, Any]]]:
+    """Returns the weights by all scenes, and a table of the choices by the weights of the other scenes."""
+    from dpmjax.deeppointmap.verification import EvidenceWeights
+
+    names = tuple(field.name for field in fields(EvidenceWeights))
+    scene = np.concatenate([np.full(_num_hypotheses(row), row["scene"]) for row in rows])
+    shares = np.concatenate([pair["shares"] for row in rows for pair in row["pairs"]])
+    is_right = np.concatenate([pair["is_right"] for row in rows for pair in row["pairs"]])
+    table = []
+    for row in rows:
+        others = scene != row["scene"]
+        _, weights = _fitted(shares[others], is_right[others])
+        for band in dict.fromkeys(pair["band"] for pair in row["pairs"]):
+            pairs = [pair for pair in row["pairs"] if pair["band"] == band]
+            right = [np.asarray(pair["is_right"]) for pair in pairs]
+            by_score = [is_right[np.argmax(pair["scores"])] for is_right, pair in zip(right, pairs, strict=True)]
+            by_fit = [
+                is_right[np.argmax(pair["shares"] @ weights)] for is_right, pair in zip(right, pairs, strict=True)
+            ]
+            table.append(
+                {
+                    **{name: row[name] for name in ("kind", "sensor", "points")},
+                    "band": band,
+                    "num_pairs": len(pairs),
+                    "by_the_present_weights": float(np.mean(by_score)),
+                    "by_a_fit_on_the_others": float(np.mean(by_fit)),
+                    "any_right": float(np.mean([one.any() for one in right])),
+                }
+            )
+    bias, weights = _fitted(shares, is_right)
+    return EvidenceWeights(**dict(zip(names, (round(bias, 2), *np.round(weights, 2).tolist()), strict=True))), table
+
+
+def as_table(table: list[dict[str, Any]]) -> str:
+    """Returns the table in Markdown."""
+    lines = ["| " + " | ".join(name.replace("_", " ") for name in table[0]) + " |", "|" + "---|" * len(table[0])]
+    for row in table:
+        cells = [f"{value:.2f}" if isinstance(value, float) else str(value) for value in row.values()]
+        lines.append("| " + " | ".join(cells) + " |")
+    return "\n".join(lines) + "\n"
+
+
+def _num_hypotheses(row: dict[str, Any]) -> int:
+    return sum(len(pair["is_right"]) for pair in row["pairs"])
+
+
+def _fitted(shares: np.ndarray, is_right: np.ndarray) -> tuple[float, np.ndarray]:
+    from dpmjax.deeppointmap.confidence import fit_weights
+
+    weights, bias = fit_weights(shares, is_right)
+    return bias, weights
+
+
+def _thinned(scan: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    scan = scan[np.linalg.norm(scan, axis=1) < MAX_RANGE_M]
+    return scan[rng.choice(len(scan), min(NUM_POINTS, len(scan)), replace=False)]
+
+
+def _turn(rng: np.random.Generator) -> np.ndarray:
+    """Returns `T_lidar_turned`: any yaw, and a tilt by about a degree."""
+    from scipy.spatial.transform import Rotation
+
+    tilt = Rotation.from_euler("xy", rng.normal(0, TILT_DEG, 2), degrees=True)
+    T = np.eye(4)
+    T[:3, :3] = (tilt * Rotation.from_euler("z", rng.uniform(0, 360), degrees=True)).as_matrix()
+    return T
+
+
+if __name__ == "__main__":
+    raise SystemExit(run_command(main, Config, experiment=EXPERIMENT, description=__doc__))
