@@ -188,13 +188,11 @@ def verify_motions(
     bias, *weights = astuple(config.evidence)
     num_visible = sum(side.is_visible.sum(axis=1) for side in sides)
     num_contradicted = sum(side.is_contradicted.sum(axis=1) for side in sides)
-    shares = (
-        num_visible / max(sum(side.is_visible.shape[1] for side in sides), 1),
-        matched,
-        num_contradicted / np.maximum(num_visible, 1),
-        _evidence(sides) @ np.array(weights) + bias,
-    )
-    return [Verification(*map(float, of_motion)) for of_motion in zip(*shares, strict=True)]
+    visible = num_visible / max(sum(side.is_visible.shape[1] for side in sides), 1)
+    contradicted = num_contradicted / np.maximum(num_visible, 1)
+    scores = _evidence(sides) @ np.array(weights) + bias
+    columns = (column.tolist() for column in (visible, matched, contradicted, scores))
+    return [Verification(*shares) for shares in zip(*columns, strict=True)]
 
 
 class _Compared(NamedTuple):
