@@ -8,7 +8,7 @@ import pytest
 from tqdm import tqdm
 
 import dpmjax
-from dpmjax.deeppointmap.confidence import OVERLAP_FEATURES
+from dpmjax.deeppointmap.confidence import OVERLAP_FEATURES, SCAN_FEATURES
 from experiments import _dpm_data, _dpm_evaluation, _dpm_overlap, _dpm_pairs, dpm_calibrate, dpm_evaluate
 from experiments._command import EXIT_BAD_INPUT, EXIT_OK, run_command
 from experiments._result_files import load_json
@@ -77,7 +77,9 @@ def test_calibration_is_stored_in_a_copy_of_the_model(weights, tmp_path, monkeyp
         T = pair.T_target_source if is_right else np.eye(4)
         of_clouds = rng.normal(size=4) + is_right
         motions = {"descriptors": T, "verified": T, "refined": T}
-        evidence = _dpm_pairs.Evidence(of_clouds, np.concatenate([of_clouds, rng.normal(size=4) + 2 * is_right]))
+        evidence = _dpm_pairs.Evidence(
+            of_clouds, np.concatenate([of_clouds, rng.normal(size=len(SCAN_FEATURES) - 4) + 2 * is_right])
+        )
         return _dpm_pairs.PairResult(motions, evidence, {})
 
     monkeypatch.setattr(_dpm_pairs, "register_pair", found)
