@@ -13,7 +13,7 @@ other scenes.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, astuple, dataclass, fields
 from functools import partial
 from typing import Annotated, Any
 
@@ -91,7 +91,7 @@ def main(config: Config) -> dict[str, Any]:
 def measure_scene(
     config: Config, model: Any, *, scene: int, kind: str, sensor: str, points: str
 ) -> dict[str, list[dict[str, Any]]]:
-    """Returns the pairs of a scene: what each hypothesis is judged by, its present score, and whether it is right."""
+    """Returns the pairs of a scene: what each hypothesis is judged by, and whether it is right."""
     import dpmjax.simulation
     from dpmjax.deeppointmap.scan_registration import match_clouds, prepare_scan
     from experiments._dpm_data import town_drive
@@ -130,7 +130,7 @@ def drawn_pairs(
 def judged(model: Any, measured: list[Any], hypotheses: Any, T_true: np.ndarray) -> dict[str, Any]:
     """Returns what all hypotheses of a pair are judged by, aligned as `register` aligns them."""
     from dpmjax.deeppointmap.scan_registration import distinct_motions
-    from dpmjax.deeppointmap.verification import evidence_shares, verify_motions
+    from dpmjax.deeppointmap.verification import evidence_shares
     from dpmjax.metrics import registration_recall
     from dpmjax.scans import correlate_views
     from dpmjax.scans.surface_alignment import align_surfaces_from
@@ -141,15 +141,16 @@ def judged(model: Any, measured: list[Any], hypotheses: Any, T_true: np.ndarray)
         T = np.stack([found.T_target_source for found in align_surfaces_from(*surfaces, T, alignment)])
     return {
         "shares": evidence_shares(*measured, T, config).tolist(),
-        "scores": [found.score for found in verify_motions(*measured, T, config)],
         "is_right": registration_recall(T, np.broadcast_to(T_true, T.shape)).is_right.tolist(),
     }
 
 
 def fit(rows: list[dict[str, Any]]) -> tuple[Any, list[dict[str, Any]]]:
     """Returns the weights by all scenes, and a table of the choices by the weights of the other scenes."""
+    from dpmjax.deeppointmap.confidence import fit_weights
     from dpmjax.deeppointmap.verification import EvidenceWeights
 
+    _, *present = astuple(EvidenceWeights())
     names = tuple(field.name for field in fields(EvidenceWeights))
     scene = np.concatenate([np.full(_num_hypotheses(row), row["scene"]) for row in rows])
     shares = np.concatenate([pair["shares"] for row in rows for pair in row["pairs"]])
@@ -157,11 +158,14 @@ def fit(rows: list[dict[str, Any]]) -> tuple[Any, list[dict[str, Any]]]:
     table = []
     for row in rows:
         others = scene != row["scene"]
-        _, weights = _fitted(shares[others], is_right[others])
+        weights, _ = fit_weights(shares[others], is_right[others])
         for band in dict.fromkeys(pair["band"] for pair in row["pairs"]):
             pairs = [pair for pair in row["pairs"] if pair["band"] == band]
             right = [np.asarray(pair["is_right"]) for pair in pairs]
-            by_score = [is_right[np.argmax(pair["scores"])] for is_right, pair in zip(right, pairs, strict=True)]
+            by_score = [
+                is_right[np.argmax(pair["shares"] @ np.array(present))]
+                for is_right, pair in zip(right, pairs, strict=True)
+            ]
             by_fit = [
                 is_right[np.argmax(pair["shares"] @ weights)] for is_right, pair in zip(right, pairs, strict=True)
             ]
@@ -175,7 +179,7 @@ def fit(rows: list[dict[str, Any]]) -> tuple[Any, list[dict[str, Any]]]:
                     "any_right": float(np.mean([one.any() for one in right])),
                 }
             )
-    bias, weights = _fitted(shares, is_right)
+    weights, bias = fit_weights(shares, is_right)
     return EvidenceWeights(**dict(zip(names, (round(bias, 2), *np.round(weights, 2).tolist()), strict=True))), table
 
 
@@ -190,13 +194,6 @@ def as_table(table: list[dict[str, Any]]) -> str:
 
 def _num_hypotheses(row: dict[str, Any]) -> int:
     return sum(len(pair["is_right"]) for pair in row["pairs"])
-
-
-def _fitted(shares: np.ndarray, is_right: np.ndarray) -> tuple[float, np.ndarray]:
-    from dpmjax.deeppointmap.confidence import fit_weights
-
-    weights, bias = fit_weights(shares, is_right)
-    return bias, weights
 
 
 def _thinned(scan: np.ndarray, rng: np.random.Generator) -> np.ndarray:

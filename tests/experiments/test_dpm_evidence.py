@@ -21,9 +21,7 @@ def made_up_rows() -> list[dict]:
         for _ in range(100):
             shares = rng.uniform(0, 1, (30, 6))
             is_right = rng.uniform(size=30) < 1 / (1 + np.exp(2 - shares @ weights))
-            pairs.append(
-                {"band": "near", "shares": shares.tolist(), "scores": [0.0] * 30, "is_right": is_right.tolist()}
-            )
+            pairs.append({"band": "near", "shares": shares.tolist(), "is_right": is_right.tolist()})
         rows.append({"scene": scene, "kind": "a", "sensor": "b", "points": "c", "pairs": pairs})
     return rows
 
