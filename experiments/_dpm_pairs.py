@@ -52,11 +52,18 @@ class PairResult(NamedTuple):
 
 def draw_pairs(drive: LidarSequence, band: str, num_pairs: int, seed: int) -> np.ndarray:
     """Returns (p, 2) rows of scans whose distance is in the band; fewer where the drive has fewer."""
+    rng = np.random.default_rng([PAIR_STREAM, list(BANDS).index(band), seed])
+    return draw_pairs_within(drive, BANDS[band], num_pairs, rng)
+
+
+def draw_pairs_within(
+    drive: LidarSequence, limits_m: tuple[float, float], num_pairs: int, rng: np.random.Generator
+) -> np.ndarray:
+    """Returns (p, 2) rows of scans whose distance is within limits; fewer where the drive has fewer."""
     assert drive.T_world_lidar is not None
     positions = drive.T_world_lidar[:, :3, 3]
     distances = np.linalg.norm(positions[:, None] - positions[None], axis=2)
-    rng = np.random.default_rng([PAIR_STREAM, list(BANDS).index(band), seed])
-    return draw_rows_apart(distances, *BANDS[band], num_pairs, rng)
+    return draw_rows_apart(distances, *limits_m, num_pairs, rng)
 
 
 def read_pairs(drive: LidarSequence, pairs: np.ndarray, seed: int) -> Iterator[ScanPair]:

@@ -12,7 +12,6 @@ other scenes.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import asdict, astuple, dataclass, fields
 from functools import partial
 from typing import Annotated, Any
@@ -95,11 +94,18 @@ def measure_scene(
     import dpmjax.simulation
     from dpmjax.deeppointmap.scan_registration import match_clouds, prepare_scan
     from experiments._dpm_data import town_drive
+    from experiments._dpm_pairs import draw_pairs_within
 
     lidar = getattr(dpmjax.simulation, sensor)
     drive = town_drive(FIRST_SCENE + scene, length_m=config.length_m, kind=kind, sensor=lidar)
+    bands = BANDS_INDOORS if kind in INDOORS else BANDS
+    drawn = [
+        (band, rows)
+        for number, (band, limits_m) in enumerate(bands.items())
+        for rows in draw_pairs_within(drive, limits_m, config.pairs, np.random.default_rng([config.seed, number]))
+    ]
     pairs = []
-    for band, rows in drawn_pairs(drive, BANDS_INDOORS if kind in INDOORS else BANDS, config.pairs, config.seed):
+    for band, rows in drawn:
         scans, poses = [], []
         for row in rows:
             rng = np.random.default_rng([config.seed, row])
@@ -112,19 +118,6 @@ def measure_scene(
         measured = [scan.measured for scan in prepared]
         pairs.append({"band": band, **judged(model, measured, found, np.linalg.inv(poses[1]) @ poses[0])})
     return {"pairs": pairs}
-
-
-def drawn_pairs(
-    drive: Any, bands: dict[str, tuple[float, float]], num: int, seed: int
-) -> Iterator[tuple[str, np.ndarray]]:
-    """Yields the band and the rows of pairs of scans."""
-    from dpmjax.deeppointmap.evaluation import draw_rows_apart
-
-    positions = drive.T_world_lidar[:, :3, 3]
-    distances = np.linalg.norm(positions[:, None] - positions[None], axis=2)
-    for number, (band, limits) in enumerate(bands.items()):
-        rng = np.random.default_rng([seed, number])
-        yield from ((band, rows) for rows in draw_rows_apart(distances, *limits, num, rng))
 
 
 def judged(model: Any, measured: list[Any], hypotheses: Any, T_true: np.ndarray) -> dict[str, Any]:
