@@ -38,8 +38,8 @@ class Config(RunOptions):
 
     model: Positional[str]
     """The model: a .safetensors file, or the name of a shipped one."""
-    towns: Annotated[int, arg(metavar="N")] = 6
-    """Number of towns."""
+    towns: Annotated[int, arg(metavar="N")] = 9
+    """Number of towns. The kinds of place, of which there are nine, take turns, so that each counts the same."""
     pairs: Annotated[int, arg(metavar="N")] = 30
     """Pairs of each town that are 2 to 10 m apart, as many 10 to 20 m apart, and as many without overlap."""
     town_length_m: Annotated[float, arg(metavar="M")] = 400.0
@@ -57,6 +57,7 @@ class Config(RunOptions):
 def main(config: Config) -> dict[str, Any]:
     """Registers and compares the pairs, fits, and writes the model."""
     from dpmjax import load_model, save_model, viz
+    from dpmjax.simulation import SceneMixture
     from dpmjax.weights import read_card
     from experiments import _dpm_overlap
     from experiments._dpm_pairs import BANDS
@@ -66,9 +67,11 @@ def main(config: Config) -> dict[str, Any]:
     rows, overlap_rows = [], []
     total = config.towns * len(BANDS) * config.pairs + config.overlap_towns * config.overlap_pairs
     with recording(folder), tqdm(total=total, unit=" pairs") as bar:
-        for town in range(FIRST_TOWN, FIRST_TOWN + config.towns):
-            work = partial(_town, config, model, town, bar)
-            rows.append(do_row(folder.path, {"town": town}, work, seed=config.seed))
+        kinds = [kind for kind, _ in SceneMixture().kinds]
+        for number in range(config.towns):
+            case = {"town": FIRST_TOWN + number, "kind": kinds[number % len(kinds)]}
+            work = partial(_town, config, model, **case, bar=bar)
+            rows.append(do_row(folder.path, case, work, seed=config.seed))
             bar.update(sum(len(row["is_right"]) for row in rows) - bar.n)
         num_done = sum(len(row["is_right"]) for row in rows)
         for town in range(FIRST_OVERLAP_TOWN, FIRST_OVERLAP_TOWN + config.overlap_towns):
@@ -97,12 +100,12 @@ def main(config: Config) -> dict[str, Any]:
     return numbers
 
 
-def _town(config: Config, model: Any, town: int, bar: tqdm) -> dict[str, Any]:
+def _town(config: Config, model: Any, *, town: int, kind: str, bar: tqdm) -> dict[str, Any]:
     from dpmjax.metrics import registration_recall
     from experiments._dpm_data import town_drive
     from experiments._dpm_pairs import BANDS, draw_pairs, read_pairs, register_pair
 
-    drive = town_drive(town, length_m=config.town_length_m)
+    drive = town_drive(town, length_m=config.town_length_m, kind=kind)
     found: dict[str, list[Any]] = {"of_clouds": [], "of_scans": [], "is_right_of_clouds": [], "is_right": []}
     for band in BANDS:
         for pair in read_pairs(drive, draw_pairs(drive, band, config.pairs, config.seed), config.seed):
