@@ -68,7 +68,13 @@ def test_bad_input_is_one_line(weights, tmp_path, capsys, arguments, message: st
 
 
 def test_calibration_is_stored_in_a_copy_of_the_model(weights, tmp_path, monkeypatch) -> None:
-    monkeypatch.setattr(_dpm_data, "town_drive", lambda seed, **_: toy.drive(seed))
+    kinds = []
+
+    def town_drive(seed, *, length_m, kind=None):
+        kinds.append(kind)
+        return toy.drive(seed)
+
+    monkeypatch.setattr(_dpm_data, "town_drive", town_drive)
     rng = np.random.default_rng(0)
 
     def found(model, pair):
@@ -85,6 +91,8 @@ def test_calibration_is_stored_in_a_copy_of_the_model(weights, tmp_path, monkeyp
     monkeypatch.setattr(_dpm_pairs, "register_pair", found)
     sizes = ["--towns", 3, "--pairs", 20, "--overlap-towns", 2, "--overlap-pairs", 16]
     assert run(dpm_calibrate, [weights, *sizes, "-o", tmp_path / "out"]) == EXIT_OK
+    assert len(set(kinds[:3])) == 3  # of towns for confidence; those for overlap are of any kind
+    assert set(kinds[3:]) == {None}
     model = dpmjax.load_model(tmp_path / "out" / "model.safetensors")
     assert model.config.calibration is not None
     assert max(model.config.calibration.of_scans.weights[4:]) > 0
