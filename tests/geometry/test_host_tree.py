@@ -1,10 +1,14 @@
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 from scipy.spatial.distance import cdist
 
-from dpmjax.geometry.host_tree import HostTree
+from dpmjax.geometry.host_tree import WAIT_POLICY, HostTree
 
 
 @pytest.mark.parametrize("num_threads", [1, 3])
@@ -25,3 +29,12 @@ def test_distances_are_the_smallest_of_all(case: str, k: int, num_threads: int) 
 def test_without_points_queries_or_neighbours_nothing_is_found(num_points: int, num_queries: int, k: int) -> None:
     rows, distances = HostTree(np.ones((num_points, 3)), num_threads=2).nearest(np.ones((num_queries, 3)), k)
     assert rows.shape == distances.shape == (num_queries, k)
+
+
+@pytest.mark.parametrize("policy", [None, "ACTIVE"])
+def test_other_libraries_keep_their_policy_of_waiting(policy: str | None) -> None:
+    variables = {name: value for name, value in os.environ.items() if name != WAIT_POLICY}
+    variables |= {} if policy is None else {WAIT_POLICY: policy}
+    program = f"import os, dpmjax.geometry.host_tree; print(os.environ.get({WAIT_POLICY!r}))"
+    printed = subprocess.run([sys.executable, "-c", program], env=variables, capture_output=True, check=True, text=True)
+    assert printed.stdout.strip() == str(policy)

@@ -2,9 +2,21 @@
 
 from __future__ import annotations
 
+import os
+
 import numpy as np
-import small_gicp
 from jaxtyping import Float, Int
+
+WAIT_POLICY = "OMP_WAIT_POLICY"
+if WAIT_POLICY in os.environ:
+    import small_gicp
+else:
+    # Its threads would wait in a loop for milliseconds after each search, on cores that JAX needs by then. OpenMP reads
+    # the policy once, when the library is loaded.
+    os.environ[WAIT_POLICY] = "PASSIVE"
+    import small_gicp
+
+    del os.environ[WAIT_POLICY]
 
 
 class HostTree:
