@@ -9,6 +9,7 @@ import json
 import os
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -19,10 +20,19 @@ from numpy.typing import NDArray
 
 import dpmjax
 from benchmarks.rows import Row, measure
-from dpmjax.deeppointmap import merge_clouds
+from dpmjax.deeppointmap import (
+    CurriculumStage,
+    ScanStore,
+    init_training,
+    make_step,
+    merge_clouds,
+    prepare_drive,
+    training_preset,
+)
+from dpmjax.deeppointmap.data_pipeline import SampleMaker
 from dpmjax.deeppointmap.encoding import pyramid_of_cloud
 from dpmjax.geometry import build_pyramid
-from dpmjax.io import open_lidar_sequence
+from dpmjax.io import LidarSequence, open_lidar_sequence
 from dpmjax.scans import preprocess_scan, preprocess_scan_on_host
 from dpmjax.simulation import HDL64E, simulate_lidar_sequence
 from dpmjax.types import DescriptorCloud
@@ -106,6 +116,26 @@ def time_overlap(folder: Path, quick: bool, *, preset: str) -> list[Row]:
     return _timed(f"{preset}, one pair", {"overlap": partial(dpmjax.overlap, model, *clouds)}, quick)
 
 
+def time_training(folder: Path, quick: bool, *, preset: str) -> list[Row]:
+    """Returns times of a training step on pairs of scans, as the curriculum begins, and the scans a second."""
+    settings = replace(training_preset(preset), num_variants=1)
+    num_scans = 4 if quick else settings.sampling.num_scans
+    settings = replace(
+        settings, curriculum=(CurriculumStage(2, 1),), sampling=replace(settings.sampling, num_scans=num_scans)
+    )
+    points = read_scans(folder)["town"]
+    T_world_lidar = np.tile(np.eye(4), (num_scans, 1, 1))
+    T_world_lidar[:, 0, 3] = np.linspace(0, 10, num_scans)
+    drive = LidarSequence("town", ("town",) * num_scans, lambda _: points, T_world_lidar)
+    with SampleMaker(ScanStore([prepare_drive(drive, settings)]), settings, seed=0) as maker:
+        batch = maker(0)
+    step = make_step(settings)
+    state = init_training(jax.random.key(0), settings)
+    timing = measure(step, state, batch, repeats=3 if quick else 12)
+    case = f"{preset}, K = 2, {num_scans} scans: training step"
+    return [*timing.rows(case), Row(case, "speed", num_scans / timing.median_s, "scans/s")]
+
+
 def run_everything(folder: Path, quick: bool, *, preset: str) -> list[Row]:
     """Returns no rows; runs encoding, registration of scans and maps, and overlap, to measure the memory."""
     model = _model(preset)
@@ -159,6 +189,7 @@ STAGES: dict[str, Callable[[Path, bool], list[Row]]] = {
     "match tiny": partial(time_matching, preset="tiny", num_target=256),
     "match scan": partial(time_matching, preset="paper", num_target=256),
     "match map": partial(time_matching, preset="paper", num_target=256 * SCANS_IN_MAP),
+    **{f"train {preset}": partial(time_training, preset=preset) for preset in ("tiny", "small", "paper")},
     "overlap": partial(time_overlap, preset="paper"),
     "everything tiny": partial(run_everything, preset="tiny"),
     "everything paper": partial(run_everything, preset="paper"),

@@ -10,7 +10,14 @@ import pytest
 
 from benchmarks import deeppointmap_stages
 from benchmarks.deeppointmap import FIGURES, FULL, QUICK, run_stage, with_figures
-from benchmarks.deeppointmap_stages import STAGES, read_scans, time_encoding, time_jax_builders, time_matching
+from benchmarks.deeppointmap_stages import (
+    STAGES,
+    read_scans,
+    time_encoding,
+    time_jax_builders,
+    time_matching,
+    time_training,
+)
 from benchmarks.rows import Row
 from tests.deeppointmap import toy
 
@@ -20,6 +27,7 @@ def folder(tmp_path, monkeypatch):
     """Two scans of a ring of posts, for a toy model."""
     monkeypatch.setattr(deeppointmap_stages.dpmjax, "model_preset", lambda name: toy.MODEL)
     angles = np.linspace(0, 2 * np.pi, 400)
+    monkeypatch.setattr(deeppointmap_stages, "training_preset", lambda name: toy.TRAINING)
     for name, radius in (("town", 20.0), ("KITTI", 30.0)):
         heights = np.tile(np.linspace(0, 3, 8), 50)
         points = np.stack([radius * np.cos(angles), radius * np.sin(angles), heights], axis=1)
@@ -58,11 +66,13 @@ def test_figures_have_a_case(folder) -> None:
     timed = [
         partial(time_encoding, preset="tiny"),
         partial(time_matching, preset="tiny", num_target=256),
+        partial(time_training, preset="tiny"),
     ]
     cases = {row.case.replace("tiny", "paper") for stage in timed for row in stage(folder, quick=True)}
     for case in FIGURES:
         if "overlap" not in case and "process" not in case:
-            assert re.sub(r"\d+ x \d+", "32 x 256", case.replace("small", "paper")) in cases
+            toy_case = re.sub(r"\d+ x \d+", "32 x 256", case.replace("small", "paper"))
+            assert toy_case.replace("16 scans", "4 scans") in cases
 
 
 def test_compile_time_is_told_of_what_is_compiled(folder) -> None:
@@ -72,3 +82,10 @@ def test_compile_time_is_told_of_what_is_compiled(folder) -> None:
         "pyramid in JAX",
         "network",
     ]
+
+
+@pytest.mark.slow
+def test_speed_of_training_is_scans_over_the_time_of_a_step(folder) -> None:
+    rows = {row.metric: row for row in time_training(folder, quick=True, preset="tiny")}
+    assert rows["speed"].value == pytest.approx(4 / (1e-3 * rows["median"].value))
+    assert {row.case for row in rows.values()} == {"tiny, K = 2, 4 scans: training step"}
