@@ -31,7 +31,7 @@ FULL = (
     "train small",
     "everything paper",
 )
-QUICK = ("products", "encode tiny", "match tiny", "train tiny", "everything tiny")
+QUICK = ("products", "encode tiny", "match tiny", "everything tiny")
 
 
 class Figure(NamedTuple):

@@ -26,8 +26,8 @@ from tests.deeppointmap import toy
 def folder(tmp_path, monkeypatch):
     """Two scans of a ring of posts, for a toy model."""
     monkeypatch.setattr(deeppointmap_stages.dpmjax, "model_preset", lambda name: toy.MODEL)
-    angles = np.linspace(0, 2 * np.pi, 400)
     monkeypatch.setattr(deeppointmap_stages, "training_preset", lambda name: toy.TRAINING)
+    angles = np.linspace(0, 2 * np.pi, 400)
     for name, radius in (("town", 20.0), ("KITTI", 30.0)):
         heights = np.tile(np.linspace(0, 3, 8), 50)
         points = np.stack([radius * np.cos(angles), radius * np.sin(angles), heights], axis=1)
