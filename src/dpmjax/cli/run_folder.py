@@ -15,9 +15,9 @@ from typing import Annotated, Any, ClassVar, Literal, TypeVar
 
 from tyro.conf import FlagCreatePairsOff, arg
 
+from dpmjax.cli.machine import environment
+from dpmjax.cli.result_files import as_json, commits_note, load_json, write_json
 from dpmjax.sequences import InputError
-from experiments._machine import environment
-from experiments._result_files import as_json, commits_note, load_json, write_json
 
 CONFIG, METRICS, HISTORY, LOG = "config.json", "metrics.json", "metrics.csv", "log.txt"
 CHECKPOINTS, BEST, AGENTS, DRIVES = "checkpoints", "checkpoints_best", "agents", "drives"

@@ -67,10 +67,8 @@ def environment() -> dict[str, Any]:
 
 def versions() -> dict[str, str]:
     """Returns the versions of Python, of this package, and of the packages that its numbers depend on."""
-    import dpmjax
-
-    installed = {name: importlib.metadata.version(name) for name in PACKAGES}
-    return {"python": platform.python_version(), "dpmjax": dpmjax.__version__, **installed}
+    installed = {name: importlib.metadata.version(name) for name in ("dpmjax", *PACKAGES)}
+    return {"python": platform.python_version(), **installed}
 
 
 def device_name() -> str | None:
@@ -84,8 +82,11 @@ def device_name() -> str | None:
 
 
 def git_hash() -> str | None:
-    """Returns the commit of this checkout, with `+changes` where it is not clean; None without git."""
-    command = ["git", "-C", str(Path(__file__).parent), "describe", "--always", "--abbrev=40", "--exclude=*"]
+    """Returns the commit of this checkout, with `+changes` where it is not clean; None where it is installed."""
+    root = Path(__file__).parents[3]
+    if not (root / "src" / "dpmjax").is_dir():  # a checkout around site-packages is another project's
+        return None
+    command = ["git", "-C", str(root), "describe", "--always", "--abbrev=40", "--exclude=*"]
     try:
         found = subprocess.run([*command, "--dirty=+changes"], capture_output=True, text=True, check=True, timeout=5)
     except (OSError, subprocess.SubprocessError):

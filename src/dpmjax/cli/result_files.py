@@ -16,8 +16,8 @@ from typing import Any, Self
 
 from tqdm import tqdm
 
+from dpmjax.cli.machine import git_hash, versions
 from dpmjax.io.files import write_atomically
-from experiments._machine import git_hash, versions
 
 UNKNOWN = "unknown"
 
