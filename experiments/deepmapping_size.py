@@ -22,7 +22,7 @@ from tyro.conf import arg
 from dpmjax.cli.command import run_command
 from dpmjax.cli.machine import environment, peak_rss_gb
 from dpmjax.cli.result_files import load_json, write_json
-from dpmjax.cli.run_folder import FolderOptions, open_run_folder, recording, write_metrics
+from dpmjax.cli.run_folder import RunOptions, open_run_folder, recording, write_metrics
 
 EXPERIMENT = "deepmapping_size"
 # The exponent is that of large sizes: below, a step does not hold its full number of scans.
@@ -30,7 +30,7 @@ _FULL_STEP = 256
 
 
 @dataclass(frozen=True, kw_only=True)
-class Config(FolderOptions):
+class Config(RunOptions):
     """Options of the measurement."""
 
     may_change: ClassVar[frozenset[str]] = frozenset({"sizes"})

@@ -15,6 +15,7 @@ ALLOWED: dict[str, set[str]] = {
     "checks": set(),
     "sequences": set(),
     "checkpoints": set(),
+    "compile_cache": set(),
     "geometry": set(),
     "scans": {"geometry"},
     "nets": {"geometry"},

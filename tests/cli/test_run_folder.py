@@ -14,8 +14,8 @@ import pytest
 from dpmjax.cli import result_files, run_folder
 from dpmjax.cli.result_files import HistoryFile, commits_note, do_row, read_history, row_path, write_json
 from dpmjax.cli.run_folder import (
-    FolderOptions,
     RunFailedError,
+    RunOptions,
     check_run_folder,
     load_config,
     open_run_folder,
@@ -30,7 +30,7 @@ class Nested:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Config(FolderOptions):
+class Config(RunOptions):
     may_change: ClassVar[frozenset[str]] = frozenset({"seconds"})
 
     data: Path | None = None

@@ -13,7 +13,7 @@ from .result_files import do_rows as do_rows
 from .result_files import load_json as load_json
 from .result_files import read_history as read_history
 from .result_files import write_json as write_json
-from .run_folder import FolderOptions as FolderOptions
+from .run_folder import OutputOptions as OutputOptions
 from .run_folder import RunFolder as RunFolder
 from .run_folder import RunOptions as RunOptions
 from .run_folder import open_run_folder as open_run_folder

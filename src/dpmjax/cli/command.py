@@ -12,13 +12,14 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import fields
 from functools import partial
 from types import FrameType
-from typing import Any, Self, TypeVar
+from typing import Any, TypeVar
 
 import tyro
 
 from dpmjax.cli import program
-from dpmjax.cli.machine import enable_compilation_cache, select_device
-from dpmjax.cli.run_folder import FolderOptions, RunFailedError, check_run_folder, find_run, load_config
+from dpmjax.cli.machine import select_device
+from dpmjax.cli.run_folder import OutputOptions, RunFailedError, check_run_folder, find_run, load_config
+from dpmjax.compile_cache import enable_compile_cache
 from dpmjax.sequences import InputError
 
 EXIT_OK, EXIT_FAILED, EXIT_BAD_INPUT = program.EXIT_OK, 1, program.EXIT_BAD_INPUT
@@ -68,7 +69,7 @@ class StopFlag:
         """Sets the flag where another process of the same run has received the signal."""
         self.received = self.received or signal_number
 
-    def __enter__(self) -> Self:
+    def __enter__(self) -> StopFlag:
         if threading.current_thread() is threading.main_thread():
             self._previous = {number: signal.signal(number, self._on_signal) for number in SIGNALS}
         return self
@@ -125,7 +126,7 @@ def run_command(
 
     Args:
         main: takes the options. Errors of the user are raised as `ValueError` before the run folder is opened.
-        config_type: frozen dataclass. Of `FolderOptions`, the folder is checked and the device selected before `main`.
+        config_type: frozen dataclass. Of `OutputOptions`, the folder is checked and the device selected before `main`.
         name: of the subcommand of `dpmjax`, or of the module in `experiments`; and of the folder in `results`.
         description: the module's docstring; `--help` begins with it.
         args: the command line; None takes that of the process.
@@ -140,12 +141,12 @@ def run_command(
     console.setLevel(logging.WARNING)
     logging.basicConfig(format="dpmjax: %(levelname)s: %(message)s", handlers=[console])
     previous = {number: signal.signal(number, _interrupt) for number in SIGNALS}
-    enable_compilation_cache()
+    enable_compile_cache()
     try:
         config = _parse(config_type, name, description, arguments)
-        if isinstance(config, FolderOptions):
+        if isinstance(config, OutputOptions):
             check_run_folder(config, name)
-            select_device(getattr(config, "device", None))
+            select_device(config.device)
         main(config)
     except SystemExit as done:  # tyro, after --help or wrong usage
         return EXIT_OK if done.code is None else int(done.code)

@@ -8,12 +8,12 @@ import platform
 import resource
 import subprocess
 import sys
-import zlib
 from pathlib import Path
 from typing import Any, Literal
 
+from dpmjax.compile_cache import cpu_model
+
 PACKAGES = ("jax", "jaxlib", "flax", "optax", "numpy", "scipy")
-CACHES = "Library/Caches" if sys.platform == "darwin" else ".cache"
 
 
 def select_device(device: Literal["cpu", "gpu"] | None) -> None:
@@ -34,23 +34,6 @@ def select_device(device: Literal["cpu", "gpu"] | None) -> None:
         raise ValueError(
             f"--device {device}: JAX finds no such device here; leave the option out or install its plugin"
         ) from error
-
-
-def enable_compilation_cache() -> None:
-    """Keeps compiled programs between runs, in `$XDG_CACHE_HOME/dpmjax`, or in the platform's folder for caches.
-
-    Call it before the first import of JAX. `DPMJAX_COMPILATION_CACHE=off` turns it off, another value names the folder;
-    `JAX_COMPILATION_CACHE_DIR`, where it is set, is kept.
-    """
-    chosen = os.environ.get("DPMJAX_COMPILATION_CACHE", "")
-    if chosen == "off" or "JAX_COMPILATION_CACHE_DIR" in os.environ:
-        return
-    # A program belongs to a processor: a home directory may be shared by several kinds.
-    caches = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / CACHES) / "dpmjax"
-    os.environ["JAX_COMPILATION_CACHE_DIR"] = chosen or str(caches / f"{zlib.crc32(cpu_model().encode()):08x}")
-    # Also the hundreds of small programs, which take seconds together.
-    os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
-    os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES", "-1")
 
 
 def environment() -> dict[str, Any]:
@@ -92,11 +75,6 @@ def git_hash() -> str | None:
     except (OSError, subprocess.SubprocessError):
         return None
     return found.stdout.strip()
-
-
-def cpu_model() -> str:
-    """Returns the name of the processor."""
-    return _fields("/proc/cpuinfo").get("model name") or platform.processor() or platform.machine()
 
 
 def usable_cores() -> int:
