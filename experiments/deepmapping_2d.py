@@ -1,6 +1,8 @@
 """The same as `dpmjax map2d`."""
 
-from dpmjax.cli.map2d import run
+import sys
+
+from dpmjax.cli import main
 
 if __name__ == "__main__":
-    raise SystemExit(run())
+    raise SystemExit(main(["map2d", *sys.argv[1:]]))

@@ -1,6 +1,8 @@
 """The same as `dpmjax slam`."""
 
-from dpmjax.cli.slam import run
+import sys
+
+from dpmjax.cli import main
 
 if __name__ == "__main__":
-    raise SystemExit(run())
+    raise SystemExit(main(["slam", *sys.argv[1:]]))

@@ -1,6 +1,8 @@
 """The same as `dpmjax train`."""
 
-from dpmjax.cli.train import run
+import sys
+
+from dpmjax.cli import main
 
 if __name__ == "__main__":
-    raise SystemExit(run())
+    raise SystemExit(main(["train", *sys.argv[1:]]))

@@ -7,6 +7,7 @@ from .machine import git_hash as git_hash
 from .machine import peak_rss_gb as peak_rss_gb
 from .machine import usable_cores as usable_cores
 from .machine import versions as versions
+from .program import main as main
 from .result_files import HistoryFile as HistoryFile
 from .result_files import do_row as do_row
 from .result_files import do_rows as do_rows
