@@ -188,12 +188,13 @@ def solve(problem: Problem, data: Any, *, key: jax.Array) -> tuple[FitState, Rep
     for phase in range(len(problem.phases)):
         if phase > 0:
             state = begin_phase(problem, state, data, phase=phase)
-        state, reports = jax.lax.scan(
-            lambda state, _, phase=phase: step(problem, state, data, phase=phase),
-            state,
-            length=num_calls(problem, problem.phases[phase]),
-        )
+        length = num_calls(problem, problem.phases[phase])
+        state, reports = jax.lax.scan(partial(_scanned_step, problem, data, phase), state, length=length)
     return state, jax.tree.map(lambda leaf: leaf[-1], reports)
+
+
+def _scanned_step(problem: Problem, data: Any, phase: int, state: FitState, _: None) -> tuple[FitState, Report]:
+    return step(problem, state, data, phase=phase)
 
 
 def is_finished(problem: Problem, state: FitState) -> bool:
