@@ -12,7 +12,7 @@ import dpmjax
 from dpmjax import deepmapping, simulation
 
 walks = [simulation.simulate_sequence(seed, 8, num_beams=64) for seed in range(8)]
-config = deepmapping.with_steps(deepmapping.preset("fast"), 100)
+config = deepmapping.with_steps(deepmapping.preset("fast"), 60)
 
 # The data of a problem are arrays in units of the typical range; stacked, they are eight data sets.
 data, units = zip(*(deepmapping.planar_data(dpmjax.ScanSet(walk.points, walk.mask)) for walk in walks), strict=True)
