@@ -160,7 +160,7 @@ def point_distance(
         raise ValueError(f"points: expected shape ({len(estimated)}, b, {dim}), got {points.shape}")
     if mask.shape != points.shape[:2] or mask.dtype != bool:
         raise ValueError(f"mask: expected bool of shape {points.shape[:2]}, got {mask.dtype} of {mask.shape}")
-    if not is_traced(mask) and not mask.any():
+    if not is_traced(mask) and not np.asarray(mask).any():
         raise ValueError("mask: expected at least one valid point, got none")
     points = xp.where(mask[..., None], points, 0)
     if not is_traced(points) and not np.isfinite(points).all():
