@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from benchmarks.rows import Row, measure
 from dpmjax import deepmapping as dm
-from dpmjax.deepmapping.fit import Progress, fit
+from dpmjax.deepmapping import Progress, fit
 from dpmjax.deepmapping.planar import as_fitted, planar_data, planar_problem
 from dpmjax.io import ScanSequence, read_sequence
 from dpmjax.metrics import absolute_trajectory_error

@@ -155,7 +155,7 @@ def _fit(task: Task, start: Floats | None, config: DeepMappingConfig | None = No
     order = np.arange(len(task.sequence)) if start is None else in_fitting_order(task, start)
     scans = replace(task, sequence=task.sequence.take(order)).scans
     fitted = deepmapping.fit_deepmapping(
-        scans, settings, key=jax.random.key(task.seed), init=None if start is None else start[order]
+        scans, settings, key=jax.random.key(task.seed), start=None if start is None else start[order]
     )
     return fitted.poses[np.argsort(order)]
 

@@ -74,7 +74,7 @@ def run_method(
     if start is None:
         return dm.fit_depth(scans, used, key=key).T_world_camera
     init = found[start] if start in found else run_method(start, sequence, settings, found, seed=seed)
-    fitted = dm.fit_depth(scans, used, key=key, init=init).T_world_camera
+    fitted = dm.fit_depth(scans, used, key=key, start=init).T_world_camera
     return max(fitted, init, key=lambda T: float(dm.projective_consistency(scans, T)))
 
 

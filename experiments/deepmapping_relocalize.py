@@ -156,9 +156,7 @@ def load_fit(run: Path, options: deepmapping_2d.Config, sequence: ScanSequence) 
     import jax
 
     from dpmjax.checkpoints import Checkpoints
-    from dpmjax.deepmapping import Fitted
-    from dpmjax.deepmapping.fit import init
-    from dpmjax.deepmapping.planar import planar_data, planar_problem
+    from dpmjax.deepmapping import Fitted, init, planar_data, planar_problem
     from dpmjax.types import ScanSet
 
     trajectory = run / "trajectory.npy"

@@ -104,9 +104,7 @@ def measure(num_scans: int, num_calls: int, seed: int, output: str) -> None:
     """Seconds a step of both phases, and the peak of memory of this process, as JSON."""
     import jax
 
-    from dpmjax.deepmapping import preset
-    from dpmjax.deepmapping.fit import fit, steps_per_call
-    from dpmjax.deepmapping.planar import planar_data, planar_problem
+    from dpmjax.deepmapping import fit, planar_data, planar_problem, preset, steps_per_call
     from dpmjax.simulation import simulate_sequence
     from dpmjax.types import ScanSet
 

@@ -15,10 +15,7 @@ import numpy as np
 from jaxtyping import Array, Float
 from numpy.typing import NDArray
 
-from dpmjax.deepmapping.config import DeepMappingConfig
-from dpmjax.deepmapping.fit import init
-from dpmjax.deepmapping.planar import planar_data, planar_problem
-from dpmjax.deepmapping.toy import toy_loss
+from dpmjax.deepmapping import DeepMappingConfig, init, planar_data, planar_problem, toy_loss
 from dpmjax.types import ScanSet
 
 

@@ -17,8 +17,7 @@ from dpmjax.cli.run_folder import CHECKPOINTS, HISTORY, RunFolder
 
 if TYPE_CHECKING:
     from dpmjax.checkpoints import Checkpoints
-    from dpmjax.deepmapping import DeepMappingConfig, Fitted, Problem
-    from dpmjax.deepmapping.fit import Fit, Progress
+    from dpmjax.deepmapping import DeepMappingConfig, Fit, Fitted, Problem, Progress
     from dpmjax.sequences import ScanSequence
 
 # Of the table; the error, named with its unit, comes last.
@@ -123,7 +122,7 @@ def record_fit(folder: RunFolder, task: FitTask, *, stop: Callable[[float], bool
     import jax
 
     from dpmjax.checkpoints import Checkpoints
-    from dpmjax.deepmapping.fit import init, resume
+    from dpmjax.deepmapping import init, resume
 
     state = init(task.problem, task.data, key=jax.random.key(task.seed))
     checkpoints = Checkpoints(Path(folder.path) / CHECKPOINTS)

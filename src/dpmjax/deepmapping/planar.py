@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from dpmjax.deepmapping.batches import draw_offsets, draw_rows, scans_in_block
 from dpmjax.deepmapping.config import DeepMappingConfig, PhaseConfig
-from dpmjax.deepmapping.fit import Fit, Report, fit
+from dpmjax.deepmapping.engine import Fit, Report, fit
 from dpmjax.deepmapping.objective import Terms, WorldBatch, chamfer_term, interpolate_log
 from dpmjax.deepmapping.problem import (
     MapFrame,
@@ -90,12 +90,12 @@ def as_scan_set(scans: ScanSet | ArrayLike, *, min_scans: int = 2) -> ScanSet:
     return ScanSet(points=clean, mask=mask)
 
 
-def planar_data(scans: ScanSet | ArrayLike, init: ArrayLike | None = None) -> tuple[MappingData, float]:
+def planar_data(scans: ScanSet | ArrayLike, start: ArrayLike | None = None) -> tuple[MappingData, float]:
     """Checked scans and poses with the typical range of the scans as the unit of length, as the problem takes them.
 
     Args:
         scans: as `as_scan_set`.
-        init: (n, 3) x, y, heading or (n, 3, 3) matrices to start from; None: cold start.
+        start: (n, 3) x, y, heading or (n, 3, 3) matrices to start from; None: cold start.
 
     Returns:
         The data, and the typical range in the unit of the scans.
@@ -106,13 +106,13 @@ def planar_data(scans: ScanSet | ArrayLike, init: ArrayLike | None = None) -> tu
     checked = as_scan_set(scans)
     unit, count = typical_range(checked.points, checked.mask), len(checked.points)
     scaled = replace(checked, points=checked.points / unit)
-    if init is None:
+    if start is None:
         return MappingData(scaled), unit
-    given = np.asarray(init, np.float64)
+    given = np.asarray(start, np.float64)
     if not np.isfinite(given).all():
-        raise ValueError("init: expected finite poses")
+        raise ValueError("start: expected finite poses")
     if given.shape not in ((count, 3), (count, 3, 3)):
-        raise ValueError(f"init: expected shape ({count}, 3) or ({count}, 3, 3), got {given.shape}")
+        raise ValueError(f"start: expected shape ({count}, 3) or ({count}, 3, 3), got {given.shape}")
     poses = given if given.ndim == 2 else se2.from_matrix(given)
     return MappingData(scaled, jnp.asarray(poses / [unit, unit, 1.0], jnp.float32)), unit
 
@@ -135,7 +135,7 @@ def fit_deepmapping(
     config: DeepMappingConfig | None = None,
     *,
     key: jax.Array,
-    init: ArrayLike | None = None,
+    start: ArrayLike | None = None,
     num_starts: int = 1,
 ) -> Fitted:
     """Registers planar scans by optimising L-Net and M-Net on them alone (DeepMapping eq. 6).
@@ -144,18 +144,18 @@ def fit_deepmapping(
         scans: (n, b, 2) in the sensor frames, any unit; all-zero or non-finite beams are left out. Or a ScanSet.
         config: settings; None: `preset("fast")`.
         key: of the whole run.
-        init: (n, 3) x, y, heading or (n, 3, 3) matrices to start from; None: cold start from zero.
+        start: (n, 3) x, y, heading or (n, 3, 3) matrices to start from; None: cold start from zero.
         num_starts: starts with other weights, side by side; the worse half by the loss is dropped again and again.
 
     Returns:
-        Fitted, poses in the unit of the points. The world is that of `init`, or arbitrary after a cold start.
+        Fitted, poses in the unit of the points. The world is that of `start`, or arbitrary after a cold start.
 
     Raises:
         ValueError: the scans or the poses have a wrong shape or are not finite, a scan has no valid beam, or there is
             no start.
     """
     config = config or DeepMappingConfig()
-    data, unit = planar_data(scans, init)
+    data, unit = planar_data(scans, start)
     return as_fitted(fit(planar_problem(config, data), data, key=key, num_starts=num_starts), unit, config)
 
 
