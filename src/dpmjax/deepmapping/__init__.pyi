@@ -5,7 +5,7 @@ from .cloud_scans import as_cloud_scans as as_cloud_scans
 from .clouds import CloudFitted as CloudFitted
 from .clouds import cloud_data as cloud_data
 from .clouds import cloud_problem as cloud_problem
-from .clouds import fit_clouds as fit_clouds
+from .clouds import register_clouds as register_clouds
 from .config import DeepMappingConfig as DeepMappingConfig
 from .config import PhaseConfig as PhaseConfig
 from .config import as_direct as as_direct

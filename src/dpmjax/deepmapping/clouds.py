@@ -1,11 +1,11 @@
-"""DeepMapping of 3-D lidar clouds: the problem, and `fit_clouds` around the engine (sections 3.2 to 3.4, in SE(3)).
+"""DeepMapping of 3-D lidar clouds: the problem, and `register_clouds` around the engine (sections 3.2 to 3.4, in SE(3)).
 
 `spatial` has the poses, `cloud_scans` the scans, `plane_distance` how they are compared.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Literal, NamedTuple
 
@@ -39,7 +39,7 @@ _JUDGED_WIDTH = 0.004
 
 
 class CloudFitted(NamedTuple):
-    """Result of `fit_clouds`.
+    """Result of `register_clouds`.
 
     Attributes:
         T_world_scan: (n, 4, 4) float64, unit of the points: of the fit, or the start where that fits better.
@@ -98,13 +98,14 @@ def cloud_problem(config: CloudMappingConfig, data: MappingData) -> Problem:
     return mapping_problem(config, data, MappingFunctions(init_spatial, _loss, spatial_poses, next_spatial_phase))
 
 
-def fit_clouds(
+def register_clouds(
     scans: CloudScans | Sequence[ArrayLike],
     config: CloudMappingConfig | None = None,
     *,
     key: jax.Array,
     start: ArrayLike | None = None,
     num_starts: int = 1,
+    engine: Callable[..., Fit] = fit,
 ) -> CloudFitted:
     """Registers 3-D lidar scans by optimising L-Net and M-Net on them alone (DeepMapping eq. 6, in SE(3)).
 
@@ -114,6 +115,8 @@ def fit_clouds(
         key: of the whole run.
         start: (n, 4, 4) T_world_scan to start from; None: cold start.
         num_starts: starts with other weights, side by side; the worse half by the loss is dropped again and again.
+        engine: what trains, called as `engine(problem, data, key=key, num_starts=num_starts)`;
+            `functools.partial(fit, on_report=..., stop=...)` reports each call of the step and can be stopped.
 
     Returns:
         CloudFitted, in the world of `start`, or an arbitrary one after a cold start.
@@ -123,7 +126,7 @@ def fit_clouds(
     """
     config = config or CloudMappingConfig()
     data, unit = cloud_data(scans, start, num_points=config.num_points)
-    return as_fitted(fit(cloud_problem(config, data), data, key=key, num_starts=num_starts), data, unit)
+    return as_fitted(engine(cloud_problem(config, data), data, key=key, num_starts=num_starts), data, unit)
 
 
 def as_fitted(done: Fit, data: MappingData, unit: float) -> CloudFitted:

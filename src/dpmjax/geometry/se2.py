@@ -142,6 +142,28 @@ def from_matrix(T_a_b: Any) -> Any:
     return xp.stack([T_a_b[..., 0, 2], T_a_b[..., 1, 2], xp.arctan2(T_a_b[..., 1, 0], T_a_b[..., 0, 0])], axis=-1)
 
 
+def as_poses(name: str, value: Any, count: int) -> Any:
+    """Makes poses x, y, heading of what a user has: these, or matrices; on the host.
+
+    Args:
+        name: of the argument, for messages.
+        value: (count, 3) x, y, heading, or (count, 3, 3) homogeneous matrices.
+        count: number of poses.
+
+    Returns:
+        (count, 3) float64.
+
+    Raises:
+        ValueError: the shape is another one, or a number is not finite.
+    """
+    poses = np.asarray(value, np.float64)
+    if poses.shape not in ((count, 3), (count, 3, 3)):
+        raise ValueError(f"{name}: expected shape ({count}, 3) or ({count}, 3, 3), got {poses.shape}")
+    if not np.isfinite(poses).all():
+        raise ValueError(f"{name}: expected finite poses")
+    return poses if poses.ndim == 2 else from_matrix(poses)
+
+
 def transform_points(pose_a_b: Any, points_b: Any) -> Any:
     """Moves the points of each scan by its pose.
 
