@@ -12,8 +12,8 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import NDArray
 
-from dpmjax.deepmapping.projective_consistency import Pinhole, fit_pinhole
-from dpmjax.geometry.normals import image_normals
+from dpmjax.deepmapping import Pinhole, as_depth_scans
+from dpmjax.geometry import image_normals
 from dpmjax.metrics import absolute_trajectory_error
 from dpmjax.sequences import DepthSequence
 

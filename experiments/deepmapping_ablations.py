@@ -98,7 +98,7 @@ def main(config: Config) -> dict[str, Any]:
 def settings_of(ablation: str, variant: str, config: Config) -> DepthMappingConfig:
     """The basis with one thing changed."""
     from dpmjax.deepmapping import JOINT_DEPTH, DepthMappingConfig, depth_preset
-    from dpmjax.nets.occupancy import OccupancyConfig
+    from dpmjax.nets import OccupancyConfig
 
     phase = replace(
         JOINT_DEPTH,

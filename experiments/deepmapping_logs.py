@@ -1,4 +1,4 @@
-"""Runs deepmapping_2d on every CARMEN log of some folders, from several starts, and writes one table.
+"""Runs `dpmjax map2d` on every CARMEN log of some folders, from several starts, and writes one table.
 
     python -m experiments.deepmapping_logs path/to/logs -o out
     python -m experiments.deepmapping_logs path/to/recordings --inits auto --corrected path/to/logs
@@ -77,7 +77,7 @@ def _run(log: Path, init: str, corrected: Path | None, config: Config) -> dict[s
     """Returns the metrics of one run, in a process with a peak memory of its own; None where the log lacks odometry."""
     folder = config.output / f"{log.name.removesuffix('.gz')}_{init}"
     if not (folder / METRICS).exists():
-        command = [sys.executable, "-m", "dpmjax.cli.map2d", str(log), "-o", str(folder), "--force"]
+        command = [sys.executable, "-m", "dpmjax", "map2d", str(log), "-o", str(folder), "--force"]
         command += ["--init", init, "--seed", str(config.seed)]
         command += [] if config.steps is None else ["--steps", str(config.steps)]
         relations = log.with_name(drive_of(log) + ".relations")

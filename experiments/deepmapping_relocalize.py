@@ -1,9 +1,9 @@
 """Draws how well a fit re-localises unseen scans, at every free pixel of a world (DeepMapping figure 7).
 
-    python -m experiments.deepmapping_2d --world 1 --init zero -o run
+    dpmjax map2d --world 1 --init zero -o run
     python -m experiments.deepmapping_relocalize run
 
-RUN is a folder of deepmapping_2d on a built-in world. L-Net is trained on the poses that the fit has found; it proposes
+RUN is a folder of `dpmjax map2d` on a built-in world. L-Net is trained on the poses that the fit has found; it proposes
 poses of each scan, and M-Net chooses. Headings are random and unknown. Written beside the results of RUN:
 relocalization.png, relocalization.json, and relocalization.npz with the numbers of each scan.
 """
@@ -23,7 +23,8 @@ from tyro.conf import Positional, arg
 from dpmjax.cli.command import run_command
 from dpmjax.cli.machine import environment
 from dpmjax.cli.result_files import write_json
-from dpmjax.cli.run_folder import CHECKPOINTS, find_run, load_config
+from dpmjax.cli.map2d import FinishedRun, as_scan_set, read_run
+from dpmjax.cli.run_folder import CHECKPOINTS
 
 if TYPE_CHECKING:
     from dpmjax.deepmapping import Fitted
@@ -40,7 +41,7 @@ class Config:
     """Options of the picture."""
 
     run: Annotated[Positional[Path], arg(metavar="RUN")]
-    """Folder of a run of deepmapping_2d on a built-in world."""
+    """Folder of a run of `dpmjax map2d` on a built-in world."""
     stride_px: Annotated[int, arg(metavar="PX")] = 6
     """A scan is taken at the centre of every square of so many pixels that is free."""
     heading: Literal["random", "nearest", "east"] = "random"
@@ -65,17 +66,17 @@ def main(config: Config) -> dict[str, Any]:
     from dpmjax.simulation import make_world, scan_world
     from dpmjax.types import ScanSet
 
-    options = load_config(find_run(deepmapping_2d.EXPERIMENT, config.run), deepmapping_2d.Config)
-    if options.data is not None:
-        raise ValueError(f"{config.run} is a run on {options.data}: the map of its world is needed; use a built-in one")
-    sequence = deepmapping_2d.read_scans(options)
-    fitted = load_fit(config.run, options, sequence)
-    grid = make_world(options.world).is_obstacle
+    run = read_run(config.run)
+    if run.world is None:
+        raise ValueError(f"{config.run} is a run on {run.sequence.name}, whose world is needed; use a built-in one")
+    sequence = run.sequence
+    fitted = load_fit(config.run, run)
+    grid = make_world(run.world).is_obstacle
     truth = free_poses(grid, sequence, config)
     points, mask = scan_world(grid, truth, num_beams=sequence.points.shape[1])
     begun = time.perf_counter()
     training = LocalizationTrainingConfig(num_steps=config.steps)
-    scans = ScanSet(sequence.points, sequence.mask)
+    scans = as_scan_set(sequence)
     trained = train_localization(fitted, scans, training, key=jax.random.key(config.seed))
     jax.block_until_ready(trained.params)
     training_s, begun = time.perf_counter() - begun, time.perf_counter()
@@ -139,13 +140,12 @@ def draw(
     viz.save_figure(figure, config.run / "relocalization.png")
 
 
-def load_fit(run: Path, options: deepmapping_2d.Config, sequence: ScanSequence) -> Fitted:
+def load_fit(path: Path, run: FinishedRun) -> Fitted:
     """The fit of a run folder, with its own poses: those that its map belongs to.
 
     Args:
-        run: the folder.
-        options: of the run.
-        sequence: its scans.
+        path: the folder.
+        run: its scans and settings.
 
     Returns:
         The fit.
@@ -157,25 +157,22 @@ def load_fit(run: Path, options: deepmapping_2d.Config, sequence: ScanSequence) 
 
     from dpmjax.checkpoints import Checkpoints
     from dpmjax.deepmapping import Fitted, init, planar_data, planar_problem
-    from dpmjax.types import ScanSet
 
-    trajectory = run / "trajectory.npy"
+    trajectory = path / "trajectory.npy"
     if not trajectory.is_file():
-        raise ValueError(f"{run} holds no trajectory.npy: let the run end, or resume it")
-    if not options.ordered:
+        raise ValueError(f"{path} holds no trajectory.npy: let the run end, or resume it")
+    if not run.is_ordered:
         raise ValueError(
-            f"{run} is a run with --no-ordered, whose fit has another order of the scans; use an ordered one"
+            f"{path} is a run with --no-ordered, whose fit has another order of the scans; use an ordered one"
         )
-    settings = deepmapping_2d.fit_settings(options, sequence)
-    start = None if options.init == "zero" else np.load(trajectory)
-    data, unit = planar_data(ScanSet(sequence.points, sequence.mask), start)
-    problem = planar_problem(settings, data)
+    data, unit = planar_data(as_scan_set(run.sequence), None if run.is_cold else np.load(trajectory))
+    problem = planar_problem(run.settings, data)
     like = init(problem, data, key=jax.random.key(0))
-    state = Checkpoints((run / CHECKPOINTS).resolve()).restore_latest(like, fallback=None)
+    state = Checkpoints((path / CHECKPOINTS).resolve()).restore_latest(like, fallback=None)
     if state is None:
-        raise ValueError(f"{run} holds no checkpoint that can be read")
-    poses = np.asarray(problem.poses(settings, problem.phases[int(state.phase)], state.params, data), np.float64)
-    return Fitted(poses * [unit, unit, 1.0], state.params, None, unit, settings)
+        raise ValueError(f"{path} holds no checkpoint that can be read")
+    poses = np.asarray(problem.poses(run.settings, problem.phases[int(state.phase)], state.params, data), np.float64)
+    return Fitted(poses * [unit, unit, 1.0], state.params, None, unit, run.settings)
 
 
 def free_poses(grid: NDArray[np.bool_], sequence: ScanSequence, config: Config) -> NDArray[np.float64]:

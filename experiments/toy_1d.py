@@ -71,7 +71,7 @@ class Config:
 def main(config: Config) -> dict[str, Any]:
     """Runs all seeds, then all variants, draws, measures, writes."""
     from dpmjax.deepmapping import ToyConfig, global_minimum
-    from dpmjax.nets.scalar import Initialization
+    from dpmjax.nets import Initialization
 
     select_device(config.device)  # type: ignore[arg-type]
     folder = open_run_folder(config, EXPERIMENT)

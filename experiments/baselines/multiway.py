@@ -14,8 +14,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from numpy.typing import NDArray
 
-from dpmjax.geometry import rigid, se2
-from dpmjax.geometry.rays import typical_range
+from dpmjax.geometry import rigid, se2, typical_range
 from dpmjax.types import AnyArray, ScanSet
 
 Floats = NDArray[np.float64]

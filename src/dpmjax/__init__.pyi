@@ -18,6 +18,8 @@ from . import types as types
 from . import viz as viz
 from . import weights as weights
 from .compile_cache import enable_compile_cache as enable_compile_cache
+from .deepmapping.clouds import register_clouds as register_clouds
+from .deepmapping.depth_registration import register_depth as register_depth
 from .deepmapping.planar import fit_deepmapping as fit_deepmapping
 from .deepmapping.relocalization import relocalize as relocalize
 from .deeppointmap.batches import encode_scans as encode_scans
@@ -54,6 +56,9 @@ from .pose_graph.graph import PoseGraph as PoseGraph
 from .pose_graph.optimize import PoseGraphConfig as PoseGraphConfig
 from .pose_graph.optimize import optimize_pose_graph as optimize_pose_graph
 from .registration.icp import icp as icp
+from .registration.pipeline import RegistrationConfig as RegistrationConfig
+from .registration.pipeline import register_scans as register_scans
+from .registration.refinement import refine as refine
 from .saved_maps.map_file import load_map as load_map
 from .saved_maps.map_file import save_map as save_map
 from .slam.agents import AgentsResult as AgentsResult

@@ -22,6 +22,8 @@ from .depth_config import DepthInitializationConfig as DepthInitializationConfig
 from .depth_config import DepthMappingConfig as DepthMappingConfig
 from .depth_config import depth_preset as depth_preset
 from .depth_initialization import initialize_depth as initialize_depth
+from .depth_registration import RegisteredDepth as RegisteredDepth
+from .depth_registration import register_depth as register_depth
 from .engine import Fit as Fit
 from .engine import FitState as FitState
 from .engine import Progress as Progress

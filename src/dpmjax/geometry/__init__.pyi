@@ -12,5 +12,6 @@ from .pyramid import PyramidStage as PyramidStage
 from .pyramid import build_pyramid as build_pyramid
 from .pyramid_host import build_pyramid_on_host as build_pyramid_on_host
 from .rays import sample_free_space as sample_free_space
+from .rays import typical_range as typical_range
 from .sampling import farthest_point_sample as farthest_point_sample
 from .sampling import voxel_sample as voxel_sample
