@@ -15,14 +15,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dpmjax import deepmapping, registration
-from dpmjax.cli.map2d_numbers import errors
+from dpmjax.cli import planar_errors
 from dpmjax.registration import DEEPMAPPING, START_NAMES
 
 if TYPE_CHECKING:
+    from dpmjax import ScanSet
     from dpmjax.deepmapping import DeepMappingConfig
+    from dpmjax.io import ScanSequence
     from dpmjax.registration import PlanarScans
-    from dpmjax.sequences import ScanSequence
-    from dpmjax.types import ScanSet
 
 Floats = NDArray[np.float64]
 Candidates = dict[str, Floats]
@@ -54,7 +54,7 @@ class Task:
     @property
     def scans(self) -> ScanSet:
         """Returns the scans without their names and reference."""
-        from dpmjax.types import ScanSet
+        from dpmjax import ScanSet
 
         return ScanSet(self.sequence.points, self.sequence.mask)
 
@@ -91,7 +91,9 @@ def refined_icp(task: Task) -> Candidates:
 def choose(task: Task, candidates: Mapping[str, Floats]) -> tuple[str, dict[str, dict[str, float]]]:
     """Returns the name of the best candidate, chosen by the scans alone, and the errors and scores of all."""
     kept, scores = registration.choose_trajectory(task.planar, candidates)
-    return kept, {name: errors(task.sequence, candidates[name]) | score._asdict() for name, score in scores.items()}
+    return kept, {
+        name: planar_errors(task.sequence, candidates[name]) | score._asdict() for name, score in scores.items()
+    }
 
 
 def assess(task: Task, poses: Floats) -> dict[str, Any]:

@@ -21,9 +21,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 import numpy as np
 from tyro.conf import arg
 
-from dpmjax.cli.command import StopFlag, run_command
-from dpmjax.cli.result_files import do_rows
-from dpmjax.cli.run_folder import RunFolder, RunOptions, open_run_folder, recording, write_metrics
+from dpmjax.cli import RunFolder, RunOptions, StopFlag, do_rows, open_run_folder, recording, run_command, write_metrics
 from experiments._rgbd_methods import errors_of
 
 if TYPE_CHECKING:

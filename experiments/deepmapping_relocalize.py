@@ -20,15 +20,11 @@ import numpy as np
 from numpy.typing import NDArray
 from tyro.conf import Positional, arg
 
-from dpmjax.cli.command import run_command
-from dpmjax.cli.machine import environment
-from dpmjax.cli.result_files import write_json
-from dpmjax.cli.map2d import FinishedRun, as_scan_set, read_run
-from dpmjax.cli.run_folder import CHECKPOINTS
+from dpmjax.cli import environment, read_map2d_run, run_command, write_json
 
 if TYPE_CHECKING:
     from dpmjax.deepmapping import Fitted
-    from dpmjax.sequences import ScanSequence
+    from dpmjax.io import ScanSequence
 
 EXPERIMENT = "deepmapping_relocalize"
 # A fit counts as a success below this error (section 4.1); so does a re-localisation.
@@ -62,21 +58,20 @@ def main(config: Config) -> dict[str, Any]:
     """Loads the run, re-localises scans everywhere with both L-Nets, draws, writes."""
     import jax
 
+    from dpmjax import ScanSet
     from dpmjax.deepmapping import LocalizationTrainingConfig, relocalize, train_localization
     from dpmjax.simulation import make_world, scan_world
-    from dpmjax.types import ScanSet
 
-    run = read_run(config.run)
+    run = read_map2d_run(config.run)
     if run.world is None:
         raise ValueError(f"{config.run} is a run on {run.sequence.name}, whose world is needed; use a built-in one")
-    sequence = run.sequence
-    fitted = load_fit(config.run, run)
+    sequence, fitted = run.sequence, run.fitted
     grid = make_world(run.world).is_obstacle
     truth = free_poses(grid, sequence, config)
     points, mask = scan_world(grid, truth, num_beams=sequence.points.shape[1])
     begun = time.perf_counter()
     training = LocalizationTrainingConfig(num_steps=config.steps)
-    scans = as_scan_set(sequence)
+    scans = ScanSet(sequence.points, sequence.mask)
     trained = train_localization(fitted, scans, training, key=jax.random.key(config.seed))
     jax.block_until_ready(trained.params)
     training_s, begun = time.perf_counter() - begun, time.perf_counter()
@@ -138,41 +133,6 @@ def draw(
     extent = (0.0, side[1], 0.0, side[0])
     figure = viz.error_maps_figure(panels, extent, sequence.reference_poses[:, :2], "px", worst=200.0)
     viz.save_figure(figure, config.run / "relocalization.png")
-
-
-def load_fit(path: Path, run: FinishedRun) -> Fitted:
-    """The fit of a run folder, with its own poses: those that its map belongs to.
-
-    Args:
-        path: the folder.
-        run: its scans and settings.
-
-    Returns:
-        The fit.
-
-    Raises:
-        ValueError: the folder holds no checkpoint or no trajectory, or its scans had no order.
-    """
-    import jax
-
-    from dpmjax.checkpoints import Checkpoints
-    from dpmjax.deepmapping import Fitted, init, planar_data, planar_problem
-
-    trajectory = path / "trajectory.npy"
-    if not trajectory.is_file():
-        raise ValueError(f"{path} holds no trajectory.npy: let the run end, or resume it")
-    if not run.is_ordered:
-        raise ValueError(
-            f"{path} is a run with --no-ordered, whose fit has another order of the scans; use an ordered one"
-        )
-    data, unit = planar_data(as_scan_set(run.sequence), None if run.is_cold else np.load(trajectory))
-    problem = planar_problem(run.settings, data)
-    like = init(problem, data, key=jax.random.key(0))
-    state = Checkpoints((path / CHECKPOINTS).resolve()).restore_latest(like, fallback=None)
-    if state is None:
-        raise ValueError(f"{path} holds no checkpoint that can be read")
-    poses = np.asarray(problem.poses(run.settings, problem.phases[int(state.phase)], state.params, data), np.float64)
-    return Fitted(poses * [unit, unit, 1.0], state.params, None, unit, run.settings)
 
 
 def free_poses(grid: NDArray[np.bool_], sequence: ScanSequence, config: Config) -> NDArray[np.float64]:

@@ -22,9 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 from tyro.conf import FlagCreatePairsOff, arg
 
-from dpmjax.cli.command import run_command
-from dpmjax.cli.machine import peak_rss_gb, select_device
-from dpmjax.cli.run_folder import RunFolder, open_run_folder, recording, write_metrics
+from dpmjax.cli import RunFolder, open_run_folder, peak_rss_gb, recording, run_command, select_device, write_metrics
 
 if TYPE_CHECKING:
     from dpmjax.deepmapping import Fit, ToyConfig

@@ -15,8 +15,8 @@ import numpy as np
 from jaxtyping import Array, Float
 from numpy.typing import NDArray
 
+from dpmjax import ScanSet
 from dpmjax.deepmapping import DeepMappingConfig, init, planar_data, planar_problem, toy_loss
-from dpmjax.types import ScanSet
 
 
 def optimize_directly(

@@ -21,7 +21,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,13 +31,18 @@ from dpmjax import deepmapping, io, registration, simulation, viz
 from dpmjax import metrics as trajectory_metrics
 from dpmjax.cli.command import StopFlag, check_least, run_command
 from dpmjax.cli.machine import peak_rss_gb
-from dpmjax.cli.map2d_numbers import ate_of, before_and_after, corrected_numbers, errors, relation_numbers, report
+from dpmjax.cli.map2d_numbers import (
+    ate_of,
+    before_and_after,
+    corrected_numbers,
+    planar_errors,
+    relation_numbers,
+    report,
+)
 from dpmjax.cli.recorded_fit import FitRecorder, draw_loss
 from dpmjax.cli.run_folder import (
     RunFolder,
     RunOptions,
-    find_run,
-    load_config,
     open_run_folder,
     recording,
     write_metrics,
@@ -214,7 +219,7 @@ def numbers_of(
     config: Config,
     measure: Callable[[Floats, str], dict[str, float]],
 ) -> dict[str, Any]:
-    """Returns the numbers of a registration under the names of `metrics.json`; given poses have the name of their file."""
+    """Returns the numbers of a registration under the names of `metrics.json`; given poses are named by their file."""
     registered = registered_scans(sequence, result)
     start, kept = (result.candidates[name].poses for name in (result.start, result.kept))
 
@@ -230,7 +235,7 @@ def numbers_of(
         "start": title(result.start),
         "kept": title(result.kept),
         "candidates": {
-            title(name): errors(registered, candidate.poses) | candidate.score._asdict()
+            title(name): planar_errors(registered, candidate.poses) | candidate.score._asdict()
             for name, candidate in result.candidates.items()
         },
         "assessment": result.assessment._asdict(),
@@ -301,31 +306,6 @@ def fit_settings(config: Config, sequence: ScanSequence) -> DeepMappingConfig:
     """Returns the preset, with the given number of steps."""
     settings = deepmapping.preset(config.preset, is_organised=sequence.is_organised)
     return settings if config.steps is None else deepmapping.with_steps(settings, config.steps)
-
-
-class FinishedRun(NamedTuple):
-    """A run of this command, as its folder tells.
-
-    Attributes:
-        sequence: the scans.
-        settings: of the fit.
-        is_ordered: the fit has the scans in their order.
-        is_cold: the fit began from zero.
-        world: the built-in world; None where the scans were read.
-    """
-
-    sequence: ScanSequence
-    settings: DeepMappingConfig
-    is_ordered: bool
-    is_cold: bool
-    world: int | str | None
-
-
-def read_run(path: Path) -> FinishedRun:
-    """Reads the scans and the settings of a run again; a `ValueError` where the folder holds none."""
-    config = load_config(find_run(NAME, path), Config)
-    sequence, world = read_scans(config), config.world if config.data is None else None
-    return FinishedRun(sequence, fit_settings(config, sequence), config.ordered, config.init == "zero", world)
 
 
 def write_trajectories(folder: RunFolder, sequence: ScanSequence, poses: Floats) -> None:

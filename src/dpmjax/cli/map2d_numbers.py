@@ -20,7 +20,7 @@ UNITS = ("m", "deg")
 _MIN_COMMON = 10
 
 
-def errors(sequence: ScanSequence, poses: Floats) -> dict[str, float]:
+def planar_errors(sequence: ScanSequence, poses: Floats) -> dict[str, float]:
     """Returns ATE and point distance in the unit of the scans; nothing where there is no reference."""
     reference = sequence.reference_poses
     if reference is None:
@@ -45,7 +45,7 @@ def before_and_after(sequence: ScanSequence, start: Floats, poses: Floats) -> di
     reference, unit = sequence.reference_poses, sequence.unit
     if reference is None:
         return {"success": None}
-    after, before = errors(sequence, poses), errors(sequence, start)
+    after, before = planar_errors(sequence, poses), planar_errors(sequence, start)
     # The paper's threshold is 20 pixels, 2 % of its world; of a real place, 2 % of what its trajectory spans.
     threshold = 20.0 if unit == "px" else 0.02 * float(np.linalg.norm(np.ptp(reference[:, :2], axis=0)))
     return {

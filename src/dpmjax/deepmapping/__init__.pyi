@@ -48,6 +48,7 @@ from .planar import planar_problem as planar_problem
 from .problem import MappingData as MappingData
 from .problem import Problem as Problem
 from .projective_consistency import DepthScans as DepthScans
+from .projective_consistency import Pinhole as Pinhole
 from .projective_consistency import projective_consistency as projective_consistency
 from .relocalization import RelocalizationConfig as RelocalizationConfig
 from .relocalization import Relocalized as Relocalized

@@ -1,4 +1,4 @@
-"""DeepMapping of 3-D lidar clouds: the problem, and `register_clouds` around the engine (sections 3.2 to 3.4, in SE(3)).
+"""DeepMapping of 3-D lidar clouds: the problem, and `register_clouds` around the engine (section 3, in SE(3)).
 
 `spatial` has the poses, `cloud_scans` the scans, `plane_distance` how they are compared.
 """
