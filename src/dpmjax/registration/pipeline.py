@@ -236,7 +236,7 @@ def _start_poses(
     if not isinstance(start, str):
         return GIVEN_POSES, start[recording.chosen]
     name = START_NAMES[start]
-    hooks.on_progress(name, 0.0)
+    hooks.on_progress(f"start: {name}", 0.0)
     match start:
         case "zero":
             return name, np.zeros((len(scans), 3))
