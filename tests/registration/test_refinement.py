@@ -70,7 +70,7 @@ def test_scans_as_a_user_has_them_are_those_of_the_record(walk) -> None:
 
 @pytest.mark.parametrize(
     ("poses", "message"),
-    [(np.zeros((3, 3)), "poses: expected shape"), (np.full((24, 3), np.nan), "poses: expected fin")],
+    [(np.zeros((3, 3)), "poses: expected shape"), (np.full((24, 3), np.nan), "poses: expected")],
 )
 def test_bad_poses_are_named(walk_scans, poses, message) -> None:
     with pytest.raises(ValueError, match=message):
