@@ -67,7 +67,8 @@ def register_depth(
         start = initialize_depth(scans, motion=config.motion, key=key)
     fitted = fit_depth(scans, config, key=key, start=start, engine=engine)
     T_start = np.asarray(start, np.float64)
-    both = [float(projective_consistency(scans, T)) for T in (fitted.T_world_camera, T_start)]
-    is_better = both[0] >= both[1]
-    T = fitted.T_world_camera if is_better else T_start
-    return RegisteredDepth(T, "fit" if is_better else "start", *both, T_start, fitted)
+    consistency, start_consistency = (float(projective_consistency(scans, T)) for T in (fitted.T_world_camera, T_start))
+    # A fit that is not finite is not better.
+    if consistency >= start_consistency:
+        return RegisteredDepth(fitted.T_world_camera, "fit", consistency, start_consistency, T_start, fitted)
+    return RegisteredDepth(T_start, "start", consistency, start_consistency, T_start, fitted)

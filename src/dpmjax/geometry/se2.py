@@ -142,7 +142,7 @@ def from_matrix(T_a_b: Any) -> Any:
     return xp.stack([T_a_b[..., 0, 2], T_a_b[..., 1, 2], xp.arctan2(T_a_b[..., 1, 0], T_a_b[..., 0, 0])], axis=-1)
 
 
-def as_poses(name: str, value: Any, count: int) -> Any:
+def as_poses(name: str, value: Any, count: int) -> NDArray[np.float64]:
     """Makes poses x, y, heading of what a user has: these, or matrices; on the host.
 
     Args:

@@ -12,6 +12,7 @@ from functools import partial
 from typing import Literal, NamedTuple, get_args
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -226,7 +227,8 @@ def _choose_scans(
 
 
 def _take(scans: ScanSet, rows: Indices) -> ScanSet:
-    return ScanSet(scans.points[rows], scans.mask[rows])
+    # On the host: each number of rows would be a program of its own.
+    return ScanSet(jnp.asarray(np.asarray(scans.points)[rows]), jnp.asarray(np.asarray(scans.mask)[rows]))
 
 
 def _start_poses(

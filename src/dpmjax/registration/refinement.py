@@ -103,24 +103,24 @@ def refine(
     """
     config = config or RefinementConfig()
     scans = scans if isinstance(scans, PlanarScans) else planar_scans(as_beams("scans", scans))
-    poses = se2.as_poses("poses", poses, len(scans))
-    candidates, num_loops = {"start": poses}, {"start": 0}
-    if scans.is_ordered and config.loops is not None and not _is_sound(scans, poses):
+    start = se2.as_poses("poses", poses, len(scans))
+    candidates, num_loops = {"start": start}, {"start": 0}
+    if scans.is_ordered and config.loops is not None and not _is_sound(scans, start):
         # The steps again, with those of the start as guess and as prior, where the scans leave a direction open.
-        chained, steps = incremental_icp(scans, odometry=poses)
+        chained, steps = incremental_icp(scans, odometry=start)
         rows = np.flatnonzero(fitting_scans(scans, chained))
         if len(rows) < len(scans):
-            fitting = refine(scans.take(rows).replace(is_ordered=True), poses[rows], config)
+            fitting = refine(scans.take(rows).replace(is_ordered=True), start[rows], config)
             return fitting._replace(poses=interpolate(len(scans), rows, fitting.poses))
         matched = matched_steps(steps, scans.typical_range)
         candidates["loops"], _, weights = close_loops(scans, chained, config.loops, steps=matched)
         num_loops["loops"] = int((weights > 0.25).sum())
-    aligned = {name: _align_all(scans, start, config) for name, start in candidates.items()}
+    aligned = {name: _align_all(scans, candidate, config) for name, candidate in candidates.items()}
     kept = "start" if len(aligned) == 1 else choose_trajectory(scans, aligned)[0]
-    poses = aligned[kept]
+    best = aligned[kept]
     if scans.noise > _MIN_NOISE * scans.typical_range:
-        poses = adjust_to_lines(scans, poses)
-    return Refined(poses, num_loops[kept])
+        best = adjust_to_lines(scans, best)
+    return Refined(best, num_loops[kept])
 
 
 def _align_all(scans: PlanarScans, poses: Floats, config: RefinementConfig) -> Floats:
