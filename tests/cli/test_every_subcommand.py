@@ -1,4 +1,4 @@
-"""Every subcommand on what the package simulates, away from the checkout, as a user of the installed package runs it."""
+"""Every subcommand on simulated input, away from the checkout, as a user of the installed package runs it."""
 
 from __future__ import annotations
 
@@ -19,8 +19,10 @@ SIMULATED = {
     "slam": ("-n", "12", "-o", "first"),
     "localize": ("first/map.npz", "scans", "-o", "found"),
     "merge": ("first/map.npz", "first/map.npz", "-o", "merged"),
-    "train": ("--steps", "3", "--num-towns", "1", "--town-length-m", "100", "--selection-pairs", "2")
-    + ("--held-out-pairs", "2", "--cache", "cache", "-o", "trained"),
+    "train": (
+        *("--steps", "3", "--num-towns", "1", "--town-length-m", "100", "--selection-pairs", "2"),
+        *("--held-out-pairs", "2", "--cache", "cache", "-o", "trained"),
+    ),
     "evaluate": ("--pairs", "2", "-o", "evaluated"),
     "info": (),
 }
