@@ -30,14 +30,14 @@ def evaluate_localization(drive: Drive, methods: SlamMethods, precision: str, nu
     num_early = sum(keyframe.scan < len(drive.sequence) / 2 for keyframe in whole.keyframes)
     half = first_keyframes(whole, max(num_early, 1))
     path = save_map(drive.folder / f"first_half_{precision}.npz", half, precision)
-    map_, taken = load_map(path), {keyframe.scan for keyframe in half.keyframes}
+    slam_map, taken = load_map(path), {keyframe.scan for keyframe in half.keyframes}
     others = [scan for scan in range(len(drive.sequence)) if scan not in taken]
     chosen = np.sort(np.random.default_rng(seed).choice(others, min(num, len(others)), replace=False))
     part = drive.sequence.take(chosen)
-    known = drive.reference[[keyframe.scan for keyframe in map_.keyframes]]
-    case, rows, clock = Case(map_, part, known), [], time.perf_counter()
-    for number, found in enumerate(localize_each(map_, _points_of(part, drive, precision), methods)):
-        rows.append(as_row(number, part, map_, found, time.perf_counter() - clock))
+    known = drive.reference[[keyframe.scan for keyframe in slam_map.keyframes]]
+    case, rows, clock = Case(slam_map, part, known), [], time.perf_counter()
+    for number, found in enumerate(localize_each(methods, slam_map, _points_of(part, drive, precision))):
+        rows.append(as_row(number, part, slam_map, found, time.perf_counter() - clock))
         clock = time.perf_counter()
     errors = measure_errors(case, rows)
     keyframes = drive.reference[sorted(taken), :3, 3]
@@ -45,7 +45,7 @@ def evaluate_localization(drive: Drive, methods: SlamMethods, precision: str, nu
     is_inside, is_found, is_right = apart <= drive.scale.reach_m, errors.is_found, errors.is_right
     return {
         "num_scans": len(rows),
-        "num_keyframes": len(map_),
+        "num_keyframes": len(slam_map),
         "map_bytes": path.stat().st_size,
         "num_inside": int(is_inside.sum()),
         "num_right": int((is_inside & is_right).sum()),

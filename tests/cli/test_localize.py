@@ -20,8 +20,8 @@ def case(tmp_path_factory):
     drive = toy.drive(num_scans=6)
     model = dpmjax.init_model(jax.random.key(0), toy.MODEL)
     dpmjax.save_model(model, folder / "model.safetensors")
-    result = dpmjax.run_slam([drive.read_scan(number) for number in range(4)], model)
-    dpmjax.save_map(folder / "map.npz", result.state.slam_map)
+    result = dpmjax.run_slam(model, [drive.read_scan(number) for number in range(4)])
+    dpmjax.save_map(folder / "map.npz", result.map)
     write_kitti_sequence(folder / "kitti", "00", drive)
     np.save(folder / "poses.npy", drive.T_world_lidar)
     return folder
@@ -89,11 +89,11 @@ def test_bad_input_is_told_in_one_line(case, tmp_path, capsys, changes, message)
 
 
 def test_errors_are_those_of_the_keyframes_frames(case) -> None:
-    map_ = dpmjax.load_map(case / "map.npz")
+    slam_map = dpmjax.load_map(case / "map.npz")
     drive = open_lidar_sequence(scans_of(case), poses=case / "poses.npy")
-    reference = np.load(case / "poses.npy")[[keyframe.scan for keyframe in map_.keyframes]]
-    where = dpm_localize.Case(map_, drive, reference)
-    T = map_.T_world_keyframe[0] @ np.linalg.inv(reference[0]) @ drive.T_world_lidar[1]
+    reference = np.load(case / "poses.npy")[[keyframe.scan for keyframe in slam_map.keyframes]]
+    where = dpm_localize.Case(slam_map, drive, reference)
+    T = slam_map.T_world_keyframe[0] @ np.linalg.inv(reference[0]) @ drive.T_world_lidar[1]
     rows = []
     for shift_m, found in ((0.0, True), (3.0, True), (0.5, True), (0.0, False)):
         moved = T.copy()
@@ -101,7 +101,7 @@ def test_errors_are_those_of_the_keyframes_frames(case) -> None:
         evidence = (0.9, 0, "numbers") if found else (0.0, None, "numbers")
         status = "found" if found else "not in this map"
         result = dpmjax.Localization(status, moved if found else None, *evidence)
-        rows.append(dpm_localize.as_row(1, drive, map_, result, 0.1))
+        rows.append(dpm_localize.as_row(1, drive, slam_map, result, 0.1))
     moved_drive = drive.take(np.array([1, 1, 1, 1]))
     errors = dpm_localize.measure_errors(where._replace(drive=moved_drive), rows)
     np.testing.assert_array_equal(errors.is_right, [True, False, True, False])

@@ -113,8 +113,8 @@ def test_refined_motions_and_loops_make_one_map(monkeypatch) -> None:
     """A fit that knows the truth brings the drifted map to the truth, over the borders of windows."""
     truth = laps(1, side_m=60.0, step_m=2.0)
     methods = SlamMethods(TruthMatcher(truth), TruthGeometry(truth, sigma_m=0.05), SlamConfig())
-    result = run_slam(scans_of(range(len(truth))), methods)
-    slam_map, true = result.state.slam_map, rigid.inverse(truth[0]) @ truth[result.keyframes]
+    result = run_slam(methods, scans_of(range(len(truth))))
+    slam_map, true = result.map, rigid.inverse(truth[0]) @ truth[result.keyframes]
 
     def fit(clouds, *, key, init):
         rows = [int(cloud[0, 0]) for cloud in clouds]

@@ -92,16 +92,16 @@ def main(config: Config) -> list[dict[str, str]]:
     from dpmjax import load_map, load_model
     from dpmjax.slam import localize_each, make_methods
 
-    map_ = load_map(config.map)
+    slam_map = load_map(config.map)
     drive = open_scans(config)
-    T_reference_keyframe = reference_of(config, map_, drive)
-    methods = make_methods(load_model(config.weights), map_.origin.config, weights=config.weights)
-    check_weights(config, map_, methods.origin)
+    T_reference_keyframe = reference_of(config, slam_map, drive)
+    methods = make_methods(load_model(config.weights), slam_map.origin.config, weights=config.weights)
+    check_weights(config, slam_map, methods.origin)
     folder = open_run_folder(config, NAME)
     path = folder / TABLE
     earlier = read_history(path) if folder.is_resumed and path.exists() else []
     rows: list[dict[str, str]] = list(earlier)
-    found = localize_each(map_, (drive.read_scan(i) for i in range(len(rows), len(drive))), methods)
+    found = localize_each(methods, slam_map, (drive.read_scan(i) for i in range(len(rows), len(drive))))
     with (
         recording(folder),
         StopFlag() as stop,
@@ -111,13 +111,13 @@ def main(config: Config) -> list[dict[str, str]]:
         clock = time.perf_counter()
         while len(rows) < len(drive) and not stop.is_requested:
             result = next(found)
-            row = as_row(len(rows), drive, map_, result, time.perf_counter() - clock)
+            row = as_row(len(rows), drive, slam_map, result, time.perf_counter() - clock)
             clock = time.perf_counter()
             table.append(**row)
             rows.append(row)
             bar.update(1)
             bar.set_postfix(found=sum(row["status"] == "found" for row in rows))
-        print(write_results(folder, config, Case(map_, drive, T_reference_keyframe), rows))
+        print(write_results(folder, config, Case(slam_map, drive, T_reference_keyframe), rows))
     print(f"results in {folder.path}")
     return rows
 
@@ -126,12 +126,12 @@ class Case(NamedTuple):
     """What was compared.
 
     Attributes:
-        map_: the map.
+        slam_map: the map.
         drive: the scans.
         T_reference_keyframe: (k, 4, 4) reference poses of the keyframes; None without a reference.
     """
 
-    map_: KeyframeMap
+    slam_map: KeyframeMap
     drive: LidarSequence
     T_reference_keyframe: np.ndarray | None
 
@@ -147,7 +147,7 @@ def open_scans(config: Config) -> LidarSequence:
     return drive
 
 
-def reference_of(config: Config, map_: KeyframeMap, drive: LidarSequence) -> np.ndarray | None:
+def reference_of(config: Config, slam_map: KeyframeMap, drive: LidarSequence) -> np.ndarray | None:
     """Returns the reference poses of the keyframes; a `ValueError` says where they cannot be used."""
     from dpmjax.io import read_poses
 
@@ -155,28 +155,28 @@ def reference_of(config: Config, map_: KeyframeMap, drive: LidarSequence) -> np.
         return None
     if drive.T_world_lidar is None:
         raise ValueError(f"--map-poses: {config.scans} has no reference poses to compare with")
-    poses, numbers = read_poses(config.map_poses), [keyframe.scan for keyframe in map_.keyframes]
+    poses, numbers = read_poses(config.map_poses), [keyframe.scan for keyframe in slam_map.keyframes]
     if max(numbers) >= len(poses):
         raise ValueError(f"{config.map_poses}: {len(poses)} poses, the map has a keyframe of scan {max(numbers)}")
     return poses[numbers]
 
 
-def check_weights(config: Config, map_: KeyframeMap, origin: MapOrigin) -> None:
+def check_weights(config: Config, slam_map: KeyframeMap, origin: MapOrigin) -> None:
     """Raises a `ValueError` where other weights made the map."""
-    if map_.origin.fingerprint != origin.fingerprint:
-        found = f"made with weights {map_.origin}, these are {origin}"
+    if slam_map.origin.fingerprint != origin.fingerprint:
+        found = f"made with weights {slam_map.origin}, these are {origin}"
         raise ValueError(f"{config.map}: {found}; name the weights that made it with --weights")
 
 
 def as_row(
-    number: int, drive: LidarSequence, map_: KeyframeMap, result: Localization, seconds: float
+    number: int, drive: LidarSequence, slam_map: KeyframeMap, result: Localization, seconds: float
 ) -> dict[str, str]:
     """Returns the row of a scan as text."""
     row = {"scan": str(number), "source": drive.sources[number], "status": result.status, "reason": result.reason}
     row |= {"probability": f"{result.probability:.4f}", "seconds": f"{seconds:.3f}"}
     if result.T_world_scan is None or result.keyframe is None:
         return row | dict.fromkeys((*POSE, "keyframe", "keyframe_scan"), "")
-    row |= {"keyframe": str(result.keyframe), "keyframe_scan": str(map_.keyframes[result.keyframe].scan)}
+    row |= {"keyframe": str(result.keyframe), "keyframe_scan": str(slam_map.keyframes[result.keyframe].scan)}
     return row | dict(zip(POSE, (f"{value:.9f}" for value in result.T_world_scan[:3].ravel()), strict=True))
 
 
@@ -200,7 +200,7 @@ def measure_errors(case: Case, rows: list[dict[str, str]]) -> Errors:
     if is_found.any():
         found = [row for row in rows if row["status"] == "found"]
         keyframes = [int(row["keyframe"]) for row in found]
-        T = rigid.inverse(case.map_.T_world_keyframe[keyframes]) @ poses_of(found)
+        T = rigid.inverse(case.slam_map.T_world_keyframe[keyframes]) @ poses_of(found)
         true = rigid.inverse(reference[keyframes]) @ T_reference_scan[is_found]
         recall = registration_recall(T, true, max_translation_m=MAX_ERROR_M, max_rotation_deg=MAX_ERROR_DEG)
         is_right[is_found] = recall.is_right
@@ -221,7 +221,7 @@ def write_results(folder: RunFolder, config: Config, case: Case, rows: list[dict
         "num_scans": len(rows),
         "num_found": len(found),
         "num_empty": sum(row["status"] == "empty" for row in rows),
-        "num_keyframes": len(case.map_),
+        "num_keyframes": len(case.slam_map),
         "map_bytes": config.map.stat().st_size,
         "scan_s": float(np.median([float(row["seconds"]) for row in rows])) if rows else None,
     }
@@ -238,16 +238,16 @@ def write_results(folder: RunFolder, config: Config, case: Case, rows: list[dict
     write_metrics(folder, metrics, seed=config.seed)
     title = f"{case.drive.name} in {config.map.name}: {text.partition(';')[0]}"
     figure = viz.localization_figure(
-        map_points(case.map_), case.map_.T_world_keyframe, T, is_wrong=is_wrong, title=title
+        map_points(case.slam_map), case.slam_map.T_world_keyframe, T, is_wrong=is_wrong, title=title
     )
     viz.save_figure(figure, folder / "map.png")
     return text
 
 
-def map_points(map_: KeyframeMap) -> np.ndarray:
+def map_points(slam_map: KeyframeMap) -> np.ndarray:
     """Returns surface points of the map, thinned at random."""
     clouds = []
-    for keyframe, T in zip(map_.keyframes, map_.T_world_keyframe, strict=True):
+    for keyframe, T in zip(slam_map.keyframes, slam_map.T_world_keyframe, strict=True):
         surface = keyframe.description.surface
         clouds.append(surface.points * surface.unit_m @ T[:3, :3].T + T[:3, 3])
     points = np.concatenate(clouds)
