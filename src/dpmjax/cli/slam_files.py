@@ -53,13 +53,13 @@ def write_graph(folder: Path, result: SlamResult) -> None:
 
     if result.graph is not None:
         dpmjax.write_g2o(folder / "graph.g2o", result.graph)
-    poses = result.state.slam_map.T_world_keyframe
+    poses = result.map.T_world_keyframe
     dpm_io.write_tum(
         folder / "keyframes.txt", poses, times=result.keyframes, frame="T_map_keyframe; stamps are numbers of scans"
     )
 
 
-def write_loops(path: Path, loops: Sequence[Loop], keyframes: Sequence[int]) -> None:
+def write_loops(path: Path, loops: Sequence[Loop], keyframes: Sequence[int] | np.ndarray) -> None:
     """Writes every candidate of a loop, and what became of it."""
     rows = [
         {
@@ -76,7 +76,9 @@ def write_loops(path: Path, loops: Sequence[Loop], keyframes: Sequence[int]) -> 
     write_table(path, ("scan", "other_scan", "found_by", "status", "overlap", "probability", "rmse_m"), rows)
 
 
-def write_scans(path: Path, reports: Sequence[ScanReport], keyframes: Sequence[int], sources: Sequence[str]) -> None:
+def write_scans(
+    path: Path, reports: Sequence[ScanReport], keyframes: Sequence[int] | np.ndarray, sources: Sequence[str]
+) -> None:
     """Writes how each scan was placed."""
     rows = [
         {
@@ -184,7 +186,7 @@ def draw_pictures(
     from dpmjax.geometry import rigid
     from dpmjax.metrics import align_rigid
 
-    T, slam_map, num_old = result.T_world_scan, result.state.slam_map, num_keyframes_before
+    T, slam_map, num_old = result.T_world_scan, result.map, num_keyframes_before
     # Odometry alone begins where the drive begins, also in a map that was there before.
     odometry = T[0] @ rigid.inverse(result.T_odometry_scan[0]) @ result.T_odometry_scan
     reference = None if sequence.T_world_lidar is None else sequence.T_world_lidar[: len(T)]

@@ -52,7 +52,7 @@ def run_numbers(run: SlamRun, result: SlamResult, sequence: LidarSequence) -> di
         "num_scans": num,
         "path_m": float(np.linalg.norm(np.diff(T[:, :3, 3], axis=0), axis=1).sum()),
         "num_keyframes": len(result.keyframes),
-        "num_parts": count_parts(result.state.slam_map),
+        "num_parts": count_parts(result.map),
         "num_loops": loops["accepted"],
         **trajectory_errors(T, reference),
         **trajectory_errors(result.T_odometry_scan, reference, "_odometry"),
