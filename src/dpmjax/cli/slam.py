@@ -197,19 +197,14 @@ def refine(
 ) -> dict[str, Any]:
     """Refines the trajectory by DeepMapping, writes it beside the other, and returns its numbers."""
     import jax
-    from tqdm import tqdm
 
+    from dpmjax.cli.progress import progress_bar
     from dpmjax.cli.slam_files import write_trajectory
     from dpmjax.cli.slam_numbers import trajectory_errors
     from dpmjax.slam import place_scans, refine_keyframes
 
     sequence = drive.sequence
-    with tqdm(desc="refine", unit=" windows of keyframes", dynamic_ncols=True) as bar:
-
-        def on_window(num_done: int, num_all: int) -> None:
-            bar.total = num_all
-            bar.update(num_done - bar.n)
-
+    with progress_bar("refine", " windows of keyframes") as on_window:
         refined = refine_keyframes(
             result.map,
             lambda row: drive.read_keyframe(result.map, row),

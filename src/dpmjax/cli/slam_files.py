@@ -65,15 +65,17 @@ def write_loops(path: Path, loops: Sequence[Loop], keyframes: Sequence[int] | np
         {
             "scan": int(keyframes[loop.source]),
             "other_scan": int(keyframes[loop.target]),
-            "found_by": loop.found_by,
-            "status": loop.status,
-            "overlap": _number(loop.overlap),
-            "probability": _number(loop.probability),
-            "rmse_m": _number(loop.rmse_m),
+            **loop_cells(loop),
         }
         for loop in loops
     ]
     write_table(path, ("scan", "other_scan", "found_by", "status", "overlap", "probability", "rmse_m"), rows)
+
+
+def loop_cells(loop: Loop) -> dict[str, str]:
+    """Returns the cells of a loop candidate in a table: how it was found, its outcome and the numbers that decided."""
+    numbers = {name: _number(getattr(loop, name)) for name in ("overlap", "probability", "rmse_m")}
+    return {"found_by": loop.found_by, "status": loop.status, **numbers}
 
 
 def write_scans(
