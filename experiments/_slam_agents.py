@@ -159,7 +159,7 @@ def agent_panels(result: AgentsResult, sequences: Sequence[LidarSequence]) -> li
             reference = None
             if alignment is not None and sequence.T_world_lidar is not None:
                 reference = sequence.T_world_lidar[:, :3, 3] @ alignment[:3, :3].T + alignment[:3, 3]
-            cloud = gather_map((sequence.read_points(scan), T[scan]) for scan in agent.keyframes)
+            cloud = gather_map((sequence.read_points(scan), T[scan]) for scan in agent.keyframes.tolist())
             label = f"agent {number + 1}, {len(T)} scans"
             color = viz.COLORS[number % len(viz.COLORS)]
             tracks.append(viz.AgentTrack(label, color, T[:, :3, 3], reference, cloud.points, cloud.heights_m))

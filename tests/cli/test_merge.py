@@ -82,7 +82,7 @@ def test_maps_that_do_not_meet_stay_as_they_were(case, tmp_path, capsys) -> None
     for number, path in enumerate(maps, start=1):
         before, after = dpmjax.load_map(path), dpmjax.load_map(out / f"map_{number}.npz")
         np.testing.assert_array_equal(after.T_world_keyframe, before.T_world_keyframe)
-    assert capsys.readouterr().out.count("no loop with another map") == 3
+    assert capsys.readouterr().out.count("no common place with another map") == 3
     # An earlier run is replaced on request only.
     assert run(*maps, *weights, "-o", out) == EXIT_BAD_INPUT
     assert "--force" in capsys.readouterr().err

@@ -83,9 +83,9 @@ class Config(RunOptions):
 
 def main(config: Config) -> list[dict[str, str]]:
     """Looks for the scans that are missing, and writes table, trajectory, numbers and picture."""
-    from dpmjax import load_model
     from dpmjax.cli.map_input import open_map
     from dpmjax.slam import localize_each, make_methods
+    from dpmjax.weights import load_model
 
     model = load_model(config.weights)
     slam_map = open_map(config.map, make_methods(model, weights=config.weights))

@@ -53,7 +53,7 @@ def localization_errors(
     is_found = np.array([one.is_in_map for one in found], bool)
     is_right, errors = np.zeros(len(found), bool), np.full((2, len(found)), np.nan)
     if is_found.any():
-        keyframes = [one.keyframe for one in found if one.is_in_map]
+        keyframes = np.array([one.keyframe for one in found if one.is_in_map], np.int64)
         T_world_scan = np.array([one.T_world_scan for one in found if one.is_in_map])
         T = rigid.inverse(slam_map.T_world_keyframe[keyframes]) @ T_world_scan
         true = rigid.inverse(T_reference_keyframe[keyframes]) @ T_reference_scan[is_found]

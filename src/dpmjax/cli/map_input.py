@@ -24,7 +24,7 @@ def open_map(path: Path, methods: SlamMethods) -> KeyframeMap:
     Raises:
         ValueError: no such file, no map, or a map of other weights.
     """
-    from dpmjax import load_map
+    from dpmjax.saved_maps import load_map
 
     slam_map, origin = load_map(path), methods.origin
     if slam_map.origin is not None and slam_map.origin.fingerprint != origin.fingerprint:

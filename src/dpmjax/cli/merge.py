@@ -7,9 +7,9 @@
 Maps are files of `dpmjax.save_map`, such as map.npz of `dpmjax slam`, all made with the same weights. Loops between
 them are found by the appearance of places; no position is needed. A merged map has the frame of its first map.
 
-Results go to results/merge/<time>/ (latest links to the newest): map.npz, or map_1.npz, map_2.npz ... where some maps
-show no common place; loops.csv (each candidate of a loop between two maps and its outcome), graph.g2o (keyframes of all
-maps), metrics.json, and map.png (all maps from above, each in its colour, with the loops).
+Results go to results/merge/<time>/ (latest links to the newest): map.npz, loops.csv (each candidate of a loop between
+two maps and its outcome), graph.g2o, metrics.json, and map.png (all maps from above, each in its colour, with the
+loops). Where some maps show no common place, the maps are map_1.npz, map_2.npz and so on.
 """
 
 from __future__ import annotations
@@ -25,6 +25,7 @@ from tyro.conf import Positional, arg
 
 from dpmjax.cli.command import run_command
 from dpmjax.cli.run_folder import OutputOptions, RunFolder, open_run_folder, recording, write_metrics
+from dpmjax.cli.slam_numbers import counted
 
 if TYPE_CHECKING:
     from dpmjax.slam import KeyframeMap, MergedMaps
@@ -48,10 +49,10 @@ class Config(OutputOptions):
 
 def main(config: Config) -> dict[str, Any]:
     """Reads the maps, merges them, writes; returns the content of `metrics.json`."""
-    from dpmjax import load_model
     from dpmjax.cli.map_input import open_map
     from dpmjax.cli.progress import progress_bar
     from dpmjax.slam import make_methods, merge_maps
+    from dpmjax.weights import load_model
 
     started = time.perf_counter()
     if len({path.resolve() for path in config.maps}) < max(len(config.maps), 2):
@@ -74,13 +75,14 @@ def main(config: Config) -> dict[str, Any]:
 
 def write_results(folder: RunFolder, maps: Sequence[KeyframeMap], merged: MergedMaps) -> None:
     """Writes the maps, the graph and the table of loops."""
-    import dpmjax
     from dpmjax.cli.slam_files import loop_cells, write_table
+    from dpmjax.io.g2o import write_g2o
+    from dpmjax.saved_maps import save_map
     from dpmjax.slam import as_pose_graph
 
     for part, slam_map in enumerate(merged.maps, start=1):
-        dpmjax.save_map(folder / map_name(part, len(merged.maps)), slam_map)
-    dpmjax.write_g2o(folder / "graph.g2o", as_pose_graph(merged.joined.slam_map))
+        save_map(folder / map_name(part, len(merged.maps)), slam_map)
+    write_g2o(folder / "graph.g2o", as_pose_graph(merged.joined.slam_map))
     ends = [(number, keyframe.scan) for number, each in enumerate(maps, start=1) for keyframe in each.keyframes]
     rows = []
     for loop in merged.loops:
@@ -141,7 +143,7 @@ def draw(folder: RunFolder, paths: Sequence[Path], merged: MergedMaps) -> None:
 
 
 def panel_of(paths: Sequence[Path], merged: MergedMaps, part: int) -> AgentPanel:
-    """Gathers what is drawn of a part: its maps with their surfaces and keyframes, and the loops between them."""
+    """Returns the panel of a part: its maps with their surfaces and keyframes, and the loops between them."""
     from dpmjax import viz
 
     members = [number for number, component in enumerate(merged.component) if component == part]
@@ -157,7 +159,7 @@ def panel_of(paths: Sequence[Path], merged: MergedMaps, part: int) -> AgentPanel
 
 
 def track_of(path: Path, merged: MergedMaps, number: int) -> AgentTrack:
-    """Gathers the keyframes of a map and the points of their surfaces."""
+    """Returns the keyframes of a map and the points of their surfaces, in its colour."""
     from dpmjax import viz
     from dpmjax.cli.map_input import keyframe_points
     from dpmjax.cli.slam_files import gather_map
@@ -165,7 +167,7 @@ def track_of(path: Path, merged: MergedMaps, number: int) -> AgentTrack:
     slam_map = merged.joined.slam_map
     rows = np.flatnonzero(merged.joined.map_of_keyframe == number)
     cloud = gather_map((keyframe_points(slam_map, row), slam_map.T_world_keyframe[row]) for row in rows.tolist())
-    label = f"{short_name(path)}, {len(rows)} keyframes"
+    label = f"{short_name(path)}, {counted(len(rows), 'keyframe')}"
     positions = slam_map.T_world_keyframe[rows, :3, 3]
     color = viz.COLORS[number % len(viz.COLORS)]
     return viz.AgentTrack(label, color, positions, None, cloud.points, cloud.heights_m)
@@ -177,9 +179,12 @@ def report(metrics: dict[str, Any]) -> str:
     lines = []
     for part in metrics["parts"]:
         members = ", ".join(names[number] for number in part["maps"])
-        text = "one map now" if len(part["maps"]) > 1 else "no loop with another map"
-        lines.append(f"{members}: {text}, {part['num_keyframes']} keyframes, {part['file']}")
-    return "\n".join([*lines, f"{metrics['num_loops']} loops between maps, of {metrics['num_candidates']} candidates"])
+        text = "one map now" if len(part["maps"]) > 1 else "no common place with another map"
+        lines.append(f"{members}: {text}, {counted(part['num_keyframes'], 'keyframe')}, {part['file']}")
+    loops = (
+        f"{counted(metrics['num_loops'], 'loop')} between maps, of {counted(metrics['num_candidates'], 'candidate')}"
+    )
+    return "\n".join([*lines, loops])
 
 
 def run(args: Sequence[str] | None = None) -> int:

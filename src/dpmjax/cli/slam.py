@@ -8,8 +8,7 @@
 
 Results go to results/slam/<time>/ (latest links to the newest): trajectories of every scan as TUM, KITTI and npy,
 scans.csv and loops.csv with the reason of every decision, graph.g2o, keyframes.txt, map.npz (to extend, and to localise
-in), map.ply, trajectory.png, map.png and metrics.json. Ctrl-C writes all of it.
-docs/slam.md explains the stages and the files.
+in), map.ply, trajectory.png, map.png and metrics.json. Ctrl-C ends the run and writes them too.
 """
 
 from __future__ import annotations
@@ -150,8 +149,8 @@ class Drive(NamedTuple):
 
 def slam_methods(config: Config) -> SlamMethods:
     """Returns the methods of the model."""
-    from dpmjax import SlamConfig, load_model
-    from dpmjax.slam import make_methods
+    from dpmjax.slam import SlamConfig, make_methods
+    from dpmjax.weights import load_model
 
     settings = SlamConfig()
     if config.no_loop:
@@ -195,7 +194,7 @@ def write_results(folder: RunFolder, config: Config, drive: Drive, run: SlamRun,
 def refine(
     folder: RunFolder, config: Config, drive: Drive, result: SlamResult, is_stopped: Callable[[], bool]
 ) -> dict[str, Any]:
-    """Refines the trajectory by DeepMapping, writes it beside the other, and returns its numbers."""
+    """Refines the trajectory by DeepMapping, writes it as refined_*.txt, and returns its numbers."""
     import jax
 
     from dpmjax.cli.progress import progress_bar

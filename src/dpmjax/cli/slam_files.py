@@ -48,11 +48,11 @@ def write_trajectory(
 
 def write_graph(folder: Path, result: SlamResult) -> None:
     """Writes graph.g2o and keyframes.txt (number and pose of each keyframe)."""
-    import dpmjax
     from dpmjax import io as dpm_io
+    from dpmjax.io.g2o import write_g2o
 
     if result.graph is not None:
-        dpmjax.write_g2o(folder / "graph.g2o", result.graph)
+        write_g2o(folder / "graph.g2o", result.graph)
     poses = result.map.T_world_keyframe
     dpm_io.write_tum(
         folder / "keyframes.txt", poses, times=result.keyframes, frame="T_map_keyframe; stamps are numbers of scans"
@@ -164,10 +164,9 @@ def keyframe_views(
 
 def write_map_file(path: Path, slam_map: KeyframeMap) -> dict[str, int]:
     """Writes the map that later runs extend and scans are localised in; returns its size at each precision."""
-    import dpmjax
-    from dpmjax.saved_maps import map_bytes
+    from dpmjax.saved_maps import map_bytes, save_map
 
-    dpmjax.save_map(path, slam_map)
+    save_map(path, slam_map)
     sizes = {name: len(map_bytes(slam_map, name)) for name in ("float16", "int8")}
     return {"map_bytes": path.stat().st_size, **{f"map_bytes_{name}": size for name, size in sizes.items()}}
 
@@ -185,6 +184,7 @@ def draw_pictures(
 ) -> None:
     """Draws trajectory.png and map.png."""
     from dpmjax import viz
+    from dpmjax.cli.slam_numbers import counted
     from dpmjax.geometry import rigid
     from dpmjax.metrics import align_rigid
 
@@ -202,10 +202,10 @@ def draw_pictures(
     if reference is not None:
         T_map_reference = align_rigid(reference[:, :3, 3], T[:, :3, 3])
         shown = reference[:, :3, 3] @ T_map_reference[:3, :3].T + T_map_reference[:3, 3]
-    title = f"{sequence.name}: {len(T)} scans"
+    title = f"{sequence.name}: {counted(len(T), 'scan')}"
     figure = viz.trajectory_figure(title, tracks, shown, slam_map.T_world_keyframe[ends, :3, 3])
     viz.save_figure(figure, folder / "trajectory.png")
-    title = f"{sequence.name}: {len(result.keyframes)} keyframes"
+    title = f"{sequence.name}: {counted(len(result.keyframes), 'keyframe')}"
     viz.save_figure(viz.height_map_figure(title, cloud.points, cloud.heights_m, T[:, :3, 3]), folder / "map.png")
 
 

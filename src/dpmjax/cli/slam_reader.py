@@ -1,4 +1,4 @@
-"""Scans of a drive as SLAM takes them: read ahead, one after the other, with times of points for deskewing."""
+"""Reads the scans of a drive for SLAM: one ahead of the caller, with times of points for deskewing."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ TURN_S = 0.1
 
 
 class ScanReader:
-    """Reads scans as SLAM takes them.
+    """Reads scans, timed ones where they are deskewed.
 
     Args:
         sequence: the drive.

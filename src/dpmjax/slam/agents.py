@@ -24,10 +24,10 @@ BYTES_A_POINT = 12
 
 
 class Traffic(NamedTuple):
-    """What an agent sends, and what sending points would cost.
+    """Bytes that an agent sends, and those of its points.
 
     Attributes:
-        keyframe_bytes: its keyframes as they are kept: descriptors, and what verifies a loop; poses; retrieval vectors.
+        keyframe_bytes: its keyframes: descriptors, surfaces and range images, poses, retrieval vectors.
         descriptor_bytes: the descriptors among them.
         keyframe_scan_bytes: the raw points of the same keyframes, three float32 numbers each.
         scan_bytes: the raw points of all scans.
@@ -40,7 +40,7 @@ class Traffic(NamedTuple):
 
 
 class AgentsResult(NamedTuple):
-    """What `run_agents` returns.
+    """Trajectories and maps of several agents.
 
     Attributes:
         T_world_scan: of each agent, (n, 4, 4) float64, in the frame of its component, which is that of the component's
@@ -59,7 +59,7 @@ class AgentsResult(NamedTuple):
 
 
 class MergedMaps(NamedTuple):
-    """What `merge_maps` returns.
+    """Merged maps, and the maps that have met.
 
     Attributes:
         maps: one map for each component, in the frame of its first map; a map that met no other is as it was.
@@ -88,9 +88,9 @@ class MergedMaps(NamedTuple):
 def run_agents(
     model: Model | SlamMethods, sequences: Sequence[Iterable[AnyScan]], config: SlamConfig | None = None
 ) -> AgentsResult:
-    """Maps with several agents: each runs alone, and what they have in common joins them.
+    """Maps with several agents: each runs alone, and loops between their maps join them.
 
-    Loops between agents are found by retrieval over all keyframes of the others, without any position. The order of the
+    These loops are found by retrieval over the keyframes of all other agents, without any position. The order of the
     agents does not change who meets whom.
 
     Args:

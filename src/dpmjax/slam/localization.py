@@ -1,7 +1,7 @@
 """Re-localisation: single scans are found in a map without a first guess, or are said not to be in it.
 
 The keyframes that look most alike are registered one by one. Registrations that put the scan at the same place support
-each other: two wrong ones hardly ever do. Then the neighbours of that place are asked too.
+each other: two wrong ones hardly ever do. Then the neighbours of that place are registered too.
 """
 
 from __future__ import annotations
@@ -37,20 +37,20 @@ LocalizationStatus = Literal["found", "not in this map", "empty"]
 
 @dataclass(frozen=True)
 class LocalizationConfig:
-    """Which keyframes are tried, and when a place is believed.
+    """Number of registrations, and limits from which on a place is accepted.
 
     Attributes:
         num_similar: number of keyframes by retrieval whose overlap is estimated.
-        num_registered: number of them that are registered at most, in order of their overlap; ...
-        num_at_once: ... so many at once: the next are tried only if the place is not clear.
+        num_registered: largest number of them that are registered, in order of their overlap.
+        num_at_once: number of registrations at a time; the next ones follow only where the place is not clear.
         num_neighbours: number of further keyframes near the best place that are registered.
         num_submap: number of keyframes whose descriptors are merged for a registration.
-        same_place_m: two registrations agree within this distance ...
-        same_place_rad: ... and this turn.
+        same_place_m: largest distance between registrations that agree.
+        same_place_rad: largest turn between registrations that agree.
         min_probability: a registration supports a place from this P(correct) on, if the scans agree.
-        min_support: number of registrations that must end at the same place, the scans of one of them agreeing (one
-            suffices where no other keyframe is near), ...
-        min_best: ... and P(correct) of the best of them. Streets look alike: several may agree on a wrong place.
+        min_support: number of registrations that must end at the same place, one of them with scans that agree. One
+            registration suffices where no other keyframe is near.
+        min_best: smallest P(correct) of the best of them. Streets look alike: several may agree on a wrong place.
         max_rival_share: another place may have this share of the sum of the best one.
     """
 
@@ -90,7 +90,7 @@ class Evidence(NamedTuple):
 
 
 class Localization(NamedTuple):
-    """Where a scan is.
+    """Place of a scan in a map, or that it is not in the map.
 
     Attributes:
         status: "found", "not in this map", or "empty": the scan has too few points.
@@ -110,7 +110,7 @@ class Localization(NamedTuple):
 
     @property
     def is_in_map(self) -> bool:
-        """Whether the scan was found."""
+        """True where the scan was found."""
         return self.status == "found"
 
 

@@ -52,7 +52,7 @@ def refine_keyframes(
         read_keyframe: reads the points of a keyframe by its row, in metres, in the frame of the lidar.
         key: of the fits.
         on_window: called after each window, for progress.
-        stop: asked before each window; where it returns True, the remaining windows keep their poses.
+        stop: called before each window; from the first True on, windows keep their poses.
 
     Returns:
         The map with refined poses, and the number of windows that became better.
