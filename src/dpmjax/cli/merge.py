@@ -154,7 +154,8 @@ def panel_of(paths: Sequence[Path], merged: MergedMaps, part: int) -> AgentPanel
         if loop.status == "accepted" and joined.map_of_keyframe[loop.source] in members
     ]
     loops = joined.slam_map.T_world_keyframe[np.reshape(ends, (-1, 2)).astype(np.int64), :3, 3]
-    text = "one map" if len(members) > 1 else "it shows no place of another map"
+    is_joined = len(members) > 1
+    text = f"in the frame of {short_name(paths[members[0]])}" if is_joined else "no common place with another map"
     return viz.AgentPanel(text, [track_of(paths[number], merged, number) for number in members], loops)
 
 

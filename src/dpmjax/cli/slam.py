@@ -92,7 +92,7 @@ class Config(RunOptions):
 
 def main(config: Config) -> dict[str, Any]:
     """Reads, maps, writes; returns the content of `metrics.json`."""
-    from dpmjax.cli.slam_numbers import summary
+    from dpmjax.cli.slam_numbers import counted, summary
     from dpmjax.cli.slam_reader import ScanReader
     from dpmjax.cli.slam_run import Hooks, find_beginning, run_scans
     from dpmjax.cli.slam_viewer import live_viewer
@@ -107,7 +107,7 @@ def main(config: Config) -> dict[str, Any]:
     beginning = find_beginning(folder, methods, start, reader)
     with recording(folder), StopFlag() as stop:
         done = f", {len(beginning.earlier.reports)} done before" if beginning.earlier else ""
-        tell(f"{sequence.name}: {len(sequence)} scans{done}")
+        tell(f"{sequence.name}: {counted(len(sequence), 'scan')}{done}")
         with live_viewer(folder, sequence.name, is_on=config.visualize) as on_scan:
             hooks = Hooks(lambda: stop.is_requested, on_scan)
             run = run_scans(folder, sequence, reader, methods, beginning, hooks)

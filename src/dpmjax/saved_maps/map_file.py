@@ -18,7 +18,7 @@ from dpmjax.deeppointmap.compact_scans import CompactScan
 from dpmjax.io.files import load_arrays, refusing, write_atomically
 from dpmjax.saved_maps.map_arrays import ArrayReader, pack_graph, pack_scans, unpack_graph, unpack_scans
 from dpmjax.saved_maps.map_coding import Precision
-from dpmjax.sequences import require
+from dpmjax.sequences import InputError, require
 from dpmjax.slam.config import MapOrigin, SlamConfig
 from dpmjax.slam.keyframes import KeyframeMap
 from dpmjax.slam.map_thinning import thin_map
@@ -109,7 +109,11 @@ def load_map(path: str | Path) -> KeyframeMap:
     Raises:
         InputError: no such file, no map, one of a newer version, or a damaged one.
     """
-    arrays = load_arrays(path)
+    try:
+        arrays = load_arrays(path)
+    except InputError as error:
+        advice = "give a file of dpmjax.save_map" if Path(path).exists() else error.advice
+        raise InputError(path, error.found, advice) from error
     require("header" in arrays, path, "a NumPy file, but not one of a dpmjax map", "give a file of dpmjax.save_map")
     with refusing(path, "its header cannot be read ({error})", ADVICE, (Exception,)):
         header = json.loads(arrays["header"].tobytes())
