@@ -33,6 +33,7 @@ import numpy as np
 from tqdm import tqdm
 from tyro.conf import FlagCreatePairsOff, Positional, arg
 
+from dpmjax.cli import DriveSelection
 from dpmjax.cli.command import StopFlag, check_least, run_command
 from dpmjax.cli.result_files import do_row
 from dpmjax.cli.run_folder import RunFolder, RunOptions, open_run_folder, recording, write_metrics
@@ -90,9 +91,9 @@ class Config(RunOptions):
             raise ValueError("only with --slam: --n-scans, --jump, --kitti-angle-correction, --refine")
 
     @property
-    def town_length_range(self) -> tuple[float, float]:
-        """Returns the lengths of the first and of the last town."""
-        return self.town_length_m[0], self.town_length_m[-1]
+    def selection(self) -> DriveSelection:
+        """The scans of each drive, with --slam."""
+        return DriveSelection(num_scans=self.n_scans, jump=self.jump, is_kitti_corrected=self.kitti_angle_correction)
 
 
 def main(config: Config) -> list[dict[str, Any]]:
@@ -106,15 +107,24 @@ def evaluate_slam(config: Config) -> list[dict[str, Any]]:
     from experiments import _slam_comparison as comparison
 
     load_model(config.weights)
-    drives = comparison.open_drives(config, FIRST_TOWN)
+    choice = comparison.DriveChoice(
+        paths=config.paths,
+        selection=config.selection,
+        town_seeds=range(FIRST_TOWN, FIRST_TOWN + config.num_towns),
+        town_lengths_m=np.linspace(config.town_length_m[0], config.town_length_m[-1], config.num_towns).tolist(),
+    )
+    compared = comparison.Comparison(
+        weights=config.weights, seed=config.seed, is_refined=config.refine, num_localized=config.localize
+    )
+    drives = comparison.open_drives(choice)
     folder = open_run_folder(config, EXPERIMENT)
     rows: list[dict[str, Any]] = []
     opened = {}
     with recording(folder), StopFlag() as stop:
-        missing = comparison.missing_peers(config)
+        missing = comparison.missing_peers(compared)
         numbers = {"weights": config.weights, "peers_left_out": missing}
         note = write_metrics(folder, numbers, seed=config.seed, rows=rows)
-        for drive, row in comparison.compare(config, folder, drives, lambda: stop.is_requested):
+        for drive, row in comparison.compare(compared, folder, drives, lambda: stop.is_requested):
             opened[drive.sequence.name] = drive
             rows.append(row)
             note = write_metrics(folder, numbers, seed=config.seed, rows=rows)

@@ -312,6 +312,13 @@ class LidarSequence:
     def __len__(self) -> int:
         return len(self.sources)
 
+    def read_points(self, index: int) -> NDArray[np.float32]:
+        """Reads scan i as `read_scan` does; a scan of no point is (0, 3), not an error."""
+        try:
+            return self.read_scan(index)
+        except EmptyScanError:
+            return np.zeros((0, 3), np.float32)
+
     def take(self, selection: Selection) -> LidarSequence:
         """The selected scans with their poses and times, in the same world; nothing is read."""
         numbers = [int(i) for i in np.arange(self.num_scans)[selection]]

@@ -2,6 +2,10 @@ from .command import StopFlag as StopFlag
 from .command import check_least as check_least
 from .command import check_names as check_names
 from .command import run_command as run_command
+from .drives import DriveSelection as DriveSelection
+from .drives import open_drive as open_drive
+from .localize_numbers import LocalizationErrors as LocalizationErrors
+from .localize_numbers import localization_errors as localization_errors
 from .machine import environment as environment
 from .machine import git_hash as git_hash
 from .machine import peak_rss_gb as peak_rss_gb
@@ -12,6 +16,7 @@ from .map2d_numbers import planar_errors as planar_errors
 from .map2d_run import Map2dRun as Map2dRun
 from .map2d_run import read_map2d_run as read_map2d_run
 from .program import main as main
+from .progress import progress_bar as progress_bar
 from .recorded_fit import FitRecorder as FitRecorder
 from .recorded_fit import draw_loss as draw_loss
 from .result_files import HistoryFile as HistoryFile
@@ -26,3 +31,13 @@ from .run_folder import RunOptions as RunOptions
 from .run_folder import open_run_folder as open_run_folder
 from .run_folder import recording as recording
 from .run_folder import write_metrics as write_metrics
+from .slam_files import gather_map as gather_map
+from .slam_files import loop_cells as loop_cells
+from .slam_files import write_loops as write_loops
+from .slam_files import write_map_file as write_map_file
+from .slam_files import write_scans as write_scans
+from .slam_files import write_table as write_table
+from .slam_files import write_trajectory as write_trajectory
+from .slam_numbers import trajectory_errors as trajectory_errors
+from .slam_run import SlamRun as SlamRun
+from .slam_run import map_drive as map_drive

@@ -2,6 +2,7 @@ from .loops import LoopRecall as LoopRecall
 from .loops import Revisits as Revisits
 from .loops import find_revisits as find_revisits
 from .loops import loop_recall as loop_recall
+from .loops import path_lengths as path_lengths
 from .poses import RegistrationRecall as RegistrationRecall
 from .poses import RelativePoseError as RelativePoseError
 from .poses import absolute_trajectory_error as absolute_trajectory_error

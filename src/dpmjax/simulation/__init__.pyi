@@ -20,6 +20,7 @@ from .scenes import simulate_scenes as simulate_scenes
 from .town.driving import Drive as Drive
 from .town.driving import DriveConfig as DriveConfig
 from .town.driving import drive as drive
+from .town.driving import route_poses as route_poses
 from .town.driving import simulate_lidar_sequence as simulate_lidar_sequence
 from .town.make import Town as Town
 from .town.make import TownConfig as TownConfig
