@@ -18,7 +18,6 @@ and its confidence are fitted afterwards: experiments.dpm_calibrate.
 
 from __future__ import annotations
 
-import math
 import time
 from collections.abc import Sequence
 from contextlib import nullcontext
@@ -29,16 +28,14 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 import numpy as np
 from tyro.conf import FlagCreatePairsOff, arg
 
-from dpmjax.cli.command import StopFlag, run_command
+from dpmjax.cli.command import StopFlag, check_least, run_command
 from dpmjax.cli.machine import peak_rss_gb, select_device
 from dpmjax.cli.result_files import read_history
-from dpmjax.cli.run_folder import HISTORY, METRICS, RunFolder, open_run_folder, recording, write_metrics
+from dpmjax.cli.run_folder import HISTORY, METRICS, RunFolder, RunOptions, open_run_folder, recording, write_metrics
 
 if TYPE_CHECKING:
     from dpmjax.cli.train_run import Records
-    from dpmjax.deeppointmap import Model, TrainingConfig
-    from dpmjax.deeppointmap.evaluation import Evaluation, EvaluationPairs
-    from dpmjax.deeppointmap.training_loop import Trained
+    from dpmjax.deeppointmap import Evaluation, EvaluationPairs, Model, Trained, TrainingConfig
 
 NAME = "train"
 MODEL = "model.safetensors"
@@ -47,14 +44,14 @@ MAX_LISTED = 10
 SHOWN_CURVES = ("loss", "pairing", "offset", "top1_accuracy", "recall", "recall_far", "real_recall")
 
 
-@dataclass(frozen=True)
-class Config:
+@dataclass(frozen=True, kw_only=True)
+class Config(RunOptions):
     """Options of the run."""
+
+    may_change: ClassVar[frozenset[str]] = frozenset({"hours", "finish", "cache", "validate"})
 
     data: Annotated[tuple[str, ...], arg(metavar="town|PATH")] = ("town",)
     """Drives to train on: simulated towns, or folders of scans with poses (KITTI, KITTI-360, MulRan, plain ...)."""
-    output: Annotated[Path | None, arg(aliases=["-o"], metavar="OUT")] = None
-    """Folder for the results, instead of results/train/<time>."""
     preset: Literal["tiny", "small", "paper"] = "tiny"
     """Size of the network and length of its training."""
     weights: Annotated[str | None, arg(metavar="NAME|FILE")] = None
@@ -86,21 +83,12 @@ class Config:
     """Measure recall every N steps, and at the end."""
     bfloat16: FlagCreatePairsOff[bool] = False
     """Multiply matrices of the networks in bfloat16; geometry stays in float32."""
-    seed: int = 0
-    """Seed of everything random."""
-    device: Annotated[Literal["cpu", "gpu"] | None, arg(metavar="cpu|gpu")] = None
-    """Where to compute; without it, JAX chooses. All devices of that kind are used."""
     coordinator: Annotated[str | None, arg(metavar="HOST:PORT|auto")] = None
     """Train in several processes as one, at this address of process 0; auto: as Slurm, Open MPI or a TPU pod says."""
     num_processes: Annotated[int | None, arg(metavar="N")] = None
     """How many processes there are."""
     process_id: Annotated[int | None, arg(metavar="I")] = None
     """Which of them this one is, from 0; process 0 alone writes and prints."""
-    may_change: ClassVar[frozenset[str]] = frozenset({"hours", "finish", "cache", "validate"})
-    resume: FlagCreatePairsOff[bool] = False
-    """Continue an interrupted run, the latest or that in OUT; options not given are the same as then."""
-    force: FlagCreatePairsOff[bool] = False
-    """Replace an earlier run in OUT."""
 
     def __post_init__(self) -> None:
         """Checks ranges.
@@ -108,14 +96,9 @@ class Config:
         Raises:
             ValueError: if an option is out of range.
         """
-        least_of = {"steps": 3, "num_towns": 1, "selection_pairs": 1, "held_out_pairs": 1, "recall_every": 1, "seed": 0}
-        for name, least in least_of.items():
-            value = getattr(self, name)
-            if value is not None and value < least:
-                raise ValueError(f"--{name.replace('_', '-')}: expected at least {least}, got {value}")
-        if not (math.isfinite(self.town_length_m) and self.town_length_m >= 100.0):
-            raise ValueError(f"--town-length-m: expected at least 100, got {self.town_length_m}")
-        if self.hours is not None and not (math.isfinite(self.hours) and self.hours > 0):
+        check_least(self, steps=3, num_towns=1, selection_pairs=1, held_out_pairs=1, recall_every=1, seed=0)
+        check_least(self, town_length_m=100, num_processes=1, process_id=0)
+        if self.hours is not None and not 0 < self.hours < float("inf"):
             raise ValueError(f"--hours: expected more than 0, got {self.hours}")
         if not self.data:
             raise ValueError("--data: expected town or a folder of scans")
@@ -129,8 +112,10 @@ def main(config: Config) -> None:
 
     started = time.perf_counter()
     join_processes(config.coordinator, config.num_processes, config.process_id)
-    select_device(config.device)
-    from dpmjax.cli.train_data import find_sources, prepare_sources
+    if config.coordinator is not None:  # not before the processes have found each other
+        select_device(config.device)
+    from dpmjax.cli.drive_sources import find_sources
+    from dpmjax.cli.train_data import prepare_sources
     from dpmjax.cli.train_run import run_training
     from dpmjax.deeppointmap import ScanStore, TrainingHooks
     from dpmjax.weights import load_model

@@ -8,6 +8,8 @@ from .curriculum import without as without
 from .data_pipeline import SampleMaker as SampleMaker
 from .encoding import encode as encode
 from .encoding import scene_scale as scene_scale
+from .evaluation import Evaluation as Evaluation
+from .evaluation import EvaluationPairs as EvaluationPairs
 from .evaluation import PairKind as PairKind
 from .evaluation import draw_evaluation_pairs as draw_evaluation_pairs
 from .evaluation import evaluate_registration as evaluate_registration
@@ -29,10 +31,18 @@ from .scan_registration import register as register
 from .scan_store import PreparedDrive as PreparedDrive
 from .scan_store import ScanStore as ScanStore
 from .scan_store import prepare_drive as prepare_drive
+from .training import TrainingReport as TrainingReport
+from .training import TrainingState as TrainingState
 from .training import finish as finish
 from .training import init_training as init_training
 from .training import make_step as make_step
+from .training_drives import prepare_drives as prepare_drives
+from .training_drives import why_useless as why_useless
+from .training_loop import StepRecord as StepRecord
+from .training_loop import Trained as Trained
 from .training_loop import TrainingHooks as TrainingHooks
+from .training_loop import TrainingLostError as TrainingLostError
 from .training_loop import TrainingProgress as TrainingProgress
+from .training_loop import begin_training as begin_training
 from .training_loop import train as train
 from .verification import VerificationConfig as VerificationConfig

@@ -1,7 +1,8 @@
 """The training loop: batches, steps, evaluation, reports, and the best parameters so far.
 
-    store = ScanStore([prepare_drive(drive, config) for drive in drives])
-    trained = train(store, config, hooks=TrainingHooks(evaluate=..., on_report=...))
+    drives = simulate_scenes(range(4))                      # or open_lidar_sequence(path) of your own
+    trained = train(drives, training_preset("tiny"))
+    save_model(trained.model, "model.safetensors")
 
 A run that continues from the `TrainingProgress` of any report gives the numbers of an unbroken run.
 """
@@ -10,8 +11,9 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import flax.struct
@@ -23,9 +25,12 @@ from dpmjax.checks import require_count
 from dpmjax.deeppointmap.curriculum import CurriculumStage, TrainingConfig
 from dpmjax.deeppointmap.data_pipeline import SampleMaker
 from dpmjax.deeppointmap.model import Model
+from dpmjax.deeppointmap.model_config import ModelConfig
 from dpmjax.deeppointmap.processes import BATCH_AXIS, device_mesh, from_first, is_first, largest, place, together
 from dpmjax.deeppointmap.scan_store import ScanStore
-from dpmjax.deeppointmap.training import TrainingReport, TrainingState, init_training, make_step
+from dpmjax.deeppointmap.training import TrainingReport, TrainingState, finish, init_training, make_step
+from dpmjax.deeppointmap.training_drives import prepare_drives
+from dpmjax.sequences import LidarSequence
 from dpmjax.types import AnyArray
 
 
@@ -91,12 +96,15 @@ class TrainingHooks:
         evaluate_every: number of steps from one evaluation to the next.
         on_report: gets the record and the progress after each step.
         stop: called before each step; any number but 0 ends training in all processes.
+        finish: called before each step until it returns True in any process; from then on the learning rate falls, as
+            `training.finish` describes.
     """
 
     evaluate: Callable[[Model], float] | None = None
     evaluate_every: int = 100
     on_report: Callable[[StepRecord, TrainingProgress], None] | None = None
     stop: Callable[[], int] = int
+    finish: Callable[[], bool] = bool
 
     def __post_init__(self) -> None:
         require_count("evaluate_every", self.evaluate_every)
@@ -119,51 +127,64 @@ class Trained(NamedTuple):
 
 
 def train(
-    store: ScanStore,
+    drives: Sequence[LidarSequence] | ScanStore,
     config: TrainingConfig,
     *,
     seed: int = 0,
-    start: TrainingProgress | None = None,
+    start: TrainingProgress | Model | None = None,
+    cache: Path | None = None,
     hooks: TrainingHooks = TrainingHooks(),
 ) -> Trained:
-    """Trains a model on all devices, or continues a training.
+    """Trains a model on drives with poses, on all devices, or continues a training (DeepPointMap section 3.3).
 
-    With several processes (`join_processes`), each calls this function with the same settings.
+    Each scan is prepared once before the first step. With several processes (`join_processes`), each calls this
+    function with the same arguments; process 0 alone evaluates and reports.
 
     Args:
-        store: the scans.
-        config: settings of training.
+        drives: sequences with a true pose for each scan, such as `io.open_lidar_sequence` and
+            `simulation.simulate_scenes` return; or scans that are prepared already.
+        config: settings of training; `training_preset` has three.
         seed: seed of parameters, samples and augmentation.
-        start: progress to continue from; that of process 0 counts.
-        hooks: evaluation, reports and stopping.
+        start: progress to continue from, that of process 0 counts; or a model to begin with its parameters; None
+            begins with random parameters.
+        cache: folder where prepared scans are kept for later calls; None keeps them in memory.
+        hooks: evaluation, which chooses the best model, reports and stopping.
 
     Returns:
-        The model and the progress.
+        The model, without calibration, and the progress.
 
     Raises:
+        ValueError: if there is no drive, if nothing can be learned from a drive (no poses, no scan that can be read, no
+            two scans at a distance of `config.sampling`), or if `start` is a model of another network.
         TrainingLostError: if the loss is not finite.
     """
-    if start is None:
-        start = begin_training(init_training(jax.random.key(seed), config))
+    config = replace(config, model=_uncalibrated(config.model))
+    if not isinstance(start, TrainingProgress):
+        start = begin_training(config, seed=seed, weights=start)
+    store = drives if isinstance(drives, ScanStore) else prepare_drives(drives, config, folder=cache, seed=seed)
     mesh, num_local = device_mesh(), jax.local_device_count()
     progress = place(from_first(start), mesh)
     step = make_step(config, mesh if jax.device_count() > 1 else None)
-    clock, stopped_by = _Clock(config.sampling.num_scans * jax.device_count()), 0
+    clock, stopped_by, is_finishing = _Clock(config.sampling.num_scans * jax.device_count()), 0, False
     first_sample = jax.process_index() * num_local
+    number, end = int(progress.state.step), int(progress.state.end)
     with SampleMaker(store, config, seed=seed, num_samples=num_local, first_sample=first_sample) as maker:
-        batches = maker.batches(int(progress.state.step), int(start.state.end))
+        batches = maker.batches(number, end)
         with together():
             batch = next(batches, None)
         while batch is not None and not (stopped_by := largest(int(hooks.stop()))):
-            stage = config.stage_at(int(progress.state.step))
+            if not is_finishing and (is_finishing := bool(largest(int(hooks.finish())))):
+                progress = place(replace(progress, state=finish(progress.state, config)), mesh)
+                end = int(progress.state.end)
+            stage = config.stage_at(number)
             begun = time.perf_counter()
             state, report = step(progress.state, place(batch, mesh, BATCH_AXIS))
+            number += 1
             with together():  # the next batch is prepared while the device computes
-                batch = next(batches, None)
+                batch = next(batches, None) if number < end else None
             report = jax.device_get(report)
             clock.add(stage, time.perf_counter() - begun)
             progress = replace(progress, state=state)
-            number = int(state.step)
             if not math.isfinite(report.loss):
                 raise TrainingLostError(f"the loss of step {number} is {report.loss}; resume from an older checkpoint")
             progress, score = _evaluate_when_due(progress, config, hooks)
@@ -175,16 +196,34 @@ def train(
     return Trained(model, progress, stopped_by, clock.speed)
 
 
-def begin_training(state: TrainingState) -> TrainingProgress:
+def begin_training(config: TrainingConfig, *, seed: int = 0, weights: Model | None = None) -> TrainingProgress:
     """Makes the progress before the first step.
 
     Args:
-        state: from `init_training`.
+        config: settings of training.
+        seed: seed of the parameters.
+        weights: a model whose parameters take the place of random ones; the optimiser begins at zero with any.
 
     Returns:
         Progress without an evaluation.
+
+    Raises:
+        ValueError: if the parameters of `weights` have other shapes than those of `config.model`.
     """
+    state = init_training(jax.random.key(seed), config)
+    if weights is not None:
+        shapes = [jax.tree.map(np.shape, params) for params in (weights.params, state.params)]
+        if shapes[0] != shapes[1]:
+            raise ValueError(
+                "start: expected parameters of config.model, got others; replace(config, model=start.config)"
+            )
+        state = replace(state, params=weights.params)
     return TrainingProgress(state, state.params, np.asarray(-1, np.float32), np.asarray(0, np.int32))
+
+
+def _uncalibrated(model: ModelConfig) -> ModelConfig:
+    # Calibrations belong to the parameters that they were fitted for.
+    return replace(model, calibration=None, overlap=None)
 
 
 def after_evaluation(progress: TrainingProgress, score: float) -> TrainingProgress:
