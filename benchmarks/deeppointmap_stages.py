@@ -20,18 +20,18 @@ from numpy.typing import NDArray
 
 import dpmjax
 from benchmarks.rows import Row, measure
-from dpmjax.cli.machine import peak_rss_gb
+from dpmjax.cli import peak_rss_gb
 from dpmjax.deeppointmap import (
     CurriculumStage,
+    SampleMaker,
     ScanStore,
     init_training,
     make_step,
     merge_clouds,
     prepare_drive,
+    pyramid_of_cloud,
     training_preset,
 )
-from dpmjax.deeppointmap.data_pipeline import SampleMaker
-from dpmjax.deeppointmap.encoding import pyramid_of_cloud
 from dpmjax.geometry import build_pyramid
 from dpmjax.io import LidarSequence, open_lidar_sequence
 from dpmjax.scans import preprocess_scan, preprocess_scan_on_host

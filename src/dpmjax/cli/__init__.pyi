@@ -2,6 +2,14 @@ from .command import StopFlag as StopFlag
 from .command import check_least as check_least
 from .command import check_names as check_names
 from .command import run_command as run_command
+from .evaluation_rows import BAND_NAMES as BAND_NAMES
+from .evaluation_rows import FIRST_EVALUATION_TOWN as FIRST_EVALUATION_TOWN
+from .evaluation_rows import calibration_numbers as calibration_numbers
+from .evaluation_rows import draw_evaluation as draw_evaluation
+from .evaluation_rows import error_columns as error_columns
+from .evaluation_rows import open_evaluation_drives as open_evaluation_drives
+from .evaluation_rows import overlap_row as overlap_row
+from .evaluation_rows import registration_row as registration_row
 from .machine import environment as environment
 from .machine import git_hash as git_hash
 from .machine import peak_rss_gb as peak_rss_gb

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple, Self
+from typing import Any, NamedTuple
 
 import numpy as np
 from tqdm import tqdm
@@ -168,7 +168,7 @@ class Records:
             self._seen.add(stage)
             self._bar.set_postfix_str(f"compiling {_stage_name(stage)}")
 
-    def __enter__(self) -> Self:
+    def __enter__(self) -> Records:
         return self
 
     def __exit__(self, *error: Any) -> None:
