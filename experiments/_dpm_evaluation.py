@@ -21,7 +21,7 @@ from dpmjax.deeppointmap import (
     read_scan_pairs,
     refine_motion,
 )
-from dpmjax.sequences import LidarSequence
+from dpmjax.io import LidarSequence
 
 # KISS-Matcher's voxels, metres; indoors is where half of the points are nearer than INDOORS_M.
 VOXEL_M, INDOOR_VOXEL_M, INDOORS_M = 0.3, 0.2, 5.0

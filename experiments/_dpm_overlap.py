@@ -21,8 +21,8 @@ from dpmjax.deeppointmap import (
     logistic_probability,
     scan_distances,
 )
+from dpmjax.io import LidarSequence
 from dpmjax.metrics import area_under_curve, brier_score
-from dpmjax.sequences import LidarSequence
 
 # Scans of each town, and of another town beside, that pairs are made of.
 NUM_SCANS, NUM_OTHER_SCANS = 36, 12

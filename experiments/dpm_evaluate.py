@@ -45,7 +45,7 @@ from dpmjax.cli import (
 )
 
 if TYPE_CHECKING:
-    from dpmjax.sequences import LidarSequence
+    from dpmjax.io import LidarSequence
 
 EXPERIMENT = "dpm_evaluate"
 # Overlap is cheap: more pairs, of each kind.
@@ -136,12 +136,12 @@ def evaluate_slam(config: Config) -> list[dict[str, Any]]:
 def evaluate_pairs(config: Config) -> list[dict[str, Any]]:
     """Registers the pairs that are missing, and writes table, numbers and pictures."""
     from dpmjax import load_model
-    from dpmjax.cli import draw_evaluation, open_evaluation_drives, overlap_row, registration_row
+    from dpmjax.cli import draw_evaluation, evaluation_towns, open_evaluation_drives, overlap_row, registration_row
     from experiments._dpm_evaluation import evaluate_matcher, kiss_matcher, search_alone, why_no_kiss
 
     model = load_model(config.weights)
     search = partial(search_alone, config=model.config.verification)
-    drives = open_evaluation_drives(config.paths, num_towns=config.num_towns, town_length_m=config.town_length_m[0])
+    drives = open_evaluation_drives(config.paths, evaluation_towns(config.num_towns, config.town_length_m[0]))
     num_overlap = OVERLAP_FACTOR * config.pairs
     no_kiss = why_no_kiss() if not config.no_kiss else "left out by --no-kiss"
     folder = open_run_folder(config, EXPERIMENT)

@@ -21,8 +21,7 @@ from tqdm import tqdm
 from tyro.conf import Positional, arg
 
 from dpmjax.cli import run_command
-from dpmjax.io import list_lidar_sequences, open_lidar_sequence
-from dpmjax.sequences import LidarSequence
+from dpmjax.io import LidarSequence, list_lidar_sequences, open_lidar_sequence
 from dpmjax.simulation import SceneMixture, simulate_drive
 from experiments._scan_statistics import (
     HISTOGRAMS,

@@ -7,6 +7,7 @@ from .evaluation_rows import FIRST_EVALUATION_TOWN as FIRST_EVALUATION_TOWN
 from .evaluation_rows import calibration_numbers as calibration_numbers
 from .evaluation_rows import draw_evaluation as draw_evaluation
 from .evaluation_rows import error_columns as error_columns
+from .evaluation_rows import evaluation_towns as evaluation_towns
 from .evaluation_rows import open_evaluation_drives as open_evaluation_drives
 from .evaluation_rows import overlap_row as overlap_row
 from .evaluation_rows import registration_row as registration_row

@@ -24,22 +24,24 @@ class Source:
         name: name of the sequence in the folder; None where it holds one.
         town_seed: seed of the town.
         town_length_m: length of the drive through the town.
+        town_kind: kind of place; None draws one.
     """
 
     path: Path | None = None
     name: str | None = None
     town_seed: int = 0
     town_length_m: float = 600.0
+    town_kind: str | None = None
 
     def open(self) -> LidarSequence:
         """Opens or simulates the drive."""
         if self.path is None:
-            return simulate_drive(self.town_seed, length_m=self.town_length_m)
+            return simulate_drive(self.town_seed, length_m=self.town_length_m, kind=self.town_kind)
         return open_lidar_sequence(self.path, sequence=self.name)
 
 
-def find_sources(data: Sequence[str], town_seeds: Sequence[int], town_length_m: float) -> list[Source]:
-    """Returns the drives of the entries of a command line, checked; a town for each seed where an entry is `town`.
+def find_sources(data: Sequence[str], towns: Sequence[Source]) -> list[Source]:
+    """Returns the drives of the entries of a command line, checked; those of the towns where an entry is `town`.
 
     Raises:
         ValueError: if a path cannot be read or holds no useful drive.
@@ -47,7 +49,7 @@ def find_sources(data: Sequence[str], town_seeds: Sequence[int], town_length_m: 
     sources: list[Source] = []
     for entry in data:
         if entry == TOWN and not Path(entry).exists():
-            sources += [Source(town_seed=seed, town_length_m=town_length_m) for seed in town_seeds]
+            sources += towns
             continue
         names: Sequence[str | None] = list_lidar_sequences(entry) or [None]
         found = {Source(Path(entry), name): open_lidar_sequence(entry, sequence=name) for name in names}

@@ -1,6 +1,6 @@
 """Measures how well weights of DeepPointMap register the scans of drives whose poses are known.
 
-    dpmjax evaluate                                a simulated town that no training has seen
+    dpmjax evaluate                                a simulated suburb that no training has seen
     dpmjax evaluate path/to/drive another/drive    any folders of scans with poses (KITTI, KITTI-360, MulRan, plain ...)
     dpmjax evaluate path/to/drive --weights model.safetensors --pairs 100
     dpmjax evaluate --resume                       continue the latest run
@@ -48,10 +48,10 @@ class Config(RunOptions):
     """Folders of scans with poses, or simulated towns."""
     weights: Annotated[str, arg(metavar="NAME|FILE")] = "dpm_small"
     """Name of a shipped model, or a .safetensors file."""
-    pairs: Annotated[int, arg(metavar="N")] = 20
+    pairs: Annotated[int, arg(metavar="N")] = 15
     """Pairs for each distance."""
     num_towns: Annotated[int, arg(metavar="N")] = 1
-    """Number of towns, where town is among the data."""
+    """Number of towns, where town is among the data; a suburb first, then other kinds of place."""
     town_length_m: Annotated[float, arg(metavar="M")] = 400.0
     """Length of the route through each town."""
 
@@ -68,11 +68,19 @@ class Config(RunOptions):
 
 def main(config: Config) -> list[dict[str, Any]]:
     """Makes the rows that are missing, and writes table, numbers and pictures."""
-    from dpmjax.cli.evaluation_rows import BAND_NAMES, open_evaluation_drives, overlap_row, registration_row
+    from dpmjax.cli.evaluation_rows import (
+        BAND_NAMES,
+        evaluation_towns,
+        open_evaluation_drives,
+        overlap_row,
+        registration_row,
+    )
+    from dpmjax.simulation import SceneMixture
     from dpmjax.weights import load_model
 
     model = load_model(config.weights)
-    drives = open_evaluation_drives(config.data, num_towns=config.num_towns, town_length_m=config.town_length_m)
+    kinds = [kind for kind, _ in SceneMixture().kinds]
+    drives = open_evaluation_drives(config.data, evaluation_towns(config.num_towns, config.town_length_m, kinds))
     folder = open_run_folder(config, NAME)
     rows: list[dict[str, Any]] = []
     with recording(folder), StopFlag() as stop, tqdm(unit=" pairs", dynamic_ncols=True) as bar:

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from dpmjax import viz
-from dpmjax.cli.drive_sources import find_sources
+from dpmjax.cli.drive_sources import Source, find_sources
 from dpmjax.cli.run_folder import RunFolder
 from dpmjax.deeppointmap import (
     Model,
@@ -29,14 +29,28 @@ BAND_NAMES = {"near": "2-10 m", "middle": "10-20 m"}
 Row = dict[str, Any]
 
 
-def open_evaluation_drives(data: Sequence[str], *, num_towns: int, town_length_m: float) -> list[LidarSequence]:
-    """Opens the drives of a command line; towns are such as no training has seen.
+def evaluation_towns(num_towns: int, length_m: float, kinds: Sequence[str | None] = (None,)) -> list[Source]:
+    """Returns towns that no training has seen; the kinds of place take turns, None draws one."""
+    return [
+        Source(town_seed=FIRST_EVALUATION_TOWN + number, town_length_m=length_m, town_kind=kinds[number % len(kinds)])
+        for number in range(num_towns)
+    ]
+
+
+def open_evaluation_drives(data: Sequence[str], towns: Sequence[Source]) -> list[LidarSequence]:
+    """Opens the drives of a command line.
+
+    Args:
+        data: folders, or `town` for the towns.
+        towns: from `evaluation_towns`.
+
+    Returns:
+        The drives, each with poses, near pairs and a name of its own.
 
     Raises:
         ValueError: a path cannot be read, or a drive has no poses or no pairs, or two drives have the same name.
     """
-    towns = range(FIRST_EVALUATION_TOWN, FIRST_EVALUATION_TOWN + num_towns)
-    drives = [source.open() for source in find_sources(data, towns, town_length_m)]
+    drives = [source.open() for source in find_sources(data, towns)]
     for drive in drives:
         if not len(draw_scan_pairs(drive, "near", 1)):
             raise ValueError(f"{drive.name}: no two scans are 2 to 10 m apart; are the poses in metres?")

@@ -114,7 +114,7 @@ def main(config: Config) -> None:
     join_processes(config.coordinator, config.num_processes, config.process_id)
     if config.coordinator is not None:  # not before the processes have found each other
         select_device(config.device)
-    from dpmjax.cli.drive_sources import find_sources
+    from dpmjax.cli.drive_sources import Source, find_sources
     from dpmjax.cli.train_data import prepare_sources
     from dpmjax.cli.train_run import run_training
     from dpmjax.deeppointmap import ScanStore, TrainingHooks
@@ -123,8 +123,9 @@ def main(config: Config) -> None:
     with together():
         weights = None if config.weights is None else load_model(config.weights)
         settings = training_settings(config, weights)
-        towns = range(config.seed, config.seed + config.num_towns)
-        sources = find_sources(config.data, towns, config.town_length_m)
+        seeds = range(config.seed, config.seed + config.num_towns)
+        towns = [Source(town_seed=seed, town_length_m=config.town_length_m) for seed in seeds]
+        sources = find_sources(config.data, towns)
         folder = open_run_folder(config, NAME) if is_first() else None
     with recording(folder) if folder is not None else nullcontext(), StopFlag() as stop:
         with together():
