@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from dpmjax import io, load_model, viz
-from dpmjax.cli import FIRST_EVALUATION_TOWN, RunFolder, do_row
+from dpmjax.cli.result_files import do_row
+from dpmjax.cli.run_folder import RunFolder
 from dpmjax.cli.slam_input import corrected, read_points, require_whole_files
 from dpmjax.metrics import align_rigid
 from dpmjax.metrics.loops import path_lengths
@@ -24,6 +25,9 @@ from experiments._slam_evaluation import ODOMETRY, OURS, PRECISIONS, Drive, Stop
 from experiments._slam_localization import evaluate_localization
 from experiments._slam_peers import PEERS, why_missing, why_not_importable
 from experiments._slam_refine import MULTIWAY, REFINED, evaluate_refinement
+
+if TYPE_CHECKING:
+    from experiments.dpm_evaluate import Config
 
 TOWN = "town"
 # Kind of place, kind of route, lidar: taken in turn. Each route drives some streets in both directions.
@@ -58,59 +62,19 @@ SIZES = {
 Task = tuple[Drive, str, Callable[[], dict[str, Any]]]
 
 
-@dataclass(frozen=True)
-class ComparedDrives:
-    """The drives of a comparison, and which of their scans.
-
-    Attributes:
-        paths: folders of scans, or "town" for simulated towns.
-        num_towns: number of towns.
-        town_length_range_m: lengths of the routes of the first and of the last town.
-        n_scans: number of scans of each drive; None takes all.
-        jump: every scan of this number is taken.
-        kitti_angle_correction: whether beams are raised by 0.205 degrees.
-    """
-
-    paths: tuple[str, ...]
-    num_towns: int
-    town_length_range_m: tuple[float, float]
-    n_scans: int | None
-    jump: int
-    kitti_angle_correction: bool
-
-
-@dataclass(frozen=True)
-class Comparison:
-    """Settings of the methods of a comparison.
-
-    Attributes:
-        weights: of our network.
-        refine: whether the keyframes of our run are refined too.
-        num_localized: number of scans that are looked for in the map of the first half; 0 leaves it out.
-        seed: of the run.
-    """
-
-    weights: str
-    refine: bool
-    num_localized: int
-    seed: int
-
-
-def open_drives(selected: ComparedDrives) -> list[LidarSequence]:
+def open_drives(config: Config, first_town: int) -> list[LidarSequence]:
     """Opens the drives; bad input that can be known before the run is a `ValueError`."""
     drives: list[LidarSequence] = []
-    for entry in selected.paths:
+    for entry in config.paths:
         if entry == TOWN and not Path(entry).exists():
-            lengths = np.linspace(*selected.town_length_range_m, selected.num_towns)
-            towns = [
-                town_drive(FIRST_EVALUATION_TOWN + number, number, length) for number, length in enumerate(lengths)
-            ]
+            lengths = np.linspace(*config.town_length_range, config.num_towns)
+            towns = [town_drive(first_town + number, number, length) for number, length in enumerate(lengths)]
             drives += _with_kept_scans(towns)
         else:
             names: Sequence[str | None] = io.list_lidar_sequences(entry) or [None]
             opened = (io.open_lidar_sequence(entry, sequence=name) for name in names)
-            drives += [corrected(drive, selected.kitti_angle_correction) for drive in opened]
-    drives = [drive.take(np.arange(len(drive))[:: selected.jump][: selected.n_scans]) for drive in drives]
+            drives += [corrected(drive, config.kitti_angle_correction) for drive in opened]
+    drives = [drive.take(np.arange(len(drive))[:: config.jump][: config.n_scans]) for drive in drives]
     for drive in drives:
         require_whole_files(drive)
         read_points(drive, 0)
@@ -143,30 +107,30 @@ def _with_kept_scans(drives: Sequence[LidarSequence]) -> list[LidarSequence]:
     return [replace(drive, read_scan=partial(read, drive)) for drive in drives]
 
 
-def missing_peers(options: Comparison) -> dict[str, str]:
+def missing_peers(config: Config) -> dict[str, str]:
     """Returns the peers that cannot run, and why."""
     reasons = {name: why_missing(name) for name in PEERS}
-    if options.refine:
+    if config.refine:
         reasons[MULTIWAY] = why_not_importable("open3d", "baselines")
     return {name: reason for name, reason in reasons.items() if reason is not None}
 
 
 def compare(
-    options: Comparison, folder: RunFolder, sequences: Sequence[LidarSequence], is_stopped: Callable[[], bool]
+    config: Config, folder: RunFolder, sequences: Sequence[LidarSequence], is_stopped: Callable[[], bool]
 ) -> Iterator[tuple[Drive, dict[str, Any]]]:
     """Makes the rows that are missing; ends early where a signal came."""
-    methods = make_methods(load_model(options.weights), weights=options.weights)
-    missing = missing_peers(options)
+    methods = make_methods(load_model(config.weights), weights=config.weights)
+    missing = missing_peers(config)
     drives = [evaluation.open_folder(folder, sequence, is_stopped) for sequence in sequences]
     ours: dict[str, dict[str, Any]] = {}
     # Trajectories of all drives come first: an early end leaves a whole table.
-    more = (_refinements(options, drives, methods), _localizations(options, drives, methods))
+    more = (_refinements(config, drives, methods), _localizations(config, drives, methods))
     for drive, method, work in itertools.chain(_runs(drives, methods, ours), *more):
         if method in missing:
             continue
         case = {"sequence": drive.sequence.name, "method": method}
         try:
-            row = do_row(folder.path, case, work, seed=options.seed)
+            row = do_row(folder.path, case, work, seed=config.seed)
         except StoppedError:
             return
         if method == OURS:
@@ -182,18 +146,18 @@ def _runs(drives: Sequence[Drive], methods: SlamMethods, ours: dict[str, dict[st
         yield drive, ODOMETRY, lambda drive=drive: evaluation.odometry_row(drive, ours[drive.sequence.name])
 
 
-def _refinements(options: Comparison, drives: Sequence[Drive], methods: SlamMethods) -> Iterator[Task]:
-    for drive in drives if options.refine else ():
+def _refinements(config: Config, drives: Sequence[Drive], methods: SlamMethods) -> Iterator[Task]:
+    for drive in drives if config.refine else ():
         for name in (REFINED, MULTIWAY):
-            yield drive, name, partial(evaluate_refinement, drive, methods, name, options.seed)
+            yield drive, name, partial(evaluate_refinement, drive, methods, name, config.seed)
 
 
-def _localizations(options: Comparison, drives: Sequence[Drive], methods: SlamMethods) -> Iterator[Task]:
+def _localizations(config: Config, drives: Sequence[Drive], methods: SlamMethods) -> Iterator[Task]:
     for drive in drives:
-        if options.num_localized and drive.reference is not None:
+        if config.localize and drive.reference is not None:
             for precision in PRECISIONS:
                 work = partial(evaluate_localization, drive, methods, precision)
-                yield drive, f"localization, {precision}", partial(work, options.num_localized, options.seed)
+                yield drive, f"localization, {precision}", partial(work, config.localize, config.seed)
 
 
 def tables(rows: Sequence[dict[str, Any]]) -> str:

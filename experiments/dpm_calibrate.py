@@ -1,6 +1,6 @@
 """Calibrates a DeepPointMap model on towns that it was not trained on: its confidence, and its overlap probability.
 
-    python -m experiments.dpm_calibrate results/dpm_train/latest/model.safetensors
+    python -m experiments.dpm_calibrate results/train/latest/model.safetensors
 
 Pairs of scans of held-out towns, overlapping and not, are registered; a logistic regression on a few features of each
 registration (consensus support, share of points that meet surfaces, share in free space ...) then predicts whether the
@@ -26,7 +26,7 @@ from dpmjax.cli import RunOptions, check_least, do_row, open_run_folder, recordi
 EXPERIMENT = "dpm_calibrate"
 MODEL = "model.safetensors"
 OVERLAP_LABELS = ("overlap probability", "share of overlapping pairs")
-# Far from the seeds of the towns of dpm_train, also of its held-out one.
+# Far from the seeds of the towns of training, also of its held-out one.
 FIRST_TOWN, FIRST_OVERLAP_TOWN = 3_000_000, 3_500_000
 
 

@@ -33,6 +33,7 @@ from tqdm import tqdm
 from tyro.conf import FlagCreatePairsOff, Positional, arg
 
 from dpmjax.cli import (
+    FIRST_TOWN,
     RunFolder,
     RunOptions,
     StopFlag,
@@ -93,6 +94,11 @@ class Config(RunOptions):
         if not self.slam and (self.n_scans is not None or self.jump != 1 or self.kitti_angle_correction or self.refine):
             raise ValueError("only with --slam: --n-scans, --jump, --kitti-angle-correction, --refine")
 
+    @property
+    def town_length_range(self) -> tuple[float, float]:
+        """Returns the lengths of the first and of the last town."""
+        return self.town_length_m[0], self.town_length_m[-1]
+
 
 def main(config: Config) -> list[dict[str, Any]]:
     """Compares SLAM, or registers pairs."""
@@ -105,24 +111,15 @@ def evaluate_slam(config: Config) -> list[dict[str, Any]]:
     from experiments import _slam_comparison as comparison
 
     load_model(config.weights)
-    selected = comparison.ComparedDrives(
-        config.paths,
-        num_towns=config.num_towns,
-        town_length_range_m=(config.town_length_m[0], config.town_length_m[-1]),
-        n_scans=config.n_scans,
-        jump=config.jump,
-        kitti_angle_correction=config.kitti_angle_correction,
-    )
-    options = comparison.Comparison(config.weights, config.refine, config.localize, config.seed)
-    drives = comparison.open_drives(selected)
+    drives = comparison.open_drives(config, FIRST_TOWN)
     folder = open_run_folder(config, EXPERIMENT)
     rows: list[dict[str, Any]] = []
     opened = {}
     with recording(folder), StopFlag() as stop:
-        missing = comparison.missing_peers(options)
+        missing = comparison.missing_peers(config)
         numbers = {"weights": config.weights, "peers_left_out": missing}
         note = write_metrics(folder, numbers, seed=config.seed, rows=rows)
-        for drive, row in comparison.compare(options, folder, drives, lambda: stop.is_requested):
+        for drive, row in comparison.compare(config, folder, drives, lambda: stop.is_requested):
             opened[drive.sequence.name] = drive
             rows.append(row)
             note = write_metrics(folder, numbers, seed=config.seed, rows=rows)

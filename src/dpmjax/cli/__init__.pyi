@@ -3,7 +3,7 @@ from .command import check_least as check_least
 from .command import check_names as check_names
 from .command import run_command as run_command
 from .evaluation_rows import BAND_NAMES as BAND_NAMES
-from .evaluation_rows import FIRST_EVALUATION_TOWN as FIRST_EVALUATION_TOWN
+from .evaluation_rows import FIRST_TOWN as FIRST_TOWN
 from .evaluation_rows import calibration_numbers as calibration_numbers
 from .evaluation_rows import draw_evaluation as draw_evaluation
 from .evaluation_rows import error_columns as error_columns

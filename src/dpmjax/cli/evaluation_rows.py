@@ -21,8 +21,9 @@ from dpmjax.deeppointmap import (
 from dpmjax.metrics import RegistrationRecall, brier_score
 from dpmjax.sequences import LidarSequence
 
-# No training, selection or calibration uses these towns.
-FIRST_EVALUATION_TOWN = 5_000_000
+FIRST_TOWN = 5_000_000
+"""Seed of the first town; no training, selection or calibration uses these towns."""
+
 NUM_SHOWN = 4
 STAGES = ("descriptors", "verified", "refined")
 BAND_NAMES = {"near": "2-10 m", "middle": "10-20 m"}
@@ -32,7 +33,7 @@ Row = dict[str, Any]
 def evaluation_towns(num_towns: int, length_m: float, kinds: Sequence[str | None] = (None,)) -> list[Source]:
     """Returns towns that no training has seen; the kinds of place take turns, None draws one."""
     return [
-        Source(town_seed=FIRST_EVALUATION_TOWN + number, town_length_m=length_m, town_kind=kinds[number % len(kinds)])
+        Source(town_seed=FIRST_TOWN + number, town_length_m=length_m, town_kind=kinds[number % len(kinds)])
         for number in range(num_towns)
     ]
 
