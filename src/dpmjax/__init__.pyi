@@ -14,8 +14,8 @@ from .deeppointmap.model_config import ModelConfig as ModelConfig
 from .deeppointmap.model_config import model_preset as model_preset
 from .deeppointmap.scan_registration import overlap as overlap
 from .deeppointmap.scan_registration import register as register
-from .deeppointmap.training_loop import TrainingHooks as TrainingHooks
 from .deeppointmap.training_loop import train as train
+from .deeppointmap.training_records import TrainingHooks as TrainingHooks
 from .geometry.alignment import weighted_svd as weighted_svd
 from .geometry.neighbours import k_nearest as k_nearest
 from .geometry.neighbours import radius_search as radius_search

@@ -17,7 +17,7 @@ TOWN = "town"
 
 @dataclass(frozen=True)
 class Source:
-    """Where a drive comes from.
+    """Origin of a drive.
 
     Attributes:
         path: folder of scans; None for a simulated town.

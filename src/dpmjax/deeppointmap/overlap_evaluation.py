@@ -43,7 +43,7 @@ class OverlapEvaluation(NamedTuple):
 
     @property
     def area_under_curve(self) -> float:
-        """How often an overlapping pair has a higher probability than another one; NaN without pairs."""
+        """Share of comparisons in which the overlapping pair has the higher probability; NaN without pairs."""
         return area_under_curve(self.probability, self.is_overlap)
 
     @property
@@ -62,7 +62,7 @@ def evaluate_overlap(
 ) -> OverlapEvaluation:
     """Predicts the overlap of pairs nearer than 20 m, and of pairs farther than 40 m.
 
-    Where the drive comes back to places, the near pairs are revisits. Each scan is turned by a random yaw.
+    The near pairs are revisits if the drive comes back to places. Each scan is turned by a random yaw.
 
     Args:
         model: encoder and decoder.

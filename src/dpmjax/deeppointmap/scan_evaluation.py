@@ -90,7 +90,7 @@ class ScanEvaluation(NamedTuple):
 
 
 def register_in_stages(model: Model, pair: ScanPair) -> StagedRegistration:
-    """Registers a pair as `register` does with `refine=True`, one stage after the other.
+    """Registers a pair as `register` does with `refine=True`, and measures each stage.
 
     Args:
         model: encoder and decoder.

@@ -19,7 +19,7 @@ PUBLISHED = SamplingConfig()
 def prepare_drives(
     drives: Sequence[LidarSequence], config: TrainingConfig, *, folder: Path | None = None, seed: int = 0
 ) -> ScanStore:
-    """Prepares drives one after the other.
+    """Prepares the scans of all drives, in order.
 
     Args:
         drives: with poses.
