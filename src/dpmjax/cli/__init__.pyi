@@ -4,6 +4,15 @@ from .command import check_names as check_names
 from .command import run_command as run_command
 from .drives import DriveSelection as DriveSelection
 from .drives import open_drive as open_drive
+from .evaluation_rows import BAND_NAMES as BAND_NAMES
+from .evaluation_rows import FIRST_TOWN as FIRST_TOWN
+from .evaluation_rows import calibration_numbers as calibration_numbers
+from .evaluation_rows import draw_evaluation as draw_evaluation
+from .evaluation_rows import error_columns as error_columns
+from .evaluation_rows import evaluation_towns as evaluation_towns
+from .evaluation_rows import open_evaluation_drives as open_evaluation_drives
+from .evaluation_rows import overlap_row as overlap_row
+from .evaluation_rows import registration_row as registration_row
 from .localize_numbers import LocalizationErrors as LocalizationErrors
 from .localize_numbers import localization_errors as localization_errors
 from .machine import environment as environment
