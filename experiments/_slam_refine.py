@@ -26,7 +26,7 @@ from experiments._slam_evaluation import Drive, StoppedError, common_numbers
 WINDOW, OVERLAP = 32, 8
 """Keyframes of a window, and those that it shares with the next one."""
 
-REFINED, MULTIWAY = "DeepPointMap refined", "multiway registration"
+REFINED, MULTIWAY = "ours, refined by DeepMapping", "ours, refined by multiway registration"
 
 
 class Refined(NamedTuple):

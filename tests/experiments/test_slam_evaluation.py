@@ -16,15 +16,16 @@ from dpmjax.cli.run_folder import RunFolder
 from dpmjax.geometry import rigid
 from dpmjax.io import LidarSequence
 from experiments import _slam_comparison, _slam_evaluation, _slam_peers, _slam_refine, dpm_evaluate
-from experiments._slam_evaluation import Drive, FoundLoop, StoppedError
+from experiments._slam_evaluation import ODOMETRY, OURS, Drive, FoundLoop, StoppedError
+from experiments._slam_refine import MULTIWAY, REFINED
 from tests.deeppointmap import toy
 from tests.slam.truth import laps, pose
 
 PEER = "steady"
 METHODS = [
     PEER,
-    "DeepPointMap",
-    "DeepPointMap odometry",
+    OURS,
+    ODOMETRY,
     *(f"localization, {p}" for p in _slam_evaluation.PRECISIONS),
 ]
 STEP_M, NUM_SCANS = 4.0, 6
@@ -93,7 +94,7 @@ def test_every_method_gets_a_row_and_a_resumed_run_computes_nothing_again(
     assert list(rows) == METHODS
     assert all(row["git_hash"] for row in metrics["rows"])
     assert rows[PEER]["ate_m"] == pytest.approx(0.0, abs=1e-6)
-    assert rows["DeepPointMap"]["num_scans"] == NUM_SCANS
+    assert rows[OURS]["num_scans"] == NUM_SCANS
     assert rows["localization, int8"]["num_scans"] == 3
     for name in ("table.md", "trajectories.png", "map_sizes.png"):
         assert (out / name).stat().st_size > 0
@@ -140,19 +141,19 @@ def test_refinements_are_rows_that_a_resumed_run_may_add(with_toys, tmp_path, mo
     monkeypatch.setattr(_slam_refine, "refine_keyframes", moved)
     monkeypatch.setitem(sys.modules, "open3d", None)
     assert run("--slam", "--resume", "--refine", "-o", out) == EXIT_OK
-    assert "multiway registration was not run: open3d is not installed" in capsys.readouterr().out
+    assert f"{MULTIWAY} was not run: open3d is not installed" in capsys.readouterr().out
     rows = {row["method"]: row for row in load_json(out / "metrics.json")["rows"]}
-    assert list(rows) == ["steady", "DeepPointMap", "DeepPointMap odometry", "DeepPointMap refined"]
-    refined = rows["DeepPointMap refined"]
+    assert list(rows) == ["steady", OURS, ODOMETRY, REFINED]
+    refined = rows[REFINED]
     assert (refined["refine_windows"], refined["num_scans"]) == (1, NUM_SCANS)
-    assert refined["ate_m"] > rows["DeepPointMap"]["ate_m"] + 0.5
+    assert refined["ate_m"] > rows[OURS]["ate_m"] + 0.5
 
 
 def test_sizes_of_maps_are_those_of_the_files(with_toys, tmp_path) -> None:
     out = tmp_path / "out"
     assert run("--slam", "town", "--weights", with_toys, "--num-towns", 1, "--localize", 3, "-o", out) == EXIT_OK
     rows = {row["method"]: row for row in load_json(out / "metrics.json")["rows"]}
-    ours, drive = rows["DeepPointMap"], toy.drive(1, num_scans=NUM_SCANS)
+    ours, drive = rows[OURS], toy.drive(1, num_scans=NUM_SCANS)
     for precision in _slam_evaluation.PRECISIONS:
         path = out / "drives" / drive.name / f"map_{precision}.npz"
         assert ours[f"map_bytes_{precision}"][-1] == path.stat().st_size
