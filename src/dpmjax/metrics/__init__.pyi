@@ -10,6 +10,9 @@ from .poses import point_distance as point_distance
 from .poses import registration_recall as registration_recall
 from .poses import relative_pose_error as relative_pose_error
 from .position_bound import position_bound as position_bound
+from .proportions import Proportion as Proportion
+from .proportions import mcnemar_p_value as mcnemar_p_value
+from .proportions import wilson_interval as wilson_interval
 from .relations import RelationErrors as RelationErrors
 from .relations import relation_errors as relation_errors
 from .segments import SegmentError as SegmentError
