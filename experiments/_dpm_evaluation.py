@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
@@ -16,6 +15,7 @@ from dpmjax.deeppointmap.verification import VerificationConfig, choose_motion, 
 from dpmjax.io import LidarSequence
 from dpmjax.viz import RegisteredPair
 from experiments._dpm_pairs import Clock, ScanPair, draw_pairs, median_seconds, read_pairs, register_pair
+from experiments._dpm_pooled import BANDS, KISS, NETWORK, SEARCH, VERIFIED
 
 # KISS-Matcher's voxels, metres; indoors is where half of the points are nearer than INDOORS_M.
 VOXEL_M, INDOOR_VOXEL_M, INDOORS_M = 0.3, 0.2, 5.0
@@ -50,13 +50,6 @@ def evaluate_registrations(
         "motions": np.reshape(motions["refined"], (-1, 16)).tolist(),
         **median_seconds(seconds),
     }
-
-
-def why_no_kiss() -> str | None:
-    """Returns why KISS-Matcher cannot run; None where it can."""
-    if importlib.util.find_spec("kiss_matcher") is None:
-        return "it is not installed (pip install dpmjax[kiss])"
-    return None
 
 
 def kiss_matcher(source: np.ndarray, target: np.ndarray) -> np.ndarray:
@@ -108,17 +101,15 @@ def calibration_numbers(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
 
 
 def table(rows: Sequence[dict[str, Any]]) -> str:
-    """Returns the table as Markdown: a row for each sequence and distance."""
+    """Returns the rows as a Markdown table: one line a sequence and distance."""
     lines = [
-        "| sequence | distance | pairs | recall, descriptors | recall, verified | recall, refined "
-        "| search without network | KISS-Matcher "
-        "| median error, descriptors | median error, refined | s / pair | KISS, s | overlap AUC |",
+        f"| sequence | distance | pairs | recall: {NETWORK} | {VERIFIED} | the same, refined | {SEARCH}, refined "
+        f"| {KISS} | median error: network alone | refined | s / pair | {KISS}, s | overlap AUC |",
         "|---|---|---|---|---|---|---|---|---|---|---|---|---|",
     ]
     by_case = {(row["method"], row["sequence"], row["band"]): row for row in rows}
-    names = {"near": "2-10 m", "middle": "10-20 m"}
     for (method, sequence, band), row in by_case.items():
-        if method != "DeepPointMap" or band not in names or not row["num_pairs"]:
+        if method != "DeepPointMap" or band not in BANDS or not row["num_pairs"]:
             continue
         kiss, search = (by_case.get((other, sequence, band), {}) for other in ("KISS-Matcher", "search"))
         auc = by_case.get(("overlap", sequence, "all"), {}).get("auc") if band == "near" else None
@@ -126,7 +117,7 @@ def table(rows: Sequence[dict[str, Any]]) -> str:
         recalls = " | ".join(f"{row[f'recall_{stage}']:.2f}" for stage in ("descriptors", "verified", "refined"))
         others = " | ".join(_number(other.get("recall_refined")) for other in (search, kiss))
         lines.append(
-            f"| {sequence} | {names[band]} | {row['num_pairs']} | {recalls} | {others} | {errors} "
+            f"| {sequence} | {BANDS[band]} | {row['num_pairs']} | {recalls} | {others} | {errors} "
             f"| {_number(row['pair_s'])} | {_number(kiss.get('pair_s'))} | {_number(auc, 3)} |"
         )
     return "\n".join(lines)

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from dpmjax import io, load_model, viz
+from dpmjax.cli.optional import why_not_importable
 from dpmjax.cli.result_files import do_row
 from dpmjax.cli.run_folder import RunFolder
 from dpmjax.cli.slam_input import corrected, read_points, require_whole_files
@@ -23,7 +24,7 @@ from dpmjax.slam import SlamMethods, make_methods
 from experiments import _slam_evaluation as evaluation
 from experiments._slam_evaluation import ODOMETRY, OURS, PRECISIONS, Drive, StoppedError
 from experiments._slam_localization import evaluate_localization
-from experiments._slam_peers import PEERS, why_missing, why_not_importable
+from experiments._slam_peers import PEERS, why_missing
 from experiments._slam_refine import MULTIWAY, REFINED, evaluate_refinement
 
 if TYPE_CHECKING:
@@ -111,7 +112,7 @@ def missing_peers(config: Config) -> dict[str, str]:
     """Returns the peers that cannot run, and why."""
     reasons = {name: why_missing(name) for name in PEERS}
     if config.refine:
-        reasons[MULTIWAY] = why_not_importable("open3d", "baselines")
+        reasons[MULTIWAY] = why_not_importable("open3d")
     return {name: reason for name, reason in reasons.items() if reason is not None}
 
 

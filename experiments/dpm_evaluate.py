@@ -10,7 +10,7 @@ A path is any folder of scans with poses (KITTI, KITTI-360, MulRan, plain ...). 
 to 20 m apart and turned by any yaw, are registered; a registration within 2 m and 5 degrees is right. Results go to
 results/dpm_evaluate/<time>/: table.md, metrics.json, reliability.png, failures.png (the worst pairs from above). Two
 more methods see the same pairs: the search and the verification of `register` without the network, and KISS-Matcher
-(extra `kiss`).
+(extra `kiss`). Rows of all recorded drives together have confidence intervals and say which methods differ.
 
 With --slam, the whole system and its odometry run beside KISS-ICP, KISS-SLAM and odometry by small_gicp (extra
 `peers`); then random scans are looked for in the map of each drive's first half. Poses are needed for the errors only.
@@ -34,6 +34,7 @@ from tqdm import tqdm
 from tyro.conf import FlagCreatePairsOff, Positional, arg
 
 from dpmjax.cli.command import StopFlag, check_least, run_command
+from dpmjax.cli.optional import why_not_importable
 from dpmjax.cli.result_files import do_row
 from dpmjax.cli.run_folder import RunFolder, RunOptions, open_run_folder, recording, write_metrics
 
@@ -133,7 +134,6 @@ def evaluate_pairs(config: Config) -> list[dict[str, Any]]:
         evaluate_registrations,
         kiss_matcher,
         search_alone,
-        why_no_kiss,
     )
     from experiments._dpm_overlap import evaluate_overlap
 
@@ -141,7 +141,7 @@ def evaluate_pairs(config: Config) -> list[dict[str, Any]]:
     search = partial(search_alone, config=model.config.verification)
     drives = open_drives(config)
     num_overlap = OVERLAP_FACTOR * config.pairs
-    no_kiss = why_no_kiss() if not config.no_kiss else "left out by --no-kiss"
+    no_kiss = why_not_importable("kiss_matcher") if not config.no_kiss else "left out by --no-kiss"
     folder = open_run_folder(config, EXPERIMENT)
     rows: list[dict[str, Any]] = []
     with recording(folder), StopFlag() as stop, tqdm(unit=" pairs", dynamic_ncols=True) as bar:
@@ -162,7 +162,7 @@ def evaluate_pairs(config: Config) -> list[dict[str, Any]]:
                 if no_kiss is None:
                     add("KISS-Matcher", drive, band, lambda p=pairs: evaluate_matcher(kiss_matcher, *p, bar))
             add("overlap", drive, "all", lambda d=drive: evaluate_overlap(model, d, num_overlap, config.seed, bar))
-        text = write_results(folder, config, rows, no_kiss)
+        text = write_results(folder, config, drives, rows, no_kiss)
         draw(folder, config, drives, rows)
     print(text)
     print(f"results in {folder.path}")
@@ -185,13 +185,22 @@ def open_drives(config: Config) -> list[LidarSequence]:
     return drives
 
 
-def write_results(folder: RunFolder, config: Config, rows: Sequence[dict[str, Any]], no_kiss: str | None) -> str:
-    """Writes table.md and metrics.json; returns the table."""
+def write_results(
+    folder: RunFolder,
+    config: Config,
+    drives: Sequence[LidarSequence],
+    rows: Sequence[dict[str, Any]],
+    no_kiss: str | None,
+) -> str:
+    """Writes table.md and metrics.json; returns the tables."""
     from experiments._dpm_evaluation import calibration_numbers, table
+    from experiments._dpm_pooled import pooled_rows, pooled_table
 
+    recorded = [drive.name for drive in drives if Path(drive.sources[0]).exists()]
+    pooled = pooled_rows(rows, recorded or [drive.name for drive in drives])
     numbers = {"weights": config.weights, "kiss_matcher": no_kiss or "run", **calibration_numbers(rows)}
-    note = write_metrics(folder, numbers, seed=config.seed, rows=rows)
-    text = table(rows)
+    note = write_metrics(folder, {**numbers, "pooled": pooled}, seed=config.seed, rows=rows)
+    text = "\n\n".join(filter(None, [table(rows), pooled_table(pooled)]))
     if no_kiss is not None:
         text += f"\n\nKISS-Matcher was not run: {no_kiss}."
     (folder / "table.md").write_text(text + (f"\n\n{note}.\n" if note else "\n"), encoding="utf-8")

@@ -11,7 +11,6 @@ installed.
 
 from __future__ import annotations
 
-import importlib.util
 import itertools
 import time
 from dataclasses import dataclass, replace
@@ -24,6 +23,7 @@ from tyro.conf import FlagCreatePairsOff, arg
 
 from dpmjax.cli.command import run_command
 from dpmjax.cli.machine import peak_rss_gb, select_device
+from dpmjax.cli.optional import require_importable, why_not_importable
 from dpmjax.cli.run_folder import RunFolder, open_run_folder, recording, write_metrics
 
 if TYPE_CHECKING:
@@ -74,6 +74,7 @@ def main(config: Config) -> dict[str, Any]:
     from dpmjax.deepmapping.toy import ToyConfig, global_minimum
     from dpmjax.nets.scalar import Initialization
 
+    require_importable("jaxopt", "the solvers of the direct form")
     select_device(config.device)  # type: ignore[arg-type]
     folder = open_run_folder(config, EXPERIMENT)
     with recording(folder):
@@ -186,8 +187,8 @@ def measure_seconds(toy: ToyConfig, config: Config) -> dict[str, Any]:
     for name, seeds in (("all_seeds", config.seeds), ("one_seed", 1)):
         run = descend(toy, replace(config, seeds=seeds))
         seconds |= {f"{name}_compile_s": run.compile_s, f"{name}_run_s": run.run_s}
-    if importlib.util.find_spec("torch") is None:
-        print("PyTorch is not installed: its loop is not timed (pip install torch)")
+    if (reason := why_not_importable("torch")) is not None:
+        print(f"the loop in PyTorch is not timed: {reason}")
     else:
         seconds["torch_one_seed_run_s"] = torch_seconds(toy, config.seed)
     return seconds

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import itertools
 from pathlib import Path
 from types import SimpleNamespace
@@ -14,6 +13,7 @@ import pytest
 import dpmjax
 from dpmjax.cli import slam_input
 from dpmjax.cli.command import EXIT_BAD_INPUT, EXIT_OK
+from dpmjax.cli.optional import why_not_importable
 from dpmjax.cli.result_files import load_json
 from dpmjax.geometry import rigid
 from dpmjax.io import write_tum
@@ -137,7 +137,7 @@ def test_the_viewer_records_where_there_is_no_screen(tmp_path, monkeypatch, caps
     drive = write_drive(tmp_path / "drive")
     monkeypatch.delenv("DISPLAY", raising=False)
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
-    if importlib.util.find_spec("rerun") is None:
+    if why_not_importable("rerun") is not None:
         assert run(drive, "-v", "-n", 30, "-o", tmp_path / "out") == EXIT_BAD_INPUT
         assert "dpmjax[viewer]" in capsys.readouterr().err
         return

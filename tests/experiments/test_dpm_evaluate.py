@@ -30,7 +30,7 @@ def run(module, arguments) -> int:
 
 def test_evaluation_measures_every_sequence_and_resumes(weights, tmp_path, monkeypatch, capsys) -> None:
     monkeypatch.setattr(train_data, "town_drive", lambda seed, **_: toy.drive(seed))
-    monkeypatch.setattr(_dpm_evaluation, "why_no_kiss", lambda: "it is not installed")
+    monkeypatch.setattr(dpm_evaluate, "why_not_importable", lambda _: "it is not installed")
     arguments = ["town", "--weights", weights, "--pairs", 2, "--num-towns", 1, "-o", tmp_path / "out"]
     assert run(dpm_evaluate, arguments) == EXIT_OK
     printed = capsys.readouterr().out

@@ -88,7 +88,7 @@ def test_every_method_gets_a_row_and_a_resumed_run_computes_nothing_again(
     arguments = ("--slam", "town", "--weights", with_toys, "--num-towns", 1, "--localize", 3, "-o", out)
     assert run(*arguments) == EXIT_OK
     printed = capsys.readouterr().out
-    assert "absent was not run: no_such_module is not installed (pip install dpmjax[peers])." in printed
+    assert "absent was not run: no_such_module is not installed (pip install 'no_such_module')." in printed
     metrics = load_json(out / "metrics.json")
     rows = {row["method"]: row for row in metrics["rows"]}
     assert list(rows) == METHODS
@@ -245,16 +245,6 @@ def test_numbers_out_of_range_are_refused(tmp_path, capsys) -> None:
 def test_scans_are_chosen_for_slam_only(tmp_path, capsys) -> None:
     assert run("town", "-n", 5, "-o", tmp_path / "out") == EXIT_BAD_INPUT
     assert "only with --slam" in capsys.readouterr().err
-
-
-def test_a_peer_that_cannot_be_imported_says_why(monkeypatch, tmp_path) -> None:
-    (tmp_path / "broken_peer.py").write_text("raise ImportError('libmissing.so.1: cannot open shared object file')\n")
-    monkeypatch.setattr(sys, "path", [str(tmp_path), *sys.path])
-    peers = {"broken": ("broken_peer", SteadyPeer), "absent": ("no_such_module", SteadyPeer), "there": ("json", None)}
-    monkeypatch.setattr(_slam_peers, "PEERS", peers)
-    assert "libmissing.so.1" in _slam_peers.why_missing("broken")
-    assert "no_such_module is not installed" in _slam_peers.why_missing("absent")
-    assert _slam_peers.why_missing("there") is None
 
 
 @pytest.mark.parametrize("name", list(_slam_peers.PEERS))
