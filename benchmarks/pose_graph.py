@@ -13,7 +13,7 @@ from typing import Any
 
 import dpmjax
 from benchmarks.rows import Row, Timing, measure
-from dpmjax.cli.optional import why_not_importable
+from dpmjax.cli import why_not_importable
 
 NAME = "pose_graph"
 DATA = Path(os.environ.get("DPMJAX_DATA", "../shared/data")) / "g2o"

@@ -7,7 +7,7 @@ from dataclasses import replace
 import jax
 
 from benchmarks.rows import Row, measure
-from dpmjax.cli.optional import why_not_importable
+from dpmjax.cli import why_not_importable
 from dpmjax.deepmapping.fit import fit
 from dpmjax.deepmapping.toy import ToyConfig, toy_problem
 from experiments.toy_1d import FORMS, share_at_minimum, torch_seconds

@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
+from dpmjax.cli import why_not_importable
 from dpmjax.cli.command import StopFlag, check_least, check_names
-from dpmjax.cli.optional import why_not_importable
 from dpmjax.cli.result_files import do_row
 from dpmjax.cli.run_folder import RunFolder, RunOptions, open_run_folder, recording
 from experiments._deepmapping_methods import METHODS, SUCCESS_PX, Task, assess, choose, errors

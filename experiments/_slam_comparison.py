@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from dpmjax import io, load_model, viz
-from dpmjax.cli.optional import why_not_importable
+from dpmjax.cli import why_not_importable
 from dpmjax.cli.result_files import do_row
 from dpmjax.cli.run_folder import RunFolder
 from dpmjax.cli.slam_input import corrected, read_points, require_whole_files

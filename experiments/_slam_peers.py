@@ -15,7 +15,7 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
-from dpmjax.cli.optional import why_not_importable
+from dpmjax.cli import why_not_importable
 from dpmjax.cli.result_files import UNKNOWN
 
 MAX_RANGE_M, INDOOR_MAX_RANGE_M = 60.0, 30.0

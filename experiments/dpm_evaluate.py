@@ -33,8 +33,8 @@ import numpy as np
 from tqdm import tqdm
 from tyro.conf import FlagCreatePairsOff, Positional, arg
 
+from dpmjax.cli import why_not_importable
 from dpmjax.cli.command import StopFlag, check_least, run_command
-from dpmjax.cli.optional import why_not_importable
 from dpmjax.cli.result_files import do_row
 from dpmjax.cli.run_folder import RunFolder, RunOptions, open_run_folder, recording, write_metrics
 

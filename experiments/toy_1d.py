@@ -21,9 +21,9 @@ import numpy as np
 from numpy.typing import NDArray
 from tyro.conf import FlagCreatePairsOff, arg
 
+from dpmjax.cli import require_importable, why_not_importable
 from dpmjax.cli.command import run_command
 from dpmjax.cli.machine import peak_rss_gb, select_device
-from dpmjax.cli.optional import require_importable, why_not_importable
 from dpmjax.cli.run_folder import RunFolder, open_run_folder, recording, write_metrics
 
 if TYPE_CHECKING:

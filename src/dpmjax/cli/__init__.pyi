@@ -7,6 +7,8 @@ from .machine import git_hash as git_hash
 from .machine import peak_rss_gb as peak_rss_gb
 from .machine import usable_cores as usable_cores
 from .machine import versions as versions
+from .optional import require_importable as require_importable
+from .optional import why_not_importable as why_not_importable
 from .program import main as main
 from .result_files import HistoryFile as HistoryFile
 from .result_files import do_row as do_row
