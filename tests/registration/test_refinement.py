@@ -11,7 +11,7 @@ from dpmjax.metrics import absolute_trajectory_error
 from dpmjax.pose_graph.graph import Edges
 from dpmjax.registration import LoopConfig, RefinementConfig, close_loops, planar_scans, refine
 from dpmjax.registration.loop_closure import LoopResult, count_support, find_candidates
-from dpmjax.registration.refinement import choose_pairs
+from dpmjax.registration.refinement import _rounded_up, choose_pairs
 from dpmjax.simulation import simulate_sequence
 
 WITHOUT_LOOPS = RefinementConfig(loops=None)
@@ -68,6 +68,12 @@ def test_pairs_are_neighbours_in_time_and_of_other_visits(walk_scans) -> None:
     away = np.abs(source - target) > 3
     assert np.hypot(*(poses[source[away]] - poses[target[away]])[:, :2].T).max() <= 40.0
     assert (np.bincount(source[away], minlength=60) <= 2).all()
+
+
+def test_pairs_are_filled_up_to_few_sizes() -> None:
+    sizes = {num_pairs: _rounded_up(num_pairs) for num_pairs in range(1, 4097)}
+    assert all(size >= num_pairs for num_pairs, size in sizes.items())
+    assert set(sizes.values()) == {128, 256, 512, 1024, 2048, 3072, 4096}
 
 
 # A walk of five rounds would take minutes; a short way there and back sees every place twice.
