@@ -22,7 +22,7 @@ def test_contributing_tells_who_may_import_whom() -> None:
     assert all(f"`{room}`" in text for room in EVERYBODY_MAY)
 
 
-@pytest.mark.parametrize("page", ["CONTRIBUTING.md", "README.md", "docs/methods.md", "docs/deepmapping_notes.md"])
+@pytest.mark.parametrize("page", ["CONTRIBUTING.md", "README.md", "docs/methods.md", "docs/notebook/deepmapping_notes.md"])
 def test_files_that_a_page_names_exist(page) -> None:
     text = (ROOT / page).read_text(encoding="utf-8")
     named = set(re.findall(r"`([\w/*]+(?:\.py|/))`", text))

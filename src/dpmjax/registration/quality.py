@@ -35,7 +35,7 @@ _CELL = 0.015
 _LEAST_TOLERANCE = 0.001
 # Bearings of the profiles that it is measured by: exact to less than that tolerance.
 _NUM_BEARINGS = 4096
-# Calibrated on right and wrong maps of simulated worlds and of thinned logs (docs/deepmapping_notes.md).
+# Calibrated on right and wrong maps of simulated worlds and of thinned logs (docs/notebook/deepmapping_notes.md).
 # Each scan is compared with so many nearest ones, by position and by position and heading (a radian as so many typical
 # ranges). Scans whose best score is lower than the second number belong to no map; at most a share of them may.
 _NUM_NEAREST, _HEADING_WEIGHT, _LEAST_SCORE, _LEAST_REGISTERED = 12, 0.5, 0.1, 0.9
