@@ -1,0 +1,22 @@
+"""A drive of 3-D scans becomes one map: a pose for every scan, loops, and a pose graph."""
+
+import dpmjax
+from dpmjax import io, simulation
+
+drive = simulation.simulate_drive(num_scans=120)  # Round a block, and on over streets that it has seen.
+model = dpmjax.load_model("dpm_small")
+result = dpmjax.run_slam(model, drive)
+
+reference = drive.T_world_lidar[:, :3, 3]
+for name, poses in (("odometry", result.T_odometry_scan), ("with loops", result.T_world_scan)):
+    print(f"{name}: ATE {dpmjax.absolute_trajectory_error(poses[:, :3, 3], reference):.3f} m")
+accepted = [loop for loop in result.loops if loop.status == "accepted"]
+print(f"{len(result.keyframes)} keyframes, {len(accepted)} loops")
+
+# Files that evo and other tools read.
+io.write_tum("trajectory_tum.txt", result.T_world_scan, times=drive.times)
+dpmjax.write_g2o("graph.g2o", result.graph)
+
+# The graph can be optimised again, or with edges of your own.
+solved = dpmjax.optimize_pose_graph(dpmjax.read_g2o("graph.g2o"))
+print(f"chi2 {solved.chi2_initial:.3f} -> {solved.chi2:.3f} after {solved.iterations} iterations")
