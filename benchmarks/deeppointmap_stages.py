@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 import dpmjax
 from benchmarks.rows import Row, measure
+from dpmjax.cli.machine import peak_rss_gb
 from dpmjax.deeppointmap import (
     CurriculumStage,
     ScanStore,
@@ -36,7 +37,6 @@ from dpmjax.io import LidarSequence, open_lidar_sequence
 from dpmjax.scans import preprocess_scan, preprocess_scan_on_host
 from dpmjax.simulation import HDL64E, simulate_lidar_sequence
 from dpmjax.types import DescriptorCloud
-from experiments._machine import peak_rss_gb
 
 Scan = NDArray[np.float32]
 DATA = Path(os.environ.get("DPMJAX_DATA", "../shared/data")) / "lidar_3d"

@@ -12,10 +12,10 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
-from experiments._command import StopFlag, check_least, check_names
+from dpmjax.cli.command import StopFlag, check_least, check_names
+from dpmjax.cli.result_files import do_row
+from dpmjax.cli.run_folder import RunFolder, RunOptions, open_run_folder, recording
 from experiments._deepmapping_methods import METHODS, SUCCESS_PX, Task, assess, choose, errors
-from experiments._result_files import do_row
-from experiments._run_folder import RunFolder, RunOptions, open_run_folder, recording
 
 NOT_RUN = {
     "go-icp": "its packages on PyPI search the turns of 3-D clouds, which may turn a flat scan over; py-goicp does not "

@@ -151,7 +151,7 @@ def worst_failures(
         a, b = drawn[number]
         title = f"{drive.name}: scan {a} onto {b}, confidence {confidence:.2f}"
         T = np.asarray(row["motions"][number]).reshape(4, 4)
-        shown.append(RegisteredPair(title, pair.source, pair.target, T, pair.T_target_source))
+        shown.append(RegisteredPair(title, pair.source, pair.target, {"found": T, "true": pair.T_target_source}))
     return shown
 
 

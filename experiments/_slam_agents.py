@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from experiments import _slam_files as files
-from experiments._run_folder import AGENTS, RunFolder
-from experiments._slam_input import read_points
-from experiments._slam_numbers import trajectory_errors
+from dpmjax.cli import slam_files as files
+from dpmjax.cli.run_folder import AGENTS, RunFolder
+from dpmjax.cli.slam_input import read_points
+from dpmjax.cli.slam_numbers import trajectory_errors
 
 if TYPE_CHECKING:
     from dpmjax.sequences import LidarSequence

@@ -12,16 +12,16 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from dpmjax import io, load_model, viz
+from dpmjax.cli.result_files import do_row
+from dpmjax.cli.run_folder import RunFolder
+from dpmjax.cli.slam_input import corrected, read_points, require_whole_files
 from dpmjax.metrics import align_rigid
 from dpmjax.metrics.loops import path_lengths
 from dpmjax.sequences import LidarSequence
 from dpmjax.simulation import HDL64E, OS1_64, DriveConfig, LidarSensor, Scene, TownConfig, simulate_scene
 from dpmjax.slam import SlamMethods, make_methods
 from experiments import _slam_evaluation as evaluation
-from experiments._result_files import do_row
-from experiments._run_folder import RunFolder
 from experiments._slam_evaluation import ODOMETRY, OURS, PRECISIONS, Drive, StoppedError
-from experiments._slam_input import corrected, read_points, require_whole_files
 from experiments._slam_localization import evaluate_localization
 from experiments._slam_peers import PEERS, why_missing, why_not_importable
 from experiments._slam_refine import MULTIWAY, REFINED, evaluate_refinement

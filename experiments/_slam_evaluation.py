@@ -18,17 +18,17 @@ import numpy as np
 from tqdm import tqdm
 
 from dpmjax import save_map
+from dpmjax.cli import slam_files as files
+from dpmjax.cli.run_folder import DRIVES, RunFolder
+from dpmjax.cli.slam_input import read_points
+from dpmjax.cli.slam_numbers import trajectory_errors
+from dpmjax.cli.slam_run import SlamRun, run_alone
 from dpmjax.geometry import rigid
 from dpmjax.metrics import find_revisits, loop_recall, registration_recall
 from dpmjax.metrics.loops import path_lengths
 from dpmjax.sequences import LidarSequence
 from dpmjax.slam import KeyframeMap, SlamMethods, SlamResult
-from experiments import _slam_files as files
-from experiments._run_folder import DRIVES, RunFolder
-from experiments._slam_input import read_points
-from experiments._slam_numbers import trajectory_errors
 from experiments._slam_peers import PEERS, POINT_BYTES, FoundLoop, KissIcp, Peer, is_indoors, peer_version
-from experiments._slam_run import SlamRun, run_alone
 
 OURS, ODOMETRY = "DeepPointMap", "DeepPointMap odometry"
 PRECISIONS = ("float32", "float16", "int8")

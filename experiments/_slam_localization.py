@@ -10,11 +10,11 @@ import numpy as np
 from tqdm import tqdm
 
 from dpmjax import load_map, save_map
+from dpmjax.cli.localize import Case, as_row, measure_errors
+from dpmjax.cli.slam_input import read_points
 from dpmjax.sequences import LidarSequence
 from dpmjax.slam import SlamMethods, localize_each
 from experiments._slam_evaluation import Drive, StoppedError, first_keyframes, map_path
-from experiments._slam_input import read_points
-from experiments.dpm_localize import Case, as_row, measure_errors
 
 
 def evaluate_localization(drive: Drive, methods: SlamMethods, precision: str, num: int, seed: int) -> dict[str, Any]:

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
-from experiments._result_files import UNKNOWN
+from dpmjax.cli.result_files import UNKNOWN
 
 MAX_RANGE_M, INDOOR_MAX_RANGE_M = 60.0, 30.0
 # Where half of the points are nearer, the place is indoors.

@@ -14,14 +14,14 @@ import numpy as np
 from tqdm import tqdm
 
 from dpmjax import deepmapping
+from dpmjax.cli.slam_input import read_points
+from dpmjax.cli.slam_run import run_alone
 from dpmjax.geometry import rigid
 from dpmjax.pose_graph.optimize import PoseGraphConfig, optimize_pose_graph
 from dpmjax.slam import KeyframeMap, SlamMethods
 from dpmjax.slam.keyframes import as_pose_graph, with_edges
 from dpmjax.slam.system import place_scans
 from experiments._slam_evaluation import Drive, StoppedError, common_numbers
-from experiments._slam_input import read_points
-from experiments._slam_run import run_alone
 
 WINDOW, OVERLAP = 32, 8
 """Keyframes of a window, and those that it shares with the next one."""

@@ -26,11 +26,11 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 from tyro.conf import Positional, arg
 
+from dpmjax.cli.command import StopFlag, check_least, run_command
+from dpmjax.cli.machine import peak_rss_gb
+from dpmjax.cli.recorded_fit import FitTask, RecordedFit, draw_loss, record_fit
+from dpmjax.cli.run_folder import RunFolder, RunOptions, open_run_folder, recording, write_metrics
 from experiments._cloud_input import read_drive, starting_poses
-from experiments._command import StopFlag, check_least, run_command
-from experiments._deepmapping_fit import FitTask, RecordedFit, draw_loss, record_fit
-from experiments._machine import peak_rss_gb
-from experiments._run_folder import RunFolder, RunOptions, open_run_folder, recording, write_metrics
 
 if TYPE_CHECKING:
     from dpmjax.deepmapping import CloudFitted, CloudMappingConfig, CloudScans
@@ -251,4 +251,4 @@ def report(metrics: dict[str, Any]) -> str:
 
 
 if __name__ == "__main__":
-    raise SystemExit(run_command(main, Config, experiment=EXPERIMENT, description=__doc__))
+    raise SystemExit(run_command(main, Config, name=EXPERIMENT, description=__doc__))

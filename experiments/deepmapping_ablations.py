@@ -21,10 +21,10 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 import numpy as np
 from tyro.conf import arg
 
-from experiments._command import StopFlag, run_command
-from experiments._result_files import do_rows
+from dpmjax.cli.command import StopFlag, run_command
+from dpmjax.cli.result_files import do_rows
+from dpmjax.cli.run_folder import RunFolder, RunOptions, open_run_folder, recording, write_metrics
 from experiments._rgbd_methods import errors_of
-from experiments._run_folder import RunFolder, RunOptions, open_run_folder, recording, write_metrics
 
 if TYPE_CHECKING:
     from dpmjax.deepmapping import DepthMappingConfig
@@ -177,4 +177,4 @@ def draw(folder: RunFolder, rows: list[dict[str, Any]]) -> None:
 
 
 if __name__ == "__main__":
-    raise SystemExit(run_command(main, Config, experiment=EXPERIMENT, description=__doc__))
+    raise SystemExit(run_command(main, Config, name=EXPERIMENT, description=__doc__))

@@ -23,11 +23,11 @@ from numpy.typing import NDArray
 from tyro.conf import arg
 
 from dpmjax import simulation, viz
+from dpmjax.cli.command import check_least, check_names, run_command
+from dpmjax.cli.run_folder import RunFolder, write_metrics
 from experiments import _deepmapping_methods as shared
 from experiments import _deepmapping_tables as tables
-from experiments._command import check_least, check_names, run_command
 from experiments._deepmapping_methods import Task
-from experiments._run_folder import RunFolder, write_metrics
 
 EXPERIMENT = "deepmapping_limits"
 COLUMNS = (
@@ -169,4 +169,4 @@ def _write(config: Config, folder: RunFolder, rows: list[dict[str, Any]], not_ru
 
 
 if __name__ == "__main__":
-    raise SystemExit(run_command(main, Config, experiment=EXPERIMENT, description=__doc__))
+    raise SystemExit(run_command(main, Config, name=EXPERIMENT, description=__doc__))

@@ -19,9 +19,9 @@ from typing import Annotated, Any
 
 from tyro.conf import Positional, arg
 
-from experiments._command import EXIT_BAD_INPUT, run_command
-from experiments._result_files import load_json
-from experiments._run_folder import METRICS, RunFolder, write_metrics
+from dpmjax.cli.command import EXIT_BAD_INPUT, run_command
+from dpmjax.cli.result_files import load_json
+from dpmjax.cli.run_folder import METRICS, RunFolder, write_metrics
 
 EXPERIMENT = "deepmapping_logs"
 ENDINGS = (".log", ".clf", ".log.gz", ".clf.gz")
@@ -77,7 +77,7 @@ def _run(log: Path, init: str, corrected: Path | None, config: Config) -> dict[s
     """Returns the metrics of one run, in a process with a peak memory of its own; None where the log lacks odometry."""
     folder = config.output / f"{log.name.removesuffix('.gz')}_{init}"
     if not (folder / METRICS).exists():
-        command = [sys.executable, "-m", "experiments.deepmapping_2d", str(log), "-o", str(folder), "--force"]
+        command = [sys.executable, "-m", "dpmjax.cli.map2d", str(log), "-o", str(folder), "--force"]
         command += ["--init", init, "--seed", str(config.seed)]
         command += [] if config.steps is None else ["--steps", str(config.steps)]
         relations = log.with_name(drive_of(log) + ".relations")
@@ -122,4 +122,4 @@ def markdown(rows: list[dict[str, Any]]) -> str:
 
 
 if __name__ == "__main__":
-    raise SystemExit(run_command(main, Config, experiment=EXPERIMENT, description=__doc__))
+    raise SystemExit(run_command(main, Config, name=EXPERIMENT, description=__doc__))

@@ -20,11 +20,10 @@ import numpy as np
 from numpy.typing import NDArray
 from tyro.conf import Positional, arg
 
-from experiments import deepmapping_2d
-from experiments._command import run_command
-from experiments._machine import environment
-from experiments._result_files import write_json
-from experiments._run_folder import CHECKPOINTS, find_run, load_config
+from dpmjax.cli.command import run_command
+from dpmjax.cli.machine import environment
+from dpmjax.cli.result_files import write_json
+from dpmjax.cli.run_folder import CHECKPOINTS, find_run, load_config
 
 if TYPE_CHECKING:
     from dpmjax.deepmapping import Fitted
@@ -268,4 +267,4 @@ def tell(report: dict[str, Any]) -> None:
 
 
 if __name__ == "__main__":
-    raise SystemExit(run_command(main, Config, experiment=EXPERIMENT, description=__doc__))
+    raise SystemExit(run_command(main, Config, name=EXPERIMENT, description=__doc__))

@@ -32,11 +32,11 @@ import numpy as np
 from numpy.typing import NDArray
 from tyro.conf import Positional, arg
 
-from experiments._command import StopFlag, check_least, run_command
-from experiments._machine import peak_rss_gb
-from experiments._result_files import do_rows
+from dpmjax.cli.command import StopFlag, check_least, run_command
+from dpmjax.cli.machine import peak_rss_gb
+from dpmjax.cli.result_files import do_rows
+from dpmjax.cli.run_folder import RunFolder, RunOptions, open_run_folder, recording, write_metrics
 from experiments._rgbd_methods import METHODS, errors_of, run_method, spread_of
-from experiments._run_folder import RunFolder, RunOptions, open_run_folder, recording, write_metrics
 
 if TYPE_CHECKING:
     from dpmjax.deepmapping import DepthMappingConfig
@@ -265,4 +265,4 @@ def tell(folder: RunFolder, metrics: dict[str, Any]) -> None:
 
 
 if __name__ == "__main__":
-    raise SystemExit(run_command(main, Config, experiment=EXPERIMENT, description=__doc__))
+    raise SystemExit(run_command(main, Config, name=EXPERIMENT, description=__doc__))

@@ -19,10 +19,10 @@ from typing import Annotated, Any, ClassVar
 import numpy as np
 from tyro.conf import arg
 
-from experiments._command import run_command
-from experiments._machine import environment, peak_rss_gb
-from experiments._result_files import load_json, write_json
-from experiments._run_folder import FolderOptions, open_run_folder, recording, write_metrics
+from dpmjax.cli.command import run_command
+from dpmjax.cli.machine import environment, peak_rss_gb
+from dpmjax.cli.result_files import load_json, write_json
+from dpmjax.cli.run_folder import RunOptions, open_run_folder, recording, write_metrics
 
 EXPERIMENT = "deepmapping_size"
 # The exponent is that of large sizes: below, a step does not hold its full number of scans.
@@ -30,7 +30,7 @@ _FULL_STEP = 256
 
 
 @dataclass(frozen=True, kw_only=True)
-class Config(FolderOptions):
+class Config(RunOptions):
     """Options of the measurement."""
 
     may_change: ClassVar[frozenset[str]] = frozenset({"sizes"})
@@ -149,4 +149,4 @@ def tell(row: dict[str, Any]) -> None:
 
 
 if __name__ == "__main__":
-    raise SystemExit(run_command(main, Config, experiment=EXPERIMENT, description=__doc__))
+    raise SystemExit(run_command(main, Config, name=EXPERIMENT, description=__doc__))

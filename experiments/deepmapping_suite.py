@@ -21,11 +21,11 @@ import numpy as np
 from tyro.conf import arg
 
 from dpmjax import metrics, simulation, viz
+from dpmjax.cli.command import check_least, run_command
+from dpmjax.cli.run_folder import RunFolder, write_metrics
 from experiments import _deepmapping_methods as shared
 from experiments import _deepmapping_tables as tables
-from experiments._command import check_least, run_command
 from experiments._deepmapping_methods import Task
-from experiments._run_folder import RunFolder, write_metrics
 
 EXPERIMENT = "deepmapping_suite"
 NUM_WORLDS, NUM_SHORT, NUM_LONG = 3, 50, 25
@@ -155,4 +155,4 @@ def _write(seed: int, folder: RunFolder, rows: list[dict[str, Any]], not_run: di
 
 
 if __name__ == "__main__":
-    raise SystemExit(run_command(main, Config, experiment=EXPERIMENT, description=__doc__))
+    raise SystemExit(run_command(main, Config, name=EXPERIMENT, description=__doc__))

@@ -21,9 +21,9 @@ import numpy as np
 from tqdm import tqdm
 from tyro.conf import Positional, arg
 
-from experiments._command import check_least, run_command
-from experiments._result_files import do_row
-from experiments._run_folder import RunOptions, open_run_folder, recording, write_metrics
+from dpmjax.cli.command import check_least, run_command
+from dpmjax.cli.result_files import do_row
+from dpmjax.cli.run_folder import RunOptions, open_run_folder, recording, write_metrics
 
 EXPERIMENT = "dpm_calibrate"
 MODEL = "model.safetensors"
@@ -101,8 +101,8 @@ def main(config: Config) -> dict[str, Any]:
 
 
 def _town(config: Config, model: Any, *, town: int, kind: str, bar: tqdm) -> dict[str, Any]:
+    from dpmjax.cli.train_data import town_drive
     from dpmjax.metrics import registration_recall
-    from experiments._dpm_data import town_drive
     from experiments._dpm_pairs import BANDS, draw_pairs, read_pairs, register_pair
 
     drive = town_drive(town, length_m=config.town_length_m, kind=kind)
@@ -121,7 +121,7 @@ def _town(config: Config, model: Any, *, town: int, kind: str, bar: tqdm) -> dic
 
 
 def _overlap_town(config: Config, model: Any, town: int, bar: tqdm) -> dict[str, Any]:
-    from experiments._dpm_data import town_drive
+    from dpmjax.cli.train_data import town_drive
     from experiments._dpm_overlap import measure_town
 
     # The other town is that of the next row.
@@ -151,4 +151,4 @@ def fit(rows: list[dict[str, Any]]) -> tuple[Any, dict[str, Any], dict[str, np.n
 
 
 if __name__ == "__main__":
-    raise SystemExit(run_command(main, Config, experiment=EXPERIMENT, description=__doc__))
+    raise SystemExit(run_command(main, Config, name=EXPERIMENT, description=__doc__))

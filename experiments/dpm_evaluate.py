@@ -33,9 +33,9 @@ import numpy as np
 from tqdm import tqdm
 from tyro.conf import FlagCreatePairsOff, Positional, arg
 
-from experiments._command import StopFlag, check_least, run_command
-from experiments._result_files import do_row
-from experiments._run_folder import RunFolder, RunOptions, open_run_folder, recording, write_metrics
+from dpmjax.cli.command import StopFlag, check_least, run_command
+from dpmjax.cli.result_files import do_row
+from dpmjax.cli.run_folder import RunFolder, RunOptions, open_run_folder, recording, write_metrics
 
 if TYPE_CHECKING:
     from dpmjax.io import LidarSequence
@@ -171,7 +171,7 @@ def evaluate_pairs(config: Config) -> list[dict[str, Any]]:
 
 def open_drives(config: Config) -> list[LidarSequence]:
     """Opens the drives; a `ValueError` names one without poses or without pairs."""
-    from experiments._dpm_data import find_sources
+    from dpmjax.cli.train_data import find_sources
     from experiments._dpm_pairs import draw_pairs
 
     towns = range(FIRST_TOWN, FIRST_TOWN + config.num_towns)
@@ -214,4 +214,4 @@ def draw(folder: RunFolder, config: Config, drives: Sequence[LidarSequence], row
 
 
 if __name__ == "__main__":
-    raise SystemExit(run_command(main, Config, experiment=EXPERIMENT, description=__doc__))
+    raise SystemExit(run_command(main, Config, name=EXPERIMENT, description=__doc__))

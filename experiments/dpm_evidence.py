@@ -19,9 +19,9 @@ from typing import Annotated, Any
 import numpy as np
 from tyro.conf import arg
 
-from experiments._command import StopFlag, check_least, run_command
-from experiments._result_files import do_rows
-from experiments._run_folder import RunOptions, open_run_folder, recording, write_metrics
+from dpmjax.cli.command import StopFlag, check_least, run_command
+from dpmjax.cli.result_files import do_rows
+from dpmjax.cli.run_folder import RunOptions, open_run_folder, recording, write_metrics
 
 EXPERIMENT = "dpm_evidence"
 # Far from the seeds of all other commands.
@@ -92,8 +92,8 @@ def measure_scene(
 ) -> dict[str, list[dict[str, Any]]]:
     """Returns the pairs of a scene: what each hypothesis is judged by, and whether it is right."""
     import dpmjax.simulation
+    from dpmjax.cli.train_data import town_drive
     from dpmjax.deeppointmap.scan_registration import match_clouds, prepare_scan
-    from experiments._dpm_data import town_drive
     from experiments._dpm_pairs import draw_pairs_within
 
     lidar = getattr(dpmjax.simulation, sensor)
@@ -205,4 +205,4 @@ def _turn(rng: np.random.Generator) -> np.ndarray:
 
 
 if __name__ == "__main__":
-    raise SystemExit(run_command(main, Config, experiment=EXPERIMENT, description=__doc__))
+    raise SystemExit(run_command(main, Config, name=EXPERIMENT, description=__doc__))

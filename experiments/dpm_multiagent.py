@@ -21,8 +21,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 from tqdm import tqdm
 from tyro.conf import FlagCreatePairsOff, Positional, arg
 
-from experiments._command import StopFlag, check_least, run_command
-from experiments._run_folder import AGENTS, RunFolder, RunOptions, open_run_folder, recording, write_metrics
+from dpmjax.cli.command import StopFlag, check_least, run_command
+from dpmjax.cli.run_folder import AGENTS, RunFolder, RunOptions, open_run_folder, recording, write_metrics
 
 if TYPE_CHECKING:
     from dpmjax.sequences import LidarSequence
@@ -63,9 +63,9 @@ class Config(RunOptions):
 
 def main(config: Config) -> dict[str, Any]:
     """Lets the agents run, joins their maps, writes; returns the content of `metrics.json`."""
+    from dpmjax.cli.slam import tell
+    from dpmjax.cli.slam_run import run_alone
     from experiments._slam_agents import summary
-    from experiments._slam_run import run_alone
-    from experiments.dpm_slam import tell
 
     started = time.perf_counter()
     methods = agent_methods(config)
@@ -98,9 +98,9 @@ def agent_methods(config: Config) -> SlamMethods:
 
 def open_agents(config: Config) -> list[LidarSequence]:
     """Opens the scans of each agent; bad input that can be known before the run is a `ValueError`."""
+    from dpmjax.cli.slam import Config as DriveOptions
+    from dpmjax.cli.slam_input import open_drive
     from experiments._slam_agents import cut_sequence
-    from experiments._slam_input import open_drive
-    from experiments.dpm_slam import Config as DriveOptions
 
     names = ("seed", "n_scans", "jump", "sequence", "kitti_angle_correction")
     options = {name: getattr(config, name) for name in names}
@@ -146,4 +146,4 @@ def write_results(
 
 
 if __name__ == "__main__":
-    raise SystemExit(run_command(main, Config, experiment=EXPERIMENT, description=__doc__))
+    raise SystemExit(run_command(main, Config, name=EXPERIMENT, description=__doc__))

@@ -20,10 +20,10 @@ import numpy as np
 from tqdm import tqdm
 from tyro.conf import Positional, arg
 
+from dpmjax.cli.command import run_command
 from dpmjax.io import list_lidar_sequences, open_lidar_sequence
 from dpmjax.sequences import LidarSequence
 from dpmjax.simulation import SceneMixture, draw_scene, simulate_scene
-from experiments._command import run_command
 from experiments._scan_statistics import (
     HISTOGRAMS,
     ScanStatistics,
@@ -117,4 +117,4 @@ def simulated(config: Config) -> dict[tuple[str, int], ScanStatistics]:
 
 
 if __name__ == "__main__":
-    raise SystemExit(run_command(main, Config, experiment=EXPERIMENT, description=__doc__))
+    raise SystemExit(run_command(main, Config, name=EXPERIMENT, description=__doc__))

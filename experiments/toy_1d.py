@@ -22,9 +22,9 @@ import numpy as np
 from numpy.typing import NDArray
 from tyro.conf import FlagCreatePairsOff, arg
 
-from experiments._command import run_command
-from experiments._machine import peak_rss_gb, select_device
-from experiments._run_folder import RunFolder, open_run_folder, recording, write_metrics
+from dpmjax.cli.command import run_command
+from dpmjax.cli.machine import peak_rss_gb, select_device
+from dpmjax.cli.run_folder import RunFolder, open_run_folder, recording, write_metrics
 
 if TYPE_CHECKING:
     from dpmjax.deepmapping.fit import Fit
@@ -242,4 +242,4 @@ def tell(folder: RunFolder, metrics: dict[str, Any]) -> None:
 
 
 if __name__ == "__main__":
-    raise SystemExit(run_command(main, Config, experiment=EXPERIMENT, description=__doc__))
+    raise SystemExit(run_command(main, Config, name=EXPERIMENT, description=__doc__))

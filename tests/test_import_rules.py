@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import ast
+import re
 from pathlib import Path
 
 import pytest
 
-PACKAGE = Path(__file__).parents[1] / "src" / "dpmjax"
+ROOT = Path(__file__).parents[1]
+PACKAGE = ROOT / "src" / "dpmjax"
 
 EVERYBODY_MAY = {"types", "checks", "sequences"}
 ALLOWED: dict[str, set[str]] = {
@@ -15,6 +17,7 @@ ALLOWED: dict[str, set[str]] = {
     "checks": set(),
     "sequences": set(),
     "checkpoints": set(),
+    "compile_cache": set(),
     "geometry": set(),
     "scans": {"geometry"},
     "nets": {"geometry"},
@@ -31,6 +34,8 @@ ALLOWED: dict[str, set[str]] = {
     "viz": {"geometry"},
     "weights": {"geometry", "nets", "deeppointmap"},
 }
+# The command imports every room, and no room imports it.
+ALLOWED |= {"cli": set(ALLOWED) - EVERYBODY_MAY, "__main__": {"cli"}}
 ONLY_IN: dict[str, set[str]] = {"matplotlib": {"viz", "io"}, "jaxlie": {"geometry"}, "torch": {"weights"}}
 NEVER = {"experiments", "benchmarks", "tests"}
 
@@ -39,7 +44,7 @@ MODULES = sorted(path for path in PACKAGE.rglob("*.py") if path != PACKAGE / "__
 
 def imported_names(path: Path) -> set[str]:
     """Full dotted names of everything that a module imports, also inside functions and under TYPE_CHECKING."""
-    own_package = ["dpmjax", *path.relative_to(PACKAGE).parent.parts]
+    own_package = ["dpmjax", *path.relative_to(PACKAGE).parent.parts] if path.is_relative_to(PACKAGE) else []
     names: set[str] = set()
     for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
         if isinstance(node, ast.Import):
@@ -116,3 +121,21 @@ def test_relative_imports_are_resolved(tmp_path: Path, monkeypatch: pytest.Monke
     module.parent.mkdir()
     module.write_text("from ..losses.chamfer import x\nfrom . import rigid\nimport dpmjax.nets\n")
     assert imported_names(module) == {"dpmjax.losses.chamfer.x", "dpmjax.geometry.rigid", "dpmjax.nets"}
+
+
+def listed_names() -> set[str]:
+    """Full names of everything that the door of the package or of a room lists."""
+    found = set()
+    for stub in PACKAGE.rglob("__init__.pyi"):
+        room = ".".join(["dpmjax", *stub.parent.relative_to(PACKAGE).parts])
+        found |= {f"{room}.{name}" for name in re.findall(r"import \w+ as (\w+)", stub.read_text(encoding="utf-8"))}
+    return found | {f"dpmjax.{room}" for room in ALLOWED}
+
+
+OUTSIDE = sorted(path for folder in ("experiments", "examples", "benchmarks") for path in (ROOT / folder).rglob("*.py"))
+
+
+@pytest.mark.parametrize("path", OUTSIDE, ids=lambda path: str(path.relative_to(ROOT)))
+def test_what_is_outside_the_package_uses_its_doors(path: Path) -> None:
+    names = {name for name in imported_names(path) if name.startswith("dpmjax.")}
+    assert not sorted(names - listed_names())

@@ -1,3 +1,4 @@
+from .compile_cache import enable_compile_cache as enable_compile_cache
 from .deepmapping.planar import fit_deepmapping as fit_deepmapping
 from .deepmapping.relocalization import relocalize as relocalize
 from .deeppointmap.batches import encode_scans as encode_scans

@@ -7,17 +7,17 @@ import json
 import numpy as np
 import pytest
 
+from dpmjax.cli.command import run_command
 from dpmjax.io import read_poses, write_ply, write_tum
 from experiments import deepmapping_3d
 from experiments._cloud_input import add_noise
-from experiments._command import run_command
 
 
 def run(*options) -> int:
     return run_command(
         deepmapping_3d.main,
         deepmapping_3d.Config,
-        experiment=deepmapping_3d.EXPERIMENT,
+        name=deepmapping_3d.EXPERIMENT,
         description=deepmapping_3d.__doc__,
         args=list(map(str, options)),
     )

@@ -10,6 +10,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from dpmjax.cli.command import run_command
 from dpmjax.geometry import se2
 from dpmjax.simulation import simulate_sequence
 from experiments import (
@@ -19,7 +20,6 @@ from experiments import (
     deepmapping_logs,
     deepmapping_suite,
 )
-from experiments._command import run_command
 from experiments._deepmapping_methods import (
     DEEPMAPPING,
     METHODS,
@@ -137,7 +137,7 @@ def test_limits_are_resumed_without_doing_a_row_twice(tmp_path, monkeypatch, cap
     def run(*options: str) -> dict:
         arguments = ["-o", str(tmp_path / "out"), "--strides", "2", "--noises-px", "0", "--orders", "ordered", *options]
         main, config = deepmapping_limits.main, deepmapping_limits.Config
-        assert run_command(main, config, experiment="limits", description=None, args=arguments) == 0
+        assert run_command(main, config, name="limits", description=None, args=arguments) == 0
         return json.loads((tmp_path / "out" / "metrics.json").read_text())
 
     monkeypatch.setattr(deepmapping_limits.simulation, "simulate_sequence", simulate)
@@ -233,7 +233,7 @@ def test_suite_writes_its_table_its_picture_and_the_bound(tmp_path, monkeypatch,
     options = ["-o", str(tmp_path / "out"), "--methods", "icp-plane", "global-deepmapping", "--steps", "2"]
     options += ["--range-noise-px", "1"]
     main, config = deepmapping_suite.main, deepmapping_suite.Config
-    assert run_command(main, config, experiment="suite", description=None, args=options) == 0
+    assert run_command(main, config, name="suite", description=None, args=options) == 0
     metrics = json.loads((tmp_path / "out" / "metrics.json").read_text())
     assert [row["method"] for row in metrics["rows"]] == ["icp-plane", "global-deepmapping"]
     candidates = metrics["methods"]["global-deepmapping"]["candidates"]
@@ -275,7 +275,7 @@ def test_a_whole_recording_is_measured_by_its_relations_and_its_corrected_log(tm
     options = [str(tmp_path), "--corrected", str(tmp_path / "corrected"), "-o", str(tmp_path / "out")]
     options += ["--inits", "odometry", "--steps", "2"]
     main, config = deepmapping_logs.main, deepmapping_logs.Config
-    assert run_command(main, config, experiment="logs", description=None, args=options) == 0
+    assert run_command(main, config, name="logs", description=None, args=options) == 0
     capsys.readouterr()
     (row,) = json.loads((tmp_path / "out" / "metrics.json").read_text())["rows"]
     assert row["num_scans"] == 48
@@ -316,11 +316,11 @@ def test_logs_keep_finished_runs_and_leave_out_lost_odometry(tmp_path, capsys) -
     options = [str(tmp_path), "-o", str(tmp_path / "out"), "--inits", "odometry", "--steps", "2"]
     for _ in range(2):
         main, config = deepmapping_logs.main, deepmapping_logs.Config
-        assert run_command(main, config, experiment="logs", description=None, args=options) == 0
+        assert run_command(main, config, name="logs", description=None, args=options) == 0
         printed = capsys.readouterr().out.splitlines()
         assert [line.split(" | ")[:3] for line in printed if "good" in line] == [["| good.log", "12 (5)", "odometry"]]
     (row,) = json.loads((tmp_path / "out" / "metrics.json").read_text())["rows"]
     assert row["candidates"][row["kept"]]["ate_m"] == row["ate_m"]
     options[:1] = [str(tmp_path), str(tmp_path)]
-    assert run_command(main, config, experiment="logs", description=None, args=options) == 2
+    assert run_command(main, config, name="logs", description=None, args=options) == 2
     assert "4 logs have 2 different names" in capsys.readouterr().err

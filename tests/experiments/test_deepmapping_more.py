@@ -8,18 +8,16 @@ import math
 import numpy as np
 import pytest
 
+from dpmjax.cli.command import run_command
 from dpmjax.simulation import simulate_sequence
 from experiments import deepmapping_ablations, deepmapping_relocalize, deepmapping_rgbd, deepmapping_size, toy_1d
-from experiments._command import run_command
 
 MODULES = (deepmapping_ablations, deepmapping_relocalize, deepmapping_rgbd, deepmapping_size, toy_1d)
 
 
 def run(module, *options) -> int:
     arguments = list(map(str, options))
-    return run_command(
-        module.main, module.Config, experiment=module.EXPERIMENT, description=module.__doc__, args=arguments
-    )
+    return run_command(module.main, module.Config, name=module.EXPERIMENT, description=module.__doc__, args=arguments)
 
 
 @pytest.mark.parametrize("module", MODULES, ids=lambda module: module.EXPERIMENT)

@@ -8,10 +8,11 @@ import pytest
 from tqdm import tqdm
 
 import dpmjax
+from dpmjax.cli import train_data
+from dpmjax.cli.command import EXIT_BAD_INPUT, EXIT_OK, run_command
+from dpmjax.cli.result_files import load_json
 from dpmjax.deeppointmap.confidence import OVERLAP_FEATURES, SCAN_FEATURES
-from experiments import _dpm_data, _dpm_evaluation, _dpm_overlap, _dpm_pairs, dpm_calibrate, dpm_evaluate
-from experiments._command import EXIT_BAD_INPUT, EXIT_OK, run_command
-from experiments._result_files import load_json
+from experiments import _dpm_evaluation, _dpm_overlap, _dpm_pairs, dpm_calibrate, dpm_evaluate
 from tests.deeppointmap import toy
 
 
@@ -24,13 +25,11 @@ def weights(tmp_path):
 
 def run(module, arguments) -> int:
     arguments = list(map(str, arguments))
-    return run_command(
-        module.main, module.Config, experiment=module.EXPERIMENT, description=module.__doc__, args=arguments
-    )
+    return run_command(module.main, module.Config, name=module.EXPERIMENT, description=module.__doc__, args=arguments)
 
 
 def test_evaluation_measures_every_sequence_and_resumes(weights, tmp_path, monkeypatch, capsys) -> None:
-    monkeypatch.setattr(_dpm_data, "town_drive", lambda seed, **_: toy.drive(seed))
+    monkeypatch.setattr(train_data, "town_drive", lambda seed, **_: toy.drive(seed))
     monkeypatch.setattr(_dpm_evaluation, "why_no_kiss", lambda: "it is not installed")
     arguments = ["town", "--weights", weights, "--pairs", 2, "--num-towns", 1, "-o", tmp_path / "out"]
     assert run(dpm_evaluate, arguments) == EXIT_OK
@@ -74,7 +73,7 @@ def test_calibration_is_stored_in_a_copy_of_the_model(weights, tmp_path, monkeyp
         kinds.append(kind)
         return toy.drive(seed)
 
-    monkeypatch.setattr(_dpm_data, "town_drive", town_drive)
+    monkeypatch.setattr(train_data, "town_drive", town_drive)
     rng = np.random.default_rng(0)
 
     def found(model, pair):

@@ -7,8 +7,8 @@ import json
 import numpy as np
 import pytest
 
-from experiments._command import run_command
-from experiments._run_folder import METRICS
+from dpmjax.cli.command import run_command
+from dpmjax.cli.run_folder import METRICS
 from experiments.dpm_evidence import EXPERIMENT, SCENES, Config, fit, main
 
 
@@ -37,7 +37,7 @@ def test_the_weights_that_made_the_data_are_found() -> None:
 
 def test_more_scenes_than_there_are_are_refused(tmp_path, capsys) -> None:
     arguments = ["--scenes", str(len(SCENES) + 1), "-o", str(tmp_path / "out")]
-    assert run_command(main, Config, experiment=EXPERIMENT, description=None, args=arguments) == 2
+    assert run_command(main, Config, name=EXPERIMENT, description=None, args=arguments) == 2
     assert "--scenes" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
 
@@ -46,7 +46,7 @@ def test_more_scenes_than_there_are_are_refused(tmp_path, capsys) -> None:
 def test_a_small_run_writes_weights_and_table_and_resumes(tmp_path) -> None:
     arguments = ["--scenes", "2", "--pairs", "2", "--length-m", "100", "-o", str(tmp_path)]
     for more in ([], ["--resume"]):
-        assert run_command(main, Config, experiment=EXPERIMENT, description=None, args=[*arguments, *more]) == 0
+        assert run_command(main, Config, name=EXPERIMENT, description=None, args=[*arguments, *more]) == 0
     metrics = json.loads((tmp_path / METRICS).read_text())
     assert metrics["evidence"]["walls_contradicted"] < 0
     assert len((tmp_path / "table.md").read_text().splitlines()) == 2 + len(metrics["table"])

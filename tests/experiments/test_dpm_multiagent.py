@@ -12,12 +12,13 @@ import numpy as np
 import pytest
 
 import dpmjax
+from dpmjax.cli import slam_files
+from dpmjax.cli.command import EXIT_BAD_INPUT, EXIT_OK, run_command
+from dpmjax.cli.result_files import load_json
 from dpmjax.io import read_poses, write_tum
 from dpmjax.metrics import absolute_trajectory_error
 from dpmjax.slam import SlamConfig, SlamMethods
-from experiments import _slam_agents, _slam_files, dpm_multiagent
-from experiments._command import EXIT_BAD_INPUT, EXIT_OK, run_command
-from experiments._result_files import load_json
+from experiments import _slam_agents, dpm_multiagent
 from tests.deeppointmap import toy
 from tests.slam.truth import TruthGeometry, TruthMatcher, laps
 
@@ -29,7 +30,7 @@ def run(*options) -> int:
     return run_command(
         dpm_multiagent.main,
         dpm_multiagent.Config,
-        experiment=dpm_multiagent.EXPERIMENT,
+        name=dpm_multiagent.EXPERIMENT,
         description=dpm_multiagent.__doc__,
         args=list(map(str, options)),
     )
@@ -43,7 +44,7 @@ def truth_methods(config) -> SlamMethods:
 def with_truth(monkeypatch) -> None:
     """Truth in place of the networks; a map file needs their descriptors."""
     monkeypatch.setattr(dpm_multiagent, "agent_methods", truth_methods)
-    monkeypatch.setattr(_slam_files, "write_map_file", lambda path, slam_map: {})
+    monkeypatch.setattr(slam_files, "write_map_file", lambda path, slam_map: {})
 
 
 def write_drive(folder: Path, numbers) -> Path:

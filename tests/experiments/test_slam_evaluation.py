@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 
 import dpmjax
+from dpmjax.cli.command import EXIT_BAD_INPUT, EXIT_OK, run_command
+from dpmjax.cli.result_files import load_json
+from dpmjax.cli.run_folder import RunFolder
 from dpmjax.geometry import rigid
 from dpmjax.io import LidarSequence
 from experiments import _slam_comparison, _slam_evaluation, _slam_peers, _slam_refine, dpm_evaluate
-from experiments._command import EXIT_BAD_INPUT, EXIT_OK, run_command
-from experiments._result_files import load_json
-from experiments._run_folder import RunFolder
 from experiments._slam_evaluation import Drive, FoundLoop, StoppedError
 from tests.deeppointmap import toy
 from tests.slam.truth import laps, pose
@@ -64,7 +64,7 @@ def run(*arguments) -> int:
     return run_command(
         dpm_evaluate.main,
         dpm_evaluate.Config,
-        experiment=dpm_evaluate.EXPERIMENT,
+        name=dpm_evaluate.EXPERIMENT,
         description=dpm_evaluate.__doc__,
         args=list(map(str, arguments)),
     )

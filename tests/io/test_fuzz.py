@@ -393,8 +393,8 @@ COMMAND_SEEDS = range(8)
 @pytest.mark.parametrize("name", SCANS)
 def test_the_command_refuses_spoilt_scans_in_one_line(tmp_path, name, capsys, monkeypatch):
     """Every refusal has exit code 2 and one line; work begins only with scans that were read."""
-    from experiments import deepmapping_2d as command
-    from experiments._command import run_command
+    from dpmjax.cli import map2d as command
+    from dpmjax.cli.command import run_command
 
     class BegunError(Exception):
         pass
@@ -408,7 +408,7 @@ def test_the_command_refuses_spoilt_scans_in_one_line(tmp_path, name, capsys, mo
         path = make_input(f"scans, {name}", seed, tmp_path / str(seed))
         output = tmp_path / f"out {seed}"
         arguments = [str(path), "-o", str(output)]
-        code = run_command(command.main, command.Config, experiment="deepmapping_2d", description="", args=arguments)
+        code = run_command(command.main, command.Config, name="deepmapping_2d", description="", args=arguments)
         told = capsys.readouterr().err
         assert not output.exists()
         if "BegunError" in told:
@@ -430,12 +430,12 @@ def test_the_command_refuses_spoilt_scans_in_one_line(tmp_path, name, capsys, mo
     ],
 )
 def test_the_command_refuses_what_cannot_be_registered(tmp_path, capsys, points, found):
-    from experiments import deepmapping_2d as command
-    from experiments._command import run_command
+    from dpmjax.cli import map2d as command
+    from dpmjax.cli.command import run_command
 
     np.save(tmp_path / "a.npy", points)
     arguments = [str(tmp_path / "a.npy"), "-o", str(tmp_path / "out")]
-    code = run_command(command.main, command.Config, experiment="deepmapping_2d", description="", args=arguments)
+    code = run_command(command.main, command.Config, name="deepmapping_2d", description="", args=arguments)
     (line,) = capsys.readouterr().err.splitlines()
     assert code == 2
     assert line.startswith(f"dpmjax: error: {tmp_path / 'a.npy'}: ")

@@ -21,7 +21,9 @@ def test_reliability_of_nothing_is_drawn() -> None:
 def test_pairs_are_drawn_under_both_motions() -> None:
     T = np.eye(4)
     T[0, 3] = 7
-    pair = viz.RegisteredPair("pair", np.zeros((1, 3), np.float32), np.ones((2, 3), np.float32), T, np.eye(4))
+    pair = viz.RegisteredPair(
+        "pair", np.zeros((1, 3), np.float32), np.ones((2, 3), np.float32), {"found": T, "true": np.eye(4)}
+    )
     figure = viz.registered_pairs_figure([pair, pair])
     assert len(figure.axes) == 4
     found, true = (axes.lines[1].get_xdata() for axes in figure.axes[:2])

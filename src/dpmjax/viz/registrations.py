@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -14,7 +14,9 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 NUM_BINS = 10
-SOURCE = "#2e6f9e"
+SOURCE, TARGET = "#2e6f9e", "#d98c3f"
+# Points farther out than this share of them are outside of the picture.
+SHOWN_SHARE = 0.99
 
 
 class RegisteredPair(NamedTuple):
@@ -24,15 +26,13 @@ class RegisteredPair(NamedTuple):
         title: title of the row.
         source: (n, 3) points, metres.
         target: (m, 3) points, metres.
-        T_found: (4, 4) target from source, as it was found.
-        T_true: the true one.
+        motions: (4, 4) `T_target_source` by the title of its panel, from left to right.
     """
 
     title: str
     source: NDArray[np.float32]
     target: NDArray[np.float32]
-    T_found: NDArray[np.float64]
-    T_true: NDArray[np.float64]
+    motions: Mapping[str, NDArray[np.float64]]
 
 
 def reliability_figure(
@@ -75,23 +75,29 @@ def reliability_figure(
 
 
 def registered_pairs_figure(pairs: Sequence[RegisteredPair]) -> Figure:
-    """Draws pairs of scans from above: on the left under the motion that was found, on the right under the true one.
+    """Draws pairs of scans from above, the source under each of the motions.
 
     Args:
-        pairs: one row each; at least one.
+        pairs: one row each; at least one, each with the same number of motions.
 
     Returns:
         The figure.
     """
     figure = new_figure(9.0, 4.2 * len(pairs))
-    grid = figure.subplots(len(pairs), 2, squeeze=False)
+    grid = figure.subplots(len(pairs), len(pairs[0].motions), squeeze=False)
     for row, pair in zip(grid, pairs, strict=True):
-        for axes, T, label in zip(row, (pair.T_found, pair.T_true), ("found", "true"), strict=True):
+        for axes, (label, T) in zip(row, pair.motions.items(), strict=True):
             moved = pair.source @ T[:3, :3].T + T[:3, 3]
-            axes.plot(pair.target[:, 0], pair.target[:, 1], ",", color=MUTED, alpha=0.6)
-            axes.plot(moved[:, 0], moved[:, 1], ",", color=SOURCE, alpha=0.6)
+            for points, color in ((pair.target, TARGET), (moved, SOURCE)):
+                axes.plot(points[:, 0], points[:, 1], ".", color=color, ms=1.2, alpha=0.5, mew=0)
             axes.plot([0, T[0, 3]], [0, T[1, 3]], "o-", color=ACCENT, ms=4, lw=1)
-            axes.set_title(f"{pair.title}, {label}", fontsize=9, color=INK)
+            both = np.concatenate([pair.target, moved])[:, :2]
+            low, high = np.quantile(both, (0.5 - SHOWN_SHARE / 2, 0.5 + SHOWN_SHARE / 2), axis=0)
+            half = 0.55 * max(float((high - low).max()), 1.0)
+            (x, y) = (low + high) / 2
+            axes.set_xlim(x - half, x + half)
+            axes.set_ylim(y - half, y + half)
+            axes.set_title(f"{pair.title}\n{label}", fontsize=9, color=INK)
             axes.set_aspect("equal")
             axes.set_xticks([])
             axes.set_yticks([])

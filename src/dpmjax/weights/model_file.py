@@ -88,16 +88,17 @@ def save_model(
     save_file(arrays, path, metadata=header)
 
 
-def read_card(path: str | Path) -> str:
+def read_card(path_or_name: str | Path) -> str:
     """Reads the description of a model; a `ValueError` says if the file is missing or no such model.
 
     Args:
-        path: a `.safetensors` file that `save_model` wrote.
+        path_or_name: the name of a shipped model, or a `.safetensors` file that `save_model` wrote.
 
     Returns:
         The description that was given to `save_model`.
     """
-    return _read(_existing(Path(path)))[0].get("card", "")
+    path = SHIPPED / f"{path_or_name}{SUFFIX}" if str(path_or_name) in shipped_models() else Path(path_or_name)
+    return _read(_existing(path))[0].get("card", "")
 
 
 def _load_safetensors(path: Path) -> Model:

@@ -12,15 +12,17 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import fields
 from functools import partial
 from types import FrameType
-from typing import Any, Self, TypeVar
+from typing import Any, TypeVar
 
 import tyro
 
+from dpmjax.cli import program
+from dpmjax.cli.machine import select_device
+from dpmjax.cli.run_folder import OutputOptions, RunFailedError, check_run_folder, find_run, load_config
+from dpmjax.compile_cache import enable_compile_cache
 from dpmjax.sequences import InputError
-from experiments._machine import enable_compilation_cache, select_device
-from experiments._run_folder import FolderOptions, RunFailedError, check_run_folder, find_run, load_config
 
-EXIT_OK, EXIT_FAILED, EXIT_BAD_INPUT = 0, 1, 2
+EXIT_OK, EXIT_FAILED, EXIT_BAD_INPUT = program.EXIT_OK, 1, program.EXIT_BAD_INPUT
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 ConfigT = TypeVar("ConfigT")
@@ -67,7 +69,7 @@ class StopFlag:
         """Sets the flag where another process of the same run has received the signal."""
         self.received = self.received or signal_number
 
-    def __enter__(self) -> Self:
+    def __enter__(self) -> StopFlag:
         if threading.current_thread() is threading.main_thread():
             self._previous = {number: signal.signal(number, self._on_signal) for number in SIGNALS}
         return self
@@ -112,7 +114,7 @@ def run_command(
     main: Callable[[ConfigT], object],
     config_type: type[ConfigT],
     *,
-    experiment: str,
+    name: str,
     description: str | None,
     args: Sequence[str] | None = None,
 ) -> int:
@@ -124,8 +126,8 @@ def run_command(
 
     Args:
         main: takes the options. Errors of the user are raised as `ValueError` before the run folder is opened.
-        config_type: frozen dataclass. Of `FolderOptions`, the folder is checked and the device selected before `main`.
-        experiment: name of the module in `experiments` and of the folder in `results`.
+        config_type: frozen dataclass. Of `OutputOptions`, the folder is checked and the device selected before `main`.
+        name: of the subcommand of `dpmjax`, or of the module in `experiments`; and of the folder in `results`.
         description: the module's docstring; `--help` begins with it.
         args: the command line; None takes that of the process.
 
@@ -134,20 +136,17 @@ def run_command(
     """
     arguments = list(sys.argv[1:] if args is None else args)
     if "--version" in arguments:
-        import dpmjax
-
-        print(f"dpmjax {dpmjax.__version__}")
-        return EXIT_OK
+        return program.main(["--version"])
     console = logging.StreamHandler()
     console.setLevel(logging.WARNING)
     logging.basicConfig(format="dpmjax: %(levelname)s: %(message)s", handlers=[console])
     previous = {number: signal.signal(number, _interrupt) for number in SIGNALS}
-    enable_compilation_cache()
+    enable_compile_cache()
     try:
-        config = _parse(config_type, experiment, description, arguments)
-        if isinstance(config, FolderOptions):
-            check_run_folder(config, experiment)
-            select_device(getattr(config, "device", None))
+        config = _parse(config_type, name, description, arguments)
+        if isinstance(config, OutputOptions):
+            check_run_folder(config, name)
+            select_device(config.device)
         main(config)
     except SystemExit as done:  # tyro, after --help or wrong usage
         return EXIT_OK if done.code is None else int(done.code)
@@ -168,14 +167,15 @@ def run_command(
     return EXIT_OK
 
 
-def _parse(config_type: type[ConfigT], experiment: str, description: str | None, arguments: list[str]) -> ConfigT:
+def _parse(config_type: type[ConfigT], name: str, description: str | None, arguments: list[str]) -> ConfigT:
     old_names = getattr(config_type, "old_names", {})
     arguments = [old_names.get(argument, argument) for argument in arguments]
-    parse = partial(tyro.cli, config_type, prog=f"python -m experiments.{experiment}", description=description)
+    prog = f"dpmjax {name}" if name in program.COMMANDS else f"python -m experiments.{name}"
+    parse = partial(tyro.cli, config_type, prog=prog, description=description)
     config = parse(args=arguments)
     if not getattr(config, "resume", False):
         return config
-    earlier = load_config(find_run(experiment, getattr(config, "output", None)), config_type)
+    earlier = load_config(find_run(name, getattr(config, "output", None)), config_type)
     # Of a flag that is on, tyro takes --no-FLAG alone; who repeats the command says --FLAG again.
     on = {f"--{field.name}".replace("_", "-") for field in fields(earlier) if getattr(earlier, field.name) is True}
     return parse(args=[argument for argument in arguments if argument.replace("_", "-") not in on], default=earlier)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from experiments._run_folder import RunFolder
+from dpmjax.cli.run_folder import RunFolder
 
 if TYPE_CHECKING:
     from dpmjax.slam import ScanReport, SlamState

@@ -11,11 +11,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from dpmjax.cli import slam, slam_files
+from dpmjax.cli.command import EXIT_BAD_INPUT, EXIT_FAILED, EXIT_OK
 from dpmjax.io import write_kitti, write_pcd, write_ply, write_tum
 from dpmjax.slam import Match, SlamConfig, SlamMethods, SurfaceGeometry
-from experiments import _slam_files, dpm_slam
-from experiments._command import EXIT_BAD_INPUT, EXIT_FAILED, EXIT_OK
-from tests.experiments.test_dpm_slam import run
+from tests.cli.test_slam import run
 from tests.slam.test_odometry import motion, planes, seen_from
 
 NUM_FUZZED = int(os.environ.get("DPMJAX_NUM_FUZZED_DRIVES", "40"))
@@ -53,9 +53,9 @@ class NoMatcher:
 @pytest.fixture
 def without_networks(monkeypatch) -> None:
     methods = SlamMethods(NoMatcher(), SurfaceGeometry(), SlamConfig())
-    monkeypatch.setattr(dpm_slam, "slam_methods", lambda config: methods)
-    monkeypatch.setattr(_slam_files, "write_map_file", lambda path, slam_map: {})
-    monkeypatch.setattr(_slam_files, "draw_pictures", lambda *_: None)
+    monkeypatch.setattr(slam, "slam_methods", lambda config: methods)
+    monkeypatch.setattr(slam_files, "write_map_file", lambda path, slam_map: {})
+    monkeypatch.setattr(slam_files, "draw_pictures", lambda *_: None)
 
 
 def write_scan(path: Path, points: np.ndarray) -> None:

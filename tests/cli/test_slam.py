@@ -16,12 +16,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from dpmjax.cli import slam, slam_files, slam_input
+from dpmjax.cli.command import EXIT_BAD_INPUT, EXIT_FAILED, EXIT_OK, run_command
+from dpmjax.cli.result_files import load_json
 from dpmjax.geometry import rigid
 from dpmjax.io import read_poses, write_tum
 from dpmjax.slam import SlamConfig, SlamMethods
-from experiments import _slam_files, _slam_input, dpm_slam
-from experiments._command import EXIT_BAD_INPUT, EXIT_FAILED, EXIT_OK, run_command
-from experiments._result_files import load_json
 from tests.slam.truth import TruthGeometry, TruthMatcher, laps
 
 REPOSITORY = Path(__file__).parents[2]
@@ -38,10 +38,10 @@ def truth_methods(config) -> SlamMethods:
 
 def run(*options) -> int:
     return run_command(
-        dpm_slam.main,
-        dpm_slam.Config,
-        experiment=dpm_slam.EXPERIMENT,
-        description=dpm_slam.__doc__,
+        slam.main,
+        slam.Config,
+        name=slam.NAME,
+        description=slam.__doc__,
         args=list(map(str, options)),
     )
 
@@ -62,8 +62,8 @@ def drive(tmp_path_factory) -> Path:
 
 def use_truth(patch: pytest.MonkeyPatch) -> None:
     """Truth in place of the networks; a map file needs their descriptors."""
-    patch.setattr(dpm_slam, "slam_methods", truth_methods)
-    patch.setattr(_slam_files, "write_map_file", lambda path, slam_map: {})
+    patch.setattr(slam, "slam_methods", truth_methods)
+    patch.setattr(slam_files, "write_map_file", lambda path, slam_map: {})
 
 
 @pytest.fixture
@@ -92,7 +92,7 @@ def table(path: Path) -> list[dict[str, str]]:
 
 def test_help_shows_examples(capsys) -> None:
     assert run("--help") == 0
-    assert "python -m experiments.dpm_slam path/to/drive -o out" in capsys.readouterr().out
+    assert "dpmjax slam path/to/drive -o out" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(
@@ -204,7 +204,7 @@ def test_a_scan_without_points_is_passed_over(with_truth, tmp_path) -> None:
 
 
 def test_an_interrupted_run_writes_all_and_goes_on(whole, drive, with_truth, tmp_path, monkeypatch) -> None:
-    out, read = tmp_path / "out", _slam_input.read_points
+    out, read = tmp_path / "out", slam_input.read_points
 
     def interrupting(sequence, index):
         if index == 77 and not out.with_suffix(".stopped").exists():
@@ -212,7 +212,7 @@ def test_an_interrupted_run_writes_all_and_goes_on(whole, drive, with_truth, tmp
             os.kill(os.getpid(), signal.SIGINT)
         return read(sequence, index)
 
-    monkeypatch.setattr(_slam_input, "read_points", interrupting)
+    monkeypatch.setattr(slam_input, "read_points", interrupting)
     assert run(drive, "-o", out) == 130
     num_done = len(np.load(out / "trajectory.npy"))
     assert 70 < num_done < 85
@@ -242,17 +242,17 @@ PROCESS = """
 import sys, time
 from pathlib import Path
 import pytest
-from experiments import _slam_input
-from tests.experiments.test_dpm_slam import run, use_truth
+from dpmjax.cli import slam_input
+from tests.cli.test_slam import run, use_truth
 
 use_truth(pytest.MonkeyPatch())
-read = _slam_input.read_points
+read = slam_input.read_points
 
 def slowly(sequence, index):
     time.sleep(0.02)
     return read(sequence, index)
 
-_slam_input.read_points = slowly
+slam_input.read_points = slowly
 sys.exit(run(*sys.argv[1:]))
 """
 

@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 if TYPE_CHECKING:
+    from dpmjax.cli.slam_run import SlamRun
     from dpmjax.sequences import LidarSequence
     from dpmjax.slam import KeyframeMap, SlamResult
-    from experiments._slam_run import SlamRun
 
 
 def trajectory_errors(T_world_scan: np.ndarray, reference: np.ndarray | None, suffix: str = "") -> dict[str, Any]:

@@ -15,9 +15,9 @@ from typing import Annotated, Any, ClassVar, Literal, TypeVar
 
 from tyro.conf import FlagCreatePairsOff, arg
 
+from dpmjax.cli.machine import environment
+from dpmjax.cli.result_files import as_json, commits_note, load_json, write_json
 from dpmjax.sequences import InputError
-from experiments._machine import environment
-from experiments._result_files import as_json, commits_note, load_json, write_json
 
 CONFIG, METRICS, HISTORY, LOG = "config.json", "metrics.json", "metrics.csv", "log.txt"
 CHECKPOINTS, BEST, AGENTS, DRIVES = "checkpoints", "checkpoints_best", "agents", "drives"
@@ -35,33 +35,37 @@ ConfigT = TypeVar("ConfigT")
 
 
 @dataclass(frozen=True, kw_only=True)
-class FolderOptions:
-    """Options of every command that can be interrupted and resumed.
+class OutputOptions:
+    """Options of every command that writes results.
 
     Attributes:
-        may_change: options that a resumed run may change, besides those that do not change what is computed.
         old_names: earlier spellings of options on the command line, with today's.
     """
 
-    may_change: ClassVar[frozenset[str]] = frozenset()
     old_names: ClassVar[Mapping[str, str]] = {}
 
     output: Annotated[Path | None, arg(aliases=["-o"], metavar="OUT")] = None
-    """Folder for the results, instead of results/<experiment>/<time>."""
+    """Folder for the results, instead of results/<command>/<time>."""
+    force: FlagCreatePairsOff[bool] = False
+    """Replace an earlier run in OUT."""
+    device: Annotated[Literal["cpu", "gpu"] | None, arg(metavar="cpu|gpu")] = None
+    """Where to compute; without it, JAX chooses."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunOptions(OutputOptions):
+    """The same of every command that can be interrupted and resumed.
+
+    Attributes:
+        may_change: options that a resumed run may change, besides those that do not change what is computed.
+    """
+
+    may_change: ClassVar[frozenset[str]] = frozenset()
+
     seed: int = 0
     """Seed of everything random."""
     resume: FlagCreatePairsOff[bool] = False
     """Continue an interrupted run, the latest or that in OUT; options not given are the same as then."""
-    force: FlagCreatePairsOff[bool] = False
-    """Replace an earlier run in OUT."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class RunOptions(FolderOptions):
-    """The same of a command that computes in this process."""
-
-    device: Annotated[Literal["cpu", "gpu"] | None, arg(metavar="cpu|gpu")] = None
-    """Where to compute; without it, JAX chooses."""
 
 
 class RunFailedError(RuntimeError):
@@ -95,7 +99,7 @@ def open_run_folder(config: Any, experiment: str) -> RunFolder:
     Call it after the input was read, so that bad input leaves no folder behind.
 
     Args:
-        config: the resolved options, a dataclass such as `FolderOptions`. Its `output` None makes
+        config: the resolved options, a dataclass such as `RunOptions`. Its `output` None makes
             `results/<experiment>/<timestamp>` and lets `latest` beside it point there; `resume` continues the run in
             `output`, or the latest one; `force` empties `output` first where it holds an earlier run.
         experiment: name of the experiment.
@@ -184,14 +188,18 @@ def load_config(path: Path, config_type: type[ConfigT]) -> ConfigT:
 
 
 def write_metrics(
-    folder: RunFolder, metrics: Mapping[str, Any], *, seed: int, rows: Sequence[Mapping[str, Any]] | None = None
+    folder: RunFolder,
+    metrics: Mapping[str, Any],
+    *,
+    seed: int | None = None,
+    rows: Sequence[Mapping[str, Any]] | None = None,
 ) -> str | None:
     """Writes `metrics.json`: plain names with units, then the seed, the versions, the device and the machine.
 
     Args:
         folder: of the run.
         metrics: numbers by name.
-        seed: of the run.
+        seed: of the run; None where nothing is random.
         rows: rows made by `do_row`; the file names those of another commit than its own.
 
     Returns:
@@ -200,7 +208,8 @@ def write_metrics(
     made_by = environment()
     note = commits_note(rows or (), made_by["git_hash"])
     table = {} if rows is None else {"note": note, "rows": rows}
-    write_json(folder / METRICS, {**metrics, "seed": seed, **made_by, **table})
+    seeds = {} if seed is None else {"seed": seed}
+    write_json(folder / METRICS, {**metrics, **seeds, **made_by, **table})
     return note
 
 

@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from experiments._result_files import HistoryFile, read_history
-from experiments._run_folder import CHECKPOINTS, HISTORY, RunFolder
+from dpmjax.cli.result_files import HistoryFile, read_history
+from dpmjax.cli.run_folder import CHECKPOINTS, HISTORY, RunFolder
 
 if TYPE_CHECKING:
     from dpmjax.checkpoints import Checkpoints

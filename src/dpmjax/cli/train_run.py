@@ -15,6 +15,9 @@ import numpy as np
 from tqdm import tqdm
 
 from dpmjax.checkpoints import Checkpoints
+from dpmjax.cli.result_files import HistoryFile, read_history
+from dpmjax.cli.run_folder import BEST, CHECKPOINTS, HISTORY, RunFolder
+from dpmjax.cli.train_data import HELD_OUT_SEED, SELECTION_SEED, town_drive
 from dpmjax.deeppointmap import (
     Model,
     PairKind,
@@ -33,9 +36,6 @@ from dpmjax.deeppointmap.training import TrainingState
 from dpmjax.deeppointmap.training_loop import StepRecord, Trained, TrainingProgress, begin_training
 from dpmjax.io import open_lidar_sequence
 from dpmjax.simulation import HDL32E, HDL64E, OS1_64
-from experiments._dpm_data import HELD_OUT_SEED, SELECTION_SEED, town_drive
-from experiments._result_files import HistoryFile, read_history
-from experiments._run_folder import BEST, CHECKPOINTS, HISTORY, RunFolder
 
 # Seconds between checkpoints; Ctrl-C and the end write one too.
 SAVE_EVERY_S = 300.0

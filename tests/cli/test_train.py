@@ -12,6 +12,11 @@ import jax
 import numpy as np
 import pytest
 
+from dpmjax.cli.command import run_command
+from dpmjax.cli.result_files import read_history
+from dpmjax.cli.run_folder import CHECKPOINTS, HISTORY, RunFolder
+from dpmjax.cli.train import NAME, Config, main, training_settings
+from dpmjax.cli.train_run import KINDS, EvaluationSets, Records, run_training
 from dpmjax.deeppointmap import (
     CurriculumStage,
     SampleMaker,
@@ -23,12 +28,6 @@ from dpmjax.deeppointmap import (
 )
 from dpmjax.deeppointmap.training_loop import after_evaluation, begin_training
 from dpmjax.weights import load_model
-from experiments import _dpm_run
-from experiments._command import run_command
-from experiments._dpm_run import KINDS, EvaluationSets, Records, run_training
-from experiments._result_files import read_history
-from experiments._run_folder import CHECKPOINTS, HISTORY, RunFolder
-from experiments.dpm_train import EXPERIMENT, Config, main, training_settings
 from tests.deeppointmap import toy
 
 REPOSITORY = Path(__file__).parents[2]
@@ -119,13 +118,13 @@ def test_batches_made_ahead_are_those_made_alone() -> None:
 
 def test_help_needs_no_jax_and_shows_examples() -> None:
     code = (
-        "import sys; from experiments._command import run_command; from experiments import dpm_train as m;"
-        "code = run_command(m.main, m.Config, experiment=m.EXPERIMENT, description=m.__doc__, args=['--help']);"
+        "import sys; from dpmjax.cli.command import run_command; from dpmjax.cli import train as m;"
+        "code = run_command(m.main, m.Config, name=m.NAME, description=m.__doc__, args=['--help']);"
         "assert not {'jax', 'matplotlib', 'scipy'} & set(sys.modules), 'slow imports'; sys.exit(code)"
     )
     done = subprocess.run([sys.executable, "-c", code], cwd=REPOSITORY, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
-    for part in ("python -m experiments.dpm_train --resume", "--preset {tiny,small,paper}", "--data", "-o OUT"):
+    for part in ("dpmjax train --resume", "--preset {tiny,small,paper}", "--data", "-o OUT"):
         assert part in done.stdout
 
 
@@ -173,7 +172,7 @@ def refused(tmp_path: Path, capsys, *options: object) -> str:
     """What stderr says to bad input; there must be one line, exit code 2, and nothing written."""
     out = tmp_path / "out"
     arguments = [*map(str, options), *(() if "-o" in options else ("-o", str(out)))]
-    code = run_command(main, Config, experiment=EXPERIMENT, description=None, args=arguments)
+    code = run_command(main, Config, name=NAME, description=None, args=arguments)
     error = capsys.readouterr().err.strip()
     assert code == 2, error
     assert not out.exists()

@@ -8,12 +8,12 @@ import platform
 import resource
 import subprocess
 import sys
-import zlib
 from pathlib import Path
 from typing import Any, Literal
 
+from dpmjax.compile_cache import cpu_model
+
 PACKAGES = ("jax", "jaxlib", "flax", "optax", "numpy", "scipy")
-CACHES = "Library/Caches" if sys.platform == "darwin" else ".cache"
 
 
 def select_device(device: Literal["cpu", "gpu"] | None) -> None:
@@ -36,23 +36,6 @@ def select_device(device: Literal["cpu", "gpu"] | None) -> None:
         ) from error
 
 
-def enable_compilation_cache() -> None:
-    """Keeps compiled programs between runs, in `$XDG_CACHE_HOME/dpmjax`, or in the platform's folder for caches.
-
-    Call it before the first import of JAX. `DPMJAX_COMPILATION_CACHE=off` turns it off, another value names the folder;
-    `JAX_COMPILATION_CACHE_DIR`, where it is set, is kept.
-    """
-    chosen = os.environ.get("DPMJAX_COMPILATION_CACHE", "")
-    if chosen == "off" or "JAX_COMPILATION_CACHE_DIR" in os.environ:
-        return
-    # A program belongs to a processor: a home directory may be shared by several kinds.
-    caches = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / CACHES) / "dpmjax"
-    os.environ["JAX_COMPILATION_CACHE_DIR"] = chosen or str(caches / f"{zlib.crc32(cpu_model().encode()):08x}")
-    # Also the hundreds of small programs, which take seconds together.
-    os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
-    os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES", "-1")
-
-
 def environment() -> dict[str, Any]:
     """Returns versions, device, git commit and machine, ready for `metrics.json`."""
     return {
@@ -67,10 +50,8 @@ def environment() -> dict[str, Any]:
 
 def versions() -> dict[str, str]:
     """Returns the versions of Python, of this package, and of the packages that its numbers depend on."""
-    import dpmjax
-
-    installed = {name: importlib.metadata.version(name) for name in PACKAGES}
-    return {"python": platform.python_version(), "dpmjax": dpmjax.__version__, **installed}
+    installed = {name: importlib.metadata.version(name) for name in ("dpmjax", *PACKAGES)}
+    return {"python": platform.python_version(), **installed}
 
 
 def device_name() -> str | None:
@@ -84,18 +65,16 @@ def device_name() -> str | None:
 
 
 def git_hash() -> str | None:
-    """Returns the commit of this checkout, with `+changes` where it is not clean; None without git."""
-    command = ["git", "-C", str(Path(__file__).parent), "describe", "--always", "--abbrev=40", "--exclude=*"]
+    """Returns the commit of this checkout, with `+changes` where it is not clean; None where it is installed."""
+    root = Path(__file__).parents[3]
+    if not (root / "src" / "dpmjax").is_dir():  # a checkout around site-packages is another project's
+        return None
+    command = ["git", "-C", str(root), "describe", "--always", "--abbrev=40", "--exclude=*"]
     try:
         found = subprocess.run([*command, "--dirty=+changes"], capture_output=True, text=True, check=True, timeout=5)
     except (OSError, subprocess.SubprocessError):
         return None
     return found.stdout.strip()
-
-
-def cpu_model() -> str:
-    """Returns the name of the processor."""
-    return _fields("/proc/cpuinfo").get("model name") or platform.processor() or platform.machine()
 
 
 def usable_cores() -> int:

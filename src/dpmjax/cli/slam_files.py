@@ -207,7 +207,7 @@ def draw_pictures(
 
 def _track(name: str, T_world_scan: np.ndarray, reference: np.ndarray | None) -> Any:
     from dpmjax import viz
-    from experiments._slam_numbers import distances_to_reference
+    from dpmjax.cli.slam_numbers import distances_to_reference
 
     errors = distances_to_reference(T_world_scan, reference)
     label = name if errors is None else f"{name}, ATE {np.sqrt(np.mean(errors**2)):.2f} m"

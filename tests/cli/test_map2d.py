@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 from evo.tools import file_interface
 
+from dpmjax.cli.command import run_command
+from dpmjax.cli.map2d import NAME, Config, main
 from dpmjax.io import ScanSequence, write_deepmapping_folder, write_pcd
 from dpmjax.simulation import simulate_sequence
-from experiments._command import run_command
-from experiments.deepmapping_2d import EXPERIMENT, Config, main
 
 REPOSITORY = Path(__file__).parents[2]
 NUM_SCANS = 16
@@ -40,13 +40,13 @@ def scans_npz(walk, tmp_path_factory) -> Path:
 
 def run(*options: object, interrupt: bool = False) -> subprocess.CompletedProcess[str]:
     """The command in a process of its own; interrupted after the first call of the step where asked."""
-    command = ["-m", "experiments.deepmapping_2d"]
+    command = ["-m", "dpmjax.cli.map2d"]
     if interrupt:
         code = (
-            "import os, signal; from experiments import _deepmapping_fit as fit, deepmapping_2d as m;"
-            "from experiments._command import run_command;"
+            "import os, signal; from dpmjax.cli import recorded_fit as fit, deepmapping_2d as m;"
+            "from dpmjax.cli.command import run_command;"
             "fit.show_progress = lambda *_: os.kill(os.getpid(), signal.SIGINT);"
-            "raise SystemExit(run_command(m.main, m.Config, experiment=m.EXPERIMENT, description=None))"
+            "raise SystemExit(run_command(m.main, m.Config, name=m.NAME, description=None))"
         )
         command = ["-c", code]
     return subprocess.run(
@@ -141,7 +141,7 @@ def refused(tmp_path: Path, capsys, *options: object) -> str:
     """What stderr says to bad input; there must be one line, exit code 2, and nothing written."""
     out = tmp_path / "out"
     arguments = [*map(str, options), "-o", str(out)]
-    code = run_command(main, Config, experiment=EXPERIMENT, description=None, args=arguments)
+    code = run_command(main, Config, name=NAME, description=None, args=arguments)
     error = capsys.readouterr().err.strip()
     assert code == 2, error
     assert not out.exists()
@@ -154,7 +154,7 @@ def test_odometry_that_leads_astray_is_not_the_only_start(tmp_path, monkeypatch)
     drive = simulate_sequence(0, 24, num_beams=128, with_odometry=True)
     astray = np.random.default_rng(0).normal(size=(24, 3)) * [200.0, 200.0, 1.0]
     drive = replace(drive, odometry_poses=astray)
-    monkeypatch.setattr("experiments.deepmapping_2d.read_scans", lambda _config: drive)
+    monkeypatch.setattr("dpmjax.cli.map2d.read_scans", lambda _config: drive)
     found = main(Config(steps=2, output=tmp_path / "out"))
     assert found["start"] == "odometry"
     assert found["kept"] == "incremental ICP, point to line, refined"
@@ -199,13 +199,13 @@ def test_a_start_that_is_not_there_is_named(as_user, scans_npz, tmp_path, capsys
 
 def test_help_needs_no_jax_and_shows_examples():
     code = (
-        "import sys; from experiments._command import run_command; from experiments import deepmapping_2d as m;"
-        "code = run_command(m.main, m.Config, experiment=m.EXPERIMENT, description=m.__doc__, args=['--help']);"
+        "import sys; from dpmjax.cli.command import run_command; from dpmjax.cli import map2d as m;"
+        "code = run_command(m.main, m.Config, name=m.NAME, description=m.__doc__, args=['--help']);"
         "assert not {'jax', 'matplotlib', 'scipy'} & set(sys.modules), 'slow imports'; sys.exit(code)"
     )
     done = subprocess.run([sys.executable, "-c", code], cwd=REPOSITORY, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
-    assert "    python -m experiments.deepmapping_2d --resume " in done.stdout
+    assert "    dpmjax map2d --resume " in done.stdout
     for option in ("-o OUT", "-n N", "-j N", "--preset {fast,paper}", "--init", "--no-refine", "--seed", "--resume"):
         assert option in done.stdout
 

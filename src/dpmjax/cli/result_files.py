@@ -12,12 +12,12 @@ from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 from tqdm import tqdm
 
+from dpmjax.cli.machine import git_hash, versions
 from dpmjax.io.files import write_atomically
-from experiments._machine import git_hash, versions
 
 UNKNOWN = "unknown"
 
@@ -168,7 +168,7 @@ class HistoryFile:
         self._writer.writerow(row)
         self._file.flush()
 
-    def __enter__(self) -> Self:
+    def __enter__(self) -> HistoryFile:
         return self
 
     def __exit__(self, *error: object) -> None:

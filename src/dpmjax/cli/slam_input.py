@@ -13,9 +13,9 @@ import numpy as np
 from dpmjax.sequences import EmptyScanError, InputError
 
 if TYPE_CHECKING:
+    from dpmjax.cli.slam import Config
     from dpmjax.sequences import LidarSequence
     from dpmjax.slam.front_end import AnyScan
-    from experiments.dpm_slam import Config
 
 TOWN_ROUTE_M, TOWN_DRIVE_M, TOWN_RATE_HZ, TOWN_AZIMUTHS = 400.0, 480.0, 3.0, 900
 TURN_S = 0.1

@@ -1,11 +1,11 @@
 """Finds single scans in a saved map without a first guess, or says that they are not in it.
 
-    python -m experiments.dpm_localize map.npz path/to/scans
-    python -m experiments.dpm_localize map.npz path/to/scans --map-poses poses.txt    compare with a reference
-    python -m experiments.dpm_localize --resume                                       go on where the last run stopped
+    dpmjax localize map.npz path/to/scans
+    dpmjax localize map.npz path/to/scans --map-poses poses.txt    compare with a reference
+    dpmjax localize --resume                                       go on where the last run stopped
 
 The map is a file of `dpmjax.save_map`, such as a run of dpm_slam writes. Each scan is looked for by itself. Results go
-to results/dpm_localize/<time>/: localizations.csv (a row a scan: status, pose, probability, reason), trajectory_tum.txt
+to results/localize/<time>/: localizations.csv (a row a scan: status, pose, probability, reason), trajectory_tum.txt
 (the scans that were found), map.png, metrics.json. Where the scans have reference poses, and --map-poses gives those of
 the drive that made the map in the same world, the errors are measured too.
 """
@@ -13,6 +13,7 @@ the drive that made the map in the same world, the errors are measured too.
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
@@ -21,16 +22,16 @@ import numpy as np
 from tqdm import tqdm
 from tyro.conf import FlagCreatePairsOff, Positional, arg
 
-from experiments._command import StopFlag, check_least, run_command
-from experiments._result_files import HistoryFile, read_history
-from experiments._run_folder import RunFolder, RunOptions, open_run_folder, recording, write_metrics
+from dpmjax.cli.command import StopFlag, check_least, run_command
+from dpmjax.cli.result_files import HistoryFile, read_history
+from dpmjax.cli.run_folder import RunFolder, RunOptions, open_run_folder, recording, write_metrics
 
 if TYPE_CHECKING:
     from dpmjax import KeyframeMap, Localization
     from dpmjax.io import LidarSequence
     from dpmjax.slam.config import MapOrigin
 
-EXPERIMENT = "dpm_localize"
+NAME = "localize"
 TABLE = "localizations.csv"
 POSE = [f"T_map_scan_{row}{column}" for row in range(3) for column in range(4)]
 COLUMNS = ["scan", "source", "status", "probability", "keyframe", "keyframe_scan", "seconds", *POSE, "reason"]
@@ -96,7 +97,7 @@ def main(config: Config) -> list[dict[str, str]]:
     T_reference_keyframe = reference_of(config, map_, drive)
     methods = make_methods(load_model(config.weights), map_.origin.config, weights=config.weights)
     check_weights(config, map_, methods.origin)
-    folder = open_run_folder(config, EXPERIMENT)
+    folder = open_run_folder(config, NAME)
     path = folder / TABLE
     earlier = read_history(path) if folder.is_resumed and path.exists() else []
     rows: list[dict[str, str]] = list(earlier)
@@ -137,8 +138,8 @@ class Case(NamedTuple):
 
 def open_scans(config: Config) -> LidarSequence:
     """Opens the scans that are asked for, and reads the first one."""
+    from dpmjax.cli.slam_input import corrected
     from dpmjax.io import open_lidar_sequence
-    from experiments._slam_input import corrected
 
     drive = open_lidar_sequence(config.scans, sequence=config.sequence, selection=slice(None, None, config.jump))
     drive = corrected(drive.take(slice(0, config.n_scans)), config.kitti_angle_correction)
@@ -253,5 +254,6 @@ def map_points(map_: KeyframeMap) -> np.ndarray:
     return points[np.random.default_rng(0).permutation(len(points))[:NUM_MAP_POINTS]]
 
 
-if __name__ == "__main__":
-    raise SystemExit(run_command(main, Config, experiment=EXPERIMENT, description=__doc__))
+def run(args: Sequence[str] | None = None) -> int:
+    """Runs the subcommand; returns the exit code."""
+    return run_command(main, Config, name=NAME, description=__doc__, args=args)

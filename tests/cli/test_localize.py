@@ -7,10 +7,9 @@ import numpy as np
 import pytest
 
 import dpmjax
+from dpmjax.cli.command import EXIT_BAD_INPUT, EXIT_OK, run_command
+from dpmjax.cli.result_files import load_json, read_history
 from dpmjax.io import open_lidar_sequence, read_poses, write_kitti_sequence
-from experiments import dpm_localize
-from experiments._command import EXIT_BAD_INPUT, EXIT_OK, run_command
-from experiments._result_files import load_json, read_history
 from tests.deeppointmap import toy
 
 
@@ -29,11 +28,9 @@ def case(tmp_path_factory):
 
 
 def run(*arguments) -> int:
-    command = dpm_localize
+    command = localize
     arguments = list(map(str, arguments))
-    return run_command(
-        command.main, command.Config, experiment=command.EXPERIMENT, description=command.__doc__, args=arguments
-    )
+    return run_command(command.main, command.Config, name=command.NAME, description=command.__doc__, args=arguments)
 
 
 def scans_of(case):

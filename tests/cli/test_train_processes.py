@@ -15,10 +15,10 @@ import pytest
 from optax.tree_utils import tree_get
 
 from dpmjax.checkpoints import Checkpoints
+from dpmjax.cli.result_files import read_history
+from dpmjax.cli.run_folder import CHECKPOINTS, HISTORY
 from dpmjax.deeppointmap import CurriculumStage, SampleMaker, init_training, join_processes, make_step
 from dpmjax.deeppointmap.training_loop import begin_training
-from experiments._result_files import read_history
-from experiments._run_folder import CHECKPOINTS, HISTORY
 from tests.deeppointmap import toy
 
 REPOSITORY = Path(__file__).parents[2]
@@ -32,12 +32,12 @@ coordinator, number, folder = sys.argv[1], int(sys.argv[2]), sys.argv[3]
 join_processes(coordinator, 2, number)
 
 from dpmjax.deeppointmap import TrainingHooks, draw_evaluation_pairs
-from experiments._dpm_run import KINDS, EvaluationSets, Records, run_training
-from experiments._run_folder import RunFolder
-from experiments._command import Interrupted, StopFlag
+from dpmjax.cli.train_run import KINDS, EvaluationSets, Records, run_training
+from dpmjax.cli.run_folder import RunFolder
+from dpmjax.cli.command import Interrupted, StopFlag
 from pathlib import Path
 from tests.deeppointmap import toy
-from tests.experiments.test_dpm_processes import TRAINING
+from tests.cli.test_train_processes import TRAINING
 
 calls = []
 

@@ -11,6 +11,9 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import jax
 from tqdm import tqdm
 
+from dpmjax.cli.run_folder import RunFolder
+from dpmjax.cli.slam_files import write_scans, write_trajectory
+from dpmjax.cli.slam_input import ScanReader
 from dpmjax.sequences import LidarSequence
 from dpmjax.slam import (
     Journal,
@@ -24,9 +27,6 @@ from dpmjax.slam import (
     step_slam,
 )
 from dpmjax.slam.system import place_scans
-from experiments._run_folder import RunFolder
-from experiments._slam_files import write_scans, write_trajectory
-from experiments._slam_input import ScanReader
 
 if TYPE_CHECKING:
     from dpmjax.slam import ScanReport

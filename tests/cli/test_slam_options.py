@@ -12,16 +12,17 @@ import numpy as np
 import pytest
 
 import dpmjax
+from dpmjax.cli import slam_input
+from dpmjax.cli.command import EXIT_BAD_INPUT, EXIT_OK
+from dpmjax.cli.result_files import load_json
 from dpmjax.geometry import rigid
 from dpmjax.io import write_tum
 from dpmjax.metrics import absolute_trajectory_error
 from dpmjax.scans import offsets_by_azimuth
 from dpmjax.slam import SlamConfig, SlamMethods, run_slam
-from experiments import _slam_input, _slam_refine
-from experiments._command import EXIT_BAD_INPUT, EXIT_OK
-from experiments._result_files import load_json
+from experiments import _slam_refine
+from tests.cli.test_slam import run, use_truth, write_drive
 from tests.deeppointmap import toy
-from tests.experiments.test_dpm_slam import run, use_truth, write_drive
 from tests.slam.test_odometry import motion, planes, seen_from
 from tests.slam.truth import TruthGeometry, TruthMatcher, laps, scans_of
 
@@ -87,7 +88,7 @@ def test_times_of_points_come_before_their_azimuths(tmp_path, times) -> None:
         np.savez(tmp_path / f"{number}.npz", points=points, times=np.linspace(0.0, 0.1, 30))
     if times:
         (tmp_path / "times.txt").write_text("".join(f"{time}\n" for time in times))
-    reader = _slam_input.ScanReader(dpmjax.io.open_lidar_sequence(tmp_path), is_deskewed=True)
+    reader = slam_input.ScanReader(dpmjax.io.open_lidar_sequence(tmp_path), is_deskewed=True)
     # Shares of the time between the two scans before: 0.2 s where it is known, else that of the turn.
     share = 0.5 if times else 1.0
     np.testing.assert_allclose(reader(3).offsets, share * np.linspace(-0.5, 0.5, 30), atol=1e-6)
@@ -97,7 +98,7 @@ def test_times_of_points_come_before_their_azimuths(tmp_path, times) -> None:
 
 def test_kittis_beams_are_raised(tmp_path) -> None:
     np.save(tmp_path / "0.npy", [[10.0, 0.0, 0.0], [0.0, 20.0, 1.0]])
-    sequence = _slam_input.corrected(dpmjax.io.open_lidar_sequence(tmp_path), True)
+    sequence = slam_input.corrected(dpmjax.io.open_lidar_sequence(tmp_path), True)
     np.testing.assert_allclose(sequence.read_scan(0)[0], [10.0, 0.0, 10 * np.radians(0.205)], atol=1e-3)
 
 

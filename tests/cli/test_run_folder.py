@@ -11,11 +11,11 @@ from typing import ClassVar
 import numpy as np
 import pytest
 
-from experiments import _result_files, _run_folder
-from experiments._result_files import HistoryFile, commits_note, do_row, read_history, row_path, write_json
-from experiments._run_folder import (
-    FolderOptions,
+from dpmjax.cli import result_files, run_folder
+from dpmjax.cli.result_files import HistoryFile, commits_note, do_row, read_history, row_path, write_json
+from dpmjax.cli.run_folder import (
     RunFailedError,
+    RunOptions,
     check_run_folder,
     load_config,
     open_run_folder,
@@ -30,7 +30,7 @@ class Nested:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Config(FolderOptions):
+class Config(RunOptions):
     may_change: ClassVar[frozenset[str]] = frozenset({"seconds"})
 
     data: Path | None = None
@@ -132,7 +132,7 @@ def test_metrics_are_valid_json_with_seed_and_versions():
 
 
 def run_rows(folder, commit, monkeypatch, methods):
-    monkeypatch.setattr(_result_files, "git_hash", lambda: commit)
+    monkeypatch.setattr(result_files, "git_hash", lambda: commit)
     return [do_row(folder.path, {"method": method}, lambda: {"ate_px": 1.5}, seed=3) for method in methods]
 
 
@@ -153,7 +153,7 @@ def test_the_file_names_the_rows_of_other_commits(monkeypatch):
     path.write_text(json.dumps(stored))
     rows = run_rows(run, "b" * 40 + "+changes", monkeypatch, ["icp", "swarm", "fit"])
     assert [row["git_hash"] for row in rows] == ["a" * 40, "unknown", "b" * 40 + "+changes"]
-    monkeypatch.setattr(_run_folder, "environment", lambda: {"git_hash": "b" * 40 + "+changes"})
+    monkeypatch.setattr(run_folder, "environment", lambda: {"git_hash": "b" * 40 + "+changes"})
     note = write_metrics(run, {}, seed=0, rows=rows)
     assert json.loads((run / "metrics.json").read_text())["note"] == note
     assert note == (
@@ -212,4 +212,4 @@ def test_log_holds_what_happened_and_the_traceback():
     log = (run / "log.txt").read_text()
     assert "step 3" in log
     assert "Traceback" in log
-    assert not any(logging.getLogger(name).handlers for name in _run_folder.LOGGERS)
+    assert not any(logging.getLogger(name).handlers for name in run_folder.LOGGERS)

@@ -24,12 +24,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar
 import tyro
-from experiments._command import StopFlag, run_command
-from experiments._result_files import HistoryFile, read_history
-from experiments._run_folder import FolderOptions, open_run_folder, recording, write_metrics
+from dpmjax.cli.command import StopFlag, run_command
+from dpmjax.cli.result_files import HistoryFile, read_history
+from dpmjax.cli.run_folder import RunOptions, open_run_folder, recording, write_metrics
 
 @dataclass(frozen=True, kw_only=True)
-class Config(FolderOptions):
+class Config(RunOptions):
     may_change: ClassVar[frozenset[str]] = frozenset({"steps"})
     old_names: ClassVar[dict[str, str]] = {"--iterations": "--steps"}
 
@@ -64,7 +64,7 @@ def main(config):
     assert "jax" not in sys.modules
 
 if __name__ == "__main__":
-    raise SystemExit(run_command(main, Config, experiment="toy", description=__doc__))
+    raise SystemExit(run_command(main, Config, name="toy", description=__doc__))
 '''
 
 
@@ -193,21 +193,3 @@ def test_resumed_command_may_repeat_its_flags(toy):
     code, _, errors = finish(toy("-o", "other", "--no-loop", "--resume"))
     assert code == 2
     assert "--no-loop was False" in errors
-
-
-@pytest.mark.parametrize(
-    ("variables", "expected"),
-    [
-        ({"XDG_CACHE_HOME": "/caches"}, "/caches/dpmjax"),
-        ({"DPMJAX_COMPILATION_CACHE": "/here"}, "/here"),
-        ({"DPMJAX_COMPILATION_CACHE": "off"}, None),
-        ({"JAX_COMPILATION_CACHE_DIR": "/mine"}, "/mine"),
-    ],
-)
-def test_compiled_programs_are_kept_where_the_user_says(variables, expected, monkeypatch):
-    from experiments._machine import enable_compilation_cache
-
-    monkeypatch.setattr(os, "environ", {"HOME": "/home/somebody", **variables})
-    enable_compilation_cache()
-    found = os.environ.get("JAX_COMPILATION_CACHE_DIR")
-    assert found == expected or found.startswith(f"{expected}/")

@@ -1,0 +1,59 @@
+"""The program `dpmjax`: finds the subcommand and hands it the remaining arguments; loads nothing else."""
+
+from __future__ import annotations
+
+import importlib
+import importlib.metadata
+import sys
+from collections.abc import Sequence
+
+COMMANDS = {
+    "register": "two 3-D scans: their relative pose, its confidence, a picture",
+    "map2d": "planar scans without poses: poses and a map",
+    "slam": "a drive of 3-D scans: a pose for every scan, loops, a map",
+    "localize": "scans in a saved map: where each was taken",
+    "merge": "saved maps of several drives: one map",
+    "train": "drives with poses: trained weights",
+    "evaluate": "weights and drives with poses: recall, errors, confidence",
+    "info": "versions, devices, shipped weights",
+}
+"""What each subcommand takes and gives; it is the module of this name beside this file."""
+
+EXAMPLES = """examples:
+  dpmjax map2d                          a simulated office, from its odometry
+  dpmjax map2d robot.log.gz             a CARMEN log
+  dpmjax register a.pcd b.pcd           where was a taken, seen from b?
+  dpmjax slam path/to/drive -o out      KITTI, MulRan, or any folder of scans
+  dpmjax localize out/map.npz scans     find scans in the map of an earlier run
+  dpmjax COMMAND --help                 the options of a subcommand"""
+
+EXIT_OK, EXIT_BAD_INPUT = 0, 2
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Runs a subcommand.
+
+    Args:
+        arguments: the command line without the program; None takes that of the process.
+
+    Returns:
+        The exit code: 0 done, 1 failed on the way, 2 wrong usage or bad input, 130 stopped by Ctrl-C.
+    """
+    given = list(sys.argv[1:] if arguments is None else arguments)
+    if given and given[0] in COMMANDS:
+        return int(importlib.import_module(f"dpmjax.cli.{given[0]}").run(given[1:]))
+    if given and given[0] == "--version":
+        print(f"dpmjax {importlib.metadata.version('dpmjax')}")
+        return EXIT_OK
+    if given and given[0] in ("-h", "--help"):
+        print(usage())
+        return EXIT_OK
+    reason = f"no subcommand {given[0]!r}" if given else "give a subcommand"
+    print(f"dpmjax: error: {reason}; expected one of {', '.join(COMMANDS)} (dpmjax --help)", file=sys.stderr)
+    return EXIT_BAD_INPUT
+
+
+def usage() -> str:
+    """Returns the text of `dpmjax --help`."""
+    lines = [f"  {name:9} {description}" for name, description in COMMANDS.items()]
+    return "\n".join(["usage: dpmjax COMMAND [OPTIONS]\n", *lines, "", EXAMPLES])

@@ -1,0 +1,141 @@
+"""Registers two 3-D lidar scans without a first guess (DeepPointMap): the motion and the probability that it is right.
+
+    dpmjax register a.pcd b.pcd                  where points of a lie in the frame of b
+    dpmjax register 000000.bin 000010.bin -o out KITTI's files
+    dpmjax register a.npy b.ply --no-refine      without the final point-to-plane alignment
+
+Scans are .pcd .ply .bin .npy or .npz, in metres, each in the frame of its lidar. Results go to
+results/register/<time>/ (latest links to the newest): T_target_source.txt (4 x 4, maps points of A to the frame of B),
+metrics.json, aligned.ply (A in the frame of B, and B, in two colours) and registration.png (from above).
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import numpy as np
+from tyro.conf import Positional, arg
+
+from dpmjax.cli.command import run_command
+from dpmjax.cli.run_folder import OutputOptions, RunFolder, open_run_folder, recording, write_metrics
+from dpmjax.io.files import write_atomically
+
+if TYPE_CHECKING:
+    from dpmjax.types import Registration
+
+NAME = "register"
+# Below this probability the motion is called uncertain.
+SURE = 0.9
+SOURCE_COLOR, TARGET_COLOR = (46, 111, 158), (217, 140, 63)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Config(OutputOptions):
+    """Options of the run."""
+
+    source: Annotated[Positional[Path], arg(metavar="A")]
+    """Scan whose points are moved."""
+    target: Annotated[Positional[Path], arg(metavar="B")]
+    """Scan in whose frame they end."""
+    weights: Annotated[str, arg(metavar="NAME|FILE")] = "dpm_small"
+    """Name of a shipped model, or a .safetensors file."""
+    refine: bool = True
+    """End with a fine point-to-plane alignment."""
+
+
+def main(config: Config) -> dict[str, Any]:
+    """Reads both scans, registers them, writes; returns the content of `metrics.json`."""
+    from dpmjax import io
+    from dpmjax.deeppointmap import register
+    from dpmjax.weights import load_model
+
+    started = time.perf_counter()
+    source, target = (io.read_lidar_file(path) for path in (config.source, config.target))
+    model = load_model(config.weights)
+    folder = open_run_folder(config, NAME)
+    with recording(folder):
+        clock = time.perf_counter()
+        found = register(model, source, target, refine=config.refine)
+        T = np.asarray(found.T_target_source, np.float64)
+        metrics = {
+            "source": config.source.name,
+            "target": config.target.name,
+            "weights": config.weights,
+            **motion_numbers(T),
+            **match_numbers(found),
+            "register_s": time.perf_counter() - clock,
+        }
+        write_results(folder, T, source, target)
+        metrics["wall_s"] = time.perf_counter() - started
+        write_metrics(folder, metrics)
+        draw(folder, config, T, metrics["confidence"], source, target)
+        print(report(T, metrics), f"results in {folder.path}", sep="\n")
+    return metrics
+
+
+def motion_numbers(T_target_source: np.ndarray) -> dict[str, Any]:
+    """Returns the motion as a matrix, a distance and an angle."""
+    from scipy.spatial.transform import Rotation
+
+    angle = Rotation.from_matrix(T_target_source[:3, :3]).magnitude()
+    return {
+        "T_target_source": T_target_source,
+        "translation_m": float(np.linalg.norm(T_target_source[:3, 3])),
+        "rotation_deg": float(np.degrees(angle)),
+    }
+
+
+def match_numbers(found: Registration) -> dict[str, Any]:
+    """Returns the confidence and the numbers that it rests on."""
+    numbers: dict[str, Any] = {"confidence": float(found.confidence), "num_inliers": int(found.num_inliers)}
+    if found.verification is not None:
+        shares = found.verification
+        numbers |= {
+            "visible_share": float(shares.visible_share),
+            "matched_share": float(shares.matched_share),
+            "contradicted_share": float(shares.contradicted_share),
+        }
+    return numbers
+
+
+def write_results(folder: RunFolder, T_target_source: np.ndarray, source: np.ndarray, target: np.ndarray) -> None:
+    """Writes T_target_source.txt and aligned.ply."""
+    from dpmjax import io
+
+    rows = (" ".join(f"{value:.9f}" for value in row) for row in T_target_source)
+    write_atomically(folder / "T_target_source.txt", "\n".join(rows) + "\n")
+    moved = source @ T_target_source[:3, :3].T + T_target_source[:3, 3]
+    colors = np.repeat(np.array([SOURCE_COLOR, TARGET_COLOR], np.uint8), [len(source), len(target)], axis=0)
+    io.write_ply(folder / "aligned.ply", np.concatenate([moved, target]).astype(np.float32), colors=colors)
+
+
+def draw(
+    folder: RunFolder, config: Config, T: np.ndarray, confidence: float, source: np.ndarray, target: np.ndarray
+) -> None:
+    """Draws registration.png."""
+    from dpmjax import viz
+
+    title = f"{config.source.name} (blue), {config.target.name} (orange)"
+    motions = {"as measured": np.eye(4), f"registered, confidence {confidence:.2f}": T}
+    pair = viz.RegisteredPair(title, source, target, motions)
+    viz.save_figure(viz.registered_pairs_figure([pair]), folder / "registration.png")
+
+
+def report(T_target_source: np.ndarray, metrics: dict[str, Any]) -> str:
+    """Returns the last lines on the console."""
+    rows = "\n".join("  " + " ".join(f"{value:12.6f}" for value in row) for row in T_target_source)
+    sure = "" if metrics["confidence"] >= SURE else ": NOT SURE, look at registration.png"
+    return (
+        f"T_target_source, which maps points of {metrics['source']} to the frame of {metrics['target']}:\n{rows}\n"
+        f"{metrics['translation_m']:.3f} m, {metrics['rotation_deg']:.2f} degrees\n"
+        f"probability that it is right within 2 m and 5 degrees: {metrics['confidence']:.2f}{sure}"
+    )
+
+
+def run(args: Sequence[str] | None = None) -> int:
+    """Runs the subcommand; returns the exit code."""
+    return run_command(main, Config, name=NAME, description=__doc__, args=args)

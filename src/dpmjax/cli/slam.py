@@ -1,0 +1,221 @@
+"""Makes one map of a drive of 3-D lidar scans: odometry, loop closure, pose graph (DeepPointMap, section 4).
+
+    dpmjax slam                                    a simulated town, once round and on
+    dpmjax slam path/to/drive -o out               KITTI, KITTI-360, MulRan, any folder of scans
+    dpmjax slam kitti/dataset --sequence 07 -n 500 the first 500 scans of a sequence
+    dpmjax slam day2 --map results/slam/latest/map.npz   extend the map of an earlier run
+    dpmjax slam --resume                           go on where the last run stopped, or was killed
+
+Results go to results/slam/<time>/ (latest links to the newest): trajectories of every scan as TUM, KITTI and npy,
+scans.csv and loops.csv with the reason of every decision, graph.g2o, keyframes.txt, map.npz (to extend, and to localise
+in), map.ply, trajectory.png, map.png and metrics.json. Ctrl-C writes all of it.
+docs/slam.md explains the stages and the files.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import logging
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, NamedTuple
+
+from tyro.conf import FlagCreatePairsOff, Positional, arg
+
+from dpmjax.cli.command import StopFlag, check_least, run_command
+from dpmjax.cli.machine import peak_rss_gb
+from dpmjax.cli.run_folder import RunFolder, RunOptions, open_run_folder, recording, write_metrics
+
+if TYPE_CHECKING:
+    from dpmjax.cli.slam_run import SlamRun
+    from dpmjax.sequences import LidarSequence
+    from dpmjax.slam import KeyframeMap, SlamMethods, SlamResult, SlamState
+
+NAME = "slam"
+LOGGER = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Config(RunOptions):
+    """Options of the run."""
+
+    may_change: ClassVar[frozenset[str]] = frozenset({"n_scans", "refine"})
+
+    data: Annotated[Positional[Path | None], arg(metavar="[DATA]")] = None
+    """Folder of scans. Without it: a simulated town of the seed."""
+    sequence: Annotated[str | None, arg(aliases=["-s"], metavar="NAME")] = None
+    """Which drive, where DATA holds several."""
+    weights: Annotated[str, arg(metavar="NAME|FILE")] = "dpm_small"
+    """Name of a shipped model, or a .safetensors file."""
+    map: Annotated[Path | None, arg(metavar="IN")] = None
+    """A saved map (map.npz of an earlier run) that this drive extends."""
+    no_loop: FlagCreatePairsOff[bool] = False
+    """Odometry alone."""
+    refine: FlagCreatePairsOff[bool] = False
+    """Polish the keyframes by DeepMapping afterwards; takes a minute for each window of 32."""
+    deskew: FlagCreatePairsOff[bool] = False
+    """Undo the motion of the lidar during its turn, by the times of the points (of .pcd .ply .npz) or their azimuth."""
+    kitti_angle_correction: FlagCreatePairsOff[bool] = False
+    """Raise the beams by 0.205 degrees, as KITTI's HDL-64E needs."""
+    n_scans: Annotated[int | None, arg(aliases=["-n"], metavar="N")] = None
+    """Number of scans; a resumed run may take more."""
+    jump: Annotated[int, arg(aliases=["-j"], metavar="N")] = 1
+    """Use every Nth scan."""
+    visualize: Annotated[FlagCreatePairsOff[bool], arg(aliases=["-v"])] = False
+    """Show the run in the live viewer (extra viewer); without a screen, OUT gets a recording, slam.rrd."""
+
+    def __post_init__(self) -> None:
+        """Checks ranges."""
+        check_least(self, n_scans=1, jump=1, seed=0)
+        if self.sequence is not None and self.data is None:
+            raise ValueError("--sequence chooses a drive of DATA: give its folder too")
+        if self.kitti_angle_correction and self.data is None:
+            raise ValueError("--kitti-angle-correction is for the scans of KITTI's car: give their folder, DATA")
+        if self.visualize and importlib.util.find_spec("rerun") is None:
+            raise ValueError("-v needs the live viewer: pip install 'dpmjax[viewer]', or leave it out")
+
+
+def main(config: Config) -> dict[str, Any]:
+    """Reads, maps, writes; returns the content of `metrics.json`."""
+    from dpmjax.cli.slam_input import ScanReader, open_drive
+    from dpmjax.cli.slam_numbers import summary
+    from dpmjax.cli.slam_run import Hooks, find_beginning, run_scans
+    from dpmjax.cli.slam_viewer import live_viewer
+    from dpmjax.slam import finish_slam
+
+    started = time.perf_counter()
+    methods = slam_methods(config)
+    start = starting_state(config, methods)
+    sequence = open_drive(config)
+    reader = ScanReader(sequence, is_deskewed=config.deskew, jump=config.jump)
+    folder = open_run_folder(config, NAME)
+    beginning = find_beginning(folder, methods, start, reader)
+    with recording(folder), StopFlag() as stop:
+        done = f", {len(beginning.earlier.reports)} done before" if beginning.earlier else ""
+        tell(f"{sequence.name}: {len(sequence)} scans{done}")
+        with live_viewer(folder, sequence.name, is_on=config.visualize) as on_scan:
+            hooks = Hooks(lambda: stop.is_requested, on_scan)
+            run = run_scans(folder, sequence, reader, methods, beginning, hooks)
+        result = finish_slam(run.state, run.reports, methods.config)
+        drive = Drive(sequence, start.front_end.num_scans, len(start.slam_map))
+        metrics = write_results(folder, config, drive, run, result)
+        if config.refine and run.failure is None and not stop.is_requested:
+            metrics |= refine(folder, config, drive, result, lambda: stop.is_requested)
+        metrics |= {"is_interrupted": stop.is_requested or run.failure is not None, "peak_rss_gb": peak_rss_gb()}
+        metrics["wall_s"] = time.perf_counter() - started
+        write_metrics(folder, metrics, seed=config.seed)
+        tell(f"{summary(metrics)}\nresults in {folder.path}")
+        if run.failure is not None:
+            raise run.failure
+    return metrics
+
+
+class Drive(NamedTuple):
+    """The scans of a run, and where it begins in a map.
+
+    Attributes:
+        sequence: the scans.
+        first_scan: number of the first scan in the map; 0 for a new one.
+        num_keyframes_before: keyframes of the map that is extended.
+    """
+
+    sequence: LidarSequence
+    first_scan: int
+    num_keyframes_before: int
+
+    def read_keyframe(self, slam_map: KeyframeMap, row: int) -> np.ndarray:
+        """Reads the points of a keyframe; of the map before, its surface is all that there is."""
+        from dpmjax.cli.slam_input import read_points
+        from dpmjax.scans.compact import expand_surface
+
+        if row < self.num_keyframes_before:
+            return expand_surface(slam_map.keyframes[row].description.surface).points
+        return read_points(self.sequence, slam_map.keyframes[row].scan - self.first_scan)
+
+
+def slam_methods(config: Config) -> SlamMethods:
+    """Returns the methods of the model."""
+    from dpmjax import SlamConfig, load_model
+    from dpmjax.slam import make_methods
+
+    settings = SlamConfig()
+    if config.no_loop:
+        settings = replace(settings, loops=replace(settings.loops, is_on=False))
+    return make_methods(load_model(config.weights), settings, weights=config.weights)
+
+
+def starting_state(config: Config, methods: SlamMethods) -> SlamState:
+    """Returns the state before the first scan; a `ValueError` for a map of other weights."""
+    from dpmjax import load_map
+    from dpmjax.slam import init_slam
+    from dpmjax.slam.keyframes import with_origin
+
+    if config.map is None:
+        return init_slam()
+    slam_map = load_map(config.map)
+    try:
+        with_origin(slam_map, methods.origin)
+    except ValueError as error:
+        raise ValueError(f"--map {config.map}: {error}") from error
+    return init_slam(slam_map)
+
+
+def write_results(folder: RunFolder, config: Config, drive: Drive, run: SlamRun, result: SlamResult) -> dict[str, Any]:
+    """Writes all files but metrics.json, and returns its numbers; pictures come last."""
+    from dpmjax.cli import slam_files as files
+    from dpmjax.cli.slam_numbers import run_numbers
+
+    sequence, slam_map = drive.sequence, result.state.slam_map
+    times = None if sequence.times is None else sequence.times[: len(result.reports)]
+    metrics = {"weights": config.weights, **run_numbers(run, result, sequence)}
+    if not result.reports:
+        return metrics
+    files.write_trajectory(folder.path, result.T_world_scan, times)
+    files.write_trajectory(folder.path, result.T_odometry_scan, times, "odometry")
+    files.write_graph(folder.path, result)
+    files.write_loops(folder / "loops.csv", result.loops, result.keyframes)
+    files.write_scans(folder / "scans.csv", result.reports, result.keyframes, sequence.sources)
+    if len(slam_map):
+        metrics |= files.write_map_file(folder / "map.npz", slam_map)
+    write_metrics(folder, metrics, seed=config.seed)  # numbers first: a picture that fails must not cost them
+    views = files.keyframe_views(slam_map, lambda row: drive.read_keyframe(slam_map, row))
+    cloud = files.gather_map(views)
+    files.write_map(folder / "map.ply", cloud)
+    files.draw_pictures(folder.path, sequence, result, cloud, drive.num_keyframes_before)
+    return metrics | {"map_points": len(cloud.points), "map_voxel_m": cloud.voxel_m}
+
+
+def refine(
+    folder: RunFolder, config: Config, drive: Drive, result: SlamResult, is_stopped: Callable[[], bool]
+) -> dict[str, Any]:
+    """Polishes the trajectory by DeepMapping, writes it beside the other, and returns its numbers."""
+    from dpmjax.cli.slam_files import write_trajectory
+    from dpmjax.cli.slam_numbers import trajectory_errors
+    from dpmjax.slam.system import place_scans
+    from experiments._slam_refine import refine_keyframes, windows
+
+    slam_map, sequence = result.state.slam_map, drive.sequence
+    num_windows = len(windows(len(slam_map)))
+    if num_windows > 1:
+        tell(f"refine: {len(slam_map)} keyframes are too many for one fit: {num_windows} windows, joined by the graph")
+    refined = refine_keyframes(
+        slam_map, lambda row: drive.read_keyframe(slam_map, row), seed=config.seed, is_stopped=is_stopped
+    )
+    T = place_scans(refined.T_world_keyframe, result.reports)
+    times = None if sequence.times is None else sequence.times[: len(T)]
+    write_trajectory(folder.path, T, times, "refined")
+    reference = None if sequence.T_world_lidar is None else sequence.T_world_lidar[: len(T)]
+    return {**refined.numbers, **trajectory_errors(T, reference, "_refined")}
+
+
+def tell(text: str) -> None:
+    """Prints, and writes to the log."""
+    print(text, flush=True)
+    LOGGER.info("%s", text)
+
+
+def run(args: Sequence[str] | None = None) -> int:
+    """Runs the subcommand; returns the exit code."""
+    return run_command(main, Config, name=NAME, description=__doc__, args=args)

@@ -1,0 +1,64 @@
+"""Compiled programs kept on disk, so that the next process loads them instead of compiling."""
+
+from __future__ import annotations
+
+import os
+import platform
+import sys
+import zlib
+from pathlib import Path
+
+CACHES = "Library/Caches" if sys.platform == "darwin" else ".cache"
+# Hundreds of small programs take seconds together, so nothing is too quick or too small to be kept.
+_SETTINGS = {
+    "jax_persistent_cache_min_compile_time_secs": 0.0,
+    "jax_persistent_cache_min_entry_size_bytes": -1,
+}
+
+
+def enable_compile_cache(folder: str | Path | None = None) -> Path | None:
+    """Keeps compiled programs in a folder, from which later processes load them.
+
+    The command `dpmjax` calls it by itself. In a script, call it before the first computation. The environment variable
+    `DPMJAX_COMPILATION_CACHE=off` turns the cache off.
+
+    Args:
+        folder: where the programs are kept; None takes the environment variables `DPMJAX_COMPILATION_CACHE` and
+            `JAX_COMPILATION_CACHE_DIR`, then `$XDG_CACHE_HOME/dpmjax` or the user's folder for caches, where each kind
+            of processor has a folder.
+
+    Returns:
+        The folder; None where the cache is off.
+    """
+    chosen = os.environ.get("DPMJAX_COMPILATION_CACHE", "")
+    if chosen == "off":
+        return None
+    path = Path(folder or chosen or os.environ.get("JAX_COMPILATION_CACHE_DIR") or _user_folder())
+    settings = {"jax_compilation_cache_dir": str(path), **_SETTINGS}
+    # Processes that this one starts inherit the settings.
+    os.environ |= {name.upper(): str(value) for name, value in settings.items()}
+    if "jax" in sys.modules:
+        import jax
+        from jax.experimental.compilation_cache import compilation_cache
+
+        for name, value in settings.items():
+            jax.config.update(name, value)
+        compilation_cache.reset_cache()  # JAX looks for a cache once, when it first compiles
+    return path
+
+
+def cpu_model() -> str:
+    """Returns the name of the processor."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace").splitlines()
+    except OSError:
+        lines = []
+    fields = (line.partition(":") for line in lines)
+    names = [value.strip() for name, _, value in fields if name.strip() == "model name"]
+    return names[0] if names else platform.processor() or platform.machine()
+
+
+def _user_folder() -> Path:
+    # A compiled program belongs to a kind of processor, and a home directory may be shared by several kinds.
+    caches = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / CACHES) / "dpmjax"
+    return caches / f"{zlib.crc32(cpu_model().encode()):08x}"

@@ -1,0 +1,61 @@
+"""The program `dpmjax`: subcommands, help, exit codes."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import time
+
+import pytest
+
+import dpmjax
+from dpmjax.cli import program
+
+
+def start(*arguments: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run([sys.executable, "-m", "dpmjax", *arguments], capture_output=True, text=True)
+
+
+def test_help_lists_every_subcommand_and_loads_nothing() -> None:
+    code = (
+        "import sys; from dpmjax.cli.program import main; code = main(['--help']);"
+        "assert not {'jax', 'numpy', 'tyro'} & sys.modules.keys(); raise SystemExit(code)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert all(f"\n  {name} " in done.stdout for name in program.COMMANDS)
+    assert "examples:" in done.stdout
+
+
+@pytest.mark.parametrize("name", sorted(program.COMMANDS))
+def test_help_of_a_subcommand_has_examples_and_needs_no_jax(name) -> None:
+    started = time.perf_counter()
+    code = (
+        f"import sys; from dpmjax.cli.program import main; code = main([{name!r}, '--help']);"
+        "assert 'jax' not in sys.modules; raise SystemExit(code)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert f"    dpmjax {name}" in done.stdout
+    # Half a second is promised; a busy machine gets some slack.
+    assert time.perf_counter() - started < 5.0
+
+
+@pytest.mark.parametrize("arguments", [(), ("mapp2d",), ("--nope",)])
+def test_wrong_usage_is_one_line(arguments) -> None:
+    done = start(*arguments)
+    assert done.returncode == 2
+    assert done.stderr.count("\n") == 1
+    assert "register, map2d" in done.stderr
+
+
+def test_version() -> None:
+    done = start("--version")
+    assert (done.returncode, done.stdout) == (0, f"dpmjax {dpmjax.__version__}\n")
+
+
+def test_info_names_versions_device_and_weights(capsys) -> None:
+    assert program.main(["info"]) == 0
+    output = capsys.readouterr().out
+    for part in (f"dpmjax {dpmjax.__version__}", "cpu", "dpm_small"):
+        assert part in output

@@ -1,0 +1,68 @@
+"""The command that registers two scans, on a network that compiles in seconds."""
+
+from __future__ import annotations
+
+import jax
+import numpy as np
+import pytest
+
+import dpmjax
+from dpmjax.cli.command import EXIT_BAD_INPUT, EXIT_OK
+from dpmjax.cli.register import run
+from dpmjax.cli.result_files import load_json
+from dpmjax.io import read_lidar_file, read_ply, write_pcd
+from tests.deeppointmap import toy
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory):
+    """Weights and two scans, in two formats."""
+    folder = tmp_path_factory.mktemp("scans")
+    drive = toy.drive(num_scans=2)
+    dpmjax.save_model(dpmjax.init_model(jax.random.key(0), toy.MODEL), folder / "model.safetensors")
+    write_pcd(folder / "a.pcd", drive.read_scan(0))
+    np.save(folder / "b.npy", drive.read_scan(1))
+    return folder
+
+
+def command(files, *arguments) -> int:
+    return run([*map(str, arguments), "--weights", str(files / "model.safetensors")])
+
+
+def test_files_hold_the_motion_that_the_library_finds(files, tmp_path, capsys) -> None:
+    out = tmp_path / "out"
+    assert command(files, files / "a.pcd", files / "b.npy", "-o", out) == EXIT_OK
+    source, target = read_lidar_file(files / "a.pcd"), read_lidar_file(files / "b.npy")
+    model = dpmjax.load_model(files / "model.safetensors")
+    expected = dpmjax.register(model, source, target, refine=True)
+    T = np.loadtxt(out / "T_target_source.txt")
+    np.testing.assert_allclose(T, expected.T_target_source, atol=1e-5)
+    metrics = load_json(out / "metrics.json")
+    np.testing.assert_allclose(metrics["T_target_source"], T, atol=1e-6)
+    assert metrics["confidence"] == pytest.approx(float(expected.confidence), abs=1e-5)
+    assert (out / "registration.png").stat().st_size > 1000
+    aligned = read_ply(out / "aligned.ply")
+    np.testing.assert_allclose(aligned[: len(source)], source @ T[:3, :3].T + T[:3, 3], atol=1e-4)
+    np.testing.assert_allclose(aligned[len(source) :], target, atol=1e-6)
+    assert "maps points of a.pcd to the frame of b.npy" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("names", "message"),
+    [(("a.pcd", "none.pcd"), "none.pcd"), (("model.safetensors", "b.npy"), "unknown kind of scan")],
+)
+def test_bad_input_is_one_line_and_leaves_no_folder(files, tmp_path, capsys, names, message) -> None:
+    out = tmp_path / "out"
+    assert command(files, *(files / name for name in names), "-o", out) == EXIT_BAD_INPUT
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1
+    assert message in error
+    assert not out.exists()
+
+
+def test_an_earlier_run_is_replaced_only_on_demand(files, tmp_path, capsys) -> None:
+    arguments = (files / "a.pcd", files / "b.npy", "--no-refine", "-o", tmp_path / "out")
+    assert command(files, *arguments) == EXIT_OK
+    assert command(files, *arguments) == EXIT_BAD_INPUT
+    assert "--force" in capsys.readouterr().err
+    assert command(files, *arguments, "--force") == EXIT_OK
