@@ -10,9 +10,10 @@ walk = simulation.simulate_sequence(0, 96)
 reference = walk.reference_poses[:, :2]
 
 # Start, fit, refinement; the best candidate is kept without a reference.
-result = dpmjax.register_scans(walk.points)
+result = dpmjax.register_scans(walk.points, key=jax.random.key(0))
 error = dpmjax.absolute_trajectory_error(result.poses[:, :2], reference)
-print(f"kept {result.kept}: ATE {error:.3f} {walk.unit}, trusted: {result.assessment.is_trusted}")
+print(f"kept {result.kept!r} of {list(result.candidates)}")
+print(f"ATE {error:.3f} {walk.unit}, trusted: {result.assessment.is_trusted}")
 
 # L-Net and M-Net alone, from zero poses: 1,200 steps on these 96 scans.
 fit = dpmjax.fit_deepmapping(walk.points, key=jax.random.key(0))

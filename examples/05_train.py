@@ -9,10 +9,6 @@ from dpmjax import deeppointmap, simulation
 stages = (deeppointmap.CurriculumStage(max_group=2, num_steps=10),)
 settings = replace(deeppointmap.training_preset("tiny"), curriculum=stages, num_variants=1)
 
-# Pyramids of points are built once for each scan; steps draw groups of scans and move them at random.
-drive = simulation.simulate_drive(num_scans=24)
-store = deeppointmap.ScanStore([deeppointmap.prepare_drive(drive, settings)])
-
 
 def show(record, progress):
     """Prints the loss of every second step."""
@@ -20,10 +16,11 @@ def show(record, progress):
         print(f"step {record.step}: loss {float(record.report.loss):.3f}")
 
 
-trained = deeppointmap.train(store, settings, seed=0, hooks=deeppointmap.TrainingHooks(on_report=show))
-dpmjax.save_model(trained.model, "tiny.safetensors", card="10 steps on one simulated drive")
+# Each scan is prepared once; then each step draws groups of scans and moves them at random.
+drive = simulation.simulate_drive(num_scans=24)
+trained = dpmjax.train([drive], settings, seed=0, hooks=deeppointmap.TrainingHooks(on_report=show))
 
 # The file is a model like the shipped one.
-model = dpmjax.load_model("tiny.safetensors")
-match = dpmjax.register(model, drive[0], drive[3])
+dpmjax.save_model(trained.model, "tiny.safetensors", card="10 steps on one simulated drive")
+match = dpmjax.register(dpmjax.load_model("tiny.safetensors"), drive[0], drive[3])
 print(f"{trained.speed.scans_per_s:.0f} scans a second; score of a pair {float(match.confidence):.2f}")
