@@ -280,6 +280,8 @@ class DepthSequence:
 class LidarSequence:
     """Scans of one drive, read lazily: `sequence[i]` reads scan i, and a loop reads one scan after the other.
 
+    Read this way, a scan without points is (0, 3).
+
     Attributes:
         name: short name of the source, for titles and folders.
         sources: where each scan comes from: a file, in general.
@@ -304,6 +306,14 @@ class LidarSequence:
     def __post_init__(self) -> None:
         _require_shapes(self, {"T_world_lidar": (self.num_scans, 4, 4), "times": (self.num_scans,)})
 
+    def __getitem__(self, index: int) -> NDArray[np.float32]:
+        if not -len(self) <= index < len(self):
+            raise IndexError(f"scan: expected a number below {len(self)}, got {index}")
+        return self.read_points(index % len(self))
+
+    def __iter__(self) -> Iterator[NDArray[np.float32]]:
+        return (self.read_points(index) for index in range(len(self)))
+
     @property
     def num_scans(self) -> int:
         """Number of scans, the bad ones too."""
@@ -312,13 +322,12 @@ class LidarSequence:
     def __len__(self) -> int:
         return len(self.sources)
 
-    def __getitem__(self, index: int) -> NDArray[np.float32]:
-        if not -len(self) <= index < len(self):
-            raise IndexError(f"scan: expected a number below {len(self)}, got {index}")
-        return self.read_scan(index % len(self))
-
-    def __iter__(self) -> Iterator[NDArray[np.float32]]:
-        return (self.read_scan(index) for index in range(len(self)))
+    def read_points(self, index: int) -> NDArray[np.float32]:
+        """Reads scan i as `read_scan` does; a scan of no point is (0, 3), not an error."""
+        try:
+            return self.read_scan(index)
+        except EmptyScanError:
+            return np.zeros((0, 3), np.float32)
 
     def take(self, selection: Selection) -> LidarSequence:
         """The selected scans with their poses and times, in the same world; nothing is read."""
