@@ -9,7 +9,7 @@
 Results go to results/slam/<time>/ (latest links to the newest): trajectories of every scan as TUM, KITTI and npy,
 scans.csv and loops.csv with the reason of every decision, graph.g2o, keyframes.txt, map.npz (to extend, and to localise
 in), map.ply, trajectory.png, map.png and metrics.json. Ctrl-C writes all of it.
-docs/slam.md explains the stages and the files.
+docs/files.md lists the files and the words of their columns.
 """
 
 from __future__ import annotations
