@@ -5,7 +5,8 @@ import numpy as np
 import dpmjax
 from dpmjax import simulation
 
-drive = simulation.simulate_drive(num_scans=8)  # A street and a lidar of 64 beams, two metres from scan to scan.
+# A simulated street and a lidar of 64 beams, two metres from scan to scan.
+drive = simulation.simulate_drive(3, kind="suburb", length_m=30)
 source, target = drive[0], drive[7]  # (n, 3) points in metres, each in the frame of its lidar.
 
 model = dpmjax.load_model("dpm_small")

@@ -3,7 +3,11 @@
 import dpmjax
 from dpmjax import io, simulation
 
-drive = simulation.simulate_drive(num_scans=120)  # Round a block, and on over streets that it has seen.
+# Round a block of a simulated suburb, 215 m, and on over streets that it has seen.
+town = simulation.TownConfig("suburb", "loop", route_length_m=200.0, block_m=50.0)
+driving = simulation.DriveConfig(rate_hz=3.0, length_m=240.0, max_turn_deg_s=30.0)
+drive = simulation.simulate_lidar_sequence(0, town, driving=driving, sensor=simulation.HDL64E.with_azimuths(900))
+
 model = dpmjax.load_model("dpm_small")
 result = dpmjax.run_slam(model, drive)
 

@@ -7,7 +7,7 @@ import numpy as np
 import dpmjax
 from dpmjax import simulation
 
-drive = simulation.simulate_drive(num_scans=40)
+drive = simulation.simulate_drive(3, kind="suburb", length_m=80)
 model = dpmjax.load_model("dpm_small")
 result = dpmjax.run_slam(model, (drive[i] for i in range(0, 24)))
 dpmjax.save_map("map.npz", result.map, precision="int8")
@@ -20,7 +20,7 @@ T_map_scan = np.linalg.inv(drive.T_world_lidar[0]) @ drive.T_world_lidar[15]
 print(found.status, f"{np.linalg.norm((found.T_world_scan - T_map_scan)[:3, 3]):.2f} m", found.reason)
 
 # A scan of another town is not found.
-elsewhere = simulation.simulate_drive(seed=1, num_scans=1)
+elsewhere = simulation.simulate_drive(6, kind="suburb", length_m=10)
 print(dpmjax.localize(model, slam_map, elsewhere[0]).status)
 
 # A second run over the last part of the same street, with a frame of its own.

@@ -17,7 +17,7 @@ def show(record, progress):
 
 
 # Each scan is prepared once; then each step draws groups of scans and moves them at random.
-drive = simulation.simulate_drive(num_scans=24)
+drive = simulation.simulate_drive(3, kind="suburb", length_m=50)
 trained = dpmjax.train([drive], settings, seed=0, hooks=deeppointmap.TrainingHooks(on_report=show))
 
 # The file is a model like the shipped one.

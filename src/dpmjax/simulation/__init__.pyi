@@ -15,7 +15,6 @@ from .raycast2d import simulate_sequence as simulate_sequence
 from .scenes import Scene as Scene
 from .scenes import SceneMixture as SceneMixture
 from .scenes import draw_scene as draw_scene
-from .scenes import simulate_drive as simulate_drive
 from .scenes import simulate_scene as simulate_scene
 from .scenes import simulate_scenes as simulate_scenes
 from .town.driving import Drive as Drive

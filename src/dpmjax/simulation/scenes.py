@@ -19,7 +19,6 @@ from dpmjax.simulation.town.scan import HDL32E, HDL64E, OS1_64, OS1_128, PANDAR6
 
 _SCENE_STREAM = 8170
 _Entry = TypeVar("_Entry")
-_DRIVE_AZIMUTHS = 900  # Half of the columns: a scan is simulated in 50 ms.
 _ROUTES = ("loop", "there_and_back", "wander")
 
 
@@ -175,31 +174,6 @@ def _scaled(sequence: LidarSequence, scale: float) -> LidarSequence:
     poses = np.array(sequence.T_world_lidar)
     poses[:, :3, 3] *= scale
     return replace(sequence, read_scan=lambda index: np.float32(scale) * sequence.read_scan(index), T_world_lidar=poses)
-
-
-def simulate_drive(seed: int = 0, num_scans: int = 120) -> LidarSequence:
-    """Simulates a car with a 64-beam lidar that drives round a block of a suburb, two metres from scan to scan.
-
-    The way round is about 215 m long; after 110 scans the car drives over streets that it has seen.
-
-    Args:
-        seed: of the suburb, the drive and the noise; the same seed gives the same drive.
-        num_scans: number of scans.
-
-    Returns:
-        The drive, with exact poses and times: `drive[i]` is scan i, (n, 3) points in metres in the lidar's frame.
-
-    Raises:
-        ValueError: a negative seed, or no scan.
-    """
-    if num_scans < 1:
-        raise ValueError(f"num_scans must be at least 1, got {num_scans}")
-    town = TownConfig("suburb", "loop", route_length_m=200.0, block_m=50.0)
-    driving = DriveConfig(rate_hz=3.0, max_turn_deg_s=30.0)
-    # No step is longer than at full speed on a straight street.
-    driving = replace(driving, length_m=num_scans * driving.speed_m_s / driving.rate_hz)
-    scene = Scene(seed, town, driving, HDL64E.with_azimuths(_DRIVE_AZIMUTHS))
-    return simulate_scene(scene).take(slice(num_scans))
 
 
 def simulate_scenes(seeds: Sequence[int], mixture: SceneMixture = SceneMixture()) -> list[LidarSequence]:
