@@ -39,11 +39,11 @@ slow: $(STAMP)  ## the tests that train or start processes
 	$(BIN)/python -m pytest -n 2 --dist worksteal -m slow
 
 demo: $(STAMP)  ## register the built-in 2-D world; pictures in results/demo
-	$(BIN)/python -m experiments.deepmapping_2d --init odometry --force -o results/demo
+	$(BIN)/dpmjax map2d --init odometry --force -o results/demo
 	@echo "Pictures:"; find results/demo/ -name '*.png' | sort | sed 's/^/  /'
 
 slam: $(STAMP)  ## map a simulated town from 3-D scans; pictures in results/slam
-	$(BIN)/python -m experiments.dpm_slam --force -o results/slam
+	$(BIN)/dpmjax slam --force -o results/slam
 	@echo "Pictures:"; find results/slam/ -name '*.png' | sort | sed 's/^/  /'
 
 bench: $(STAMP)  ## speed and accuracy of everything that is measured

@@ -16,14 +16,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.rows import Row, measure
+from dpmjax import ScanSet
 from dpmjax import deepmapping as dm
-from dpmjax.deepmapping.fit import Progress, fit
-from dpmjax.deepmapping.planar import as_fitted, planar_data, planar_problem
+from dpmjax.deepmapping import Progress, fit, planar_data, planar_problem
 from dpmjax.io import ScanSequence, read_sequence
 from dpmjax.metrics import absolute_trajectory_error
 from dpmjax.registration import PlanarScans, incremental_icp, planar_scans, refine
 from dpmjax.simulation import simulate_sequence
-from dpmjax.types import ScanSet
 
 NAME = "deepmapping"
 DATA = Path(os.environ.get("DPMJAX_DATA", "../shared/data")) / "deepmapping_2d"
@@ -111,7 +110,7 @@ def _fit(sequence: ScanSequence, start: NDArray[np.float64] | None, case: str, q
             rows.append(Row(case, f"ate after {marks.pop(0):.0f} s", ate, "px"))
 
     done = fit(planar_problem(config, data), data, key=jax.random.key(0), on_report=at_mark)
-    poses = as_fitted(done, length, config).poses
+    poses = np.asarray(done.poses, np.float64) * unit
     rows += [
         Row(case, "ate at the end", _ate(sequence, poses), "px"),
         Row(case, "run", done.run_s, "s"),

@@ -14,11 +14,10 @@ import numpy as np
 
 from benchmarks.deepmapping import DATA
 from benchmarks.rows import Row
-from dpmjax import fit_deepmapping
+from dpmjax import ScanSet, fit_deepmapping
 from dpmjax.io import ScanSequence, read_sequence
 from dpmjax.metrics import absolute_trajectory_error
 from dpmjax.simulation import simulate_sequence
-from dpmjax.types import ScanSet
 
 NAME = "deepmapping_zero"
 _FIRST_SEED = 700

@@ -8,8 +8,7 @@ from dataclasses import replace
 import jax
 
 from benchmarks.rows import Row, measure
-from dpmjax.deepmapping.fit import fit
-from dpmjax.deepmapping.toy import ToyConfig, toy_problem
+from dpmjax.deepmapping import ToyConfig, fit, toy_problem
 from experiments.toy_1d import FORMS, share_at_minimum, torch_seconds
 
 NAME = "toy"

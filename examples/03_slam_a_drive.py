@@ -23,4 +23,4 @@ dpmjax.write_g2o("graph.g2o", result.graph)
 
 # The graph can be optimised again, or with edges of your own.
 solved = dpmjax.optimize_pose_graph(dpmjax.read_g2o("graph.g2o"))
-print(f"chi2 {solved.chi2_initial:.3f} -> {solved.chi2:.3f} after {solved.iterations} iterations")
+print(f"chi2 {solved.chi2_initial:.1f} -> {solved.chi2:.1f}")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -10,70 +11,110 @@ import numpy as np
 from numpy.typing import NDArray
 
 if TYPE_CHECKING:
-    from dpmjax.sequences import LidarSequence
-    from experiments.deepmapping_3d import Config
+    from dpmjax.io import LidarSequence
 
 Floats = NDArray[np.float64]
 
 _NUM_SIMULATED = 16
-_SIMULATED_NOISE_M = 0.2
 
 
-def read_drive(config: Config) -> LidarSequence:
+@dataclass(frozen=True)
+class DriveWindow:
+    """Some scans of a drive.
+
+    Attributes:
+        data: folder of the drive, or None for a simulated place.
+        sequence: name of the drive where the folder holds several.
+        scene: the simulated place, "room" or "street".
+        rows: scans to use.
+        seed: of the simulated place.
+    """
+
+    data: Path | None
+    sequence: str | None
+    scene: str
+    rows: slice
+    seed: int
+
+
+@dataclass(frozen=True)
+class FirstPoses:
+    """Poses to start from.
+
+    Attributes:
+        source: "poses" (of the drive), "zero", or the path of a trajectory.
+        noise_m: root mean square of the noise of the positions, metres.
+        noise_deg: the same of the orientations, where there is noise.
+        seed: of the noise.
+    """
+
+    source: str
+    noise_m: float
+    noise_deg: float
+    seed: int
+
+
+def read_drive(window: DriveWindow) -> LidarSequence:
     """Opens the scans of the window; a `ValueError` where there are fewer than two."""
     from dpmjax import io
 
-    drive = (
-        simulated_drive(config)
-        if config.data is None
-        else io.open_lidar_sequence(config.data, sequence=config.sequence)
-    )
-    part = drive.take(config.selection())
+    if window.data is None:
+        drive = simulated_drive(window)
+    else:
+        drive = io.open_lidar_sequence(window.data, sequence=window.sequence)
+    part = drive.take(window.rows)
     if len(part) < 2:
-        raise ValueError(f"--window {config.window} --jump {config.jump}: chooses {len(part)} of {len(drive)} scans")
+        begin, end = ("" if row is None else row for row in (window.rows.start, window.rows.stop))
+        raise ValueError(f"--window {begin}:{end} --jump {window.rows.step}: chooses {len(part)} of {len(drive)} scans")
     return part
 
 
-def simulated_drive(config: Config) -> LidarSequence:
+def simulated_drive(window: DriveWindow) -> LidarSequence:
     """Returns the first scans of a simulated flat or suburb."""
     from dpmjax import simulation
 
     kind, sensor, spacing = (
-        ("flat", simulation.OS1_64, 4.0) if config.scene == "room" else ("suburb", simulation.HDL64E, 2.0)
+        ("flat", simulation.OS1_64, 4.0) if window.scene == "room" else ("suburb", simulation.HDL64E, 2.0)
     )
     mixture = simulation.SceneMixture(
         kinds=((kind, 1.0),), sensors=((sensor, 1.0),), spacing_m=spacing, indoor_scale=(1.0, 1.0), moving_rate=0.0
     )
-    drive = simulation.simulate_scene(simulation.draw_scene(config.seed, mixture))
+    drive = simulation.simulate_scene(simulation.draw_scene(window.seed, mixture))
     return drive.take(slice(0, _NUM_SIMULATED))
 
 
-def starting_poses(config: Config, sequence: LidarSequence) -> Floats | None:
-    """Returns (n, 4, 4) poses with their noise; None for a cold start."""
-    if config.init == "zero":
+def starting_poses(first: FirstPoses, sequence: LidarSequence, rows: slice) -> Floats | None:
+    """Returns (n, 4, 4) poses with their noise; None for a cold start.
+
+    Args:
+        first: where they come from.
+        sequence: the scans of the window.
+        rows: of the window in its drive; a trajectory may have a pose for each scan of either.
+
+    Returns:
+        The poses.
+    """
+    if first.source == "zero":
         return None
-    if config.init == "poses":
+    if first.source == "poses":
         if sequence.T_world_lidar is None:
             raise ValueError(f"{sequence.name}: has no poses to start from; use --init FILE or --init zero")
         T = sequence.T_world_lidar
     else:
-        T = read_start(config, len(sequence))
-    noise_m = config.init_noise
-    if noise_m is None:
-        noise_m = _SIMULATED_NOISE_M if config.data is None and config.init == "poses" else 0.0
-    return T if noise_m == 0.0 else add_noise(T, noise_m, config.init_noise_deg, config.seed)
+        T = read_start(first.source, len(sequence), rows)
+    return T if first.noise_m == 0.0 else add_noise(T, first.noise_m, first.noise_deg, first.seed)
 
 
-def read_start(config: Config, num_scans: int) -> Floats:
-    """Reads the trajectory of `--init`: a pose for each scan of the window, or of the whole drive."""
+def read_start(path: str, num_scans: int, rows: slice) -> Floats:
+    """Reads a trajectory: a pose for each scan of the window, or of the whole drive."""
     from dpmjax import io
 
-    if not Path(config.init).exists():
-        raise ValueError(f"--init {config.init}: no such file, and none of poses, zero")
-    T = io.read_poses(config.init)
-    chosen = T if len(T) == num_scans else T[config.selection()]
+    if not Path(path).exists():
+        raise ValueError(f"--init {path}: no such file, and none of poses, zero")
+    T = io.read_poses(path)
+    chosen = T if len(T) == num_scans else T[rows]
     if len(chosen) != num_scans:
-        raise ValueError(f"{config.init}: {len(T)} poses for {num_scans} scans; give one a scan, in the scans' order")
+        raise ValueError(f"{path}: {len(T)} poses for {num_scans} scans; give one a scan, in the scans' order")
     return chosen
 
 

@@ -1,4 +1,4 @@
-"""What the commands of DeepMapping share: starts, methods to compare, and the numbers of every candidate.
+"""The methods that the tables of DeepMapping compare: baselines, parts of the pipeline, and their combinations.
 
 A candidate is a set of poses under the name of what produced it. "DeepMapping" names what L-Net or M-Net produced;
 a search, an ICP or a refinement is called that.
@@ -14,35 +14,21 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from dpmjax import deepmapping, metrics, registration
+from dpmjax import deepmapping, registration
+from dpmjax.cli import planar_errors
+from dpmjax.registration import DEEPMAPPING, START_NAMES
 
 if TYPE_CHECKING:
+    from dpmjax import ScanSet
     from dpmjax.deepmapping import DeepMappingConfig
+    from dpmjax.io import ScanSequence
     from dpmjax.registration import PlanarScans
-    from dpmjax.sequences import ScanSequence
-    from dpmjax.types import ScanSet
 
 Floats = NDArray[np.float64]
 Candidates = dict[str, Floats]
 
 SUCCESS_PX = 20.0
 """ATE below which the paper calls a run a success (section 4.1)."""
-
-DEEPMAPPING = "DeepMapping"
-START_NAMES = {
-    "icp-plane": "incremental ICP, point to line",
-    "icp-point": "incremental ICP, point to point",
-    "global": "global registration",
-    "odometry": "odometry",
-    "zero": "zero poses",
-}
-"""Starts of a fit: the word on the command line, and the name of the candidate."""
-
-STARTS_FROM_SCANS = ("icp-plane", "icp-point", "global")
-"""Starts that know nothing but the scans."""
-
-# A fit whose map takes so many times the nats of the refined start is not refined.
-_LEAST_PROMISING = 1.15
 
 _LBFGS_ITERATIONS = 150
 
@@ -68,7 +54,7 @@ class Task:
     @property
     def scans(self) -> ScanSet:
         """Returns the scans without their names and reference."""
-        from dpmjax.types import ScanSet
+        from dpmjax import ScanSet
 
         return ScanSet(self.sequence.points, self.sequence.mask)
 
@@ -102,43 +88,17 @@ def refined_icp(task: Task) -> Candidates:
     return {f"{START_NAMES['icp-plane']}, refined": refined(task, incremental(task))}
 
 
-def refined_candidates(task: Task, candidates: Candidates, init: str) -> Candidates:
-    """Returns the start and the fit, each refined; a fit that is a worse map than the refined start is left out.
-
-    The fit is sharper near a good start; the start keeps what a robot's odometry knows.
-    """
-    (start, start_poses), (fit, fit_poses) = candidates.items()
-    found = {} if init == "zero" else {f"{start}, refined": refined(task, start_poses)}
-    scores = registration.choose_trajectory(task.planar, {fit: fit_poses, **found})[1]
-    nats = [score.code_length for score in scores.values()]
-    if nats[0] <= _LEAST_PROMISING * nats[-1]:
-        found[f"{fit}, refined"] = refined(task, fit_poses)
-    return found
-
-
 def choose(task: Task, candidates: Mapping[str, Floats]) -> tuple[str, dict[str, dict[str, float]]]:
     """Returns the name of the best candidate, chosen by the scans alone, and the errors and scores of all."""
     kept, scores = registration.choose_trajectory(task.planar, candidates)
-    return kept, {name: errors(task.sequence, candidates[name]) | score._asdict() for name, score in scores.items()}
+    return kept, {
+        name: planar_errors(task.sequence, candidates[name]) | score._asdict() for name, score in scores.items()
+    }
 
 
 def assess(task: Task, poses: Floats) -> dict[str, Any]:
     """Returns the assessment of poses, from the scans alone, under the names of the result files."""
     return registration.assess_trajectory(task.planar, poses)._asdict()
-
-
-def errors(sequence: ScanSequence, poses: Floats) -> dict[str, float]:
-    """Returns ATE and point distance in the unit of the scans; nothing where there is no reference."""
-    from dpmjax.geometry import se2
-
-    reference = sequence.reference_poses
-    if reference is None:
-        return {}
-    distance = metrics.point_distance(sequence.points, sequence.mask, se2.to_matrix(poses), se2.to_matrix(reference))
-    return {
-        f"ate_{sequence.unit}": metrics.absolute_trajectory_error(poses[:, :2], reference[:, :2]),
-        f"point_distance_{sequence.unit}": distance,
-    }
 
 
 def in_fitting_order(task: Task, start: Floats) -> NDArray[np.intp]:
@@ -155,7 +115,7 @@ def _fit(task: Task, start: Floats | None, config: DeepMappingConfig | None = No
     order = np.arange(len(task.sequence)) if start is None else in_fitting_order(task, start)
     scans = replace(task, sequence=task.sequence.take(order)).scans
     fitted = deepmapping.fit_deepmapping(
-        scans, settings, key=jax.random.key(task.seed), init=None if start is None else start[order]
+        scans, settings, key=jax.random.key(task.seed), start=None if start is None else start[order]
     )
     return fitted.poses[np.argsort(order)]
 

@@ -12,10 +12,18 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
-from dpmjax.cli.command import StopFlag, check_least, check_names
-from dpmjax.cli.result_files import do_row
-from dpmjax.cli.run_folder import RunFolder, RunOptions, open_run_folder, recording
-from experiments._deepmapping_methods import METHODS, SUCCESS_PX, Task, assess, choose, errors
+from dpmjax.cli import (
+    RunFolder,
+    RunOptions,
+    StopFlag,
+    check_least,
+    check_names,
+    do_row,
+    open_run_folder,
+    planar_errors,
+    recording,
+)
+from experiments._deepmapping_methods import METHODS, SUCCESS_PX, Task, assess, choose
 
 NOT_RUN = {
     "go-icp": "its packages on PyPI search the turns of 3-D clouds, which may turn a flat scan over; py-goicp does not "
@@ -52,7 +60,7 @@ def run_method(name: str, task: Task) -> dict[str, Any]:
     seconds, cpu_seconds = time.perf_counter() - begun, time.process_time() - begun_cpu
     kept, measured = chosen or choose(task, candidates)
     return {
-        **errors(task.sequence, candidates[kept]),
+        **planar_errors(task.sequence, candidates[kept]),
         "success": measured[kept]["ate_px"] < SUCCESS_PX,
         "seconds": seconds,
         "cpu_s": cpu_seconds,

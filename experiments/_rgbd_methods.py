@@ -69,13 +69,14 @@ def run_method(
         return multiway_images(sequence.points, sequence.mask)
     if name == "icp":
         return chain_icp(sequence, seed=seed)
+    if name in ("deepmapping", "deepmapping-icp"):
+        first = "placed" if name == "deepmapping" else "icp"
+        start = found.get(first)
+        if start is None and first == "icp":
+            start = chain_icp(sequence, seed=seed)
+        return dm.register_depth(scans, settings, key=key, start=start).T_world_camera
     used = dm.as_direct(settings) if name == "direct" else settings
-    start = {"deepmapping": "placed", "deepmapping-icp": "icp"}.get(name)
-    if start is None:
-        return dm.fit_depth(scans, used, key=key).T_world_camera
-    init = found[start] if start in found else run_method(start, sequence, settings, found, seed=seed)
-    fitted = dm.fit_depth(scans, used, key=key, init=init).T_world_camera
-    return max(fitted, init, key=lambda T: float(dm.projective_consistency(scans, T)))
+    return dm.fit_depth(scans, used, key=key).T_world_camera
 
 
 def chain_icp(sequence: DepthSequence, *, seed: int) -> NDArray[np.float64]:

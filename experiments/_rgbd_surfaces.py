@@ -12,10 +12,10 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import NDArray
 
-from dpmjax.deepmapping.projective_consistency import Pinhole, fit_pinhole
-from dpmjax.geometry.normals import image_normals
+from dpmjax.deepmapping import Pinhole, as_depth_scans
+from dpmjax.geometry import image_normals
+from dpmjax.io import DepthSequence
 from dpmjax.metrics import absolute_trajectory_error
-from dpmjax.sequences import DepthSequence
 
 # Standard deviations: of the length of a move if nothing is seen, and of what a pixel says at depth 0.
 _MOVE_M, _FLOOR_M = 0.3, 0.002
@@ -41,7 +41,7 @@ def surface_spread(sequence: DepthSequence, depth_noise_m: float) -> float:
     assert T is not None
     count = len(sequence)
     information = _information_of_moves(count)
-    pinhole = fit_pinhole(sequence.points, sequence.mask)
+    pinhole = as_depth_scans(sequence.points, sequence.mask).pinhole
     surfaces = image_normals(sequence.points, sequence.mask)
     for one in range(count):
         for other in range(count):

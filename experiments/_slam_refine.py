@@ -72,8 +72,8 @@ def refine_keyframes(
             kept.append("not tried")
             continue
         clouds = [read_points(row) for row in rows]
-        fitted = deepmapping.fit_clouds(
-            clouds, key=jax.random.fold_in(jax.random.key(seed), number), init=T[list(rows)]
+        fitted = deepmapping.register_clouds(
+            clouds, key=jax.random.fold_in(jax.random.key(seed), number), start=T[list(rows)]
         )
         kept.append(fitted.kept)
         if fitted.kept == "fit":

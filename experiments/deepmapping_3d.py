@@ -26,19 +26,29 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 from tyro.conf import Positional, arg
 
-from dpmjax.cli.command import StopFlag, check_least, run_command
-from dpmjax.cli.machine import peak_rss_gb
-from dpmjax.cli.recorded_fit import FitTask, RecordedFit, draw_loss, record_fit
-from dpmjax.cli.run_folder import RunFolder, RunOptions, open_run_folder, recording, write_metrics
-from experiments._cloud_input import read_drive, starting_poses
+from dpmjax.cli import (
+    FitRecorder,
+    RunFolder,
+    RunOptions,
+    StopFlag,
+    check_least,
+    draw_loss,
+    open_run_folder,
+    peak_rss_gb,
+    recording,
+    run_command,
+    write_metrics,
+)
+from experiments._cloud_input import DriveWindow, FirstPoses, read_drive, starting_poses
 
 if TYPE_CHECKING:
     from dpmjax.deepmapping import CloudFitted, CloudMappingConfig, CloudScans
-    from dpmjax.sequences import LidarSequence
+    from dpmjax.io import LidarSequence
 
 Floats = NDArray[np.float64]
 
 EXPERIMENT = "deepmapping_3d"
+_SIMULATED_NOISE_M = 0.2
 # Points on steeper surfaces than this are drawn: walls, not the ground or the ceiling.
 _WALL_COSINE = 0.5
 
@@ -83,28 +93,45 @@ class Config(RunOptions):
             raise ValueError(f"--window: expected A:B with A below B, such as 100:140, got {self.window}")
         return slice(begin, end, self.jump)
 
+    def drive_window(self) -> DriveWindow:
+        """The scans to register."""
+        return DriveWindow(self.data, self.sequence, self.scene, self.selection(), self.seed)
+
+    def first_poses(self) -> FirstPoses:
+        """Where the poses start."""
+        is_simulated = self.data is None and self.init == "poses"
+        usual = _SIMULATED_NOISE_M if is_simulated else 0.0
+        noise = usual if self.init_noise is None else self.init_noise
+        return FirstPoses(self.init, noise, self.init_noise_deg, self.seed)
+
 
 def main(config: Config) -> dict[str, Any]:
-    """Reads, fits, judges, writes; returns the content of `metrics.json`."""
+    """Reads, registers, writes; returns the content of `metrics.json`."""
+    import jax
+
+    from dpmjax import register_clouds
+
     started = time.perf_counter()
-    sequence = read_drive(config)
-    start = starting_poses(config, sequence)
+    sequence = read_drive(config.drive_window())
+    start = starting_poses(config.first_poses(), sequence, config.selection())
     scans = read_scans(sequence, fit_settings(config))
     folder = open_run_folder(config, EXPERIMENT)
     with recording(folder), StopFlag() as stop:
         print(f"{sequence.name}: {len(sequence)} scans of {scans.points.shape[1]} points, from {config.init}")
-        recorded, fitted = _fit(folder, config, sequence, scans, start, stop)
+        recorder = _recorder(folder, sequence, scans, stop)
+        key, settings = jax.random.key(config.seed), fit_settings(config)
+        fitted = register_clouds(scans, settings, key=key, start=start, engine=recorder)
         metrics = {
             "num_scans": len(sequence),
-            "steps": int(recorded.done.state.step),
+            "steps": recorder.steps,
             "start": config.init,
             "kept": fitted.kept,
             **errors(sequence, start, fitted),
             "misfit": fitted.misfit,
             "start_misfit": fitted.start_misfit,
             "unit_m": fitted.unit,
-            "fit_s": recorded.run_s,
-            "compile_s": recorded.done.compile_s,
+            "fit_s": recorder.run_s,
+            "compile_s": recorder.compile_s,
             "peak_rss_gb": peak_rss_gb(),
             "is_interrupted": stop.is_requested,
             "wall_s": time.perf_counter() - started,
@@ -135,24 +162,12 @@ def fit_settings(config: Config) -> CloudMappingConfig:
     return settings if config.steps is None else deepmapping.with_steps(settings, config.steps)
 
 
-def _fit(
-    folder: RunFolder,
-    config: Config,
-    sequence: LidarSequence,
-    scans: CloudScans,
-    start: Floats | None,
-    stop: StopFlag,
-) -> tuple[RecordedFit, CloudFitted]:
-    """Fits in the run folder, and judges."""
-    from dpmjax.deepmapping.clouds import as_fitted, cloud_data, cloud_problem
+def _recorder(folder: RunFolder, sequence: LidarSequence, scans: CloudScans, stop: StopFlag) -> FitRecorder:
+    """Returns the engine of the fit in the run folder."""
+    from dpmjax.geometry import typical_range
 
-    data, unit = cloud_data(scans, start)
-    measure = ate_of(sequence)
-    task = FitTask(
-        cloud_problem(fit_settings(config), data), data, config.seed, lambda T: measure(unit * T[:, :3, 3]), "m"
-    )
-    recorded = record_fit(folder, task, stop=lambda _: stop.is_requested)
-    return recorded, as_fitted(recorded.done, data, unit)
+    unit, measure = typical_range(scans.points, scans.mask), ate_of(sequence)
+    return FitRecorder(folder, lambda T: measure(unit * T[:, :3, 3]), "m", stop=lambda _: stop.is_requested)
 
 
 def ate_of(sequence: LidarSequence) -> Callable[[Floats], float]:
@@ -220,8 +235,7 @@ def draw_map(
 
 def seen_from_above(title: str, scans: CloudScans, T: Floats, ate: float) -> Any:
     """Returns the panel of poses: walls as planar scans, positions and headings as planar poses."""
-    from dpmjax import viz
-    from dpmjax.types import ScanSet
+    from dpmjax import ScanSet, viz
 
     heading = np.arctan2(T[:, 1, 0], T[:, 0, 0])
     cos, sin = np.cos(heading)[:, None], np.sin(heading)[:, None]

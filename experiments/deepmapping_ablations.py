@@ -21,9 +21,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 import numpy as np
 from tyro.conf import arg
 
-from dpmjax.cli.command import StopFlag, run_command
-from dpmjax.cli.result_files import do_rows
-from dpmjax.cli.run_folder import RunFolder, RunOptions, open_run_folder, recording, write_metrics
+from dpmjax.cli import RunFolder, RunOptions, StopFlag, do_rows, open_run_folder, recording, run_command, write_metrics
 from experiments._rgbd_methods import errors_of
 
 if TYPE_CHECKING:
@@ -97,8 +95,8 @@ def main(config: Config) -> dict[str, Any]:
 
 def settings_of(ablation: str, variant: str, config: Config) -> DepthMappingConfig:
     """The basis with one thing changed."""
-    from dpmjax.deepmapping.depth_config import JOINT_DEPTH, DepthMappingConfig, depth_preset
-    from dpmjax.nets.occupancy import OccupancyConfig
+    from dpmjax.deepmapping import JOINT_DEPTH, DepthMappingConfig, depth_preset
+    from dpmjax.nets import OccupancyConfig
 
     phase = replace(
         JOINT_DEPTH,

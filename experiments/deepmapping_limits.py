@@ -23,8 +23,7 @@ from numpy.typing import NDArray
 from tyro.conf import arg
 
 from dpmjax import simulation, viz
-from dpmjax.cli.command import check_least, check_names, run_command
-from dpmjax.cli.run_folder import RunFolder, write_metrics
+from dpmjax.cli import RunFolder, check_least, check_names, run_command, write_metrics
 from experiments import _deepmapping_methods as shared
 from experiments import _deepmapping_tables as tables
 from experiments._deepmapping_methods import Task

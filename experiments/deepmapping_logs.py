@@ -1,4 +1,4 @@
-"""Runs deepmapping_2d on every CARMEN log of some folders, from several starts, and writes one table.
+"""Runs `dpmjax map2d` on every CARMEN log of some folders, from several starts, and writes one table.
 
     python -m experiments.deepmapping_logs path/to/logs -o out
     python -m experiments.deepmapping_logs path/to/recordings --inits auto --corrected path/to/logs
@@ -19,11 +19,10 @@ from typing import Annotated, Any
 
 from tyro.conf import Positional, arg
 
-from dpmjax.cli.command import EXIT_BAD_INPUT, run_command
-from dpmjax.cli.result_files import load_json
-from dpmjax.cli.run_folder import METRICS, RunFolder, write_metrics
+from dpmjax.cli import RunFolder, load_json, run_command, write_metrics
 
 EXPERIMENT = "deepmapping_logs"
+_METRICS, _EXIT_BAD_INPUT = "metrics.json", 2
 ENDINGS = (".log", ".clf", ".log.gz", ".clf.gz")
 
 
@@ -76,19 +75,19 @@ def drive_of(log: Path) -> str:
 def _run(log: Path, init: str, corrected: Path | None, config: Config) -> dict[str, Any] | None:
     """Returns the metrics of one run, in a process with a peak memory of its own; None where the log lacks odometry."""
     folder = config.output / f"{log.name.removesuffix('.gz')}_{init}"
-    if not (folder / METRICS).exists():
-        command = [sys.executable, "-m", "dpmjax.cli.map2d", str(log), "-o", str(folder), "--force"]
+    if not (folder / _METRICS).exists():
+        command = [sys.executable, "-m", "dpmjax", "map2d", str(log), "-o", str(folder), "--force"]
         command += ["--init", init, "--seed", str(config.seed)]
         command += [] if config.steps is None else ["--steps", str(config.steps)]
         relations = log.with_name(drive_of(log) + ".relations")
         command += ["--relations", str(relations)] if relations.exists() else []
         command += [] if corrected in (None, log) else ["--corrected", str(corrected)]
         code = subprocess.run(command).returncode
-        if code == EXIT_BAD_INPUT:
+        if code == _EXIT_BAD_INPUT:
             return None
         if code != 0:
             raise RuntimeError(f"{log} from {init}: the run ended with exit code {code}")
-    return load_json(folder / METRICS)
+    return load_json(folder / _METRICS)
 
 
 def markdown(rows: list[dict[str, Any]]) -> str:

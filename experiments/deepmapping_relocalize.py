@@ -1,9 +1,9 @@
 """Draws how well a fit re-localises unseen scans, at every free pixel of a world (DeepMapping figure 7).
 
-    python -m experiments.deepmapping_2d --world 1 --init zero -o run
+    dpmjax map2d --world 1 --init zero -o run
     python -m experiments.deepmapping_relocalize run
 
-RUN is a folder of deepmapping_2d on a built-in world. L-Net is trained on the poses that the fit has found; it proposes
+RUN is a folder of `dpmjax map2d` on a built-in world. L-Net is trained on the poses that the fit has found; it proposes
 poses of each scan, and M-Net chooses. Headings are random and unknown. Written beside the results of RUN:
 relocalization.png, relocalization.json, and relocalization.npz with the numbers of each scan.
 """
@@ -20,14 +20,11 @@ import numpy as np
 from numpy.typing import NDArray
 from tyro.conf import Positional, arg
 
-from dpmjax.cli.command import run_command
-from dpmjax.cli.machine import environment
-from dpmjax.cli.result_files import write_json
-from dpmjax.cli.run_folder import CHECKPOINTS, find_run, load_config
+from dpmjax.cli import environment, read_map2d_run, run_command, write_json
 
 if TYPE_CHECKING:
     from dpmjax.deepmapping import Fitted
-    from dpmjax.sequences import ScanSequence
+    from dpmjax.io import ScanSequence
 
 EXPERIMENT = "deepmapping_relocalize"
 # A fit counts as a success below this error (section 4.1); so does a re-localisation.
@@ -40,7 +37,7 @@ class Config:
     """Options of the picture."""
 
     run: Annotated[Positional[Path], arg(metavar="RUN")]
-    """Folder of a run of deepmapping_2d on a built-in world."""
+    """Folder of a run of `dpmjax map2d` on a built-in world."""
     stride_px: Annotated[int, arg(metavar="PX")] = 6
     """A scan is taken at the centre of every square of so many pixels that is free."""
     heading: Literal["random", "nearest", "east"] = "random"
@@ -61,16 +58,15 @@ def main(config: Config) -> dict[str, Any]:
     """Loads the run, re-localises scans everywhere with both L-Nets, draws, writes."""
     import jax
 
+    from dpmjax import ScanSet
     from dpmjax.deepmapping import LocalizationTrainingConfig, relocalize, train_localization
     from dpmjax.simulation import make_world, scan_world
-    from dpmjax.types import ScanSet
 
-    options = load_config(find_run(deepmapping_2d.EXPERIMENT, config.run), deepmapping_2d.Config)
-    if options.data is not None:
-        raise ValueError(f"{config.run} is a run on {options.data}: the map of its world is needed; use a built-in one")
-    sequence = deepmapping_2d.read_scans(options)
-    fitted = load_fit(config.run, options, sequence)
-    grid = make_world(options.world).is_obstacle
+    run = read_map2d_run(config.run)
+    if run.world is None:
+        raise ValueError(f"{config.run} is a run on {run.sequence.name}, whose world is needed; use a built-in one")
+    sequence, fitted = run.sequence, run.fitted
+    grid = make_world(run.world).is_obstacle
     truth = free_poses(grid, sequence, config)
     points, mask = scan_world(grid, truth, num_beams=sequence.points.shape[1])
     begun = time.perf_counter()
@@ -137,47 +133,6 @@ def draw(
     extent = (0.0, side[1], 0.0, side[0])
     figure = viz.error_maps_figure(panels, extent, sequence.reference_poses[:, :2], "px", worst=200.0)
     viz.save_figure(figure, config.run / "relocalization.png")
-
-
-def load_fit(run: Path, options: deepmapping_2d.Config, sequence: ScanSequence) -> Fitted:
-    """The fit of a run folder, with its own poses: those that its map belongs to.
-
-    Args:
-        run: the folder.
-        options: of the run.
-        sequence: its scans.
-
-    Returns:
-        The fit.
-
-    Raises:
-        ValueError: the folder holds no checkpoint or no trajectory, or its scans had no order.
-    """
-    import jax
-
-    from dpmjax.checkpoints import Checkpoints
-    from dpmjax.deepmapping import Fitted
-    from dpmjax.deepmapping.fit import init
-    from dpmjax.deepmapping.planar import planar_data, planar_problem
-    from dpmjax.types import ScanSet
-
-    trajectory = run / "trajectory.npy"
-    if not trajectory.is_file():
-        raise ValueError(f"{run} holds no trajectory.npy: let the run end, or resume it")
-    if not options.ordered:
-        raise ValueError(
-            f"{run} is a run with --no-ordered, whose fit has another order of the scans; use an ordered one"
-        )
-    settings = deepmapping_2d.fit_settings(options, sequence)
-    start = None if options.init == "zero" else np.load(trajectory)
-    data, unit = planar_data(ScanSet(sequence.points, sequence.mask), start)
-    problem = planar_problem(settings, data)
-    like = init(problem, data, key=jax.random.key(0))
-    state = Checkpoints((run / CHECKPOINTS).resolve()).restore_latest(like, fallback=None)
-    if state is None:
-        raise ValueError(f"{run} holds no checkpoint that can be read")
-    poses = np.asarray(problem.poses(settings, problem.phases[int(state.phase)], state.params, data), np.float64)
-    return Fitted(poses * [unit, unit, 1.0], state.params, None, unit, settings)
 
 
 def free_poses(grid: NDArray[np.bool_], sequence: ScanSequence, config: Config) -> NDArray[np.float64]:

@@ -32,10 +32,18 @@ import numpy as np
 from numpy.typing import NDArray
 from tyro.conf import Positional, arg
 
-from dpmjax.cli.command import StopFlag, check_least, run_command
-from dpmjax.cli.machine import peak_rss_gb
-from dpmjax.cli.result_files import do_rows
-from dpmjax.cli.run_folder import RunFolder, RunOptions, open_run_folder, recording, write_metrics
+from dpmjax.cli import (
+    RunFolder,
+    RunOptions,
+    StopFlag,
+    check_least,
+    do_rows,
+    open_run_folder,
+    peak_rss_gb,
+    recording,
+    run_command,
+    write_metrics,
+)
 from experiments._rgbd_methods import METHODS, errors_of, run_method, spread_of
 
 if TYPE_CHECKING:

@@ -19,10 +19,17 @@ from typing import Annotated, Any, ClassVar
 import numpy as np
 from tyro.conf import arg
 
-from dpmjax.cli.command import run_command
-from dpmjax.cli.machine import environment, peak_rss_gb
-from dpmjax.cli.result_files import load_json, write_json
-from dpmjax.cli.run_folder import RunOptions, open_run_folder, recording, write_metrics
+from dpmjax.cli import (
+    RunOptions,
+    environment,
+    load_json,
+    open_run_folder,
+    peak_rss_gb,
+    recording,
+    run_command,
+    write_json,
+    write_metrics,
+)
 
 EXPERIMENT = "deepmapping_size"
 # The exponent is that of large sizes: below, a step does not hold its full number of scans.
@@ -104,11 +111,9 @@ def measure(num_scans: int, num_calls: int, seed: int, output: str) -> None:
     """Seconds a step of both phases, and the peak of memory of this process, as JSON."""
     import jax
 
-    from dpmjax.deepmapping import preset
-    from dpmjax.deepmapping.fit import fit, steps_per_call
-    from dpmjax.deepmapping.planar import planar_data, planar_problem
+    from dpmjax import ScanSet
+    from dpmjax.deepmapping import fit, planar_data, planar_problem, preset, steps_per_call
     from dpmjax.simulation import simulate_sequence
-    from dpmjax.types import ScanSet
 
     sequence = simulate_sequence(0, num_scans, seed=seed, with_odometry=True)
     before_gb = peak_rss_gb()

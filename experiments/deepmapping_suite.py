@@ -21,8 +21,7 @@ import numpy as np
 from tyro.conf import arg
 
 from dpmjax import metrics, simulation, viz
-from dpmjax.cli.command import check_least, run_command
-from dpmjax.cli.run_folder import RunFolder, write_metrics
+from dpmjax.cli import RunFolder, check_least, run_command, write_metrics
 from experiments import _deepmapping_methods as shared
 from experiments import _deepmapping_tables as tables
 from experiments._deepmapping_methods import Task

@@ -22,13 +22,10 @@ import numpy as np
 from numpy.typing import NDArray
 from tyro.conf import FlagCreatePairsOff, arg
 
-from dpmjax.cli.command import run_command
-from dpmjax.cli.machine import peak_rss_gb, select_device
-from dpmjax.cli.run_folder import RunFolder, open_run_folder, recording, write_metrics
+from dpmjax.cli import RunFolder, open_run_folder, peak_rss_gb, recording, run_command, select_device, write_metrics
 
 if TYPE_CHECKING:
-    from dpmjax.deepmapping.fit import Fit
-    from dpmjax.deepmapping.toy import ToyConfig
+    from dpmjax.deepmapping import Fit, ToyConfig
 
 EXPERIMENT = "toy_1d"
 FORMS = ("network", "direct")
@@ -71,8 +68,8 @@ class Config:
 
 def main(config: Config) -> dict[str, Any]:
     """Runs all seeds, then all variants, draws, measures, writes."""
-    from dpmjax.deepmapping.toy import ToyConfig, global_minimum
-    from dpmjax.nets.scalar import Initialization
+    from dpmjax.deepmapping import ToyConfig, global_minimum
+    from dpmjax.nets import Initialization
 
     select_device(config.device)  # type: ignore[arg-type]
     folder = open_run_folder(config, EXPERIMENT)
@@ -108,8 +105,7 @@ def descend(toy: ToyConfig, config: Config) -> Fit:
     """All seeds as starts of one fit."""
     import jax
 
-    from dpmjax.deepmapping.fit import fit
-    from dpmjax.deepmapping.toy import toy_problem
+    from dpmjax.deepmapping import fit, toy_problem
 
     return fit(toy_problem(toy), None, key=jax.random.key(config.seed), num_starts=config.seeds)
 
@@ -131,7 +127,7 @@ def run_paper(toy: ToyConfig, config: Config) -> tuple[dict[str, NDArray[np.floa
     import jax
     import jax.numpy as jnp
 
-    from dpmjax.deepmapping.toy import network_value, toy_loss
+    from dpmjax.deepmapping import network_value, toy_loss
     from experiments.baselines.direct import minimize_toy
 
     runs = descend_both(toy, config)
@@ -170,7 +166,7 @@ def choose_seed(network_x: NDArray[np.floating], direct_x: NDArray[np.floating])
 
 def is_at_minimum(x: NDArray[np.floating]) -> NDArray[np.bool_]:
     """Which ends are at the global minimum."""
-    from dpmjax.deepmapping.toy import global_minimum
+    from dpmjax.deepmapping import global_minimum
 
     return np.abs(np.asarray(x, np.float64) - global_minimum()[0]) < _SAME_PLACE
 
@@ -220,7 +216,7 @@ def draw(
 ) -> None:
     """toy.png and endings.png."""
     from dpmjax import viz
-    from dpmjax.deepmapping.toy import toy_loss
+    from dpmjax.deepmapping import toy_loss
 
     x = np.linspace(-VIEW, VIEW, 2401)
     loss = np.asarray(toy_loss(x))

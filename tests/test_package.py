@@ -14,9 +14,12 @@ import jax.numpy as jnp
 import pytest
 
 import dpmjax
-from dpmjax import deeppointmap, geometry, losses, metrics, nets, slam, weights
+from tests.test_kernels import KERNELS
 
-PACKAGES = [dpmjax, deeppointmap, geometry, losses, metrics, nets, slam, weights]
+ROOMS = sorted(module.name for module in pkgutil.iter_modules(dpmjax.__path__))
+FOLDERS = sorted(module.name for module in pkgutil.iter_modules(dpmjax.__path__) if module.ispkg)
+PACKAGES = [dpmjax, *(getattr(dpmjax, name) for name in FOLDERS)]
+API = Path(__file__).parents[1] / "docs" / "api.md"
 
 
 def test_import_loads_no_jax_and_is_fast() -> None:
@@ -28,6 +31,13 @@ def test_import_loads_no_jax_and_is_fast() -> None:
     result = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
     # 0.1 s is promised; a busy machine gets some slack.
     assert float(result.stdout) < 0.5
+
+
+def test_every_room_is_reached_from_the_package_alone() -> None:
+    # In a process of its own: an import of a room elsewhere would make it an attribute of the package.
+    program = f"import dpmjax; print([getattr(dpmjax, room).__name__ for room in {ROOMS}])"
+    result = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert result.stdout.strip() == str([f"dpmjax.{room}" for room in ROOMS])
 
 
 @pytest.mark.parametrize("package", PACKAGES, ids=lambda package: package.__name__)
@@ -43,7 +53,8 @@ def test_no_module_hides_a_public_name(package) -> None:
     for module in pkgutil.iter_modules(package.__path__):
         if module.name != "__main__":
             importlib.import_module(f"{package.__name__}.{module.name}")
-    assert not [name for name in package.__all__ if isinstance(getattr(package, name), ModuleType)]
+    hidden = {name for name in package.__all__ if isinstance(getattr(package, name), ModuleType)}
+    assert hidden == (set(ROOMS) if package is dpmjax else set())
 
 
 def test_version_is_the_one_of_the_distribution() -> None:
@@ -58,8 +69,15 @@ def test_compile_counter_counts(count_compilations) -> None:
 
 
 def test_api_page_lists_exactly_the_root_names() -> None:
-    page = (Path(__file__).parents[1] / "docs" / "api.md").read_text(encoding="utf-8")
-    listed = re.findall(r"^\* `(\w+)`: .+\.$", page, re.MULTILINE)
+    page = API.read_text(encoding="utf-8")
+    listed = re.findall(r"^\* `(\w+)`(?: \(K\))?: .+\.$", page, re.MULTILINE)
     assert len(listed) == page.count("\n* "), "one line each: * `name`: what it is."
-    assert sorted(listed) == sorted(set(dpmjax.__all__) - {"__version__"})
+    assert sorted(listed) == sorted(set(dpmjax.__all__) - {"__version__", *ROOMS})
     assert page.count("\n## ") == 12, "eleven groups, and the packages"
+    assert sorted(re.findall(r"^\| `dpmjax\.(\w+)` \|", page, re.MULTILINE)) == FOLDERS
+
+
+def test_what_the_api_page_calls_a_kernel_is_tested_as_one() -> None:
+    marked = set(re.findall(r"^\* `(\w+)` \(K\):", API.read_text(encoding="utf-8"), re.MULTILINE))
+    tested = {name.split()[0] for name in KERNELS}
+    assert marked == tested & set(dpmjax.__all__)

@@ -15,11 +15,8 @@ import numpy as np
 from jaxtyping import Array, Float
 from numpy.typing import NDArray
 
-from dpmjax.deepmapping.config import DeepMappingConfig
-from dpmjax.deepmapping.fit import init
-from dpmjax.deepmapping.planar import planar_data, planar_problem
-from dpmjax.deepmapping.toy import toy_loss
-from dpmjax.types import ScanSet
+from dpmjax import ScanSet
+from dpmjax.deepmapping import DeepMappingConfig, init, planar_data, planar_problem, toy_loss
 
 
 def optimize_directly(

@@ -14,9 +14,8 @@ import numpy as np
 from jaxtyping import Bool, Float
 from numpy.typing import NDArray
 
-from dpmjax.geometry import rigid, se2
-from dpmjax.geometry.rays import typical_range
-from dpmjax.types import AnyArray, ScanSet
+from dpmjax import ScanSet
+from dpmjax.geometry import rigid, se2, typical_range
 
 Floats = NDArray[np.float64]
 
@@ -64,7 +63,7 @@ def multiway(scans: ScanSet, config: MultiwayConfig | None = None) -> Floats:
 
 
 def multiway_images(
-    points: Float[AnyArray, "n h w 3"], mask: Bool[AnyArray, "n h w"], config: MultiwayConfig | None = None
+    points: Float[np.ndarray, "n h w 3"], mask: Bool[np.ndarray, "n h w"], config: MultiwayConfig | None = None
 ) -> Float[NDArray[np.float64], "n 4 4"]:
     """Poses of depth images by Open3D's multiway registration; a ModuleNotFoundError without Open3D.
 

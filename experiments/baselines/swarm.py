@@ -15,10 +15,9 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 from numpy.typing import NDArray
 
-from dpmjax.geometry import se2
-from dpmjax.geometry.rays import typical_range
+from dpmjax import ScanSet
+from dpmjax.geometry import se2, typical_range
 from dpmjax.losses import chamfer_distance
-from dpmjax.types import ScanSet
 
 
 @dataclass(frozen=True)

@@ -9,8 +9,9 @@ How the data flows, and the package that each step lives in:
 5. `deeppointmap` turns each 3-D scan into a few hundred descriptors and registers descriptor clouds.
 6. `metrics` compares trajectories with a reference, `viz` draws them.
 
-All of them use `geometry`: poses, alignment, neighbours, sampling, normals, rays.
-The names below are loaded on first use, so that `import dpmjax` costs nothing.
+All of them use `geometry`: poses, alignment, neighbours, sampling, normals, rays. `weights` and `saved_maps` are the
+files of models and maps, `slam` makes maps of drives. Public names and packages (`dpmjax.registration`, say) are
+loaded on first use, so that `import dpmjax` costs nothing.
 """
 
 import lazy_loader as _lazy

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
+from numpy.typing import ArrayLike
 
-from dpmjax.types import AnyArray
+from dpmjax.types import AnyArray, ScanSet
 
 
 def as_float(name: str, value: AnyArray) -> jax.Array:
@@ -75,6 +78,33 @@ def as_mask(name: str, value: AnyArray | None, shape: tuple[int, ...]) -> jax.Ar
         raise ValueError(f"{name}: expected dtype bool, got {array.dtype}")
     require_shape(name, array, shape)
     return array
+
+
+def as_beams(name: str, value: ScanSet | ArrayLike) -> ScanSet:
+    """Makes planar scans with a mask; beams with coordinates that are not finite, or both zero, measured nothing.
+
+    Args:
+        name: of the argument, for messages.
+        value: (n, b, 2) beam end points in the sensor frames; or a ScanSet, whose mask is kept.
+
+    Returns:
+        The scans, zeros where nothing was measured.
+
+    Raises:
+        ValueError: the shape is another one, or what the mask of a ScanSet calls valid is not finite.
+    """
+    points: Any = value.points if isinstance(value, ScanSet) else np.asarray(value, np.float32)
+    if points.ndim != 3 or points.shape[-1] != 2:
+        raise ValueError(f"{name}: expected shape (n, b, 2), got {points.shape}")
+    if isinstance(value, ScanSet):
+        mask = jnp.asarray(value.mask, bool)
+    else:
+        mask = jnp.asarray(np.isfinite(points).all(-1) & (np.abs(points).sum(-1) > 0))
+    require_shape(f"mask of {name}", mask, points.shape[:2])
+    clean = jnp.where(mask[..., None], jnp.asarray(points, jnp.float32), 0.0)
+    if not bool(jnp.isfinite(clean).all()):
+        raise ValueError(f"{name}: expected finite coordinates where the mask is True")
+    return ScanSet(points=clean, mask=mask)
 
 
 def require_shape(name: str, array: jax.Array, shape: tuple[int, ...]) -> None:

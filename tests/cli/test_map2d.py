@@ -40,10 +40,10 @@ def scans_npz(walk, tmp_path_factory) -> Path:
 
 def run(*options: object, interrupt: bool = False) -> subprocess.CompletedProcess[str]:
     """The command in a process of its own; interrupted after the first call of the step where asked."""
-    command = ["-m", "dpmjax.cli.map2d"]
+    command = ["-m", "dpmjax", "map2d"]
     if interrupt:
         code = (
-            "import os, signal; from dpmjax.cli import recorded_fit as fit, deepmapping_2d as m;"
+            "import os, signal; from dpmjax.cli import recorded_fit as fit, map2d as m;"
             "from dpmjax.cli.command import run_command;"
             "fit.show_progress = lambda *_: os.kill(os.getpid(), signal.SIGINT);"
             "raise SystemExit(run_command(m.main, m.Config, name=m.NAME, description=None))"

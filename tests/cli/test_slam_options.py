@@ -120,7 +120,7 @@ def test_refined_motions_and_loops_make_one_map(monkeypatch) -> None:
         rows = [int(cloud[0, 0]) for cloud in clouds]
         return SimpleNamespace(T_world_scan=init[0] @ rigid.inverse(true[rows[0]]) @ true[rows], kept="fit")
 
-    monkeypatch.setattr(_slam_refine.deepmapping, "fit_clouds", fit)
+    monkeypatch.setattr(_slam_refine.deepmapping, "register_clouds", fit)
     refined = _slam_refine.refine_keyframes(
         slam_map, lambda row: np.array([[row, 0.0, 0.0]]), seed=0, is_stopped=lambda: False
     )

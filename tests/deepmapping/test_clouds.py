@@ -13,7 +13,7 @@ from dpmjax import deepmapping as dm
 from dpmjax.deepmapping.batches import draw_rows
 from dpmjax.deepmapping.cloud_scans import find_partners
 from dpmjax.deepmapping.clouds import cloud_data, cloud_problem
-from dpmjax.deepmapping.fit import init
+from dpmjax.deepmapping.engine import init
 from dpmjax.deepmapping.plane_distance import Cloud, clouds_of, misfit_of_pairs, plane_misfit, trajectory_misfit
 from dpmjax.geometry import se3
 from dpmjax.metrics import absolute_trajectory_error
@@ -134,7 +134,7 @@ def test_rows_that_are_not_there_never_matter(truth, scans) -> None:
 
 @pytest.mark.slow
 def test_a_perturbed_start_comes_back(truth, scans, start) -> None:
-    fitted = dm.fit_clouds(scans, small(80), key=KEY, init=start)
+    fitted = dm.register_clouds(scans, small(80), key=KEY, start=start)
     assert fitted.kept == "fit"
     assert fitted.misfit < fitted.start_misfit
     assert ate(fitted.T_world_scan, truth) < 0.25 * ate(start, truth)
@@ -144,7 +144,7 @@ def test_a_perturbed_start_comes_back(truth, scans, start) -> None:
 def test_a_fit_that_is_worse_than_its_start_is_not_kept(truth, scans) -> None:
     config = small(2)
     thrown = replace(config.warm_phases[0], learning_rate=1.0)
-    fitted = dm.fit_clouds(scans, replace(config, warm_phases=(thrown,)), key=KEY, init=truth)
+    fitted = dm.register_clouds(scans, replace(config, warm_phases=(thrown,)), key=KEY, start=truth)
     assert fitted.kept == "start"
     assert fitted.misfit > fitted.start_misfit
     np.testing.assert_allclose(fitted.T_world_scan, truth, **ACCUMULATED)
@@ -152,15 +152,15 @@ def test_a_fit_that_is_worse_than_its_start_is_not_kept(truth, scans) -> None:
 
 @pytest.mark.slow
 def test_equal_keys_give_equal_fits_and_the_second_compiles_nothing(scans, start, assert_compiles_nothing) -> None:
-    first = dm.fit_clouds(scans, small(), key=KEY, init=start)
+    first = dm.register_clouds(scans, small(), key=KEY, start=start)
     with assert_compiles_nothing():
-        second = dm.fit_clouds(scans, small(), key=KEY, init=start)
+        second = dm.register_clouds(scans, small(), key=KEY, start=start)
     np.testing.assert_array_equal(first.T_world_scan, second.T_world_scan)
 
 
 @pytest.mark.slow
 def test_a_cold_start_goes_through_all_phases(scans) -> None:
-    fitted = dm.fit_clouds(scans, small(), key=KEY)
+    fitted = dm.register_clouds(scans, small(), key=KEY)
     square = np.einsum("nji,njk->nik", fitted.T_world_scan[:, :3, :3], fitted.T_world_scan[:, :3, :3])
     np.testing.assert_allclose(square, np.tile(np.eye(3), (NUM_SCANS, 1, 1)), atol=1e-5)
     assert fitted.start_misfit is None
@@ -230,9 +230,9 @@ def test_thinning_keeps_points_of_the_scan_and_fills_the_capacity(clouds) -> Non
 )
 def test_bad_scans_are_refused(scans, message) -> None:
     with pytest.raises(ValueError, match=message):
-        dm.fit_clouds(scans, key=KEY)
+        dm.register_clouds(scans, key=KEY)
 
 
 def test_bad_starts_are_refused(scans) -> None:
     with pytest.raises(ValueError, match="init"):
-        dm.fit_clouds(scans, small(), key=KEY, init=np.eye(4))
+        dm.register_clouds(scans, small(), key=KEY, start=np.eye(4))

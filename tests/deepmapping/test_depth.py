@@ -12,7 +12,7 @@ import pytest
 from dpmjax import deepmapping as dm
 from dpmjax import io, simulation
 from dpmjax.deepmapping.depth import depth_problem
-from dpmjax.deepmapping.fit import init
+from dpmjax.deepmapping.engine import init
 from dpmjax.deepmapping.problem import MappingData
 from dpmjax.deepmapping.projective_consistency import (
     Agreement,
@@ -79,7 +79,7 @@ def test_a_fit_improves_the_trajectory_of_a_perturbed_start(walk, scans) -> None
     start = walk.T_world_camera @ shake
     refine = replace(dm.depth_preset("fast").warm_phases[0], num_steps=60)
     config = replace(small("planar"), warm_phases=(refine,), steps_per_call=30)
-    fitted = dm.fit_depth(scans, config, key=KEY, init=start)
+    fitted = dm.fit_depth(scans, config, key=KEY, start=start)
 
     def ate(T: np.ndarray) -> float:
         return absolute_trajectory_error(T[:, :3, 3], walk.T_world_camera[:, :3, 3])
@@ -89,7 +89,7 @@ def test_a_fit_improves_the_trajectory_of_a_perturbed_start(walk, scans) -> None
 
 @pytest.mark.slow
 def test_full_motion_leaves_the_plane(scans) -> None:
-    fitted = dm.fit_depth(scans, small("full"), key=KEY, init=np.tile(np.eye(4), (4, 1, 1)))
+    fitted = dm.fit_depth(scans, small("full"), key=KEY, start=np.tile(np.eye(4), (4, 1, 1)))
     assert_rigid(fitted.T_world_camera)
     assert (fitted.T_world_camera[:, 1, 3] != 0.0).all()
 
@@ -102,9 +102,9 @@ def assert_rigid(T: np.ndarray) -> None:
 
 def test_sets_of_one_shape_share_their_compilation(scans, assert_compiles_nothing) -> None:
     start, other = np.tile(np.eye(4), (4, 1, 1)), replace(scans, points=0.9 * scans.points)
-    dm.fit_depth(scans, small("full"), key=KEY, init=start)
+    dm.fit_depth(scans, small("full"), key=KEY, start=start)
     with assert_compiles_nothing():
-        dm.fit_depth(other, small("full"), key=KEY, init=start)
+        dm.fit_depth(other, small("full"), key=KEY, start=start)
 
 
 def test_masked_pixels_never_matter(walk) -> None:
@@ -187,7 +187,7 @@ def test_every_pair_of_images_counts_once(walk, count: int) -> None:
         (np.ones((2, 3, 4)), {}, "points: expected shape"),
         (np.ones((1, 3, 4, 3)), {}, "points: expected shape"),
         (np.stack([np.ones((3, 4, 3)), np.zeros((3, 4, 3))]), {}, "image 1 has no valid pixel"),
-        (np.ones((2, 3, 4, 3)), {"init": np.zeros((3, 4, 4))}, "init: expected finite"),
+        (np.ones((2, 3, 4, 3)), {"start": np.zeros((3, 4, 4))}, "start: expected finite"),
     ],
 )
 def test_bad_input_is_named(points, options, message) -> None:

@@ -11,7 +11,7 @@ import pytest
 
 from dpmjax import deepmapping as dm
 from dpmjax.deepmapping.batches import draw_rows
-from dpmjax.deepmapping.fit import fit, init
+from dpmjax.deepmapping.engine import fit, init
 from dpmjax.deepmapping.planar import as_scan_set, planar_problem
 from dpmjax.deepmapping.problem import MappingData
 from dpmjax.geometry import se2
@@ -38,7 +38,7 @@ def ate(poses: np.ndarray, reference: np.ndarray) -> float:
 
 @pytest.fixture(scope="module")
 def warm(tiny_walk, shaken) -> dm.Fitted:
-    return dm.fit_deepmapping(ScanSet(tiny_walk.points, tiny_walk.mask), SMALL, key=KEY, init=shaken)
+    return dm.fit_deepmapping(ScanSet(tiny_walk.points, tiny_walk.mask), SMALL, key=KEY, start=shaken)
 
 
 def test_a_perturbed_start_is_improved(tiny_walk, shaken, warm) -> None:
@@ -146,8 +146,8 @@ def test_beams_that_are_zero_or_not_finite_are_masked() -> None:
         (np.ones((1, 5, 2)), {}, "scans: expected at least 2"),
         (np.stack([np.ones((5, 2)), np.zeros((5, 2))]), {}, "scan 1 has no valid beam"),
         (ScanSet(jnp.full((2, 5, 2), jnp.nan), jnp.ones((2, 5), bool)), {}, "scans: expected finite"),
-        (np.ones((2, 5, 2)), {"init": np.zeros((3, 3))}, "init: expected shape"),
-        (np.ones((2, 5, 2)), {"init": np.full((2, 3), np.nan)}, "init: expected finite"),
+        (np.ones((2, 5, 2)), {"start": np.zeros((3, 3))}, "start: expected shape"),
+        (np.ones((2, 5, 2)), {"start": np.full((2, 3), np.nan)}, "start: expected finite"),
         (np.ones((2, 5, 2)), {"num_starts": 0}, "num_starts"),
     ],
 )

@@ -12,7 +12,7 @@ from scipy.ndimage import maximum_filter
 
 import dpmjax
 from dpmjax import deepmapping as dm
-from dpmjax.deepmapping.fit import init
+from dpmjax.deepmapping.engine import init
 from dpmjax.deepmapping.localization_training import shift_scan, turn_scan
 from dpmjax.deepmapping.map_raster import make_raster, render_scans
 from dpmjax.deepmapping.map_search import largest_nearby

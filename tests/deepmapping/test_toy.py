@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from dpmjax.deepmapping.fit import fit
+from dpmjax.deepmapping.engine import fit
 from dpmjax.deepmapping.toy import ToyConfig, global_minimum, network_value, toy_loss, toy_problem
 from dpmjax.nets.scalar import ScalarNet, ScalarNetConfig
 from experiments.baselines.direct import minimize_toy

@@ -13,7 +13,7 @@ import pytest
 import dpmjax
 from dpmjax import deepmapping as dm
 from dpmjax.deepmapping.batches import draw_rows
-from dpmjax.deepmapping.fit import init
+from dpmjax.deepmapping.engine import init
 from dpmjax.deepmapping.planar import planar_data, planar_problem
 from dpmjax.deepmapping.windows import join_windows, window_rows
 from dpmjax.geometry import se2

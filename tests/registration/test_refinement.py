@@ -13,6 +13,7 @@ from dpmjax.registration import LoopConfig, RefinementConfig, close_loops, plana
 from dpmjax.registration.loop_closure import LoopResult, count_support, find_candidates
 from dpmjax.registration.refinement import choose_pairs
 from dpmjax.simulation import simulate_sequence
+from dpmjax.types import ScanSet
 
 WITHOUT_LOOPS = RefinementConfig(loops=None)
 
@@ -55,6 +56,27 @@ def test_refinement_stays_in_the_world_of_the_start(walk, walk_scans) -> None:
     offset = np.array([[1000.0, -500.0, 2.0]])
     refined = refine(walk_scans, se2.compose(offset, walk.reference_poses), WITHOUT_LOOPS)
     np.testing.assert_allclose(refined.poses, se2.compose(offset, walk.reference_poses), atol=0.05)
+
+
+def test_scans_as_a_user_has_them_are_those_of_the_record(walk) -> None:
+    few = walk.take(slice(0, 6))
+    arrays = np.where(few.mask[..., None], few.points, np.nan)
+    start = shaken(few.reference_poses, 3.0)
+    expected = refine(planar_scans(few.points, few.mask), start, WITHOUT_LOOPS)
+    for scans, poses in ((arrays, start), (ScanSet(few.points, few.mask), se2.to_matrix(start))):
+        np.testing.assert_allclose(refine(scans, poses, WITHOUT_LOOPS).poses, expected.poses, atol=1e-6)
+    np.testing.assert_array_equal(expected.T_world_scan, se2.to_matrix(expected.poses))
+
+
+@pytest.mark.parametrize(
+    ("poses", "message"),
+    [(np.zeros((3, 3)), "poses: expected shape"), (np.full((24, 3), np.nan), "poses: expected")],
+)
+def test_bad_poses_are_named(walk_scans, poses, message) -> None:
+    with pytest.raises(ValueError, match=message):
+        refine(walk_scans, poses)
+    with pytest.raises(ValueError, match="scans: expected shape"):
+        refine(np.zeros((24, 3)), poses)
 
 
 def test_pairs_are_neighbours_in_time_and_of_other_visits(walk_scans) -> None:

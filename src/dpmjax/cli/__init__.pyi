@@ -5,9 +5,15 @@ from .command import run_command as run_command
 from .machine import environment as environment
 from .machine import git_hash as git_hash
 from .machine import peak_rss_gb as peak_rss_gb
+from .machine import select_device as select_device
 from .machine import usable_cores as usable_cores
 from .machine import versions as versions
+from .map2d_numbers import planar_errors as planar_errors
+from .map2d_run import Map2dRun as Map2dRun
+from .map2d_run import read_map2d_run as read_map2d_run
 from .program import main as main
+from .recorded_fit import FitRecorder as FitRecorder
+from .recorded_fit import draw_loss as draw_loss
 from .result_files import HistoryFile as HistoryFile
 from .result_files import do_row as do_row
 from .result_files import do_rows as do_rows

@@ -17,7 +17,6 @@ half a metre or 20 degrees apart are registered, and all others follow the odome
 from __future__ import annotations
 
 import logging
-import math
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -25,25 +24,42 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 from tyro.conf import Positional, arg
 
 from dpmjax import deepmapping, io, registration, simulation, viz
 from dpmjax import metrics as trajectory_metrics
 from dpmjax.cli.command import StopFlag, check_least, run_command
 from dpmjax.cli.machine import peak_rss_gb
-from dpmjax.cli.recorded_fit import FitRun, draw_loss, run_fit
-from dpmjax.cli.run_folder import RunFolder, RunOptions, open_run_folder, recording, write_metrics
-from experiments import _deepmapping_methods as shared
-from experiments._deepmapping_methods import Candidates, Floats, Task
-from experiments._recordings import Recording, choose_scans, corrected_numbers, relation_numbers
+from dpmjax.cli.map2d_numbers import (
+    ate_of,
+    before_and_after,
+    corrected_numbers,
+    planar_errors,
+    relation_numbers,
+    report,
+)
+from dpmjax.cli.recorded_fit import FitRecorder, draw_loss
+from dpmjax.cli.run_folder import (
+    RunFolder,
+    RunOptions,
+    open_run_folder,
+    recording,
+    write_metrics,
+)
 
 if TYPE_CHECKING:
-    from dpmjax.deepmapping import DeepMappingConfig
+    from dpmjax.deepmapping import DeepMappingConfig, Fitted
+    from dpmjax.registration import RegisteredScans, RegistrationConfig
     from dpmjax.sequences import ScanSequence
+    from dpmjax.types import ScanSet
+
+Floats = NDArray[np.float64]
 
 NAME = "map2d"
-LOGGER = logging.getLogger("dpmjax.deepmapping_2d")
-UNITS = ("m", "deg")
+LOGGER = logging.getLogger("dpmjax.map2d")
+# Scans of a recording in metres that lie this far apart are registered.
+_MIN_DISTANCE_M, _MIN_TURN_RAD = 0.5, 0.35
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -94,54 +110,31 @@ class Config(RunOptions):
 
 
 def main(config: Config) -> dict[str, Any]:
-    """Reads, starts, fits, refines, keeps the best candidate, writes; returns the content of `metrics.json`."""
+    """Reads, registers, measures, writes; returns the content of `metrics.json`."""
     started = time.perf_counter()
-    by_scans = config.init in shared.STARTS_FROM_SCANS
-    log = choose_scans(read_scans(config), is_ordered=config.ordered, by_scans=by_scans)
-    sequence = log.registered
-    planar = registration.planar_scans(sequence.points, sequence.mask, is_ordered=config.ordered)
-    task = Task(sequence, planar, is_ordered=config.ordered, seed=config.seed)
-    start_name, start = starting_poses(config, task, log)
-    measure = measures_of(config, log)
-    measured_before = measure(log.between(start), "_initial")
-    settings = fit_settings(config, sequence)
+    sequence = read_scans(config)
+    start = starting_poses(config, sequence)
+    measure = measures_of(config, sequence)
     folder = open_run_folder(config, NAME)
     with recording(folder), StopFlag() as stop:
-        print(f"{sequence.name}: {log.title}, from {start_name}")
-        run = _fit(folder, task, settings, start, config, stop)
-        candidates = {start_name: start, shared.DEEPMAPPING: run.fitted.poses}
-        if config.refine and not stop.is_requested:
-            candidates |= shared.refined_candidates(task, candidates, config.init)
-        kept, compared = shared.choose(task, candidates)
-        assessment = shared.assess(task, candidates[kept])
-        has_other = config.init == "auto" and config.refine and sequence.odometry_poses is not None
-        if has_other and not assessment["is_trusted"] and not stop.is_requested:
-            print("The map from odometry cannot be trusted: the scans are registered without it, too ...", flush=True)
-            candidates |= shared.refined_icp(task)
-            kept, compared = shared.choose(task, candidates)
-            assessment = shared.assess(task, candidates[kept])
-        trajectory = log.aligned(candidates[kept])
+        print(f"{sequence.name}: {len(sequence)} scans of {sequence.points.shape[1]} beams")
+        fit = _Fit(folder, sequence, config, stop)
+        result = register(sequence, start, config, fit)
         metrics = {
-            "num_scans": len(log.whole),
-            "num_registered": len(sequence),
-            "steps": run.steps,
-            **before_and_after(sequence, start, candidates[kept]),
-            **measured_before,
-            **measure(trajectory, ""),
-            "start": start_name,
-            "kept": kept,
-            "candidates": compared,
-            "assessment": assessment,
-            "fit_s": run.run_s,
-            "compile_s": run.compile_s,
+            **numbers_of(sequence, result, config, measure),
+            "fit_s": fit.recorder.run_s,
+            "compile_s": fit.recorder.compile_s,
+            "steps": fit.recorder.steps,
             "peak_rss_gb": peak_rss_gb(),
             "is_interrupted": stop.is_requested,
         }
         # Numbers first: a picture that fails must not cost them.
-        write_trajectories(folder, log.whole, trajectory)
+        write_trajectories(folder, sequence, result.poses)
         write_metrics(folder, metrics | {"wall_s": time.perf_counter() - started}, seed=config.seed)
-        limits = draw_map(folder, task, candidates, metrics)
-        draw_occupancy(folder, sequence, run, candidates[kept], limits)
+        registered = registered_scans(sequence, result)
+        limits = draw_map(folder, registered, result, metrics)
+        if fit.recorder.has_map:
+            draw_occupancy(folder, registered, result, limits)
         draw_loss(folder, sequence.unit)
         metrics["wall_s"] = time.perf_counter() - started
         write_metrics(folder, metrics, seed=config.seed)
@@ -151,34 +144,123 @@ def main(config: Config) -> dict[str, Any]:
     return metrics
 
 
-def _fit(
-    folder: RunFolder, task: Task, settings: DeepMappingConfig, start: Floats, config: Config, stop: StopFlag
-) -> FitRun:
-    """Fits the scans in an order in which neighbours are near each other."""
-    order = shared.in_fitting_order(task, start)
-    run = run_fit(
-        folder,
-        task.sequence.take(order),
-        settings,
-        start=None if config.init == "zero" else start[order],
-        seed=config.seed,
-        stop=lambda run_s: stop.is_requested or (config.seconds is not None and run_s >= config.seconds),
+class _Fit:
+    """The fit of some scans in a run folder, with history, checkpoints and a progress bar; it can be stopped.
+
+    Attributes:
+        recorder: the engine of the fit; made by the call.
+    """
+
+    recorder: FitRecorder
+
+    def __init__(self, folder: RunFolder, sequence: ScanSequence, config: Config, stop: StopFlag) -> None:
+        self._folder, self._sequence, self._config, self.stop = folder, sequence, config, stop
+
+    def __call__(self, rows: NDArray[np.integer], start: Floats | None) -> Fitted:
+        """Fits the scans of these rows, in this order."""
+        import jax
+
+        from dpmjax.geometry import typical_range
+
+        sequence, seconds = self._sequence.take(rows), self._config.seconds
+        if len(rows) < len(self._sequence):
+            print(f"{len(rows)} of the scans are registered, chosen by their motion")
+        self.recorder = FitRecorder(
+            self._folder,
+            ate_of(sequence, typical_range(sequence.points, sequence.mask)),
+            sequence.unit,
+            stop=lambda run_s: self.stop.is_requested or (seconds is not None and run_s >= seconds),
+        )
+        return deepmapping.fit_deepmapping(
+            as_scan_set(sequence),
+            fit_settings(self._config, sequence),
+            key=jax.random.key(self._config.seed),
+            start=start,
+            engine=self.recorder,
+        )
+
+
+def register(sequence: ScanSequence, start: str | Floats, config: Config, fit: _Fit) -> RegisteredScans:
+    """Registers the scans; prints each stage where it begins."""
+    import jax
+
+    def show(stage: str, share: float) -> None:
+        if share == 0.0:
+            print(f"{stage} ...", flush=True)
+
+    return registration.register_scans(
+        as_scan_set(sequence),
+        registration_settings(config, sequence),
+        key=jax.random.key(config.seed),
+        start=start,
+        odometry=sequence.odometry_poses if config.ordered else None,
+        hooks=registration.RegistrationHooks(show, lambda: fit.stop.is_requested, fit),
     )
-    return run._replace(fitted=run.fitted._replace(poses=run.fitted.poses[np.argsort(order)]))
 
 
-def measures_of(config: Config, log: Recording) -> Callable[[Floats, str], dict[str, float]]:
-    """Reads what the result is measured by, beside its own reference; returns the numbers of poses of all scans."""
+def as_scan_set(sequence: ScanSequence) -> ScanSet:
+    """Returns the scans without their name, unit and poses."""
+    import jax.numpy as jnp
+
+    from dpmjax.types import ScanSet
+
+    return ScanSet(jnp.asarray(sequence.points), jnp.asarray(sequence.mask))
+
+
+def registered_scans(sequence: ScanSequence, result: RegisteredScans) -> ScanSequence:
+    """Returns the scans that were registered."""
+    chosen = result.recording.chosen
+    return sequence if len(chosen) == len(sequence) else sequence.take(chosen)
+
+
+def numbers_of(
+    sequence: ScanSequence,
+    result: RegisteredScans,
+    config: Config,
+    measure: Callable[[Floats, str], dict[str, float]],
+) -> dict[str, Any]:
+    """Returns the numbers of a registration under the names of `metrics.json`; given poses are named by their file."""
+    registered = registered_scans(sequence, result)
+    start, kept = (result.candidates[name].poses for name in (result.start, result.kept))
+
+    def title(name: str) -> str:
+        return name.replace(registration.GIVEN_POSES, f"poses of {Path(config.init).name}")
+
+    return {
+        "num_scans": len(sequence),
+        "num_registered": len(registered),
+        **before_and_after(registered, start, kept),
+        **measure(result.recording.between(start), "_initial"),
+        **measure(result.poses, ""),
+        "start": title(result.start),
+        "kept": title(result.kept),
+        "candidates": {
+            title(name): planar_errors(registered, candidate.poses) | candidate.score._asdict()
+            for name, candidate in result.candidates.items()
+        },
+        "assessment": result.assessment._asdict(),
+    }
+
+
+def measures_of(config: Config, sequence: ScanSequence) -> Callable[[Floats, str], dict[str, float]]:
+    """Reads what the result is measured by, beside its own reference; returns the numbers of poses of all scans.
+
+    A `ValueError` names a file that does not belong to the scans.
+    """
     relations = None if config.relations is None else io.read_relations(config.relations)
     corrected = None if config.corrected is None else io.read_sequence(config.corrected)
     if relations is None and corrected is None:
         return lambda _poses, _suffix: {}
-    times = log.times()
+    times = sequence.times
+    if times is None:
+        raise ValueError(f"{sequence.name}: its scans have no times, which relations and a corrected log need")
 
     def measure(poses: Floats, suffix: str) -> dict[str, float]:
         by_relations = {} if relations is None else relation_numbers(times, poses, relations, suffix)
         return by_relations | ({} if corrected is None else corrected_numbers(times, poses, corrected, suffix))
 
+    # Files of another drive are refused before any long work.
+    measure(np.zeros((len(sequence), 3)), "")
     return measure
 
 
@@ -193,51 +275,37 @@ def read_scans(config: Config) -> ScanSequence:
     return sequence.take(slice(config.start, stop, config.jump))
 
 
-def starting_poses(config: Config, task: Task, log: Recording) -> tuple[str, Floats]:
-    """Returns the name of the start and its (n, 3) poses; other words than those of `START_NAMES` name a file."""
-    sequence, init = task.sequence, config.init
-    if init == "auto":
-        init = "icp-plane" if sequence.odometry_poses is None else "odometry"
-    name = shared.START_NAMES.get(init, f"poses of {Path(init).name}")
-    match init:
-        case "zero":
-            return name, np.zeros((len(sequence), 3))
-        case "global":
-            return name, shared.search(task)
-        case "icp-plane" | "icp-point":
-            return name, shared.incremental(task, "plane" if init == "icp-plane" else "point")
-        case "odometry" if sequence.odometry_poses is None:
-            raise ValueError(
-                f"{sequence.name}: has no odometry of its own (its odometry column repeats the corrected pose, or is "
-                "missing); use --init icp-plane"
-            )
-        case "odometry":
-            return name, sequence.odometry_poses
-        case _ if not Path(init).exists():
-            raise ValueError(f"--init {init}: no such file, and none of auto, {', '.join(shared.START_NAMES)}")
-    return name, io.read_planar_poses(init, len(log.whole), sequence.unit)[log.chosen]
+def starting_poses(config: Config, sequence: ScanSequence) -> Any:
+    """Returns the word of a start, or the poses of the file that `--init` names, for all scans."""
+    init = config.init
+    if init == "odometry" and sequence.odometry_poses is None:
+        raise ValueError(
+            f"{sequence.name}: has no odometry of its own (its odometry column repeats the corrected pose, or is "
+            "missing); use --init icp-plane"
+        )
+    words = ("auto", *registration.START_NAMES)
+    if init in words:
+        return init
+    if not Path(init).exists():
+        raise ValueError(f"--init {init}: no such file, and none of {', '.join(words)}")
+    return io.read_planar_poses(init, len(sequence), sequence.unit)
+
+
+def registration_settings(config: Config, sequence: ScanSequence) -> RegistrationConfig:
+    """Returns the settings of the registration; scans in metres are chosen by their motion."""
+    return registration.RegistrationConfig(
+        is_ordered=config.ordered,
+        refine=config.refine,
+        fit=fit_settings(config, sequence),
+        min_distance=_MIN_DISTANCE_M if sequence.unit == "m" else None,
+        min_turn=_MIN_TURN_RAD,
+    )
 
 
 def fit_settings(config: Config, sequence: ScanSequence) -> DeepMappingConfig:
     """Returns the preset, with the given number of steps."""
     settings = deepmapping.preset(config.preset, is_organised=sequence.is_organised)
     return settings if config.steps is None else deepmapping.with_steps(settings, config.steps)
-
-
-def before_and_after(sequence: ScanSequence, start: Floats, poses: Floats) -> dict[str, Any]:
-    """Returns errors of the kept poses and of the start; `success` is None where there is no reference."""
-    reference, unit = sequence.reference_poses, sequence.unit
-    if reference is None:
-        return {"success": None}
-    after, before = shared.errors(sequence, poses), shared.errors(sequence, start)
-    # The paper's threshold is 20 pixels, 2 % of its world; of a real place, 2 % of what its trajectory spans.
-    threshold = 20.0 if unit == "px" else 0.02 * float(np.linalg.norm(np.ptp(reference[:, :2], axis=0)))
-    return {
-        **after,
-        **{name.replace(f"_{unit}", f"_initial_{unit}"): value for name, value in before.items()},
-        f"success_threshold_{unit}": threshold,
-        "success": after[f"ate_{unit}"] < threshold,
-    }
 
 
 def write_trajectories(folder: RunFolder, sequence: ScanSequence, poses: Floats) -> None:
@@ -247,59 +315,35 @@ def write_trajectories(folder: RunFolder, sequence: ScanSequence, poses: Floats)
     io.write_kitti(folder / "trajectory_kitti.txt", poses)
 
 
-def draw_map(folder: RunFolder, task: Task, candidates: Candidates, metrics: Mapping[str, Any]) -> viz.Limits:
+def draw_map(
+    folder: RunFolder, registered: ScanSequence, result: RegisteredScans, metrics: Mapping[str, Any]
+) -> viz.Limits:
     """Draws map.png: the start, DeepMapping, the kept candidate, the reference; returns its limits."""
-    scans, unit, kept = task.scans, task.sequence.unit, metrics["kept"]
+    scans, unit = as_scan_set(registered), registered.unit
     panels = []
-    for name in dict.fromkeys((metrics["start"], shared.DEEPMAPPING, kept)):
-        numbers = metrics["candidates"][name]
+    titles = dict(zip(result.candidates, metrics["candidates"], strict=True))
+    for name in dict.fromkeys((result.start, registration.DEEPMAPPING, result.kept)):
+        title, numbers = titles[name], metrics["candidates"][titles[name]]
         ate, distance = numbers.get(f"ate_{unit}"), numbers.get(f"point_distance_{unit}")
-        title = name[0].upper() + name[1:] + (" (kept)" if name == kept else "")
-        panels.append(viz.Panel(title, scans, candidates[name], ate=ate, point_distance=distance))
-    if task.sequence.reference_poses is None:
+        title = title[0].upper() + title[1:] + (" (kept)" if name == result.kept else "")
+        panels.append(viz.Panel(title, scans, result.candidates[name].poses, ate=ate, point_distance=distance))
+    if registered.reference_poses is None:
         panels = [replace(panel, is_reference=panel.title.endswith(" (kept)")) for panel in panels]
     else:
-        panels.append(viz.Panel("Reference", scans, task.sequence.reference_poses, is_reference=True))
+        panels.append(viz.Panel("Reference", scans, registered.reference_poses, is_reference=True))
     figure = viz.registered_scans_figure(panels, unit)
     viz.save_figure(figure, folder / "map.png")
     return viz.Limits(*figure.axes[0].get_xlim(), *figure.axes[0].get_ylim())
 
 
-def draw_occupancy(folder: RunFolder, sequence: ScanSequence, run: FitRun, kept: Floats, limits: viz.Limits) -> None:
+def draw_occupancy(folder: RunFolder, registered: ScanSequence, result: RegisteredScans, limits: viz.Limits) -> None:
     """Draws occupancy.png: what M-Net learned, in the frame and within the limits of map.png."""
-    if not run.has_map:
-        return
-    picture = deepmapping.draw_map(run.fitted, sequence.points, sequence.mask)
-    anchor = kept if sequence.reference_poses is None else sequence.reference_poses
-    trajectory = run.fitted.poses[:, :2]
+    picture = deepmapping.draw_map(result.fitted, registered.points, registered.mask)
+    kept, reference = result.candidates[result.kept].poses, registered.reference_poses
+    anchor, trajectory = kept if reference is None else reference, result.fitted.poses[:, :2]
     T_view_fit = trajectory_metrics.align_rigid(trajectory, anchor[:, :2])
-    figure = viz.occupancy_figure(picture, trajectory, sequence.unit, T_view_world=T_view_fit, limits=limits)
+    figure = viz.occupancy_figure(picture, trajectory, registered.unit, T_view_world=T_view_fit, limits=limits)
     viz.save_figure(figure, folder / "occupancy.png")
-
-
-def report(unit: str, metrics: Mapping[str, Any]) -> str:
-    """Returns the last lines on the console: errors and scores of each candidate, assessment of the kept one."""
-    candidates, assessment = metrics["candidates"], metrics["assessment"]
-    width = max(map(len, candidates))
-    lines = [f"  {'candidate':{width}}  {'ATE, ' + unit:>10}  nats a beam  beams off a surface"]
-    for name, numbers in candidates.items():
-        mark, ate = "*" if name == metrics["kept"] else " ", numbers.get(f"ate_{unit}", math.nan)
-        lines.append(f"{mark} {name:{width}}  {ate:10.3g}  {numbers['code_length']:11.3f}  {numbers['misfit']:19.1%}")
-    trust = "can be trusted" if assessment["is_trusted"] else "DO NOT TRUST this map"
-    weakest, contradiction = assessment["weakest_connection"], assessment["contradiction"]
-    lines += [
-        f"kept: {metrics['kept']} (chosen by the scans alone)",
-        f"{trust}: weakest connection {weakest:.2f}, {contradiction:.1%} of the beams contradict beyond the usual",
-    ]
-    if "num_relations" in metrics:
-        kinds = (f"{metrics[f'relations_initial_{kind}']:.3g} -> {metrics[f'relations_{kind}']:.3g}" for kind in UNITS)
-        lines.append(f"mean error of {metrics['num_relations']} hand-checked relations: {' m, '.join(kinds)} degrees")
-    if "num_corrected" in metrics:
-        before, after = metrics["ate_corrected_initial_m"], metrics["ate_corrected_m"]
-        lines.append(f"ATE at {metrics['num_corrected']} scans of the corrected log: {before:.3g} -> {after:.3g} m")
-        errors = metrics["relations_corrected_m"], metrics["relations_corrected_deg"]
-        lines.append("mean error from each of these scans to the next: {:.3g} m, {:.3g} degrees".format(*errors))
-    return "\n".join(lines)
 
 
 def run(args: Sequence[str] | None = None) -> int:

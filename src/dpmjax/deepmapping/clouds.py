@@ -1,11 +1,11 @@
-"""DeepMapping of 3-D lidar clouds: the problem, and `fit_clouds` around the engine (sections 3.2 to 3.4, in SE(3)).
+"""DeepMapping of 3-D lidar clouds: the problem, and `register_clouds` around the engine (section 3, in SE(3)).
 
 `spatial` has the poses, `cloud_scans` the scans, `plane_distance` how they are compared.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Literal, NamedTuple
 
@@ -19,7 +19,7 @@ from dpmjax.deepmapping.batches import draw_offsets, draw_rows, scans_in_block
 from dpmjax.deepmapping.cloud_config import CloudMappingConfig
 from dpmjax.deepmapping.cloud_scans import CloudScans, as_cloud_scans, find_partners
 from dpmjax.deepmapping.config import PhaseConfig
-from dpmjax.deepmapping.fit import Fit, Report, fit
+from dpmjax.deepmapping.engine import Fit, Report, fit
 from dpmjax.deepmapping.objective import Terms, WorldBatch, chamfer_term, interpolate_log
 from dpmjax.deepmapping.plane_distance import Cloud, clouds_of, misfit_of_pairs, take_rows, trajectory_misfit
 from dpmjax.deepmapping.problem import MappingData, MappingFunctions, Params, Problem, mapping_loss, mapping_problem
@@ -39,7 +39,7 @@ _JUDGED_WIDTH = 0.004
 
 
 class CloudFitted(NamedTuple):
-    """Result of `fit_clouds`.
+    """Result of `register_clouds`.
 
     Attributes:
         T_world_scan: (n, 4, 4) float64, unit of the points: of the fit, or the start where that fits better.
@@ -61,28 +61,28 @@ class CloudFitted(NamedTuple):
 
 
 def cloud_data(
-    scans: CloudScans | Sequence[ArrayLike], init: ArrayLike | None = None, *, num_points: int = 2048
+    scans: CloudScans | Sequence[ArrayLike], start: ArrayLike | None = None, *, num_points: int = 2048
 ) -> tuple[MappingData, float]:
     """Scans and poses with the typical range of the scans as the unit of length, as the problem takes them.
 
     Args:
         scans: (m_i, 3) points in the lidar frames; or CloudScans.
-        init: (n, 4, 4) T_world_scan to start from; None: cold start.
+        start: (n, 4, 4) T_world_scan to start from; None: cold start.
         num_points: capacity of each scan where they are thinned.
 
     Returns:
         The data, and the typical range in the unit of the scans.
 
     Raises:
-        ValueError: as `as_cloud_scans`, or `init` has a wrong shape or is not finite.
+        ValueError: as `as_cloud_scans`, or `start` has a wrong shape or is not finite.
     """
     scans = scans if isinstance(scans, CloudScans) else as_cloud_scans(scans, num_points)
     unit = typical_range(scans.points, scans.mask)
-    start = None if init is None else start_poses(init, len(scans.points), unit)
+    T_start = None if start is None else start_poses(start, len(scans.points), unit)
     scaled = replace(scans, points=scans.points / unit, spacing=scans.spacing / unit)
-    if start is not None:
-        scaled = replace(scaled, partners=find_partners(np.asarray(start), 1.0))
-    return MappingData(scaled, start), unit
+    if T_start is not None:
+        scaled = replace(scaled, partners=find_partners(np.asarray(T_start), 1.0))
+    return MappingData(scaled, T_start), unit
 
 
 def cloud_problem(config: CloudMappingConfig, data: MappingData) -> Problem:
@@ -98,13 +98,14 @@ def cloud_problem(config: CloudMappingConfig, data: MappingData) -> Problem:
     return mapping_problem(config, data, MappingFunctions(init_spatial, _loss, spatial_poses, next_spatial_phase))
 
 
-def fit_clouds(
+def register_clouds(
     scans: CloudScans | Sequence[ArrayLike],
     config: CloudMappingConfig | None = None,
     *,
     key: jax.Array,
-    init: ArrayLike | None = None,
+    start: ArrayLike | None = None,
     num_starts: int = 1,
+    engine: Callable[..., Fit] = fit,
 ) -> CloudFitted:
     """Registers 3-D lidar scans by optimising L-Net and M-Net on them alone (DeepMapping eq. 6, in SE(3)).
 
@@ -112,18 +113,20 @@ def fit_clouds(
         scans: (m_i, 3) points in the lidar frames, any unit, in the order of time; or CloudScans.
         config: settings; None: `cloud_preset("fast")`.
         key: of the whole run.
-        init: (n, 4, 4) T_world_scan to start from; None: cold start.
+        start: (n, 4, 4) T_world_scan to start from; None: cold start.
         num_starts: starts with other weights, side by side; the worse half by the loss is dropped again and again.
+        engine: what trains, called as `engine(problem, data, key=key, num_starts=num_starts)`;
+            `functools.partial(fit, on_report=..., stop=...)` reports each call of the step and can be stopped.
 
     Returns:
-        CloudFitted, in the world of `init`, or an arbitrary one after a cold start.
+        CloudFitted, in the world of `start`, or an arbitrary one after a cold start.
 
     Raises:
         ValueError: as `cloud_data`.
     """
     config = config or CloudMappingConfig()
-    data, unit = cloud_data(scans, init, num_points=config.num_points)
-    return as_fitted(fit(cloud_problem(config, data), data, key=key, num_starts=num_starts), data, unit)
+    data, unit = cloud_data(scans, start, num_points=config.num_points)
+    return as_fitted(engine(cloud_problem(config, data), data, key=key, num_starts=num_starts), data, unit)
 
 
 def as_fitted(done: Fit, data: MappingData, unit: float) -> CloudFitted:

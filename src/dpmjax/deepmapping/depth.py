@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -17,7 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from dpmjax.deepmapping.batches import draw_offsets
 from dpmjax.deepmapping.config import PhaseConfig
 from dpmjax.deepmapping.depth_config import DepthMappingConfig
-from dpmjax.deepmapping.fit import Report, fit
+from dpmjax.deepmapping.engine import Fit, Report, fit
 from dpmjax.deepmapping.objective import Terms, WorldBatch, chamfer_term, interpolate_log
 from dpmjax.deepmapping.problem import (
     MappingData,
@@ -87,8 +88,9 @@ def fit_depth(
     config: DepthMappingConfig | None = None,
     *,
     key: jax.Array,
-    init: ArrayLike | None = None,
+    start: ArrayLike | None = None,
     num_starts: int = 1,
+    engine: Callable[..., Fit] = fit,
 ) -> DepthFitted:
     """Registers depth images by optimising L-Net and M-Net on them alone (DeepMapping section 4.2).
 
@@ -96,21 +98,23 @@ def fit_depth(
         scans: (n, h, w, 3) in the camera frames, any unit, or DepthScans with their mask.
         config: settings; None: `depth_preset("fast")`.
         key: of the whole run.
-        init: (n, 4, 4) T_world_camera to start from; None: cold start.
+        start: (n, 4, 4) T_world_camera to start from; None: cold start.
         num_starts: starts with other weights, side by side; the worse half by the loss is dropped again and again.
+        engine: what trains, called as `engine(problem, data, key=key, num_starts=num_starts)`;
+            `functools.partial(fit, on_report=..., stop=...)` reports each call of the step and can be stopped.
 
     Returns:
-        DepthFitted, in the world of `init`, or an arbitrary one after a cold start.
+        DepthFitted, in the world of `start`, or an arbitrary one after a cold start.
 
     Raises:
-        ValueError: as `as_depth_scans`, or `init` has a wrong shape or is not finite.
+        ValueError: as `as_depth_scans`, or `start` has a wrong shape or is not finite.
     """
     config = config or DepthMappingConfig()
     scans = scans if isinstance(scans, DepthScans) else as_depth_scans(scans)
     unit = typical_range(scans.points, scans.mask)
-    start = None if init is None else start_poses(init, len(scans.points), unit)
-    data = MappingData(replace(scans, points=scans.points / unit), start)
-    fitted = fit(depth_problem(config, data), data, key=key, num_starts=num_starts)
+    T_start = None if start is None else start_poses(start, len(scans.points), unit)
+    data = MappingData(replace(scans, points=scans.points / unit), T_start)
+    fitted = engine(depth_problem(config, data), data, key=key, num_starts=num_starts)
     return DepthFitted(fitted_poses(fitted.poses, unit), fitted.state.params, fitted.report, unit)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple
@@ -12,9 +13,10 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 from numpy.typing import ArrayLike, NDArray
 
+from dpmjax.checks import as_beams
 from dpmjax.deepmapping.batches import draw_offsets, draw_rows, scans_in_block
 from dpmjax.deepmapping.config import DeepMappingConfig, PhaseConfig
-from dpmjax.deepmapping.fit import Fit, Report, fit
+from dpmjax.deepmapping.engine import Fit, Report, fit
 from dpmjax.deepmapping.objective import Terms, WorldBatch, chamfer_term, interpolate_log
 from dpmjax.deepmapping.problem import (
     MapFrame,
@@ -72,30 +74,21 @@ def as_scan_set(scans: ScanSet | ArrayLike, *, min_scans: int = 2) -> ScanSet:
         ValueError: the shape is not (n, b, 2), there are too few scans, a scan has no valid beam, or what the
             mask of a ScanSet calls valid is not finite.
     """
-    if not isinstance(scans, ScanSet):
-        points = np.asarray(scans, np.float32)
-        if points.ndim != 3 or points.shape[-1] != 2:
-            raise ValueError(f"scans: expected shape (n, b, 2), got {points.shape}")
-        is_hit = np.isfinite(points).all(-1) & (np.abs(points).sum(-1) > 0)
-        scans = ScanSet(points=jnp.asarray(np.where(is_hit[..., None], points, 0.0)), mask=jnp.asarray(is_hit))
-    if scans.points.shape[0] < min_scans:
-        raise ValueError(f"scans: expected at least {min_scans}, got {scans.points.shape[0]}")
-    empty = np.flatnonzero(~np.asarray(scans.mask).any(-1))
+    beams = as_beams("scans", scans)
+    if beams.points.shape[0] < min_scans:
+        raise ValueError(f"scans: expected at least {min_scans}, got {beams.points.shape[0]}")
+    empty = np.flatnonzero(~np.asarray(beams.mask).any(-1))
     if len(empty):
         raise ValueError(f"scans: scan {empty[0]} has no valid beam; leave it out ({len(empty)} such scans)")
-    mask = jnp.asarray(scans.mask, bool)
-    clean = jnp.where(mask[..., None], jnp.asarray(scans.points, jnp.float32), 0.0)
-    if not bool(jnp.isfinite(clean).all()):
-        raise ValueError("scans: expected finite coordinates where the mask is True")
-    return ScanSet(points=clean, mask=mask)
+    return beams
 
 
-def planar_data(scans: ScanSet | ArrayLike, init: ArrayLike | None = None) -> tuple[MappingData, float]:
+def planar_data(scans: ScanSet | ArrayLike, start: ArrayLike | None = None) -> tuple[MappingData, float]:
     """Checked scans and poses with the typical range of the scans as the unit of length, as the problem takes them.
 
     Args:
         scans: as `as_scan_set`.
-        init: (n, 3) x, y, heading or (n, 3, 3) matrices to start from; None: cold start.
+        start: (n, 3) x, y, heading or (n, 3, 3) matrices to start from; None: cold start.
 
     Returns:
         The data, and the typical range in the unit of the scans.
@@ -106,14 +99,9 @@ def planar_data(scans: ScanSet | ArrayLike, init: ArrayLike | None = None) -> tu
     checked = as_scan_set(scans)
     unit, count = typical_range(checked.points, checked.mask), len(checked.points)
     scaled = replace(checked, points=checked.points / unit)
-    if init is None:
+    if start is None:
         return MappingData(scaled), unit
-    given = np.asarray(init, np.float64)
-    if not np.isfinite(given).all():
-        raise ValueError("init: expected finite poses")
-    if given.shape not in ((count, 3), (count, 3, 3)):
-        raise ValueError(f"init: expected shape ({count}, 3) or ({count}, 3, 3), got {given.shape}")
-    poses = given if given.ndim == 2 else se2.from_matrix(given)
+    poses = se2.as_poses("start", start, count)
     return MappingData(scaled, jnp.asarray(poses / [unit, unit, 1.0], jnp.float32)), unit
 
 
@@ -135,8 +123,9 @@ def fit_deepmapping(
     config: DeepMappingConfig | None = None,
     *,
     key: jax.Array,
-    init: ArrayLike | None = None,
+    start: ArrayLike | None = None,
     num_starts: int = 1,
+    engine: Callable[..., Fit] = fit,
 ) -> Fitted:
     """Registers planar scans by optimising L-Net and M-Net on them alone (DeepMapping eq. 6).
 
@@ -144,19 +133,21 @@ def fit_deepmapping(
         scans: (n, b, 2) in the sensor frames, any unit; all-zero or non-finite beams are left out. Or a ScanSet.
         config: settings; None: `preset("fast")`.
         key: of the whole run.
-        init: (n, 3) x, y, heading or (n, 3, 3) matrices to start from; None: cold start from zero.
+        start: (n, 3) x, y, heading or (n, 3, 3) matrices to start from; None: cold start from zero.
         num_starts: starts with other weights, side by side; the worse half by the loss is dropped again and again.
+        engine: what trains, called as `engine(problem, data, key=key, num_starts=num_starts)`;
+            `functools.partial(fit, on_report=..., stop=...)` reports each call of the step and can be stopped.
 
     Returns:
-        Fitted, poses in the unit of the points. The world is that of `init`, or arbitrary after a cold start.
+        Fitted, poses in the unit of the points. The world is that of `start`, or arbitrary after a cold start.
 
     Raises:
         ValueError: the scans or the poses have a wrong shape or are not finite, a scan has no valid beam, or there is
             no start.
     """
     config = config or DeepMappingConfig()
-    data, unit = planar_data(scans, init)
-    return as_fitted(fit(planar_problem(config, data), data, key=key, num_starts=num_starts), unit, config)
+    data, unit = planar_data(scans, start)
+    return as_fitted(engine(planar_problem(config, data), data, key=key, num_starts=num_starts), unit, config)
 
 
 def as_fitted(done: Fit, unit: float, config: DeepMappingConfig) -> Fitted:

@@ -66,7 +66,7 @@ def start_poses(poses: ArrayLike, num_scans: int, unit: float) -> Float[Array, "
     """
     T = np.array(poses, np.float64)
     if T.shape != (num_scans, 4, 4) or not np.isfinite(T).all():
-        raise ValueError(f"init: expected finite numbers of shape ({num_scans}, 4, 4), got {T.shape}")
+        raise ValueError(f"start: expected finite numbers of shape ({num_scans}, 4, 4), got {T.shape}")
     T[:, :3, 3] /= unit
     return jnp.asarray(T, jnp.float32)
 

@@ -20,6 +20,7 @@ from dpmjax.geometry import rigid
 from dpmjax.geometry.alignment import weighted_svd
 from dpmjax.geometry.bearing import directions_of, turned_directions
 from dpmjax.geometry.consensus import ConsensusConfig, find_consensus, motion_support
+from dpmjax.geometry.namespace import safe_sqrt
 from dpmjax.types import AnyArray, DescriptorCloud, Registration
 
 PredictOffsets = Callable[[Int[Array, " k"], Int[Array, " k"]], tuple[Float[Array, "k 3"], Float[Array, "k 3"]]]
@@ -234,7 +235,7 @@ def _align(
             T_target_source=T_target_source,
             confidence=mean_score,
             mean_score=mean_score,
-            rmse_m=jnp.where(is_determined, _sqrt(squared), jnp.inf),
+            rmse_m=jnp.where(is_determined, safe_sqrt(squared), jnp.inf),
             support=support,
             num_inliers=num_inliers,
             source_indices=rows[0],
@@ -249,11 +250,6 @@ def _align(
 def _num_distinct(rows: Int[Array, " p"], mask: Bool[Array, " p"]) -> Int[Array, ""]:
     ordered = jnp.sort(jnp.where(mask, rows, -1))
     return jnp.sum(jnp.diff(ordered, prepend=-1) > 0)
-
-
-def _sqrt(squared: Float[Array, "*p"]) -> Float[Array, "*p"]:
-    # The derivative at 0 is 0 instead of infinite.
-    return jnp.where(squared > 0, jnp.sqrt(jnp.where(squared > 0, squared, 1)), 0)
 
 
 class _PointPairs(NamedTuple):
@@ -296,7 +292,7 @@ def _choose_inliers(pairs: _PointPairs, first: Bool[Array, " p"], config: MatchC
 def _solve(pairs: _PointPairs, is_inlier: Bool[Array, " p"]) -> tuple[Float[Array, "4 4"], Float[Array, " p"]]:
     T_target_source = weighted_svd(pairs.source, pairs.target, jnp.where(is_inlier, pairs.scores, 0))
     squared = jnp.sum((rigid.transform_points(T_target_source, pairs.source) - pairs.target) ** 2, axis=1)
-    return T_target_source, _sqrt(squared)
+    return T_target_source, safe_sqrt(squared)
 
 
 @jax.jit

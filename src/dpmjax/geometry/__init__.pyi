@@ -1,3 +1,5 @@
+from . import rigid as rigid
+from . import se2 as se2
 from .alignment import weighted_svd as weighted_svd
 from .consensus import Consensus as Consensus
 from .consensus import ConsensusConfig as ConsensusConfig
@@ -12,5 +14,6 @@ from .pyramid import PyramidStage as PyramidStage
 from .pyramid import build_pyramid as build_pyramid
 from .pyramid_host import build_pyramid_on_host as build_pyramid_on_host
 from .rays import sample_free_space as sample_free_space
+from .rays import typical_range as typical_range
 from .sampling import farthest_point_sample as farthest_point_sample
 from .sampling import voxel_sample as voxel_sample

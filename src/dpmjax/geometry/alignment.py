@@ -8,12 +8,17 @@ signed *sum* is zero, that is where R itself is ambiguous. So R carries a deriva
 
 from __future__ import annotations
 
+from types import ModuleType
+from typing import Any
+
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
 from dpmjax.checks import as_float, as_points, require_shape
+from dpmjax.geometry.namespace import matmul, namespace_of
 from dpmjax.types import AnyArray
 
 DEGENERATE_IN_EPS = 32
@@ -46,72 +51,91 @@ def weighted_svd(
     target, weights = as_points("target", target), as_float("weights", weights)
     require_shape("target", target, source.shape)
     require_shape("weights", weights, source.shape[:1])
-    return _weighted_svd(source, target, weights)
+    return best_motion(source, target, weights)
 
 
-@jax.jit
-def _weighted_svd(source: jax.Array, target: jax.Array, weights: jax.Array) -> jax.Array:
-    dim = source.shape[1]
+def best_motion(source: Any, target: Any, weights: Any) -> Any:
+    """Computes what `weighted_svd` describes, of unchecked arrays of either kind.
+
+    Args:
+        source: (n, 2) or (n, 3), in the source frame.
+        target: the same number of points, in the target frame.
+        weights: (n,) of each pair.
+
+    Returns:
+        `T_target_source`, (d+1, d+1): of NumPy in the dtype of the points if all arrays are NumPy's, else of JAX.
+    """
+    xp = namespace_of(source, target, weights)
+    return (_motion if xp is np else _compiled_motion)(source, target, weights)
+
+
+def _motion(source: Any, target: Any, weights: Any) -> Any:
+    xp, dim = namespace_of(source, target, weights), source.shape[1]
     if source.shape[0] == 0:
-        return jnp.eye(dim + 1, dtype=source.dtype)
+        return xp.eye(dim + 1, dtype=source.dtype)
     is_used = weights > 0
     # Only ratios count: scaled by the largest, weights of any size are safe to square.
-    heaviest = lax.stop_gradient(jnp.max(jnp.where(is_used, weights, 0)))
-    weights = jnp.where(is_used, weights, 0) / jnp.where(heaviest > 0, heaviest, 1)
-    source, target = (jnp.where(is_used[:, None], points, 0) for points in (source, target))
-    mean_source, mean_target = _weighted_mean(source, weights), _weighted_mean(target, weights)
-    centred_source = jnp.where(is_used[:, None], source - mean_source, 0)
-    centred_target = jnp.where(is_used[:, None], target - mean_target, 0)
-    covariance = jnp.einsum("n,ni,nj->ij", weights, centred_source, centred_target, precision=lax.Precision.HIGHEST)
-    R = _best_rotation_2d(covariance) if dim == 2 else _best_rotation_3d(covariance)
-    translation = mean_target - jnp.sum(R * mean_source, axis=1)
-    bottom = jnp.zeros((1, dim + 1), source.dtype).at[0, dim].set(1)
-    return jnp.concatenate([jnp.concatenate([R, translation[:, None]], axis=1), bottom])
+    heaviest = _constant(xp.max(xp.where(is_used, weights, 0)))
+    weights = xp.where(is_used, weights, 0) / xp.where(heaviest > 0, heaviest, 1)
+    source, target = (xp.where(is_used[:, None], points, 0) for points in (source, target))
+    mean_source, mean_target = (_weighted_mean(points, weights, xp) for points in (source, target))
+    centred_source = xp.where(is_used[:, None], source - mean_source, 0)
+    centred_target = xp.where(is_used[:, None], target - mean_target, 0)
+    H = _scaled(matmul((weights[:, None] * centred_source).T, centred_target), xp)
+    R = _best_rotation_2d(H, xp) if dim == 2 else _best_rotation_3d(H, xp)
+    translation = mean_target - xp.sum(R * mean_source, axis=1)
+    top = xp.concatenate([R, translation[:, None]], axis=1)
+    return xp.concatenate([top, xp.eye(dim + 1, dtype=source.dtype)[dim:]])
 
 
-def _weighted_mean(points: Float[Array, "n d"], weights: Float[Array, " n"]) -> Float[Array, " d"]:
+_compiled_motion = jax.jit(_motion)
+
+
+def _constant(value: Any) -> Any:
+    """Returns the value without its derivative."""
+    return lax.stop_gradient(value) if isinstance(value, jax.Array) else value
+
+
+def _weighted_mean(points: Any, weights: Any, xp: ModuleType) -> Any:
     # Relative to the heaviest point: a single pair then has exactly no spread, and no digit is lost far out.
-    anchor = lax.stop_gradient(points[jnp.argmax(weights)])
-    total = jnp.sum(weights)
-    return anchor + jnp.sum(weights[:, None] * (points - anchor), axis=0) / jnp.where(total > 0, total, 1)
+    anchor = _constant(points[xp.argmax(weights)])
+    total = xp.sum(weights)
+    return anchor + xp.sum(weights[:, None] * (points - anchor), axis=0) / xp.where(total > 0, total, 1)
 
 
-def _scaled(covariance: Float[Array, "d d"]) -> Float[Array, "d d"]:
+def _scaled(covariance: Any, xp: ModuleType) -> Any:
     """Returns the matrix with its largest entry at one: the rotation does not depend on the scale."""
-    largest = lax.stop_gradient(jnp.max(jnp.abs(covariance)))
-    return covariance / jnp.where(largest > 0, largest, 1)
+    largest = _constant(xp.max(xp.abs(covariance)))
+    return covariance / xp.where(largest > 0, largest, 1)
 
 
-def _degenerate_tolerance(dtype: jnp.dtype) -> float:
+def _degenerate_tolerance(dtype: Any) -> float:
     return DEGENERATE_IN_EPS * float(jnp.finfo(dtype).eps)
 
 
-def _best_rotation_2d(covariance: Float[Array, "2 2"]) -> Float[Array, "2 2"]:
-    H = _scaled(covariance)
+def _best_rotation_2d(H: Any, xp: ModuleType) -> Any:
     cos, sin = H[0, 0] + H[1, 1], H[0, 1] - H[1, 0]
     squared_length = cos**2 + sin**2
     is_open = squared_length <= _degenerate_tolerance(H.dtype) ** 2
-    length = jnp.sqrt(jnp.where(is_open, 1, squared_length))
-    cos, sin = jnp.where(is_open, 1, cos / length), jnp.where(is_open, 0, sin / length)
-    return jnp.stack([jnp.stack([cos, -sin]), jnp.stack([sin, cos])])
+    length = xp.sqrt(xp.where(is_open, 1, squared_length))
+    cos, sin = xp.where(is_open, 1, cos / length), xp.where(is_open, 0, sin / length)
+    return xp.stack([xp.stack([cos, -sin]), xp.stack([sin, cos])])
 
 
-def _best_rotation_3d(covariance: Float[Array, "3 3"]) -> Float[Array, "3 3"]:
-    H = _scaled(covariance)
+def _best_rotation_3d(H: Any, xp: ModuleType) -> Any:
     tolerance = _degenerate_tolerance(H.dtype)
     # The 2x2 minors measure the product of the two largest singular values: none left means rank one or zero.
-    minors = jnp.cross(H, jnp.roll(H, -1, axis=0))
-    is_rank_one = jnp.sum(minors**2) <= (tolerance / 4) ** 2
+    minors = xp.cross(H, xp.roll(H, -1, axis=0))
+    is_rank_one = xp.sum(minors**2) <= (tolerance / 4) ** 2
     # There, a small pull towards the identity settles what the data leave open.
-    return _nearest_rotation(jnp.where(is_rank_one, H + tolerance * jnp.eye(3, dtype=H.dtype), H))
+    H = xp.where(is_rank_one, H + tolerance * xp.eye(3, dtype=H.dtype), H)
+    return _nearest_rotation(H) if xp is jnp else _rotation_and_parts(H)[0]
 
 
 @jax.custom_jvp
 def _nearest_rotation(H: Float[Array, "3 3"]) -> Float[Array, "3 3"]:
     """Returns the rotation R that maximises trace(R H)."""
-    U, singular_values, V = _signed_svd(H)
-    del singular_values
-    return jnp.matmul(V, U.T, precision=lax.Precision.HIGHEST)
+    return _rotation_and_parts(H)[0]
 
 
 @_nearest_rotation.defjvp
@@ -119,8 +143,7 @@ def _nearest_rotation_jvp(primals: tuple[jax.Array], tangents: tuple[jax.Array])
     # R H stays symmetric as H moves. With dR = W R, W skew, that is W M + M W = (R dH)^T - R dH for M = R H, and in
     # the basis V, where M is diagonal: W_ij = (B_ji - B_ij) / (s_i + s_j) with B = V^T R dH V.
     (H,), (dH,) = primals, tangents
-    U, singular_values, V = _signed_svd(H)
-    R = jnp.matmul(V, U.T, precision=lax.Precision.HIGHEST)
+    R, U, singular_values, V = _rotation_and_parts(H)
     B = jnp.linalg.multi_dot([U.T, dH, V], precision=lax.Precision.HIGHEST)
     sums = singular_values[:, None] + singular_values[None, :]
     is_open = sums <= 4 * _degenerate_tolerance(H.dtype) * singular_values[0]
@@ -128,9 +151,11 @@ def _nearest_rotation_jvp(primals: tuple[jax.Array], tangents: tuple[jax.Array])
     return R, jnp.linalg.multi_dot([V, W, V.T, R], precision=lax.Precision.HIGHEST)
 
 
-def _signed_svd(H: Float[Array, "3 3"]) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Returns U, s, V with H = U diag(s) V^T and V U^T a rotation: the last singular value takes the sign of det H."""
-    U, singular_values, Vt = jnp.linalg.svd(H)
-    is_mirrored = jnp.linalg.det(U) * jnp.linalg.det(Vt) < 0
-    sign = jnp.where(is_mirrored, -1, 1).astype(H.dtype) * jnp.array([0, 0, 1], H.dtype) + jnp.array([1, 1, 0], H.dtype)
-    return U, singular_values * sign, Vt.T * sign
+def _rotation_and_parts(H: Any) -> tuple[Any, Any, Any, Any]:
+    """Returns R, U, s, V: H = U diag(s) V^T, R = V U^T a rotation, the last singular value with the sign of det H."""
+    xp = namespace_of(H)
+    U, singular_values, Vt = xp.linalg.svd(H)
+    is_mirrored = xp.linalg.det(U) * xp.linalg.det(Vt) < 0
+    sign = xp.where(is_mirrored, xp.array([1, 1, -1], H.dtype), xp.ones(3, H.dtype))
+    V = Vt.T * sign
+    return matmul(V, U.T), U, singular_values * sign, V

@@ -6,9 +6,9 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float
 
+from dpmjax.geometry.namespace import namespace_of
 from dpmjax.types import AnyArray
 
 
@@ -21,7 +21,7 @@ def inverse(T_a_b: Any) -> Any:
     Returns:
         `T_b_a`, of the same kind and shape.
     """
-    xp = jnp if isinstance(T_a_b, jax.Array) else np
+    xp = namespace_of(T_a_b)
     dim = T_a_b.shape[-1] - 1
     R_b_a = xp.swapaxes(T_a_b[..., :dim, :dim], -1, -2)
     translation = -xp.sum(R_b_a * T_a_b[..., None, :dim, dim], axis=-1)

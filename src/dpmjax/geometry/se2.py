@@ -6,7 +6,6 @@ with any leading axes, and returns the same kind and dtype. Lengths keep their u
 
 from __future__ import annotations
 
-from types import ModuleType
 from typing import Any
 
 import jax
@@ -16,14 +15,10 @@ import numpy as np
 from jaxtyping import Array, Float
 from numpy.typing import NDArray
 
+from dpmjax.geometry.namespace import namespace_of
 from dpmjax.types import AnyArray
 
 Poses = NDArray[np.float64]
-
-
-def _namespace(*arrays: Any) -> ModuleType:
-    """Returns `jax.numpy` as soon as one array is JAX's, else `numpy`."""
-    return jnp if any(isinstance(array, jax.Array) for array in arrays) else np
 
 
 def wrap_angle(angle: Any) -> Any:
@@ -35,7 +30,7 @@ def wrap_angle(angle: Any) -> Any:
     Returns:
         The same angles in [-pi, pi].
     """
-    return angle - 2 * np.pi * _namespace(angle).round(angle / (2 * np.pi))
+    return angle - 2 * np.pi * namespace_of(angle).round(angle / (2 * np.pi))
 
 
 def compose(pose_a_b: Any, pose_b_c: Any) -> Any:
@@ -48,7 +43,7 @@ def compose(pose_a_b: Any, pose_b_c: Any) -> Any:
     Returns:
         (..., 3) pose of c in a.
     """
-    xp = _namespace(pose_a_b, pose_b_c)
+    xp = namespace_of(pose_a_b, pose_b_c)
     cos, sin = xp.cos(pose_a_b[..., 2]), xp.sin(pose_a_b[..., 2])
     x = pose_a_b[..., 0] + cos * pose_b_c[..., 0] - sin * pose_b_c[..., 1]
     y = pose_a_b[..., 1] + sin * pose_b_c[..., 0] + cos * pose_b_c[..., 1]
@@ -64,7 +59,7 @@ def inverse(pose_a_b: Any) -> Any:
     Returns:
         (..., 3) pose of a in b.
     """
-    xp = _namespace(pose_a_b)
+    xp = namespace_of(pose_a_b)
     x, y, heading = pose_a_b[..., 0], pose_a_b[..., 1], pose_a_b[..., 2]
     cos, sin = xp.cos(heading), xp.sin(heading)
     return xp.stack([-cos * x - sin * y, sin * x - cos * y, wrap_angle(-heading)], axis=-1)
@@ -80,7 +75,7 @@ def relative(pose_w_a: Any, pose_w_b: Any) -> Any:
     Returns:
         (..., 3) pose of b in a.
     """
-    xp = _namespace(pose_w_a, pose_w_b)
+    xp = namespace_of(pose_w_a, pose_w_b)
     cos, sin = xp.cos(pose_w_a[..., 2]), xp.sin(pose_w_a[..., 2])
     # The difference first: poses far from the origin lose no digits to each other.
     dx, dy = pose_w_b[..., 0] - pose_w_a[..., 0], pose_w_b[..., 1] - pose_w_a[..., 1]
@@ -112,7 +107,7 @@ def rotation(heading: Any) -> Any:
     Returns:
         (..., 2, 2).
     """
-    xp = _namespace(heading)
+    xp = namespace_of(heading)
     cos, sin = xp.cos(heading), xp.sin(heading)
     return xp.stack([xp.stack([cos, -sin], axis=-1), xp.stack([sin, cos], axis=-1)], axis=-2)
 
@@ -126,7 +121,7 @@ def to_matrix(pose_a_b: Any) -> Any:
     Returns:
         `T_a_b` (..., 3, 3).
     """
-    xp = _namespace(pose_a_b)
+    xp = namespace_of(pose_a_b)
     x, y = pose_a_b[..., 0], pose_a_b[..., 1]
     cos, sin = xp.cos(pose_a_b[..., 2]), xp.sin(pose_a_b[..., 2])
     zero, one = xp.zeros_like(x), xp.ones_like(x)
@@ -143,8 +138,30 @@ def from_matrix(T_a_b: Any) -> Any:
     Returns:
         (..., 3) poses, heading in [-pi, pi].
     """
-    xp = _namespace(T_a_b)
+    xp = namespace_of(T_a_b)
     return xp.stack([T_a_b[..., 0, 2], T_a_b[..., 1, 2], xp.arctan2(T_a_b[..., 1, 0], T_a_b[..., 0, 0])], axis=-1)
+
+
+def as_poses(name: str, value: Any, count: int) -> NDArray[np.float64]:
+    """Makes poses x, y, heading of what a user has: these, or matrices; on the host.
+
+    Args:
+        name: of the argument, for messages.
+        value: (count, 3) x, y, heading, or (count, 3, 3) homogeneous matrices.
+        count: number of poses.
+
+    Returns:
+        (count, 3) float64.
+
+    Raises:
+        ValueError: the shape is another one, or a number is not finite.
+    """
+    poses = np.asarray(value, np.float64)
+    if poses.shape not in ((count, 3), (count, 3, 3)):
+        raise ValueError(f"{name}: expected shape ({count}, 3) or ({count}, 3, 3), got {poses.shape}")
+    if not np.isfinite(poses).all():
+        raise ValueError(f"{name}: expected finite poses")
+    return poses if poses.ndim == 2 else from_matrix(poses)
 
 
 def transform_points(pose_a_b: Any, points_b: Any) -> Any:
@@ -157,7 +174,7 @@ def transform_points(pose_a_b: Any, points_b: Any) -> Any:
     Returns:
         (..., n, 2) points in a.
     """
-    xp = _namespace(pose_a_b, points_b)
+    xp = namespace_of(pose_a_b, points_b)
     cos, sin = xp.cos(pose_a_b[..., 2, None]), xp.sin(pose_a_b[..., 2, None])
     x = cos * points_b[..., 0] - sin * points_b[..., 1] + pose_a_b[..., 0, None]
     y = sin * points_b[..., 0] + cos * points_b[..., 1] + pose_a_b[..., 1, None]
@@ -173,7 +190,7 @@ def adjoint(pose_a_b: Any) -> Any:
     Returns:
         (..., 3, 3).
     """
-    xp = _namespace(pose_a_b)
+    xp = namespace_of(pose_a_b)
     cos, sin = xp.cos(pose_a_b[..., 2]), xp.sin(pose_a_b[..., 2])
     zero, one = xp.zeros_like(cos), xp.ones_like(cos)
     rows = ((cos, -sin, pose_a_b[..., 1]), (sin, cos, -pose_a_b[..., 0]), (zero, zero, one))

@@ -12,6 +12,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from dpmjax.checks import as_float, as_mask, as_points, require_positive, require_shape
+from dpmjax.geometry.namespace import safe_sqrt
 from dpmjax.types import AnyArray
 
 SINGULAR_IN_EPS = 8
@@ -133,9 +134,7 @@ def _offset_loss(predicted: jax.Array, true: jax.Array, mask: jax.Array) -> jax.
     inverse = _inverse_covariance(lax.stop_gradient(residuals), mask)
     # Differences of products, summed over the last axis: a short contraction in full precision everywhere.
     squared = jnp.sum(residuals * jnp.matmul(residuals, inverse, precision=lax.Precision.HIGHEST), axis=1)
-    is_apart = mask & (squared > 0)
-    distances = jnp.where(is_apart, jnp.sqrt(jnp.where(is_apart, squared, 1)), 0)
-    return jnp.sum(distances) / jnp.maximum(jnp.sum(mask), 1)
+    return jnp.sum(safe_sqrt(squared)) / jnp.maximum(jnp.sum(mask), 1)
 
 
 def _inverse_covariance(residuals: Float[Array, "n d"], mask: Bool[Array, " n"]) -> Float[Array, "d d"]:

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from dpmjax.checks import as_float, as_mask, as_points
+from dpmjax.geometry.namespace import safe_sqrt
 from dpmjax.geometry.neighbours import k_nearest
 from dpmjax.types import AnyArray
 
@@ -64,10 +65,7 @@ def _mean_distance(
     near = k_nearest(queries, points, 1, mask)
     is_counted = query_mask & near.mask[:, 0]
     squared = jnp.where(is_counted, near.squared_distances[:, 0], 0)
-    # The slope of the square root is infinite at zero: guard its input, then its output.
-    is_apart = squared > 0
-    distances = jnp.where(is_apart, jnp.sqrt(jnp.where(is_apart, squared, 1)), 0)
-    return jnp.sum(jnp.minimum(distances, limit)) / jnp.maximum(jnp.sum(is_counted), 1)
+    return jnp.sum(jnp.minimum(safe_sqrt(squared), limit)) / jnp.maximum(jnp.sum(is_counted), 1)
 
 
 def occupancy_loss(

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.spatial import cKDTree
 
-from dpmjax.metrics.poses import checked_poses
+from dpmjax.metrics.inputs import checked_poses
 from dpmjax.types import AnyArray
 
 _OPPOSITE_COSINE = -0.5

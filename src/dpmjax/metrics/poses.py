@@ -1,17 +1,22 @@
-"""Errors of poses in float64 on the host: rigid alignment, ATE, RPE, point distance, recall of registrations.
+"""Errors of poses: rigid alignment, ATE, RPE, point distance, recall of registrations.
 
 Lengths come out in the unit they come in; angles in radians. Poses are `T_world_scan`, (n, d+1, d+1) with d = 2 or 3.
+Arrays of NumPy give float64 numbers of the host. If one array is JAX's, the result is an array of JAX in its dtype,
+and the function is traceable: `jit`, `vmap`, `grad` with a finite gradient everywhere. Only the recall is of NumPy.
 """
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+import jax
 import numpy as np
 from jaxtyping import Bool, Float
-from numpy.typing import NDArray
 
 from dpmjax.geometry import rigid
+from dpmjax.geometry.alignment import best_motion
+from dpmjax.geometry.namespace import matmul, namespace_of, safe_sqrt
+from dpmjax.metrics.inputs import as_floats, checked_poses, checked_positions, is_traced, require_same_shape
 from dpmjax.types import AnyArray
 
 
@@ -24,8 +29,8 @@ class RelativePoseError(NamedTuple):
         num_pairs: how many pairs were compared.
     """
 
-    translation_rmse: float
-    rotation_rmse: float
+    translation_rmse: float | jax.Array
+    rotation_rmse: float | jax.Array
     num_pairs: int
 
 
@@ -45,55 +50,47 @@ class RegistrationRecall(NamedTuple):
     is_right: Bool[np.ndarray, " n"]
 
 
-def align_rigid(estimated: Float[AnyArray, "n d"], reference: Float[AnyArray, "n d"]) -> Float[np.ndarray, "d1 d1"]:
-    """The rigid motion, without scale, that brings estimated positions closest to the reference ones.
+def align_rigid(
+    estimated: Float[AnyArray, "n d"], reference: Float[AnyArray, "n d"], mask: Bool[AnyArray, " n"] | None = None
+) -> Float[AnyArray, "d1 d1"]:
+    """Computes the rigid motion, without scale, that brings estimated positions closest to the reference ones.
 
-    Least squares in closed form (Horn 1987). What the positions leave open (n = 1; in 3-D all on one line) is settled
-    by the rotation nearest to the identity.
+    Least squares in closed form, as `weighted_svd`. What the positions leave open (n = 1; in 3-D all on one line) is
+    settled by a rotation near the identity, with derivative 0.
 
     Args:
         estimated: (n, 2) or (n, 3) positions.
         reference: the same positions in another frame, the same unit.
+        mask: False for positions that are not there; they may hold anything.
 
     Returns:
-        `T_reference_estimated`, (d+1, d+1) float64.
+        `T_reference_estimated`, (d+1, d+1): float64, or of JAX where an array is JAX's.
 
     Raises:
         ValueError: the shapes differ, are not (n, 2) or (n, 3) with n >= 1, or a number is not finite.
     """
-    estimated = _checked_positions("estimated", estimated)
-    reference = _checked_positions("reference", reference)
-    require_same_shape("reference", reference, estimated)
-    mean_estimated, mean_reference = estimated.mean(axis=0), reference.mean(axis=0)
-    covariance = (estimated - mean_estimated).T @ (reference - mean_reference)
-    dim = covariance.shape[0]
-    scale = np.abs(covariance).max()
-    # A pull towards the identity, far below what the data can tell, decides what they leave open.
-    U, _, Vt = np.linalg.svd(covariance / scale + 1e-12 * np.eye(dim) if scale > 0 else np.eye(dim))
-    sign = np.ones(dim)
-    sign[-1] = np.sign(np.linalg.det(U) * np.linalg.det(Vt))
-    T = np.eye(dim + 1)
-    T[:dim, :dim] = (Vt.T * sign) @ U.T
-    T[:dim, dim] = mean_reference - T[:dim, :dim] @ mean_estimated
-    return T
+    return best_motion(*checked_positions(estimated, reference, mask))
 
 
-def absolute_trajectory_error(estimated: Float[AnyArray, "n d"], reference: Float[AnyArray, "n d"]) -> float:
+def absolute_trajectory_error(
+    estimated: Float[AnyArray, "n d"], reference: Float[AnyArray, "n d"], mask: Bool[AnyArray, " n"] | None = None
+) -> float | Float[jax.Array, ""]:
     """Root mean square distance of positions after the best rigid alignment (DeepMapping section 4; Sturm 2012).
 
     Args:
         estimated: positions, (n, 2) or (n, 3).
         reference: the same positions in another frame, the same unit.
+        mask: False for positions that are not there; they may hold anything.
 
     Returns:
-        The error, in the unit of the positions.
+        The error, in the unit of the positions: a float, or of JAX where an array is JAX's. Its gradient at 0 is 0.
 
     Raises:
         ValueError: the shapes differ, are not (n, 2) or (n, 3) with n >= 1, or a number is not finite.
     """
-    T = align_rigid(estimated, reference)
-    aligned = _transform(T, np.asarray(estimated, np.float64))
-    return float(np.sqrt(np.mean(np.sum((aligned - np.asarray(reference, np.float64)) ** 2, axis=1))))
+    estimated, reference, weights = checked_positions(estimated, reference, mask)
+    difference = _transform(best_motion(estimated, reference, weights), estimated) - reference
+    return _number(safe_sqrt(_mean((difference**2).sum(axis=1), weights > 0)))
 
 
 def relative_pose_error(
@@ -116,19 +113,20 @@ def relative_pose_error(
         ValueError: the shapes differ, are not (n, 3, 3) or (n, 4, 4), a number is not finite, or `delta` is not in
             [1, n - 1].
     """
-    estimated, reference = checked_poses("estimated", estimated), checked_poses("reference", reference)
+    xp = namespace_of(estimated, reference)
+    estimated, reference = checked_poses("estimated", estimated, xp), checked_poses("reference", reference, xp)
     require_same_shape("reference", reference, estimated)
     num_poses = len(estimated)
     if not 1 <= delta < num_poses:
         raise ValueError(f"delta: expected 1 <= delta < {num_poses}, the number of poses, got {delta}")
-    moved_estimated = rigid.inverse(estimated[:-delta]) @ estimated[delta:]
-    moved_reference = rigid.inverse(reference[:-delta]) @ reference[delta:]
-    error = rigid.inverse(moved_reference) @ moved_estimated
+    moved_estimated = matmul(rigid.inverse(estimated[:-delta]), estimated[delta:])
+    moved_reference = matmul(rigid.inverse(reference[:-delta]), reference[delta:])
+    error = matmul(rigid.inverse(moved_reference), moved_estimated)
     angles = rotation_angle(error[:, :-1, :-1])
-    squared_lengths = np.sum(error[:, :-1, -1] ** 2, axis=1)
+    squared_lengths = (error[:, :-1, -1] ** 2).sum(axis=1)
     return RelativePoseError(
-        translation_rmse=float(np.sqrt(np.mean(squared_lengths))),
-        rotation_rmse=float(np.sqrt(np.mean(angles**2))),
+        translation_rmse=_number(safe_sqrt(squared_lengths.mean())),
+        rotation_rmse=_number(safe_sqrt((angles**2).mean())),
         num_pairs=len(error),
     )
 
@@ -138,7 +136,7 @@ def point_distance(
     mask: Bool[AnyArray, "n b"],
     T_estimated: Float[AnyArray, "n d1 d1"],
     T_reference: Float[AnyArray, "n d1 d1"],
-) -> float:
+) -> float | Float[jax.Array, ""]:
     """Mean distance of corresponding map points, after the rigid alignment of positions (DeepMapping section 4).
 
     Args:
@@ -153,22 +151,23 @@ def point_distance(
     Raises:
         ValueError: the shapes do not match, a number is not finite, or no point is valid.
     """
-    estimated, reference = checked_poses("T_estimated", T_estimated), checked_poses("T_reference", T_reference)
+    xp = namespace_of(points, mask, T_estimated, T_reference)
+    estimated, reference = checked_poses("T_estimated", T_estimated, xp), checked_poses("T_reference", T_reference, xp)
     require_same_shape("T_reference", reference, estimated)
-    points, mask = np.asarray(points, np.float64), np.asarray(mask)
+    points, mask = as_floats("points", points, xp), xp.asarray(mask)
     dim = estimated.shape[1] - 1
     if points.ndim != 3 or points.shape[0] != len(estimated) or points.shape[2] != dim:
         raise ValueError(f"points: expected shape ({len(estimated)}, b, {dim}), got {points.shape}")
     if mask.shape != points.shape[:2] or mask.dtype != bool:
         raise ValueError(f"mask: expected bool of shape {points.shape[:2]}, got {mask.dtype} of {mask.shape}")
-    if not mask.any():
+    if not is_traced(mask) and not np.asarray(mask).any():
         raise ValueError("mask: expected at least one valid point, got none")
-    if not np.isfinite(points[mask]).all():
+    points = xp.where(mask[..., None], points, 0)
+    if not is_traced(points) and not np.isfinite(points).all():
         raise ValueError("points: expected finite numbers where mask is True, got NaN or infinity")
-    aligned = align_rigid(estimated[:, :dim, dim], reference[:, :dim, dim]) @ estimated
-    points = np.where(mask[..., None], points, 0)
-    distances = np.linalg.norm(_transform(aligned, points) - _transform(reference, points), axis=-1)
-    return float(distances[mask].mean())
+    aligned = matmul(align_rigid(estimated[:, :dim, dim], reference[:, :dim, dim]), estimated)
+    difference = _transform(aligned, points) - _transform(reference, points)
+    return _number(_mean(safe_sqrt((difference**2).sum(axis=-1)), mask))
 
 
 def registration_recall(
@@ -204,46 +203,27 @@ def registration_recall(
     return RegistrationRecall(float(is_right.mean()) if len(true) > 0 else 0.0, translation, rotation, is_right)
 
 
-def _checked_positions(name: str, value: AnyArray) -> NDArray[np.float64]:
-    array = np.asarray(value, np.float64)
-    if array.ndim != 2 or array.shape[0] < 1 or array.shape[1] not in (2, 3):
-        raise ValueError(f"{name}: expected positions of shape (n, 2) or (n, 3), n >= 1, got {array.shape}")
-    return _checked_finite(name, array)
+def _number(value: Any) -> Any:
+    """A float of a number of NumPy; a number of JAX stays traceable."""
+    return value if isinstance(value, jax.Array) else float(value)
 
 
-def checked_poses(name: str, value: AnyArray) -> NDArray[np.float64]:
-    """Returns poses as float64; a ValueError names what is no (n, 3, 3) or (n, 4, 4) or not finite."""
-    array = np.asarray(value, np.float64)
-    if array.ndim != 3 or array.shape[0] < 1 or array.shape[1:] not in ((3, 3), (4, 4)):
-        raise ValueError(f"{name}: expected poses of shape (n, 3, 3) or (n, 4, 4), n >= 1, got {array.shape}")
-    return _checked_finite(name, array)
+def _mean(values: Any, mask: Any) -> Any:
+    """Mean of the valid values; 0 without any."""
+    xp = namespace_of(values)
+    return xp.where(mask, values, 0).sum() / xp.maximum(mask.sum(), 1)
 
 
-def _checked_finite(name: str, array: NDArray[np.float64]) -> NDArray[np.float64]:
-    if not np.isfinite(array).all():
-        raise ValueError(f"{name}: expected finite numbers, got NaN or infinity in row {_first_bad_row(array)}")
-    return array
-
-
-def _first_bad_row(array: NDArray[np.float64]) -> int:
-    return int(np.argmin(np.isfinite(array).reshape(len(array), -1).all(axis=1)))
-
-
-def require_same_shape(name: str, array: NDArray[np.float64], other: NDArray[np.float64]) -> None:
-    """Raises a ValueError where two arrays have different shapes."""
-    if array.shape != other.shape:
-        raise ValueError(f"{name}: expected shape {other.shape} like the estimated, got {array.shape}")
-
-
-def _transform(T: NDArray[np.float64], points: NDArray[np.float64]) -> NDArray[np.float64]:
+def _transform(T: Any, points: Any) -> Any:
     dim = points.shape[-1]
-    return points @ np.swapaxes(T[..., :dim, :dim], -1, -2) + T[..., None, :dim, dim]
+    return matmul(points, T[..., :dim, :dim].swapaxes(-1, -2)) + T[..., None, :dim, dim]
 
 
-def rotation_angle(R: NDArray[np.float64]) -> NDArray[np.float64]:
+def rotation_angle(R: Any) -> Any:
     """Returns the angle of rotation matrices in [0, pi], exact for small angles (an arc cosine is not)."""
-    skew = (R - np.swapaxes(R, 1, 2)) / 2
-    sin = np.sqrt(np.sum(skew**2, axis=(1, 2)) / 2)
-    trace = np.trace(R, axis1=1, axis2=2)
+    xp = namespace_of(R)
+    skew = (R - xp.swapaxes(R, 1, 2)) / 2
+    sin = safe_sqrt((skew**2).sum(axis=(1, 2)) / 2)
+    trace = xp.trace(R, axis1=1, axis2=2)
     cos = trace / 2 if R.shape[1] == 2 else (trace - 1) / 2
-    return np.arctan2(sin, cos)
+    return xp.arctan2(sin, cos)

@@ -9,7 +9,8 @@ import numpy as np
 from jaxtyping import Float
 
 from dpmjax.geometry import rigid
-from dpmjax.metrics.poses import checked_poses, require_same_shape, rotation_angle
+from dpmjax.metrics.inputs import checked_poses, require_same_shape
+from dpmjax.metrics.poses import rotation_angle
 from dpmjax.types import AnyArray
 
 KITTI_LENGTHS_M = (100.0, 200.0, 300.0, 400.0, 500.0, 600.0, 700.0, 800.0)

@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 from functools import partial
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from dpmjax.checks import as_float, as_points, require_shape
+from dpmjax.checks import as_float, as_mask, as_points, require_shape
 from dpmjax.geometry import rigid, se2, se3
 from dpmjax.geometry.alignment import weighted_svd
+from dpmjax.geometry.namespace import safe_sqrt
 from dpmjax.geometry.neighbours import k_nearest
 from dpmjax.geometry.normals import estimate_normals
 from dpmjax.types import AnyArray
@@ -20,15 +21,20 @@ from dpmjax.types import AnyArray
 _NORMAL_NEIGHBOURS = 6
 """Points that a normal is fitted to, as in the published DeepMapping program."""
 
+_MAX_ITERATIONS = 100
+_OPEN_SHARE = 1e-5
+"""Share of the largest singular value of the balance's derivative below which a direction counts as open."""
+
 
 class IcpResult(NamedTuple):
-    """What `icp` found.
+    """Result of `icp`.
 
     Attributes:
         T_target_source: homogeneous transform of source points into the target's frame.
-        rmse: root mean square distance of the inlier pairs: to the point, or to the target's line or plane.
+        rmse: root mean square distance of the inlier pairs, to the point, or to the target's line or plane; infinite
+            without any.
         num_inliers: pairs within three robust deviations.
-        converged: the last step was smaller than a millionth of the cloud.
+        converged: True where the last step was smaller than a millionth of the cloud.
     """
 
     T_target_source: Float[Array, "d1 d1"]
@@ -41,103 +47,215 @@ def icp(
     source: Float[AnyArray, "n d"],
     target: Float[AnyArray, "m d"],
     metric: Literal["point", "plane"] = "plane",
-    init: Float[AnyArray, "d1 d1"] | None = None,
-    *,
-    max_iterations: int = 100,
+    T_init: Float[AnyArray, "d1 d1"] | None = None,
+    source_mask: Bool[AnyArray, " n"] | None = None,
+    target_mask: Bool[AnyArray, " m"] | None = None,
 ) -> IcpResult:
     """Aligns two clouds from a first guess; planar (d = 2: "plane" means line) or spatial (d = 3).
 
     Each source point is paired with its nearest target point. Pairs are trusted by a Geman-McClure weight whose scale
-    is three times the median distance of the pairs, so that what only one cloud has seen does not pull.
+    is three times the median distance of the pairs, so that what only one cloud has seen does not pull. The loop ends
+    after 100 iterations or earlier.
+
+    The gradient is that of the solution, by the implicit function theorem (Blondel et al. 2022, section 2.1): the
+    weighted residuals balance at the solution, and still do after the points have moved. Pairs and normals are
+    constants of the derivative. It is zero along directions that the data leave open, and with respect to `T_init`.
 
     Args:
-        source: finite points.
-        target: finite points, same unit.
-        metric: distance to the nearest point (Besl and McKay), or to its line or plane (Chen and Medioni).
-        init: first guess of T_target_source; None: identity. The basin is about as wide as the structures: some
+        source: points.
+        target: points, same unit.
+        metric: distance to the nearest point (Besl and McKay), or to its line or plane (Chen and Medioni); static
+            under `jit`.
+        T_init: first guess of T_target_source; None: identity. The basin is about as wide as the structures: some
             degrees.
-        max_iterations: at most so many.
+        source_mask: False for source points that are not there; they may hold anything.
+        target_mask: the same for the target.
 
     Returns:
-        IcpResult. With too few points to fix the motion it stays where the data leave it: near `init`, `converged`
+        IcpResult. With too few points to fix the motion it stays where the data leave it: near `T_init`, `converged`
         true.
 
     Raises:
-        ValueError: wrong shapes, not finite, unknown metric, or an empty cloud.
+        ValueError: wrong shapes, unknown metric, an empty cloud, or numbers that are not finite (where not traced).
     """
     source = as_points("source", source, dimensions=(2, 3))
-    target = as_points("target", target, dimensions=source.shape[1:])
-    start = jnp.eye(source.shape[1] + 1) if init is None else as_float("init", init)
-    require_shape("init", start, (source.shape[1] + 1, source.shape[1] + 1))
-    for name, array in (("source", source), ("target", target), ("init", start)):
-        if len(array) == 0 or not bool(jnp.isfinite(array).all()):
-            raise ValueError(f"{name}: expected one point or more and finite numbers; leave invalid points out")
+    target = as_points("target", target, dimensions=source.shape[1:]).astype(source.dtype)
+    start = jnp.eye(source.shape[1] + 1) if T_init is None else as_float("T_init", T_init)
+    require_shape("T_init", start, (source.shape[1] + 1, source.shape[1] + 1))
     if metric not in ("point", "plane"):
         raise ValueError(f"metric: expected 'point' or 'plane', got {metric!r}")
-    target, start = target.astype(source.dtype), start.astype(source.dtype)
-    return _icp(source, target, start, jnp.asarray(max_iterations), metric=metric)
+    clouds = (
+        _Cloud(source, as_mask("source_mask", source_mask, source.shape[:1])),
+        _Cloud(target, as_mask("target_mask", target_mask, target.shape[:1])),
+    )
+    _require_finite("source", *clouds[0])
+    _require_finite("target", *clouds[1])
+    _require_finite("T_init", start, jnp.ones(len(start), bool))
+    return _icp(*clouds, start.astype(source.dtype), metric=metric)
+
+
+class _Cloud(NamedTuple):
+    points: Float[Array, "n d"]
+    mask: Bool[Array, " n"]
+
+
+class _Pairs(NamedTuple):
+    """Each source point under a motion, and its nearest target point.
+
+    Attributes:
+        points: source points in the frame of the target.
+        apart: from the target points to them.
+        matched: the target points.
+        normals: of the target points; zero where they have none, and for the metric "point".
+        residuals: distance to the line or plane, or to the point where there is no normal.
+        weights: robust weights, 0 to 1.
+        mask: True where a pair is there.
+    """
+
+    points: Float[Array, "n d"]
+    apart: Float[Array, "n d"]
+    matched: Float[Array, "n d"]
+    normals: Float[Array, "n d"]
+    residuals: Float[Array, " n"]
+    weights: Float[Array, " n"]
+    mask: Bool[Array, " n"]
+
+
+def _require_finite(name: str, array: Array, mask: Array) -> None:
+    is_known = not any(isinstance(value, jax.core.Tracer) for value in (array, mask))
+    if len(array) == 0 or (is_known and not np.isfinite(np.asarray(array)[np.asarray(mask)]).all()):
+        raise ValueError(f"{name}: expected one point or more and finite numbers; leave invalid points out")
 
 
 @partial(jax.jit, static_argnames="metric")
-def _icp(
-    source: Float[Array, "n d"], target: Float[Array, "m d"], start: Array, max_iterations: Array, *, metric: str
-) -> IcpResult:
-    size = jnp.sqrt(jnp.mean(jnp.sum((target - target.mean(0)) ** 2, -1)))
-    normals = estimate_normals(target, _NORMAL_NEIGHBOURS)
-    # Not below rounding, and its square is no zero: one point, or equal ones, have no size.
-    rounding = jnp.finfo(source.dtype).eps * jnp.max(jnp.abs(target))
-    tiny = jnp.maximum(jnp.maximum(1e-6 * size, rounding), 1e-12)
+def _icp(source: _Cloud, target: _Cloud, start: Array, *, metric: str) -> IcpResult:
+    source, target = (_Cloud(jnp.where(mask[:, None], points, 0), mask) for points, mask in (source, target))
+    if metric == "plane":
+        normals = estimate_normals(target.points, _NORMAL_NEIGHBOURS, target.mask).normals
+    else:
+        normals = jnp.zeros_like(target.points)
+    T, converged = _solve(metric, source, target, normals, start)
+    pairs = _find_pairs(source, target, normals, T)
+    limit = 3.0 * 1.4826 * jax.lax.stop_gradient(_median(pairs.residuals, pairs.mask))
+    is_inlier = pairs.mask & (pairs.residuals <= jnp.maximum(limit, _resolution(target)))
+    num_inliers = is_inlier.sum()
+    mean_square = jnp.sum(jnp.where(is_inlier, pairs.residuals**2, 0.0)) / jnp.maximum(num_inliers, 1)
+    return IcpResult(T, jnp.where(num_inliers > 0, safe_sqrt(mean_square), jnp.inf), num_inliers, converged)
 
-    def distances(T: Float[Array, "d1 d1"]) -> tuple[Array, Array, Array, Array]:
-        moved = rigid.transform_points(T, source)
-        nearest = k_nearest(moved, target, 1).indices[:, 0]
-        apart = moved - target[nearest]
-        pair_distance = jnp.linalg.norm(apart, axis=-1)
-        # A point whose neighbourhood is no line or plane counts by its distance to the point itself.
-        has_plane = normals.mask[nearest] & (metric == "plane")
-        residual = jnp.where(has_plane, jnp.abs(jnp.sum(apart * normals.normals[nearest], -1)), pair_distance)
-        scale = jnp.maximum(3.0 * jnp.median(pair_distance), tiny)
-        weight = (scale**2 / (scale**2 + pair_distance**2)) ** 2
-        return moved, nearest, residual, jnp.where(pair_distance <= 2.0 * scale, weight, 0.0)
+
+@partial(jax.custom_jvp, nondiff_argnums=(0,))
+def _solve(metric: str, source: _Cloud, target: _Cloud, normals: Array, start: Array) -> tuple[Array, Array]:
+    """Returns the motion, and whether it has converged."""
+    resolution, centre = _resolution(target), _mean(source)[None]
 
     def iterate(carry: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
         T, _, count = carry
-        moved, nearest, _, weight = distances(T)
-        if metric == "point":
-            T = weighted_svd(source, target[nearest], weight)
+        pairs = _find_pairs(source, target, normals, T)
+        if metric == "plane":
+            T_new = rigid.compose(_step_to_planes(pairs, rigid.transform_points(T, centre)[0]), T)
         else:
-            step = _step_to_planes(moved, target[nearest], normals.normals[nearest], weight * normals.mask[nearest])
-            T = rigid.compose(step, T)
-        change = jnp.linalg.norm(rigid.transform_points(T, source) - moved, axis=-1).max()
-        return T, change, count + 1
+            T_new = jnp.where(pairs.weights.any(), weighted_svd(source.points, pairs.matched, pairs.weights), T)
+        change = jnp.linalg.norm(rigid.transform_points(T_new, source.points) - pairs.points, axis=-1)
+        return T_new, jnp.where(source.mask, change, 0.0).max(), count + 1
 
-    begin = start, jnp.asarray(jnp.inf, source.dtype), jnp.asarray(0)
-    T, change, _ = jax.lax.while_loop(lambda c: (c[1] > tiny) & (c[2] < max_iterations), iterate, begin)
-    residual = distances(T)[2]
-    is_inlier = residual <= jnp.maximum(3.0 * 1.4826 * jnp.median(residual), tiny)
-    num_inliers = is_inlier.sum()
-    rmse = jnp.sqrt(jnp.sum(jnp.where(is_inlier, residual**2, 0.0)) / jnp.maximum(num_inliers, 1))
-    return IcpResult(T, rmse, num_inliers, change <= tiny)
+    begin = start, jnp.asarray(jnp.inf, start.dtype), jnp.asarray(0)
+    T, change, _ = jax.lax.while_loop(lambda c: (c[1] > resolution) & (c[2] < _MAX_ITERATIONS), iterate, begin)
+    return T, change <= resolution
 
 
-def _step_to_planes(
-    points: Float[Array, "n d"], matched: Float[Array, "n d"], normals: Float[Array, "n d"], weight: Float[Array, " n"]
-) -> Float[Array, "d1 d1"]:
+@_solve.defjvp
+def _solve_jvp(metric: str, primals: Any, tangents: Any) -> tuple[tuple[Array, Array], Any]:
+    # The balance b(step, clouds) is 0 at the solution: d step = -(db / dstep)^-1 (db / dclouds) dclouds.
+    source, target, normals, _ = primals
+    T, converged = _solve(metric, *primals)
+    centre, size = rigid.transform_points(T, _mean(source)[None])[0], jnp.maximum(_size(source), _resolution(target))
+    dim = source.points.shape[1]
+    # Angles count in lengths at the rim of the cloud, so that all directions have one unit.
+    scales = jnp.where(jnp.arange(dim * (dim + 1) // 2) < dim, 1.0, 1.0 / size).astype(T.dtype)
+
+    def moved(step: Array) -> Array:
+        return rigid.compose(_about(scales * step, centre), T)
+
+    def balance(step: Array, source_points: Array, target_points: Array) -> Array:
+        clouds = source._replace(points=source_points), target._replace(points=target_points)
+        pairs = _find_pairs(*clouds, normals, moved(step))
+        forces = pairs.apart
+        if metric == "plane":
+            forces = pairs.normals * jnp.sum(pairs.normals * pairs.apart, axis=-1, keepdims=True)
+        forces = pairs.weights[:, None] * forces
+        return scales * jnp.concatenate([forces, _turning(pairs.points - centre, forces)], axis=-1).sum(0)
+
+    still = jnp.zeros_like(scales)
+    derivative = jax.jacfwd(balance)(still, source.points, target.points)
+    _, change = jax.jvp(
+        partial(balance, still), (source.points, target.points), (tangents[0].points, tangents[1].points)
+    )
+    step = -jnp.matmul(jnp.linalg.pinv(derivative, rtol=_OPEN_SHARE), change, precision="highest")
+    _, T_tangent = jax.jvp(moved, (still,), (step,))
+    return (T, converged), (T_tangent, np.zeros(converged.shape, jax.dtypes.float0))
+
+
+def _find_pairs(source: _Cloud, target: _Cloud, normals: Float[Array, "m d"], T: Float[Array, "d1 d1"]) -> _Pairs:
+    points = rigid.transform_points(T, source.points)
+    nearest = k_nearest(points, target.points, 1, target.mask).indices[:, 0]
+    apart, normals = points - target.points[nearest], normals[nearest]
+    distances = safe_sqrt(jnp.sum(apart**2, axis=-1))
+    # A point whose neighbourhood is no line or plane counts by its distance to the point itself.
+    has_plane = jnp.any(normals != 0.0, axis=-1)
+    residuals = jnp.where(has_plane, jnp.abs(jnp.sum(apart * normals, axis=-1)), distances)
+    mask = source.mask & target.mask.any()
+    scale = jnp.maximum(3.0 * _median(distances, mask), _resolution(target))
+    weights = (scale**2 / (scale**2 + distances**2)) ** 2
+    weights = jnp.where(mask & (distances <= 2.0 * scale), weights, 0.0)
+    return _Pairs(points, apart, target.points[nearest], normals, residuals, weights, mask)
+
+
+def _step_to_planes(pairs: _Pairs, centre: Float[Array, " d"]) -> Float[Array, "d1 d1"]:
     """The small motion that brings points onto the lines or planes of their partners, about the points' mean."""
-    dim = points.shape[1]
-    centre = jnp.mean(points, axis=0)
-    lever = points - centre
-    i, j = np.array([[0], [1]] if dim == 2 else [[1, 2, 0], [2, 0, 1]])
-    turning = lever[:, i] * normals[:, j] - lever[:, j] * normals[:, i]
-    jacobian = jnp.concatenate([normals, turning], axis=-1)
-    residual = jnp.sum((points - matched) * normals, -1)
-    weighted = weight[:, None] * jacobian
+    jacobian = jnp.concatenate([pairs.normals, _turning(pairs.points - centre, pairs.normals)], axis=-1)
+    residual = jnp.sum(pairs.apart * pairs.normals, -1)
+    weighted = pairs.weights[:, None] * jacobian
     system = jnp.einsum("ni,nj->ij", weighted, jacobian, precision="highest")
     diagonal = jnp.diagonal(system)
     # Directions that no plane holds stay as they are.
-    damping = 1e-4 * diagonal + 1e-6 * diagonal.max() + jnp.finfo(points.dtype).tiny
+    damping = 1e-4 * diagonal + 1e-6 * diagonal.max() + jnp.finfo(residual.dtype).tiny
     gradient = jnp.einsum("ni,n->i", weighted, residual, precision="highest")
-    step = jnp.linalg.solve(system + jnp.diag(damping), -gradient)
+    return _about(jnp.linalg.solve(system + jnp.diag(damping), -gradient), centre)
+
+
+def _turning(lever: Float[Array, "n d"], vectors: Float[Array, "n d"]) -> Float[Array, "n r"]:
+    """Torques: the cross product of levers and vectors, one number in the plane."""
+    i, j = np.array([[0], [1]] if lever.shape[1] == 2 else [[1, 2, 0], [2, 0, 1]])
+    return lever[:, i] * vectors[:, j] - lever[:, j] * vectors[:, i]
+
+
+def _about(step: Float[Array, " k"], centre: Float[Array, " d"]) -> Float[Array, "d1 d1"]:
+    """The motion of a twist about a centre."""
+    dim = len(centre)
     motion = se2.exp(step) if dim == 2 else se3.exp(step)
-    about_centre = centre - jnp.matmul(motion[:dim, :dim], centre, precision="highest")
-    return motion.at[:dim, dim].add(about_centre)
+    return motion.at[:dim, dim].add(centre - jnp.matmul(motion[:dim, :dim], centre, precision="highest"))
+
+
+def _mean(cloud: _Cloud) -> Float[Array, " d"]:
+    return jnp.sum(jnp.where(cloud.mask[:, None], cloud.points, 0), axis=0) / jnp.maximum(cloud.mask.sum(), 1)
+
+
+def _size(cloud: _Cloud) -> Float[Array, ""]:
+    """Root mean square distance of the points from their mean."""
+    squared = jnp.sum((cloud.points - _mean(cloud)) ** 2, axis=-1)
+    return safe_sqrt(jnp.sum(jnp.where(cloud.mask, squared, 0)) / jnp.maximum(cloud.mask.sum(), 1))
+
+
+def _resolution(target: _Cloud) -> Float[Array, ""]:
+    """A millionth of the cloud, or rounding, and not 0; a constant of the derivative."""
+    target = _Cloud(jax.lax.stop_gradient(target.points), target.mask)
+    rounding = jnp.finfo(target.points.dtype).eps * jnp.max(jnp.abs(target.points))
+    return jnp.maximum(jnp.maximum(1e-6 * _size(target), rounding), 1e-12)
+
+
+def _median(values: Float[Array, " n"], mask: Bool[Array, " n"]) -> Float[Array, ""]:
+    """Median of the valid values; 0 without any."""
+    count = mask.sum()
+    ordered = jnp.sort(jnp.where(mask, values, jnp.inf))
+    middle = 0.5 * (ordered[jnp.maximum(count - 1, 0) // 2] + ordered[count // 2])
+    return jnp.where(count > 0, middle, 0.0)

@@ -7,6 +7,8 @@ nearer one of them.
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from jaxtyping import Float
 from numpy.typing import NDArray
@@ -14,8 +16,9 @@ from numpy.typing import NDArray
 from dpmjax.checks import require_positive
 from dpmjax.geometry import se2
 from dpmjax.registration.pair_alignment import FINE, PosePrior, match_pairs
-from dpmjax.registration.planar_scans import Floats, Indices, PlanarScans
+from dpmjax.registration.planar_scans import Floats, Indices, PlanarScans, planar_scans
 from dpmjax.registration.range_profiles import contradicted_share, make_profiles
+from dpmjax.types import ScanSet
 
 # Standard deviation of odometry from one chosen scan to the next: translation in typical ranges, radians.
 _ODOMETRY_SIGMA = (0.005, 0.01)
@@ -26,6 +29,50 @@ _LOOSE_SIGMA, _TURNS = (0.01, 0.1), (-0.15, -0.1, -0.05, 0.0, 0.05, 0.1, 0.15)
 _MIN_FITNESS, _MAX_CONTRADICTED = 0.5, 0.05
 # Scans that are aligned at a time.
 _BLOCK = 1024
+
+
+class Recording(NamedTuple):
+    """All scans of a recording, and those that are registered.
+
+    Attributes:
+        scans: all n scans.
+        chosen: rows of the k registered scans, in order.
+        motion: (n, 3) poses that tell how each scan moves from one registered scan to the next; None where all are
+            registered.
+    """
+
+    scans: ScanSet
+    chosen: Indices
+    motion: Floats | None = None
+
+    def between(self, poses: Floats) -> Floats:
+        """Returns poses of all scans, by those of the registered ones and the motion between them."""
+        return poses if self.motion is None else fill_between(self.chosen, poses, self.motion)
+
+    def aligned(self, poses: Floats) -> Floats:
+        """Returns the same, each scan aligned with the nearest registered one."""
+        if self.motion is None:
+            return poses
+        return align_between(planar_scans(self.scans), self.chosen, self.between(poses))
+
+
+def choose_scans(scans: ScanSet, motion: Floats | None, min_distance: float, min_turn: float) -> Recording:
+    """Chooses the scans of a recording that are registered: those that lie apart, or all where most do.
+
+    Args:
+        scans: n scans in the order of time.
+        motion: (n, 3) poses that tell how the scans move; None: all scans are registered.
+        min_distance: as `choose_by_motion`.
+        min_turn: as `choose_by_motion`.
+
+    Returns:
+        Recording.
+    """
+    count = len(scans.points)
+    chosen = np.arange(count) if motion is None else choose_by_motion(motion, min_distance, min_turn)
+    if motion is None or 2 * len(chosen) >= count:
+        return Recording(scans, np.arange(count))
+    return Recording(scans, chosen, motion)
 
 
 def choose_by_motion(odometry: Float[np.ndarray, "n 3"], min_distance: float, min_turn: float) -> Indices:

@@ -13,7 +13,9 @@ import jax
 import numpy as np
 import scipy.spatial
 from jaxtyping import Array
+from numpy.typing import ArrayLike
 
+from dpmjax.checks import as_beams
 from dpmjax.geometry import se2
 from dpmjax.pose_graph.graph import Edges, join_edges
 from dpmjax.pose_graph.normal_equations import solve_blocks
@@ -21,9 +23,10 @@ from dpmjax.registration.incremental import incremental_icp
 from dpmjax.registration.line_adjustment import adjust_to_lines
 from dpmjax.registration.loop_closure import LoopConfig, close_loops, matched_steps, pose_steps
 from dpmjax.registration.pair_alignment import FINE, PairSystem, Schedule, linearise_pair, match_pairs
-from dpmjax.registration.planar_scans import Floats, Indices, PlanarScans
+from dpmjax.registration.planar_scans import Floats, Indices, PlanarScans, planar_scans
 from dpmjax.registration.quality import choose_trajectory
 from dpmjax.registration.step_scores import fitting_scans, interpolate
+from dpmjax.types import ScanSet
 
 # Distances of one round are kept below this by leaving out beams of the sources: about two seconds on two cores.
 _ROUND_DISTANCES = 1.5e9
@@ -70,8 +73,15 @@ class Refined(NamedTuple):
     poses: Floats
     num_loops: int
 
+    @property
+    def T_world_scan(self) -> Floats:
+        """(n, 3, 3) the poses as matrices."""
+        return se2.to_matrix(self.poses)
 
-def refine(scans: PlanarScans, poses: Floats, config: RefinementConfig | None = None) -> Refined:
+
+def refine(
+    scans: PlanarScans | ScanSet | ArrayLike, poses: ArrayLike, config: RefinementConfig | None = None
+) -> Refined:
     """Closes loops where the start leaves doubt, then aligns all scans together, and to common lines if there is noise.
 
     Loops are searched from a chain of the start's steps, which forgets what else the start knows; so the start is
@@ -79,31 +89,38 @@ def refine(scans: PlanarScans, poses: Floats, config: RefinementConfig | None = 
     the steps of the start mean nothing, and no loops are searched.
 
     Args:
-        scans: n scans.
-        poses: (n, 3) start, x, y, heading.
+        scans: (n, b, 2) beam end points in the sensor frames, any unit, in the order of time; all-zero or non-finite
+            beams are left out. Or a ScanSet. Or PlanarScans: scans without an order are
+            `planar_scans(scans, is_ordered=False)`.
+        poses: start, (n, 3) x, y, heading or (n, 3, 3) matrices, in the unit of the scans.
         config: settings.
 
     Returns:
         Refined; the first pose is that of the start, unless loops are kept.
+
+    Raises:
+        ValueError: the scans or the poses have a wrong shape or are not finite.
     """
     config = config or RefinementConfig()
-    candidates, num_loops = {"start": poses}, {"start": 0}
-    if scans.is_ordered and config.loops is not None and not _is_sound(scans, poses):
+    scans = scans if isinstance(scans, PlanarScans) else planar_scans(as_beams("scans", scans))
+    start = se2.as_poses("poses", poses, len(scans))
+    candidates, num_loops = {"start": start}, {"start": 0}
+    if scans.is_ordered and config.loops is not None and not _is_sound(scans, start):
         # The steps again, with those of the start as guess and as prior, where the scans leave a direction open.
-        chained, steps = incremental_icp(scans, odometry=poses)
+        chained, steps = incremental_icp(scans, odometry=start)
         rows = np.flatnonzero(fitting_scans(scans, chained))
         if len(rows) < len(scans):
-            fitting = refine(scans.take(rows).replace(is_ordered=True), poses[rows], config)
+            fitting = refine(scans.take(rows).replace(is_ordered=True), start[rows], config)
             return fitting._replace(poses=interpolate(len(scans), rows, fitting.poses))
         matched = matched_steps(steps, scans.typical_range)
         candidates["loops"], _, weights = close_loops(scans, chained, config.loops, steps=matched)
         num_loops["loops"] = int((weights > 0.25).sum())
-    aligned = {name: _align_all(scans, start, config) for name, start in candidates.items()}
+    aligned = {name: _align_all(scans, candidate, config) for name, candidate in candidates.items()}
     kept = "start" if len(aligned) == 1 else choose_trajectory(scans, aligned)[0]
-    poses = aligned[kept]
+    best = aligned[kept]
     if scans.noise > _MIN_NOISE * scans.typical_range:
-        poses = adjust_to_lines(scans, poses)
-    return Refined(poses, num_loops[kept])
+        best = adjust_to_lines(scans, best)
+    return Refined(best, num_loops[kept])
 
 
 def _align_all(scans: PlanarScans, poses: Floats, config: RefinementConfig) -> Floats:

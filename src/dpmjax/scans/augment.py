@@ -17,6 +17,7 @@ from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from dpmjax.checks import require_fields
 from dpmjax.geometry import rigid
+from dpmjax.geometry.namespace import namespace_of
 from dpmjax.scans.preprocess import farthest_first
 from dpmjax.types import AnyArray, PointCloud
 
@@ -185,7 +186,7 @@ def random_motions_on_host(config: AugmentConfig, num: int, rng: np.random.Gener
 
 def _motion(angles: AnyArray, translation: AnyArray, config: AugmentConfig) -> Any:
     # From uniform and normal numbers (..., 3), of NumPy or of JAX.
-    xp = jnp if isinstance(angles, jax.Array) else np
+    xp = namespace_of(angles)
     angles = angles * xp.array([config.max_tilt_rad, config.max_tilt_rad, config.max_yaw_rad])
     translation = translation * config.translation_sigma_m * xp.array([1, 1, 0.5])
     (sx, sy, sz), (cx, cy, cz) = (xp.moveaxis(f(angles), -1, 0) for f in (xp.sin, xp.cos))

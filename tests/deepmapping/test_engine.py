@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import operator
 from dataclasses import dataclass, replace
 
 import jax
@@ -13,10 +14,21 @@ import pytest
 
 from dpmjax import deepmapping as dm
 from dpmjax.checkpoints import Checkpoints
+from dpmjax.deepmapping import (
+    MappingData,
+    Problem,
+    Progress,
+    begin_phase,
+    fit,
+    init,
+    is_finished,
+    planar_problem,
+    resume,
+    solve,
+    step,
+    steps_per_call,
+)
 from dpmjax.deepmapping.batches import draw_offsets
-from dpmjax.deepmapping.fit import Progress, fit, init, is_finished, resume, step, steps_per_call
-from dpmjax.deepmapping.planar import planar_problem
-from dpmjax.deepmapping.problem import MappingData, Problem
 from dpmjax.nets.localization import LocalizationConfig
 from dpmjax.nets.occupancy import OccupancyConfig
 from tests.tolerances import ACCUMULATED, DOUBLE
@@ -164,6 +176,36 @@ def test_step_by_step_is_the_fit() -> None:
     assert report.loss == pytest.approx(float(np.mean(done.report.losses)))
 
 
+def test_the_steps_of_a_phase_run_under_jit_and_vmap() -> None:
+    problem, data = valley(), jnp.linspace(0.0, 1.0, 3)
+    keys = jax.random.split(KEY, 3)
+    states = jax.vmap(lambda x, key: init(problem, x, key=key))(data, keys)
+    enter = jax.jit(jax.vmap(lambda state, x: begin_phase(problem, state, x, phase=1)))
+    take = jax.jit(jax.vmap(lambda state, x: step(problem, state, x, phase=1)))
+    together, reports = take(enter(states, data), data)
+    for row in range(3):
+        state = begin_phase(problem, init(problem, data[row], key=keys[row]), data[row], phase=1)
+        state, report = step(problem, state, data[row])
+        expected = state.params, report.losses, state.phase, state.phase_step
+        actual = (together.params, reports.losses, together.phase, together.phase_step)
+        of_row = jax.tree.map(operator.itemgetter(row), actual)
+        jax.tree.map(lambda x, y: np.testing.assert_allclose(x, y, **ACCUMULATED), of_row, expected)
+
+
+def test_a_traced_state_needs_its_phase() -> None:
+    state = init(valley(), jnp.zeros(()), key=KEY)
+    with pytest.raises(ValueError, match="phase: expected the index"):
+        jax.jit(lambda state: step(valley(), state, jnp.zeros(())))(state)
+
+
+def test_solve_is_the_fit() -> None:
+    problem, data = valley(), jnp.zeros(())
+    state, report = solve(problem, data, key=KEY)
+    done = fit(problem, data, key=KEY)
+    jax.tree.map(lambda x, y: np.testing.assert_allclose(x, y, **ACCUMULATED), state, done.state)
+    jax.tree.map(lambda x, y: np.testing.assert_allclose(x, y, **ACCUMULATED), report, done.report)
+
+
 def test_progress_tells_shares_phases_and_seconds() -> None:
     seen: list[Progress] = []
     fit(valley(), jnp.zeros(()), key=KEY, on_report=seen.append)
@@ -207,6 +249,17 @@ def test_other_data_of_the_same_shape_compile_nothing_in_any_phase(tiny_data, as
         second = fit(planar_problem(replace(BRIEF), other), other, key=jax.random.key(4))
     assert int(first.state.phase) == int(second.state.phase) == len(COLD.phases) - 1
     assert not np.array_equal(first.poses, second.poses)
+
+
+def test_planar_fits_under_vmap_are_the_single_fits(tiny_data) -> None:
+    scans = tiny_data.scans
+    both = MappingData(jax.tree.map(lambda leaf: jnp.stack([leaf[:10], leaf[10:]]), scans))
+    keys = jax.random.split(KEY, 2)
+    state, report = jax.vmap(lambda data, key: solve(COLD, data, key=key))(both, keys)
+    for row in range(2):
+        alone = fit(COLD, jax.tree.map(operator.itemgetter(row), both), key=keys[row])
+        np.testing.assert_allclose(report.poses[row], alone.poses, rtol=1e-3, atol=1e-4)
+        assert int(state.step[row]) == int(alone.state.step)
 
 
 def test_same_key_same_numbers_and_another_key_others(tiny_data) -> None:

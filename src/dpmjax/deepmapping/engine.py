@@ -2,6 +2,8 @@
 
 A state is one pytree of arrays: written to disk after any call, it goes on exactly. The data are arguments of the
 compiled step, so that another set of the same shape compiles nothing. Several starts are one more leading axis.
+`init`, `begin_phase`, `step` and `solve` are pure functions of arrays, for `jit` and `vmap`. `fit` and `resume` run
+the same steps from the host, with progress and a stop.
 """
 
 from __future__ import annotations
@@ -120,19 +122,79 @@ def init(problem: Problem, data: Any, *, key: jax.Array, num_starts: int = 1) ->
     return _init(problem, data, key if num_starts == 1 else jax.random.split(key, num_starts))
 
 
-def step(problem: Problem, state: FitState, data: Any) -> tuple[FitState, Report]:
-    """Does one call of steps, and enters the next phase first where one is over.
+def step(problem: Problem, state: FitState, data: Any, *, phase: int | None = None) -> tuple[FitState, Report]:
+    """Does one call of steps.
 
     Args:
-        problem: what to fit.
+        problem: what to fit; static under `jit`.
         state: from `init` or from an earlier call.
         data: of the problem.
+        phase: index of the phase of the state, static under `jit`; `begin_phase` enters the next one. None: the
+            index is read from the state on the host, and a phase that is over is left first.
 
     Returns:
         The state after the call, and its report.
+
+    Raises:
+        ValueError: the state is traced, and no phase is given.
     """
-    state = _enter_phase(problem, state, data)
-    return _advance(problem, _scalar(state.phase), state, data)
+    if phase is None:
+        if isinstance(state.phase, jax.core.Tracer):
+            raise ValueError("phase: expected the index of the phase, because the state is traced")
+        state = _enter_phase(problem, state, data)
+        phase = _scalar(state.phase)
+    return _advance(problem, phase, state, data)
+
+
+@partial(jax.jit, static_argnums=0, static_argnames="phase")
+def begin_phase(problem: Problem, state: FitState, data: Any, *, phase: int) -> FitState:
+    """Makes the state at the start of a phase from the state at the end of the phase before.
+
+    Args:
+        problem: what to fit; static under `jit`.
+        state: at the end of phase `phase - 1`.
+        data: of the problem.
+        phase: index of the phase that begins, from 1; static under `jit`.
+
+    Returns:
+        The state, with fresh moments of the optimiser.
+    """
+
+    def begin(state: FitState, data: Any) -> FitState:
+        params = problem.next_phase(problem.config, problem.phases[phase - 1], state.params, data)
+        moments = problem.optimizer(problem.config, problem.phases[phase]).init(params)
+        return replace(
+            state, params=params, optimizer=moments, phase=state.phase + 1, phase_step=jnp.zeros_like(state.phase_step)
+        )
+
+    return _over_starts(begin, state, data)
+
+
+@partial(jax.jit, static_argnums=0)
+def solve(problem: Problem, data: Any, *, key: jax.Array) -> tuple[FitState, Report]:
+    """Steps a fresh state through all phases, as `fit` does, as one pure function.
+
+    Several data sets of equal shapes: `jax.vmap(lambda data, key: solve(problem, data, key=key))(data, keys)`.
+
+    Args:
+        problem: what to fit; static under `jit`.
+        data: of the problem.
+        key: of the run.
+
+    Returns:
+        The state at the end, and the report of the last call of the step.
+    """
+    state = init(problem, data, key=key)
+    for phase in range(len(problem.phases)):
+        if phase > 0:
+            state = begin_phase(problem, state, data, phase=phase)
+        length = num_calls(problem, problem.phases[phase])
+        state, reports = jax.lax.scan(partial(_scanned_step, problem, data, phase), state, length=length)
+    return state, jax.tree.map(lambda leaf: leaf[-1], reports)
+
+
+def _scanned_step(problem: Problem, data: Any, phase: int, state: FitState, _: None) -> tuple[FitState, Report]:
+    return step(problem, state, data, phase=phase)
 
 
 def is_finished(problem: Problem, state: FitState) -> bool:
@@ -223,6 +285,19 @@ def _scalar(count: Array) -> int:
     return int(np.asarray(count).reshape(-1)[0])
 
 
+def num_calls(problem: Problem, phase: Any) -> int:
+    """Calls of the step that a phase takes.
+
+    Args:
+        problem: what is fitted.
+        phase: of the fit.
+
+    Returns:
+        The number of calls.
+    """
+    return -(-phase.num_steps // problem.steps_per_call)
+
+
 def steps_per_call(problem: Problem, phase: Any) -> int:
     """Steps of one call: the calls share those of the phase evenly, so that the last one hardly goes beyond.
 
@@ -233,8 +308,7 @@ def steps_per_call(problem: Problem, phase: Any) -> int:
     Returns:
         The number of steps.
     """
-    num_calls = -(-phase.num_steps // problem.steps_per_call)
-    return -(-phase.num_steps // num_calls)
+    return -(-phase.num_steps // num_calls(problem, phase))
 
 
 @partial(jax.jit, static_argnums=0)
@@ -253,24 +327,12 @@ def _enter_phase(problem: Problem, state: FitState, data: Any) -> FitState:
     phase = _scalar(state.phase)
     if phase + 1 == len(problem.phases) or _scalar(state.phase_step) < problem.phases[phase].num_steps:
         return state
-    return _begin_next_phase(problem, phase, state, data)
+    return begin_phase(problem, state, data, phase=phase + 1)
 
 
 def _over_starts(function: Callable[..., Any], state: FitState, data: Any) -> Any:
     """The function of one state, or of all starts side by side."""
     return jax.vmap(function, in_axes=(0, None))(state, data) if state.step.ndim else function(state, data)
-
-
-@partial(jax.jit, static_argnums=(0, 1))
-def _begin_next_phase(problem: Problem, phase: int, state: FitState, data: Any) -> FitState:
-    def begin(state: FitState, data: Any) -> FitState:
-        params = problem.next_phase(problem.config, problem.phases[phase], state.params, data)
-        moments = problem.optimizer(problem.config, problem.phases[phase + 1]).init(params)
-        return replace(
-            state, params=params, optimizer=moments, phase=state.phase + 1, phase_step=jnp.zeros_like(state.phase_step)
-        )
-
-    return _over_starts(begin, state, data)
 
 
 @partial(jax.jit, static_argnums=(0, 1))

@@ -1,0 +1,298 @@
+"""Registration of planar scans by one call: a start, DeepMapping from it, refinement, and the choice among the results.
+
+`register_scans` joins the functions of this room with DeepMapping; no other file of the room imports `deepmapping`. A
+candidate is a trajectory under the name of what produced it: "DeepMapping" is what L-Net or M-Net produced.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import partial
+from typing import Literal, NamedTuple, get_args
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from numpy.typing import ArrayLike
+
+from dpmjax.checks import require_one_of, require_positive
+from dpmjax.deepmapping.config import DeepMappingConfig
+from dpmjax.deepmapping.engine import Progress, fit
+from dpmjax.deepmapping.planar import Fitted, as_scan_set, fit_deepmapping
+from dpmjax.geometry import se2
+from dpmjax.registration.global_registration import nearest_tour, register_globally
+from dpmjax.registration.incremental import incremental_icp, scan_odometry
+from dpmjax.registration.planar_scans import Floats, Indices, PlanarScans, planar_scans
+from dpmjax.registration.quality import Assessment, Score, assess_trajectory, choose_trajectory
+from dpmjax.registration.recordings import Recording, choose_scans
+from dpmjax.registration.refinement import refine
+from dpmjax.types import ScanSet
+
+StartName = Literal["auto", "odometry", "icp-plane", "icp-point", "global", "zero"]
+"""Where the poses start; "auto": see `register_scans`."""
+
+DEEPMAPPING = "DeepMapping"
+GIVEN_POSES = "given poses"
+START_NAMES: dict[str, str] = {
+    "icp-plane": "incremental ICP, point to line",
+    "icp-point": "incremental ICP, point to point",
+    "global": "global registration",
+    "odometry": "odometry",
+    "zero": "zero poses",
+}
+"""The name of the candidate that each start makes."""
+
+STARTS_FROM_SCANS = ("icp-plane", "icp-point", "global")
+"""Starts that use the scans alone."""
+
+# Up to this many scans without odometry are all registered.
+_MAX_WHOLE = 256
+# A fit whose map takes this many times the nats of the refined start is not refined.
+_LEAST_PROMISING = 1.15
+
+
+@dataclass(frozen=True)
+class RegistrationConfig:
+    """Settings of `register_scans`.
+
+    Attributes:
+        is_ordered: the scans lie in the order of time.
+        refine: the start and the fit are refined, too, and the better map counts.
+        fit: settings of DeepMapping; presets are `dpmjax.deepmapping.preset`.
+        min_distance: scans of a recording are registered where they lie at least this far apart, in the unit of the
+            scans, or are turned by `min_turn`; the others follow the motion between these. None: all are registered.
+        min_turn: see above, radians.
+
+    Raises:
+        ValueError: a limit is not positive.
+    """
+
+    is_ordered: bool = True
+    refine: bool = True
+    fit: DeepMappingConfig = field(default_factory=DeepMappingConfig)
+    min_distance: float | None = None
+    min_turn: float = 0.35
+
+    def __post_init__(self) -> None:
+        require_positive("min_distance", 1.0 if self.min_distance is None else self.min_distance)
+        require_positive("min_turn", self.min_turn)
+
+
+class RegistrationHooks(NamedTuple):
+    """Functions that `register_scans` calls.
+
+    Attributes:
+        on_progress: called with the name of a stage and the share of it that is done: 0 where the stage begins, and
+            after each call of the step of the fit.
+        stop: called before each stage that may be left out and before each call of the step of the fit. Where it
+            returns True, the fit ends, and the best of the candidates so far is kept.
+        fit: called with rows of the scans and their (k, 3) poses to start from, None for a cold start; returns the fit
+            of these scans in this order. None: `fit_deepmapping`.
+    """
+
+    on_progress: Callable[[str, float], None] = lambda _stage, _share: None
+    stop: Callable[[], bool] = lambda: False
+    fit: Callable[[Indices, Floats | None], Fitted] | None = None
+
+
+class Candidate(NamedTuple):
+    """A trajectory that was compared.
+
+    Attributes:
+        poses: (k, 3) T_world_scan of the registered scans.
+        score: of its map, by the scans alone.
+    """
+
+    poses: Floats
+    score: Score
+
+
+class RegisteredScans(NamedTuple):
+    """Result of `register_scans`.
+
+    Attributes:
+        poses: (n, 3) T_world_scan of all scans, x, y, heading, in the unit of the scans.
+        kept: name of the candidate that the poses come from.
+        start: name of the candidate that the fit started from.
+        candidates: all candidates by name.
+        assessment: of the kept candidate: `assessment.is_trusted` tells whether its map can be trusted.
+        fitted: DeepMapping of the registered scans.
+        recording: all scans, and the rows of those that were registered.
+    """
+
+    poses: Floats
+    kept: str
+    start: str
+    candidates: dict[str, Candidate]
+    assessment: Assessment
+    fitted: Fitted
+    recording: Recording
+
+    @property
+    def T_world_scan(self) -> Floats:
+        """(n, 3, 3) the poses as matrices."""
+        return se2.to_matrix(self.poses)
+
+
+def register_scans(
+    scans: ScanSet | ArrayLike,
+    config: RegistrationConfig | None = None,
+    *,
+    key: jax.Array,
+    start: StartName | ArrayLike = "auto",
+    odometry: ArrayLike | None = None,
+    hooks: RegistrationHooks | None = None,
+) -> RegisteredScans:
+    """Registers planar scans: a start, DeepMapping from it, both refined, and of these the best map.
+
+    The map is chosen and assessed by the scans alone. Where the start was "auto", it was the odometry, and the map
+    cannot be trusted, the scans are registered without odometry, too.
+
+    Args:
+        scans: (n, b, 2) beam end points in the sensor frames, any unit; all-zero or non-finite beams are left out. Or a
+            ScanSet.
+        config: settings.
+        key: of the fit.
+        start: where the poses start: "odometry"; "icp-plane" and "icp-point", incremental ICP; "global", an exhaustive
+            search of scan pairs, which needs no order; "zero"; or (n, 3) x, y, heading or (n, 3, 3) matrices. "auto":
+            the odometry where there is one, else incremental point-to-line ICP; "global" for scans without an order.
+        odometry: (n, 3) or (n, 3, 3) raw odometry of ordered scans.
+        hooks: functions that are called: progress, a request to stop, the fit.
+
+    Returns:
+        RegisteredScans.
+
+    Raises:
+        ValueError: the scans, the start or the odometry have a wrong shape or are not finite; a scan has no valid beam;
+            there is no odometry to start from; or the start needs an order that the scans do not have.
+    """
+    config, hooks = config or RegistrationConfig(), hooks or RegistrationHooks()
+    everyone = as_scan_set(scans)
+    wheels = None if odometry is None else se2.as_poses("odometry", odometry, len(everyone.points))
+    first = _checked_start(start, wheels, len(everyone.points), config)
+    recording = _choose_scans(everyone, wheels, first, config, hooks)
+    lines = planar_scans(_take(everyone, recording.chosen), is_ordered=config.is_ordered)
+    start_name, poses = _start_poses(lines, first, wheels, recording, hooks)
+    fitted = _fit(recording, poses, config, key=key, hooks=hooks, is_cold=start_name == START_NAMES["zero"])
+    found = {start_name: poses, DEEPMAPPING: fitted.poses}
+    if config.refine and not hooks.stop():
+        found |= _refined_candidates(lines, found, hooks)
+    hooks.on_progress("choice and assessment", 0.0)
+    kept, scores = choose_trajectory(lines, found)
+    assessment = assess_trajectory(lines, found[kept])
+    has_other = isinstance(start, str) and start == "auto" and config.refine and wheels is not None
+    if has_other and not assessment.is_trusted and not hooks.stop():
+        hooks.on_progress("the map from odometry cannot be trusted: registration without it", 0.0)
+        name = START_NAMES["icp-plane"]
+        found[f"{name}, refined"] = refine(lines, incremental_icp(lines).poses).poses
+        kept, scores = choose_trajectory(lines, found)
+        assessment = assess_trajectory(lines, found[kept])
+    if recording.motion is not None:
+        hooks.on_progress("poses between the registered scans", 0.0)
+    candidates = {name: Candidate(found[name], score) for name, score in scores.items()}
+    return RegisteredScans(recording.aligned(found[kept]), kept, start_name, candidates, assessment, fitted, recording)
+
+
+def _checked_start(
+    start: StartName | ArrayLike, odometry: Floats | None, count: int, config: RegistrationConfig
+) -> str | Floats:
+    """Returns the start with "auto" resolved, or the given poses."""
+    if not config.is_ordered and odometry is not None:
+        raise ValueError("odometry: expected None, because the scans are not ordered")
+    if not isinstance(start, str):
+        return se2.as_poses("start", start, count)
+    require_one_of("start", start, get_args(StartName))
+    if start == "auto":
+        by_order = "icp-plane" if odometry is None else "odometry"
+        return by_order if config.is_ordered else "global"
+    if start == "odometry" and odometry is None:
+        raise ValueError("start: expected a start without odometry, because there is none, got 'odometry'")
+    if start != "global" and not config.is_ordered:
+        raise ValueError(f"start: expected 'global' or poses, because the scans are not ordered, got {start!r}")
+    return start
+
+
+def _choose_scans(
+    scans: ScanSet, odometry: Floats | None, start: str | Floats, config: RegistrationConfig, hooks: RegistrationHooks
+) -> Recording:
+    """Chooses the scans that are registered by the odometry, or by the scans where the start uses them alone."""
+    motion = None if isinstance(start, str) and start in STARTS_FROM_SCANS else odometry
+    if config.min_distance is None or not config.is_ordered:
+        return Recording(scans, np.arange(len(scans.points)))
+    if motion is None and len(scans.points) > _MAX_WHOLE:
+        hooks.on_progress("odometry from the scans", 0.0)
+        motion = scan_odometry(planar_scans(scans))
+    return choose_scans(scans, motion, config.min_distance, config.min_turn)
+
+
+def _take(scans: ScanSet, rows: Indices) -> ScanSet:
+    # On the host: each number of rows would be a program of its own.
+    return ScanSet(jnp.asarray(np.asarray(scans.points)[rows]), jnp.asarray(np.asarray(scans.mask)[rows]))
+
+
+def _start_poses(
+    scans: PlanarScans, start: str | Floats, odometry: Floats | None, recording: Recording, hooks: RegistrationHooks
+) -> tuple[str, Floats]:
+    """Returns the name of the start and the poses of the registered scans."""
+    if not isinstance(start, str):
+        return GIVEN_POSES, start[recording.chosen]
+    name = START_NAMES[start]
+    hooks.on_progress(f"start: {name}", 0.0)
+    match start:
+        case "zero":
+            return name, np.zeros((len(scans), 3))
+        case "global":
+            return name, register_globally(scans).poses
+        case "icp-plane" | "icp-point":
+            return name, incremental_icp(scans, "plane" if start == "icp-plane" else "point").poses
+    assert odometry is not None
+    return name, odometry[recording.chosen]
+
+
+def _fit(
+    recording: Recording,
+    poses: Floats,
+    config: RegistrationConfig,
+    *,
+    key: jax.Array,
+    hooks: RegistrationHooks,
+    is_cold: bool,
+) -> Fitted:
+    """Fits the registered scans in an order in which neighbours are near each other: that of time, or a tour."""
+    order = np.arange(len(poses)) if config.is_ordered else nearest_tour(poses)
+    rows, start = recording.chosen[order], None if is_cold else poses[order]
+    hooks.on_progress(DEEPMAPPING, 0.0)
+    if hooks.fit is not None:
+        fitted = hooks.fit(rows, start)
+    else:
+
+        def report(progress: Progress) -> None:
+            hooks.on_progress(DEEPMAPPING, progress.share)
+
+        engine = partial(fit, on_report=report, stop=hooks.stop)
+        fitted = fit_deepmapping(_take(recording.scans, rows), config.fit, key=key, start=start, engine=engine)
+    return fitted._replace(poses=fitted.poses[np.argsort(order)])
+
+
+def _refined_candidates(
+    scans: PlanarScans, candidates: dict[str, Floats], hooks: RegistrationHooks
+) -> dict[str, Floats]:
+    """Returns the start and the fit, each refined; a fit that is a worse map than the refined start is left out.
+
+    The fit is sharper near a good start; the start keeps what the odometry of a robot tells.
+    """
+    (start, start_poses), (fit_name, fit_poses) = candidates.items()
+    found: dict[str, Floats] = {}
+
+    def add_refined(name: str, poses: Floats) -> None:
+        hooks.on_progress(f"{name}, refined", 0.0)
+        found[f"{name}, refined"] = refine(scans, poses).poses
+
+    if start != START_NAMES["zero"]:
+        add_refined(start, start_poses)
+    scores = choose_trajectory(scans, {fit_name: fit_poses, **found})[1]
+    nats = [score.code_length for score in scores.values()]
+    if nats[0] <= _LEAST_PROMISING * nats[-1]:
+        add_refined(fit_name, fit_poses)
+    return found

@@ -1,0 +1,69 @@
+"""Every subcommand on simulated input, away from the checkout, as a user of the installed package runs it."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from dpmjax.cli.program import COMMANDS
+
+EXIT_OK, EXIT_BAD_INPUT = 0, 2
+
+SIMULATED = {
+    "register": ("a.npy", "b.npy", "-o", "registered"),
+    "map2d": ("-n", "24", "--steps", "20", "-o", "mapped"),
+    "slam": ("-n", "12", "-o", "first"),
+    "localize": ("first/map.npz", "scans", "-o", "found"),
+    "merge": ("first/map.npz", "first/map.npz", "-o", "merged"),
+    "train": (
+        *("--steps", "3", "--num-towns", "1", "--town-length-m", "100", "--selection-pairs", "2"),
+        *("--held-out-pairs", "2", "--cache", "cache", "-o", "trained"),
+    ),
+    "evaluate": ("--pairs", "2", "-o", "evaluated"),
+    "info": (),
+}
+"""Arguments in an order in which each finds what those before have written."""
+
+MISSING = {
+    "register": ("none.pcd", "b.npy"),
+    "map2d": ("none.log",),
+    "slam": ("none",),
+    "localize": ("none.npz", "scans"),
+    "merge": ("none.npz", "first/map.npz"),
+    "train": ("--data", "none"),
+    "evaluate": ("none",),
+}
+
+
+def start(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run([sys.executable, "-m", "dpmjax", *arguments], cwd=folder, capture_output=True, text=True)
+
+
+@pytest.mark.slow
+def test_every_subcommand_ends_well_on_simulated_input(tmp_path) -> None:
+    from dpmjax.simulation import SceneMixture, draw_scene, simulate_scene
+
+    drive = simulate_scene(draw_scene(0, SceneMixture(length_m=100.0)))
+    (tmp_path / "scans").mkdir()
+    for number, name in enumerate(("a.npy", "b.npy", "scans/0.npy", "scans/1.npy")):
+        np.save(tmp_path / name, drive.read_scan(number))
+    assert SIMULATED.keys() == COMMANDS.keys()
+    for name, arguments in SIMULATED.items():
+        done = start(tmp_path, name, *arguments)
+        assert done.returncode == EXIT_OK, f"{name}: {done.stderr[-2000:]}"
+        if "-o" in arguments:
+            assert (tmp_path / arguments[-1] / "metrics.json").is_file(), name
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", sorted(MISSING))
+def test_a_missing_file_is_one_line_and_exit_code_2(name, tmp_path) -> None:
+    done = start(tmp_path, name, *MISSING[name], "-o", "out")
+    assert done.returncode == EXIT_BAD_INPUT, done.stderr[-2000:]
+    assert len(done.stderr.strip().splitlines()) == 1, done.stderr
+    assert "none" in done.stderr
+    assert not (tmp_path / "out").exists()

@@ -1,0 +1,68 @@
+"""Laws of the registration of depth images by one call."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import jax
+import numpy as np
+import pytest
+
+from dpmjax import deepmapping as dm
+from dpmjax import io, simulation
+from dpmjax.geometry import typical_range
+
+KEY = jax.random.key(3)
+CONFIG = replace(dm.depth_preset("fast"), steps_per_call=1)
+
+
+@pytest.fixture(scope="module")
+def walk() -> io.DepthSequence:
+    return simulation.simulate_depth_sequence(0, 4, seed=1, config=simulation.DepthWalkConfig(height=12, width=16))
+
+
+@pytest.fixture(scope="module")
+def scans(walk) -> dm.DepthScans:
+    return dm.as_depth_scans(walk.points, walk.mask)
+
+
+def returning(T: np.ndarray, scans: dm.DepthScans) -> Callable[..., dm.Fit]:
+    """An engine that trains nothing and returns poses."""
+    poses = np.array(T)
+    poses[:, :3, 3] /= typical_range(scans.points, scans.mask)
+
+    def engine(problem, data, *, key, num_starts):
+        return dm.fit(problem, data, key=key, num_starts=num_starts, stop=lambda: True)._replace(poses=poses)
+
+    return engine
+
+
+def test_of_start_and_fit_the_more_consistent_one_is_kept(walk, scans) -> None:
+    right, apart = walk.T_world_camera, np.array(walk.T_world_camera)
+    apart[:, 0, 3] += np.arange(4.0)
+    for start, fitted, kept in ((right, apart, "start"), (apart, right, "fit")):
+        found = dm.register_depth(scans, CONFIG, key=KEY, start=start, engine=returning(fitted, scans))
+        assert found.kept == kept
+        np.testing.assert_allclose(found.T_world_camera, right, atol=1e-6)
+        assert (found.consistency > found.start_consistency) == (kept == "fit")
+        assert found.consistency == pytest.approx(float(dm.projective_consistency(scans, fitted)), abs=1e-4)
+
+
+def test_a_fit_that_is_not_finite_is_not_kept(walk, scans) -> None:
+    lost = np.full((4, 4, 4), np.nan)
+    found = dm.register_depth(scans, CONFIG, key=KEY, start=walk.T_world_camera, engine=returning(lost, scans))
+    assert found.kept == "start"
+
+
+@pytest.mark.slow
+def test_without_a_start_the_search_is_the_start(walk, scans) -> None:
+    found = dm.register_depth(scans, CONFIG, key=KEY, engine=returning(walk.T_world_camera, scans))
+    np.testing.assert_array_equal(found.start, dm.initialize_depth(scans, motion="planar", key=KEY))
+
+
+def test_bad_input_is_named(scans) -> None:
+    with pytest.raises(ValueError, match="points: expected shape"):
+        dm.register_depth(np.zeros((4, 3)), key=KEY)
+    with pytest.raises(ValueError, match="start: expected"):
+        dm.register_depth(scans, key=KEY, start=np.eye(4))
