@@ -20,23 +20,22 @@ from numpy.typing import NDArray
 
 import dpmjax
 from benchmarks.rows import Row, measure
-from dpmjax.cli.machine import peak_rss_gb
+from dpmjax.cli import peak_rss_gb
 from dpmjax.deeppointmap import (
     CurriculumStage,
+    SampleMaker,
     ScanStore,
     init_training,
     make_step,
     merge_clouds,
     prepare_drive,
+    pyramid_of_cloud,
     training_preset,
 )
-from dpmjax.deeppointmap.data_pipeline import SampleMaker
-from dpmjax.deeppointmap.encoding import pyramid_of_cloud
 from dpmjax.geometry import build_pyramid
 from dpmjax.io import LidarSequence, open_lidar_sequence
 from dpmjax.scans import preprocess_scan, preprocess_scan_on_host
 from dpmjax.simulation import HDL64E, simulate_lidar_sequence
-from dpmjax.types import DescriptorCloud
 
 Scan = NDArray[np.float32]
 DATA = Path(os.environ.get("DPMJAX_DATA", "../shared/data")) / "lidar_3d"
@@ -165,11 +164,11 @@ def _model(preset: str) -> dpmjax.Model:
     return dpmjax.init_model(jax.random.key(0), dpmjax.model_preset(preset))
 
 
-def _cloud(model: dpmjax.Model, num_descriptors: int, *, seed: int) -> DescriptorCloud:
+def _cloud(model: dpmjax.Model, num_descriptors: int, *, seed: int) -> dpmjax.DescriptorCloud:
     rng = np.random.default_rng(seed)
     positions = rng.uniform(-40.0, 40.0, (num_descriptors, 3)).astype(np.float32)
     features = rng.normal(size=(num_descriptors, model.config.decoder.input_channels)).astype(np.float32)
-    return DescriptorCloud(jnp.asarray(positions), jnp.asarray(features), jnp.ones(num_descriptors, bool))
+    return dpmjax.DescriptorCloud(jnp.asarray(positions), jnp.asarray(features), jnp.ones(num_descriptors, bool))
 
 
 def _timed(case: str, parts: dict[str, Callable[[], object]], quick: bool, repeats: int = 12) -> list[Row]:

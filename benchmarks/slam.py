@@ -24,11 +24,10 @@ from typing import NamedTuple
 import numpy as np
 
 from benchmarks.rows import Row
-from dpmjax.geometry import rigid
 from dpmjax.metrics import absolute_trajectory_error, registration_recall
-from dpmjax.simulation.town.streets import arc_lengths, at_way, lane_of, make_streets, tangents
+from dpmjax.simulation import route_poses
 from dpmjax.slam import SlamConfig, SlamMethods, SlamResult, finish_slam, init_slam, step_slam
-from tests.slam.truth import MistakenMatcher, TruthGeometry, pose, scans_of
+from tests.slam.truth import MistakenMatcher, TruthGeometry, scans_of
 
 NAME = "slam"
 ROUTE_STREAM = 77
@@ -72,10 +71,8 @@ def run(quick: bool) -> list[Row]:
 
 def route(seed: int, length_m: float, kind: str = "wander") -> np.ndarray:
     """Returns poses on the lane of a route through streets, one every metre."""
-    streets = make_streets(np.random.default_rng([ROUTE_STREAM, seed]), kind, length_m, BLOCK_M)
-    lane = lane_of(streets, is_reversed=False)
-    found = at_way(np.column_stack([lane, tangents(lane)]), np.arange(0.0, arc_lengths(lane)[-1], STEP_M))
-    return np.array([pose(x, y, np.arctan2(dy, dx)) for x, y, dx, dy in found])
+    rng = np.random.default_rng([ROUTE_STREAM, seed])
+    return route_poses(rng, kind, length_m, block_m=BLOCK_M, step_m=STEP_M)
 
 
 def methods_for(truth: np.ndarray, seed: int) -> SlamMethods:
@@ -97,7 +94,7 @@ def judged(result: SlamResult, truth: np.ndarray) -> Proof:
     loops = [loop for loop in result.loops if loop.status == "accepted"]
     source, target = (truth[result.keyframes[[getattr(loop, end) for loop in loops]]] for end in ("source", "target"))
     found = np.reshape([loop.T_target_source for loop in loops], (-1, 4, 4))
-    right = registration_recall(found, rigid.inverse(target) @ source).is_right
+    right = registration_recall(found, np.linalg.inv(target) @ source).is_right
     is_opposite = np.einsum("ni,ni->n", source[:, :3, 0], target[:, :3, 0]) < 0
     ate_m, ate_odometry_m = (
         absolute_trajectory_error(poses[:, :3, 3], truth[:, :3, 3])

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from dpmjax.scans.preprocess import PreprocessConfig, preprocess_scan_on_host
+from dpmjax.scans import PreprocessConfig, preprocess_scan_on_host
 
 RANGE_EDGES_M = np.arange(0.0, 61.0, 2.5)
 HEIGHT_EDGES_M = np.r_[-np.inf, np.arange(-4.0, 12.1, 0.5), np.inf]

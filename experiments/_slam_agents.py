@@ -7,13 +7,18 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from dpmjax.cli import slam_files as files
-from dpmjax.cli.run_folder import AGENTS, RunFolder
-from dpmjax.cli.slam_input import read_points
-from dpmjax.cli.slam_numbers import trajectory_errors
+from dpmjax.cli import (
+    RunFolder,
+    gather_map,
+    loop_cells,
+    trajectory_errors,
+    write_map_file,
+    write_table,
+    write_trajectory,
+)
 
 if TYPE_CHECKING:
-    from dpmjax.sequences import LidarSequence
+    from dpmjax.io import LidarSequence
     from dpmjax.slam import AgentsResult, Loop
     from dpmjax.viz import AgentPanel
 
@@ -48,17 +53,16 @@ def write_agents(folder: RunFolder, result: AgentsResult, sequences: Sequence[Li
     for number, (T_world_scan, agent, sequence) in enumerate(
         zip(result.T_world_scan, result.agents, sequences, strict=True), start=1
     ):
-        files.write_trajectory(folder.path, T_world_scan, sequence.times, f"agent_{number}")
-        slam_map = agent.state.slam_map
-        path = folder / AGENTS / f"agent_{number}" / "map.npz"
-        sizes.append(files.write_map_file(path, slam_map) if len(slam_map) else {})
+        write_trajectory(folder.path, T_world_scan, sequence.times, f"agent_{number}")
+        path = folder.part("agents", f"agent_{number}") / "map.npz"
+        sizes.append(write_map_file(path, agent.map) if len(agent.map) else {})
     for component in range(max(result.component) + 1):
         slam_map = take_component(result.joined, component)
         if len(slam_map):
-            files.write_map_file(folder / f"map_{component + 1}.npz", slam_map)
+            write_map_file(folder / f"map_{component + 1}.npz", slam_map)
     if len(result.joined.slam_map):
         dpmjax.write_g2o(folder / "graph.g2o", as_pose_graph(result.joined.slam_map))
-    files.write_table(folder / "loops.csv", LOOP_COLUMNS, _loop_rows(result))
+    write_table(folder / "loops.csv", LOOP_COLUMNS, _loop_rows(result))
     return sizes
 
 
@@ -74,16 +78,13 @@ def _loop_rows(result: AgentsResult) -> list[dict[str, Any]]:
 
 def _loop_row(kind: str, loop: Loop, ends: Sequence[tuple[int, int]]) -> dict[str, Any]:
     (agent, scan), (other_agent, other_scan) = ends[loop.source], ends[loop.target]
-    numbers = {name: getattr(loop, name) for name in ("overlap", "probability", "rmse_m")}
     return {
         "kind": kind,
         "agent": agent,
         "scan": scan,
         "other_agent": other_agent,
         "other_scan": other_scan,
-        "found_by": loop.found_by,
-        "status": loop.status,
-        **{name: "" if value is None else f"{value:.6g}" for name, value in numbers.items()},
+        **loop_cells(loop),
     }
 
 
@@ -158,7 +159,7 @@ def agent_panels(result: AgentsResult, sequences: Sequence[LidarSequence]) -> li
             reference = None
             if alignment is not None and sequence.T_world_lidar is not None:
                 reference = sequence.T_world_lidar[:, :3, 3] @ alignment[:3, :3].T + alignment[:3, 3]
-            cloud = files.gather_map((read_points(sequence, scan), T[scan]) for scan in agent.keyframes)
+            cloud = gather_map((sequence.read_points(scan), T[scan]) for scan in agent.keyframes.tolist())
             label = f"agent {number + 1}, {len(T)} scans"
             color = viz.COLORS[number % len(viz.COLORS)]
             tracks.append(viz.AgentTrack(label, color, T[:, :3, 3], reference, cloud.points, cloud.heights_m))
@@ -187,14 +188,12 @@ def _alignment(result: AgentsResult, sequences: Sequence[LidarSequence], members
 
 
 def _shown_frame(result: AgentsResult, members: Sequence[int]) -> np.ndarray:
-    from dpmjax.geometry import rigid
-
     for number in members:
         rows = np.flatnonzero(result.joined.map_of_keyframe == number)
         if len(rows):
             first = result.agents[number].reports[0]
             T_map_scan = result.joined.slam_map.T_world_keyframe[rows[first.keyframe]] @ first.T_keyframe_scan
-            return np.asarray(result.T_world_scan[number][0] @ rigid.inverse(T_map_scan))
+            return np.asarray(result.T_world_scan[number][0] @ np.linalg.inv(T_map_scan))
     return np.eye(4)
 
 

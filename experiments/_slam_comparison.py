@@ -4,20 +4,17 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from dpmjax import io, load_model, viz
-from dpmjax.cli.result_files import do_row
-from dpmjax.cli.run_folder import RunFolder
-from dpmjax.cli.slam_input import corrected, read_points, require_whole_files
-from dpmjax.metrics import align_rigid
-from dpmjax.metrics.loops import path_lengths
-from dpmjax.sequences import LidarSequence
+from dpmjax.cli import DriveSelection, RunFolder, do_row, open_drive
+from dpmjax.io import LidarSequence
+from dpmjax.metrics import align_rigid, path_lengths
 from dpmjax.simulation import HDL64E, OS1_64, DriveConfig, LidarSensor, Scene, TownConfig, simulate_scene
 from dpmjax.slam import SlamMethods, make_methods
 from experiments import _slam_evaluation as evaluation
@@ -25,9 +22,6 @@ from experiments._slam_evaluation import ODOMETRY, OURS, PRECISIONS, Drive, Stop
 from experiments._slam_localization import evaluate_localization
 from experiments._slam_peers import PEERS, why_missing, why_not_importable
 from experiments._slam_refine import MULTIWAY, REFINED, evaluate_refinement
-
-if TYPE_CHECKING:
-    from experiments.dpm_evaluate import Config
 
 TOWN = "town"
 # Kind of place, kind of route, lidar: taken in turn. Each route drives some streets in both directions.
@@ -62,25 +56,56 @@ SIZES = {
 Task = tuple[Drive, str, Callable[[], dict[str, Any]]]
 
 
-def open_drives(config: Config, first_town: int) -> list[LidarSequence]:
+@dataclass(frozen=True, kw_only=True)
+class DriveChoice:
+    """Drives that are compared.
+
+    Attributes:
+        paths: folders of scans, or `TOWN` for simulated towns.
+        selection: scans of each folder and of each town.
+        town_seeds: seeds of the towns.
+        town_lengths_m: length of each town's route.
+    """
+
+    paths: Sequence[str]
+    selection: DriveSelection
+    town_seeds: Sequence[int] = ()
+    town_lengths_m: Sequence[float] = ()
+
+
+@dataclass(frozen=True, kw_only=True)
+class Comparison:
+    """Rows that are made of each drive.
+
+    Attributes:
+        weights: name of a shipped model, or a file.
+        seed: of the refinement and of the scans that are looked for.
+        is_refined: whether refinements of our run are rows.
+        num_localized: number of scans that are looked for in the map of the first half; 0 for no such row.
+    """
+
+    weights: str
+    seed: int
+    is_refined: bool
+    num_localized: int
+
+
+def open_drives(choice: DriveChoice) -> list[LidarSequence]:
     """Opens the drives; bad input that can be known before the run is a `ValueError`."""
     drives: list[LidarSequence] = []
-    for entry in config.paths:
+    part = choice.selection
+    for entry in choice.paths:
         if entry == TOWN and not Path(entry).exists():
-            lengths = np.linspace(*config.town_length_range, config.num_towns)
-            towns = [town_drive(first_town + number, number, length) for number, length in enumerate(lengths)]
-            drives += _with_kept_scans(towns)
+            towns = zip(choice.town_seeds, choice.town_lengths_m, strict=True)
+            simulated = [town_drive(seed, number, length_m) for number, (seed, length_m) in enumerate(towns)]
+            rows = slice(None, None, part.jump)
+            drives += [drive.take(rows).take(slice(part.num_scans)) for drive in _with_kept_scans(simulated)]
         else:
             names: Sequence[str | None] = io.list_lidar_sequences(entry) or [None]
-            opened = (io.open_lidar_sequence(entry, sequence=name) for name in names)
-            drives += [corrected(drive, config.kitti_angle_correction) for drive in opened]
-    drives = [drive.take(np.arange(len(drive))[:: config.jump][: config.n_scans]) for drive in drives]
-    for drive in drives:
-        require_whole_files(drive)
-        read_points(drive, 0)
-    names = [drive.name for drive in drives]
-    if len(set(names)) < len(names):
-        raise ValueError(f"two drives have the same name ({', '.join(sorted(names))}); evaluate them one by one")
+            drives += [open_drive(replace(part, data=Path(entry), sequence=name)) for name in names]
+    titles = [drive.name for drive in drives]
+    if len(set(titles)) < len(titles):
+        raise ValueError(f"two drives have the same name ({', '.join(sorted(titles))}); evaluate them one by one")
     return drives
 
 
@@ -107,30 +132,30 @@ def _with_kept_scans(drives: Sequence[LidarSequence]) -> list[LidarSequence]:
     return [replace(drive, read_scan=partial(read, drive)) for drive in drives]
 
 
-def missing_peers(config: Config) -> dict[str, str]:
+def missing_peers(comparison: Comparison) -> dict[str, str]:
     """Returns the peers that cannot run, and why."""
     reasons = {name: why_missing(name) for name in PEERS}
-    if config.refine:
+    if comparison.is_refined:
         reasons[MULTIWAY] = why_not_importable("open3d", "baselines")
     return {name: reason for name, reason in reasons.items() if reason is not None}
 
 
 def compare(
-    config: Config, folder: RunFolder, sequences: Sequence[LidarSequence], is_stopped: Callable[[], bool]
+    comparison: Comparison, folder: RunFolder, sequences: Sequence[LidarSequence], is_stopped: Callable[[], bool]
 ) -> Iterator[tuple[Drive, dict[str, Any]]]:
     """Makes the rows that are missing; ends early where a signal came."""
-    methods = make_methods(load_model(config.weights), weights=config.weights)
-    missing = missing_peers(config)
+    methods = make_methods(load_model(comparison.weights), weights=comparison.weights)
+    missing = missing_peers(comparison)
     drives = [evaluation.open_folder(folder, sequence, is_stopped) for sequence in sequences]
     ours: dict[str, dict[str, Any]] = {}
     # Trajectories of all drives come first: an early end leaves a whole table.
-    more = (_refinements(config, drives, methods), _localizations(config, drives, methods))
+    more = (_refinements(comparison, drives, methods), _localizations(comparison, drives, methods))
     for drive, method, work in itertools.chain(_runs(drives, methods, ours), *more):
         if method in missing:
             continue
         case = {"sequence": drive.sequence.name, "method": method}
         try:
-            row = do_row(folder.path, case, work, seed=config.seed)
+            row = do_row(folder.path, case, work, seed=comparison.seed)
         except StoppedError:
             return
         if method == OURS:
@@ -146,18 +171,18 @@ def _runs(drives: Sequence[Drive], methods: SlamMethods, ours: dict[str, dict[st
         yield drive, ODOMETRY, lambda drive=drive: evaluation.odometry_row(drive, ours[drive.sequence.name])
 
 
-def _refinements(config: Config, drives: Sequence[Drive], methods: SlamMethods) -> Iterator[Task]:
-    for drive in drives if config.refine else ():
+def _refinements(comparison: Comparison, drives: Sequence[Drive], methods: SlamMethods) -> Iterator[Task]:
+    for drive in drives if comparison.is_refined else ():
         for name in (REFINED, MULTIWAY):
-            yield drive, name, partial(evaluate_refinement, drive, methods, name, config.seed)
+            yield drive, name, partial(evaluate_refinement, drive, methods, name, comparison.seed)
 
 
-def _localizations(config: Config, drives: Sequence[Drive], methods: SlamMethods) -> Iterator[Task]:
+def _localizations(comparison: Comparison, drives: Sequence[Drive], methods: SlamMethods) -> Iterator[Task]:
     for drive in drives:
-        if config.localize and drive.reference is not None:
+        if comparison.num_localized and drive.reference is not None:
             for precision in PRECISIONS:
                 work = partial(evaluate_localization, drive, methods, precision)
-                yield drive, f"localization, {precision}", partial(work, config.localize, config.seed)
+                yield drive, f"localization, {precision}", partial(work, comparison.num_localized, comparison.seed)
 
 
 def tables(rows: Sequence[dict[str, Any]]) -> str:

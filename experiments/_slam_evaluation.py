@@ -18,20 +18,15 @@ import numpy as np
 from tqdm import tqdm
 
 from dpmjax import save_map
-from dpmjax.cli import slam_files as files
-from dpmjax.cli.run_folder import DRIVES, RunFolder
-from dpmjax.cli.slam_input import read_points
-from dpmjax.cli.slam_numbers import trajectory_errors
-from dpmjax.cli.slam_run import SlamRun, run_alone
-from dpmjax.geometry import rigid
-from dpmjax.metrics import find_revisits, loop_recall, registration_recall
-from dpmjax.metrics.loops import path_lengths
-from dpmjax.sequences import LidarSequence
+from dpmjax.cli import RunFolder, SlamRun, map_drive, trajectory_errors, write_loops, write_scans, write_trajectory
+from dpmjax.io import LidarSequence
+from dpmjax.metrics import find_revisits, loop_recall, path_lengths, registration_recall
+from dpmjax.saved_maps import Precision
 from dpmjax.slam import KeyframeMap, SlamMethods, SlamResult
 from experiments._slam_peers import PEERS, POINT_BYTES, FoundLoop, KissIcp, Peer, is_indoors, peer_version
 
 OURS, ODOMETRY = "DeepPointMap", "DeepPointMap odometry"
-PRECISIONS = ("float32", "float16", "int8")
+PRECISIONS: tuple[Precision, ...] = ("float32", "float16", "int8")
 # Sizes of maps are taken so many times on the way.
 NUM_SIZES = 8
 # Stages of a run that no other program's time has.
@@ -86,10 +81,8 @@ class Drive(NamedTuple):
 
 def open_folder(folder: RunFolder, sequence: LidarSequence, is_stopped: Callable[[], bool]) -> Drive:
     """Makes the folder of a drive."""
-    path = folder / DRIVES / sequence.name.replace("/", "-")
-    path.mkdir(parents=True, exist_ok=True)
-    # A drive that was begun goes on, whatever the command was told.
-    return Drive(sequence, RunFolder(path, is_resumed=True), is_indoors(read_points(sequence, 0)), is_stopped)
+    part = folder.part("drives", sequence.name.replace("/", "-"))
+    return Drive(sequence, part, is_indoors(sequence.read_points(0)), is_stopped)
 
 
 def file_name(method: str) -> str:
@@ -99,7 +92,7 @@ def file_name(method: str) -> str:
 
 def evaluate_ours(drive: Drive, methods: SlamMethods) -> dict[str, Any]:
     """Runs the whole system, and writes its files."""
-    run, result = run_alone(drive.folder, drive.sequence, methods, drive.is_stopped)
+    run, result = map_drive(drive.folder, drive.sequence, methods, drive.is_stopped)
     if len(run.reports) < len(drive.sequence):
         raise StoppedError
     loops = [loop for loop in result.loops if loop.status == "accepted"]
@@ -109,9 +102,9 @@ def evaluate_ours(drive: Drive, methods: SlamMethods) -> dict[str, Any]:
         for loop in loops
         if loop.T_target_source is not None
     ]
-    files.write_loops(drive.folder / "loops.csv", result.loops, result.keyframes)
-    files.write_scans(drive.folder / "scans.csv", result.reports, result.keyframes, drive.sequence.sources)
-    write_trajectory(drive, ODOMETRY, result.T_odometry_scan)
+    write_loops(drive.folder / "loops.csv", result.loops, result.keyframes)
+    write_scans(drive.folder / "scans.csv", result.reports, result.keyframes, drive.sequence.sources)
+    save_trajectory(drive, ODOMETRY, result.T_odometry_scan)
     odometry_s = sum(run.stages_s.get(stage, 0.0) for stage in _ODOMETRY_STAGES)
     return {
         **common_numbers(drive, OURS, result.T_world_scan, found),
@@ -144,7 +137,7 @@ def evaluate_peer(drive: Drive, name: str) -> dict[str, Any]:
     for number in tqdm(range(num_scans), desc=f"{drive.sequence.name}, {name}", unit=" scans", dynamic_ncols=True):
         if drive.is_stopped():
             raise StoppedError
-        points = read_points(drive.sequence, number).astype(np.float64)
+        points = drive.sequence.read_points(number).astype(np.float64)
         if len(points):
             clock = time.perf_counter()
             peer.step(points)
@@ -171,7 +164,7 @@ def evaluate_peer(drive: Drive, name: str) -> dict[str, Any]:
 
 def common_numbers(drive: Drive, method: str, T_world_scan: np.ndarray, loops: Sequence[FoundLoop]) -> dict[str, Any]:
     """Writes the trajectory of a method, and returns its errors and those of its loops."""
-    write_trajectory(drive, method, T_world_scan)
+    save_trajectory(drive, method, T_world_scan)
     known = T_world_scan if drive.reference is None else drive.reference
     return {
         "num_scans": len(T_world_scan),
@@ -182,9 +175,9 @@ def common_numbers(drive: Drive, method: str, T_world_scan: np.ndarray, loops: S
     }
 
 
-def write_trajectory(drive: Drive, method: str, T_world_scan: np.ndarray) -> None:
+def save_trajectory(drive: Drive, method: str, T_world_scan: np.ndarray) -> None:
     """Writes the trajectory of a method."""
-    files.write_trajectory(drive.folder.path, T_world_scan, drive.sequence.times, file_name(method))
+    write_trajectory(drive.folder.path, T_world_scan, drive.sequence.times, file_name(method))
 
 
 def loop_numbers(drive: Drive, loops: Sequence[FoundLoop]) -> dict[str, Any]:
@@ -193,7 +186,7 @@ def loop_numbers(drive: Drive, loops: Sequence[FoundLoop]) -> dict[str, Any]:
     assert poses is not None
     newer, older = (np.array([getattr(loop, end)[0] for loop in loops], int) for end in ("newer", "older"))
     found = np.reshape([loop.T_older_newer for loop in loops], (-1, 4, 4))
-    is_right = registration_recall(found, rigid.inverse(poses[older]) @ poses[newer]).is_right
+    is_right = registration_recall(found, np.linalg.inv(poses[older]) @ poses[newer]).is_right
     revisits = find_revisits(poses, distance_m=scale.distance_m, min_path_m=scale.min_path_m)
     right = [loop for loop, good in zip(loops, is_right, strict=True) if good]
     ends = np.reshape([loop.newer for loop in right], (-1, 2)).astype(int)
@@ -240,7 +233,7 @@ def size_marks(num: int) -> np.ndarray:
 
 def map_sizes(folder: Path, result: SlamResult) -> dict[str, Any]:
     """Returns the bytes of all points and of map files at each precision, on the way; the whole maps stay as files."""
-    whole = result.state.slam_map
+    whole = result.map
     points = np.cumsum([report.num_points for report in result.reports])
     marks = [int(mark) for mark in size_marks(len(whole)) if mark]
     scans = [int(whole.keyframes[mark - 1].scan) + 1 for mark in marks[:-1]] + ([len(points)] if marks else [])
@@ -256,7 +249,7 @@ def map_sizes(folder: Path, result: SlamResult) -> dict[str, Any]:
     return sizes
 
 
-def map_path(folder: Path, precision: str) -> Path:
+def map_path(folder: Path, precision: Precision) -> Path:
     """Returns the file of the map at a precision."""
     return folder / f"map_{precision}.npz"
 

@@ -16,8 +16,6 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
-from dpmjax.cli.result_files import UNKNOWN
-
 MAX_RANGE_M, INDOOR_MAX_RANGE_M = 60.0, 30.0
 # Where half of the points are nearer, the place is indoors.
 INDOORS_M = 5.0
@@ -167,7 +165,7 @@ def peer_version(name: str) -> str:
     try:
         return importlib.metadata.version(name)
     except importlib.metadata.PackageNotFoundError:
-        return UNKNOWN
+        return "unknown"
 
 
 def is_indoors(points: np.ndarray) -> bool:

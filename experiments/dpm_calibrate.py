@@ -1,6 +1,6 @@
 """Calibrates a DeepPointMap model on towns that it was not trained on: its confidence, and its overlap probability.
 
-    python -m experiments.dpm_calibrate results/dpm_train/latest/model.safetensors
+    python -m experiments.dpm_calibrate results/train/latest/model.safetensors
 
 Pairs of scans of held-out towns, overlapping and not, are registered; a logistic regression on a few features of each
 registration (consensus support, share of points that meet surfaces, share in free space ...) then predicts whether the
@@ -21,14 +21,12 @@ import numpy as np
 from tqdm import tqdm
 from tyro.conf import Positional, arg
 
-from dpmjax.cli.command import check_least, run_command
-from dpmjax.cli.result_files import do_row
-from dpmjax.cli.run_folder import RunOptions, open_run_folder, recording, write_metrics
+from dpmjax.cli import RunOptions, check_least, do_row, open_run_folder, recording, run_command, write_metrics
 
 EXPERIMENT = "dpm_calibrate"
 MODEL = "model.safetensors"
 OVERLAP_LABELS = ("overlap probability", "share of overlapping pairs")
-# Far from the seeds of the towns of dpm_train, also of its held-out one.
+# Far from the seeds of the towns of training, also of its held-out one.
 FIRST_TOWN, FIRST_OVERLAP_TOWN = 3_000_000, 3_500_000
 
 
@@ -57,15 +55,15 @@ class Config(RunOptions):
 def main(config: Config) -> dict[str, Any]:
     """Registers and compares the pairs, fits, and writes the model."""
     from dpmjax import load_model, save_model, viz
+    from dpmjax.deeppointmap import DISTANCE_BANDS_M
     from dpmjax.simulation import SceneMixture
     from dpmjax.weights import read_card
     from experiments import _dpm_overlap
-    from experiments._dpm_pairs import BANDS
 
     model = load_model(config.model)
     folder = open_run_folder(config, EXPERIMENT)
     rows, overlap_rows = [], []
-    total = config.towns * len(BANDS) * config.pairs + config.overlap_towns * config.overlap_pairs
+    total = config.towns * len(DISTANCE_BANDS_M) * config.pairs + config.overlap_towns * config.overlap_pairs
     with recording(folder), tqdm(total=total, unit=" pairs") as bar:
         kinds = [kind for kind, _ in SceneMixture().kinds]
         for number in range(config.towns):
@@ -101,16 +99,17 @@ def main(config: Config) -> dict[str, Any]:
 
 
 def _town(config: Config, model: Any, *, town: int, kind: str, bar: tqdm) -> dict[str, Any]:
-    from dpmjax.cli.train_data import town_drive
+    from dpmjax.deeppointmap import DISTANCE_BANDS_M, draw_scan_pairs, read_scan_pairs, register_in_stages
     from dpmjax.metrics import registration_recall
-    from experiments._dpm_pairs import BANDS, draw_pairs, read_pairs, register_pair
+    from dpmjax.simulation import simulate_drive
 
-    drive = town_drive(town, length_m=config.town_length_m, kind=kind)
+    drive = simulate_drive(town, length_m=config.town_length_m, kind=kind)
     found: dict[str, list[Any]] = {"of_clouds": [], "of_scans": [], "is_right_of_clouds": [], "is_right": []}
-    for band in BANDS:
-        for pair in read_pairs(drive, draw_pairs(drive, band, config.pairs, config.seed), config.seed):
-            result = register_pair(model, pair)
-            motions = np.stack([result.motions["descriptors"], result.motions["verified"]])
+    for band in DISTANCE_BANDS_M:
+        drawn = draw_scan_pairs(drive, band, config.pairs, seed=config.seed)
+        for pair in read_scan_pairs(drive, drawn, seed=config.seed):
+            result = register_in_stages(model, pair)
+            motions = np.stack([result.descriptors, result.verified])
             is_right = registration_recall(motions, np.stack([pair.T_target_source] * 2)).is_right
             found["of_clouds"].append(result.evidence.of_clouds.tolist())
             found["of_scans"].append(result.evidence.of_scans.tolist())
@@ -121,17 +120,17 @@ def _town(config: Config, model: Any, *, town: int, kind: str, bar: tqdm) -> dic
 
 
 def _overlap_town(config: Config, model: Any, town: int, bar: tqdm) -> dict[str, Any]:
-    from dpmjax.cli.train_data import town_drive
+    from dpmjax.simulation import simulate_drive
     from experiments._dpm_overlap import measure_town
 
     # The other town is that of the next row.
-    drives = [town_drive(seed, length_m=config.town_length_m) for seed in (town, town + 1)]
+    drives = [simulate_drive(seed, length_m=config.town_length_m) for seed in (town, town + 1)]
     return measure_town(model, drives, config.overlap_pairs, config.seed, bar)
 
 
 def fit(rows: list[dict[str, Any]]) -> tuple[Any, dict[str, Any], dict[str, np.ndarray]]:
     """Returns the calibration of all towns, its numbers, and the confidence of each town when it is left out."""
-    from dpmjax.deeppointmap.confidence import CLOUD_FEATURES, SCAN_FEATURES, Calibration, fit_logistic
+    from dpmjax.deeppointmap import CLOUD_FEATURES, SCAN_FEATURES, Calibration, fit_logistic
     from experiments._dpm_overlap import held_out_probability
 
     kinds = {"of_clouds": (CLOUD_FEATURES, "is_right_of_clouds"), "of_scans": (SCAN_FEATURES, "is_right")}

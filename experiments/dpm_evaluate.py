@@ -29,21 +29,27 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
-import numpy as np
 from tqdm import tqdm
 from tyro.conf import FlagCreatePairsOff, Positional, arg
 
-from dpmjax.cli.command import StopFlag, check_least, run_command
-from dpmjax.cli.result_files import do_row
-from dpmjax.cli.run_folder import RunFolder, RunOptions, open_run_folder, recording, write_metrics
+from dpmjax.cli import (
+    FIRST_TOWN,
+    DriveSelection,
+    RunFolder,
+    RunOptions,
+    StopFlag,
+    check_least,
+    do_row,
+    open_run_folder,
+    recording,
+    run_command,
+    write_metrics,
+)
 
 if TYPE_CHECKING:
     from dpmjax.io import LidarSequence
 
 EXPERIMENT = "dpm_evaluate"
-# No training, selection or calibration uses these towns.
-FIRST_TOWN = 5_000_000
-NUM_SHOWN = 4
 # Overlap is cheap: more pairs, of each kind.
 OVERLAP_FACTOR = 4
 
@@ -90,9 +96,9 @@ class Config(RunOptions):
             raise ValueError("only with --slam: --n-scans, --jump, --kitti-angle-correction, --refine")
 
     @property
-    def town_length_range(self) -> tuple[float, float]:
-        """Returns the lengths of the first and of the last town."""
-        return self.town_length_m[0], self.town_length_m[-1]
+    def selection(self) -> DriveSelection:
+        """The scans of each drive, with --slam."""
+        return DriveSelection(num_scans=self.n_scans, jump=self.jump, is_kitti_corrected=self.kitti_angle_correction)
 
 
 def main(config: Config) -> list[dict[str, Any]]:
@@ -106,15 +112,24 @@ def evaluate_slam(config: Config) -> list[dict[str, Any]]:
     from experiments import _slam_comparison as comparison
 
     load_model(config.weights)
-    drives = comparison.open_drives(config, FIRST_TOWN)
+    choice = comparison.DriveChoice(
+        paths=config.paths,
+        selection=config.selection,
+        town_seeds=range(FIRST_TOWN, FIRST_TOWN + config.num_towns),
+        town_lengths_m=np.linspace(config.town_length_m[0], config.town_length_m[-1], config.num_towns).tolist(),
+    )
+    compared = comparison.Comparison(
+        weights=config.weights, seed=config.seed, is_refined=config.refine, num_localized=config.localize
+    )
+    drives = comparison.open_drives(choice)
     folder = open_run_folder(config, EXPERIMENT)
     rows: list[dict[str, Any]] = []
     opened = {}
     with recording(folder), StopFlag() as stop:
-        missing = comparison.missing_peers(config)
+        missing = comparison.missing_peers(compared)
         numbers = {"weights": config.weights, "peers_left_out": missing}
         note = write_metrics(folder, numbers, seed=config.seed, rows=rows)
-        for drive, row in comparison.compare(config, folder, drives, lambda: stop.is_requested):
+        for drive, row in comparison.compare(compared, folder, drives, lambda: stop.is_requested):
             opened[drive.sequence.name] = drive
             rows.append(row)
             note = write_metrics(folder, numbers, seed=config.seed, rows=rows)
@@ -128,18 +143,12 @@ def evaluate_slam(config: Config) -> list[dict[str, Any]]:
 def evaluate_pairs(config: Config) -> list[dict[str, Any]]:
     """Registers the pairs that are missing, and writes table, numbers and pictures."""
     from dpmjax import load_model
-    from experiments._dpm_evaluation import (
-        evaluate_matcher,
-        evaluate_registrations,
-        kiss_matcher,
-        search_alone,
-        why_no_kiss,
-    )
-    from experiments._dpm_overlap import evaluate_overlap
+    from dpmjax.cli import draw_evaluation, evaluation_towns, open_evaluation_drives, overlap_row, registration_row
+    from experiments._dpm_evaluation import evaluate_matcher, kiss_matcher, search_alone, why_no_kiss
 
     model = load_model(config.weights)
     search = partial(search_alone, config=model.config.verification)
-    drives = open_drives(config)
+    drives = open_evaluation_drives(config.paths, evaluation_towns(config.num_towns, config.town_length_m[0]))
     num_overlap = OVERLAP_FACTOR * config.pairs
     no_kiss = why_no_kiss() if not config.no_kiss else "left out by --no-kiss"
     folder = open_run_folder(config, EXPERIMENT)
@@ -152,42 +161,31 @@ def evaluate_pairs(config: Config) -> list[dict[str, Any]]:
                 case = {"method": method, "sequence": drive.name, "band": band}
                 rows.append(do_row(folder.path, case, work, seed=config.seed))
 
+        tick = partial(bar.update, 1)
         for drive in drives:
             for band in ("near", "middle", "far"):
-                pairs = (drive, band, config.pairs, config.seed)
-                add("DeepPointMap", drive, band, lambda p=pairs: evaluate_registrations(model, *p, bar))
+                pairs = (drive, band, config.pairs)
+                mine = partial(registration_row, model, *pairs, seed=config.seed, on_pair=tick)
+                add("DeepPointMap", drive, band, mine)
                 if band == "far":
                     continue
-                add("search", drive, band, lambda p=pairs: evaluate_matcher(search, *p, bar))
+                add("search", drive, band, partial(evaluate_matcher, search, *pairs, config.seed, bar))
                 if no_kiss is None:
-                    add("KISS-Matcher", drive, band, lambda p=pairs: evaluate_matcher(kiss_matcher, *p, bar))
-            add("overlap", drive, "all", lambda d=drive: evaluate_overlap(model, d, num_overlap, config.seed, bar))
+                    add("KISS-Matcher", drive, band, partial(evaluate_matcher, kiss_matcher, *pairs, config.seed, bar))
+            work = partial(overlap_row, model, drive, num_overlap, seed=config.seed, on_scan=bar.refresh)
+            add("overlap", drive, "all", work)
         text = write_results(folder, config, rows, no_kiss)
-        draw(folder, config, drives, rows)
+        title = f"{Path(config.weights).stem}, all pairs"
+        draw_evaluation(folder, drives, rows, title=title, seed=config.seed)
     print(text)
     print(f"results in {folder.path}")
     return rows
 
 
-def open_drives(config: Config) -> list[LidarSequence]:
-    """Opens the drives; a `ValueError` names one without poses or without pairs."""
-    from dpmjax.cli.train_data import find_sources
-    from experiments._dpm_pairs import draw_pairs
-
-    towns = range(FIRST_TOWN, FIRST_TOWN + config.num_towns)
-    drives = [source.open() for source in find_sources(config.paths, towns, config.town_length_m[0])]
-    for drive in drives:
-        if not len(draw_pairs(drive, "near", 1, 0)):
-            raise ValueError(f"{drive.name}: no two scans are 2 to 10 m apart; are the poses in metres?")
-    names = [drive.name for drive in drives]
-    if len(set(names)) < len(names):
-        raise ValueError(f"two drives have the same name ({', '.join(sorted(names))}); evaluate them one by one")
-    return drives
-
-
 def write_results(folder: RunFolder, config: Config, rows: Sequence[dict[str, Any]], no_kiss: str | None) -> str:
     """Writes table.md and metrics.json; returns the table."""
-    from experiments._dpm_evaluation import calibration_numbers, table
+    from dpmjax.cli import calibration_numbers
+    from experiments._dpm_evaluation import table
 
     numbers = {"weights": config.weights, "kiss_matcher": no_kiss or "run", **calibration_numbers(rows)}
     note = write_metrics(folder, numbers, seed=config.seed, rows=rows)
@@ -196,21 +194,6 @@ def write_results(folder: RunFolder, config: Config, rows: Sequence[dict[str, An
         text += f"\n\nKISS-Matcher was not run: {no_kiss}."
     (folder / "table.md").write_text(text + (f"\n\n{note}.\n" if note else "\n"), encoding="utf-8")
     return text
-
-
-def draw(folder: RunFolder, config: Config, drives: Sequence[LidarSequence], rows: Sequence[dict[str, Any]]) -> None:
-    """Draws reliability.png and failures.png."""
-    from dpmjax import viz
-    from experiments._dpm_evaluation import worst_failures
-
-    mine = [row for row in rows if row["method"] == "DeepPointMap"]
-    confidence = np.concatenate([row["confidence"] for row in mine] or [np.zeros(0)])
-    is_right = np.concatenate([row["is_right"] for row in mine] or [np.zeros(0, bool)])
-    figure = viz.reliability_figure(confidence, is_right, title=f"{Path(config.weights).stem}, all pairs")
-    viz.save_figure(figure, folder / "reliability.png")
-    worst = worst_failures(drives, mine, NUM_SHOWN, config.seed)
-    if worst:
-        viz.save_figure(viz.registered_pairs_figure(worst), folder / "failures.png")
 
 
 if __name__ == "__main__":

@@ -5,7 +5,7 @@
 Pairs of scans of simulated scenes are registered: out of doors and inside, whole and thinned to 1,400 points within
 30 m. All hypotheses of a pair, those of the network and those of the search among views from above, are aligned and
 compared with the truth; a logistic regression on `evidence_shares` predicts which are right. Results go to
-results/dpm_evidence/<time>/: metrics.json with the weights for `dpmjax.deeppointmap.verification.EvidenceWeights`, and
+results/dpm_evidence/<time>/: metrics.json with the weights for `dpmjax.deeppointmap.EvidenceWeights`, and
 table.md, the share of pairs whose right hypothesis has the highest score of all, scene by scene, each by a fit on the
 other scenes.
 """
@@ -19,9 +19,16 @@ from typing import Annotated, Any
 import numpy as np
 from tyro.conf import arg
 
-from dpmjax.cli.command import StopFlag, check_least, run_command
-from dpmjax.cli.result_files import do_rows
-from dpmjax.cli.run_folder import RunOptions, open_run_folder, recording, write_metrics
+from dpmjax.cli import (
+    RunOptions,
+    StopFlag,
+    check_least,
+    do_rows,
+    open_run_folder,
+    recording,
+    run_command,
+    write_metrics,
+)
 
 EXPERIMENT = "dpm_evidence"
 # Far from the seeds of all other commands.
@@ -91,18 +98,17 @@ def measure_scene(
     config: Config, model: Any, *, scene: int, kind: str, sensor: str, points: str
 ) -> dict[str, list[dict[str, Any]]]:
     """Returns the pairs of a scene: what each hypothesis is judged by, and whether it is right."""
-    import dpmjax.simulation
-    from dpmjax.cli.train_data import town_drive
-    from dpmjax.deeppointmap.scan_registration import match_clouds, prepare_scan
-    from experiments._dpm_pairs import draw_pairs_within
+    from dpmjax import simulation
+    from dpmjax.deeppointmap import draw_rows_apart, match_clouds, prepare_scan, scan_distances
 
-    lidar = getattr(dpmjax.simulation, sensor)
-    drive = town_drive(FIRST_SCENE + scene, length_m=config.length_m, kind=kind, sensor=lidar)
+    lidar = getattr(simulation, sensor)
+    drive = simulation.simulate_drive(FIRST_SCENE + scene, length_m=config.length_m, kind=kind, sensor=lidar)
+    distances = scan_distances(drive)
     bands = BANDS_INDOORS if kind in INDOORS else BANDS
     drawn = [
         (band, rows)
         for number, (band, limits_m) in enumerate(bands.items())
-        for rows in draw_pairs_within(drive, limits_m, config.pairs, np.random.default_rng([config.seed, number]))
+        for rows in draw_rows_apart(distances, *limits_m, config.pairs, np.random.default_rng([config.seed, number]))
     ]
     pairs = []
     for band, rows in drawn:
@@ -122,11 +128,9 @@ def measure_scene(
 
 def judged(model: Any, measured: list[Any], hypotheses: Any, T_true: np.ndarray) -> dict[str, Any]:
     """Returns what all hypotheses of a pair are judged by, aligned as `register` aligns them."""
-    from dpmjax.deeppointmap.scan_registration import distinct_motions
-    from dpmjax.deeppointmap.verification import evidence_shares
+    from dpmjax.deeppointmap import distinct_motions, evidence_shares
     from dpmjax.metrics import registration_recall
-    from dpmjax.scans import correlate_views
-    from dpmjax.scans.surface_alignment import align_surfaces_from
+    from dpmjax.scans import align_surfaces_from, correlate_views
 
     config, surfaces = model.config.verification, [scan.surface for scan in measured]
     T = np.concatenate([distinct_motions(hypotheses), correlate_views(*surfaces, config.views)])
@@ -140,8 +144,7 @@ def judged(model: Any, measured: list[Any], hypotheses: Any, T_true: np.ndarray)
 
 def fit(rows: list[dict[str, Any]]) -> tuple[Any, list[dict[str, Any]]]:
     """Returns the weights by all scenes, and a table of the choices by the weights of the other scenes."""
-    from dpmjax.deeppointmap.confidence import fit_weights
-    from dpmjax.deeppointmap.verification import EvidenceWeights
+    from dpmjax.deeppointmap import EvidenceWeights, fit_weights
 
     _, *present = astuple(EvidenceWeights())
     names = tuple(field.name for field in fields(EvidenceWeights))

@@ -14,18 +14,27 @@ bytes, agents.png.
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-from tqdm import tqdm
 from tyro.conf import FlagCreatePairsOff, Positional, arg
 
-from dpmjax.cli.command import StopFlag, check_least, run_command
-from dpmjax.cli.run_folder import AGENTS, RunFolder, RunOptions, open_run_folder, recording, write_metrics
+from dpmjax.cli import (
+    DriveSelection,
+    RunFolder,
+    RunOptions,
+    StopFlag,
+    check_least,
+    open_drive,
+    open_run_folder,
+    recording,
+    run_command,
+    write_metrics,
+)
 
 if TYPE_CHECKING:
-    from dpmjax.sequences import LidarSequence
+    from dpmjax.io import LidarSequence
     from dpmjax.slam import AgentsResult, SlamMethods, SlamResult
 
 EXPERIMENT = "dpm_multiagent"
@@ -59,12 +68,25 @@ class Config(RunOptions):
             raise ValueError(f"--overlap: expected a share from 0 to 1, got {self.overlap:g}")
         if self.sequence is not None and len(self.data) != 1:
             raise ValueError("--sequence chooses a drive of DATA: give one folder")
+        if self.kitti_angle_correction and not self.data:
+            raise ValueError("--kitti-angle-correction is for the scans of KITTI's car: give their folder, DATA")
+
+    @property
+    def selection(self) -> DriveSelection:
+        """The scans of each folder."""
+        return DriveSelection(
+            sequence=self.sequence,
+            num_scans=self.n_scans,
+            jump=self.jump,
+            is_kitti_corrected=self.kitti_angle_correction,
+            seed=self.seed,
+        )
 
 
 def main(config: Config) -> dict[str, Any]:
     """Lets the agents run, joins their maps, writes; returns the content of `metrics.json`."""
-    from dpmjax.cli.slam import tell
-    from dpmjax.cli.slam_run import run_alone
+    from dpmjax.cli import map_drive, progress_bar
+    from dpmjax.slam import join_agents
     from experiments._slam_agents import summary
 
     started = time.perf_counter()
@@ -75,16 +97,18 @@ def main(config: Config) -> dict[str, Any]:
         agents: list[SlamResult] = []
         for number, sequence in enumerate(sequences, start=1):
             if not stop.is_requested:
-                _, agent = run_alone(agent_folder(folder, number), sequence, methods, lambda: stop.is_requested)
+                part = folder.part("agents", f"agent_{number}")
+                _, agent = map_drive(part, sequence, methods, lambda: stop.is_requested)
                 agents.append(agent)
         sequences = [
             sequence.take(slice(0, len(agent.reports))) for sequence, agent in zip(sequences, agents, strict=False)
         ]
-        result = join(methods, agents)
+        with progress_bar("loops between agents", " keyframes") as on_keyframe:
+            result = join_agents(methods, agents, on_keyframe=on_keyframe)
         metrics = write_results(folder, config, result, sequences)
         metrics |= {"is_interrupted": stop.is_requested, "wall_s": time.perf_counter() - started}
         write_metrics(folder, metrics, seed=config.seed)
-        tell(f"{summary(metrics)}\nresults in {folder.path}")
+        print(f"{summary(metrics)}\nresults in {folder.path}")
     return metrics
 
 
@@ -98,34 +122,10 @@ def agent_methods(config: Config) -> SlamMethods:
 
 def open_agents(config: Config) -> list[LidarSequence]:
     """Opens the scans of each agent; bad input that can be known before the run is a `ValueError`."""
-    from dpmjax.cli.slam import Config as DriveOptions
-    from dpmjax.cli.slam_input import open_drive
     from experiments._slam_agents import cut_sequence
 
-    names = ("seed", "n_scans", "jump", "sequence", "kitti_angle_correction")
-    options = {name: getattr(config, name) for name in names}
-    drives = [open_drive(DriveOptions(data=data, **options)) for data in config.data or (None,)]
+    drives = [open_drive(replace(config.selection, data=data)) for data in config.data or (None,)]
     return drives if len(drives) > 1 else cut_sequence(drives[0], config.agents, config.overlap)
-
-
-def agent_folder(folder: RunFolder, number: int) -> RunFolder:
-    """Makes the folder of an agent's own run."""
-    path = folder / AGENTS / f"agent_{number}"
-    path.mkdir(parents=True, exist_ok=True)
-    return RunFolder(path, is_resumed=folder.is_resumed)
-
-
-def join(methods: SlamMethods, agents: list[SlamResult]) -> AgentsResult:
-    """Joins what the agents have mapped."""
-    from dpmjax.slam import join_agents
-
-    with tqdm(desc="loops between agents", unit=" keyframes", dynamic_ncols=True) as bar:
-
-        def on_keyframe(num_done: int, num_all: int) -> None:
-            bar.total = num_all
-            bar.update(num_done - bar.n)
-
-        return join_agents(methods, agents, on_keyframe=on_keyframe)
 
 
 def write_results(

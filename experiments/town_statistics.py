@@ -12,7 +12,7 @@ mixture, of the nearest scene, and of the nearest other real sequence.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
@@ -20,10 +20,9 @@ import numpy as np
 from tqdm import tqdm
 from tyro.conf import Positional, arg
 
-from dpmjax.cli.command import run_command
-from dpmjax.io import list_lidar_sequences, open_lidar_sequence
-from dpmjax.sequences import LidarSequence
-from dpmjax.simulation import SceneMixture, draw_scene, simulate_scene
+from dpmjax.cli import run_command
+from dpmjax.io import LidarSequence, list_lidar_sequences, open_lidar_sequence
+from dpmjax.simulation import SceneMixture, simulate_drive
 from experiments._scan_statistics import (
     HISTOGRAMS,
     ScanStatistics,
@@ -110,8 +109,7 @@ def simulated(config: Config) -> dict[tuple[str, int], ScanStatistics]:
 
     def measure(scene: tuple[str, int]) -> ScanStatistics:
         seed = _FIRST_SEED + 1000 * config.seed + wanted.index(scene)
-        drawn = draw_scene(seed, replace(mixture, kinds=((scene[0], 1.0),)))
-        return scan_statistics(evenly(simulate_scene(drawn), config.scans))
+        return scan_statistics(evenly(simulate_drive(seed, kind=scene[0]), config.scans))
 
     return {scene: measure(scene) for scene in tqdm(wanted, desc="scenes", leave=False)}
 

@@ -13,6 +13,7 @@ EXAMPLES = sorted((ROOT / "examples").glob("[0-9]*.py"))
 GUIDES = sorted((ROOT / "docs" / "guides").glob("*.md"))
 QUICK = ("06", "08")
 """Examples of seconds; the others train, or map a drive."""
+LONG = (pytest.mark.slow, pytest.mark.timeout(900))
 
 
 def _blocks(page: Path) -> list[str]:
@@ -20,7 +21,7 @@ def _blocks(page: Path) -> list[str]:
 
 
 def _marked(path: Path):
-    return pytest.param(path, id=path.stem, marks=() if path.name.startswith(QUICK) else pytest.mark.slow)
+    return pytest.param(path, id=path.stem, marks=() if path.name.startswith(QUICK) else LONG)
 
 
 @pytest.mark.parametrize("path", [_marked(path) for path in EXAMPLES])
@@ -31,6 +32,7 @@ def test_example_runs(path, tmp_path, monkeypatch, capsys) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(900)
 @pytest.mark.parametrize("name", ["README.md", "docs/quickstart.md"])
 def test_code_of_a_page_runs_as_printed(name, tmp_path, monkeypatch, capsys) -> None:
     monkeypatch.chdir(tmp_path)

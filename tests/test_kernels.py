@@ -134,7 +134,7 @@ def match(**arrays: Any) -> Any:
     a, b = clouds_of(**arrays)
     similarity = jnp.clip(a.features @ b.features.T / 9.0, -1.0, 1.0)
     offsets = lambda rows, others: (jnp.zeros((*rows.shape, 3)),) * 2  # noqa: E731
-    found = match_descriptors(a, b, similarity, offsets, config=MatchConfig())
+    found = match_descriptors(a, b, similarity, offsets, config=MatchConfig(num_rounds=1))
     return found.T_target_source, found.scores, found.num_inliers
 
 
@@ -331,15 +331,16 @@ def test_gradients_are_those_of_differences(kernel: Kernel, float64) -> None:
 
 
 def test_degenerate_trajectories_have_an_error_and_a_gradient() -> None:
-    line = jnp.linspace(0.0, 4.0, 5)[:, None] * jnp.asarray([1.0, 2.0, -1.0])
-    for path in (line[:1], jnp.ones((4, 3)), line, line[:, :2]):
-        value, gradient = jax.value_and_grad(dpmjax.absolute_trajectory_error)(path, path + 3.0)
+    line, every = jnp.linspace(0.0, 4.0, 5)[:, None] * jnp.asarray([1.0, 2.0, -1.0]), jnp.ones(5, bool)
+    error = jax.jit(jax.value_and_grad(dpmjax.absolute_trajectory_error))
+    for path, mask in ((line, every), (jnp.ones((5, 3)), every), (line, jnp.arange(5) == 2), (line, ~every)):
+        value, gradient = error(path, path + 3.0, mask)
         assert float(value) == pytest.approx(0.0, abs=1e-5)
         assert np.isfinite(gradient).all()
         assert f"{value:.1f}" == "0.0"
 
 
-@pytest.mark.parametrize(("metric", "dim"), [("point", 2), ("plane", 2), ("plane", 3)])
+@pytest.mark.parametrize(("metric", "dim"), [("point", 2), ("plane", 3)])
 def test_gradient_of_icp_is_that_of_its_solution(metric: str, dim: int, float64) -> None:
     arrays = {name: jnp.asarray(x, float) for name, x in moved_clouds(dim)(np.random.default_rng(3)).items()}
     source, target = arrays["source"], arrays["target"]

@@ -7,7 +7,9 @@ import numpy as np
 import pytest
 
 import dpmjax
-from dpmjax.cli.command import EXIT_BAD_INPUT, EXIT_OK, run_command
+from dpmjax.cli import localize
+from dpmjax.cli.command import EXIT_BAD_INPUT, EXIT_OK
+from dpmjax.cli.localize_numbers import localization_errors
 from dpmjax.cli.result_files import load_json, read_history
 from dpmjax.io import open_lidar_sequence, read_poses, write_kitti_sequence
 from tests.deeppointmap import toy
@@ -20,17 +22,15 @@ def case(tmp_path_factory):
     drive = toy.drive(num_scans=6)
     model = dpmjax.init_model(jax.random.key(0), toy.MODEL)
     dpmjax.save_model(model, folder / "model.safetensors")
-    result = dpmjax.run_slam([drive.read_scan(number) for number in range(4)], model)
-    dpmjax.save_map(folder / "map.npz", result.state.slam_map)
+    result = dpmjax.run_slam(model, [drive.read_scan(number) for number in range(4)])
+    dpmjax.save_map(folder / "map.npz", result.map)
     write_kitti_sequence(folder / "kitti", "00", drive)
     np.save(folder / "poses.npy", drive.T_world_lidar)
     return folder
 
 
 def run(*arguments) -> int:
-    command = localize
-    arguments = list(map(str, arguments))
-    return run_command(command.main, command.Config, name=command.NAME, description=command.__doc__, args=arguments)
+    return localize.run(list(map(str, arguments)))
 
 
 def scans_of(case):
@@ -89,22 +89,24 @@ def test_bad_input_is_told_in_one_line(case, tmp_path, capsys, changes, message)
 
 
 def test_errors_are_those_of_the_keyframes_frames(case) -> None:
-    map_ = dpmjax.load_map(case / "map.npz")
+    slam_map = dpmjax.load_map(case / "map.npz")
     drive = open_lidar_sequence(scans_of(case), poses=case / "poses.npy")
-    reference = np.load(case / "poses.npy")[[keyframe.scan for keyframe in map_.keyframes]]
-    where = dpm_localize.Case(map_, drive, reference)
-    T = map_.T_world_keyframe[0] @ np.linalg.inv(reference[0]) @ drive.T_world_lidar[1]
-    rows = []
-    for shift_m, found in ((0.0, True), (3.0, True), (0.5, True), (0.0, False)):
+    reference = np.load(case / "poses.npy")[[keyframe.scan for keyframe in slam_map.keyframes]]
+    T = slam_map.T_world_keyframe[0] @ np.linalg.inv(reference[0]) @ drive.T_world_lidar[1]
+    found = []
+    for shift_m, is_found in ((0.0, True), (3.0, True), (0.5, True), (0.0, False)):
         moved = T.copy()
         moved[0, 3] += shift_m
-        evidence = (0.9, 0, "numbers") if found else (0.0, None, "numbers")
-        status = "found" if found else "not in this map"
-        result = dpmjax.Localization(status, moved if found else None, *evidence)
-        rows.append(dpm_localize.as_row(1, drive, map_, result, 0.1))
-    moved_drive = drive.take(np.array([1, 1, 1, 1]))
-    errors = dpm_localize.measure_errors(where._replace(drive=moved_drive), rows)
+        evidence = (0.9, 0, "numbers") if is_found else (0.0, None, "numbers")
+        status = "found" if is_found else "not in this map"
+        found.append(dpmjax.Localization(status, moved if is_found else None, *evidence))
+    errors = localization_errors(found, slam_map, reference, drive.T_world_lidar[[1, 1, 1, 1]])
     np.testing.assert_array_equal(errors.is_right, [True, False, True, False])
     np.testing.assert_array_equal(errors.is_found, [True, True, True, False])
     np.testing.assert_allclose(errors.translation_m[:3], [0, 3, 0.5], atol=1e-6)
-    assert errors.is_inside.all()
+    # The table of a run that goes on holds the same results.
+    rows = [localize.as_row(number, drive, slam_map, one, 0.1) for number, one in enumerate(found)]
+    again = localization_errors(
+        list(map(localize.as_localization, rows)), slam_map, reference, drive.T_world_lidar[[1, 1, 1, 1]]
+    )
+    np.testing.assert_allclose(again.translation_m, errors.translation_m, atol=1e-6)

@@ -1,4 +1,4 @@
-"""The command dpm_slam: options, bad input, its files as others read them, stops, kills and resumed runs.
+"""The command `dpmjax slam`: options, bad input, its files as others read them, stops, kills and resumed runs.
 
 Matcher and geometry know the truth; a scan is one point, whose x is the number of its pose.
 """
@@ -16,11 +16,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from dpmjax.cli import slam, slam_files, slam_input
+from dpmjax.cli import slam, slam_files
 from dpmjax.cli.command import EXIT_BAD_INPUT, EXIT_FAILED, EXIT_OK, run_command
 from dpmjax.cli.result_files import load_json
 from dpmjax.geometry import rigid
-from dpmjax.io import read_poses, write_tum
+from dpmjax.io import LidarSequence, read_poses, write_tum
 from dpmjax.slam import SlamConfig, SlamMethods
 from tests.slam.truth import TruthGeometry, TruthMatcher, laps
 
@@ -204,7 +204,7 @@ def test_a_scan_without_points_is_passed_over(with_truth, tmp_path) -> None:
 
 
 def test_an_interrupted_run_writes_all_and_goes_on(whole, drive, with_truth, tmp_path, monkeypatch) -> None:
-    out, read = tmp_path / "out", slam_input.read_points
+    out, read = tmp_path / "out", LidarSequence.read_points
 
     def interrupting(sequence, index):
         if index == 77 and not out.with_suffix(".stopped").exists():
@@ -212,7 +212,7 @@ def test_an_interrupted_run_writes_all_and_goes_on(whole, drive, with_truth, tmp
             os.kill(os.getpid(), signal.SIGINT)
         return read(sequence, index)
 
-    monkeypatch.setattr(slam_input, "read_points", interrupting)
+    monkeypatch.setattr(LidarSequence, "read_points", interrupting)
     assert run(drive, "-o", out) == 130
     num_done = len(np.load(out / "trajectory.npy"))
     assert 70 < num_done < 85
@@ -242,17 +242,17 @@ PROCESS = """
 import sys, time
 from pathlib import Path
 import pytest
-from dpmjax.cli import slam_input
+from dpmjax.io import LidarSequence
 from tests.cli.test_slam import run, use_truth
 
 use_truth(pytest.MonkeyPatch())
-read = slam_input.read_points
+read = LidarSequence.read_points
 
 def slowly(sequence, index):
     time.sleep(0.02)
     return read(sequence, index)
 
-slam_input.read_points = slowly
+LidarSequence.read_points = slowly
 sys.exit(run(*sys.argv[1:]))
 """
 

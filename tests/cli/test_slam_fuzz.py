@@ -1,4 +1,4 @@
-"""Broken drives: dpm_slam ends with results, or with one line and an exit code, never with a traceback."""
+"""Broken drives: `dpmjax slam` ends with results, or with one line and an exit code, never with a traceback."""
 
 from __future__ import annotations
 

@@ -1,30 +1,24 @@
-"""Options of dpm_slam: saved maps are extended, trajectories refined, scans deskewed, and the viewer records."""
+"""Options of `dpmjax slam`: saved maps are extended, trajectories refined, scans deskewed, and the viewer records."""
 
 from __future__ import annotations
 
 import importlib.util
-import itertools
 from pathlib import Path
-from types import SimpleNamespace
 
 import jax
 import numpy as np
 import pytest
 
 import dpmjax
-from dpmjax.cli import slam_input
 from dpmjax.cli.command import EXIT_BAD_INPUT, EXIT_OK
+from dpmjax.cli.drives import DriveSelection, open_drive, with_raised_beams
 from dpmjax.cli.result_files import load_json
-from dpmjax.geometry import rigid
+from dpmjax.cli.slam_reader import ScanReader
 from dpmjax.io import write_tum
-from dpmjax.metrics import absolute_trajectory_error
 from dpmjax.scans import offsets_by_azimuth
-from dpmjax.slam import SlamConfig, SlamMethods, run_slam
-from experiments import _slam_refine
 from tests.cli.test_slam import run, use_truth, write_drive
 from tests.deeppointmap import toy
 from tests.slam.test_odometry import motion, planes, seen_from
-from tests.slam.truth import TruthGeometry, TruthMatcher, laps, scans_of
 
 
 @pytest.fixture(scope="module")
@@ -88,7 +82,7 @@ def test_times_of_points_come_before_their_azimuths(tmp_path, times) -> None:
         np.savez(tmp_path / f"{number}.npz", points=points, times=np.linspace(0.0, 0.1, 30))
     if times:
         (tmp_path / "times.txt").write_text("".join(f"{time}\n" for time in times))
-    reader = slam_input.ScanReader(dpmjax.io.open_lidar_sequence(tmp_path), is_deskewed=True)
+    reader = ScanReader(dpmjax.io.open_lidar_sequence(tmp_path), is_deskewed=True)
     # Shares of the time between the two scans before: 0.2 s where it is known, else that of the turn.
     share = 0.5 if times else 1.0
     np.testing.assert_allclose(reader(3).offsets, share * np.linspace(-0.5, 0.5, 30), atol=1e-6)
@@ -98,38 +92,16 @@ def test_times_of_points_come_before_their_azimuths(tmp_path, times) -> None:
 
 def test_kittis_beams_are_raised(tmp_path) -> None:
     np.save(tmp_path / "0.npy", [[10.0, 0.0, 0.0], [0.0, 20.0, 1.0]])
-    sequence = slam_input.corrected(dpmjax.io.open_lidar_sequence(tmp_path), True)
+    sequence = with_raised_beams(dpmjax.io.open_lidar_sequence(tmp_path))
     np.testing.assert_allclose(sequence.read_scan(0)[0], [10.0, 0.0, 10 * np.radians(0.205)], atol=1e-3)
 
 
-@pytest.mark.parametrize("num", [1, 2, 31, 32, 33, 56, 57, 200])
-def test_windows_of_the_refinement_cover_all_keyframes(num: int) -> None:
-    parts = _slam_refine.windows(num)
-    assert sorted({row for rows in parts for row in rows}) == list(range(num))
-    assert all(b.start == a.stop - _slam_refine.OVERLAP for a, b in itertools.pairwise(parts))
-
-
-def test_refined_motions_and_loops_make_one_map(monkeypatch) -> None:
-    """A fit that knows the truth brings the drifted map to the truth, over the borders of windows."""
-    truth = laps(1, side_m=60.0, step_m=2.0)
-    methods = SlamMethods(TruthMatcher(truth), TruthGeometry(truth, sigma_m=0.05), SlamConfig())
-    result = run_slam(scans_of(range(len(truth))), methods)
-    slam_map, true = result.state.slam_map, rigid.inverse(truth[0]) @ truth[result.keyframes]
-
-    def fit(clouds, *, key, init):
-        rows = [int(cloud[0, 0]) for cloud in clouds]
-        return SimpleNamespace(T_world_scan=init[0] @ rigid.inverse(true[rows[0]]) @ true[rows], kept="fit")
-
-    monkeypatch.setattr(_slam_refine.deepmapping, "register_clouds", fit)
-    refined = _slam_refine.refine_keyframes(
-        slam_map, lambda row: np.array([[row, 0.0, 0.0]]), seed=0, is_stopped=lambda: False
-    )
-    before, after = (
-        absolute_trajectory_error(T[:, :3, 3], true[:, :3, 3])
-        for T in (slam_map.T_world_keyframe, refined.T_world_keyframe)
-    )
-    assert refined.numbers["refine_windows"] > 1
-    assert after < 0.1 * before
+def test_a_selection_is_every_nth_scan_of_its_reference(tmp_path) -> None:
+    drive = write_drive(tmp_path / "drive")
+    part = open_drive(DriveSelection(data=drive, jump=3, num_scans=4))
+    assert [Path(source).stem for source in part.sources] == ["000", "003", "006", "009"]
+    whole = dpmjax.io.open_lidar_sequence(drive)
+    np.testing.assert_array_equal(part.T_world_lidar, whole.T_world_lidar[:12:3])
 
 
 def test_the_viewer_records_where_there_is_no_screen(tmp_path, monkeypatch, capsys) -> None:

@@ -12,6 +12,7 @@ import jax
 import numpy as np
 import pytest
 
+from dpmjax.cli import train_run
 from dpmjax.cli.command import run_command
 from dpmjax.cli.result_files import read_history
 from dpmjax.cli.run_folder import CHECKPOINTS, HISTORY, RunFolder
@@ -21,12 +22,13 @@ from dpmjax.deeppointmap import (
     CurriculumStage,
     SampleMaker,
     TrainingHooks,
+    begin_training,
     draw_evaluation_pairs,
     init_model,
     init_training,
     training_preset,
 )
-from dpmjax.deeppointmap.training_loop import after_evaluation, begin_training
+from dpmjax.deeppointmap.training_records import after_evaluation
 from dpmjax.weights import load_model
 from tests.deeppointmap import toy
 
@@ -84,7 +86,7 @@ def test_a_broken_off_run_goes_on_with_the_numbers_of_an_unbroken_one(tmp_path: 
 
 @pytest.mark.slow
 def test_a_cut_off_checkpoint_is_passed_over_for_the_one_before(tmp_path: Path, whole, monkeypatch, caplog) -> None:
-    monkeypatch.setattr(_dpm_run, "SAVE_EVERY_S", 0.0)
+    monkeypatch.setattr(train_run, "SAVE_EVERY_S", 0.0)
     train(tmp_path, stop_after=3)
     saved = sorted((tmp_path / CHECKPOINTS).iterdir(), key=lambda path: int(path.name))
     assert [path.name for path in saved] == ["2", "3"]
@@ -97,7 +99,7 @@ def test_a_cut_off_checkpoint_is_passed_over_for_the_one_before(tmp_path: Path, 
 
 def test_the_best_of_equal_models_is_the_later() -> None:
     state = init_training(jax.random.key(0), TRAINING)
-    first = after_evaluation(begin_training(state), 0.5)
+    first = after_evaluation(begin_training(TRAINING), 0.5)
 
     def after(step: int, scale: float):
         params = jax.tree.map(lambda leaf: scale * leaf, state.params)

@@ -17,8 +17,14 @@ from optax.tree_utils import tree_get
 from dpmjax.checkpoints import Checkpoints
 from dpmjax.cli.result_files import read_history
 from dpmjax.cli.run_folder import CHECKPOINTS, HISTORY
-from dpmjax.deeppointmap import CurriculumStage, SampleMaker, init_training, join_processes, make_step
-from dpmjax.deeppointmap.training_loop import begin_training
+from dpmjax.deeppointmap import (
+    CurriculumStage,
+    SampleMaker,
+    begin_training,
+    init_training,
+    join_processes,
+    make_step,
+)
 from tests.deeppointmap import toy
 
 REPOSITORY = Path(__file__).parents[2]
@@ -101,7 +107,7 @@ def test_two_processes_train_as_one_and_stop_as_one(tmp_path: Path) -> None:
     state, step = init_training(jax.random.key(0), TRAINING), make_step(TRAINING)
     maker = SampleMaker(toy.store(), TRAINING, seed=0, num_samples=2)
     progress = Checkpoints(tmp_path / CHECKPOINTS).restore_latest(
-        replace(begin_training(state), best_params={}), fallback=None
+        replace(begin_training(TRAINING), best_params={}), fallback=None
     )
     for number in range(2):
         state, _ = step(state, maker(number))

@@ -252,13 +252,16 @@ def test_other_data_of_the_same_shape_compile_nothing_in_any_phase(tiny_data, as
 
 
 def test_planar_fits_under_vmap_are_the_single_fits(tiny_data) -> None:
-    scans = tiny_data.scans
-    both = MappingData(jax.tree.map(lambda leaf: jnp.stack([leaf[:10], leaf[10:]]), scans))
+    sets = [tiny_data, MappingData(replace(tiny_data.scans, points=0.9 * tiny_data.scans.points))]
+    both = jax.tree.map(lambda *leaves: jnp.stack(leaves), *sets)
     keys = jax.random.split(KEY, 2)
     state, report = jax.vmap(lambda data, key: solve(COLD, data, key=key))(both, keys)
     for row in range(2):
-        alone = fit(COLD, jax.tree.map(operator.itemgetter(row), both), key=keys[row])
-        np.testing.assert_allclose(report.poses[row], alone.poses, rtol=1e-3, atol=1e-4)
+        alone = fit(COLD, sets[row], key=keys[row])
+        # Adam turns rounding into a shift of the whole map, which the losses leave open.
+        shape, shape_alone = (poses - poses.mean(axis=0) for poses in map(np.asarray, (report.poses[row], alone.poses)))
+        np.testing.assert_allclose(shape, shape_alone, rtol=1e-3, atol=1e-4)
+        np.testing.assert_allclose(report.losses[row], alone.report.losses, rtol=1e-3)
         assert int(state.step[row]) == int(alone.state.step)
 
 

@@ -14,7 +14,7 @@ from dpmjax.deeppointmap.confidence import (
     Calibration,
     LogisticModel,
     fit_logistic,
-    probability,
+    logistic_probability,
 )
 from tests.deeppointmap import toy
 
@@ -32,13 +32,13 @@ def test_fit_finds_the_probabilities_of_the_examples() -> None:
     features, is_right, _ = examples(0)
     model = fit_logistic(CLOUD_FEATURES, features, is_right)
     other, _, p = examples(1)
-    np.testing.assert_allclose(probability(model, other), p, atol=0.07)
+    np.testing.assert_allclose(logistic_probability(model, other), p, atol=0.07)
 
 
 def test_fit_is_calibrated_as_a_whole() -> None:
     """At the optimum of the likelihood the mean probability is the share of right ones."""
     features, is_right, _ = examples(2, 300)
-    assert probability(fit_logistic(CLOUD_FEATURES, features, is_right), features).mean() == pytest.approx(
+    assert logistic_probability(fit_logistic(CLOUD_FEATURES, features, is_right), features).mean() == pytest.approx(
         is_right.mean(), abs=1e-3
     )
 
@@ -47,7 +47,7 @@ def test_separable_examples_have_a_finite_fit() -> None:
     features = np.repeat(np.array([[0.0], [1.0]]), 20, axis=0) * np.ones(4)
     model = fit_logistic(CLOUD_FEATURES, features, features[:, 0] > 0.5)
     assert np.isfinite(model.weights).all()
-    assert probability(model, features[-1]) > 0.9 > 0.1 > probability(model, features[0])
+    assert logistic_probability(model, features[-1]) > 0.9 > 0.1 > logistic_probability(model, features[0])
 
 
 def test_examples_of_one_kind_are_refused() -> None:

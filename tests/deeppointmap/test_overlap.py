@@ -11,7 +11,7 @@ import pytest
 
 import dpmjax
 from dpmjax.deeppointmap import correlate
-from dpmjax.deeppointmap.confidence import OVERLAP_FEATURES, LogisticModel, probability
+from dpmjax.deeppointmap.confidence import OVERLAP_FEATURES, LogisticModel, logistic_probability
 from dpmjax.deeppointmap.model import overlap_logit, similarity_features
 from dpmjax.deeppointmap.overlap_prediction import (
     HIGH,
@@ -112,7 +112,7 @@ def test_an_empty_or_broken_cloud_overlaps_nothing(fitted, side: int) -> None:
 
 def test_the_probability_is_the_logistic_function_of_the_evidence(fitted, assert_compiles_nothing) -> None:
     a, b = cloud(1), cloud(2)
-    expected = probability(fitted.config.overlap, np.asarray(overlap_evidence(fitted, a, b), float))
+    expected = logistic_probability(fitted.config.overlap, np.asarray(overlap_evidence(fitted, a, b), float))
     np.testing.assert_allclose(overlap_probability(fitted, a, b), expected, **ACCUMULATED)
     with assert_compiles_nothing():
         overlap_probability(fitted, b, cloud(3))

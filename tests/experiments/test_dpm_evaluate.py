@@ -8,11 +8,13 @@ import pytest
 from tqdm import tqdm
 
 import dpmjax
-from dpmjax.cli import train_data
+from dpmjax import deeppointmap, simulation
+from dpmjax.cli import drive_sources, evaluation_rows
 from dpmjax.cli.command import EXIT_BAD_INPUT, EXIT_OK, run_command
 from dpmjax.cli.result_files import load_json
-from dpmjax.deeppointmap.confidence import OVERLAP_FEATURES, SCAN_FEATURES
-from experiments import _dpm_evaluation, _dpm_overlap, _dpm_pairs, dpm_calibrate, dpm_evaluate
+from dpmjax.deeppointmap import OVERLAP_FEATURES, SCAN_FEATURES, Evidence
+from dpmjax.deeppointmap.scan_evaluation import StagedRegistration, StageSeconds
+from experiments import _dpm_evaluation, _dpm_overlap, dpm_calibrate, dpm_evaluate
 from tests.deeppointmap import toy
 
 
@@ -29,7 +31,7 @@ def run(module, arguments) -> int:
 
 
 def test_evaluation_measures_every_sequence_and_resumes(weights, tmp_path, monkeypatch, capsys) -> None:
-    monkeypatch.setattr(train_data, "town_drive", lambda seed, **_: toy.drive(seed))
+    monkeypatch.setattr(drive_sources, "simulate_drive", lambda seed, **_: toy.drive(seed))
     monkeypatch.setattr(_dpm_evaluation, "why_no_kiss", lambda: "it is not installed")
     arguments = ["town", "--weights", weights, "--pairs", 2, "--num-towns", 1, "-o", tmp_path / "out"]
     assert run(dpm_evaluate, arguments) == EXIT_OK
@@ -45,7 +47,7 @@ def test_evaluation_measures_every_sequence_and_resumes(weights, tmp_path, monke
     for name in ("table.md", "reliability.png", "failures.png"):
         assert (tmp_path / "out" / name).stat().st_size > 0
     # All rows are there: nothing is registered again.
-    monkeypatch.setattr(_dpm_evaluation, "register_pair", None)
+    monkeypatch.setattr(evaluation_rows, "evaluate_scan_pairs", None)
     assert run(dpm_evaluate, ["--resume", "-o", tmp_path / "out"]) == EXIT_OK
     assert load_json(tmp_path / "out" / "metrics.json")["rows"] == metrics["rows"]
 
@@ -69,11 +71,11 @@ def test_bad_input_is_one_line(weights, tmp_path, capsys, arguments, message: st
 def test_calibration_is_stored_in_a_copy_of_the_model(weights, tmp_path, monkeypatch) -> None:
     kinds = []
 
-    def town_drive(seed, *, length_m, kind=None):
+    def simulate_drive(seed, *, length_m, kind=None):
         kinds.append(kind)
         return toy.drive(seed)
 
-    monkeypatch.setattr(train_data, "town_drive", town_drive)
+    monkeypatch.setattr(simulation, "simulate_drive", simulate_drive)
     rng = np.random.default_rng(0)
 
     def found(model, pair):
@@ -81,13 +83,12 @@ def test_calibration_is_stored_in_a_copy_of_the_model(weights, tmp_path, monkeyp
         is_right = rng.uniform() < 0.5
         T = pair.T_target_source if is_right else np.eye(4)
         of_clouds = rng.normal(size=4) + is_right
-        motions = {"descriptors": T, "verified": T, "refined": T}
-        evidence = _dpm_pairs.Evidence(
+        evidence = Evidence(
             of_clouds, np.concatenate([of_clouds, rng.normal(size=len(SCAN_FEATURES) - 4) + 2 * is_right])
         )
-        return _dpm_pairs.PairResult(motions, evidence, {})
+        return StagedRegistration(T, T, T, evidence, StageSeconds(*[0.0] * 5))
 
-    monkeypatch.setattr(_dpm_pairs, "register_pair", found)
+    monkeypatch.setattr(deeppointmap, "register_in_stages", found)
     sizes = ["--towns", 3, "--pairs", 20, "--overlap-towns", 2, "--overlap-pairs", 16]
     assert run(dpm_calibrate, [weights, *sizes, "-o", tmp_path / "out"]) == EXIT_OK
     assert len(set(kinds[:3])) == 3  # of towns for confidence; those for overlap are of any kind
@@ -113,41 +114,3 @@ def test_half_of_the_overlap_pairs_of_a_town_overlap(weights) -> None:
         row = _dpm_overlap.measure_town(dpmjax.load_model(weights), drives, 32, 0, bar)
     assert sum(row["is_overlap"]) == 16
     assert np.shape(row["evidence"]) == (32, len(OVERLAP_FEATURES))
-
-
-def test_the_auc_is_one_for_a_model_that_knows_and_a_half_for_one_that_guesses(weights, monkeypatch) -> None:
-    drive, model, known = toy.drive(), dpmjax.load_model(weights), {}
-    for is_perfect, expected in ((True, 1.0), (False, 0.5)):
-
-        def encoded(model, points):
-            """A cloud that carries what its scan sees first."""
-            return dpmjax.types.DescriptorCloud(points[:1], points[:1], np.ones(1, bool))
-
-        def probability(model, sources, targets, is_perfect=is_perfect):
-            known["num"] = len(sources)
-            return np.arange(len(sources)) < 10 if is_perfect else np.full(len(sources), 0.3)
-
-        monkeypatch.setattr(_dpm_overlap, "encode", encoded)
-        monkeypatch.setattr(_dpm_overlap, "overlap_pairs", probability)
-        with tqdm(disable=True) as bar:
-            row = _dpm_overlap.evaluate_overlap(model, drive, 10, 0, bar)
-        assert (row["auc"], row["num_pairs"], known["num"]) == (expected, 20, 20)
-
-
-def test_pairs_have_the_motion_of_their_poses() -> None:
-    """World points that both scans see coincide under the true motion, whatever the yaws."""
-    drive = toy.drive()
-    (pair,) = _dpm_pairs.read_pairs(drive, _dpm_pairs.draw_pairs(drive, "near", 1, seed=3), seed=3)
-    moved = pair.source @ pair.T_target_source[:3, :3].T + pair.T_target_source[:3, 3]
-    distances = np.linalg.norm(moved[:, None] - pair.target[None], axis=2).min(axis=1)
-    assert np.quantile(distances, 0.3) < 1e-3
-
-
-@pytest.mark.parametrize(("band", "low", "high"), [("near", 2, 10), ("middle", 10, 20), ("far", 60, np.inf)])
-def test_pairs_are_as_far_apart_as_their_band_says(band: str, low: float, high: float) -> None:
-    drive = toy.drive()
-    pairs = _dpm_pairs.draw_pairs(drive, band, 7, seed=0)
-    assert len(pairs) == 7
-    distances = np.linalg.norm(np.diff(drive.T_world_lidar[pairs, :3, 3], axis=1)[:, 0], axis=1)
-    assert ((distances >= low) & (distances <= high)).all()
-    np.testing.assert_array_equal(pairs, _dpm_pairs.draw_pairs(drive, band, 7, seed=0))

@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 
 import dpmjax
-from dpmjax.cli import slam_files
 from dpmjax.cli.command import EXIT_BAD_INPUT, EXIT_OK, run_command
 from dpmjax.cli.result_files import load_json
 from dpmjax.io import read_poses, write_tum
@@ -44,7 +43,7 @@ def truth_methods(config) -> SlamMethods:
 def with_truth(monkeypatch) -> None:
     """Truth in place of the networks; a map file needs their descriptors."""
     monkeypatch.setattr(dpm_multiagent, "agent_methods", truth_methods)
-    monkeypatch.setattr(slam_files, "write_map_file", lambda path, slam_map: {})
+    monkeypatch.setattr(_slam_agents, "write_map_file", lambda path, slam_map: {})
 
 
 def write_drive(folder: Path, numbers) -> Path:

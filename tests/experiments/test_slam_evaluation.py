@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import jax
@@ -15,6 +16,7 @@ from dpmjax.cli.result_files import load_json
 from dpmjax.cli.run_folder import RunFolder
 from dpmjax.geometry import rigid
 from dpmjax.io import LidarSequence
+from dpmjax.slam import RefinedKeyframes
 from experiments import _slam_comparison, _slam_evaluation, _slam_peers, _slam_refine, dpm_evaluate
 from experiments._slam_evaluation import Drive, FoundLoop, StoppedError
 from tests.deeppointmap import toy
@@ -98,7 +100,7 @@ def test_every_method_gets_a_row_and_a_resumed_run_computes_nothing_again(
     for name in ("table.md", "trajectories.png", "map_sizes.png"):
         assert (out / name).stat().st_size > 0
     assert f"| toy 1 | {NUM_SCANS}, 20 m | {PEER} | 0.000 |" in (out / "table.md").read_text()
-    monkeypatch.setattr(_slam_evaluation, "run_alone", None)
+    monkeypatch.setattr(_slam_evaluation, "map_drive", None)
     monkeypatch.setattr(SteadyPeer, "step", None)
     assert run("--resume", "-o", out) == EXIT_OK
     assert load_json(out / "metrics.json")["rows"] == metrics["rows"]
@@ -135,7 +137,7 @@ def test_refinements_are_rows_that_a_resumed_run_may_add(with_toys, tmp_path, mo
             np.testing.assert_array_equal(read_points(row), drive.read_scan(keyframe.scan))
         T = np.array(slam_map.T_world_keyframe)
         T[:, 1, 3] += 3.0 * np.arange(len(T))
-        return _slam_refine.Refined(T, {"refine_windows": 1})
+        return RefinedKeyframes(replace(slam_map, T_world_keyframe=T), 1, 1)
 
     monkeypatch.setattr(_slam_refine, "refine_keyframes", moved)
     monkeypatch.setitem(sys.modules, "open3d", None)

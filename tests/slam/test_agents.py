@@ -38,7 +38,7 @@ def methods_of(truth: np.ndarray, matcher: TruthMatcher | None = None, seed: int
 
 
 def run(parts=PARTS, *, truth: np.ndarray = TRUTH, matcher: TruthMatcher | None = None, seed: int = 0) -> AgentsResult:
-    return run_agents([scans_of(part) for part in parts], methods_of(truth, matcher, seed))
+    return run_agents(methods_of(truth, matcher, seed), [scans_of(part) for part in parts])
 
 
 def joint_error_m(result: AgentsResult, parts, agents, truth: np.ndarray = TRUTH) -> float:
@@ -111,17 +111,17 @@ def test_gross_errors_do_not_join_strangers(seed) -> None:
 
 def test_an_agent_without_scans_is_alone() -> None:
     scans = [scans_of(range(30)), [EMPTY, EMPTY], [], scans_of(range(10, 40))]
-    result = run_agents(scans, methods_of(TRUTH))
+    result = run_agents(methods_of(TRUTH), scans)
     assert result.component == (0, 1, 2, 0)
     assert [len(T_world_scan) for T_world_scan in result.T_world_scan] == [30, 2, 0, 30]
     with pytest.raises(ValueError, match="sequences: expected"):
-        run_agents([], methods_of(TRUTH))
+        run_agents(methods_of(TRUTH), [])
 
 
 def test_an_agent_alone_finds_what_it_finds_alone() -> None:
     methods = methods_of(TRUTH)
-    alone = dpmjax.run_slam(scans_of(range(60)), methods)
-    result = run_agents([scans_of(range(60))], methods)
+    alone = dpmjax.run_slam(methods, scans_of(range(60)))
+    result = run_agents(methods, [scans_of(range(60))])
     np.testing.assert_allclose(result.T_world_scan[0], alone.T_world_scan, atol=1e-9)
     assert result.component == (0,)
 
@@ -137,8 +137,8 @@ def test_bytes_are_counted() -> None:
 
 def test_maps_of_different_days_are_merged() -> None:
     methods = methods_of(TRUTH)
-    a, b = (dpmjax.run_slam(scans_of(part), methods).state.slam_map for part in PARTS[:2])
-    merged = dpmjax.merge_maps(a, b, methods)
+    a, b = (dpmjax.run_slam(methods, scans_of(part)).map for part in PARTS[:2])
+    merged = dpmjax.merge_maps(methods, a, b)
     assert merged.is_joined
     (both,) = merged.maps
     assert len(both) == len(a) + len(b)
@@ -147,28 +147,47 @@ def test_maps_of_different_days_are_merged() -> None:
     rows = [keyframe.description for keyframe in both.keyframes]
     assert absolute_trajectory_error(both.T_world_keyframe[:, :3, 3], TRUTH[rows][:, :3, 3]) < 1.0
     # A third drive extends what was merged.
-    extended = dpmjax.run_slam(scans_of(PARTS[2]), methods, map_=both)
-    rows = [keyframe.description for keyframe in extended.state.slam_map.keyframes]
-    found = extended.state.slam_map.T_world_keyframe[:, :3, 3]
+    extended = dpmjax.run_slam(methods, scans_of(PARTS[2]), slam_map=both)
+    rows = [keyframe.description for keyframe in extended.map.keyframes]
+    found = extended.map.T_world_keyframe[:, :3, 3]
     assert absolute_trajectory_error(found, TRUTH[rows][:, :3, 3]) < 1.0
-    assert len({keyframe.scan for keyframe in extended.state.slam_map.keyframes}) == len(rows)
+    assert len({keyframe.scan for keyframe in extended.map.keyframes}) == len(rows)
 
 
 def test_maps_that_do_not_meet_are_returned_as_they_were() -> None:
     methods = methods_of(TRUTH)
-    a, b = (dpmjax.run_slam(scans_of(part), methods).state.slam_map for part in (range(30), range(80, 110)))
-    merged = dpmjax.merge_maps(a, b, methods)
+    a, b = (dpmjax.run_slam(methods, scans_of(part)).map for part in (range(30), range(80, 110)))
+    merged = dpmjax.merge_maps(methods, a, b)
     assert not merged.is_joined
     assert merged.maps == (a, b)
 
 
 def test_maps_of_other_weights_are_refused(as_user) -> None:
     a, b = (
-        dpmjax.run_slam(scans_of(range(10)), methods_of(TRUTH, TruthMatcher(TRUTH, fingerprint=name))).state.slam_map
+        dpmjax.run_slam(methods_of(TRUTH, TruthMatcher(TRUTH, fingerprint=name)), scans_of(range(10))).map
         for name in ("one", "other")
     )
     with pytest.raises(ValueError, match="made with weights one, these are other"):
-        dpmjax.merge_maps(a, b, methods_of(TRUTH))
+        dpmjax.merge_maps(methods_of(TRUTH), a, b)
+    with pytest.raises(ValueError, match="made with weights one, these are truth"):
+        dpmjax.merge_maps(methods_of(TRUTH), a, a)
+
+
+def test_of_three_maps_those_that_meet_become_one() -> None:
+    methods = methods_of(TRUTH)
+    parts = (range(30), range(80, 110), range(10, 40))
+    maps = [dpmjax.run_slam(methods, scans_of(part)).map for part in parts]
+    merged = dpmjax.merge_maps(methods, *maps)
+    assert merged.component == (0, 1, 0)
+    assert not merged.is_joined
+    assert len(merged.maps[0]) == len(maps[0]) + len(maps[2])
+    assert merged.maps[1] is maps[1]
+    assert any(loop.status == "accepted" for loop in merged.loops)
+
+
+def test_one_map_has_nothing_to_be_merged_with(as_user) -> None:
+    with pytest.raises(ValueError, match="maps: expected at least two, got 1"):
+        dpmjax.merge_maps(methods_of(TRUTH), dpmjax.KeyframeMap())
 
 
 def test_a_lost_agent_is_joined_as_a_whole() -> None:

@@ -31,13 +31,13 @@ def methods(gross_share: float, seed: int = 0) -> SlamMethods:
 
 
 @pytest.fixture(scope="module")
-def map_() -> KeyframeMap:
-    return run_slam(scans_of(range(len(ROUND))), methods(0.0)).state.slam_map
+def slam_map() -> KeyframeMap:
+    return run_slam(methods(0.0), scans_of(range(len(ROUND)))).map
 
 
 @pytest.mark.parametrize(("gross_share", "least"), [(0.0, 1.0), (0.3, 0.9)])
-def test_scans_are_found_where_they_are(map_, gross_share, least) -> None:
-    found = list(localize_each(map_, scans_of(QUERIES), methods(gross_share)))
+def test_scans_are_found_where_they_are(slam_map, gross_share, least) -> None:
+    found = list(localize_each(methods(gross_share), slam_map, scans_of(QUERIES)))
     is_found = [one.is_in_map for one in found]
     assert np.mean(is_found) >= least
     for number, one in zip(QUERIES, found, strict=True):
@@ -52,9 +52,9 @@ def test_scans_are_found_where_they_are(map_, gross_share, least) -> None:
 
 
 @pytest.mark.parametrize("seed", [0, 1, 2])
-def test_scans_of_another_place_are_not_found(map_, seed) -> None:
+def test_scans_of_another_place_are_not_found(slam_map, seed) -> None:
     # Each registration is grossly wrong, with a probability as high as a right one.
-    found = list(localize_each(map_, scans_of(STRANGERS), methods(1.0, seed)))
+    found = list(localize_each(methods(1.0, seed), slam_map, scans_of(STRANGERS)))
     assert [one.status for one in found] == ["not in this map"] * len(STRANGERS)
     assert all(one.reason and one.evidence for one in found)
 
@@ -78,32 +78,32 @@ class SeeingMatcher(TruthMatcher):
     ("nearest_share", "probability", "is_found"), [(0.6, 0.97, True), (0.3, 0.97, False), (0.6, 0.9, False)]
 )
 def test_a_clear_registration_whose_scans_agree_is_supported_by_those_farther_off(
-    map_, nearest_share, probability, is_found
+    slam_map, nearest_share, probability, is_found
 ) -> None:
-    thin = thin_map(map_, spacing_share=0.8)
+    thin = thin_map(slam_map, spacing_share=0.8)
     matcher = SeeingMatcher(TRUTH, gross_share=0.0, nearest_share=nearest_share, probability=probability)
-    found = list(localize_each(thin, scans_of(QUERIES), SlamMethods(matcher, TruthGeometry(TRUTH), SlamConfig())))
+    found = list(localize_each(SlamMethods(matcher, TruthGeometry(TRUTH), SlamConfig()), thin, scans_of(QUERIES)))
     assert [one.is_in_map for one in found] == [is_found] * len(QUERIES)
     assert any(not evidence.do_scans_agree for one in found for evidence in one.evidence)
 
 
-def test_no_keyframe_is_registered_twice(map_) -> None:
+def test_no_keyframe_is_registered_twice(slam_map) -> None:
     matcher = SeeingMatcher(TRUTH, gross_share=0.5, nearest_share=0.4)
-    for one in localize_each(map_, scans_of(QUERIES), SlamMethods(matcher, TruthGeometry(TRUTH), SlamConfig())):
+    for one in localize_each(SlamMethods(matcher, TruthGeometry(TRUTH), SlamConfig()), slam_map, scans_of(QUERIES)):
         rows = [evidence.keyframe for evidence in one.evidence]
         assert len(set(rows)) == len(rows)
 
 
-def test_an_empty_scan_is_said_to_be_empty(map_) -> None:
-    found = localize(map_, EMPTY, methods(0.0))
+def test_an_empty_scan_is_said_to_be_empty(slam_map) -> None:
+    found = localize(methods(0.0), slam_map, EMPTY)
     assert (found.status, found.T_world_scan, found.evidence) == ("empty", None, ())
 
 
-def test_wrong_input_is_refused(as_user, map_) -> None:
-    with pytest.raises(ValueError, match="points: expected shape"):
-        localize(map_, np.zeros((4, 2)), methods(0.0))
-    with pytest.raises(ValueError, match="map_: expected keyframes, got an empty map"):
-        localize(KeyframeMap(), EMPTY, methods(0.0))
+def test_wrong_input_is_refused(as_user, slam_map) -> None:
+    with pytest.raises(ValueError, match="scan: expected shape"):
+        localize(methods(0.0), slam_map, np.zeros((4, 2)))
+    with pytest.raises(ValueError, match="slam_map: expected keyframes, got an empty map"):
+        localize(methods(0.0), KeyframeMap(), EMPTY)
     other = TruthMatcher(TRUTH, fingerprint="other")
-    with pytest.raises(ValueError, match="map_: made with weights truth, these are other"):
-        localize(map_, EMPTY, SlamMethods(other, TruthGeometry(TRUTH), SlamConfig()))
+    with pytest.raises(ValueError, match="slam_map: made with weights truth, these are other"):
+        localize(SlamMethods(other, TruthGeometry(TRUTH), SlamConfig()), slam_map, EMPTY)

@@ -13,7 +13,7 @@ from tests.slam.truth import TruthGeometry, TruthMatcher, laps, scans_of
 
 TRUTH = laps(2, side_m=40.0, step_m=2.0)
 METHODS = SlamMethods(TruthMatcher(TRUTH, gross_share=0.0), TruthGeometry(TRUTH), SlamConfig())
-MAP = run_slam(scans_of(range(len(TRUTH))), METHODS).state.slam_map
+MAP = run_slam(METHODS, scans_of(range(len(TRUTH)))).map
 
 
 @pytest.mark.parametrize("spacing_share", [0.001, 0.8, 1.5])

@@ -39,11 +39,11 @@ def run(matcher: TruthMatcher, seed: int = 0, num_neighbours: int = 3) -> SlamRe
     front = replace(CONFIG.front_end, num_neighbours=num_neighbours)
     config = replace(CONFIG, front_end=front, loops=replace(CONFIG.loops, is_on=False))
     geometry = TruthGeometry(TRUTH, sigma_m=0.02, sigma_rad=0.003, seed=seed)
-    return run_slam(scans_of(range(len(TRUTH))), SlamMethods(matcher, geometry, config))
+    return run_slam(SlamMethods(matcher, geometry, config), scans_of(range(len(TRUTH))))
 
 
 def skips(result: SlamResult) -> list[tuple[int, int]]:
-    edges = result.state.slam_map.edges
+    edges = result.map.edges
     return [(edge.source, edge.source - edge.target) for edge in edges if edge.source - edge.target > 1]
 
 
@@ -67,7 +67,7 @@ def test_each_keyframe_is_aligned_with_those_before_the_last_one() -> None:
     ]
     assert skips(result) == expected
     assert {hops for _, hops in expected} == {2, 3, 4}
-    assert {edge.kind for edge in result.state.slam_map.edges} == {"odometry"}
+    assert {edge.kind for edge in result.map.edges} == {"odometry"}
     assert not skips(run(AligningMatcher(TRUTH), num_neighbours=0))
 
 
@@ -81,7 +81,7 @@ def test_what_odometry_or_the_scans_contradict_is_not_believed(change) -> None:
 def test_chains_that_nothing_measured_joins_stay_apart() -> None:
     matcher = AligningMatcher(TRUTH)
     result = run(matcher)
-    slam_map = result.state.slam_map
+    slam_map = result.map
     last = slam_map.keyframes[-1]
     broken = replace(slam_map, keyframes=(*slam_map.keyframes[:-1], last._replace(segment=1)))
     methods = SlamMethods(matcher, TruthGeometry(TRUTH), CONFIG)

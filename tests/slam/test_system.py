@@ -20,7 +20,7 @@ CONFIG = SlamConfig()
 def run(T_world_scan: np.ndarray, numbers=None, *, geometry=None, matcher=None, config=CONFIG) -> SlamResult:
     scans = scans_of(range(len(T_world_scan)) if numbers is None else numbers)
     methods = SlamMethods(matcher or TruthMatcher(T_world_scan), geometry or TruthGeometry(T_world_scan), config)
-    return run_slam(scans, methods)
+    return run_slam(methods, scans)
 
 
 def without_loops() -> SlamConfig:
@@ -119,7 +119,7 @@ def test_every_scan_gets_a_pose_and_empty_ones_are_flagged() -> None:
     for number in (0, 10, 11, 40):
         scans[number] = EMPTY
     methods = SlamMethods(TruthMatcher(truth), TruthGeometry(truth), CONFIG)
-    result = run_slam(scans, methods)
+    result = run_slam(methods, scans)
     assert result.T_world_scan.shape == (len(truth), 4, 4)
     assert [report.scan for report in result.reports if report.status == "empty"] == [0, 10, 11, 40]
     assert absolute_trajectory_error(result.T_world_scan[2:, :3, 3], truth[2:, :3, 3]) < 0.5
@@ -127,10 +127,10 @@ def test_every_scan_gets_a_pose_and_empty_ones_are_flagged() -> None:
 
 def test_only_empty_scans_stay_at_the_origin() -> None:
     methods = SlamMethods(TruthMatcher(np.eye(4)[None]), TruthGeometry(np.eye(4)[None]), CONFIG)
-    result = run_slam([EMPTY, EMPTY], methods)
+    result = run_slam(methods, [EMPTY, EMPTY])
     np.testing.assert_array_equal(result.T_world_scan, np.tile(np.eye(4), (2, 1, 1)))
     assert result.graph is None
-    assert run_slam([], methods).T_world_scan.shape == (0, 4, 4)
+    assert run_slam(methods, []).T_world_scan.shape == (0, 4, 4)
 
 
 def test_standing_still_makes_one_keyframe() -> None:
@@ -182,10 +182,10 @@ def test_a_scan_where_nothing_agrees_is_predicted() -> None:
 
 def test_a_scan_of_another_shape_is_refused(as_user) -> None:
     methods = SlamMethods(TruthMatcher(np.eye(4)[None]), TruthGeometry(np.eye(4)[None]), CONFIG)
-    with pytest.raises(ValueError, match="points: expected shape"):
+    with pytest.raises(ValueError, match="scan: expected shape"):
         step_slam(methods, init_slam(), np.zeros((5, 4)))
     with pytest.raises(ValueError, match="config: expected None"):
-        run_slam([], methods, CONFIG)
+        run_slam(methods, [], CONFIG)
 
 
 @pytest.mark.parametrize("seed", [0, 1])
@@ -193,8 +193,8 @@ def test_a_map_is_extended_by_a_later_drive(seed) -> None:
     # The second drive begins elsewhere and meets the first one on its way.
     truth = laps(2, side_m=60.0, step_m=2.0)
     methods = SlamMethods(TruthMatcher(truth, seed=seed), TruthGeometry(truth, seed=seed), CONFIG)
-    first = run_slam(scans_of(range(70)), methods)
-    second = run_slam(scans_of(range(90, 200)), methods, map_=first.state.slam_map)
+    first = run_slam(methods, scans_of(range(70)))
+    second = run_slam(methods, scans_of(range(90, 200)), slam_map=first.map)
     assert [report.scan for report in second.reports][:2] == [69, 70]
     assert second.reports[0].status == "first"
     assert second.T_world_scan.shape == (110, 4, 4)
@@ -203,7 +203,7 @@ def test_a_map_is_extended_by_a_later_drive(seed) -> None:
     assert apart.max() < 1.0
     # The first part keeps its frame and its loops.
     rows = len(first.keyframes)
-    kept = second.state.slam_map.T_world_keyframe[:rows, :3, 3] - first.state.slam_map.T_world_keyframe[:, :3, 3]
+    kept = second.map.T_world_keyframe[:rows, :3, 3] - first.map.T_world_keyframe[:, :3, 3]
     assert np.abs(kept).max() < 0.5
 
 
@@ -211,8 +211,8 @@ def test_a_map_of_other_weights_is_refused(as_user) -> None:
     truth = laps(1, side_m=20.0)
     first = run(truth, range(10))
     other = SlamMethods(TruthMatcher(truth, fingerprint="other"), TruthGeometry(truth), CONFIG)
-    with pytest.raises(ValueError, match="map_: made with weights truth, these are other"):
-        run_slam(scans_of([0]), other, map_=first.state.slam_map)
+    with pytest.raises(ValueError, match="slam_map: made with weights truth, these are other"):
+        run_slam(other, scans_of([0]), slam_map=first.map)
 
 
 class SparseGeometry(TruthGeometry):

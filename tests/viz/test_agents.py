@@ -25,7 +25,7 @@ def test_agents_of_one_frame_share_a_panel() -> None:
         assert {agent.color for agent in panel.agents} <= colors
         assert axes.get_aspect() == 1.0
     labels = [text.get_text() for text in figure.axes[0].get_legend().get_texts()]
-    assert "3 loops between agents" in labels
+    assert "3 loops between them" in labels
 
 
 def test_a_pixel_has_the_colour_of_who_saw_it() -> None:

@@ -144,7 +144,8 @@ def run_command(
     enable_compile_cache()
     try:
         config = _parse(config_type, name, description, arguments)
-        if isinstance(config, OutputOptions):
+        # Of several processes that run as one, `main` selects devices and one opens the folder.
+        if isinstance(config, OutputOptions) and getattr(config, "coordinator", None) is None:
             check_run_folder(config, name)
             select_device(config.device)
         main(config)

@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dpmjax import metrics
-from dpmjax.geometry import se2
 from dpmjax.sequences import Relations, ScanSequence
 
 Floats = NDArray[np.float64]
@@ -22,6 +21,8 @@ _MIN_COMMON = 10
 
 def planar_errors(sequence: ScanSequence, poses: Floats) -> dict[str, float]:
     """Returns ATE and point distance in the unit of the scans; nothing where there is no reference."""
+    from dpmjax.geometry import se2
+
     reference = sequence.reference_poses
     if reference is None:
         return {}
@@ -71,6 +72,8 @@ def corrected_numbers(times: Floats, poses: Floats, corrected: ScanSequence, suf
 
     The latter are measured like hand-checked relations: the relative poses of successive scans of the corrected log.
     """
+    from dpmjax.geometry import se2
+
     if corrected.reference_poses is None or corrected.times is None:
         raise ValueError(f"{corrected.name}: has no corrected poses with times")
     _, mine, theirs = np.intersect1d(np.round(times, 3), np.round(corrected.times, 3), return_indices=True)

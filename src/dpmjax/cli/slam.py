@@ -8,8 +8,7 @@
 
 Results go to results/slam/<time>/ (latest links to the newest): trajectories of every scan as TUM, KITTI and npy,
 scans.csv and loops.csv with the reason of every decision, graph.g2o, keyframes.txt, map.npz (to extend, and to localise
-in), map.ply, trajectory.png, map.png and metrics.json. Ctrl-C writes all of it.
-docs/files.md lists the files and the words of their columns.
+in), map.ply, trajectory.png, map.png and metrics.json. Ctrl-C ends the run and writes them too.
 """
 
 from __future__ import annotations
@@ -22,9 +21,11 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, NamedTuple
 
+import numpy as np
 from tyro.conf import FlagCreatePairsOff, Positional, arg
 
 from dpmjax.cli.command import StopFlag, check_least, run_command
+from dpmjax.cli.drives import DriveSelection, open_drive
 from dpmjax.cli.machine import peak_rss_gb
 from dpmjax.cli.run_folder import RunFolder, RunOptions, open_run_folder, recording, write_metrics
 
@@ -54,7 +55,7 @@ class Config(RunOptions):
     no_loop: FlagCreatePairsOff[bool] = False
     """Odometry alone."""
     refine: FlagCreatePairsOff[bool] = False
-    """Polish the keyframes by DeepMapping afterwards; takes a minute for each window of 32."""
+    """Refine the keyframes by DeepMapping afterwards; takes a minute for each window of 32."""
     deskew: FlagCreatePairsOff[bool] = False
     """Undo the motion of the lidar during its turn, by the times of the points (of .pcd .ply .npz) or their azimuth."""
     kitti_angle_correction: FlagCreatePairsOff[bool] = False
@@ -76,11 +77,23 @@ class Config(RunOptions):
         if self.visualize and importlib.util.find_spec("rerun") is None:
             raise ValueError("-v needs the live viewer: pip install 'dpmjax[viewer]', or leave it out")
 
+    @property
+    def selection(self) -> DriveSelection:
+        """The scans of the run."""
+        return DriveSelection(
+            data=self.data,
+            sequence=self.sequence,
+            num_scans=self.n_scans,
+            jump=self.jump,
+            is_kitti_corrected=self.kitti_angle_correction,
+            seed=self.seed,
+        )
+
 
 def main(config: Config) -> dict[str, Any]:
     """Reads, maps, writes; returns the content of `metrics.json`."""
-    from dpmjax.cli.slam_input import ScanReader, open_drive
-    from dpmjax.cli.slam_numbers import summary
+    from dpmjax.cli.slam_numbers import counted, summary
+    from dpmjax.cli.slam_reader import ScanReader
     from dpmjax.cli.slam_run import Hooks, find_beginning, run_scans
     from dpmjax.cli.slam_viewer import live_viewer
     from dpmjax.slam import finish_slam
@@ -88,13 +101,13 @@ def main(config: Config) -> dict[str, Any]:
     started = time.perf_counter()
     methods = slam_methods(config)
     start = starting_state(config, methods)
-    sequence = open_drive(config)
+    sequence = open_drive(config.selection)
     reader = ScanReader(sequence, is_deskewed=config.deskew, jump=config.jump)
     folder = open_run_folder(config, NAME)
     beginning = find_beginning(folder, methods, start, reader)
     with recording(folder), StopFlag() as stop:
         done = f", {len(beginning.earlier.reports)} done before" if beginning.earlier else ""
-        tell(f"{sequence.name}: {len(sequence)} scans{done}")
+        tell(f"{sequence.name}: {counted(len(sequence), 'scan')}{done}")
         with live_viewer(folder, sequence.name, is_on=config.visualize) as on_scan:
             hooks = Hooks(lambda: stop.is_requested, on_scan)
             run = run_scans(folder, sequence, reader, methods, beginning, hooks)
@@ -126,19 +139,18 @@ class Drive(NamedTuple):
     num_keyframes_before: int
 
     def read_keyframe(self, slam_map: KeyframeMap, row: int) -> np.ndarray:
-        """Reads the points of a keyframe; of the map before, its surface is all that there is."""
-        from dpmjax.cli.slam_input import read_points
-        from dpmjax.scans.compact import expand_surface
+        """Reads the points of a keyframe; those of the extended map are the points of its surface."""
+        from dpmjax.cli.map_input import keyframe_points
 
         if row < self.num_keyframes_before:
-            return expand_surface(slam_map.keyframes[row].description.surface).points
-        return read_points(self.sequence, slam_map.keyframes[row].scan - self.first_scan)
+            return keyframe_points(slam_map, row)
+        return self.sequence.read_points(slam_map.keyframes[row].scan - self.first_scan)
 
 
 def slam_methods(config: Config) -> SlamMethods:
     """Returns the methods of the model."""
-    from dpmjax import SlamConfig, load_model
-    from dpmjax.slam import make_methods
+    from dpmjax.slam import SlamConfig, make_methods
+    from dpmjax.weights import load_model
 
     settings = SlamConfig()
     if config.no_loop:
@@ -148,18 +160,10 @@ def slam_methods(config: Config) -> SlamMethods:
 
 def starting_state(config: Config, methods: SlamMethods) -> SlamState:
     """Returns the state before the first scan; a `ValueError` for a map of other weights."""
-    from dpmjax import load_map
+    from dpmjax.cli.map_input import open_map
     from dpmjax.slam import init_slam
-    from dpmjax.slam.keyframes import with_origin
 
-    if config.map is None:
-        return init_slam()
-    slam_map = load_map(config.map)
-    try:
-        with_origin(slam_map, methods.origin)
-    except ValueError as error:
-        raise ValueError(f"--map {config.map}: {error}") from error
-    return init_slam(slam_map)
+    return init_slam(None if config.map is None else open_map(config.map, methods))
 
 
 def write_results(folder: RunFolder, config: Config, drive: Drive, run: SlamRun, result: SlamResult) -> dict[str, Any]:
@@ -167,7 +171,7 @@ def write_results(folder: RunFolder, config: Config, drive: Drive, run: SlamRun,
     from dpmjax.cli import slam_files as files
     from dpmjax.cli.slam_numbers import run_numbers
 
-    sequence, slam_map = drive.sequence, result.state.slam_map
+    sequence, slam_map = drive.sequence, result.map
     times = None if sequence.times is None else sequence.times[: len(result.reports)]
     metrics = {"weights": config.weights, **run_numbers(run, result, sequence)}
     if not result.reports:
@@ -190,24 +194,29 @@ def write_results(folder: RunFolder, config: Config, drive: Drive, run: SlamRun,
 def refine(
     folder: RunFolder, config: Config, drive: Drive, result: SlamResult, is_stopped: Callable[[], bool]
 ) -> dict[str, Any]:
-    """Polishes the trajectory by DeepMapping, writes it beside the other, and returns its numbers."""
+    """Refines the trajectory by DeepMapping, writes it as refined_*.txt, and returns its numbers."""
+    import jax
+
+    from dpmjax.cli.progress import progress_bar
     from dpmjax.cli.slam_files import write_trajectory
     from dpmjax.cli.slam_numbers import trajectory_errors
-    from dpmjax.slam.system import place_scans
-    from experiments._slam_refine import refine_keyframes, windows
+    from dpmjax.slam import place_scans, refine_keyframes
 
-    slam_map, sequence = result.state.slam_map, drive.sequence
-    num_windows = len(windows(len(slam_map)))
-    if num_windows > 1:
-        tell(f"refine: {len(slam_map)} keyframes are too many for one fit: {num_windows} windows, joined by the graph")
-    refined = refine_keyframes(
-        slam_map, lambda row: drive.read_keyframe(slam_map, row), seed=config.seed, is_stopped=is_stopped
-    )
-    T = place_scans(refined.T_world_keyframe, result.reports)
+    sequence = drive.sequence
+    with progress_bar("refine", " windows of keyframes") as on_window:
+        refined = refine_keyframes(
+            result.map,
+            lambda row: drive.read_keyframe(result.map, row),
+            key=jax.random.key(config.seed),
+            on_window=on_window,
+            stop=is_stopped,
+        )
+    T = place_scans(refined.slam_map.T_world_keyframe, result.reports)
     times = None if sequence.times is None else sequence.times[: len(T)]
     write_trajectory(folder.path, T, times, "refined")
     reference = None if sequence.T_world_lidar is None else sequence.T_world_lidar[: len(T)]
-    return {**refined.numbers, **trajectory_errors(T, reference, "_refined")}
+    numbers = {"refine_windows": refined.num_windows, "refine_windows_improved": refined.num_improved}
+    return {**numbers, **trajectory_errors(T, reference, "_refined")}
 
 
 def tell(text: str) -> None:

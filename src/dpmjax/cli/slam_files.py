@@ -48,35 +48,39 @@ def write_trajectory(
 
 def write_graph(folder: Path, result: SlamResult) -> None:
     """Writes graph.g2o and keyframes.txt (number and pose of each keyframe)."""
-    import dpmjax
     from dpmjax import io as dpm_io
+    from dpmjax.io.g2o import write_g2o
 
     if result.graph is not None:
-        dpmjax.write_g2o(folder / "graph.g2o", result.graph)
-    poses = result.state.slam_map.T_world_keyframe
+        write_g2o(folder / "graph.g2o", result.graph)
+    poses = result.map.T_world_keyframe
     dpm_io.write_tum(
         folder / "keyframes.txt", poses, times=result.keyframes, frame="T_map_keyframe; stamps are numbers of scans"
     )
 
 
-def write_loops(path: Path, loops: Sequence[Loop], keyframes: Sequence[int]) -> None:
+def write_loops(path: Path, loops: Sequence[Loop], keyframes: Sequence[int] | np.ndarray) -> None:
     """Writes every candidate of a loop, and what became of it."""
     rows = [
         {
             "scan": int(keyframes[loop.source]),
             "other_scan": int(keyframes[loop.target]),
-            "found_by": loop.found_by,
-            "status": loop.status,
-            "overlap": _number(loop.overlap),
-            "probability": _number(loop.probability),
-            "rmse_m": _number(loop.rmse_m),
+            **loop_cells(loop),
         }
         for loop in loops
     ]
     write_table(path, ("scan", "other_scan", "found_by", "status", "overlap", "probability", "rmse_m"), rows)
 
 
-def write_scans(path: Path, reports: Sequence[ScanReport], keyframes: Sequence[int], sources: Sequence[str]) -> None:
+def loop_cells(loop: Loop) -> dict[str, str]:
+    """Returns the cells of a loop candidate in a table: how it was found, its outcome and the numbers that decided."""
+    numbers = {name: _number(getattr(loop, name)) for name in ("overlap", "probability", "rmse_m")}
+    return {"found_by": loop.found_by, "status": loop.status, **numbers}
+
+
+def write_scans(
+    path: Path, reports: Sequence[ScanReport], keyframes: Sequence[int] | np.ndarray, sources: Sequence[str]
+) -> None:
     """Writes how each scan was placed."""
     rows = [
         {
@@ -160,10 +164,9 @@ def keyframe_views(
 
 def write_map_file(path: Path, slam_map: KeyframeMap) -> dict[str, int]:
     """Writes the map that later runs extend and scans are localised in; returns its size at each precision."""
-    import dpmjax
-    from dpmjax.saved_maps import map_bytes
+    from dpmjax.saved_maps import map_bytes, save_map
 
-    dpmjax.save_map(path, slam_map)
+    save_map(path, slam_map)
     sizes = {name: len(map_bytes(slam_map, name)) for name in ("float16", "int8")}
     return {"map_bytes": path.stat().st_size, **{f"map_bytes_{name}": size for name, size in sizes.items()}}
 
@@ -181,10 +184,11 @@ def draw_pictures(
 ) -> None:
     """Draws trajectory.png and map.png."""
     from dpmjax import viz
+    from dpmjax.cli.slam_numbers import counted
     from dpmjax.geometry import rigid
     from dpmjax.metrics import align_rigid
 
-    T, slam_map, num_old = result.T_world_scan, result.state.slam_map, num_keyframes_before
+    T, slam_map, num_old = result.T_world_scan, result.map, num_keyframes_before
     # Odometry alone begins where the drive begins, also in a map that was there before.
     odometry = T[0] @ rigid.inverse(result.T_odometry_scan[0]) @ result.T_odometry_scan
     reference = None if sequence.T_world_lidar is None else sequence.T_world_lidar[: len(T)]
@@ -198,10 +202,10 @@ def draw_pictures(
     if reference is not None:
         T_map_reference = align_rigid(reference[:, :3, 3], T[:, :3, 3])
         shown = reference[:, :3, 3] @ T_map_reference[:3, :3].T + T_map_reference[:3, 3]
-    title = f"{sequence.name}: {len(T)} scans"
+    title = f"{sequence.name}: {counted(len(T), 'scan')}"
     figure = viz.trajectory_figure(title, tracks, shown, slam_map.T_world_keyframe[ends, :3, 3])
     viz.save_figure(figure, folder / "trajectory.png")
-    title = f"{sequence.name}: {len(result.keyframes)} keyframes"
+    title = f"{sequence.name}: {counted(len(result.keyframes), 'keyframe')}"
     viz.save_figure(viz.height_map_figure(title, cloud.points, cloud.heights_m, T[:, :3, 3]), folder / "map.png")
 
 

@@ -13,6 +13,14 @@ if TYPE_CHECKING:
     from dpmjax.sequences import LidarSequence
     from dpmjax.slam import KeyframeMap, SlamResult
 
+UNSURE = {
+    "network": "placed by the network, because alignment with the scans before failed",
+    "predicted": "placed by the predicted motion only: uncertain",
+    "restarted": "not placed: a new part of the map begins there",
+    "empty": "without enough points",
+}
+"""Texts for scans that were not aligned with the scans before them, by status."""
+
 
 def trajectory_errors(T_world_scan: np.ndarray, reference: np.ndarray | None, suffix: str = "") -> dict[str, Any]:
     """Returns ATE, RPE and KITTI's errors of a trajectory; none without a reference."""
@@ -52,7 +60,7 @@ def run_numbers(run: SlamRun, result: SlamResult, sequence: LidarSequence) -> di
         "num_scans": num,
         "path_m": float(np.linalg.norm(np.diff(T[:, :3, 3], axis=0), axis=1).sum()),
         "num_keyframes": len(result.keyframes),
-        "num_parts": count_parts(result.state.slam_map),
+        "num_parts": count_parts(result.map),
         "num_loops": loops["accepted"],
         **trajectory_errors(T, reference),
         **trajectory_errors(result.T_odometry_scan, reference, "_odometry"),
@@ -76,19 +84,23 @@ def count_parts(slam_map: KeyframeMap) -> int:
 
 def summary(metrics: dict[str, Any]) -> str:
     """Returns the last lines on the console."""
-    lines = [
-        f"{metrics['num_scans']} scans, {metrics['path_m']:.0f} m, {metrics['num_keyframes']} keyframes, "
-        f"{metrics['num_loops']} loops",
+    counts = (("scan", "num_scans"), ("keyframe", "num_keyframes"), ("loop closure", "num_loops"))
+    scans, *others = (counted(metrics[name], noun) for noun, name in counts)
+    lines = [", ".join([scans, f"{metrics['path_m']:.1f} m driven", *others])]
+    lines += [
+        f"{counted(metrics['scan_statuses'][status], 'scan')} {text}"
+        for status, text in UNSURE.items()
+        if status in metrics["scan_statuses"]
     ]
-    statuses = {name: count for name, count in metrics["scan_statuses"].items() if name not in ("first", "tracked")}
-    if statuses:
-        found = ", ".join(f"{count} {name}" for name, count in statuses.items())
-        lines.append(f"not tracked by geometry alone: {found} (scans.csv has the reasons)")
+    if len(lines) > 1:
+        lines[-1] += " (scans.csv has the reason for each)"
     if metrics["num_parts"] > 1:
-        lines.append(f"the map has {metrics['num_parts']} parts that no loop joins; where they lie is a guess")
+        lines.append(f"the map has {metrics['num_parts']} parts that no loop joins; their relative pose is a guess")
+    if "ate_m" in metrics:
+        lines.append("errors against the reference poses (ATE of the whole drive, RPE from scan to scan):")
     for suffix, name in (("_odometry", "odometry alone"), ("", "SLAM"), ("_refined", "refined")):
         if f"ate{suffix}_m" in metrics:
-            line = f"{name:14}  ATE {metrics[f'ate{suffix}_m']:.3f} m, RPE {metrics[f'rpe{suffix}_m']:.3f} m"
+            line = f"  {name:14}  ATE {metrics[f'ate{suffix}_m']:.3f} m, RPE {metrics[f'rpe{suffix}_m']:.3f} m"
             t_rel, r_rel = metrics.get(f"t_rel{suffix}_percent"), metrics.get(f"r_rel{suffix}_deg_per_100m")
             is_long = t_rel is not None and math.isfinite(t_rel)
             lines.append(line + (f", {t_rel:.2f} %, {r_rel:.2f} degrees/100 m" if is_long else ""))
@@ -98,3 +110,8 @@ def summary(metrics: dict[str, Any]) -> str:
         stages = ", ".join(f"{name} {ms:.0f}" for name, ms in slowest)
         lines.append(f"{speed:.1f} scans/s (ms a scan: {stages}); compilation took {metrics['compile_s']:.0f} s more")
     return "\n".join(lines)
+
+
+def counted(number: int, noun: str) -> str:
+    """Returns a number with its noun, in the plural unless the number is 1."""
+    return f"{number} {noun}{'s' * (number != 1)}"

@@ -13,7 +13,7 @@ from tqdm import tqdm
 
 from dpmjax.cli.run_folder import RunFolder
 from dpmjax.cli.slam_files import write_scans, write_trajectory
-from dpmjax.cli.slam_input import ScanReader
+from dpmjax.cli.slam_reader import ScanReader
 from dpmjax.sequences import LidarSequence
 from dpmjax.slam import (
     Journal,
@@ -23,10 +23,10 @@ from dpmjax.slam import (
     SlamState,
     finish_slam,
     init_slam,
+    place_scans,
     read_journal,
     step_slam,
 )
-from dpmjax.slam.system import place_scans
 
 if TYPE_CHECKING:
     from dpmjax.slam import ScanReport
@@ -58,11 +58,11 @@ class Beginning(NamedTuple):
 
 
 class Hooks(NamedTuple):
-    """What a run asks and tells.
+    """Callbacks of a run.
 
     Attributes:
         is_stopped: whether to end before the next scan.
-        on_scan: is told every scan, the state after it and its report; None for nobody.
+        on_scan: called with each scan, the state after it and its report; None for no call.
     """
 
     is_stopped: Callable[[], bool]
@@ -95,7 +95,7 @@ class Stopwatch:
     """Seconds of stages, and of compilation, which belongs to none."""
 
     def __init__(self) -> None:
-        self.stages_s: collections.Counter[str] = collections.Counter()
+        self.stages_s: collections.defaultdict[str, float] = collections.defaultdict(float)
         self.compile_s = 0.0
         jax.monitoring.register_event_duration_secs_listener(self._on_event)
 
@@ -107,9 +107,9 @@ class Stopwatch:
         finally:
             self.stages_s[stage] += time.perf_counter() - started - (self.compile_s - compiled)
 
-    def _on_event(self, event: str, duration_s: float, **_: object) -> None:
+    def _on_event(self, event: str, duration_secs: float, **_: str | int) -> None:
         if event.startswith("/jax/core/compile/"):
-            self.compile_s += duration_s
+            self.compile_s += duration_secs
 
 
 class Timed:
@@ -136,10 +136,23 @@ def find_beginning(folder: RunFolder, methods: SlamMethods, start: SlamState, re
     return Beginning(start, read_journal(folder / JOURNAL, methods, lambda scan: reader(scan - first), start))
 
 
-def run_alone(
+def map_drive(
     folder: RunFolder, sequence: LidarSequence, methods: SlamMethods, is_stopped: Callable[[], bool]
 ) -> tuple[SlamRun, SlamResult]:
-    """Maps a drive from its beginning, or goes on; what ends it early is raised."""
+    """Maps a drive from its beginning, or goes on from the journal in its folder.
+
+    Args:
+        folder: for the journal and interim results.
+        sequence: the drive.
+        methods: matcher, geometry and settings.
+        is_stopped: whether to end before the next scan.
+
+    Returns:
+        The run with its seconds, and the trajectory and the map.
+
+    Raises:
+        InputError: a scan on the way that cannot be read.
+    """
     reader = ScanReader(sequence)
     beginning = find_beginning(folder, methods, init_slam(), reader)
     run = run_scans(folder, sequence, reader, methods, beginning, Hooks(is_stopped))

@@ -1,4 +1,4 @@
-"""The live viewer of dpm_slam: what it is told of each scan."""
+"""The live viewer of `dpmjax slam`: shows each scan and the map so far."""
 
 from __future__ import annotations
 

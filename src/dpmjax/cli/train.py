@@ -18,7 +18,6 @@ and its confidence are fitted afterwards: experiments.dpm_calibrate.
 
 from __future__ import annotations
 
-import math
 import time
 from collections.abc import Sequence
 from contextlib import nullcontext
@@ -26,35 +25,27 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
-import numpy as np
 from tyro.conf import FlagCreatePairsOff, arg
 
-from dpmjax.cli.command import StopFlag, run_command
+from dpmjax.cli.command import StopFlag, check_least, run_command
 from dpmjax.cli.machine import peak_rss_gb, select_device
-from dpmjax.cli.result_files import read_history
-from dpmjax.cli.run_folder import HISTORY, METRICS, RunFolder, open_run_folder, recording, write_metrics
+from dpmjax.cli.run_folder import RunFolder, RunOptions, open_run_folder, recording, write_metrics
 
 if TYPE_CHECKING:
     from dpmjax.cli.train_run import Records
     from dpmjax.deeppointmap import Model, TrainingConfig
-    from dpmjax.deeppointmap.evaluation import Evaluation, EvaluationPairs
-    from dpmjax.deeppointmap.training_loop import Trained
 
 NAME = "train"
-MODEL = "model.safetensors"
-# More bad scans than this are counted only.
-MAX_LISTED = 10
-SHOWN_CURVES = ("loss", "pairing", "offset", "top1_accuracy", "recall", "recall_far", "real_recall")
 
 
-@dataclass(frozen=True)
-class Config:
+@dataclass(frozen=True, kw_only=True)
+class Config(RunOptions):
     """Options of the run."""
+
+    may_change: ClassVar[frozenset[str]] = frozenset({"hours", "finish", "cache", "validate"})
 
     data: Annotated[tuple[str, ...], arg(metavar="town|PATH")] = ("town",)
     """Drives to train on: simulated towns, or folders of scans with poses (KITTI, KITTI-360, MulRan, plain ...)."""
-    output: Annotated[Path | None, arg(aliases=["-o"], metavar="OUT")] = None
-    """Folder for the results, instead of results/train/<time>."""
     preset: Literal["tiny", "small", "paper"] = "tiny"
     """Size of the network and length of its training."""
     weights: Annotated[str | None, arg(metavar="NAME|FILE")] = None
@@ -86,21 +77,12 @@ class Config:
     """Measure recall every N steps, and at the end."""
     bfloat16: FlagCreatePairsOff[bool] = False
     """Multiply matrices of the networks in bfloat16; geometry stays in float32."""
-    seed: int = 0
-    """Seed of everything random."""
-    device: Annotated[Literal["cpu", "gpu"] | None, arg(metavar="cpu|gpu")] = None
-    """Where to compute; without it, JAX chooses. All devices of that kind are used."""
     coordinator: Annotated[str | None, arg(metavar="HOST:PORT|auto")] = None
     """Train in several processes as one, at this address of process 0; auto: as Slurm, Open MPI or a TPU pod says."""
     num_processes: Annotated[int | None, arg(metavar="N")] = None
     """How many processes there are."""
     process_id: Annotated[int | None, arg(metavar="I")] = None
     """Which of them this one is, from 0; process 0 alone writes and prints."""
-    may_change: ClassVar[frozenset[str]] = frozenset({"hours", "finish", "cache", "validate"})
-    resume: FlagCreatePairsOff[bool] = False
-    """Continue an interrupted run, the latest or that in OUT; options not given are the same as then."""
-    force: FlagCreatePairsOff[bool] = False
-    """Replace an earlier run in OUT."""
 
     def __post_init__(self) -> None:
         """Checks ranges.
@@ -108,14 +90,9 @@ class Config:
         Raises:
             ValueError: if an option is out of range.
         """
-        least_of = {"steps": 3, "num_towns": 1, "selection_pairs": 1, "held_out_pairs": 1, "recall_every": 1, "seed": 0}
-        for name, least in least_of.items():
-            value = getattr(self, name)
-            if value is not None and value < least:
-                raise ValueError(f"--{name.replace('_', '-')}: expected at least {least}, got {value}")
-        if not (math.isfinite(self.town_length_m) and self.town_length_m >= 100.0):
-            raise ValueError(f"--town-length-m: expected at least 100, got {self.town_length_m}")
-        if self.hours is not None and not (math.isfinite(self.hours) and self.hours > 0):
+        check_least(self, steps=3, num_towns=1, selection_pairs=1, held_out_pairs=1, recall_every=1, seed=0)
+        check_least(self, town_length_m=100, num_processes=1, process_id=0)
+        if self.hours is not None and not 0 < self.hours < float("inf"):
             raise ValueError(f"--hours: expected more than 0, got {self.hours}")
         if not self.data:
             raise ValueError("--data: expected town or a folder of scans")
@@ -129,8 +106,11 @@ def main(config: Config) -> None:
 
     started = time.perf_counter()
     join_processes(config.coordinator, config.num_processes, config.process_id)
-    select_device(config.device)
-    from dpmjax.cli.train_data import find_sources, prepare_sources
+    if config.coordinator is not None:  # not before the processes have found each other
+        select_device(config.device)
+    from dpmjax.cli.drive_sources import Source, find_sources
+    from dpmjax.cli.train_data import prepare_sources
+    from dpmjax.cli.train_results import draw, measure, print_summary, write_model
     from dpmjax.cli.train_run import run_training
     from dpmjax.deeppointmap import ScanStore, TrainingHooks
     from dpmjax.weights import load_model
@@ -138,8 +118,9 @@ def main(config: Config) -> None:
     with together():
         weights = None if config.weights is None else load_model(config.weights)
         settings = training_settings(config, weights)
-        towns = range(config.seed, config.seed + config.num_towns)
-        sources = find_sources(config.data, towns, config.town_length_m)
+        seeds = range(config.seed, config.seed + config.num_towns)
+        towns = [Source(town_seed=seed, town_length_m=config.town_length_m) for seed in seeds]
+        sources = find_sources(config.data, towns)
         folder = open_run_folder(config, NAME) if is_first() else None
     with recording(folder) if folder is not None else nullcontext(), StopFlag() as stop:
         with together():
@@ -160,10 +141,11 @@ def main(config: Config) -> None:
             "wall_s": time.perf_counter() - started,
             "peak_rss_gb": peak_rss_gb(),
             "is_interrupted": stop.is_requested,
+            "seed": config.seed,
         }
         # Numbers first: a picture that fails must not cost them.
-        write_metrics(folder, metrics, seed=config.seed)
-        write_model(folder, trained.model, config, metrics)
+        write_metrics(folder, metrics)
+        write_model(folder, trained.model, metrics, origin=f"{config.preset}, trained on {', '.join(config.data)}")
         draw(folder, evaluation, records.sets.held_out)
         print_summary(folder, metrics)
 
@@ -191,18 +173,6 @@ def plateau_seconds(config: Config, settings: TrainingConfig) -> float | None:
     return None if config.hours is None else 3600 * config.hours * (1 - settings.decay_ratio)
 
 
-def print_summary(folder: RunFolder, metrics: dict[str, Any]) -> None:
-    """Prints the recall, the scans that were left out, and the folder."""
-    at = "" if metrics["best_step"] is None else f" (best, after step {metrics['best_step']})"
-    print(f"recall on the held-out town {metrics['recall_untrained']:.2f} -> {metrics['recall']:.2f}{at}")
-    bad = metrics["bad_scans"]
-    if bad:
-        print(f"{len(bad)} scans left out, all of them in {folder / METRICS}:")
-        for source, reason in list(bad.items())[:MAX_LISTED]:
-            print(f"  {source}: {reason}")
-    print(f"results in {folder.path}")
-
-
 def training_settings(config: Config, weights: Model | None = None) -> TrainingConfig:
     """Returns the preset, with the options applied; the network is that of the weights, if there are any."""
     from dataclasses import replace
@@ -220,75 +190,6 @@ def training_settings(config: Config, weights: Model | None = None) -> TrainingC
     if config.bfloat16:
         settings = replace(settings, model=settings.model.with_compute_dtype("bfloat16"))
     return settings if config.steps is None else settings.with_steps(config.steps)
-
-
-def measure(trained: Trained, records: Records) -> tuple[Evaluation, dict[str, Any]]:
-    """Returns recall and errors of the trained and of the untrained network, and times."""
-    from dpmjax.cli.train_run import KIND_NAMES
-    from dpmjax.deeppointmap import evaluate_registration
-
-    pairs = records.sets.held_out
-    models = {"": trained.model, "_untrained": records.untrained}
-    evaluations = {suffix: evaluate_registration(model, pairs) for suffix, model in models.items()}
-    metrics: dict[str, Any] = {
-        "num_held_out_pairs": len(pairs.pairs[0].sources),
-        "steps": int(trained.progress.state.step),
-        "best_step": int(trained.progress.best_step) or None,
-        "selection_score": float(trained.progress.best_score),
-        "train_s": records.run_s,
-        "compile_s": trained.speed.compile_s,
-        "scans_per_s": trained.speed.scans_per_s,
-    }
-    for suffix, evaluation in evaluations.items():
-        near = evaluation.recalls[0]
-        of_kinds = zip(KIND_NAMES, evaluation.recalls, strict=True)
-        metrics |= {f"{name}{suffix}": recall.recall for name, recall in of_kinds}
-        metrics |= {
-            f"translation_error_median{suffix}_m": float(np.median(near.translation_errors_m)),
-            f"rotation_error_median{suffix}_deg": float(np.median(near.rotation_errors_deg)),
-        }
-    return evaluations[""], metrics
-
-
-def write_model(folder: RunFolder, model: Model, config: Config, metrics: dict[str, Any]) -> None:
-    """Writes model.safetensors with a description of its training."""
-    from dpmjax.weights import save_model
-
-    best = "" if metrics["best_step"] is None else f" (best recall after {metrics['best_step']})"
-    card = (
-        f"{config.preset}, trained on {', '.join(config.data)} ({metrics['num_scans']} scans), "
-        f"{metrics['steps']} steps{best}, seed {config.seed}. Held-out town, {metrics['num_held_out_pairs']} pairs "
-        f"2-10 m apart, any yaw: recall (2 m, 5 deg) {metrics['recall']:.3f}, "
-        f"untrained {metrics['recall_untrained']:.3f}."
-    )
-    unfinished = folder / f".tmp_{MODEL}"
-    save_model(model, unfinished, card=card)
-    unfinished.replace(folder / MODEL)
-
-
-def draw(folder: RunFolder, evaluation: Evaluation, pairs: EvaluationPairs) -> None:
-    """Draws loss.png and matches.png."""
-    from dpmjax import viz
-
-    rows = read_history(folder / HISTORY)
-    if rows:
-        names = {name: name.replace("_", " ") for name in SHOWN_CURVES}
-        curves = {label: np.array([float(row[name] or "nan") for row in rows]) for name, label in names.items()}
-        curves = {label: curve for label, curve in curves.items() if np.isfinite(curve).any()}
-        steps = [int(row["step"]) for row in rows]
-        viz.save_figure(viz.curves_figure(steps, curves), folder / "loss.png")
-    # The held-out pair of scans of median error.
-    errors, of_kind = evaluation.recalls[0].translation_errors_m, pairs.pairs[0]
-    number = int(np.argsort(errors)[len(errors) // 2])
-    a, b = int(of_kind.sources[number, 0]), int(of_kind.targets[number, 0])
-    matches, T_true = evaluation.matches[0], pairs.true_motions(of_kind)[number]
-    is_inlier = matches.is_inlier[number]
-    p = np.asarray(evaluation.clouds.positions[a])[matches.source_indices[number][is_inlier]]
-    q = np.asarray(evaluation.clouds.positions[b])[matches.target_indices[number][is_inlier]]
-    distances = np.linalg.norm(p @ T_true[:3, :3].T + T_true[:3, 3] - q, axis=1)
-    title = f"held-out pair of median error, {errors[number]:.2f} m; green: matches less than 3 m apart"
-    scans = viz.MatchedScans(pairs.scan_points(a), pairs.scan_points(b), p, q, distances < 3.0)
-    viz.save_figure(viz.matches_figure(scans, matches.T_target_source[number], title=title), folder / "matches.png")
 
 
 def run(args: Sequence[str] | None = None) -> int:

@@ -4,38 +4,38 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple, Self
+from typing import Any, NamedTuple
 
-import jax
 import numpy as np
 from tqdm import tqdm
 
 from dpmjax.checkpoints import Checkpoints
 from dpmjax.cli.result_files import HistoryFile, read_history
 from dpmjax.cli.run_folder import BEST, CHECKPOINTS, HISTORY, RunFolder
-from dpmjax.cli.train_data import HELD_OUT_SEED, SELECTION_SEED, town_drive
+from dpmjax.cli.train_data import HELD_OUT_SEED, SELECTION_SEED
 from dpmjax.deeppointmap import (
+    CurriculumStage,
+    EvaluationPairs,
     Model,
     PairKind,
     ScanStore,
+    StepRecord,
+    Trained,
     TrainingConfig,
     TrainingHooks,
+    TrainingProgress,
+    TrainingState,
+    begin_training,
     draw_evaluation_pairs,
     evaluate_registration,
-    finish,
-    init_training,
     train,
 )
-from dpmjax.deeppointmap.curriculum import CurriculumStage
-from dpmjax.deeppointmap.evaluation import EvaluationPairs
-from dpmjax.deeppointmap.training import TrainingState
-from dpmjax.deeppointmap.training_loop import StepRecord, Trained, TrainingProgress, begin_training
 from dpmjax.io import open_lidar_sequence
-from dpmjax.simulation import HDL32E, HDL64E, OS1_64
+from dpmjax.simulation import HDL32E, HDL64E, OS1_64, simulate_drive
 
 # Seconds between checkpoints; Ctrl-C and the end write one too.
 SAVE_EVERY_S = 300.0
@@ -49,8 +49,6 @@ KINDS = (PairKind(2.0, 10.0), PairKind(10.0, 20.0), PairKind(2.0, 10.0, 4), Pair
 KIND_NAMES = ("recall", "recall_far", "recall_maps", "recall_maps_far")
 RECALLS = (*KIND_NAMES, "real_recall", "real_recall_far")
 COLUMNS = ("step", "stage", "run_s", *MEASURES, *RECALLS)
-BEGIN_DECAY = 1000
-"""What a stop hook returns when the time for the constant learning rate is over; no signal has this number."""
 
 
 class EvaluationSets(NamedTuple):
@@ -74,10 +72,10 @@ def draw_sets(
     draw = partial(draw_evaluation_pairs, config=settings.model)
     num = max(1, selection_pairs // (len(KINDS) * len(SELECTION_SCENES)))
     towns = [
-        town_drive(SELECTION_SEED + number, length_m=min(length_m, 250.0), kind=kind, sensor=sensor)
+        simulate_drive(SELECTION_SEED + number, length_m=min(length_m, 250.0), kind=kind, sensor=sensor)
         for number, (kind, sensor) in enumerate(SELECTION_SCENES)
     ]
-    held_out = town_drive(HELD_OUT_SEED, length_m=length_m, kind="suburb", sensor=HDL64E)
+    held_out = simulate_drive(HELD_OUT_SEED, length_m=length_m, kind="suburb", sensor=HDL64E)
     work = [partial(draw, town, num, kinds=KINDS, max_scans=64) for town in towns]
     work += [partial(draw, open_lidar_sequence(path), VALIDATION_PAIRS, kinds=KINDS[:2]) for path in validate]
     work += [partial(draw, held_out, held_out_pairs, kinds=KINDS)]
@@ -107,9 +105,7 @@ class Records:
     ) -> None:
         self.folder, self.sets, self._settings = folder, sets, settings
         self._checkpoints, self._best = Checkpoints(folder / CHECKPOINTS), Checkpoints(folder / BEST)
-        state = init_training(jax.random.key(seed), settings)
-        # The optimiser starts at zero with any weights.
-        self.start = begin_training(state if weights is None else replace(state, params=weights.params))
+        self.start = begin_training(settings, seed=seed, weights=weights)
         self.untrained = Model(self.start.state.params, settings.model)
         if folder.is_resumed:
             self.start = self._restored(self.start)
@@ -119,7 +115,7 @@ class Records:
         total = int(self.start.state.end)
         self._bar = tqdm(total=total, initial=first, desc="train", unit=" steps", dynamic_ncols=True)
         self._last_saved, self._recalls = time.perf_counter(), dict.fromkeys(RECALLS, math.nan)
-        self.run_s, self._call_s = self.earlier_s, 0.0
+        self.run_s = self.earlier_s
         self._seen: set[CurriculumStage] = set()
         self._tell_compilation(self.start.state)
 
@@ -140,13 +136,10 @@ class Records:
         if math.isfinite(record.score):
             values |= {name: value for name, value in self._recalls.items() if math.isfinite(value)}
         measured = {name: f"{value:.7g}" for name, value in values.items()}
-        seconds = record.speed.run_s + record.speed.compile_s
-        if seconds < self._call_s:  # the decay is a call of its own
-            self.earlier_s += self._call_s
-        self._call_s = seconds
-        self.run_s = self.earlier_s + seconds
+        self.run_s = self.earlier_s + record.speed.run_s + record.speed.compile_s
         self._history.append(step=record.step, stage=_stage_name(record.stage), run_s=round(self.run_s, 3), **measured)
         self._bar.set_postfix_str(_summary(record, self._recalls["recall"]), refresh=False)
+        self._bar.total = int(progress.state.end)
         self._bar.update(1)
         self._tell_compilation(progress.state)
         if time.perf_counter() - self._last_saved > SAVE_EVERY_S:
@@ -167,7 +160,7 @@ class Records:
             params = self._best.restore(int(found.best_step), start.best_params)
             if params is not None:
                 return replace(found, best_params=params)
-        return begin_training(found.state)
+        return replace(start, state=found.state, best_params=found.state.params)
 
     def _tell_compilation(self, state: TrainingState) -> None:
         stage = self._settings.stage_at(int(state.step))
@@ -175,7 +168,7 @@ class Records:
             self._seen.add(stage)
             self._bar.set_postfix_str(f"compiling {_stage_name(stage)}")
 
-    def __enter__(self) -> Self:
+    def __enter__(self) -> Records:
         return self
 
     def __exit__(self, *error: Any) -> None:
@@ -198,39 +191,14 @@ def run_training(
     learning rate begins.
     """
     if records is None:
-        return train_with_decay(store, settings, hooks, seed=seed)
+        return train(store, settings, seed=seed, hooks=hooks)
     with records:
         hooks = replace(hooks, evaluate=records.evaluate, on_report=records.on_report)
         if plateau_s is not None:
-            hooks = replace(hooks, stop=partial(_stop_or_decay, hooks.stop, records, plateau_s))
-        trained = train_with_decay(store, settings, hooks, seed=seed, start=records.start)
+            hooks = replace(hooks, finish=lambda: records.run_s >= plateau_s)
+        trained = train(store, settings, seed=seed, start=records.start, hooks=hooks)
         records.save(trained.progress)
         return trained
-
-
-def train_with_decay(
-    store: ScanStore,
-    settings: TrainingConfig,
-    hooks: TrainingHooks,
-    *,
-    seed: int,
-    start: TrainingProgress | None = None,
-) -> Trained:
-    """Returns the result of training; where `hooks.stop` returns `BEGIN_DECAY`, the learning rate falls from there."""
-    trained = train(store, settings, seed=seed, start=start, hooks=hooks)
-    if trained.stopped_by != BEGIN_DECAY:
-        return trained
-    progress = replace(trained.progress, state=finish(trained.progress.state, settings))
-    without_decay = replace(hooks, stop=lambda: _without_decay(hooks.stop()))
-    return train(store, settings, seed=seed, start=progress, hooks=without_decay)
-
-
-def _stop_or_decay(stop: Callable[[], int], records: Records, plateau_s: float) -> int:
-    return stop() or (BEGIN_DECAY if records.run_s >= plateau_s else 0)
-
-
-def _without_decay(stopped_by: int) -> int:
-    return 0 if stopped_by == BEGIN_DECAY else stopped_by
 
 
 def _stage_name(stage: CurriculumStage) -> str:

@@ -113,7 +113,7 @@ def gather_evidence(hypotheses: Registration, row: int | None, verification: Ver
     return Evidence(of_clouds, np.concatenate([of_clouds, of_scans]))
 
 
-def probability(model: LogisticModel, features: Float[np.ndarray, "*n f"]) -> Float[np.ndarray, "*n"]:
+def logistic_probability(model: LogisticModel, features: Float[np.ndarray, "*n f"]) -> Float[np.ndarray, "*n"]:
     """Computes the probability that a registration is right.
 
     Args:
@@ -196,4 +196,4 @@ def with_confidence(match: Registration, evidence: Evidence, calibration: Calibr
     features, model = evidence.of_scans, calibration.of_scans
     if features is None:
         features, model = evidence.of_clouds, calibration.of_clouds
-    return replace(match, confidence=jax.numpy.float32(probability(model, features)))
+    return replace(match, confidence=jax.numpy.float32(logistic_probability(model, features)))

@@ -21,6 +21,7 @@ from dpmjax.deeppointmap.matching import merge_clouds
 from dpmjax.deeppointmap.model import Model, encode_stored
 from dpmjax.deeppointmap.model_config import ModelConfig
 from dpmjax.deeppointmap.sampling import SampleScans
+from dpmjax.deeppointmap.scan_pairs import draw_rows_apart, scan_distances, true_poses
 from dpmjax.deeppointmap.scan_registration import trace_match
 from dpmjax.deeppointmap.scan_store import ScanStore, prepare_drive
 from dpmjax.geometry import rigid
@@ -157,8 +158,7 @@ def draw_evaluation_pairs(
     Raises:
         ValueError: if the drive has no poses, or no pairs of a kind.
     """
-    if drive.T_world_lidar is None:
-        raise ValueError("drive: expected a true pose for each scan, got none")
+    true_poses(drive)
     rng = np.random.default_rng([PAIR_STREAM, seed])
     thinned = drive.take(slice(None, None, -(-len(drive) // max_scans)))
     pairs = tuple(_draw(thinned, num_pairs, kind, rng) for kind in kinds)
@@ -168,28 +168,8 @@ def draw_evaluation_pairs(
     return EvaluationPairs(scans, T_world_scan, pairs, config.scale_m)
 
 
-def draw_rows_apart(
-    distances_m: Float[np.ndarray, "n n"], least_m: float, most_m: float, num_pairs: int, rng: np.random.Generator
-) -> Int[np.ndarray, "p 2"]:
-    """Draws pairs of scans at a distance of each other, without repetition.
-
-    Args:
-        distances_m: between all scans, metres.
-        least_m: smallest distance of a pair, metres.
-        most_m: largest one.
-        num_pairs: number of pairs.
-        rng: draws them.
-
-    Returns:
-        Rows of the scans; fewer pairs where there are fewer.
-    """
-    pairs = np.argwhere((distances_m >= least_m) & (distances_m <= most_m))
-    return pairs[rng.choice(len(pairs), min(num_pairs, len(pairs)), replace=False)] if len(pairs) else pairs
-
-
 def _draw(drive: LidarSequence, num_pairs: int, kind: PairKind, rng: np.random.Generator) -> Pairs:
-    positions = np.asarray(drive.T_world_lidar)[:, :3, 3]
-    distances = np.linalg.norm(positions[:, None] - positions, axis=2)
+    distances = scan_distances(drive)
     pairs = draw_rows_apart(distances, kind.min_distance_m, kind.max_distance_m, num_pairs, rng)
     if len(pairs) == 0:
         raise ValueError(f"drive: expected scans {kind.min_distance_m} to {kind.max_distance_m} m apart, got none")

@@ -1,7 +1,8 @@
 """The training loop: batches, steps, evaluation, reports, and the best parameters so far.
 
-    store = ScanStore([prepare_drive(drive, config) for drive in drives])
-    trained = train(store, config, hooks=TrainingHooks(evaluate=..., on_report=...))
+    drives = simulate_scenes(range(4))                      # or open_lidar_sequence(path) of your own
+    trained = train(drives, training_preset("tiny"))
+    save_model(trained.model, "model.safetensors")
 
 A run that continues from the `TrainingProgress` of any report gives the numbers of an unbroken run.
 """
@@ -10,197 +11,112 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable
-from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
 
-import flax.struct
 import jax
 import numpy as np
-from jaxtyping import Float, Int
 
-from dpmjax.checks import require_count
 from dpmjax.deeppointmap.curriculum import CurriculumStage, TrainingConfig
 from dpmjax.deeppointmap.data_pipeline import SampleMaker
 from dpmjax.deeppointmap.model import Model
 from dpmjax.deeppointmap.processes import BATCH_AXIS, device_mesh, from_first, is_first, largest, place, together
 from dpmjax.deeppointmap.scan_store import ScanStore
-from dpmjax.deeppointmap.training import TrainingReport, TrainingState, init_training, make_step
-from dpmjax.types import AnyArray
+from dpmjax.deeppointmap.training import finish, make_step
+from dpmjax.deeppointmap.training_drives import prepare_drives
+from dpmjax.deeppointmap.training_records import (
+    Speed,
+    StepRecord,
+    Trained,
+    TrainingHooks,
+    TrainingLostError,
+    TrainingProgress,
+    after_evaluation,
+    begin_training,
+    uncalibrated,
+)
+from dpmjax.sequences import LidarSequence
 
-
-class TrainingLostError(ArithmeticError):
-    """The loss is not finite."""
-
-
-@flax.struct.dataclass
-class TrainingProgress:
-    """The state of training and the best parameters so far; a checkpoint of it resumes the run exactly.
-
-    Attributes:
-        state: state after the last step.
-        best_params: parameters with the best score; the initial ones before the first evaluation.
-        best_score: the best score; -1 before the first evaluation.
-        best_step: number of steps before the best evaluation; 0 before the first.
-    """
-
-    state: TrainingState
-    best_params: dict[str, Any]
-    best_score: Float[AnyArray, ""]
-    best_step: Int[AnyArray, ""]
-
-
-class Speed(NamedTuple):
-    """Seconds of steps.
-
-    Attributes:
-        run_s: seconds of all steps, without compilation.
-        compile_s: seconds of the first step of each stage.
-        scans_per_s: scans that a second of steps processes.
-    """
-
-    run_s: float
-    compile_s: float
-    scans_per_s: float
-
-
-class StepRecord(NamedTuple):
-    """What the loop reports after a step.
-
-    Attributes:
-        step: number of steps done.
-        stage: stage of the step.
-        report: measures of the step.
-        score: score of an evaluation after this step; NaN without one.
-        speed: seconds of the steps of this call.
-    """
-
-    step: int
-    stage: CurriculumStage
-    report: TrainingReport
-    score: float
-    speed: Speed
-
-
-@dataclass(frozen=True)
-class TrainingHooks:
-    """Functions that the loop calls. `evaluate` and `on_report` are called in process 0 only.
-
-    Attributes:
-        evaluate: scores a model, larger is better; the model with the best score is kept.
-        evaluate_every: number of steps from one evaluation to the next.
-        on_report: gets the record and the progress after each step.
-        stop: called before each step; any number but 0 ends training in all processes.
-    """
-
-    evaluate: Callable[[Model], float] | None = None
-    evaluate_every: int = 100
-    on_report: Callable[[StepRecord, TrainingProgress], None] | None = None
-    stop: Callable[[], int] = int
-
-    def __post_init__(self) -> None:
-        require_count("evaluate_every", self.evaluate_every)
-
-
-class Trained(NamedTuple):
-    """Result of training.
-
-    Attributes:
-        model: the model with the best score; the last one without an evaluation.
-        progress: progress after the last step.
-        stopped_by: the number that `stop` returned; 0 after the last step.
-        speed: seconds of the steps of this call.
-    """
-
-    model: Model
-    progress: TrainingProgress
-    stopped_by: int
-    speed: Speed
+NO_HOOKS = TrainingHooks()
 
 
 def train(
-    store: ScanStore,
+    drives: Sequence[LidarSequence] | ScanStore,
     config: TrainingConfig,
     *,
     seed: int = 0,
-    start: TrainingProgress | None = None,
-    hooks: TrainingHooks = TrainingHooks(),
+    start: TrainingProgress | Model | None = None,
+    cache: Path | None = None,
+    hooks: TrainingHooks = NO_HOOKS,
 ) -> Trained:
-    """Trains a model on all devices, or continues a training.
+    """Trains a model on drives with poses, on all devices, or continues a training (DeepPointMap section 3.3).
 
-    With several processes (`join_processes`), each calls this function with the same settings.
+    Each scan is prepared once before the first step. With several processes (`join_processes`), each calls this
+    function with the same arguments; process 0 alone evaluates and reports.
 
     Args:
-        store: the scans.
-        config: settings of training.
+        drives: sequences with a true pose for each scan, such as `io.open_lidar_sequence` and
+            `simulation.simulate_scenes` return; or scans that are prepared already.
+        config: settings of training; `training_preset` has three.
         seed: seed of parameters, samples and augmentation.
-        start: progress to continue from; that of process 0 counts.
-        hooks: evaluation, reports and stopping.
+        start: progress to continue from, that of process 0 counts; or a model to begin with its parameters; None
+            begins with random parameters.
+        cache: folder where prepared scans are kept for later calls; None keeps them in memory.
+        hooks: evaluation, which chooses the best model, reports and stopping.
 
     Returns:
-        The model and the progress.
+        The model, without calibration, and the progress.
 
     Raises:
+        ValueError: if there is no drive, or if `start` is a model of another network; or if a drive has no poses, no
+            scan that can be read, or no two scans at a distance of `config.sampling`.
         TrainingLostError: if the loss is not finite.
     """
-    if start is None:
-        start = begin_training(init_training(jax.random.key(seed), config))
+    config = replace(config, model=uncalibrated(config.model))
+    if not isinstance(start, TrainingProgress):
+        start = begin_training(config, seed=seed, weights=start)
+    store = drives if isinstance(drives, ScanStore) else prepare_drives(drives, config, folder=cache, seed=seed)
+    progress, stopped_by, speed = _run_steps(store, config, hooks, start, seed=seed)
+    params = progress.best_params if int(progress.best_step) > 0 else progress.state.params
+    return Trained(_local(Model(params, config.model)), progress, stopped_by, speed)
+
+
+def _run_steps(
+    store: ScanStore, config: TrainingConfig, hooks: TrainingHooks, start: TrainingProgress, *, seed: int
+) -> tuple[TrainingProgress, int, Speed]:
+    """Returns the progress after the last step, the number that stopped it, and the seconds."""
     mesh, num_local = device_mesh(), jax.local_device_count()
     progress = place(from_first(start), mesh)
     step = make_step(config, mesh if jax.device_count() > 1 else None)
-    clock, stopped_by = _Clock(config.sampling.num_scans * jax.device_count()), 0
+    clock, stopped_by, is_finishing = _Clock(config.sampling.num_scans * jax.device_count()), 0, False
     first_sample = jax.process_index() * num_local
+    number, end = int(progress.state.step), int(progress.state.end)
     with SampleMaker(store, config, seed=seed, num_samples=num_local, first_sample=first_sample) as maker:
-        batches = maker.batches(int(progress.state.step), int(start.state.end))
+        batches = maker.batches(number, end)
         with together():
             batch = next(batches, None)
         while batch is not None and not (stopped_by := largest(int(hooks.stop()))):
-            stage = config.stage_at(int(progress.state.step))
+            if not is_finishing and (is_finishing := bool(largest(int(hooks.finish())))):
+                progress = place(replace(progress, state=finish(progress.state, config)), mesh)
+                end = int(progress.state.end)
+            stage = config.stage_at(number)
             begun = time.perf_counter()
             state, report = step(progress.state, place(batch, mesh, BATCH_AXIS))
+            number += 1
             with together():  # the next batch is prepared while the device computes
-                batch = next(batches, None)
+                batch = next(batches, None) if number < end else None
             report = jax.device_get(report)
             clock.add(stage, time.perf_counter() - begun)
             progress = replace(progress, state=state)
-            number = int(state.step)
             if not math.isfinite(report.loss):
                 raise TrainingLostError(f"the loss of step {number} is {report.loss}; resume from an older checkpoint")
             progress, score = _evaluate_when_due(progress, config, hooks)
             with together():
                 if hooks.on_report is not None and is_first():
                     hooks.on_report(StepRecord(number, stage, report, score, clock.speed), progress)
-    params = progress.best_params if int(progress.best_step) > 0 else progress.state.params
-    model = _local(Model(params, config.model))
-    return Trained(model, progress, stopped_by, clock.speed)
-
-
-def begin_training(state: TrainingState) -> TrainingProgress:
-    """Makes the progress before the first step.
-
-    Args:
-        state: from `init_training`.
-
-    Returns:
-        Progress without an evaluation.
-    """
-    return TrainingProgress(state, state.params, np.asarray(-1, np.float32), np.asarray(0, np.int32))
-
-
-def after_evaluation(progress: TrainingProgress, score: float) -> TrainingProgress:
-    """Keeps the parameters of the state if no score was better; of equal scores, the later one counts.
-
-    Args:
-        progress: progress before the evaluation.
-        score: score of the parameters of the state.
-
-    Returns:
-        The new progress.
-    """
-    if not score >= float(progress.best_score):
-        return progress
-    state = progress.state
-    return TrainingProgress(state, state.params, np.asarray(score, np.float32), np.asarray(state.step, np.int32))
+    return progress, stopped_by, clock.speed
 
 
 def _evaluate_when_due(

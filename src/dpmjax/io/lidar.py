@@ -224,8 +224,9 @@ def _choose(path: Path, sequence: str | None) -> Path:
     if sequence is not None:
         if sequence not in drives and is_drive and path.resolve().name == sequence:
             return path
-        found = f"no sequence {sequence}; there are: {known or 'none'}"
-        require(sequence in drives, path, found, "name one of those")
+        held = f"it has {known}" if drives else "it is one drive without a name" if is_drive else "it has no scans"
+        advice = "name one of those" if drives else "leave the name out, or give another folder"
+        require(sequence in drives, path, f"no sequence {sequence}, {held}", advice)
         return drives[sequence]
     require(len(drives) > 0, path, "a folder without scans", f"give {_FORMATS}")
     require(len(drives) == 1, path, f"{len(drives)} sequences: {known}", "name one of them, or give its folder")

@@ -2,6 +2,7 @@ from .loops import LoopRecall as LoopRecall
 from .loops import Revisits as Revisits
 from .loops import find_revisits as find_revisits
 from .loops import loop_recall as loop_recall
+from .loops import path_lengths as path_lengths
 from .poses import RegistrationRecall as RegistrationRecall
 from .poses import RelativePoseError as RelativePoseError
 from .poses import absolute_trajectory_error as absolute_trajectory_error
@@ -10,6 +11,8 @@ from .poses import point_distance as point_distance
 from .poses import registration_recall as registration_recall
 from .poses import relative_pose_error as relative_pose_error
 from .position_bound import position_bound as position_bound
+from .probabilities import area_under_curve as area_under_curve
+from .probabilities import brier_score as brier_score
 from .relations import RelationErrors as RelationErrors
 from .relations import relation_errors as relation_errors
 from .segments import SegmentError as SegmentError

@@ -85,18 +85,18 @@ class ArrayReader:
         return [slice(int(end - count), int(end)) for end, count in zip(ends, counts, strict=True)]
 
 
-def pack_graph(map_: KeyframeMap, precision: Precision) -> Arrays:
+def pack_graph(slam_map: KeyframeMap, precision: Precision) -> Arrays:
     """Makes the arrays of poses and edges.
 
     Args:
-        map_: the map.
+        slam_map: the map.
         precision: "float32" keeps float64 poses exactly; others round them to float32.
 
     Returns:
         The arrays by name.
     """
     dtype = np.float64 if precision == "float32" else np.float32
-    keyframes, edges = map_.keyframes, map_.edges
+    keyframes, edges = slam_map.keyframes, slam_map.edges
 
     def poses(of_all: Iterable[NDArray[Any]]) -> NDArray[Any]:
         return np.array([T[:3] for T in of_all], dtype).reshape(-1, 3, 4)
@@ -107,8 +107,8 @@ def pack_graph(map_: KeyframeMap, precision: Precision) -> Arrays:
         "path_m": np.array([keyframe.path_m for keyframe in keyframes], np.float64),
         "extent_m": np.array([keyframe.extent_m for keyframe in keyframes], np.float64),
         "T_odometry_keyframe": poses(keyframe.T_odometry_keyframe for keyframe in keyframes),
-        "T_world_keyframe": poses(map_.T_world_keyframe),
-        "vectors": map_.vectors.astype(np.float32 if precision == "float32" else np.float16),
+        "T_world_keyframe": poses(slam_map.T_world_keyframe),
+        "vectors": slam_map.vectors.astype(np.float32 if precision == "float32" else np.float16),
         "edge_rows": np.array([edge[:2] for edge in edges], np.int32).reshape(-1, 2),
         "edge_kind": np.array([KINDS.index(edge.kind) for edge in edges], np.uint8),
         "edge_T": poses(edge.T_target_source for edge in edges),

@@ -18,7 +18,7 @@ from dpmjax.deeppointmap.compact_scans import CompactScan
 from dpmjax.io.files import load_arrays, refusing, write_atomically
 from dpmjax.saved_maps.map_arrays import ArrayReader, pack_graph, pack_scans, unpack_graph, unpack_scans
 from dpmjax.saved_maps.map_coding import Precision
-from dpmjax.sequences import require
+from dpmjax.sequences import InputError, require
 from dpmjax.slam.config import MapOrigin, SlamConfig
 from dpmjax.slam.keyframes import KeyframeMap
 from dpmjax.slam.map_thinning import thin_map
@@ -30,13 +30,13 @@ ADVICE = "save it again with dpmjax.save_map"
 
 
 def save_map(
-    path: str | Path, map_: KeyframeMap, precision: Precision = "float32", *, spacing_share: float | None = None
+    path: str | Path, slam_map: KeyframeMap, precision: Precision = "float32", *, spacing_share: float | None = None
 ) -> Path:
     """Writes a map to a file that `load_map` reads; an interruption never leaves half of it.
 
     Args:
         path: must end in `.npz`; an existing file is replaced.
-        map_: of a run, `result.state.slam_map`, with at least one keyframe.
+        slam_map: of a run, `result.map`, with at least one keyframe.
         precision: "float32" keeps everything exactly: a run that goes on from the file equals an unbroken one.
             "float16" rounds features and poses. "int8" is the smallest, for localisation: it rounds features to codes,
             thins surfaces to 2,000 points, and leaves out keyframes that others cover (`slam.thin_map`).
@@ -53,14 +53,14 @@ def save_map(
     path = Path(path)
     if path.suffix != ".npz":
         raise ValueError(f"path: expected a file that ends in .npz, got {str(path)!r}")
-    return write_atomically(path, map_bytes(map_, precision, spacing_share=spacing_share))
+    return write_atomically(path, map_bytes(slam_map, precision, spacing_share=spacing_share))
 
 
-def map_bytes(map_: KeyframeMap, precision: Precision = "float32", *, spacing_share: float | None = None) -> bytes:
+def map_bytes(slam_map: KeyframeMap, precision: Precision = "float32", *, spacing_share: float | None = None) -> bytes:
     """Makes the content of the file of a map; its length is what the map costs.
 
     Args:
-        map_: see `save_map`.
+        slam_map: see `save_map`.
         precision: see `save_map`.
         spacing_share: see `save_map`.
 
@@ -72,15 +72,15 @@ def map_bytes(map_: KeyframeMap, precision: Precision = "float32", *, spacing_sh
     """
     if precision not in get_args(Precision):
         raise ValueError(f"precision: expected one of {', '.join(get_args(Precision))}, got {precision!r}")
-    origin = map_.origin
+    origin = slam_map.origin
     if origin is None:
-        raise ValueError("map_: expected keyframes, got an empty map")
-    if not all(isinstance(keyframe.description, CompactScan) for keyframe in map_.keyframes):
-        raise ValueError("map_: expected keyframes of a network, got those of another matcher")
+        raise ValueError("slam_map: expected keyframes, got an empty map")
+    if not all(isinstance(keyframe.description, CompactScan) for keyframe in slam_map.keyframes):
+        raise ValueError("slam_map: expected keyframes of a network, got those of another matcher")
     if spacing_share is None:
         spacing_share = SPACING_SHARE if precision == "int8" else 0.0
     if spacing_share != 0:
-        map_ = thin_map(map_, spacing_share=spacing_share)
+        slam_map = thin_map(slam_map, spacing_share=spacing_share)
     header = {
         "format": FORMAT,
         "version": VERSION,
@@ -91,8 +91,8 @@ def map_bytes(map_: KeyframeMap, precision: Precision = "float32", *, spacing_sh
     }
     content = io.BytesIO()
     named = {"header": np.frombuffer(json.dumps(header).encode(), np.uint8)}
-    named |= pack_graph(map_, precision)
-    named |= pack_scans([keyframe.description for keyframe in map_.keyframes], precision)
+    named |= pack_graph(slam_map, precision)
+    named |= pack_scans([keyframe.description for keyframe in slam_map.keyframes], precision)
     np.savez_compressed(content, allow_pickle=False, **named)
     return content.getvalue()
 
@@ -109,7 +109,11 @@ def load_map(path: str | Path) -> KeyframeMap:
     Raises:
         InputError: no such file, no map, one of a newer version, or a damaged one.
     """
-    arrays = load_arrays(path)
+    try:
+        arrays = load_arrays(path)
+    except InputError as error:
+        advice = "give a file of dpmjax.save_map" if Path(path).exists() else error.advice
+        raise InputError(path, error.found, advice) from error
     require("header" in arrays, path, "a NumPy file, but not one of a dpmjax map", "give a file of dpmjax.save_map")
     with refusing(path, "its header cannot be read ({error})", ADVICE, (Exception,)):
         header = json.loads(arrays["header"].tobytes())

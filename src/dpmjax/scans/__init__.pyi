@@ -13,6 +13,7 @@ from .surface_alignment import AlignmentConfig as AlignmentConfig
 from .surface_alignment import AlignmentLevel as AlignmentLevel
 from .surface_alignment import SurfaceAlignment as SurfaceAlignment
 from .surface_alignment import align_surfaces as align_surfaces
+from .surface_alignment import align_surfaces_from as align_surfaces_from
 from .surfaces import Surface as Surface
 from .surfaces import SurfaceConfig as SurfaceConfig
 from .surfaces import scan_surface as scan_surface

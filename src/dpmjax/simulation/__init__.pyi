@@ -15,11 +15,13 @@ from .raycast2d import simulate_sequence as simulate_sequence
 from .scenes import Scene as Scene
 from .scenes import SceneMixture as SceneMixture
 from .scenes import draw_scene as draw_scene
+from .scenes import simulate_drive as simulate_drive
 from .scenes import simulate_scene as simulate_scene
 from .scenes import simulate_scenes as simulate_scenes
 from .town.driving import Drive as Drive
 from .town.driving import DriveConfig as DriveConfig
 from .town.driving import drive as drive
+from .town.driving import route_poses as route_poses
 from .town.driving import simulate_lidar_sequence as simulate_lidar_sequence
 from .town.make import Town as Town
 from .town.make import TownConfig as TownConfig

@@ -187,3 +187,28 @@ def simulate_scenes(seeds: Sequence[int], mixture: SceneMixture = SceneMixture()
         One sequence a seed.
     """
     return [simulate_scene(draw_scene(seed, mixture)) for seed in seeds]
+
+
+def simulate_drive(
+    seed: int, *, length_m: float = 600.0, kind: str | None = None, sensor: LidarSensor | None = None
+) -> LidarSequence:
+    """Draws and builds one scene of the mixture, of a given kind of place or with a given lidar.
+
+    Args:
+        seed: of everything random in it, not negative.
+        length_m: length of the way outdoors; indoors a quarter of it.
+        kind: kind of place; None draws one.
+        sensor: the lidar; None draws one.
+
+    Returns:
+        The sequence, with exact poses and times; a scan is simulated when it is read.
+
+    Raises:
+        ValueError: a negative seed, an unknown kind, or a length that is not positive.
+    """
+    mixture = SceneMixture(length_m=length_m)
+    if kind is not None:
+        mixture = replace(mixture, kinds=((kind, 1.0),))
+    if sensor is not None:
+        mixture = replace(mixture, sensors=((sensor, 1.0),))
+    return simulate_scene(draw_scene(seed, mixture))

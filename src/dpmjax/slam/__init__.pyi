@@ -30,6 +30,8 @@ from .matcher import Matcher as Matcher
 from .matcher import NetworkMatcher as NetworkMatcher
 from .methods import SlamMethods as SlamMethods
 from .odometry import SurfaceGeometry as SurfaceGeometry
+from .refinement import RefinedKeyframes as RefinedKeyframes
+from .refinement import refine_keyframes as refine_keyframes
 from .reports import Loop as Loop
 from .reports import ScanReport as ScanReport
 from .system import SlamResult as SlamResult
@@ -38,5 +40,6 @@ from .system import finish_slam as finish_slam
 from .system import init_slam as init_slam
 from .system import iterate_slam as iterate_slam
 from .system import make_methods as make_methods
+from .system import place_scans as place_scans
 from .system import run_slam as run_slam
 from .system import step_slam as step_slam

@@ -24,10 +24,10 @@ BYTES_A_POINT = 12
 
 
 class Traffic(NamedTuple):
-    """What an agent sends, and what sending points would cost.
+    """Bytes that an agent sends, and those of its points.
 
     Attributes:
-        keyframe_bytes: its keyframes as they are kept: descriptors, and what verifies a loop; poses; retrieval vectors.
+        keyframe_bytes: its keyframes: descriptors, surfaces and range images, poses, retrieval vectors.
         descriptor_bytes: the descriptors among them.
         keyframe_scan_bytes: the raw points of the same keyframes, three float32 numbers each.
         scan_bytes: the raw points of all scans.
@@ -40,7 +40,7 @@ class Traffic(NamedTuple):
 
 
 class AgentsResult(NamedTuple):
-    """What `run_agents` returns.
+    """Trajectories and maps of several agents.
 
     Attributes:
         T_world_scan: of each agent, (n, 4, 4) float64, in the frame of its component, which is that of the component's
@@ -59,33 +59,43 @@ class AgentsResult(NamedTuple):
 
 
 class MergedMaps(NamedTuple):
-    """What `merge_maps` returns.
+    """Merged maps, and the maps that have met.
 
     Attributes:
-        maps: one map if both meet, in the frame of the first; else both as they were.
-        loops: candidates between them and what became of each; rows are those of the first map, then of the second.
+        maps: one map for each component, in the frame of its first map; a map that met no other is as it was.
+        joined: the keyframes of all maps in one record, and the loops between maps.
     """
 
     maps: tuple[KeyframeMap, ...]
-    loops: tuple[Loop, ...]
+    joined: JoinedMaps
+
+    @property
+    def component(self) -> tuple[int, ...]:
+        """Row of `maps` that each given map is part of; maps with equal numbers have met."""
+        return self.joined.component_of_map
+
+    @property
+    def loops(self) -> tuple[Loop, ...]:
+        """Candidates between maps and their outcome; rows are those of the first map, then of the next."""
+        return self.joined.loops
 
     @property
     def is_joined(self) -> bool:
-        """Whether the maps meet."""
+        """True where all maps have become one."""
         return len(self.maps) == 1
 
 
 def run_agents(
-    sequences: Sequence[Iterable[AnyScan]], model: Model | SlamMethods, config: SlamConfig | None = None
+    model: Model | SlamMethods, sequences: Sequence[Iterable[AnyScan]], config: SlamConfig | None = None
 ) -> AgentsResult:
-    """Maps with several agents: each runs alone, and what they have in common joins them.
+    """Maps with several agents: each runs alone, and loops between their maps join them.
 
-    Loops between agents are found by retrieval over all keyframes of the others, without any position. The order of the
+    These loops are found by retrieval over the keyframes of all other agents, without any position. The order of the
     agents does not change who meets whom.
 
     Args:
-        sequences: scans of each agent as `run_slam` takes them.
         model: a trained model; or methods of your own.
+        sequences: scans of each agent as `run_slam` takes them.
         config: settings; None takes the defaults. Methods of your own carry theirs.
 
     Returns:
@@ -97,7 +107,7 @@ def run_agents(
     if not sequences:
         raise ValueError("sequences: expected the scans of at least one agent, got none")
     methods = as_methods(model, config)
-    return join_agents(methods, [run_slam(scans, methods) for scans in sequences])
+    return join_agents(methods, [run_slam(methods, scans) for scans in sequences])
 
 
 def join_agents(
@@ -120,26 +130,35 @@ def join_agents(
 
 
 def merge_maps(
-    a: KeyframeMap, b: KeyframeMap, model: Model | SlamMethods, config: SlamConfig | None = None
+    model: Model | SlamMethods,
+    *maps: KeyframeMap,
+    config: SlamConfig | None = None,
+    on_keyframe: OnKeyframe | None = None,
 ) -> MergedMaps:
-    """Joins two maps, of different days or of different robots, where they show the same places.
+    """Joins maps of different days or of different robots where they show the same places.
 
     Args:
-        a: a map; its frame is kept.
-        b: the other.
-        model: the model that made both; or methods of your own.
+        model: the model that made the maps; or methods of your own.
+        *maps: two or more. The frame of the first map of each component is kept.
         config: settings; None takes the defaults. Methods of your own carry theirs.
+        on_keyframe: called while keyframes are compared, for progress.
 
     Returns:
-        One map, or both where nothing joins them.
+        One map, or several where no loop joins them, and who has met whom.
 
     Raises:
-        ValueError: if the maps were made with other weights, or if methods come with another configuration.
+        ValueError: if there are fewer than two maps, if a map was made with other weights, or if methods come with
+            another configuration.
     """
-    joined = join_maps(as_methods(model, config), [a, b])
-    if len(set(joined.component_of_map)) > 1:
-        return MergedMaps((a, b), joined.loops)
-    return MergedMaps((take_component(joined, 0),), joined.loops)
+    if len(maps) < 2:
+        raise ValueError(f"maps: expected at least two, got {len(maps)}")
+    joined = join_maps(as_methods(model, config), maps, on_keyframe=on_keyframe)
+    numbers = joined.component_of_map
+    merged = [
+        take_component(joined, component) if numbers.count(component) > 1 else maps[numbers.index(component)]
+        for component in range(max(numbers) + 1)
+    ]
+    return MergedMaps(tuple(merged), joined)
 
 
 def _traffic(agent: SlamResult) -> Traffic:

@@ -137,7 +137,7 @@ def with_origin(slam_map: KeyframeMap, origin: MapOrigin) -> KeyframeMap:
     made_by = slam_map.origin
     if made_by is not None and made_by.fingerprint != origin.fingerprint:
         advice = "load the weights that made the map, or map again"
-        raise ValueError(f"map_: made with weights {made_by}, these are {origin}; {advice}")
+        raise ValueError(f"slam_map: made with weights {made_by}, these are {origin}; {advice}")
     return replace(slam_map, origin=origin)
 
 

@@ -1,7 +1,7 @@
 """Re-localisation: single scans are found in a map without a first guess, or are said not to be in it.
 
 The keyframes that look most alike are registered one by one. Registrations that put the scan at the same place support
-each other: two wrong ones hardly ever do. Then the neighbours of that place are asked too.
+each other: two wrong ones hardly ever do. Then the neighbours of that place are registered too.
 """
 
 from __future__ import annotations
@@ -37,20 +37,20 @@ LocalizationStatus = Literal["found", "not in this map", "empty"]
 
 @dataclass(frozen=True)
 class LocalizationConfig:
-    """Which keyframes are tried, and when a place is believed.
+    """Number of registrations, and limits from which on a place is accepted.
 
     Attributes:
         num_similar: number of keyframes by retrieval whose overlap is estimated.
-        num_registered: number of them that are registered at most, in order of their overlap; ...
-        num_at_once: ... so many at once: the next are tried only if the place is not clear.
+        num_registered: largest number of them that are registered, in order of their overlap.
+        num_at_once: number of registrations at a time; the next ones follow only where the place is not clear.
         num_neighbours: number of further keyframes near the best place that are registered.
         num_submap: number of keyframes whose descriptors are merged for a registration.
-        same_place_m: two registrations agree within this distance ...
-        same_place_rad: ... and this turn.
+        same_place_m: largest distance between registrations that agree.
+        same_place_rad: largest turn between registrations that agree.
         min_probability: a registration supports a place from this P(correct) on, if the scans agree.
-        min_support: number of registrations that must end at the same place, the scans of one of them agreeing (one
-            suffices where no other keyframe is near), ...
-        min_best: ... and P(correct) of the best of them. Streets look alike: several may agree on a wrong place.
+        min_support: number of registrations that must end at the same place, one of them with scans that agree. One
+            registration suffices where no other keyframe is near.
+        min_best: smallest P(correct) of the best of them. Streets look alike: several may agree on a wrong place.
         max_rival_share: another place may have this share of the sum of the best one.
     """
 
@@ -90,7 +90,7 @@ class Evidence(NamedTuple):
 
 
 class Localization(NamedTuple):
-    """Where a scan is.
+    """Place of a scan in a map, or that it is not in the map.
 
     Attributes:
         status: "found", "not in this map", or "empty": the scan has too few points.
@@ -110,7 +110,7 @@ class Localization(NamedTuple):
 
     @property
     def is_in_map(self) -> bool:
-        """Whether the scan was found."""
+        """True where the scan was found."""
         return self.status == "found"
 
 
@@ -124,18 +124,18 @@ class _Place(NamedTuple):
 
 
 def localize(
-    map_: KeyframeMap,
-    points: Float[AnyArray, "n 3"],
     model: Model | SlamMethods,
+    slam_map: KeyframeMap,
+    scan: Float[AnyArray, "n 3"],
     config: LocalizationConfig | None = None,
 ) -> Localization:
     """Finds a scan in a map without a first guess.
 
     Args:
-        map_: from `load_map` or of a run.
-        points: metres, in the frame of the lidar; points that are not finite are dropped.
         model: the model that made the map; or methods of your own.
-        config: what is tried and believed; None takes the defaults.
+        slam_map: from `load_map` or of a run.
+        scan: points in metres, in the frame of the lidar; points that are not finite are dropped.
+        config: number of registrations and limits of acceptance; None takes the defaults.
 
     Returns:
         The pose in the frame of the map, or that the scan is not in it.
@@ -143,22 +143,22 @@ def localize(
     Raises:
         ValueError: if the shape is not (n, 3), the map is empty, or it was made with other weights.
     """
-    (found,) = localize_each(map_, [points], model, config)
+    (found,) = localize_each(model, slam_map, [scan], config)
     return found
 
 
 def localize_each(
-    map_: KeyframeMap,
-    scans: Iterable[Float[AnyArray, "_n 3"]],
     model: Model | SlamMethods,
+    slam_map: KeyframeMap,
+    scans: Iterable[Float[AnyArray, "_n 3"]],
     config: LocalizationConfig | None = None,
 ) -> Iterator[Localization]:
     """Finds scans in a map, each by itself.
 
     Args:
-        map_: see `localize`.
-        scans: points of each; any iterable.
         model: see `localize`.
+        slam_map: see `localize`.
+        scans: points of each; any iterable.
         config: see `localize`.
 
     Yields:
@@ -167,58 +167,62 @@ def localize_each(
     Raises:
         ValueError: see `localize`.
     """
-    if map_.origin is None:
-        raise ValueError("map_: expected keyframes, got an empty map")
-    methods = model if isinstance(model, SlamMethods) else make_methods(model, map_.origin.config)
-    with_origin(map_, methods.origin)
-    for points in scans:
-        yield _localized(map_, np.asarray(points), methods, config or LocalizationConfig())
+    if slam_map.origin is None:
+        raise ValueError("slam_map: expected keyframes, got an empty map")
+    methods = model if isinstance(model, SlamMethods) else make_methods(model, slam_map.origin.config)
+    with_origin(slam_map, methods.origin)
+    for scan in scans:
+        yield _localized(methods, slam_map, np.asarray(scan), config or LocalizationConfig())
 
 
-def _localized(map_: KeyframeMap, points: np.ndarray, methods: SlamMethods, config: LocalizationConfig) -> Localization:
-    if points.ndim != 2 or points.shape[1] != 3:
-        raise ValueError(f"points: expected shape (n, 3), got {points.shape}")
-    points = points[np.isfinite(points).all(axis=1)]
+def _localized(
+    methods: SlamMethods, slam_map: KeyframeMap, scan: np.ndarray, config: LocalizationConfig
+) -> Localization:
+    if scan.ndim != 2 or scan.shape[1] != 3:
+        raise ValueError(f"scan: expected shape (n, 3), got {scan.shape}")
+    points = scan[np.isfinite(scan).all(axis=1)]
     measured = methods.geometry.measure(points)
     if measured is None:
         return Localization("empty", None, 0.0, None, "too few points")
     description = methods.matcher.describe(points, measured)
     extent_m = methods.geometry.extent_m(measured)
-    rows = _candidates(map_, description, methods, config)
+    rows = _candidates(slam_map, description, methods, config)
     tried: list[Evidence] = []
     for start in range(0, len(rows), config.num_at_once):
         done = {one.keyframe for one in tried}
         left = [row for row in rows[start : start + config.num_at_once] if row not in done]
-        tried += _registered(map_, left, description, methods, config)
+        tried += _registered(slam_map, left, description, methods, config)
         place = max(_places(tried, config), key=lambda place: place.total, default=None)
         if place is not None and not _is_supported(place, config, config.min_support):
-            near = _neighbours(map_, place.members[0], tried, extent_m, config)
-            tried += _registered(map_, near, description, methods, config)
-        found = _decided(map_, tried, extent_m, config)
+            near = _neighbours(slam_map, place.members[0], tried, extent_m, config)
+            tried += _registered(slam_map, near, description, methods, config)
+        found = _decided(slam_map, tried, extent_m, config)
         if found.status == "found":
             return found
     return found
 
 
-def _candidates(map_: KeyframeMap, description: Any, methods: SlamMethods, config: LocalizationConfig) -> list[int]:
+def _candidates(slam_map: KeyframeMap, description: Any, methods: SlamMethods, config: LocalizationConfig) -> list[int]:
     """Returns the keyframes to register, the most probable overlap first."""
     vector = methods.matcher.vector(description)
     vector = vector / max(float(np.linalg.norm(vector)), 1e-12)
-    rows, _ = most_similar(map_.vectors, vector, config.num_similar)
-    overlaps = methods.matcher.overlaps(description, [map_.keyframes[row].description for row in rows])
+    rows, _ = most_similar(slam_map.vectors, vector, config.num_similar)
+    overlaps = methods.matcher.overlaps(description, [slam_map.keyframes[row].description for row in rows])
     order = np.argsort(-overlaps, kind="stable")[: config.num_registered]
     return [int(rows[number]) for number in order]
 
 
 def _registered(
-    map_: KeyframeMap, rows: list[int], description: Any, methods: SlamMethods, config: LocalizationConfig
+    slam_map: KeyframeMap, rows: list[int], description: Any, methods: SlamMethods, config: LocalizationConfig
 ) -> list[Evidence]:
     source, radius_m = Submap((description,), np.eye(4)[None]), methods.config.front_end.submap_radius_m
-    targets = [submap_around(map_, row, config.num_submap, radius_m) for row in rows]
+    targets = [submap_around(slam_map, row, config.num_submap, radius_m) for row in rows]
     matches = methods.matcher.register([(source, target) for target in targets]) if rows else []
     loops = methods.config.loops
     return [
-        Evidence(row, orthonormal(map_.T_world_keyframe[row] @ match.T_target_source), match, scans_agree(match, loops))
+        Evidence(
+            row, orthonormal(slam_map.T_world_keyframe[row] @ match.T_target_source), match, scans_agree(match, loops)
+        )
         for row, match in zip(rows, matches, strict=True)
     ]
 
@@ -245,16 +249,16 @@ def _is_supported(place: _Place, config: LocalizationConfig, min_support: int) -
 
 
 def _neighbours(
-    map_: KeyframeMap, best: Evidence, tried: list[Evidence], extent_m: float, config: LocalizationConfig
+    slam_map: KeyframeMap, best: Evidence, tried: list[Evidence], extent_m: float, config: LocalizationConfig
 ) -> list[int]:
     """Returns keyframes near the place that were not tried yet, nearest first."""
-    apart_m = distances_to(map_, best.T_world_scan[:3, 3])
+    apart_m = distances_to(slam_map, best.T_world_scan[:3, 3])
     done = {one.keyframe for one in tried}
     near = [int(row) for row in np.argsort(apart_m, kind="stable") if apart_m[row] <= extent_m]
     return [row for row in near if row not in done][: config.num_neighbours]
 
 
-def _decided(map_: KeyframeMap, tried: list[Evidence], extent_m: float, config: LocalizationConfig) -> Localization:
+def _decided(slam_map: KeyframeMap, tried: list[Evidence], extent_m: float, config: LocalizationConfig) -> Localization:
     places = sorted(_places(tried, config), key=lambda place: -place.total)
     evidence = tuple(tried)
     if not places:
@@ -264,7 +268,7 @@ def _decided(map_: KeyframeMap, tried: list[Evidence], extent_m: float, config: 
     first = best.members[0]
     numbers = f"{len(best.members)} of {len(tried)} agree, P {first.match.probability:.2f}, sum {best.total:.2f}"
     numbers += f", next place {rival:.2f}"
-    is_alone = int((distances_to(map_, first.T_world_scan[:3, 3]) <= extent_m).sum()) <= 1
+    is_alone = int((distances_to(slam_map, first.T_world_scan[:3, 3]) <= extent_m).sum()) <= 1
     is_supported = _is_supported(best, config, 1 if is_alone else config.min_support)
     if not is_supported or rival > config.max_rival_share * best.total:
         return Localization("not in this map", None, 0.0, None, numbers, evidence)

@@ -62,11 +62,12 @@ def join_maps(
         All keyframes, and which maps were joined.
 
     Raises:
-        ValueError: if there is no map, or if maps were made by different matchers.
+        ValueError: if there is no map, or if a map was made by another matcher.
     """
     if not maps:
         raise ValueError("maps: expected at least one, got none")
     joined = _side_by_side(maps)
+    with_origin(joined, methods.origin)
     map_of_row = np.repeat(np.arange(len(maps)), [len(each) for each in maps])
     inner = loops_of_map(joined).loops
     loops: tuple[Loop, ...] = ()

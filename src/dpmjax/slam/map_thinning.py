@@ -10,14 +10,14 @@ from dpmjax.geometry import rigid
 from dpmjax.slam.keyframes import KeyframeMap, MapEdge, connected_parts, distances_to
 
 
-def thin_map(map_: KeyframeMap, *, spacing_share: float = 0.8) -> KeyframeMap:
+def thin_map(slam_map: KeyframeMap, *, spacing_share: float = 0.8) -> KeyframeMap:
     """Leaves out keyframes near others, also of other laps, so that the map does not grow where it is driven again.
 
     The poses are those of the map. An edge between keyframes that were left out joins those that cover them; its
     information falls with the number of steps that it stands for.
 
     Args:
-        map_: of a run.
+        slam_map: of a run.
         spacing_share: no two joined keyframes are nearer than this share of the extent of the earlier one.
 
     Returns:
@@ -27,46 +27,46 @@ def thin_map(map_: KeyframeMap, *, spacing_share: float = 0.8) -> KeyframeMap:
         ValueError: if the spacing is not positive.
     """
     require_positive("spacing_share", spacing_share)
-    if len(map_) == 0:
-        return map_
-    kept, cover = _covering(map_, spacing_share)
+    if len(slam_map) == 0:
+        return slam_map
+    kept, cover = _covering(slam_map, spacing_share)
     row_of = {row: number for number, row in enumerate(kept)}
     edges: dict[tuple[int, int, str], MapEdge] = {}
-    for edge in map_.edges:
-        found = _contracted(map_, edge, cover, row_of)
+    for edge in slam_map.edges:
+        found = _contracted(slam_map, edge, cover, row_of)
         key = (found.source, found.target, found.kind)
         if found.source != found.target and (key not in edges or _weight(found) > _weight(edges[key])):
             edges[key] = found
     return KeyframeMap(
-        tuple(map_.keyframes[row] for row in kept),
-        map_.T_world_keyframe[kept],
-        map_.vectors[kept],
+        tuple(slam_map.keyframes[row] for row in kept),
+        slam_map.T_world_keyframe[kept],
+        slam_map.vectors[kept],
         tuple(edges.values()),
-        map_.origin,
+        slam_map.origin,
     )
 
 
-def _covering(map_: KeyframeMap, spacing_share: float) -> tuple[list[int], Int[np.ndarray, " k"]]:
+def _covering(slam_map: KeyframeMap, spacing_share: float) -> tuple[list[int], Int[np.ndarray, " k"]]:
     """Returns the rows that stay, and for each row the nearest of them."""
-    extents_m = np.array([keyframe.extent_m for keyframe in map_.keyframes])
+    extents_m = np.array([keyframe.extent_m for keyframe in slam_map.keyframes])
     # Parts of a map that no loop has joined have no known distance.
-    part = connected_parts(len(map_), [edge for edge in map_.edges if edge.kind != "guess"])
+    part = connected_parts(len(slam_map), [edge for edge in slam_map.edges if edge.kind != "guess"])
 
     def apart_m(row: int) -> Float[np.ndarray, " n"]:
-        distances = distances_to(map_, map_.T_world_keyframe[row, :3, 3])[kept]
+        distances = distances_to(slam_map, slam_map.T_world_keyframe[row, :3, 3])[kept]
         return np.where(part[kept] == part[row], distances, np.inf)
 
     kept: list[int] = []
-    for row in range(len(map_)):
+    for row in range(len(slam_map)):
         if not (apart_m(row) < spacing_share * extents_m[kept]).any():
             kept.append(row)
-    return kept, np.array([kept[int(np.argmin(apart_m(row)))] for row in range(len(map_))], np.int64)
+    return kept, np.array([kept[int(np.argmin(apart_m(row)))] for row in range(len(slam_map))], np.int64)
 
 
-def _contracted(map_: KeyframeMap, edge: MapEdge, cover: Int[np.ndarray, " k"], row_of: dict[int, int]) -> MapEdge:
+def _contracted(slam_map: KeyframeMap, edge: MapEdge, cover: Int[np.ndarray, " k"], row_of: dict[int, int]) -> MapEdge:
     """Moves both ends of an edge to the keyframes that cover them."""
     source, target = int(cover[edge.source]), int(cover[edge.target])
-    T_world = map_.T_world_keyframe
+    T_world = slam_map.T_world_keyframe
     T_target_end = rigid.inverse(T_world[target]) @ T_world[edge.target]
     T_start_source = rigid.inverse(T_world[edge.source]) @ T_world[source]
     T = T_target_end @ edge.T_target_source @ T_start_source

@@ -50,7 +50,7 @@ class SlamResult(NamedTuple):
         graph: poses of the keyframes and the edges that were kept, with ids of scans; None without any keyframe.
         reports: how each scan was placed.
         state: goes on with `step_slam`.
-        T_odometry_scan: (n, 4, 4) every scan by odometry alone, which no loop has corrected.
+        T_odometry_scan: (n, 4, 4) every scan by odometry alone, without any loop.
     """
 
     T_world_scan: Float[np.ndarray, "n 4 4"]
@@ -60,6 +60,11 @@ class SlamResult(NamedTuple):
     reports: tuple[ScanReport, ...]
     state: SlamState
     T_odometry_scan: Float[np.ndarray, "n 4 4"]
+
+    @property
+    def map(self) -> KeyframeMap:
+        """The map: keyframes, poses and edges."""
+        return self.state.slam_map
 
 
 def make_methods(model: Model, config: SlamConfig | None = None, *, weights: str = "") -> SlamMethods:
@@ -97,20 +102,20 @@ def as_methods(model: Model | SlamMethods, config: SlamConfig | None) -> SlamMet
     return make_methods(model, config)
 
 
-def init_slam(map_: KeyframeMap | None = None) -> SlamState:
-    """Begins an empty map, or a new part of one that was made before.
+def init_slam(slam_map: KeyframeMap | None = None) -> SlamState:
+    """Begins an empty map, or a new part of an earlier one.
 
-    Scans are numbered on from those of the map. Nothing is known of where the new part lies until a loop joins it.
+    Scans are numbered on from those of the map. The new part has no known place in the map until a loop joins it.
 
     Args:
-        map_: from `load_map` or of an earlier run; None for an empty one.
+        slam_map: from `load_map` or of an earlier run; None for an empty one.
 
     Returns:
         The state before the first scan.
     """
-    if map_ is None or len(map_) == 0:
+    if slam_map is None or len(slam_map) == 0:
         return SlamState(FrontEndState(), KeyframeMap(), LoopState())
-    return SlamState(FrontEndState(num_scans=map_.keyframes[-1].scan + 1), map_, loops_of_map(map_))
+    return SlamState(FrontEndState(num_scans=slam_map.keyframes[-1].scan + 1), slam_map, loops_of_map(slam_map))
 
 
 def step_slam(methods: SlamMethods, state: SlamState, scan: AnyScan) -> tuple[SlamState, ScanReport]:
@@ -130,7 +135,7 @@ def step_slam(methods: SlamMethods, state: SlamState, scan: AnyScan) -> tuple[Sl
     """
     shape = np.shape(scan.points if isinstance(scan, TimedScan) else scan)
     if len(shape) != 2 or shape[1] != 3:
-        raise ValueError(f"points: expected shape (n, 3), got {shape}")
+        raise ValueError(f"scan: expected shape (n, 3), got {shape}")
     front, slam_map, report = front_end.step(methods, state.front_end, state.slam_map, scan)
     report, loops = report._replace(num_points=shape[0]), state.loops
     if report.is_keyframe:
@@ -211,32 +216,32 @@ def iterate_slam(
 
 
 def run_slam(
-    scans: Iterable[AnyScan],
     model: Model | SlamMethods,
+    scans: Iterable[AnyScan],
     config: SlamConfig | None = None,
     *,
-    map_: KeyframeMap | None = None,
+    slam_map: KeyframeMap | None = None,
 ) -> SlamResult:
     """Makes one map of a drive: odometry, loops, and a graph that agrees with both (DeepPointMap section 4).
 
-    Every scan gets a pose, also an empty one. What is uncertain is flagged in `reports`.
+    Every scan gets a pose, also an empty one. `reports` has how each pose was found, and flags uncertain ones.
 
     Args:
+        model: a trained model; or methods of your own.
         scans: points in metres, each in the frame of the lidar, in the order of time; any iterable. `TimedScan`s are
             deskewed.
-        model: a trained model; or methods of your own.
         config: settings; None takes the defaults. Methods of your own carry theirs.
-        map_: from `load_map`, to be extended; None begins an empty one.
+        slam_map: from `load_map`, to be extended; None begins an empty one.
 
     Returns:
-        `T_world_scan` of every scan, keyframes, loops, graph and reports.
+        `T_world_scan` of every scan, keyframes, loops, graph, map and reports.
 
     Raises:
         ValueError: if a scan is not (n, 3), if methods come with another configuration, or if the map was made with
             other weights.
     """
     methods = as_methods(model, config)
-    start = state = init_slam(map_)
+    start = state = init_slam(slam_map)
     reports = []
     for state, report in iterate_slam(methods, scans, start):  # noqa: B007 (the last one is used)
         reports.append(report)

@@ -102,7 +102,7 @@ def _draw_panel(axes: Axes, panel: AgentPanel, limits: Limits, size: tuple[float
         axes.plot(*agent.positions[:1, :2].T, "o", ms=5.5, color=agent.color, mec="white", zorder=8)
     if len(panel.loops):
         lines = LineCollection(list(panel.loops[:, :, :2]), colors=INK, linewidths=0.9, zorder=7)
-        lines.set_label(f"{len(panel.loops)} loops between agents")
+        lines.set_label(f"{len(panel.loops)} loop{'s' * (len(panel.loops) != 1)} between them")
         axes.add_collection(lines)
         axes.plot(*panel.loops.reshape(-1, 3)[:, :2].T, ".", ms=3.5, color=INK, zorder=7)
     frame_map(axes, limits)

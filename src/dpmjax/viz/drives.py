@@ -240,7 +240,7 @@ def _draw_errors(axes: Axes, tracks: Sequence[Track]) -> None:
     style_axes(axes)
     axes.set_ylim(bottom=0)
     axes.set_xlim(left=0)
-    axes.set_xlabel("way, m", fontsize=8, color=MUTED)
+    axes.set_xlabel("distance driven, m", fontsize=8, color=MUTED)
     axes.set_title("distance to the aligned reference, m", fontsize=8.5, color=MUTED, loc="left")
 
 

@@ -126,7 +126,7 @@ def growth_figure(
         axes.set_yscale("log")
         axes.set_xlim(left=0)
         axes.set_title(drive, fontsize=8.5, color=INK)
-        axes.set_xlabel("way, m", fontsize=8, color=MUTED)
+        axes.set_xlabel("distance driven, m", fontsize=8, color=MUTED)
         style_axes(axes)
     grid[0].set_ylabel("map, MB", fontsize=8, color=MUTED)
     _add_legend(figure, entries)

@@ -14,7 +14,7 @@ from dpmjax.sequences import FloatArray, LidarSequence
 from dpmjax.simulation.town.make import Town, TownConfig, make_town
 from dpmjax.simulation.town.primitives import TownPrimitives
 from dpmjax.simulation.town.scan import HDL64E, LidarSensor, scan_town
-from dpmjax.simulation.town.streets import arc_lengths, at_way, lane_of, tangents
+from dpmjax.simulation.town.streets import arc_lengths, at_way, lane_of, make_streets, tangents
 
 _WHEELBASE_M = 2.7
 _TRACK_M = 1.6
@@ -93,6 +93,31 @@ def simulate_lidar_sequence(
     driving = driving or DriveConfig(sensor_height_m=sensor.height_m)
     way = drive(town, driving, seed=seed)
     return scan_along(town.name, town.primitives, way, seed=seed, sensor=sensor)
+
+
+def route_poses(
+    rng: np.random.Generator, kind: str, length_m: float, *, block_m: float = 100.0, step_m: float = 1.0
+) -> FloatArray:
+    """Draws a route through streets and puts a pose on its lane at every step; nothing is scanned.
+
+    Args:
+        rng: source of all choices.
+        kind: of the route, see `make_streets`.
+        length_m: wanted length of the route; met within a block or two.
+        block_m: side of a block.
+        step_m: way between two poses.
+
+    Returns:
+        (n, 4, 4) poses on the ground, x forward, y left, z up.
+    """
+    lane = lane_of(make_streets(rng, kind, length_m, block_m), is_reversed=False)
+    way = np.arange(0.0, arc_lengths(lane)[-1], step_m)
+    x, y, *forward = at_way(np.column_stack([lane, tangents(lane)]), way).T
+    cos, sin = np.array(forward) / np.linalg.norm(forward, axis=0)
+    T = np.tile(np.eye(4), (len(way), 1, 1))
+    T[:, :2, :2] = np.moveaxis(np.array([[cos, -sin], [sin, cos]]), -1, 0)
+    T[:, 0, 3], T[:, 1, 3] = x, y
+    return T
 
 
 def scan_along(

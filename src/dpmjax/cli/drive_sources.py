@@ -1,0 +1,62 @@
+"""Drives of a command line: simulated towns, or folders of scans with poses."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from dpmjax.deeppointmap import why_useless
+from dpmjax.io import LidarSequence, list_lidar_sequences, open_lidar_sequence
+from dpmjax.simulation import simulate_drive
+
+LOGGER = logging.getLogger("dpmjax.drives")
+TOWN = "town"
+
+
+@dataclass(frozen=True)
+class Source:
+    """Origin of a drive.
+
+    Attributes:
+        path: folder of scans; None for a simulated town.
+        name: name of the sequence in the folder; None where it holds one.
+        town_seed: seed of the town.
+        town_length_m: length of the drive through the town.
+        town_kind: kind of place; None draws one.
+    """
+
+    path: Path | None = None
+    name: str | None = None
+    town_seed: int = 0
+    town_length_m: float = 600.0
+    town_kind: str | None = None
+
+    def open(self) -> LidarSequence:
+        """Opens or simulates the drive."""
+        if self.path is None:
+            return simulate_drive(self.town_seed, length_m=self.town_length_m, kind=self.town_kind)
+        return open_lidar_sequence(self.path, sequence=self.name)
+
+
+def find_sources(data: Sequence[str], towns: Sequence[Source]) -> list[Source]:
+    """Returns the drives of the entries of a command line, checked; those of the towns where an entry is `town`.
+
+    Raises:
+        ValueError: if a path cannot be read or holds no useful drive.
+    """
+    sources: list[Source] = []
+    for entry in data:
+        if entry == TOWN and not Path(entry).exists():
+            sources += towns
+            continue
+        names: Sequence[str | None] = list_lidar_sequences(entry) or [None]
+        found = {Source(Path(entry), name): open_lidar_sequence(entry, sequence=name) for name in names}
+        reasons = {source: reason for source, drive in found.items() if (reason := why_useless(drive)) is not None}
+        if len(reasons) == len(found):
+            raise ValueError("; ".join(f"{entry}: {reason}" for reason in dict.fromkeys(reasons.values())))
+        for source, reason in reasons.items():
+            LOGGER.warning("%s is left out: %s", found[source].name, reason)
+        sources += [source for source in found if source not in reasons]
+    return sources

@@ -1,0 +1,98 @@
+"""The scans that a command takes: a drive in any layout or a simulated town, a part of it, and its checks."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from dpmjax.sequences import InputError
+
+if TYPE_CHECKING:
+    from dpmjax.sequences import LidarSequence
+
+TOWN_ROUTE_M, TOWN_DRIVE_M, TOWN_RATE_HZ, TOWN_AZIMUTHS = 400.0, 480.0, 3.0, 900
+_FLOAT32_ROW_BYTES = 16
+
+
+@dataclass(frozen=True, kw_only=True)
+class DriveSelection:
+    """Scans of one drive.
+
+    Attributes:
+        data: folder of scans; None for a simulated town.
+        sequence: name of the drive, where the folder holds several.
+        num_scans: number of scans; None for all.
+        jump: every `jump`-th scan is taken.
+        is_kitti_corrected: the beams are raised by 0.205 degrees, as KITTI's HDL-64E needs.
+        seed: of the simulated town.
+    """
+
+    data: Path | None = None
+    sequence: str | None = None
+    num_scans: int | None = None
+    jump: int = 1
+    is_kitti_corrected: bool = False
+    seed: int = 0
+
+
+def open_drive(selection: DriveSelection) -> LidarSequence:
+    """Opens a drive, checks the lengths of its files and reads its first scan.
+
+    Args:
+        selection: the scans.
+
+    Returns:
+        The drive.
+
+    Raises:
+        InputError: no such folder, no such drive, a file that is missing or cut off, or a first scan that is bad.
+    """
+    from dpmjax import io
+
+    if selection.data is None:
+        drive = simulated_drive(selection.seed)
+    else:
+        drive = io.open_lidar_sequence(selection.data, sequence=selection.sequence)
+    if selection.is_kitti_corrected:
+        drive = with_raised_beams(drive)
+    part = drive.take(np.arange(len(drive))[:: selection.jump][: selection.num_scans])
+    require_whole_files(part)
+    part.read_points(0)
+    return part
+
+
+def with_raised_beams(drive: LidarSequence) -> LidarSequence:
+    """Returns the drive with the beams of KITTI's lidar raised to their true elevation."""
+    from dpmjax.scans import raise_beams
+    from dpmjax.scans.elevation import KITTI_ELEVATION_DEG
+
+    def read_scan(index: int) -> np.ndarray:
+        return raise_beams(drive.read_scan(index), KITTI_ELEVATION_DEG)
+
+    return replace(drive, read_scan=read_scan)
+
+
+def simulated_drive(seed: int) -> LidarSequence:
+    """Simulates a drive once round a town and on over known streets, with an HDL-64 of half the columns."""
+    from dpmjax.simulation import HDL64E, DriveConfig, Scene, TownConfig, simulate_scene
+
+    town = TownConfig("suburb", "loop", TOWN_ROUTE_M, 90.0)
+    driving = DriveConfig(rate_hz=TOWN_RATE_HZ, length_m=TOWN_DRIVE_M)
+    return simulate_scene(Scene(seed, town, driving, HDL64E.with_azimuths(TOWN_AZIMUTHS)))
+
+
+def require_whole_files(drive: LidarSequence) -> None:
+    """Raises an `InputError` for the first file that is missing or cut off, as far as its length shows it."""
+    for source in map(Path, drive.sources):
+        if source.suffix.lower() != ".bin":
+            continue
+        try:
+            size = source.stat().st_size
+        except OSError as error:
+            raise InputError(source, f"cannot be read ({error.strerror})", "check the file") from error
+        if size % _FLOAT32_ROW_BYTES:
+            found = f"{size} bytes are no whole number of points of 4 float32: truncated, or other columns"
+            raise InputError(source, found, "copy the file again, or leave it out")

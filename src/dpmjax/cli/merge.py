@@ -1,0 +1,193 @@
+"""Merges saved maps into one where they show the same places (DeepPointMap, section 4).
+
+    dpmjax merge monday/map.npz tuesday/map.npz -o both
+    dpmjax merge robot_1.npz robot_2.npz robot_3.npz
+    dpmjax merge a.npz b.npz --weights my_model.safetensors
+
+Maps are files of `dpmjax.save_map`, such as map.npz of `dpmjax slam`, all made with the same weights. Loops between
+them are found by the appearance of places; no position is needed. A merged map has the frame of its first map.
+
+Results go to results/merge/<time>/ (latest links to the newest): map.npz, loops.csv (each candidate of a loop between
+two maps and its outcome), graph.g2o, metrics.json, and map.png (all maps from above, each in its colour, with the
+loops). Where some maps show no common place, the maps are map_1.npz, map_2.npz and so on.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import numpy as np
+from tyro.conf import Positional, arg
+
+from dpmjax.cli.command import run_command
+from dpmjax.cli.run_folder import OutputOptions, RunFolder, open_run_folder, recording, write_metrics
+from dpmjax.cli.slam_numbers import counted
+
+if TYPE_CHECKING:
+    from dpmjax.slam import KeyframeMap, MergedMaps
+    from dpmjax.viz import AgentPanel, AgentTrack
+
+NAME = "merge"
+LOOP_COLUMNS = (
+    "map", "scan", "other_map", "other_scan", "found_by", "status", "overlap", "probability", "rmse_m"
+)  # fmt: skip
+
+
+@dataclass(frozen=True, kw_only=True)
+class Config(OutputOptions):
+    """Options of the run."""
+
+    maps: Annotated[Positional[tuple[Path, ...]], arg(metavar="MAP MAP ...", help_behavior_hint="required")] = ()
+    """Two or more maps, files of dpmjax.save_map."""
+    weights: Annotated[str, arg(metavar="NAME|FILE")] = "dpm_small"
+    """The weights that made the maps: a shipped name or a .safetensors file."""
+
+
+def main(config: Config) -> dict[str, Any]:
+    """Reads the maps, merges them, writes; returns the content of `metrics.json`."""
+    from dpmjax.cli.map_input import open_map
+    from dpmjax.cli.progress import progress_bar
+    from dpmjax.slam import make_methods, merge_maps
+    from dpmjax.weights import load_model
+
+    started = time.perf_counter()
+    if len({path.resolve() for path in config.maps}) < max(len(config.maps), 2):
+        given = " ".join(map(str, config.maps)) or "none"
+        raise ValueError(f"give two or more different maps, files of dpmjax.save_map; got {given}")
+    methods = make_methods(load_model(config.weights), weights=config.weights)
+    maps = [open_map(path, methods) for path in config.maps]
+    folder = open_run_folder(config, NAME)
+    with recording(folder):
+        with progress_bar("loops between maps", " keyframes") as on_keyframe:
+            merged = merge_maps(methods, *maps, on_keyframe=on_keyframe)
+        write_results(folder, maps, merged)
+        metrics = {"weights": config.weights, **merge_numbers(config.maps, maps, merged)}
+        metrics["wall_s"] = time.perf_counter() - started
+        write_metrics(folder, metrics)
+        draw(folder, config.maps, merged)
+        print(report(metrics), f"results in {folder.path}", sep="\n")
+    return metrics
+
+
+def write_results(folder: RunFolder, maps: Sequence[KeyframeMap], merged: MergedMaps) -> None:
+    """Writes the maps, the graph and the table of loops."""
+    from dpmjax.cli.slam_files import loop_cells, write_table
+    from dpmjax.io.g2o import write_g2o
+    from dpmjax.saved_maps import save_map
+    from dpmjax.slam import as_pose_graph
+
+    for part, slam_map in enumerate(merged.maps, start=1):
+        save_map(folder / map_name(part, len(merged.maps)), slam_map)
+    write_g2o(folder / "graph.g2o", as_pose_graph(merged.joined.slam_map))
+    ends = [(number, keyframe.scan) for number, each in enumerate(maps, start=1) for keyframe in each.keyframes]
+    rows = []
+    for loop in merged.loops:
+        (number, scan), (other, other_scan) = ends[loop.source], ends[loop.target]
+        rows.append({"map": number, "scan": scan, "other_map": other, "other_scan": other_scan, **loop_cells(loop)})
+    write_table(folder / "loops.csv", LOOP_COLUMNS, rows)
+
+
+def map_name(part: int, num_parts: int) -> str:
+    """Returns the name of the file of a part, counted from 1."""
+    return "map.npz" if num_parts == 1 else f"map_{part}.npz"
+
+
+def short_name(path: Path) -> str:
+    """Returns the name of a map with its folder: most maps are called map.npz."""
+    return str(Path(*path.parts[-2:]))
+
+
+def merge_numbers(paths: Sequence[Path], maps: Sequence[KeyframeMap], merged: MergedMaps) -> dict[str, Any]:
+    """Returns the content of `metrics.json`: which maps have met, and the numbers of loops and keyframes."""
+    accepted = [loop for loop in merged.loops if loop.status == "accepted"]
+    map_of_row = merged.joined.map_of_keyframe + 1
+    pairs = [sorted((int(map_of_row[loop.source]), int(map_of_row[loop.target]))) for loop in accepted]
+    parts = [
+        {
+            "file": map_name(part, len(merged.maps)),
+            "maps": [number for number, component in enumerate(merged.component, start=1) if component == part - 1],
+            "num_keyframes": len(slam_map),
+        }
+        for part, slam_map in enumerate(merged.maps, start=1)
+    ]
+    return {
+        "num_maps": len(maps),
+        "num_parts": len(parts),
+        "num_loops": len(accepted),
+        "num_candidates": len(merged.loops),
+        "num_keyframes": len(merged.joined.slam_map),
+        "parts": parts,
+        "maps": [
+            {"map": number, "file": short_name(path), "num_keyframes": len(each)}
+            for number, (path, each) in enumerate(zip(paths, maps, strict=True), start=1)
+        ],
+        "loops_between": [
+            {"maps": list(pair), "num_loops": pairs.count(list(pair))} for pair in sorted(set(map(tuple, pairs)))
+        ],
+    }
+
+
+def draw(folder: RunFolder, paths: Sequence[Path], merged: MergedMaps) -> None:
+    """Draws map.png, a panel for each part."""
+    from dpmjax import viz
+
+    title = (
+        f"{len(paths)} maps, {len(merged.maps)} after merging" if len(merged.maps) > 1 else f"{len(paths)} maps in one"
+    )
+    panels = [panel_of(paths, merged, part) for part in range(len(merged.maps))]
+    viz.save_figure(viz.agents_figure(title, panels), folder / "map.png")
+
+
+def panel_of(paths: Sequence[Path], merged: MergedMaps, part: int) -> AgentPanel:
+    """Returns the panel of a part: its maps with their surfaces and keyframes, and the loops between them."""
+    from dpmjax import viz
+
+    members = [number for number, component in enumerate(merged.component) if component == part]
+    joined = merged.joined
+    ends = [
+        (loop.source, loop.target)
+        for loop in merged.loops
+        if loop.status == "accepted" and joined.map_of_keyframe[loop.source] in members
+    ]
+    loops = joined.slam_map.T_world_keyframe[np.reshape(ends, (-1, 2)).astype(np.int64), :3, 3]
+    is_joined = len(members) > 1
+    text = f"in the frame of {short_name(paths[members[0]])}" if is_joined else "no common place with another map"
+    return viz.AgentPanel(text, [track_of(paths[number], merged, number) for number in members], loops)
+
+
+def track_of(path: Path, merged: MergedMaps, number: int) -> AgentTrack:
+    """Returns the keyframes of a map and the points of their surfaces, in its colour."""
+    from dpmjax import viz
+    from dpmjax.cli.map_input import keyframe_points
+    from dpmjax.cli.slam_files import gather_map
+
+    slam_map = merged.joined.slam_map
+    rows = np.flatnonzero(merged.joined.map_of_keyframe == number)
+    cloud = gather_map((keyframe_points(slam_map, row), slam_map.T_world_keyframe[row]) for row in rows.tolist())
+    label = f"{short_name(path)}, {counted(len(rows), 'keyframe')}"
+    positions = slam_map.T_world_keyframe[rows, :3, 3]
+    color = viz.COLORS[number % len(viz.COLORS)]
+    return viz.AgentTrack(label, color, positions, None, cloud.points, cloud.heights_m)
+
+
+def report(metrics: dict[str, Any]) -> str:
+    """Returns the last lines on the console."""
+    names = {entry["map"]: entry["file"] for entry in metrics["maps"]}
+    lines = []
+    for part in metrics["parts"]:
+        members = ", ".join(names[number] for number in part["maps"])
+        text = "one map now" if len(part["maps"]) > 1 else "no common place with another map"
+        lines.append(f"{members}: {text}, {counted(part['num_keyframes'], 'keyframe')}, {part['file']}")
+    loops = (
+        f"{counted(metrics['num_loops'], 'loop')} between maps, of {counted(metrics['num_candidates'], 'candidate')}"
+    )
+    return "\n".join([*lines, loops])
+
+
+def run(args: Sequence[str] | None = None) -> int:
+    """Runs the subcommand; returns the exit code."""
+    return run_command(main, Config, name=NAME, description=__doc__, args=args)

@@ -1,0 +1,114 @@
+"""The command `dpmjax merge` on a network that compiles in seconds."""
+
+from __future__ import annotations
+
+import csv
+from dataclasses import replace
+
+import jax
+import numpy as np
+import pytest
+
+import dpmjax
+from dpmjax.cli import merge
+from dpmjax.cli.command import EXIT_BAD_INPUT, EXIT_OK
+from dpmjax.cli.result_files import load_json
+from dpmjax.slam import JoinedMaps, MergedMaps
+from dpmjax.slam.keyframes import MapEdge
+from dpmjax.slam.reports import Loop
+from tests.deeppointmap import toy
+
+
+@pytest.fixture(scope="module")
+def case(tmp_path_factory):
+    """Weights, and the maps of two drives and of a part of one."""
+    folder = tmp_path_factory.mktemp("case")
+    model = dpmjax.init_model(jax.random.key(0), toy.MODEL)
+    dpmjax.save_model(model, folder / "model.safetensors")
+    dpmjax.save_model(dpmjax.init_model(jax.random.key(1), toy.MODEL), folder / "other.safetensors")
+    for seed, name in ((1, "a"), (2, "b"), (3, "c")):
+        drive = toy.drive(seed, num_scans=3)
+        result = dpmjax.run_slam(model, [drive.read_scan(number) for number in range(3)])
+        dpmjax.save_map(folder / f"{name}.npz", result.map)
+    return folder
+
+
+def run(*arguments) -> int:
+    return merge.run(list(map(str, arguments)))
+
+
+def joined_by_a_loop(model, *maps, on_keyframe=None) -> MergedMaps:
+    """The first two maps meet at their first keyframes; a third one meets nobody."""
+    starts = np.cumsum([0, *map(len, maps)])
+    everything = dpmjax.merge_maps(model, *maps).joined.slam_map
+    loop = Loop(int(starts[1]), 0, "retrieval", "accepted", 0.9, 0.95, 0.03, np.eye(4), np.eye(6))
+    rejected = loop._replace(source=int(starts[1]) + 1, status="improbable", T_target_source=None, information=None)
+    edge = MapEdge(loop.source, loop.target, np.eye(4), np.eye(6), "loop")
+    everything = replace(everything, edges=(*everything.edges, edge))
+    component = (0, 0, *range(1, len(maps) - 1))
+    joined = JoinedMaps(everything, np.repeat(np.arange(len(maps)), [len(each) for each in maps]), component, ())
+    parts = (dpmjax.slam.take_component(joined, 0), *maps[2:])
+    return MergedMaps(parts, joined._replace(loops=(loop, rejected)))
+
+
+def test_maps_that_meet_become_one_file(case, tmp_path, monkeypatch, capsys) -> None:
+    monkeypatch.setattr("dpmjax.slam.merge_maps", joined_by_a_loop)
+    out, weights = tmp_path / "out", ("--weights", case / "model.safetensors")
+    assert run(case / "a.npz", case / "b.npz", *weights, "-o", out) == EXIT_OK
+    assert "one map now" in capsys.readouterr().out
+    metrics = load_json(out / "metrics.json")
+    a, b, both = (dpmjax.load_map(path) for path in (case / "a.npz", case / "b.npz", out / "map.npz"))
+    assert len(both) == len(a) + len(b) == metrics["num_keyframes"]
+    assert metrics["parts"] == [{"file": "map.npz", "maps": [1, 2], "num_keyframes": len(both)}]
+    assert metrics["loops_between"] == [{"maps": [1, 2], "num_loops": 1}]
+    rows = list(csv.DictReader((out / "loops.csv").read_text().splitlines()))
+    assert [(row["map"], row["other_map"], row["status"]) for row in rows] == [
+        ("2", "1", "accepted"),
+        ("2", "1", "improbable"),
+    ]
+    # Scans are numbered as in the drive of each map.
+    assert [row["scan"] for row in rows] == [str(keyframe.scan) for keyframe in b.keyframes[:2]]
+    assert len(dpmjax.read_g2o(out / "graph.g2o").poses) == len(both)
+    assert (out / "map.png").stat().st_size > 0
+
+
+def test_maps_that_do_not_meet_stay_as_they_were(case, tmp_path, capsys) -> None:
+    out, weights = tmp_path / "out", ("--weights", case / "model.safetensors")
+    maps = [case / f"{name}.npz" for name in "abc"]
+    assert run(*maps, *weights, "-o", out) == EXIT_OK
+    metrics = load_json(out / "metrics.json")
+    assert (metrics["num_maps"], metrics["num_parts"], metrics["num_loops"]) == (3, 3, 0)
+    assert not (out / "map.npz").exists()
+    for number, path in enumerate(maps, start=1):
+        before, after = dpmjax.load_map(path), dpmjax.load_map(out / f"map_{number}.npz")
+        np.testing.assert_array_equal(after.T_world_keyframe, before.T_world_keyframe)
+    assert capsys.readouterr().out.count("no common place with another map") == 3
+    # An earlier run is replaced on request only.
+    assert run(*maps, *weights, "-o", out) == EXIT_BAD_INPUT
+    assert "--force" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("maps", "weights", "message"),
+    [
+        ((), "model.safetensors", "two or more different maps"),
+        (("a.npz",), "model.safetensors", "two or more different maps"),
+        (("a.npz", "a.npz"), "model.safetensors", "two or more different maps"),
+        (("a.npz", "none.npz"), "model.safetensors", "none.npz: no such file"),
+        (("a.npz", "model.safetensors"), "model.safetensors", "model.safetensors"),
+        (("a.npz", "b.npz"), "none.safetensors", "none.safetensors"),
+        (("a.npz", "b.npz"), "other.safetensors", "name the weights that made it with --weights"),
+    ],
+)
+def test_bad_input_is_told_in_one_line(case, tmp_path, capsys, maps, weights, message) -> None:
+    given = [case / name for name in maps]
+    assert run(*given, "--weights", case / weights, "-o", tmp_path / "out") == EXIT_BAD_INPUT
+    errors = capsys.readouterr().err
+    assert message in errors
+    assert errors.count("\n") == 1
+    assert not (tmp_path / "out").exists()
+
+
+def test_help_shows_examples(capsys) -> None:
+    assert run("--help") == EXIT_OK
+    assert "dpmjax merge monday/map.npz tuesday/map.npz -o both" in capsys.readouterr().out

@@ -1,0 +1,100 @@
+"""Pairs of a drive, registered stage by stage and compared with the truth; overlap of pairs."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import jax
+import numpy as np
+import pytest
+
+import dpmjax
+from dpmjax.deeppointmap import (
+    draw_scan_pairs,
+    evaluate_overlap,
+    evaluate_scan_pairs,
+    overlap_evaluation,
+    read_scan_pairs,
+)
+from dpmjax.metrics import area_under_curve, brier_score
+from tests.deeppointmap import toy
+
+
+@pytest.fixture(scope="module")
+def model():
+    return dpmjax.init_model(jax.random.key(0), toy.MODEL)
+
+
+def test_the_auc_is_one_for_a_model_that_knows_and_a_half_for_one_that_guesses(model, monkeypatch) -> None:
+    drive, known = toy.drive(), {}
+    for is_perfect, expected in ((True, 1.0), (False, 0.5)):
+
+        def encoded(model, points):
+            """A cloud that carries what its scan sees first."""
+            return dpmjax.types.DescriptorCloud(points[:1], points[:1], np.ones(1, bool))
+
+        def probability(model, sources, targets, is_perfect=is_perfect):
+            known["num"] = len(sources)
+            return np.arange(len(sources)) < 10 if is_perfect else np.full(len(sources), 0.3)
+
+        monkeypatch.setattr(overlap_evaluation, "encode", encoded)
+        monkeypatch.setattr(overlap_evaluation, "overlap_pairs", probability)
+        found = evaluate_overlap(model, drive, 10)
+        assert (found.area_under_curve, len(found.is_overlap), known["num"]) == (expected, 20, 20)
+
+
+def test_pairs_have_the_motion_of_their_poses() -> None:
+    """World points that both scans see coincide under the true motion, whatever the yaws."""
+    drive = toy.drive()
+    (pair,) = read_scan_pairs(drive, draw_scan_pairs(drive, "near", 1, seed=3), seed=3)
+    moved = pair.source @ pair.T_target_source[:3, :3].T + pair.T_target_source[:3, 3]
+    distances = np.linalg.norm(moved[:, None] - pair.target[None], axis=2).min(axis=1)
+    assert np.quantile(distances, 0.3) < 1e-3
+
+
+@pytest.mark.parametrize(("band", "low", "high"), [("near", 2, 10), ("middle", 10, 20), ("far", 60, np.inf)])
+def test_pairs_are_as_far_apart_as_their_band_says(band: str, low: float, high: float) -> None:
+    drive = toy.drive()
+    pairs = draw_scan_pairs(drive, band, 7)
+    assert len(pairs) == 7
+    distances = np.linalg.norm(np.diff(drive.T_world_lidar[pairs, :3, 3], axis=1)[:, 0], axis=1)
+    assert ((distances >= low) & (distances <= high)).all()
+    np.testing.assert_array_equal(pairs, draw_scan_pairs(drive, band, 7))
+
+
+def test_the_refined_motion_and_the_confidence_are_those_of_register(model) -> None:
+    drive, ticks = toy.drive(), []
+    pairs = list(read_scan_pairs(drive, draw_scan_pairs(drive, "near", 3)))
+    found = evaluate_scan_pairs(model, pairs, on_pair=lambda: ticks.append(1))
+    assert len(ticks) == len(found.confidence) == len(found.seconds.total) == 3
+    for number, pair in enumerate(pairs):
+        match = dpmjax.register(model, pair.source, pair.target, refine=True)
+        np.testing.assert_allclose(match.T_target_source, found.T_target_source[number], atol=1e-4)
+        error = np.linalg.norm(found.T_target_source[number][:3, 3] - pair.T_target_source[:3, 3])
+        assert found.refined.translation_errors_m[number] == pytest.approx(error)
+
+
+def test_without_pairs_an_evaluation_is_empty(model) -> None:
+    found = evaluate_scan_pairs(model, [])
+    assert (len(found.confidence), found.refined.recall, len(found.seconds.total)) == (0, 0.0, 0)
+    none = evaluate_overlap(model, toy.drive(num_scans=4), 5)
+    assert len(none.probability) == 0
+    assert np.isnan(none.area_under_curve)
+
+
+def test_a_drive_without_poses_has_no_pairs() -> None:
+    with pytest.raises(ValueError, match="expected a true pose for each scan, got none in toy 0"):
+        draw_scan_pairs(replace(toy.drive(), T_world_lidar=None), "near", 1)
+
+
+def test_area_under_curve_counts_pairs_and_ties_count_half() -> None:
+    rng = np.random.default_rng(0)
+    score, label = rng.integers(0, 5, 60), rng.random(60) < 0.4
+    slow = np.mean([(p > n) + 0.5 * (p == n) for p in score[label] for n in score[~label]])
+    assert area_under_curve(score.astype(float), label) == pytest.approx(slow)
+    assert np.isnan(area_under_curve(np.ones(3), np.ones(3, bool)))
+
+
+def test_brier_score_is_the_mean_squared_error() -> None:
+    assert brier_score(np.array([1.0, 0.0, 0.5]), np.array([True, True, False])) == pytest.approx((0 + 1 + 0.25) / 3)
+    assert np.isnan(brier_score(np.zeros(0), np.zeros(0, bool)))

@@ -1,0 +1,109 @@
+"""`dpmjax.train`: drives in, a model out; a continued training; input that cannot be trained on."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import jax
+import numpy as np
+import pytest
+
+import dpmjax
+from dpmjax.deeppointmap import CurriculumStage, TrainingHooks, begin_training
+from dpmjax.sequences import LidarSequence
+from tests.deeppointmap import toy
+
+TRAINING = replace(toy.TRAINING, curriculum=(CurriculumStage(2, 3),))
+
+
+def num_steps(trained) -> int:
+    return int(trained.progress.state.step)
+
+
+@pytest.fixture(scope="module")
+def whole():
+    """An unbroken training, with the numbers of its steps."""
+    steps: list[int] = []
+    hooks = TrainingHooks(on_report=lambda record, _: steps.append(record.step))
+    return dpmjax.train([toy.drive()], TRAINING, hooks=hooks), steps
+
+
+def test_three_steps_train_and_the_model_can_be_written_and_read(whole, tmp_path) -> None:
+    trained, steps = whole
+    assert steps == [1, 2, 3]
+    assert (num_steps(trained), trained.stopped_by) == (3, 0)
+    start = begin_training(TRAINING).state.params
+    assert any(
+        np.any(a != b) for a, b in zip(jax.tree.leaves(trained.model.params), jax.tree.leaves(start), strict=True)
+    )
+    dpmjax.save_model(trained.model, tmp_path / "model.safetensors")
+    toy.assert_trees_equal(dpmjax.load_model(tmp_path / "model.safetensors").params, trained.model.params)
+
+
+def test_a_training_that_stops_and_continues_equals_an_unbroken_one(whole) -> None:
+    calls = iter([0, 7])
+    first = dpmjax.train([toy.drive()], TRAINING, hooks=TrainingHooks(stop=lambda: next(calls)))
+    assert (num_steps(first), first.stopped_by) == (1, 7)
+    second = dpmjax.train([toy.drive()], TRAINING, start=first.progress)
+    toy.assert_trees_equal(second.progress, whole[0].progress)
+
+
+def test_prepared_scans_and_drives_train_the_same_model(whole, tmp_path) -> None:
+    for scans, cache in ((toy.store(), None), ([toy.drive()], tmp_path)):
+        trained = dpmjax.train(scans, TRAINING, cache=cache)
+        toy.assert_trees_equal(trained.model.params, whole[0].model.params)
+    assert list(tmp_path.glob("*.npy"))
+
+
+def test_the_best_model_is_that_of_the_best_score(whole) -> None:
+    scores, seen = iter([0.2, 0.9, 0.4]), []
+
+    def evaluate(model):
+        seen.append(model)
+        return next(scores)
+
+    trained = dpmjax.train([toy.drive()], TRAINING, hooks=TrainingHooks(evaluate=evaluate, evaluate_every=1))
+    assert int(trained.progress.best_step) == 2
+    toy.assert_trees_equal(trained.model.params, seen[1].params)
+
+
+def test_a_training_that_is_told_to_finish_ends_early_by_a_decay() -> None:
+    config = replace(TRAINING, curriculum=(CurriculumStage(2, 60),), decay_ratio=0.4)
+    rates: list[float] = []
+    calls = iter([False, False, True])
+    hooks = TrainingHooks(
+        finish=lambda: next(calls), on_report=lambda record, _: rates.append(float(record.report.learning_rate))
+    )
+    trained = dpmjax.train(toy.store(), config, hooks=hooks)
+    assert num_steps(trained) == int(trained.progress.state.end) == 4
+    assert rates[0] == rates[1] == rates[2] > rates[3] > config.final_learning_rate
+
+
+def test_a_training_from_a_model_begins_with_its_parameters() -> None:
+    model = dpmjax.init_model(jax.random.key(5), toy.MODEL)
+    trained = dpmjax.train(toy.store(), TRAINING, start=model, hooks=TrainingHooks(stop=lambda: 1))
+    assert num_steps(trained) == 0
+    toy.assert_trees_equal(trained.model.params, model.params)
+    other = replace(toy.MODEL, decoder=replace(toy.MODEL.decoder, model_channels=16))
+    with pytest.raises(ValueError, match="^start: "):
+        dpmjax.train(toy.store(), TRAINING, start=dpmjax.init_model(jax.random.key(0), other))
+
+
+def spoiled(index: int) -> np.ndarray:
+    raise ValueError("cut off")
+
+
+@pytest.mark.parametrize(
+    ("drives", "message"),
+    [
+        ([], "^drives: expected at least one, got none$"),
+        ([replace(toy.drive(), T_world_lidar=None)], "^drives: toy 0: no poses"),
+        ([toy.drive(), replace(toy.drive(1), read_scan=spoiled)], "^drives: toy 1: all 24 scans are bad; .*cut off$"),
+        ([toy.drive(step_m=50.0)], "^drives: toy 0: 24 scans, no two of them 0.25 to 20.0 m apart"),
+        ([LidarSequence("empty", (), spoiled, np.zeros((0, 4, 4)))], "^drives: empty: 0 scans"),
+    ],
+)
+def test_drives_that_cannot_be_trained_on_are_refused_in_one_line(drives, message: str) -> None:
+    with pytest.raises(ValueError, match=message) as refused:
+        dpmjax.train(drives, TRAINING)
+    assert "\n" not in str(refused.value)
