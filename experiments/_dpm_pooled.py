@@ -79,7 +79,8 @@ def pooled_table(pooled: Sequence[Mapping[str, Any]]) -> str:
         p_values = "; ".join(f"{name} {_p_value(p)}" for name, p in row["p_values"].items())
         lines.append(
             f"| {row['drives']} | {BAND_NAMES[row['band']]} | {row['num_pairs']} | {row['method']} "
-            f"| {row['num_right']} | {row['recall']:.3f} ({row['recall_low']:.3f} to {row['recall_high']:.3f}) | {p_values or '-'} |"
+            f"| {row['num_right']} | {row['recall']:.3f} ({row['recall_low']:.3f} to {row['recall_high']:.3f}) "
+            f"| {p_values or '-'} |"
         )
     notes = "Intervals: Wilson. p: McNemar's exact test, two-sided, on the same pairs."
     if watched := sorted({name for row in pooled for name in row["sequences"]} & set(MONITORED)):

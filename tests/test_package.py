@@ -81,10 +81,3 @@ def test_what_the_api_page_calls_a_kernel_is_tested_as_one() -> None:
     marked = set(re.findall(r"^\* `(\w+)` \(K\):", API.read_text(encoding="utf-8"), re.MULTILINE))
     tested = {name.split()[0] for name in KERNELS}
     assert marked == tested & set(dpmjax.__all__)
-
-
-def test_links_of_the_pages_lead_somewhere() -> None:
-    root = Path(__file__).parents[1]
-    for page in (root / "README.md", root / "CONTRIBUTING.md", *(root / "docs").glob("*.md")):
-        for target in re.findall(r"\]\((?!https?:)([^)#]+)", page.read_text(encoding="utf-8")):
-            assert (page.parent / target).exists(), f"{page.name} links to {target}"

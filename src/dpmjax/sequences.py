@@ -5,7 +5,7 @@ NumPy only, on the host. `dpmjax.io` and `dpmjax.simulation` make these records.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -278,7 +278,9 @@ class DepthSequence:
 
 @dataclass(frozen=True)
 class LidarSequence:
-    """Scans of one drive, read lazily.
+    """Scans of one drive, read lazily: `sequence[i]` reads scan i, and a loop reads one scan after the other.
+
+    Read this way, a scan without points is (0, 3).
 
     Attributes:
         name: short name of the source, for titles and folders.
@@ -303,6 +305,14 @@ class LidarSequence:
 
     def __post_init__(self) -> None:
         _require_shapes(self, {"T_world_lidar": (self.num_scans, 4, 4), "times": (self.num_scans,)})
+
+    def __getitem__(self, index: int) -> NDArray[np.float32]:
+        if not -len(self) <= index < len(self):
+            raise IndexError(f"scan: expected a number below {len(self)}, got {index}")
+        return self.read_points(index % len(self))
+
+    def __iter__(self) -> Iterator[NDArray[np.float32]]:
+        return (self.read_points(index) for index in range(len(self)))
 
     @property
     def num_scans(self) -> int:

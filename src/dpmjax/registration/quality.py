@@ -36,7 +36,7 @@ _LEAST_TOLERANCE = 0.001
 # Bearings of the profiles that it is measured by: exact to less than that tolerance.
 _NUM_BEARINGS = 4096
 # Limits of `assess_trajectory`, calibrated on right and wrong maps of simulated worlds and of thinned logs
-# (docs/deepmapping_notes.md).
+# (docs/notebook/deepmapping_notes.md).
 # Number of nearest scans, by position and once more by position and heading, that each scan is compared with.
 _NUM_NEAREST = 12
 # Typical ranges that a radian of heading counts as in the second of these searches.

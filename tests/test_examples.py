@@ -1,0 +1,56 @@
+"""Examples run, and the pages show their code: README and quick start as printed, guides as quoted."""
+
+from __future__ import annotations
+
+import re
+import runpy
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+EXAMPLES = sorted((ROOT / "examples").glob("[0-9]*.py"))
+GUIDES = sorted((ROOT / "docs" / "guides").glob("*.md"))
+QUICK = ("06", "08")
+"""Examples of seconds; the others train, or map a drive."""
+LONG = (pytest.mark.slow, pytest.mark.timeout(900))
+
+
+def _blocks(page: Path) -> list[str]:
+    return re.findall(r"^```python\n(.*?)^```$", page.read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL)
+
+
+def _marked(path: Path):
+    return pytest.param(path, id=path.stem, marks=() if path.name.startswith(QUICK) else LONG)
+
+
+@pytest.mark.parametrize("path", [_marked(path) for path in EXAMPLES])
+def test_example_runs(path, tmp_path, monkeypatch, capsys) -> None:
+    monkeypatch.chdir(tmp_path)
+    runpy.run_path(str(path), run_name="__main__")
+    assert capsys.readouterr().out
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(900)
+@pytest.mark.parametrize("name", ["README.md", "docs/quickstart.md"])
+def test_code_of_a_page_runs_as_printed(name, tmp_path, monkeypatch, capsys) -> None:
+    monkeypatch.chdir(tmp_path)
+    exec(compile("\n".join(_blocks(ROOT / name)), name, "exec"), {})
+    assert capsys.readouterr().out
+
+
+@pytest.mark.parametrize("guide", GUIDES, ids=lambda guide: guide.stem)
+def test_code_of_a_guide_is_that_of_an_example_that_it_names(guide) -> None:
+    named = re.findall(r"\]\(../../examples/([\w.]+)\)", guide.read_text(encoding="utf-8"))
+    sources = [(ROOT / "examples" / name).read_text(encoding="utf-8") for name in named]
+    blocks = _blocks(guide)
+    assert blocks
+    for block in blocks:
+        assert any(block in source for source in sources), block
+
+
+def test_examples_are_numbered_and_short() -> None:
+    assert [path.name[:3] for path in EXAMPLES] == [f"{number:02}_" for number in range(1, len(EXAMPLES) + 1)]
+    for path in EXAMPLES:
+        assert len(path.read_text(encoding="utf-8").splitlines()) <= 40, path.name
