@@ -8,7 +8,7 @@ import sys
 from pathlib import Path
 
 from benchmarks.rows import Row
-from dpmjax.cli.machine import environment, peak_rss_gb
+from dpmjax.cli import environment, peak_rss_gb
 
 
 def main(module: str, output: str, effort: str) -> None:

@@ -16,7 +16,7 @@ import pytest
 import dpmjax
 from tests.test_kernels import KERNELS
 
-ROOMS = sorted(module.name for module in pkgutil.iter_modules(dpmjax.__path__))
+ROOMS = sorted({module.name for module in pkgutil.iter_modules(dpmjax.__path__)} - {"__main__"})
 FOLDERS = sorted(module.name for module in pkgutil.iter_modules(dpmjax.__path__) if module.ispkg)
 PACKAGES = [dpmjax, *(getattr(dpmjax, name) for name in FOLDERS)]
 API = Path(__file__).parents[1] / "docs" / "api.md"
@@ -53,8 +53,11 @@ def test_no_module_hides_a_public_name(package) -> None:
     for module in pkgutil.iter_modules(package.__path__):
         if module.name != "__main__":
             importlib.import_module(f"{package.__name__}.{module.name}")
-    hidden = {name for name in package.__all__ if isinstance(getattr(package, name), ModuleType)}
-    assert hidden == (set(ROOMS) if package is dpmjax else set())
+    modules = {name for name in package.__all__ if isinstance(getattr(package, name), ModuleType)}
+    stub = Path(package.__path__[0], "__init__.pyi").read_text(encoding="utf-8")
+    listed = set(re.findall(r"^from \. import (\w+) as", stub, re.MULTILINE))
+    assert modules == listed
+    assert package is not dpmjax or listed == set(ROOMS)
 
 
 def test_version_is_the_one_of_the_distribution() -> None:
@@ -73,7 +76,7 @@ def test_api_page_lists_exactly_the_root_names() -> None:
     listed = re.findall(r"^\* `(\w+)`(?: \(K\))?: .+\.$", page, re.MULTILINE)
     assert len(listed) == page.count("\n* "), "one line each: * `name`: what it is."
     assert sorted(listed) == sorted(set(dpmjax.__all__) - {"__version__", *ROOMS})
-    assert page.count("\n## ") == 12, "eleven groups, and the packages"
+    assert page.count("\n## ") == 13, "twelve groups, and the packages"
     assert sorted(re.findall(r"^\| `dpmjax\.(\w+)` \|", page, re.MULTILINE)) == FOLDERS
 
 

@@ -1,6 +1,7 @@
 from . import checkpoints as checkpoints
 from . import checks as checks
 from . import cli as cli
+from . import compile_cache as compile_cache
 from . import deepmapping as deepmapping
 from . import deeppointmap as deeppointmap
 from . import geometry as geometry
