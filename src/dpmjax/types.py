@@ -107,7 +107,7 @@ class Registration:
         confidence: in [0, 1]. With a calibrated model, `register` makes it the probability that the motion is right
             within 2 m and 5 degrees; else it is `mean_score`, which is no probability and 0 without any inlier.
         mean_score: mean score of the first inliers, in [0, 1]; 0 without any.
-        rmse_m: of the inliers after alignment; infinite without any.
+        rmse: of the inliers after alignment, metres; infinite without any.
         support: consensus support of the motion: sum of 1 - error / tolerance over distinct pairs.
         num_inliers: how many pairs the motion rests on, both directions counted.
         source_indices: row of each pair in the source; first the pairs of eq. 1, then the same of eq. 2.
@@ -120,7 +120,7 @@ class Registration:
     T_target_source: Float[Array, "4 4"]
     confidence: Float[Array, ""]
     mean_score: Float[Array, ""]
-    rmse_m: Float[Array, ""]
+    rmse: Float[Array, ""]
     support: Float[Array, ""]
     num_inliers: Int[Array, ""]
     source_indices: Int[Array, " p"]
@@ -128,11 +128,6 @@ class Registration:
     scores: Float[Array, " p"]
     is_inlier: Bool[Array, " p"]
     verification: Verification | None = None
-
-    @property
-    def rmse(self) -> Float[Array, ""]:
-        """`rmse_m`, under the name that all registrations have."""
-        return self.rmse_m
 
 
 @flax.struct.dataclass

@@ -59,7 +59,7 @@ def test_motion_is_found_from_all_pairs() -> None:
     match = match_clouds(*clouds(1), config=MatchConfig(pair_ratio=1.0))
     np.testing.assert_allclose(match.T_target_source, T, atol=2e-4)
     assert match.num_inliers > 140
-    assert match.rmse_m < 1e-3
+    assert match.rmse < 1e-3
     assert match.confidence > 0.9
 
 
@@ -74,7 +74,7 @@ def test_motion_is_the_best_one_of_its_inliers() -> None:
     np.testing.assert_allclose(match.T_target_source[:3, :3], rotation, **ALIGNMENT)
     np.testing.assert_allclose(match.T_target_source[:3, 3], centres[1] - rotation @ centres[0], atol=1e-3)
     residuals = p @ rotation.T + centres[1] - rotation @ centres[0] - q
-    np.testing.assert_allclose(match.rmse_m, np.sqrt(np.mean(np.sum(residuals**2, axis=1))), rtol=1e-3)
+    np.testing.assert_allclose(match.rmse, np.sqrt(np.mean(np.sum(residuals**2, axis=1))), rtol=1e-3)
 
 
 def test_one_far_outlier_is_dropped_in_rounds() -> None:
@@ -106,7 +106,7 @@ def test_offsets_of_both_directions_move_points_onto_each_other() -> None:
     with_offsets = match_clouds(source, target, similarity, true_offsets)
     without = match_clouds(source, target, similarity)
     np.testing.assert_allclose(with_offsets.T_target_source, T, atol=5e-4)
-    assert with_offsets.rmse_m < 1e-3 < 0.1 < without.rmse_m
+    assert with_offsets.rmse < 1e-3 < 0.1 < without.rmse
 
 
 def test_pairs_with_long_offsets_are_dropped() -> None:
@@ -140,7 +140,7 @@ def test_padded_equals_unpadded() -> None:
     plain = jax.device_get(match_clouds(source, target, similarity))
     np.testing.assert_allclose(padded.T_target_source, plain.T_target_source, atol=1e-4)
     np.testing.assert_allclose(padded.confidence, plain.confidence, **ROUNDING)
-    np.testing.assert_allclose(padded.rmse_m, plain.rmse_m, atol=1e-4)
+    np.testing.assert_allclose(padded.rmse, plain.rmse, atol=1e-4)
     assert padded.num_inliers == plain.num_inliers
 
 
@@ -150,7 +150,7 @@ def test_a_motion_that_rests_on_fewer_than_three_points_has_an_infinite_error(nu
     partners = np.argmax(similarity[:num], axis=1)
     masks = np.arange(80) < num, np.isin(np.arange(80), partners)
     match = match_clouds(source, target, similarity, masks=masks, config=MatchConfig(pair_ratio=1.0))
-    assert np.isinf(match.rmse_m) == (num < 3)
+    assert np.isinf(match.rmse) == (num < 3)
     assert match.num_inliers == 2 * num
 
 
@@ -159,12 +159,12 @@ def test_too_few_descriptors_are_told_by_the_result(num_source: int, num_target:
     source, target, similarity = clouds(7)
     masks = np.arange(80) < num_source, np.arange(80) < num_target
     match = jax.device_get(match_clouds(source, target, similarity, masks=masks))
-    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(match.replace(rmse_m=0.0)))
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(match.replace(rmse=0.0)))
     assert match.num_inliers <= 2 * min(num_source, num_target)
     if num_source == 0:
         np.testing.assert_array_equal(match.T_target_source, np.eye(4))
         assert match.confidence == 0
-        assert np.isinf(match.rmse_m)
+        assert np.isinf(match.rmse)
 
 
 def test_gradient_is_finite() -> None:
@@ -177,7 +177,7 @@ def test_gradient_is_finite() -> None:
             return jnp.tile(offset, (len(i), 1)), jnp.tile(offset, (len(j), 1))
 
         match = match_clouds(source, target, similarity, offsets, (mask, None))
-        return jnp.sum(match.T_target_source**2) + jnp.where(jnp.isfinite(match.rmse_m), match.rmse_m, 0)
+        return jnp.sum(match.T_target_source**2) + jnp.where(jnp.isfinite(match.rmse), match.rmse, 0)
 
     for num_valid in (0, 1, 80):
         assert np.isfinite(gradient(jnp.full(3, 0.1), np.arange(80) < num_valid)).all()

@@ -75,7 +75,7 @@ def test_registration_is_the_published_one(case, decoder) -> None:
     )
     np.testing.assert_allclose(match.T_target_source[:3, :3], case["registration_rotation"], **PARITY)
     np.testing.assert_allclose(match.T_target_source[:3, 3], case["registration_translation"], **PARITY)
-    np.testing.assert_allclose(match.rmse_m, case["registration_rmse"][0], **PARITY)
+    np.testing.assert_allclose(match.rmse, case["registration_rmse"][0], **PARITY)
     published = case["registration_confidence"]
     assert int(match.num_inliers) == len(published)
     np.testing.assert_allclose(np.asarray(match.scores)[np.asarray(match.is_inlier)], published, **PARITY)

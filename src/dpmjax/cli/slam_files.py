@@ -74,8 +74,9 @@ def write_loops(path: Path, loops: Sequence[Loop], keyframes: Sequence[int] | np
 
 def loop_cells(loop: Loop) -> dict[str, str]:
     """Returns the cells of a loop candidate in a table: how it was found, its outcome and the numbers that decided."""
-    numbers = {name: _number(getattr(loop, name)) for name in ("overlap", "probability", "rmse_m")}
-    return {"found_by": loop.found_by, "status": loop.status, **numbers}
+    numbers = {"overlap": loop.overlap, "probability": loop.probability, "rmse_m": loop.rmse}
+    cells = {name: _number(number) for name, number in numbers.items()}
+    return {"found_by": loop.found_by, "status": loop.status, **cells}
 
 
 def write_scans(

@@ -105,7 +105,7 @@ def gather_evidence(hypotheses: Registration, row: int | None, verification: Ver
         of_clouds = np.array([0.0, 0.0, MAX_RMSE_M, -support.max()])
     else:
         second = np.delete(support, row).max(initial=0.0)
-        rmse_m = min(float(hypotheses.rmse_m[row]), MAX_RMSE_M)
+        rmse_m = min(float(hypotheses.rmse[row]), MAX_RMSE_M)
         of_clouds = np.array([support[row], float(hypotheses.mean_score[row]), rmse_m, support[row] - second])
     if verification is None:
         return Evidence(of_clouds, None)

@@ -235,7 +235,7 @@ def _align(
             T_target_source=T_target_source,
             confidence=mean_score,
             mean_score=mean_score,
-            rmse_m=jnp.where(is_determined, safe_sqrt(squared), jnp.inf),
+            rmse=jnp.where(is_determined, safe_sqrt(squared), jnp.inf),
             support=support,
             num_inliers=num_inliers,
             source_indices=rows[0],

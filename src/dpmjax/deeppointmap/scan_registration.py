@@ -127,11 +127,11 @@ def register(
             2 or 4 from the extent of both scans. Prepared scans know theirs. The result is in metres.
 
     Returns:
-        `T_target_source`, `confidence`, `rmse_m` and the pairs. The confidence is the probability that the motion is
+        `T_target_source`, `confidence`, `rmse` and the pairs. The confidence is the probability that the motion is
         right within 2 m and 5 degrees if the model is calibrated (`model.config.calibration`), else the mean score of
         the pairs, which is no probability. A motion that only the views from above suggested has no inliers, and
         without calibration the confidence 0. Failure is data: without any pair and without a view the motion is the
-        identity and the confidence 0; with fewer than three distinct pairs `rmse_m` is infinite.
+        identity and the confidence 0; with fewer than three distinct pairs `rmse` is infinite.
 
     Raises:
         ValueError: if the points are no real numbers (n, 3), if features have another width than the model, if
@@ -270,7 +270,7 @@ def _in_metres(hypotheses: Registration, scale: float) -> Registration:
         return hypotheses
     T = np.array(hypotheses.T_target_source)
     T[:, :3, 3] /= scale
-    return replace(hypotheses, T_target_source=jnp.asarray(T), rmse_m=hypotheses.rmse_m / np.float32(scale))
+    return replace(hypotheses, T_target_source=jnp.asarray(T), rmse=hypotheses.rmse / np.float32(scale))
 
 
 def _prepared(
@@ -316,7 +316,7 @@ def _without_inliers(match: Registration) -> Registration:
         match,
         confidence=zero,
         mean_score=zero,
-        rmse_m=zero + jnp.inf,
+        rmse=zero + jnp.inf,
         support=zero,
         num_inliers=jnp.zeros_like(match.num_inliers),
         is_inlier=jnp.zeros_like(match.is_inlier),

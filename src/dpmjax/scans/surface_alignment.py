@@ -74,12 +74,12 @@ class SurfaceAlignment(NamedTuple):
 
     Attributes:
         T_target_source: float64.
-        rmse_m: weighted root mean square distance of the pairs to their planes; infinite where there are too few.
+        rmse: weighted root mean square distance of the pairs to their planes, metres; infinite where there are too few.
         num_pairs: number of pairs in the last step.
     """
 
     T_target_source: Float[np.ndarray, "4 4"]
-    rmse_m: float
+    rmse: float
     num_pairs: int
 
 
@@ -171,7 +171,7 @@ def align_surfaces_from(
         What `align_surfaces` returns for each guess.
     """
     T = np.array(T_target_source, np.float64)
-    rmse_m, num_pairs = np.full(len(T), np.inf), np.zeros(len(T), int)
+    rmse, num_pairs = np.full(len(T), np.inf), np.zeros(len(T), int)
     has_pairs = np.ones(len(T), bool)
     for level in config.levels:
         is_active = has_pairs.copy()
@@ -181,16 +181,16 @@ def align_surfaces_from(
             num_pairs[rows] = pairs.is_paired.sum(axis=1)
             is_enough = num_pairs[rows] >= MIN_PAIRS
             lost = rows[~is_enough]
-            rmse_m[lost], has_pairs[lost], is_active[lost] = np.inf, False, False
+            rmse[lost], has_pairs[lost], is_active[lost] = np.inf, False, False
             if not is_enough.all():
                 rows, pairs = rows[is_enough], pairs.take(is_enough)
             if len(rows) == 0:
                 break
-            step, centre, rmse_m[rows] = _step_to_planes(pairs, level, config)
+            step, centre, rmse[rows] = _step_to_planes(pairs, level, config)
             T[rows] = _motions(step, centre) @ T[rows]
             length_m, angle_rad = np.linalg.norm(step[:, :3], axis=1), np.linalg.norm(step[:, 3:], axis=1)
             is_active[rows] = (length_m >= config.converged_m) | (angle_rad >= config.converged_rad)
-    return [SurfaceAlignment(*found) for found in zip(T, rmse_m.tolist(), num_pairs.tolist(), strict=True)]
+    return [SurfaceAlignment(*found) for found in zip(T, rmse.tolist(), num_pairs.tolist(), strict=True)]
 
 
 def nearest_planes(
@@ -255,7 +255,7 @@ def _step_to_planes(
     weights *= (width**2 / (width**2 + pairs.residuals**2)) ** 2
     total = weights.sum(axis=1)
     squares = np.sum(weights * pairs.residuals**2, axis=1)
-    rmse_m = np.sqrt(np.divide(squares, total, out=np.full(len(total), np.inf), where=total > 0))
+    rmse = np.sqrt(np.divide(squares, total, out=np.full(len(total), np.inf), where=total > 0))
     centre = np.einsum("sn,snd->sd", pairs.is_paired.astype(float), pairs.points) / pairs.is_paired.sum(axis=1)[:, None]
     jacobian = _jacobian(pairs.points - centre[:, None], pairs.normals)
     weighted = weights[:, None] * jacobian
@@ -264,7 +264,7 @@ def _step_to_planes(
     diagonal = np.einsum("sii->si", system)
     damping = 1e-6 * diagonal + 1e-9 * diagonal.sum(axis=1, keepdims=True) + np.finfo(float).tiny
     system = system + damping[..., None] * np.eye(6)
-    return -np.linalg.solve(system, weighted @ pairs.residuals[..., None])[..., 0], centre, rmse_m
+    return -np.linalg.solve(system, weighted @ pairs.residuals[..., None])[..., 0], centre, rmse
 
 
 def _jacobian(levers: Float[np.ndarray, "s n 3"], normals: Float[np.ndarray, "s n 3"]) -> Float[np.ndarray, "s 6 n"]:

@@ -118,7 +118,7 @@ def _register_candidates(
         loops[number] = loops[number]._replace(
             status=status_of(slam_map, loops[number], match, config),
             probability=match.probability,
-            rmse_m=match.rmse_m,
+            rmse=match.rmse,
             T_target_source=match.T_target_source,
             information=_edge_information(match, config),
         )

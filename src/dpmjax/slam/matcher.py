@@ -37,7 +37,7 @@ class Match(NamedTuple):
     Attributes:
         T_target_source: float64.
         probability: that it is right within 2 m and 5 degrees, if the matcher is calibrated; else a score in [0, 1].
-        rmse_m: of the pairs that it rests on.
+        rmse: of the pairs that it rests on, metres.
         verification: how well the scans agree under it; None where the matcher has no scans.
         information: (6, 6) inverse covariance by the planes of the scans, in the tangent of the source, translation
             first; None where it is not known.
@@ -45,7 +45,7 @@ class Match(NamedTuple):
 
     T_target_source: Pose
     probability: float
-    rmse_m: float
+    rmse: float
     verification: Verification | None = None
     information: Float[np.ndarray, "6 6"] | None = None
 
@@ -250,7 +250,7 @@ class NetworkMatcher:
     def _match(self, source: PreparedScan, target: PreparedScan, found: Registration) -> Match:
         T = np.asarray(found.T_target_source, np.float64)
         information = self._information(source.measured, target.measured, T)
-        return Match(T, float(found.confidence), float(found.rmse_m), found.verification, information)
+        return Match(T, float(found.confidence), float(found.rmse), found.verification, information)
 
     def _information(self, source: MeasuredScan, target: MeasuredScan, T: Pose) -> Float[np.ndarray, "6 6"]:
         config = self._model.config.verification

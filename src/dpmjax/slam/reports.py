@@ -72,7 +72,7 @@ class Loop(NamedTuple):
         status: what became of it.
         overlap: probability of overlap; 1 where no network is asked, None where another candidate surely overlaps.
         probability: P(correct) of the registration; None without one.
-        rmse_m: of the registration; None without one.
+        rmse: of the registration, metres; None without one.
         T_target_source: the registration; None without one.
         information: (6, 6) inverse covariance by the planes of the scans, as in `MapEdge`; None where it is not known.
     """
@@ -83,6 +83,6 @@ class Loop(NamedTuple):
     status: LoopStatus
     overlap: float | None
     probability: float | None = None
-    rmse_m: float | None = None
+    rmse: float | None = None
     T_target_source: Pose | None = None
     information: Float[np.ndarray, "6 6"] | None = None
