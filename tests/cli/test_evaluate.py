@@ -54,10 +54,10 @@ def test_a_folder_of_scans_with_poses_is_evaluated(weights, tmp_path, capsys) ->
 
 
 def test_a_table_of_no_right_registration_has_no_median() -> None:
-    row = {"sequence": "a", "band": "near", "num_pairs": 1, "pair_s": 0.5}
+    row = {"sequence": "a", "band": "near", "num_pairs": 1, "pair_s": 0.5, "is_right": [False]}
     for stage in ("descriptors", "verified", "refined"):
         row |= {f"recall_{stage}": 0.0, f"median_error_{stage}_m": np.nan}
-    assert table([row]).splitlines()[-1] == "| a | 2-10 m | 1 | 0.00 | 0.00 | 0.00 | - | - | 0.50 | - |"
+    assert table([row]).splitlines()[-1] == "| a | 2-10 m | 1 | 0.00 | 0.00 | 0.00 (0.00 to 0.79) | - | - | 0.50 | - |"
 
 
 @pytest.mark.parametrize(

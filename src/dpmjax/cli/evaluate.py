@@ -21,6 +21,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
+import numpy as np
 from tqdm import tqdm
 from tyro.conf import Positional, arg
 
@@ -35,7 +36,7 @@ NAME = "evaluate"
 # Overlap is cheap: more pairs, of each kind.
 OVERLAP_FACTOR = 2
 HEADER = (
-    "drive | distance | pairs | recall, network alone | recall, verified | recall, refined "
+    "drive | distance | pairs | recall, network alone | recall, verified | recall, refined (95 % interval) "
     "| median error, network alone | median error, refined | s / pair | overlap AUC"
 )
 
@@ -121,6 +122,7 @@ def write_results(
 def table(rows: Sequence[dict[str, Any]]) -> str:
     """Returns the table as Markdown: a row for each drive and distance."""
     from dpmjax.cli.evaluation_rows import BAND_NAMES
+    from dpmjax.metrics import wilson_interval
 
     by_case = {(row["sequence"], row["band"]): row for row in rows}
     lines = [f"| {HEADER} |", "|" + "---|" * (HEADER.count("|") + 1)]
@@ -128,11 +130,13 @@ def table(rows: Sequence[dict[str, Any]]) -> str:
         if band not in BAND_NAMES or not row["num_pairs"]:
             continue
         auc = by_case.get((sequence, "overlap"), {}).get("auc")
+        refined = wilson_interval(int(np.sum(row["is_right"])), row["num_pairs"])
         cells = [
             sequence,
             BAND_NAMES[band],
             str(row["num_pairs"]),
-            *(f"{row[f'recall_{stage}']:.2f}" for stage in ("descriptors", "verified", "refined")),
+            *(f"{row[f'recall_{stage}']:.2f}" for stage in ("descriptors", "verified")),
+            f"{refined.share:.2f} ({refined.low:.2f} to {refined.high:.2f})",
             *(_length(row[f"median_error_{stage}_m"]) for stage in ("descriptors", "refined")),
             f"{row['pair_s']:.2f}",
             "-" if auc is None or band != "near" else f"{auc:.3f}",
@@ -143,7 +147,7 @@ def table(rows: Sequence[dict[str, Any]]) -> str:
 
 def _length(metres: float | None) -> str:
     # Without a right registration the median is NaN, which JSON has no word for.
-    return "-" if metres is None or metres != metres else f"{metres:.3f} m"
+    return "-" if metres is None or np.isnan(metres) else f"{metres:.3f} m"
 
 
 def run(args: Sequence[str] | None = None) -> int:
