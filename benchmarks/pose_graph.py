@@ -6,7 +6,6 @@ its own. GTSAM gets a tight prior on the first node, which adds nothing to the c
 
 from __future__ import annotations
 
-import importlib.util
 import os
 import sys
 from pathlib import Path
@@ -14,6 +13,7 @@ from typing import Any
 
 import dpmjax
 from benchmarks.rows import Row, Timing, measure
+from dpmjax.cli import why_not_importable
 
 NAME = "pose_graph"
 DATA = Path(os.environ.get("DPMJAX_DATA", "../shared/data")) / "g2o"
@@ -24,18 +24,19 @@ def run(quick: bool) -> list[Row]:
     """Optimises each graph with both programs."""
     repeats = 2 if quick else 5
     rows: list[Row] = []
-    if importlib.util.find_spec("gtsam") is None:
-        print("gtsam is not installed (pip install dpmjax[gtsam]): no peer", file=sys.stderr)
+    no_peer = why_not_importable("gtsam")
+    if no_peer is not None:
+        print(f"no peer: {no_peer}", file=sys.stderr)
     for name in GRAPHS[:2] if quick else GRAPHS:
         path = DATA / f"{name}.g2o"
         if not path.exists():
             print(f"{path} is not there: skipped; set DPMJAX_DATA", file=sys.stderr)
             continue
-        rows += compare(path, repeats)
+        rows += compare(path, repeats, has_peer=no_peer is None)
     return rows
 
 
-def compare(path: Path, repeats: int) -> list[Row]:
+def compare(path: Path, repeats: int, *, has_peer: bool) -> list[Row]:
     """The rows of one graph."""
     graph = dpmjax.read_g2o(path)
     case = f"{path.stem} {len(graph.poses)} poses, {len(graph.edges.source)} edges"
@@ -44,7 +45,7 @@ def compare(path: Path, repeats: int) -> list[Row]:
     rows = ours.rows(f"{case}: dpmjax")
     rows += [Row(f"{case}: dpmjax", metric, getattr(solved, metric), "") for metric in ("chi2_initial", "chi2")]
     rows.append(Row(f"{case}: dpmjax", "iterations", solved.iterations, ""))
-    if importlib.util.find_spec("gtsam") is None:
+    if not has_peer:
         return rows
     theirs, chi2 = gtsam_timing(path, graph.tangent_size == 6, repeats)
     rows += [row for row in theirs.rows(f"{case}: GTSAM") if row.metric != "compile"]

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import importlib.util
 from dataclasses import replace
 
 import jax
 
 from benchmarks.rows import Row, measure
+from dpmjax.cli import why_not_importable
 from dpmjax.deepmapping import ToyConfig, fit, toy_problem
 from experiments.toy_1d import FORMS, share_at_minimum, torch_seconds
 
@@ -29,7 +29,7 @@ def run(quick: bool) -> list[Row]:
             rows += measure(ends, repeats=3).rows(f"{case}: dpmjax")
             if num_seeds > 1:
                 rows.append(Row(f"{case}: dpmjax", "share at global minimum", share_at_minimum(ends()), ""))
-    if importlib.util.find_spec("torch") is not None:
+    if why_not_importable("torch") is None:
         seconds = min(torch_seconds(toy, seed) for seed in range(3))
         rows.append(Row(f"network form, 1 seeds x {toy.num_steps} steps: PyTorch", "min", 1e3 * seconds, "ms"))
     return rows

@@ -228,7 +228,7 @@ METHODS: dict[str, Method] = {
     "search-refined": Method("global registration, refined", lambda task: refined(task, search(task))),
     "direct-adam": Method("direct optimisation from zero, Adam", partial(_direct, has_windows=False)),
     "direct-windows": Method("direct optimisation from zero in windows, Adam", partial(_direct, has_windows=True)),
-    "direct-lbfgs": Method("direct optimisation from zero, L-BFGS", _direct_lbfgs),
+    "direct-lbfgs": Method("direct optimisation from zero, L-BFGS", _direct_lbfgs, "jaxopt"),
     "global-deepmapping": Method("global registration, then DeepMapping", _global_deepmapping),
     "all": Method("ICP, global registration, DeepMapping from it, and each refined", _all_candidates),
     "refined-deepmapping": Method("ICP or global registration, then DeepMapping, refined", _refined_deepmapping),

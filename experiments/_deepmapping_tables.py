@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -22,6 +21,7 @@ from dpmjax.cli import (
     open_run_folder,
     planar_errors,
     recording,
+    why_not_importable,
 )
 from experiments._deepmapping_methods import METHODS, SUCCESS_PX, Task, assess, choose
 
@@ -39,7 +39,7 @@ class TableOptions(RunOptions):
     """Options of a comparison of methods."""
 
     methods: tuple[str, ...] = tuple(METHODS)
-    """Columns."""
+    """Columns; of all of them, those whose package cannot be imported are left out and named."""
     steps: int | None = None
     """Steps of the fit; without it, the preset decides."""
 
@@ -47,6 +47,13 @@ class TableOptions(RunOptions):
         """Checks names and ranges."""
         check_names("--methods", self.methods, METHODS)
         check_least(self, steps=2)
+
+
+def unusable_methods(names: Sequence[str]) -> dict[str, str]:
+    """Returns the methods whose package cannot be imported, and why."""
+    packages = {name: package for name in names if (package := METHODS[name].package) is not None}
+    reasons = {name: why_not_importable(package) for name, package in packages.items()}
+    return {name: reason for name, reason in reasons.items() if reason is not None}
 
 
 def run_method(name: str, task: Task) -> dict[str, Any]:
@@ -104,13 +111,16 @@ def run_table(
 
     Returns:
         All rows.
+
+    Raises:
+        ValueError: the package of a chosen method cannot be imported.
     """
+    unusable = unusable_methods(config.methods)
+    if unusable and set(config.methods) != set(METHODS):
+        name, reason = next(iter(unusable.items()))
+        raise ValueError(f"--methods {name}: {reason}")
+    not_run = NOT_RUN | unusable
     folder = open_run_folder(config, experiment)
-    not_run = NOT_RUN | {
-        name: f"needs {package}: pip install dpmjax[baselines]"
-        for name in config.methods
-        if (package := METHODS[name].package) is not None and importlib.util.find_spec(package) is None
-    }
 
     def work(method: str, prepared: Callable[[], tuple[Task, dict[str, Any]]]) -> dict[str, Any]:
         task, extra = prepared()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import time
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
@@ -11,7 +10,7 @@ import numpy as np
 from tqdm import tqdm
 
 from dpmjax import registration_recall
-from dpmjax.cli import BAND_NAMES, error_columns
+from dpmjax.cli import error_columns
 from dpmjax.deeppointmap import (
     ScanPair,
     VerificationConfig,
@@ -22,17 +21,11 @@ from dpmjax.deeppointmap import (
     refine_motion,
 )
 from dpmjax.io import LidarSequence
+from experiments._dpm_pooled import KISS, NETWORK, SEARCH, VERIFIED
 
 # KISS-Matcher's voxels, metres; indoors is where half of the points are nearer than INDOORS_M.
 VOXEL_M, INDOOR_VOXEL_M, INDOORS_M = 0.3, 0.2, 5.0
 Matcher = Callable[[np.ndarray, np.ndarray], np.ndarray]
-
-
-def why_no_kiss() -> str | None:
-    """Returns why KISS-Matcher cannot run; None where it can."""
-    if importlib.util.find_spec("kiss_matcher") is None:
-        return "it is not installed (pip install dpmjax[kiss])"
-    return None
 
 
 def kiss_matcher(source: np.ndarray, target: np.ndarray) -> np.ndarray:
@@ -75,11 +68,10 @@ def evaluate_matcher(
 
 
 def table(rows: Sequence[dict[str, Any]]) -> str:
-    """Returns the table as Markdown: a row for each sequence and distance."""
+    """Returns the rows as a Markdown table: one line a sequence and distance."""
     lines = [
-        "| sequence | distance | pairs | recall, descriptors | recall, verified | recall, refined "
-        "| search without network | KISS-Matcher "
-        "| median error, descriptors | median error, refined | s / pair | KISS, s | overlap AUC |",
+        f"| sequence | distance | pairs | recall: {NETWORK} | {VERIFIED} | the same, refined | {SEARCH}, refined "
+        f"| {KISS} | median error: network alone | refined | s / pair | {KISS}, s | overlap AUC |",
         "|---|---|---|---|---|---|---|---|---|---|---|---|---|",
     ]
     by_case = {(row["method"], row["sequence"], row["band"]): row for row in rows}

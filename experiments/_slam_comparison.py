@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from dpmjax import io, load_model, viz
-from dpmjax.cli import DriveSelection, RunFolder, do_row, open_drive
+from dpmjax.cli import DriveSelection, RunFolder, do_row, open_drive, why_not_importable
 from dpmjax.io import LidarSequence
 from dpmjax.metrics import align_rigid, path_lengths
 from dpmjax.simulation import HDL64E, OS1_64, DriveConfig, LidarSensor, Scene, TownConfig, simulate_scene
@@ -20,7 +20,7 @@ from dpmjax.slam import SlamMethods, make_methods
 from experiments import _slam_evaluation as evaluation
 from experiments._slam_evaluation import ODOMETRY, OURS, PRECISIONS, Drive, StoppedError
 from experiments._slam_localization import evaluate_localization
-from experiments._slam_peers import PEERS, why_missing, why_not_importable
+from experiments._slam_peers import PEERS, why_missing
 from experiments._slam_refine import MULTIWAY, REFINED, evaluate_refinement
 
 TOWN = "town"
@@ -136,7 +136,7 @@ def missing_peers(comparison: Comparison) -> dict[str, str]:
     """Returns the peers that cannot run, and why."""
     reasons = {name: why_missing(name) for name in PEERS}
     if comparison.is_refined:
-        reasons[MULTIWAY] = why_not_importable("open3d", "baselines")
+        reasons[MULTIWAY] = why_not_importable("open3d")
     return {name: reason for name, reason in reasons.items() if reason is not None}
 
 

@@ -25,7 +25,8 @@ from dpmjax.saved_maps import Precision
 from dpmjax.slam import KeyframeMap, SlamMethods, SlamResult
 from experiments._slam_peers import PEERS, POINT_BYTES, FoundLoop, KissIcp, Peer, is_indoors, peer_version
 
-OURS, ODOMETRY = "DeepPointMap", "DeepPointMap odometry"
+# Odometry is point-to-plane alignment; the networks propose loops, and poses where it fails.
+OURS, ODOMETRY = "ours, odometry and loops", "ours, point-to-plane odometry"
 PRECISIONS: tuple[Precision, ...] = ("float32", "float16", "int8")
 # Sizes of maps are taken so many times on the way.
 NUM_SIZES = 8
@@ -87,7 +88,7 @@ def open_folder(folder: RunFolder, sequence: LidarSequence, is_stopped: Callable
 
 def file_name(method: str) -> str:
     """Returns the name of the files of a method."""
-    return method.lower().replace(" ", "_").replace("-", "_")
+    return method.lower().replace(",", "").replace(" ", "_").replace("-", "_")
 
 
 def evaluate_ours(drive: Drive, methods: SlamMethods) -> dict[str, Any]:

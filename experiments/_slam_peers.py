@@ -8,13 +8,14 @@ half as large indoors. None of them corrects scans for the motion of the lidar, 
 from __future__ import annotations
 
 import contextlib
-import importlib
 import importlib.metadata
 import os
 from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
+
+from dpmjax.cli import why_not_importable
 
 MAX_RANGE_M, INDOOR_MAX_RANGE_M = 60.0, 30.0
 # Where half of the points are nearer, the place is indoors.
@@ -146,18 +147,7 @@ PEERS: dict[str, tuple[str, Callable[..., Any]]] = {
 
 def why_missing(name: str) -> str | None:
     """Returns why a peer cannot run; None where it can."""
-    return why_not_importable(PEERS[name][0], "peers")
-
-
-def why_not_importable(module: str, extra: str) -> str | None:
-    """Returns why a package of an extra cannot be used; None where it can."""
-    try:
-        importlib.import_module(module)
-    except ModuleNotFoundError as error:
-        return f"{error.name} is not installed (pip install dpmjax[{extra}])"
-    except ImportError as error:  # a system library is missing
-        return f"it cannot be imported ({str(error).splitlines()[0]})"
-    return None
+    return why_not_importable(PEERS[name][0])
 
 
 def peer_version(name: str) -> str:

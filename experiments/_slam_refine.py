@@ -12,7 +12,7 @@ from dpmjax.cli import map_drive, progress_bar
 from dpmjax.slam import SlamMethods, place_scans, refine_keyframes
 from experiments._slam_evaluation import Drive, StoppedError, common_numbers
 
-REFINED, MULTIWAY = "DeepPointMap refined", "multiway registration"
+REFINED, MULTIWAY = "ours, refined by DeepMapping", "ours, refined by multiway registration"
 
 
 def evaluate_refinement(drive: Drive, methods: SlamMethods, method: str, seed: int) -> dict[str, Any]:

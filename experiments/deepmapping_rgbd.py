@@ -24,7 +24,6 @@ from __future__ import annotations
 import time
 from dataclasses import dataclass, replace
 from functools import partial
-from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
@@ -41,6 +40,7 @@ from dpmjax.cli import (
     open_run_folder,
     peak_rss_gb,
     recording,
+    require_importable,
     run_command,
     write_metrics,
 )
@@ -102,12 +102,12 @@ class Config(RunOptions):
         unknown = [name for name in self.methods if name not in METHODS]
         if unknown or not self.methods:
             raise ValueError(f"--methods: expected some of {', '.join(METHODS)}, got {', '.join(unknown) or 'none'}")
-        if "multiway" in self.methods and find_spec("open3d") is None:
-            raise ValueError("--methods: multiway needs Open3D (pip install dpmjax[baselines])")
 
 
 def main(config: Config) -> dict[str, Any]:
     """Runs what is missing, then writes the table and the pictures."""
+    if "multiway" in config.methods:
+        require_importable("open3d", "--methods multiway")
     settings = fit_settings(config, read_trajectory(config, 0))
     cases = [{"trajectory": index} for index in range(num_trajectories(config))]
     folder = open_run_folder(config, EXPERIMENT)

@@ -10,7 +10,7 @@ A path is any folder of scans with poses (KITTI, KITTI-360, MulRan, plain ...). 
 to 20 m apart and turned by any yaw, are registered; a registration within 2 m and 5 degrees is right. Results go to
 results/dpm_evaluate/<time>/: table.md, metrics.json, reliability.png, failures.png (the worst pairs from above). Two
 more methods see the same pairs: the search and the verification of `register` without the network, and KISS-Matcher
-(extra `kiss`).
+(extra `kiss`). Rows of all recorded drives together have confidence intervals and say which methods differ.
 
 With --slam, the whole system and its odometry run beside KISS-ICP, KISS-SLAM and odometry by small_gicp (extra
 `peers`); then random scans are looked for in the map of each drive's first half. Poses are needed for the errors only.
@@ -43,6 +43,7 @@ from dpmjax.cli import (
     open_run_folder,
     recording,
     run_command,
+    why_not_importable,
     write_metrics,
 )
 
@@ -144,13 +145,13 @@ def evaluate_pairs(config: Config) -> list[dict[str, Any]]:
     """Registers the pairs that are missing, and writes table, numbers and pictures."""
     from dpmjax import load_model
     from dpmjax.cli import draw_evaluation, evaluation_towns, open_evaluation_drives, overlap_row, registration_row
-    from experiments._dpm_evaluation import evaluate_matcher, kiss_matcher, search_alone, why_no_kiss
+    from experiments._dpm_evaluation import evaluate_matcher, kiss_matcher, search_alone
 
     model = load_model(config.weights)
     search = partial(search_alone, config=model.config.verification)
     drives = open_evaluation_drives(config.paths, evaluation_towns(config.num_towns, config.town_length_m[0]))
     num_overlap = OVERLAP_FACTOR * config.pairs
-    no_kiss = why_no_kiss() if not config.no_kiss else "left out by --no-kiss"
+    no_kiss = why_not_importable("kiss_matcher") if not config.no_kiss else "left out by --no-kiss"
     folder = open_run_folder(config, EXPERIMENT)
     rows: list[dict[str, Any]] = []
     with recording(folder), StopFlag() as stop, tqdm(unit=" pairs", dynamic_ncols=True) as bar:
@@ -174,7 +175,7 @@ def evaluate_pairs(config: Config) -> list[dict[str, Any]]:
                     add("KISS-Matcher", drive, band, partial(evaluate_matcher, kiss_matcher, *pairs, config.seed, bar))
             work = partial(overlap_row, model, drive, num_overlap, seed=config.seed, on_scan=bar.refresh)
             add("overlap", drive, "all", work)
-        text = write_results(folder, config, rows, no_kiss)
+        text = write_results(folder, config, drives, rows, no_kiss)
         title = f"{Path(config.weights).stem}, all pairs"
         draw_evaluation(folder, drives, rows, title=title, seed=config.seed)
     print(text)
@@ -182,14 +183,23 @@ def evaluate_pairs(config: Config) -> list[dict[str, Any]]:
     return rows
 
 
-def write_results(folder: RunFolder, config: Config, rows: Sequence[dict[str, Any]], no_kiss: str | None) -> str:
-    """Writes table.md and metrics.json; returns the table."""
+def write_results(
+    folder: RunFolder,
+    config: Config,
+    drives: Sequence[LidarSequence],
+    rows: Sequence[dict[str, Any]],
+    no_kiss: str | None,
+) -> str:
+    """Writes table.md and metrics.json; returns the tables."""
     from dpmjax.cli import calibration_numbers
     from experiments._dpm_evaluation import table
+    from experiments._dpm_pooled import pooled_rows, pooled_table
 
+    recorded = [drive.name for drive in drives if Path(drive.sources[0]).exists()]
+    pooled = pooled_rows(rows, recorded or [drive.name for drive in drives])
     numbers = {"weights": config.weights, "kiss_matcher": no_kiss or "run", **calibration_numbers(rows)}
-    note = write_metrics(folder, numbers, seed=config.seed, rows=rows)
-    text = table(rows)
+    note = write_metrics(folder, {**numbers, "pooled": pooled}, seed=config.seed, rows=rows)
+    text = "\n\n".join(filter(None, [table(rows), pooled_table(pooled)]))
     if no_kiss is not None:
         text += f"\n\nKISS-Matcher was not run: {no_kiss}."
     (folder / "table.md").write_text(text + (f"\n\n{note}.\n" if note else "\n"), encoding="utf-8")

@@ -11,7 +11,6 @@ installed.
 
 from __future__ import annotations
 
-import importlib.util
 import itertools
 import time
 from dataclasses import dataclass, replace
@@ -22,7 +21,17 @@ import numpy as np
 from numpy.typing import NDArray
 from tyro.conf import FlagCreatePairsOff, arg
 
-from dpmjax.cli import RunFolder, open_run_folder, peak_rss_gb, recording, run_command, select_device, write_metrics
+from dpmjax.cli import (
+    RunFolder,
+    open_run_folder,
+    peak_rss_gb,
+    recording,
+    require_importable,
+    run_command,
+    select_device,
+    why_not_importable,
+    write_metrics,
+)
 
 if TYPE_CHECKING:
     from dpmjax.deepmapping import Fit, ToyConfig
@@ -71,6 +80,7 @@ def main(config: Config) -> dict[str, Any]:
     from dpmjax.deepmapping import ToyConfig, global_minimum
     from dpmjax.nets import Initialization
 
+    require_importable("jaxopt", "the solvers of the direct form")
     select_device(config.device)  # type: ignore[arg-type]
     folder = open_run_folder(config, EXPERIMENT)
     with recording(folder):
@@ -182,8 +192,8 @@ def measure_seconds(toy: ToyConfig, config: Config) -> dict[str, Any]:
     for name, seeds in (("all_seeds", config.seeds), ("one_seed", 1)):
         run = descend(toy, replace(config, seeds=seeds))
         seconds |= {f"{name}_compile_s": run.compile_s, f"{name}_run_s": run.run_s}
-    if importlib.util.find_spec("torch") is None:
-        print("PyTorch is not installed: its loop is not timed (pip install torch)")
+    if (reason := why_not_importable("torch")) is not None:
+        print(f"the loop in PyTorch is not timed: {reason}")
     else:
         seconds["torch_one_seed_run_s"] = torch_seconds(toy, config.seed)
     return seconds

@@ -26,7 +26,7 @@ ALLOWED: dict[str, set[str]] = {
     "registration": {"geometry", "losses", "pose_graph"},
     "deepmapping": {"geometry", "nets", "losses", "scans"},
     "deeppointmap": {"geometry", "nets", "losses", "scans", "metrics"},
-    "slam": {"deeppointmap", "registration", "pose_graph", "geometry", "scans", "deepmapping"},
+    "slam": {"deeppointmap", "pose_graph", "geometry", "scans", "deepmapping"},
     "saved_maps": {"slam", "deeppointmap", "scans", "geometry", "weights", "io"},
     "metrics": {"geometry"},
     "io": {"geometry", "pose_graph"},

@@ -26,13 +26,13 @@ CLOSE: Arrays = {"rtol": 1e-3, "atol": 2e-4}
 
 @dataclass(frozen=True)
 class Kernel:
-    """A kernel and what the laws need of it.
+    """A kernel and the arguments of its tests.
 
     Attributes:
         call: of arrays by name.
         make: example arrays of a random generator.
         by: the arrays that it has a derivative by; empty for choices of indices.
-        padding: what the rows hold that are not there, by array; empty where nothing is masked.
+        padding: numbers in the rows that are not there, by array; empty where nothing is masked.
         is_exact: False where the derivative is not compared with differences (a network, or a long fit).
     """
 

@@ -22,6 +22,7 @@ from dpmjax.cli.result_files import load_json
 from dpmjax.geometry import rigid
 from dpmjax.io import LidarSequence, read_poses, write_tum
 from dpmjax.slam import SlamConfig, SlamMethods
+from tests.optional import import_or_skip
 from tests.slam.truth import TruthGeometry, TruthMatcher, laps
 
 REPOSITORY = Path(__file__).parents[2]
@@ -148,7 +149,7 @@ def test_results_say_what_was_done(whole, drive) -> None:
 
 
 def test_evo_reads_the_trajectories(whole) -> None:
-    file_interface = pytest.importorskip("evo.tools.file_interface")
+    file_interface = import_or_skip("evo.tools.file_interface")
     expected = np.load(whole / "trajectory.npy")
     for read, name in (("read_tum_trajectory_file", "trajectory_tum"), ("read_kitti_poses_file", "trajectory_kitti")):
         found = getattr(file_interface, read)(str(whole / f"{name}.txt"))
@@ -158,7 +159,7 @@ def test_evo_reads_the_trajectories(whole) -> None:
 
 
 def test_gtsam_reads_the_graph(whole) -> None:
-    gtsam = pytest.importorskip("gtsam", reason="gtsam is not installed (pip install dpmjax[gtsam])")
+    gtsam = import_or_skip("gtsam")
     factors, values = gtsam.readG2o(str(whole / "graph.g2o"), True)
     metrics = load_json(whole / "metrics.json")
     assert values.size() == metrics["num_keyframes"]
@@ -166,7 +167,7 @@ def test_gtsam_reads_the_graph(whole) -> None:
 
 
 def test_plyfile_reads_the_map(whole) -> None:
-    plyfile = pytest.importorskip("plyfile", reason="plyfile is not installed (pip install plyfile)")
+    plyfile = import_or_skip("plyfile")
     vertices = plyfile.PlyData.read(str(whole / "map.ply"))["vertex"]
     assert vertices.count > 10
     assert {"x", "y", "z", "red", "green", "blue"} == {entry.name for entry in vertices.properties}

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 from pathlib import Path
 
 import jax
@@ -12,6 +11,7 @@ import pytest
 import dpmjax
 from dpmjax.cli.command import EXIT_BAD_INPUT, EXIT_OK
 from dpmjax.cli.drives import DriveSelection, open_drive, with_raised_beams
+from dpmjax.cli.optional import why_not_importable
 from dpmjax.cli.result_files import load_json
 from dpmjax.cli.slam_reader import ScanReader
 from dpmjax.io import write_tum
@@ -109,7 +109,7 @@ def test_the_viewer_records_where_there_is_no_screen(tmp_path, monkeypatch, caps
     drive = write_drive(tmp_path / "drive")
     monkeypatch.delenv("DISPLAY", raising=False)
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
-    if importlib.util.find_spec("rerun") is None:
+    if why_not_importable("rerun") is not None:
         assert run(drive, "-v", "-n", 30, "-o", tmp_path / "out") == EXIT_BAD_INPUT
         assert "dpmjax[viewer]" in capsys.readouterr().err
         return

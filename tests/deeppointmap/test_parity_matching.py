@@ -13,6 +13,7 @@ import pytest
 from dpmjax.deeppointmap.matching import MatchConfig, match_descriptors
 from dpmjax.deeppointmap.objective import ObjectiveConfig, TrainingSide, close_pairs, matching_loss
 from tests.deeppointmap import toy
+from tests.optional import import_or_skip
 
 FOLDER = Path(os.environ.get("DPMJAX_PARITY", Path(__file__).parents[3] / "shared" / "parity" / "small"))
 PARITY: dict[str, Any] = {"rtol": 1e-4, "atol": 1e-5}
@@ -30,7 +31,7 @@ def case() -> dict[str, np.ndarray]:
 
 @pytest.fixture(scope="module")
 def decoder() -> dict[str, np.ndarray]:
-    torch = pytest.importorskip("torch", reason="the published weights are a PyTorch file")
+    torch = import_or_skip("torch")
     weights = torch.load(FOLDER / "weights.pth", map_location="cpu", weights_only=True)["decoder"]
     return {name: value.double().numpy().reshape(value.shape[:2]) for name, value in weights.items()}
 

@@ -14,6 +14,7 @@ from dpmjax.simulation import simulate_depth_sequence, simulate_sequence
 from dpmjax.types import ScanSet
 from experiments.baselines.multiway import multiway, multiway_clouds, multiway_images
 from experiments.baselines.swarm import SwarmConfig, swarm_chain
+from tests.optional import import_or_skip
 
 QUICK = SwarmConfig(num_particles=24, num_iterations=30, num_rounds=1, num_beams=64)
 
@@ -34,13 +35,12 @@ def ate(poses: np.ndarray, walk: ScanSequence) -> float:
 
 @pytest.fixture
 def with_swarms() -> None:
-    pytest.importorskip("evosax", reason="evosax is not installed (pip install dpmjax[baselines])")
+    import_or_skip("evosax")
 
 
 @pytest.fixture
 def with_open3d() -> None:
-    reason = "Open3D is not installed (pip install dpmjax[baselines])"
-    pytest.importorskip("open3d", reason=reason, exc_type=ImportError)
+    import_or_skip("open3d")
 
 
 @pytest.mark.usefixtures("with_swarms")

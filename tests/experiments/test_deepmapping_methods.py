@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import json
 from collections import Counter
 from dataclasses import replace
@@ -28,6 +27,7 @@ from experiments._deepmapping_methods import (
     make_task,
 )
 from experiments._deepmapping_tables import best_kept, run_method
+from tests.optional import import_or_skip
 
 # ATE in px that each method stays below on the tiny walk; the start of all poses at zero has 14 px there. The direct
 # optimisation has two steps only: it must run and give poses.
@@ -63,8 +63,8 @@ def test_every_method_has_a_test() -> None:
 @pytest.mark.parametrize("name", METHODS)
 def test_method_registers_a_tiny_walk(name, task) -> None:
     package = METHODS[name].package
-    if package is not None and importlib.util.find_spec(package) is None:
-        pytest.skip(f"{package} is not installed")
+    if package is not None:
+        import_or_skip(package)
     row = run_method(name, task)
     assert row["ate_px"] < LARGEST_ATE_PX[name]
     assert row["ate_px"] == row["candidates"][row["kept"]]["ate_px"]

@@ -14,7 +14,7 @@ from dpmjax.cli.command import EXIT_BAD_INPUT, EXIT_OK, run_command
 from dpmjax.cli.result_files import load_json
 from dpmjax.deeppointmap import OVERLAP_FEATURES, SCAN_FEATURES, Evidence
 from dpmjax.deeppointmap.scan_evaluation import StagedRegistration, StageSeconds
-from experiments import _dpm_evaluation, _dpm_overlap, dpm_calibrate, dpm_evaluate
+from experiments import _dpm_overlap, dpm_calibrate, dpm_evaluate
 from tests.deeppointmap import toy
 
 
@@ -32,7 +32,7 @@ def run(module, arguments) -> int:
 
 def test_evaluation_measures_every_sequence_and_resumes(weights, tmp_path, monkeypatch, capsys) -> None:
     monkeypatch.setattr(drive_sources, "simulate_drive", lambda seed, **_: toy.drive(seed))
-    monkeypatch.setattr(_dpm_evaluation, "why_no_kiss", lambda: "it is not installed")
+    monkeypatch.setattr(dpm_evaluate, "why_not_importable", lambda _: "it is not installed")
     arguments = ["town", "--weights", weights, "--pairs", 2, "--num-towns", 1, "-o", tmp_path / "out"]
     assert run(dpm_evaluate, arguments) == EXIT_OK
     printed = capsys.readouterr().out

@@ -162,7 +162,6 @@ def test_gradient_is_finite(case: str) -> None:
 @pytest.mark.parametrize("num_samples", [1, 50, 299, 300])
 @pytest.mark.parametrize("seed", [0, 1, 2])
 def test_buckets_choose_what_the_kernel_chooses(num_samples: int, seed: int) -> None:
-    pytest.importorskip("fpsample")
     points = farthest_first(cloud(seed))
     chosen = pyramid_host._sample_by_buckets(points, num_samples)
     expected = farthest_points_on_host(points[:, ::-1] if num_samples == 1 else points, np.ones(300, bool), num_samples)

@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from dpmjax import Edges, PoseGraph, optimize_pose_graph, read_g2o, write_g2o
 from dpmjax.io import InputError
+from tests.optional import import_or_skip
 
 PLANAR = """# two nodes and a loop
 VERTEX_SE2 7 0 0 0
@@ -72,7 +73,7 @@ def test_graph_is_read_as_it_was_written(tmp_path: Path, text: str) -> None:
 
 @pytest.mark.parametrize("text", [PLANAR.replace("FIX 3\n", ""), spatial_text()[0]], ids=["plane", "space"])
 def test_gtsam_reads_the_same_cost(tmp_path: Path, text: str) -> None:
-    gtsam = pytest.importorskip("gtsam", reason="gtsam is not installed (pip install dpmjax[gtsam])")
+    gtsam = import_or_skip("gtsam")
     graph = read_g2o(written(tmp_path, text))
     path = write_g2o(tmp_path / "ours.g2o", graph)
     factors, values = gtsam.readG2o(str(path), graph.tangent_size == 6)

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from dpmjax.io import InputError, read_ply, write_ply
+from tests.optional import import_or_skip
 
 POINTS = np.array([[1, 2, 3], [-4, 5.5, 6], [0.25, 0, -1]], np.float32)
 HEADER = """ply
@@ -76,7 +77,7 @@ def test_colours_are_written_and_the_points_stay(tmp_path):
     colors = np.array([[1, 2, 3], [255, 0, 9], [7, 7, 7]], np.uint8)
     path = write_ply(tmp_path / "a.ply", POINTS, colors=colors)
     np.testing.assert_array_equal(read_ply(path), POINTS)
-    plyfile = pytest.importorskip("plyfile", reason="plyfile is not installed")
+    plyfile = import_or_skip("plyfile")
     vertices = plyfile.PlyData.read(str(path))["vertex"]
     np.testing.assert_array_equal(np.column_stack([vertices[name] for name in ("red", "green", "blue")]), colors)
     with pytest.raises(ValueError, match="colors must be"):

@@ -15,6 +15,7 @@ from dpmjax.io import (
     write_tum,
 )
 from dpmjax.io.poses import planar_to_homogeneous
+from tests.optional import import_or_skip
 
 POSES = np.column_stack([np.random.default_rng(0).uniform(-500, 500, (9, 2)), np.linspace(-3.1, 3.1, 9)])
 WRITTEN = 1e-6  # The files keep nine digits.
@@ -36,7 +37,7 @@ def test_planar_and_spatial_readers_agree(tmp_path, name):
 
 
 def test_evo_reads_what_we_write(tmp_path):
-    file_interface = pytest.importorskip("evo.tools.file_interface")
+    file_interface = import_or_skip("evo.tools.file_interface")
     times = np.linspace(1.25, 9, 9)
     tum = file_interface.read_tum_trajectory_file(str(write_tum(tmp_path / "t.txt", POSES, times=times)))
     kitti = file_interface.read_kitti_poses_file(str(write_kitti(tmp_path / "k.txt", POSES)))

@@ -11,7 +11,7 @@ from dpmjax.metrics import absolute_trajectory_error
 from dpmjax.pose_graph.graph import Edges
 from dpmjax.registration import LoopConfig, RefinementConfig, close_loops, planar_scans, refine
 from dpmjax.registration.loop_closure import LoopResult, count_support, find_candidates
-from dpmjax.registration.refinement import choose_pairs
+from dpmjax.registration.refinement import _rounded_up, choose_pairs
 from dpmjax.simulation import simulate_sequence
 from dpmjax.types import ScanSet
 
@@ -92,6 +92,12 @@ def test_pairs_are_neighbours_in_time_and_of_other_visits(walk_scans) -> None:
     assert (np.bincount(source[away], minlength=60) <= 2).all()
 
 
+def test_pairs_are_filled_up_to_few_sizes() -> None:
+    sizes = {num_pairs: _rounded_up(num_pairs) for num_pairs in range(1, 4097)}
+    assert all(size >= num_pairs for num_pairs, size in sizes.items())
+    assert set(sizes.values()) == {128, 256, 512, 1024, 2048, 3072, 4096}
+
+
 # A walk of five rounds would take minutes; a short way there and back sees every place twice.
 @pytest.fixture(scope="module")
 def revisit() -> ScanSequence:
@@ -127,13 +133,25 @@ def test_a_trajectory_without_revisits_is_left_alone(walk_scans) -> None:
     assert len(loops.source) == len(weight) == 0
 
 
+@pytest.fixture(scope="module")
+def wrong_poses(walk, walk_scans) -> np.ndarray:
+    """A walk that alignment does not put right: each scan is turned by 57 degrees against its neighbours.
+
+    From a start that alignment does put right, both candidates would end at the same map, and either may be kept.
+    """
+    wrong = walk.reference_poses + np.where(np.arange(len(walk)) % 2, 0.5, -0.5)[:, None] * [0.0, 0.0, 1.0]
+    assert ate(refine(walk_scans, wrong, WITHOUT_LOOPS).poses, walk.reference_poses) > 1.0
+    return wrong
+
+
 @pytest.mark.parametrize("are_loops_right", [False, True])
-def test_the_better_of_start_and_loops_is_kept(walk, walk_scans, monkeypatch, are_loops_right) -> None:
-    right, wrong = walk.reference_poses, walk.reference_poses * [1.2, 1.2, 1.0]
+def test_the_better_of_start_and_loops_is_kept(walk, walk_scans, wrong_poses, monkeypatch, are_loops_right) -> None:
+    right, wrong = walk.reference_poses, wrong_poses
     start, closed = (wrong, right) if are_loops_right else (right, wrong)
     nothing = np.zeros(0, np.int64)
     loops = LoopResult(closed, Edges(nothing, nothing, np.zeros((0, 3)), np.zeros((0, 3, 3))), np.ones(5))
     monkeypatch.setattr("dpmjax.registration.refinement._is_sound", lambda *_: False)
+    monkeypatch.setattr("dpmjax.registration.refinement.fitting_scans", lambda scans, _: np.ones(len(scans), bool))
     monkeypatch.setattr("dpmjax.registration.refinement.close_loops", lambda *_args, **_named: loops)
     found = refine(walk_scans, start)
     assert ate(found.poses, right) < 0.01

@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 import dataclasses
-import importlib.util
 import io
 import json
 import os
@@ -10,6 +9,7 @@ import subprocess
 import sys
 import zipfile
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -22,11 +22,13 @@ from dpmjax.weights.__main__ import main
 from dpmjax.weights.config_json import config_from_json
 from dpmjax.weights.torch_import import read_torch_file
 from tests.deeppointmap import toy
+from tests.optional import import_or_skip
 from tests.weights.published import published_tensors
 
-needs_torch = pytest.mark.skipif(
-    importlib.util.find_spec("torch") is None, reason="PyTorch is not installed (pip install dpmjax[torch])"
-)
+
+@pytest.fixture
+def torch() -> Any:
+    return import_or_skip("torch")
 
 
 @pytest.fixture(scope="module")
@@ -68,10 +70,7 @@ def test_wrong_configurations_are_named() -> None:
         config_from_json({"encoder": {"stem_channels": "x"}}, ModelConfig)
 
 
-@needs_torch
-def test_full_size_checkpoint_is_loaded_by_its_tensors(tmp_path: Path) -> None:
-    import torch
-
+def test_full_size_checkpoint_is_loaded_by_its_tensors(torch: Any, tmp_path: Path) -> None:
     config = ModelConfig()
     tensors = published_tensors(config)
     torch.save(
@@ -85,10 +84,7 @@ def test_full_size_checkpoint_is_loaded_by_its_tensors(tmp_path: Path) -> None:
     np.testing.assert_array_equal(model.params["decoder"]["layer_2"]["cross_attention"]["in_kernel"], kernel)
 
 
-@needs_torch
-def test_old_format_is_read_by_pytorch(model: Model, tmp_path: Path) -> None:
-    import torch
-
+def test_old_format_is_read_by_pytorch(torch: Any, model: Model, tmp_path: Path) -> None:
     content = {"a": torch.arange(6.0).reshape(2, 3).T, "b": {"c": torch.ones(2, dtype=torch.float16)}}
     torch.save(content, tmp_path / "old.pth", _use_new_zipfile_serialization=False)
     torch.save(content, tmp_path / "new.pth")
@@ -98,10 +94,7 @@ def test_old_format_is_read_by_pytorch(model: Model, tmp_path: Path) -> None:
         np.testing.assert_array_equal(found["b"]["c"], np.ones(2))
 
 
-@needs_torch
-def test_parameters_and_ordered_dictionaries_are_read(tmp_path: Path) -> None:
-    import torch
-
+def test_parameters_and_ordered_dictionaries_are_read(torch: Any, tmp_path: Path) -> None:
     torch.save(torch.nn.Linear(2, 3).state_dict(), tmp_path / "x.pth")
     assert {name: array.shape for name, array in read_torch_file(tmp_path / "x.pth").items()} == {
         "weight": (3, 2),

@@ -24,6 +24,8 @@ from .machine import versions as versions
 from .map2d_numbers import planar_errors as planar_errors
 from .map2d_run import Map2dRun as Map2dRun
 from .map2d_run import read_map2d_run as read_map2d_run
+from .optional import require_importable as require_importable
+from .optional import why_not_importable as why_not_importable
 from .program import main as main
 from .progress import progress_bar as progress_bar
 from .recorded_fit import FitRecorder as FitRecorder

@@ -178,7 +178,8 @@ def _parse(config_type: type[ConfigT], name: str, description: str | None, argum
         return config
     earlier = load_config(find_run(name, getattr(config, "output", None)), config_type)
     # Of a flag that is on, tyro takes --no-FLAG alone; who repeats the command says --FLAG again.
-    on = {f"--{field.name}".replace("_", "-") for field in fields(earlier) if getattr(earlier, field.name) is True}
+    names = [field.name for field in fields(config_type)]  # type: ignore[arg-type]
+    on = {f"--{name}".replace("_", "-") for name in names if getattr(earlier, name) is True}
     return parse(args=[argument for argument in arguments if argument.replace("_", "-") not in on], default=earlier)
 
 

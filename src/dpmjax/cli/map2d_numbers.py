@@ -28,8 +28,8 @@ def planar_errors(sequence: ScanSequence, poses: Floats) -> dict[str, float]:
         return {}
     distance = metrics.point_distance(sequence.points, sequence.mask, se2.to_matrix(poses), se2.to_matrix(reference))
     return {
-        f"ate_{sequence.unit}": metrics.absolute_trajectory_error(poses[:, :2], reference[:, :2]),
-        f"point_distance_{sequence.unit}": distance,
+        f"ate_{sequence.unit}": float(metrics.absolute_trajectory_error(poses[:, :2], reference[:, :2])),
+        f"point_distance_{sequence.unit}": float(distance),
     }
 
 
@@ -38,7 +38,7 @@ def ate_of(sequence: ScanSequence, unit: float) -> Callable[[Floats], float]:
     reference = sequence.reference_poses
     if reference is None:
         return lambda _: math.nan
-    return lambda poses: metrics.absolute_trajectory_error(unit * poses[:, :2], reference[:, :2])
+    return lambda poses: float(metrics.absolute_trajectory_error(unit * poses[:, :2], reference[:, :2]))
 
 
 def before_and_after(sequence: ScanSequence, start: Floats, poses: Floats) -> dict[str, Any]:
@@ -86,7 +86,7 @@ def corrected_numbers(times: Floats, poses: Floats, corrected: ScanSequence, suf
         Relations(at[:-1], at[1:], se2.relative(reference[:-1], reference[1:])), at, poses[mine]
     )
     return {
-        f"ate_corrected{suffix}_m": metrics.absolute_trajectory_error(poses[mine, :2], reference[:, :2]),
+        f"ate_corrected{suffix}_m": float(metrics.absolute_trajectory_error(poses[mine, :2], reference[:, :2])),
         f"relations_corrected{suffix}_m": float(steps.translation_m.mean()),
         f"relations_corrected{suffix}_deg": float(steps.rotation_deg.mean()),
         "num_corrected": len(mine),

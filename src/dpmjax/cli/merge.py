@@ -55,9 +55,8 @@ def main(config: Config) -> dict[str, Any]:
     from dpmjax.weights import load_model
 
     started = time.perf_counter()
-    if len({path.resolve() for path in config.maps}) < max(len(config.maps), 2):
-        given = " ".join(map(str, config.maps)) or "none"
-        raise ValueError(f"give two or more different maps, files of dpmjax.save_map; got {given}")
+    if len(config.maps) < 2:
+        raise ValueError(f"give two or more maps, files of dpmjax.save_map; got {len(config.maps)}")
     methods = make_methods(load_model(config.weights), weights=config.weights)
     maps = [open_map(path, methods) for path in config.maps]
     folder = open_run_folder(config, NAME)

@@ -13,7 +13,6 @@ in), map.ply, trajectory.png, map.png and metrics.json. Ctrl-C ends the run and 
 
 from __future__ import annotations
 
-import importlib.util
 import logging
 import time
 from collections.abc import Callable, Sequence
@@ -27,6 +26,7 @@ from tyro.conf import FlagCreatePairsOff, Positional, arg
 from dpmjax.cli.command import StopFlag, check_least, run_command
 from dpmjax.cli.drives import DriveSelection, open_drive
 from dpmjax.cli.machine import peak_rss_gb
+from dpmjax.cli.optional import require_importable
 from dpmjax.cli.run_folder import RunFolder, RunOptions, open_run_folder, recording, write_metrics
 
 if TYPE_CHECKING:
@@ -74,8 +74,6 @@ class Config(RunOptions):
             raise ValueError("--sequence chooses a drive of DATA: give its folder too")
         if self.kitti_angle_correction and self.data is None:
             raise ValueError("--kitti-angle-correction is for the scans of KITTI's car: give their folder, DATA")
-        if self.visualize and importlib.util.find_spec("rerun") is None:
-            raise ValueError("-v needs the live viewer: pip install 'dpmjax[viewer]', or leave it out")
 
     @property
     def selection(self) -> DriveSelection:
@@ -98,6 +96,8 @@ def main(config: Config) -> dict[str, Any]:
     from dpmjax.cli.slam_viewer import live_viewer
     from dpmjax.slam import finish_slam
 
+    if config.visualize:
+        require_importable("rerun", "-v")
     started = time.perf_counter()
     methods = slam_methods(config)
     start = starting_state(config, methods)

@@ -32,7 +32,7 @@ def checked_positions(estimated: AnyArray, reference: AnyArray, mask: AnyArray |
 
 
 def checked_poses(name: str, value: AnyArray, xp: ModuleType = np) -> Any:
-    """Returns float poses, of NumPy float64; a ValueError names what is no (n, 3, 3) or (n, 4, 4) or not finite."""
+    """Returns poses as floats; a ValueError names an argument that is not (n, 3, 3) or (n, 4, 4), or not finite."""
     array = as_floats(name, value, xp)
     if array.ndim != 3 or array.shape[0] < 1 or array.shape[1:] not in ((3, 3), (4, 4)):
         raise ValueError(f"{name}: expected poses of shape (n, 3, 3) or (n, 4, 4), n >= 1, got {array.shape}")

@@ -96,7 +96,7 @@ def absolute_trajectory_error(
 def relative_pose_error(
     estimated: Float[AnyArray, "n d1 d1"], reference: Float[AnyArray, "n d1 d1"], delta: int = 1
 ) -> RelativePoseError:
-    """How wrong the motion from each pose to the one `delta` later is (Sturm 2012).
+    """Errors of the motion from each pose to the one `delta` later (Sturm 2012).
 
     The error of a pair is inv(inv(Q_i) Q_j) inv(P_i) P_j with P estimated, Q the reference and j = i + delta. It does
     not depend on the frame of either trajectory.

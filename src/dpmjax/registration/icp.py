@@ -57,8 +57,8 @@ def icp(
     is three times the median distance of the pairs, so that what only one cloud has seen does not pull. The loop ends
     after 100 iterations or earlier.
 
-    The gradient is that of the solution, by the implicit function theorem (Blondel et al. 2022, section 2.1): the
-    weighted residuals balance at the solution, and still do after the points have moved. Pairs and normals are
+    The gradient is that of the solution, by the implicit function theorem (Blondel et al. 2022, section 2.1). The
+    weighted residuals balance at the solution, also after the points have moved a little. Pairs and normals are
     constants of the derivative. It is zero along directions that the data leave open, and with respect to `T_init`.
 
     Args:

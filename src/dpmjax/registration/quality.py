@@ -35,15 +35,27 @@ _CELL = 0.015
 _LEAST_TOLERANCE = 0.001
 # Bearings of the profiles that it is measured by: exact to less than that tolerance.
 _NUM_BEARINGS = 4096
-# Calibrated on right and wrong maps of simulated worlds and of thinned logs (docs/notebook/deepmapping_notes.md).
-# Each scan is compared with so many nearest ones, by position and by position and heading (a radian as so many typical
-# ranges). Scans whose best score is lower than the second number belong to no map; at most a share of them may.
-_NUM_NEAREST, _HEADING_WEIGHT, _LEAST_SCORE, _LEAST_REGISTERED = 12, 0.5, 0.1, 0.9
-# The least score of the weakest connection of two parts of a map; a part has so many scans, or this share of them.
-_MIN_CONNECTION, _PART_SCANS, _PART_SHARE, _FEW_SCANS = 0.1, 3, 0.02, 60
-# Share of beams that may contradict beyond those of the pairs that hold the map, which sensor and people cause: a part
-# that is always allowed, a multiple of that share, and the most.
-_CONTRADICTION_FLOOR, _CONTRADICTION_FACTOR, _MAX_CONTRADICTION = 0.02, 1.6, 0.055
+# Limits of `assess_trajectory`, calibrated on right and wrong maps of simulated worlds and of thinned logs
+# (docs/notebook/deepmapping_notes.md).
+# Number of nearest scans, by position and once more by position and heading, that each scan is compared with.
+_NUM_NEAREST = 12
+# Typical ranges that a radian of heading counts as in the second of these searches.
+_HEADING_WEIGHT = 0.5
+# Score of its best pair above which a scan belongs to the map.
+_LEAST_SCORE = 0.1
+# Least share of the scans that the connected map must hold.
+_LEAST_REGISTERED = 0.9
+# Least score of the weakest connection between two parts of a trusted map.
+_MIN_CONNECTION = 0.1
+# Least number of scans of a part, and least share of the connected scans; the larger of the two decides.
+_PART_SCANS, _PART_SHARE = 3, 0.02
+# In maps of no more connected scans than this, a single scan is a part.
+_FEW_SCANS = 60
+# The largest contradiction (`Assessment`) of a trusted map is the floor plus the factor times the contradicted share of
+# the connections that hold the map, because sensor and people contradict there too; it is never above the maximum.
+_CONTRADICTION_FLOOR = 0.02
+_CONTRADICTION_FACTOR = 1.6
+_MAX_CONTRADICTION = 0.055
 # Range noise in typical ranges above which right and wrong maps look alike: no map is trusted there.
 _MAX_NOISE = 0.0225
 

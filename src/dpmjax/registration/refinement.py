@@ -32,6 +32,8 @@ from dpmjax.types import ScanSet
 _ROUND_DISTANCES = 1.5e9
 # Pairs that are linearised side by side: few enough for the cache, enough for all cores.
 _PAIRS_AT_ONCE = 128
+# The number of pairs is rounded up to a power of two up to this one, then to its multiples, so that few shapes compile.
+_PAIRS_ROUNDED = 1024
 # How gates and kernels shrink over the rounds.
 _ROUNDS = Schedule(gate=(0.09, 0.015), kernel=(0.06, 0.0015), num_iterations=14)
 # The start is sound, and no loops are searched, if the fitness of all its steps is above this, and so is the weakest
@@ -205,11 +207,18 @@ def _linearise(
     """Systems of all pairs at these poses, gate and kernel; the count is rounded up, so that few shapes compile."""
     relative = se2.relative(poses[target], poses[source])
     stride = max(1, int(np.ceil(len(source) * scans.mask.shape[1] ** 2 / _ROUND_DISTANCES)))
-    filled = np.resize(np.arange(len(source)), 1024 * -(-len(source) // 1024))
+    filled = np.resize(np.arange(len(source)), _rounded_up(len(source)))
     pairs = source[filled], target[filled], relative[filled].astype(np.float32)
     system = _linearise_pairs(scans.replace(is_ordered=False), pairs, scale, source_stride=stride)
     system = jax.tree.map(lambda x: np.asarray(x, np.float64)[: len(source)], system)
     return Edges(source, target, relative, np.asarray(system.information)), system
+
+
+def _rounded_up(num_pairs: int) -> int:
+    """Returns the number of pairs that is computed in place of `num_pairs`."""
+    if num_pairs > _PAIRS_ROUNDED:
+        return _PAIRS_ROUNDED * -(-num_pairs // _PAIRS_ROUNDED)
+    return max(_PAIRS_AT_ONCE, 1 << (num_pairs - 1).bit_length())
 
 
 def _is_sound(scans: PlanarScans, poses: Floats) -> bool:

@@ -1,0 +1,80 @@
+"""Shares of right answers: their confidence intervals, and whether one method is right more often than another."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool
+from scipy import special
+
+from dpmjax.types import AnyArray
+
+
+class Proportion(NamedTuple):
+    """A share with its confidence interval.
+
+    Attributes:
+        share: right answers divided by all answers; NaN without any answer.
+        low: lower end of the interval.
+        high: upper end of the interval.
+    """
+
+    share: float
+    low: float
+    high: float
+
+
+def wilson_interval(num_right: int, num_all: int, *, confidence: float = 0.95) -> Proportion:
+    """Returns a share with Wilson's score interval (Wilson 1927, "Probable Inference", eq. 4).
+
+    The interval stays within 0 and 1, and has a positive width also where none or all of the answers are right.
+
+    Args:
+        num_right: number of right answers.
+        num_all: number of answers; without any, the share is NaN and the interval is 0 to 1.
+        confidence: probability that the interval covers the true share.
+
+    Returns:
+        The share and its interval.
+
+    Raises:
+        ValueError: the numbers are not 0 <= num_right <= num_all, or the confidence is not between 0 and 1.
+    """
+    if not 0 <= num_right <= num_all:
+        raise ValueError(f"num_right: expected 0 to num_all = {num_all}, got {num_right}")
+    if not 0.0 < confidence < 1.0:
+        raise ValueError(f"confidence: expected a number between 0 and 1, got {confidence}")
+    if num_all == 0:
+        return Proportion(np.nan, 0.0, 1.0)
+    share = num_right / num_all
+    z2 = float(special.ndtri(0.5 + 0.5 * confidence)) ** 2
+    centre = (num_right + 0.5 * z2) / (num_all + z2)
+    half = np.sqrt(z2 * (num_all * share * (1.0 - share) + 0.25 * z2)) / (num_all + z2)
+    # The ends are exact where none or all are right; rounding must not move them.
+    low = 0.0 if num_right == 0 else float(centre - half)
+    high = 1.0 if num_right == num_all else float(centre + half)
+    return Proportion(share, low, high)
+
+
+def mcnemar_p_value(is_right_a: Bool[AnyArray, " n"], is_right_b: Bool[AnyArray, " n"]) -> float:
+    """Returns the p-value of McNemar's exact test: two methods answered the same n questions.
+
+    Only the questions that one of the two answers right count. Where both methods are equally good, each of these is
+    as likely one's as the other's, so their number is binomial with a probability of a half (McNemar 1947).
+
+    Args:
+        is_right_a: answers of one method.
+        is_right_b: answers of the other method to the same questions, in the same order.
+
+    Returns:
+        Probability, two-sided, that two equally good methods differ at least as much; 1 where no answer differs.
+
+    Raises:
+        ValueError: the shapes are not the same (n,).
+    """
+    a, b = np.asarray(is_right_a, bool), np.asarray(is_right_b, bool)
+    if a.ndim != 1 or a.shape != b.shape:
+        raise ValueError(f"expected two arrays of the same shape (n,), got {a.shape} and {b.shape}")
+    only_a, only_b = int((a & ~b).sum()), int((b & ~a).sum())
+    return min(1.0, 2.0 * float(special.bdtr(min(only_a, only_b), only_a + only_b, 0.5)))

@@ -1,0 +1,20 @@
+"""Tests of what needs a package of an extra are skipped with the reason, also where the package is broken."""
+
+from __future__ import annotations
+
+import importlib
+from types import ModuleType
+
+import pytest
+
+from dpmjax.cli.optional import why_not_importable
+
+
+def import_or_skip(module: str) -> ModuleType:
+    """Returns the module; skips the test where it cannot be imported.
+
+    Unlike `pytest.importorskip`, it also skips where the import raises anything else than an ImportError.
+    """
+    if (reason := why_not_importable(module)) is not None:
+        pytest.skip(reason)
+    return importlib.import_module(module)
