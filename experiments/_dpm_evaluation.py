@@ -10,7 +10,7 @@ import numpy as np
 from tqdm import tqdm
 
 from dpmjax import registration_recall
-from dpmjax.cli import error_columns
+from dpmjax.cli import BAND_NAMES, error_columns
 from dpmjax.deeppointmap import (
     ScanPair,
     VerificationConfig,
