@@ -40,6 +40,12 @@ class Group(NamedTuple):
 
 
 SCANS_2D = Group("2-D scans", (
+    Section("RegistrationConfig", "dpmjax.registration", "`register_scans(scans, config, key=key)`", {
+        "is_ordered": ("", "False for scans without an order in time; the start is then the global search"),
+        "refine": ("", "False: no candidate is refined"),
+        "min_distance": ("unit of the scans", "0.5 m for whole recordings: nearer scans follow the odometry"),
+        "min_turn": ("rad", "the same for turns"),
+    }),
     Section("DeepMappingConfig", "dpmjax.deepmapping", "`fit_deepmapping(scans, config, key=key)`", {
         "cold_phases": ("", "phases from zero poses; see PhaseConfig"),
         "warm_phases": ("", "phases from given poses; see PhaseConfig"),

@@ -83,6 +83,7 @@ def pooled_table(pooled: Sequence[Mapping[str, Any]]) -> str:
             f"| {p_values or '-'} |"
         )
     notes = "Intervals: Wilson. p: McNemar's exact test, two-sided, on the same pairs."
+    notes += " All motions but those of the network alone and of KISS-Matcher are refined."
     if watched := sorted({name for row in pooled for name in row["sequences"]} & set(MONITORED)):
         notes += f" The recall on {', '.join(watched)} was watched during the training: it is no unseen drive."
     return "\n".join([*lines, "", notes])

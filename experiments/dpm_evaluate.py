@@ -29,6 +29,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
+import numpy as np
 from tqdm import tqdm
 from tyro.conf import FlagCreatePairsOff, Positional, arg
 

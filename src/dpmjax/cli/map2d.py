@@ -19,7 +19,7 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
@@ -27,10 +27,10 @@ import numpy as np
 from numpy.typing import NDArray
 from tyro.conf import Positional, arg
 
-from dpmjax import deepmapping, io, registration, simulation, viz
-from dpmjax import metrics as trajectory_metrics
+from dpmjax import deepmapping, io, registration, simulation
 from dpmjax.cli.command import StopFlag, check_least, run_command
 from dpmjax.cli.machine import peak_rss_gb
+from dpmjax.cli.map2d_files import as_scan_set, draw_map, draw_occupancy, registered_scans, write_trajectories
 from dpmjax.cli.map2d_numbers import (
     ate_of,
     before_and_after,
@@ -52,7 +52,6 @@ if TYPE_CHECKING:
     from dpmjax.deepmapping import DeepMappingConfig, Fitted
     from dpmjax.registration import RegisteredScans, RegistrationConfig
     from dpmjax.sequences import ScanSequence
-    from dpmjax.types import ScanSet
 
 Floats = NDArray[np.float64]
 
@@ -198,21 +197,6 @@ def register(sequence: ScanSequence, start: str | Floats, config: Config, fit: _
     )
 
 
-def as_scan_set(sequence: ScanSequence) -> ScanSet:
-    """Returns the scans without their name, unit and poses."""
-    import jax.numpy as jnp
-
-    from dpmjax.types import ScanSet
-
-    return ScanSet(jnp.asarray(sequence.points), jnp.asarray(sequence.mask))
-
-
-def registered_scans(sequence: ScanSequence, result: RegisteredScans) -> ScanSequence:
-    """Returns the scans that were registered."""
-    chosen = result.recording.chosen
-    return sequence if len(chosen) == len(sequence) else sequence.take(chosen)
-
-
 def numbers_of(
     sequence: ScanSequence,
     result: RegisteredScans,
@@ -306,44 +290,6 @@ def fit_settings(config: Config, sequence: ScanSequence) -> DeepMappingConfig:
     """Returns the preset, with the given number of steps."""
     settings = deepmapping.preset(config.preset, is_organised=sequence.is_organised)
     return settings if config.steps is None else deepmapping.with_steps(settings, config.steps)
-
-
-def write_trajectories(folder: RunFolder, sequence: ScanSequence, poses: Floats) -> None:
-    """Writes T_world_scan of every scan: trajectory.npy, trajectory_tum.txt, trajectory_kitti.txt."""
-    io.write_poses_npy(folder / "trajectory.npy", poses)
-    io.write_tum(folder / "trajectory_tum.txt", poses, times=sequence.times, unit=sequence.unit)
-    io.write_kitti(folder / "trajectory_kitti.txt", poses)
-
-
-def draw_map(
-    folder: RunFolder, registered: ScanSequence, result: RegisteredScans, metrics: Mapping[str, Any]
-) -> viz.Limits:
-    """Draws map.png: the start, DeepMapping, the kept candidate, the reference; returns its limits."""
-    scans, unit = as_scan_set(registered), registered.unit
-    panels = []
-    titles = dict(zip(result.candidates, metrics["candidates"], strict=True))
-    for name in dict.fromkeys((result.start, registration.DEEPMAPPING, result.kept)):
-        title, numbers = titles[name], metrics["candidates"][titles[name]]
-        ate, distance = numbers.get(f"ate_{unit}"), numbers.get(f"point_distance_{unit}")
-        title = title[0].upper() + title[1:] + (" (kept)" if name == result.kept else "")
-        panels.append(viz.Panel(title, scans, result.candidates[name].poses, ate=ate, point_distance=distance))
-    if registered.reference_poses is None:
-        panels = [replace(panel, is_reference=panel.title.endswith(" (kept)")) for panel in panels]
-    else:
-        panels.append(viz.Panel("Reference", scans, registered.reference_poses, is_reference=True))
-    figure = viz.registered_scans_figure(panels, unit)
-    viz.save_figure(figure, folder / "map.png")
-    return viz.Limits(*figure.axes[0].get_xlim(), *figure.axes[0].get_ylim())
-
-
-def draw_occupancy(folder: RunFolder, registered: ScanSequence, result: RegisteredScans, limits: viz.Limits) -> None:
-    """Draws occupancy.png: what M-Net learned, in the frame and within the limits of map.png."""
-    picture = deepmapping.draw_map(result.fitted, registered.points, registered.mask)
-    kept, reference = result.candidates[result.kept].poses, registered.reference_poses
-    anchor, trajectory = kept if reference is None else reference, result.fitted.poses[:, :2]
-    T_view_fit = trajectory_metrics.align_rigid(trajectory, anchor[:, :2])
-    figure = viz.occupancy_figure(picture, trajectory, registered.unit, T_view_world=T_view_fit, limits=limits)
-    viz.save_figure(figure, folder / "occupancy.png")
 
 
 def run(args: Sequence[str] | None = None) -> int:

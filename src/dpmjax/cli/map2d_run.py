@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from dpmjax.cli.map2d import NAME, Config, as_scan_set, fit_settings, read_scans
+from dpmjax.cli.map2d import NAME, Config, fit_settings, read_scans
+from dpmjax.cli.map2d_files import as_scan_set
 from dpmjax.cli.run_folder import CHECKPOINTS, find_run, load_config
 
 if TYPE_CHECKING:

@@ -44,7 +44,7 @@ class FitRecorder:
         *,
         stop: Callable[[float], bool],
     ) -> None:
-        """Takes what the history holds.
+        """Makes an engine for one fit.
 
         Args:
             folder: of the run; gets `metrics.csv` and checkpoints.

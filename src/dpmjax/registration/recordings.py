@@ -37,8 +37,7 @@ class Recording(NamedTuple):
     Attributes:
         scans: all n scans.
         chosen: rows of the k registered scans, in order.
-        motion: (n, 3) poses that tell how each scan moves from one registered scan to the next; None where all are
-            registered.
+        motion: (n, 3) poses whose steps are the motion between registered scans; None where all are registered.
     """
 
     scans: ScanSet
@@ -61,7 +60,7 @@ def choose_scans(scans: ScanSet, motion: Floats | None, min_distance: float, min
 
     Args:
         scans: n scans in the order of time.
-        motion: (n, 3) poses that tell how the scans move; None: all scans are registered.
+        motion: (n, 3) odometry of any kind; None: all scans are registered.
         min_distance: as `choose_by_motion`.
         min_turn: as `choose_by_motion`.
 
