@@ -227,9 +227,17 @@ def numbers_of(
 
 
 def measures_of(config: Config, sequence: ScanSequence) -> Callable[[Floats, str], dict[str, float]]:
-    """Reads what the result is measured by, beside its own reference; returns the numbers of poses of all scans.
+    """Reads what the result is measured by, beside its own reference.
 
-    A `ValueError` names a file that does not belong to the scans.
+    Args:
+        config: options of the run.
+        sequence: all scans.
+
+    Returns:
+        A function of the poses of all scans and a suffix of the names; it returns the numbers.
+
+    Raises:
+        ValueError: a file does not belong to the scans.
     """
     relations = None if config.relations is None else io.read_relations(config.relations)
     corrected = None if config.corrected is None else io.read_sequence(config.corrected)

@@ -71,6 +71,18 @@ def corrected_numbers(times: Floats, poses: Floats, corrected: ScanSequence, suf
     """Returns the ATE at scans that a corrected log of the same drive has too, and errors from one to the next.
 
     The latter are measured like hand-checked relations: the relative poses of successive scans of the corrected log.
+
+    Args:
+        times: of all scans.
+        poses: of all scans.
+        corrected: the corrected log.
+        suffix: of the names.
+
+    Returns:
+        The numbers by name.
+
+    Raises:
+        ValueError: the corrected log has no poses with times, or few scans of the same times.
     """
     from dpmjax.geometry import se2
 

@@ -30,6 +30,12 @@ def write_json(path: Path, value: Any) -> None:
 def load_json(path: Path) -> dict[str, Any]:
     """Reads a JSON object.
 
+    Args:
+        path: the file.
+
+    Returns:
+        The object.
+
     Raises:
         ValueError: the file is no JSON object.
     """

@@ -129,7 +129,8 @@ def open_run_folder(config: Any, experiment: str) -> RunFolder:
             _clear(path)
         write_json(path / CONFIG, config)
     except OSError as error:
-        raise _cannot_write(config.output or RESULTS / experiment, error.strerror or str(error)) from error
+        reason = error.strerror or str(error)
+        raise ValueError(_cannot_write(config.output or RESULTS / experiment, reason)) from error
     return RunFolder(path, is_resumed=is_resumed)
 
 
@@ -230,7 +231,8 @@ def recording(folder: RunFolder) -> Iterator[None]:
         Nothing.
 
     Raises:
-        RunFailedError: from the error that ended the block. Interrupts pass through.
+        RunFailedError: from the error that ended the block.
+        KeyboardInterrupt: the block was interrupted.
     """
     handler = logging.FileHandler(folder / LOG, encoding="utf-8")
     handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(name)s: %(message)s"))
@@ -286,9 +288,9 @@ def _check_replaceable(path: Path, force: bool) -> None:
     """Raises a ValueError where `path` is no folder, cannot be written, or holds what must not be replaced."""
     existing = next(folder for folder in (path, *path.absolute().parents) if folder.exists())
     if not existing.is_dir():
-        raise _cannot_write(path, f"{existing} is a file")
+        raise ValueError(_cannot_write(path, f"{existing} is a file"))
     if not os.access(existing, os.W_OK):
-        raise _cannot_write(path, "permission denied")
+        raise ValueError(_cannot_write(path, "permission denied"))
     if existing != path or not any(path.iterdir()):
         return
     if not (path / CONFIG).is_file():
@@ -297,8 +299,9 @@ def _check_replaceable(path: Path, force: bool) -> None:
         raise ValueError(f"{path} holds an earlier run: --resume continues it, --force replaces it, -o names another")
 
 
-def _cannot_write(path: Path, reason: str) -> ValueError:
-    return ValueError(f"cannot write to {path}: {reason}; name another folder with -o")
+def _cannot_write(path: Path, reason: str) -> str:
+    """Returns the message of a folder that cannot be written."""
+    return f"cannot write to {path}: {reason}; name another folder with -o"
 
 
 def _clear(path: Path) -> None:

@@ -129,6 +129,9 @@ def gather_map(views: Iterable[tuple[np.ndarray, np.ndarray]]) -> Cloud:
 
     Args:
         views: points of a scan and its pose, one after the other.
+
+    Returns:
+        The points of all scans, thinned.
     """
     from dpmjax.scans.preprocess import first_of_each_voxel
 
