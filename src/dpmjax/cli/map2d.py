@@ -9,9 +9,9 @@
 
 Results go to results/map2d/<time>/ (latest links to the newest): metrics.json, trajectories as TUM, KITTI and
 npy, and pictures: map.png, occupancy.png, loss.png. Without --init the start is the odometry, where there is one, else
-incremental point-to-line ICP. Of the start, DeepMapping and both after refinement, the candidate is kept whose map
-describes the beams best, judged without ground truth; metrics.json and map.png name it. Of a whole recording, scans
-half a metre or 20 degrees apart are registered, and all others follow the odometry between them.
+incremental point-to-line ICP. There are four candidates: the start and DeepMapping, each with and without refinement.
+The one whose map fits the beams best is kept, chosen without ground truth; metrics.json and map.png name it. Of a whole
+recording, scans half a metre or 20 degrees apart are registered, and all others follow the odometry between them.
 """
 
 from __future__ import annotations
@@ -73,8 +73,8 @@ class Config(RunOptions):
     preset: Literal["fast", "paper"] = "fast"
     """fast: minutes on two cores; paper: architecture, losses and sampling of the paper."""
     init: Annotated[str, arg(metavar="auto|odometry|icp-plane|icp-point|global|zero|FILE")] = "auto"
-    """Where the poses start; auto: odometry where there is one, else icp-plane, which is tried, too, where the map from
-    odometry cannot be trusted; global: an exhaustive search of scan pairs, needs no guess; FILE is a trajectory."""
+    """Where the poses start; auto: odometry if there is any, else icp-plane; if the map from odometry cannot be
+    trusted, icp-plane is tried, too; global: exhaustive search of scan pairs, needs no guess; FILE is a trajectory."""
     ordered: bool = True
     """Scans lie in the order of time; --no-ordered makes no use of it, and needs --init global."""
     refine: bool = True

@@ -1,8 +1,8 @@
 """Registers two 3-D lidar scans without a first guess (DeepPointMap): the motion and the probability that it is right.
 
-    dpmjax register a.pcd b.pcd                  where points of a lie in the frame of b
-    dpmjax register 000000.bin 000010.bin -o out KITTI's files
-    dpmjax register a.npy b.ply --no-refine      without the final point-to-plane alignment
+    dpmjax register a.pcd b.pcd                   where points of a lie in the frame of b
+    dpmjax register 000000.bin 000010.bin -o out  KITTI's files
+    dpmjax register a.npy b.ply --no-refine       without the final point-to-plane alignment
 
 Scans are .pcd .ply .bin .npy or .npz, in metres, each in the frame of its lidar. Results go to
 results/register/<time>/ (latest links to the newest): T_target_source.txt (4 x 4, maps points of A to the frame of B),

@@ -1,14 +1,14 @@
 """Makes one map of a drive of 3-D lidar scans: odometry, loop closure, pose graph (DeepPointMap, section 4).
 
-    dpmjax slam                                    a simulated town, once round and on
-    dpmjax slam path/to/drive -o out               KITTI, KITTI-360, MulRan, any folder of scans
-    dpmjax slam kitti/dataset --sequence 07 -n 500 the first 500 scans of a sequence
-    dpmjax slam day2 --map results/slam/latest/map.npz   extend the map of an earlier run
-    dpmjax slam --resume                           go on where the last run stopped, or was killed
+    dpmjax slam                                         a simulated town, once round and on
+    dpmjax slam path/to/drive -o out                    KITTI, KITTI-360, MulRan, any folder of scans
+    dpmjax slam kitti/dataset --sequence 07 -n 500      the first 500 scans of a sequence
+    dpmjax slam day2 --map results/slam/latest/map.npz  extend the map of an earlier run
+    dpmjax slam --resume                                go on where the last run stopped, or was killed
 
 Results go to results/slam/<time>/ (latest links to the newest): trajectories of every scan as TUM, KITTI and npy,
-scans.csv and loops.csv with the reason of every decision, graph.g2o, keyframes.txt, map.npz (to extend, and to localise
-in), map.ply, trajectory.png, map.png and metrics.json. Ctrl-C ends the run and writes them too.
+scans.csv and loops.csv with the reason of every decision, graph.g2o, keyframes.txt, map.npz (to extend, and for
+`dpmjax localize`), map.ply, trajectory.png, map.png and metrics.json. Ctrl-C ends the run and writes them too.
 """
 
 from __future__ import annotations

@@ -1,19 +1,19 @@
 """Trains the networks of DeepPointMap: descriptors of lidar scans, and how two clouds of them are registered.
 
-    dpmjax train                                   tiny network, simulated towns, two cores
-    dpmjax train --preset small --num-towns 20 --hours 8   two cores, over night
-    dpmjax train --resume --finish                 end a longer run now: the learning rate falls
-    dpmjax train --data kitti town --preset paper  drives from files, and towns
-    dpmjax train --data kitti --preset small --weights dpm_small           tune trained weights
-    dpmjax train --resume                          continue the latest run
-    dpmjax train --coordinator host0:8476 --num-processes 2 --process-id 0     on two hosts, and
-                                                                      the same with --process-id 1 on the other
+    dpmjax train                                                  tiny network, simulated towns, two cores
+    dpmjax train --preset small --num-towns 20 --hours 8          two cores, over night
+    dpmjax train --data kitti town --preset paper                 drives from files, and towns
+    dpmjax train --data kitti --preset small --weights dpm_small  tune trained weights
+    dpmjax train --resume                                         continue the latest run
+    dpmjax train --resume --finish                                end it now: the learning rate falls
+    dpmjax train --coordinator host0:8476 --num-processes 2 --process-id 0
+                                                                  on two hosts; --process-id 1 on the other
 
 Results go to results/train/<time>/ (latest links to the newest): model.safetensors for dpmjax.load_model,
 metrics.csv, metrics.json, checkpoints, and pictures: loss.png, matches.png. Recall is the share of pairs of a held-out
 town, turned by any yaw, that are registered within 2 m and 5 degrees: of scans and of maps, 2 to 10 and 10 to 20 m
-apart. The model is the one of the step with the best mean recall on other towns (metrics.json: best_step). Its overlap
-and its confidence are fitted afterwards: experiments.dpm_calibrate.
+apart. The model is the one of the step with the best mean recall on other towns (metrics.json: best_step). Afterwards
+`python -m experiments.dpm_calibrate MODEL` calibrates its overlap and its confidence.
 """
 
 from __future__ import annotations
