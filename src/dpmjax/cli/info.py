@@ -1,6 +1,8 @@
 """Prints versions, devices, the shipped weights, and which optional packages are there.
 
-dpmjax info
+    dpmjax info
+
+A bug report begins with what this prints.
 """
 
 from __future__ import annotations
