@@ -42,9 +42,9 @@ demo: $(STAMP)  ## register the built-in 2-D world; pictures in results/demo
 	$(BIN)/dpmjax map2d --init odometry --force -o results/demo
 	@echo "Pictures:"; find results/demo/ -name '*.png' | sort | sed 's/^/  /'
 
-slam: $(STAMP)  ## map a simulated town from 3-D scans; pictures in results/slam
-	$(BIN)/dpmjax slam --force -o results/slam
-	@echo "Pictures:"; find results/slam/ -name '*.png' | sort | sed 's/^/  /'
+slam: $(STAMP)  ## map a simulated town from 3-D scans; pictures in results/slam_demo
+	$(BIN)/dpmjax slam --force -o results/slam_demo
+	@echo "Pictures:"; find results/slam_demo/ -name '*.png' | sort | sed 's/^/  /'
 
 bench: $(STAMP)  ## speed and accuracy of everything that is measured
 	$(BIN)/python -m benchmarks

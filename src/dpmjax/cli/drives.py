@@ -53,7 +53,7 @@ def open_drive(selection: DriveSelection) -> LidarSequence:
     from dpmjax import io
 
     if selection.data is None:
-        drive = simulated_drive(selection.seed)
+        drive = demo_drive(selection.seed)
     else:
         drive = io.open_lidar_sequence(selection.data, sequence=selection.sequence)
     if selection.is_kitti_corrected:
@@ -75,7 +75,7 @@ def with_raised_beams(drive: LidarSequence) -> LidarSequence:
     return replace(drive, read_scan=read_scan)
 
 
-def simulated_drive(seed: int) -> LidarSequence:
+def demo_drive(seed: int) -> LidarSequence:
     """Simulates a drive once round a town and on over known streets, with an HDL-64 of half the columns."""
     from dpmjax.simulation import HDL64E, DriveConfig, Scene, TownConfig, simulate_scene
 

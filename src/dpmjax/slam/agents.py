@@ -140,7 +140,7 @@ def merge_maps(
     Args:
         model: the model that made the maps; or methods of your own.
         *maps: two or more. The frame of the first map of each component is kept.
-        config: settings; None takes the defaults. Methods of your own carry theirs.
+        config: settings; None takes those of the first map. Methods of your own carry theirs.
         on_keyframe: called while keyframes are compared, for progress.
 
     Returns:
@@ -152,6 +152,8 @@ def merge_maps(
     """
     if len(maps) < 2:
         raise ValueError(f"maps: expected at least two, got {len(maps)}")
+    if config is None and not isinstance(model, SlamMethods) and maps[0].origin is not None:
+        config = maps[0].origin.config
     joined = join_maps(as_methods(model, config), maps, on_keyframe=on_keyframe)
     numbers = joined.component_of_map
     merged = [
