@@ -101,23 +101,14 @@ def assess(task: Task, poses: Floats) -> dict[str, Any]:
     return registration.assess_trajectory(task.planar, poses)._asdict()
 
 
-def in_fitting_order(task: Task, start: Floats) -> NDArray[np.intp]:
-    """Returns an order in which neighbours are near each other: that of time, or a tour of the start."""
-    return np.arange(len(start)) if task.is_ordered else registration.nearest_tour(start)
-
-
 def _fit(task: Task, start: Floats | None, config: DeepMappingConfig | None = None) -> Floats:
     """Returns poses by DeepMapping from a start, or from zero poses."""
     import jax
 
     settings = config or deepmapping.preset("fast")
     settings = settings if task.steps is None else deepmapping.with_steps(settings, task.steps)
-    order = np.arange(len(task.sequence)) if start is None else in_fitting_order(task, start)
-    scans = replace(task, sequence=task.sequence.take(order)).scans
-    fitted = deepmapping.fit_deepmapping(
-        scans, settings, key=jax.random.key(task.seed), start=None if start is None else start[order]
-    )
-    return fitted.poses[np.argsort(order)]
+    key = jax.random.key(task.seed)
+    return registration.fit_in_order(task.scans, settings, key=key, start=start, is_ordered=task.is_ordered).poses
 
 
 def _direct_lbfgs(task: Task) -> Floats:

@@ -18,6 +18,7 @@ import re
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -118,9 +119,10 @@ def main(config: Config) -> dict[str, Any]:
     folder = open_run_folder(config, EXPERIMENT)
     with recording(folder), StopFlag() as stop:
         print(f"{sequence.name}: {len(sequence)} scans of {scans.points.shape[1]} points, from {config.init}")
-        recorder = _recorder(folder, sequence, scans, stop)
+        recorder = FitRecorder(folder, "m", stop=lambda _: stop.is_requested)
         key, settings = jax.random.key(config.seed), fit_settings(config)
-        fitted = register_clouds(scans, settings, key=key, start=start, engine=recorder)
+        engine = partial(recorder, measure=_measure(sequence, scans))
+        fitted = register_clouds(scans, settings, key=key, start=start, engine=engine)
         metrics = {
             "num_scans": len(sequence),
             "steps": recorder.steps,
@@ -162,12 +164,12 @@ def fit_settings(config: Config) -> CloudMappingConfig:
     return settings if config.steps is None else deepmapping.with_steps(settings, config.steps)
 
 
-def _recorder(folder: RunFolder, sequence: LidarSequence, scans: CloudScans, stop: StopFlag) -> FitRecorder:
-    """Returns the engine of the fit in the run folder."""
+def _measure(sequence: LidarSequence, scans: CloudScans) -> Callable[[Floats], float]:
+    """Returns the ATE, in metres, of the poses that the fit counts in typical ranges."""
     from dpmjax.geometry import typical_range
 
     unit, measure = typical_range(scans.points, scans.mask), ate_of(sequence)
-    return FitRecorder(folder, lambda T: measure(unit * T[:, :3, 3]), "m", stop=lambda _: stop.is_requested)
+    return lambda T: measure(unit * T[:, :3, 3])
 
 
 def ate_of(sequence: LidarSequence) -> Callable[[Floats], float]:

@@ -13,8 +13,7 @@ import numpy as np
 import pytest
 
 import dpmjax
-from dpmjax import deepmapping, geometry, losses
-from dpmjax.deeppointmap.matching import MatchConfig, match_descriptors
+from dpmjax import deepmapping, deeppointmap, geometry, losses
 from dpmjax.geometry import se2, se3
 from tests.deeppointmap import toy
 
@@ -79,13 +78,25 @@ def trajectories(rng: np.random.Generator) -> Arrays:
 
 
 def mapped_points(rng: np.random.Generator) -> Arrays:
+    """Beams of all scans; the beams come first, so that they can be padded."""
     T = trajectories(rng)
-    scans = rng.normal(size=(NUM, 5, 3)).astype(np.float32)
-    return {"points": scans, "mask": np.ones((NUM, 5), bool)} | {f"T_{name}": poses for name, poses in T.items()}
+    beams = rng.normal(size=(5, NUM, 3)).astype(np.float32)
+    return {"points": beams, "mask": np.ones((5, NUM), bool)} | {f"T_{name}": poses for name, poses in T.items()}
+
+
+def distance_of_beams(points: Any, mask: Any, **T: Any) -> Any:
+    return dpmjax.point_distance(jnp.swapaxes(points, 0, 1), mask.T, **T)
 
 
 def contrast(rng: np.random.Generator) -> Arrays:
-    return points("queries", "keys")(rng) | {"positives": rng.permutation(NUM), "mask": np.ones(NUM, bool)}
+    """Descriptors, of which some queries and some keys do not count."""
+    masks = {name: rng.uniform(size=NUM) < 0.8 for name in ("is_query", "is_key")}
+    return points("queries", "keys")(rng) | {"positives": rng.permutation(NUM)} | masks
+
+
+def contrast_of(queries: Any, keys: Any, positives: Any, is_query: Any, is_key: Any) -> Any:
+    ignore = jnp.broadcast_to(~is_key, (len(queries), len(keys)))
+    return dpmjax.info_nce(queries, keys, positives, ignore=ignore, mask=is_query)
 
 
 def beams(rng: np.random.Generator) -> Arrays:
@@ -110,7 +121,8 @@ def scan(rng: np.random.Generator) -> Arrays:
 
 def descriptors(rng: np.random.Generator) -> Arrays:
     arrays = {name: rng.normal(size=(16, 8)).astype(np.float32) for name in ("a", "b")}
-    return arrays | {name: 9.0 * rng.normal(size=(16, 3)).astype(np.float32) for name in ("at_a", "at_b")}
+    arrays |= {name: 9.0 * rng.normal(size=(16, 3)).astype(np.float32) for name in ("at_a", "at_b")}
+    return arrays | {name: np.ones(16, bool) for name in ("is_a", "is_b")}
 
 
 MODEL = dpmjax.init_model(jax.random.key(0), toy.MODEL)
@@ -121,9 +133,8 @@ def encode(points: Any, mask: Any) -> Any:
     return dpmjax.encode_pyramid(MODEL, geometry.build_pyramid(points, mask, toy.MODEL.pyramid))
 
 
-def clouds_of(a: Any, b: Any, at_a: Any, at_b: Any) -> Any:
-    is_there = jnp.ones(16, bool)
-    return tuple(dpmjax.DescriptorCloud(at, features, is_there) for at, features in ((at_a, a), (at_b, b)))
+def clouds_of(a: Any, b: Any, at_a: Any, at_b: Any, is_a: Any, is_b: Any) -> Any:
+    return dpmjax.DescriptorCloud(at_a, a, is_a), dpmjax.DescriptorCloud(at_b, b, is_b)
 
 
 def correlate(**arrays: Any) -> Any:
@@ -132,10 +143,12 @@ def correlate(**arrays: Any) -> Any:
 
 def match(**arrays: Any) -> Any:
     a, b = clouds_of(**arrays)
-    similarity = jnp.clip(a.features @ b.features.T / 9.0, -1.0, 1.0)
+    left, right = (jnp.where(cloud.mask[:, None], cloud.features, 0.0) for cloud in (a, b))
+    # Numbers of pairs that are not there may be anything.
+    cosines = jnp.where(a.mask[:, None] & b.mask, jnp.tanh(left @ right.T / 9.0), jnp.nan)
     offsets = lambda rows, others: (jnp.zeros((*rows.shape, 3)),) * 2  # noqa: E731
-    found = match_descriptors(a, b, similarity, offsets, config=MatchConfig(num_rounds=1))
-    return found.T_target_source, found.scores, found.num_inliers
+    found = deeppointmap.match_descriptors(a, b, cosines, offsets, config=deeppointmap.MatchConfig(num_rounds=1))
+    return found.T_target_source, found.mean_score, found.num_inliers
 
 
 def solve_toy(seed: Any) -> Any:
@@ -155,6 +168,7 @@ def seeds(rng: np.random.Generator) -> Arrays:
 
 
 BOTH = {"source_mask": "source_mask", "target_mask": "target_mask"}
+CLOUDS = masked("a", "b", "at_a", "at_b", is_a="is_a", is_b="is_b")
 KERNELS = {
     "weighted_svd": Kernel(
         dpmjax.weighted_svd, weighted, ("source", "target", "weights"), masked("source", "target") | {"weights": 0.0}
@@ -172,7 +186,9 @@ KERNELS = {
         masked("estimated", "reference", mask="mask"),
     ),
     "relative_pose_error": Kernel(dpmjax.relative_pose_error, trajectories, ("estimated", "reference")),
-    "point_distance": Kernel(dpmjax.point_distance, mapped_points, ("points", "T_estimated")),
+    "point_distance": Kernel(
+        distance_of_beams, mapped_points, ("points", "T_estimated"), masked("points", mask="mask")
+    ),
     "k_nearest": Kernel(
         lambda queries, points, mask: dpmjax.k_nearest(queries, points, 3, mask),
         with_masks("queries", "points", mask="mask"),
@@ -212,7 +228,10 @@ KERNELS = {
         padding=masked("source", "target", mask="mask"),
     ),
     "info_nce": Kernel(
-        dpmjax.info_nce, contrast, ("queries", "keys"), {"queries": np.nan, "positives": 0, "mask": False}
+        contrast_of,
+        contrast,
+        ("queries", "keys"),
+        {"positives": 0} | masked("queries", "keys", query="is_query", key="is_key"),
     ),
     "chamfer_distance": Kernel(
         dpmjax.chamfer_distance,
@@ -245,8 +264,8 @@ KERNELS = {
         is_exact=False,
     ),
     "encode_pyramid": Kernel(encode, scan, ("points",), masked("points", mask="mask"), is_exact=False),
-    "correlate": Kernel(correlate, descriptors, ("a", "b"), is_exact=False),
-    "match_descriptors": Kernel(match, descriptors),
+    "correlate": Kernel(correlate, descriptors, ("a", "b"), CLOUDS, is_exact=False),
+    "match_descriptors": Kernel(match, descriptors, ("a", "b", "at_a", "at_b"), CLOUDS),
     "step": Kernel(step_toy, seeds, ("x",), is_exact=False),
     "solve": Kernel(lambda seed, x: solve_toy(seed), seeds),
 }
@@ -337,7 +356,6 @@ def test_degenerate_trajectories_have_an_error_and_a_gradient() -> None:
         value, gradient = error(path, path + 3.0, mask)
         assert float(value) == pytest.approx(0.0, abs=1e-5)
         assert np.isfinite(gradient).all()
-        assert f"{value:.1f}" == "0.0"
 
 
 @pytest.mark.parametrize(("metric", "dim"), [("point", 2), ("plane", 3)])

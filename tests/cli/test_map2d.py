@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import os
+import signal
 import subprocess
 import sys
 from dataclasses import replace
@@ -12,9 +14,10 @@ import numpy as np
 import pytest
 from evo.tools import file_interface
 
-from dpmjax.cli.command import run_command
+from dpmjax.cli.command import Interrupted, run_command
 from dpmjax.cli.map2d import NAME, Config, main
 from dpmjax.io import ScanSequence, write_deepmapping_folder, write_pcd
+from dpmjax.registration import register_scans
 from dpmjax.simulation import simulate_sequence
 
 REPOSITORY = Path(__file__).parents[2]
@@ -112,6 +115,22 @@ def test_an_interrupted_run_is_resumed_to_the_same_numbers(scans_npz, tmp_path) 
     assert steps == [
         line.split(",")[0] for line in (tmp_path / "unbroken" / "metrics.csv").read_text().splitlines()[1:]
     ]
+
+
+def test_a_run_interrupted_before_the_fit_keeps_its_start(scans_npz, tmp_path, monkeypatch) -> None:
+    def interrupted(*options: object, **hooks: object) -> object:
+        os.kill(os.getpid(), signal.SIGINT)
+        return register_scans(*options, **hooks)  # type: ignore[arg-type]
+
+    monkeypatch.setattr("dpmjax.registration.register_scans", interrupted)
+    with pytest.raises(Interrupted):
+        main(Config(data=scans_npz, init="zero", output=tmp_path / "out"))
+    found = metrics_of(tmp_path / "out")
+    assert found["is_interrupted"]
+    assert (found["steps"], found["kept"]) == (0, "zero poses")
+    assert list(found["candidates"]) == ["zero poses"]
+    assert (tmp_path / "out" / "map.png").exists()
+    assert not (tmp_path / "out" / "occupancy.png").exists()
 
 
 @pytest.mark.slow

@@ -43,7 +43,7 @@ def fitted(tiny_walk) -> dm.Fitted:
     )
     data, unit = planar_data(ScanSet(tiny_walk.points, tiny_walk.mask))
     params = init(planar_problem(config, data), data, key=KEY).params
-    return dm.Fitted(tiny_walk.reference_poses, with_true_map(params, tiny_walk, unit), None, unit, config)
+    return dm.Fitted(tiny_walk.reference_poses, with_true_map(params, tiny_walk, unit), None, unit, config, 1)
 
 
 def with_true_map(params, walk, unit: float):

@@ -106,7 +106,7 @@ def test_phases_with_networks_of_other_windows_are_refused() -> None:
 def test_networks_of_windows_do_not_relocalize(tiny_walk) -> None:
     data, unit = planar_data(ScanSet(tiny_walk.points, tiny_walk.mask))
     params = init(planar_problem(SMALL, data), data, key=KEY).params
-    fitted = dm.Fitted(tiny_walk.reference_poses, params, None, unit, SMALL)
+    fitted = dm.Fitted(tiny_walk.reference_poses, params, None, unit, SMALL, 0)
     with pytest.raises(ValueError, match="train_localization"):
         dpmjax.relocalize(fitted, tiny_walk.points)
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from collections import Counter
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -23,7 +22,6 @@ from experiments._deepmapping_methods import (
     DEEPMAPPING,
     METHODS,
     Task,
-    in_fitting_order,
     make_task,
 )
 from experiments._deepmapping_tables import best_kept, run_method
@@ -98,11 +96,6 @@ def test_shuffled_task_keeps_scans_with_their_truth(task) -> None:
     ]
     assert sorted(order) == list(range(8)) != order
     np.testing.assert_array_equal(shuffled.sequence.points, task.sequence.points[order])
-    # Along a walk, the order in which the fit takes the scans has no long steps.
-    x = np.column_stack([np.array(order, float), np.zeros((8, 2))])
-    steps = np.abs(np.diff(x[in_fitting_order(shuffled, x), 0]))
-    assert np.sort(steps)[-2] == 1.0
-    np.testing.assert_array_equal(in_fitting_order(replace(shuffled, is_ordered=True), x), np.arange(8))
 
 
 def a_row(method: str, ate: float, kept: str = "search", **candidates: float) -> dict:

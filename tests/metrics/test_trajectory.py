@@ -1,5 +1,8 @@
 from __future__ import annotations
 
+import itertools
+
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.optimize import minimize
@@ -149,5 +152,8 @@ def test_bad_input_is_named(as_user) -> None:
         point_distance(points, mask[:, :3], estimated, reference)
     with pytest.raises(ValueError, match="^mask: expected at least one"):
         point_distance(points, ~mask, estimated, reference)
+    for error, xp in itertools.product((absolute_trajectory_error, align_rigid), (np.asarray, jnp.asarray)):
+        with pytest.raises(ValueError, match="^mask: expected at least one"):
+            error(xp(points[:, 0]), xp(points[:, 0]), xp(np.zeros(25, bool)))
     with pytest.raises(ValueError, match="^T_estimated: expected finite"):
         point_distance(points, mask, broken, reference)

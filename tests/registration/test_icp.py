@@ -100,7 +100,12 @@ def test_a_line_slides_along_itself_only() -> None:
         (np.ones((5, 2)), np.full((5, 2), np.nan), {}, "target: .* finite numbers"),
         (np.ones((5, 2)), np.ones((5, 2)), {"metric": "wall"}, "metric: expected 'point' or 'plane'"),
         (np.ones((5, 2)), np.ones((5, 2)), {"T_init": np.eye(4)}, "T_init: expected shape"),
-        (np.ones((5, 2)), np.ones((5, 2)), {"T_init": np.full((3, 3), np.nan)}, "T_init: .* finite numbers"),
+        (
+            np.ones((5, 2)),
+            np.ones((5, 2)),
+            {"T_init": np.full((3, 3), np.nan)},
+            "T_init: expected finite numbers, got NaN",
+        ),
     ],
 )
 def test_bad_input_is_named(as_user, source, target, options, message) -> None:

@@ -9,7 +9,16 @@ import jax
 import numpy as np
 import pytest
 
-from dpmjax.deepmapping import DeepMappingConfig, Fitted, fit_deepmapping, preset, with_steps
+from dpmjax.deepmapping import (
+    DeepMappingConfig,
+    Fit,
+    FitState,
+    MappingData,
+    Problem,
+    fit_deepmapping,
+    preset,
+    with_steps,
+)
 from dpmjax.geometry import se2
 from dpmjax.registration import (
     DEEPMAPPING,
@@ -20,6 +29,7 @@ from dpmjax.registration import (
     RegistrationHooks,
     assess_trajectory,
     choose_trajectory,
+    fit_in_order,
     incremental_icp,
     pipeline,
     planar_scans,
@@ -41,21 +51,29 @@ def scan_set(sequence: ScanSequence) -> ScanSet:
 
 
 class Untrained:
-    """A fit that returns its start; notes what it was called with."""
+    """Makes an engine that returns its start; notes the rows, and what the engine was called with."""
 
-    def __init__(self) -> None:
+    def __init__(self, num_steps: int = 1) -> None:
+        self.num_steps = num_steps
         self.rows: np.ndarray = np.zeros(0, int)
         self.start: np.ndarray | None = None
+        self.config: DeepMappingConfig | None = None
 
-    def __call__(self, rows: np.ndarray, start: np.ndarray | None) -> Fitted:
-        self.rows, self.start = rows, start
-        poses = np.zeros((len(rows), 3)) if start is None else start
-        return Fitted(poses, None, None, 1.0, DeepMappingConfig())  # type: ignore[arg-type]
+    def __call__(self, rows: np.ndarray) -> Callable[..., Fit]:
+        self.rows = rows
+        return self.train
+
+    def train(self, problem: Problem, data: MappingData, *, key: jax.Array, num_starts: int) -> Fit:
+        self.start, self.config = None if data.start is None else np.asarray(data.start), problem.config
+        np.testing.assert_array_equal(jax.random.key_data(key), jax.random.key_data(KEY))
+        phase, count = np.int32(0), np.int32(self.num_steps)
+        poses = np.zeros((len(self.rows), 3)) if data.start is None else data.start
+        return Fit(FitState(None, None, key, phase, count, count), poses, None, 0.0, 0.0)  # type: ignore[arg-type]
 
 
 def register(sequence: ScanSequence, config: RegistrationConfig = SHORT, **options) -> RegisteredScans:
     """The registration without a trained fit."""
-    options.setdefault("hooks", RegistrationHooks(fit=Untrained()))
+    options.setdefault("hooks", RegistrationHooks(engine=Untrained()))
     return register_scans(scan_set(sequence), config, key=KEY, **options)
 
 
@@ -88,16 +106,18 @@ def test_the_poses_are_those_of_the_steps_one_after_the_other(few) -> None:
 @pytest.mark.slow
 def test_a_shuffled_set_is_registered_without_its_order(walk) -> None:
     order = np.random.default_rng(1).permutation(12)
-    shuffled, fit = walk.take(order), Untrained()
+    shuffled, engine = walk.take(order), Untrained()
     config = replace(SHORT, is_ordered=False)
-    found = register(shuffled, config, hooks=RegistrationHooks(fit=fit))
+    found = register(shuffled, config, hooks=RegistrationHooks(engine=engine))
     assert found.start == GLOBAL
     assert ate(found.poses, shuffled.reference_poses) < 0.1
     # The fit gets all scans once, and neighbours in space follow each other.
-    assert sorted(fit.rows) == list(range(12))
-    assert np.abs(np.diff(order[fit.rows])).mean() < np.abs(np.diff(order)).mean()
-    np.testing.assert_array_equal(fit.start, found.candidates[GLOBAL].poses[fit.rows])
-    np.testing.assert_array_equal(found.fitted.poses, found.candidates[GLOBAL].poses)
+    assert engine.config == SHORT.fit
+    assert sorted(engine.rows) == list(range(12))
+    assert np.abs(np.diff(order[engine.rows])).mean() < np.abs(np.diff(order)).mean()
+    start, unit = found.candidates[GLOBAL].poses, found.fitted.unit
+    np.testing.assert_allclose(engine.start * [unit, unit, 1.0], start[engine.rows], atol=1e-4)
+    np.testing.assert_allclose(found.fitted.poses, start, atol=1e-4)
 
 
 @pytest.mark.slow
@@ -113,9 +133,32 @@ def test_untrusted_odometry_leads_to_a_registration_without_it(walk) -> None:
 
 
 def test_stop_ends_with_what_exists(few) -> None:
-    found = register(few, start=few.reference_poses, hooks=RegistrationHooks(stop=lambda: True, fit=Untrained()))
-    assert list(found.candidates) == [GIVEN_POSES, DEEPMAPPING]
+    found = register(few, start=few.reference_poses, hooks=RegistrationHooks(stop=lambda: True))
+    assert list(found.candidates) == [GIVEN_POSES]
+    assert found.kept == GIVEN_POSES
+    assert found.fitted.num_steps == 0
     np.testing.assert_array_equal(found.poses, few.reference_poses)
+
+
+def test_a_resumed_fit_that_is_over_is_a_candidate_and_one_without_a_step_is_not(few) -> None:
+    start = few.reference_poses
+    for num_steps, names in ((0, [GIVEN_POSES]), (20, [GIVEN_POSES, DEEPMAPPING])):
+        hooks = RegistrationHooks(engine=Untrained(num_steps))
+        found = register(few, start=start, hooks=hooks)
+        assert found.fitted.report is None
+        assert list(found.candidates) == [*names, *(f"{name}, refined" for name in names)]
+
+
+def test_a_fit_in_another_order_returns_poses_in_that_of_the_scans(few) -> None:
+    along = np.random.default_rng(0).permutation(10)
+    start = np.column_stack([along.astype(float), np.zeros((10, 2))])
+    for is_ordered in (True, False):
+        engine = Untrained()
+        fitted = fit_in_order(scan_set(few), SHORT.fit, key=KEY, start=start, is_ordered=is_ordered, engine_of=engine)
+        np.testing.assert_allclose(fitted.poses, start, atol=1e-4)
+        # Along a line, a tour has one long step at most.
+        steps = np.sort(np.abs(np.diff(along[engine.rows])))
+        assert (steps[-2] == 1) == (not is_ordered)
 
 
 def test_stop_ends_the_fit_between_calls_of_its_step(few) -> None:
@@ -136,16 +179,16 @@ def test_stop_ends_the_fit_between_calls_of_its_step(few) -> None:
 
 def test_each_stage_is_told_before_it_begins(few) -> None:
     stages: list[str] = []
-    hooks = RegistrationHooks(on_progress=lambda stage, _: stages.append(stage), fit=Untrained())
+    hooks = RegistrationHooks(on_progress=lambda stage, _: stages.append(stage), engine=Untrained())
     register(few, start="icp-plane", hooks=hooks)
     assert stages[:3] == [f"start: {ICP}", DEEPMAPPING, f"{ICP}, refined"]
     assert stages[-1] == "choice and assessment"
 
 
 def test_a_cold_start_has_no_poses_and_is_not_refined(few) -> None:
-    fit = Untrained()
-    found = register(few, replace(SHORT, refine=False), start="zero", hooks=RegistrationHooks(fit=fit))
-    assert fit.start is None
+    engine = Untrained()
+    found = register(few, replace(SHORT, refine=False), start="zero", hooks=RegistrationHooks(engine=engine))
+    assert engine.start is None
     assert list(found.candidates) == [START_NAMES["zero"], DEEPMAPPING]
 
 

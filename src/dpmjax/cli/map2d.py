@@ -17,9 +17,11 @@ recording, scans half a metre or 20 degrees apart are registered, and all others
 from __future__ import annotations
 
 import logging
+import math
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
@@ -41,7 +43,6 @@ from dpmjax.cli.map2d_numbers import (
 )
 from dpmjax.cli.recorded_fit import FitRecorder, draw_loss
 from dpmjax.cli.run_folder import (
-    RunFolder,
     RunOptions,
     open_run_folder,
     recording,
@@ -49,7 +50,7 @@ from dpmjax.cli.run_folder import (
 )
 
 if TYPE_CHECKING:
-    from dpmjax.deepmapping import DeepMappingConfig, Fitted
+    from dpmjax.deepmapping import DeepMappingConfig, Fit
     from dpmjax.registration import RegisteredScans, RegistrationConfig
     from dpmjax.sequences import ScanSequence
 
@@ -117,13 +118,14 @@ def main(config: Config) -> dict[str, Any]:
     folder = open_run_folder(config, NAME)
     with recording(folder), StopFlag() as stop:
         print(f"{sequence.name}: {len(sequence)} scans of {sequence.points.shape[1]} beams")
-        fit = _Fit(folder, sequence, config, stop)
-        result = register(sequence, start, config, fit)
+        seconds = math.inf if config.seconds is None else config.seconds
+        recorder = FitRecorder(folder, sequence.unit, stop=lambda run_s: stop.is_requested or run_s >= seconds)
+        result = register(sequence, start, config, recorder, stop)
         metrics = {
             **numbers_of(sequence, result, config, measure),
-            "fit_s": fit.recorder.run_s,
-            "compile_s": fit.recorder.compile_s,
-            "steps": fit.recorder.steps,
+            "fit_s": recorder.run_s,
+            "compile_s": recorder.compile_s,
+            "steps": recorder.steps,
             "peak_rss_gb": peak_rss_gb(),
             "is_interrupted": stop.is_requested,
         }
@@ -132,7 +134,7 @@ def main(config: Config) -> dict[str, Any]:
         write_metrics(folder, metrics | {"wall_s": time.perf_counter() - started}, seed=config.seed)
         registered = registered_scans(sequence, result)
         limits = draw_map(folder, registered, result, metrics)
-        if fit.recorder.has_map:
+        if recorder.has_map:
             draw_occupancy(folder, registered, result, limits)
         draw_loss(folder, sequence.unit)
         metrics["wall_s"] = time.perf_counter() - started
@@ -143,49 +145,23 @@ def main(config: Config) -> dict[str, Any]:
     return metrics
 
 
-class _Fit:
-    """The fit of some scans in a run folder, with history, checkpoints and a progress bar; it can be stopped.
-
-    Attributes:
-        recorder: the engine of the fit; made by the call.
-    """
-
-    recorder: FitRecorder
-
-    def __init__(self, folder: RunFolder, sequence: ScanSequence, config: Config, stop: StopFlag) -> None:
-        self._folder, self._sequence, self._config, self.stop = folder, sequence, config, stop
-
-    def __call__(self, rows: NDArray[np.integer], start: Floats | None) -> Fitted:
-        """Fits the scans of these rows, in this order."""
-        import jax
-
-        from dpmjax.geometry import typical_range
-
-        sequence, seconds = self._sequence.take(rows), self._config.seconds
-        if len(rows) < len(self._sequence):
-            print(f"{len(rows)} of the scans are registered, chosen by their motion")
-        self.recorder = FitRecorder(
-            self._folder,
-            ate_of(sequence, typical_range(sequence.points, sequence.mask)),
-            sequence.unit,
-            stop=lambda run_s: self.stop.is_requested or (seconds is not None and run_s >= seconds),
-        )
-        return deepmapping.fit_deepmapping(
-            as_scan_set(sequence),
-            fit_settings(self._config, sequence),
-            key=jax.random.key(self._config.seed),
-            start=start,
-            engine=self.recorder,
-        )
-
-
-def register(sequence: ScanSequence, start: str | Floats, config: Config, fit: _Fit) -> RegisteredScans:
-    """Registers the scans; prints each stage where it begins."""
+def register(
+    sequence: ScanSequence, start: str | Floats, config: Config, recorder: FitRecorder, stop: StopFlag
+) -> RegisteredScans:
+    """Registers the scans, the fit by the recorder; prints each stage where it begins."""
     import jax
+
+    from dpmjax.geometry import typical_range
 
     def show(stage: str, share: float) -> None:
         if share == 0.0:
             print(f"{stage} ...", flush=True)
+
+    def engine(rows: NDArray[np.integer]) -> Callable[..., Fit]:
+        if len(rows) < len(sequence):
+            print(f"{len(rows)} of the scans are registered, chosen by their motion")
+        fitted = sequence.take(rows)
+        return partial(recorder, measure=ate_of(fitted, typical_range(fitted.points, fitted.mask)))
 
     return registration.register_scans(
         as_scan_set(sequence),
@@ -193,7 +169,7 @@ def register(sequence: ScanSequence, start: str | Floats, config: Config, fit: _
         key=jax.random.key(config.seed),
         start=start,
         odometry=sequence.odometry_poses if config.ordered else None,
-        hooks=registration.RegistrationHooks(show, lambda: fit.stop.is_requested, fit),
+        hooks=registration.RegistrationHooks(show, lambda: stop.is_requested, engine),
     )
 
 

@@ -44,11 +44,13 @@ def write_trajectories(folder: RunFolder, sequence: ScanSequence, poses: NDArray
 def draw_map(
     folder: RunFolder, registered: ScanSequence, result: RegisteredScans, metrics: Mapping[str, Any]
 ) -> viz.Limits:
-    """Draws map.png: the start, DeepMapping, the kept candidate, the reference; returns its limits."""
+    """Draws map.png: the start, DeepMapping if it was trained, the kept one, the reference; returns its limits."""
     scans, unit = as_scan_set(registered), registered.unit
     panels = []
     titles = dict(zip(result.candidates, metrics["candidates"], strict=True))
     for name in dict.fromkeys((result.start, registration.DEEPMAPPING, result.kept)):
+        if name not in result.candidates:
+            continue
         title, numbers = titles[name], metrics["candidates"][titles[name]]
         ate, distance = numbers.get(f"ate_{unit}"), numbers.get(f"point_distance_{unit}")
         title = title[0].upper() + title[1:] + (" (kept)" if name == result.kept else "")

@@ -66,5 +66,5 @@ def read_map2d_run(path: Path) -> Map2dRun:
     if state is None:
         raise ValueError(f"{path} holds no checkpoint that can be read")
     poses = np.asarray(problem.poses(settings, problem.phases[int(state.phase)], state.params, data), np.float64)
-    fitted = Fitted(poses * [unit, unit, 1.0], state.params, None, unit, settings)
+    fitted = Fitted(poses * [unit, unit, 1.0], state.params, None, unit, settings, int(state.step))
     return Map2dRun(sequence, fitted, config.world if config.data is None else None)

@@ -29,6 +29,8 @@ _SAVE_EVERY_S = 20.0
 class FitRecorder:
     """Engine of a fit in a run folder (`engine=` of `fit_deepmapping`): it goes on where the checkpoints end.
 
+    `functools.partial(recorder, measure=...)` is the same engine with a column for the error.
+
     Attributes:
         steps: steps done in all.
         run_s: seconds of stepping, those of earlier runs too, compile time apart.
@@ -39,7 +41,6 @@ class FitRecorder:
     def __init__(
         self,
         folder: RunFolder,
-        measure: Callable[[NDArray[np.float64]], float],
         length: str,
         *,
         stop: Callable[[float], bool],
@@ -48,15 +49,22 @@ class FitRecorder:
 
         Args:
             folder: of the run; gets `metrics.csv` and checkpoints.
-            measure: ATE of the problem's poses; NaN without a reference.
             length: unit of the ATE.
             stop: called before each call of the step with the run time so far, seconds; the fit ends where it is True.
         """
-        self._folder, self._measure, self._length, self._stop = folder, measure, length, stop
+        self._folder, self._length, self._stop = folder, length, stop
         self.steps, self.run_s, self.compile_s, self.has_map = 0, 0.0, 0.0, False
 
-    def __call__(self, problem: Problem, data: Any, *, key: jax.Array, num_starts: int = 1) -> Fit:
-        """Fits, or continues where the checkpoints of the folder end."""
+    def __call__(
+        self,
+        problem: Problem,
+        data: Any,
+        *,
+        key: jax.Array,
+        num_starts: int = 1,
+        measure: Callable[[NDArray[np.float64]], float] = lambda _: math.nan,
+    ) -> Fit:
+        """Fits, or continues where the checkpoints of the folder end; `measure` gives the ATE of its poses."""
         from dpmjax.checkpoints import Checkpoints
         from dpmjax.deepmapping import init, resume
 
@@ -74,7 +82,7 @@ class FitRecorder:
         def record(progress: Progress) -> None:
             nonlocal saved_at
             self.run_s = earlier_s + progress.run_s
-            self._write(progress, history, bar)
+            self._write(progress, measure(np.asarray(progress.report.poses, np.float64)), history, bar)
             if time.perf_counter() - saved_at > _SAVE_EVERY_S:
                 checkpoints.save(int(progress.state.step), progress.state)
                 saved_at = time.perf_counter()
@@ -83,13 +91,12 @@ class FitRecorder:
             done = resume(problem, state, data, on_report=record, stop=lambda: self._stop(self.run_s))
         checkpoints.save(int(done.state.step), done.state)
         self.steps, self.compile_s = int(done.state.step), done.compile_s
-        self.has_map = problem.phases[int(done.state.phase)].occupancy_weight > 0.0
+        self.has_map = self.steps > 0 and problem.phases[int(done.state.phase)].occupancy_weight > 0.0
         return done
 
-    def _write(self, progress: Progress, history: HistoryFile, bar: tqdm) -> None:
+    def _write(self, progress: Progress, ate: float, history: HistoryFile, bar: tqdm) -> None:
         """Adds one call of the step to the table and to the progress bar."""
         report, phase, step = progress.report, progress.phase.name, int(progress.state.step)
-        ate = self._measure(np.asarray(report.poses, np.float64))
         losses = {name: float(np.mean(term)) for name, term in report.terms._asdict().items()}
         row = {"step": step, "phase": phase, "run_s": round(self.run_s, 4), f"ate_{self._length}": ate}
         history.append(**row, loss=report.loss, **losses)

@@ -34,8 +34,8 @@ from dpmjax.deepmapping.spatial import (
 from dpmjax.geometry import rigid
 from dpmjax.geometry.rays import typical_range
 
-# Width of the kernel, in typical ranges, by which the start and the fit are compared.
-_JUDGED_WIDTH = 0.004
+# Kernel width, in typical ranges, of the misfit by which the start and the fit are compared.
+_MISFIT_KERNEL_WIDTH = 0.004
 
 
 class CloudFitted(NamedTuple):
@@ -46,7 +46,7 @@ class CloudFitted(NamedTuple):
         params: of L-Net and M-Net.
         report: of the last call of the step.
         unit: the length that the parameters count in, unit of the points.
-        kept: which poses these are.
+        kept: source of the poses, the fit or the start.
         misfit: share of planes that do not meet the planes of other scans, 0 to 1, at the poses of the fit.
         start_misfit: the same at the start; None after a cold start.
     """
@@ -143,10 +143,10 @@ def as_fitted(done: Fit, data: MappingData, unit: float) -> CloudFitted:
     Returns:
         CloudFitted.
     """
-    misfit, start_misfit = float(trajectory_misfit(data.scans, done.poses, _JUDGED_WIDTH)), None
+    misfit, start_misfit = float(trajectory_misfit(data.scans, done.poses, _MISFIT_KERNEL_WIDTH)), None
     T, kept = fitted_poses(done.poses, unit), "fit"
     if data.start is not None:
-        start_misfit = float(trajectory_misfit(data.scans, data.start, _JUDGED_WIDTH))
+        start_misfit = float(trajectory_misfit(data.scans, data.start, _MISFIT_KERNEL_WIDTH))
         # A fit that is not finite is not better.
         if not misfit < start_misfit:
             T, kept = fitted_poses(data.start, unit), "start"

@@ -21,7 +21,7 @@ class RegisteredDepth(NamedTuple):
 
     Attributes:
         T_world_camera: (n, 4, 4) float64, unit of the points: of the fit, or the start where that agrees better.
-        kept: which poses these are.
+        kept: source of the poses, the fit or the start.
         consistency: projective consistency of the fit, at most 1.
         start_consistency: the same of the start.
         start: (n, 4, 4) poses that the fit started from.
@@ -65,6 +65,8 @@ def register_depth(
     scans = images if isinstance(images, DepthScans) else as_depth_scans(images)
     if start is None:
         start = initialize_depth(scans, motion=config.motion, key=key)
+    # Search and fit share the key: a fit from given poses gives the same as one from the same poses, found here. The
+    # published numbers rest on it.
     fitted = fit_depth(scans, config, key=key, start=start, engine=engine)
     T_start = np.asarray(start, np.float64)
     consistency, start_consistency = (float(projective_consistency(scans, T)) for T in (fitted.T_world_camera, T_start))

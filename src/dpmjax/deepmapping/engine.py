@@ -103,7 +103,7 @@ class Fit(NamedTuple):
 
 
 def init(problem: Problem, data: Any, *, key: jax.Array, num_starts: int = 1) -> FitState:
-    """A fresh state at the start of the first phase.
+    """Makes a fresh state at the start of the first phase.
 
     Args:
         problem: what to fit.
@@ -198,7 +198,7 @@ def _scanned_step(problem: Problem, data: Any, phase: int, state: FitState, _: N
 
 
 def is_finished(problem: Problem, state: FitState) -> bool:
-    """Whether all steps of the last phase are done.
+    """Tells whether all steps of the last phase are done.
 
     Args:
         problem: what is fitted.
@@ -281,12 +281,12 @@ def resume(
 
 
 def _scalar(count: Array) -> int:
-    """A counter, which is the same for all starts."""
+    """Returns a counter, which is the same for all starts."""
     return int(np.asarray(count).reshape(-1)[0])
 
 
 def num_calls(problem: Problem, phase: Any) -> int:
-    """Calls of the step that a phase takes.
+    """Counts the calls of the step that a phase takes.
 
     Args:
         problem: what is fitted.
@@ -299,7 +299,7 @@ def num_calls(problem: Problem, phase: Any) -> int:
 
 
 def steps_per_call(problem: Problem, phase: Any) -> int:
-    """Steps of one call: the calls share those of the phase evenly, so that the last one hardly goes beyond.
+    """Counts the steps of one call: the calls share those of the phase evenly; the last one hardly goes beyond.
 
     Args:
         problem: what is fitted.
@@ -313,7 +313,7 @@ def steps_per_call(problem: Problem, phase: Any) -> int:
 
 @partial(jax.jit, static_argnums=0)
 def _init(problem: Problem, data: Any, key: Array) -> FitState:
-    """A state, or one for each of several keys."""
+    """Makes a state, or one for each of several keys."""
     if key.ndim:
         return jax.vmap(lambda one: _init(problem, data, one))(key)
     params = problem.init(problem.config, key, data)
@@ -323,7 +323,7 @@ def _init(problem: Problem, data: Any, key: Array) -> FitState:
 
 
 def _enter_phase(problem: Problem, state: FitState, data: Any) -> FitState:
-    """The state at the start of the next phase if its phase is over and not the last; else the same state."""
+    """Returns the state at the start of the next phase if its phase is over and not the last; else the same state."""
     phase = _scalar(state.phase)
     if phase + 1 == len(problem.phases) or _scalar(state.phase_step) < problem.phases[phase].num_steps:
         return state
@@ -331,7 +331,7 @@ def _enter_phase(problem: Problem, state: FitState, data: Any) -> FitState:
 
 
 def _over_starts(function: Callable[..., Any], state: FitState, data: Any) -> Any:
-    """The function of one state, or of all starts side by side."""
+    """Calls the function on one state, or on all starts side by side."""
     return jax.vmap(function, in_axes=(0, None))(state, data) if state.step.ndim else function(state, data)
 
 
@@ -342,7 +342,7 @@ def _current_poses(problem: Problem, phase: int, state: FitState, data: Any) -> 
 
 @partial(jax.jit, static_argnums=(0, 1))
 def _advance(problem: Problem, phase_index: int, state: FitState, data: Any) -> tuple[FitState, Report]:
-    """One call of steps of a phase."""
+    """Does one call of steps of a phase."""
     phase = problem.phases[phase_index]
     optimizer = problem.optimizer(problem.config, phase)
 
@@ -365,7 +365,7 @@ def _advance(problem: Problem, phase_index: int, state: FitState, data: Any) -> 
 
 
 def _num_kept(problem: Problem, state: FitState, steps_before: int) -> int:
-    """Number of starts to go on with where some are to be dropped; else 0."""
+    """Returns the number of starts to go on with where some are to be dropped; else 0."""
     num_starts = state.step.size
     if num_starts == 1 or not problem.halve_at:
         return 0
@@ -377,7 +377,7 @@ def _num_kept(problem: Problem, state: FitState, steps_before: int) -> int:
 
 
 def _keep_best(state: FitState, report: Report, num_kept: int) -> tuple[FitState, Report]:
-    """The starts of the smallest mean loss of the last call; a single one loses its leading axis."""
+    """Returns the starts of the smallest mean loss of the last call; a single one loses its leading axis."""
     losses = np.nan_to_num(np.asarray(report.losses).mean(axis=-1), nan=np.inf)
     best = np.sort(np.argsort(losses, kind="stable")[:num_kept])
     return jax.tree.map(lambda leaf: leaf[best[0]] if num_kept == 1 else leaf[best], (state, report))

@@ -46,6 +46,7 @@ class Fitted(NamedTuple):
         report: of the last call of the step.
         unit: the length that the parameters count in, unit of the points.
         config: settings of the fit.
+        num_steps: steps done in all, those of a resumed run too; with 0, the networks are untrained.
     """
 
     poses: NDArray[np.float64]
@@ -53,6 +54,7 @@ class Fitted(NamedTuple):
     report: Report | None
     unit: float
     config: DeepMappingConfig
+    num_steps: int
 
     @property
     def T_world_scan(self) -> NDArray[np.float64]:
@@ -162,7 +164,9 @@ def as_fitted(done: Fit, unit: float, config: DeepMappingConfig) -> Fitted:
         Fitted.
     """
     poses = np.asarray(done.poses, np.float64) * [unit, unit, 1.0]
-    return Fitted(poses, done.state.params, done.report, unit, config)
+    # Several starts have done the same number of steps.
+    num_steps = int(np.max(done.state.step))
+    return Fitted(poses, done.state.params, done.report, unit, config, num_steps)
 
 
 def localize_scans(

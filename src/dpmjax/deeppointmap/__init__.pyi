@@ -25,6 +25,7 @@ from .evaluation import PairKind as PairKind
 from .evaluation import draw_evaluation_pairs as draw_evaluation_pairs
 from .evaluation import evaluate_registration as evaluate_registration
 from .matching import MatchConfig as MatchConfig
+from .matching import match_descriptors as match_descriptors
 from .matching import merge_clouds as merge_clouds
 from .model import Model as Model
 from .model import correlate as correlate

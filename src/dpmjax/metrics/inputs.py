@@ -25,6 +25,8 @@ def checked_positions(estimated: AnyArray, reference: AnyArray, mask: AnyArray |
     is_valid = xp.ones(len(estimated), bool) if mask is None else xp.asarray(mask)
     if is_valid.shape != estimated.shape[:1] or is_valid.dtype != bool:
         raise ValueError(f"mask: expected bool of shape {estimated.shape[:1]}, got {is_valid.dtype} {is_valid.shape}")
+    if not is_traced(is_valid) and not np.asarray(is_valid).any():
+        raise ValueError("mask: expected at least one valid position, got none")
     estimated, reference = (xp.where(is_valid[:, None], value, 0) for value in (estimated, reference))
     require_finite("estimated", estimated)
     require_finite("reference", reference)

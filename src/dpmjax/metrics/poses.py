@@ -61,13 +61,15 @@ def align_rigid(
     Args:
         estimated: (n, 2) or (n, 3) positions.
         reference: the same positions in another frame, the same unit.
-        mask: False for positions that are not there; they may hold anything.
+        mask: False for positions that are not there; they may hold anything. A traced mask without any position gives
+            the identity.
 
     Returns:
         `T_reference_estimated`, (d+1, d+1): float64, or of JAX where an array is JAX's.
 
     Raises:
-        ValueError: the shapes differ, are not (n, 2) or (n, 3) with n >= 1, or a number is not finite.
+        ValueError: the shapes differ, are not (n, 2) or (n, 3) with n >= 1, a number is not finite, or no position is
+            there.
     """
     return best_motion(*checked_positions(estimated, reference, mask))
 
@@ -80,13 +82,15 @@ def absolute_trajectory_error(
     Args:
         estimated: positions, (n, 2) or (n, 3).
         reference: the same positions in another frame, the same unit.
-        mask: False for positions that are not there; they may hold anything.
+        mask: False for positions that are not there; they may hold anything. A traced mask without any position gives
+            0.
 
     Returns:
         The error, in the unit of the positions: a float, or of JAX where an array is JAX's. Its gradient at 0 is 0.
 
     Raises:
-        ValueError: the shapes differ, are not (n, 2) or (n, 3) with n >= 1, or a number is not finite.
+        ValueError: the shapes differ, are not (n, 2) or (n, 3) with n >= 1, a number is not finite, or no position is
+            there.
     """
     estimated, reference, weights = checked_positions(estimated, reference, mask)
     difference = _transform(best_motion(estimated, reference, weights), estimated) - reference
@@ -141,7 +145,7 @@ def point_distance(
 
     Args:
         points: of each scan, in its own frame.
-        mask: False for points that are not there; they may hold anything.
+        mask: False for points that are not there; they may hold anything. A traced mask without any point gives 0.
         T_estimated: `T_world_scan` of each scan.
         T_reference: the same, in the reference's world.
 

@@ -13,6 +13,7 @@ from .pipeline import Candidate as Candidate
 from .pipeline import RegisteredScans as RegisteredScans
 from .pipeline import RegistrationConfig as RegistrationConfig
 from .pipeline import RegistrationHooks as RegistrationHooks
+from .pipeline import fit_in_order as fit_in_order
 from .pipeline import register_scans as register_scans
 from .planar_scans import PlanarScans as PlanarScans
 from .planar_scans import planar_scans as planar_scans

@@ -1,4 +1,4 @@
-"""Iterated closest point for two clouds, planar or spatial: the textbook method, robust and honest about its result."""
+"""Iterated closest point for two clouds, planar or spatial: robust weights, and whether the loop has converged."""
 
 from __future__ import annotations
 
@@ -88,9 +88,10 @@ def icp(
         _Cloud(source, as_mask("source_mask", source_mask, source.shape[:1])),
         _Cloud(target, as_mask("target_mask", target_mask, target.shape[:1])),
     )
-    _require_finite("source", *clouds[0])
-    _require_finite("target", *clouds[1])
-    _require_finite("T_init", start, jnp.ones(len(start), bool))
+    _require_finite_cloud("source", clouds[0])
+    _require_finite_cloud("target", clouds[1])
+    if not isinstance(start, jax.core.Tracer) and not np.isfinite(np.asarray(start)).all():
+        raise ValueError("T_init: expected finite numbers, got NaN or infinity")
     return _icp(*clouds, start.astype(source.dtype), metric=metric)
 
 
@@ -121,9 +122,9 @@ class _Pairs(NamedTuple):
     mask: Bool[Array, " n"]
 
 
-def _require_finite(name: str, array: Array, mask: Array) -> None:
-    is_known = not any(isinstance(value, jax.core.Tracer) for value in (array, mask))
-    if len(array) == 0 or (is_known and not np.isfinite(np.asarray(array)[np.asarray(mask)]).all()):
+def _require_finite_cloud(name: str, cloud: _Cloud) -> None:
+    is_known = not any(isinstance(value, jax.core.Tracer) for value in cloud)
+    if len(cloud.points) == 0 or (is_known and not np.isfinite(np.asarray(cloud.points)[np.asarray(cloud.mask)]).all()):
         raise ValueError(f"{name}: expected one point or more and finite numbers; leave invalid points out")
 
 
@@ -211,7 +212,7 @@ def _find_pairs(source: _Cloud, target: _Cloud, normals: Float[Array, "m d"], T:
 
 
 def _step_to_planes(pairs: _Pairs, centre: Float[Array, " d"]) -> Float[Array, "d1 d1"]:
-    """The small motion that brings points onto the lines or planes of their partners, about the points' mean."""
+    """Computes the small motion, of points onto the lines or planes of their partners, about the points' mean."""
     jacobian = jnp.concatenate([pairs.normals, _turning(pairs.points - centre, pairs.normals)], axis=-1)
     residual = jnp.sum(pairs.apart * pairs.normals, -1)
     weighted = pairs.weights[:, None] * jacobian
@@ -224,13 +225,13 @@ def _step_to_planes(pairs: _Pairs, centre: Float[Array, " d"]) -> Float[Array, "
 
 
 def _turning(lever: Float[Array, "n d"], vectors: Float[Array, "n d"]) -> Float[Array, "n r"]:
-    """Torques: the cross product of levers and vectors, one number in the plane."""
+    """Computes torques: the cross product of levers and vectors, one number in the plane."""
     i, j = np.array([[0], [1]] if lever.shape[1] == 2 else [[1, 2, 0], [2, 0, 1]])
     return lever[:, i] * vectors[:, j] - lever[:, j] * vectors[:, i]
 
 
 def _about(step: Float[Array, " k"], centre: Float[Array, " d"]) -> Float[Array, "d1 d1"]:
-    """The motion of a twist about a centre."""
+    """Returns the motion of a twist about a centre."""
     dim = len(centre)
     motion = se2.exp(step) if dim == 2 else se3.exp(step)
     return motion.at[:dim, dim].add(centre - jnp.matmul(motion[:dim, :dim], centre, precision="highest"))
@@ -241,20 +242,20 @@ def _mean(cloud: _Cloud) -> Float[Array, " d"]:
 
 
 def _size(cloud: _Cloud) -> Float[Array, ""]:
-    """Root mean square distance of the points from their mean."""
+    """Returns the root mean square distance of the points from their mean."""
     squared = jnp.sum((cloud.points - _mean(cloud)) ** 2, axis=-1)
     return safe_sqrt(jnp.sum(jnp.where(cloud.mask, squared, 0)) / jnp.maximum(cloud.mask.sum(), 1))
 
 
 def _resolution(target: _Cloud) -> Float[Array, ""]:
-    """A millionth of the cloud, or rounding, and not 0; a constant of the derivative."""
+    """Returns a millionth of the cloud, or rounding, and not 0; a constant of the derivative."""
     target = _Cloud(jax.lax.stop_gradient(target.points), target.mask)
     rounding = jnp.finfo(target.points.dtype).eps * jnp.max(jnp.abs(target.points))
     return jnp.maximum(jnp.maximum(1e-6 * _size(target), rounding), 1e-12)
 
 
 def _median(values: Float[Array, " n"], mask: Bool[Array, " n"]) -> Float[Array, ""]:
-    """Median of the valid values; 0 without any."""
+    """Returns the median of the valid values; 0 without any."""
     count = mask.sum()
     ordered = jnp.sort(jnp.where(mask, values, jnp.inf))
     middle = 0.5 * (ordered[jnp.maximum(count - 1, 0) // 2] + ordered[count // 2])

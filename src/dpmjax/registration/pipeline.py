@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike
 
 from dpmjax.checks import require_one_of, require_positive
 from dpmjax.deepmapping.config import DeepMappingConfig
-from dpmjax.deepmapping.engine import Progress, fit
+from dpmjax.deepmapping.engine import Fit, Progress, fit
 from dpmjax.deepmapping.planar import Fitted, as_scan_set, fit_deepmapping
 from dpmjax.geometry import se2
 from dpmjax.registration.global_registration import nearest_tour, register_globally
@@ -46,6 +46,11 @@ START_NAMES: dict[str, str] = {
 STARTS_FROM_SCANS = ("icp-plane", "icp-point", "global")
 """Starts that use the scans alone."""
 
+Engine = Callable[..., Fit]
+"""What trains, as `fit_deepmapping(engine=...)` takes it."""
+EngineOf = Callable[[Indices], Engine]
+"""Makes the engine of the scans of these rows, in this order."""
+
 # Up to this many scans without odometry are all registered.
 _MAX_WHOLE = 256
 # A fit whose map takes this many times the nats of the refined start is not refined.
@@ -62,7 +67,7 @@ class RegistrationConfig:
         fit: settings of DeepMapping; presets are `dpmjax.deepmapping.preset`.
         min_distance: scans of a recording are registered where they lie at least this far apart, in the unit of the
             scans, or are turned by `min_turn`; the others follow the motion between these. None: all are registered.
-        min_turn: see above, radians.
+        min_turn: scans of a recording that are turned at least this far against each other are registered, radians.
 
     Raises:
         ValueError: a limit is not positive.
@@ -87,13 +92,13 @@ class RegistrationHooks(NamedTuple):
             after each call of the step of the fit.
         stop: called before each stage that may be left out and before each call of the step of the fit. Where it
             returns True, the fit ends, and the best of the candidates so far is kept.
-        fit: called with rows of the scans and their (k, 3) poses to start from, None for a cold start; returns the fit
-            of these scans in this order. None: `fit_deepmapping`.
+        engine: called with the rows of the scans that are fitted, in the order of the fit; returns what trains them,
+            as `fit_deepmapping(engine=...)`, which reports and stops by itself. None: `deepmapping.fit`.
     """
 
     on_progress: Callable[[str, float], None] = lambda _stage, _share: None
     stop: Callable[[], bool] = lambda: False
-    fit: Callable[[Indices, Floats | None], Fitted] | None = None
+    engine: EngineOf | None = None
 
 
 class Candidate(NamedTuple):
@@ -115,9 +120,9 @@ class RegisteredScans(NamedTuple):
         poses: (n, 3) T_world_scan of all scans, x, y, heading, in the unit of the scans.
         kept: name of the candidate that the poses come from.
         start: name of the candidate that the fit started from.
-        candidates: all candidates by name.
+        candidates: all candidates by name; DeepMapping is one if it has done a step.
         assessment: of the kept candidate: `assessment.is_trusted` tells whether its map can be trusted.
-        fitted: DeepMapping of the registered scans.
+        fitted: DeepMapping of the registered scans; untrained where the fit was stopped before its first step.
         recording: all scans, and the rows of those that were registered.
     """
 
@@ -158,7 +163,7 @@ def register_scans(
             search of scan pairs, which needs no order; "zero"; or (n, 3) x, y, heading or (n, 3, 3) matrices. "auto":
             the odometry where there is one, else incremental point-to-line ICP; "global" for scans without an order.
         odometry: (n, 3) or (n, 3, 3) raw odometry of ordered scans.
-        hooks: functions that are called: progress, a request to stop, the fit.
+        hooks: functions that are called: progress, a request to stop, the engine of the fit.
 
     Returns:
         RegisteredScans.
@@ -168,20 +173,23 @@ def register_scans(
             there is no odometry to start from; or the start needs an order that the scans do not have.
     """
     config, hooks = config or RegistrationConfig(), hooks or RegistrationHooks()
-    everyone = as_scan_set(scans)
-    wheels = None if odometry is None else se2.as_poses("odometry", odometry, len(everyone.points))
-    first = _checked_start(start, wheels, len(everyone.points), config)
-    recording = _choose_scans(everyone, wheels, first, config, hooks)
-    lines = planar_scans(_take(everyone, recording.chosen), is_ordered=config.is_ordered)
-    start_name, poses = _start_poses(lines, first, wheels, recording, hooks)
-    fitted = _fit(recording, poses, config, key=key, hooks=hooks, is_cold=start_name == START_NAMES["zero"])
-    found = {start_name: poses, DEEPMAPPING: fitted.poses}
+    all_scans = as_scan_set(scans)
+    odometry_poses = None if odometry is None else se2.as_poses("odometry", odometry, len(all_scans.points))
+    first_poses = _checked_start(start, odometry_poses, len(all_scans.points), config)
+    recording = _choose_scans(all_scans, odometry_poses, first_poses, config, hooks)
+    lines = planar_scans(_take(all_scans, recording.chosen), is_ordered=config.is_ordered)
+    start_name, poses = _start_poses(lines, first_poses, odometry_poses, recording, hooks)
+    warm_start = None if start_name == START_NAMES["zero"] else poses
+    fitted = _fit(recording, warm_start, config, key=key, hooks=hooks)
+    found = {start_name: poses}
+    if fitted.num_steps > 0:
+        found[DEEPMAPPING] = fitted.poses
     if config.refine and not hooks.stop():
         found |= _refined_candidates(lines, found, hooks)
     hooks.on_progress("choice and assessment", 0.0)
     kept, scores = choose_trajectory(lines, found)
     assessment = assess_trajectory(lines, found[kept])
-    has_other = isinstance(start, str) and start == "auto" and config.refine and wheels is not None
+    has_other = isinstance(start, str) and start == "auto" and config.refine and odometry_poses is not None
     if has_other and not assessment.is_trusted and not hooks.stop():
         hooks.on_progress("the map from odometry cannot be trusted: registration without it", 0.0)
         name = START_NAMES["icp-plane"]
@@ -250,29 +258,55 @@ def _start_poses(
     return name, odometry[recording.chosen]
 
 
-def _fit(
-    recording: Recording,
-    poses: Floats,
-    config: RegistrationConfig,
+def fit_in_order(
+    scans: ScanSet,
+    config: DeepMappingConfig,
     *,
     key: jax.Array,
-    hooks: RegistrationHooks,
-    is_cold: bool,
+    start: Floats | None,
+    is_ordered: bool,
+    engine_of: EngineOf | None = None,
 ) -> Fitted:
-    """Fits the registered scans in an order in which neighbours are near each other: that of time, or a tour."""
-    order = np.arange(len(poses)) if config.is_ordered else nearest_tour(poses)
-    rows, start = recording.chosen[order], None if is_cold else poses[order]
-    hooks.on_progress(DEEPMAPPING, 0.0)
-    if hooks.fit is not None:
-        fitted = hooks.fit(rows, start)
-    else:
+    """Fits scans in an order in which neighbours are near each other: that of time, or a tour of the start.
 
-        def report(progress: Progress) -> None:
-            hooks.on_progress(DEEPMAPPING, progress.share)
+    Args:
+        scans: the scans.
+        config: settings of the fit.
+        key: of the fit.
+        start: (n, 3) x, y, heading to start from; None: cold start, in the given order.
+        is_ordered: the scans lie in the order of time.
+        engine_of: called with the order, rows of the scans; returns what trains them, as in `fit_deepmapping`. None:
+            `deepmapping.fit`.
 
-        engine = partial(fit, on_report=report, stop=hooks.stop)
-        fitted = fit_deepmapping(_take(recording.scans, rows), config.fit, key=key, start=start, engine=engine)
+    Returns:
+        The fit, its poses in the order of the scans.
+
+    Raises:
+        ValueError: as `fit_deepmapping`.
+    """
+    order = np.arange(len(scans.points)) if is_ordered or start is None else nearest_tour(start)
+    first_poses = None if start is None else start[order]
+    engine = fit if engine_of is None else engine_of(order)
+    fitted = fit_deepmapping(_take(scans, order), config, key=key, start=first_poses, engine=engine)
     return fitted._replace(poses=fitted.poses[np.argsort(order)])
+
+
+def _fit(
+    recording: Recording, start: Floats | None, config: RegistrationConfig, *, key: jax.Array, hooks: RegistrationHooks
+) -> Fitted:
+    """Fits the registered scans by the engine of the hooks, or by one that reports to them."""
+    hooks.on_progress(DEEPMAPPING, 0.0)
+
+    def report(progress: Progress) -> None:
+        hooks.on_progress(DEEPMAPPING, progress.share)
+
+    def engine_of(order: Indices) -> Engine:
+        if hooks.engine is not None:
+            return hooks.engine(recording.chosen[order])
+        return partial(fit, on_report=report, stop=hooks.stop)
+
+    scans = _take(recording.scans, recording.chosen)
+    return fit_in_order(scans, config.fit, key=key, start=start, is_ordered=config.is_ordered, engine_of=engine_of)
 
 
 def _refined_candidates(
@@ -280,9 +314,9 @@ def _refined_candidates(
 ) -> dict[str, Floats]:
     """Returns the start and the fit, each refined; a fit that is a worse map than the refined start is left out.
 
-    The fit is sharper near a good start; the start keeps what the odometry of a robot tells.
+    Near a good start the fit gives the sharper map. The start keeps the motion that a robot's odometry has measured.
     """
-    (start, start_poses), (fit_name, fit_poses) = candidates.items()
+    (start, start_poses), *fits = candidates.items()
     found: dict[str, Floats] = {}
 
     def add_refined(name: str, poses: Floats) -> None:
@@ -291,8 +325,9 @@ def _refined_candidates(
 
     if start != START_NAMES["zero"]:
         add_refined(start, start_poses)
-    scores = choose_trajectory(scans, {fit_name: fit_poses, **found})[1]
-    nats = [score.code_length for score in scores.values()]
-    if nats[0] <= _LEAST_PROMISING * nats[-1]:
-        add_refined(fit_name, fit_poses)
+    for name, poses in fits:
+        scores = choose_trajectory(scans, {name: poses, **found})[1]
+        nats = [score.code_length for score in scores.values()]
+        if nats[0] <= _LEAST_PROMISING * nats[-1]:
+            add_refined(name, poses)
     return found
