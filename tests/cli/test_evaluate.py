@@ -30,8 +30,10 @@ def test_a_town_is_evaluated_and_nothing_is_registered_twice(weights, tmp_path, 
     assert "| toy 5000000 | 2-10 m | 2 |" in printed
     assert "| toy 5000000 | 10-20 m | 2 |" in printed
     assert "Brier score of the confidence" in printed
+    assert "(0 is best; these weights are not calibrated)" in printed
     metrics = load_json(out / "metrics.json")
     assert [row["band"] for row in metrics["rows"]] == ["near", "middle", "far", "overlap"]
+    assert metrics["is_calibrated"] is False
     near = metrics["rows"][0]
     assert len(near["translation_errors_refined_m"]) == len(near["confidence"]) == 2
     assert near["pair_s"] > 0

@@ -42,12 +42,15 @@ def test_every_scan_gets_a_row_and_a_resumed_run_equals_an_unbroken_one(case, tm
     out = tmp_path / "out"
     arguments = (case / "map.npz", scans_of(case), *weights, "--map-poses", case / "poses.npy", "-o", out)
     assert run(*arguments) == EXIT_OK
-    assert "of 6 scans found" in capsys.readouterr().out
+    printed = capsys.readouterr().out
+    assert "of 6 scans found" in printed
+    assert "these weights are not calibrated" in printed
     table = out / "localizations.csv"
     rows = read_history(table)
     assert [row["scan"] for row in rows] == list(map(str, range(6)))
     metrics = load_json(out / "metrics.json")
     assert metrics["num_inside"] == 6
+    assert metrics["is_calibrated"] is False
     assert metrics["num_right"] + metrics["num_wrong"] == metrics["num_found"]
     assert (out / "map.png").stat().st_size > 0
     num_found = sum(row["status"] == "found" for row in rows)

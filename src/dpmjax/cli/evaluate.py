@@ -112,7 +112,8 @@ def write_results(
     note = write_metrics(folder, {"weights": config.weights, **numbers}, seed=config.seed, rows=rows)
     text = table(rows)
     if numbers:
-        text += f"\n\nBrier score of the confidence, all pairs: {numbers['brier']:.3f} (0 is best)."
+        note_of_score = "" if numbers["is_calibrated"] else "; these weights are not calibrated"
+        text += f"\n\nBrier score of the confidence, all pairs: {numbers['brier']:.3f} (0 is best{note_of_score})."
     (folder / "table.md").write_text(text + (f"\n\n{note}.\n" if note else "\n"), encoding="utf-8")
     title = f"{Path(config.weights).stem}, all pairs"
     draw_evaluation(folder, drives, rows, title=title, seed=config.seed)
