@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import itertools
+import os
+import signal
+
 import jax
 import numpy as np
 import pytest
@@ -11,6 +15,7 @@ from dpmjax.cli import drive_sources, evaluation_rows
 from dpmjax.cli.command import EXIT_BAD_INPUT, EXIT_OK
 from dpmjax.cli.evaluate import run, table
 from dpmjax.cli.result_files import load_json
+from dpmjax.deeppointmap import scan_evaluation
 from dpmjax.io import write_kitti_sequence
 from tests.deeppointmap import toy
 
@@ -43,6 +48,30 @@ def test_a_town_is_evaluated_and_nothing_is_registered_twice(weights, tmp_path, 
     monkeypatch.setattr(evaluation_rows, "evaluate_scan_pairs", None)
     assert run(["--resume", "-o", str(out)]) == EXIT_OK
     assert load_json(out / "metrics.json")["rows"] == metrics["rows"]
+
+
+@pytest.mark.parametrize("num_registered", [1, 4])
+def test_ctrl_c_within_a_band_keeps_the_rows_before_it(weights, tmp_path, monkeypatch, num_registered: int) -> None:
+    monkeypatch.setattr(drive_sources, "simulate_drive", lambda seed, **_: toy.drive(seed))
+    out, register, count = tmp_path / "out", scan_evaluation.register_in_stages, itertools.count(1)
+
+    def interrupting(*arguments):
+        if next(count) == num_registered:
+            os.kill(os.getpid(), signal.SIGINT)
+        return register(*arguments)
+
+    # The first pair of a band is registered twice.
+    monkeypatch.setattr(scan_evaluation, "register_in_stages", interrupting)
+    assert run(["--weights", str(weights), "--pairs", "2", "-o", str(out)]) == 130
+    stopped = load_json(out / "metrics.json")
+    assert stopped["is_interrupted"] is True
+    assert [row["band"] for row in stopped["rows"]] == ["near"][: num_registered // 4]
+    assert next(count) <= num_registered + 3
+    assert run(["--resume", "-o", str(out)]) == EXIT_OK
+    whole = load_json(out / "metrics.json")
+    assert whole["is_interrupted"] is False
+    assert [row["band"] for row in whole["rows"]] == ["near", "middle", "far", "overlap"]
+    assert whole["rows"][: len(stopped["rows"])] == stopped["rows"]
 
 
 def test_a_folder_of_scans_with_poses_is_evaluated(weights, tmp_path, capsys) -> None:
