@@ -15,7 +15,7 @@ from dpmjax.cli import drive_sources, evaluation_rows
 from dpmjax.cli.command import EXIT_BAD_INPUT, EXIT_OK
 from dpmjax.cli.evaluate import run, table
 from dpmjax.cli.result_files import load_json
-from dpmjax.deeppointmap import scan_evaluation
+from dpmjax.deeppointmap import SamplingConfig, scan_evaluation
 from dpmjax.io import write_kitti_sequence
 from tests.deeppointmap import toy
 
@@ -82,6 +82,14 @@ def test_a_folder_of_scans_with_poses_is_evaluated(weights, tmp_path, capsys) ->
     # No two scans are so far apart: those rows are empty.
     by_band = {row["band"]: row for row in load_json(tmp_path / "out" / "metrics.json")["rows"]}
     assert (by_band["far"]["num_pairs"], by_band["overlap"]["auc"]) == (0, None)
+
+
+def test_a_drive_is_checked_with_the_distances_that_are_asked_for(tmp_path) -> None:
+    write_kitti_sequence(tmp_path / "kitti", "00", toy.drive(num_scans=6))
+    assert len(drive_sources.find_sources([str(tmp_path / "kitti")], [])) == 1
+    far = SamplingConfig(min_distance_m=500.0, max_distance_m=900.0)
+    with pytest.raises(ValueError, match=r"no two of them 500\.0 to 900\.0 m apart"):
+        drive_sources.find_sources([str(tmp_path / "kitti")], [], far)
 
 
 def test_a_table_of_no_right_registration_has_no_median() -> None:
