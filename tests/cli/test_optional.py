@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -23,14 +24,16 @@ FAILURES = {
 
 
 @pytest.fixture
-def packages(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def packages(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     """A folder of fake packages, found before those that are installed."""
     folder = tmp_path / "packages"
     folder.mkdir()
     monkeypatch.syspath_prepend(folder)
     for name in (*EXTRAS, "broken"):
         monkeypatch.delitem(sys.modules, name, raising=False)
-    return folder
+    yield folder
+    for name in (*EXTRAS, "broken"):
+        sys.modules.pop(name, None)
 
 
 @pytest.mark.parametrize("failure", FAILURES)
