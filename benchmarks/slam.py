@@ -24,6 +24,7 @@ from typing import NamedTuple
 import numpy as np
 
 from benchmarks.rows import Row
+from dpmjax.geometry import rigid
 from dpmjax.metrics import absolute_trajectory_error, registration_recall
 from dpmjax.simulation import route_poses
 from dpmjax.slam import SlamConfig, SlamMethods, SlamResult, finish_slam, init_slam, step_slam
@@ -94,7 +95,7 @@ def judged(result: SlamResult, truth: np.ndarray) -> Proof:
     loops = [loop for loop in result.loops if loop.status == "accepted"]
     source, target = (truth[result.keyframes[[getattr(loop, end) for loop in loops]]] for end in ("source", "target"))
     found = np.reshape([loop.T_target_source for loop in loops], (-1, 4, 4))
-    right = registration_recall(found, np.linalg.inv(target) @ source).is_right
+    right = registration_recall(found, rigid.inverse(target) @ source).is_right
     is_opposite = np.einsum("ni,ni->n", source[:, :3, 0], target[:, :3, 0]) < 0
     ate_m, ate_odometry_m = (
         absolute_trajectory_error(poses[:, :3, 3], truth[:, :3, 3])

@@ -16,6 +16,7 @@ from dpmjax.cli import (
     write_table,
     write_trajectory,
 )
+from dpmjax.geometry import rigid
 
 if TYPE_CHECKING:
     from dpmjax.io import LidarSequence
@@ -193,7 +194,7 @@ def _shown_frame(result: AgentsResult, members: Sequence[int]) -> np.ndarray:
         if len(rows):
             first = result.agents[number].reports[0]
             T_map_scan = result.joined.slam_map.T_world_keyframe[rows[first.keyframe]] @ first.T_keyframe_scan
-            return np.asarray(result.T_world_scan[number][0] @ np.linalg.inv(T_map_scan))
+            return np.asarray(result.T_world_scan[number][0] @ rigid.inverse(T_map_scan))
     return np.eye(4)
 
 

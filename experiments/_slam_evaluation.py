@@ -19,6 +19,7 @@ from tqdm import tqdm
 
 from dpmjax import save_map
 from dpmjax.cli import RunFolder, SlamRun, map_drive, trajectory_errors, write_loops, write_scans, write_trajectory
+from dpmjax.geometry import rigid
 from dpmjax.io import LidarSequence
 from dpmjax.metrics import find_revisits, loop_recall, path_lengths, registration_recall
 from dpmjax.saved_maps import Precision
@@ -187,7 +188,7 @@ def loop_numbers(drive: Drive, loops: Sequence[FoundLoop]) -> dict[str, Any]:
     assert poses is not None
     newer, older = (np.array([getattr(loop, end)[0] for loop in loops], int) for end in ("newer", "older"))
     found = np.reshape([loop.T_older_newer for loop in loops], (-1, 4, 4))
-    is_right = registration_recall(found, np.linalg.inv(poses[older]) @ poses[newer]).is_right
+    is_right = registration_recall(found, rigid.inverse(poses[older]) @ poses[newer]).is_right
     revisits = find_revisits(poses, distance_m=scale.distance_m, min_path_m=scale.min_path_m)
     right = [loop for loop, good in zip(loops, is_right, strict=True) if good]
     ends = np.reshape([loop.newer for loop in right], (-1, 2)).astype(int)

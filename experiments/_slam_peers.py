@@ -15,7 +15,8 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
-from dpmjax.cli import why_not_importable
+from dpmjax.cli import UNKNOWN, why_not_importable
+from dpmjax.geometry import rigid
 
 MAX_RANGE_M, INDOOR_MAX_RANGE_M = 60.0, 30.0
 # Where half of the points are nearer, the place is indoors.
@@ -106,7 +107,7 @@ class KissSlam:
         lengths = [len(local_map.local_trajectory) for local_map in graph.local_maps()]
         first = np.concatenate([[0], np.cumsum(np.array(lengths) - 1)])
         loops = [
-            FoundLoop((first[newer], first[newer + 1]), (first[older], first[older + 1]), np.linalg.inv(T_newer_older))
+            FoundLoop((first[newer], first[newer + 1]), (first[older], first[older + 1]), rigid.inverse(T_newer_older))
             for older, newer, T_newer_older in self._closer.found
         ]
         return np.array(poses), loops
@@ -128,7 +129,7 @@ class SmallGicp:
         T = np.eye(4)
         if self._poses:
             before, last = (self._poses * 2)[-2:]
-            start = last @ np.linalg.inv(before) @ last if len(self._poses) > 1 else last
+            start = last @ rigid.inverse(before) @ last if len(self._poses) > 1 else last
             T = self._library.align(self._map, scan, start, num_threads=self._threads).T_target_source
         self._map.insert(scan, T)
         self._poses.append(T)
@@ -155,7 +156,7 @@ def peer_version(name: str) -> str:
     try:
         return importlib.metadata.version(name)
     except importlib.metadata.PackageNotFoundError:
-        return "unknown"
+        return UNKNOWN
 
 
 def is_indoors(points: np.ndarray) -> bool:

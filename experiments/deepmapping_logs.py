@@ -19,10 +19,9 @@ from typing import Annotated, Any
 
 from tyro.conf import Positional, arg
 
-from dpmjax.cli import RunFolder, load_json, run_command, write_metrics
+from dpmjax.cli import EXIT_BAD_INPUT, METRICS, RunFolder, load_json, run_command, write_metrics
 
 EXPERIMENT = "deepmapping_logs"
-_METRICS, _EXIT_BAD_INPUT = "metrics.json", 2
 ENDINGS = (".log", ".clf", ".log.gz", ".clf.gz")
 
 
@@ -75,7 +74,7 @@ def drive_of(log: Path) -> str:
 def _run(log: Path, init: str, corrected: Path | None, config: Config) -> dict[str, Any] | None:
     """Returns the metrics of one run, in a process with a peak memory of its own; None where the log lacks odometry."""
     folder = config.output / f"{log.name.removesuffix('.gz')}_{init}"
-    if not (folder / _METRICS).exists():
+    if not (folder / METRICS).exists():
         command = [sys.executable, "-m", "dpmjax", "map2d", str(log), "-o", str(folder), "--force"]
         command += ["--init", init, "--seed", str(config.seed)]
         command += [] if config.steps is None else ["--steps", str(config.steps)]
@@ -83,11 +82,11 @@ def _run(log: Path, init: str, corrected: Path | None, config: Config) -> dict[s
         command += ["--relations", str(relations)] if relations.exists() else []
         command += [] if corrected in (None, log) else ["--corrected", str(corrected)]
         code = subprocess.run(command).returncode
-        if code == _EXIT_BAD_INPUT:
+        if code == EXIT_BAD_INPUT:
             return None
         if code != 0:
             raise RuntimeError(f"{log} from {init}: the run ended with exit code {code}")
-    return load_json(folder / _METRICS)
+    return load_json(folder / METRICS)
 
 
 def markdown(rows: list[dict[str, Any]]) -> str:

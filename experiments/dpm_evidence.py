@@ -29,6 +29,7 @@ from dpmjax.cli import (
     run_command,
     write_metrics,
 )
+from dpmjax.geometry import rigid
 
 EXPERIMENT = "dpm_evidence"
 # Far from the seeds of all other commands.
@@ -122,7 +123,7 @@ def measure_scene(
         prepared = [prepare_scan(model, scan.astype(np.float32)) for scan in scans]
         found = match_clouds(model, *(scan.descriptors for scan in prepared), config=model.config.matching)
         measured = [scan.measured for scan in prepared]
-        pairs.append({"band": band, **judged(model, measured, found, np.linalg.inv(poses[1]) @ poses[0])})
+        pairs.append({"band": band, **judged(model, measured, found, rigid.inverse(poses[1]) @ poses[0])})
     return {"pairs": pairs}
 
 

@@ -102,6 +102,18 @@ def test_no_room_reaches_itself(imported_rooms) -> None:
     assert not [room for room in imported_rooms if room in reached(room, imported_rooms)]
 
 
+@pytest.mark.parametrize("folder", [PACKAGE / "cli", ROOT / "experiments"], ids=lambda path: path.name)
+def test_no_circle_of_modules_within(folder: Path) -> None:
+    base = PACKAGE.parent if folder.is_relative_to(PACKAGE) else ROOT
+    paths = {".".join(path.relative_to(base).with_suffix("").parts): path for path in folder.rglob("*.py")}
+    imported = {
+        module: {other for name in imported_names(path) for other in paths if f"{name}.".startswith(f"{other}.")}
+        for module, path in paths.items()
+    }
+    assert sum(map(len, imported.values())) > 10
+    assert not [module for module in imported if module in reached(module, imported)]
+
+
 def test_nets_and_losses_never_meet(imported_rooms) -> None:
     assert "losses" not in reached("nets", imported_rooms)
     assert "nets" not in reached("losses", imported_rooms)

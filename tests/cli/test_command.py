@@ -8,8 +8,12 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
+
+from dpmjax.cli import register
+from dpmjax.cli.command import EXIT_BAD_INPUT
 
 REPOSITORY = Path(__file__).parents[2]
 
@@ -141,6 +145,19 @@ def test_a_folder_that_is_taken_is_refused_before_the_input_is_read(toy, tmp_pat
 
 def test_old_names_of_options_still_work(toy):
     assert finish(toy("-o", "out", "--iterations", "2"))[:2] == (0, "0\n1\n")
+
+
+@pytest.mark.parametrize("error", [RuntimeError("no backend"), AssertionError()])
+def test_a_device_that_is_not_there_is_one_line_with_exit_code_2(tmp_path, monkeypatch, capsys, error):
+    # JAX raises the second where its plugin is not installed. The setting is put back for the tests that follow.
+    monkeypatch.setattr("jax.config.update", lambda *_: None)
+    monkeypatch.setattr("jax.devices", Mock(side_effect=error))
+    arguments = ["a.npy", "b.npy", "--device", "gpu", "-o", str(tmp_path / "out")]
+    assert register.run(arguments) == EXIT_BAD_INPUT
+    assert capsys.readouterr().err.splitlines() == [
+        "dpmjax: error: --device gpu: JAX finds no such device here; leave the option out or install its plugin"
+    ]
+    assert not (tmp_path / "out").exists()
 
 
 def test_wrong_usage_exits_with_two(toy):

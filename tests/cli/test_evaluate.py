@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import itertools
+import os
+import signal
+
 import jax
 import numpy as np
 import pytest
@@ -11,6 +15,7 @@ from dpmjax.cli import drive_sources, evaluation_rows
 from dpmjax.cli.command import EXIT_BAD_INPUT, EXIT_OK
 from dpmjax.cli.evaluate import run, table
 from dpmjax.cli.result_files import load_json
+from dpmjax.deeppointmap import SamplingConfig, scan_evaluation
 from dpmjax.io import write_kitti_sequence
 from tests.deeppointmap import toy
 
@@ -30,8 +35,10 @@ def test_a_town_is_evaluated_and_nothing_is_registered_twice(weights, tmp_path, 
     assert "| toy 5000000 | 2-10 m | 2 |" in printed
     assert "| toy 5000000 | 10-20 m | 2 |" in printed
     assert "Brier score of the confidence" in printed
+    assert "(0 is best; these weights are not calibrated)" in printed
     metrics = load_json(out / "metrics.json")
     assert [row["band"] for row in metrics["rows"]] == ["near", "middle", "far", "overlap"]
+    assert metrics["is_calibrated"] is False
     near = metrics["rows"][0]
     assert len(near["translation_errors_refined_m"]) == len(near["confidence"]) == 2
     assert near["pair_s"] > 0
@@ -43,6 +50,30 @@ def test_a_town_is_evaluated_and_nothing_is_registered_twice(weights, tmp_path, 
     assert load_json(out / "metrics.json")["rows"] == metrics["rows"]
 
 
+@pytest.mark.parametrize("num_registered", [1, 4])
+def test_ctrl_c_within_a_band_keeps_the_rows_before_it(weights, tmp_path, monkeypatch, num_registered: int) -> None:
+    monkeypatch.setattr(drive_sources, "simulate_drive", lambda seed, **_: toy.drive(seed))
+    out, register, count = tmp_path / "out", scan_evaluation.register_in_stages, itertools.count(1)
+
+    def interrupting(*arguments):
+        if next(count) == num_registered:
+            os.kill(os.getpid(), signal.SIGINT)
+        return register(*arguments)
+
+    # The first pair of a band is registered twice.
+    monkeypatch.setattr(scan_evaluation, "register_in_stages", interrupting)
+    assert run(["--weights", str(weights), "--pairs", "2", "-o", str(out)]) == 130
+    stopped = load_json(out / "metrics.json")
+    assert stopped["is_interrupted"] is True
+    assert [row["band"] for row in stopped["rows"]] == ["near"][: num_registered // 4]
+    assert next(count) <= num_registered + 3
+    assert run(["--resume", "-o", str(out)]) == EXIT_OK
+    whole = load_json(out / "metrics.json")
+    assert whole["is_interrupted"] is False
+    assert [row["band"] for row in whole["rows"]] == ["near", "middle", "far", "overlap"]
+    assert whole["rows"][: len(stopped["rows"])] == stopped["rows"]
+
+
 def test_a_folder_of_scans_with_poses_is_evaluated(weights, tmp_path, capsys) -> None:
     write_kitti_sequence(tmp_path / "kitti", "00", toy.drive(num_scans=6))
     arguments = [str(tmp_path / "kitti"), "--weights", str(weights), "--pairs", "1", "-o", str(tmp_path / "out")]
@@ -51,6 +82,14 @@ def test_a_folder_of_scans_with_poses_is_evaluated(weights, tmp_path, capsys) ->
     # No two scans are so far apart: those rows are empty.
     by_band = {row["band"]: row for row in load_json(tmp_path / "out" / "metrics.json")["rows"]}
     assert (by_band["far"]["num_pairs"], by_band["overlap"]["auc"]) == (0, None)
+
+
+def test_a_drive_is_checked_with_the_distances_that_are_asked_for(tmp_path) -> None:
+    write_kitti_sequence(tmp_path / "kitti", "00", toy.drive(num_scans=6))
+    assert len(drive_sources.find_sources([str(tmp_path / "kitti")], [])) == 1
+    far = SamplingConfig(min_distance_m=500.0, max_distance_m=900.0)
+    with pytest.raises(ValueError, match=r"no two of them 500\.0 to 900\.0 m apart"):
+        drive_sources.find_sources([str(tmp_path / "kitti")], [], far)
 
 
 def test_a_table_of_no_right_registration_has_no_median() -> None:

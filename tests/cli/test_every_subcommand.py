@@ -1,9 +1,13 @@
-"""Every subcommand on simulated input, away from the checkout, as a user of the installed package runs it."""
+"""Every subcommand on simulated input, on a copy of the files that are installed, away from the checkout."""
 
 from __future__ import annotations
 
+import os
+import shutil
 import subprocess
 import sys
+import tomllib
+from fnmatch import fnmatch
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +16,7 @@ import pytest
 from dpmjax.cli.program import COMMANDS
 
 EXIT_OK, EXIT_BAD_INPUT = 0, 2
+REPOSITORY = Path(__file__).parents[2]
 
 SIMULATED = {
     "register": ("a.npy", "b.npy", "-o", "registered"),
@@ -39,12 +44,33 @@ MISSING = {
 }
 
 
-def start(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run([sys.executable, "-m", "dpmjax", *arguments], cwd=folder, capture_output=True, text=True)
+@pytest.fixture(scope="module")
+def installed(tmp_path_factory) -> Path:
+    """A folder with the files of the package that setuptools installs."""
+    options = tomllib.loads((REPOSITORY / "pyproject.toml").read_text())["tool"]["setuptools"]
+    patterns = ["*.py", *options["package-data"]["*"]]
+
+    def left_out(folder: str, names: list[str]) -> set[str]:
+        return {
+            name
+            for name in names
+            if not (Path(folder) / name / "__init__.py").is_file()
+            and not any(fnmatch(name, pattern) for pattern in patterns)
+        }
+
+    folder = tmp_path_factory.mktemp("installed")
+    shutil.copytree(REPOSITORY / "src" / "dpmjax", folder / "dpmjax", ignore=left_out)
+    return folder
+
+
+def start(installed: Path, folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, *(arguments if arguments[0] == "-c" else ("-m", "dpmjax", *arguments))]
+    environment = {**os.environ, "PYTHONPATH": str(installed)}
+    return subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True)
 
 
 @pytest.mark.slow
-def test_every_subcommand_ends_well_on_simulated_input(tmp_path) -> None:
+def test_every_subcommand_ends_well_on_simulated_input(installed, tmp_path) -> None:
     from dpmjax.simulation import SceneMixture, draw_scene, simulate_scene
 
     drive = simulate_scene(draw_scene(0, SceneMixture(length_m=100.0)))
@@ -52,8 +78,10 @@ def test_every_subcommand_ends_well_on_simulated_input(tmp_path) -> None:
     for number, name in enumerate(("a.npy", "b.npy", "scans/0.npy", "scans/1.npy")):
         np.save(tmp_path / name, drive.read_scan(number))
     assert SIMULATED.keys() == COMMANDS.keys()
+    found = start(installed, tmp_path, "-c", "import dpmjax; print(dpmjax.__file__)")
+    assert Path(found.stdout.strip()).is_relative_to(installed)
     for name, arguments in SIMULATED.items():
-        done = start(tmp_path, name, *arguments)
+        done = start(installed, tmp_path, name, *arguments)
         assert done.returncode == EXIT_OK, f"{name}: {done.stderr[-2000:]}"
         if "-o" in arguments:
             assert (tmp_path / arguments[-1] / "metrics.json").is_file(), name
@@ -61,8 +89,8 @@ def test_every_subcommand_ends_well_on_simulated_input(tmp_path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", sorted(MISSING))
-def test_a_missing_file_is_one_line_and_exit_code_2(name, tmp_path) -> None:
-    done = start(tmp_path, name, *MISSING[name], "-o", "out")
+def test_a_missing_file_is_one_line_and_exit_code_2(installed, name, tmp_path) -> None:
+    done = start(installed, tmp_path, name, *MISSING[name], "-o", "out")
     assert done.returncode == EXIT_BAD_INPUT, done.stderr[-2000:]
     assert len(done.stderr.strip().splitlines()) == 1, done.stderr
     assert "none" in done.stderr

@@ -11,7 +11,9 @@ from dpmjax.cli import localize
 from dpmjax.cli.command import EXIT_BAD_INPUT, EXIT_OK
 from dpmjax.cli.localize_numbers import localization_errors
 from dpmjax.cli.result_files import load_json, read_history
+from dpmjax.geometry import rigid
 from dpmjax.io import open_lidar_sequence, read_poses, write_kitti_sequence
+from dpmjax.slam import Match, NetworkMatcher, Submap, make_methods
 from tests.deeppointmap import toy
 
 
@@ -37,22 +39,54 @@ def scans_of(case):
     return next(path.parent for path in case.glob("**/velodyne"))
 
 
-def test_every_scan_gets_a_row_and_a_resumed_run_equals_an_unbroken_one(case, tmp_path, capsys) -> None:
+@pytest.fixture
+def with_truth(case, monkeypatch) -> None:
+    """Registrations are those of the true poses, and sure ones but for the last scan: the networks are untrained."""
+    methods = make_methods(dpmjax.load_model(case / "model.safetensors"))
+    drive, truth = open_lidar_sequence(scans_of(case)), np.load(case / "poses.npy")
+
+    def described(number: int) -> np.ndarray:
+        points = drive.read_points(number)
+        return methods.matcher.vector(methods.matcher.describe(points, methods.geometry.measure(points)))
+
+    vectors = np.array([described(number) for number in range(len(truth))])
+
+    def number_of(submap: Submap) -> int:
+        vector = methods.matcher.vector(submap.descriptions[0])
+        return int(np.argmin(np.linalg.norm(vectors - vector, axis=1)))
+
+    def register(self, pairs: list[tuple[Submap, Submap]]) -> list[Match]:
+        numbers = [(number_of(source), number_of(target)) for source, target in pairs]
+        return [
+            Match(rigid.inverse(truth[target]) @ truth[source], 0.0 if source == len(truth) - 1 else 0.99, 0.1)
+            for source, target in numbers
+        ]
+
+    monkeypatch.setattr(NetworkMatcher, "register", register)
+
+
+def test_every_scan_gets_a_row_and_a_resumed_run_equals_an_unbroken_one(case, with_truth, tmp_path, capsys) -> None:
     weights = ("--weights", case / "model.safetensors")
     out = tmp_path / "out"
     arguments = (case / "map.npz", scans_of(case), *weights, "--map-poses", case / "poses.npy", "-o", out)
     assert run(*arguments) == EXIT_OK
-    assert "of 6 scans found" in capsys.readouterr().out
+    printed = capsys.readouterr().out
+    assert "5 of 6 scans found" in printed
+    assert "these weights are not calibrated" in printed
     table = out / "localizations.csv"
     rows = read_history(table)
     assert [row["scan"] for row in rows] == list(map(str, range(6)))
     metrics = load_json(out / "metrics.json")
     assert metrics["num_inside"] == 6
-    assert metrics["num_right"] + metrics["num_wrong"] == metrics["num_found"]
+    assert metrics["is_calibrated"] is False
+    assert (metrics["num_found"], metrics["num_right"], metrics["num_wrong"]) == (5, 5, 0)
+    assert metrics["median_error_m"] < 1e-3
     assert (out / "map.png").stat().st_size > 0
-    num_found = sum(row["status"] == "found" for row in rows)
-    if num_found:
-        assert len(read_poses(out / "trajectory_tum.txt")) == num_found
+    assert [row["status"] for row in rows] == [*["found"] * 5, "not in this map"]
+    slam_map, truth = dpmjax.load_map(case / "map.npz"), np.load(case / "poses.npy")
+    T_keyframe_scan = [rigid.inverse(truth[int(row["keyframe_scan"])]) @ truth[i] for i, row in enumerate(rows[:5])]
+    expected = slam_map.T_world_keyframe[[int(row["keyframe"]) for row in rows[:5]]] @ T_keyframe_scan
+    np.testing.assert_allclose(read_poses(out / "trajectory_tum.txt"), expected, atol=1e-5)
     # The run is cut off in the middle of a row.
     text = table.read_text()
     cut = text.splitlines(keepends=True)

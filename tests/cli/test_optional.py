@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
-from dpmjax.cli import slam
-from dpmjax.cli.command import EXIT_BAD_INPUT, run_command
+from dpmjax.cli import info, slam
+from dpmjax.cli.command import EXIT_BAD_INPUT, EXIT_OK, run_command
 from dpmjax.cli.optional import EXTRAS, require_importable, why_not_importable
 from experiments import deepmapping_rgbd, deepmapping_suite, toy_1d
 from tests.optional import import_or_skip
@@ -23,14 +24,16 @@ FAILURES = {
 
 
 @pytest.fixture
-def packages(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def packages(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     """A folder of fake packages, found before those that are installed."""
     folder = tmp_path / "packages"
     folder.mkdir()
     monkeypatch.syspath_prepend(folder)
     for name in (*EXTRAS, "broken"):
         monkeypatch.delitem(sys.modules, name, raising=False)
-    return folder
+    yield folder
+    for name in (*EXTRAS, "broken"):
+        sys.modules.pop(name, None)
 
 
 @pytest.mark.parametrize("failure", FAILURES)
@@ -57,6 +60,20 @@ def test_a_package_that_warns_can_be_used(packages: Path) -> None:
     (packages / "broken.py").write_text("import warnings; warnings.warn('old', DeprecationWarning)")
     assert why_not_importable("broken") is None
     require_importable("broken", "--methods x")
+
+
+def test_info_names_what_is_broken_and_what_is_missing(
+    packages: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+) -> None:
+    for name in EXTRAS:
+        (packages / f"{name}.py").touch()
+    (packages / "open3d.py").write_text(FAILURES["a missing library"])
+    monkeypatch.setitem(sys.modules, "gtsam", None)
+    assert info.run([]) == EXIT_OK
+    lines = [line.removeprefix("extra").strip() for line in capsys.readouterr().out.splitlines()]
+    assert f"baselines: open3d is installed, but its import fails: {LIBUSB}" in lines
+    assert "gtsam: gtsam is not installed (pip install 'dpmjax[gtsam]')" in lines
+    assert "peers: installed" in lines
 
 
 def test_tests_of_a_broken_package_are_skipped_with_the_reason(packages: Path) -> None:

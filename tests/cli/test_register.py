@@ -8,7 +8,7 @@ import pytest
 
 import dpmjax
 from dpmjax.cli.command import EXIT_BAD_INPUT, EXIT_OK
-from dpmjax.cli.register import run
+from dpmjax.cli.register import report, run
 from dpmjax.cli.result_files import load_json
 from dpmjax.io import read_lidar_file, read_ply, write_pcd
 from tests.deeppointmap import toy
@@ -44,7 +44,20 @@ def test_files_hold_the_motion_that_the_library_finds(files, tmp_path, capsys) -
     aligned = read_ply(out / "aligned.ply")
     np.testing.assert_allclose(aligned[: len(source)], source @ T[:3, :3].T + T[:3, 3], atol=1e-4)
     np.testing.assert_allclose(aligned[len(source) :], target, atol=1e-6)
-    assert "maps points of a.pcd to the frame of b.npy" in capsys.readouterr().out
+    printed = capsys.readouterr().out
+    assert "maps points of a.pcd to the frame of b.npy" in printed
+    # The network is untrained, so its score is no probability.
+    assert metrics["is_calibrated"] is False
+    assert "score of the matches (these weights are not calibrated)" in printed
+    assert "probability" not in printed
+
+
+@pytest.mark.parametrize(("confidence", "is_sure"), [(0.5, False), (0.95, True)])
+def test_a_calibrated_confidence_is_a_probability_with_a_limit(confidence: float, is_sure: bool) -> None:
+    metrics = {"source": "a", "target": "b", "translation_m": 1.0, "rotation_deg": 2.0, "confidence": confidence}
+    *_, last = report(np.eye(4), {**metrics, "is_calibrated": True}).splitlines()
+    assert last.startswith(f"probability that it is right within 2 m and 5 degrees: {confidence:.2f}")
+    assert ("NOT SURE" not in last) == is_sure
 
 
 @pytest.mark.parametrize(

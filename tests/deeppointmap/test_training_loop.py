@@ -55,6 +55,12 @@ def test_prepared_scans_and_drives_train_the_same_model(whole, tmp_path) -> None
     assert list(tmp_path.glob("*.npy"))
 
 
+def test_a_cache_for_prepared_scans_is_refused(tmp_path) -> None:
+    with pytest.raises(ValueError, match="cache: expected None"):
+        dpmjax.train(toy.store(), TRAINING, cache=tmp_path)
+    assert not list(tmp_path.iterdir())
+
+
 def test_the_best_model_is_that_of_the_best_score(whole) -> None:
     scores, seen = iter([0.2, 0.9, 0.4]), []
 

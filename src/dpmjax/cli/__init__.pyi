@@ -1,3 +1,4 @@
+from .command import EXIT_BAD_INPUT as EXIT_BAD_INPUT
 from .command import StopFlag as StopFlag
 from .command import check_least as check_least
 from .command import check_names as check_names
@@ -30,12 +31,14 @@ from .program import main as main
 from .progress import progress_bar as progress_bar
 from .recorded_fit import FitRecorder as FitRecorder
 from .recorded_fit import draw_loss as draw_loss
+from .result_files import UNKNOWN as UNKNOWN
 from .result_files import HistoryFile as HistoryFile
 from .result_files import do_row as do_row
 from .result_files import do_rows as do_rows
 from .result_files import load_json as load_json
 from .result_files import read_history as read_history
 from .result_files import write_json as write_json
+from .run_folder import METRICS as METRICS
 from .run_folder import OutputOptions as OutputOptions
 from .run_folder import RunFolder as RunFolder
 from .run_folder import RunOptions as RunOptions
@@ -50,5 +53,5 @@ from .slam_files import write_scans as write_scans
 from .slam_files import write_table as write_table
 from .slam_files import write_trajectory as write_trajectory
 from .slam_numbers import trajectory_errors as trajectory_errors
-from .slam_run import SlamRun as SlamRun
+from .slam_outcome import SlamRun as SlamRun
 from .slam_run import map_drive as map_drive

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from dpmjax.deeppointmap import why_useless
+from dpmjax.deeppointmap import SamplingConfig, why_useless
 from dpmjax.io import LidarSequence, list_lidar_sequences, open_lidar_sequence
 from dpmjax.simulation import simulate_drive
 
@@ -40,20 +40,30 @@ class Source:
         return open_lidar_sequence(self.path, sequence=self.name)
 
 
-def find_sources(data: Sequence[str], towns: Sequence[Source]) -> list[Source]:
+def find_sources(data: Sequence[str], towns: Sequence[Source], sampling: SamplingConfig | None = None) -> list[Source]:
     """Returns the drives of the entries of a command line, checked; those of the towns where an entry is `town`.
+
+    Args:
+        data: folders, or `town` for the towns.
+        towns: such as the seeds of the run give.
+        sampling: distances at which a drive must have pairs of scans; None takes the published ones.
+
+    Returns:
+        The drives, in order.
 
     Raises:
         ValueError: if a path cannot be read or holds no useful drive.
     """
     sources: list[Source] = []
+    sampling = sampling or SamplingConfig()
     for entry in data:
         if entry == TOWN and not Path(entry).exists():
             sources += towns
             continue
         names: Sequence[str | None] = list_lidar_sequences(entry) or [None]
         found = {Source(Path(entry), name): open_lidar_sequence(entry, sequence=name) for name in names}
-        reasons = {source: reason for source, drive in found.items() if (reason := why_useless(drive)) is not None}
+        checked = ((source, why_useless(drive, sampling)) for source, drive in found.items())
+        reasons = {source: reason for source, reason in checked if reason is not None}
         if len(reasons) == len(found):
             raise ValueError("; ".join(f"{entry}: {reason}" for reason in dict.fromkeys(reasons.values())))
         for source, reason in reasons.items():

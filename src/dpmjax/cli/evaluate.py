@@ -16,6 +16,7 @@ the drive has some) with pairs more than 40 m apart.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -28,6 +29,7 @@ from tyro.conf import Positional, arg
 from dpmjax.cli.command import StopFlag, check_least, run_command
 from dpmjax.cli.result_files import do_row
 from dpmjax.cli.run_folder import RunFolder, RunOptions, open_run_folder, recording, write_metrics
+from dpmjax.io.files import write_atomically
 
 if TYPE_CHECKING:
     from dpmjax.sequences import LidarSequence
@@ -67,6 +69,10 @@ class Config(RunOptions):
             raise ValueError("give at least one folder of scans, or town")
 
 
+class BandStopped(Exception):
+    """A signal came while the pairs of a band were registered."""
+
+
 def main(config: Config) -> list[dict[str, Any]]:
     """Makes the rows that are missing, and writes table, numbers and pictures."""
     from dpmjax.cli.evaluation_rows import (
@@ -89,31 +95,44 @@ def main(config: Config) -> list[dict[str, Any]]:
         def add(drive: LidarSequence, band: str, work: Callable[[], dict[str, Any]]) -> None:
             if not stop.is_requested:
                 bar.set_description(f"{drive.name}, {BAND_NAMES.get(band, band)}")
-                rows.append(do_row(folder.path, {"sequence": drive.name, "band": band}, work, seed=config.seed))
+                with suppress(BandStopped):
+                    rows.append(do_row(folder.path, {"sequence": drive.name, "band": band}, work, seed=config.seed))
+
+        def advance(num_pairs: int) -> None:
+            bar.update(num_pairs)
+            if stop.is_requested:
+                raise BandStopped
 
         for drive in drives:
             for band in ("near", "middle", "far"):
                 work = partial(registration_row, model, drive, band, config.pairs)
-                add(drive, band, partial(work, seed=config.seed, on_pair=lambda: bar.update(1)))
+                add(drive, band, partial(work, seed=config.seed, on_pair=partial(advance, 1)))
             of_overlap = partial(overlap_row, model, drive, OVERLAP_FACTOR * config.pairs)
-            add(drive, "overlap", partial(of_overlap, seed=config.seed, on_scan=bar.refresh))
-        text = write_results(folder, config, drives, rows)
+            add(drive, "overlap", partial(of_overlap, seed=config.seed, on_scan=partial(advance, 0)))
+        text = write_results(folder, config, drives, rows, is_interrupted=stop.is_requested)
     print(text, f"results in {folder.path}", sep="\n")
     return rows
 
 
 def write_results(
-    folder: RunFolder, config: Config, drives: Sequence[LidarSequence], rows: Sequence[dict[str, Any]]
+    folder: RunFolder,
+    config: Config,
+    drives: Sequence[LidarSequence],
+    rows: Sequence[dict[str, Any]],
+    *,
+    is_interrupted: bool,
 ) -> str:
     """Writes table.md, metrics.json and the pictures; returns the text to print."""
     from dpmjax.cli.evaluation_rows import calibration_numbers, draw_evaluation
 
     numbers = calibration_numbers(rows)
-    note = write_metrics(folder, {"weights": config.weights, **numbers}, seed=config.seed, rows=rows)
+    metrics = {"weights": config.weights, **numbers, "is_interrupted": is_interrupted}
+    note = write_metrics(folder, metrics, seed=config.seed, rows=rows)
     text = table(rows)
     if numbers:
-        text += f"\n\nBrier score of the confidence, all pairs: {numbers['brier']:.3f} (0 is best)."
-    (folder / "table.md").write_text(text + (f"\n\n{note}.\n" if note else "\n"), encoding="utf-8")
+        note_of_score = "" if numbers["is_calibrated"] else "; these weights are not calibrated"
+        text += f"\n\nBrier score of the confidence, all pairs: {numbers['brier']:.3f} (0 is best{note_of_score})."
+    write_atomically(folder / "table.md", text + (f"\n\n{note}.\n" if note else "\n"))
     title = f"{Path(config.weights).stem}, all pairs"
     draw_evaluation(folder, drives, rows, title=title, seed=config.seed)
     return text

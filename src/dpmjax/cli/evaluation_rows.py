@@ -115,7 +115,7 @@ def error_columns(errors: RegistrationRecall, suffix: str) -> Row:
 
 
 def calibration_numbers(rows: Sequence[Row]) -> Row:
-    """Returns the Brier score of the confidence, over all pairs and over those of each band."""
+    """Returns the Brier score of the confidence, over all pairs and those of each band, and `is_calibrated`."""
     known = [row for row in rows if "confidence" in row and row["num_pairs"]]
 
     def brier(some: Sequence[Row]) -> float:
@@ -124,7 +124,8 @@ def calibration_numbers(rows: Sequence[Row]) -> Row:
 
     bands = dict.fromkeys(row["band"] for row in known)
     numbers = {f"brier_{band}": brier([row for row in known if row["band"] == band]) for band in bands}
-    return {"brier": brier(known), **numbers} if known else {}
+    is_calibrated = all(row["is_calibrated"] for row in known)
+    return {"brier": brier(known), **numbers, "is_calibrated": is_calibrated} if known else {}
 
 
 def draw_evaluation(

@@ -7,13 +7,12 @@ A bug report begins with what this prints.
 
 from __future__ import annotations
 
-import importlib.metadata
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 from dpmjax.cli.command import run_command
 from dpmjax.cli.machine import device_name, environment
+from dpmjax.cli.optional import EXTRAS, why_not_importable
 
 NAME = "info"
 
@@ -37,23 +36,17 @@ def main(config: Config) -> None:
     print(f"cache      {enable_compile_cache() or 'off'} (compiled programs)")
     for name in shipped_models():
         print(f"weights    {name}: {read_card(name)}")
-    for extra, missing in missing_packages().items():
-        state = f"needs {', '.join(missing)}: pip install 'dpmjax[{extra}]'" if missing else "installed"
-        print(f"extra      {extra}: {state}")
+    for extra, reasons in unusable_packages().items():
+        print(f"extra      {extra}: {'; '.join(reasons) or 'installed'}")
 
 
-def missing_packages() -> dict[str, list[str]]:
-    """Returns the packages of each extra for users that are not installed."""
+def unusable_packages() -> dict[str, list[str]]:
+    """Returns for each extra why packages of it cannot be imported; no reason where all can."""
     found: dict[str, list[str]] = {}
-    for requirement in importlib.metadata.requires("dpmjax") or ():
-        name, extra = re.match(r"[\w.-]+", requirement), re.search(r"extra == ['\"]([\w-]+)['\"]", requirement)
-        if name is None or extra is None or extra[1] == "dev":
-            continue
-        missing = found.setdefault(extra[1], [])
-        try:
-            importlib.metadata.version(name[0])
-        except importlib.metadata.PackageNotFoundError:
-            missing.append(name[0])
+    for package, extra in EXTRAS.items():
+        reasons = found.setdefault(extra, [])
+        if (reason := why_not_importable(package)) is not None:
+            reasons.append(reason)
     return found
 
 

@@ -90,7 +90,8 @@ def main(config: Config) -> list[dict[str, str]]:
     model = load_model(config.weights)
     slam_map = open_map(config.map, make_methods(model, weights=config.weights))
     drive = open_drive(config.selection)
-    case = Case(slam_map, drive, reference_of(config, slam_map, drive))
+    is_calibrated = model.config.calibration is not None
+    case = Case(slam_map, drive, reference_of(config, slam_map, drive), is_calibrated)
     folder = open_run_folder(config, NAME)
     path = folder / TABLE
     earlier = read_history(path) if folder.is_resumed and path.exists() else []
@@ -123,11 +124,13 @@ class Case(NamedTuple):
         slam_map: the map.
         drive: the scans.
         T_reference_keyframe: (k, 4, 4) reference poses of the keyframes; None without a reference.
+        is_calibrated: whether the probabilities are such; they are scores of the matches where it is false.
     """
 
     slam_map: KeyframeMap
     drive: LidarSequence
     T_reference_keyframe: np.ndarray | None
+    is_calibrated: bool
 
 
 def reference_of(config: Config, slam_map: KeyframeMap, drive: LidarSequence) -> np.ndarray | None:
@@ -183,6 +186,7 @@ def write_results(folder: RunFolder, config: Config, case: Case, rows: list[dict
         "num_found": len(numbers),
         "num_empty": sum(result.status == "empty" for result in results),
         "num_keyframes": len(case.slam_map),
+        "is_calibrated": case.is_calibrated,
         "map_bytes": config.map.stat().st_size,
         "scan_s": float(np.median([float(row["seconds"]) for row in rows])) if rows else None,
     }
@@ -198,6 +202,8 @@ def write_results(folder: RunFolder, config: Config, case: Case, rows: list[dict
             metrics["median_error_m"] = float(np.median(errors.translation_m[errors.is_right]))
             metrics["median_error_deg"] = float(np.median(errors.rotation_deg[errors.is_right]))
         text += f"; {num_inside} are within {REACH_M:g} m of a keyframe; {num_right} right, {is_wrong.sum()} wrong"
+    if not case.is_calibrated:
+        text += "; the probabilities are scores (these weights are not calibrated)"
     write_metrics(folder, metrics, seed=config.seed)
     title = f"{case.drive.name} in {config.map.name}: {text.partition(';')[0]}"
     figure = viz.localization_figure(

@@ -30,7 +30,7 @@ def select_device(device: Literal["cpu", "gpu"] | None) -> None:
     jax.config.update("jax_platforms", {"cpu": "cpu", "gpu": "cuda"}[device])
     try:
         jax.devices()
-    except RuntimeError as error:
+    except (RuntimeError, AssertionError) as error:  # the second where the plugin of the device is not installed
         raise ValueError(
             f"--device {device}: JAX finds no such device here; leave the option out or install its plugin"
         ) from error

@@ -37,7 +37,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         arguments: the command line without the program; None takes that of the process.
 
     Returns:
-        The exit code: 0 done, 1 failed on the way, 2 wrong usage or bad input, 130 stopped by Ctrl-C.
+        The exit code: 0 done, 1 failed on the way, 2 wrong usage or bad input, 130 or 143 stopped by a signal.
     """
     given = list(sys.argv[1:] if arguments is None else arguments)
     if given and given[0] in COMMANDS:

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from dpmjax.types import Registration
 
 NAME = "register"
-# Below this probability the motion is called uncertain.
+# Below this probability the motion is called uncertain; a score without calibration has no such limit.
 SURE = 0.9
 SOURCE_COLOR, TARGET_COLOR = (46, 111, 158), (217, 140, 63)
 
@@ -67,6 +67,7 @@ def main(config: Config) -> dict[str, Any]:
             "weights": config.weights,
             **motion_numbers(T),
             **match_numbers(found),
+            "is_calibrated": model.config.calibration is not None,
             "register_s": time.perf_counter() - clock,
         }
         write_results(folder, T, source, target)
@@ -128,11 +129,15 @@ def draw(
 def report(T_target_source: np.ndarray, metrics: dict[str, Any]) -> str:
     """Returns the last lines on the console."""
     rows = "\n".join("  " + " ".join(f"{value:12.6f}" for value in row) for row in T_target_source)
-    sure = "" if metrics["confidence"] >= SURE else ": NOT SURE, look at registration.png"
+    if metrics["is_calibrated"]:
+        sure = "" if metrics["confidence"] >= SURE else ": NOT SURE, look at registration.png"
+        confidence = f"probability that it is right within 2 m and 5 degrees: {metrics['confidence']:.2f}{sure}"
+    else:
+        confidence = f"score of the matches (these weights are not calibrated): {metrics['confidence']:.2f}"
     return (
         f"T_target_source, which maps points of {metrics['source']} to the frame of {metrics['target']}:\n{rows}\n"
         f"{metrics['translation_m']:.3f} m, {metrics['rotation_deg']:.2f} degrees\n"
-        f"probability that it is right within 2 m and 5 degrees: {metrics['confidence']:.2f}{sure}"
+        f"{confidence}"
     )
 
 

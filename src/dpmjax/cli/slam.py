@@ -30,7 +30,7 @@ from dpmjax.cli.optional import require_importable
 from dpmjax.cli.run_folder import RunFolder, RunOptions, open_run_folder, recording, write_metrics
 
 if TYPE_CHECKING:
-    from dpmjax.cli.slam_run import SlamRun
+    from dpmjax.cli.slam_outcome import SlamRun
     from dpmjax.sequences import LidarSequence
     from dpmjax.slam import KeyframeMap, SlamMethods, SlamResult, SlamState
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 if TYPE_CHECKING:
-    from dpmjax.cli.slam_run import SlamRun
+    from dpmjax.cli.slam_outcome import SlamRun
     from dpmjax.sequences import LidarSequence
     from dpmjax.slam import KeyframeMap, SlamResult
 

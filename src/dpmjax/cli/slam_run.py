@@ -13,6 +13,7 @@ from tqdm import tqdm
 
 from dpmjax.cli.run_folder import RunFolder
 from dpmjax.cli.slam_files import write_scans, write_trajectory
+from dpmjax.cli.slam_outcome import SlamRun
 from dpmjax.cli.slam_reader import ScanReader
 from dpmjax.sequences import LidarSequence
 from dpmjax.slam import (
@@ -67,28 +68,6 @@ class Hooks(NamedTuple):
 
     is_stopped: Callable[[], bool]
     on_scan: Callable[[AnyScan, SlamState, ScanReport], None] | None = None
-
-
-class SlamRun(NamedTuple):
-    """A run until its end or its stop.
-
-    Attributes:
-        state: after the last scan.
-        reports: of all scans.
-        stages_s: seconds of each stage in this process, without compilation.
-        compile_s: seconds of compilation.
-        run_s: seconds of all scans of this process, without compilation.
-        num_done: number of scans of this process.
-        failure: what ended the run early; None where nothing did.
-    """
-
-    state: SlamState
-    reports: tuple[ScanReport, ...]
-    stages_s: dict[str, float]
-    compile_s: float
-    run_s: float
-    num_done: int
-    failure: Exception | None
 
 
 class Stopwatch:

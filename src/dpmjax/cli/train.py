@@ -120,7 +120,7 @@ def main(config: Config) -> None:
         settings = training_settings(config, weights)
         seeds = range(config.seed, config.seed + config.num_towns)
         towns = [Source(town_seed=seed, town_length_m=config.town_length_m) for seed in seeds]
-        sources = find_sources(config.data, towns)
+        sources = find_sources(config.data, towns, settings.sampling)
         folder = open_run_folder(config, NAME) if is_first() else None
     with recording(folder) if folder is not None else nullcontext(), StopFlag() as stop:
         with together():

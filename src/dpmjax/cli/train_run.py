@@ -105,7 +105,7 @@ class Records:
     ) -> None:
         self.folder, self.sets, self._settings = folder, sets, settings
         self._checkpoints, self._best = Checkpoints(folder / CHECKPOINTS), Checkpoints(folder / BEST)
-        self.start = begin_training(settings, seed=seed, weights=weights)
+        self.start = begin_training(settings, seed=seed, start=weights)
         self.untrained = Model(self.start.state.params, settings.model)
         if folder.is_resumed:
             self.start = self._restored(self.start)

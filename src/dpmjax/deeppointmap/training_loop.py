@@ -63,7 +63,7 @@ def train(
         seed: seed of parameters, samples and augmentation.
         start: progress to continue from, that of process 0 counts; or a model to begin with its parameters; None
             begins with random parameters.
-        cache: folder where prepared scans are kept for later calls; None keeps them in memory.
+        cache: folder where scans that are prepared here are kept for later calls; None keeps them in memory.
         hooks: evaluation, which chooses the best model, reports and stopping.
 
     Returns:
@@ -71,12 +71,15 @@ def train(
 
     Raises:
         ValueError: if there is no drive, or if `start` is a model of another network; or if a drive has no poses, no
-            scan that can be read, or no two scans at a distance of `config.sampling`.
+            scan that can be read, or no two scans at a distance of `config.sampling`; or if `cache` is given with
+            scans that are prepared already.
         TrainingLostError: if the loss is not finite.
     """
+    if cache is not None and isinstance(drives, ScanStore):
+        raise ValueError("cache: expected None, because the scans of a ScanStore are prepared already")
     config = replace(config, model=uncalibrated(config.model))
     if not isinstance(start, TrainingProgress):
-        start = begin_training(config, seed=seed, weights=start)
+        start = begin_training(config, seed=seed, start=start)
     store = drives if isinstance(drives, ScanStore) else prepare_drives(drives, config, folder=cache, seed=seed)
     progress, stopped_by, speed = _run_steps(store, config, hooks, start, seed=seed)
     params = progress.best_params if int(progress.best_step) > 0 else progress.state.params

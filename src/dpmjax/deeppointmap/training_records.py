@@ -111,28 +111,28 @@ class Trained(NamedTuple):
     speed: Speed
 
 
-def begin_training(config: TrainingConfig, *, seed: int = 0, weights: Model | None = None) -> TrainingProgress:
+def begin_training(config: TrainingConfig, *, seed: int = 0, start: Model | None = None) -> TrainingProgress:
     """Makes the progress before the first step.
 
     Args:
         config: settings of training.
         seed: seed of the parameters.
-        weights: a model whose parameters take the place of random ones; the optimiser begins at zero with any.
+        start: a model whose parameters take the place of random ones; the optimiser begins at zero with any.
 
     Returns:
         Progress without an evaluation.
 
     Raises:
-        ValueError: if the parameters of `weights` have other shapes than those of `config.model`.
+        ValueError: if the parameters of `start` have other shapes than those of `config.model`.
     """
     state = init_training(jax.random.key(seed), config)
-    if weights is not None:
-        shapes = [jax.tree.map(np.shape, params) for params in (weights.params, state.params)]
+    if start is not None:
+        shapes = [jax.tree.map(np.shape, params) for params in (start.params, state.params)]
         if shapes[0] != shapes[1]:
             raise ValueError(
                 "start: expected parameters of config.model, got others; replace(config, model=start.config)"
             )
-        state = replace(state, params=weights.params)
+        state = replace(state, params=start.params)
     return TrainingProgress(state, state.params, np.asarray(-1, np.float32), np.asarray(0, np.int32))
 
 
