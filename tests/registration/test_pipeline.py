@@ -249,6 +249,7 @@ def whole() -> ScanSequence:
     return replace(walk, points=(walk.points * METRES_A_PX).astype(np.float32), unit="m", reference_poses=poses)
 
 
+@pytest.mark.slow
 def test_the_scans_alone_tell_which_lie_apart(whole, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(pipeline, "_MAX_WHOLE", 20)
     # The odometry tells nonsense, and is not used.
@@ -267,6 +268,7 @@ def test_the_scans_alone_tell_which_lie_apart(whole, monkeypatch: pytest.MonkeyP
     np.testing.assert_array_equal(without.recording.chosen, chosen)
 
 
+@pytest.mark.slow
 def test_few_scans_without_odometry_and_scans_without_limit_are_all_registered(whole) -> None:
     start, wheels = whole.reference_poses, np.zeros((40, 3))
     assert len(register(whole, APART, start=start).recording.chosen) == 40
