@@ -20,6 +20,8 @@ from .model import init_model as init_model
 from .model_config import ModelConfig as ModelConfig
 from .model_config import model_preset as model_preset
 from .objective import ObjectiveConfig as ObjectiveConfig
+from .offset_evaluation import OffsetQuality as OffsetQuality
+from .offset_evaluation import offset_quality as offset_quality
 from .processes import join_processes as join_processes
 from .sampling import SamplingConfig as SamplingConfig
 from .scan_registration import PreparedScan as PreparedScan
