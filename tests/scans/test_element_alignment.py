@@ -91,6 +91,14 @@ def test_starts_are_aligned_side_by_side() -> None:
         np.testing.assert_allclose(many.T_target_source[row], expected.T_target_source, atol=1e-5)
 
 
+def test_pairs_are_aligned_side_by_side() -> None:
+    sources, targets = (jax.tree.map(lambda *x: jnp.stack(x), *pair) for pair in ((SOURCE, TARGET), (TARGET, SOURCE)))
+    starts = jnp.asarray(np.stack([GUESS, np.linalg.inv(GUESS)]), jnp.float32)
+    many = jax.vmap(align_elements)(sources, targets, starts)
+    expected = align_elements(TARGET, SOURCE, starts[1])
+    np.testing.assert_allclose(many.T_target_source[1], expected.T_target_source, atol=1e-5)
+
+
 @pytest.mark.parametrize("num", [0, 10])
 def test_too_few_pairs_leave_the_motion(num: int) -> None:
     few = SOURCE.replace(mask=jnp.arange(300) < num)

@@ -329,10 +329,8 @@ def merge_clouds(clouds: DescriptorCloud, T_map_cloud: Float[AnyArray, "s 4 4"])
         turn = T_map_cloud.at[:, :3, 3].set(0)
         normals_map = rigid.transform_points(turn, jnp.where(clouds.mask[..., None], clouds.normals, 0))
 
-    def joined(values: Array | None) -> Array | None:
+    def joined(values: Array) -> Array:
         # Those that have features stand in front, in the map as in each cloud.
-        if values is None:
-            return None
         parts = values[:, :num_described], values[:, num_described:]
         return jnp.concatenate([part.reshape(-1, *values.shape[2:]) for part in parts])
 
@@ -341,6 +339,6 @@ def merge_clouds(clouds: DescriptorCloud, T_map_cloud: Float[AnyArray, "s 4 4"])
         features=joined(clouds.features),
         mask=joined(clouds.mask),
         directions=joined(directions),
-        normals=joined(normals_map),
-        planarity=joined(clouds.planarity),
+        normals=None if normals_map is None else joined(normals_map),
+        planarity=None if clouds.planarity is None else joined(clouds.planarity),
     )

@@ -24,7 +24,7 @@ from dpmjax.geometry.pyramid_host import build_pyramid_on_host
 from dpmjax.geometry.pyramid_storage import StoredPyramid, moved_pyramid
 from dpmjax.nets.decoder import DescriptorDecoder
 from dpmjax.nets.point_encoder import PointEncoder, frame_directions, without_masked
-from dpmjax.types import AnyArray, DescriptorCloud, PointPyramid
+from dpmjax.types import AnyArray, DescriptorCloud, PointPyramid, SurfaceElements
 
 
 @flax.struct.dataclass
@@ -116,8 +116,7 @@ def encode_pyramid(model: Model, pyramid: PointPyramid, *, num_elements: int | N
         `config.num_descriptors` descriptors, and the further elements; zero where the mask is False.
 
     Raises:
-        ValueError: if the pyramid has other stages than the model, or if `num_elements` is not between the number of
-            descriptors and that of the points of the first stage.
+        ValueError: if the pyramid has other stages than the model, or if `num_elements` is out of range.
     """
     stages = model.config.pyramid.stages
     if len(pyramid.levels) != len(stages) + 1:
@@ -132,19 +131,39 @@ def encode_pyramid(model: Model, pyramid: PointPyramid, *, num_elements: int | N
     directions = frame_directions(model.config.encoder.frame, finer, level)
     if directions is None:
         directions = ray_directions(level.positions)
-    num_descriptors = model.config.num_descriptors
-    num_elements = num_descriptors if num_elements is None else num_elements
-    if num_elements < num_descriptors:
-        raise ValueError(f"num_elements: expected at least the {num_descriptors} descriptors, got {num_elements}")
-    elements = pyramid_elements(pyramid, num_elements)
+    num_elements = model.config.num_descriptors if num_elements is None else num_elements
+    elements = elements_of_pyramid(pyramid, model.config, num_elements=num_elements)
     return DescriptorCloud(
-        positions=elements.positions * model.config.scale_m,
+        positions=elements.positions,
         features=features,
         mask=elements.mask,
         directions=directions,
         normals=elements.normals,
         planarity=elements.planarity,
     )
+
+
+@functools.partial(jax.jit, static_argnames=("config", "num_elements"))
+def elements_of_pyramid(pyramid: PointPyramid, config: ModelConfig, *, num_elements: int) -> SurfaceElements:
+    """Computes the surface elements of a scan in metres, without the networks: those of `encode_pyramid`.
+
+    Args:
+        pyramid: one scan in normalised coordinates, from `config.pyramid`; masked points may hold anything.
+        config: scale and pyramid.
+        num_elements: at least the number of descriptors, at most the number of points of the first stage.
+
+    Returns:
+        Elements in the frame of the lidar, in the order of farthest points.
+
+    Raises:
+        ValueError: if the number is out of range.
+    """
+    if num_elements < config.num_descriptors:
+        raise ValueError(
+            f"num_elements: expected at least the {config.num_descriptors} descriptors, got {num_elements}"
+        )
+    elements = pyramid_elements(pyramid, num_elements)
+    return elements.replace(positions=elements.positions * config.scale_m)
 
 
 def encode_stored(model: Model, stored: StoredPyramid, T_new_lidar: Float[AnyArray, "4 4"]) -> DescriptorCloud:

@@ -117,7 +117,7 @@ def align_elements_on_host(
         The motion, as arrays of NumPy.
     """
     source, target = (jax.tree.map(_on_host, side) for side in (source, target))
-    T = np.array(T_target_source, np.float64)
+    T: AnyArray = np.array(T_target_source, np.float64)
     for level in config.levels:
         step_from = _stepper(source, target, level, config, is_symmetric=is_symmetric)
         for _ in range(level.num_iterations):

@@ -68,6 +68,8 @@ class AlignmentConfig:
     converged_rad: float = 1e-4
 
     def __post_init__(self) -> None:
+        if not self.levels:
+            raise ValueError("levels: expected one or more, got none")
         require_fields(self, "min_cosine", low=0, high=1)
         require_fields(self, "kernel_share", "min_kernel_m", "converged_m", "converged_rad", low=1e-9)
 
