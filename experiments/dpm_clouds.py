@@ -6,8 +6,8 @@
 Random pairs 2 to 10 m and 10 to 20 m apart, turned by any yaw, are encoded; the scans themselves are not used again. A
 registration within 2 m and 5 degrees is right. A row of the table has the share of right ones and their median error:
 of the decoder, and after the alignment of N surface elements, of which the descriptors are the first. The last columns
-tell how well the offset head predicts the offsets of close descriptors: the coefficient of determination along x, y and
-z of the lidar. Results go to results/dpm_clouds/<time>/: table.md, metrics.json.
+tell how well the offset head predicts the offsets of close descriptors: the coefficient of determination and the root
+mean square residual along x, y and z of the lidar. Results go to results/dpm_clouds/<time>/: table.md, metrics.json.
 """
 
 from __future__ import annotations
@@ -159,7 +159,7 @@ def table(rows: Sequence[dict[str, Any]], elements: Sequence[int]) -> str:
     columns = ["decoder", *(f"elements_{num}" for num in elements)]
     names = ["decoder", *(f"{num} elements" for num in elements)]
     lines = [
-        f"| sequence | distance | pairs | {' | '.join(names)} | R2 of offsets x, y, z |",
+        f"| sequence | distance | pairs | {' | '.join(names)} | R2 of offsets x, y, z (rmse) |",
         "|---" * (len(names) + 4) + "|",
     ]
     for row in rows:
@@ -169,7 +169,12 @@ def table(rows: Sequence[dict[str, Any]], elements: Sequence[int]) -> str:
         for column in columns:
             error = row[f"median_error_{column}_m"]
             cells.append(f"{row[f'recall_{column}']:.2f}, {'' if error is None else f'{error:.3f} m'}")
-        r2 = ", ".join("" if value is None else f"{value:.2f}" for value in row["offset_r2"])
+        # JSON has no NaN: what could not be measured is null in the file of a row.
+        numbers = (
+            [np.nan if value is None else value for value in row[name]] for name in ("offset_r2", "offset_rmse_m")
+        )
+        parts = zip(*numbers, strict=True)
+        r2 = ", ".join(f"{share:.2f} ({rmse_m:.2f} m)" for share, rmse_m in parts)
         lines.append(f"| {row['sequence']} | {BANDS[row['band']]} | {row['num_pairs']} | {' | '.join(cells)} | {r2} |")
     return "\n".join(lines)
 

@@ -67,5 +67,9 @@ def test_offsets_are_compared_with_the_true_ones(model, clouds) -> None:
     quality = offset_quality(model, [(*clouds, T_B_A.astype(np.float32))])
     assert quality.num_pairs > 100
     np.testing.assert_allclose(quality.r2, 1 - (quality.rmse_m / quality.spread_m) ** 2, atol=1e-6)
-    with pytest.raises(ValueError, match="pairs: expected descriptors"):
-        offset_quality(model, [])
+    apart = np.eye(4, dtype=np.float32)
+    apart[0, 3] = 1000
+    for nothing in ([], [(*clouds, apart)]):
+        quality = offset_quality(model, nothing)
+        assert quality.num_pairs == 0
+        assert np.isnan(quality.r2).all()

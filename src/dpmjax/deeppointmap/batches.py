@@ -119,10 +119,12 @@ def _of_pairs(chunk: Any, model: Model, sources: Sequence[ScanOrCloud], targets:
     encoded = jax.device_get(encode_scans(model, raw)) if raw else None
     numbers = {id(scan): number for number, scan in enumerate(raw)}
 
-    def cloud(scan: ScanOrCloud) -> Any:
+    def cloud(scan: Any) -> DescriptorCloud:
         if id(scan) in numbers:
-            return jax.tree.map(lambda leaf: leaf[numbers[id(scan)]], encoded).described
-        return (scan.descriptors if isinstance(scan, PreparedScan) else scan).described
+            found: DescriptorCloud = jax.tree.map(lambda leaf: leaf[numbers[id(scan)]], encoded)
+        else:
+            found = scan.descriptors if isinstance(scan, PreparedScan) else scan
+        return found.described
 
     clouds = {key: cloud(scan) for key, scan in scans.items()}
     pairs = [(clouds[id(source)], clouds[id(target)]) for source, target in zip(sources, targets, strict=True)]

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import functools
 import hashlib
+from dataclasses import replace
 from typing import Any
 
 import flax.struct
@@ -163,7 +164,7 @@ def elements_of_pyramid(pyramid: PointPyramid, config: ModelConfig, *, num_eleme
             f"num_elements: expected at least the {config.num_descriptors} descriptors, got {num_elements}"
         )
     elements = pyramid_elements(pyramid, num_elements)
-    return elements.replace(positions=elements.positions * config.scale_m)
+    return replace(elements, positions=elements.positions * config.scale_m)
 
 
 def encode_stored(model: Model, stored: StoredPyramid, T_new_lidar: Float[AnyArray, "4 4"]) -> DescriptorCloud:

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from dpmjax.deeppointmap.model import Model, correlate, predict_offsets
-from dpmjax.deeppointmap.objective import ClosePairs, ObjectiveConfig, close_pairs
+from dpmjax.deeppointmap.objective import ObjectiveConfig, close_pairs
 from dpmjax.geometry.bearing import directions_of
 from dpmjax.types import AnyArray, DescriptorCloud
 
@@ -46,33 +46,29 @@ def offset_quality(
 
     Args:
         model: encoder and decoder.
-        pairs: source, target and true motion `T_target_source` of each pair of clouds; at least one.
+        pairs: source, target and true motion `T_target_source` of each pair of clouds.
         config: radius and number of close pairs, as in training.
 
     Returns:
-        The quality; `r2` is NaN along an axis without spread.
-
-    Raises:
-        ValueError: if no two descriptors are close.
+        The quality; NaN where no two descriptors are close, and `r2` along an axis without spread.
     """
-    found = [_offsets(model, source.described, target.described, jnp.asarray(T), config) for source, target, T in pairs]
-    masks = [np.asarray(close.mask) for _, close in found]
-    predicted = np.concatenate(
-        [np.asarray(offsets)[mask] for (offsets, _), mask in zip(found, masks, strict=True)] or [np.zeros((0, 3))]
-    )
-    if len(predicted) == 0:
-        raise ValueError("pairs: expected descriptors of both clouds that are close under the true motion, got none")
-    true = np.concatenate([np.asarray(close.offsets)[mask] for (_, close), mask in zip(found, masks, strict=True)])
-    squared = np.mean((predicted - true).astype(float) ** 2, axis=0)
-    variance = np.var(true.astype(float), axis=0)
+    found = [_offsets(model, source, target, jnp.asarray(T), config) for source, target, T in pairs]
+    if sum(len(true) for _, true in found) == 0:
+        nothing = np.full(3, np.nan)
+        return OffsetQuality(nothing, nothing, nothing, 0)
+    predicted, true = (np.concatenate(parts).astype(np.float64) for parts in zip(*found, strict=True))
+    squared, variance = np.mean((predicted - true) ** 2, axis=0), np.var(true, axis=0)
     r2 = 1 - np.divide(squared, variance, out=np.full(3, np.nan), where=variance > 0)
     return OffsetQuality(r2, np.sqrt(squared), np.sqrt(variance), len(true))
 
 
 def _offsets(
     model: Model, source: DescriptorCloud, target: DescriptorCloud, T: jax.Array, config: ObjectiveConfig
-) -> tuple[jax.Array, ClosePairs]:
+) -> tuple[Float[np.ndarray, "p 3"], Float[np.ndarray, "p 3"]]:
+    """Returns predicted and true offsets of the close pairs, in the frame of the source."""
     source, target = correlate(model, source, target)
     close, _ = close_pairs(source, target, T, config=config)
     directions = directions_of(source)[:, None]
-    return predict_offsets(model, source.features[:, None], target.features, directions, close.indices), close
+    predicted = predict_offsets(model, source.features[:, None], target.features, directions, close.indices)
+    mask = np.asarray(close.mask)
+    return np.asarray(predicted)[mask], np.asarray(close.offsets)[mask]

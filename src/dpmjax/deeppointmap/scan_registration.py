@@ -327,7 +327,8 @@ def _refined(source: DescriptorCloud, target: DescriptorCloud, hypotheses: Regis
     # The elements alone cannot choose among hypotheses: in a corridor, or turned by half, others meet as many planes.
     T_target_source = np.array(hypotheses.T_target_source[0], np.float64)
     if hypotheses.num_inliers[0] > 0 and np.isfinite(T_target_source).all():
-        T_target_source = align_elements_on_host(source.elements, target.elements, T_target_source).T_target_source
+        aligned = align_elements_on_host(source.elements, target.elements, T_target_source)
+        T_target_source = np.array(aligned.T_target_source)
     T_target_source[:3, 3] /= scale
     return _Motions(0, T_target_source, None, None)
 
