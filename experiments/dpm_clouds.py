@@ -4,17 +4,17 @@
     python -m experiments.dpm_clouds scenes --num-scenes 9              simulated scenes that no training has seen
 
 Random pairs 2 to 10 m and 10 to 20 m apart, turned by any yaw, are encoded; the scans themselves are not used again. A
-registration within 2 m and 5 degrees is right. A row of the table has the share of right ones and their median error:
-of the decoder, and after the alignment of N surface elements, of which the descriptors are the first. The last columns
-tell how well the offset head predicts the offsets of close descriptors: the coefficient of determination and the root
-mean square residual along x, y and z of the lidar. Results go to results/dpm_clouds/<time>/: table.md, metrics.json.
+registration within 2 m and 5 degrees is right. A row of the table has the share of right ones and their median error,
+for the decoder alone and after the alignment of N surface elements. The descriptors are the first elements. The last
+column has the accuracy of the offset head on close descriptors: coefficient of determination and root mean square
+residual along x, y and z of the lidar. Results go to results/dpm_clouds/<time>/: table.md, metrics.json.
 """
 
 from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -88,9 +88,8 @@ def open_drives(config: Config) -> list[LidarSequence]:
     drives: list[LidarSequence] = []
     for path in config.paths:
         if path == "scenes" and not Path(path).exists():
-            for seed in range(FIRST_SCENE, FIRST_SCENE + config.num_scenes):
-                drive = simulate_scene(draw_scene(seed))
-                drives.append(replace(drive, name=f"{drive.name}-{seed}"))
+            seeds = range(FIRST_SCENE, FIRST_SCENE + config.num_scenes)
+            drives += [simulate_scene(draw_scene(seed)) for seed in seeds]
             continue
         drives += [open_lidar_sequence(path, sequence=name) for name in list_lidar_sequences(path) or [None]]
     for drive in drives:

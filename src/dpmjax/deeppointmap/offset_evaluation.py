@@ -19,7 +19,7 @@ TRAINED = ObjectiveConfig()
 
 
 class OffsetQuality(NamedTuple):
-    """How well offsets are predicted, along x, y and z of the lidar.
+    """Accuracy of predicted offsets along x, y and z of the lidar.
 
     Attributes:
         r2: coefficient of determination: 1 less the mean squared residual over the variance of the true offsets.

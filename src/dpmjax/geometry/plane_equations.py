@@ -45,13 +45,13 @@ def step_to_planes(
 ) -> PlaneStep:
     """Solves the weighted normal equations of point-to-plane alignment (Chen and Medioni 1992).
 
-    The step is that of `T <- motion_about(step) T`. Directions that no plane holds stay as they are.
+    The step is that of `T <- motion_about(step) T`. A direction that no plane constrains does not move.
 
     Args:
         points: points where the moved side and the fixed planes are compared, in the fixed frame.
         normals: of the planes, same frame.
         residuals: signed distances of the moved side to the fixed one, along the normals.
-        weights: of the pairs, 0 for pairs that do not count; the other arrays must be finite there.
+        weights: weights of the pairs; the other arrays must be finite where a weight is 0 too.
 
     Returns:
         The step; 0 where no pair counts.

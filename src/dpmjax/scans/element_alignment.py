@@ -72,8 +72,8 @@ def align_elements(
     """Aligns two sets of surface elements from a first guess, by the distances of points to planes.
 
     Each element of the source is moved onto the plane of the nearest element of the target (Chen and Medioni 1992). In
-    the symmetric form each element of the target is also compared with the nearest plane of the source, so that the
-    normals of both sides count, as in Rusinkiewicz 2019. A Geman-McClure kernel makes it robust. A pair counts by the
+    the symmetric form, each element of the target is also paired with the nearest plane of the source: the normals of
+    both sides count, as in Rusinkiewicz 2019. A Geman-McClure kernel makes it robust. A pair counts by the
     planarity of the plane and by the cosine between both normals; elements of less than `MIN_FLATNESS` are left out.
 
     The derivative is that of the last step with its pairs and weights held fixed: at convergence, that of the solution.
