@@ -58,22 +58,61 @@ class Neighbours(NamedTuple):
 
 
 @flax.struct.dataclass
+class SurfaceElements:
+    """Points of a surface with the planes through their neighbourhoods.
+
+    Attributes:
+        positions: metres.
+        normals: unit vectors, either side; any where `planarity` is 0.
+        planarity: in [0, 1]: (l2 - l1) / l3 of the eigenvalues of the covariance of the neighbourhood, smallest first;
+            0 where there is no plane.
+        mask: True for elements that are there; the others may hold anything.
+    """
+
+    positions: Float[AnyArray, "n 3"]
+    normals: Float[AnyArray, "n 3"]
+    planarity: Float[AnyArray, " n"]
+    mask: Bool[AnyArray, " n"]
+
+
+@flax.struct.dataclass
 class DescriptorCloud:
     """A scan, or a union of scans, as sparse points that carry learned features (DeepPointMap section 3.1).
 
+    The points of a scan are in the order of farthest-point sampling. The first m have features; the others, if there
+    are any, are surface elements only, for alignment.
+
     Attributes:
         positions: metres, in the frame of the lidar or of the map.
-        features: what the network says of the surroundings of each.
-        mask: True for descriptors that are there.
+        features: what the network says of the surroundings of each of the first m points.
+        mask: True for points that are there.
         directions: cosine and sine of the azimuth of the frame of each descriptor (`EncoderConfig.frame`), in the
             frame of the cloud; a map keeps those of its scans. None for a single scan with frames along its rays, whose
             positions give them.
+        normals: unit normals of the surface at each point, in the frame of the cloud, either side; None in a cloud
+            without surface elements.
+        planarity: see `SurfaceElements`; None together with `normals`.
     """
 
-    positions: Float[Array, "m 3"]
+    positions: Float[Array, "n 3"]
     features: Float[Array, "m c"]
-    mask: Bool[Array, " m"]
+    mask: Bool[Array, " n"]
     directions: Float[Array, "m 2"] | None = None
+    normals: Float[Array, "n 3"] | None = None
+    planarity: Float[Array, " n"] | None = None
+
+    @property
+    def described(self) -> DescriptorCloud:
+        """The points that have features, without surface elements: what matching reads; of stacked clouds too."""
+        num = self.features.shape[-2]
+        return DescriptorCloud(self.positions[..., :num, :], self.features, self.mask[..., :num], self.directions)
+
+    @property
+    def elements(self) -> SurfaceElements:
+        """All points as surface elements; a `ValueError` says if the cloud has no normals."""
+        if self.normals is None or self.planarity is None:
+            raise ValueError("cloud: expected surface elements, got a cloud without normals and planarity")
+        return SurfaceElements(self.positions, self.normals, self.planarity, self.mask)
 
 
 class Verification(NamedTuple):

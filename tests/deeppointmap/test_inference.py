@@ -9,11 +9,13 @@ import numpy as np
 import pytest
 
 import dpmjax
-from dpmjax.deeppointmap import VerificationConfig, prepare_scan, scene_scale
+from dpmjax.deeppointmap import VerificationConfig, elements_of_pyramid, prepare_scan, scene_scale
+from dpmjax.deeppointmap.encoding import pyramid_of_scan
+from dpmjax.geometry import PyramidConfig, PyramidStage
 from dpmjax.scans import ViewCorrelationConfig
 from dpmjax.types import PointCloud
 from tests.deeppointmap import toy
-from tests.tolerances import ACCUMULATED
+from tests.tolerances import ACCUMULATED, ROUNDING
 
 
 @pytest.fixture(scope="module")
@@ -145,6 +147,39 @@ def test_the_scale_of_a_scene_follows_the_larger_scan(model, extent_m: float, sc
     assert scene_scale([small, points], model.config) == scale
 
 
-def test_refinement_without_points_is_refused(model, scans) -> None:
-    with pytest.raises(ValueError, match="refine: expected two scans"):
-        dpmjax.register(model, scans[0], dpmjax.encode(model, scans[1]), refine=True)
+def test_refinement_of_a_cloud_without_elements_is_refused(model, scans) -> None:
+    for source in (scans[0], prepare_scan(model, scans[0])):
+        with pytest.raises(ValueError, match="refine: expected scans, or clouds with surface elements"):
+            dpmjax.register(model, source, dpmjax.encode(model, scans[1]).described, refine=True)
+
+
+def test_further_elements_follow_the_descriptors_and_change_no_match(scans) -> None:
+    stages = (PyramidStage(64, (0.2,), 8), *toy.MODEL.pyramid.stages)
+    config = replace(toy.MODEL, pyramid=PyramidConfig(stages, num_interpolations=1))
+    model = dpmjax.init_model(jax.random.key(0), config)
+    clouds = [dpmjax.encode(model, scan) for scan in scans]
+    larger = [dpmjax.encode(model, scan, num_elements=64) for scan in scans]
+    assert larger[0].features.shape == clouds[0].features.shape == (32, 8)
+    assert larger[0].positions.shape == larger[0].normals.shape == (64, 3)
+    assert larger[0].planarity.shape == larger[0].mask.shape == (64,)
+    np.testing.assert_array_equal(larger[0].positions[:32], clouds[0].positions)
+    alone = elements_of_pyramid(pyramid_of_scan(scans[0], config), config, num_elements=64)
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, **ROUNDING), alone, larger[0].elements)
+    expected, found = (dpmjax.register(model, *pair) for pair in (clouds, larger))
+    jax.tree.map(np.testing.assert_array_equal, expected, found)
+    bare = [cloud.described for cloud in clouds]
+    jax.tree.map(np.testing.assert_array_equal, expected, dpmjax.register(model, *bare))
+    assert dpmjax.overlap(model, *larger) == dpmjax.overlap(model, *bare)
+
+
+@pytest.mark.parametrize("num", [7, 33])
+def test_a_number_of_elements_that_the_pyramid_has_not_is_refused(model, scans, num: int) -> None:
+    with pytest.raises(ValueError, match="num_elements: expected"):
+        dpmjax.encode(model, scans[0], num_elements=num)
+
+
+def test_clouds_that_share_nothing_stay_where_they_are(model, scans) -> None:
+    empty = dpmjax.encode(model, np.zeros((0, 3), np.float32))
+    match = dpmjax.register(model, empty, dpmjax.encode(model, scans[0]), refine=True)
+    np.testing.assert_array_equal(match.T_target_source, np.eye(4))
+    assert match.confidence == 0

@@ -219,6 +219,31 @@ def test_merging_ignores_what_is_masked() -> None:
     np.testing.assert_array_equal(merged.positions, [[1.0] * 3] + 5 * [[0.0] * 3])
 
 
+def test_merging_turns_elements_and_leaves_those_with_features_in_front() -> None:
+    rng = np.random.default_rng(0)
+    positions, normals = rng.normal(size=(2, 2, 5, 3)).astype(np.float32)
+    features = rng.normal(size=(2, 3, 4)).astype(np.float32)
+    mask = np.array([[True] * 5, [True, False, True, True, False]])
+    clouds = DescriptorCloud(
+        positions, features, mask, normals=normals, planarity=rng.random((2, 5)).astype(np.float32)
+    )
+    poses = np.stack([np.eye(4), np.asarray(T)])
+    merged = merge_clouds(clouds, poses)
+    described = [(cloud, row) for cloud in range(2) for row in range(3)]
+    others = [(cloud, row) for cloud in range(2) for row in range(3, 5)]
+    for place, (cloud, row) in enumerate([*described, *others]):
+        turn, is_there = poses[cloud, :3, :3], mask[cloud, row]
+        assert merged.mask[place] == is_there
+        assert merged.planarity[place] == clouds.planarity[cloud, row]
+        expected = turn @ positions[cloud, row] + poses[cloud, :3, 3] if is_there else np.zeros(3)
+        np.testing.assert_allclose(merged.positions[place], expected, atol=1e-5)
+        np.testing.assert_allclose(merged.normals[place], is_there * (turn @ normals[cloud, row]), atol=1e-5)
+    np.testing.assert_array_equal(merged.features, features.reshape(6, 4))
+    assert merged.directions.shape == (6, 2)
+    bare = jax.vmap(lambda cloud: cloud.described)(clouds)
+    jax.tree.map(np.testing.assert_array_equal, merge_clouds(bare, poses), merged.described)
+
+
 def test_wrong_arguments_are_named(as_user) -> None:
     with pytest.raises(ValueError, match="^pair_ratio: expected"):
         MatchConfig(pair_ratio=5.0)

@@ -29,11 +29,14 @@ from .matching import match_descriptors as match_descriptors
 from .matching import merge_clouds as merge_clouds
 from .model import Model as Model
 from .model import correlate as correlate
+from .model import elements_of_pyramid as elements_of_pyramid
 from .model import encode_pyramid as encode_pyramid
 from .model import init_model as init_model
 from .model_config import ModelConfig as ModelConfig
 from .model_config import model_preset as model_preset
 from .objective import ObjectiveConfig as ObjectiveConfig
+from .offset_evaluation import OffsetQuality as OffsetQuality
+from .offset_evaluation import offset_quality as offset_quality
 from .overlap_evaluation import NO_OVERLAP_M as NO_OVERLAP_M
 from .overlap_evaluation import OverlapEvaluation as OverlapEvaluation
 from .overlap_evaluation import encode_turned as encode_turned

@@ -22,7 +22,11 @@ CHUNK = 4
 
 
 def encode_scans(
-    model: Model, scans: Sequence[PointCloud | Float[AnyArray, "_n 3"]], *, scale: float = 1.0
+    model: Model,
+    scans: Sequence[PointCloud | Float[AnyArray, "_n 3"]],
+    *,
+    scale: float = 1.0,
+    num_elements: int | None = None,
 ) -> DescriptorCloud:
     """Encodes many raw scans; they may have different numbers of points.
 
@@ -32,16 +36,17 @@ def encode_scans(
         model: encoder and configuration.
         scans: points in metres, each in the frame of its lidar.
         scale: see `encode`.
+        num_elements: see `encode`.
 
     Returns:
-        Stacked clouds, as `merge_clouds` takes them: positions (s, m, 3), features (s, m, c), mask (s, m).
+        Stacked clouds, as `merge_clouds` takes them: positions (s, n, 3), features (s, m, c), mask (s, n).
     """
     _require_some("scans", scans)
     parts = []
     for start in range(0, len(scans), CHUNK):
         # JAX still encodes the chunk before.
         pyramids = [pyramid_of_scan(points, model.config, scale=scale) for points in scans[start : start + CHUNK]]
-        parts.append(_encode_chunk(model, _stacked(pyramids)))
+        parts.append(_encode_chunk(model, _stacked(pyramids), num_elements=num_elements))
     return _joined(parts, len(scans))
 
 
@@ -114,10 +119,12 @@ def _of_pairs(chunk: Any, model: Model, sources: Sequence[ScanOrCloud], targets:
     encoded = jax.device_get(encode_scans(model, raw)) if raw else None
     numbers = {id(scan): number for number, scan in enumerate(raw)}
 
-    def cloud(scan: ScanOrCloud) -> Any:
+    def cloud(scan: Any) -> DescriptorCloud:
         if id(scan) in numbers:
-            return jax.tree.map(lambda leaf: leaf[numbers[id(scan)]], encoded)
-        return scan.descriptors if isinstance(scan, PreparedScan) else scan
+            found: DescriptorCloud = jax.tree.map(lambda leaf: leaf[numbers[id(scan)]], encoded)
+        else:
+            found = scan.descriptors if isinstance(scan, PreparedScan) else scan
+        return found.described
 
     clouds = {key: cloud(scan) for key, scan in scans.items()}
     pairs = [(clouds[id(source)], clouds[id(target)]) for source, target in zip(sources, targets, strict=True)]
@@ -125,9 +132,9 @@ def _of_pairs(chunk: Any, model: Model, sources: Sequence[ScanOrCloud], targets:
     return _joined([chunk(model, some) for some in chunks], len(pairs))
 
 
-@jax.jit
-def _encode_chunk(model: Model, pyramids: Any) -> DescriptorCloud:
-    return jax.lax.map(functools.partial(encode_pyramid, model), pyramids)
+@functools.partial(jax.jit, static_argnames="num_elements")
+def _encode_chunk(model: Model, pyramids: Any, *, num_elements: int | None) -> DescriptorCloud:
+    return jax.lax.map(functools.partial(encode_pyramid, model, num_elements=num_elements), pyramids)
 
 
 @jax.jit

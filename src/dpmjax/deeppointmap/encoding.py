@@ -18,22 +18,33 @@ EXTENT_PERCENT, FULL_EXTENT_M, MAX_SCALE = 90, 32.0, 4.0
 """Scans whose extent is nearer to half or a quarter of the full one than to the whole are enlarged by 2 or 4."""
 
 
-def encode(model: Model, points: PointCloud | Float[AnyArray, "n 3"], *, scale: float = 1.0) -> DescriptorCloud:
+def encode(
+    model: Model,
+    points: PointCloud | Float[AnyArray, "n 3"],
+    *,
+    scale: float = 1.0,
+    num_elements: int | None = None,
+) -> DescriptorCloud:
     """Encodes a raw scan to descriptors, preprocessing included (DeepPointMap section 3.1).
 
-    A `ValueError` says if the points are no real numbers (n, 3), or if the scale is not positive. A warning says if
-    hardly any point is in range: the points are then probably not in metres.
+    A `ValueError` says if the points are no real numbers (n, 3), if the scale is not positive, or if `num_elements` is
+    out of range. A warning says if hardly any point is in range: the points are then probably not in metres.
 
     Args:
         model: its configuration includes the preprocessing.
         points: (n, 3), metres, in the frame of the lidar; points that are not finite are dropped.
         scale: factor by which the points are enlarged first, for rooms (`scene_scale`). All scans that are compared
             or merged must share it; positions, and poses for `merge_clouds`, are then in metres times this factor.
+        num_elements: number of surface elements, from that of the descriptors to that of the points of the first stage
+            of `model.config.pyramid`; those beyond the descriptors have no features, and make `register` of two clouds
+            more exact. None for the descriptors alone, which are surface elements too.
 
     Returns:
-        `model.config.num_descriptors` descriptors, metres, same frame. The mask of an empty scan is all False.
+        `model.config.num_descriptors` descriptors and the further elements, metres, same frame, in the order of
+        farthest points. The mask of an empty scan is all False.
     """
-    return encode_pyramid(model, pyramid_of_scan(points, model.config, scale=scale))
+    pyramid = pyramid_of_scan(points, model.config, scale=scale)
+    return encode_pyramid(model, pyramid, num_elements=num_elements)
 
 
 def scene_scale(scans: Sequence[PointCloud | Float[AnyArray, "_n 3"]], config: ModelConfig) -> float:

@@ -300,28 +300,41 @@ def merge_clouds(clouds: DescriptorCloud, T_map_cloud: Float[AnyArray, "s 4 4"])
     """Merges several descriptor clouds into one frame: a map, without new extraction (DeepPointMap section 3.1).
 
     Args:
-        clouds: s clouds of equal capacity, stacked: positions (s, m, 3), features (s, m, c), mask (s, m).
+        clouds: s clouds of equal capacity, stacked: positions (s, n, 3), features (s, m, c), mask (s, n).
         T_map_cloud: pose of each cloud in the frame of the map, metres. The pose of a cloud without a valid descriptor
             may be anything.
 
     Returns:
-        One cloud of capacity s * m, with the directions of the rays of all clouds; positions are 0 where the mask is
-        False.
+        One cloud of capacity s * n, the s * m points with features in front, with the directions of the rays of all
+        clouds, and with their normals if they have some; positions are 0 where the mask is False.
 
     Raises:
         ValueError: if the shapes do not match.
     """
     if clouds.positions.ndim != 3:
-        raise ValueError(f"clouds: expected stacked clouds, positions (s, m, 3), got {clouds.positions.shape}")
+        raise ValueError(f"clouds: expected stacked clouds, positions (s, n, 3), got {clouds.positions.shape}")
     T_map_cloud = as_float("T_map_cloud", T_map_cloud)
     require_shape("T_map_cloud", T_map_cloud, (len(clouds.positions), 4, 4))
+    num_described = clouds.features.shape[1]
     positions_cloud = jnp.where(clouds.mask[..., None], clouds.positions, 0)
     T_map_cloud = jnp.where(jnp.any(clouds.mask, axis=1)[:, None, None], T_map_cloud, 0)
     positions_map = jnp.where(clouds.mask[..., None], rigid.transform_points(T_map_cloud, positions_cloud), 0)
     directions = turned_directions(directions_of(replace(clouds, positions=positions_cloud)), T_map_cloud)
+    normals_map = None
+    if clouds.normals is not None:
+        turn = T_map_cloud.at[:, :3, 3].set(0)
+        normals_map = rigid.transform_points(turn, jnp.where(clouds.mask[..., None], clouds.normals, 0))
+
+    def joined(values: Array) -> Array:
+        # Those that have features stand in front, in the map as in each cloud.
+        parts = values[:, :num_described], values[:, num_described:]
+        return jnp.concatenate([part.reshape(-1, *values.shape[2:]) for part in parts])
+
     return DescriptorCloud(
-        positions=positions_map.reshape(-1, 3),
-        features=clouds.features.reshape(-1, clouds.features.shape[-1]),
-        mask=clouds.mask.reshape(-1),
-        directions=directions.reshape(-1, 2),
+        positions=joined(positions_map),
+        features=joined(clouds.features),
+        mask=joined(clouds.mask),
+        directions=joined(directions),
+        normals=None if normals_map is None else joined(normals_map),
+        planarity=None if clouds.planarity is None else joined(clouds.planarity),
     )

@@ -5,7 +5,9 @@ All functions take one scan or one pair; `vmap` over the clouds batches them.
 
 from __future__ import annotations
 
+import functools
 import hashlib
+from dataclasses import replace
 from typing import Any
 
 import flax.struct
@@ -18,11 +20,12 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray
 from dpmjax.checks import require_shape
 from dpmjax.deeppointmap.model_config import ModelConfig
 from dpmjax.geometry.bearing import from_ray_frame, ray_directions
+from dpmjax.geometry.elements import pyramid_elements
 from dpmjax.geometry.pyramid_host import build_pyramid_on_host
 from dpmjax.geometry.pyramid_storage import StoredPyramid, moved_pyramid
 from dpmjax.nets.decoder import DescriptorDecoder
 from dpmjax.nets.point_encoder import PointEncoder, frame_directions, without_masked
-from dpmjax.types import AnyArray, DescriptorCloud, PointPyramid
+from dpmjax.types import AnyArray, DescriptorCloud, PointPyramid, SurfaceElements
 
 
 @flax.struct.dataclass
@@ -97,19 +100,24 @@ def model_fingerprint(model: Model) -> str:
     return digest.hexdigest()[:16]
 
 
-@jax.jit
-def encode_pyramid(model: Model, pyramid: PointPyramid) -> DescriptorCloud:
+@functools.partial(jax.jit, static_argnames="num_elements")
+def encode_pyramid(model: Model, pyramid: PointPyramid, *, num_elements: int | None = None) -> DescriptorCloud:
     """Encodes one scan to descriptors in metres, in the frame of the lidar (DeepPointMap section 3.1).
+
+    Each descriptor is a surface element too: its normal is that of the plane through the neighbours that the encoder
+    looks at first.
 
     Args:
         model: a model whose `config.pyramid` built the pyramid.
         pyramid: one scan in normalised coordinates; masked points may hold anything.
+        num_elements: number of surface elements, at most that of the first stage: the points that follow the
+            descriptors in the order of farthest points have no features. None for the descriptors alone.
 
     Returns:
-        `config.num_descriptors` descriptors; zero where the mask is False.
+        `config.num_descriptors` descriptors, and the further elements; zero where the mask is False.
 
     Raises:
-        ValueError: if the pyramid has other stages than the model.
+        ValueError: if the pyramid has other stages than the model, or if `num_elements` is out of range.
     """
     stages = model.config.pyramid.stages
     if len(pyramid.levels) != len(stages) + 1:
@@ -124,8 +132,39 @@ def encode_pyramid(model: Model, pyramid: PointPyramid) -> DescriptorCloud:
     directions = frame_directions(model.config.encoder.frame, finer, level)
     if directions is None:
         directions = ray_directions(level.positions)
-    positions = jnp.asarray(level.positions) * model.config.scale_m
-    return DescriptorCloud(positions, features, jnp.asarray(level.mask), directions)
+    num_elements = model.config.num_descriptors if num_elements is None else num_elements
+    elements = elements_of_pyramid(pyramid, model.config, num_elements=num_elements)
+    return DescriptorCloud(
+        positions=elements.positions,
+        features=features,
+        mask=elements.mask,
+        directions=directions,
+        normals=elements.normals,
+        planarity=elements.planarity,
+    )
+
+
+@functools.partial(jax.jit, static_argnames=("config", "num_elements"))
+def elements_of_pyramid(pyramid: PointPyramid, config: ModelConfig, *, num_elements: int) -> SurfaceElements:
+    """Computes the surface elements of a scan in metres, without the networks: those of `encode_pyramid`.
+
+    Args:
+        pyramid: one scan in normalised coordinates, from `config.pyramid`; masked points may hold anything.
+        config: scale and pyramid.
+        num_elements: at least the number of descriptors, at most the number of points of the first stage.
+
+    Returns:
+        Elements in the frame of the lidar, in the order of farthest points.
+
+    Raises:
+        ValueError: if the number is out of range.
+    """
+    if num_elements < config.num_descriptors:
+        raise ValueError(
+            f"num_elements: expected at least the {config.num_descriptors} descriptors, got {num_elements}"
+        )
+    elements = pyramid_elements(pyramid, num_elements)
+    return replace(elements, positions=elements.positions * config.scale_m)
 
 
 def encode_stored(model: Model, stored: StoredPyramid, T_new_lidar: Float[AnyArray, "4 4"]) -> DescriptorCloud:
@@ -156,8 +195,10 @@ def correlate(model: Model, a: DescriptorCloud, b: DescriptorCloud) -> tuple[Des
         b: the same.
 
     Returns:
-        Both clouds with correlated features; positions and masks stay as they are (zero where masked).
+        Both clouds with correlated features; positions and masks stay as they are (zero where masked). Surface
+        elements are left out.
     """
+    a, b = a.described, b.described
     for name, cloud in (("a", a), ("b", b)):
         _require_cloud(name, cloud, model.config.decoder.input_channels)
     return _decode(model, a, b, part="correlate")

@@ -100,6 +100,7 @@ def overlap_evidence(model: Model, a: DescriptorCloud, b: DescriptorCloud) -> Ov
     Returns:
         The numbers; finite for finite features, also where a cloud is empty.
     """
+    a, b = a.described, b.described
     correlated = correlate(model, a, b)
     is_pair = a.mask[:, None] & b.mask[None, :]
     similarity = jnp.where(is_pair, descriptor_similarity(model, *correlated), -1)

@@ -27,15 +27,18 @@ from dpmjax.deeppointmap.overlap_prediction import overlap_probability
 from dpmjax.deeppointmap.verification import (
     MeasuredScan,
     VerificationConfig,
-    VerifiedMotion,
     choose_motion,
     measure_scan,
     refine_motion,
 )
 from dpmjax.geometry.bearing import directions_of
-from dpmjax.types import AnyArray, DescriptorCloud, PointCloud, Registration
+from dpmjax.scans.element_alignment import align_elements_on_host
+from dpmjax.types import AnyArray, DescriptorCloud, PointCloud, Registration, Verification
 
 NUM_THREADS = 2
+
+NUM_ELEMENTS = 1024
+"""Number of surface elements of a scan that is refined against a cloud."""
 
 
 class PreparedScan(NamedTuple):
@@ -114,15 +117,17 @@ def register(
 
     Where both are scans, the best distinct motions of the descriptors are verified by the scans themselves: points
     must meet surfaces and leave free space free. Where none of the first is clearly right, motions under which the
-    scans look alike from above are tried too. The motion under which the scans agree best is taken.
+    scans look alike from above are tried too. The motion under which the scans agree best is taken. Descriptor clouds
+    have no points: the best motion of the descriptors is taken, and refined by their surface elements.
 
     Args:
         model: encoder and decoder.
         source: a raw scan (n, 3) in metres, a scan from `prepare_scan`, or a descriptor cloud.
         target: the same; one may be a scan and the other a map.
         config: choice of pairs and inliers; None takes that of the model.
-        refine: whether to end with a fine point-to-plane alignment of the scans. Without it, the motion of two scans is
-            that of the short alignment that verified it, and any other that of the descriptors.
+        refine: whether to end with a fine point-to-plane alignment: of two scans, or else of the surface elements of
+            both clouds. Without it, the motion of two scans is that of the short alignment that verified it, and any
+            other that of the descriptors.
         scale: factor by which raw scans are enlarged for the encoder, or by which descriptors were; "auto" chooses 1,
             2 or 4 from the extent of both scans. Prepared scans know theirs. The result is in metres.
 
@@ -135,7 +140,7 @@ def register(
 
     Raises:
         ValueError: if the points are no real numbers (n, 3), if features have another width than the model, if
-            `refine` is asked for without two scans, if both have another scale, or if "auto" meets descriptors.
+            `refine` meets a cloud without surface elements, if both have another scale, or if "auto" meets descriptors.
     """
     return register_each(model, [(source, target)], config=config, refine=refine, scale=scale)[0]
 
@@ -163,21 +168,25 @@ def register_each(
     Raises:
         ValueError: as `register` says.
     """
-    if refine and any(isinstance(scan, DescriptorCloud) for pair in pairs for scan in pair):
-        raise ValueError("refine: expected two scans, raw or from prepare_scan, got descriptors without points")
+    if refine:
+        _require_elements(pairs)
     scale = _scale_of(pairs, scale, model)
-    prepared = _prepared(model, pairs, scale)
+    prepared = _prepared(model, pairs, scale, num_elements=_num_elements(model) if refine else None)
     matching, verification = config or model.config.matching, model.config.verification
     with ThreadPoolExecutor(NUM_THREADS) as pool:
         started = []
         for pair in pairs:
             source, target = (prepared[id(scan)] for scan in pair)
-            hypotheses = match_clouds(model, _descriptors(source), _descriptors(target), config=matching)
-            hypotheses = _in_metres(hypotheses, _shared_scale(source, target, scale))
+            clouds = _descriptors(source), _descriptors(target)
+            in_cloud_units = match_clouds(model, *clouds, config=matching)
+            pair_scale = _shared_scale(source, target, scale)
+            hypotheses = _in_metres(in_cloud_units, pair_scale)
             motions: Future[_Motions] | None = None
             if isinstance(source, PreparedScan) and isinstance(target, PreparedScan):
                 scans = source.measured, target.measured
                 motions = pool.submit(_verified, *scans, hypotheses, verification, refine=refine)
+            elif refine:
+                motions = pool.submit(_refined, *clouds, in_cloud_units, pair_scale)
             started.append((hypotheses, motions))
         return [
             _finished(model, hypotheses, None if motions is None else motions.result())
@@ -199,7 +208,7 @@ def match_clouds(
     Returns:
         All hypotheses, with a leading axis, as arrays of NumPy on the host.
     """
-    return jax.device_get(trace_match(model, source, target, config=config))
+    return jax.device_get(trace_match(model, source.described, target.described, config=config))
 
 
 def overlap(model: Model, source: ScanOrCloud, target: ScanOrCloud) -> Float[Array, ""]:
@@ -220,7 +229,7 @@ def overlap(model: Model, source: ScanOrCloud, target: ScanOrCloud) -> Float[Arr
     Returns:
         The probability; 0 where a scan is empty or a feature is not finite.
     """
-    return overlap_probability(model, _as_cloud(model, source), _as_cloud(model, target))
+    return overlap_probability(model, _as_cloud(model, source).described, _as_cloud(model, target).described)
 
 
 def distinct_motions(hypotheses: Registration) -> Float[np.ndarray, "h 4 4"]:
@@ -237,9 +246,24 @@ def distinct_motions(hypotheses: Registration) -> Float[np.ndarray, "h 4 4"]:
 
 
 class _Motions(NamedTuple):
-    # The confidence rests on the chosen motion, with and without a refinement.
-    chosen: VerifiedMotion
-    final: VerifiedMotion
+    # The chosen hypothesis and its final motion, metres. The confidence rests on the evidence before the refinement.
+    row: int | None
+    T_target_source: Float[np.ndarray, "4 4"]
+    evidence: Verification | None
+    verification: Verification | None
+
+
+def _require_elements(pairs: Sequence[tuple[ScanOrCloud, ScanOrCloud]]) -> None:
+    for pair in pairs:
+        if not any(isinstance(scan, DescriptorCloud) for scan in pair):
+            continue
+        clouds = [_descriptors(scan) for scan in pair if isinstance(scan, DescriptorCloud | PreparedScan)]
+        if any(cloud.normals is None for cloud in clouds):
+            raise ValueError("refine: expected scans, or clouds with surface elements, got a cloud without normals")
+
+
+def _num_elements(model: Model) -> int:
+    return min(NUM_ELEMENTS, model.config.pyramid.stages[0].num_points)
 
 
 def _measured(points: RawScan, config: VerificationConfig) -> MeasuredScan:
@@ -274,7 +298,7 @@ def _in_metres(hypotheses: Registration, scale: float) -> Registration:
 
 
 def _prepared(
-    model: Model, pairs: Sequence[tuple[ScanOrCloud, ScanOrCloud]], scale: float
+    model: Model, pairs: Sequence[tuple[ScanOrCloud, ScanOrCloud]], scale: float, *, num_elements: int | None
 ) -> dict[int, DescriptorCloud | PreparedScan]:
     # By identity; each scan once. Surfaces are measured only where both sides of a pair are scans.
     raw: dict[int, RawScan] = {}
@@ -287,7 +311,7 @@ def _prepared(
             elif is_verified:
                 raw[id(scan)] = scan
             elif id(scan) not in ready:
-                ready[id(scan)] = encode(model, scan, scale=scale)
+                ready[id(scan)] = encode(model, scan, scale=scale, num_elements=num_elements)
     return {**ready, **dict(zip(raw, prepare_scans(model, list(raw.values()), scale=scale), strict=True))}
 
 
@@ -295,18 +319,29 @@ def _verified(
     source: MeasuredScan, target: MeasuredScan, hypotheses: Registration, config: VerificationConfig, *, refine: bool
 ) -> _Motions:
     chosen = choose_motion(source, target, distinct_motions(hypotheses), config)
-    return _Motions(chosen, refine_motion(source, target, chosen, config) if refine else chosen)
+    final = refine_motion(source, target, chosen, config) if refine else chosen
+    return _Motions(chosen.row, final.T_target_source, chosen.verification, final.verification)
+
+
+def _refined(source: DescriptorCloud, target: DescriptorCloud, hypotheses: Registration, scale: float) -> _Motions:
+    # The elements alone cannot choose among hypotheses: in a corridor, or turned by half, others meet as many planes.
+    T_target_source = np.array(hypotheses.T_target_source[0], np.float64)
+    if hypotheses.num_inliers[0] > 0 and np.isfinite(T_target_source).all():
+        aligned = align_elements_on_host(source.elements, target.elements, T_target_source)
+        T_target_source = np.array(aligned.T_target_source)
+    T_target_source[:3, 3] /= scale
+    return _Motions(0, T_target_source, None, None)
 
 
 def _finished(model: Model, hypotheses: Registration, motions: _Motions | None) -> Registration:
-    row = 0 if motions is None else motions.chosen.row
-    evidence = gather_evidence(hypotheses, row, None if motions is None else motions.chosen.verification)
+    row = 0 if motions is None else motions.row
+    evidence = gather_evidence(hypotheses, row, None if motions is None else motions.evidence)
     match = jax.tree.map(lambda leaf: jnp.asarray(leaf[0 if row is None else row]), hypotheses)
     if row is None:
         match = _without_inliers(match)
     if motions is not None:
-        T = jnp.asarray(motions.final.T_target_source, match.T_target_source.dtype)
-        match = replace(match, T_target_source=T, verification=motions.final.verification)
+        T = jnp.asarray(motions.T_target_source, match.T_target_source.dtype)
+        match = replace(match, T_target_source=T, verification=motions.verification)
     return with_confidence(match, evidence, model.config.calibration)
 
 

@@ -4,6 +4,7 @@ from .alignment import weighted_svd as weighted_svd
 from .consensus import Consensus as Consensus
 from .consensus import ConsensusConfig as ConsensusConfig
 from .consensus import find_consensus as find_consensus
+from .elements import pyramid_elements as pyramid_elements
 from .neighbours import k_nearest as k_nearest
 from .neighbours import radius_search as radius_search
 from .normals import Normals as Normals

@@ -73,7 +73,7 @@ def directions_of(cloud: DescriptorCloud) -> Float[Array, "*b m 2"]:
     Returns:
         Unit vectors in the horizontal plane of the cloud's frame.
     """
-    return ray_directions(cloud.positions) if cloud.directions is None else jnp.asarray(cloud.directions)
+    return ray_directions(cloud.described.positions) if cloud.directions is None else jnp.asarray(cloud.directions)
 
 
 def to_ray_frame(vectors: Float[AnyArray, "... 3"], directions: Float[AnyArray, "... 2"]) -> Float[Array, "... 3"]:

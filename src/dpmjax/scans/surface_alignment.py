@@ -7,13 +7,13 @@ of its pairs, samples all directions of normals alike, and pairs only surfaces w
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
-from scipy.spatial.transform import Rotation
 
 from dpmjax.checks import require_count, require_fields, require_positive
+from dpmjax.geometry.plane_equations import PlaneStep, geman_mcclure, motion_about, step_to_planes
 from dpmjax.scans.surfaces import Surface
 
 MIN_PAIRS = 20
@@ -28,14 +28,17 @@ class AlignmentLevel:
         radius_m: a point is paired with the nearest point of the other surface within this distance.
         num_points: number of points that are paired.
         num_iterations: largest number of steps.
+        kernel_m: width of the kernel; None for that of the configuration.
     """
 
     radius_m: float
     num_points: int
     num_iterations: int
+    kernel_m: float | None = None
 
     def __post_init__(self) -> None:
         require_positive("radius_m", self.radius_m)
+        require_positive("kernel_m", 1.0 if self.kernel_m is None else self.kernel_m)
         require_count("num_points", self.num_points)
         require_count("num_iterations", self.num_iterations)
 
@@ -65,8 +68,35 @@ class AlignmentConfig:
     converged_rad: float = 1e-4
 
     def __post_init__(self) -> None:
+        if not self.levels:
+            raise ValueError("levels: expected one or more, got none")
         require_fields(self, "min_cosine", low=0, high=1)
         require_fields(self, "kernel_share", "min_kernel_m", "converged_m", "converged_rad", low=1e-9)
+
+    def kernel_width_m(self, level: AlignmentLevel) -> float:
+        """Returns the width of the kernel at a level.
+
+        Args:
+            level: one of the levels.
+
+        Returns:
+            Metres.
+        """
+        return max(self.min_kernel_m, self.kernel_share * level.radius_m) if level.kernel_m is None else level.kernel_m
+
+    def is_converged(self, step: PlaneStep) -> Any:
+        """Compares steps with the least ones that go on.
+
+        Args:
+            step: steps of any leading axes, of NumPy or of JAX.
+
+        Returns:
+            True for short steps.
+        """
+        length_squared, angle_squared = (
+            (part**2).sum(axis=-1) for part in (step.tangent[..., :3], step.tangent[..., 3:])
+        )
+        return (length_squared < self.converged_m**2) & (angle_squared < self.converged_rad**2)
 
 
 class SurfaceAlignment(NamedTuple):
@@ -186,10 +216,9 @@ def align_surfaces_from(
                 rows, pairs = rows[is_enough], pairs.take(is_enough)
             if len(rows) == 0:
                 break
-            step, centre, rmse[rows] = _step_to_planes(pairs, level, config)
-            T[rows] = _motions(step, centre) @ T[rows]
-            length_m, angle_rad = np.linalg.norm(step[:, :3], axis=1), np.linalg.norm(step[:, 3:], axis=1)
-            is_active[rows] = (length_m >= config.converged_m) | (angle_rad >= config.converged_rad)
+            step, rmse[rows] = _step(pairs, level, config)
+            T[rows] = motion_about(step) @ T[rows]
+            is_active[rows] = ~config.is_converged(step)
     return [SurfaceAlignment(*found) for found in zip(T, rmse.tolist(), num_pairs.tolist(), strict=True)]
 
 
@@ -246,38 +275,13 @@ def pair_with_planes(
     return PlanePairs(*(values[pairs.is_paired] for values in pairs[1:]))
 
 
-def _step_to_planes(
+def _step(
     pairs: NearestPlanes, level: AlignmentLevel, config: AlignmentConfig
-) -> tuple[Float[np.ndarray, "s 6"], Float[np.ndarray, "s 3"], Float[np.ndarray, " s"]]:
-    """Returns the small translation and rotation that bring points onto their planes, its centre, and the rmse."""
-    width = max(config.min_kernel_m, config.kernel_share * level.radius_m)
+) -> tuple[PlaneStep, Float[np.ndarray, " s"]]:
+    """Returns the step that brings points onto their planes, and the rmse before it."""
     weights = pairs.flatness * np.maximum(pairs.cosines - config.min_cosine, 0) * pairs.is_paired
-    weights *= (width**2 / (width**2 + pairs.residuals**2)) ** 2
+    weights *= geman_mcclure(pairs.residuals, config.kernel_width_m(level))
     total = weights.sum(axis=1)
     squares = np.sum(weights * pairs.residuals**2, axis=1)
     rmse = np.sqrt(np.divide(squares, total, out=np.full(len(total), np.inf), where=total > 0))
-    centre = np.einsum("sn,snd->sd", pairs.is_paired.astype(float), pairs.points) / pairs.is_paired.sum(axis=1)[:, None]
-    jacobian = _jacobian(pairs.points - centre[:, None], pairs.normals)
-    weighted = weights[:, None] * jacobian
-    system = weighted @ jacobian.transpose(0, 2, 1)
-    # Directions that no plane holds stay as they are.
-    diagonal = np.einsum("sii->si", system)
-    damping = 1e-6 * diagonal + 1e-9 * diagonal.sum(axis=1, keepdims=True) + np.finfo(float).tiny
-    system = system + damping[..., None] * np.eye(6)
-    return -np.linalg.solve(system, weighted @ pairs.residuals[..., None])[..., 0], centre, rmse
-
-
-def _jacobian(levers: Float[np.ndarray, "s n 3"], normals: Float[np.ndarray, "s n 3"]) -> Float[np.ndarray, "s 6 n"]:
-    """Returns the normals, and the levers crossed with them."""
-    jacobian = np.empty((len(normals), 6, normals.shape[1]))
-    (lx, ly, lz), (nx, ny, nz) = np.moveaxis(levers, -1, 0), np.moveaxis(normals, -1, 0)
-    for row, values in enumerate((nx, ny, nz, ly * nz - lz * ny, lz * nx - lx * nz, lx * ny - ly * nx)):
-        jacobian[:, row] = values
-    return jacobian
-
-
-def _motions(step: Float[np.ndarray, "s 6"], centre: Float[np.ndarray, "s 3"]) -> Float[np.ndarray, "s 4 4"]:
-    T = np.tile(np.eye(4), (len(step), 1, 1))
-    T[:, :3, :3] = Rotation.from_rotvec(step[:, 3:]).as_matrix()
-    T[:, :3, 3] = step[:, :3] + centre - np.einsum("sij,sj->si", T[:, :3, :3], centre)
-    return T
+    return step_to_planes(pairs.points, pairs.normals, pairs.residuals, weights), rmse

@@ -10,7 +10,7 @@ from jaxtyping import Float, Int
 
 from dpmjax.checks import require_count, require_positive_fields
 from dpmjax.geometry.host_tree import HostTree
-from dpmjax.scans.plane_fits import fit_planes
+from dpmjax.geometry.plane_fits import fit_planes
 from dpmjax.scans.preprocess import first_of_each_voxel
 
 MIN_NEIGHBOURS = 4

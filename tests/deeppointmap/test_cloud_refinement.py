@@ -1,0 +1,75 @@
+"""Registration of two descriptor clouds without their scans, by the shipped network."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import dpmjax
+from dpmjax.deeppointmap import merge_clouds, offset_quality
+from dpmjax.scans.element_alignment import align_elements_on_host
+from dpmjax.types import DescriptorCloud
+from tests.scans.surface_scenes import motion, seen_from, street
+
+T_WORLD_A, T_WORLD_B = motion(5, (1, -2, 0.1), 1), motion(40, (-2, 1, 0), -1)
+T_B_A = np.linalg.inv(T_WORLD_B) @ T_WORLD_A
+
+
+@pytest.fixture(scope="module")
+def model() -> dpmjax.Model:
+    return dpmjax.load_model("dpm_small")
+
+
+@pytest.fixture(scope="module")
+def clouds(model) -> tuple[DescriptorCloud, ...]:
+    """Two views of the same surfaces that share no point."""
+    views = [seen_from(street(seed, 30000), T) for seed, T in enumerate((T_WORLD_A, T_WORLD_B))]
+    return tuple(dpmjax.encode(model, view, num_elements=1024) for view in views)
+
+
+def error_m(match: dpmjax.types.Registration) -> float:
+    return float(np.linalg.norm((np.linalg.inv(T_B_A) @ np.asarray(match.T_target_source, float))[:3, 3]))
+
+
+def test_elements_make_the_registration_of_clouds_exact(model, clouds) -> None:
+    coarse, fine = (dpmjax.register(model, *clouds, refine=refine) for refine in (False, True))
+    assert error_m(coarse) < 2
+    assert error_m(fine) < 0.02
+    assert fine.confidence == coarse.confidence
+    assert fine.num_inliers == coarse.num_inliers
+
+
+def test_the_refined_motion_is_the_aligned_one(model, clouds) -> None:
+    coarse, fine = (dpmjax.register(model, *clouds, refine=refine) for refine in (False, True))
+    expected = align_elements_on_host(clouds[0].elements, clouds[1].elements, coarse.T_target_source)
+    np.testing.assert_allclose(fine.T_target_source, expected.T_target_source, atol=1e-5)
+
+
+def test_a_scan_is_refined_against_a_cloud(model, clouds) -> None:
+    points = seen_from(street(0, 30000), T_WORLD_A)
+    match = dpmjax.register(model, points, clouds[1], refine=True)
+    np.testing.assert_allclose(
+        match.T_target_source, dpmjax.register(model, *clouds, refine=True).T_target_source, atol=1e-5
+    )
+
+
+def test_a_merged_map_is_refined_like_a_scan(model, clouds) -> None:
+    """The map holds the target alone, in another frame."""
+    T_map_b = motion(70, (3, -4, 0.5))
+    stacked = clouds[1].replace(**{name: value[None] for name, value in vars(clouds[1]).items()})
+    merged = merge_clouds(stacked, T_map_b[None].astype(np.float32))
+    match = dpmjax.register(model, clouds[0], merged, refine=True)
+    difference = np.linalg.inv(T_map_b @ T_B_A) @ np.asarray(match.T_target_source, float)
+    assert np.linalg.norm(difference[:3, 3]) < 0.02
+
+
+def test_offsets_are_compared_with_the_true_ones(model, clouds) -> None:
+    quality = offset_quality(model, [(*clouds, T_B_A.astype(np.float32))])
+    assert quality.num_pairs > 100
+    np.testing.assert_allclose(quality.r2, 1 - (quality.rmse_m / quality.spread_m) ** 2, atol=1e-6)
+    apart = np.eye(4, dtype=np.float32)
+    apart[0, 3] = 1000
+    for nothing in ([], [(*clouds, apart)]):
+        quality = offset_quality(model, nothing)
+        assert quality.num_pairs == 0
+        assert np.isnan(quality.r2).all()
