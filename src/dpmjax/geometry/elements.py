@@ -24,7 +24,7 @@ def pyramid_elements(pyramid: PointPyramid, num_elements: int) -> SurfaceElement
 
     Returns:
         Elements in the frame and the unit of the pyramid. Normals face the origin and have no derivative; they are 0
-        where the mask is False.
+        where there are too few neighbours for a plane.
 
     Raises:
         ValueError: if level 1 has fewer points.
@@ -45,7 +45,7 @@ def pyramid_elements(pyramid: PointPyramid, num_elements: int) -> SurfaceElement
     is_plane = mask & (jnp.sum(is_near, axis=1) >= MIN_NEIGHBOURS)
     return SurfaceElements(
         positions=positions,
-        normals=jnp.where(mask[:, None], normals, 0),
+        normals=jnp.where(is_plane[:, None], normals, 0),
         planarity=jnp.where(is_plane, fit.flatness, 0),
         mask=mask,
     )
