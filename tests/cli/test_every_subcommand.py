@@ -70,6 +70,7 @@ def start(installed: Path, folder: Path, *arguments: str) -> subprocess.Complete
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(900)
 def test_every_subcommand_ends_well_on_simulated_input(installed, tmp_path) -> None:
     from dpmjax.simulation import SceneMixture, draw_scene, simulate_scene
 
