@@ -24,14 +24,11 @@ SIMULATED = {
     "slam": ("-n", "12", "-o", "first"),
     "localize": ("first/map.npz", "scans", "-o", "found"),
     "merge": ("first/map.npz", "first/map.npz", "-o", "merged"),
-    "train": (
-        *("--steps", "3", "--num-towns", "1", "--town-length-m", "100", "--selection-pairs", "2"),
-        *("--held-out-pairs", "2", "--cache", "cache", "-o", "trained"),
-    ),
     "evaluate": ("--pairs", "2", "-o", "evaluated"),
     "info": (),
 }
-"""Arguments in an order in which each finds what those before have written."""
+"""Arguments in an order in which each finds what those before have written. A training compiles for minutes: the tests of
+`dpmjax train` run it."""
 
 MISSING = {
     "register": ("none.pcd", "b.npy"),
@@ -78,7 +75,7 @@ def test_every_subcommand_ends_well_on_simulated_input(installed, tmp_path) -> N
     (tmp_path / "scans").mkdir()
     for number, name in enumerate(("a.npy", "b.npy", "scans/0.npy", "scans/1.npy")):
         np.save(tmp_path / name, drive.read_scan(number))
-    assert SIMULATED.keys() == COMMANDS.keys()
+    assert SIMULATED.keys() == COMMANDS.keys() - {"train"}
     found = start(installed, tmp_path, "-c", "import dpmjax; print(dpmjax.__file__)")
     assert Path(found.stdout.strip()).is_relative_to(installed)
     for name, arguments in SIMULATED.items():
