@@ -35,7 +35,7 @@ check: $(STAMP)  ## lint, docstrings, format, types, import rules
 test: $(STAMP)  ## the test suite, without what is slow
 	$(BIN)/python -m pytest -n 2 --dist worksteal
 
-slow: $(STAMP)  ## the tests that train or start processes
+slow: $(STAMP)  ## the tests that train, start processes, or compile for seconds
 	$(BIN)/python -m pytest -n 2 --dist worksteal -m slow
 
 demo: $(STAMP)  ## register the built-in 2-D world; pictures in results/demo

@@ -27,8 +27,8 @@ SIMULATED = {
     "evaluate": ("--pairs", "2", "-o", "evaluated"),
     "info": (),
 }
-"""Arguments in an order in which each finds what those before have written. A training compiles for minutes: the tests of
-`dpmjax train` run it."""
+"""Arguments in an order in which each finds what those before have written. A training compiles for minutes:
+the tests of `dpmjax train` run it."""
 
 MISSING = {
     "register": ("none.pcd", "b.npy"),

@@ -130,6 +130,7 @@ def test_an_image_of_one_wall_is_slid_along_it_first() -> None:
         np.testing.assert_allclose(np.abs(directions[0, -1] @ ACROSS), 1.0, atol=1e-3)
 
 
+@pytest.mark.slow
 def test_what_a_wall_leaves_open_is_proposed_side_by_side() -> None:
     scans = two_views_of_a_wall()
     views = Views(scans.pixels, scans.surfaces, jnp.asarray(surface_directions(scans, "planar")))

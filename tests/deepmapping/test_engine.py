@@ -241,6 +241,7 @@ BRIEF = replace(
 COLD = planar_problem(BRIEF, MappingData(None))
 
 
+@pytest.mark.slow
 def test_other_data_of_the_same_shape_compile_nothing_in_any_phase(tiny_data, assert_compiles_nothing) -> None:
     first = fit(COLD, tiny_data, key=KEY)
     # Another random key and other scans; the problem is made anew from equal settings.
@@ -251,6 +252,7 @@ def test_other_data_of_the_same_shape_compile_nothing_in_any_phase(tiny_data, as
     assert not np.array_equal(first.poses, second.poses)
 
 
+@pytest.mark.slow
 def test_planar_fits_under_vmap_are_the_single_fits(tiny_data) -> None:
     sets = [tiny_data, MappingData(replace(tiny_data.scans, points=0.9 * tiny_data.scans.points))]
     both = jax.tree.map(lambda *leaves: jnp.stack(leaves), *sets)

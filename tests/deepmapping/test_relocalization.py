@@ -81,6 +81,7 @@ def queries(tiny_walk) -> tuple[np.ndarray, np.ndarray]:
     return scan_world(make_world(0).is_obstacle, truth, num_beams=64)[0], truth
 
 
+@pytest.mark.slow
 def test_new_scans_of_any_heading_are_found_and_known(trained, queries) -> None:
     points, truth = queries
     found = dpmjax.relocalize(trained, points)
@@ -187,6 +188,7 @@ def test_a_shifted_scan_of_no_or_few_beams_stays_finite() -> None:
         np.testing.assert_array_equal(np.asarray(seen)[valid:], np.asarray(points)[valid:])
 
 
+@pytest.mark.slow
 def test_a_second_call_compiles_nothing(trained, tiny_walk, assert_compiles_nothing) -> None:
     scans = ScanSet(tiny_walk.points, tiny_walk.mask)
     dpmjax.relocalize(trained, scans)

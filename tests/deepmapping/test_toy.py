@@ -40,6 +40,7 @@ def test_direct_form_is_plain_gradient_descent() -> None:
     np.testing.assert_allclose(run.poses, path[-1], **ACCUMULATED)
 
 
+@pytest.mark.slow
 def test_both_forms_start_alike_and_the_first_network_step_is_descent_on_all_of_it() -> None:
     problem = toy_problem(SHORT)
     start = problem.init(SHORT, KEY, None)

@@ -67,6 +67,7 @@ def test_small_outputs_begin_near_zero_and_are_a_share_of_the_others() -> None:
     np.testing.assert_allclose(output(0.1), 0.1 * output(1.0), rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_windows_with_different_scans_do_not_learn_from_each_other(tiny_data) -> None:
     phase = replace(SMALL.cold_phases[0], num_steps=2, scans_per_window=8)
     config = replace(SMALL, cold_phases=(phase,))

@@ -31,6 +31,7 @@ def error_m(match: dpmjax.types.Registration) -> float:
     return float(np.linalg.norm((np.linalg.inv(T_B_A) @ np.asarray(match.T_target_source, float))[:3, 3]))
 
 
+@pytest.mark.slow
 def test_elements_make_the_registration_of_clouds_exact(model, clouds) -> None:
     coarse, fine = (dpmjax.register(model, *clouds, refine=refine) for refine in (False, True))
     assert error_m(coarse) < 2

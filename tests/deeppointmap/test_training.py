@@ -120,6 +120,7 @@ def test_places_without_a_group_change_nothing(maker, start) -> None:
     np.testing.assert_allclose(loss(start.params, masked), expected, **ACCUMULATED)
 
 
+@pytest.mark.slow
 def test_a_batch_of_empty_scans_has_no_loss_and_a_finite_gradient(maker, step, start) -> None:
     batch: RegistrationSample = maker(0)
     empty = replace(batch.scans.pyramids, num_points=np.zeros_like(batch.scans.pyramids.num_points))

@@ -145,6 +145,7 @@ def test_a_map_of_contradictions_has_cuts_too() -> None:
     assert len(weakest_cuts(np.full((3, 3), -5.0), 6)) == 2
 
 
+@pytest.mark.slow
 def test_shuffling_the_scans_permutes_the_result(sequence) -> None:
     order = np.array([3, 0, 6, 2, 5, 1, 4])
     one = register_globally(scans_of(sequence, is_ordered=False), CONFIG).poses
@@ -160,6 +161,7 @@ def half_circle(sequence: ScanSequence) -> ScanSequence:
     return replace(sequence, mask=sequence.mask & is_seen)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("is_ordered", "noise"), [(True, 2.0), (False, 0.0), (False, 2.0)])
 def test_scans_are_registered_at_180_degrees_and_with_noise(is_ordered: bool, noise: float) -> None:
     # 30 px apart, so that half circles overlap; the world is 1024 px wide.

@@ -34,6 +34,7 @@ def register_as_set(scans: PlanarScans, config: GlobalConfig, monkeypatch: pytes
     return register_globally(scans, config).poses
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("num_torn", [1, 12])
 def test_torn_steps_are_healed_from_the_scans_alone(there, monkeypatch: pytest.MonkeyPatch, num_torn: int) -> None:
     """Of few scans all pairs are searched as soon as one step is weak; of many, where many steps are."""
@@ -56,6 +57,7 @@ def test_a_sequence_of_strong_steps_needs_no_other_search(there) -> None:
     assert ate(found.poses, np.asarray(there.reference_poses)) < 1.0
 
 
+@pytest.mark.slow
 def test_a_robot_may_go_out_and_back_between_two_keyframes(there, monkeypatch: pytest.MonkeyPatch) -> None:
     out = there.take(slice(5))
     truth = np.asarray(out.reference_poses)

@@ -34,6 +34,7 @@ def test_chain_is_bounded_under_noise(noisy_walk, noisy_walk_scans) -> None:
     assert ate(incremental_icp(noisy_walk_scans).poses, noisy_walk.reference_poses) < 1.5
 
 
+@pytest.mark.slow
 def test_point_metric_recovers_the_walk_roughly(walk, walk_scans) -> None:
     poses, steps = incremental_icp(walk_scans, "point")
     assert ate(poses, walk.reference_poses) < 3.0
@@ -55,6 +56,7 @@ def test_odometry_is_the_guess(walk, walk_scans) -> None:
     assert abs(se2.wrap_angle(poses[12:13, 2] - poses[11, 2])[0]) > 2.5
 
 
+@pytest.mark.slow
 def test_a_scan_that_fits_nowhere_is_bridged(walk, chained) -> None:
     points = np.array(walk.points)
     # Someone stands around the sensor: short ranges all round.

@@ -132,6 +132,7 @@ def test_untrusted_odometry_leads_to_a_registration_without_it(walk) -> None:
     assert ICP not in " ".join(register(walk, odometry=astray, start="odometry").candidates)
 
 
+@pytest.mark.slow
 def test_stop_ends_with_what_exists(few) -> None:
     found = register(few, start=few.reference_poses, hooks=RegistrationHooks(stop=lambda: True))
     assert list(found.candidates) == [GIVEN_POSES]
@@ -177,6 +178,7 @@ def test_stop_ends_the_fit_between_calls_of_its_step(few) -> None:
     assert found.fitted.report is not None
 
 
+@pytest.mark.slow
 def test_each_stage_is_told_before_it_begins(few) -> None:
     stages: list[str] = []
     hooks = RegistrationHooks(on_progress=lambda stage, _: stages.append(stage), engine=Untrained())

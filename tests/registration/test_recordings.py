@@ -100,6 +100,7 @@ def test_scans_between_are_aligned_with_the_chosen_ones() -> None:
     assert after < 0.2 * before
 
 
+@pytest.mark.slow
 def test_a_scan_whose_wheels_were_read_in_another_moment_of_a_turn_is_turned_back() -> None:
     sequence = simulate_sequence(0, 21, num_beams=128, seed=5, range_noise_px=0.5)
     true = np.asarray(sequence.reference_poses)

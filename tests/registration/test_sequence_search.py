@@ -47,6 +47,7 @@ def log(tmp_path_factory) -> tuple[PlanarScans, np.ndarray]:
     return planar_scans(read.points, read.mask), poses
 
 
+@pytest.mark.slow
 def test_scans_that_stand_still_repeat_or_are_swapped_do_not_break_the_sequence(log) -> None:
     scans, truth = log
     poses = incremental_icp(scans).poses

@@ -65,6 +65,7 @@ def test_what_are_no_times_of_a_turn_is_not_used(times: list[float]) -> None:
     assert offsets_by_times(np.array(times), 0.1) is None
 
 
+@pytest.mark.slow
 def test_a_scan_of_a_moving_lidar_equals_that_of_a_resting_one() -> None:
     town = make_town(3, TownConfig(route_length_m=300.0))
     pose = drive(town, seed=3).T_world_lidar[20]

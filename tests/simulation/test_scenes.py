@@ -100,6 +100,7 @@ def cast(town, pose, motion=None, depths=None):
     return cast_turn(near, pose, rays, max_range=SENSOR.max_range_m, config=config), rays
 
 
+@pytest.mark.slow
 def test_foliage_lets_through_what_beer_and_lambert_say():
     """exp(-thickness / softness), in one layer or in two."""
     pose = np.eye(4)

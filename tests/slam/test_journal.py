@@ -73,6 +73,7 @@ def truth_run() -> tuple[SlamMethods, list[np.ndarray]]:
     return SlamMethods(TruthMatcher(truth), TruthGeometry(truth, sigma_m=0.03), CONFIG), scans
 
 
+@pytest.mark.slow
 def test_a_run_that_is_cut_off_anywhere_goes_on_like_an_unbroken_one(tmp_path) -> None:
     methods, scans = truth_run()
     whole_state, whole_reports = recorded(methods, scans, tmp_path / "whole")

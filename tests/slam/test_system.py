@@ -85,6 +85,7 @@ class AligningMatcher(TruthMatcher):
         return super()._match(source, target)._replace(information=information)
 
 
+@pytest.mark.slow
 def test_loops_that_are_known_to_be_exact_correct_more() -> None:
     truth = laps(2, side_m=80.0, step_m=2.0)
     geometry = TruthGeometry(truth, sigma_m=0.005, sigma_rad=0.0002)
