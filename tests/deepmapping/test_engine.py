@@ -33,7 +33,7 @@ from dpmjax.nets.localization import LocalizationConfig
 from dpmjax.nets.occupancy import OccupancyConfig
 from tests.tolerances import ACCUMULATED, DOUBLE
 
-KEY = jax.random.key(3)
+KEY, OTHER_KEY = jax.random.key(3), jax.random.key(4)
 
 
 @dataclass(frozen=True)
@@ -247,7 +247,7 @@ def test_other_data_of_the_same_shape_compile_nothing_in_any_phase(tiny_data, as
     # Another random key and other scans; the problem is made anew from equal settings.
     other = MappingData(replace(tiny_data.scans, points=0.9 * tiny_data.scans.points))
     with assert_compiles_nothing():
-        second = fit(planar_problem(replace(BRIEF), other), other, key=jax.random.key(4))
+        second = fit(planar_problem(replace(BRIEF), other), other, key=OTHER_KEY)
     assert int(first.state.phase) == int(second.state.phase) == len(COLD.phases) - 1
     assert not np.array_equal(first.poses, second.poses)
 
