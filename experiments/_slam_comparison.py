@@ -48,7 +48,6 @@ SIZES = {
     "map_bytes_points": "points of all scans",
     "map_bytes_voxels": "voxel map of KISS-ICP",
     "map_bytes_float32": "ours, float32",
-    "map_bytes_float16": "ours, float16",
     "map_bytes_int8": "ours, int8",
 }
 

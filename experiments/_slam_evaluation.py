@@ -28,11 +28,11 @@ from experiments._slam_peers import PEERS, POINT_BYTES, FoundLoop, KissIcp, Peer
 
 # Odometry is point-to-plane alignment; the networks propose loops, and poses where it fails.
 OURS, ODOMETRY = "ours, odometry and loops", "ours, point-to-plane odometry"
-PRECISIONS: tuple[Precision, ...] = ("float32", "float16", "int8")
+PRECISIONS: tuple[Precision, ...] = ("float32", "int8")
 # Sizes of maps are taken so many times on the way.
 NUM_SIZES = 8
 # Stages of a run that no other program's time has.
-_FILE_STAGES = ("read", "journal", "write", "viewer")
+_FILE_STAGES = ("read", "write", "viewer")
 _ODOMETRY_STAGES = ("surface", "odometry")
 
 

@@ -16,7 +16,7 @@ REFINED, MULTIWAY = "ours, refined by DeepMapping", "ours, refined by multiway r
 
 
 def evaluate_refinement(drive: Drive, methods: SlamMethods, method: str, seed: int) -> dict[str, Any]:
-    """Refines the keyframes of our run, which is read from its journal, and measures the poses of all scans."""
+    """Refines the keyframes of our run, which goes on from its state, and measures the poses of all scans."""
     run, result = map_drive(drive.folder, drive.sequence, methods, drive.is_stopped)
     if len(run.reports) < len(drive.sequence):
         raise StoppedError

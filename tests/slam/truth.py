@@ -6,15 +6,33 @@ A scan is the number of its pose: `points` is (1, 3), and its first coordinate i
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from dpmjax.deeppointmap.compact_scans import CompactScan
 from dpmjax.geometry import rigid
-from dpmjax.slam import Alignment, Match, Submap
+from dpmjax.scans.compact import CompactElements, CompactImage, expand_elements
+from dpmjax.slam import Alignment, LocalMap, Match, Proposal, Submap, ThinnedScan
 
 EMPTY = np.zeros((0, 3))
+NO_IMAGE = CompactImage(90, 0, *(np.zeros((0, 180), np.uint8),) * 2)
+
+
+def compact_of(number: int) -> CompactScan:
+    """A keyframe of one element, whose first coordinate is the number of the scan."""
+    elements = CompactElements(
+        1.0, np.array([[number, 0, 0]], np.int16), np.array([[0, 0, 127]], np.int8), np.array([255], np.uint8), ONE
+    )
+    return CompactScan(elements, np.zeros((1, 2), np.int8), np.ones(1, np.float32), np.zeros(1, np.int8), NO_IMAGE)
+
+
+ONE = np.ones(1, bool)
+
+
+def number_of(compact: CompactScan) -> int:
+    """The number of the scan of a keyframe."""
+    return int(compact.elements.positions[0, 0])
 
 
 def pose(x: float, y: float, heading: float) -> np.ndarray:
@@ -50,16 +68,9 @@ def laps(num_laps: int, side_m: float = 100.0, step_m: float = 1.0) -> np.ndarra
     return np.array(poses)
 
 
-class TruthMap(NamedTuple):
-    """The last scan of the local map."""
-
-    number: int
-    T_map_scan: np.ndarray
-
-
 @dataclass(frozen=True)
 class TruthGeometry:
-    """Alignment is right up to noise where the start is near the truth, and fails elsewhere."""
+    """Alignment is right up to noise where a start is near the truth, and fails elsewhere."""
 
     T_world_scan: np.ndarray
     sigma_m: float = 0.01
@@ -67,35 +78,31 @@ class TruthGeometry:
     seed: int = 0
     failures: frozenset[int] = frozenset()
 
-    def measure(self, points: np.ndarray) -> int | None:
-        return int(points[0, 0]) if len(points) else None
+    def thin(self, points: np.ndarray) -> ThinnedScan | None:
+        if not len(points):
+            return None
+        elements = expand_elements(compact_of(int(points[0, 0])).elements)
+        return ThinnedScan(None, elements, None, 10.0)
 
-    def extent_m(self, measured: int) -> float:
-        return 10.0
+    def align(self, local_map: LocalMap, scan: ThinnedScan, T_map_scan: np.ndarray) -> Alignment:
+        return self.search(local_map, scan, T_map_scan[None])
 
-    def insert(self, local_map: TruthMap | None, measured: int, T_map_scan: np.ndarray, scan: int) -> TruthMap:
-        return TruthMap(measured, T_map_scan)
-
-    def move(self, local_map: TruthMap, T_new_map: np.ndarray) -> TruthMap:
-        return TruthMap(local_map.number, T_new_map @ local_map.T_map_scan)
-
-    def align(self, local_map: TruthMap, measured: int, starts: Any) -> Alignment:
-        rng = np.random.default_rng([self.seed, measured, local_map.number])
-        T = local_map.T_map_scan @ rigid.inverse(self.T_world_scan[local_map.number]) @ self.T_world_scan[measured]
-        start = starts.T_map_last @ starts.T_last_scan
-        is_near = np.linalg.norm(T[:3, 3] - start[:3, 3]) < 5.0 and measured not in self.failures
-        if measured != local_map.number:
+    def search(self, local_map: LocalMap, scan: ThinnedScan, T_map_scan: np.ndarray) -> Alignment:
+        # Relative to the last scan of the local map: odometry drifts.
+        T_map_last, elements = (local_map.recent or local_map.keyframes[:1])[-1]
+        last, number = (round(float(one.positions[0, 0])) for one in (elements, scan.elements))
+        rng = np.random.default_rng([self.seed, number, last])
+        T = T_map_last @ rigid.inverse(self.T_world_scan[last]) @ self.T_world_scan[number]
+        apart_m = np.linalg.norm(T_map_scan[:, :3, 3] - T[:3, 3], axis=1).min()
+        if number != last:
             T = T @ noise(rng, self.sigma_m, self.sigma_rad)
         information = np.diag(np.repeat([1 / max(self.sigma_m, 1e-3) ** 2, 1 / max(self.sigma_rad, 1e-4) ** 2], 3))
-        if not is_near:
-            return Alignment(start, 0.0, 0.5, -1.0, information)
+        if apart_m >= 5.0 or number in self.failures:
+            return Alignment(T_map_scan[0], 0.0, 0.5, -1.0, information)
         return Alignment(T, 0.9, 0.0, 0.9, information)
 
-    def pack(self, local_map: TruthMap) -> dict[str, np.ndarray]:
-        return {"number": np.array(local_map.number), "T_map_scan": local_map.T_map_scan}
-
-    def unpack(self, arrays: dict[str, np.ndarray], measure_again: Any) -> TruthMap:
-        return TruthMap(int(arrays["number"]), arrays["T_map_scan"])
+    def other_motions(self, T_last_scan: np.ndarray, extent_m: float) -> np.ndarray:
+        return T_last_scan[None]
 
 
 @dataclass(frozen=True)
@@ -111,29 +118,25 @@ class TruthMatcher:
     least_probability: float = 0.6
     fingerprint: str = "truth"
 
-    def describe(self, points: np.ndarray, measured: int) -> int:
-        return measured
+    def encode(self, scan: ThinnedScan) -> CompactScan:
+        return compact_of(round(float(scan.elements.positions[0, 0])))
 
-    def pack(self, description: int) -> dict[str, np.ndarray]:
-        return {"number": np.array(description)}
+    def propose(self, source: CompactScan, target: CompactScan, num_motions: int) -> Proposal:
+        match = self._match(number_of(source), number_of(target))
+        return Proposal(match.T_target_source[None], match.probability)
 
-    def unpack(self, arrays: dict[str, np.ndarray]) -> int:
-        return int(arrays["number"])
-
-    def vector(self, description: int) -> np.ndarray:
+    def vector(self, scan: CompactScan) -> np.ndarray:
         # Random Fourier features: the cosine of two places falls with their distance.
         rng = np.random.default_rng(7)
         waves, phases = rng.normal(0, 1 / 10.0, (2, 256)), rng.uniform(0, 2 * np.pi, 256)
-        return np.cos(self.T_world_scan[description][:2, 3] @ waves + phases)
+        return np.cos(self.T_world_scan[number_of(scan)][:2, 3] @ waves + phases)
 
     def register(self, pairs: list[tuple[Submap, Submap]]) -> list[Match]:
-        return [self._match(source.descriptions[0], target.descriptions[0]) for source, target in pairs]
+        return [self._match(number_of(source.scans[0]), number_of(target.scans[0])) for source, target in pairs]
 
-    def align_scans(self, source: int, target: int, T_target_source: np.ndarray) -> Alignment | None:
-        return None
-
-    def overlaps(self, source: int, targets: list[int]) -> np.ndarray:
-        apart = self.T_world_scan[targets][:, :2, 3] - self.T_world_scan[source][:2, 3]
+    def overlaps(self, source: CompactScan, targets: list[CompactScan]) -> np.ndarray:
+        rows = [number_of(target) for target in targets]
+        apart = self.T_world_scan[rows][:, :2, 3] - self.T_world_scan[number_of(source)][:2, 3]
         return 1 / (1 + np.exp((np.linalg.norm(apart, axis=1) - self.reach_m) / 2))
 
     def _match(self, source: int, target: int) -> Match:
@@ -149,7 +152,7 @@ class TruthMatcher:
 class MistakenMatcher(TruthMatcher):
     """Overlap is wrong as often as registrations are."""
 
-    def overlaps(self, source: int, targets: list[int]) -> np.ndarray:
-        rng = np.random.default_rng([self.seed, source, len(targets), 5])
+    def overlaps(self, source: CompactScan, targets: list[CompactScan]) -> np.ndarray:
+        rng = np.random.default_rng([self.seed, number_of(source), len(targets), 5])
         is_wrong = rng.random(len(targets)) < self.gross_share
         return np.where(is_wrong, rng.random(len(targets)), super().overlaps(source, targets))

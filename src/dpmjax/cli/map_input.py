@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from dpmjax.scans.compact import expand_elements
+
 if TYPE_CHECKING:
     from dpmjax.slam import KeyframeMap, SlamMethods
 
@@ -34,14 +36,14 @@ def open_map(path: Path, methods: SlamMethods) -> KeyframeMap:
 
 
 def keyframe_points(slam_map: KeyframeMap, row: int) -> np.ndarray:
-    """Returns the surface points of a keyframe.
+    """Returns the surface elements of a keyframe.
 
     Args:
-        slam_map: of a network, as files hold them.
+        slam_map: the map.
         row: of the keyframe.
 
     Returns:
         (n, 3) metres, in the frame of the keyframe's lidar.
     """
-    surface = slam_map.keyframes[row].description.surface
-    return np.asarray(surface.points * surface.unit_m)
+    elements = expand_elements(slam_map.keyframes[row].compact.elements)
+    return np.asarray(elements.positions)[np.asarray(elements.mask)]

@@ -23,7 +23,7 @@ CONFIG, METRICS, HISTORY, LOG = "config.json", "metrics.json", "metrics.csv", "l
 CHECKPOINTS, BEST, AGENTS, DRIVES = "checkpoints", "checkpoints_best", "agents", "drives"
 # --force removes these folders and kinds of files only: a mistyped -o must not cost a user anything else.
 RESULT_FOLDERS = (CHECKPOINTS, BEST, AGENTS, DRIVES, "rows")
-RESULT_SUFFIXES = (".json", ".csv", ".txt", ".npy", ".npz", ".png", ".ply", ".g2o", ".journal", ".rrd")
+RESULT_SUFFIXES = (".json", ".csv", ".txt", ".npy", ".npz", ".png", ".ply", ".g2o", ".rrd")
 LOGGERS = ("dpmjax", "experiments", "__main__")
 # Options that do not change what is computed.
 FREE_OPTIONS = frozenset(

@@ -28,6 +28,7 @@ from dpmjax.cli.drives import DriveSelection, open_drive
 from dpmjax.cli.machine import peak_rss_gb
 from dpmjax.cli.optional import require_importable
 from dpmjax.cli.run_folder import RunFolder, RunOptions, open_run_folder, recording, write_metrics
+from dpmjax.slam.config import Proposer
 
 if TYPE_CHECKING:
     from dpmjax.cli.slam_outcome import SlamRun
@@ -52,8 +53,10 @@ class Config(RunOptions):
     """Name of a shipped model, or a .safetensors file."""
     map: Annotated[Path | None, arg(metavar="IN")] = None
     """A saved map (map.npz of an earlier run) that this drive extends."""
+    odometry: Proposer = "prediction"
+    """Source of the first guess of a pose: the motion of before, or the network for every scan, as in the paper."""
     no_loop: FlagCreatePairsOff[bool] = False
-    """Odometry alone."""
+    """No loop closure: odometry alone."""
     refine: FlagCreatePairsOff[bool] = False
     """Refine the keyframes by DeepMapping afterwards; takes a minute for each window of 32."""
     deskew: FlagCreatePairsOff[bool] = False
@@ -104,9 +107,9 @@ def main(config: Config) -> dict[str, Any]:
     sequence = open_drive(config.selection)
     reader = ScanReader(sequence, is_deskewed=config.deskew, jump=config.jump)
     folder = open_run_folder(config, NAME)
-    beginning = find_beginning(folder, methods, start, reader)
+    beginning = find_beginning(folder, methods, start)
     with recording(folder), StopFlag() as stop:
-        done = f", {len(beginning.earlier.reports)} done before" if beginning.earlier else ""
+        done = f", {len(beginning.reports)} done before" if beginning.reports else ""
         tell(f"{sequence.name}: {counted(len(sequence), 'scan')}{done}")
         with live_viewer(folder, sequence.name, is_on=config.visualize) as on_scan:
             hooks = Hooks(lambda: stop.is_requested, on_scan)
@@ -153,6 +156,7 @@ def slam_methods(config: Config) -> SlamMethods:
     from dpmjax.weights import load_model
 
     settings = SlamConfig()
+    settings = replace(settings, odometry=replace(settings.odometry, proposer=config.odometry))
     if config.no_loop:
         settings = replace(settings, loops=replace(settings.loops, is_on=False))
     return make_methods(load_model(config.weights), settings, weights=config.weights)

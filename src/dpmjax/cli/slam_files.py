@@ -171,7 +171,7 @@ def write_map_file(path: Path, slam_map: KeyframeMap) -> dict[str, int]:
     from dpmjax.saved_maps import map_bytes, save_map
 
     save_map(path, slam_map)
-    sizes = {name: len(map_bytes(slam_map, name)) for name in ("float16", "int8")}
+    sizes = {"int8": len(map_bytes(slam_map, "int8"))}
     return {"map_bytes": path.stat().st_size, **{f"map_bytes_{name}": size for name, size in sizes.items()}}
 
 

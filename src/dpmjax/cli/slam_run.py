@@ -1,4 +1,4 @@
-"""A SLAM run in its folder: progress, the journal, interim results, seconds of each stage; a stop at any scan."""
+"""A SLAM run in its folder: progress, interim results, seconds of each stage, and the state from which it goes on."""
 
 from __future__ import annotations
 
@@ -15,47 +15,40 @@ from dpmjax.cli.run_folder import RunFolder
 from dpmjax.cli.slam_files import write_scans, write_trajectory
 from dpmjax.cli.slam_outcome import SlamRun
 from dpmjax.cli.slam_reader import ScanReader
+from dpmjax.saved_maps import load_state, save_state
 from dpmjax.sequences import LidarSequence
-from dpmjax.slam import (
-    Journal,
-    JournalContent,
-    SlamMethods,
-    SlamResult,
-    SlamState,
-    finish_slam,
-    init_slam,
-    place_scans,
-    read_journal,
-    step_slam,
-)
+from dpmjax.slam import SlamMethods, SlamResult, SlamState, finish_slam, init_slam, place_scans, step_slam
 
 if TYPE_CHECKING:
     from dpmjax.slam import ScanReport
     from dpmjax.slam.front_end import AnyScan
 
-JOURNAL = "slam.journal"
+STATE = "run_state.npz"
+# Seconds between writings of the state: a killed run repeats the scans since the last one.
+SAVE_EVERY_S = 10.0
 # Seconds between interim results, for those who look at a run that goes on.
 FLUSH_EVERY_S = 30.0
 _STAGES = {
-    "measure": "surface",
+    "thin": "thinning",
     "align": "odometry",
-    "align_scans": "neighbours",
-    "describe": "encode",
+    "search": "odometry",
+    "encode": "encoder",
+    "propose": "decoder",
     "register": "loops",
     "overlaps": "loops",
 }
 
 
 class Beginning(NamedTuple):
-    """Where a run goes on.
+    """State from which a run goes on.
 
     Attributes:
-        start: state before the first scan of the drive.
-        earlier: what the journal of a resumed run holds; None for a new one.
+        state: after the scans that are done.
+        reports: of the scans of the drive that are done.
     """
 
-    start: SlamState
-    earlier: JournalContent | None = None
+    state: SlamState
+    reports: tuple[ScanReport, ...] = ()
 
 
 class Hooks(NamedTuple):
@@ -107,21 +100,25 @@ class Timed:
         return partial(self._watch.timed, _STAGES[name], found) if name in _STAGES else found
 
 
-def find_beginning(folder: RunFolder, methods: SlamMethods, start: SlamState, reader: ScanReader) -> Beginning:
-    """Reads what a run has done that is resumed."""
-    if not folder.is_resumed or not (folder / JOURNAL).is_file():
+def find_beginning(folder: RunFolder, methods: SlamMethods, start: SlamState) -> Beginning:
+    """Reads how far a run has come that is resumed; a `ValueError` for one of other weights."""
+    path = folder / STATE
+    if not folder.is_resumed or not path.is_file():
         return Beginning(start)
-    first = start.front_end.num_scans
-    return Beginning(start, read_journal(folder / JOURNAL, methods, lambda scan: reader(scan - first), start))
+    state, reports = load_state(path)
+    made_by, given = state.slam_map.origin, methods.origin
+    if made_by is not None and made_by.fingerprint != given.fingerprint:
+        raise ValueError(f"{path}: made with weights {made_by}, these are {given}; give those, or start again")
+    return Beginning(state, reports)
 
 
 def map_drive(
     folder: RunFolder, sequence: LidarSequence, methods: SlamMethods, is_stopped: Callable[[], bool]
 ) -> tuple[SlamRun, SlamResult]:
-    """Maps a drive from its beginning, or goes on from the journal in its folder.
+    """Maps a drive from its beginning, or goes on from the state in its folder.
 
     Args:
-        folder: for the journal and interim results.
+        folder: for the state and interim results.
         sequence: the drive.
         methods: matcher, geometry and settings.
         is_stopped: whether to end before the next scan.
@@ -133,7 +130,7 @@ def map_drive(
         InputError: a scan on the way that cannot be read.
     """
     reader = ScanReader(sequence)
-    beginning = find_beginning(folder, methods, init_slam(), reader)
+    beginning = find_beginning(folder, methods, init_slam())
     run = run_scans(folder, sequence, reader, methods, beginning, Hooks(is_stopped))
     if run.failure is not None:
         raise run.failure
@@ -148,14 +145,13 @@ def run_scans(
     beginning: Beginning,
     hooks: Hooks,
 ) -> SlamRun:
-    """Places all scans that are left; what ends it early is in the result, and what was found is in the journal."""
+    """Places the remaining scans; the result holds what ended it early, and the state of the last keyframe is saved."""
     watch = Stopwatch()
     timed = methods._replace(matcher=Timed(methods.matcher, watch), geometry=Timed(methods.geometry, watch))
-    earlier, state = beginning.earlier, beginning.start
-    reports, fresh = list(earlier.reports if earlier else ()), []
-    journal = Journal(folder / JOURNAL, earlier, state)
-    state = earlier.state if earlier else state
-    first, failure, started, flushed = len(reports), None, time.perf_counter(), time.perf_counter()
+    state, reports = beginning.state, list(beginning.reports)
+    first, failure, started = len(reports), None, time.perf_counter()
+    flushed = saved = started
+    resumable: Beginning | None = None
     bar = tqdm(total=len(sequence), initial=first, desc=sequence.name, unit=" scans", dynamic_ncols=True)
     scans = reader.iterate(first)
     try:
@@ -165,10 +161,11 @@ def run_scans(
             scan = watch.timed("read", next, scans)
             state, report = step_slam(timed, state, scan)
             reports.append(report)
-            fresh.append(report)
             if report.is_keyframe:
-                watch.timed("journal", journal.append, methods, state, fresh)
-                fresh = []
+                resumable = Beginning(state, tuple(reports))
+            if resumable is not None and time.perf_counter() - saved > SAVE_EVERY_S:
+                watch.timed("write", save_state, folder / STATE, *resumable)
+                resumable, saved = None, time.perf_counter()
             if hooks.on_scan is not None:
                 watch.timed("viewer", hooks.on_scan, scan, state, report)
             bar.set_postfix_str(_progress(state, reports, watch), refresh=False)
@@ -180,9 +177,8 @@ def run_scans(
         failure = error
     finally:
         scans.close()
-        if fresh:
-            journal.append(methods, state, fresh)
-        journal.close()
+        if resumable is not None:
+            save_state(folder / STATE, *resumable)
         bar.close()
     run_s = time.perf_counter() - started - watch.compile_s
     watch.stages_s["rest"] = run_s - sum(watch.stages_s.values())

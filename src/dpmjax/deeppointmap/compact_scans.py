@@ -1,85 +1,115 @@
-"""A prepared scan in few bytes, for maps: descriptors, a thinned surface and a coarse range image."""
+"""A keyframe in few bytes: descriptors, surface elements and a coarse range image, from which registration goes on.
+
+A run of SLAM works with the rounded values, so that a map which is read from a file is the map that was written.
+"""
 
 from __future__ import annotations
 
 from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float, Int8
 
 from dpmjax.deeppointmap.scan_registration import PreparedScan
 from dpmjax.deeppointmap.verification import MeasuredScan
-from dpmjax.geometry.bearing import directions_of
 from dpmjax.scans.compact import (
+    CompactElements,
     CompactImage,
-    CompactSurface,
+    compact_elements,
     compact_image,
-    compact_surface,
+    expand_elements,
     expand_image,
-    expand_surface,
 )
+from dpmjax.scans.free_space import RangeImage
+from dpmjax.scans.surfaces import surface_of_elements
 from dpmjax.types import DescriptorCloud
 
-MAX_SURFACE_POINTS = 8000
+MAX_CODE = np.iinfo(np.int8).max
 
 
 class CompactScan(NamedTuple):
-    """What a map keeps of a scan. All of it is arrays of NumPy, so that a file holds exactly the same.
+    """What a map keeps of a scan, as arrays of NumPy.
 
     Attributes:
-        positions: (m, 3) float32, of the descriptors, metres, in the frame of the lidar.
-        features: (m, c) float32.
-        directions: (m, 2) float32, of their frames.
-        mask: (m,) True for descriptors that are there.
-        surface: thinned points.
+        elements: surface elements in the order of farthest points; the first m have features.
+        features: (m, c) in steps.
+        feature_steps: (m,) step of the features of each descriptor, float32.
+        directions: (m,) azimuths of the frames of the descriptors, pi as 127.
         image: range image.
     """
 
-    positions: Float[np.ndarray, "m 3"]
-    features: Float[np.ndarray, "m c"]
-    directions: Float[np.ndarray, "m 2"]
-    mask: Bool[np.ndarray, " m"]
-    surface: CompactSurface
+    elements: CompactElements
+    features: Int8[np.ndarray, "m c"]
+    feature_steps: Float[np.ndarray, " m"]
+    directions: Int8[np.ndarray, " m"]
     image: CompactImage
 
     @property
-    def descriptors(self) -> DescriptorCloud:
-        """The descriptors, as arrays of NumPy."""
-        arrays: tuple[Any, ...] = (self.positions, self.features, self.mask, self.directions)
-        return DescriptorCloud(*arrays)
+    def cloud(self) -> DescriptorCloud:
+        """Descriptors and surface elements, as float32 arrays of NumPy."""
+        elements = expand_elements(self.elements)
+        angles = self.directions * (np.pi / MAX_CODE)
+        directions = np.stack([np.cos(angles), np.sin(angles)], axis=-1).astype(np.float32)
+        features = self.features * self.feature_steps[:, None]
+        # Arrays of NumPy stand for those of JAX.
+        parts: tuple[Any, ...] = (elements.positions, features, elements.mask, directions)
+        parts += elements.normals, elements.planarity
+        return DescriptorCloud(*parts)
 
 
-def compact_scan(
-    descriptors: DescriptorCloud, measured: MeasuredScan, *, max_points: int = MAX_SURFACE_POINTS
-) -> CompactScan:
-    """Keeps of a scan what registration and verification need.
+def compact_scan(cloud: DescriptorCloud, image: RangeImage) -> CompactScan:
+    """Rounds what registration and verification need of a scan.
 
     Args:
-        descriptors: of one scan.
-        measured: surface and free space of the scan.
-        max_points: number of surface points that are kept at most.
+        cloud: descriptors of one scan with surface elements and directions.
+        image: free space of the scan.
 
     Returns:
         The compact scan.
     """
     return CompactScan(
-        np.asarray(descriptors.positions, np.float32),
-        np.asarray(descriptors.features, np.float32),
-        np.asarray(directions_of(descriptors), np.float32),
-        np.asarray(descriptors.mask, bool),
-        compact_surface(measured.surface, max_points),
-        compact_image(measured.image),
+        compact_elements(cloud.elements),
+        *round_features(np.asarray(cloud.features, np.float32)),
+        round_directions(np.asarray(cloud.directions)),
+        compact_image(image),
     )
 
 
+def round_features(
+    features: Float[np.ndarray, "m c"],
+) -> tuple[Int8[np.ndarray, "m c"], Float[np.ndarray, " m"]]:
+    """Rounds the features of each descriptor to 127 steps of their largest absolute value.
+
+    Args:
+        features: of the descriptors.
+
+    Returns:
+        The features in steps, and the steps.
+    """
+    steps = np.maximum(np.abs(features).max(axis=1, initial=0), 1e-12).astype(np.float32) / np.float32(MAX_CODE)
+    return np.rint(features / steps[:, None]).astype(np.int8), steps
+
+
+def round_directions(directions: Float[np.ndarray, "m 2"]) -> Int8[np.ndarray, " m"]:
+    """Rounds horizontal directions to azimuths 1.4 degrees apart.
+
+    Args:
+        directions: unit vectors.
+
+    Returns:
+        Azimuths, pi as 127.
+    """
+    return np.rint(np.arctan2(directions[:, 1], directions[:, 0]) * (MAX_CODE / np.pi)).astype(np.int8)
+
+
 def expand_scan(compact: CompactScan) -> PreparedScan:
-    """Makes the scan ready for registrations, in some milliseconds.
+    """Makes a scan ready for registrations, in a millisecond.
 
     Args:
         compact: from `compact_scan`.
 
     Returns:
-        Descriptors and the thinned surface and free space.
+        Descriptors, surface and free space.
     """
-    measured = MeasuredScan(expand_surface(compact.surface), expand_image(compact.image))
-    return PreparedScan(compact.descriptors, measured)
+    cloud = compact.cloud
+    return PreparedScan(cloud, MeasuredScan(surface_of_elements(cloud.elements), expand_image(compact.image)))

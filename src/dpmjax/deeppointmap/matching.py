@@ -12,8 +12,10 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
+from scipy.spatial import cKDTree
 
 from dpmjax.checks import as_float, require_fields, require_positive_fields, require_shape
 from dpmjax.geometry import rigid
@@ -338,3 +340,28 @@ def merge_clouds(clouds: DescriptorCloud, T_map_cloud: Float[AnyArray, "s 4 4"])
         normals=None if normals_map is None else joined(normals_map),
         planarity=None if clouds.planarity is None else joined(clouds.planarity),
     )
+
+
+def thin_merged(merged: DescriptorCloud, num_a_cloud: int) -> DescriptorCloud:
+    """Removes descriptors of places that an earlier cloud of the union describes, on the host.
+
+    The softmax over a target would be split between copies of one place. A descriptor is removed if one of an earlier
+    cloud is nearer than the spacing of the first cloud: the median distance between its nearest descriptors.
+
+    Args:
+        merged: from `merge_clouds`, without further surface elements.
+        num_a_cloud: number of descriptors of each cloud.
+
+    Returns:
+        The union with a smaller mask.
+    """
+    positions, mask = np.asarray(merged.positions), np.array(merged.mask)
+    first = positions[:num_a_cloud][mask[:num_a_cloud]]
+    if len(first) < 2:
+        return merged
+    spacing_m = np.median(np.asarray(cKDTree(first).query(first, 2)[0])[:, 1])
+    for start in range(num_a_cloud, len(positions), num_a_cloud):
+        rows = np.arange(start, start + num_a_cloud)[mask[start : start + num_a_cloud]]
+        if len(rows):
+            mask[rows] = cKDTree(positions[:start][mask[:start]]).query(positions[rows])[0] > spacing_m
+    return replace(merged, mask=jnp.asarray(mask))

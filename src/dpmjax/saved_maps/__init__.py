@@ -1,4 +1,4 @@
-"""Maps of SLAM in files: versioned, checked on load, exact or small."""
+"""Maps and states of SLAM in files: versioned, checked on load, exact or small."""
 
 import lazy_loader as _lazy
 

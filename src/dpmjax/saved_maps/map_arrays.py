@@ -8,21 +8,17 @@ from typing import Any, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from dpmjax.deeppointmap.compact_scans import CompactScan
+from dpmjax.deeppointmap.compact_scans import CompactScan, round_features
 from dpmjax.saved_maps.map_coding import (
-    POSITION_STEP_M,
+    ElementCodes,
     FeatureCodes,
     Precision,
-    SurfaceCodes,
-    decode_directions,
+    decode_elements,
     decode_features,
-    decode_surface,
-    encode_directions,
+    encode_elements,
     encode_features,
-    encode_surface,
-    rounded_to,
 )
-from dpmjax.scans.compact import CompactImage, CompactSurface
+from dpmjax.scans.compact import CompactElements, CompactImage
 from dpmjax.slam.config import MapOrigin
 from dpmjax.slam.keyframes import EdgeKind, Keyframe, KeyframeMap, MapEdge, orthonormal
 
@@ -177,19 +173,18 @@ def pack_scans(scans: Sequence[CompactScan], precision: Precision) -> Arrays:
     Returns:
         The arrays by name.
     """
-    features = np.stack([scan.features for scan in scans])
-    positions = np.stack([scan.positions for scan in scans])
-    directions = np.stack([scan.directions for scan in scans])
-    arrays: Arrays = {"mask": np.stack([scan.mask for scan in scans]), **_pack_images([scan.image for scan in scans])}
+    num_elements = max(len(scan.elements.mask) for scan in scans)
+    elements = [_padded(scan.elements, num_elements) for scan in scans]
+    arrays = {"directions": np.stack([scan.directions for scan in scans])}
+    arrays |= _pack_images([scan.image for scan in scans])
     if precision == "int8":
-        codes = encode_features(features.reshape(-1, features.shape[-1]))
-        arrays |= {f"feature_{name}": np.asarray(value) for name, value in codes._asdict().items()}
-        arrays["positions"] = rounded_to(positions, POSITION_STEP_M)
-        arrays["directions"] = encode_directions(directions)
-        return arrays | _joined([encode_surface(scan.surface) for scan in scans])
-    dtype = np.float32 if precision == "float32" else np.float16
-    arrays |= {"features": features.astype(dtype), "positions": positions, "directions": directions.astype(dtype)}
-    return arrays | _joined([scan.surface for scan in scans])
+        features = np.concatenate([scan.features * scan.feature_steps[:, None] for scan in scans])
+        arrays |= _prefixed("feature", encode_features(features)) | _prefixed("element", encode_elements(elements))
+        return arrays
+    arrays |= {name: np.stack([getattr(scan, name) for scan in scans]) for name in ("features", "feature_steps")}
+    return arrays | {
+        f"element_{name}": np.stack([getattr(one, name) for one in elements]) for name in CompactElements._fields
+    }
 
 
 def unpack_scans(reader: ArrayReader, precision: Precision) -> list[CompactScan]:
@@ -205,36 +200,41 @@ def unpack_scans(reader: ArrayReader, precision: Precision) -> list[CompactScan]
     Raises:
         ValueError: if arrays are missing or do not fit together.
     """
-    mask = reader.take("mask", None, None, kind="b")
-    k, m = mask.shape
-    if k == 0:
-        raise ValueError("mask: expected at least one keyframe")
+    directions, mask = (reader.take(name, None, None, kind="ib") for name in ("directions", "element_mask"))
+    (k, m), (_, n) = directions.shape, mask.shape
+    if k == 0 or len(mask) != k or m > n:
+        raise ValueError(f"element_mask: expected rows of {k} keyframes with {m} descriptors or more, got {mask.shape}")
     if precision == "int8":
-        positions = (reader.take("positions", k, m, 3, kind="i") * POSITION_STEP_M).astype(np.float32)
         features = decode_features(_feature_codes(reader, k * m)).reshape(k, m, -1)
-        directions = decode_directions(reader.take("directions", k, m, kind="i"))
-        surfaces = [decode_surface(codes) for codes in _surface_codes(reader, k)]
+        rounded = [round_features(one) for one in features]
+        codes = ElementCodes(
+            reader.take("element_positions", k, 3, n, kind="i"),
+            reader.take("element_normals", k, 2, n, kind="i"),
+            reader.take("element_planarity", k, n, kind="u"),
+            mask,
+        )
+        elements = decode_elements(codes)
     else:
-        positions = reader.take("positions", k, m, 3).astype(np.float32)
-        features = reader.take("features", k, m, None).astype(np.float32)
-        directions = reader.take("directions", k, m, 2).astype(np.float32)
-        surfaces = _surfaces(reader, k)
-    images = _unpack_images(reader, k)
-    parts = zip(positions, features, directions, mask, surfaces, images, strict=True)
-    return [CompactScan(*parts_of_scan) for parts_of_scan in parts]
+        steps = reader.take("feature_steps", k, m)
+        rounded = list(zip(reader.take("features", k, m, None, kind="i"), steps, strict=True))
+        units_m, positions = reader.take("element_unit_m", k), reader.take("element_positions", k, n, 3, kind="i")
+        normals = reader.take("element_normals", k, n, 3, kind="i")
+        planarity = reader.take("element_planarity", k, n, kind="u")
+        columns = zip(units_m.tolist(), positions, normals, planarity, mask, strict=True)
+        elements = [CompactElements(*parts) for parts in columns]
+    parts_of_scans = zip(elements, rounded, directions, _unpack_images(reader, k), strict=True)
+    return [CompactScan(one, *codes_of, angles, image) for one, codes_of, angles, image in parts_of_scans]
 
 
-def _joined(surfaces: Sequence[CompactSurface | SurfaceCodes]) -> Arrays:
-    """Returns the arrays of all surfaces side by side."""
-    axis = 1 if isinstance(surfaces[0], SurfaceCodes) else 0
-    arrays: Arrays = {
-        "surface_count": np.array([len(surface.flatness) for surface in surfaces], np.int32),
-        "surface_unit_m": np.array([surface.unit_m for surface in surfaces], np.float64),
-    }
-    for name in surfaces[0]._fields[1:]:
-        parts = [getattr(surface, name) for surface in surfaces]
-        arrays[f"surface_{name}"] = np.concatenate(parts, axis=-1 if name == "flatness" else axis)
-    return arrays
+def _padded(elements: CompactElements, num_elements: int) -> CompactElements:
+    """Fills up with elements that are not there: keyframes of a map that was thinned have fewer."""
+    missing = num_elements - len(elements.mask)
+    padded = (np.pad(array, [(0, missing), *[(0, 0)] * (array.ndim - 1)]) for array in elements[1:])
+    return CompactElements(elements.unit_m, *padded) if missing else elements
+
+
+def _prefixed(name: str, codes: FeatureCodes | ElementCodes) -> Arrays:
+    return {f"{name}_{field}": np.asarray(value) for field, value in codes._asdict().items()}
 
 
 def _feature_codes(reader: ArrayReader, num_descriptors: int) -> FeatureCodes:
@@ -242,30 +242,6 @@ def _feature_codes(reader: ArrayReader, num_descriptors: int) -> FeatureCodes:
     mean = reader.take("feature_mean", None)
     basis = reader.take("feature_basis", len(codes), len(mean)).astype(np.float32)
     return FeatureCodes(mean, basis, float(reader.take("feature_step")), codes)
-
-
-def _surfaces(reader: ArrayReader, k: int) -> list[CompactSurface]:
-    rows, units_m = reader.take_rows("surface_count", k), reader.take("surface_unit_m", k).tolist()
-    total = rows[-1].stop
-    points = reader.take("surface_points", total, 3, kind="i")
-    normals = reader.take("surface_normals", total, 3, kind="i")
-    flatness = reader.take("surface_flatness", total, kind="u")
-    return [
-        CompactSurface(unit_m, points[part], normals[part], flatness[part])
-        for unit_m, part in zip(units_m, rows, strict=True)
-    ]
-
-
-def _surface_codes(reader: ArrayReader, k: int) -> list[SurfaceCodes]:
-    rows, units_m = reader.take_rows("surface_count", k), reader.take("surface_unit_m", k).tolist()
-    total = rows[-1].stop
-    steps = reader.take("surface_steps", 3, total, kind="i")
-    normals = reader.take("surface_normals", 2, total, kind="i")
-    flatness = reader.take("surface_flatness", total, kind="u")
-    return [
-        SurfaceCodes(unit_m, steps[:, part], normals[:, part], flatness[part])
-        for unit_m, part in zip(units_m, rows, strict=True)
-    ]
 
 
 def _pack_images(images: Sequence[CompactImage]) -> Arrays:

@@ -1,29 +1,28 @@
-"""How the arrays of compact scans are stored at each precision: exactly, or as codes of few bytes.
+"""Codes of few bytes for the smallest maps.
 
-At int8, features are written in the basis of their principal components (few carry nearly all), and all coefficients
-are rounded to one step. Points are rounded to centimetres and stored as differences along their space-filling curve,
-so that the compression of the file finds small numbers.
+Features are written in the basis of their principal components (few carry nearly all), and all coefficients are rounded
+to one step. Surface elements are rounded to centimetres.
 """
 
 from __future__ import annotations
 
-from typing import Any, Literal, NamedTuple
+from collections.abc import Sequence
+from typing import Literal, NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int8, Int16, UInt8
-from numpy.typing import NDArray
+from jaxtyping import Bool, Float, Int8, Int16, UInt8
 
-from dpmjax.scans.compact import MAX_COMPONENT, MAX_COORDINATE, CompactSurface, compact_surface, expand_surface
+from dpmjax.scans.compact import MAX_COMPONENT, CompactElements
 
-Precision = Literal["float32", "float16", "int8"]
+Precision = Literal["float32", "int8"]
 
 MAX_RANK = 48
 STEP_SHARE = 0.5
 """Step of the coefficients, as a share of the standard deviation of a channel."""
 
-POINT_STEP_M, POSITION_STEP_M = 0.02, 0.05
-MAX_STORED_POINTS = 2000
-FLATNESS_STEP = 17
+POSITION_STEP_M = 0.02
+MAX_STORED_ELEMENTS = 1024
+PLANARITY_STEP = 17
 MAX_CODE = np.iinfo(np.int8).max
 
 
@@ -78,52 +77,59 @@ def decode_features(stored: FeatureCodes) -> Float[np.ndarray, "d c"]:
     return (stored.codes.T.astype(np.float32) * np.float32(stored.step)) @ stored.basis.astype(np.float32) + stored.mean
 
 
-class SurfaceCodes(NamedTuple):
-    """The surface points of a scan as codes.
+class ElementCodes(NamedTuple):
+    """Surface elements of keyframes as codes.
 
     Attributes:
-        unit_m: what 1 stands for in `steps`.
-        steps: (3, n) differences of rounded coordinates along the curve; the first stands for itself.
-        normals: (2, n) octahedral coordinates times 127 (Meyer et al. 2010), of the side that looks up.
-        flatness: (n,) from 0 to 15.
+        positions: (k, 3, n) in steps of 2 cm.
+        normals: (k, 2, n) octahedral coordinates times 127 (Meyer et al. 2010), of the side that looks up.
+        planarity: (k, n) from 0 to 15.
+        mask: (k, n) True for elements that are there.
     """
 
-    unit_m: float
-    steps: Int16[np.ndarray, "3 n"]
-    normals: Int8[np.ndarray, "2 n"]
-    flatness: UInt8[np.ndarray, " n"]
+    positions: Int16[np.ndarray, "k 3 n"]
+    normals: Int8[np.ndarray, "k 2 n"]
+    planarity: UInt8[np.ndarray, "k n"]
+    mask: Bool[np.ndarray, "k n"]
 
 
-def encode_surface(surface: CompactSurface) -> SurfaceCodes:
-    """Thins a compact surface again, and rounds it to codes.
+def encode_elements(keyframes: Sequence[CompactElements]) -> ElementCodes:
+    """Keeps the first surface elements of each keyframe, and rounds them to codes.
 
     Args:
-        surface: of a keyframe.
+        keyframes: of one number of elements.
 
     Returns:
         The codes.
     """
-    if len(surface.points) > MAX_STORED_POINTS:
-        surface = compact_surface(expand_surface(surface), MAX_STORED_POINTS)
-    unit_m = max(POINT_STEP_M, surface.unit_m * 2)  # differences of two coordinates fit 16 bits
-    rounded = np.rint(surface.points.T * (surface.unit_m / unit_m)).astype(np.int32)
-    steps = np.diff(rounded, axis=1, prepend=0).astype(np.int16)
-    flatness = np.rint(surface.flatness / FLATNESS_STEP).astype(np.uint8)
-    return SurfaceCodes(unit_m, steps, _octahedral(surface.normals), flatness)
+    kept = [CompactElements(one.unit_m, *(array[:MAX_STORED_ELEMENTS] for array in one[1:])) for one in keyframes]
+    return ElementCodes(
+        np.stack([np.rint(one.positions.T * (one.unit_m / POSITION_STEP_M)) for one in kept]).astype(np.int16),
+        np.stack([_octahedral(one.normals) for one in kept]),
+        np.stack([np.rint(one.planarity / PLANARITY_STEP) for one in kept]).astype(np.uint8),
+        np.stack([one.mask for one in kept]),
+    )
 
 
-def decode_surface(stored: SurfaceCodes) -> CompactSurface:
-    """Makes the compact surface again.
+def decode_elements(stored: ElementCodes) -> list[CompactElements]:
+    """Makes the surface elements again.
 
     Args:
-        stored: from `encode_surface`.
+        stored: from `encode_elements`.
 
     Returns:
-        The surface.
+        Elements of each keyframe.
     """
-    rounded = np.clip(np.cumsum(stored.steps, axis=1, dtype=np.int64), -MAX_COORDINATE, MAX_COORDINATE)
-    flatness = np.minimum(stored.flatness.astype(np.int64) * FLATNESS_STEP, 255).astype(np.uint8)
-    return CompactSurface(stored.unit_m, rounded.T.astype(np.int16), _from_octahedral(stored.normals), flatness)
+    return [
+        CompactElements(
+            POSITION_STEP_M,
+            positions.T.astype(np.int16),
+            np.where(planarity[:, None] > 0, _from_octahedral(normals), 0).astype(np.int8),
+            np.minimum(planarity.astype(np.int64) * PLANARITY_STEP, 255).astype(np.uint8),
+            mask,
+        )
+        for positions, normals, planarity, mask in zip(*stored, strict=True)
+    ]
 
 
 def _octahedral(normals: Int8[np.ndarray, "n 3"]) -> Int8[np.ndarray, "2 n"]:
@@ -137,41 +143,3 @@ def _from_octahedral(stored: Int8[np.ndarray, "2 n"]) -> Int8[np.ndarray, "n 3"]
     normals = np.column_stack([*flat, np.maximum(1 - np.abs(flat).sum(axis=0), 0)])
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     return np.rint(normals * MAX_COMPONENT).astype(np.int8)
-
-
-def encode_directions(directions: Float[np.ndarray, "*d 2"]) -> Int8[np.ndarray, "*d"]:
-    """Rounds horizontal directions to angles 1.4 degrees apart.
-
-    Args:
-        directions: unit vectors.
-
-    Returns:
-        Their azimuths, pi as 127.
-    """
-    return np.rint(np.arctan2(directions[..., 1], directions[..., 0]) * (MAX_CODE / np.pi)).astype(np.int8)
-
-
-def decode_directions(codes: Int8[np.ndarray, "*d"]) -> Float[np.ndarray, "*d 2"]:
-    """Makes unit vectors again.
-
-    Args:
-        codes: from `encode_directions`.
-
-    Returns:
-        The directions, float32.
-    """
-    angles = codes.astype(np.float64) * (np.pi / MAX_CODE)
-    return np.stack([np.cos(angles), np.sin(angles)], axis=-1).astype(np.float32)
-
-
-def rounded_to(values: Float[np.ndarray, "..."], step: float) -> NDArray[Any]:
-    """Rounds to multiples of a step, as 16-bit integers.
-
-    Args:
-        values: within 32,767 steps of 0.
-        step: the step.
-
-    Returns:
-        The integers.
-    """
-    return np.clip(np.rint(values / step), -MAX_COORDINATE, MAX_COORDINATE).astype(np.int16)

@@ -14,9 +14,8 @@ from typing import get_args
 
 import numpy as np
 
-from dpmjax.deeppointmap.compact_scans import CompactScan
 from dpmjax.io.files import load_arrays, refusing, write_atomically
-from dpmjax.saved_maps.map_arrays import ArrayReader, pack_graph, pack_scans, unpack_graph, unpack_scans
+from dpmjax.saved_maps.map_arrays import ArrayReader, Arrays, pack_graph, pack_scans, unpack_graph, unpack_scans
 from dpmjax.saved_maps.map_coding import Precision
 from dpmjax.sequences import InputError, require
 from dpmjax.slam.config import MapOrigin, SlamConfig
@@ -24,7 +23,7 @@ from dpmjax.slam.keyframes import KeyframeMap
 from dpmjax.slam.map_thinning import thin_map
 from dpmjax.weights.config_json import config_from_json
 
-FORMAT, VERSION = "dpmjax map", 2
+FORMAT, VERSION = "dpmjax map", 3
 SPACING_SHARE = 0.8
 ADVICE = "save it again with dpmjax.save_map"
 
@@ -37,18 +36,17 @@ def save_map(
     Args:
         path: must end in `.npz`; an existing file is replaced.
         slam_map: of a run, `result.map`, with at least one keyframe.
-        precision: "float32" keeps everything exactly: a run that goes on from the file equals an unbroken one.
-            "float16" rounds features and poses. "int8" is the smallest, for localisation: it rounds features to codes,
-            thins surfaces to 2,000 points, and leaves out keyframes that others cover (`slam.thin_map`).
+        precision: "float32" keeps everything exactly: a run that goes on from the file equals an unbroken one. "int8"
+            is the smallest, for localisation: it rounds features and elements to codes, and leaves out keyframes that
+            others cover (`slam.thin_map`).
         spacing_share: keyframes nearer to others than this share of their extent are left out; 0 keeps all. None takes
-            0.8 for "int8" and 0 for the others.
+            0.8 for "int8" and 0 for "float32".
 
     Returns:
         The path.
 
     Raises:
-        ValueError: if the path has another ending, the precision is unknown, the map is empty, or its keyframes are not
-            those of a network.
+        ValueError: if the path has another ending, the precision is unknown, or the map is empty.
     """
     path = Path(path)
     if path.suffix != ".npz":
@@ -68,19 +66,35 @@ def map_bytes(slam_map: KeyframeMap, precision: Precision = "float32", *, spacin
         The bytes.
 
     Raises:
-        ValueError: if the precision is unknown, the map is empty, or its keyframes are not those of a network.
+        ValueError: if the precision is unknown or the map is empty.
     """
     if precision not in get_args(Precision):
         raise ValueError(f"precision: expected one of {', '.join(get_args(Precision))}, got {precision!r}")
-    origin = slam_map.origin
-    if origin is None:
-        raise ValueError("slam_map: expected keyframes, got an empty map")
-    if not all(isinstance(keyframe.description, CompactScan) for keyframe in slam_map.keyframes):
-        raise ValueError("slam_map: expected keyframes of a network, got those of another matcher")
     if spacing_share is None:
         spacing_share = SPACING_SHARE if precision == "int8" else 0.0
     if spacing_share != 0:
         slam_map = thin_map(slam_map, spacing_share=spacing_share)
+    content = io.BytesIO()
+    np.savez_compressed(content, allow_pickle=False, **map_arrays(slam_map, precision))
+    return content.getvalue()
+
+
+def map_arrays(slam_map: KeyframeMap, precision: Precision) -> Arrays:
+    """Makes the arrays of the file of a map.
+
+    Args:
+        slam_map: with at least one keyframe.
+        precision: see `save_map`.
+
+    Returns:
+        The arrays by name, the header among them.
+
+    Raises:
+        ValueError: if the map is empty.
+    """
+    origin = slam_map.origin
+    if origin is None:
+        raise ValueError("slam_map: expected keyframes, got an empty map")
     header = {
         "format": FORMAT,
         "version": VERSION,
@@ -89,12 +103,9 @@ def map_bytes(slam_map: KeyframeMap, precision: Precision = "float32", *, spacin
         "weights": origin.weights,
         "config": dataclasses.asdict(origin.config),
     }
-    content = io.BytesIO()
-    named = {"header": np.frombuffer(json.dumps(header).encode(), np.uint8)}
-    named |= pack_graph(slam_map, precision)
-    named |= pack_scans([keyframe.description for keyframe in slam_map.keyframes], precision)
-    np.savez_compressed(content, allow_pickle=False, **named)
-    return content.getvalue()
+    named: Arrays = {"header": np.frombuffer(json.dumps(header).encode(), np.uint8)}
+    scans = [keyframe.compact for keyframe in slam_map.keyframes]
+    return named | pack_graph(slam_map, precision) | pack_scans(scans, precision)
 
 
 def load_map(path: str | Path) -> KeyframeMap:
@@ -114,13 +125,30 @@ def load_map(path: str | Path) -> KeyframeMap:
     except InputError as error:
         advice = "give a file of dpmjax.save_map" if Path(path).exists() else error.advice
         raise InputError(path, error.found, advice) from error
+    return map_of_arrays(path, arrays)
+
+
+def map_of_arrays(path: str | Path, arrays: Arrays) -> KeyframeMap:
+    """Makes a map of the arrays of a file.
+
+    Args:
+        path: of the file, for messages.
+        arrays: from `map_arrays`; others may be among them.
+
+    Returns:
+        The map.
+
+    Raises:
+        InputError: no map, one of another version, or a damaged one.
+    """
     require("header" in arrays, path, "a NumPy file, but not one of a dpmjax map", "give a file of dpmjax.save_map")
     with refusing(path, "its header cannot be read ({error})", ADVICE, (Exception,)):
         header = json.loads(arrays["header"].tobytes())
         found, version, precision = header["format"], header["version"], header["precision"]
         fingerprint, weights = str(header["fingerprint"]), str(header["weights"])
     require(found == FORMAT, path, "not a dpmjax map", "give a file of dpmjax.save_map")
-    require(version == VERSION, path, f"format version {version}, this dpmjax reads {VERSION}", "update dpmjax")
+    advice = "update dpmjax" if version > VERSION else "map the drive again"
+    require(version == VERSION, path, f"format version {version}, this dpmjax reads {VERSION}", advice)
     require(precision in get_args(Precision), path, f"precision {precision}", ADVICE)
     with refusing(path, "{error}", ADVICE, (ValueError, TypeError)):
         origin = MapOrigin(fingerprint, config_from_json(header["config"], SlamConfig), weights)

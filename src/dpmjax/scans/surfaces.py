@@ -12,6 +12,7 @@ from dpmjax.checks import require_count, require_positive_fields
 from dpmjax.geometry.host_tree import HostTree
 from dpmjax.geometry.plane_fits import fit_planes
 from dpmjax.scans.preprocess import first_of_each_voxel
+from dpmjax.types import SurfaceElements
 
 MIN_NEIGHBOURS = 4
 """A normal needs this many neighbours, the point itself among them."""
@@ -97,20 +98,20 @@ def scan_surface(points: Float[np.ndarray, "n 3"], config: SurfaceConfig = Surfa
     return Surface(points, normals, flatness, _samples(normals, flatness), tree)
 
 
-def surface_of_points(
-    points: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"], flatness: Float[np.ndarray, " n"]
-) -> Surface:
-    """Makes a surface of points whose normals are known.
+def surface_of_elements(elements: SurfaceElements) -> Surface:
+    """Makes a surface of elements whose normals are known.
 
     Args:
-        points: metres, in the frame of the lidar.
-        normals: unit normals.
-        flatness: of their neighbourhoods.
+        elements: metres, in the frame of the lidar.
 
     Returns:
-        The surface, with samples and tree.
+        The surface of the elements that are there, with samples and tree.
     """
-    return Surface(points, normals, flatness, _samples(normals, flatness), HostTree(points))
+    mask = np.asarray(elements.mask)
+    points, normals, planarity = (
+        np.asarray(array, np.float64)[mask] for array in (elements.positions, elements.normals, elements.planarity)
+    )
+    return Surface(points, normals, planarity, _samples(normals, planarity), HostTree(points))
 
 
 def _normals(

@@ -27,8 +27,8 @@ class Traffic(NamedTuple):
     """Bytes that an agent sends, and those of its points.
 
     Attributes:
-        keyframe_bytes: its keyframes: descriptors, surfaces and range images, poses, retrieval vectors.
-        descriptor_bytes: the descriptors among them.
+        keyframe_bytes: its keyframes: descriptors, surface elements, range images, poses, retrieval vectors.
+        descriptor_bytes: features of the descriptors among them.
         keyframe_scan_bytes: the raw points of the same keyframes, three float32 numbers each.
         scan_bytes: the raw points of all scans.
     """
@@ -165,12 +165,12 @@ def merge_maps(
 
 def _traffic(agent: SlamResult) -> Traffic:
     slam_map = agent.state.slam_map
-    descriptions = [keyframe.description for keyframe in slam_map.keyframes]
+    scans = [keyframe.compact for keyframe in slam_map.keyframes]
     vectors_and_poses = slam_map.vectors.nbytes + slam_map.T_world_keyframe.nbytes
     scan_bytes = [BYTES_A_POINT * report.num_points for report in agent.reports]
     return Traffic(
-        keyframe_bytes=sum(map(_num_bytes, descriptions)) + vectors_and_poses,
-        descriptor_bytes=sum(_num_bytes(getattr(description, "descriptors", ())) for description in descriptions),
+        keyframe_bytes=sum(map(_num_bytes, scans)) + vectors_and_poses,
+        descriptor_bytes=sum(_num_bytes((scan.features, scan.feature_steps, scan.directions)) for scan in scans),
         keyframe_scan_bytes=sum(scan_bytes[keyframe.scan] for keyframe in slam_map.keyframes),
         scan_bytes=sum(scan_bytes),
     )

@@ -1,15 +1,33 @@
-"""What the front end asks of a geometry, which aligns scans with recent ones: `odometry` has the one that is used."""
+"""Records of odometry, and the interface of the geometry that aligns scans with the local map (`odometry`)."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any, NamedTuple, Protocol
+from collections.abc import Sequence
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from jaxtyping import Float
 
-from dpmjax.slam.columns import Arrays
+from dpmjax.deeppointmap.verification import MeasuredScan
 from dpmjax.slam.keyframes import Pose
+from dpmjax.slam.local_map import LocalMap
+from dpmjax.types import PointPyramid, SurfaceElements
+
+
+class ThinnedScan(NamedTuple):
+    """A scan after its one thinning and its one neighbour search.
+
+    Attributes:
+        pyramid: what the encoder reads.
+        elements: surface elements, metres, in the frame of the lidar, in the order of farthest points.
+        measured: surface and free space.
+        extent_m: median range of the thinned points.
+    """
+
+    pyramid: PointPyramid
+    elements: SurfaceElements
+    measured: MeasuredScan
+    extent_m: float
 
 
 class Alignment(NamedTuple):
@@ -17,11 +35,10 @@ class Alignment(NamedTuple):
 
     Attributes:
         T_map_scan: float64.
-        matched_share: share of the scan's points that meet planes of the map.
-        contradicted_share: share of the map's visible points that lie in the scan's free space.
-        score: against a map, `matched_share` less the weighted `contradicted_share`; of two scans as in `Verification`.
+        matched_share: share of the elements of the scan that meet planes of the map.
+        contradicted_share: share of the visible elements of the map that lie in the free space of the scan.
+        score: `matched_share` less the weighted `contradicted_share`.
         information: (6, 6) inverse covariance in the tangent of the scan, translation first: weak along a corridor.
-        num_starts: number of starts that were tried.
     """
 
     T_map_scan: Pose
@@ -29,108 +46,68 @@ class Alignment(NamedTuple):
     contradicted_share: float
     score: float
     information: Float[np.ndarray, "6 6"]
-    num_starts: int = 1
-
-
-class PosePrior(NamedTuple):
-    """Where the search for a pose begins.
-
-    Attributes:
-        T_map_last: pose of the last scan.
-        T_last_scan: predicted motion since.
-        usual_score: of recent alignments; 1 where there is none yet.
-        is_sure: whether only small errors of the prediction are searched.
-    """
-
-    T_map_last: Pose
-    T_last_scan: Pose
-    usual_score: float = 1.0
-    is_sure: bool = False
 
 
 class Geometry(Protocol):
-    """Measures scans and aligns them with the recent ones."""
+    """Thins scans and aligns them with the local map."""
 
-    def measure(self, points: Float[np.ndarray, "n 3"]) -> Any | None:
+    def thin(self, points: Float[np.ndarray, "n 3"]) -> ThinnedScan | None:
         """Prepares a scan.
 
         Args:
-            points: metres, in the frame of the lidar; may hold NaN.
+            points: finite, metres, in the frame of the lidar.
 
         Returns:
-            A record that the geometry and the matcher read; None for a scan without enough points.
+            The thinned scan; None for a scan without enough flat points.
         """
         ...
 
-    def extent_m(self, measured: Any) -> float:
-        """Returns the median range of a scan.
+    def align(self, local_map: LocalMap, scan: ThinnedScan, T_map_scan: Pose) -> Alignment:
+        """Aligns a scan from a first guess that is nearly right.
 
         Args:
-            measured: from `measure`.
+            local_map: the local map.
+            scan: the scan.
+            T_map_scan: first guess.
 
         Returns:
-            Metres.
+            The pose.
         """
         ...
 
-    def insert(self, local_map: Any | None, measured: Any, T_map_scan: Pose, scan: int) -> Any:
-        """Adds a scan to the local map, where it tells something new.
+    def search(self, local_map: LocalMap, scan: ThinnedScan, T_map_scan: Float[np.ndarray, "s 4 4"]) -> Alignment:
+        """Aligns a scan from several first guesses, coarse to fine.
 
         Args:
-            local_map: None for an empty one.
-            measured: the scan.
-            T_map_scan: its pose.
-            scan: its number.
+            local_map: the local map.
+            scan: the scan.
+            T_map_scan: first guesses; at least one.
 
         Returns:
-            The local map after.
+            The pose of the highest score.
         """
         ...
 
-    def move(self, local_map: Any, T_new_map: Pose) -> Any:
-        """Changes the frame of the local map.
+    def other_motions(self, T_last_scan: Pose, extent_m: float) -> Float[np.ndarray, "s 4 4"]:
+        """Returns motions that a vehicle may make instead of the predicted one.
 
         Args:
-            local_map: the map.
-            T_new_map: the old frame in the new one.
+            T_last_scan: the predicted motion.
+            extent_m: median range of the scan.
 
         Returns:
-            The map in its new frame.
+            The motions.
         """
         ...
 
-    def align(self, local_map: Any, measured: Any, starts: PosePrior) -> Alignment:
-        """Aligns a scan with the local map.
 
-        Args:
-            local_map: the map.
-            measured: the scan.
-            starts: the predicted pose and what is usual.
+def best_of(alignments: Sequence[Alignment]) -> Alignment:
+    """Returns the alignment of the highest score.
 
-        Returns:
-            The best pose.
-        """
-        ...
+    Args:
+        alignments: at least one.
 
-    def pack(self, local_map: Any) -> Arrays:
-        """Turns the local map into arrays for a file; numbers of scans stand for the scans.
-
-        Args:
-            local_map: the map.
-
-        Returns:
-            Arrays by name.
-        """
-        ...
-
-    def unpack(self, arrays: Arrays, measure_again: Callable[[int], Any]) -> Any:
-        """Makes the local map again, bit for bit.
-
-        Args:
-            arrays: from `pack`.
-            measure_again: gives the measured scan of a number.
-
-        Returns:
-            The local map.
-        """
-        ...
+    Returns:
+        The first of the best.
+    """
+    return max(alignments, key=lambda found: found.score)

@@ -6,60 +6,61 @@ The extent of a scan is the median range of its surface points: about 12 m in a 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import Literal, NamedTuple, get_args
 
-from dpmjax.checks import require_fields, require_positive_fields
+from dpmjax.checks import require_fields, require_one_of, require_positive_fields
 from dpmjax.scans.surface_alignment import AlignmentConfig, AlignmentLevel
 
-NARROW = AlignmentConfig(levels=(AlignmentLevel(1.0, 1000, 10), AlignmentLevel(0.3, 4000, 12)), min_kernel_m=0.03)
+Proposer = Literal["prediction", "network"]
+
+NARROW = AlignmentConfig(levels=(AlignmentLevel(1.0, 1000, 10), AlignmentLevel(1.0, 4000, 12, kernel_m=0.1)))
 WIDE = AlignmentConfig(levels=(AlignmentLevel(3.0, 300, 10),))
 
 
 @dataclass(frozen=True)
 class OdometryConfig:
-    """Registration of a scan against the local map of recent scans, point to plane.
+    """Registration of a scan against the local map, point to plane.
 
     Attributes:
-        min_range_m: nearer points belong to the vehicle and are dropped.
-        max_range_m: farther points are too sparse and are dropped.
-        voxel_share: side of the voxels that thin a scan, as a share of its extent ...
-        voxel_sizes_m: ... rounded down to one of these.
-        sparse_radius_share: see `SurfaceConfig`.
-        min_num_points: a scan with fewer surface points counts as empty.
-        narrow: alignment from a prior that is nearly right.
-        wide: alignment from any other start.
-        num_frames: number of scans in the local map.
-        frame_share: a scan joins the local map where it is farther than this share of the extent from the last one ...
-        frame_rad: ... or turned by more than this.
-        num_samples: number of points that decide about the quality of a pose.
-        plane_distance_m: a point meets a plane that is nearer than this.
-        min_cosine: and whose normal makes a larger cosine with its own.
-        contradiction_weight: how much a point in free space counts against one that meets a plane.
-        good_share: no other start is tried for a pose of this share of the usual score.
-        step_factors: starts of the search: the predicted step, times these numbers; ...
-        ahead_shares: ... steps along the x axis of the lidar, as shares of the extent; ...
-        turns_deg: ... turns by these angles about its vertical; ...
-        tilts_deg: ... and by these about its two other axes.
-        floor_m: standard deviation of the translation that no number of points undercuts ...
-        floor_rad: ... and of the rotation.
+        proposer: source of the first guess. "prediction": the motion of before; where it fails, other motions and the
+            decoder. "network": the decoder registers each scan to the nearest keyframe (DeepPointMap section 4).
+        min_num_points: a scan with fewer flat surface elements counts as empty.
+        num_keyframes: number of the nearest keyframes in the local map.
+        num_recent: number of scans since the last keyframe in the local map.
+        recent_share: smallest distance of these scans, as a share of the extent.
+        recent_rad: turn from which on a scan joins them at a smaller distance.
+        narrow: alignment from a first guess that is nearly right.
+        wide: alignment from other starts.
+        num_samples: number of surface elements that the score of a pose compares.
+        plane_radius_m: largest distance between an element and the element of the map whose plane it meets.
+        plane_distance_m: largest distance to that plane.
+        min_cosine: smallest cosine between both normals.
+        contradiction_weight: weight of the share of points in free space in the score.
+        good_share: share of the usual score from which on no other start is tried.
+        num_hypotheses: number of motions that the decoder proposes.
+        step_factors: factors of the predicted step among the other starts.
+        ahead_shares: steps along the x axis of the lidar among them, as shares of the extent.
+        turns_deg: turns about the vertical among them.
+        tilts_deg: turns about the two other axes among them.
+        floor_m: lower bound of the standard deviation of a translation.
+        floor_rad: lower bound of the standard deviation of a rotation.
     """
 
-    min_range_m: float = 1.0
-    max_range_m: float = 80.0
-    voxel_share: float = 0.025
-    voxel_sizes_m: tuple[float, ...] = (0.1, 0.15, 0.2, 0.3)
-    sparse_radius_share: float = 1.5
+    proposer: Proposer = "prediction"
     min_num_points: int = 100
+    num_keyframes: int = 12
+    num_recent: int = 8
+    recent_share: float = 0.08
+    recent_rad: float = 0.17
     narrow: AlignmentConfig = NARROW
     wide: AlignmentConfig = WIDE
-    num_frames: int = 32
-    frame_share: float = 0.08
-    frame_rad: float = 0.17
     num_samples: int = 1000
+    plane_radius_m: float = 1.5
     plane_distance_m: float = 0.15
     min_cosine: float = 0.7
     contradiction_weight: float = 2.0
     good_share: float = 0.85
+    num_hypotheses: int = 3
     step_factors: tuple[float, ...] = (0.0, 0.5, 1.0, 1.5, 2.0, 3.0, 4.0)
     ahead_shares: tuple[float, ...] = (-0.08, 0.08, 0.16)
     turns_deg: tuple[float, ...] = (-10.0, 10.0, -20.0, 20.0, -35.0, 35.0, -50.0, 50.0)
@@ -68,39 +69,34 @@ class OdometryConfig:
     floor_rad: float = 0.001
 
     def __post_init__(self) -> None:
-        require_positive_fields(self, "voxel_share", "frame_share", "frame_rad", "plane_distance_m", "floor_m")
-        require_positive_fields(self, "floor_rad")
-        require_fields(self, "min_num_points", "num_frames", "num_samples", low=1)
-        require_fields(self, "min_range_m", "contradiction_weight", "sparse_radius_share", low=0)
+        require_one_of("proposer", self.proposer, get_args(Proposer))
+        require_positive_fields(self, "recent_share", "recent_rad", "plane_radius_m", "plane_distance_m")
+        require_positive_fields(self, "floor_m", "floor_rad")
+        require_fields(self, "min_num_points", "num_keyframes", "num_samples", "num_hypotheses", low=1)
+        require_fields(self, "num_recent", "contradiction_weight", low=0)
         require_fields(self, "min_cosine", "good_share", low=0, high=1)
-        require_fields(self, "max_range_m", low=self.min_range_m)
-        if not self.voxel_sizes_m or min(self.voxel_sizes_m) <= 0:
-            raise ValueError(f"voxel_sizes_m: expected sizes above 0, got {self.voxel_sizes_m}")
 
 
 @dataclass(frozen=True)
 class FrontEndConfig:
-    """Which pose of a scan is believed, and which scans become keyframes.
+    """Acceptance of the pose of a scan, and choice of keyframes.
 
     Attributes:
-        min_score_share: a pose with a lower share of the usual score is not believed.
-        min_score: nor one with a lower score. A lower share is believed where the network, asked without the
-            prediction, has this P(correct) ...
-        min_probability: ... or more, and its pose and that of geometry differ by ...
-        near_m: ... less than this (the distance that P(correct) is about) ...
-        near_rad: ... and this.
-        num_submap: at most so many keyframes are merged for a registration (attention is quadratic in their number).
-        submap_radius_m: keyframes farther away are not merged (DeepPointMap's published configuration).
-        num_lost: after this many scans without a believed pose a new segment begins, which loops join to the map.
-        keyframe_share: a keyframe is made where the last one is farther than this share of the extent ...
-        keyframe_rad: ... or turned by more than this.
+        min_score_share: smallest accepted share of the usual score.
+        min_score: smallest accepted score.
+        min_probability: smallest P(correct) of the decoder's motion that accepts a pose of a lower share.
+        near_m: largest distance between that motion and the pose.
+        near_rad: largest turn between them.
+        num_submap: largest number of keyframes that are merged for a registration.
+        submap_radius_m: largest distance of these keyframes (DeepPointMap's published configuration).
+        num_lost: number of scans without an accepted pose after which a new segment begins, which loops may join.
+        keyframe_share: distance of keyframes, as a share of the extent.
+        keyframe_rad: turn between keyframes at a smaller distance.
         max_keyframe_m: upper bound of the distance of keyframes (DeepPointMap: 3 to 10 m).
-        min_keyframe_m: lower bound of it.
-        num_neighbours: a keyframe is also aligned with so many before the last one ...
-        neighbour_share: ... that are within this many extents.
-        usual_window: the usual score is the median over this many scans.
-        guess_m: standard deviation of a motion that was only predicted ...
-        guess_rad: ... and of its rotation.
+        min_keyframe_m: lower bound of the distance of keyframes.
+        usual_window: number of scans whose median is the usual score.
+        guess_m: standard deviation of a predicted translation.
+        guess_rad: standard deviation of a predicted rotation.
     """
 
     min_score_share: float = 0.4
@@ -115,15 +111,13 @@ class FrontEndConfig:
     keyframe_rad: float = 0.6
     max_keyframe_m: float = 5.0
     min_keyframe_m: float = 0.5
-    num_neighbours: int = 3
-    neighbour_share: float = 1.5
     usual_window: int = 20
     guess_m: float = 1.0
     guess_rad: float = 0.2
 
     def __post_init__(self) -> None:
         require_fields(self, "min_score_share", "min_probability", low=0, high=1)
-        require_fields(self, "near_m", "near_rad", "num_neighbours", "neighbour_share", low=0)
+        require_fields(self, "near_m", "near_rad", low=0)
         require_fields(self, "num_submap", "num_lost", "usual_window", low=1)
         require_positive_fields(self, "submap_radius_m", "keyframe_share", "keyframe_rad", "guess_m", "guess_rad")
         require_fields(self, "min_keyframe_m", low=1e-3, high=self.max_keyframe_m)
@@ -214,7 +208,7 @@ class SlamConfig:
 
     Attributes:
         odometry: registration against the local map.
-        front_end: belief, keyframes, re-localisation.
+        front_end: acceptance of poses, and keyframes.
         loops: loop closure and optimisation.
     """
 

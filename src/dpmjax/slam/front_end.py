@@ -1,34 +1,34 @@
 """The front end: one scan after the other gets a pose, and some become keyframes (DeepPointMap section 4).
 
-Geometry comes first, because it is more accurate than descriptors of 0.3 m voxels. Where it fails, the network gives
-another start, and the scans themselves decide between the two. Where nothing agrees, the pose is a guess.
+A first guess comes from the motion of before or from the decoder. The alignment with the local map makes it exact, and
+the share of elements that meet planes decides whether the pose is accepted.
 """
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
+from dpmjax.deeppointmap.compact_scans import CompactScan
 from dpmjax.geometry import rigid
 from dpmjax.scans.deskew import deskew
-from dpmjax.slam.alignment import PosePrior
+from dpmjax.slam.alignment import Alignment, ThinnedScan, best_of
 from dpmjax.slam.keyframes import (
     EdgeKind,
     Keyframe,
     KeyframeMap,
     MapEdge,
     Pose,
-    Submap,
     add_keyframe,
     are_near,
     diagonal_information,
     orthonormal,
-    submap_around,
     turn_rad,
     with_origin,
 )
+from dpmjax.slam.local_map import LocalMap, local_map_of, nearest_keyframe, with_scan
 from dpmjax.slam.methods import SlamMethods
 from dpmjax.slam.reports import ScanReport, ScanStatus
 from dpmjax.types import AnyArray
@@ -38,19 +38,21 @@ UNKNOWN_M = 1000.0
 
 
 class FrontEndState(NamedTuple):
-    """What the next scan needs of those before. The frame is that of the last keyframe.
+    """State of odometry after a scan. The frame is that of the last keyframe.
 
     Attributes:
         num_scans: number of scans so far, those of a loaded map among them.
-        local_map: recent scans; None before the first.
+        is_begun: True from the first keyframe of this run on.
+        local_map: keyframes and recent scans; None where it has to be made from the map.
         T_keyframe_last: pose of the last scan.
-        T_before_last: its motion since the scan before.
-        scores: of recent scans that were believed.
-        num_lost: number of scans since one was believed.
+        T_before_last: motion of the last scan since the scan before.
+        scores: of recent scans that were accepted.
+        num_lost: number of scans since one was accepted.
     """
 
     num_scans: int = 0
-    local_map: Any | None = None
+    is_begun: bool = False
+    local_map: LocalMap | None = None
     T_keyframe_last: Pose = np.eye(4)
     T_before_last: Pose = np.eye(4)
     scores: tuple[float, ...] = ()
@@ -58,7 +60,7 @@ class FrontEndState(NamedTuple):
 
 
 class Located(NamedTuple):
-    """The pose of a scan in the frame of the last keyframe, and why it is believed or not.
+    """The pose of a scan in the frame of the last keyframe, and why it is accepted or not.
 
     Attributes:
         T_keyframe_scan: the pose.
@@ -66,8 +68,9 @@ class Located(NamedTuple):
         reason: the numbers that decided.
         score: agreement with the local map.
         information: (6, 6) in the tangent of the scan.
-        probability: P(correct) of the network; None where it was not asked.
-        description: of the scan, by the matcher; None where it was not asked.
+        probability: P(correct) of the network's motion; None without one.
+        compact: the encoded scan; None where it was not encoded.
+        T_turn: predicted motion that the scan was deskewed by; None for none.
     """
 
     T_keyframe_scan: Pose
@@ -76,7 +79,8 @@ class Located(NamedTuple):
     score: float
     information: Float[np.ndarray, "6 6"]
     probability: float | None = None
-    description: Any | None = None
+    compact: CompactScan | None = None
+    T_turn: Pose | None = None
 
 
 class TimedScan(NamedTuple):
@@ -109,22 +113,26 @@ def step(
         The state and the map after, and how the scan was placed.
     """
     T_turn = state.T_before_last if isinstance(scan, TimedScan) else None
-    points = corrected_points(scan, T_turn)
-    measured = methods.geometry.measure(points)
-    if measured is None:
+    thinned = methods.geometry.thin(corrected_points(scan, T_turn))
+    if thinned is None:
         return _pass_over(state, slam_map)
-    prepared = Scan(points, measured, T_turn)
-    if state.local_map is None:
+    if not state.is_begun:
         reason = "a new part of the map begins here" if len(slam_map) else "the map begins here"
         located = Located(np.eye(4), "first", reason, 1.0, diagonal_information(UNKNOWN_M, np.pi))
-        return _make_keyframe(methods, state, slam_map, prepared, located)
-    located = _locate(methods, state, slam_map, prepared)
+        return _make_keyframe(methods, state, slam_map, thinned, located._replace(T_turn=T_turn))
+    local_map = local_map_of(slam_map, methods.config.odometry) if state.local_map is None else state.local_map
+    state = state._replace(local_map=local_map)
+    located = _locate(methods, state, local_map, thinned)
     # The next prediction uses this pose three times, so a rounding error would triple from scan to scan.
-    located = located._replace(T_keyframe_scan=orthonormal(located.T_keyframe_scan))
-    if located.status == "restarted" or _is_keyframe(methods, located, measured):
-        return _make_keyframe(methods, state, slam_map, prepared, located)
-    after = _advanced(methods, state, located, measured)
-    return after, slam_map, _report(state, slam_map, located, is_keyframe=False)._replace(T_turn=T_turn)
+    located = located._replace(T_keyframe_scan=orthonormal(located.T_keyframe_scan), T_turn=T_turn)
+    if located.status == "restarted" or _is_keyframe(methods, located, thinned):
+        return _make_keyframe(methods, state, slam_map, thinned, located)
+    after = _advanced(methods, state, located)
+    if located.status != "predicted":
+        spacing_m = methods.config.odometry.recent_share * thinned.extent_m
+        placed = thinned.elements, located.T_keyframe_scan, spacing_m
+        after = after._replace(local_map=with_scan(local_map, *placed, methods.config.odometry))
+    return after, slam_map, _report(state, slam_map, located, is_keyframe=False)
 
 
 def corrected_points(scan: AnyScan, T_turn: Pose | None) -> Float[np.ndarray, "n 3"]:
@@ -144,20 +152,6 @@ def corrected_points(scan: AnyScan, T_turn: Pose | None) -> Float[np.ndarray, "n
     return deskew(points[is_finite], np.asarray(scan.offsets)[is_finite], T_turn)
 
 
-class Scan(NamedTuple):
-    """A scan that is not empty.
-
-    Attributes:
-        points: metres, in the frame of the lidar.
-        measured: what the geometry has measured of it.
-        T_turn: motion that its points were corrected by; None for none.
-    """
-
-    points: Float[np.ndarray, "n 3"]
-    measured: Any
-    T_turn: Pose | None = None
-
-
 def _pass_over(state: FrontEndState, slam_map: KeyframeMap) -> tuple[FrontEndState, KeyframeMap, ScanReport]:
     guess = diagonal_information(1.0, 1.0)
     located = Located(state.T_keyframe_last @ state.T_before_last, "empty", "too few points", 0.0, guess)
@@ -165,59 +159,88 @@ def _pass_over(state: FrontEndState, slam_map: KeyframeMap) -> tuple[FrontEndSta
     return after, slam_map, _report(state, slam_map, located, is_keyframe=False)
 
 
-def _locate(methods: SlamMethods, state: FrontEndState, slam_map: KeyframeMap, scan: Scan) -> Located:
-    config = methods.config.front_end
+class _Attempt(NamedTuple):
+    # The pose from the prediction or another motion, that from the decoder, and what the decoder said.
+    tracked: Alignment | None
+    matched: Alignment | None = None
+    T_map_scan: Pose | None = None
+    probability: float | None = None
+    compact: CompactScan | None = None
+
+
+def _locate(methods: SlamMethods, state: FrontEndState, local_map: LocalMap, scan: ThinnedScan) -> Located:
+    config, predicted = methods.config.front_end, state.T_keyframe_last @ state.T_before_last
     usual = float(np.median(state.scores)) if state.scores else 1.0
     # Nothing is usual yet where a part of the map begins: sparse scans never score high.
     wanted = max(config.min_score, config.min_score_share * usual if state.scores else 0.0)
-    prior = PosePrior(state.T_keyframe_last, state.T_before_last, usual)
-    found = methods.geometry.align(state.local_map, scan.measured, prior)
-    if found.score >= wanted:
-        reason = f"score {found.score:.2f} of usually {usual:.2f}"
-        return Located(found.T_map_scan, "tracked", reason, found.score, found.information)
-    description = methods.matcher.describe(scan.points, scan.measured)
-    source = Submap((description,), np.eye(4)[None])
-    target = submap_around(slam_map, len(slam_map) - 1, config.num_submap, config.submap_radius_m)
-    match = methods.matcher.register([(source, target)])[0]
-    start = PosePrior(match.T_target_source, np.eye(4), usual, is_sure=True)
-    other = methods.geometry.align(state.local_map, scan.measured, start)
-    numbers = f"score {found.score:.2f} by geometry, {other.score:.2f} by the network with P {match.probability:.2f}"
-    is_confirmed = (
-        match.probability >= config.min_probability
-        and other.score >= config.min_score
-        and are_near(found.T_map_scan, other.T_map_scan, config.near_m, config.near_rad)
-        and are_near(match.T_target_source, other.T_map_scan, config.near_m, config.near_rad)
-    )
-    if is_confirmed or (other.score >= wanted and other.score > found.score):
-        agreed = other.score, other.information, match.probability
-        return Located(other.T_map_scan, "network", numbers, *agreed, description)
-    status: ScanStatus = "restarted" if state.num_lost + 1 >= config.num_lost else "predicted"
+    tried = _attempt(methods, state, local_map, scan, usual)
+    best = best_of([found for found in (tried.tracked, tried.matched) if found is not None])
+    is_matched = best is tried.matched
+    numbers = f"score {best.score:.2f} of usually {usual:.2f}"
+    if tried.probability is not None:
+        numbers += f", P {tried.probability:.2f} by the network"
+    network = tried.probability, tried.compact
+    if best.score >= wanted or _is_confirmed(methods, tried, best):
+        status: ScanStatus = "network" if is_matched else "tracked"
+        return Located(best.T_map_scan, status, numbers, best.score, best.information, *network)
+    status = "restarted" if state.num_lost + 1 >= config.num_lost else "predicted"
     guess = diagonal_information(config.guess_m, config.guess_rad)
+    # The best alignment is the better guess, unless a robot hardly moves like that.
+    is_likely = are_near(predicted, best.T_map_scan, 3 * config.guess_m, 3 * config.guess_rad)
+    return Located(best.T_map_scan if is_likely else predicted, status, numbers, best.score, guess, *network)
+
+
+def _attempt(
+    methods: SlamMethods, state: FrontEndState, local_map: LocalMap, scan: ThinnedScan, usual: float
+) -> _Attempt:
+    """Aligns from the prediction and from the decoder's motions, in the order that the configuration names."""
+    geometry, config = methods.geometry, methods.config.odometry
     predicted = state.T_keyframe_last @ state.T_before_last
-    # What geometry prefers is the better guess, unless a robot hardly moves like that.
-    is_likely = are_near(predicted, found.T_map_scan, 3 * config.guess_m, 3 * config.guess_rad)
-    T = found.T_map_scan if is_likely else predicted
-    return Located(T, status, numbers, max(found.score, other.score), guess, match.probability, description)
+    # The second scan of a drive has no motion to go on with.
+    has_motion = len(state.scores) > 0
+    tracked = None
+    if config.proposer == "prediction" and has_motion:
+        tracked = geometry.align(local_map, scan, predicted)
+        if tracked.score >= config.good_share * usual:
+            return _Attempt(tracked)
+    compact = methods.matcher.encode(scan)
+    row = nearest_keyframe(local_map, predicted[:3, 3])
+    proposal = methods.matcher.propose(compact, local_map.compact[row], config.num_hypotheses)
+    starts = orthonormal(local_map.keyframes[row].T_map_scan @ proposal.T_target_source)
+    matched = geometry.search(local_map, scan, starts)
+    if tracked is None and (config.proposer == "prediction" or matched.score < config.good_share * usual):
+        tracked = geometry.align(local_map, scan, predicted)
+    if tracked is not None and matched.score < config.good_share * usual:
+        others = state.T_keyframe_last @ geometry.other_motions(state.T_before_last, scan.extent_m)
+        tracked = best_of([tracked, geometry.search(local_map, scan, orthonormal(others))])
+    return _Attempt(tracked, matched, starts[0], proposal.probability, compact)
 
 
-def _is_keyframe(methods: SlamMethods, located: Located, measured: Any) -> bool:
+def _is_confirmed(methods: SlamMethods, tried: _Attempt, best: Alignment) -> bool:
+    """Returns True where the decoder alone and the alignment from other starts end at the same pose."""
+    config = methods.config.front_end
+    if tried.tracked is None or tried.T_map_scan is None or (tried.probability or 0.0) < config.min_probability:
+        return False
+    ends = (tried.tracked.T_map_scan, tried.T_map_scan)
+    are_equal = all(are_near(T, best.T_map_scan, config.near_m, config.near_rad) for T in ends)
+    return are_equal and best.score >= config.min_score
+
+
+def _is_keyframe(methods: SlamMethods, located: Located, scan: ThinnedScan) -> bool:
     if located.status == "predicted":
         return False
     config, T = methods.config.front_end, located.T_keyframe_scan
-    spacing_m = config.keyframe_share * methods.geometry.extent_m(measured)
+    spacing_m = config.keyframe_share * scan.extent_m
     spacing_m = float(np.clip(spacing_m, config.min_keyframe_m, config.max_keyframe_m))
     return bool(np.linalg.norm(T[:3, 3]) > spacing_m) or turn_rad(T) > config.keyframe_rad
 
 
 def _make_keyframe(
-    methods: SlamMethods, state: FrontEndState, slam_map: KeyframeMap, scan: Scan, located: Located
+    methods: SlamMethods, state: FrontEndState, slam_map: KeyframeMap, scan: ThinnedScan, located: Located
 ) -> tuple[FrontEndState, KeyframeMap, ScanReport]:
-    matcher, geometry, T = methods.matcher, methods.geometry, located.T_keyframe_scan
-    row = len(slam_map)
+    T, row = located.T_keyframe_scan, len(slam_map)
     is_guess = row > 0 and located.status in ("first", "restarted")
-    description = located.description
-    if description is None:
-        description = matcher.describe(scan.points, scan.measured)
+    compact = methods.matcher.encode(scan) if located.compact is None else located.compact
     T_odometry, T_world, path_m, segment, edge = T, T, 0.0, 0, None
     if row:
         last = slam_map.keyframes[-1]
@@ -225,21 +248,15 @@ def _make_keyframe(
         path_m, segment = last.path_m + float(np.linalg.norm(T[:3, 3])), last.segment + is_guess
         kind: EdgeKind = "guess" if is_guess else "odometry"
         edge = MapEdge(row, row - 1, T, located.information, kind)
-    keyframe = Keyframe(state.num_scans, T_odometry, path_m, segment, geometry.extent_m(scan.measured), description)
+    keyframe = Keyframe(state.num_scans, T_odometry, path_m, segment, scan.extent_m, compact)
     slam_map = with_origin(slam_map, methods.origin)
-    slam_map = add_keyframe(slam_map, keyframe, T_world, matcher.vector(description), edge)
-    after = _advanced(methods, state, located, scan.measured)
-    if is_guess or row == 0:
-        local_map = geometry.insert(None, scan.measured, np.eye(4), state.num_scans)
-    else:
-        local_map = geometry.move(after.local_map, rigid.inverse(T))
-    after = after._replace(local_map=local_map, T_keyframe_last=np.eye(4))
-    report = _report(state, slam_map, located._replace(T_keyframe_scan=np.eye(4)), is_keyframe=True)
-    return after, slam_map, report._replace(T_turn=scan.T_turn)
+    slam_map = add_keyframe(slam_map, keyframe, T_world, methods.matcher.vector(compact), edge)
+    after = _advanced(methods, state, located)._replace(is_begun=True, local_map=None, T_keyframe_last=np.eye(4))
+    return after, slam_map, _report(state, slam_map, located._replace(T_keyframe_scan=np.eye(4)), is_keyframe=True)
 
 
-def _advanced(methods: SlamMethods, state: FrontEndState, located: Located, measured: Any) -> FrontEndState:
-    """Returns the state after a scan: only a believed one joins the local map and changes the predicted motion."""
+def _advanced(methods: SlamMethods, state: FrontEndState, located: Located) -> FrontEndState:
+    """Returns the state after a scan: only an accepted one changes the predicted motion."""
     T = located.T_keyframe_scan
     after = state._replace(num_scans=state.num_scans + 1, T_keyframe_last=T)
     if located.status == "predicted":
@@ -247,7 +264,6 @@ def _advanced(methods: SlamMethods, state: FrontEndState, located: Located, meas
     if located.status in ("first", "restarted"):
         return after._replace(num_lost=0, scores=())
     return after._replace(
-        local_map=methods.geometry.insert(state.local_map, measured, T, state.num_scans),
         T_before_last=rigid.inverse(state.T_keyframe_last) @ T,
         scores=(*state.scores, located.score)[-methods.config.front_end.usual_window :],
         num_lost=0,
@@ -256,5 +272,14 @@ def _advanced(methods: SlamMethods, state: FrontEndState, located: Located, meas
 
 def _report(state: FrontEndState, slam_map: KeyframeMap, located: Located, *, is_keyframe: bool) -> ScanReport:
     keyframe, T = max(len(slam_map) - 1, 0), located.T_keyframe_scan
-    numbers = located.score, located.probability
-    return ScanReport(state.num_scans, located.status, located.reason, keyframe, T, is_keyframe, *numbers)
+    return ScanReport(
+        state.num_scans,
+        located.status,
+        located.reason,
+        keyframe,
+        T,
+        is_keyframe,
+        score=located.score,
+        probability=located.probability,
+        T_turn=located.T_turn,
+    )

@@ -5,13 +5,14 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 import scipy.sparse as sp
 from jaxtyping import Float, Int
 from scipy.spatial.transform import Rotation
 
+from dpmjax.deeppointmap.compact_scans import CompactScan
 from dpmjax.geometry import rigid
 from dpmjax.pose_graph.graph import Edges, PoseGraph
 from dpmjax.slam.config import MapOrigin
@@ -29,7 +30,7 @@ class Keyframe(NamedTuple):
         path_m: length of the path until here, by odometry.
         segment: number of the unbroken chain of odometry that it belongs to.
         extent_m: median range of its points.
-        description: what the matcher registers.
+        compact: descriptors, surface elements and free space.
     """
 
     scan: int
@@ -37,7 +38,7 @@ class Keyframe(NamedTuple):
     path_m: float
     segment: int
     extent_m: float
-    description: Any
+    compact: CompactScan
 
 
 class MapEdge(NamedTuple):
@@ -84,11 +85,11 @@ class Submap(NamedTuple):
     """Keyframes around one of them, to be registered as a whole.
 
     Attributes:
-        descriptions: of the keyframes; the first is the central one.
+        scans: of the keyframes; the first is the central one.
         T_submap_keyframe: (n, 4, 4) their poses in the frame of the first.
     """
 
-    descriptions: tuple[Any, ...]
+    scans: tuple[CompactScan, ...]
     T_submap_keyframe: Float[np.ndarray, "n 4 4"]
 
 
@@ -213,26 +214,39 @@ def connected_parts(num_keyframes: int, edges: Sequence[MapEdge]) -> Int[np.ndar
     return np.asarray(sp.csgraph.connected_components(joined, directed=False)[1], np.int64)
 
 
+def nearest_in_graph(slam_map: KeyframeMap, row: int, num_keyframes: int, radius_m: float) -> Int[np.ndarray, " n"]:
+    """Finds the nearest keyframes among those that the graph joins to a keyframe.
+
+    Args:
+        slam_map: the map.
+        row: of the keyframe.
+        num_keyframes: largest number of keyframes, and of edges between them and the first.
+        radius_m: keyframes farther away are left out.
+
+    Returns:
+        Rows, the keyframe itself first, then nearest first.
+    """
+    steps = graph_steps(slam_map, row, num_keyframes)
+    apart = distances_to(slam_map, slam_map.T_world_keyframe[row, :3, 3])
+    rows = np.flatnonzero(np.isfinite(steps) & (apart <= radius_m))
+    return rows[np.lexsort((apart[rows], rows != row))][:num_keyframes]
+
+
 def submap_around(slam_map: KeyframeMap, row: int, num_keyframes: int, radius_m: float) -> Submap:
     """Gathers a keyframe and its neighbours in the graph, nearest first.
 
     Args:
         slam_map: the map.
         row: of the central keyframe.
-        num_keyframes: at most so many, the central one among them.
+        num_keyframes: largest number of keyframes, the central one among them.
         radius_m: neighbours farther away are left out.
 
     Returns:
         The submap, in the frame of the central keyframe.
     """
-    steps = graph_steps(slam_map, row, num_keyframes)
-    apart = distances_to(slam_map, slam_map.T_world_keyframe[row, :3, 3])
-    rows = np.flatnonzero(np.isfinite(steps) & (apart <= radius_m))
-    rows = rows[np.lexsort((apart[rows], rows != row))][:num_keyframes]
+    rows = nearest_in_graph(slam_map, row, num_keyframes, radius_m)
     T_submap_world = rigid.inverse(slam_map.T_world_keyframe[row])
-    return Submap(
-        tuple(slam_map.keyframes[i].description for i in rows), T_submap_world @ slam_map.T_world_keyframe[rows]
-    )
+    return Submap(tuple(slam_map.keyframes[i].compact for i in rows), T_submap_world @ slam_map.T_world_keyframe[rows])
 
 
 def as_pose_graph(slam_map: KeyframeMap) -> PoseGraph:

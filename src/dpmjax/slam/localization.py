@@ -8,12 +8,13 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
-from typing import Any, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
 from dpmjax.checks import require_fields, require_positive_fields
+from dpmjax.deeppointmap.compact_scans import CompactScan
 from dpmjax.deeppointmap.model import Model
 from dpmjax.slam.keyframes import (
     KeyframeMap,
@@ -181,41 +182,42 @@ def _localized(
     if scan.ndim != 2 or scan.shape[1] != 3:
         raise ValueError(f"scan: expected shape (n, 3), got {scan.shape}")
     points = scan[np.isfinite(scan).all(axis=1)]
-    measured = methods.geometry.measure(points)
-    if measured is None:
+    thinned = methods.geometry.thin(points)
+    if thinned is None:
         return Localization("empty", None, 0.0, None, "too few points")
-    description = methods.matcher.describe(points, measured)
-    extent_m = methods.geometry.extent_m(measured)
-    rows = _candidates(slam_map, description, methods, config)
+    compact, extent_m = methods.matcher.encode(thinned), thinned.extent_m
+    rows = _candidates(slam_map, compact, methods, config)
     tried: list[Evidence] = []
     for start in range(0, len(rows), config.num_at_once):
         done = {one.keyframe for one in tried}
         left = [row for row in rows[start : start + config.num_at_once] if row not in done]
-        tried += _registered(slam_map, left, description, methods, config)
+        tried += _registered(slam_map, left, compact, methods, config)
         place = max(_places(tried, config), key=lambda place: place.total, default=None)
         if place is not None and not _is_supported(place, config, config.min_support):
             near = _neighbours(slam_map, place.members[0], tried, extent_m, config)
-            tried += _registered(slam_map, near, description, methods, config)
+            tried += _registered(slam_map, near, compact, methods, config)
         found = _decided(slam_map, tried, extent_m, config)
         if found.status == "found":
             return found
     return found
 
 
-def _candidates(slam_map: KeyframeMap, description: Any, methods: SlamMethods, config: LocalizationConfig) -> list[int]:
+def _candidates(
+    slam_map: KeyframeMap, compact: CompactScan, methods: SlamMethods, config: LocalizationConfig
+) -> list[int]:
     """Returns the keyframes to register, the most probable overlap first."""
-    vector = methods.matcher.vector(description)
+    vector = methods.matcher.vector(compact)
     vector = vector / max(float(np.linalg.norm(vector)), 1e-12)
     rows, _ = most_similar(slam_map.vectors, vector, config.num_similar)
-    overlaps = methods.matcher.overlaps(description, [slam_map.keyframes[row].description for row in rows])
+    overlaps = methods.matcher.overlaps(compact, [slam_map.keyframes[row].compact for row in rows])
     order = np.argsort(-overlaps, kind="stable")[: config.num_registered]
     return [int(rows[number]) for number in order]
 
 
 def _registered(
-    slam_map: KeyframeMap, rows: list[int], description: Any, methods: SlamMethods, config: LocalizationConfig
+    slam_map: KeyframeMap, rows: list[int], compact: CompactScan, methods: SlamMethods, config: LocalizationConfig
 ) -> list[Evidence]:
-    source, radius_m = Submap((description,), np.eye(4)[None]), methods.config.front_end.submap_radius_m
+    source, radius_m = Submap((compact,), np.eye(4)[None]), methods.config.front_end.submap_radius_m
     targets = [submap_around(slam_map, row, config.num_submap, radius_m) for row in rows]
     matches = methods.matcher.register([(source, target) for target in targets]) if rows else []
     loops = methods.config.loops

@@ -134,11 +134,11 @@ def _overlaps(
     config = methods.config.loops
     if config.min_overlap == 0:
         return [1.0] * len(candidates)
-    descriptions = [slam_map.keyframes[candidate.row].description for candidate in candidates]
+    scans = [slam_map.keyframes[candidate.row].compact for candidate in candidates]
     found: list[float | None] = []
     for start in range(0, len(candidates), config.num_asked):
-        some = descriptions[start : start + config.num_asked]
-        found += methods.matcher.overlaps(slam_map.keyframes[row].description, some).tolist()
+        some = scans[start : start + config.num_asked]
+        found += methods.matcher.overlaps(slam_map.keyframes[row].compact, some).tolist()
         if max(filter(None, found), default=0.0) >= config.sure_overlap:
             break
     return found + [None] * (len(candidates) - len(found))

@@ -1,10 +1,10 @@
-"""What SLAM asks of a matcher, and the one that asks DeepPointMap's networks."""
+"""The interface of a matcher (encoding, proposals, registration, overlap), and the one of DeepPointMap's networks."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any, NamedTuple, Protocol
+from typing import NamedTuple, Protocol
 
 import jax
 import jax.numpy as jnp
@@ -13,22 +13,19 @@ from jaxtyping import Float
 
 from dpmjax.deeppointmap.batches import overlap_pairs
 from dpmjax.deeppointmap.compact_scans import CompactScan, compact_scan, expand_scan
-from dpmjax.deeppointmap.encoding import encode
-from dpmjax.deeppointmap.matching import merge_clouds
-from dpmjax.deeppointmap.model import Model, model_fingerprint
-from dpmjax.deeppointmap.scan_registration import PreparedScan, register_each
-from dpmjax.deeppointmap.verification import MeasuredScan, verify_motion
-from dpmjax.scans.compact import CompactImage, CompactSurface
-from dpmjax.scans.surface_alignment import AlignmentLevel, align_surfaces, pair_with_planes
-from dpmjax.slam.alignment import Alignment
-from dpmjax.slam.columns import Arrays, from_columns, to_columns
+from dpmjax.deeppointmap.confidence import gather_evidence, with_confidence
+from dpmjax.deeppointmap.matching import merge_clouds, thin_merged
+from dpmjax.deeppointmap.model import Model, encode_pyramid, model_fingerprint
+from dpmjax.deeppointmap.scan_registration import PreparedScan, distinct_motions, match_clouds, register_each
+from dpmjax.scans.surface_alignment import AlignmentLevel, pair_with_planes
+from dpmjax.slam.alignment import ThinnedScan
 from dpmjax.slam.keyframes import Pose, Submap
 from dpmjax.slam.plane_information import plane_information
 from dpmjax.slam.retrieval import pooled_vector
 from dpmjax.types import DescriptorCloud, Registration, Verification
 
-MIN_ALIGNED_POINTS = 4000
-"""Scans with fewer surface points share too few planes: against the local map of many scans they are placed better."""
+ELEMENT_RADIUS_M = 2.0
+"""Radius of `VerificationConfig.plane_radius_m` for surface elements, which are metres apart."""
 
 
 class Match(NamedTuple):
@@ -50,63 +47,65 @@ class Match(NamedTuple):
     information: Float[np.ndarray, "6 6"] | None = None
 
 
+class Proposal(NamedTuple):
+    """Motions of a scan that descriptors alone propose.
+
+    Attributes:
+        T_target_source: (h, 4, 4) float64, the most likely first.
+        probability: P(correct) of the first.
+    """
+
+    T_target_source: Float[np.ndarray, "h 4 4"]
+    probability: float
+
+
 class Matcher(Protocol):
     """Recognises places and registers scans and maps without a first guess.
 
     Attributes:
-        fingerprint: descriptions are compared only with those of a matcher of the same fingerprint.
+        fingerprint: keyframes are compared only with those of a matcher of the same fingerprint.
     """
 
     @property
     def fingerprint(self) -> str: ...  # noqa: D102
 
-    def describe(self, points: Float[np.ndarray, "n 3"], measured: Any) -> Any:
+    def encode(self, scan: ThinnedScan) -> CompactScan:
         """Prepares a scan for any number of registrations.
 
         Args:
-            points: metres, in the frame of the lidar.
-            measured: what the geometry has measured of it.
+            scan: the scan.
 
         Returns:
-            A record that only the matcher reads.
+            Descriptors, surface elements and free space.
         """
         ...
 
-    def pack(self, description: Any) -> Arrays:
-        """Turns a description into arrays for a file.
-
-        Args:
-            description: from `describe`.
-
-        Returns:
-            Arrays by name.
-        """
-        ...
-
-    def unpack(self, arrays: Arrays) -> Any:
-        """Makes a description again, bit for bit.
-
-        Args:
-            arrays: from `pack`.
-
-        Returns:
-            The description.
-        """
-        ...
-
-    def vector(self, description: Any) -> Float[np.ndarray, " c"]:
+    def vector(self, scan: CompactScan) -> Float[np.ndarray, " c"]:
         """Returns one vector for retrieval, of a length that is the same for all scans.
 
         Args:
-            description: from `describe`.
+            scan: from `encode`.
 
         Returns:
             The vector.
         """
         ...
 
+    def propose(self, source: CompactScan, target: CompactScan, num_motions: int) -> Proposal:
+        """Registers a scan by descriptors alone.
+
+        Args:
+            source: a scan.
+            target: the other.
+            num_motions: largest number of motions.
+
+        Returns:
+            Distinct motions; at least one.
+        """
+        ...
+
     def register(self, pairs: Sequence[tuple[Submap, Submap]]) -> list[Match]:
-        """Registers pairs of source and target.
+        """Registers pairs of source and target, and verifies them by their surfaces.
 
         Args:
             pairs: submaps; a single scan is a submap of one.
@@ -116,25 +115,12 @@ class Matcher(Protocol):
         """
         ...
 
-    def align_scans(self, source: Any, target: Any, T_target_source: Pose) -> Alignment | None:
-        """Aligns two scans from a motion that is nearly right.
-
-        Args:
-            source: description of a scan.
-            target: of the other.
-            T_target_source: first guess.
-
-        Returns:
-            The scan in the frame of the other; None where the descriptions hold too few points for that.
-        """
-        ...
-
-    def overlaps(self, source: Any, targets: Sequence[Any]) -> Float[np.ndarray, " n"]:
+    def overlaps(self, source: CompactScan, targets: Sequence[CompactScan]) -> Float[np.ndarray, " n"]:
         """Estimates the probability that scans see the same place, for many scans at once.
 
         Args:
-            source: description of a scan.
-            targets: of the others; at least one.
+            source: a scan.
+            targets: the others; at least one.
 
         Returns:
             The probabilities.
@@ -150,57 +136,50 @@ class NetworkMatcher:
     """
 
     def __init__(self, model: Model) -> None:
-        self._model = model
+        verification = replace(model.config.verification, plane_radius_m=ELEMENT_RADIUS_M)
+        self._model = replace(model, config=replace(model.config, verification=verification))
         self.fingerprint = model_fingerprint(model)
 
-    def describe(self, points: Float[np.ndarray, "n 3"], measured: MeasuredScan) -> CompactScan:
+    def encode(self, scan: ThinnedScan) -> CompactScan:
         """Encodes a scan, and keeps of it what a map needs; see `Matcher`.
 
         Args:
-            points: metres, in the frame of the lidar.
-            measured: surface and free space of the scan.
+            scan: the scan.
 
         Returns:
             The compact scan.
         """
-        return compact_scan(jax.device_get(encode(self._model, points)), measured)
+        num_elements = self._model.config.pyramid.stages[0].num_points
+        cloud = encode_pyramid(self._model, scan.pyramid, num_elements=num_elements)
+        return compact_scan(jax.device_get(cloud), scan.measured.image)
 
-    def pack(self, description: CompactScan) -> Arrays:
-        """Keeps all arrays of a scan; see `Matcher`.
-
-        Args:
-            description: from `describe`.
-
-        Returns:
-            Arrays by name.
-        """
-        cloud = to_columns([description], "scan", without=("surface", "image"))
-        return cloud | to_columns([description.surface], "surface") | to_columns([description.image], "image")
-
-    def unpack(self, arrays: Arrays) -> CompactScan:
-        """Makes the scan again; see `Matcher`.
-
-        Args:
-            arrays: from `pack`.
-
-        Returns:
-            The compact scan.
-        """
-        (scan,) = from_columns(CompactScan, arrays, "scan")
-        (surface,) = from_columns(CompactSurface, arrays, "surface")
-        (image,) = from_columns(CompactImage, arrays, "image")
-        return scan._replace(surface=surface, image=image)
-
-    def vector(self, description: CompactScan) -> Float[np.ndarray, " c"]:
+    def vector(self, scan: CompactScan) -> Float[np.ndarray, " c"]:
         """Pools the descriptors; see `Matcher`.
 
         Args:
-            description: from `describe`.
+            scan: from `encode`.
 
         Returns:
             The vector.
         """
-        return pooled_vector(description.descriptors)
+        return pooled_vector(scan.cloud.described)
+
+    def propose(self, source: CompactScan, target: CompactScan, num_motions: int) -> Proposal:
+        """Registers two descriptor clouds by the decoder; see `Matcher`.
+
+        Args:
+            source: a scan.
+            target: the other.
+            num_motions: largest number of motions.
+
+        Returns:
+            Distinct motions, best first.
+        """
+        config = self._model.config
+        hypotheses = match_clouds(self._model, source.cloud, target.cloud, config=config.matching)
+        best = jax.tree.map(lambda leaf: jnp.asarray(leaf[0]), hypotheses)
+        confident = with_confidence(best, gather_evidence(hypotheses, 0, None), config.calibration)
+        return Proposal(distinct_motions(hypotheses)[:num_motions], float(confident.confidence))
 
     def register(self, pairs: Sequence[tuple[Submap, Submap]]) -> list[Match]:
         """Registers merged descriptors and verifies by the central scans; see `Matcher`.
@@ -215,27 +194,8 @@ class NetworkMatcher:
         found = register_each(self._model, prepared, refine=True)
         return [self._match(*scans, match) for scans, match in zip(prepared, found, strict=True)]
 
-    def align_scans(self, source: CompactScan, target: CompactScan, T_target_source: Pose) -> Alignment | None:
-        """Aligns the surfaces of two scans point to plane; see `Matcher`.
-
-        Args:
-            source: a scan.
-            target: the other.
-            T_target_source: first guess.
-
-        Returns:
-            The motion, and how well the scans agree under it; None for sparse scans.
-        """
-        if min(len(source.surface.points), len(target.surface.points)) < MIN_ALIGNED_POINTS:
-            return None
-        config = self._model.config.verification
-        scan, other = expand_scan(source).measured, expand_scan(target).measured
-        T = align_surfaces(scan.surface, other.surface, T_target_source, config.refinement).T_target_source
-        shares, information = verify_motion(scan, other, T, config), self._information(scan, other, T)
-        return Alignment(T, shares.matched_share, shares.contradicted_share, shares.score, information)
-
     def overlaps(self, source: CompactScan, targets: Sequence[CompactScan]) -> Float[np.ndarray, " n"]:
-        """Asks the overlap head; see `Matcher`.
+        """Predicts the probabilities of overlap; see `Matcher`.
 
         Args:
             source: a scan.
@@ -244,33 +204,29 @@ class NetworkMatcher:
         Returns:
             The probabilities.
         """
-        clouds = [target.descriptors for target in targets]
-        return np.asarray(overlap_pairs(self._model, [source.descriptors] * len(targets), clouds))
+        clouds = [target.cloud.described for target in targets]
+        return np.asarray(overlap_pairs(self._model, [source.cloud.described] * len(targets), clouds))
 
     def _match(self, source: PreparedScan, target: PreparedScan, found: Registration) -> Match:
-        T = np.asarray(found.T_target_source, np.float64)
-        information = self._information(source.measured, target.measured, T)
-        return Match(T, float(found.confidence), float(found.rmse), found.verification, information)
-
-    def _information(self, source: MeasuredScan, target: MeasuredScan, T: Pose) -> Float[np.ndarray, "6 6"]:
         config = self._model.config.verification
+        T = np.asarray(found.T_target_source, np.float64)
         level = AlignmentLevel(config.plane_radius_m, config.num_samples, 1)
-        pairs = pair_with_planes(source.surface, target.surface, T, level)
-        return plane_information(pairs, T, max_residual_m=config.plane_distance_m)
+        pairs = pair_with_planes(source.measured.surface, target.measured.surface, T, level)
+        information = plane_information(pairs, T, max_residual_m=config.plane_distance_m)
+        return Match(T, float(found.confidence), float(found.rmse), found.verification, information)
 
 
 def _merged(submap: Submap) -> PreparedScan:
     """Merges descriptors; the number of scans is filled up to a power of two, so that few programs are compiled."""
-    first = expand_scan(submap.descriptions[0])
-    num = len(submap.descriptions)
-    if num == 1:
-        return first
+    first = expand_scan(submap.scans[0])
+    num = len(submap.scans)
+    clouds = [scan.cloud.described for scan in submap.scans]
     capacity = 1 << (num - 1).bit_length()
-    clouds = [description.descriptors for description in submap.descriptions]
     clouds += [_without_points(clouds[0])] * (capacity - num)
     T_submap_scan = np.concatenate([submap.T_submap_keyframe, np.tile(np.eye(4), (capacity - num, 1, 1))])
     stacked = jax.tree.map(lambda *leaves: np.stack(leaves), *clouds)
-    return PreparedScan(merge_clouds(stacked, jnp.asarray(T_submap_scan, jnp.float32)), first.measured)
+    merged = merge_clouds(stacked, jnp.asarray(T_submap_scan, jnp.float32))
+    return PreparedScan(thin_merged(merged, len(clouds[0].mask)), first.measured)
 
 
 def _without_points(cloud: DescriptorCloud) -> DescriptorCloud:

@@ -20,7 +20,6 @@ from dpmjax.slam.loop_state import LoopState, loops_of_map
 from dpmjax.slam.map_optimization import optimize_map
 from dpmjax.slam.matcher import NetworkMatcher
 from dpmjax.slam.methods import SlamMethods
-from dpmjax.slam.neighbours import join_neighbours
 from dpmjax.slam.odometry import SurfaceGeometry
 from dpmjax.slam.reports import Loop, ScanReport
 
@@ -79,7 +78,7 @@ def make_methods(model: Model, config: SlamConfig | None = None, *, weights: str
         The methods.
     """
     config = config or SlamConfig()
-    return SlamMethods(NetworkMatcher(model), SurfaceGeometry(config.odometry), config, weights)
+    return SlamMethods(NetworkMatcher(model), SurfaceGeometry(model.config, config.odometry), config, weights)
 
 
 def as_methods(model: Model | SlamMethods, config: SlamConfig | None) -> SlamMethods:
@@ -140,10 +139,7 @@ def step_slam(methods: SlamMethods, state: SlamState, scan: AnyScan) -> tuple[Sl
     report, loops = report._replace(num_points=shape[0]), state.loops
     if report.is_keyframe:
         num_before = num_accepted(loops.loops)
-        joined = join_neighbours(methods, slam_map)
-        # Where nothing holds the chain but itself, there is nothing to optimise.
-        loops = loops._replace(is_stale=loops.is_stale or joined is not slam_map)
-        slam_map, loops = close_loops(methods, joined, loops)
+        slam_map, loops = close_loops(methods, slam_map, loops)
         report = report._replace(num_accepted=num_accepted(loops.loops) - num_before)
     return SlamState(front, slam_map, loops), report
 
