@@ -15,7 +15,7 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from dpmjax.deeppointmap.confidence import Evidence, gather_evidence, logistic_probability
+from dpmjax.deeppointmap.confidence import Evidence, calibrated_probability, gather_evidence
 from dpmjax.deeppointmap.encoding import encode
 from dpmjax.deeppointmap.model import Model
 from dpmjax.deeppointmap.scan_pairs import ScanPair
@@ -159,7 +159,7 @@ def _confidence(model: Model, evidence: Evidence) -> float:
     calibration = model.config.calibration
     if calibration is None or evidence.of_scans is None:
         return float(evidence.of_clouds[1])
-    return float(logistic_probability(calibration.of_scans, evidence.of_scans))
+    return calibrated_probability(calibration, evidence)
 
 
 class _Clock:

@@ -1,13 +1,14 @@
 """Verification of motion hypotheses by the scans themselves: surfaces that meet, and free space that stays free.
 
 A short point-to-plane alignment first brings a hypothesis to where the surfaces say that it should be. A right one then
-puts most points onto planes of the other scan, and hardly any into its free space.
+puts most points onto planes of the other scan, and hardly any into its free space. In corridors wrong ones do so, too:
+there, motions along the axis and half-turns are tried, and the elements that face the axis choose.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import astuple, dataclass, field
+from dataclasses import astuple, dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -16,15 +17,18 @@ from jaxtyping import Bool, Float
 from dpmjax.checks import require_fields
 from dpmjax.geometry import rigid
 from dpmjax.scans.free_space import RangeImage, RangeImageConfig, range_image, view_points
+from dpmjax.scans.plane_information import plane_information
 from dpmjax.scans.surface_alignment import (
     AlignmentConfig,
     AlignmentLevel,
     align_surfaces,
     align_surfaces_from,
     nearest_planes,
+    pair_with_planes,
 )
 from dpmjax.scans.surfaces import Surface, SurfaceConfig, scan_surface
 from dpmjax.scans.view_correlation import ViewCorrelationConfig, correlate_views
+from dpmjax.scans.weak_directions import WallAxis, facing_surface, sliding_motions, wall_axis, weak_share
 from dpmjax.types import Verification
 
 HYPOTHESES_AT_ONCE = 4
@@ -38,9 +42,12 @@ LEVEL_COSINE = 0.8
 DISTINCT_M, DISTINCT_RAD = 2.0, np.radians(5.0)
 """Motions that differ by less end in the same place."""
 
+OF_THE_SEARCH = ("gap", "num_tried", "num_slid", "facing_gap")
+"""Fields of `Verification` that rest on all motions that were tried."""
 
 COARSE = AlignmentConfig(levels=(AlignmentLevel(3.0, 600, 5),))
 FINE = AlignmentConfig(levels=(AlignmentLevel(1.0, 1500, 5),))
+SLIDING = AlignmentConfig(levels=(*COARSE.levels, *FINE.levels))
 REFINEMENT = AlignmentConfig(levels=(AlignmentLevel(1.0, 4000, 8), AlignmentLevel(0.4, 8000, 10)))
 
 
@@ -71,6 +78,34 @@ class EvidenceWeights:
 
 
 @dataclass(frozen=True)
+class SlidingConfig:
+    """Search along a weak axis.
+
+    Attributes:
+        max_weak_share: an axis is weak if its share of the information of the walls is smaller; 0.25 or more in streets
+            and rooms, 0.07 to 0.21 in corridors. 0 switches the search off.
+        step_m: distance of the motions that are tried.
+        alignment: of each.
+        num_samples: number of elements of each scan that face the axis and are compared.
+        contradicted: an element that faces the axis and lies in free space counts against a motion as so many that
+            meet count for it.
+        visible: the same of an element that the other scan sees.
+    """
+
+    max_weak_share: float = 0.22
+    step_m: float = 0.7
+    alignment: AlignmentConfig = SLIDING
+    num_samples: int = 4000
+    contradicted: float = 3.0
+    visible: float = 0.2
+
+    def __post_init__(self) -> None:
+        require_fields(self, "max_weak_share", "contradicted", "visible", low=0)
+        require_fields(self, "step_m", low=1e-9)
+        require_fields(self, "num_samples", low=1)
+
+
+@dataclass(frozen=True)
 class VerificationConfig:
     """Settings of the verification and of the final alignment.
 
@@ -88,6 +123,7 @@ class VerificationConfig:
         min_cosine: ... and the cosine between both normals is larger.
         evidence: what the points of both scans say about a motion.
         clear_score: no further hypothesis is tried after one with higher log odds.
+        sliding: further motions where the walls hold one direction only, and their comparison.
     """
 
     surface: SurfaceConfig = field(default_factory=SurfaceConfig)
@@ -103,6 +139,7 @@ class VerificationConfig:
     min_cosine: float = 0.7
     evidence: EvidenceWeights = field(default_factory=EvidenceWeights)
     clear_score: float = 1.0
+    sliding: SlidingConfig = field(default_factory=SlidingConfig)
 
     def __post_init__(self) -> None:
         require_fields(self, "num_fine", "num_samples", low=1)
@@ -266,6 +303,9 @@ def choose_motion(
 ) -> VerifiedMotion:
     """Chooses the hypothesis under which two scans agree best.
 
+    Where the walls of both hold one direction only, motions along the other are tried too, both ways round, and the
+    motion is taken under which most elements that face this direction meet.
+
     Args:
         source: a scan.
         target: the other.
@@ -289,16 +329,50 @@ def choose_motion(
         tried.sort(key=lambda motion: -motion.verification.score)
         if tried[0].verification.score > config.clear_score:
             break
-    fine = aligned(config.fine, tried[: config.num_fine])
-    chosen = max(fine, key=lambda motion: motion.verification.score)
-    others = [*fine, *tried[config.num_fine :]]
-    others = [other for other in others if _is_apart(other.T_target_source, chosen.T_target_source)]
-    second = max((other.verification.score for other in others), default=0.0)
-    gap = chosen.verification.score - max(second, 0.0)
+    finalists, remaining = aligned(config.fine, tried[: config.num_fine]), tried[config.num_fine :]
+    axes = wall_axis(source.surface), wall_axis(target.surface)
+    slid = np.zeros((0, 4, 4))
+    if is_weak := weak_share(*axes) < config.sliding.max_weak_share:
+        slid = sliding_motions(*axes, config.sliding.step_m)
+        finalists += aligned(config.sliding.alignment, [_Candidate(None, T) for T in slid])
+    motions = [*finalists, *remaining]
+    T = np.stack([motion.T_target_source for motion in motions])
+    scores = np.array([motion.verification.score for motion in motions])
+    facing = _facing_elements(source, target, axes, T, config) if is_weak else np.zeros(len(motions))
+    best = int(np.argmax((facing if is_weak else scores)[: len(finalists)]))
+    chosen, is_other = motions[best], _is_apart(T, T[best])
     if chosen.row is None:
-        agreeing = (row for row, T in enumerate(T_target_source) if not _is_apart(T, chosen.T_target_source))
-        chosen = chosen._replace(row=next(agreeing, None))
-    return chosen._replace(verification=chosen.verification._replace(gap=gap, num_tried=len(tried)))
+        agreeing = np.flatnonzero(~_is_apart(np.asarray(T_target_source, float), T[best]))
+        chosen = chosen._replace(row=int(agreeing[0]) if len(agreeing) else None)
+    gap, facing_gap = (values[best] - values[is_other].max(initial=0.0) for values in (scores, facing))
+    found = chosen.verification._replace(gap=gap, num_tried=len(tried), num_slid=len(slid), facing_gap=facing_gap)
+    return chosen._replace(verification=found)
+
+
+def _facing_elements(
+    source: MeasuredScan,
+    target: MeasuredScan,
+    axes: tuple[WallAxis, WallAxis],
+    T_target_source: Float[np.ndarray, "s 4 4"],
+    config: VerificationConfig,
+) -> Float[np.ndarray, " s"]:
+    """Counts elements that face the weak axis and meet; those in free space and unmet visible ones count against it."""
+    sliding, settings = config.sliding, replace(config, num_samples=config.sliding.num_samples)
+    first, second = (
+        scan._replace(surface=facing_surface(scan.surface, axis.axis))
+        for scan, axis in zip((source, target), axes, strict=True)
+    )
+    sides = (
+        _compared(first, target, T_target_source, settings),
+        _compared(second, source, rigid.inverse(T_target_source), settings),
+    )
+    counts = [
+        side.meets.sum(axis=1)
+        - sliding.contradicted * side.is_contradicted.sum(axis=1)
+        - sliding.visible * side.is_visible.sum(axis=1)
+        for side in sides
+    ]
+    return np.mean(counts, axis=0)
 
 
 class _Candidate(NamedTuple):
@@ -345,12 +419,31 @@ def refine_motion(
     start = motion.T_target_source
     T = align_surfaces(source.surface, target.surface, start, config.refinement).T_target_source
     found = verify_motion(source, target, T, config)
-    kept = motion.verification
-    return VerifiedMotion(motion.row, T, found._replace(gap=kept.gap, num_tried=kept.num_tried))
+    kept = {name: getattr(motion.verification, name) for name in OF_THE_SEARCH}
+    return VerifiedMotion(motion.row, T, found._replace(**kept))
 
 
-def _is_apart(T_a: Float[np.ndarray, "4 4"], T_b: Float[np.ndarray, "4 4"]) -> bool:
-    """Whether two motions differ: near-equal ones do not compete."""
-    difference = rigid.inverse(T_a) @ T_b
-    cosine = (np.trace(difference[:3, :3]) - 1) / 2
-    return bool(np.linalg.norm(difference[:3, 3]) > DISTINCT_M or cosine < np.cos(DISTINCT_RAD))
+def motion_information(
+    source: MeasuredScan, target: MeasuredScan, T_target_source: Float[np.ndarray, "4 4"], config: VerificationConfig
+) -> Float[np.ndarray, "6 6"]:
+    """Computes how well the planes that meet hold a motion.
+
+    Args:
+        source: a scan.
+        target: the other.
+        T_target_source: the motion.
+        config: tolerances.
+
+    Returns:
+        Inverse covariance in the tangent of the source, translation first.
+    """
+    level = AlignmentLevel(config.plane_radius_m, config.num_samples, 1)
+    pairs = pair_with_planes(source.surface, target.surface, T_target_source, level)
+    return plane_information(pairs, T_target_source, max_residual_m=config.plane_distance_m)
+
+
+def _is_apart(T: Float[np.ndarray, "s 4 4"], T_other: Float[np.ndarray, "4 4"]) -> Bool[np.ndarray, " s"]:
+    """Whether motions differ from another: near-equal ones do not compete."""
+    difference = rigid.inverse(T_other) @ T
+    cosine = (np.trace(difference[:, :3, :3], axis1=1, axis2=2) - 1) / 2
+    return (np.linalg.norm(difference[:, :3, 3], axis=1) > DISTINCT_M) | (cosine < np.cos(DISTINCT_RAD))

@@ -17,13 +17,12 @@ from dpmjax.deeppointmap.encoding import encode
 from dpmjax.deeppointmap.matching import merge_clouds
 from dpmjax.deeppointmap.model import Model, model_fingerprint
 from dpmjax.deeppointmap.scan_registration import PreparedScan, register_each
-from dpmjax.deeppointmap.verification import MeasuredScan, verify_motion
+from dpmjax.deeppointmap.verification import MeasuredScan, motion_information, verify_motion
 from dpmjax.scans.compact import CompactImage, CompactSurface
-from dpmjax.scans.surface_alignment import AlignmentLevel, align_surfaces, pair_with_planes
+from dpmjax.scans.surface_alignment import align_surfaces
 from dpmjax.slam.alignment import Alignment
 from dpmjax.slam.columns import Arrays, from_columns, to_columns
 from dpmjax.slam.keyframes import Pose, Submap
-from dpmjax.slam.plane_information import plane_information
 from dpmjax.slam.retrieval import pooled_vector
 from dpmjax.types import DescriptorCloud, Registration, Verification
 
@@ -253,10 +252,7 @@ class NetworkMatcher:
         return Match(T, float(found.confidence), float(found.rmse), found.verification, information)
 
     def _information(self, source: MeasuredScan, target: MeasuredScan, T: Pose) -> Float[np.ndarray, "6 6"]:
-        config = self._model.config.verification
-        level = AlignmentLevel(config.plane_radius_m, config.num_samples, 1)
-        pairs = pair_with_planes(source.surface, target.surface, T, level)
-        return plane_information(pairs, T, max_residual_m=config.plane_distance_m)
+        return motion_information(source, target, T, self._model.config.verification)
 
 
 def _merged(submap: Submap) -> PreparedScan:

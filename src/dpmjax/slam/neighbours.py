@@ -11,12 +11,12 @@ import math
 import numpy as np
 
 from dpmjax.geometry import rigid
+from dpmjax.scans.plane_information import with_least_covariance
 from dpmjax.slam.alignment import Alignment
 from dpmjax.slam.config import SlamConfig
 from dpmjax.slam.keyframes import KeyframeMap, MapEdge, Pose, are_near, with_edges
 from dpmjax.slam.loop_consistency import shares_suffice
 from dpmjax.slam.methods import SlamMethods
-from dpmjax.slam.plane_information import with_least_covariance
 
 
 def join_neighbours(methods: SlamMethods, slam_map: KeyframeMap) -> KeyframeMap:

@@ -18,6 +18,7 @@ from dpmjax.deeppointmap.verification import MeasuredScan
 from dpmjax.geometry import rigid
 from dpmjax.geometry.host_tree import HostTree
 from dpmjax.scans.free_space import range_image, view_points
+from dpmjax.scans.plane_information import plane_information, with_least_covariance
 from dpmjax.scans.preprocess import first_of_each_voxel
 from dpmjax.scans.surface_alignment import AlignmentLevel, PlanePairs, align_surfaces_from, pair_with_planes
 from dpmjax.scans.surfaces import MIN_FLATNESS, Surface, SurfaceConfig, scan_surface
@@ -25,7 +26,6 @@ from dpmjax.slam.alignment import Alignment, PosePrior
 from dpmjax.slam.columns import Arrays
 from dpmjax.slam.config import OdometryConfig
 from dpmjax.slam.keyframes import Pose, orthonormal, turn_rad
-from dpmjax.slam.plane_information import plane_information, with_least_covariance
 
 MAX_LOCAL_POINTS = 4000
 """Points of the local map that are compared with the free space of a scan."""

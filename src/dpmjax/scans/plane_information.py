@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from jaxtyping import Float
 
 from dpmjax.scans.surface_alignment import PlanePairs
-from dpmjax.slam.keyframes import Pose, diagonal_information
 
-UNKNOWN_M, UNKNOWN_RAD = 10.0, 1.0
-"""A direction that no plane holds is known so well."""
+UNKNOWN = np.diag(np.repeat([10.0**-2, 1.0**-2], 3))
+"""Information without any plane: standard deviations of 10 m and 1 rad."""
 
 NUM_INDEPENDENT = 200
 """The pairs count as that many independent ones, for their residuals are correlated."""
@@ -17,7 +18,21 @@ NUM_INDEPENDENT = 200
 MIN_SIGMA_M = 0.01
 
 
-def plane_information(pairs: PlanePairs, T_target_source: Pose, *, max_residual_m: float) -> Float[np.ndarray, "6 6"]:
+class WeakDirection(NamedTuple):
+    """The direction in which a motion is known least.
+
+    Attributes:
+        direction: unit vector in the target frame, either sign.
+        sigma_m: standard deviation of the translation along it, metres.
+    """
+
+    direction: Float[np.ndarray, "3"]
+    sigma_m: float
+
+
+def plane_information(
+    pairs: PlanePairs, T_target_source: Float[np.ndarray, "4 4"], *, max_residual_m: float
+) -> Float[np.ndarray, "6 6"]:
     """Computes the normal equations of point-to-plane residuals.
 
     Args:
@@ -30,13 +45,29 @@ def plane_information(pairs: PlanePairs, T_target_source: Pose, *, max_residual_
     """
     is_used = np.abs(pairs.residuals) < max_residual_m
     if is_used.sum() < 6:
-        return diagonal_information(UNKNOWN_M, UNKNOWN_RAD)
+        return UNKNOWN.copy()
     normals = pairs.normals[is_used] @ T_target_source[:3, :3]
     points = (pairs.points[is_used] - T_target_source[:3, 3]) @ T_target_source[:3, :3]
     jacobian = np.concatenate([normals, np.cross(points, normals)], axis=1)
     variance = max(float(np.mean(pairs.residuals[is_used] ** 2)), MIN_SIGMA_M**2)
     system = NUM_INDEPENDENT / len(jacobian) / variance * jacobian.T @ jacobian
-    return np.asarray(system + diagonal_information(UNKNOWN_M, UNKNOWN_RAD))
+    return np.asarray(system + UNKNOWN)
+
+
+def weakest_direction(
+    information: Float[np.ndarray, "6 6"], T_target_source: Float[np.ndarray, "4 4"]
+) -> WeakDirection:
+    """Finds the direction in which the translation is known least, whatever the rotation is.
+
+    Args:
+        information: from `plane_information`.
+        T_target_source: the motion.
+
+    Returns:
+        The direction and the standard deviation along it.
+    """
+    variances, directions = np.linalg.eigh(np.linalg.inv(information)[:3, :3])
+    return WeakDirection(T_target_source[:3, :3] @ directions[:, 2], float(np.sqrt(variances[2])))
 
 
 def with_least_covariance(
