@@ -5,6 +5,7 @@ from .batches import register_pairs as register_pairs
 from .confidence import CLOUD_FEATURES as CLOUD_FEATURES
 from .confidence import OVERLAP_FEATURES as OVERLAP_FEATURES
 from .confidence import SCAN_FEATURES as SCAN_FEATURES
+from .confidence import WEAK_FEATURES as WEAK_FEATURES
 from .confidence import Calibration as Calibration
 from .confidence import Evidence as Evidence
 from .confidence import LogisticModel as LogisticModel

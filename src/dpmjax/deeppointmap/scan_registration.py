@@ -29,7 +29,7 @@ from dpmjax.deeppointmap.verification import (
     VerificationConfig,
     choose_motion,
     measure_scan,
-    motion_information,
+    planes_met,
     refine_motion,
 )
 from dpmjax.geometry.bearing import directions_of
@@ -325,7 +325,7 @@ def _verified(
     chosen = choose_motion(source, target, distinct_motions(hypotheses), config)
     final = refine_motion(source, target, chosen, config) if refine else chosen
     T = final.T_target_source
-    weak = weakest_direction(motion_information(source, target, T, config), T)
+    weak = weakest_direction(planes_met(source, target, T, config), T, max_residual_m=config.plane_distance_m)
     return _Motions(chosen.row, T, chosen.verification, final.verification, weak)
 
 

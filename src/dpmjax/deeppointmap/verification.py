@@ -17,10 +17,10 @@ from jaxtyping import Bool, Float
 from dpmjax.checks import require_fields
 from dpmjax.geometry import rigid
 from dpmjax.scans.free_space import RangeImage, RangeImageConfig, range_image, view_points
-from dpmjax.scans.plane_information import plane_information
 from dpmjax.scans.surface_alignment import (
     AlignmentConfig,
     AlignmentLevel,
+    PlanePairs,
     align_surfaces,
     align_surfaces_from,
     nearest_planes,
@@ -423,23 +423,22 @@ def refine_motion(
     return VerifiedMotion(motion.row, T, found._replace(**kept))
 
 
-def motion_information(
+def planes_met(
     source: MeasuredScan, target: MeasuredScan, T_target_source: Float[np.ndarray, "4 4"], config: VerificationConfig
-) -> Float[np.ndarray, "6 6"]:
-    """Computes how well the planes that meet hold a motion.
+) -> PlanePairs:
+    """Pairs samples of the source with the planes of the target, as the verification does.
 
     Args:
         source: a scan.
         target: the other.
         T_target_source: the motion.
-        config: tolerances.
+        config: number of samples and radius.
 
     Returns:
-        Inverse covariance in the tangent of the source, translation first.
+        The pairs, those with large residuals included.
     """
     level = AlignmentLevel(config.plane_radius_m, config.num_samples, 1)
-    pairs = pair_with_planes(source.surface, target.surface, T_target_source, level)
-    return plane_information(pairs, T_target_source, max_residual_m=config.plane_distance_m)
+    return pair_with_planes(source.surface, target.surface, T_target_source, level)
 
 
 def _is_apart(T: Float[np.ndarray, "s 4 4"], T_other: Float[np.ndarray, "4 4"]) -> Bool[np.ndarray, " s"]:

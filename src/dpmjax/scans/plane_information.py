@@ -16,6 +16,7 @@ NUM_INDEPENDENT = 200
 """The pairs count as that many independent ones, for their residuals are correlated."""
 
 MIN_SIGMA_M = 0.01
+MIN_FACING_COSINE = 0.25
 
 
 class WeakDirection(NamedTuple):
@@ -55,19 +56,30 @@ def plane_information(
 
 
 def weakest_direction(
-    information: Float[np.ndarray, "6 6"], T_target_source: Float[np.ndarray, "4 4"]
+    pairs: PlanePairs, T_target_source: Float[np.ndarray, "4 4"], *, max_residual_m: float
 ) -> WeakDirection:
     """Finds the direction in which the translation is known least, whatever the rotation is.
 
+    Normals across that direction have small components along it by noise alone, which tell nothing; they do not count.
+
     Args:
-        information: from `plane_information`.
+        pairs: under the motion.
         T_target_source: the motion.
+        max_residual_m: pairs with a larger residual meet no plane.
 
     Returns:
         The direction and the standard deviation along it.
     """
-    variances, directions = np.linalg.eigh(np.linalg.inv(information)[:3, :3])
-    return WeakDirection(T_target_source[:3, :3] @ directions[:, 2], float(np.sqrt(variances[2])))
+
+    def covariance_in_target(some: PlanePairs) -> Float[np.ndarray, "3 3"]:
+        inverse = np.linalg.inv(plane_information(some, T_target_source, max_residual_m=max_residual_m))
+        return T_target_source[:3, :3] @ inverse[:3, :3] @ T_target_source[:3, :3].T
+
+    direction = np.linalg.eigh(covariance_in_target(pairs))[1][:, 2]
+    along = pairs.normals @ direction
+    noise = np.where(np.abs(along) < MIN_FACING_COSINE, along, 0)
+    held = pairs._replace(normals=pairs.normals - noise[:, None] * direction)
+    return WeakDirection(direction, float(np.sqrt(direction @ covariance_in_target(held) @ direction)))
 
 
 def with_least_covariance(

@@ -17,8 +17,9 @@ from dpmjax.deeppointmap.encoding import encode
 from dpmjax.deeppointmap.matching import merge_clouds
 from dpmjax.deeppointmap.model import Model, model_fingerprint
 from dpmjax.deeppointmap.scan_registration import PreparedScan, register_each
-from dpmjax.deeppointmap.verification import MeasuredScan, motion_information, verify_motion
+from dpmjax.deeppointmap.verification import MeasuredScan, planes_met, verify_motion
 from dpmjax.scans.compact import CompactImage, CompactSurface
+from dpmjax.scans.plane_information import plane_information
 from dpmjax.scans.surface_alignment import align_surfaces
 from dpmjax.slam.alignment import Alignment
 from dpmjax.slam.columns import Arrays, from_columns, to_columns
@@ -252,7 +253,8 @@ class NetworkMatcher:
         return Match(T, float(found.confidence), float(found.rmse), found.verification, information)
 
     def _information(self, source: MeasuredScan, target: MeasuredScan, T: Pose) -> Float[np.ndarray, "6 6"]:
-        return motion_information(source, target, T, self._model.config.verification)
+        config = self._model.config.verification
+        return plane_information(planes_met(source, target, T, config), T, max_residual_m=config.plane_distance_m)
 
 
 def _merged(submap: Submap) -> PreparedScan:
