@@ -159,8 +159,8 @@ class Registration:
         scores: how well the two of a pair match, in [0, 1].
         is_inlier: True for pairs that the motion rests on.
         verification: how well the scans themselves agree; None where only descriptors were registered.
-        weak_direction: the direction in which the translation is known least, as a unit vector in the target frame; in
-            a corridor its axis. None where only descriptors were registered.
+        weak_direction: the horizontal direction in which the translation is known least, as a unit vector in the target
+            frame; in a corridor its axis. None where only descriptors were registered.
         weak_sigma_m: standard deviation of the translation along it, metres, by the planes that meet; None likewise.
     """
 

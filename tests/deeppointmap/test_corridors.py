@@ -17,10 +17,9 @@ from dpmjax.deeppointmap.verification import (
     VerifiedMotion,
     choose_motion,
     measure_scan,
-    planes_met,
     refine_motion,
+    weak_direction_of,
 )
-from dpmjax.scans.plane_information import weakest_direction
 from dpmjax.scans.weak_directions import facing_surface, sliding_motions, wall_axis, weak_share
 from tests.scans.surface_scenes import corridor, motion, seen_from
 
@@ -89,13 +88,13 @@ def test_the_weak_direction_is_the_axis_of_the_corridor(bare) -> None:
     assert weak_share(axes[0], axes[1]) < 0.1
     for axis, pose in zip(axes, POSES, strict=True):
         assert abs(axis.axis @ pose[:3, :3].T[:, 0]) > 0.999
-    weak = weakest_direction(planes_met(*bare, T_TRUE, CONFIG), T_TRUE, max_residual_m=CONFIG.plane_distance_m)
+    weak = weak_direction_of(*bare, T_TRUE, CONFIG)
     assert abs(weak.direction @ POSES[1][:3, :3].T[:, 0]) > 0.99
     assert weak.sigma_m > 1
 
 
 def test_elements_that_face_the_axis_make_the_shift_known(with_pillars) -> None:
-    weak = weakest_direction(planes_met(*with_pillars, T_TRUE, CONFIG), T_TRUE, max_residual_m=CONFIG.plane_distance_m)
+    weak = weak_direction_of(*with_pillars, T_TRUE, CONFIG)
     assert abs(weak.direction @ POSES[1][:3, :3].T[:, 0]) > 0.99
     assert 0 < weak.sigma_m < 0.2
 

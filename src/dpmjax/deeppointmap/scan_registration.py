@@ -29,12 +29,12 @@ from dpmjax.deeppointmap.verification import (
     VerificationConfig,
     choose_motion,
     measure_scan,
-    planes_met,
     refine_motion,
+    weak_direction_of,
 )
 from dpmjax.geometry.bearing import directions_of
 from dpmjax.scans.element_alignment import align_elements_on_host
-from dpmjax.scans.plane_information import WeakDirection, weakest_direction
+from dpmjax.scans.plane_information import WeakDirection
 from dpmjax.types import AnyArray, DescriptorCloud, PointCloud, Registration, Verification
 
 NUM_THREADS = 2
@@ -325,7 +325,7 @@ def _verified(
     chosen = choose_motion(source, target, distinct_motions(hypotheses), config)
     final = refine_motion(source, target, chosen, config) if refine else chosen
     T = final.T_target_source
-    weak = weakest_direction(planes_met(source, target, T, config), T, max_residual_m=config.plane_distance_m)
+    weak = weak_direction_of(source, target, T, config)
     return _Motions(chosen.row, T, chosen.verification, final.verification, weak)
 
 

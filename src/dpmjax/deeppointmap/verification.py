@@ -17,17 +17,17 @@ from jaxtyping import Bool, Float
 from dpmjax.checks import require_fields
 from dpmjax.geometry import rigid
 from dpmjax.scans.free_space import RangeImage, RangeImageConfig, range_image, view_points
+from dpmjax.scans.plane_information import WeakDirection, weakest_direction
 from dpmjax.scans.surface_alignment import (
     AlignmentConfig,
     AlignmentLevel,
-    PlanePairs,
     align_surfaces,
     align_surfaces_from,
     nearest_planes,
     pair_with_planes,
 )
 from dpmjax.scans.surfaces import Surface, SurfaceConfig, scan_surface
-from dpmjax.scans.view_correlation import ViewCorrelationConfig, correlate_views
+from dpmjax.scans.view_correlation import T_level_lidar, ViewCorrelationConfig, correlate_views
 from dpmjax.scans.weak_directions import WallAxis, facing_surface, sliding_motions, wall_axis, weak_share
 from dpmjax.types import Verification
 
@@ -423,22 +423,25 @@ def refine_motion(
     return VerifiedMotion(motion.row, T, found._replace(**kept))
 
 
-def planes_met(
+def weak_direction_of(
     source: MeasuredScan, target: MeasuredScan, T_target_source: Float[np.ndarray, "4 4"], config: VerificationConfig
-) -> PlanePairs:
-    """Pairs samples of the source with the planes of the target, as the verification does.
+) -> WeakDirection:
+    """Finds the horizontal direction in which a motion is known least, by all elements of the source that meet planes.
 
     Args:
         source: a scan.
         target: the other.
         T_target_source: the motion.
-        config: number of samples and radius.
+        config: tolerances.
 
     Returns:
-        The pairs, those with large residuals included.
+        The direction in the target frame, and the standard deviation of the translation along it.
     """
-    level = AlignmentLevel(config.plane_radius_m, config.num_samples, 1)
-    return pair_with_planes(source.surface, target.surface, T_target_source, level)
+    # The first samples are of all directions alike, which would hide that few elements face the weak one.
+    level = AlignmentLevel(config.plane_radius_m, max(1, len(source.surface.samples)), 1)
+    pairs = pair_with_planes(source.surface, target.surface, T_target_source, level)
+    up = T_level_lidar(target.surface)[2, :3]
+    return weakest_direction(pairs, T_target_source, up, max_residual_m=config.plane_distance_m)
 
 
 def _is_apart(T: Float[np.ndarray, "s 4 4"], T_other: Float[np.ndarray, "4 4"]) -> Bool[np.ndarray, " s"]:

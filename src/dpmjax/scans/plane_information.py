@@ -16,11 +16,11 @@ NUM_INDEPENDENT = 200
 """The pairs count as that many independent ones, for their residuals are correlated."""
 
 MIN_SIGMA_M = 0.01
-MIN_FACING_COSINE = 0.25
+MIN_FACING_COSINE = 0.6
 
 
 class WeakDirection(NamedTuple):
-    """The direction in which a motion is known least.
+    """The horizontal direction in which a motion is known least.
 
     Attributes:
         direction: unit vector in the target frame, either sign.
@@ -56,15 +56,20 @@ def plane_information(
 
 
 def weakest_direction(
-    pairs: PlanePairs, T_target_source: Float[np.ndarray, "4 4"], *, max_residual_m: float
+    pairs: PlanePairs,
+    T_target_source: Float[np.ndarray, "4 4"],
+    up: Float[np.ndarray, "3"],
+    *,
+    max_residual_m: float,
 ) -> WeakDirection:
-    """Finds the direction in which the translation is known least, whatever the rotation is.
+    """Finds the horizontal direction in which the translation is known least, whatever the rotation is.
 
     Normals across that direction have small components along it by noise alone, which tell nothing; they do not count.
 
     Args:
         pairs: under the motion.
         T_target_source: the motion.
+        up: unit vector in the target frame.
         max_residual_m: pairs with a larger residual meet no plane.
 
     Returns:
@@ -75,7 +80,8 @@ def weakest_direction(
         inverse = np.linalg.inv(plane_information(some, T_target_source, max_residual_m=max_residual_m))
         return T_target_source[:3, :3] @ inverse[:3, :3] @ T_target_source[:3, :3].T
 
-    direction = np.linalg.eigh(covariance_in_target(pairs))[1][:, 2]
+    horizontal = np.linalg.svd(up[None])[2][1:]
+    direction = np.linalg.eigh(horizontal @ covariance_in_target(pairs) @ horizontal.T)[1][:, 1] @ horizontal
     along = pairs.normals @ direction
     noise = np.where(np.abs(along) < MIN_FACING_COSINE, along, 0)
     held = pairs._replace(normals=pairs.normals - noise[:, None] * direction)

@@ -17,10 +17,10 @@ from dpmjax.deeppointmap.encoding import encode
 from dpmjax.deeppointmap.matching import merge_clouds
 from dpmjax.deeppointmap.model import Model, model_fingerprint
 from dpmjax.deeppointmap.scan_registration import PreparedScan, register_each
-from dpmjax.deeppointmap.verification import MeasuredScan, planes_met, verify_motion
+from dpmjax.deeppointmap.verification import MeasuredScan, verify_motion
 from dpmjax.scans.compact import CompactImage, CompactSurface
 from dpmjax.scans.plane_information import plane_information
-from dpmjax.scans.surface_alignment import align_surfaces
+from dpmjax.scans.surface_alignment import AlignmentLevel, align_surfaces, pair_with_planes
 from dpmjax.slam.alignment import Alignment
 from dpmjax.slam.columns import Arrays, from_columns, to_columns
 from dpmjax.slam.keyframes import Pose, Submap
@@ -254,7 +254,9 @@ class NetworkMatcher:
 
     def _information(self, source: MeasuredScan, target: MeasuredScan, T: Pose) -> Float[np.ndarray, "6 6"]:
         config = self._model.config.verification
-        return plane_information(planes_met(source, target, T, config), T, max_residual_m=config.plane_distance_m)
+        level = AlignmentLevel(config.plane_radius_m, config.num_samples, 1)
+        pairs = pair_with_planes(source.surface, target.surface, T, level)
+        return plane_information(pairs, T, max_residual_m=config.plane_distance_m)
 
 
 def _merged(submap: Submap) -> PreparedScan:
