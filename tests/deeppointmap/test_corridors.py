@@ -10,16 +10,8 @@ import pytest
 
 import dpmjax
 from dpmjax.deeppointmap.confidence import WEAK_FEATURES, logistic_probability
-from dpmjax.deeppointmap.verification import (
-    MeasuredScan,
-    SlidingConfig,
-    VerificationConfig,
-    VerifiedMotion,
-    choose_motion,
-    measure_scan,
-    refine_motion,
-    weak_direction_of,
-)
+from dpmjax.deeppointmap.motion_choice import VerifiedMotion, choose_motion, refine_motion, weak_direction_of
+from dpmjax.deeppointmap.verification import MeasuredScan, SlidingConfig, VerificationConfig, measure_scan
 from dpmjax.scans.weak_directions import facing_surface, sliding_motions, wall_axis, weak_share
 from tests.scans.surface_scenes import corridor, motion, seen_from
 

@@ -18,9 +18,10 @@ from jaxtyping import Float
 from dpmjax.deeppointmap.confidence import Evidence, calibrated_probability, gather_evidence
 from dpmjax.deeppointmap.encoding import encode
 from dpmjax.deeppointmap.model import Model
+from dpmjax.deeppointmap.motion_choice import choose_motion, refine_motion
 from dpmjax.deeppointmap.scan_pairs import ScanPair
 from dpmjax.deeppointmap.scan_registration import distinct_motions, match_clouds
-from dpmjax.deeppointmap.verification import choose_motion, measure_scan, refine_motion
+from dpmjax.deeppointmap.verification import measure_scan
 from dpmjax.metrics.poses import RegistrationRecall, registration_recall
 
 Seconds = float | Float[np.ndarray, " p"]

@@ -23,15 +23,9 @@ from dpmjax.deeppointmap.model import (
     encode_pyramid,
     predict_offsets,
 )
+from dpmjax.deeppointmap.motion_choice import choose_motion, refine_motion, weak_direction_of
 from dpmjax.deeppointmap.overlap_prediction import overlap_probability
-from dpmjax.deeppointmap.verification import (
-    MeasuredScan,
-    VerificationConfig,
-    choose_motion,
-    measure_scan,
-    refine_motion,
-    weak_direction_of,
-)
+from dpmjax.deeppointmap.verification import MeasuredScan, VerificationConfig, measure_scan
 from dpmjax.geometry.bearing import directions_of
 from dpmjax.scans.element_alignment import align_elements_on_host
 from dpmjax.scans.plane_information import WeakDirection
