@@ -171,6 +171,8 @@ def fit(rows: list[dict[str, Any]]) -> tuple[Any, dict[str, Any], dict[str, np.n
             for features, is_right in zip(row[kind], row[label], strict=True)
             if features is not None
         ]
+        if kind == "of_weak_scans" and len({is_right for _, _, is_right in pairs}) < 2:
+            continue
         place, features, is_right = (np.array(column) for column in zip(*pairs, strict=True))
         models[kind] = fit_logistic(names, features, is_right)
         confidence = held_out_probability(names, features, is_right, place)

@@ -62,8 +62,8 @@ def choose_motion(
 ) -> VerifiedMotion:
     """Chooses the hypothesis under which two scans agree best.
 
-    Where the walls of both hold one direction only, motions along the other are tried too, both ways round, and the
-    motion is taken under which most elements that face this direction meet.
+    The walls of a corridor hold one horizontal direction only. There, motions along its axis are tried too, both ways
+    round, and the elements that face the axis choose.
 
     Args:
         source: a scan.
@@ -226,7 +226,7 @@ def weak_direction_of(
 
 
 def _is_apart(T: Float[np.ndarray, "s 4 4"], T_other: Float[np.ndarray, "4 4"]) -> Bool[np.ndarray, " s"]:
-    """Whether motions differ from another: near-equal ones do not compete."""
+    """Finds the motions that differ from another one: near-equal ones do not compete."""
     difference = rigid.inverse(T_other) @ T
     cosine = (np.trace(difference[:, :3, :3], axis1=1, axis2=2) - 1) / 2
     return (np.linalg.norm(difference[:, :3, 3], axis=1) > DISTINCT_M) | (cosine < np.cos(DISTINCT_RAD))

@@ -80,7 +80,7 @@ def weak_share(source: WallAxis, target: WallAxis) -> float:
 
     Args:
         source: axis of a scan.
-        target: of the other.
+        target: axis of the other scan.
 
     Returns:
         In [0, 0.5]: 0 for bare parallel walls, 0.5 where all directions are held alike, or a scan has no walls.
@@ -96,7 +96,7 @@ def sliding_motions(source: WallAxis, target: WallAxis, step_m: float) -> Float[
 
     Args:
         source: axis of a scan.
-        target: of the other.
+        target: axis of the other scan.
         step_m: length of a step; the motions reach as far as the scans, up to 25 m.
 
     Returns:
