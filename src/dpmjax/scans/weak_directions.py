@@ -13,6 +13,7 @@ from jaxtyping import Float
 from scipy.ndimage import gaussian_filter1d
 
 from dpmjax.geometry import rigid
+from dpmjax.scans.preprocess import first_of_each_voxel
 from dpmjax.scans.surfaces import MIN_FLATNESS, Surface
 from dpmjax.scans.view_correlation import STEEP_COSINE, T_level_lidar, planar_motion
 
@@ -63,7 +64,7 @@ def wall_axis(surface: Surface) -> WallAxis:
     normals = surface.normals @ T[:3, :3].T
     is_wall = (surface.flatness > MIN_FLATNESS) & (np.abs(normals[:, 2]) < STEEP_COSINE)
     points, normals = (surface.points[is_wall] @ T[:3, :3].T)[:, :2], normals[is_wall, :2]
-    rows = np.unique(np.floor(surface.points[is_wall] / VOXEL_M), axis=0, return_index=True)[1]
+    rows = first_of_each_voxel(surface.points[is_wall], VOXEL_M)
     points, normals = points[rows], normals[rows]
     information, axes = np.linalg.eigh(normals.T @ normals)
     along, across = axes[:, 0], np.array([-axes[1, 0], axes[0, 0]])
