@@ -29,6 +29,9 @@ from dpmjax.io import LidarSequence
 EXPERIMENT = "dpm_calibrate"
 MODEL = "model.safetensors"
 OVERLAP_LABELS = ("overlap probability", "share of overlapping pairs")
+TOWN_BANDS = ("near", "middle", "far")
+# The two ends of a corridor may look alike: no evidence tells a pair without overlap from a right one.
+CORRIDOR_BANDS = ("near", "middle")
 KINDS = ("of_clouds", "of_scans", "of_weak_scans")
 # Far from the seeds of the towns of training, also of its held-out one.
 FIRST_TOWN, FIRST_CORRIDOR, FIRST_OVERLAP_TOWN = 3_000_000, 3_100_000, 3_500_000
@@ -47,7 +50,7 @@ class Config(RunOptions):
     town_length_m: Annotated[float, arg(metavar="M")] = 400.0
     """Length of the drive through each town."""
     corridors: Annotated[int, arg(metavar="N")] = 8
-    """Number of corridors with a lidar of 16 beams, with as many pairs each."""
+    """Number of corridors with a lidar of 16 beams, each with as many pairs of the first two kinds."""
     overlap_towns: Annotated[int, arg(metavar="N")] = 24
     """Number of towns for overlap."""
     overlap_pairs: Annotated[int, arg(metavar="N")] = 96
@@ -61,7 +64,6 @@ class Config(RunOptions):
 def main(config: Config) -> dict[str, Any]:
     """Registers and compares the pairs, fits, and writes the model."""
     from dpmjax import load_model, save_model, viz
-    from dpmjax.deeppointmap import DISTANCE_BANDS_M
     from dpmjax.simulation import SceneMixture
     from dpmjax.weights import read_card
     from experiments import _dpm_overlap
@@ -69,8 +71,8 @@ def main(config: Config) -> dict[str, Any]:
     model = load_model(config.model)
     folder = open_run_folder(config, EXPERIMENT)
     rows, overlap_rows = [], []
-    num_places = config.towns + config.corridors
-    total = num_places * len(DISTANCE_BANDS_M) * config.pairs + config.overlap_towns * config.overlap_pairs
+    num_registered = (config.towns * len(TOWN_BANDS) + config.corridors * len(CORRIDOR_BANDS)) * config.pairs
+    total = num_registered + config.overlap_towns * config.overlap_pairs
     with recording(folder), tqdm(total=total, unit=" pairs") as bar:
         kinds = [kind for kind, _ in SceneMixture().kinds]
         for number in range(config.towns):
@@ -112,7 +114,8 @@ def main(config: Config) -> dict[str, Any]:
 def _town(config: Config, model: Any, *, town: int, kind: str, bar: tqdm) -> dict[str, Any]:
     from dpmjax.simulation import simulate_drive
 
-    return _registrations(config, model, simulate_drive(town, length_m=config.town_length_m, kind=kind), bar)
+    drive = simulate_drive(town, length_m=config.town_length_m, kind=kind)
+    return _registrations(config, model, drive, TOWN_BANDS, bar)
 
 
 def _corridor(config: Config, model: Any, *, corridor: int, bar: tqdm) -> dict[str, Any]:
@@ -121,15 +124,17 @@ def _corridor(config: Config, model: Any, *, corridor: int, bar: tqdm) -> dict[s
     mixture = SceneMixture(
         kinds=(("corridor", 1.0),), sensors=((VLP16, 1.0),), indoor_scale=(1.0, 1.0), length_m=config.town_length_m
     )
-    return _registrations(config, model, simulate_scenes([corridor], mixture)[0], bar)
+    return _registrations(config, model, simulate_scenes([corridor], mixture)[0], CORRIDOR_BANDS, bar)
 
 
-def _registrations(config: Config, model: Any, drive: LidarSequence, bar: tqdm) -> dict[str, Any]:
-    from dpmjax.deeppointmap import DISTANCE_BANDS_M, draw_scan_pairs, read_scan_pairs, register_in_stages
+def _registrations(
+    config: Config, model: Any, drive: LidarSequence, bands: tuple[str, ...], bar: tqdm
+) -> dict[str, Any]:
+    from dpmjax.deeppointmap import draw_scan_pairs, read_scan_pairs, register_in_stages
     from dpmjax.metrics import registration_recall
 
     found: dict[str, list[Any]] = {name: [] for name in (*KINDS, "is_right_of_clouds", "is_right")}
-    for band in DISTANCE_BANDS_M:
+    for band in bands:
         drawn = draw_scan_pairs(drive, band, config.pairs, seed=config.seed)
         for pair in read_scan_pairs(drive, drawn, seed=config.seed):
             result = register_in_stages(model, pair)
