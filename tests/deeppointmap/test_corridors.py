@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import dpmjax
-from dpmjax.deeppointmap.confidence import WEAK_FEATURES, logistic_probability
+from dpmjax.deeppointmap.confidence import logistic_probability, weak_features
 from dpmjax.deeppointmap.motion_choice import VerifiedMotion, choose_motion, refine_motion, weak_direction_of
 from dpmjax.deeppointmap.verification import MeasuredScan, SlidingConfig, VerificationConfig, measure_scan
 from dpmjax.scans.weak_directions import facing_surface, sliding_motions, wall_axis, weak_share
@@ -43,8 +43,7 @@ def confidence(found: VerifiedMotion) -> float:
     calibration = dpmjax.load_model("dpm_small").config.calibration
     assert calibration is not None
     assert calibration.of_weak_scans is not None
-    features = np.array([getattr(found.verification, name) for name in WEAK_FEATURES])
-    return float(logistic_probability(calibration.of_weak_scans, features))
+    return float(logistic_probability(calibration.of_weak_scans, weak_features(found.verification)))
 
 
 def along_the_corridor(distance_m: float, turn_deg: float = 0.0) -> np.ndarray:

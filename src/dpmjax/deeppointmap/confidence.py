@@ -19,7 +19,7 @@ from dpmjax.types import Registration, Verification
 
 CLOUD_FEATURES = ("support", "mean_score", "rmse_m", "support_gap")
 SCAN_FEATURES = (*CLOUD_FEATURES, "visible_share", "matched_share", "contradicted_share", "score", "score_gap")
-WEAK_FEATURES = ("score", "facing_gap")
+WEAK_FEATURES = ("score_capped", "facing_gap_root")
 OVERLAP_FEATURES = (
     "scan_similarity",
     "similarity_median",
@@ -41,6 +41,8 @@ OVERLAP_FEATURES = (
 """`deeppointmap.overlap_prediction` computes them."""
 
 MAX_RMSE_M = 5.0
+MAX_SCORE = 3.0
+"""Higher log odds tell nothing more where walls hold one direction only: wrong motions have them, too."""
 RIDGE = 1e-3
 
 
@@ -115,10 +117,20 @@ def gather_evidence(hypotheses: Registration, row: int | None, verification: Ver
     if verification is None:
         return Evidence(of_clouds, None)
     of_scans = verification[: verification._fields.index("num_tried")]
-    of_weak_scans = np.array([getattr(verification, name) for name in WEAK_FEATURES])
-    return Evidence(
-        of_clouds, np.concatenate([of_clouds, of_scans]), of_weak_scans if verification.num_slid > 0 else None
-    )
+    of_weak_scans = weak_features(verification) if verification.num_slid > 0 else None
+    return Evidence(of_clouds, np.concatenate([of_clouds, of_scans]), of_weak_scans)
+
+
+def weak_features(verification: Verification) -> Float[np.ndarray, "2"]:
+    """Computes `WEAK_FEATURES`; the noise of a count grows with its root.
+
+    Args:
+        verification: of a motion whose walls hold one direction only.
+
+    Returns:
+        The features.
+    """
+    return np.array([min(verification.score, MAX_SCORE), np.sqrt(max(verification.facing_gap, 0.0))])
 
 
 def calibrated_probability(calibration: Calibration, evidence: Evidence) -> float:
