@@ -12,7 +12,7 @@ import dpmjax
 from dpmjax.deeppointmap.confidence import logistic_probability, weak_features
 from dpmjax.deeppointmap.motion_choice import VerifiedMotion, choose_motion, refine_motion, weak_direction_of
 from dpmjax.deeppointmap.verification import MeasuredScan, SlidingConfig, VerificationConfig, measure_scan
-from dpmjax.scans.weak_directions import facing_surface, sliding_motions, wall_axis, weak_share
+from dpmjax.scans.weak_directions import facing_surface, facing_weights, sliding_motions, wall_axis, weak_share
 from tests.scans.surface_scenes import corridor, motion, seen_from
 
 CONFIG = VerificationConfig()
@@ -124,6 +124,17 @@ def test_only_elements_that_face_the_axis_are_compared(with_pillars) -> None:
     at_pillars = (surface.points[facing.samples] @ POSES[0][:3, :3].T + POSES[0][:3, 3])[:, 0]
     distances = np.abs(at_pillars[:, None] - np.array([*PILLARS_M, *(x + 0.6 for x in PILLARS_M)])).min(axis=1)
     assert np.median(distances) < 0.1
+
+
+def test_an_end_wall_counts_as_one_position(with_pillars) -> None:
+    axis = POSES[0][:3, :3].T[:, 0]
+    facing = facing_surface(with_pillars[0].surface, axis)
+    weights = facing_weights(facing, axis, 10.0)
+    positions = np.floor(facing.points[facing.samples] @ axis / 0.5)
+    for position in np.unique(positions):
+        at = positions == position
+        assert weights[at].sum() == pytest.approx(min(at.sum(), 10.0))
+    np.testing.assert_array_equal(facing_weights(facing, axis, np.inf), 1)
 
 
 def test_scans_without_walls_have_no_weak_axis() -> None:

@@ -30,7 +30,14 @@ from dpmjax.scans.surface_alignment import (
     pair_with_planes,
 )
 from dpmjax.scans.view_correlation import T_level_lidar, correlate_views
-from dpmjax.scans.weak_directions import WallAxis, facing_surface, sliding_motions, wall_axis, weak_share
+from dpmjax.scans.weak_directions import (
+    WallAxis,
+    facing_surface,
+    facing_weights,
+    sliding_motions,
+    wall_axis,
+    weak_share,
+)
 from dpmjax.types import Verification
 
 HYPOTHESES_AT_ONCE = 4
@@ -148,10 +155,9 @@ def _facing_elements(
         compare_scans(second, scans[0], rigid.inverse(T_target_source), settings),
     )
     counts = [
-        side.meets.sum(axis=1)
-        - sliding.contradicted * side.is_contradicted.sum(axis=1)
-        - sliding.visible * side.is_visible.sum(axis=1)
-        for side in sides
+        (side.meets - sliding.contradicted * side.is_contradicted - sliding.visible * side.is_visible)
+        @ facing_weights(scan.surface, axis.axis, sliding.max_count)[: sliding.num_samples]
+        for side, scan, axis in zip(sides, (first, second), axes, strict=True)
     ]
     return np.mean(counts, axis=0)
 

@@ -73,6 +73,8 @@ class SlidingConfig:
         step_m: distance of the motions that are tried.
         num_fine: number of them that are aligned finely.
         num_samples: number of elements of each scan that face the axis and are compared.
+        max_count: number of elements that count at most at one position along the axis, so that an end wall is one
+            observation; the two ends of a corridor may look alike.
         contradicted: an element that faces the axis and lies in free space counts against a motion as so many that
             meet count for it.
         visible: the same of an element that the other scan sees.
@@ -82,12 +84,13 @@ class SlidingConfig:
     step_m: float = 0.7
     num_fine: int = 32
     num_samples: int = 4000
+    max_count: float = 10.0
     contradicted: float = 3.0
     visible: float = 0.2
 
     def __post_init__(self) -> None:
         require_fields(self, "max_weak_share", "contradicted", "visible", low=0)
-        require_fields(self, "step_m", low=1e-9)
+        require_fields(self, "step_m", "max_count", low=1e-9)
         require_fields(self, "num_fine", "num_samples", low=1)
 
 

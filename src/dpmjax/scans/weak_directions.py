@@ -25,6 +25,9 @@ PARALLEL_COSINE, FACING_COSINE = 0.9, 0.6
 Elements face the axis if the cosine between their normal and the axis is larger."""
 
 BIN_M, NUM_BINS, MAX_COUNT = 0.2, 301, 20.0
+POSITION_M = 0.5
+"""Elements nearer to each other along the axis have one position."""
+
 EXTENT_PERCENT, MAX_REACH_M = 90.0, 25.0
 
 
@@ -126,3 +129,19 @@ def facing_surface(surface: Surface, axis: Float[np.ndarray, "3"]) -> Surface:
     """
     is_facing = np.abs(surface.normals[surface.samples] @ axis) > FACING_COSINE
     return surface._replace(samples=surface.samples[is_facing])
+
+
+def facing_weights(surface: Surface, axis: Float[np.ndarray, "3"], max_count: float) -> Float[np.ndarray, " s"]:
+    """Weighs samples so that those at one position along an axis count up to a limit together.
+
+    Args:
+        surface: from `facing_surface`.
+        axis: unit vector in the frame of the lidar.
+        max_count: largest sum of the weights at one position.
+
+    Returns:
+        A weight in (0, 1] for each sample.
+    """
+    positions = np.floor(surface.points[surface.samples] @ axis / POSITION_M)
+    _, position, counts = np.unique(positions, return_inverse=True, return_counts=True)
+    return np.minimum(1.0, max_count / counts[position])
