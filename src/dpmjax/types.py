@@ -127,6 +127,9 @@ class Verification(NamedTuple):
             scan sees.
         gap: how much more it is than the score of the best other hypothesis that was tried, or than 0.
         num_tried: number of hypotheses that were tried.
+        num_slid: number of further motions along a weak axis; 0 where the walls hold all directions.
+        facing_gap: how many more elements that face the weak axis meet and do not contradict than under the best other
+            motion that was tried; 0 where no axis is weak.
     """
 
     visible_share: float
@@ -135,6 +138,8 @@ class Verification(NamedTuple):
     score: float
     gap: float = 0.0
     num_tried: int = 1
+    num_slid: int = 0
+    facing_gap: float = 0.0
 
 
 @flax.struct.dataclass
@@ -154,6 +159,9 @@ class Registration:
         scores: how well the two of a pair match, in [0, 1].
         is_inlier: True for pairs that the motion rests on.
         verification: how well the scans themselves agree; None where only descriptors were registered.
+        weak_direction: the horizontal direction in which the translation is known least, as a unit vector in the target
+            frame; in a corridor its axis. None where only descriptors were registered.
+        weak_sigma_m: standard deviation of the translation along it, metres, by the planes that meet; None likewise.
     """
 
     T_target_source: Float[Array, "4 4"]
@@ -167,6 +175,8 @@ class Registration:
     scores: Float[Array, " p"]
     is_inlier: Bool[Array, " p"]
     verification: Verification | None = None
+    weak_direction: Float[Array, "3"] | None = None
+    weak_sigma_m: Float[Array, ""] | None = None
 
 
 @flax.struct.dataclass

@@ -8,7 +8,8 @@ import numpy as np
 from dpmjax.deeppointmap import init_model, model_preset
 from dpmjax.deeppointmap.compact_scans import compact_scan, expand_scan
 from dpmjax.deeppointmap.model import model_fingerprint
-from dpmjax.deeppointmap.verification import VerificationConfig, choose_motion, measure_scan, refine_motion
+from dpmjax.deeppointmap.motion_choice import choose_motion, refine_motion
+from dpmjax.deeppointmap.verification import VerificationConfig, measure_scan
 from dpmjax.geometry import rigid
 from dpmjax.geometry.bearing import directions_of
 from dpmjax.types import DescriptorCloud

@@ -5,13 +5,12 @@ from dataclasses import astuple, replace
 import numpy as np
 import pytest
 
+from dpmjax.deeppointmap.motion_choice import VerifiedMotion, choose_motion, refine_motion
 from dpmjax.deeppointmap.verification import (
+    SlidingConfig,
     VerificationConfig,
-    VerifiedMotion,
-    choose_motion,
     evidence_shares,
     measure_scan,
-    refine_motion,
     verify_motion,
     verify_motions,
 )
@@ -100,7 +99,7 @@ def test_the_scans_find_the_motion_that_no_hypothesis_names(scans) -> None:
     found = choose_motion(*scans, (T_TRUE @ motion(90, (9, 0, 0)))[None], CONFIG)
     assert found.row is None
     assert translation_error(found.T_target_source) < 0.1
-    without = replace(CONFIG, views=replace(CONFIG.views, num_motions=0))
+    without = replace(CONFIG, views=replace(CONFIG.views, num_motions=0), sliding=SlidingConfig(max_weak_share=0))
     found = choose_motion(*scans, (T_TRUE @ motion(90, (9, 0, 0)))[None], without)
     assert found.row == 0
     assert found.verification.num_tried == 1
@@ -108,7 +107,7 @@ def test_the_scans_find_the_motion_that_no_hypothesis_names(scans) -> None:
 
 def test_near_equal_hypotheses_do_not_compete(scans) -> None:
     hypotheses = np.stack([T_TRUE @ motion(angle, (0, 0, 0)) for angle in (0, 1, -1, 2)])
-    found = choose_motion(*scans, hypotheses, CONFIG)
+    found = choose_motion(*scans, hypotheses, replace(CONFIG, sliding=SlidingConfig(max_weak_share=0)))
     assert found.verification.gap == found.verification.score
 
 

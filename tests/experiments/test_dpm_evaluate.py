@@ -12,7 +12,7 @@ from dpmjax import deeppointmap, simulation
 from dpmjax.cli import drive_sources, evaluation_rows
 from dpmjax.cli.command import EXIT_BAD_INPUT, EXIT_OK, run_command
 from dpmjax.cli.result_files import load_json
-from dpmjax.deeppointmap import OVERLAP_FEATURES, SCAN_FEATURES, Evidence
+from dpmjax.deeppointmap import OVERLAP_FEATURES, SCAN_FEATURES, WEAK_FEATURES, Evidence
 from dpmjax.deeppointmap.scan_evaluation import StagedRegistration, StageSeconds
 from experiments import _dpm_overlap, dpm_calibrate, dpm_evaluate
 from tests.deeppointmap import toy
@@ -76,6 +76,7 @@ def test_calibration_is_stored_in_a_copy_of_the_model(weights, tmp_path, monkeyp
         return toy.drive(seed)
 
     monkeypatch.setattr(simulation, "simulate_drive", simulate_drive)
+    monkeypatch.setattr(simulation, "simulate_scenes", lambda seeds, mixture: [toy.drive(seed) for seed in seeds])
     rng = np.random.default_rng(0)
 
     def found(model, pair):
@@ -84,18 +85,21 @@ def test_calibration_is_stored_in_a_copy_of_the_model(weights, tmp_path, monkeyp
         T = pair.T_target_source if is_right else np.eye(4)
         of_clouds = rng.normal(size=4) + is_right
         evidence = Evidence(
-            of_clouds, np.concatenate([of_clouds, rng.normal(size=len(SCAN_FEATURES) - 4) + 2 * is_right])
+            of_clouds,
+            np.concatenate([of_clouds, rng.normal(size=len(SCAN_FEATURES) - 4) + 2 * is_right]),
+            rng.normal(size=len(WEAK_FEATURES)) + 2 * is_right if rng.uniform() < 0.5 else None,
         )
         return StagedRegistration(T, T, T, evidence, StageSeconds(*[0.0] * 5))
 
     monkeypatch.setattr(deeppointmap, "register_in_stages", found)
-    sizes = ["--towns", 3, "--pairs", 20, "--overlap-towns", 2, "--overlap-pairs", 16]
+    sizes = ["--towns", 3, "--pairs", 20, "--corridors", 2, "--overlap-towns", 2, "--overlap-pairs", 16]
     assert run(dpm_calibrate, [weights, *sizes, "-o", tmp_path / "out"]) == EXIT_OK
     assert len(set(kinds[:3])) == 3  # of towns for confidence; those for overlap are of any kind
     assert set(kinds[3:]) == {None}
     model = dpmjax.load_model(tmp_path / "out" / "model.safetensors")
     assert model.config.calibration is not None
     assert max(model.config.calibration.of_scans.weights[4:]) > 0
+    assert min(model.config.calibration.of_weak_scans.weights) > 0
     metrics = load_json(tmp_path / "out" / "metrics.json")
     assert metrics["brier_of_scans"] < metrics["brier_of_clouds"] < metrics["brier_of_a_constant_of_clouds"]
     assert model.config.overlap is not None
@@ -103,7 +107,7 @@ def test_calibration_is_stored_in_a_copy_of_the_model(weights, tmp_path, monkeyp
     assert 0 <= metrics["auc_overlap"] <= 1
     assert (tmp_path / "out" / "reliability_overlap.png").stat().st_size > 0
     assert (
-        "Confidence calibrated on 3 towns, 180 pairs; overlap fitted on 2 towns, 32 pairs"
+        "Confidence calibrated on 3 towns, 180 pairs, and 2 corridors; overlap fitted on 2 towns, 32 pairs"
         in dpmjax.weights.read_card(tmp_path / "out" / "model.safetensors")
     )
 

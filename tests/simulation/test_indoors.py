@@ -7,7 +7,7 @@ import pytest
 from dpmjax.simulation import BuildingConfig, LidarSensor, WalkConfig, make_building, scan_town, walk
 
 SENSOR = LidarSensor("test", tuple(np.linspace(20.0, -20.0, 16)), 360, min_range_m=0.2, drop_rate=0.0, mixed_rate=0.0)
-KINDS = ("office", "hall", "flat")
+KINDS = ("office", "hall", "flat", "corridor")
 
 
 @pytest.fixture(scope="module", params=KINDS)

@@ -7,6 +7,7 @@ import pytest
 
 from dpmjax.geometry import rigid
 from dpmjax.metrics import absolute_trajectory_error
+from dpmjax.scans.plane_information import plane_information, with_least_covariance
 from dpmjax.scans.surface_alignment import PlanePairs
 from dpmjax.slam import KeyframeMap, LoopClosureConfig
 from dpmjax.slam.keyframes import Keyframe, MapEdge, add_keyframe, diagonal_information, submap_around
@@ -14,7 +15,6 @@ from dpmjax.slam.loop_candidates import find_candidates
 from dpmjax.slam.loop_consistency import are_consistent
 from dpmjax.slam.loop_state import LoopState
 from dpmjax.slam.map_optimization import optimize_map
-from dpmjax.slam.plane_information import plane_information, with_least_covariance
 from dpmjax.slam.reports import Loop
 from dpmjax.slam.retrieval import most_similar, pooled_vector
 from dpmjax.types import DescriptorCloud

@@ -5,6 +5,7 @@ from .batches import register_pairs as register_pairs
 from .confidence import CLOUD_FEATURES as CLOUD_FEATURES
 from .confidence import OVERLAP_FEATURES as OVERLAP_FEATURES
 from .confidence import SCAN_FEATURES as SCAN_FEATURES
+from .confidence import WEAK_FEATURES as WEAK_FEATURES
 from .confidence import Calibration as Calibration
 from .confidence import Evidence as Evidence
 from .confidence import LogisticModel as LogisticModel
@@ -34,6 +35,9 @@ from .model import encode_pyramid as encode_pyramid
 from .model import init_model as init_model
 from .model_config import ModelConfig as ModelConfig
 from .model_config import model_preset as model_preset
+from .motion_choice import VerifiedMotion as VerifiedMotion
+from .motion_choice import choose_motion as choose_motion
+from .motion_choice import refine_motion as refine_motion
 from .objective import ObjectiveConfig as ObjectiveConfig
 from .offset_evaluation import OffsetQuality as OffsetQuality
 from .offset_evaluation import offset_quality as offset_quality
@@ -82,8 +86,5 @@ from .training_records import begin_training as begin_training
 from .verification import EvidenceWeights as EvidenceWeights
 from .verification import MeasuredScan as MeasuredScan
 from .verification import VerificationConfig as VerificationConfig
-from .verification import VerifiedMotion as VerifiedMotion
-from .verification import choose_motion as choose_motion
 from .verification import evidence_shares as evidence_shares
 from .verification import measure_scan as measure_scan
-from .verification import refine_motion as refine_motion

@@ -19,6 +19,7 @@ from dpmjax.types import Registration, Verification
 
 CLOUD_FEATURES = ("support", "mean_score", "rmse_m", "support_gap")
 SCAN_FEATURES = (*CLOUD_FEATURES, "visible_share", "matched_share", "contradicted_share", "score", "score_gap")
+WEAK_FEATURES = ("score_capped", "facing_gap_root")
 OVERLAP_FEATURES = (
     "scan_similarity",
     "similarity_median",
@@ -40,6 +41,8 @@ OVERLAP_FEATURES = (
 """`deeppointmap.overlap_prediction` computes them."""
 
 MAX_RMSE_M = 5.0
+MAX_SCORE = 3.0
+"""Higher log odds tell nothing more where walls hold one direction only: wrong motions have them, too."""
 RIDGE = 1e-3
 
 
@@ -60,7 +63,7 @@ class LogisticModel:
     def __post_init__(self) -> None:
         if len(self.features) != len(self.weights):
             raise ValueError(f"weights: expected {len(self.features)}, one for each feature, got {len(self.weights)}")
-        if self.features not in (CLOUD_FEATURES, SCAN_FEATURES, OVERLAP_FEATURES):
+        if self.features not in (CLOUD_FEATURES, SCAN_FEATURES, WEAK_FEATURES, OVERLAP_FEATURES):
             raise ValueError(f"features: expected those that this version computes, got {', '.join(self.features)}")
 
 
@@ -71,10 +74,12 @@ class Calibration:
     Attributes:
         of_clouds: of registrations of descriptor clouds.
         of_scans: of registrations that the scans have verified.
+        of_weak_scans: of those whose walls hold one direction only, as in corridors; None rates them as the others.
     """
 
     of_clouds: LogisticModel
     of_scans: LogisticModel
+    of_weak_scans: LogisticModel | None = None
 
 
 class Evidence(NamedTuple):
@@ -83,10 +88,12 @@ class Evidence(NamedTuple):
     Attributes:
         of_clouds: `CLOUD_FEATURES`.
         of_scans: `SCAN_FEATURES`; None without scans.
+        of_weak_scans: `WEAK_FEATURES`; None where the walls hold all directions, and without scans.
     """
 
     of_clouds: Float[np.ndarray, " f"]
     of_scans: Float[np.ndarray, " g"] | None
+    of_weak_scans: Float[np.ndarray, " w"] | None = None
 
 
 def gather_evidence(hypotheses: Registration, row: int | None, verification: Verification | None) -> Evidence:
@@ -110,7 +117,37 @@ def gather_evidence(hypotheses: Registration, row: int | None, verification: Ver
     if verification is None:
         return Evidence(of_clouds, None)
     of_scans = verification[: verification._fields.index("num_tried")]
-    return Evidence(of_clouds, np.concatenate([of_clouds, of_scans]))
+    of_weak_scans = weak_features(verification) if verification.num_slid > 0 else None
+    return Evidence(of_clouds, np.concatenate([of_clouds, of_scans]), of_weak_scans)
+
+
+def weak_features(verification: Verification) -> Float[np.ndarray, "2"]:
+    """Computes `WEAK_FEATURES`; the noise of a count grows with its root.
+
+    Args:
+        verification: of a motion whose walls hold one direction only.
+
+    Returns:
+        The features.
+    """
+    return np.array([min(verification.score, MAX_SCORE), np.sqrt(max(verification.facing_gap, 0.0))])
+
+
+def calibrated_probability(calibration: Calibration, evidence: Evidence) -> float:
+    """Computes the probability that a registration is right by the model for what it rests on.
+
+    Args:
+        calibration: fitted models.
+        evidence: features of the registration.
+
+    Returns:
+        In [0, 1].
+    """
+    if evidence.of_weak_scans is not None and calibration.of_weak_scans is not None:
+        return float(logistic_probability(calibration.of_weak_scans, evidence.of_weak_scans))
+    if evidence.of_scans is not None:
+        return float(logistic_probability(calibration.of_scans, evidence.of_scans))
+    return float(logistic_probability(calibration.of_clouds, evidence.of_clouds))
 
 
 def logistic_probability(model: LogisticModel, features: Float[np.ndarray, "*n f"]) -> Float[np.ndarray, "*n"]:
@@ -193,7 +230,4 @@ def with_confidence(match: Registration, evidence: Evidence, calibration: Calibr
     is_empty = int(match.num_inliers) == 0 and (verified is None or verified.matched_share == 0)
     if calibration is None or is_empty:
         return match
-    features, model = evidence.of_scans, calibration.of_scans
-    if features is None:
-        features, model = evidence.of_clouds, calibration.of_clouds
-    return replace(match, confidence=jax.numpy.float32(logistic_probability(model, features)))
+    return replace(match, confidence=jax.numpy.float32(calibrated_probability(calibration, evidence)))

@@ -15,12 +15,13 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from dpmjax.deeppointmap.confidence import Evidence, gather_evidence, logistic_probability
+from dpmjax.deeppointmap.confidence import Evidence, calibrated_probability, gather_evidence
 from dpmjax.deeppointmap.encoding import encode
 from dpmjax.deeppointmap.model import Model
+from dpmjax.deeppointmap.motion_choice import choose_motion, refine_motion
 from dpmjax.deeppointmap.scan_pairs import ScanPair
 from dpmjax.deeppointmap.scan_registration import distinct_motions, match_clouds
-from dpmjax.deeppointmap.verification import choose_motion, measure_scan, refine_motion
+from dpmjax.deeppointmap.verification import measure_scan
 from dpmjax.metrics.poses import RegistrationRecall, registration_recall
 
 Seconds = float | Float[np.ndarray, " p"]
@@ -159,7 +160,7 @@ def _confidence(model: Model, evidence: Evidence) -> float:
     calibration = model.config.calibration
     if calibration is None or evidence.of_scans is None:
         return float(evidence.of_clouds[1])
-    return float(logistic_probability(calibration.of_scans, evidence.of_scans))
+    return calibrated_probability(calibration, evidence)
 
 
 class _Clock:

@@ -23,16 +23,12 @@ from dpmjax.deeppointmap.model import (
     encode_pyramid,
     predict_offsets,
 )
+from dpmjax.deeppointmap.motion_choice import choose_motion, refine_motion, weak_direction_of
 from dpmjax.deeppointmap.overlap_prediction import overlap_probability
-from dpmjax.deeppointmap.verification import (
-    MeasuredScan,
-    VerificationConfig,
-    choose_motion,
-    measure_scan,
-    refine_motion,
-)
+from dpmjax.deeppointmap.verification import MeasuredScan, VerificationConfig, measure_scan
 from dpmjax.geometry.bearing import directions_of
 from dpmjax.scans.element_alignment import align_elements_on_host
+from dpmjax.scans.plane_information import WeakDirection
 from dpmjax.types import AnyArray, DescriptorCloud, PointCloud, Registration, Verification
 
 NUM_THREADS = 2
@@ -117,7 +113,8 @@ def register(
 
     Where both are scans, the best distinct motions of the descriptors are verified by the scans themselves: points
     must meet surfaces and leave free space free. Where none of the first is clearly right, motions under which the
-    scans look alike from above are tried too. The motion under which the scans agree best is taken. Descriptor clouds
+    scans look alike from above are tried too; in corridors, motions along the axis and half-turns. The motion under
+    which the scans agree best is taken. Descriptor clouds
     have no points: the best motion of the descriptors is taken, and refined by their surface elements.
 
     Args:
@@ -249,8 +246,9 @@ class _Motions(NamedTuple):
     # The chosen hypothesis and its final motion, metres. The confidence rests on the evidence before the refinement.
     row: int | None
     T_target_source: Float[np.ndarray, "4 4"]
-    evidence: Verification | None
-    verification: Verification | None
+    evidence: Verification | None = None
+    verification: Verification | None = None
+    weak: WeakDirection | None = None
 
 
 def _require_elements(pairs: Sequence[tuple[ScanOrCloud, ScanOrCloud]]) -> None:
@@ -320,7 +318,9 @@ def _verified(
 ) -> _Motions:
     chosen = choose_motion(source, target, distinct_motions(hypotheses), config)
     final = refine_motion(source, target, chosen, config) if refine else chosen
-    return _Motions(chosen.row, final.T_target_source, chosen.verification, final.verification)
+    T = final.T_target_source
+    weak = weak_direction_of(source, target, T, config)
+    return _Motions(chosen.row, T, chosen.verification, final.verification, weak)
 
 
 def _refined(source: DescriptorCloud, target: DescriptorCloud, hypotheses: Registration, scale: float) -> _Motions:
@@ -330,7 +330,7 @@ def _refined(source: DescriptorCloud, target: DescriptorCloud, hypotheses: Regis
         aligned = align_elements_on_host(source.elements, target.elements, T_target_source)
         T_target_source = np.array(aligned.T_target_source)
     T_target_source[:3, 3] /= scale
-    return _Motions(0, T_target_source, None, None)
+    return _Motions(0, T_target_source)
 
 
 def _finished(model: Model, hypotheses: Registration, motions: _Motions | None) -> Registration:
@@ -342,6 +342,9 @@ def _finished(model: Model, hypotheses: Registration, motions: _Motions | None) 
     if motions is not None:
         T = jnp.asarray(motions.T_target_source, match.T_target_source.dtype)
         match = replace(match, T_target_source=T, verification=motions.verification)
+    if motions is not None and motions.weak is not None:
+        direction, sigma_m = (jnp.asarray(value, match.T_target_source.dtype) for value in motions.weak)
+        match = replace(match, weak_direction=direction, weak_sigma_m=sigma_m)
     return with_confidence(match, evidence, model.config.calibration)
 
 

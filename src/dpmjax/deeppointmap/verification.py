@@ -6,7 +6,7 @@ puts most points onto planes of the other scan, and hardly any into its free spa
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import astuple, dataclass, field
 from typing import NamedTuple
 
@@ -19,25 +19,18 @@ from dpmjax.scans.free_space import RangeImage, RangeImageConfig, range_image, v
 from dpmjax.scans.surface_alignment import (
     AlignmentConfig,
     AlignmentLevel,
-    align_surfaces,
-    align_surfaces_from,
     nearest_planes,
 )
 from dpmjax.scans.surfaces import Surface, SurfaceConfig, scan_surface
-from dpmjax.scans.view_correlation import ViewCorrelationConfig, correlate_views
+from dpmjax.scans.view_correlation import ViewCorrelationConfig
 from dpmjax.types import Verification
 
-HYPOTHESES_AT_ONCE = 4
 SPARSE_SHARE = 0.5
 """A target with a smaller share of the source's number of points has been thinned (`saved_maps`). Too few of its points
 are near those of the source, so its own points are compared with the planes of the source."""
 
 LEVEL_COSINE = 0.8
 """Surfaces whose normals are nearer to the vertical are level."""
-
-DISTINCT_M, DISTINCT_RAD = 2.0, np.radians(5.0)
-"""Motions that differ by less end in the same place."""
-
 
 COARSE = AlignmentConfig(levels=(AlignmentLevel(3.0, 600, 5),))
 FINE = AlignmentConfig(levels=(AlignmentLevel(1.0, 1500, 5),))
@@ -71,6 +64,37 @@ class EvidenceWeights:
 
 
 @dataclass(frozen=True)
+class SlidingConfig:
+    """Search along a weak axis.
+
+    Attributes:
+        max_weak_share: an axis is weak if its share of the information of the walls is smaller; 0.25 or more in streets
+            and rooms, 0.07 to 0.21 in corridors. 0 switches the search off.
+        step_m: distance of the motions that are tried.
+        num_fine: number of them that are aligned finely.
+        num_samples: number of elements of each scan that face the axis and are compared.
+        max_count: number of elements that count at most at one position along the axis, so that an end wall is one
+            observation; the two ends of a corridor may look alike.
+        contradicted: an element that faces the axis and lies in free space counts against a motion as so many that
+            meet count for it.
+        visible: the same of an element that the other scan sees.
+    """
+
+    max_weak_share: float = 0.22
+    step_m: float = 0.7
+    num_fine: int = 32
+    num_samples: int = 4000
+    max_count: float = 10.0
+    contradicted: float = 3.0
+    visible: float = 0.2
+
+    def __post_init__(self) -> None:
+        require_fields(self, "max_weak_share", "contradicted", "visible", low=0)
+        require_fields(self, "step_m", "max_count", low=1e-9)
+        require_fields(self, "num_fine", "num_samples", low=1)
+
+
+@dataclass(frozen=True)
 class VerificationConfig:
     """Settings of the verification and of the final alignment.
 
@@ -88,6 +112,7 @@ class VerificationConfig:
         min_cosine: ... and the cosine between both normals is larger.
         evidence: what the points of both scans say about a motion.
         clear_score: no further hypothesis is tried after one with higher log odds.
+        sliding: further motions where the walls hold one direction only, and their comparison.
     """
 
     surface: SurfaceConfig = field(default_factory=SurfaceConfig)
@@ -103,6 +128,7 @@ class VerificationConfig:
     min_cosine: float = 0.7
     evidence: EvidenceWeights = field(default_factory=EvidenceWeights)
     clear_score: float = 1.0
+    sliding: SlidingConfig = field(default_factory=SlidingConfig)
 
     def __post_init__(self) -> None:
         require_fields(self, "num_fine", "num_samples", low=1)
@@ -120,21 +146,6 @@ class MeasuredScan(NamedTuple):
 
     surface: Surface
     image: RangeImage
-
-
-class VerifiedMotion(NamedTuple):
-    """A hypothesis after verification.
-
-    Attributes:
-        row: the hypothesis of the descriptors that it comes from, or agrees with; None where only the views of the
-            scans have suggested it.
-        T_target_source: its motion after the alignment of the surfaces.
-        verification: how well the scans agree under that motion.
-    """
-
-    row: int | None
-    T_target_source: Float[np.ndarray, "4 4"]
-    verification: Verification
 
 
 def measure_scan(points: Float[np.ndarray, "n 3"], config: VerificationConfig) -> MeasuredScan:
@@ -195,8 +206,15 @@ def verify_motions(
     return [Verification(*shares) for shares in zip(*columns, strict=True)]
 
 
-class _Compared(NamedTuple):
-    """Samples of a scan under several motions, in the other scan."""
+class ComparedScan(NamedTuple):
+    """Samples of a scan under several motions, in the other scan.
+
+    Attributes:
+        meets: (s, n) whether a sample meets a plane of the other scan.
+        is_visible: (s, n) whether the other scan sees there.
+        is_contradicted: (s, n) whether it lies in the free space of the other scan.
+        is_level: (n,) whether it is of a level surface.
+    """
 
     meets: Bool[np.ndarray, "s n"]
     is_visible: Bool[np.ndarray, "s n"]
@@ -204,16 +222,29 @@ class _Compared(NamedTuple):
     is_level: Bool[np.ndarray, " n"]
 
 
-def _compared(
+def compare_scans(
     scan: MeasuredScan, other: MeasuredScan, T_other_scan: Float[np.ndarray, "s 4 4"], config: VerificationConfig
-) -> _Compared:
+) -> ComparedScan:
+    """Compares the samples of one scan with the other scan.
+
+    Args:
+        scan: the scan whose samples are compared.
+        other: the other.
+        T_other_scan: motions.
+        config: number of samples and tolerances.
+
+    Returns:
+        The samples under each motion.
+    """
     level = AlignmentLevel(config.plane_radius_m, config.num_samples, 1)
     planes = nearest_planes(scan.surface, other.surface, T_other_scan, level)
     meets = planes.is_paired & (np.abs(planes.residuals) < config.plane_distance_m)
     meets &= planes.cosines > config.min_cosine
     view = view_points(other.image, planes.points.reshape(-1, 3), config.image)
     is_level = np.abs(scan.surface.normals[scan.surface.samples[: config.num_samples], 2]) > LEVEL_COSINE
-    return _Compared(meets, view.is_visible.reshape(meets.shape), view.is_contradicted.reshape(meets.shape), is_level)
+    return ComparedScan(
+        meets, view.is_visible.reshape(meets.shape), view.is_contradicted.reshape(meets.shape), is_level
+    )
 
 
 def evidence_shares(
@@ -238,14 +269,14 @@ def evidence_shares(
 
 def _both_sides(
     source: MeasuredScan, target: MeasuredScan, T_target_source: Float[np.ndarray, "s 4 4"], config: VerificationConfig
-) -> tuple[_Compared, _Compared]:
+) -> tuple[ComparedScan, ComparedScan]:
     return (
-        _compared(source, target, T_target_source, config),
-        _compared(target, source, rigid.inverse(T_target_source), config),
+        compare_scans(source, target, T_target_source, config),
+        compare_scans(target, source, rigid.inverse(T_target_source), config),
     )
 
 
-def _evidence(sides: Sequence[_Compared]) -> Float[np.ndarray, "s 6"]:
+def _evidence(sides: Sequence[ComparedScan]) -> Float[np.ndarray, "s 6"]:
     shares = []
     for is_level in (False, True):
         of_kind = [side.is_visible & (side.is_level == is_level) for side in sides]
@@ -259,98 +290,3 @@ def _evidence(sides: Sequence[_Compared]) -> Float[np.ndarray, "s 6"]:
 
 def _share(points: Bool[np.ndarray, "s n"]) -> Float[np.ndarray, " s"]:
     return points.sum(axis=1) / max(points.shape[1], 1)
-
-
-def choose_motion(
-    source: MeasuredScan, target: MeasuredScan, T_target_source: Float[np.ndarray, "h 4 4"], config: VerificationConfig
-) -> VerifiedMotion:
-    """Chooses the hypothesis under which two scans agree best.
-
-    Args:
-        source: a scan.
-        target: the other.
-        T_target_source: at least one hypothesis, the most likely first.
-        config: alignments and tolerances.
-
-    Returns:
-        The best hypothesis, aligned.
-    """
-
-    def aligned(alignment: AlignmentConfig, candidates: Sequence[_Candidate | VerifiedMotion]) -> list[VerifiedMotion]:
-        starts = np.stack([candidate.T_target_source for candidate in candidates])
-        found = align_surfaces_from(source.surface, target.surface, starts, alignment)
-        T = np.stack([alignment.T_target_source for alignment in found])
-        verified = verify_motions(source, target, T, config)
-        return [VerifiedMotion(one.row, *rest) for one, *rest in zip(candidates, T, verified, strict=True)]
-
-    tried: list[VerifiedMotion] = []
-    for some in _candidates(source, target, np.asarray(T_target_source, float), config):
-        tried += aligned(config.coarse, some)
-        tried.sort(key=lambda motion: -motion.verification.score)
-        if tried[0].verification.score > config.clear_score:
-            break
-    fine = aligned(config.fine, tried[: config.num_fine])
-    chosen = max(fine, key=lambda motion: motion.verification.score)
-    others = [*fine, *tried[config.num_fine :]]
-    others = [other for other in others if _is_apart(other.T_target_source, chosen.T_target_source)]
-    second = max((other.verification.score for other in others), default=0.0)
-    gap = chosen.verification.score - max(second, 0.0)
-    if chosen.row is None:
-        agreeing = (row for row, T in enumerate(T_target_source) if not _is_apart(T, chosen.T_target_source))
-        chosen = chosen._replace(row=next(agreeing, None))
-    return chosen._replace(verification=chosen.verification._replace(gap=gap, num_tried=len(tried)))
-
-
-class _Candidate(NamedTuple):
-    row: int | None
-    T_target_source: Float[np.ndarray, "4 4"]
-
-
-def _candidates(
-    source: MeasuredScan, target: MeasuredScan, T_target_source: Float[np.ndarray, "h 4 4"], config: VerificationConfig
-) -> Iterator[list[_Candidate]]:
-    """Yields hypotheses, some at a time, from the second time on in turn with motions from the views of the scans."""
-    hypotheses = _batched([_Candidate(row, T) for row, T in enumerate(T_target_source)])
-    yield hypotheses[0]
-    searched = _batched([_Candidate(None, T) for T in _searched(source, target, config)])
-    for number in range(max(len(searched), len(hypotheses) - 1)):
-        yield from (*searched[number : number + 1], *hypotheses[number + 1 : number + 2])
-
-
-def _searched(source: MeasuredScan, target: MeasuredScan, config: VerificationConfig) -> Float[np.ndarray, "s 4 4"]:
-    if config.views.num_motions == 0:
-        return np.zeros((0, 4, 4))
-    return correlate_views(source.surface, target.surface, config.views)
-
-
-def _batched(candidates: list[_Candidate]) -> list[list[_Candidate]]:
-    starts = range(0, len(candidates), HYPOTHESES_AT_ONCE)
-    return [candidates[start : start + HYPOTHESES_AT_ONCE] for start in starts]
-
-
-def refine_motion(
-    source: MeasuredScan, target: MeasuredScan, motion: VerifiedMotion, config: VerificationConfig
-) -> VerifiedMotion:
-    """Aligns the surfaces of two scans point to plane, as finely as the scans allow.
-
-    Args:
-        source: a scan.
-        target: the other.
-        motion: from `choose_motion`.
-        config: alignment and tolerances.
-
-    Returns:
-        The refined motion and its verification.
-    """
-    start = motion.T_target_source
-    T = align_surfaces(source.surface, target.surface, start, config.refinement).T_target_source
-    found = verify_motion(source, target, T, config)
-    kept = motion.verification
-    return VerifiedMotion(motion.row, T, found._replace(gap=kept.gap, num_tried=kept.num_tried))
-
-
-def _is_apart(T_a: Float[np.ndarray, "4 4"], T_b: Float[np.ndarray, "4 4"]) -> bool:
-    """Whether two motions differ: near-equal ones do not compete."""
-    difference = rigid.inverse(T_a) @ T_b
-    cosine = (np.trace(difference[:3, :3]) - 1) / 2
-    return bool(np.linalg.norm(difference[:3, 3]) > DISTINCT_M or cosine < np.cos(DISTINCT_RAD))

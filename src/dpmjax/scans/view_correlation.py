@@ -89,7 +89,7 @@ def correlate_views(
     """
     if len(source.points) == 0 or len(target.points) == 0:
         return np.zeros((0, 4, 4))
-    levels = _T_level_lidar(source), _T_level_lidar(target)
+    levels = T_level_lidar(source), T_level_lidar(target)
     config = replace(config, cell_m=config.cell_m * _extent_share(source, target, config))
     turns = np.arange(config.num_turns) * (2 * np.pi / config.num_turns)
     images = _images(source, levels[0], turns, config)
@@ -103,7 +103,7 @@ def correlate_views(
     spectra = np.conj(fft.rfft2(images)) * fft.rfft2(fixed)
     scores = fft.irfft2(spectra.sum(axis=1), s=images.shape[2:])
     found = _best_peaks(scores, turns, config)
-    return np.stack([rigid.inverse(levels[1]) @ _planar(*row) @ levels[0] for row in found])
+    return np.stack([rigid.inverse(levels[1]) @ planar_motion(*row) @ levels[0] for row in found])
 
 
 def _extent_share(source: Surface, target: Surface, config: ViewCorrelationConfig) -> float:
@@ -111,8 +111,15 @@ def _extent_share(source: Surface, target: Surface, config: ViewCorrelationConfi
     return float(np.clip(max(extents) / config.full_extent_m, MIN_EXTENT_SHARE, 1))
 
 
-def _T_level_lidar(surface: Surface) -> Float[np.ndarray, "4 4"]:
-    """Returns the turn that makes the ground level, and the shift that puts it at height 0."""
+def T_level_lidar(surface: Surface) -> Float[np.ndarray, "4 4"]:
+    """Finds the turn that makes the ground of a scan level, and the shift that puts it at height 0.
+
+    Args:
+        surface: of the scan.
+
+    Returns:
+        The motion; the identity where there is too little ground.
+    """
     T, up = np.eye(4), np.array([0.0, 0.0, 1.0])
     is_flat = surface.flatness > MIN_FLATNESS
     points, normals = surface.points[is_flat], surface.normals[is_flat]
@@ -179,7 +186,17 @@ def _best_peaks(
     return found
 
 
-def _planar(turn: float, x: float, y: float) -> Float[np.ndarray, "4 4"]:
+def planar_motion(turn: float, x: float, y: float) -> Float[np.ndarray, "4 4"]:
+    """Makes a motion in the horizontal plane.
+
+    Args:
+        turn: about the vertical, radians.
+        x: metres.
+        y: metres.
+
+    Returns:
+        The matrix.
+    """
     T = np.eye(4)
     T[:2, :2] = [[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]]
     T[:2, 3] = x, y

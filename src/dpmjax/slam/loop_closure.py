@@ -7,6 +7,7 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 from jaxtyping import Float
 
+from dpmjax.scans.plane_information import with_least_covariance
 from dpmjax.slam.config import LoopClosureConfig
 from dpmjax.slam.keyframes import KeyframeMap, Submap, diagonal_information, submap_around
 from dpmjax.slam.loop_candidates import LoopCandidate, find_candidates
@@ -15,7 +16,6 @@ from dpmjax.slam.loop_state import LoopState
 from dpmjax.slam.map_optimization import optimize_map
 from dpmjax.slam.matcher import Match
 from dpmjax.slam.methods import SlamMethods
-from dpmjax.slam.plane_information import with_least_covariance
 from dpmjax.slam.reports import Loop, LoopStatus
 
 

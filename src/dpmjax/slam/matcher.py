@@ -18,12 +18,12 @@ from dpmjax.deeppointmap.matching import merge_clouds, thin_merged
 from dpmjax.deeppointmap.model import Model, encode_pyramid, model_fingerprint
 from dpmjax.deeppointmap.scan_registration import PreparedScan, distinct_motions, match_clouds, register_each
 from dpmjax.scans.compact import expand_elements
+from dpmjax.scans.plane_information import plane_information
 from dpmjax.scans.surface_alignment import AlignmentLevel, align_surfaces, pair_with_planes
 from dpmjax.scans.surfaces import Surface
 from dpmjax.slam.alignment import ThinnedScan
 from dpmjax.slam.keyframes import Pose, Submap
 from dpmjax.slam.local_map import PlacedElements, joined_surface
-from dpmjax.slam.plane_information import plane_information
 from dpmjax.slam.retrieval import pooled_vector
 from dpmjax.types import DescriptorCloud, Registration, Verification
 

@@ -14,13 +14,13 @@ from dpmjax.deeppointmap.model import elements_of_pyramid
 from dpmjax.deeppointmap.model_config import ModelConfig
 from dpmjax.deeppointmap.verification import MeasuredScan
 from dpmjax.scans.free_space import range_image, view_points
+from dpmjax.scans.plane_information import plane_information, with_least_covariance
 from dpmjax.scans.surface_alignment import AlignmentLevel, align_surfaces_from, nearest_planes, pair_with_planes
 from dpmjax.scans.surfaces import Surface, surface_of_elements, with_further_points
 from dpmjax.slam.alignment import Alignment, ThinnedScan, best_of
 from dpmjax.slam.config import OdometryConfig
 from dpmjax.slam.keyframes import Pose, orthonormal
 from dpmjax.slam.local_map import LocalMap
-from dpmjax.slam.plane_information import plane_information, with_least_covariance
 
 MAX_VIEWED = 4000
 """Number of elements of the local map that are compared with the free space of a scan."""

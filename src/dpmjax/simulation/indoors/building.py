@@ -16,7 +16,7 @@ from dpmjax.simulation.town.primitives import CELL_M, Ground, TownPrimitives, Tr
 from dpmjax.simulation.town.vegetation import plant_bushes
 
 _Put = Callable[[Collection, np.random.Generator, Place], None]
-KINDS = ("office", "hall", "flat")
+KINDS = ("office", "hall", "flat", "corridor")
 _THICKNESS_M = 0.12
 _CLEARANCE_M = 0.45  # Nothing stands nearer than this to the route.
 _MARGIN_M = 20.0
@@ -28,7 +28,7 @@ class BuildingConfig:
     """What a building is like.
 
     Attributes:
-        kind: office, hall or flat.
+        kind: office, hall, flat or corridor.
         route_length_m: least length of the walk.
 
     Raises:
@@ -84,7 +84,10 @@ def make_building(seed: int, config: BuildingConfig = BuildingConfig()) -> Build
     for number, room in enumerate(plan.rooms):
         _walls(into, rng, room, [door for door in plan.doors if number in door.rooms])
         _ceiling(into, rng, room)
-        _furniture(into, rng, room, route, is_hall=config.kind == "hall")
+        if config.kind == "corridor" and number == 0:
+            _fittings(into, rng, room, route)
+        else:
+            _furniture(into, rng, room, route, is_hall=config.kind == "hall")
     tables = (np.array(rows, np.float64) for rows in (into.boxes, into.cylinders, into.spheroids))
     kinds = (primitives.SOLID, primitives.POLE, primitives.SOFT)
     boxes, cylinders, spheroids = map(pack_bodies, tables, kinds)
@@ -151,6 +154,21 @@ def _ceiling(into: Collection, rng: np.random.Generator, room: Room) -> None:
     if rng.random() < 0.5:
         at = _place(middle[0], rng.uniform(room.low[1] + 0.5, room.high[1] - 0.5))
         put_box(into, at, (0.97 * room.size[0], 0.4), (room.height - 2.2 * deep, room.height - 1.2 * deep))
+
+
+def _fittings(into: Collection, rng: np.random.Generator, room: Room, route: FloatArray) -> None:
+    """Pillars or door frames along the walls of a corridor, often at equal steps, and few things between them."""
+    step, deep, wide = rng.uniform(2.5, 8.0), rng.uniform(0.04, 0.4), rng.uniform(0.15, 1.2)
+    high = room.height if rng.random() < 0.5 else 2.2
+    jitter = float(rng.choice([0.0, 0.25])) * step
+    for y in (room.low[1] + 0.5 * deep + _THICKNESS_M, room.high[1] - 0.5 * deep - _THICKNESS_M):
+        for x in np.arange(room.low[0] + rng.uniform(0.5, step), room.high[0] - 1, step):
+            if rng.random() < 0.85:
+                put_box(into, _place(x + rng.normal(0, jitter), y), (wide, deep), (0.0, high))
+    for _ in range(rng.poisson(0.04 * room.size[0])):
+        y = float(rng.choice([room.low[1] + 0.45, room.high[1] - 0.45]))
+        spot = np.array([rng.uniform(room.low[0], room.high[0]), y])
+        _put_if_free(into, rng, (spot, 0.0), route, [_put_cabinet, _put_plant, put_person])
 
 
 def _furniture(into: Collection, rng: np.random.Generator, room: Room, route: FloatArray, *, is_hall: bool) -> None:

@@ -72,13 +72,16 @@ def make_plan(rng: np.random.Generator, kind: str) -> Plan:
     Args:
         rng: source of all choices.
         kind: "office": rooms on both sides of a corridor; "hall": one to three halls in a row, with side rooms;
-            "flat": small rooms on both sides of a short corridor.
+            "flat": small rooms on both sides of a short corridor; "corridor": one long corridor or tunnel with up to
+            three side rooms.
 
     Returns:
         The plan.
     """
     if kind == "hall":
         return _row_of_halls(rng)
+    if kind == "corridor":
+        return _long_corridor(rng)
     small = kind == "flat"
     width, height = rng.uniform(1.2, 2.0) if small else rng.uniform(1.8, 3.5), rng.uniform(2.4, 3.4)
     length = rng.uniform(7, 12) if small else rng.uniform(22, 50)
@@ -114,6 +117,21 @@ def _row_of_halls(rng: np.random.Generator) -> Plan:
     return Plan(tuple(rooms), tuple(doors))
 
 
+def _long_corridor(rng: np.random.Generator) -> Plan:
+    is_tunnel = rng.random() < 0.3
+    width, height = (
+        (rng.uniform(4, 8), rng.uniform(3.5, 6)) if is_tunnel else (rng.uniform(1.8, 4), rng.uniform(2.4, 3.4))
+    )
+    length = rng.uniform(40, 120)
+    rooms, doors = [Room((0.0, -0.5 * width), (length, 0.5 * width), height)], []
+    for x in np.arange(4, length - 10, length / 3)[: rng.integers(4)] + rng.uniform(0, 6):
+        side, wide = int(rng.choice([-1, 1])), rng.uniform(3, 6)
+        near, far = 0.5 * width * side, (0.5 * width + rng.uniform(3, 6)) * side
+        doors.append(_door(rng, (0, len(rooms)), (float(x + 0.5 * wide), near), 1, (0.85, 1.4)))
+        rooms.append(Room((x, min(near, far)), (x + wide, max(near, far)), height))
+    return Plan(tuple(rooms), tuple(doors))
+
+
 def _door(
     rng: np.random.Generator, rooms: tuple[int, int], place: tuple[float, float], axis: int, width: tuple[float, float]
 ) -> Door:
@@ -136,6 +154,9 @@ def make_route(rng: np.random.Generator, plan: Plan, length: float) -> FloatArra
     last = -1
     while len(points) < 2 or np.linalg.norm(np.diff(points, axis=0), axis=1).sum() < length:
         exits = [(n, door) for n, door in enumerate(plan.doors) if here in door.rooms]
+        if not exits:
+            points += _round(rng, plan.rooms[here])
+            continue
         others = [(n, door) for n, door in exits if n != last] or exits
         number, door = others[rng.integers(len(others))]
         last, there = number, door.rooms[0] if door.rooms[1] == here else door.rooms[1]

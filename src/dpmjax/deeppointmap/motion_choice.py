@@ -1,0 +1,238 @@
+"""Choice among motion hypotheses: each is aligned by the surfaces of both scans, and the scans choose.
+
+In corridors wrong motions agree with the scans, too. There, motions along the axis and half-turns are tried, and the
+elements that face the axis choose.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from dpmjax.deeppointmap.verification import (
+    MeasuredScan,
+    VerificationConfig,
+    compare_scans,
+    verify_motion,
+    verify_motions,
+)
+from dpmjax.geometry import rigid
+from dpmjax.scans.plane_information import WeakDirection, weakest_direction
+from dpmjax.scans.surface_alignment import (
+    AlignmentConfig,
+    AlignmentLevel,
+    align_surfaces,
+    align_surfaces_from,
+    pair_with_planes,
+)
+from dpmjax.scans.view_correlation import T_level_lidar, correlate_views
+from dpmjax.scans.weak_directions import (
+    WallAxis,
+    facing_surface,
+    facing_weights,
+    sliding_motions,
+    wall_axis,
+    weak_share,
+)
+from dpmjax.types import Verification
+
+HYPOTHESES_AT_ONCE = 4
+
+DISTINCT_M, DISTINCT_RAD = 2.0, np.radians(5.0)
+"""Motions that differ by less end in the same place."""
+
+OF_THE_SEARCH = ("gap", "num_tried", "num_slid", "facing_gap")
+"""Fields of `Verification` that rest on all motions that were tried."""
+
+
+class VerifiedMotion(NamedTuple):
+    """A hypothesis after verification.
+
+    Attributes:
+        row: the hypothesis of the descriptors that it comes from, or agrees with; None where only the views of the
+            scans have suggested it.
+        T_target_source: its motion after the alignment of the surfaces.
+        verification: how well the scans agree under that motion.
+    """
+
+    row: int | None
+    T_target_source: Float[np.ndarray, "4 4"]
+    verification: Verification
+
+
+def choose_motion(
+    source: MeasuredScan, target: MeasuredScan, T_target_source: Float[np.ndarray, "h 4 4"], config: VerificationConfig
+) -> VerifiedMotion:
+    """Chooses the hypothesis under which two scans agree best.
+
+    The walls of a corridor hold one horizontal direction only. There, motions along its axis are tried too, both ways
+    round, and the elements that face the axis choose.
+
+    Args:
+        source: a scan.
+        target: the other.
+        T_target_source: at least one hypothesis, the most likely first.
+        config: alignments and tolerances.
+
+    Returns:
+        The best hypothesis, aligned.
+    """
+    hypotheses, scans = np.asarray(T_target_source, float), (source, target)
+    tried: list[VerifiedMotion] = []
+    for some in _candidates(source, target, hypotheses, config):
+        tried += _aligned(scans, some, config.coarse, config)
+        tried.sort(key=lambda motion: -motion.verification.score)
+        if tried[0].verification.score > config.clear_score:
+            break
+    finalists, remaining = _aligned(scans, tried[: config.num_fine], config.fine, config), tried[config.num_fine :]
+    axes = wall_axis(source.surface), wall_axis(target.surface)
+    num_slid = 0
+    if is_weak := weak_share(*axes) < config.sliding.max_weak_share:
+        starts = sliding_motions(*axes, config.sliding.step_m)
+        num_slid = len(starts)
+        finalists += _aligned(scans, _best_along(scans, axes, starts, config), config.fine, config)
+    motions = [*finalists, *remaining]
+    T = np.stack([motion.T_target_source for motion in motions])
+    scores = np.array([motion.verification.score for motion in motions])
+    facing = _facing_elements(scans, axes, T, config) if is_weak else np.zeros(len(motions))
+    best = int(np.argmax((facing if is_weak else scores)[: len(finalists)]))
+    chosen, is_other = motions[best], _is_apart(T, T[best])
+    if chosen.row is None:
+        agreeing = np.flatnonzero(~_is_apart(hypotheses, T[best]))
+        chosen = chosen._replace(row=int(agreeing[0]) if len(agreeing) else None)
+    gap, facing_gap = (float(values[best] - values[is_other].max(initial=0.0)) for values in (scores, facing))
+    found = chosen.verification._replace(gap=gap, num_tried=len(tried), num_slid=num_slid, facing_gap=facing_gap)
+    return chosen._replace(verification=found)
+
+
+def _aligned(
+    scans: tuple[MeasuredScan, MeasuredScan],
+    candidates: Sequence[_Candidate | VerifiedMotion],
+    alignment: AlignmentConfig,
+    config: VerificationConfig,
+) -> list[VerifiedMotion]:
+    T = _moved(scans, np.stack([candidate.T_target_source for candidate in candidates]), alignment)
+    verified = verify_motions(*scans, T, config)
+    return [VerifiedMotion(one.row, *rest) for one, *rest in zip(candidates, T, verified, strict=True)]
+
+
+def _moved(
+    scans: tuple[MeasuredScan, MeasuredScan], starts: Float[np.ndarray, "s 4 4"], alignment: AlignmentConfig
+) -> Float[np.ndarray, "s 4 4"]:
+    found = align_surfaces_from(scans[0].surface, scans[1].surface, starts, alignment)
+    return np.stack([one.T_target_source for one in found])
+
+
+def _best_along(
+    scans: tuple[MeasuredScan, MeasuredScan],
+    axes: tuple[WallAxis, WallAxis],
+    starts: Float[np.ndarray, "s 4 4"],
+    config: VerificationConfig,
+) -> list[_Candidate]:
+    """Returns the motions that the elements that face the axis support most, coarsely aligned."""
+    slid = _moved(scans, starts, config.coarse)
+    order = np.argsort(-_facing_elements(scans, axes, slid, config), kind="stable")
+    return [_Candidate(None, T) for T in slid[order[: config.sliding.num_fine]]]
+
+
+def _facing_elements(
+    scans: tuple[MeasuredScan, MeasuredScan],
+    axes: tuple[WallAxis, WallAxis],
+    T_target_source: Float[np.ndarray, "s 4 4"],
+    config: VerificationConfig,
+) -> Float[np.ndarray, " s"]:
+    """Counts elements that face the weak axis and meet; those in free space and unmet visible ones count against it."""
+    sliding, settings = config.sliding, replace(config, num_samples=config.sliding.num_samples)
+    first, second = (
+        scan._replace(surface=facing_surface(scan.surface, axis.axis)) for scan, axis in zip(scans, axes, strict=True)
+    )
+    sides = (
+        compare_scans(first, scans[1], T_target_source, settings),
+        compare_scans(second, scans[0], rigid.inverse(T_target_source), settings),
+    )
+    counts = [
+        (side.meets - sliding.contradicted * side.is_contradicted - sliding.visible * side.is_visible)
+        @ facing_weights(scan.surface, axis.axis, sliding.max_count)[: sliding.num_samples]
+        for side, scan, axis in zip(sides, (first, second), axes, strict=True)
+    ]
+    return np.mean(counts, axis=0)
+
+
+class _Candidate(NamedTuple):
+    row: int | None
+    T_target_source: Float[np.ndarray, "4 4"]
+
+
+def _candidates(
+    source: MeasuredScan, target: MeasuredScan, T_target_source: Float[np.ndarray, "h 4 4"], config: VerificationConfig
+) -> Iterator[list[_Candidate]]:
+    """Yields hypotheses, some at a time, from the second time on in turn with motions from the views of the scans."""
+    hypotheses = _batched([_Candidate(row, T) for row, T in enumerate(T_target_source)])
+    yield hypotheses[0]
+    searched = _batched([_Candidate(None, T) for T in _searched(source, target, config)])
+    for number in range(max(len(searched), len(hypotheses) - 1)):
+        yield from (*searched[number : number + 1], *hypotheses[number + 1 : number + 2])
+
+
+def _searched(source: MeasuredScan, target: MeasuredScan, config: VerificationConfig) -> Float[np.ndarray, "s 4 4"]:
+    if config.views.num_motions == 0:
+        return np.zeros((0, 4, 4))
+    return correlate_views(source.surface, target.surface, config.views)
+
+
+def _batched(candidates: list[_Candidate]) -> list[list[_Candidate]]:
+    starts = range(0, len(candidates), HYPOTHESES_AT_ONCE)
+    return [candidates[start : start + HYPOTHESES_AT_ONCE] for start in starts]
+
+
+def refine_motion(
+    source: MeasuredScan, target: MeasuredScan, motion: VerifiedMotion, config: VerificationConfig
+) -> VerifiedMotion:
+    """Aligns the surfaces of two scans point to plane, as finely as the scans allow.
+
+    Args:
+        source: a scan.
+        target: the other.
+        motion: from `choose_motion`.
+        config: alignment and tolerances.
+
+    Returns:
+        The refined motion and its verification.
+    """
+    start = motion.T_target_source
+    T = align_surfaces(source.surface, target.surface, start, config.refinement).T_target_source
+    found = verify_motion(source, target, T, config)
+    kept = {name: getattr(motion.verification, name) for name in OF_THE_SEARCH}
+    return VerifiedMotion(motion.row, T, found._replace(**kept))
+
+
+def weak_direction_of(
+    source: MeasuredScan, target: MeasuredScan, T_target_source: Float[np.ndarray, "4 4"], config: VerificationConfig
+) -> WeakDirection:
+    """Finds the horizontal direction in which a motion is known least, by all elements of the source that meet planes.
+
+    Args:
+        source: a scan.
+        target: the other.
+        T_target_source: the motion.
+        config: tolerances.
+
+    Returns:
+        The direction in the target frame, and the standard deviation of the translation along it.
+    """
+    # The first samples are of all directions alike, which would hide that few elements face the weak one.
+    level = AlignmentLevel(config.plane_radius_m, max(1, len(source.surface.samples)), 1)
+    pairs = pair_with_planes(source.surface, target.surface, T_target_source, level)
+    up = T_level_lidar(target.surface)[2, :3]
+    return weakest_direction(pairs, T_target_source, up, max_residual_m=config.plane_distance_m)
+
+
+def _is_apart(T: Float[np.ndarray, "s 4 4"], T_other: Float[np.ndarray, "4 4"]) -> Bool[np.ndarray, " s"]:
+    """Finds the motions that differ from another one: near-equal ones do not compete."""
+    difference = rigid.inverse(T_other) @ T
+    cosine = (np.trace(difference[:, :3, :3], axis1=1, axis2=2) - 1) / 2
+    return (np.linalg.norm(difference[:, :3, 3], axis=1) > DISTINCT_M) | (cosine < np.cos(DISTINCT_RAD))

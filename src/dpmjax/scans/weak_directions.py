@@ -1,0 +1,147 @@
+"""The horizontal direction along which the walls of two scans hold a motion least, and motions along it.
+
+In a corridor almost all walls are parallel to its axis. They agree with any shift along the axis, and with a half-turn;
+only the few elements that face the axis (end walls, pillars, door frames) tell one motion from another.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+from scipy.ndimage import gaussian_filter1d
+
+from dpmjax.geometry import rigid
+from dpmjax.scans.preprocess import first_of_each_voxel
+from dpmjax.scans.surfaces import MIN_FLATNESS, Surface
+from dpmjax.scans.view_correlation import STEEP_COSINE, T_level_lidar, planar_motion
+
+VOXEL_M = 1.0
+"""One normal of each voxel counts, so that many points of a near wall do not outweigh a far one."""
+
+PARALLEL_COSINE, FACING_COSINE = 0.9, 0.6
+"""Walls are parallel to an axis if the cosine between their normal and the horizontal direction across it is larger.
+Elements face the axis if the cosine between their normal and the axis is larger."""
+
+BIN_M, NUM_BINS, MAX_COUNT = 0.2, 301, 20.0
+POSITION_M = 0.5
+"""Elements nearer to each other along the axis have one position."""
+
+EXTENT_PERCENT, MAX_REACH_M = 90.0, 25.0
+
+
+class WallAxis(NamedTuple):
+    """The horizontal direction that the walls of a scan hold least.
+
+    Attributes:
+        T_level_lidar: makes the ground level, at height 0.
+        yaw: angle of the axis in the level frame, radians; either of two opposite directions.
+        information: (2,) sums of squared components of the normals along the axis, and across it.
+        profile: (b,) number of voxels of parallel walls by their position across the axis.
+        extent_m: horizontal range of nine in ten voxels.
+    """
+
+    T_level_lidar: Float[np.ndarray, "4 4"]
+    yaw: float
+    information: Float[np.ndarray, "2"]
+    profile: Float[np.ndarray, " b"]
+    extent_m: float
+
+    @property
+    def axis(self) -> Float[np.ndarray, "3"]:
+        """The axis as a unit vector in the frame of the lidar."""
+        return np.array([np.cos(self.yaw), np.sin(self.yaw), 0.0]) @ self.T_level_lidar[:3, :3]
+
+
+def wall_axis(surface: Surface) -> WallAxis:
+    """Finds the weak axis of the walls of a scan.
+
+    Args:
+        surface: of the scan.
+
+    Returns:
+        The axis; the information is 0 where there is no wall.
+    """
+    T = T_level_lidar(surface)
+    normals = surface.normals @ T[:3, :3].T
+    is_wall = (surface.flatness > MIN_FLATNESS) & (np.abs(normals[:, 2]) < STEEP_COSINE)
+    points, normals = (surface.points[is_wall] @ T[:3, :3].T)[:, :2], normals[is_wall, :2]
+    rows = first_of_each_voxel(surface.points[is_wall], VOXEL_M)
+    points, normals = points[rows], normals[rows]
+    information, axes = np.linalg.eigh(normals.T @ normals)
+    along, across = axes[:, 0], np.array([-axes[1, 0], axes[0, 0]])
+    is_parallel = np.abs(normals @ across) > PARALLEL_COSINE
+    edges = (np.arange(NUM_BINS + 1) - NUM_BINS / 2) * BIN_M
+    counts = np.histogram((points @ across)[is_parallel], edges)[0]
+    profile = gaussian_filter1d(np.minimum(counts, MAX_COUNT), 1.0, mode="constant")
+    extent_m = float(np.percentile(np.linalg.norm(points, axis=1), EXTENT_PERCENT)) if len(points) else 0.0
+    return WallAxis(T, float(np.arctan2(along[1], along[0])), np.maximum(information, 0), profile, extent_m)
+
+
+def weak_share(source: WallAxis, target: WallAxis) -> float:
+    """Computes the share of the weak axis in the information of the walls of two scans.
+
+    Args:
+        source: axis of a scan.
+        target: axis of the other scan.
+
+    Returns:
+        In [0, 0.5]: 0 for bare parallel walls, 0.5 where all directions are held alike, or a scan has no walls.
+    """
+    if min(source.information.sum(), target.information.sum()) == 0:
+        return 0.5
+    along, across = source.information + target.information
+    return float(along / (along + across))
+
+
+def sliding_motions(source: WallAxis, target: WallAxis, step_m: float) -> Float[np.ndarray, "s 4 4"]:
+    """Makes the motions that bring the walls along both axes onto each other, both ways round, at steps along the axis.
+
+    Args:
+        source: axis of a scan.
+        target: axis of the other scan.
+        step_m: length of a step; the motions reach as far as the scans, up to 25 m.
+
+    Returns:
+        T_target_source.
+    """
+    reach_m = min(max(source.extent_m, target.extent_m), MAX_REACH_M)
+    along, up = np.array([np.cos(target.yaw), np.sin(target.yaw)]), rigid.inverse(target.T_level_lidar)
+    motions = []
+    for turn, profile in ((0.0, source.profile), (np.pi, source.profile[::-1])):
+        lag = int(np.argmax(np.correlate(target.profile, profile, "full"))) - (NUM_BINS - 1)
+        for distance_m in np.arange(-reach_m, reach_m + step_m, step_m):
+            x, y = distance_m * along + lag * BIN_M * np.array([-along[1], along[0]])
+            motions.append(up @ planar_motion(target.yaw - source.yaw + turn, x, y) @ source.T_level_lidar)
+    return np.stack(motions)
+
+
+def facing_surface(surface: Surface, axis: Float[np.ndarray, "3"]) -> Surface:
+    """Returns a surface whose samples are those that face an axis.
+
+    Args:
+        surface: of a scan.
+        axis: unit vector in the frame of the lidar.
+
+    Returns:
+        The surface with fewer samples.
+    """
+    is_facing = np.abs(surface.normals[surface.samples] @ axis) > FACING_COSINE
+    return surface._replace(samples=surface.samples[is_facing])
+
+
+def facing_weights(surface: Surface, axis: Float[np.ndarray, "3"], max_count: float) -> Float[np.ndarray, " s"]:
+    """Weighs samples so that those at one position along an axis count up to a limit together.
+
+    Args:
+        surface: from `facing_surface`.
+        axis: unit vector in the frame of the lidar.
+        max_count: largest sum of the weights at one position.
+
+    Returns:
+        A weight in (0, 1] for each sample.
+    """
+    positions = np.floor(surface.points[surface.samples] @ axis / POSITION_M)
+    _, position, counts = np.unique(positions, return_inverse=True, return_counts=True)
+    return np.minimum(1.0, max_count / counts[position])

@@ -1,0 +1,160 @@
+"""Laws of registration where walls hold one direction only."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import permutations
+
+import numpy as np
+import pytest
+
+import dpmjax
+from dpmjax.deeppointmap.confidence import logistic_probability, weak_features
+from dpmjax.deeppointmap.motion_choice import VerifiedMotion, choose_motion, refine_motion, weak_direction_of
+from dpmjax.deeppointmap.verification import MeasuredScan, SlidingConfig, VerificationConfig, measure_scan
+from dpmjax.scans.weak_directions import facing_surface, facing_weights, sliding_motions, wall_axis, weak_share
+from tests.scans.surface_scenes import corridor, motion, seen_from
+
+CONFIG = VerificationConfig()
+PILLARS_M = (-13.0, -8.5, -2.0, 4.0, 5.5, 14.0)
+POSES = motion(20, (-2.0, 0.2, 0.0), 5), motion(-115, (3.0, 0.0, 0.1), -4)
+T_TRUE = np.linalg.inv(POSES[1]) @ POSES[0]
+RANGE_M = 20.0
+
+
+def scans_of(pillars_m: tuple[float, ...]) -> list[MeasuredScan]:
+    """Scans of both poses, of other points of the same surfaces."""
+    points = [seen_from(corridor(seed, pillars_m), T) for seed, T in enumerate(POSES)]
+    return [measure_scan(some[np.linalg.norm(some, axis=1) < RANGE_M], CONFIG) for some in points]
+
+
+@pytest.fixture(scope="module")
+def with_pillars() -> list[MeasuredScan]:
+    return scans_of(PILLARS_M)
+
+
+@pytest.fixture(scope="module")
+def bare() -> list[MeasuredScan]:
+    return scans_of(())
+
+
+def confidence(found: VerifiedMotion) -> float:
+    """Of the shipped model."""
+    calibration = dpmjax.load_model("dpm_small").config.calibration
+    assert calibration is not None
+    assert calibration.of_weak_scans is not None
+    return float(logistic_probability(calibration.of_weak_scans, weak_features(found.verification)))
+
+
+def along_the_corridor(distance_m: float, turn_deg: float = 0.0) -> np.ndarray:
+    """A motion that is wrong by a shift along the corridor, and by a turn about the vertical of the world."""
+    return np.linalg.inv(POSES[1]) @ motion(turn_deg, (distance_m, 0, 0)) @ POSES[0]
+
+
+@pytest.mark.parametrize(("distance_m", "turn_deg"), [(0.0, 0.0), (5.0, 0.0), (-7.0, 0.0), (0.0, 180.0), (4.0, 180.0)])
+def test_the_motion_is_found_from_any_shift_and_half_turn(with_pillars, distance_m: float, turn_deg: float) -> None:
+    found = choose_motion(*with_pillars, along_the_corridor(distance_m, turn_deg)[None], CONFIG)
+    assert found.verification.num_slid > 0
+    assert np.linalg.norm(found.T_target_source[:3, 3] - T_TRUE[:3, 3]) < 0.2
+    assert found.T_target_source[:3, 0] @ T_TRUE[:3, 0] > 0.99
+    assert found.verification.facing_gap > 0
+    refined = refine_motion(*with_pillars, found, CONFIG)
+    assert refined.verification.facing_gap == found.verification.facing_gap
+
+
+def test_a_bare_corridor_is_never_sure_of_the_shift(bare) -> None:
+    found = choose_motion(*bare, T_TRUE[None], CONFIG)
+    assert found.verification.num_slid > 0
+    assert confidence(found) < 0.5
+    assert confidence(choose_motion(*scans_of(PILLARS_M), T_TRUE[None], CONFIG)) > 0.9
+
+
+def test_pillars_at_equal_steps_leave_the_shift_open() -> None:
+    scans = scans_of(tuple(np.arange(-58.0, 58.0, 4.0)))
+    assert confidence(choose_motion(*scans, T_TRUE[None], CONFIG)) < 0.9
+
+
+def test_the_weak_direction_is_the_axis_of_the_corridor(bare) -> None:
+    axes = [wall_axis(scan.surface) for scan in bare]
+    assert weak_share(axes[0], axes[1]) < 0.1
+    for axis, pose in zip(axes, POSES, strict=True):
+        assert abs(axis.axis @ pose[:3, :3].T[:, 0]) > 0.999
+    weak = weak_direction_of(*bare, T_TRUE, CONFIG)
+    assert abs(weak.direction @ POSES[1][:3, :3].T[:, 0]) > 0.99
+    assert weak.sigma_m > 1
+
+
+def test_elements_that_face_the_axis_make_the_shift_known(with_pillars) -> None:
+    weak = weak_direction_of(*with_pillars, T_TRUE, CONFIG)
+    assert abs(weak.direction @ POSES[1][:3, :3].T[:, 0]) > 0.99
+    assert 0 < weak.sigma_m < 0.2
+
+
+def test_walls_of_all_directions_leave_the_choice_as_it_was() -> None:
+    rng = np.random.default_rng(3)
+    ground = np.column_stack([rng.uniform(-20, 20, (4000, 2)), np.full(4000, -1.2)])
+    walls = [
+        seen_from(corridor(seed, length_m=8.0)[::3], motion(angle, (0, 12, 0)))
+        for seed, angle in enumerate(range(0, 360, 50))
+    ]
+    points = np.concatenate([ground, *walls])
+    scans = [measure_scan(seen_from(points, T), CONFIG) for T in POSES]
+    hypotheses = np.stack([along_the_corridor(9.0), along_the_corridor(0.5)])
+    found = choose_motion(*scans, hypotheses, CONFIG)
+    without = choose_motion(*scans, hypotheses, replace(CONFIG, sliding=SlidingConfig(max_weak_share=0)))
+    assert found.verification == without.verification
+    assert found.verification.num_slid == 0
+    np.testing.assert_array_equal(found.T_target_source, without.T_target_source)
+
+
+def test_the_motions_go_both_ways_round_as_far_as_the_scans_reach(bare) -> None:
+    axes = [wall_axis(scan.surface) for scan in bare]
+    along = POSES[1] @ sliding_motions(axes[0], axes[1], 0.7) @ np.linalg.inv(POSES[0])
+    assert set(np.round(along[:, 0, 0]).tolist()) == {-1.0, 1.0}
+    for sign in (-1, 1):
+        shifts = np.sort(along[np.sign(along[:, 0, 0]) == sign, 0, 3])
+        assert np.diff(shifts).max() < 0.75
+        assert np.ptp(shifts) > RANGE_M
+
+
+def test_only_elements_that_face_the_axis_are_compared(with_pillars) -> None:
+    surface, axis = with_pillars[0].surface, POSES[0][:3, :3].T[:, 0]
+    facing = facing_surface(surface, axis)
+    assert 0 < len(facing.samples) < len(surface.samples) / 10
+    at_pillars = (surface.points[facing.samples] @ POSES[0][:3, :3].T + POSES[0][:3, 3])[:, 0]
+    distances = np.abs(at_pillars[:, None] - np.array([*PILLARS_M, *(x + 0.6 for x in PILLARS_M)])).min(axis=1)
+    assert np.median(distances) < 0.1
+
+
+def test_an_end_wall_counts_as_one_position(with_pillars) -> None:
+    axis = POSES[0][:3, :3].T[:, 0]
+    facing = facing_surface(with_pillars[0].surface, axis)
+    weights = facing_weights(facing, axis, 10.0)
+    positions = np.floor(facing.points[facing.samples] @ axis / 0.5)
+    for position in np.unique(positions):
+        at = positions == position
+        assert weights[at].sum() == pytest.approx(min(at.sum(), 10.0))
+    np.testing.assert_array_equal(facing_weights(facing, axis, np.inf), 1)
+
+
+def test_scans_without_walls_have_no_weak_axis() -> None:
+    empty = wall_axis(measure_scan(np.zeros((0, 3)), CONFIG).surface)
+    assert weak_share(empty, empty) == 0.5
+    assert empty.extent_m == 0
+
+
+@pytest.mark.slow
+def test_recorded_corridors_are_right_or_not_sure(real_data) -> None:
+    folder = real_data / "field_3d" / "corridor_pair"
+    if not folder.is_dir():
+        pytest.skip(f"no {folder}")
+    model = dpmjax.load_model("dpm_small")
+    for source, target in ((28, 16), (18, 10)):
+        scans = {number: np.load(folder / f"{number}.npy")[:, :3].astype(np.float32) for number in (source, target)}
+        T_true = np.loadtxt(folder / f"T_{target}_from_{source}.txt").reshape(4, 4)
+        for a, b in permutations((source, target)):
+            found = dpmjax.register(model, scans[a], scans[b])
+            T = T_true if a == source else np.linalg.inv(T_true)
+            assert np.linalg.norm(np.asarray(found.T_target_source)[:3, 3] - T[:3, 3]) < 1.0
+            assert abs(np.asarray(found.weak_direction)[1]) > 0.95
+            assert 0 < float(found.weak_sigma_m) < 1
