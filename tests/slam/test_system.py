@@ -219,8 +219,8 @@ def test_a_map_of_other_weights_is_refused(as_user) -> None:
 class SparseGeometry(TruthGeometry):
     """Scans of so few points that a right pose never scores high."""
 
-    def align(self, local_map, measured, starts):
-        return super().align(local_map, measured, starts)._replace(score=0.4)
+    def search(self, local_map, scan, T_map_scan):
+        return super().search(local_map, scan, T_map_scan)._replace(score=0.4)
 
 
 def test_sparse_scans_are_tracked_from_the_first_one_on() -> None:
