@@ -31,7 +31,7 @@ def room(tmp_path_factory) -> tuple[Path, Path]:
     for number, T in enumerate(truth):
         np.save(folder / "drive" / f"{number}.npy", seen_from(planes(rng), T).astype(np.float32))
     write_tum(folder / "drive" / "poses_lidar.txt", truth)
-    dpmjax.save_model(dpmjax.init_model(jax.random.key(0), toy.MODEL), folder / "toy.safetensors", card="toy")
+    dpmjax.save_model(dpmjax.init_model(jax.random.key(0), toy.SLAM_MODEL), folder / "toy.safetensors", card="toy")
     return folder / "drive", folder / "toy.safetensors"
 
 
@@ -46,7 +46,7 @@ def test_a_saved_map_is_extended(room, tmp_path, capsys) -> None:
     assert len(after) > len(before)
     assert [keyframe.scan for keyframe in after.keyframes][: len(before)] == [k.scan for k in before.keyframes]
     assert len(np.load(second / "trajectory.npy")) == 20
-    # The journal of the second run holds what came after the map.
+    # The state of the second run holds the map, too.
     for name in ("trajectory.npy", "map.npz", "loops.csv"):
         (tmp_path / name).write_bytes((second / name).read_bytes())
     assert run("--resume", "-o", second) == EXIT_OK
@@ -54,7 +54,7 @@ def test_a_saved_map_is_extended(room, tmp_path, capsys) -> None:
         assert (tmp_path / name).read_bytes() == (second / name).read_bytes()
     capsys.readouterr()
     other = tmp_path / "other.safetensors"
-    dpmjax.save_model(dpmjax.init_model(jax.random.key(1), toy.MODEL), other, card="toy")
+    dpmjax.save_model(dpmjax.init_model(jax.random.key(1), toy.SLAM_MODEL), other, card="toy")
     for options, message in (
         (["--map", first / "map.npz", "--weights", other], "made with weights"),
         (["--map", first / "config.json", "--weights", weights], "config.json"),
