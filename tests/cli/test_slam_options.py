@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import dpmjax
+from dpmjax.cli import slam
 from dpmjax.cli.command import EXIT_BAD_INPUT, EXIT_OK
 from dpmjax.cli.drives import DriveSelection, open_drive, with_raised_beams
 from dpmjax.cli.optional import why_not_importable
@@ -16,6 +17,7 @@ from dpmjax.cli.result_files import load_json
 from dpmjax.cli.slam_reader import ScanReader
 from dpmjax.io import write_tum
 from dpmjax.scans import offsets_by_azimuth
+from dpmjax.slam import SlamConfig
 from tests.cli.test_slam import run, use_truth, write_drive
 from tests.deeppointmap import toy
 from tests.slam.test_odometry import motion, planes, seen_from
@@ -73,6 +75,16 @@ def test_deskewing_and_odometry_alone_are_options(room, tmp_path) -> None:
     metrics = load_json(tmp_path / "out" / "metrics.json")
     assert metrics["loop_statuses"] == {}
     assert metrics["ate_m"] == pytest.approx(metrics["ate_odometry_m"])
+
+
+def test_options_of_odometry_and_loops_reach_the_settings(room) -> None:
+    _, weights = room
+    given = slam.slam_methods(slam.Config(weights=str(weights), odometry="network", no_loop=True))
+    assert given.config.odometry.proposer == "network"
+    assert not given.config.loops.is_on
+    # Those of the geometry and of the matcher are the same.
+    assert given.geometry.config is given.config.odometry
+    assert slam.slam_methods(slam.Config(weights=str(weights))).config == SlamConfig()
 
 
 @pytest.mark.parametrize("times", [None, (0.0, 0.2, 0.4, 0.8)])
