@@ -102,6 +102,14 @@ def test_the_oldest_of_too_many_scans_leaves() -> None:
     assert with_scan(keyframes, elements_at(5.0), pose(9, 0, 0), SPACING_M, without) is keyframes
 
 
+def test_elements_of_a_turned_scan_are_turned() -> None:
+    local_map = local_map_of(chain(TRUTH[:3]), CONFIG)
+    wall = replace(elements_at(5.0), normals=np.float32([[1, 0, 0]] * 2))
+    joined = with_scan(local_map, wall, pose(1.0, 2.0, np.pi / 2), SPACING_M, CONFIG)
+    np.testing.assert_allclose(joined.surface.points[-1], [1.0, 7.0, 0.0], atol=1e-6)
+    np.testing.assert_allclose(joined.surface.normals[-1], [0.0, 1.0, 0.0], atol=1e-6)
+
+
 def test_elements_without_a_plane_stay_out() -> None:
     local_map = local_map_of(chain(TRUTH[:3]), CONFIG)
     joined = with_scan(local_map, elements_at(5.0, planarity=0.05), pose(3, 0, 0), SPACING_M, CONFIG)

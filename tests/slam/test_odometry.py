@@ -159,7 +159,10 @@ def test_other_motions_are_rigid_and_hold_the_prediction_and_rest(geometry) -> N
         motions[:, :3, :3] @ motions[:, :3, :3].transpose(0, 2, 1), np.tile(np.eye(3), (len(motions), 1, 1)), atol=1e-12
     )
     ahead = motion(0.16 * 10.0, 0.0, 5.0)
-    for expected in (T_last_scan, motion(0.0, 0.0, 5.0), motion(1.4, 0.2, 5.0), motion(0.7, 0.1, 40.0), ahead):
+    tilted = motion(0.7, 0.1, 5.0)
+    tilted[:3, :3] = tilted[:3, :3] @ Rotation.from_euler("y", -8.0, degrees=True).as_matrix()
+    turned = motion(0.7, 0.1, 40.0)
+    for expected in (T_last_scan, motion(0.0, 0.0, 5.0), motion(1.4, 0.2, 5.0), turned, ahead, tilted):
         assert np.abs(motions - expected).max(axis=(1, 2)).min() < 1e-9
 
 
