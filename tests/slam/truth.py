@@ -82,7 +82,7 @@ class TruthGeometry:
         if not len(points):
             return None
         elements = expand_elements(compact_of(int(points[0, 0])).elements)
-        return ThinnedScan(None, elements, None, 10.0)
+        return ThinnedScan(None, elements, None, None, 10.0)
 
     def align(self, local_map: LocalMap, scan: ThinnedScan, T_map_scan: np.ndarray) -> Alignment:
         return self.search(local_map, scan, T_map_scan[None])

@@ -28,7 +28,7 @@ from dpmjax.cli.drives import DriveSelection, open_drive
 from dpmjax.cli.machine import peak_rss_gb
 from dpmjax.cli.optional import require_importable
 from dpmjax.cli.run_folder import RunFolder, RunOptions, open_run_folder, recording, write_metrics
-from dpmjax.slam.config import Proposer
+from dpmjax.slam.config import Proposer, SlamPreset
 
 if TYPE_CHECKING:
     from dpmjax.cli.slam_outcome import SlamRun
@@ -53,8 +53,10 @@ class Config(RunOptions):
     """Name of a shipped model, or a .safetensors file."""
     map: Annotated[Path | None, arg(metavar="IN")] = None
     """A saved map (map.npz of an earlier run) that this drive extends."""
-    odometry: Proposer = "prediction"
-    """Source of the first guess of a pose: the motion of before, or the network for every scan, as in the paper."""
+    preset: SlamPreset = "default"
+    """Settings of SLAM: the default ones, or the thresholds of the paper."""
+    odometry: Proposer | None = None
+    """Source of the first guess of a pose: the motion of before, or the network for every scan. None: of the preset."""
     no_loop: FlagCreatePairsOff[bool] = False
     """No loop closure: odometry alone."""
     refine: FlagCreatePairsOff[bool] = False
@@ -152,11 +154,12 @@ class Drive(NamedTuple):
 
 def slam_methods(config: Config) -> SlamMethods:
     """Returns the methods of the model."""
-    from dpmjax.slam import SlamConfig, make_methods
+    from dpmjax.slam import make_methods, slam_preset
     from dpmjax.weights import load_model
 
-    settings = SlamConfig()
-    settings = replace(settings, odometry=replace(settings.odometry, proposer=config.odometry))
+    settings = slam_preset(config.preset)
+    if config.odometry is not None:
+        settings = replace(settings, odometry=replace(settings.odometry, proposer=config.odometry))
     if config.no_loop:
         settings = replace(settings, loops=replace(settings.loops, is_on=False))
     return make_methods(load_model(config.weights), settings, weights=config.weights)

@@ -21,7 +21,6 @@ STEP_SHARE = 0.5
 """Step of the coefficients, as a share of the standard deviation of a channel."""
 
 POSITION_STEP_M = 0.02
-MAX_STORED_ELEMENTS = 1024
 PLANARITY_STEP = 17
 MAX_CODE = np.iinfo(np.int8).max
 
@@ -94,7 +93,7 @@ class ElementCodes(NamedTuple):
 
 
 def encode_elements(keyframes: Sequence[CompactElements]) -> ElementCodes:
-    """Keeps the first surface elements of each keyframe, and rounds them to codes.
+    """Rounds surface elements to codes.
 
     Args:
         keyframes: of one number of elements.
@@ -102,12 +101,11 @@ def encode_elements(keyframes: Sequence[CompactElements]) -> ElementCodes:
     Returns:
         The codes.
     """
-    kept = [CompactElements(one.unit_m, *(array[:MAX_STORED_ELEMENTS] for array in one[1:])) for one in keyframes]
     return ElementCodes(
-        np.stack([np.rint(one.positions.T * (one.unit_m / POSITION_STEP_M)) for one in kept]).astype(np.int16),
-        np.stack([_octahedral(one.normals) for one in kept]),
-        np.stack([np.rint(one.planarity / PLANARITY_STEP) for one in kept]).astype(np.uint8),
-        np.stack([one.mask for one in kept]),
+        np.stack([np.rint(one.positions.T * (one.unit_m / POSITION_STEP_M)) for one in keyframes]).astype(np.int16),
+        np.stack([_octahedral(one.normals) for one in keyframes]),
+        np.stack([np.rint(one.planarity / PLANARITY_STEP) for one in keyframes]).astype(np.uint8),
+        np.stack([one.mask for one in keyframes]),
     )
 
 

@@ -121,7 +121,7 @@ class NearestPlanes(NamedTuple):
         points: (s, n, 3) samples in the frame of the target.
         residuals: (s, n) signed distances to the planes, metres.
         normals: (s, n, 3) normals of the planes.
-        cosines: (s, n) absolute cosine between the normals of both surfaces.
+        cosines: (s, n) absolute cosine between the normals of both surfaces; 1 for a sample without a normal.
         flatness: (s, n) of the target's neighbourhood.
     """
 
@@ -246,13 +246,14 @@ def nearest_planes(
         return NearestPlanes(nothing > 0, moved, nothing, np.zeros_like(moved), nothing, nothing)
     found, distances = target.tree.nearest(moved.reshape(-1, 3), 1)
     nearest, is_paired = found.reshape(moved.shape[:2]), distances.reshape(moved.shape[:2]) < level.radius_m
-    normals = target.normals[nearest]
+    normals, own = target.normals[nearest], source.normals[rows]
+    cosines = np.abs(np.einsum("snd,snd->sn", own @ R_transposed, normals))
     return NearestPlanes(
         is_paired,
         points=moved,
         residuals=np.einsum("snd,snd->sn", moved - target.points[nearest], normals),
         normals=normals,
-        cosines=np.abs(np.einsum("snd,snd->sn", source.normals[rows] @ R_transposed, normals)),
+        cosines=np.where(own.any(axis=1), cosines, 1.0),
         flatness=target.flatness[nearest],
     )
 

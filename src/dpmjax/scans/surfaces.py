@@ -114,6 +114,26 @@ def surface_of_elements(elements: SurfaceElements) -> Surface:
     return Surface(points, normals, planarity, _samples(normals, planarity), HostTree(points))
 
 
+def with_further_points(surface: Surface, points: Float[np.ndarray, "m 3"]) -> Surface:
+    """Adds points without normals, which an alignment moves onto planes but finds no planes at.
+
+    Args:
+        surface: of a scan.
+        points: of the same scan, metres.
+
+    Returns:
+        The surface with more samples, which follow those of before in random order; its tree is that of before.
+    """
+    further = len(surface.points) + np.random.default_rng(0).permutation(len(points))
+    return Surface(
+        np.concatenate([surface.points, points]),
+        np.concatenate([surface.normals, np.zeros((len(points), 3))]),
+        np.concatenate([surface.flatness, np.zeros(len(points))]),
+        np.concatenate([surface.samples, further]),
+        surface.tree,
+    )
+
+
 def _normals(
     points: Float[np.ndarray, "n 3"], tree: HostTree, config: SurfaceConfig
 ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, " n"]]:

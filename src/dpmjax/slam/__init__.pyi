@@ -11,6 +11,7 @@ from .config import FrontEndConfig as FrontEndConfig
 from .config import LoopClosureConfig as LoopClosureConfig
 from .config import OdometryConfig as OdometryConfig
 from .config import SlamConfig as SlamConfig
+from .config import slam_preset as slam_preset
 from .front_end import TimedScan as TimedScan
 from .keyframes import KeyframeMap as KeyframeMap
 from .keyframes import Submap as Submap

@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from dpmjax.deeppointmap.verification import MeasuredScan
+from dpmjax.scans.surfaces import Surface
 from dpmjax.slam.keyframes import Pose
 from dpmjax.slam.local_map import LocalMap
 from dpmjax.types import PointPyramid, SurfaceElements
@@ -21,12 +22,14 @@ class ThinnedScan(NamedTuple):
         pyramid: what the encoder reads.
         elements: surface elements, metres, in the frame of the lidar, in the order of farthest points.
         measured: surface and free space.
+        surface: that surface, and all thinned points.
         extent_m: median range of the thinned points.
     """
 
     pyramid: PointPyramid
     elements: SurfaceElements
     measured: MeasuredScan
+    surface: Surface
     extent_m: float
 
 

@@ -87,6 +87,7 @@ class FrontEndConfig:
         min_probability: smallest P(correct) of the decoder's motion that accepts a pose of a lower share.
         near_m: largest distance between that motion and the pose.
         near_rad: largest turn between them.
+        min_margin: difference of the scores from which on the decoder's motion replaces another one.
         num_submap: largest number of keyframes that are merged for a registration.
         submap_radius_m: largest distance of these keyframes (DeepPointMap's published configuration).
         num_lost: number of scans without an accepted pose after which a new segment begins, which loops may join.
@@ -104,6 +105,7 @@ class FrontEndConfig:
     min_probability: float = 0.5
     near_m: float = 2.0
     near_rad: float = 0.087
+    min_margin: float = 0.1
     num_submap: int = 4
     submap_radius_m: float = 20.0
     num_lost: int = 6
@@ -117,7 +119,7 @@ class FrontEndConfig:
 
     def __post_init__(self) -> None:
         require_fields(self, "min_score_share", "min_probability", low=0, high=1)
-        require_fields(self, "near_m", "near_rad", low=0)
+        require_fields(self, "near_m", "near_rad", "min_margin", low=0)
         require_fields(self, "num_submap", "num_lost", "usual_window", low=1)
         require_positive_fields(self, "submap_radius_m", "keyframe_share", "keyframe_rad", "guess_m", "guess_rad")
         require_fields(self, "min_keyframe_m", low=1e-3, high=self.max_keyframe_m)
@@ -232,3 +234,40 @@ class MapOrigin(NamedTuple):
 
     def __str__(self) -> str:
         return f"{self.weights} ({self.fingerprint})" if self.weights else self.fingerprint
+
+
+SlamPreset = Literal["default", "paper"]
+
+
+def slam_preset(name: SlamPreset) -> SlamConfig:
+    """Returns named settings of SLAM.
+
+    Args:
+        name: "default", or "paper" for the thresholds of DeepPointMap's published configuration: the decoder registers
+            every scan, keyframes are up to 10 m apart, one loop candidate by distance is registered from an overlap
+            probability of 0.7 on and accepted alone.
+
+    Returns:
+        The settings.
+
+    Raises:
+        ValueError: if the name is unknown.
+    """
+    require_one_of("name", name, get_args(SlamPreset))
+    if name == "default":
+        return SlamConfig()
+    return SlamConfig(
+        odometry=OdometryConfig(proposer="network", num_keyframes=16),
+        front_end=FrontEndConfig(
+            min_probability=0.6, num_submap=16, num_lost=5, keyframe_share=1.0, max_keyframe_m=10.0, min_keyframe_m=1.0
+        ),
+        loops=LoopClosureConfig(
+            num_near=16,
+            num_similar=0,
+            min_overlap=0.7,
+            num_asked=16,
+            num_registered=1,
+            min_probability=0.6,
+            min_support=1,
+        ),
+    )

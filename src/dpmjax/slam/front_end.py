@@ -15,6 +15,7 @@ from dpmjax.deeppointmap.compact_scans import CompactScan
 from dpmjax.geometry import rigid
 from dpmjax.scans.deskew import deskew
 from dpmjax.slam.alignment import Alignment, ThinnedScan, best_of
+from dpmjax.slam.config import FrontEndConfig
 from dpmjax.slam.keyframes import (
     EdgeKind,
     Keyframe,
@@ -174,12 +175,16 @@ def _locate(methods: SlamMethods, state: FrontEndState, local_map: LocalMap, sca
     # Nothing is usual yet where a part of the map begins: sparse scans never score high.
     wanted = max(config.min_score, config.min_score_share * usual if state.scores else 0.0)
     tried = _attempt(methods, state, local_map, scan, usual)
-    best = best_of([found for found in (tried.tracked, tried.matched) if found is not None])
+    best = _better(tried, config)
     is_matched = best is tried.matched
     numbers = f"score {best.score:.2f} of usually {usual:.2f}"
     if tried.probability is not None:
         numbers += f", P {tried.probability:.2f} by the network"
     network = tried.probability, tried.compact
+    is_far = not are_near(predicted, best.T_map_scan, config.near_m, np.inf)
+    if is_far and (tried.probability or 0.0) < config.min_probability:
+        # A motion that neither the motion of before nor the decoder supports needs the usual score.
+        wanted = methods.config.odometry.good_share * usual
     if best.score >= wanted or _is_confirmed(methods, tried, best):
         status: ScanStatus = "network" if is_matched else "tracked"
         return Located(best.T_map_scan, status, numbers, best.score, best.information, *network)
@@ -214,6 +219,16 @@ def _attempt(
         others = state.T_keyframe_last @ geometry.other_motions(state.T_before_last, scan.extent_m)
         tracked = best_of([tracked, geometry.search(local_map, scan, orthonormal(others))])
     return _Attempt(tracked, matched, starts[0], proposal.probability, compact)
+
+
+def _better(tried: _Attempt, config: FrontEndConfig) -> Alignment:
+    """Returns the better pose; another place must fit better by a margin than the one that the prediction supports."""
+    tracked, matched = tried.tracked, tried.matched
+    if tracked is None or matched is None:
+        return best_of([found for found in (tracked, matched) if found is not None])
+    is_same = are_near(tracked.T_map_scan, matched.T_map_scan, config.near_m, config.near_rad)
+    margin = 0.0 if is_same else config.min_margin
+    return matched if matched.score > tracked.score + margin else tracked
 
 
 def _is_confirmed(methods: SlamMethods, tried: _Attempt, best: Alignment) -> bool:

@@ -65,7 +65,7 @@ def local_map_of(slam_map: KeyframeMap, config: OdometryConfig) -> LocalMap:
     placed = [
         PlacedElements(T, expand_elements(scan.elements)) for T, scan in zip(T_map_keyframe, compact, strict=True)
     ]
-    return LocalMap(tuple(placed), compact, (), _surface_of(placed))
+    return LocalMap(tuple(placed), compact, (), joined_surface(placed))
 
 
 def with_scan(
@@ -89,7 +89,7 @@ def with_scan(
         return local_map
     recent = (*local_map.recent, PlacedElements(T_map_scan, elements))[-config.num_recent :]
     placed = (*local_map.keyframes, *recent)
-    return local_map._replace(recent=recent, surface=_surface_of(placed)) if config.num_recent else local_map
+    return local_map._replace(recent=recent, surface=joined_surface(placed)) if config.num_recent else local_map
 
 
 def nearest_keyframe(local_map: LocalMap, position_map: Float[np.ndarray, " 3"]) -> int:
@@ -106,8 +106,15 @@ def nearest_keyframe(local_map: LocalMap, position_map: Float[np.ndarray, " 3"])
     return int(np.argmin(np.linalg.norm(positions - position_map, axis=1)))
 
 
-def _surface_of(placed: Sequence[PlacedElements]) -> Surface:
-    """Joins the flat elements; any of them may be drawn first."""
+def joined_surface(placed: Sequence[PlacedElements]) -> Surface:
+    """Joins the flat elements of several scans.
+
+    Args:
+        placed: at least one scan.
+
+    Returns:
+        The surface in the frame of the poses; its samples are in random order.
+    """
     parts = []
     for T, elements in placed:
         is_flat = elements.mask & (elements.planarity > MIN_FLATNESS)

@@ -64,7 +64,7 @@ class LocalizationConfig:
     same_place_rad: float = 0.06
     min_probability: float = 0.2
     min_support: int = 2
-    min_best: float = 0.95
+    min_best: float = 0.9
     max_rival_share: float = 0.5
 
     def __post_init__(self) -> None:

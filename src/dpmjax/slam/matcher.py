@@ -17,9 +17,12 @@ from dpmjax.deeppointmap.confidence import gather_evidence, with_confidence
 from dpmjax.deeppointmap.matching import merge_clouds, thin_merged
 from dpmjax.deeppointmap.model import Model, encode_pyramid, model_fingerprint
 from dpmjax.deeppointmap.scan_registration import PreparedScan, distinct_motions, match_clouds, register_each
-from dpmjax.scans.surface_alignment import AlignmentLevel, pair_with_planes
+from dpmjax.scans.compact import expand_elements
+from dpmjax.scans.surface_alignment import AlignmentLevel, align_surfaces, pair_with_planes
+from dpmjax.scans.surfaces import Surface
 from dpmjax.slam.alignment import ThinnedScan
 from dpmjax.slam.keyframes import Pose, Submap
+from dpmjax.slam.local_map import PlacedElements, joined_surface
 from dpmjax.slam.plane_information import plane_information
 from dpmjax.slam.retrieval import pooled_vector
 from dpmjax.types import DescriptorCloud, Registration, Verification
@@ -182,7 +185,7 @@ class NetworkMatcher:
         return Proposal(distinct_motions(hypotheses)[:num_motions], float(confident.confidence))
 
     def register(self, pairs: Sequence[tuple[Submap, Submap]]) -> list[Match]:
-        """Registers merged descriptors and verifies by the central scans; see `Matcher`.
+        """Registers merged descriptors, verifies by the central scans, aligns with the whole target; see `Matcher`.
 
         Args:
             pairs: submaps.
@@ -192,7 +195,7 @@ class NetworkMatcher:
         """
         prepared = [(_merged(source), _merged(target)) for source, target in pairs]
         found = register_each(self._model, prepared, refine=True)
-        return [self._match(*scans, match) for scans, match in zip(prepared, found, strict=True)]
+        return [self._match(*pair, match) for pair, match in zip(pairs, found, strict=True)]
 
     def overlaps(self, source: CompactScan, targets: Sequence[CompactScan]) -> Float[np.ndarray, " n"]:
         """Predicts the probabilities of overlap; see `Matcher`.
@@ -207,13 +210,21 @@ class NetworkMatcher:
         clouds = [target.cloud.described for target in targets]
         return np.asarray(overlap_pairs(self._model, [source.cloud.described] * len(targets), clouds))
 
-    def _match(self, source: PreparedScan, target: PreparedScan, found: Registration) -> Match:
+    def _match(self, source: Submap, target: Submap, found: Registration) -> Match:
         config = self._model.config.verification
-        T = np.asarray(found.T_target_source, np.float64)
+        scan, union = _surface(source._replace(scans=source.scans[:1])), _surface(target)
+        aligned = align_surfaces(scan, union, np.asarray(found.T_target_source, np.float64), config.refinement)
+        T = aligned.T_target_source
         level = AlignmentLevel(config.plane_radius_m, config.num_samples, 1)
-        pairs = pair_with_planes(source.measured.surface, target.measured.surface, T, level)
-        information = plane_information(pairs, T, max_residual_m=config.plane_distance_m)
+        information = plane_information(
+            pair_with_planes(scan, union, T, level), T, max_residual_m=config.plane_distance_m
+        )
         return Match(T, float(found.confidence), float(found.rmse), found.verification, information)
+
+
+def _surface(submap: Submap) -> Surface:
+    placed = zip(submap.T_submap_keyframe, submap.scans, strict=False)
+    return joined_surface([PlacedElements(T, expand_elements(scan.elements)) for T, scan in placed])
 
 
 def _merged(submap: Submap) -> PreparedScan:

@@ -14,8 +14,8 @@ from dpmjax.deeppointmap.model import elements_of_pyramid
 from dpmjax.deeppointmap.model_config import ModelConfig
 from dpmjax.deeppointmap.verification import MeasuredScan
 from dpmjax.scans.free_space import range_image, view_points
-from dpmjax.scans.surface_alignment import AlignmentLevel, PlanePairs, align_surfaces_from, pair_with_planes
-from dpmjax.scans.surfaces import Surface, surface_of_elements
+from dpmjax.scans.surface_alignment import AlignmentLevel, align_surfaces_from, nearest_planes, pair_with_planes
+from dpmjax.scans.surfaces import Surface, surface_of_elements, with_further_points
 from dpmjax.slam.alignment import Alignment, ThinnedScan, best_of
 from dpmjax.slam.config import OdometryConfig
 from dpmjax.slam.keyframes import Pose, orthonormal
@@ -59,9 +59,14 @@ class SurfaceGeometry:
         surface = surface_of_elements(elements)
         if len(surface.samples) < self.config.min_num_points:
             return None
-        thinned = np.asarray(pyramid.levels[0].positions)[np.asarray(pyramid.levels[0].mask)] * np.float64(scale_m)
+        level, chosen = pyramid.levels[0], np.asarray(pyramid.levels[1].sample_indices)
+        is_further = np.array(level.mask)
+        thinned = np.asarray(level.positions)[is_further] * np.float64(scale_m)
+        is_further[chosen[np.asarray(elements.mask)]] = False
+        further = np.asarray(level.positions)[is_further] * np.float64(scale_m)
+        extent_m = float(np.median(np.linalg.norm(thinned, axis=1)))
         measured = MeasuredScan(surface, range_image(thinned))
-        return ThinnedScan(pyramid, elements, measured, float(np.median(np.linalg.norm(thinned, axis=1))))
+        return ThinnedScan(pyramid, elements, measured, with_further_points(surface, further), extent_m)
 
     def align(self, local_map: LocalMap, scan: ThinnedScan, T_map_scan: Pose) -> Alignment:
         """Aligns from a first guess that is nearly right; see `Geometry`.
@@ -90,8 +95,8 @@ class SurfaceGeometry:
         num_samples = self.config.num_samples // 3
         coarse = []
         for found in align_surfaces_from(scan.measured.surface, local_map.surface, T_map_scan, self.config.wide):
-            pairs = self._pairs(local_map, scan.measured.surface, found.T_target_source, num_samples)
-            coarse.append((self._matched_share(pairs, scan.measured.surface, num_samples), found.T_target_source))
+            matched = self._matched_share(local_map, scan.measured.surface, found.T_target_source, num_samples)
+            coarse.append((matched, found.T_target_source))
         coarse.sort(key=lambda entry: -entry[0])
         return best_of(self._aligned(local_map, scan, np.array([T for _, T in coarse[:NUM_FINE]])))
 
@@ -122,27 +127,35 @@ class SurfaceGeometry:
         return found
 
     def _aligned(self, local_map: LocalMap, scan: ThinnedScan, starts: Float[np.ndarray, "s 4 4"]) -> list[Alignment]:
-        surface = scan.measured.surface
-        found = align_surfaces_from(surface, local_map.surface, orthonormal(starts), self.config.narrow)
+        found = align_surfaces_from(scan.surface, local_map.surface, orthonormal(starts), self.config.narrow)
         return [self._scored(local_map, scan.measured, each.T_target_source) for each in found]
 
     def _scored(self, local_map: LocalMap, measured: MeasuredScan, T: Pose) -> Alignment:
-        config = self.config
-        pairs = self._pairs(local_map, measured.surface, T, config.num_samples)
-        matched = self._matched_share(pairs, measured.surface, config.num_samples)
+        config, surface = self.config, measured.surface
+        matched = self._matched_share(local_map, surface, T, config.num_samples)
         contradicted = _contradicted_share(local_map, measured, T)
         score = matched - config.contradiction_weight * contradicted
+        level = AlignmentLevel(config.plane_radius_m, config.num_samples, 1)
+        pairs = pair_with_planes(surface, local_map.surface, T, level)
         information = plane_information(pairs, T, max_residual_m=config.plane_distance_m)
         information = with_least_covariance(information, config.floor_m, config.floor_rad)
         return Alignment(T, matched, contradicted, score, information)
 
-    def _pairs(self, local_map: LocalMap, surface: Surface, T_map_scan: Pose, num_samples: int) -> PlanePairs:
-        level = AlignmentLevel(self.config.plane_radius_m, num_samples, 1)
-        return pair_with_planes(surface, local_map.surface, T_map_scan, level)
+    def _matched_share(self, local_map: LocalMap, surface: Surface, T_map_scan: Pose, num_samples: int) -> float:
+        """Returns the mean share of elements that meet planes, over the main directions of their normals.
 
-    def _matched_share(self, pairs: PlanePairs, surface: Surface, num_samples: int) -> float:
-        meets = (np.abs(pairs.residuals) < self.config.plane_distance_m) & (pairs.cosines > self.config.min_cosine)
-        return float(meets.sum()) / max(min(num_samples, len(surface.samples)), 1)
+        Ground meets ground under any motion: without the mean it would outvote the walls.
+        """
+        config = self.config
+        level = AlignmentLevel(config.plane_radius_m, num_samples, 1)
+        planes = nearest_planes(surface, local_map.surface, T_map_scan[None], level)
+        meets = planes.is_paired & (np.abs(planes.residuals) < config.plane_distance_m)
+        meets &= planes.cosines > config.min_cosine
+        direction = np.argmax(np.abs(surface.normals[surface.samples[:num_samples]]), axis=1)
+        counts = np.bincount(direction, minlength=3)
+        shares = np.bincount(direction, weights=meets[0], minlength=3) / np.maximum(counts, 1)
+        # A direction of few elements counts less: their share is hardly known.
+        return float(np.average(shares, weights=np.minimum(counts, counts.max() / 3) + 1e-9))
 
 
 def _contradicted_share(local_map: LocalMap, measured: MeasuredScan, T_map_scan: Pose) -> float:
