@@ -27,7 +27,8 @@ from benchmarks.rows import Row
 from dpmjax.geometry import rigid
 from dpmjax.metrics import absolute_trajectory_error, registration_recall
 from dpmjax.simulation import route_poses
-from dpmjax.slam import SlamConfig, SlamMethods, SlamResult, finish_slam, init_slam, step_slam
+from dpmjax.slam import SlamConfig, SlamMethods, SlamResult, SlamState, finish_slam, init_slam, step_slam
+from dpmjax.slam.local_map import local_map_of
 from tests.slam.truth import MistakenMatcher, TruthGeometry, scans_of
 
 NAME = "slam"
@@ -132,7 +133,7 @@ class Cost(NamedTuple):
     Attributes:
         cpu_ms: mean over the scans around it.
         map_mb: keyframes, edges and loop candidates.
-        front_end_mb: everything else that the next scan needs.
+        front_end_mb: the local map after a keyframe, and everything else that the next scan needs.
         resident_mb: memory of the whole process.
     """
 
@@ -166,7 +167,7 @@ def costs(truth: np.ndarray, moments: Sequence[int]) -> list[Cost]:
         state, _ = step_slam(methods, state, scan)
         clocks.append(time.process_time())
         if len(clocks) - 1 in moments:
-            found.append((_megabytes(state.slam_map, state.loops), _megabytes(state.front_end), resident_mb()))
+            found.append((_megabytes(state.slam_map, state.loops), front_end_mb(methods, state), resident_mb()))
     half = WINDOW // 2
     cpu_ms = [1e3 * (clocks[moment + half] - clocks[moment - half]) / WINDOW for moment in moments]
     return [Cost(ms, *memory) for ms, memory in zip(cpu_ms, found, strict=True)]
@@ -178,6 +179,13 @@ def resident_mb() -> float:
     if not path.exists():
         return float("nan")
     return int(path.read_text().split()[1]) * resource.getpagesize() / 1e6
+
+
+def front_end_mb(methods: SlamMethods, state: SlamState) -> float:
+    """Returns the size of the state of odometry; the search tree is made of the points."""
+    local_map = local_map_of(state.slam_map, methods.config.odometry)
+    local_map = local_map._replace(surface=local_map.surface._replace(tree=None))
+    return _megabytes(state.front_end._replace(local_map=local_map))
 
 
 def _megabytes(*parts: object) -> float:

@@ -90,11 +90,10 @@ SCANS_3D = Group("3-D scans", (
 
 SLAM = Group("SLAM", (
     Section("OdometryConfig", "dpmjax.slam", "`SlamConfig(odometry=...)`", {
-        "min_range_m": ("m", "higher if the vehicle itself is seen"),
-        "max_range_m": ("m", "shorter indoors, longer in open country"),
-        "voxel_share": ("share of the median range", "higher: faster, coarser"),
-        "num_frames": ("scans", "more: less drift, slower"),
-        "min_num_points": ("points", "lower for very sparse lidars; below it a scan counts as empty"),
+        "proposer": ("", "\"network\": the decoder proposes the motion of every scan, slower"),
+        "num_keyframes": ("keyframes", "more: a larger local map, less drift, slower"),
+        "num_recent": ("scans", "more: a denser local map, slower"),
+        "min_num_points": ("elements", "lower for very sparse lidars; below it a scan counts as empty"),
         "plane_distance_m": ("m", "higher for noisy lidars"),
         "turns_deg": ("deg", "wider if the robot turns fast between scans"),
         "tilts_deg": ("deg", "wider if the vehicle pitches and rolls"),
@@ -104,7 +103,6 @@ SLAM = Group("SLAM", (
         "keyframe_share": ("share of the median range", "higher: fewer keyframes, smaller maps, fewer loops"),
         "max_keyframe_m": ("m", "longest way between two keyframes"),
         "keyframe_rad": ("rad", "largest turn between two keyframes"),
-        "num_neighbours": ("keyframes", "0: no edges to earlier neighbours, more drift, faster"),
         "num_lost": ("scans", "after this number of rejected scans a new part of the map begins"),
     }),
     Section("LoopClosureConfig", "dpmjax.slam", "`SlamConfig(loops=...)`", {

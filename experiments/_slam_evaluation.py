@@ -33,7 +33,7 @@ PRECISIONS: tuple[Precision, ...] = ("float32", "int8")
 NUM_SIZES = 8
 # Stages of a run that no other program's time has.
 _FILE_STAGES = ("read", "write", "viewer")
-_ODOMETRY_STAGES = ("surface", "odometry")
+_ODOMETRY_STAGES = ("thinning", "odometry")
 
 
 class StoppedError(Exception):
@@ -123,7 +123,7 @@ def _per_scan(run: SlamRun, seconds: float) -> float | None:
 
 
 def odometry_row(drive: Drive, ours: dict[str, Any]) -> dict[str, Any]:
-    """Measures our odometry in the same run, before neighbours and loops: its time is that of its stages."""
+    """Measures our odometry in the same run, before loops: its time is that of its stages."""
     numbers = common_numbers(drive, ODOMETRY, drive.trajectory(ODOMETRY), [])
     return {**numbers, "scan_s": ours["scan_odometry_s"]}
 

@@ -22,7 +22,7 @@ def case(tmp_path_factory):
     """Weights, a map of the first scans of a drive, and a folder with all of them."""
     folder = tmp_path_factory.mktemp("case")
     drive = toy.drive(num_scans=6)
-    model = dpmjax.init_model(jax.random.key(0), toy.MODEL)
+    model = dpmjax.init_model(jax.random.key(0), toy.SLAM_MODEL)
     dpmjax.save_model(model, folder / "model.safetensors")
     result = dpmjax.run_slam(model, [drive.read_scan(number) for number in range(4)])
     dpmjax.save_map(folder / "map.npz", result.map)
@@ -46,13 +46,13 @@ def with_truth(case, monkeypatch) -> None:
     drive, truth = open_lidar_sequence(scans_of(case)), np.load(case / "poses.npy")
 
     def described(number: int) -> np.ndarray:
-        points = drive.read_points(number)
-        return methods.matcher.vector(methods.matcher.describe(points, methods.geometry.measure(points)))
+        scan = methods.geometry.thin(drive.read_points(number))
+        return methods.matcher.vector(methods.matcher.encode(scan))
 
     vectors = np.array([described(number) for number in range(len(truth))])
 
     def number_of(submap: Submap) -> int:
-        vector = methods.matcher.vector(submap.descriptions[0])
+        vector = methods.matcher.vector(submap.scans[0])
         return int(np.argmin(np.linalg.norm(vectors - vector, axis=1)))
 
     def register(self, pairs: list[tuple[Submap, Submap]]) -> list[Match]:
@@ -110,7 +110,7 @@ def test_every_scan_gets_a_row_and_a_resumed_run_equals_an_unbroken_one(case, wi
 def test_bad_input_is_told_in_one_line(case, tmp_path, capsys, changes, message) -> None:
     other = case / "other.safetensors"
     if not other.exists():
-        dpmjax.save_model(dpmjax.init_model(jax.random.key(1), toy.MODEL), other)
+        dpmjax.save_model(dpmjax.init_model(jax.random.key(1), toy.SLAM_MODEL), other)
     given = {"map": "map.npz", "weights": "model.safetensors", "map_poses": "poses.npy", **changes}
     scans = case / given["scans"] if "scans" in given else scans_of(case)
     weights = given["weights"] if given["weights"] == "no_such_model" else case / given["weights"]

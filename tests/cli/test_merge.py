@@ -23,9 +23,9 @@ from tests.deeppointmap import toy
 def case(tmp_path_factory):
     """Weights, and the maps of two drives and of a part of one."""
     folder = tmp_path_factory.mktemp("case")
-    model = dpmjax.init_model(jax.random.key(0), toy.MODEL)
+    model = dpmjax.init_model(jax.random.key(0), toy.SLAM_MODEL)
     dpmjax.save_model(model, folder / "model.safetensors")
-    dpmjax.save_model(dpmjax.init_model(jax.random.key(1), toy.MODEL), folder / "other.safetensors")
+    dpmjax.save_model(dpmjax.init_model(jax.random.key(1), toy.SLAM_MODEL), folder / "other.safetensors")
     for seed, name in ((1, "a"), (2, "b"), (3, "c")):
         drive = toy.drive(seed, num_scans=3)
         result = dpmjax.run_slam(model, [drive.read_scan(number) for number in range(3)])

@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from dpmjax.cli import slam, slam_files
+from dpmjax.cli import slam, slam_run
 from dpmjax.cli.command import EXIT_BAD_INPUT, EXIT_FAILED, EXIT_OK, run_command
 from dpmjax.cli.result_files import load_json
 from dpmjax.geometry import rigid
@@ -29,7 +29,7 @@ REPOSITORY = Path(__file__).parents[2]
 TRUTH = laps(2, side_m=40.0, step_m=2.0)
 SAME_FILES = (
     "trajectory.npy", "trajectory_tum.txt", "trajectory_kitti.txt", "odometry.npy", "keyframes.txt", "graph.g2o",
-    "loops.csv", "scans.csv", "map.ply",
+    "loops.csv", "scans.csv", "map.ply", "map.npz",
 )  # fmt: skip
 
 
@@ -62,9 +62,9 @@ def drive(tmp_path_factory) -> Path:
 
 
 def use_truth(patch: pytest.MonkeyPatch) -> None:
-    """Truth in place of the networks; a map file needs their descriptors."""
+    """Truth in place of the networks, and a state that is written often."""
     patch.setattr(slam, "slam_methods", truth_methods)
-    patch.setattr(slam_files, "write_map_file", lambda path, slam_map: {})
+    patch.setattr(slam_run, "SAVE_EVERY_S", 0.2)
 
 
 @pytest.fixture
@@ -135,7 +135,7 @@ def test_results_say_what_was_done(whole, drive) -> None:
     assert metrics["t_rel_percent"] < 1.0
     assert metrics["seed"] == 0
     assert metrics["is_interrupted"] is False
-    assert {"surface", "odometry", "encode", "loops", "read", "journal"} <= set(metrics["stages_s"])
+    assert {"thinning", "odometry", "encoder", "decoder", "loops", "read", "write"} <= set(metrics["stages_s"])
     scans, loops = table(whole / "scans.csv"), table(whole / "loops.csv")
     assert [int(row["scan"]) for row in scans] == list(range(len(TRUTH)))
     assert {row["status"] for row in scans} == {"first", "tracked"}
@@ -144,7 +144,7 @@ def test_results_say_what_was_done(whole, drive) -> None:
     assert sum(row["status"] == "accepted" for row in loops) == metrics["num_loops"]
     assert {row["found_by"] for row in loops} <= {"distance", "retrieval"}
     assert metrics["num_parts"] == 1
-    for name in ("config.json", "log.txt", "trajectory.png", "map.png", "map.ply", "slam.journal"):
+    for name in ("config.json", "log.txt", "trajectory.png", "map.png", "map.ply", "map.npz", "run_state.npz"):
         assert (whole / name).stat().st_size > 0
 
 
@@ -272,7 +272,7 @@ def test_a_killed_run_equals_an_unbroken_one(whole, drive, tmp_path) -> None:
     for _ in range(5):
         process = start(*(["--resume"] if out.exists() else [drive]), "-o", out)
         deadline = time.monotonic() + 120
-        while not (out / "slam.journal").exists() and time.monotonic() < deadline:
+        while not (out / "run_state.npz").exists() and time.monotonic() < deadline:
             time.sleep(0.05)
         time.sleep(rng.uniform(0, 4))
         process.kill()

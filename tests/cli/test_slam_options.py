@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import dpmjax
+from dpmjax.cli import slam
 from dpmjax.cli.command import EXIT_BAD_INPUT, EXIT_OK
 from dpmjax.cli.drives import DriveSelection, open_drive, with_raised_beams
 from dpmjax.cli.optional import why_not_importable
@@ -16,6 +17,7 @@ from dpmjax.cli.result_files import load_json
 from dpmjax.cli.slam_reader import ScanReader
 from dpmjax.io import write_tum
 from dpmjax.scans import offsets_by_azimuth
+from dpmjax.slam import SlamConfig
 from tests.cli.test_slam import run, use_truth, write_drive
 from tests.deeppointmap import toy
 from tests.slam.test_odometry import motion, planes, seen_from
@@ -31,7 +33,7 @@ def room(tmp_path_factory) -> tuple[Path, Path]:
     for number, T in enumerate(truth):
         np.save(folder / "drive" / f"{number}.npy", seen_from(planes(rng), T).astype(np.float32))
     write_tum(folder / "drive" / "poses_lidar.txt", truth)
-    dpmjax.save_model(dpmjax.init_model(jax.random.key(0), toy.MODEL), folder / "toy.safetensors", card="toy")
+    dpmjax.save_model(dpmjax.init_model(jax.random.key(0), toy.SLAM_MODEL), folder / "toy.safetensors", card="toy")
     return folder / "drive", folder / "toy.safetensors"
 
 
@@ -46,7 +48,7 @@ def test_a_saved_map_is_extended(room, tmp_path, capsys) -> None:
     assert len(after) > len(before)
     assert [keyframe.scan for keyframe in after.keyframes][: len(before)] == [k.scan for k in before.keyframes]
     assert len(np.load(second / "trajectory.npy")) == 20
-    # The journal of the second run holds what came after the map.
+    # The state of the second run holds the map, too.
     for name in ("trajectory.npy", "map.npz", "loops.csv"):
         (tmp_path / name).write_bytes((second / name).read_bytes())
     assert run("--resume", "-o", second) == EXIT_OK
@@ -54,7 +56,7 @@ def test_a_saved_map_is_extended(room, tmp_path, capsys) -> None:
         assert (tmp_path / name).read_bytes() == (second / name).read_bytes()
     capsys.readouterr()
     other = tmp_path / "other.safetensors"
-    dpmjax.save_model(dpmjax.init_model(jax.random.key(1), toy.MODEL), other, card="toy")
+    dpmjax.save_model(dpmjax.init_model(jax.random.key(1), toy.SLAM_MODEL), other, card="toy")
     for options, message in (
         (["--map", first / "map.npz", "--weights", other], "made with weights"),
         (["--map", first / "config.json", "--weights", weights], "config.json"),
@@ -73,6 +75,16 @@ def test_deskewing_and_odometry_alone_are_options(room, tmp_path) -> None:
     metrics = load_json(tmp_path / "out" / "metrics.json")
     assert metrics["loop_statuses"] == {}
     assert metrics["ate_m"] == pytest.approx(metrics["ate_odometry_m"])
+
+
+def test_options_of_odometry_and_loops_reach_the_settings(room) -> None:
+    _, weights = room
+    given = slam.slam_methods(slam.Config(weights=str(weights), odometry="network", no_loop=True))
+    assert given.config.odometry.proposer == "network"
+    assert not given.config.loops.is_on
+    # Those of the geometry and of the matcher are the same.
+    assert given.geometry.config is given.config.odometry
+    assert slam.slam_methods(slam.Config(weights=str(weights))).config == SlamConfig()
 
 
 @pytest.mark.parametrize("times", [None, (0.0, 0.2, 0.4, 0.8)])

@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from dpmjax.deeppointmap import MatchConfig, merge_clouds
-from dpmjax.deeppointmap.matching import best_pairs, match_descriptors
+from dpmjax.deeppointmap.matching import best_pairs, match_descriptors, thin_merged
 from dpmjax.geometry import ConsensusConfig, rigid, se3
 from dpmjax.types import DescriptorCloud, Registration
 from tests.deeppointmap import toy
@@ -242,6 +242,42 @@ def test_merging_turns_elements_and_leaves_those_with_features_in_front() -> Non
     assert merged.directions.shape == (6, 2)
     bare = jax.vmap(lambda cloud: cloud.described)(clouds)
     jax.tree.map(np.testing.assert_array_equal, merge_clouds(bare, poses), merged.described)
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_a_union_describes_no_place_twice(seed: int) -> None:
+    """The oracle goes through the descriptors one cloud after the other and compares all distances."""
+    rng, num = np.random.default_rng(seed), 30
+    positions = rng.uniform(0, 20, (4, num, 3)).astype(np.float32)
+    positions[1, :10] = positions[0, :10] + 0.01
+    mask = rng.random((4, num)) > 0.2
+    mask[3] = seed != 1
+    merged = merge_clouds(DescriptorCloud(positions, rng.normal(size=(4, num, 5)), mask), np.tile(np.eye(4), (4, 1, 1)))
+    thin = thin_merged(merged, num)
+    first = positions[0][mask[0]].astype(np.float64)
+    apart = np.linalg.norm(first[:, None] - first, axis=2) + np.diag(np.full(len(first), np.inf))
+    spacing_m, kept, expected = np.median(apart.min(axis=1)), [], []
+    for number in range(4):
+        earlier = np.array(kept).reshape(-1, 3)
+        for point, is_there in zip(positions[number], mask[number], strict=True):
+            is_new = is_there and (number == 0 or np.linalg.norm(earlier - point, axis=1).min() > spacing_m)
+            expected.append(is_new)
+            kept += [point] if is_new else []
+    np.testing.assert_array_equal(thin.mask, expected)
+    assert mask[0].sum() < sum(expected) < mask.sum()
+    for name in ("positions", "features", "directions"):
+        np.testing.assert_array_equal(getattr(thin, name), getattr(merged, name))
+
+
+@pytest.mark.parametrize("num_valid", [0, 1, 6])
+def test_copies_of_a_cloud_are_left_out(num_valid: int) -> None:
+    positions = np.random.default_rng(0).normal(0, 10, (1, 6, 3)).repeat(3, axis=0)
+    mask = np.tile(np.arange(6) < num_valid, (3, 1))
+    clouds = DescriptorCloud(positions.astype(np.float32), np.ones((3, 6, 2), np.float32), mask)
+    thin = thin_merged(merge_clouds(clouds, np.tile(np.eye(4), (3, 1, 1))), 6)
+    # A single descriptor has no spacing, and all of its copies stay.
+    expected = mask if num_valid < 2 else mask & (np.arange(3) == 0)[:, None]
+    np.testing.assert_array_equal(thin.mask, expected.ravel())
 
 
 def test_wrong_arguments_are_named(as_user) -> None:

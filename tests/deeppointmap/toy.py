@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -28,6 +30,13 @@ MODEL = ModelConfig(
     decoder=DecoderConfig(input_channels=8, model_channels=12, num_layers=1, num_heads=2),
     preprocess=PreprocessConfig(capacity=128, num_outlier_neighbours=0, voxel_size_m=0.5),
 )
+
+SLAM_MODEL = replace(
+    MODEL,
+    pyramid=replace(MODEL.pyramid, stages=(PyramidStage(512, (0.05,), 12), PyramidStage(16, (0.4,), 8))),
+    preprocess=replace(MODEL.preprocess, capacity=2048),
+)
+"""Enough surface elements for odometry."""
 
 TRAINING = TrainingConfig(
     model=MODEL,

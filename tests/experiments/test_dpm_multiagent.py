@@ -16,6 +16,7 @@ from dpmjax.cli.command import EXIT_BAD_INPUT, EXIT_OK, run_command
 from dpmjax.cli.result_files import load_json
 from dpmjax.io import read_poses, write_tum
 from dpmjax.metrics import absolute_trajectory_error
+from dpmjax.saved_maps import load_state
 from dpmjax.slam import SlamConfig, SlamMethods
 from experiments import _slam_agents, dpm_multiagent
 from tests.deeppointmap import toy
@@ -41,9 +42,8 @@ def truth_methods(config) -> SlamMethods:
 
 @pytest.fixture(autouse=True)
 def with_truth(monkeypatch) -> None:
-    """Truth in place of the networks; a map file needs their descriptors."""
+    """Truth in place of the networks."""
     monkeypatch.setattr(dpm_multiagent, "agent_methods", truth_methods)
-    monkeypatch.setattr(_slam_agents, "write_map_file", lambda path, slam_map: {})
 
 
 def write_drive(folder: Path, numbers) -> Path:
@@ -90,10 +90,16 @@ def test_a_finished_run_is_not_done_again(tmp_path, monkeypatch) -> None:
     drive, out = write_drive(tmp_path / "drive", range(len(TRUTH))), tmp_path / "out"
     assert run(drive, "-o", out) == EXIT_OK
     before = {name: (out / name).read_bytes() for name in FILES}
-    # The journals of the agents hold all scans: resuming places none.
-    monkeypatch.setattr(TruthGeometry, "align", None)
+    # The states of the agents are those of the last keyframes: resuming places only the scans since.
+    states = [load_state(path) for path in sorted(out.glob("agents/*/run_state.npz"))]
+    num_scans = sum(len(np.load(out / f"agent_{number}.npy")) for number in (1, 2, 3))
+    placed, thin = [], TruthGeometry.thin
+    monkeypatch.setattr(TruthGeometry, "thin", lambda self, points: placed.append(points) or thin(self, points))
     assert run("--resume", "-o", out) == EXIT_OK
     assert {name: (out / name).read_bytes() for name in FILES} == before
+    assert len(states) == 3
+    assert len(placed) == num_scans - sum(len(state.reports) for state in states)
+    assert len(placed) < 10
 
 
 def test_parts_overlap_and_hold_all_scans() -> None:

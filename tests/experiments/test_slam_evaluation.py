@@ -59,7 +59,7 @@ def with_toys(monkeypatch, tmp_path) -> Path:
         monkeypatch.setattr(module, "PEERS", peers)
     monkeypatch.setattr(_slam_comparison, "COLORS", {**_slam_comparison.COLORS, PEER: "#000000"})
     path = tmp_path / "model.safetensors"
-    dpmjax.save_model(dpmjax.init_model(jax.random.key(0), toy.MODEL), path)
+    dpmjax.save_model(dpmjax.init_model(jax.random.key(0), toy.SLAM_MODEL), path)
     return path
 
 

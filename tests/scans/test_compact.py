@@ -1,13 +1,16 @@
-"""Laws of compact scans: small integers from which surface and free space are made again, within stated errors."""
+"""Laws of compact scans: small integers from which elements and free space are made again, within stated errors."""
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from dpmjax.scans.compact import compact_image, compact_surface, expand_image, expand_surface
+from dpmjax.scans.compact import compact_elements, compact_image, expand_elements, expand_image
 from dpmjax.scans.free_space import range_image, view_points
-from dpmjax.scans.surfaces import SurfaceConfig, scan_surface
+from dpmjax.scans.surfaces import Surface, SurfaceConfig, scan_surface
+from dpmjax.types import SurfaceElements
 
 
 def room(num: int = 20000, seed: int = 0) -> np.ndarray:
@@ -24,35 +27,69 @@ def room(num: int = 20000, seed: int = 0) -> np.ndarray:
 SURFACE = scan_surface(room(), SurfaceConfig(voxel_size_m=0.15))
 
 
-@pytest.mark.parametrize("max_points", [0, 1, 500, 100_000])
-def test_a_thinned_surface_is_of_points_of_the_surface(max_points) -> None:
-    found = expand_surface(compact_surface(SURFACE, max_points))
-    assert len(found.points) == min(max_points, len(SURFACE.points))
-    if max_points == 0:
-        return
-    is_flat = SURFACE.flatness > 0.1
-    assert (found.flatness > 0.1).sum() >= min(0.8 * max_points, is_flat.sum() - 20)
-    rows, distances = (column[:, 0] for column in SURFACE.tree.nearest(found.points, 1))
-    assert distances.max() < 10 / 32767 * 2
-    np.testing.assert_allclose(found.flatness, SURFACE.flatness[rows], atol=0.5 / 255 + 1e-9)
-    cosines = np.abs(np.sum(found.normals * SURFACE.normals[rows], axis=1))
-    assert cosines.min() > np.cos(np.radians(1.0))
-    np.testing.assert_allclose(np.linalg.norm(found.normals, axis=1), 1, atol=1e-9)
-    # The tree and the samples are those of the points.
-    np.testing.assert_array_equal(found.tree.nearest(found.points, 1)[0][:, 0], np.arange(len(found.points)))
-    assert (found.flatness[found.samples] > 0.1).all()
+def elements_of(surface: Surface, seed: int = 0) -> SurfaceElements:
+    """A tenth of the surface as elements; a fifth of them is not there and may be anything, some have no plane."""
+    rng = np.random.default_rng(seed)
+    rows = rng.permutation(len(surface.points))[: len(surface.points) // 10]
+    mask, is_plane = rng.random(len(rows)) > 0.2, rng.random(len(rows)) > 0.1
+    positions = np.where(mask[:, None], surface.points[rows], np.nan).astype(np.float32)
+    normals = np.where(is_plane[:, None], surface.normals[rows], 0).astype(np.float32)
+    planarity = np.where(is_plane, surface.flatness[rows], 0).astype(np.float32)
+    return SurfaceElements(positions, normals, np.where(mask, planarity, np.nan), mask)
 
 
-def test_thinned_points_cover_the_surface() -> None:
-    found = expand_surface(compact_surface(SURFACE, 1000))
-    assert found.tree.nearest(SURFACE.points, 1)[1].max() < 2.0
+ELEMENTS = elements_of(SURFACE)
 
 
-def test_an_empty_surface_stays_empty() -> None:
-    empty = scan_surface(np.zeros((0, 3), np.float32))
-    found = expand_surface(compact_surface(empty, 100))
-    assert found.points.shape == found.normals.shape == (0, 3)
-    image = expand_image(compact_image(range_image(empty.points)))
+@pytest.mark.parametrize("scale", [0.01, 1.0, 6.0])
+def test_elements_are_rounded_within_stated_errors(scale: float) -> None:
+    mask = ELEMENTS.mask
+    compact = compact_elements(replace(ELEMENTS, positions=np.float32(scale) * ELEMENTS.positions))
+    found = expand_elements(compact)
+    farthest_m = max(np.abs(ELEMENTS.positions[mask]).max() * scale, 1.0)
+    np.testing.assert_allclose(compact.unit_m, farthest_m / 32767, rtol=1e-6)
+    np.testing.assert_array_equal(found.mask, mask)
+    errors = np.abs(found.positions - scale * ELEMENTS.positions)[mask]
+    assert errors.max() <= 0.51 * compact.unit_m + 1e-6 * farthest_m
+    assert np.abs(found.planarity - ELEMENTS.planarity)[mask].max() <= 0.5 / 255 + 1e-6
+    is_plane = mask & (np.linalg.norm(ELEMENTS.normals, axis=1) > 0)
+    cosines = np.sum(found.normals * ELEMENTS.normals, axis=1)[is_plane]
+    assert cosines.min() > np.cos(np.radians(0.5))
+    np.testing.assert_allclose(np.linalg.norm(found.normals[is_plane], axis=1), 1, atol=1e-6)
+    assert not found.normals[mask & ~is_plane].any()
+    assert {array.dtype for array in (found.positions, found.normals, found.planarity)} == {np.dtype(np.float32)}
+
+
+def test_elements_that_are_not_there_are_zero() -> None:
+    found = compact_elements(ELEMENTS)
+    for array in (found.positions, found.planarity):
+        assert not array[~ELEMENTS.mask].any()
+    # The other elements do not depend on them.
+    other = replace(ELEMENTS, positions=np.where(ELEMENTS.mask[:, None], ELEMENTS.positions, 1e9))
+    for ours, theirs in zip(found, compact_elements(other), strict=True):
+        np.testing.assert_array_equal(ours, theirs)
+
+
+def test_rounding_twice_moves_nothing() -> None:
+    once = compact_elements(ELEMENTS)
+    twice = compact_elements(expand_elements(once))
+    np.testing.assert_allclose(twice.unit_m, once.unit_m, rtol=1e-6)
+    for name in ("positions", "planarity", "mask"):
+        np.testing.assert_array_equal(getattr(twice, name), getattr(once, name))
+    # The length of a rounded normal is not 127: its components move by a step at most.
+    assert np.abs(twice.normals.astype(int) - once.normals).max() <= 1
+    image = compact_image(range_image(SURFACE.points))
+    for ours, theirs in zip(expand_image(image), expand_image(image), strict=True):
+        np.testing.assert_array_equal(ours, theirs)
+
+
+@pytest.mark.parametrize("num", [0, 5])
+def test_a_scan_without_elements_stays_empty(num: int) -> None:
+    nothing = SurfaceElements(np.zeros((num, 3)), np.zeros((num, 3)), np.zeros(num), np.zeros(num, bool))
+    found = expand_elements(compact_elements(nothing))
+    assert found.positions.shape == found.normals.shape == (num, 3)
+    assert not found.mask.any()
+    image = expand_image(compact_image(range_image(np.zeros((0, 3)))))
     assert not np.isfinite(image.nearest_m).any()
     assert not image.farthest_m.any()
 
@@ -75,10 +112,3 @@ def test_a_compact_image_contradicts_nothing_more() -> None:
     exact, found = view_points(image, points), view_points(expand_image(compact_image(image)), points)
     assert not (found.is_contradicted & ~exact.is_contradicted).any()
     assert found.is_contradicted.sum() > 0.9 * exact.is_contradicted.sum()
-
-
-def test_expanding_twice_gives_the_same() -> None:
-    compact = compact_surface(SURFACE, 700)
-    first, second = expand_surface(compact), expand_surface(compact)
-    for name in ("points", "normals", "flatness", "samples"):
-        np.testing.assert_array_equal(getattr(first, name), getattr(second, name))

@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 
 import dpmjax
+from dpmjax.deeppointmap.compact_scans import CompactScan
 from dpmjax.geometry import rigid
 from dpmjax.metrics import absolute_trajectory_error
 from dpmjax.slam import AgentsResult, SlamConfig, SlamMethods, run_agents, take_component
-from tests.slam.truth import EMPTY, TruthGeometry, TruthMatcher, laps, pose, scans_of
+from tests.slam.truth import EMPTY, TruthGeometry, TruthMatcher, laps, number_of, pose, scans_of
 
 CONFIG = SlamConfig()
 TRUTH = laps(1, side_m=80.0, step_m=2.0)
@@ -26,10 +27,10 @@ class ConfusedMatcher(TruthMatcher):
 
     gross_share: float = 1.0
 
-    def vector(self, description: int) -> np.ndarray:
-        return np.ones(4) + 0.01 * np.random.default_rng(description).normal(size=4)
+    def vector(self, scan: CompactScan) -> np.ndarray:
+        return np.ones(4) + 0.01 * np.random.default_rng(number_of(scan)).normal(size=4)
 
-    def overlaps(self, source: int, targets: list[int]) -> np.ndarray:
+    def overlaps(self, source: CompactScan, targets: list[CompactScan]) -> np.ndarray:
         return np.ones(len(targets))
 
 
@@ -64,8 +65,8 @@ def test_three_agents_that_meet_make_one_graph(seed) -> None:
 
 
 def numbers_of(result: AgentsResult) -> list[int]:
-    """The number of the pose of each keyframe; descriptions of the truth are numbers."""
-    return [keyframe.description for keyframe in result.joined.slam_map.keyframes]
+    """The number of the pose of each keyframe."""
+    return [number_of(keyframe.compact) for keyframe in result.joined.slam_map.keyframes]
 
 
 def test_agents_that_never_meet_stay_apart() -> None:
@@ -144,11 +145,11 @@ def test_maps_of_different_days_are_merged() -> None:
     assert len(both) == len(a) + len(b)
     # The frame of the first map is kept.
     np.testing.assert_allclose(both.T_world_keyframe[0], a.T_world_keyframe[0], atol=1e-9)
-    rows = [keyframe.description for keyframe in both.keyframes]
+    rows = [number_of(keyframe.compact) for keyframe in both.keyframes]
     assert absolute_trajectory_error(both.T_world_keyframe[:, :3, 3], TRUTH[rows][:, :3, 3]) < 1.0
     # A third drive extends what was merged.
     extended = dpmjax.run_slam(methods, scans_of(PARTS[2]), slam_map=both)
-    rows = [keyframe.description for keyframe in extended.map.keyframes]
+    rows = [number_of(keyframe.compact) for keyframe in extended.map.keyframes]
     found = extended.map.T_world_keyframe[:, :3, 3]
     assert absolute_trajectory_error(found, TRUTH[rows][:, :3, 3]) < 1.0
     assert len({keyframe.scan for keyframe in extended.map.keyframes}) == len(rows)

@@ -18,7 +18,7 @@ from dpmjax.slam.map_optimization import optimize_map
 from dpmjax.slam.reports import Loop
 from dpmjax.slam.retrieval import most_similar, pooled_vector
 from dpmjax.types import DescriptorCloud
-from tests.slam.truth import laps, noise, pose
+from tests.slam.truth import compact_of, laps, noise, number_of, pose
 
 CONFIG = LoopClosureConfig()
 
@@ -33,7 +33,7 @@ def map_of(T_world_keyframe: np.ndarray, *, sigma_m: float = 0.0, segments=None,
             step = rigid.inverse(T_world_keyframe[row - 1]) @ T_true @ noise(rng, sigma_m, sigma_m / 10)
             T, edge = T @ step, MapEdge(row, row - 1, step, diagonal_information(0.05, 0.005), "odometry")
         segment = 0 if segments is None else segments[row]
-        keyframe = Keyframe(row, T, 2.0 * row, segment, 10.0, row)
+        keyframe = Keyframe(row, T, 2.0 * row, segment, 10.0, compact_of(row))
         slam_map = add_keyframe(slam_map, keyframe, T, np.ones(3), edge)
     return slam_map
 
@@ -170,7 +170,8 @@ def test_a_guess_gives_way_to_loops() -> None:
 def test_a_submap_is_in_the_frame_of_its_centre(num_keyframes) -> None:
     truth = laps(1, side_m=40.0, step_m=2.0)
     submap = submap_around(map_of(truth), 10, num_keyframes, 20.0)
-    assert submap.descriptions[0] == 10
-    assert len(submap.descriptions) == num_keyframes
-    expected = rigid.inverse(truth[10]) @ truth[list(submap.descriptions)]
+    numbers = [number_of(scan) for scan in submap.scans]
+    assert numbers[0] == 10
+    assert len(numbers) == num_keyframes
+    expected = rigid.inverse(truth[10]) @ truth[numbers]
     np.testing.assert_allclose(submap.T_submap_keyframe, expected, atol=1e-9)

@@ -1,14 +1,19 @@
-"""Laws of the geometry: a scan of a simulated room finds its pose among recent scans."""
+"""Laws of the geometry: a scan of a simulated room finds its pose in the local map."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
+from dpmjax import model_preset
+from dpmjax.deeppointmap.compact_scans import CompactScan
 from dpmjax.geometry import rigid
-from dpmjax.slam import PosePrior, SurfaceGeometry
-from dpmjax.slam.keyframes import diagonal_information, orthonormal, turn_rad
+from dpmjax.scans.compact import compact_elements, compact_image
+from dpmjax.slam import Alignment, KeyframeMap, LocalMap, OdometryConfig, SurfaceGeometry, ThinnedScan
+from dpmjax.slam.keyframes import Keyframe, add_keyframe, diagonal_information, orthonormal, turn_rad
+from dpmjax.slam.local_map import local_map_of
 
 
 def planes(rng: np.random.Generator, *, is_corridor: bool = False, num: int = 4000) -> np.ndarray:
@@ -35,21 +40,53 @@ def seen_from(points: np.ndarray, T_world_scan: np.ndarray) -> np.ndarray:
     return (points - T_world_scan[:3, 3]) @ T_world_scan[:3, :3]
 
 
+def compacted(scan: ThinnedScan) -> CompactScan:
+    """The scan as a map keeps it, without descriptors."""
+    none = np.zeros((0, 1), np.int8), np.zeros(0, np.float32), np.zeros(0, np.int8)
+    return CompactScan(compact_elements(scan.elements), *none, compact_image(scan.measured.image))
+
+
+def map_of_one(scan: ThinnedScan) -> LocalMap:
+    """The local map after the first keyframe."""
+    keyframe = Keyframe(0, np.eye(4), 0.0, 0, scan.extent_m, compacted(scan))
+    return local_map_of(add_keyframe(KeyframeMap(), keyframe, np.eye(4), np.ones(1), None), OdometryConfig())
+
+
 @pytest.fixture(scope="module")
 def geometry() -> SurfaceGeometry:
-    return SurfaceGeometry()
+    return SurfaceGeometry(model_preset("small"))
 
 
-@pytest.mark.parametrize(("x", "y", "heading_deg"), [(0.3, 0.1, 3.0), (1.0, -0.2, -20.0), (0.0, 0.0, 35.0)])
-def test_a_scan_finds_its_pose(geometry, x, y, heading_deg) -> None:
-    rng = np.random.default_rng(0)
-    true = motion(x, y, heading_deg)
-    local_map = geometry.insert(None, geometry.measure(planes(rng)), np.eye(4), 0)
-    found = geometry.align(local_map, geometry.measure(seen_from(planes(rng), true)), PosePrior(np.eye(4), np.eye(4)))
+@pytest.fixture(scope="module")
+def room(geometry) -> LocalMap:
+    return map_of_one(geometry.thin(planes(np.random.default_rng(0))))
+
+
+def assert_is_at(found: Alignment, true: np.ndarray, most_m: float, most_rad: float) -> None:
     apart = rigid.inverse(true) @ found.T_map_scan
-    assert np.linalg.norm(apart[:3, 3]) < 0.03
-    assert turn_rad(apart) < 0.01
+    assert np.linalg.norm(apart[:3, 3]) < most_m
+    assert turn_rad(apart) < most_rad
+
+
+@pytest.mark.parametrize(("x", "y", "heading_deg"), [(0.3, 0.1, 3.0), (0.0, 0.0, 0.0), (-0.2, 0.2, -4.0)])
+def test_a_scan_finds_its_pose_from_a_guess_that_is_nearly_right(geometry, room, x, y, heading_deg) -> None:
+    true = motion(x, y, heading_deg)
+    scan = geometry.thin(seen_from(planes(np.random.default_rng(1)), true))
+    found = geometry.align(room, scan, np.eye(4))
+    assert_is_at(found, true, 0.03, 0.01)
     assert found.score > 0.5
+
+
+@pytest.mark.parametrize(("x", "y", "heading_deg"), [(1.0, -0.2, -20.0), (0.0, 0.0, 35.0), (1.5, 0.0, 0.0)])
+def test_a_scan_finds_its_pose_among_other_motions(geometry, room, x, y, heading_deg) -> None:
+    true = motion(x, y, heading_deg)
+    scan = geometry.thin(seen_from(planes(np.random.default_rng(1)), true))
+    starts = geometry.other_motions(np.eye(4), scan.extent_m)
+    found = geometry.search(room, scan, starts)
+    assert_is_at(found, true, 0.03, 0.01)
+    assert found.score > 0.5
+    # The order of the first guesses decides nothing.
+    np.testing.assert_allclose(geometry.search(room, scan, starts[::-1]).T_map_scan, found.T_map_scan, atol=0.02)
 
 
 @pytest.mark.parametrize("axis", ["x", "y"])
@@ -58,71 +95,75 @@ def test_a_sparse_scan_of_a_robot_that_tilts_finds_its_pose(geometry, axis) -> N
     rng = np.random.default_rng(1)
     true = motion(1.0, 0.1, 3.0)
     true[:3, :3] = true[:3, :3] @ Rotation.from_euler(axis, 12.0, degrees=True).as_matrix()
-    local_map = geometry.insert(None, geometry.measure(planes(rng, num=1500)), np.eye(4), 0)
-    sparse = seen_from(planes(rng, num=300), true)
-    prior = PosePrior(np.eye(4), motion(1.0, 0.0, 0.0))
-    found = geometry.align(local_map, geometry.measure(sparse), prior)
-    apart = rigid.inverse(true) @ found.T_map_scan
-    assert np.linalg.norm(apart[:3, 3]) < 0.1
-    assert turn_rad(apart) < 0.02
+    local_map = map_of_one(geometry.thin(planes(rng, num=1500)))
+    sparse = geometry.thin(seen_from(planes(rng, num=300), true))
+    found = geometry.search(local_map, sparse, geometry.other_motions(motion(1.0, 0.0, 0.0), sparse.extent_m))
+    assert_is_at(found, true, 0.1, 0.02)
 
 
 def test_a_corridor_is_weak_along_its_axis(geometry) -> None:
     rng = np.random.default_rng(0)
     weakness = []
     for is_corridor in (False, True):
-        scans = [geometry.measure(planes(rng, is_corridor=is_corridor)) for _ in range(2)]
-        local_map = geometry.insert(None, scans[0], np.eye(4), 0)
-        found = geometry.align(local_map, scans[1], PosePrior(np.eye(4), np.eye(4)))
+        first, second = (geometry.thin(planes(rng, is_corridor=is_corridor)) for _ in range(2))
+        found = geometry.align(map_of_one(first), second, np.eye(4))
         covariance = np.linalg.inv(found.information)
         weakness.append(covariance[0, 0] / covariance[1, 1])
         np.testing.assert_allclose(found.information, found.information.T)
     assert weakness[1] > 5 * weakness[0]
 
 
-def test_a_scan_of_another_place_scores_low(geometry) -> None:
-    rng = np.random.default_rng(0)
-    local_map = geometry.insert(None, geometry.measure(planes(rng)), np.eye(4), 0)
-    elsewhere = geometry.measure(rng.uniform(-8, 8, (4000, 3)))
-    assert geometry.align(local_map, elsewhere, PosePrior(np.eye(4), np.eye(4))).score < 0.3
+def test_a_scan_of_another_place_scores_low(geometry, room) -> None:
+    elsewhere = geometry.thin(np.random.default_rng(0).uniform(-8, 8, (4000, 3)))
+    assert geometry.align(room, elsewhere, np.eye(4)).score < 0.3
+    starts = geometry.other_motions(np.eye(4), elsewhere.extent_m)
+    assert geometry.search(room, elsewhere, starts).score < 0.3
+
+
+def test_an_element_of_the_map_in_free_space_lowers_the_score(geometry, room) -> None:
+    points = planes(np.random.default_rng(1))
+    half = geometry.thin(points[points[:, 0] > 0])
+    # Beams that end behind the pillar of the map, through it.
+    is_pillar = np.isclose(points[:, 0], 5.0, atol=1e-6)
+    through = geometry.thin(points[(points[:, 0] > 0) & ~is_pillar])
+    seen, missed = (geometry.align(room, scan, np.eye(4)) for scan in (half, through))
+    assert seen.contradicted_share < 0.002
+    assert missed.contradicted_share > 0.008
+    for found in (seen, missed):
+        assert found.score == found.matched_share - geometry.config.contradiction_weight * found.contradicted_share
 
 
 def test_empty_scans_are_none(geometry) -> None:
-    assert geometry.measure(np.zeros((0, 3))) is None
-    assert geometry.measure(np.zeros((5000, 3))) is None
-    assert geometry.measure(np.full((5000, 3), 1e6)) is None
+    assert geometry.thin(np.zeros((0, 3))) is None
+    for points in (np.zeros((5000, 3)), np.full((5000, 3), 1e6)):
+        with pytest.warns(UserWarning, match="is it in metres"):
+            assert geometry.thin(points) is None
+    assert geometry.thin(planes(np.random.default_rng(0), num=20)) is None
 
 
-def test_a_moved_map_gives_the_moved_pose(geometry) -> None:
-    rng = np.random.default_rng(0)
-    scans = [geometry.measure(planes(rng)) for _ in range(2)]
-    local_map = geometry.insert(None, scans[0], np.eye(4), 0)
-    T_new_map = motion(2.0, 1.0, 50.0)
-    found = geometry.align(local_map, scans[1], PosePrior(np.eye(4), np.eye(4)))
-    moved = geometry.align(geometry.move(local_map, T_new_map), scans[1], PosePrior(T_new_map, np.eye(4)))
-    np.testing.assert_allclose(moved.T_map_scan, T_new_map @ found.T_map_scan, atol=1e-9)
+def test_a_thinned_scan_is_of_points_of_the_scan(geometry) -> None:
+    points = planes(np.random.default_rng(0))
+    scan = geometry.thin(points)
+    positions = scan.elements.positions[scan.elements.mask]
+    assert cKDTree(points).query(positions)[0].max() < 1e-4
+    assert len(positions) == model_preset("small").pyramid.stages[0].num_points
+    np.testing.assert_allclose(scan.extent_m, np.median(np.linalg.norm(points, axis=1)), rtol=0.2)
+    # A scan that is far from empty is one whatever its number of points.
+    assert geometry.thin(planes(np.random.default_rng(0), num=100)) is not None
 
 
-def test_a_scan_that_tells_nothing_new_does_not_join(geometry) -> None:
-    measured = geometry.measure(planes(np.random.default_rng(0)))
-    local_map = geometry.insert(None, measured, np.eye(4), 0)
-    assert geometry.insert(local_map, measured, motion(0.01, 0, 0), 1) is local_map
-    for step in range(1, geometry.config.num_frames + 8):
-        local_map = geometry.insert(local_map, measured, motion(3 * step, 0, 0), step)
-    assert len(local_map.frames) == geometry.config.num_frames
-
-
-def test_a_map_that_has_lost_old_scans_is_that_of_the_scans_it_holds(geometry) -> None:
-    rng = np.random.default_rng(0)
-    measured = [geometry.measure(planes(rng)) for _ in range(geometry.config.num_frames + 4)]
-    local_map = None
-    for scan, one in enumerate(measured):
-        local_map = geometry.insert(local_map, one, motion(2.0 * scan, 0.1 * scan, 3.0 * scan), scan)
-        local_map = geometry.move(local_map, motion(-1.0, 0.5, 4.0))
-    again = geometry.unpack(geometry.pack(local_map), lambda scan: measured[scan])
-    assert set(local_map.scans) == set(range(4, len(measured)))
-    for name in ("points", "normals", "flatness", "samples"):
-        np.testing.assert_array_equal(getattr(again.surface, name), getattr(local_map.surface, name))
+def test_other_motions_are_rigid_and_hold_the_prediction_and_rest(geometry) -> None:
+    T_last_scan = motion(0.7, 0.1, 5.0)
+    motions = geometry.other_motions(T_last_scan, 10.0)
+    np.testing.assert_allclose(
+        motions[:, :3, :3] @ motions[:, :3, :3].transpose(0, 2, 1), np.tile(np.eye(3), (len(motions), 1, 1)), atol=1e-12
+    )
+    ahead = motion(0.16 * 10.0, 0.0, 5.0)
+    tilted = motion(0.7, 0.1, 5.0)
+    tilted[:3, :3] = tilted[:3, :3] @ Rotation.from_euler("y", -8.0, degrees=True).as_matrix()
+    turned = motion(0.7, 0.1, 40.0)
+    for expected in (T_last_scan, motion(0.0, 0.0, 5.0), motion(1.4, 0.2, 5.0), turned, ahead, tilted):
+        assert np.abs(motions - expected).max(axis=(1, 2)).min() < 1e-9
 
 
 def test_rounding_errors_of_a_rotation_are_removed() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ from dpmjax.metrics import absolute_trajectory_error
 from dpmjax.slam import SlamConfig, SlamMethods, SlamResult, init_slam, run_slam, step_slam
 from dpmjax.slam.keyframes import diagonal_information
 from dpmjax.slam.matcher import Match
-from tests.slam.truth import EMPTY, MistakenMatcher, TruthGeometry, TruthMatcher, laps, pose, scans_of
+from tests.slam.truth import EMPTY, MistakenMatcher, TruthGeometry, TruthMatcher, laps, number_of, pose, scans_of
 
 CONFIG = SlamConfig()
 
@@ -173,6 +174,54 @@ def test_the_network_helps_where_geometry_fails() -> None:
     assert absolute_trajectory_error(result.T_world_scan[:, :3, 3], expected) < 0.5
 
 
+def by_network(**changes) -> SlamConfig:
+    return replace(CONFIG, odometry=replace(CONFIG.odometry, proposer="network", **changes))
+
+
+def test_the_network_places_every_scan_where_it_is_the_proposer() -> None:
+    truth = laps(1, side_m=20.0)
+    exact = TruthMatcher(truth, gross_share=0.0)
+    result = run(truth, matcher=exact, config=by_network())
+    assert {report.status for report in result.reports[1:]} == {"network"}
+    assert all(report.probability is not None for report in result.reports[1:])
+    assert absolute_trajectory_error(result.T_world_scan[:, :3, 3], truth[:, :3, 3]) < 0.5
+    # Where the network is grossly wrong, the prediction takes its place.
+    result = run(truth, matcher=TruthMatcher(truth, gross_share=0.3), config=by_network())
+    assert {report.status for report in result.reports[1:]} == {"network", "tracked"}
+    assert absolute_trajectory_error(result.T_world_scan[:, :3, 3], truth[:, :3, 3]) < 0.5
+
+
+def test_the_second_scan_of_a_drive_is_placed_by_the_network() -> None:
+    # No motion is known yet, and the identity is farther off than geometry can do.
+    truth = np.array([pose(8.0 * number, 0.0, 0.0) for number in range(12)])
+    result = run(truth, matcher=TruthMatcher(truth, gross_share=0.0))
+    assert [report.status for report in result.reports] == ["first", "network", *["tracked"] * 10]
+    assert absolute_trajectory_error(result.T_world_scan[:, :3, 3], truth[:, :3, 3]) < 0.5
+
+
+class CountingMatcher(TruthMatcher):
+    """Notes the scans that it encodes and those that it proposes motions for."""
+
+    encoded: ClassVar[list[int]] = []
+    proposed: ClassVar[list[int]] = []
+
+    def encode(self, scan):
+        compact = super().encode(scan)
+        self.encoded.append(number_of(compact))
+        return compact
+
+    def propose(self, source, target, num_motions):
+        self.proposed.append(number_of(source))
+        return super().propose(source, target, num_motions)
+
+
+def test_networks_run_for_keyframes_alone_where_the_prediction_is_right() -> None:
+    truth = np.array([pose(float(number), 0.0, 0.0) for number in range(40)])
+    result = run(truth, matcher=CountingMatcher(truth, gross_share=0.0), config=without_loops())
+    assert CountingMatcher.proposed == [1]
+    assert CountingMatcher.encoded == sorted({1, *result.keyframes.tolist()})
+
+
 def test_a_scan_where_nothing_agrees_is_predicted() -> None:
     truth = laps(1, side_m=60.0)
     geometry = TruthGeometry(truth, failures=frozenset({15}))
@@ -219,8 +268,8 @@ def test_a_map_of_other_weights_is_refused(as_user) -> None:
 class SparseGeometry(TruthGeometry):
     """Scans of so few points that a right pose never scores high."""
 
-    def align(self, local_map, measured, starts):
-        return super().align(local_map, measured, starts)._replace(score=0.4)
+    def search(self, local_map, scan, T_map_scan):
+        return super().search(local_map, scan, T_map_scan)._replace(score=0.4)
 
 
 def test_sparse_scans_are_tracked_from_the_first_one_on() -> None:

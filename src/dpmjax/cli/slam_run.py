@@ -178,7 +178,7 @@ def run_scans(
     finally:
         scans.close()
         if resumable is not None:
-            save_state(folder / STATE, *resumable)
+            watch.timed("write", save_state, folder / STATE, *resumable)
         bar.close()
     run_s = time.perf_counter() - started - watch.compile_s
     watch.stages_s["rest"] = run_s - sum(watch.stages_s.values())

@@ -32,23 +32,32 @@ def to_columns(records: Sequence[Any], name: str, *, without: Collection[str] = 
     return columns
 
 
-def from_columns(record_type: Any, columns: Mapping[str, np.ndarray], name: str) -> list[Any]:
+def from_columns(
+    record_type: Any, columns: Mapping[str, np.ndarray], name: str, *, without: Collection[str] = ()
+) -> list[Any]:
     """Turns columns back into records.
 
     Args:
         record_type: the named tuple.
         columns: from `to_columns`; others may be among them.
         name: as given there.
+        without: as given there.
 
     Returns:
         The records: numbers and texts of Python, arrays of NumPy; None for a field that was left out.
+
+    Raises:
+        ValueError: if a field is missing.
     """
     num = int(columns[name])
     fields = []
     for field in record_type._fields:
-        column = columns.get(f"{name}.{field}", np.zeros(0))
+        key, mask = f"{name}.{field}", f"{name}.{field}.is_there"
+        if num and field not in without and key not in columns and mask not in columns:
+            raise ValueError(f"{key} is missing")
+        column = columns.get(key, np.zeros(0))
         found = iter(column.tolist() if column.ndim == 1 else column)
-        is_there = columns.get(f"{name}.{field}.is_there", np.full(num, f"{name}.{field}" in columns))
+        is_there = columns.get(mask, np.full(num, key in columns))
         fields.append([next(found) if there else None for there in is_there])
     return [record_type(*values) for values in zip(*fields, strict=True)] if num else []
 

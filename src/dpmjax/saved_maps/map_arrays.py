@@ -200,7 +200,8 @@ def unpack_scans(reader: ArrayReader, precision: Precision) -> list[CompactScan]
     Raises:
         ValueError: if arrays are missing or do not fit together.
     """
-    directions, mask = (reader.take(name, None, None, kind="ib") for name in ("directions", "element_mask"))
+    directions = reader.take("directions", None, None, kind="i")
+    mask = reader.take("element_mask", None, None, kind="b")
     (k, m), (_, n) = directions.shape, mask.shape
     if k == 0 or len(mask) != k or m > n:
         raise ValueError(f"element_mask: expected rows of {k} keyframes with {m} descriptors or more, got {mask.shape}")

@@ -13,15 +13,18 @@ from typing import NamedTuple
 import numpy as np
 
 from dpmjax.io.files import load_arrays, refusing, write_atomically
-from dpmjax.saved_maps.columns import from_columns, to_columns
+from dpmjax.saved_maps.columns import from_columns, part_of, prefixed, to_columns
 from dpmjax.saved_maps.map_file import map_arrays, map_of_arrays
-from dpmjax.sequences import require
+from dpmjax.sequences import InputError, require
 from dpmjax.slam.front_end import FrontEndState
 from dpmjax.slam.loop_state import LoopState
 from dpmjax.slam.reports import Loop, ScanReport
 from dpmjax.slam.system import SlamState
 
 ADVICE = "start the run again without --resume"
+OF_LOOPS = ("loops",)
+OF_FRONT_END = ("local_map", "scores")
+"""Fields that are written apart, or made again from the map."""
 
 
 class RunState(NamedTuple):
@@ -48,11 +51,13 @@ def save_state(path: str | Path, state: SlamState, reports: Sequence[ScanReport]
         The path.
 
     Raises:
-        ValueError: if the map is empty.
+        ValueError: if the map is empty, or the last scan is not the one of a keyframe.
     """
-    arrays = map_arrays(state.slam_map, "float32") | to_columns(reports, "report")
-    arrays |= to_columns(state.loops.loops, "loop") | to_columns([state.loops], "loops", without=("loops",))
-    arrays |= to_columns([state.front_end], "front_end", without=("local_map", "scores"))
+    if state.front_end.local_map is not None:
+        raise ValueError("state: expected the state after a keyframe, got scans since the last one")
+    arrays = prefixed(map_arrays(state.slam_map, "float32"), "map") | to_columns(reports, "report")
+    arrays |= to_columns(state.loops.loops, "loop") | to_columns([state.loops], "loops", without=OF_LOOPS)
+    arrays |= to_columns([state.front_end], "front_end", without=OF_FRONT_END)
     arrays["scores"] = np.array(state.front_end.scores)
     content = io.BytesIO()
     np.savez(content, allow_pickle=False, **arrays)
@@ -71,12 +76,15 @@ def load_state(path: str | Path) -> RunState:
     Raises:
         InputError: no such file, or one that cannot be read.
     """
-    arrays = load_arrays(path)
-    require("front_end" in arrays, path, "no state of a run", ADVICE)
-    slam_map = map_of_arrays(path, arrays)
+    try:
+        arrays = load_arrays(path)
+        require("front_end" in arrays, path, "no state of a run", ADVICE)
+        slam_map = map_of_arrays(path, part_of(arrays, "map"))
+    except InputError as error:
+        raise InputError(path, error.found, ADVICE) from error
     with refusing(path, "damaged: {error}", ADVICE, (Exception,)):
-        (loops,) = from_columns(LoopState, arrays, "loops")
-        (front_end,) = from_columns(FrontEndState, arrays, "front_end")
+        (loops,) = from_columns(LoopState, arrays, "loops", without=OF_LOOPS)
+        (front_end,) = from_columns(FrontEndState, arrays, "front_end", without=OF_FRONT_END)
         front_end = front_end._replace(scores=tuple(arrays["scores"].tolist()))
         loops = loops._replace(loops=tuple(from_columns(Loop, arrays, "loop")))
         return RunState(SlamState(front_end, slam_map, loops), tuple(from_columns(ScanReport, arrays, "report")))

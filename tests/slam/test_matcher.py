@@ -1,0 +1,83 @@
+"""Laws of the matcher of networks, on a network that compiles in seconds: its keyframes are those of odometry."""
+
+from __future__ import annotations
+
+import jax
+import numpy as np
+import pytest
+
+import dpmjax
+from dpmjax.scans.compact import compact_elements
+from dpmjax.slam import NetworkMatcher, Submap, SurfaceGeometry, ThinnedScan
+from tests.deeppointmap import toy
+from tests.slam.test_odometry import motion, planes, seen_from
+
+POSES = [motion(1.5 * number, 0.1, 10.0 * number) for number in range(3)]
+
+
+@pytest.fixture(scope="module")
+def scans() -> list[ThinnedScan]:
+    geometry, rng = SurfaceGeometry(toy.SLAM_MODEL), np.random.default_rng(0)
+    return [geometry.thin(seen_from(planes(rng), T)) for T in POSES]
+
+
+@pytest.fixture(scope="module")
+def matcher() -> NetworkMatcher:
+    return NetworkMatcher(dpmjax.init_model(jax.random.key(0), toy.SLAM_MODEL))
+
+
+def test_a_keyframe_holds_the_elements_that_odometry_aligns(matcher, scans) -> None:
+    for scan in scans:
+        compact = matcher.encode(scan)
+        expected = compact_elements(scan.elements)
+        np.testing.assert_allclose(compact.elements.unit_m, expected.unit_m, rtol=1e-5)
+        np.testing.assert_array_equal(compact.elements.mask, expected.mask)
+        for name, most in (("positions", 1), ("normals", 1), ("planarity", 1)):
+            ours, theirs = (getattr(elements, name).astype(int) for elements in (compact.elements, expected))
+            assert np.abs(ours - theirs).max() <= most, name
+        num, channels = toy.SLAM_MODEL.num_descriptors, toy.SLAM_MODEL.encoder.output_channels
+        assert compact.features.shape == (num, channels)
+        assert len(compact.elements.mask) == toy.SLAM_MODEL.pyramid.stages[0].num_points
+        vector = matcher.vector(compact)
+        assert vector.shape == matcher.vector(matcher.encode(scans[0])).shape
+        assert np.isfinite(vector).all()
+
+
+@pytest.mark.parametrize("num_motions", [1, 3])
+def test_proposed_motions_are_rigid_and_few(matcher, scans, num_motions) -> None:
+    source, target = map(matcher.encode, scans[:2])
+    found = matcher.propose(source, target, num_motions)
+    T = found.T_target_source
+    assert 1 <= len(T) <= num_motions
+    np.testing.assert_allclose(
+        T[:, :3, :3] @ T[:, :3, :3].transpose(0, 2, 1), np.eye(3)[None].repeat(len(T), 0), atol=1e-5
+    )
+    assert 0 <= found.probability <= 1
+    np.testing.assert_array_equal(T, matcher.propose(source, target, num_motions).T_target_source)
+
+
+@pytest.mark.slow
+def test_a_pair_has_a_match_and_a_target_an_overlap(matcher, scans, assert_compiles_nothing) -> None:
+    first, *others = map(matcher.encode, scans)
+    one = Submap((first,), np.eye(4)[None])
+    three, two = (
+        Submap(
+            (others[0], first, others[1])[:num],
+            np.linalg.inv(POSES[1]) @ np.array([POSES[1], POSES[0], POSES[2]][:num]),
+        )
+        for num in (3, 2)
+    )
+    matches = matcher.register([(one, three), (one, two)])
+    assert len(matches) == 2
+    for match in matches:
+        assert 0 <= match.probability <= 1
+        assert match.verification is not None
+        np.testing.assert_allclose(match.information, match.information.T, rtol=1e-6)
+        assert np.linalg.eigvalsh(match.information).min() > 0
+    overlaps = matcher.overlaps(first, others)
+    assert overlaps.shape == (2,)
+    assert ((overlaps >= 0) & (overlaps <= 1)).all()
+    # The number of scans is filled up: a submap of four needs no new program.
+    four = Submap((*three.scans, first), np.concatenate([three.T_submap_keyframe, three.T_submap_keyframe[1:2]]))
+    with assert_compiles_nothing():
+        matcher.register([(one, four)])
