@@ -4,8 +4,14 @@ import numpy as np
 import pytest
 
 from dpmjax.geometry import estimate_normals
-from dpmjax.scans.surface_alignment import AlignmentConfig, AlignmentLevel, align_surfaces, align_surfaces_from
-from dpmjax.scans.surfaces import SurfaceConfig, scan_surface
+from dpmjax.scans.surface_alignment import (
+    AlignmentConfig,
+    AlignmentLevel,
+    align_surfaces,
+    align_surfaces_from,
+    nearest_planes,
+)
+from dpmjax.scans.surfaces import SurfaceConfig, scan_surface, with_further_points
 from tests.scans.surface_scenes import motion, seen_from, street
 
 
@@ -124,3 +130,16 @@ def test_settings_out_of_range_are_named(make, name: str) -> None:
 def test_wrong_shape_is_named(as_user) -> None:
     with pytest.raises(ValueError, match="^points: expected shape"):
         scan_surface(np.zeros((4, 2)))
+
+
+def test_points_without_normals_follow_the_samples_and_are_paired_with_any_plane() -> None:
+    surface, further = scan_surface(street(0)), street(3)[:500].astype(np.float64)
+    more = with_further_points(surface, further)
+    num = len(surface.samples)
+    np.testing.assert_array_equal(more.samples[:num], surface.samples)
+    assert set(more.samples[num:]) == set(range(len(surface.points), len(surface.points) + 500))
+    planes = nearest_planes(more, surface, np.eye(4)[None], AlignmentLevel(3.0, num + 500, 1))
+    assert (planes.cosines[0, num:] == 1).all()
+    np.testing.assert_allclose(planes.cosines[0, :num], 1)
+    aligned = align_surfaces(more, scan_surface(street(1)), motion(2, (0.2, 0.1, 0)))
+    assert np.linalg.norm(aligned.T_target_source[:3, 3]) < 0.05

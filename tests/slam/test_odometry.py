@@ -120,6 +120,22 @@ def test_a_scan_of_another_place_scores_low(geometry, room) -> None:
     assert geometry.search(room, elsewhere, starts).score < 0.3
 
 
+def test_ground_does_not_outvote_walls(geometry) -> None:
+    # Nine tenths of the scan are ground, and the map holds nothing else.
+    rng = np.random.default_rng(0)
+    a, b = rng.uniform(-1, 1, (2, 9000))
+    ground = np.column_stack([20 * a, 20 * b, np.full(9000, -1.5)])
+    walls = np.column_stack([np.full(500, 8.0), 4 * b[:500], 1 + 2 * a[:500]])
+    sides = np.column_stack([8 * a[:500], np.full(500, 5.0), 1 + 2 * b[:500]])
+    local_map = map_of_one(geometry.thin(ground))
+    alone = geometry.align(local_map, geometry.thin(ground), np.eye(4))
+    scan = geometry.thin(np.concatenate([ground, walls, sides]))
+    surface = scan.measured.surface
+    ground_share = np.mean(np.abs(surface.normals[surface.samples, 2]) > 0.9)
+    assert alone.matched_share > 0.95
+    assert geometry.align(local_map, scan, np.eye(4)).matched_share < ground_share - 0.1
+
+
 def test_an_element_of_the_map_in_free_space_lowers_the_score(geometry, room) -> None:
     points = planes(np.random.default_rng(1))
     half = geometry.thin(points[points[:, 0] > 0])

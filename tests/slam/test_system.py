@@ -10,7 +10,7 @@ import pytest
 
 from dpmjax.geometry import rigid
 from dpmjax.metrics import absolute_trajectory_error
-from dpmjax.slam import SlamConfig, SlamMethods, SlamResult, init_slam, run_slam, step_slam
+from dpmjax.slam import SlamConfig, SlamMethods, SlamResult, init_slam, run_slam, slam_preset, step_slam
 from dpmjax.slam.keyframes import diagonal_information
 from dpmjax.slam.matcher import Match
 from tests.slam.truth import EMPTY, MistakenMatcher, TruthGeometry, TruthMatcher, laps, number_of, pose, scans_of
@@ -276,3 +276,21 @@ def test_sparse_scans_are_tracked_from_the_first_one_on() -> None:
     truth = laps(1, side_m=20.0)
     result = run(truth, geometry=SparseGeometry(truth))
     assert {report.status for report in result.reports[1:]} == {"tracked"}
+
+
+def test_the_settings_of_the_paper_ask_the_network_for_every_scan() -> None:
+    paper = slam_preset("paper")
+    assert slam_preset("default") == SlamConfig()
+    assert paper.odometry.proposer == "network"
+    assert paper.loops.min_overlap == 0.7
+    truth = laps(1, 20.0)
+    methods = SlamMethods(TruthMatcher(truth, gross_share=0.0), TruthGeometry(truth), paper)
+    result = run_slam(methods, scans_of(range(30)))
+    assert "tracked" not in {report.status for report in result.reports}
+    # The extent of a scan is 10 m.
+    assert len(result.keyframes) <= 5
+
+
+def test_unknown_settings_are_refused(as_user) -> None:
+    with pytest.raises(ValueError, match="name: expected one of"):
+        slam_preset("fast")
