@@ -164,15 +164,6 @@ def test_keyframes_may_have_different_numbers_of_elements(tmp_path, precision) -
     np.testing.assert_allclose(clouds[0].positions[: NUM_DESCRIPTORS + 5], clouds[1].positions, atol=0.011)
 
 
-def test_int8_keeps_the_first_elements(tmp_path) -> None:
-    many = with_compact(MAP, scan(0, 1500))
-    found = load_map(save_map(tmp_path / "map.npz", many, "int8"))
-    ours, theirs = (one.keyframes[0].compact.cloud for one in (found, many))
-    assert len(ours.mask) == 1024
-    np.testing.assert_allclose(ours.positions, theirs.positions[:1024], atol=0.011)
-    assert len(load_map(save_map(tmp_path / "map.npz", many)).keyframes[0].compact.elements.mask) == 1500
-
-
 def test_wrong_arguments_are_refused(as_user, tmp_path) -> None:
     with pytest.raises(ValueError, match="path: expected a file that ends in .npz"):
         save_map(tmp_path / "map.bin", MAP)
