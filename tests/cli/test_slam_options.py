@@ -17,7 +17,7 @@ from dpmjax.cli.result_files import load_json
 from dpmjax.cli.slam_reader import ScanReader
 from dpmjax.io import write_tum
 from dpmjax.scans import offsets_by_azimuth
-from dpmjax.slam import SlamConfig
+from dpmjax.slam import SlamConfig, slam_preset
 from tests.cli.test_slam import run, use_truth, write_drive
 from tests.deeppointmap import toy
 from tests.slam.test_odometry import motion, planes, seen_from
@@ -85,6 +85,10 @@ def test_options_of_odometry_and_loops_reach_the_settings(room) -> None:
     # Those of the geometry and of the matcher are the same.
     assert given.geometry.config is given.config.odometry
     assert slam.slam_methods(slam.Config(weights=str(weights))).config == SlamConfig()
+    for odometry, proposer in ((None, "network"), ("prediction", "prediction")):
+        paper = slam.slam_methods(slam.Config(weights=str(weights), preset="paper", odometry=odometry)).config
+        assert paper.front_end == slam_preset("paper").front_end
+        assert paper.odometry.proposer == proposer
 
 
 @pytest.mark.parametrize("times", [None, (0.0, 0.2, 0.4, 0.8)])

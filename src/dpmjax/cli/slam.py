@@ -18,7 +18,7 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, NamedTuple
 
 import numpy as np
 from tyro.conf import FlagCreatePairsOff, Positional, arg
@@ -28,7 +28,6 @@ from dpmjax.cli.drives import DriveSelection, open_drive
 from dpmjax.cli.machine import peak_rss_gb
 from dpmjax.cli.optional import require_importable
 from dpmjax.cli.run_folder import RunFolder, RunOptions, open_run_folder, recording, write_metrics
-from dpmjax.slam.config import Proposer, SlamPreset
 
 if TYPE_CHECKING:
     from dpmjax.cli.slam_outcome import SlamRun
@@ -53,9 +52,9 @@ class Config(RunOptions):
     """Name of a shipped model, or a .safetensors file."""
     map: Annotated[Path | None, arg(metavar="IN")] = None
     """A saved map (map.npz of an earlier run) that this drive extends."""
-    preset: SlamPreset = "default"
+    preset: Literal["default", "paper"] = "default"
     """Settings of SLAM: the default ones, or the thresholds of the paper."""
-    odometry: Proposer | None = None
+    odometry: Literal["prediction", "network"] | None = None
     """Source of the first guess of a pose: the motion of before, or the network for every scan. None: of the preset."""
     no_loop: FlagCreatePairsOff[bool] = False
     """No loop closure: odometry alone."""

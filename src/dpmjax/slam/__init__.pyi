@@ -17,6 +17,7 @@ from .keyframes import KeyframeMap as KeyframeMap
 from .keyframes import Submap as Submap
 from .keyframes import as_pose_graph as as_pose_graph
 from .local_map import LocalMap as LocalMap
+from .local_map import local_map_of as local_map_of
 from .localization import Localization as Localization
 from .localization import LocalizationConfig as LocalizationConfig
 from .localization import localize as localize
