@@ -27,8 +27,7 @@ from benchmarks.rows import Row
 from dpmjax.geometry import rigid
 from dpmjax.metrics import absolute_trajectory_error, registration_recall
 from dpmjax.simulation import route_poses
-from dpmjax.slam import SlamConfig, SlamMethods, SlamResult, SlamState, finish_slam, init_slam,
-    local_map_of, step_slam
+from dpmjax.slam import SlamConfig, SlamMethods, SlamResult, SlamState, finish_slam, init_slam, local_map_of, step_slam
 from tests.slam.truth import MistakenMatcher, TruthGeometry, scans_of
 
 NAME = "slam"
