@@ -8,9 +8,11 @@ from pathlib import Path
 import numpy as np
 
 from dpmjax.geometry import rigid
-from dpmjax.io.drives import Drive3D, match_poses, match_rows, match_times, numbers_of, scan_files
+from dpmjax.io.calibration import read_camera_calibration, read_labelled_numbers
+from dpmjax.io.drives import Drive3D, scan_files
 from dpmjax.io.files import natural_key, read_lines, read_table
 from dpmjax.io.poses import check_poses, from_rows, homogeneous, interpolate_poses, read_poses
+from dpmjax.io.references import match_poses, match_rows, match_times, numbers_of
 from dpmjax.sequences import FloatArray, InputError, require
 
 _CARLA_POSES_PER_FRAME = 100  # KITTI-CARLA writes poses at 1000 Hz and frames at 10 Hz.
@@ -44,7 +46,7 @@ def read_kitti_odometry(folder: Path) -> Drive3D:
         return drive
     poses = read_poses(path)
     if path != in_lidar:
-        T_cam0_lidar = _read_camera_calibration(folder / "calib.txt")
+        T_cam0_lidar = read_camera_calibration(folder / "calib.txt")
         poses = rigid.inverse(T_cam0_lidar) @ poses @ T_cam0_lidar
     return drive._replace(T_world_lidar=match_poses(poses, files, path))
 
@@ -214,37 +216,6 @@ def _read_stamps(path: Path, files: list[Path]) -> FloatArray | None:
         return None
     matched = match_rows(stamps, files)
     return None if matched is None or not len(matched) else (matched - matched[0]).astype(np.float64) * 1e-9
-
-
-def read_labelled_numbers(path: Path) -> dict[str, FloatArray]:
-    """Reads the lines `key: numbers` of a calibration file; other lines are ignored.
-
-    Args:
-        path: the file.
-
-    Returns:
-        The numbers by key.
-
-    Raises:
-        InputError: there is no such file.
-    """
-    found = {}
-    for key, _, numbers in (line.partition(":") for line in read_lines(path)):
-        try:
-            found[key.strip()] = np.array(numbers.split(), np.float64)
-        except ValueError:
-            continue
-    return found
-
-
-def _read_camera_calibration(path: Path) -> FloatArray:
-    """(4, 4) `T_cam0_lidar`: `Tr`, the lidar's frame to the left grey camera's, out of KITTI's calib.txt."""
-    entries = read_labelled_numbers(path)
-    for key in ("Tr", "Tr_velo_to_cam", "Tr_velo_cam"):
-        if key in entries and len(entries[key]) == 12:
-            return from_rows(entries[key], path)[0]
-    advice = "take the calib.txt with a line 'Tr:' of 12 numbers (data_odometry_calib); camera poses need it"
-    raise InputError(path, "no line 'Tr:' of 12 numbers", advice)
 
 
 def _read_imu_calibration(path: Path) -> FloatArray:
