@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from pathlib import Path
 
@@ -113,8 +114,40 @@ def _parse_header(content: bytes, source: str) -> CloudLayout:
             raise ValueError("lengths differ, or a number is negative")
         if any(counts[fields.index(name)] < 1 for name in "xyz" if name in fields):
             raise ValueError("a coordinate without a number")
+        encoding = entries["DATA"][0].lower()
         layout = np.dtype([(f"{i}", t, (c,)) for i, (t, c) in enumerate(zip(types, counts, strict=True))])
-        return CloudLayout(fields, layout, num_points, entries["DATA"][0].lower(), size, num_lines)
+        if encoding == "binary" and PADDING in fields:
+            layout = _aligned(layout, fields)
+        return CloudLayout(fields, layout, num_points, encoding, size, num_lines)
+
+
+def _aligned(layout: np.dtype[np.void], fields: list[str]) -> np.dtype[np.void]:
+    """The layout with the padding that was meant, where fields are aligned under it and not under the header's."""
+    # The Point Cloud Library counts the padding before a field as if the field before the padding had its size.
+    names = [f"{i}" for i in range(len(fields))]
+    kinds, starts = [layout[name] for name in names], [layout.fields[name][1] for name in names]  # type: ignore[index]
+    offsets, before = list(starts), None
+    for i, name in enumerate(fields):
+        if name == PADDING:
+            continue
+        if before is not None and i > before + 1:
+            wrong_size = math.prod(kinds[before].shape) * kinds[i].base.itemsize
+            offsets[i] = offsets[before] + wrong_size + starts[i] - starts[before] - kinds[before].itemsize
+        before = i
+    held = [i for i, name in enumerate(fields) if name != PADDING]
+
+    def is_aligned(offsets: list[int]) -> bool:
+        ends = [offsets[i] + kinds[i].itemsize for i in held]
+        is_apart = (
+            all(end <= offsets[i] for end, i in zip(ends, held[1:], strict=False)) and ends[-1] <= layout.itemsize
+        )
+        return is_apart and all(offsets[i] % kinds[i].base.itemsize == 0 for i in held)
+
+    if not held or is_aligned(starts) or not is_aligned(offsets):
+        return layout
+    formats = [kind if i in held else np.dtype(("u1", (0,))) for i, kind in enumerate(kinds)]
+    places = [offsets[i] if i in held else 0 for i in range(len(fields))]
+    return np.dtype({"names": names, "formats": formats, "offsets": places, "itemsize": layout.itemsize})
 
 
 def _ascii_columns(body: bytes, header: CloudLayout, source: str) -> dict[str, NDArray[np.generic]]:

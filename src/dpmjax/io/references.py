@@ -86,7 +86,7 @@ def match_poses(poses: FloatArray, files: Sequence[Path], path: Path) -> FloatAr
 def to_seconds(stamps: FloatArray) -> FloatArray:
     """Converts time stamps in nano-, micro- or milliseconds to seconds; their size tells the unit.
 
-    Stamps from 1970 on are told by their values, others, where they are whole numbers, by their median step.
+    Stamps from 1970 on are told by their values, others by their median step; milliseconds are whole numbers.
 
     Args:
         stamps: (n,) in order.
@@ -98,9 +98,10 @@ def to_seconds(stamps: FloatArray) -> FloatArray:
         return stamps
     smallest, steps = float(np.abs(stamps).min()), np.diff(stamps)
     is_whole = bool((stamps == np.round(stamps)).all())
-    step = float(np.median(np.abs(steps))) if len(steps) and is_whole else 0.0
+    step = float(np.median(np.abs(steps))) if len(steps) else 0.0
     for per_second, least_stamp, least_step in _UNITS:
-        if smallest >= least_stamp or (smallest < 1e8 and step >= least_step):
+        is_step = step >= least_step and (is_whole or per_second > 1e3)
+        if smallest >= least_stamp or (smallest < 1e8 and is_step):
             return stamps / per_second
     return stamps
 
