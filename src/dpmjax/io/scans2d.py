@@ -11,15 +11,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dpmjax.geometry import se2
+from dpmjax.io.bags import is_bag
 from dpmjax.io.carmen import read_carmen_log
 from dpmjax.io.deepmapping_folder import read_deepmapping_folder
 from dpmjax.io.files import load_arrays, read_bytes, to_float32
 from dpmjax.io.poses import check_poses
+from dpmjax.io.scan_bags import read_scan_bag
 from dpmjax.sequences import BoolArray, FloatArray, InputError, ScanSequence, Unit, has_angular_order, require
 
 Table = Mapping[str, NDArray[np.generic]]
 _log = logging.getLogger(__name__)
-_FORMATS = "a folder or .tar of .pcd files, a CARMEN .log, .clf or .log.gz, or .npy / .npz arrays"
+_FORMATS = "a folder or .tar of .pcd files, a CARMEN .log, .clf or .log.gz, a bag of ROS, or .npy / .npz arrays"
 _KEYS = "points (n, b, 2), or ranges (n, b) and angles (b,); optional mask, poses, odometry, times, unit"
 _ENDINGS = {"folder": (".tar", ".tar.gz", ".tgz"), "arrays": (".npy", ".npz")}
 _ENDINGS |= {"carmen": (".log", ".clf", ".log.gz", ".clf.gz")}
@@ -38,18 +40,20 @@ def read_sequence(
     stride: int = 1,
     unit: Unit | None = None,
     max_range: float | None = None,
+    topic: str | None = None,
 ) -> ScanSequence:
     """Reads a sequence of planar scans, whatever of the known formats it is in.
 
     Args:
         path: a folder or tar archive of PCD files (`read_deepmapping_folder`), a CARMEN log (`read_carmen_log`), or a
-            NumPy file (`read_arrays`). The ending decides, else the first bytes.
+            NumPy file (`read_arrays`), or a bag of ROS (`read_scan_bag`). The ending decides, else the first bytes.
         start: first scan to keep.
         stop: scan to stop before; None for the end.
         stride: keep every `stride`-th scan.
         unit: unit of the file's lengths where the file does not state it; None takes PCD files as pixels / 512 and
             arrays as metres. CARMEN logs are in metres.
         max_range: beams of this length or more (in the sequence's unit) are masked; None leaves it to the reader.
+        topic: of a bag: which scans; may be left out where there is one topic of planar scans.
 
     Returns:
         The sequence: two scans at least of 17 beams at least, each with one valid beam at least.
@@ -64,7 +68,7 @@ def read_sequence(
     is_good = start >= 0 and stride >= 1 and (stop is None or stop >= 0)
     require(is_good, path, chosen, "start and stop count from 0, stride from 1")
     require(max_range is None or max_range > 0, path, f"max_range is {max_range}", "give a positive length")
-    whole = _read_any(path, unit, max_range)
+    whole = _read_any(path, unit, max_range, topic)
     if max_range is not None:
         whole = _limit(whole, max_range)
     sequence = whole.take(slice(start, stop, stride))
@@ -77,9 +81,13 @@ def read_sequence(
     return sequence
 
 
-def _read_any(path: Path, unit: Unit | None, max_range: float | None) -> ScanSequence:
+def _read_any(path: Path, unit: Unit | None, max_range: float | None, topic: str | None) -> ScanSequence:
     require(path.exists(), path, "no such file or folder", "check the path")
     kind = _detect(path)
+    require(topic is None or kind == "bag", path, "no bag of ROS", "leave the topic out")
+    if kind == "bag":
+        require(unit != "px", path, "a bag is in metres, not px", "leave the unit out")
+        return read_scan_bag(path, topic)
     if kind == "folder":
         return read_deepmapping_folder(path, unit=unit)
     if kind == "arrays":
@@ -89,7 +97,9 @@ def _read_any(path: Path, unit: Unit | None, max_range: float | None) -> ScanSeq
 
 
 def _detect(path: Path) -> str:
-    """What the path holds, by its ending, else by its first bytes: "folder", "arrays" or "carmen"."""
+    """What the path holds, by its ending, else by its first bytes: "folder", "arrays", "bag" or "carmen"."""
+    if is_bag(path):
+        return "bag"
     if path.is_dir():
         has_scans = any(file.suffix.lower() == ".pcd" for file in path.iterdir())
         require(has_scans, path, "a folder without .pcd files", f"give {_FORMATS}")
