@@ -100,6 +100,7 @@ def test_notes_are_in_the_log_and_the_numbers_and_errors_are_those_of_matched_sc
 
 def test_millimetres_and_a_map_are_named_by_the_command(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     write_room(tmp_path / "drive", 3)
-    write_pcd(tmp_path / "drive" / "000000.pcd", np.random.default_rng(0).normal(size=(500, 3)) + [5e5, 5.4e6, 300])
+    far = np.random.default_rng(0).normal([5e5, 5.4e6, 300], 1, (500, 3))
+    write_pcd(tmp_path / "drive" / "000000.pcd", far)
     assert run(tmp_path / "drive", "-o", tmp_path / "out") == EXIT_BAD_INPUT
     assert "UTM; subtract an origin" in capsys.readouterr().err

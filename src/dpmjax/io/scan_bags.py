@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,7 +22,7 @@ from dpmjax.io.ros_messages import (
     matrix_of,
     stamp_of,
 )
-from dpmjax.sequences import FloatArray, ScanSequence, has_angular_order, require
+from dpmjax.sequences import FloatArray, ScanSequence, has_angular_order
 
 _log = logging.getLogger(__name__)
 # Frames whose motion against the robot is the result of a mapping, not odometry.
