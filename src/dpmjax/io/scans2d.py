@@ -161,8 +161,9 @@ def read_arrays(path: str | Path, *, unit: Unit | None = None) -> ScanSequence:
     ahead; and optionally `mask` (n, b), `poses` (the reference) and `odometry` as (n, 3) x, y, heading or (n, 3, 3)
     `T_world_scan`, `times` (n,) in seconds, and `unit`, "px" or "m".
 
-    A beam is invalid where `mask` is False, where both coordinates are NaN, or where its range is NaN, infinite or not
-    positive (as scanner drivers write a beam without echo). A beam with one NaN coordinate is an error.
+    A beam is invalid where `mask` is False, where both coordinates are NaN or one is infinite, or where its range is
+    NaN, infinite or not positive (as scanner drivers write a beam without echo). A beam with one NaN coordinate and a
+    finite one is an error.
 
     Args:
         path: the file.
@@ -205,7 +206,7 @@ def _points(table: Table, path: str | Path) -> tuple[FloatArray, BoolArray]:
     is_good = _is_numeric(points, (*points.shape[:2], 2), (*points.shape[:2], 3)) and points.ndim == 3
     require(is_good, path, f"points are {points.shape} {points.dtype}", "give (n, b, 2): scans, beams, x and y")
     planar = points[..., :2].astype(np.float64)
-    return planar, np.isnan(planar).sum(axis=2) < 2
+    return planar, (np.isnan(planar).sum(axis=2) < 2) & ~np.isinf(planar).any(axis=2)
 
 
 def _from_ranges(table: Table, path: str | Path) -> tuple[FloatArray, BoolArray]:
