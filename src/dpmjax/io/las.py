@@ -12,12 +12,16 @@ import numpy as np
 from dpmjax.io.clouds import TimedCloud
 from dpmjax.io.extras import import_for
 from dpmjax.io.files import read_bytes, refusing, to_float32
-from dpmjax.sequences import require
+from dpmjax.sequences import InputError, require
 
+_ADVICE = "copy the file again, or save it anew as LAS 1.2 or 1.4"
 # LAZ packs a point of 20 bytes or more to 3, and to less only where all points are alike.
 _MOST_POINTS_PER_BYTE = 100
 # The least length of a variable length record.
 _RECORD_BYTES = 54
+# Types of the compressed items of a point, with their bytes; the others have any number.
+_ITEM_BYTES = {6: 20, 7: 8, 8: 6, 9: 29, 10: 30, 11: 6, 12: 8, 13: 29}
+_BYTE_ITEMS = (0, 14)
 
 
 def read_las(path: Path) -> TimedCloud:
@@ -31,25 +35,31 @@ def read_las(path: Path) -> TimedCloud:
 
     Raises:
         InputError: no such file, no laspy, or a damaged file.
+        BaseException: an interruption.
     """
     content = read_bytes(path)
     laspy = import_for(path, "laspy", "las")
-    advice = "copy the file again, or save it anew as LAS 1.2 or 1.4"
-    require(content[:4] == b"LASF", path, "no LAS header", advice)
-    # Damaged headers raise many kinds of errors, those of the decompressor, too.
-    with refusing(path, "not a readable LAS file ({kind}: {error})", advice, (Exception,)):
-        _require_room_for_records(content)
-        backend = (laspy.LazBackend.Lazrs,)
-        with (
-            np.errstate(all="ignore"),
-            laspy.open(io.BytesIO(content), laz_backend=backend, read_evlrs=False) as reader,
-        ):
-            _require_whole(reader.header, content)
-            cloud = reader.read()
+    require(content[:4] == b"LASF", path, "no LAS header", _ADVICE)
+    try:
+        # Damaged headers raise many kinds of errors.
+        with refusing(path, "not a readable LAS file ({kind}: {error})", _ADVICE, (Exception,)):
+            return _read(laspy, content)
+    except BaseException as error:
+        # A panic of the decompressor, which is written in Rust, is no Exception.
+        if type(error).__name__ == "PanicException":
+            raise InputError(path, f"not a readable LAS file ({error})", _ADVICE) from error
+        raise
+
+
+def _read(laspy: Any, content: bytes) -> TimedCloud:
+    _require_room_for_records(content)
+    options = {"laz_backend": (laspy.LazBackend.Lazrs,), "read_evlrs": False}
+    with np.errstate(all="ignore"), laspy.open(io.BytesIO(content), **options) as reader:
+        _require_whole(reader.header, content)
+        cloud = reader.read()
         points = np.stack([np.asarray(cloud.x), np.asarray(cloud.y), np.asarray(cloud.z)], axis=1)
         has_times = "gps_time" in cloud.point_format.dimension_names
-        times = np.asarray(cloud.gps_time, np.float64) if has_times else None
-        return TimedCloud(to_float32(points), times)
+        return TimedCloud(to_float32(points), np.asarray(cloud.gps_time, np.float64) if has_times else None)
 
 
 def _require_room_for_records(content: bytes) -> None:
@@ -67,9 +77,25 @@ def _require_whole(header: Any, content: bytes) -> None:
     if not is_whole:
         raise ValueError(f"truncated: {count} points, {size} bytes are there")
     if header.are_points_compressed:
-        # The decompressor makes room for as many chunks as the table names, and ends the process where it cannot.
-        (place,) = struct.unpack_from("<q", content, start)
-        (place,) = struct.unpack_from("<q", content, size - 8) if place == -1 else (place,)
-        version, num_chunks = struct.unpack_from("<II", content, place) if 0 < place <= size - 8 else (1, 0)
-        if version != 0 or num_chunks > size:
-            raise ValueError("no table of its compressed chunks")
+        _require_chunks(content, start)
+        _require_items(header.vlrs.get("LasZipVlr")[0].record_data, width)
+
+
+def _require_chunks(content: bytes, start: int) -> None:
+    """Raises a ValueError where there is no table of the compressed chunks."""
+    # The decompressor makes room for as many chunks as the table names, and ends the process where it cannot.
+    size = len(content)
+    (place,) = struct.unpack_from("<q", content, start)
+    (place,) = struct.unpack_from("<q", content, size - 8) if place == -1 else (place,)
+    version, num_chunks = struct.unpack_from("<II", content, place) if 0 < place <= size - 8 else (1, 0)
+    if version != 0 or num_chunks > size:
+        raise ValueError("no table of its compressed chunks")
+
+
+def _require_items(record: bytes, width: int) -> None:
+    """Raises a ValueError where the items of a compressed point are unknown, or do not make a point."""
+    (count,) = struct.unpack_from("<H", record, 32)
+    items = [struct.unpack_from("<HH", record, 34 + 6 * i) for i in range(count)]
+    is_known = all(size == _ITEM_BYTES[kind] if kind in _ITEM_BYTES else kind in _BYTE_ITEMS for kind, size in items)
+    if not items or not is_known or sum(size for _, size in items) != width:
+        raise ValueError(f"points of {width} bytes in compressed items {items}")
