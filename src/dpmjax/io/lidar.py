@@ -64,8 +64,9 @@ def open_lidar_sequence(
     path, poses = Path(path), None if poses is None else Path(poses)
     is_good = bin_columns is None or bin_columns >= 3
     require(is_good, path, f"bin_columns is {bin_columns}", "a point has x, y and z at least")
-    require(topic is None or is_bag(path) or not path.exists(), path, "no bag of ROS", "leave the topic out")
-    whole = _open_bag(path, topic, poses) if is_bag(path) else _open_folder(_choose(path, sequence), poses, bin_columns)
+    is_recording = is_bag(path) and (path.is_file() or _kind(path) is None)
+    require(topic is None or is_recording or not path.exists(), path, "no bag of ROS", "leave the topic out")
+    whole = _open_bag(path, topic, poses) if is_recording else _open_folder(_choose(path, sequence), poses, bin_columns)
     note = None if whole.T_world_lidar is None else camera_note(whole.T_world_lidar, poses or path)
     whole = replace(whole, notes=(*whole.notes, *([] if note is None else [note])))
     log_notes(whole.notes)

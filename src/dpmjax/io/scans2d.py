@@ -98,10 +98,10 @@ def _read_any(path: Path, unit: Unit | None, max_range: float | None, topic: str
 
 def _detect(path: Path) -> str:
     """What the path holds, by its ending, else by its first bytes: "folder", "arrays", "bag" or "carmen"."""
-    if is_bag(path):
+    has_scans = path.is_dir() and any(file.suffix.lower() == ".pcd" for file in path.iterdir())
+    if is_bag(path) and not has_scans:
         return "bag"
     if path.is_dir():
-        has_scans = any(file.suffix.lower() == ".pcd" for file in path.iterdir())
         require(has_scans, path, "a folder without .pcd files", f"give {_FORMATS}")
         return "folder"
     name = path.name.lower()
