@@ -18,6 +18,8 @@ from dpmjax.sequences import FloatArray, InputError, Note, require
 _LARGEST_TOLERANCE_S, _SMALLEST_TOLERANCE_S = 0.1, 0.001
 # Stamps since 1970 and steps of stamps from 0, of which these are the smallest, in nano-, micro- and milliseconds.
 _UNITS = ((1e9, 1e17, 3e6), (1e6, 1e14, 3e3), (1e3, 1e11, 8.0))
+# Nanoseconds since 1970 are below this for three thousand years.
+_LARGEST_STAMP = 1e20
 # A lidar moves along its x axis, a camera along its z axis: share of the squared way, and the shortest way, m.
 _CAMERA_SHARE, _CAMERA_WAY_M = 0.8, 2.0
 
@@ -94,7 +96,7 @@ def to_seconds(stamps: FloatArray) -> FloatArray:
     Returns:
         (n,) s.
     """
-    if not len(stamps) or not np.isfinite(stamps).all():
+    if not len(stamps) or not _are_times(stamps):
         return stamps
     smallest, steps = float(np.abs(stamps).min()), np.diff(stamps)
     is_whole = bool((stamps == np.round(stamps)).all())
@@ -121,9 +123,9 @@ def scan_times(homes: Sequence[Path], files: Sequence[Path]) -> tuple[FloatArray
     if path is not None:
         try:
             stamps = read_table(path)[:, 0]
-            if len(stamps) == len(files) and np.isfinite(stamps).all():
+            if len(stamps) == len(files) and _are_times(stamps):
                 return to_seconds(stamps), ()
-            found = f"{len(stamps)} rows, or some not finite, for {len(files)} scans"
+            found = f"{len(stamps)} rows, or some that are no times, for {len(files)} scans"
         except InputError as error:
             found = error.found
         notes = (Note(f"{path}: {found}; these times are not used", is_doubt=True),)
@@ -145,7 +147,7 @@ def match_times(path: Path, files: Sequence[Path]) -> FloatArray | None:
         times = match_rows(read_table(path)[:, 0], files)
     except InputError:
         return None
-    return to_seconds(times) if times is not None and np.isfinite(times).all() else None
+    return to_seconds(times) if times is not None and _are_times(times) else None
 
 
 def match_reference(found: StampedPoses, times: FloatArray | None, num_scans: int, path: Path) -> Reference:
@@ -167,7 +169,8 @@ def match_reference(found: StampedPoses, times: FloatArray | None, num_scans: in
     Raises:
         InputError: no times to match by, and another number of poses than of scans.
     """
-    count, stamps = len(found.poses), found.stamps
+    count = len(found.poses)
+    stamps = found.stamps if found.stamps is not None and _are_times(found.stamps) else None
     if stamps is not None and _are_numbers(stamps, times, num_scans):
         T = np.full((num_scans, 4, 4), np.nan)
         T[stamps.astype(np.int64)] = found.poses
@@ -206,6 +209,10 @@ def camera_note(T_world_lidar: FloatArray, source: str | Path) -> Note | None:
     found = f"the poses move along their own z axis ({share:.0%} of the way), as a camera does, not a lidar"
     advice = "their rotations are off by 90 degrees; give poses of the lidar, or a calib.txt with Tr beside them"
     return Note(f"{source}: {found}; {advice}", is_doubt=True)
+
+
+def _are_times(stamps: FloatArray) -> bool:
+    return bool((np.abs(stamps) < _LARGEST_STAMP).all())
 
 
 def _are_numbers(stamps: FloatArray, times: FloatArray | None, num_scans: int) -> bool:
