@@ -200,8 +200,10 @@ def camera_note(T_world_lidar: FloatArray, source: str | Path) -> Note | None:
     """
     T = T_world_lidar[np.isfinite(T_world_lidar).all(axis=(1, 2))]
     steps = np.einsum("nji,nj->ni", T[:-1, :3, :3], np.diff(T[:, :3, 3], axis=0))
-    squares = (steps**2).sum(axis=0)
-    if not len(steps) or np.linalg.norm(steps, axis=1).sum() < _CAMERA_WAY_M or squares.sum() == 0:
+    with np.errstate(over="ignore"):
+        squares = (steps**2).sum(axis=0)
+        way_m = float(np.linalg.norm(steps, axis=1).sum())
+    if not _CAMERA_WAY_M <= way_m < np.inf or not np.isfinite(squares.sum()):
         return None
     share = float(squares[2] / squares.sum())
     if share < _CAMERA_SHARE:
