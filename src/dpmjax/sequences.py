@@ -95,6 +95,7 @@ class ScanSequence:
         reference_poses: (n, 3) float64 x, y, heading of the sensor in the world (`unit`, radians), or None.
         odometry_poses: (n, 3) float64, raw odometry in its own world, or None where the source has none.
         times: (n,) float64 seconds, or None.
+        notes: what the reader decided about the input, and doubts.
 
     Raises:
         ValueError: shapes that do not belong together, or a unit other than "px" and "m".
@@ -108,6 +109,7 @@ class ScanSequence:
     reference_poses: FloatArray | None = None
     odometry_poses: FloatArray | None = None
     times: FloatArray | None = None
+    notes: tuple[Note, ...] = ()
 
     def __post_init__(self) -> None:
         if self.unit not in ("px", "m"):

@@ -63,6 +63,7 @@ class BagWriter:
         if kind_of_transforms not in self.types.types:
             text = "geometry_msgs/TransformStamped[] transforms"
             self.types.register(get_types_from_msg(text, kind_of_transforms))
+        self.parse = get_types_from_msg
         self.path = path.with_suffix(".bag") if self.is_ros1 else path
         plugin = StoragePlugin.MCAP if kind == "mcap" else StoragePlugin.SQLITE3
         self._writer: Any = Writer1(self.path) if self.is_ros1 else Writer2(self.path, version=9, storage_plugin=plugin)
@@ -118,6 +119,21 @@ class BagWriter:
         kind, header = "sensor_msgs/msg/PointCloud2", self.header(stamp_ns)
         shape = (num_rows, width, entries, is_bigendian, step, width * step + row_tail)
         self.write(topic, kind, stamp_ns + delay_ns, self.make(kind, header, *shape, data, False))
+
+    def write_livox(self, points: np.ndarray, stamp_ns: int, times_ns: np.ndarray) -> None:
+        """Writes Livox's own message: a list of points with times in nanoseconds from its header."""
+        kind, point_kind = "livox_ros_driver/msg/CustomMsg", "livox_ros_driver/msg/CustomPoint"
+        if kind not in self.types.types:
+            point_text = (
+                "uint32 offset_time\nfloat32 x\nfloat32 y\nfloat32 z\nuint8 reflectivity\nuint8 tag\nuint8 line"
+            )
+            text = "std_msgs/Header header\nuint64 timebase\nuint32 point_num\nuint8 lidar_id\nuint8[3] rsvd\n"
+            text += "CustomPoint[] points"
+            self.types.register(self.parse(point_text, point_kind) | self.parse(text, kind))
+        rows = zip(times_ns.tolist(), points.tolist(), strict=True)
+        entries = [self.make(point_kind, time, *point, 9, 0, 1) for time, point in rows]
+        values = (stamp_ns, len(points), 1, np.zeros(3, np.uint8), entries)
+        self.write("/livox/lidar", kind, stamp_ns, self.make(kind, self.header(stamp_ns), *values))
 
     def write_scan(
         self, ranges: np.ndarray, stamp_ns: int, *, topic: str = "/scan", range_max: float = 30.0, frame: str = "laser"

@@ -80,6 +80,17 @@ def test_beams_that_met_nothing_are_left_out_with_their_times(tmp_path: Path, cl
     assert drive[1].shape == (0, 3)
 
 
+@pytest.mark.parametrize("kind", ["bag", "mcap"])
+def test_the_message_of_livox_is_read(tmp_path: Path, kind: str, clouds) -> None:
+    times_ns = np.arange(120) * 800_000
+    with BagWriter(tmp_path / "a", kind) as bag:
+        for index, points in enumerate(clouds):
+            bag.write_livox(points, EPOCH_NS + index * STEP_NS, times_ns)
+    drive = open_lidar_sequence(bag.path)
+    np.testing.assert_array_equal(drive.read_scan(2), clouds[2])
+    np.testing.assert_array_equal(drive.read_times(2), times_ns)
+
+
 def test_headers_without_a_time_have_that_of_the_recording(tmp_path: Path, clouds) -> None:
     with BagWriter(tmp_path / "a", "bag") as bag:
         for index, points in enumerate(clouds):

@@ -213,7 +213,7 @@ def test_a_scan_in_millimetres_is_warned_of(tmp_path, caplog):
         read_sequence(save(tmp_path, points=POINTS))
         assert not caplog.records
         read_sequence(save(tmp_path, points=POINTS * 40))
-    assert "are these millimetres?" in caplog.text
+    assert "are these millimetres or centimetres?" in caplog.text
 
 
 def test_import_is_light():

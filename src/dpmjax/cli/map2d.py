@@ -32,6 +32,7 @@ from tyro.conf import Positional, arg
 
 from dpmjax import deepmapping, io, registration, simulation
 from dpmjax.cli.command import StopFlag, check_least, run_command
+from dpmjax.cli.drives import report_notes
 from dpmjax.cli.machine import peak_rss_gb
 from dpmjax.cli.map2d_files import as_scan_set, draw_map, draw_occupancy, registered_scans, write_trajectories
 from dpmjax.cli.map2d_numbers import (
@@ -121,11 +122,13 @@ def main(config: Config) -> dict[str, Any]:
     folder = open_run_folder(config, NAME)
     with recording(folder), StopFlag() as stop:
         print(f"{sequence.name}: {len(sequence)} scans of {sequence.points.shape[1]} beams")
+        notes = report_notes(sequence.notes)
         seconds = math.inf if config.seconds is None else config.seconds
         recorder = FitRecorder(folder, sequence.unit, stop=lambda run_s: stop.is_requested or run_s >= seconds)
         result = register(sequence, start, config, recorder, stop)
         metrics = {
             **numbers_of(sequence, result, config, measure),
+            **notes,
             "fit_s": recorder.run_s,
             "compile_s": recorder.compile_s,
             "steps": recorder.steps,

@@ -16,9 +16,10 @@ from dpmjax.io.drives import Drive3D, read_learned_folder, read_plain_folder, sc
 from dpmjax.io.files import natural_key
 from dpmjax.io.lidar_bags import open_lidar_bag
 from dpmjax.io.lidar_datasets import read_kitti_360, read_kitti_carla, read_kitti_odometry, read_kitti_raw, read_mulran
+from dpmjax.io.notes import log_notes
 from dpmjax.io.poses import read_stamped_poses
 from dpmjax.io.references import camera_note, match_reference
-from dpmjax.io.scan_file import log_notes, read_point_times, read_points, unit_note
+from dpmjax.io.scan_file import read_point_times, read_points, unit_note
 from dpmjax.sequences import InputError, LidarSequence, Note, require
 
 _FORMATS = (

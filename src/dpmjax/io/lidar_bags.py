@@ -9,8 +9,9 @@ import numpy as np
 from dpmjax.io.bags import Bag
 from dpmjax.io.clouds import TimedCloud
 from dpmjax.io.files import refusing
+from dpmjax.io.notes import log_notes
 from dpmjax.io.ros_messages import LIVOX_CLOUDS, POINT_CLOUD, cloud_of
-from dpmjax.io.scan_file import check_scan, log_notes, unit_note
+from dpmjax.io.scan_file import check_scan, unit_note
 from dpmjax.sequences import LidarSequence
 
 

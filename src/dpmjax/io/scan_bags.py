@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from pathlib import Path
 from typing import NamedTuple
 
@@ -22,9 +21,8 @@ from dpmjax.io.ros_messages import (
     matrix_of,
     stamp_of,
 )
-from dpmjax.sequences import FloatArray, ScanSequence, has_angular_order
+from dpmjax.sequences import FloatArray, Note, ScanSequence, has_angular_order
 
-_log = logging.getLogger(__name__)
 # Frames whose motion against the robot is the result of a mapping, not odometry.
 _MAP_FRAMES = ("map", "world", "earth")
 # Odometry may end this long before or after a scan, s, for this share of the scans at least.
@@ -67,7 +65,7 @@ def read_scan_bag(path: Path, topic: str | None = None) -> ScanSequence:
         times = np.array([stamp for stamp, _, _ in found])
         frame = found[0][1].strip("/")
         edges = _transforms(bag)
-        T_odom_laser = _odometry(bag, edges, frame, times)
+        T_odom_laser, note = _odometry(bag, edges, frame, times)
     points, mask = _points([beams for _, _, beams in found])
     if _is_upside_down(edges, frame, T_odom_laser):
         points = points * np.array([1, -1], np.float32)
@@ -76,7 +74,8 @@ def read_scan_bag(path: Path, topic: str | None = None) -> ScanSequence:
         heading = np.arctan2(T_odom_laser[:, 1, 0], T_odom_laser[:, 0, 0])
         odometry = np.column_stack([T_odom_laser[:, :2, 3], heading])
     name, is_organised = path.resolve().stem, has_angular_order(points, mask)
-    return ScanSequence(name, points, mask, "m", is_organised, None, odometry, times)
+    notes = () if note is None else (note,)
+    return ScanSequence(name, points, mask, "m", is_organised, None, odometry, times, notes)
 
 
 def _points(scans: list[LaserBeams]) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
@@ -110,8 +109,10 @@ def _as_motions(rows: list[tuple[float, FloatArray]]) -> _Motions:
     return _Motions(times, np.array([rows[i][1] for i in first]))
 
 
-def _odometry(bag: Bag, edges: dict[str, tuple[str, _Motions]], frame: str, times: FloatArray) -> FloatArray | None:
-    """`T_odom_laser` at the times of the scans; None where the bag has no odometry for them."""
+def _odometry(
+    bag: Bag, edges: dict[str, tuple[str, _Motions]], frame: str, times: FloatArray
+) -> tuple[FloatArray | None, Note | None]:
+    """`T_odom_laser` at the times of the scans, None where the bag has no odometry for them; and where it is from."""
     T, moving, seen = np.tile(np.eye(4), (len(times), 1, 1)), False, {frame}
     top = frame
     while top in edges and edges[top][0] not in (*_MAP_FRAMES, *seen):
@@ -124,25 +125,24 @@ def _odometry(bag: Bag, edges: dict[str, tuple[str, _Motions]], frame: str, time
         top = parent
         seen.add(top)
     if moving:
-        _log.info("%s: odometry of the transforms from %s to %s", bag.path, top, frame)
-        return T
+        return T, Note(f"{bag.path}: odometry of the transforms from {top} to {frame}")
     topics = bag.of_kinds(ODOMETRY)
     if len(topics) != 1:
-        if topics:
-            names = ", ".join(topic.name for topic in topics)
-            _log.warning("%s: %d topics of odometry (%s), none is used", bag.path, len(topics), names)
-        return None
+        names = ", ".join(topic.name for topic in topics)
+        text = f"{bag.path}: {len(topics)} topics of odometry ({names}), none is used"
+        return None, Note(text, is_doubt=True) if topics else None
     rows = []
     for message in bag.messages(topics[0].name):
         pose = message.pose.pose
         rows.append((stamp_of(message), matrix_of(pose.position, pose.orientation)))
     motions = _as_motions(rows)
+    name = topics[0].name
     if not _covers(motions.times, times):
-        _log.warning("%s: the odometry of %s is not of the times of the scans; not used", bag.path, topics[0].name)
-        return None
-    _log.info("%s: odometry of %s", bag.path, topics[0].name)
+        text = f"{bag.path}: the odometry of {name} is not of the times of the scans; it is not used"
+        return None, Note(text, is_doubt=True)
     # The transforms that were walked are fixed: the place of the laser on the robot.
-    return np.asarray(interpolate_poses(motions.times, motions.T_parent_child, times) @ T)
+    T_odom_base = interpolate_poses(motions.times, motions.T_parent_child, times)
+    return np.asarray(T_odom_base @ T), Note(f"{bag.path}: odometry of {name}")
 
 
 def _covers(times: FloatArray, wanted: FloatArray) -> bool:

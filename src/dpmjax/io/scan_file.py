@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import logging
-from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
@@ -14,11 +12,11 @@ from dpmjax.io.clouds import TimedCloud
 from dpmjax.io.drives import SCAN_SUFFIXES
 from dpmjax.io.files import load_arrays, read_bytes, to_float32
 from dpmjax.io.las import read_las
+from dpmjax.io.notes import log_notes
 from dpmjax.io.pcd import parse_pcd
 from dpmjax.io.ply import parse_ply
 from dpmjax.sequences import EmptyScanError, FloatArray, InputError, Note, require
 
-_log = logging.getLogger(__name__)
 _NPZ_KEYS = ("lidar_pcd", "points", "xyz", "arr_0")
 _NPZ_TIMES = "times"
 # No lidar on the ground measures outside of these, in metres; nearly all points of a scan lie within the usual range.
@@ -208,13 +206,3 @@ def unit_note(points: NDArray[np.float32], source: str | Path) -> Note | None:
         return None
     found = f"{100 * share:.1f} % of the points lie within {_USUAL_M:g} m"
     return Note(f"{source}: {found}; are these millimetres or centimetres?", is_doubt=True)
-
-
-def log_notes(notes: Iterable[Note]) -> None:
-    """Logs doubts as warnings, and other notes as information.
-
-    Args:
-        notes: of a reader.
-    """
-    for note in notes:
-        _log.log(logging.WARNING if note.is_doubt else logging.INFO, "%s", note.text)

@@ -15,9 +15,10 @@ from dpmjax.io.bags import is_bag
 from dpmjax.io.carmen import read_carmen_log
 from dpmjax.io.deepmapping_folder import read_deepmapping_folder
 from dpmjax.io.files import load_arrays, read_bytes, to_float32
+from dpmjax.io.notes import log_notes
 from dpmjax.io.poses import check_poses
 from dpmjax.io.scan_bags import read_scan_bag
-from dpmjax.sequences import BoolArray, FloatArray, InputError, ScanSequence, Unit, has_angular_order, require
+from dpmjax.sequences import BoolArray, FloatArray, InputError, Note, ScanSequence, Unit, has_angular_order, require
 
 Table = Mapping[str, NDArray[np.generic]]
 _log = logging.getLogger(__name__)
@@ -75,9 +76,11 @@ def read_sequence(
     found = f"{len(sequence)} of {len(whole)} scans chosen ({chosen})"
     require(len(sequence) >= 2, path, found, "a registration needs two scans at least")
     _check_beams(sequence, path, start, stride)
-    _check_unit(sequence, path)
+    doubt = _check_unit(sequence, path)
     if whole.odometry_poses is None and whole.unit == "m":
         _log.info("%s: no raw odometry", path)
+    sequence = replace(sequence, notes=(*sequence.notes, *doubt))
+    log_notes(sequence.notes)
     return sequence
 
 
@@ -141,7 +144,8 @@ def _check_beams(sequence: ScanSequence, path: Path, start: int, stride: int) ->
     require(differ.any(), path, "all points of each scan are one and the same", "give scans that see some surroundings")
 
 
-def _check_unit(sequence: ScanSequence, path: Path) -> None:
+def _check_unit(sequence: ScanSequence, path: Path) -> list[Note]:
+    """Refuses lengths that no such unit explains; a note doubts those that another unit explains better."""
     ranges = np.linalg.norm(sequence.points[sequence.mask].astype(np.float64), axis=1)
     median = float(np.median(ranges))
     low, high = _PLAUSIBLE_RANGE[sequence.unit]
@@ -149,8 +153,10 @@ def _check_unit(sequence: ScanSequence, path: Path) -> None:
     advice = "convert millimetres to metres, or name the unit" if is_metric else "name the unit, or give pixels"
     require(low <= median <= high, path, f"the median range is {median:.4g} {sequence.unit}", advice)
     share = float((ranges < _USUAL_M).mean())
-    if is_metric and share < _LEAST_USUAL_SHARE:
-        _log.warning("%s: %.1f %% of the beams are below %g m; are these millimetres?", path, 100 * share, _USUAL_M)
+    if not is_metric or share >= _LEAST_USUAL_SHARE:
+        return []
+    found = f"{100 * share:.1f} % of the beams are below {_USUAL_M:g} m"
+    return [Note(f"{path}: {found}; are these millimetres or centimetres?", is_doubt=True)]
 
 
 def read_arrays(path: str | Path, *, unit: Unit | None = None) -> ScanSequence:
