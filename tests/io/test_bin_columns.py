@@ -1,4 +1,4 @@
-"""The number of columns of raw files: judged by the values, by the ending, or said."""
+"""The number of columns of raw files: inferred from the values, by the ending, or said."""
 
 from __future__ import annotations
 
@@ -65,7 +65,9 @@ def test_one_scan_decides_for_its_drive(tmp_path: Path, table: np.ndarray) -> No
     for index in range(3):
         table[index:, :5].tofile(tmp_path / f"{index}.bin")
     drive = open_lidar_sequence(tmp_path)
-    assert [note.text.endswith("5 columns a point, judged by the values; --columns decides") for note in drive.notes]
+    assert [
+        note.text.endswith("5 columns a point, inferred from the values; --columns decides") for note in drive.notes
+    ]
     for index in range(3):
         np.testing.assert_array_equal(drive.read_scan(index), table[index:, :3])
     require_whole_files(drive)

@@ -27,7 +27,7 @@ class DriveSelection:
         num_scans: number of scans; None for all.
         jump: every `jump`-th scan is taken.
         is_kitti_corrected: the beams are raised by 0.205 degrees, as KITTI's HDL-64E needs.
-        columns: numbers a point has in `.bin` files; None judges.
+        columns: numbers a point has in `.bin` files; None infers it from the values.
         topic: which clouds of a bag of ROS; None takes the only ones.
         seed: of the simulated town.
     """

@@ -43,7 +43,7 @@ class _Place(NamedTuple):
 
 
 def is_bag(path: Path) -> bool:
-    """Whether a path is a bag of ROS: a file .bag, .mcap or .db3, or a folder of these or with metadata.yaml."""
+    """Returns whether a path is a bag of ROS: a file .bag, .mcap or .db3, or a folder of these."""
     return path.suffix.lower() in _SUFFIXES if path.is_file() else path.is_dir() and bool(_bag_files(path))
 
 
@@ -67,7 +67,7 @@ class Bag:
 
     Attributes:
         path: the path.
-        topics: what it holds.
+        topics: names, types and numbers of messages.
 
     Raises:
         InputError: no rosbags, or a bag that cannot be read.
@@ -199,7 +199,7 @@ class Bag:
         return seconds * 10**9 + nanoseconds
 
     def _advice(self) -> str:
-        """What to do with a bag that has no scans of the kind that is wanted."""
+        """Returns the advice for a bag without scans of the wanted kind."""
         kinds = [each.kind.rpartition("/")[2] for each in self.topics]
         if "LaserScan" in kinds or "MultiEchoLaserScan" in kinds:
             return "planar scans are mapped by dpmjax map2d"

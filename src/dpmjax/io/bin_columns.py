@@ -1,4 +1,4 @@
-"""Points of raw float32 files, whose number of columns stands nowhere: judged by the extension and by the values."""
+"""Points of raw float32 files, whose number of columns is inferred from the name and the values."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class Columns(NamedTuple):
 
     Attributes:
         num_columns: numbers that each point has, x, y and z first.
-        note: how it was judged, or None for the four columns of KITTI.
+        note: how it was inferred, or None for the four columns of KITTI.
     """
 
     num_columns: int
@@ -36,7 +36,7 @@ class Columns(NamedTuple):
 
 
 def find_columns(path: Path, content: bytes) -> Columns:
-    """Judges the columns of a raw file.
+    """Infers the columns of a raw file.
 
     The right layout has values of one kind in each column, a wrong one mixes them: so the layout is taken under which
     the column tells most about the value. `.pcd.bin` files, as those of nuScenes, have five columns unless the values
@@ -53,14 +53,14 @@ def find_columns(path: Path, content: bytes) -> Columns:
         InputError: the file has no whole number of points of the layout, or of any.
     """
     fitting = [n for n in LAYOUTS if len(content) % (4 * n) == 0]
-    judged = _columns_by_values(np.frombuffer(content[: len(content) // 4 * 4], "<f4"))
+    inferred = _columns_by_values(np.frombuffer(content[: len(content) // 4 * 4], "<f4"))
     is_nuscenes = path.name.lower().endswith(_NUSCENES_ENDING)
-    if judged is None and is_nuscenes and _NUSCENES_COLUMNS in fitting:
+    if inferred is None and is_nuscenes and _NUSCENES_COLUMNS in fitting:
         return Columns(_NUSCENES_COLUMNS, Note(f"{path}: 5 columns a point, by its ending; --columns decides"))
-    if judged is not None:
-        check_size(path, len(content), judged)
-        text = f"{path}: {judged} columns a point, judged by the values; --columns decides"
-        return Columns(judged, None if judged == USUAL_COLUMNS else Note(text))
+    if inferred is not None:
+        check_size(path, len(content), inferred)
+        text = f"{path}: {inferred} columns a point, inferred from the values; --columns decides"
+        return Columns(inferred, None if inferred == USUAL_COLUMNS else Note(text))
     require(USUAL_COLUMNS in fitting, path, *_no_whole_number(len(content), USUAL_COLUMNS))
     if len(fitting) == 1 or not content:
         return Columns(USUAL_COLUMNS)
@@ -88,7 +88,7 @@ def read_bin(path: Path, columns: int | None) -> NDArray[np.float32]:
 
     Args:
         path: the file.
-        columns: numbers of a point; None judges.
+        columns: numbers of a point; None infers it from the values.
 
     Returns:
         (n, 3).
@@ -104,13 +104,13 @@ def read_bin(path: Path, columns: int | None) -> NDArray[np.float32]:
 
 
 def columns_of_drive(files: Iterable[Path]) -> Columns:
-    """Judges the columns of the raw files of a drive by the first one that can be read.
+    """Infers the columns of the raw files of a drive by the first one that can be read.
 
     Args:
         files: the scans.
 
     Returns:
-        The layout; KITTI's where no file is raw, or none can be judged.
+        The layout; KITTI's where no file is raw, or none can be inferred.
     """
     for file in files:
         if file.suffix.lower() != ".bin":

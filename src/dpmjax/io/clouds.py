@@ -22,7 +22,7 @@ class CloudLayout(NamedTuple):
 
     Attributes:
         fields: names of the fields; a name may occur twice.
-        layout: one record; its fields are called "0", "1" and so on, each an array of as many numbers as it holds.
+        layout: one record; its fields are called "0", "1" and so on, and are arrays.
         num_points: number of records.
         encoding: of the body, as the header names it.
         size: bytes of the header.

@@ -19,7 +19,7 @@ _ADVICE = "copy the file again, or save it anew as LAS 1.2 or 1.4"
 _MOST_POINTS_PER_BYTE = 100
 # The least length of a variable length record.
 _RECORD_BYTES = 54
-# Types of the compressed items of a point, with their bytes; the others have any number.
+# Types of the compressed items of a point with fixed lengths, in bytes; byte items have any length.
 _ITEM_BYTES = {6: 20, 7: 8, 8: 6, 9: 29, 10: 30, 11: 6, 12: 8, 13: 29}
 _BYTE_ITEMS = (0, 14)
 
@@ -83,7 +83,7 @@ def _require_whole(header: Any, content: bytes) -> None:
 
 def _require_chunks(content: bytes, start: int) -> None:
     """Raises a ValueError where there is no table of the compressed chunks."""
-    # The decompressor makes room for as many chunks as the table names, and ends the process where it cannot.
+    # The decompressor reserves memory by the number in the table, and ends the process where it fails.
     size = len(content)
     (place,) = struct.unpack_from("<q", content, start)
     (place,) = struct.unpack_from("<q", content, size - 8) if place == -1 else (place,)

@@ -52,7 +52,7 @@ def open_lidar_sequence(
         sequence: which drive of a root, like "00"; may be left out where there is only one.
         poses: a pose file in the lidar's frame (KITTI or TUM rows, `.npy`) instead of the data set's own.
         selection: start, stop and stride in scans.
-        bin_columns: numbers a point has in `.bin` files; None judges by the first one.
+        bin_columns: numbers a point has in `.bin` files; None infers it from the first one.
         topic: of a bag: which clouds; may be left out where there is one topic of clouds.
 
     Returns:
@@ -111,7 +111,7 @@ def require_whole_files(sequence: LidarSequence, *, bin_columns: int | None = No
 
     Args:
         sequence: the drive.
-        bin_columns: numbers a point has in `.bin` files; None judges by the first one.
+        bin_columns: numbers a point has in `.bin` files; None infers it from the first one.
 
     Raises:
         InputError: names the first such file.
@@ -201,7 +201,7 @@ def _read_plain(path: Path, scans: str, poses: Path | None) -> Drive3D:
 
 
 def _kind(path: Path) -> str | None:
-    """Which layout a folder has, judged by what lies in it; None for none."""
+    """Which layout a folder has, found by the files in it; None for none."""
     if (path / "generated" / "frames").is_dir() or (path / "full_poses_lidar.txt").is_file():
         return "kitti_carla"
     if (path / "Ouster").is_dir() or (path / "sensor_data" / "Ouster").is_dir():

@@ -242,8 +242,9 @@ def _poses_from_oxts(records: FloatArray, source: Path) -> FloatArray:
     """
     from scipy.spatial.transform import Rotation
 
-    is_good = np.isfinite(records).all() and (np.abs(records[:, 0]) < 89.0).all()
-    require(is_good, source, "records that are not finite, or a latitude beyond 89 degrees", "copy them again")
+    is_good = np.isfinite(records).all() and (np.abs(records[:, :3]) < (89.0, 361.0, 1e6)).all()
+    found = "records that are not finite, or beyond 89 degrees of latitude, 361 of longitude, or 1000 km of height"
+    require(is_good, source, found, "copy them again")
     latitude, longitude = np.radians(records[:, 0]), np.radians(records[:, 1])
     scale = np.cos(latitude[0]) * _EARTH_RADIUS_M
     east, north = scale * longitude, scale * np.log(np.tan(0.25 * np.pi + 0.5 * latitude))

@@ -1,4 +1,4 @@
-"""LZF, the compression of PCD files: runs of literal bytes and copies of what was unpacked before."""
+"""LZF, the compression of PCD files: runs of literal bytes and copies of earlier bytes."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ MOST_EXPANSION = 88
 def unpack_lzf(packed: bytes, size: int) -> bytes:
     """Unpacks a block of LZF.
 
-    A control byte below 32 begins a run of that many literal bytes and one more. Any other holds the length of a copy,
-    less two, in its upper three bits (7: the next byte is added), and with the byte that follows its distance, less
-    one.
+    A control byte below 32 begins a run of that many literal bytes and one more. Any other begins a copy. Its upper
+    three bits are the length less two; 7 adds the next byte. Its lower five bits and the next byte are the distance
+    less one.
 
     Args:
         packed: the block.

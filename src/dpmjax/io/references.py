@@ -52,7 +52,7 @@ def numbers_of(files: Sequence[Path], largest: float = 2.0**62) -> list[int] | N
 
 
 def match_rows(rows: NDArray[Any], files: Sequence[Path]) -> NDArray[Any] | None:
-    """The row of each scan of a data set: in order if there are as many, else by the number that is the file's name.
+    """Returns the row of each scan of a data set: in order if the counts are equal, else by the file's number.
 
     Args:
         rows: (m, ...) values.
@@ -86,9 +86,10 @@ def match_poses(poses: FloatArray, files: Sequence[Path], path: Path) -> FloatAr
 
 
 def to_seconds(stamps: FloatArray) -> FloatArray:
-    """Converts time stamps in nano-, micro- or milliseconds to seconds; their size tells the unit.
+    """Converts time stamps in nano-, micro- or milliseconds to seconds.
 
-    Stamps from 1970 on are told by their values, others by their median step; milliseconds are whole numbers.
+    The unit of stamps since 1970 is found by their values, that of others by their median step. Milliseconds are whole
+    numbers.
 
     Args:
         stamps: (n,) in order.
@@ -153,9 +154,9 @@ def match_times(path: Path, files: Sequence[Path]) -> FloatArray | None:
 def match_reference(found: StampedPoses, times: FloatArray | None, num_scans: int, path: Path) -> Reference:
     """Gives each scan its reference pose.
 
-    Where poses and scans have times, the pose is interpolated at the time of the scan, if the nearest pose lies within
-    the tolerance: half the step of the poses, at most 0.1 s. Stamps that are the numbers of scans are taken as such.
-    Without times, or where the two have no time in common, there must be one pose a scan.
+    If poses and scans have times, poses are interpolated at the times of the scans. The nearest pose must lie within
+    the tolerance: half the step of the poses, at most 0.1 s. Stamps may also be the numbers of the scans. Without times
+    in common, there must be one pose a scan.
 
     Args:
         found: the poses of the file.
@@ -218,7 +219,7 @@ def _are_times(stamps: FloatArray) -> bool:
 
 
 def _are_numbers(stamps: FloatArray, times: FloatArray | None, num_scans: int) -> bool:
-    """Whether stamps are the numbers of scans: whole, no time spans, and none beyond the last scan."""
+    """Returns whether stamps are numbers of scans: whole, no times of the scans, none beyond the last scan."""
     is_whole = bool((stamps == np.round(stamps)).all() and len(np.unique(stamps)) == len(stamps))
     if not is_whole or stamps.min() < 0 or stamps.max() >= num_scans or len(stamps) < 1:
         return False

@@ -40,8 +40,8 @@ class _Motions(NamedTuple):
 def read_scan_bag(path: Path, topic: str | None = None) -> ScanSequence:
     """Reads the planar scans of a bag.
 
-    The odometry is that of the transforms (/tf) up to the odometry frame, or of the only topic of Odometry; a laser
-    whose place on the robot stands in /tf_static gets its own poses, and one that is mounted upside down is turned.
+    The odometry is that of the transforms (/tf) up to the odometry frame, or of the only topic of Odometry. A laser
+    whose place on the robot is in /tf_static gets its own poses. Beams of one that is mounted upside down are mirrored.
 
     Args:
         path: a bag, see `Bag`.
@@ -151,7 +151,7 @@ def _covers(times: FloatArray, wanted: FloatArray) -> bool:
 
 
 def _is_upside_down(edges: dict[str, tuple[str, _Motions]], frame: str, T_odom_laser: FloatArray | None) -> bool:
-    """Whether the z axis of the laser points down, in the odometry or on the robot."""
+    """Returns whether the z axis of the laser points down, in the odometry or on the robot."""
     if T_odom_laser is not None:
         return bool(np.median(T_odom_laser[:, 2, 2]) < 0)
     return frame in edges and bool(np.median(edges[frame][1].T_parent_child[:, 2, 2]) < 0)

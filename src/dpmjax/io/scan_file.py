@@ -35,7 +35,8 @@ def read_lidar_file(path: str | Path, *, bin_columns: int | None = None) -> NDAr
     Args:
         path: `.bin` (float32 rows of x, y, z and more, as of KITTI), `.npy` (n, 3 or more), `.npz` (key `lidar_pcd`,
             `points`, `xyz` or `arr_0`), `.pcd`, `.ply`, `.las` or `.laz`.
-        bin_columns: numbers a point has in a `.bin` file: 4 with KITTI and MulRan, 5 with nuScenes; None judges.
+        bin_columns: numbers a point has in a `.bin` file: 4 with KITTI and MulRan, 5 with nuScenes; None
+            infers it from the values.
 
     Returns:
         (n, 3) float32 x, y, z in the lidar's frame, m, without beams that met nothing: points at the origin, and points
@@ -65,8 +66,8 @@ def scan_notes(path: str | Path, points: NDArray[np.float32], *, bin_columns: in
         InputError: the file cannot be read any more.
     """
     path = Path(path)
-    is_judged = bin_columns is None and path.suffix.lower() == ".bin"
-    columns = find_columns(path, read_bytes(path)).note if is_judged else None
+    is_inferred = bin_columns is None and path.suffix.lower() == ".bin"
+    columns = find_columns(path, read_bytes(path)).note if is_inferred else None
     return [note for note in (columns, unit_note(points, path)) if note is not None]
 
 
@@ -75,7 +76,7 @@ def read_points(path: str | Path, *, bin_columns: int | None = None) -> NDArray[
 
     Args:
         path: the file.
-        bin_columns: numbers a point has in a `.bin` file; None judges.
+        bin_columns: numbers a point has in a `.bin` file; None infers it from the values.
 
     Returns:
         (n, 3) float32, m.
@@ -109,7 +110,7 @@ def read_timed_cloud(path: Path, bin_columns: int | None) -> TimedCloud:
 
     Args:
         path: the file.
-        bin_columns: numbers a point has in a `.bin` file; None judges.
+        bin_columns: numbers a point has in a `.bin` file; None infers it from the values.
 
     Returns:
         The cloud.
