@@ -7,13 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from dpmjax.cli import localize, map2d, slam, slam_files
+from dpmjax.cli import localize, map2d, slam
 from dpmjax.cli.command import EXIT_BAD_INPUT, EXIT_OK
 from dpmjax.cli.result_files import load_json
 from dpmjax.io import write_pcd
-from dpmjax.slam import SlamConfig, SlamMethods, SurfaceGeometry
 from tests.cli.test_slam import run, table
-from tests.cli.test_slam_fuzz import NoMatcher
+from tests.cli.test_slam_fuzz import leave_networks_out
 from tests.io.bag_files import EPOCH_NS, KINDS, BagWriter
 from tests.slam.test_odometry import motion, planes, seen_from
 
@@ -22,10 +21,7 @@ NUM, STEP_NS = 5, 100_000_000
 
 @pytest.fixture
 def without_networks(monkeypatch: pytest.MonkeyPatch) -> None:
-    methods = SlamMethods(NoMatcher(), SurfaceGeometry(), SlamConfig())
-    monkeypatch.setattr(slam, "slam_methods", lambda config: methods)
-    monkeypatch.setattr(slam_files, "write_map_file", lambda path, slam_map: {})
-    monkeypatch.setattr(slam_files, "draw_pictures", lambda *_: None)
+    leave_networks_out(monkeypatch)
 
 
 @pytest.fixture(scope="module")

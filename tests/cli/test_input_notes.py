@@ -7,23 +7,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from dpmjax.cli import slam, slam_files
 from dpmjax.cli.command import EXIT_BAD_INPUT, EXIT_FAILED, EXIT_OK
 from dpmjax.cli.result_files import load_json
 from dpmjax.cli.slam_numbers import status_of, why_failed
 from dpmjax.io import write_pcd, write_tum
-from dpmjax.slam import SlamConfig, SlamMethods, SurfaceGeometry
 from tests.cli.test_slam import run
-from tests.cli.test_slam_fuzz import NoMatcher
+from tests.cli.test_slam_fuzz import leave_networks_out
 from tests.slam.test_odometry import motion, planes, seen_from
 
 
 @pytest.fixture(autouse=True)
 def without_networks(monkeypatch: pytest.MonkeyPatch) -> None:
-    methods = SlamMethods(NoMatcher(), SurfaceGeometry(), SlamConfig())
-    monkeypatch.setattr(slam, "slam_methods", lambda config: methods)
-    monkeypatch.setattr(slam_files, "write_map_file", lambda path, slam_map: {})
-    monkeypatch.setattr(slam_files, "draw_pictures", lambda *_: None)
+    leave_networks_out(monkeypatch)
 
 
 def ring(index: int) -> np.ndarray:

@@ -50,12 +50,17 @@ class NoMatcher:
         return 0
 
 
+def leave_networks_out(patch: pytest.MonkeyPatch) -> None:
+    """Alignment alone; no pictures, and no map file, which needs descriptors."""
+    methods = SlamMethods(NoMatcher(), SurfaceGeometry(), SlamConfig())
+    patch.setattr(slam, "slam_methods", lambda config: methods)
+    patch.setattr(slam_files, "write_map_file", lambda path, slam_map: {})
+    patch.setattr(slam_files, "draw_pictures", lambda *_: None)
+
+
 @pytest.fixture
 def without_networks(monkeypatch) -> None:
-    methods = SlamMethods(NoMatcher(), SurfaceGeometry(), SlamConfig())
-    monkeypatch.setattr(slam, "slam_methods", lambda config: methods)
-    monkeypatch.setattr(slam_files, "write_map_file", lambda path, slam_map: {})
-    monkeypatch.setattr(slam_files, "draw_pictures", lambda *_: None)
+    leave_networks_out(monkeypatch)
 
 
 def write_scan(path: Path, points: np.ndarray) -> None:

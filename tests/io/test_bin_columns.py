@@ -65,9 +65,8 @@ def test_one_scan_decides_for_its_drive(tmp_path: Path, table: np.ndarray) -> No
     for index in range(3):
         table[index:, :5].tofile(tmp_path / f"{index}.bin")
     drive = open_lidar_sequence(tmp_path)
-    assert [
-        note.text.endswith("5 columns a point, inferred from the values; --columns decides") for note in drive.notes
-    ]
+    (note,) = drive.notes
+    assert note.text.endswith("5 columns a point, inferred from the values; --columns decides")
     for index in range(3):
         np.testing.assert_array_equal(drive.read_scan(index), table[index:, :3])
     require_whole_files(drive)
