@@ -120,6 +120,19 @@ def test_a_pose_file_is_matched_by_time(tmp_path: Path, clouds) -> None:
     np.testing.assert_allclose(drive.T_world_lidar[:, 0, 3], 5.0 * np.arange(NUM), atol=1e-4)
 
 
+@pytest.mark.parametrize("kind", ["bag", "mcap"])
+def test_poses_beside_a_bag_are_used_where_they_have_its_times(tmp_path: Path, kind: str, clouds) -> None:
+    path = write_clouds(tmp_path / "a", kind, clouds)
+    home = path if path.is_dir() else path.parent
+    T = np.tile(np.eye(4), (30, 1, 1))
+    write_tum(home / "groundtruth.txt", T, times=1.6e9 + 0.02 * np.arange(30))
+    assert open_lidar_sequence(path).has_reference.all()
+    write_tum(home / "groundtruth.txt", T, times=1.5e9 + 0.02 * np.arange(30))
+    drive = open_lidar_sequence(path)
+    assert drive.T_world_lidar is None
+    assert "no scan has the time of a pose; these poses are not used" in drive.notes[0].text
+
+
 def test_topics_are_chosen_or_named(tmp_path: Path, clouds) -> None:
     with BagWriter(tmp_path / "a", "bag") as bag:
         for topic in ("/left/points", "/right/points"):

@@ -156,6 +156,23 @@ def test_a_stray_map_is_named_and_left_out(folder: Path) -> None:
     assert strays_among([Path("a.pcd"), Path("b.pcd"), Path("c1.pcd")]) == []
 
 
+def test_kitti_folders_take_rows_of_tum_by_time(tmp_path: Path) -> None:
+    (tmp_path / "velodyne").mkdir()
+    rng = np.random.default_rng(0)
+    for index in range(NUM):
+        rows = np.column_stack([rng.normal(size=(40, 3)) * [10, 10, 1], np.ones(40)])
+        rows.astype("<f4").tofile(tmp_path / "velodyne" / f"{index:06d}.bin")
+    (tmp_path / "velodyne" / "map.bin").write_bytes(b"0" * 160)
+    times, fine = 0.1 * np.arange(NUM), 0.01 * np.arange(10 * NUM)
+    write_times(tmp_path, times)
+    for name in ("poses_lidar.txt", "groundtruth.txt"):
+        write_tum(tmp_path / name, drive_along(fine), times=fine)
+        drive = open_lidar_sequence(tmp_path)
+        np.testing.assert_allclose(drive.T_world_lidar, drive_along(times), atol=1e-4)
+        assert "map.bin is no scan" in drive.notes[0].text
+        (tmp_path / name).unlink()
+
+
 def test_real_reference_of_another_rate(real_data: Path) -> None:
     drive = open_lidar_sequence(real_data / "field_3d" / "tum_reference_of_another_rate")
     rows = np.loadtxt(real_data / "field_3d" / "tum_reference_of_another_rate" / "groundtruth.txt")

@@ -20,8 +20,9 @@ from dpmjax.sequences import FloatArray, InputError, LidarSequence, Note, requir
 
 _log = logging.getLogger(__name__)
 SCAN_SUFFIXES = (".bin", ".npy", ".npz", ".pcd", ".ply", ".las", ".laz")
-_POSE_FILES = ("poses_lidar.txt", "poses_lidar.npy", "poses.txt", "poses.npy", "trajectory.txt", "trajectory_tum.txt",
-               "trajectory.npy", "gt_poses.txt", "groundtruth.txt")  # fmt: skip
+POSE_FILES = ("poses_lidar.txt", "poses_lidar.npy", "poses.txt", "poses.npy", "trajectory.txt", "trajectory_tum.txt",
+              "trajectory.npy", "gt_poses.txt", "groundtruth.txt")  # fmt: skip
+"""Usual names of files of reference poses in the lidar's frame."""
 # Axes of a camera that looks along x of the lidar: x right, y down, z forward. Written sequences have it in the lidar.
 _T_CAM0_LIDAR = np.array([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]])
 
@@ -52,13 +53,47 @@ def scan_files(folder: Path, suffixes: tuple[str, ...] = SCAN_SUFFIXES) -> list[
         suffixes: endings of scans.
 
     Returns:
-        The files; none where there is no such folder.
+        The files, without those that `stray_note` names; none where there is no such folder.
     """
+    most = _of_one_ending(folder, suffixes)
+    strays = strays_among(most)
+    return sort_scans([file for file in most if file not in strays])
+
+
+def stray_note(folder: Path) -> Note | None:
+    """Names the files of a folder that are no scans although they have the ending of scans, such as map.pcd.
+
+    Args:
+        folder: of the scans.
+
+    Returns:
+        The note, or None.
+    """
+    strays = strays_among(_of_one_ending(folder, SCAN_SUFFIXES))
+    if not strays:
+        return None
+    text = f"{folder}: {strays[0].name} is no scan, as its name has no number; {len(strays)} such left out"
+    return Note(text, is_doubt=True)
+
+
+def _of_one_ending(folder: Path, suffixes: tuple[str, ...]) -> list[Path]:
+    """The files of the most frequent ending, unsorted."""
     if not folder.is_dir():
         return []
-    files = [f for f in folder.iterdir() if f.is_file() and f.name[0] != "." and f.name not in _POSE_FILES]
-    most = max(([f for f in files if f.suffix.lower() == suffix] for suffix in suffixes), key=len)
-    return sort_scans(most)
+    files = [f for f in folder.iterdir() if f.is_file() and f.name[0] != "." and f.name not in POSE_FILES]
+    return max(([f for f in files if f.suffix.lower() == suffix] for suffix in suffixes), key=len)
+
+
+def find_pose_file(*homes: Path) -> Path | None:
+    """Finds a file of reference poses by the usual names.
+
+    Args:
+        *homes: folders where it may lie.
+
+    Returns:
+        The first one; None where there is none.
+    """
+    return next((home / name for home in homes for name in POSE_FILES if (home / name).is_file()), None)
 
 
 def read_plain_folder(folder: Path, *, poses: Path | None = None) -> Drive3D:
@@ -75,17 +110,11 @@ def read_plain_folder(folder: Path, *, poses: Path | None = None) -> Drive3D:
     Raises:
         InputError: broken files, or poses that match the scans neither by time nor by number.
     """
-    found = scan_files(folder)
-    notes: tuple[Note, ...] = ()
-    strays = strays_among(found)
-    if strays:
-        text = f"{folder}: {strays[0].name} is no scan, as its name has no number; {len(strays)} such left out"
-        notes = (Note(text, is_doubt=True),)
-    files = [file for file in found if file not in strays]
+    files = scan_files(folder)
     homes = [folder, folder.resolve().parent] if folder.name in ("data", "scans", "lidar", "velodyne") else [folder]
-    path = poses or next((h / n for h in homes for n in _POSE_FILES if (h / n).is_file()), None)
-    times, time_notes = scan_times(homes, files)
-    drive = Drive3D(folder.resolve().name, files, None, times, (*notes, *time_notes))
+    path = poses or find_pose_file(*homes)
+    times, notes = scan_times(homes, files)
+    drive = Drive3D(folder.resolve().name, files, None, times, notes)
     if path is None:
         return drive
     T, pose_notes = match_reference(read_stamped_poses(path), times, len(files), path)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from dpmjax.io.bags import is_bag
 from dpmjax.io.bin_columns import check_size, columns_of_drive
-from dpmjax.io.drives import Drive3D, read_learned_folder, read_plain_folder, scan_files
+from dpmjax.io.drives import Drive3D, find_pose_file, read_learned_folder, read_plain_folder, scan_files, stray_note
 from dpmjax.io.files import natural_key
 from dpmjax.io.lidar_bags import open_lidar_bag
 from dpmjax.io.lidar_datasets import read_kitti_360, read_kitti_carla, read_kitti_odometry, read_kitti_raw, read_mulran
@@ -80,11 +80,11 @@ def _open_folder(path: Path, poses: Path | None, bin_columns: int | None) -> Lid
     """The scans of one drive in files."""
     drive = _read(path, poses)
     require(len(drive.files) > 0, path, "a folder without scans", f"give {_FORMATS}")
-    notes: tuple[Note, ...] = drive.notes
+    notes: list[Note | None] = [stray_note(drive.files[0].parent), *drive.notes]
     if bin_columns is None:
         columns = columns_of_drive(drive.files)
         bin_columns = columns.num_columns
-        notes = notes if columns.note is None else (*notes, columns.note)
+        notes.append(columns.note)
     sources, read_scan = tuple(map(str, drive.files)), partial(_read_scan, drive.files, bin_columns)
     return LidarSequence(
         drive.name,
@@ -93,16 +93,23 @@ def _open_folder(path: Path, poses: Path | None, bin_columns: int | None) -> Lid
         drive.T_world_lidar,
         drive.times,
         lambda index: read_point_times(sources[index]),
-        notes,
+        tuple(note for note in notes if note is not None),
     )
 
 
 def _open_bag(path: Path, topic: str | None, poses: Path | None) -> LidarSequence:
-    """The clouds of a bag, with poses of a file beside them."""
+    """The clouds of a bag, with poses of a file, or of one of the usual names beside the bag that has their times."""
     sequence = open_lidar_bag(path, topic)
-    if poses is None:
+    beside = find_pose_file(path if path.is_dir() else path.resolve().parent) if poses is None else poses
+    if beside is None:
         return sequence
-    T, notes = match_reference(read_stamped_poses(poses), sequence.times, len(sequence), poses)
+    try:
+        T, notes = match_reference(read_stamped_poses(beside), sequence.times, len(sequence), beside)
+    except InputError as error:
+        if poses is not None:
+            raise
+        note = Note(f"{beside}: {error.found}; these poses are not used", is_doubt=True)
+        return replace(sequence, notes=(*sequence.notes, note))
     return replace(sequence, T_world_lidar=T, notes=(*sequence.notes, *notes))
 
 

@@ -9,10 +9,10 @@ import numpy as np
 
 from dpmjax.geometry import rigid
 from dpmjax.io.calibration import read_camera_calibration, read_labelled_numbers
-from dpmjax.io.drives import Drive3D, scan_files
+from dpmjax.io.drives import Drive3D, find_pose_file, scan_files
 from dpmjax.io.files import natural_key, read_lines, read_table
-from dpmjax.io.poses import check_poses, from_rows, homogeneous, interpolate_poses, read_poses
-from dpmjax.io.references import match_poses, match_rows, match_times, numbers_of
+from dpmjax.io.poses import check_poses, from_rows, homogeneous, interpolate_poses, read_stamped_poses
+from dpmjax.io.references import match_poses, match_reference, match_rows, match_times, numbers_of
 from dpmjax.sequences import FloatArray, InputError, require
 
 _CARLA_POSES_PER_FRAME = 100  # KITTI-CARLA writes poses at 1000 Hz and frames at 10 Hz.
@@ -26,7 +26,8 @@ def read_kitti_odometry(folder: Path) -> Drive3D:
     """Lists a sequence of KITTI odometry.
 
     Poses are looked for in poses_lidar.txt (already in the lidar's frame), poses.txt beside velodyne/ (SemanticKITTI's)
-    and poses/NN.txt two folders up, both in the left camera's frame.
+    and poses/NN.txt two folders up, both in the left camera's frame; or a file of another usual name, in the lidar's.
+    Rows of TUM are matched by time, others by the numbers of the scans.
 
     Args:
         folder: the folder that holds velodyne/.
@@ -41,14 +42,17 @@ def read_kitti_odometry(folder: Path) -> Drive3D:
     in_lidar, name = folder / "poses_lidar.txt", folder.resolve().name
     in_camera = [folder / "poses.txt", folder.resolve().parents[1] / "poses" / f"{name}.txt"]
     drive = Drive3D(name, files, times=match_times(folder / "times.txt", files))
-    path = next((p for p in (in_lidar, *in_camera) if p.is_file()), None)
-    if path is None:
+    path = next((p for p in (in_lidar, *in_camera) if p.is_file()), find_pose_file(folder))
+    if path is None or not files:
         return drive
-    poses = read_poses(path)
-    if path != in_lidar:
+    found = read_stamped_poses(path)
+    if path in in_camera:
         T_cam0_lidar = read_camera_calibration(folder / "calib.txt")
-        poses = rigid.inverse(T_cam0_lidar) @ poses @ T_cam0_lidar
-    return drive._replace(T_world_lidar=match_poses(poses, files, path))
+        found = found._replace(poses=rigid.inverse(T_cam0_lidar) @ found.poses @ T_cam0_lidar)
+    if found.stamps is None:
+        return drive._replace(T_world_lidar=match_poses(found.poses, files, path))
+    T, notes = match_reference(found, drive.times, len(files), path)
+    return drive._replace(T_world_lidar=T, notes=notes)
 
 
 def read_kitti_raw(folder: Path) -> Drive3D:
