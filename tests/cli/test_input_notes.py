@@ -99,3 +99,15 @@ def test_millimetres_and_a_map_are_named_by_the_command(tmp_path: Path, capsys: 
     write_pcd(tmp_path / "drive" / "000000.pcd", far)
     assert run(tmp_path / "drive", "-o", tmp_path / "out") == EXIT_BAD_INPUT
     assert "UTM; subtract an origin" in capsys.readouterr().err
+
+
+def test_a_doubt_about_the_unit_is_in_the_log_and_the_numbers(tmp_path: Path) -> None:
+    """Decimetres: nearly all points lie beyond 120."""
+    drive, out = tmp_path / "drive", tmp_path / "out"
+    drive.mkdir()
+    for index in range(3):
+        write_pcd(drive / f"{index}.pcd", 30 * ring(index))
+    assert run(drive, "-o", out) == EXIT_FAILED
+    (note,) = load_json(out / "metrics.json")["input_notes"]
+    assert "are these millimetres or centimetres?" in note
+    assert note in (out / "log.txt").read_text()
