@@ -155,25 +155,27 @@ def test_contents_decide_where_the_ending_does_not(tmp_path, small):
 def test_sub_range_and_stride_take_poses_and_times_along(tmp_path):
     path = tmp_path / "a.log.gz"
     path.write_bytes(gzip.compress(LOG.encode()))
-    part = read_sequence(path, start=1, stop=6, stride=2)
+    part = read_sequence(path, selection=slice(1, 6, 2))
     for poses in (part.reference_poses, part.odometry_poses):
         np.testing.assert_array_equal(poses[:, 0], [1, 3, 5])
     np.testing.assert_array_equal(part.times, [1, 3, 5])
     assert part.points.shape == (3, NUM_BEAMS, 2)
 
 
-@pytest.mark.parametrize("choice", [{"start": 99}, {"stop": 1}, {"stride": 0}, {"start": -1}, {"stride": 6}])
+@pytest.mark.parametrize(
+    "choice", [slice(99, None), slice(1), slice(None, None, 0), slice(-1, None), slice(None, None, 6)]
+)
 def test_choices_that_leave_nothing_are_refused(tmp_path, choice):
     path = tmp_path / "a.log"
     path.write_text(LOG)
     with pytest.raises(InputError, match=r"a\.log"):
-        read_sequence(path, **choice)
+        read_sequence(path, selection=choice)
 
 
 def test_limit_masks_far_beams_of_every_format(tmp_path):
     (tmp_path / "a.log").write_text(LOG)
     assert (read_sequence(tmp_path / "a.log", max_range=2.5).mask == (np.arange(NUM_BEAMS) != 2)).all()
-    assert read_sequence(save(tmp_path, points=POINTS), start=0, stop=2, max_range=7).mask.all()
+    assert read_sequence(save(tmp_path, points=POINTS), selection=slice(2), max_range=7).mask.all()
     with pytest.raises(InputError, match="no valid beam"):
         read_sequence(save(tmp_path, points=POINTS), max_range=7)
 

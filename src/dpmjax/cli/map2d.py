@@ -242,7 +242,7 @@ def read_scans(config: Config) -> ScanSequence:
     """Returns the scans of DATA or of the built-in world, sub-range and stride applied."""
     stop = None if config.n_scans is None else config.start + config.n_scans * config.jump
     if config.data is not None:
-        return io.read_sequence(config.data, start=config.start, stop=stop, stride=config.jump, topic=config.topic)
+        return io.read_sequence(config.data, selection=slice(config.start, stop, config.jump), topic=config.topic)
     sequence = simulation.simulate_sequence(
         config.world, stop or 256, range_noise_px=config.range_noise_px, seed=config.seed, with_odometry=True
     )

@@ -36,9 +36,7 @@ _LEAST_BEAMS = 17  # Lines are fitted to up to 17 neighbouring beams.
 def read_sequence(
     path: str | Path,
     *,
-    start: int = 0,
-    stop: int | None = None,
-    stride: int = 1,
+    selection: slice = slice(None),
     unit: Unit | None = None,
     max_range: float | None = None,
     topic: str | None = None,
@@ -46,11 +44,9 @@ def read_sequence(
     """Reads a sequence of planar scans, whatever of the known formats it is in.
 
     Args:
-        path: a folder or tar archive of PCD files (`read_deepmapping_folder`), a CARMEN log (`read_carmen_log`), or a
+        path: a folder or tar archive of PCD files (`read_deepmapping_folder`), a CARMEN log (`read_carmen_log`), a
             NumPy file (`read_arrays`), or a bag of ROS (`read_scan_bag`). The ending decides, else the first bytes.
-        start: first scan to keep.
-        stop: scan to stop before; None for the end.
-        stride: keep every `stride`-th scan.
+        selection: start, stop and stride in scans.
         unit: unit of the file's lengths where the file does not state it; None takes PCD files as pixels / 512 and
             arrays as metres. CARMEN logs are in metres.
         max_range: beams of this length or more (in the sequence's unit) are masked; None leaves it to the reader.
@@ -65,6 +61,7 @@ def read_sequence(
             explains, or arguments out of range.
     """
     path = Path(path)
+    start, stop, stride = selection.start or 0, selection.stop, 1 if selection.step is None else selection.step
     chosen = f"start {start}, stop {stop}, stride {stride}"
     is_good = start >= 0 and stride >= 1 and (stop is None or stop >= 0)
     require(is_good, path, chosen, "start and stop count from 0, stride from 1")
