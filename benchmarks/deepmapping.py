@@ -34,7 +34,7 @@ def run(quick: bool) -> list[Row]:
     rows: list[Row] = []
     sequences = [simulate_sequence(0, 64 if quick else 256, seed=0)]
     if DATA.is_dir():
-        sequences.insert(0, read_sequence(DATA / "v1_pose0.tar", stop=64 if quick else None))
+        sequences.insert(0, read_sequence(DATA / "v1_pose0.tar", selection=slice(64 if quick else None)))
     for sequence in sequences:
         for noise_px in (0.0, 1.0, 3.0):
             rows += _classical(_with_noise(sequence, noise_px), f"{sequence.name}, noise {noise_px:g} px", quick)

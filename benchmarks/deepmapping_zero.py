@@ -46,7 +46,7 @@ def run(quick: bool) -> list[Row]:
     rows += [Row(f"{len(lengths)} walks, from zero", name, float(value), units[name]) for name, value in ours.items()]
     rows += [Row("the paper's 75 walks (GPU)", name, value, units[name]) for name, value in _PAPER.items()]
     if DATA.is_dir():
-        sequence = read_sequence(DATA / "v1_pose0.tar", stop=64 if quick else None)
+        sequence = read_sequence(DATA / "v1_pose0.tar", selection=slice(64 if quick else None))
         rows += _rows(f"{sequence.name}, from zero", _call(sequence))
     return rows
 

@@ -40,6 +40,18 @@ class EmptyScanError(InputError):
     """A scan without any point: the lidar measured nothing, or the file is empty. A drive goes on without it."""
 
 
+class Note(NamedTuple):
+    """What a reader decided about its input, or doubts.
+
+    Attributes:
+        text: one line that names the file.
+        is_doubt: the input may be wrong; False for a decision that is only told.
+    """
+
+    text: str
+    is_doubt: bool = False
+
+
 def require(is_good: bool | np.bool_, source: str | Path, found: str, advice: str) -> None:
     """Raises an `InputError` unless the input is good.
 
@@ -83,6 +95,7 @@ class ScanSequence:
         reference_poses: (n, 3) float64 x, y, heading of the sensor in the world (`unit`, radians), or None.
         odometry_poses: (n, 3) float64, raw odometry in its own world, or None where the source has none.
         times: (n,) float64 seconds, or None.
+        notes: what the reader decided about the input, and doubts.
 
     Raises:
         ValueError: shapes that do not belong together, or a unit other than "px" and "m".
@@ -96,6 +109,7 @@ class ScanSequence:
     reference_poses: FloatArray | None = None
     odometry_poses: FloatArray | None = None
     times: FloatArray | None = None
+    notes: tuple[Note, ...] = ()
 
     def __post_init__(self) -> None:
         if self.unit not in ("px", "m"):
@@ -287,10 +301,11 @@ class LidarSequence:
         sources: where each scan comes from: a file, in general.
         read_scan: read_scan(i) gives scan i as (n, 3) float32 points in the lidar's frame (x forward, y left, z up), m;
             raises an InputError that names the file where the scan is bad.
-        T_world_lidar: (num_scans, 4, 4) float64 reference poses, or None.
+        T_world_lidar: (num_scans, 4, 4) float64 reference poses, NaN for scans without one; or None.
         times: (num_scans,) float64 s, or None.
         read_times: read_times(i) gives when each point of scan i was measured, (n,) float64 in the unit of its file, or
             None where the file does not say; the same errors. None: no scan says.
+        notes: what the reader decided about the input, and doubts.
 
     Raises:
         ValueError: poses or times that are not one a scan.
@@ -302,6 +317,7 @@ class LidarSequence:
     T_world_lidar: FloatArray | None = field(default=None, repr=False)
     times: FloatArray | None = field(default=None, repr=False)
     read_times: Callable[[int], FloatArray | None] | None = field(default=None, repr=False)
+    notes: tuple[Note, ...] = field(default=(), repr=False)
 
     def __post_init__(self) -> None:
         _require_shapes(self, {"T_world_lidar": (self.num_scans, 4, 4), "times": (self.num_scans,)})
@@ -313,6 +329,12 @@ class LidarSequence:
 
     def __iter__(self) -> Iterator[NDArray[np.float32]]:
         return (self.read_points(index) for index in range(len(self)))
+
+    @property
+    def has_reference(self) -> BoolArray:
+        """(num_scans,) whether a scan has a reference pose."""
+        T = self.T_world_lidar
+        return np.zeros(len(self), bool) if T is None else np.asarray(np.isfinite(T.reshape(-1, 16)).all(axis=1))
 
     @property
     def num_scans(self) -> int:

@@ -24,6 +24,7 @@ SIMULATED = {
     "slam": ("-n", "12", "-o", "first"),
     "localize": ("first/map.npz", "scans", "-o", "found"),
     "merge": ("first/map.npz", "first/map.npz", "-o", "merged"),
+    "graph": ("first/graph.g2o", "-o", "optimised"),
     "evaluate": ("--pairs", "2", "-o", "evaluated"),
     "info": (),
 }
@@ -36,6 +37,7 @@ MISSING = {
     "slam": ("none",),
     "localize": ("none.npz", "scans"),
     "merge": ("none.npz", "first/map.npz"),
+    "graph": ("none.g2o",),
     "train": ("--data", "none"),
     "evaluate": ("none",),
 }

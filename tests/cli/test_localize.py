@@ -8,7 +8,7 @@ import pytest
 
 import dpmjax
 from dpmjax.cli import localize
-from dpmjax.cli.command import EXIT_BAD_INPUT, EXIT_OK
+from dpmjax.cli.command import EXIT_BAD_INPUT, EXIT_FAILED, EXIT_OK
 from dpmjax.cli.localize_numbers import localization_errors
 from dpmjax.cli.result_files import load_json, read_history
 from dpmjax.geometry import rigid
@@ -144,3 +144,16 @@ def test_errors_are_those_of_the_keyframes_frames(case) -> None:
         list(map(localize.as_localization, rows)), slam_map, reference, drive.T_world_lidar[[1, 1, 1, 1]]
     )
     np.testing.assert_allclose(again.translation_m, errors.translation_m, atol=1e-6)
+
+
+def test_scans_without_points_are_a_failure(case, tmp_path, capsys) -> None:
+    """The map is fine; nothing could be looked for."""
+    scans, out = tmp_path / "scans", tmp_path / "out"
+    scans.mkdir()
+    for number in range(3):
+        np.save(scans / f"{number}.npy", np.zeros((50, 3), np.float32))
+    arguments = (case / "map.npz", scans, "--weights", case / "model.safetensors", "-o", out)
+    assert run(*arguments) == EXIT_FAILED
+    last = capsys.readouterr().err.replace("\r", "\n").splitlines()[-1]
+    assert "3 of 3 scans without enough points" in last
+    assert load_json(out / "metrics.json")["status"] == "failed"

@@ -79,3 +79,19 @@ def test_an_earlier_run_is_replaced_only_on_demand(files, tmp_path, capsys) -> N
     assert command(files, *arguments) == EXIT_BAD_INPUT
     assert "--force" in capsys.readouterr().err
     assert command(files, *arguments, "--force") == EXIT_OK
+
+
+def test_columns_of_raw_files_are_judged_said_and_noted(files, tmp_path, capsys) -> None:
+    paths = [tmp_path / "a.pcd.bin", tmp_path / "b.pcd.bin"]
+    rng = np.random.default_rng(0)
+    for path, points in zip(paths, (read_lidar_file(files / "a.pcd"), read_lidar_file(files / "b.npy")), strict=True):
+        more = np.column_stack([rng.integers(0, 255, len(points)), rng.integers(0, 32, len(points))])
+        np.column_stack([points, more]).astype("<f4").tofile(path)
+    assert command(files, *paths, "--no-refine", "-o", tmp_path / "out") == EXIT_OK
+    notes = load_json(tmp_path / "out" / "metrics.json")["input_notes"]
+    assert [("5 columns a point" in note) for note in notes] == [True, True]
+    assert all(note in (tmp_path / "out" / "log.txt").read_text() for note in notes)
+    assert command(files, *paths, "--no-refine", "--columns", "2", "-o", tmp_path / "other") == EXIT_BAD_INPUT
+    assert "--columns: expected at least 3" in capsys.readouterr().err
+    assert command(files, *paths, "--no-refine", "--columns", "5", "-o", tmp_path / "other") == EXIT_OK
+    assert load_json(tmp_path / "other" / "metrics.json")["input_notes"] == []

@@ -102,7 +102,7 @@ def test_help_shows_examples(capsys) -> None:
         (["-n", 0], "--n-scans"),
         (["-j", 0], "--jump"),
         (["--sequence", "00"], "--sequence"),
-        (["/no/such/folder"], "no such folder"),
+        (["/no/such/folder"], "no such file or folder"),
         (["--weights", "no_such_model"], "no_such_model"),
         (["--resume", "-o", "/no/such/run"], "nothing to resume"),
     ],

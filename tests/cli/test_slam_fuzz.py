@@ -45,11 +45,16 @@ class NoMatcher:
         return np.zeros(len(targets))
 
 
+def leave_networks_out(patch: pytest.MonkeyPatch) -> None:
+    """Alignment alone; no pictures."""
+    methods = SlamMethods(NoMatcher(), SurfaceGeometry(model_preset("tiny")), SlamConfig())
+    patch.setattr(slam, "slam_methods", lambda config: methods)
+    patch.setattr(slam_files, "draw_pictures", lambda *_: None)
+
+
 @pytest.fixture
 def without_networks(monkeypatch) -> None:
-    methods = SlamMethods(NoMatcher(), SurfaceGeometry(model_preset("tiny")), SlamConfig())
-    monkeypatch.setattr(slam, "slam_methods", lambda config: methods)
-    monkeypatch.setattr(slam_files, "draw_pictures", lambda *_: None)
+    leave_networks_out(monkeypatch)
 
 
 def write_scan(path: Path, points: np.ndarray) -> None:

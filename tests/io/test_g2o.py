@@ -87,8 +87,8 @@ def test_gtsam_reads_the_same_cost(tmp_path: Path, text: str) -> None:
         ("VERTEX_XY 0 1 2", "line 1: 'VERTEX_XY' is not read here"),
         (PLANAR + "VERTEX_SE3:QUAT 9 0 0 0 0 0 0 1\n", "is not read here"),
         (PLANAR + "EDGE_SE2 7 3 1 2\n", "line 7: 4 values after EDGE_SE2"),
-        (PLANAR + "VERTEX_SE2 8 0 zero 0\n", "line 7: not a number"),
-        (PLANAR + "VERTEX_SE2 x 0 0 0\n", "line 7: not a number"),
+        (PLANAR + "VERTEX_SE2 8 0 zero 0\n", "line 7: column 4, 'zero', is not a number"),
+        (PLANAR + "VERTEX_SE2 x 0 0 0\n", "line 7: column 2, 'x', is not a whole number"),
         (PLANAR + "VERTEX_SE2 8 0 nan 0\n", "expected finite numbers"),
         (PLANAR + "VERTEX_SE2 7 0 0 0\n", "every id once"),
         (PLANAR + "FIX 12\n", "node 12 has no vertex"),
@@ -106,6 +106,101 @@ def test_bad_file_is_refused_in_one_line(tmp_path: Path, text: str, message: str
         read_g2o(path)
     assert message in str(refused.value)
     assert "\n" not in str(refused.value)
+
+
+EDGES = """EDGE_SE2 5 6 1 0 0.5 1 0 0 1 0 1
+EDGE_SE2 6 9 1 0 0.5 1 0 0 1 0 1
+EDGE_SE2 9 5 -1.2 0.4 -1 1 0 0 1 0 1
+EDGE_SE2 20 21 0 2 0 1 0 0 1 0 1
+"""
+
+
+def test_edges_alone_are_chained_along_a_spanning_tree(tmp_path: Path) -> None:
+    graph = read_g2o(written(tmp_path, EDGES))
+    np.testing.assert_array_equal(graph.ids, [5, 6, 9, 20, 21])
+    np.testing.assert_allclose(graph.poses[1], [1, 0, 0.5], atol=1e-12)
+    # Node 9 is one edge from node 5: T_5_9 is the inverse of T_9_5.
+    T = np.linalg.inv([[np.cos(-1), -np.sin(-1), -1.2], [np.sin(-1), np.cos(-1), 0.4], [0, 0, 1]])
+    np.testing.assert_allclose(graph.poses[2], [T[0, 2], T[1, 2], 1.0], atol=1e-12)
+    np.testing.assert_allclose(graph.poses[3:], [[0, 0, 0], [0, 2, 0]], atol=1e-12)
+    assert optimize_pose_graph(graph).is_converged
+
+
+def test_edges_alone_end_where_the_vertices_lead(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    truth = np.column_stack([rng.uniform(-5, 5, (12, 2)), rng.uniform(-3, 3, 12)])
+    pairs = [(i, (i + 1) % 12) for i in range(12)] + [(0, 6), (3, 9)]
+    T = [np.array([[np.cos(h), -np.sin(h), x], [np.sin(h), np.cos(h), y], [0, 0, 1]]) for x, y, h in truth]
+    rows = []
+    for a, b in pairs:
+        M = np.linalg.inv(T[a]) @ T[b]
+        rows.append(f"EDGE_SE2 {a} {b} {M[0, 2]} {M[1, 2]} {np.arctan2(M[1, 0], M[0, 0])} 4 0 0 4 0 9")
+    found = optimize_pose_graph(read_g2o(written(tmp_path, "\n".join(rows))))
+    assert found.chi2 < 1e-12
+    expected = np.array([np.linalg.inv(T[0]) @ each for each in T])
+    np.testing.assert_allclose(found.graph.poses[:, :2], expected[:, :2, 2], atol=1e-6)
+
+
+def test_toro_writes_the_same_graphs_with_other_numbers(tmp_path: Path) -> None:
+    planar = "VERTEX2 7 0 0 0\nVERTEX2 3 1 2 0.5\nFIX 3\nEDGE2 7 3 1.1 2.1 0.4 11 12 22 99 13 23\n"
+    assert_same(read_g2o(written(tmp_path, planar)), read_g2o(written(tmp_path, PLANAR)))
+    roots = np.random.default_rng(0).normal(size=(6, 6))
+    numbers = " ".join(f"{x:.17g}" for x in (roots @ roots.T)[np.triu_indices(6)])
+    roll, pitch, yaw = 0.1, -0.2, 0.3
+    pose = f"1 2 3 {roll} {pitch} {yaw}"
+    spatial = f"VERTEX3 0 0 0 0 0 0 0\nVERTEX3 1 {pose}\nEDGE3 0 1 {pose} {numbers}\n"
+    graph = read_g2o(written(tmp_path, spatial))
+    turn = Rotation.from_euler("ZYX", [yaw, pitch, roll]).as_matrix()
+    np.testing.assert_allclose(graph.poses[1, :3, :3], turn, atol=1e-15)
+    np.testing.assert_allclose(graph.edges.measurements[0, :3, 3], [1, 2, 3])
+    np.testing.assert_allclose(graph.edges.information[0], roots @ roots.T, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("line", "advice"),
+    [
+        ("VERTEX_XY 2 1 1", "landmarks are not read"),
+        ("EDGE_SE3_TRACKXYZ 0 2 0 1 1 1", "landmarks are not read"),
+        ("EDGE_SE2_SWITCHABLE 7 3 2 1 0 0 1 0 0 1 0 1", "switchable and mixture edges are not read"),
+        ("EDGE_SE2_MAXMIX 7 3 0.1 1 0 0 1 0 0 1 0 1", "switchable and mixture edges are not read"),
+        ("EDGE_PRIOR_SE2 7 1 0 0 1 0 0 1 0 1", "priors of single poses are not read"),
+        ("EDGE3 7 3 1", "in the plane, or one in space"),
+    ],
+)
+def test_the_line_that_is_not_read_is_the_one_that_is_named(tmp_path: Path, line: str, advice: str) -> None:
+    with pytest.raises(InputError, match=f"line 7: '{line.split()[0]}' is not read here.*{advice}"):
+        read_g2o(written(tmp_path, PLANAR + line + "\n"))
+
+
+def test_indefinite_information_names_its_edge_and_can_be_projected(tmp_path: Path) -> None:
+    path = written(tmp_path, PLANAR + "EDGE_SE2 3 7 1 2 3 1 2 0 1 0 1\n")
+    named = r"line 7: the information of edge 3 7 is not positive semidefinite, its least eigenvalue is -1"
+    with pytest.raises(InputError, match=named):
+        read_g2o(path)
+    graph = read_g2o(path, nearest_psd=True)
+    # Eigenvalues of [[1, 2], [2, 1]] are 3 and -1: what remains is 3 along (1, 1).
+    np.testing.assert_allclose(graph.edges.information[1], [[1.5, 1.5, 0], [1.5, 1.5, 0], [0, 0, 1]], atol=1e-12)
+    np.testing.assert_array_equal(graph.edges.information[0], read_g2o(written(tmp_path, PLANAR)).edges.information[0])
+
+
+def test_edges_without_information_are_named(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="line 4: 9 values after EDGE_SE3:QUAT, the information matrix is missing"):
+        read_g2o(written(tmp_path, SPATIAL))
+
+
+def test_real_graphs_of_users(real_data: Path) -> None:
+    folder = real_data / "field_2d"
+    found = optimize_pose_graph(read_g2o(folder / "CSAIL.g2o"))
+    assert found.chi2 == pytest.approx(40.55, abs=0.02)
+    graph = read_g2o(folder / "w100.graph")
+    assert (len(graph.poses), len(graph.edges.source)) == (100, 300)
+    assert optimize_pose_graph(graph).is_converged
+    with pytest.raises(InputError, match=r"line 4: the information of edge 2655 2656 is not positive semidefinite"):
+        read_g2o(folder / "cubicle_2edges.g2o")
+    assert len(read_g2o(folder / "cubicle_2edges.g2o", nearest_psd=True).edges.source) == 2
+    for name, line in {"landmark_xy": 3, "switchable": 3, "maxmix": 3, "g2o345_trackxyz": 5}.items():
+        with pytest.raises(InputError, match=f"line {line}: '.*' is not read here"):
+            read_g2o(folder / f"{name}.g2o")
 
 
 def test_missing_file_and_bytes_are_refused(tmp_path: Path) -> None:

@@ -73,6 +73,15 @@ def test_nan_points_and_the_mask_are_invalid_beams(tmp_path):
     assert (scans.points[~scans.mask] == 0).all()
 
 
+def test_points_of_infinite_ranges_are_no_echo(tmp_path):
+    ranges = np.linalg.norm(POINTS, axis=2)
+    ranges[1, 0], ranges[2, 3] = np.inf, -np.inf
+    with np.errstate(invalid="ignore"):
+        points = POINTS / np.linalg.norm(POINTS, axis=2)[..., None] * ranges[..., None]
+    scans = read_sequence(save(tmp_path, "a.npz", points=points))
+    np.testing.assert_array_equal(np.argwhere(~scans.mask), [[1, 0], [2, 3]])
+
+
 def with_value(index, value):
     points = POINTS.copy()
     points[index] = value
@@ -83,7 +92,6 @@ def with_value(index, value):
     ("arrays", "found"),
     [
         ({"points": with_value((0, 1, 0), np.nan)}, "scan 0, beam 1"),
-        ({"points": with_value((2, 1), np.inf)}, "infinite"),
         ({"points": with_value((2,), np.nan)}, "1 of 6 scans .* scan 2"),
         ({"points": with_value((), np.nan)}, "every beam"),
         ({"points": POINTS[0]}, r"give \(n, b, 2\)"),
@@ -147,25 +155,27 @@ def test_contents_decide_where_the_ending_does_not(tmp_path, small):
 def test_sub_range_and_stride_take_poses_and_times_along(tmp_path):
     path = tmp_path / "a.log.gz"
     path.write_bytes(gzip.compress(LOG.encode()))
-    part = read_sequence(path, start=1, stop=6, stride=2)
+    part = read_sequence(path, selection=slice(1, 6, 2))
     for poses in (part.reference_poses, part.odometry_poses):
         np.testing.assert_array_equal(poses[:, 0], [1, 3, 5])
     np.testing.assert_array_equal(part.times, [1, 3, 5])
     assert part.points.shape == (3, NUM_BEAMS, 2)
 
 
-@pytest.mark.parametrize("choice", [{"start": 99}, {"stop": 1}, {"stride": 0}, {"start": -1}, {"stride": 6}])
+@pytest.mark.parametrize(
+    "choice", [slice(99, None), slice(1), slice(None, None, 0), slice(-1, None), slice(None, None, 6)]
+)
 def test_choices_that_leave_nothing_are_refused(tmp_path, choice):
     path = tmp_path / "a.log"
     path.write_text(LOG)
     with pytest.raises(InputError, match=r"a\.log"):
-        read_sequence(path, **choice)
+        read_sequence(path, selection=choice)
 
 
 def test_limit_masks_far_beams_of_every_format(tmp_path):
     (tmp_path / "a.log").write_text(LOG)
     assert (read_sequence(tmp_path / "a.log", max_range=2.5).mask == (np.arange(NUM_BEAMS) != 2)).all()
-    assert read_sequence(save(tmp_path, points=POINTS), start=0, stop=2, max_range=7).mask.all()
+    assert read_sequence(save(tmp_path, points=POINTS), selection=slice(2), max_range=7).mask.all()
     with pytest.raises(InputError, match="no valid beam"):
         read_sequence(save(tmp_path, points=POINTS), max_range=7)
 
@@ -205,7 +215,7 @@ def test_a_scan_in_millimetres_is_warned_of(tmp_path, caplog):
         read_sequence(save(tmp_path, points=POINTS))
         assert not caplog.records
         read_sequence(save(tmp_path, points=POINTS * 40))
-    assert "are these millimetres?" in caplog.text
+    assert "are these millimetres or centimetres?" in caplog.text
 
 
 def test_import_is_light():

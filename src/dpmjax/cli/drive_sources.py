@@ -7,6 +7,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+
 from dpmjax.deeppointmap import SamplingConfig, why_useless
 from dpmjax.io import LidarSequence, list_lidar_sequences, open_lidar_sequence
 from dpmjax.simulation import simulate_drive
@@ -34,10 +36,11 @@ class Source:
     town_kind: str | None = None
 
     def open(self) -> LidarSequence:
-        """Opens or simulates the drive."""
+        """Opens or simulates the drive; of one with reference poses, the scans that have one."""
         if self.path is None:
             return simulate_drive(self.town_seed, length_m=self.town_length_m, kind=self.town_kind)
-        return open_lidar_sequence(self.path, sequence=self.name)
+        drive = open_lidar_sequence(self.path, sequence=self.name)
+        return drive if drive.T_world_lidar is None else drive.take(np.flatnonzero(drive.has_reference))
 
 
 def find_sources(data: Sequence[str], towns: Sequence[Source], sampling: SamplingConfig | None = None) -> list[Source]:
@@ -61,7 +64,7 @@ def find_sources(data: Sequence[str], towns: Sequence[Source], sampling: Samplin
             sources += towns
             continue
         names: Sequence[str | None] = list_lidar_sequences(entry) or [None]
-        found = {Source(Path(entry), name): open_lidar_sequence(entry, sequence=name) for name in names}
+        found = {source: source.open() for source in (Source(Path(entry), name) for name in names)}
         checked = ((source, why_useless(drive, sampling)) for source, drive in found.items())
         reasons = {source: reason for source, reason in checked if reason is not None}
         if len(reasons) == len(found):

@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
+import logging
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from dpmjax.sequences import InputError
-
 if TYPE_CHECKING:
-    from dpmjax.sequences import LidarSequence
+    from dpmjax.sequences import LidarSequence, Note
 
+LOGGER = logging.getLogger(__name__)
 TOWN_ROUTE_M, TOWN_DRIVE_M, TOWN_RATE_HZ, TOWN_AZIMUTHS = 400.0, 480.0, 3.0, 900
-_FLOAT32_ROW_BYTES = 16
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -22,11 +22,13 @@ class DriveSelection:
     """Scans of one drive.
 
     Attributes:
-        data: folder of scans; None for a simulated town.
+        data: folder of scans, or a bag of ROS; None for a simulated town.
         sequence: name of the drive, where the folder holds several.
         num_scans: number of scans; None for all.
         jump: every `jump`-th scan is taken.
         is_kitti_corrected: the beams are raised by 0.205 degrees, as KITTI's HDL-64E needs.
+        columns: numbers a point has in `.bin` files; None infers it from the values.
+        topic: which clouds of a bag of ROS; None takes the only ones.
         seed: of the simulated town.
     """
 
@@ -35,6 +37,8 @@ class DriveSelection:
     num_scans: int | None = None
     jump: int = 1
     is_kitti_corrected: bool = False
+    columns: int | None = None
+    topic: str | None = None
     seed: int = 0
 
 
@@ -55,13 +59,33 @@ def open_drive(selection: DriveSelection) -> LidarSequence:
     if selection.data is None:
         drive = demo_drive(selection.seed)
     else:
-        drive = io.open_lidar_sequence(selection.data, sequence=selection.sequence)
+        drive = io.open_lidar_sequence(
+            selection.data, sequence=selection.sequence, bin_columns=selection.columns, topic=selection.topic
+        )
     if selection.is_kitti_corrected:
         drive = with_raised_beams(drive)
     part = drive.take(np.arange(len(drive))[:: selection.jump][: selection.num_scans])
-    require_whole_files(part)
-    part.read_points(0)
-    return part
+    io.require_whole_files(part, bin_columns=selection.columns)
+    note = io.unit_note(part.read_points(0), part.sources[0])
+    return part if note is None else replace(part, notes=(*part.notes, note))
+
+
+def report_notes(notes: Iterable[Note]) -> dict[str, list[str]]:
+    """Writes what was decided about the input to the log; prints it, but for doubts, which the console has already.
+
+    Args:
+        notes: of a drive.
+
+    Returns:
+        The entry of `metrics.json`.
+    """
+    texts = []
+    for note in notes:
+        LOGGER.info("%s", note.text)
+        texts.append(note.text)
+        if not note.is_doubt:
+            print(note.text, flush=True)
+    return {"input_notes": texts}
 
 
 def with_raised_beams(drive: LidarSequence) -> LidarSequence:
@@ -82,17 +106,3 @@ def demo_drive(seed: int) -> LidarSequence:
     town = TownConfig("suburb", "loop", TOWN_ROUTE_M, 90.0)
     driving = DriveConfig(rate_hz=TOWN_RATE_HZ, length_m=TOWN_DRIVE_M)
     return simulate_scene(Scene(seed, town, driving, HDL64E.with_azimuths(TOWN_AZIMUTHS)))
-
-
-def require_whole_files(drive: LidarSequence) -> None:
-    """Raises an `InputError` for the first file that is missing or cut off, as far as its length shows it."""
-    for source in map(Path, drive.sources):
-        if source.suffix.lower() != ".bin":
-            continue
-        try:
-            size = source.stat().st_size
-        except OSError as error:
-            raise InputError(source, f"cannot be read ({error.strerror})", "check the file") from error
-        if size % _FLOAT32_ROW_BYTES:
-            found = f"{size} bytes are no whole number of points of 4 float32: truncated, or other columns"
-            raise InputError(source, found, "copy the file again, or leave it out")

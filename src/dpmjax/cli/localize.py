@@ -23,10 +23,11 @@ from tqdm import tqdm
 from tyro.conf import FlagCreatePairsOff, Positional, arg
 
 from dpmjax.cli.command import StopFlag, check_least, run_command
-from dpmjax.cli.drives import DriveSelection, open_drive
+from dpmjax.cli.drives import DriveSelection, open_drive, report_notes
 from dpmjax.cli.localize_numbers import localization_errors
 from dpmjax.cli.result_files import HistoryFile, read_history
 from dpmjax.cli.run_folder import RunFolder, RunOptions, open_run_folder, recording, write_metrics
+from dpmjax.sequences import InputError
 
 if TYPE_CHECKING:
     from dpmjax.sequences import LidarSequence
@@ -49,7 +50,7 @@ class Config(RunOptions):
     map: Annotated[Positional[Path], arg(metavar="MAP", help_behavior_hint="required")] = Path()
     """Map, a file of dpmjax.save_map."""
     scans: Annotated[Positional[Path], arg(metavar="SCANS", help_behavior_hint="required")] = Path()
-    """Folder of scans."""
+    """Folder of scans, or a bag of ROS."""
     sequence: Annotated[str | None, arg(aliases=["-s"], metavar="NAME")] = None
     """Which drive of a folder that holds several."""
     weights: Annotated[str, arg(metavar="NAME|FILE")] = "dpm_small"
@@ -60,12 +61,16 @@ class Config(RunOptions):
     """Use the first N scans."""
     jump: Annotated[int, arg(aliases=["-j"], metavar="J")] = 1
     """Use every J-th scan."""
+    topic: Annotated[str | None, arg(aliases=["-t"], metavar="NAME")] = None
+    """Which clouds of a bag of ROS, where it holds several topics of them."""
+    columns: Annotated[int | None, arg(metavar="N")] = None
+    """Numbers a point has in .bin files; without it, the values decide."""
     map_poses: Annotated[Path | None, arg(metavar="FILE")] = None
     """Reference poses of all scans of the drive that made the map, in the world of the scans' reference."""
 
     def __post_init__(self) -> None:
         """Checks ranges."""
-        check_least(self, n_scans=1, jump=1, seed=0)
+        check_least(self, n_scans=1, jump=1, seed=0, columns=3)
         if not self.resume and Path() in (self.map, self.scans):
             raise ValueError("give a map and a folder of scans")
 
@@ -78,6 +83,8 @@ class Config(RunOptions):
             num_scans=self.n_scans,
             jump=self.jump,
             is_kitti_corrected=self.kitti_angle_correction,
+            columns=self.columns,
+            topic=self.topic,
         )
 
 
@@ -103,6 +110,7 @@ def main(config: Config) -> list[dict[str, str]]:
         HistoryFile(path, COLUMNS, keep_until=len(drive) if earlier else None) as table,
         tqdm(total=len(drive), initial=len(rows), unit=" scans", dynamic_ncols=True) as bar,
     ):
+        notes = report_notes(drive.notes)
         clock = time.perf_counter()
         while len(rows) < len(drive) and not stop.is_requested:
             result = next(results)
@@ -112,7 +120,10 @@ def main(config: Config) -> list[dict[str, str]]:
             rows.append(row)
             bar.update(1)
             bar.set_postfix(found=sum(row["status"] == "found" for row in rows))
-        print(write_results(folder, config, case, rows))
+        print(write_results(folder, config, case, rows, notes))
+        if rows and all(row["status"] == "empty" for row in rows) and not stop.is_requested:
+            found = f"{len(rows)} of {len(rows)} scans without enough points, none could be looked for"
+            raise InputError(drive.name, found, "check that the scans are 3-D and in metres")
     print(f"results in {folder.path}")
     return rows
 
@@ -171,7 +182,9 @@ def as_localization(row: dict[str, str]) -> Localization:
     return Localization("found", T, float(row["probability"]), int(row["keyframe"]), row["reason"])
 
 
-def write_results(folder: RunFolder, config: Config, case: Case, rows: list[dict[str, str]]) -> str:
+def write_results(
+    folder: RunFolder, config: Config, case: Case, rows: list[dict[str, str]], notes: dict[str, list[str]]
+) -> str:
     """Writes trajectory, metrics and picture; returns a summary."""
     from dpmjax import io, viz
 
@@ -188,13 +201,15 @@ def write_results(folder: RunFolder, config: Config, case: Case, rows: list[dict
         "num_keyframes": len(case.slam_map),
         "is_calibrated": case.is_calibrated,
         "map_bytes": config.map.stat().st_size,
+        **notes,
+        "status": "failed" if rows and all(result.status == "empty" for result in results) else "done",
         "scan_s": float(np.median([float(row["seconds"]) for row in rows])) if rows else None,
     }
     text, is_wrong, reference = f"{len(numbers)} of {len(rows)} scans found", None, case.T_reference_keyframe
     if reference is not None and case.drive.T_world_lidar is not None and rows:
-        T_reference_scan = case.drive.T_world_lidar[: len(rows)]
+        T_reference_scan, has_reference = case.drive.T_world_lidar[: len(rows)], case.drive.has_reference[: len(rows)]
         errors = localization_errors(results, case.slam_map, reference, T_reference_scan)
-        is_wrong = ~errors.is_right[errors.is_found]
+        is_wrong = (~errors.is_right & has_reference)[errors.is_found]
         apart = np.linalg.norm(T_reference_scan[:, None, :3, 3] - reference[None, :, :3, 3], axis=2)
         num_inside, num_right = int((apart.min(axis=1) <= REACH_M).sum()), int(errors.is_right.sum())
         metrics |= {"num_inside": num_inside, "num_right": num_right, "num_wrong": int(is_wrong.sum())}

@@ -3,6 +3,7 @@
     dpmjax map2d                              the built-in world
     dpmjax map2d scans.tar -o out             a folder or .tar of .pcd + gt_pose.mat
     dpmjax map2d robot.log.gz                 a CARMEN log, as recorded or thinned
+    dpmjax map2d drive.bag --topic /scan      LaserScan of a bag of ROS 1 or 2 (extra ros)
     dpmjax map2d scans.npz --seconds 60       arrays (n, b, 2)
     dpmjax map2d --jump 8 --init global       large steps: no first guess is needed
     dpmjax map2d --resume                     continue the latest run
@@ -31,6 +32,7 @@ from tyro.conf import Positional, arg
 
 from dpmjax import deepmapping, io, registration, simulation
 from dpmjax.cli.command import StopFlag, check_least, run_command
+from dpmjax.cli.drives import report_notes
 from dpmjax.cli.machine import peak_rss_gb
 from dpmjax.cli.map2d_files import as_scan_set, draw_map, draw_occupancy, registered_scans, write_trajectories
 from dpmjax.cli.map2d_numbers import (
@@ -70,7 +72,9 @@ class Config(RunOptions):
     old_names: ClassVar[Mapping[str, str]] = {"--polish": "--refine", "--no-polish": "--no-refine"}
 
     data: Annotated[Positional[Path | None], arg(metavar="[DATA]")] = None
-    """Scans: a folder or .tar of .pcd, a CARMEN log, .npy or .npz. Without it: the built-in world."""
+    """Scans: a folder or .tar of .pcd, a CARMEN log, a bag of ROS, .npy or .npz. Without it: the built-in world."""
+    topic: Annotated[str | None, arg(aliases=["-t"], metavar="NAME")] = None
+    """Which scans of a bag, where it holds several topics of them."""
     preset: Literal["fast", "paper"] = "fast"
     """fast: minutes on two cores; paper: architecture, losses and sampling of the paper."""
     init: Annotated[str, arg(metavar="auto|odometry|icp-plane|icp-point|global|zero|FILE")] = "auto"
@@ -118,11 +122,13 @@ def main(config: Config) -> dict[str, Any]:
     folder = open_run_folder(config, NAME)
     with recording(folder), StopFlag() as stop:
         print(f"{sequence.name}: {len(sequence)} scans of {sequence.points.shape[1]} beams")
+        notes = report_notes(sequence.notes)
         seconds = math.inf if config.seconds is None else config.seconds
         recorder = FitRecorder(folder, sequence.unit, stop=lambda run_s: stop.is_requested or run_s >= seconds)
         result = register(sequence, start, config, recorder, stop)
         metrics = {
             **numbers_of(sequence, result, config, measure),
+            **notes,
             "fit_s": recorder.run_s,
             "compile_s": recorder.compile_s,
             "steps": recorder.steps,
@@ -236,7 +242,7 @@ def read_scans(config: Config) -> ScanSequence:
     """Returns the scans of DATA or of the built-in world, sub-range and stride applied."""
     stop = None if config.n_scans is None else config.start + config.n_scans * config.jump
     if config.data is not None:
-        return io.read_sequence(config.data, start=config.start, stop=stop, stride=config.jump)
+        return io.read_sequence(config.data, selection=slice(config.start, stop, config.jump), topic=config.topic)
     sequence = simulation.simulate_sequence(
         config.world, stop or 256, range_noise_px=config.range_noise_px, seed=config.seed, with_odometry=True
     )

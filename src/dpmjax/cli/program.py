@@ -13,6 +13,7 @@ COMMANDS = {
     "slam": "a drive of 3-D scans: a pose for every scan, loops, a map",
     "localize": "scans in a saved map: where each was taken",
     "merge": "saved maps of several drives: one map",
+    "graph": "a pose graph (g2o, TORO): optimised poses",
     "train": "drives with poses: trained weights",
     "evaluate": "weights and drives with poses: recall, errors, confidence",
     "info": "versions, devices, shipped weights",

@@ -4,7 +4,7 @@
     dpmjax register 000000.bin 000010.bin -o out  KITTI's files
     dpmjax register a.npy b.ply --no-refine       without the final point-to-plane alignment
 
-Scans are .pcd .ply .bin .npy or .npz, in metres, each in the frame of its lidar. Results go to
+Scans are .pcd .ply .las .laz .bin .npy or .npz, in metres, each in the frame of its lidar. Results go to
 results/register/<time>/ (latest links to the newest): T_target_source.txt (4 x 4, maps points of A to the frame of B),
 metrics.json, aligned.ply (A in the frame of B, and B, in two colours) and registration.png (from above).
 """
@@ -20,7 +20,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import numpy as np
 from tyro.conf import Positional, arg
 
-from dpmjax.cli.command import run_command
+from dpmjax.cli.command import check_least, run_command
+from dpmjax.cli.drives import report_notes
 from dpmjax.cli.run_folder import OutputOptions, RunFolder, open_run_folder, recording, write_metrics
 from dpmjax.io.files import write_atomically
 
@@ -43,8 +44,14 @@ class Config(OutputOptions):
     """Scan in whose frame they end."""
     weights: Annotated[str, arg(metavar="NAME|FILE")] = "dpm_small"
     """Name of a shipped model, or a .safetensors file."""
+    columns: Annotated[int | None, arg(metavar="N")] = None
+    """Numbers a point has in .bin files (4: KITTI, 5: nuScenes); without it, the values decide."""
     refine: bool = True
     """End with a fine point-to-plane alignment."""
+
+    def __post_init__(self) -> None:
+        """Checks ranges."""
+        check_least(self, columns=3)
 
 
 def main(config: Config) -> dict[str, Any]:
@@ -54,10 +61,13 @@ def main(config: Config) -> dict[str, Any]:
     from dpmjax.weights import load_model
 
     started = time.perf_counter()
-    source, target = (io.read_lidar_file(path) for path in (config.source, config.target))
+    source, target = (io.read_lidar_file(path, bin_columns=config.columns) for path in (config.source, config.target))
+    scans = {config.source: source, config.target: target}
+    notes = [note for path, points in scans.items() for note in io.scan_notes(path, points, bin_columns=config.columns)]
     model = load_model(config.weights)
     folder = open_run_folder(config, NAME)
     with recording(folder):
+        told = report_notes(notes)
         clock = time.perf_counter()
         found = register(model, source, target, refine=config.refine)
         T = np.asarray(found.T_target_source, np.float64)
@@ -65,6 +75,7 @@ def main(config: Config) -> dict[str, Any]:
             "source": config.source.name,
             "target": config.target.name,
             "weights": config.weights,
+            **told,
             **motion_numbers(T),
             **match_numbers(found),
             "is_calibrated": model.config.calibration is not None,

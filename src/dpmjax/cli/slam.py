@@ -2,6 +2,7 @@
 
     dpmjax slam                                         a simulated town, once round and on
     dpmjax slam path/to/drive -o out                    KITTI, KITTI-360, MulRan, any folder of scans
+    dpmjax slam drive.bag --topic /points               a bag of ROS 1 or 2 (.bag, .mcap, a folder; extra ros)
     dpmjax slam kitti/dataset --sequence 07 -n 500      the first 500 scans of a sequence
     dpmjax slam day2 --map results/slam/latest/map.npz  extend the map of an earlier run
     dpmjax slam --resume                                go on where the last run stopped, or was killed
@@ -24,10 +25,11 @@ import numpy as np
 from tyro.conf import FlagCreatePairsOff, Positional, arg
 
 from dpmjax.cli.command import StopFlag, check_least, run_command
-from dpmjax.cli.drives import DriveSelection, open_drive
+from dpmjax.cli.drives import DriveSelection, open_drive, report_notes
 from dpmjax.cli.machine import peak_rss_gb
 from dpmjax.cli.optional import require_importable
 from dpmjax.cli.run_folder import RunFolder, RunOptions, open_run_folder, recording, write_metrics
+from dpmjax.sequences import InputError
 
 if TYPE_CHECKING:
     from dpmjax.cli.slam_outcome import SlamRun
@@ -45,9 +47,13 @@ class Config(RunOptions):
     may_change: ClassVar[frozenset[str]] = frozenset({"n_scans", "refine"})
 
     data: Annotated[Positional[Path | None], arg(metavar="[DATA]")] = None
-    """Folder of scans. Without it: a simulated town of the seed."""
+    """Folder of scans, or a bag of ROS. Without it: a simulated town of the seed."""
     sequence: Annotated[str | None, arg(aliases=["-s"], metavar="NAME")] = None
     """Which drive, where DATA holds several."""
+    topic: Annotated[str | None, arg(aliases=["-t"], metavar="NAME")] = None
+    """Which clouds of a bag, where it holds several topics of them."""
+    columns: Annotated[int | None, arg(metavar="N")] = None
+    """Numbers a point has in .bin files (4: KITTI, 5: nuScenes); without it, the values decide."""
     weights: Annotated[str, arg(metavar="NAME|FILE")] = "dpm_small"
     """Name of a shipped model, or a .safetensors file."""
     map: Annotated[Path | None, arg(metavar="IN")] = None
@@ -73,7 +79,7 @@ class Config(RunOptions):
 
     def __post_init__(self) -> None:
         """Checks ranges."""
-        check_least(self, n_scans=1, jump=1, seed=0)
+        check_least(self, n_scans=1, jump=1, seed=0, columns=3)
         if self.sequence is not None and self.data is None:
             raise ValueError("--sequence chooses a drive of DATA: give its folder too")
         if self.kitti_angle_correction and self.data is None:
@@ -88,13 +94,15 @@ class Config(RunOptions):
             num_scans=self.n_scans,
             jump=self.jump,
             is_kitti_corrected=self.kitti_angle_correction,
+            columns=self.columns,
+            topic=self.topic,
             seed=self.seed,
         )
 
 
 def main(config: Config) -> dict[str, Any]:
     """Reads, maps, writes; returns the content of `metrics.json`."""
-    from dpmjax.cli.slam_numbers import counted, summary
+    from dpmjax.cli.slam_numbers import counted, status_of, summary, why_failed
     from dpmjax.cli.slam_reader import ScanReader
     from dpmjax.cli.slam_run import Hooks, find_beginning, run_scans
     from dpmjax.cli.slam_viewer import live_viewer
@@ -112,6 +120,7 @@ def main(config: Config) -> dict[str, Any]:
     with recording(folder), StopFlag() as stop:
         done = f", {len(beginning.reports)} done before" if beginning.reports else ""
         tell(f"{sequence.name}: {counted(len(sequence), 'scan')}{done}")
+        notes = report_notes(sequence.notes)
         with live_viewer(folder, sequence.name, is_on=config.visualize) as on_scan:
             hooks = Hooks(lambda: stop.is_requested, on_scan)
             run = run_scans(folder, sequence, reader, methods, beginning, hooks)
@@ -121,11 +130,14 @@ def main(config: Config) -> dict[str, Any]:
         if config.refine and run.failure is None and not stop.is_requested:
             metrics |= refine(folder, config, drive, result, lambda: stop.is_requested)
         metrics |= {"is_interrupted": stop.is_requested or run.failure is not None, "peak_rss_gb": peak_rss_gb()}
-        metrics["wall_s"] = time.perf_counter() - started
+        failed = why_failed(metrics["scan_statuses"])
+        metrics |= {**notes, "status": status_of(metrics), "wall_s": time.perf_counter() - started}
         write_metrics(folder, metrics, seed=config.seed)
         tell(f"{summary(metrics)}\nresults in {folder.path}")
         if run.failure is not None:
             raise run.failure
+        if failed is not None and not stop.is_requested:
+            raise InputError(sequence.name, failed, "check that the scans are 3-D, in metres, and follow each other")
     return metrics
 
 

@@ -203,9 +203,11 @@ def draw_pictures(
         tracks = [viz.Track("the map before", slam_map.T_world_keyframe[:num_old, :3, 3]), *tracks]
     tracks.append(_track("SLAM", T, reference))
     shown = None
-    if reference is not None:
-        T_map_reference = align_rigid(reference[:, :3, 3], T[:, :3, 3])
-        shown = reference[:, :3, 3] @ T_map_reference[:3, :3].T + T_map_reference[:3, 3]
+    if reference is not None and sequence.has_reference[: len(T)].any():
+        has_reference = sequence.has_reference[: len(T)]
+        positions = reference[has_reference, :3, 3]
+        T_map_reference = align_rigid(positions, T[has_reference, :3, 3])
+        shown = positions @ T_map_reference[:3, :3].T + T_map_reference[:3, 3]
     title = f"{sequence.name}: {counted(len(T), 'scan')}"
     figure = viz.trajectory_figure(title, tracks, shown, slam_map.T_world_keyframe[ends, :3, 3])
     viz.save_figure(figure, folder / "trajectory.png")
@@ -218,5 +220,5 @@ def _track(name: str, T_world_scan: np.ndarray, reference: np.ndarray | None) ->
     from dpmjax.cli.slam_numbers import distances_to_reference
 
     errors = distances_to_reference(T_world_scan, reference)
-    label = name if errors is None else f"{name}, ATE {np.sqrt(np.mean(errors**2)):.2f} m"
+    label = name if errors is None else f"{name}, ATE {np.sqrt(np.nanmean(errors**2)):.2f} m"
     return viz.Track(label, T_world_scan[:, :3, 3], errors)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import collections
 import math
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -23,10 +24,14 @@ UNSURE = {
 
 
 def trajectory_errors(T_world_scan: np.ndarray, reference: np.ndarray | None, suffix: str = "") -> dict[str, Any]:
-    """Returns ATE, RPE and KITTI's errors of a trajectory; none without a reference."""
+    """Returns ATE, RPE and KITTI's errors of a trajectory, at scans with a reference pose; none without two of them."""
     from dpmjax.metrics import absolute_trajectory_error, relative_pose_error, segment_error
 
-    if reference is None or len(T_world_scan) < 2:
+    if reference is None:
+        return {}
+    has_reference = np.isfinite(reference.reshape(-1, 16)).all(axis=1)
+    T_world_scan, reference = T_world_scan[has_reference], reference[has_reference]
+    if len(T_world_scan) < 2:
         return {}
     relative, segments = relative_pose_error(T_world_scan, reference), segment_error(T_world_scan, reference)
     return {
@@ -39,12 +44,15 @@ def trajectory_errors(T_world_scan: np.ndarray, reference: np.ndarray | None, su
 
 
 def distances_to_reference(T_world_scan: np.ndarray, reference: np.ndarray | None) -> np.ndarray | None:
-    """Returns the distance of each scan to the reference after the best rigid alignment."""
+    """Returns the distance of each scan to the reference after the best rigid alignment; NaN for scans without one."""
     from dpmjax.metrics import align_rigid
 
-    if reference is None or not len(T_world_scan):
+    if reference is None:
         return None
-    T = align_rigid(T_world_scan[:, :3, 3], reference[:, :3, 3])
+    has_reference = np.isfinite(reference.reshape(-1, 16)).all(axis=1)
+    if not has_reference.any():
+        return None
+    T = align_rigid(T_world_scan[has_reference, :3, 3], reference[has_reference, :3, 3])
     moved = T_world_scan[:, :3, 3] @ T[:3, :3].T + T[:3, 3]
     return np.asarray(np.linalg.norm(moved - reference[:, :3, 3], axis=1))
 
@@ -72,6 +80,42 @@ def run_numbers(run: SlamRun, result: SlamResult, sequence: LidarSequence) -> di
         "stages_s": run.stages_s,
         "stages_ms_per_scan": {name: 1000 * s / max(run.num_done, 1) for name, s in run.stages_s.items()},
     }
+
+
+def why_failed(statuses: Mapping[str, int]) -> str | None:
+    """Returns why a run has no result, although it has come to its end; None where it has one.
+
+    Args:
+        statuses: number of scans by status.
+
+    Returns:
+        One text.
+    """
+    num_scans, num_empty = sum(statuses.values()), statuses.get("empty", 0)
+    num_aligned = statuses.get("tracked", 0) + statuses.get("network", 0)
+    if num_scans and num_empty == num_scans:
+        return f"{num_empty} of {counted(num_scans, 'scan')} without enough points, no map was made"
+    if num_scans > 1 and not num_aligned:
+        return f"none of {counted(num_scans, 'scan')} could be aligned with those before, the trajectory is no result"
+    return None
+
+
+def status_of(metrics: Mapping[str, Any]) -> str:
+    """Returns how a run ended.
+
+    Args:
+        metrics: the numbers of the run.
+
+    Returns:
+        done; uncertain: less than half of the scans were aligned; failed: none; interrupted: before its end.
+    """
+    statuses = metrics["scan_statuses"]
+    if metrics["is_interrupted"]:
+        return "interrupted"
+    if why_failed(statuses) is not None:
+        return "failed"
+    num_sure = sum(statuses.get(status, 0) for status in ("first", "tracked", "network"))
+    return "done" if 2 * num_sure >= sum(statuses.values()) else "uncertain"
 
 
 def count_parts(slam_map: KeyframeMap) -> int:

@@ -1,6 +1,7 @@
 """The DeepMapping authors' layout of a 2-D trajectory: one PCD file per scan, and gt_pose.mat beside them.
 
-Coordinates in the PCD files are pixels / 512, poses are pixels and radians; an invalid beam is a point of zeros.
+Coordinates in the PCD files are pixels / 512, poses are pixels and radians; an invalid beam is a point of
+zeros, or one that is not finite.
 """
 
 from __future__ import annotations
@@ -12,9 +13,9 @@ from typing import Any
 
 import numpy as np
 
-from dpmjax.io.clouds import parse_pcd, write_pcd
 from dpmjax.io.files import natural_key, read_bytes, refusing, write_atomically
 from dpmjax.io.mat import parse_mat
+from dpmjax.io.pcd import parse_pcd, write_pcd
 from dpmjax.sequences import FloatArray, ScanSequence, Unit, has_angular_order, require
 
 _PIXELS_PER_UNIT = 512.0
@@ -46,7 +47,7 @@ def read_deepmapping_folder(path: str | Path, *, unit: Unit | None = None) -> Sc
     scans = [parse_pcd(files[name], f"{path}/{name}").points[:, :2] for name in names]
     points = np.zeros((len(scans), max(len(scan) for scan in scans), 2), np.float32)
     for row, scan in zip(points, scans, strict=True):
-        row[: len(scan)] = scan
+        row[: len(scan)] = np.where(np.isfinite(scan).all(axis=1, keepdims=True), scan, 0)
     mask = (points != 0).any(axis=2)
     found = "every point of every scan is zero (an invalid beam)"
     require(mask.any(), path, found, "give scans that measured something")

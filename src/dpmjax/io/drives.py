@@ -3,22 +3,26 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dpmjax.geometry import rigid
-from dpmjax.io.files import load_arrays, natural_key, read_table, write_atomically
-from dpmjax.io.poses import check_poses, homogeneous, read_poses, write_kitti
-from dpmjax.sequences import FloatArray, InputError, LidarSequence, require
+from dpmjax.io.calibration import read_camera_calibration
+from dpmjax.io.files import load_arrays, write_atomically
+from dpmjax.io.poses import check_poses, homogeneous, read_stamped_poses, write_kitti
+from dpmjax.io.references import camera_note, match_reference, scan_times
+from dpmjax.io.scan_names import sort_scans, strays_among
+from dpmjax.sequences import FloatArray, InputError, LidarSequence, Note, require
 
 _log = logging.getLogger(__name__)
-SCAN_SUFFIXES = (".bin", ".npy", ".npz", ".pcd", ".ply")
-_POSE_FILES = ("poses_lidar.txt", "poses_lidar.npy", "poses.txt", "poses.npy", "trajectory.txt", "trajectory_tum.txt",
-               "trajectory.npy", "gt_poses.txt", "groundtruth.txt")  # fmt: skip
+SCAN_SUFFIXES = (".bin", ".npy", ".npz", ".pcd", ".ply", ".las", ".laz")
+POSE_FILES = ("poses_lidar.txt", "poses_lidar.npy", "poses.txt", "poses.npy", "trajectory.txt", "trajectory_tum.txt",
+              "trajectory.npy", "gt_poses.txt", "groundtruth.txt")  # fmt: skip
+"""Usual names of files of reference poses in the lidar's frame."""
 # Axes of a camera that looks along x of the lidar: x right, y down, z forward. Written sequences have it in the lidar.
 _T_CAM0_LIDAR = np.array([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]])
 
@@ -29,118 +33,96 @@ class Drive3D(NamedTuple):
     Attributes:
         name: for titles.
         files: the scans.
-        T_world_lidar: (n, 4, 4), or None.
+        T_world_lidar: (n, 4, 4), NaN for scans without a pose; or None.
         times: (n,) s, or None.
+        notes: what was decided about the files, and doubts.
     """
 
     name: str
     files: list[Path]
     T_world_lidar: FloatArray | None = None
     times: FloatArray | None = None
+    notes: tuple[Note, ...] = ()
 
 
 def scan_files(folder: Path, suffixes: tuple[str, ...] = SCAN_SUFFIXES) -> list[Path]:
-    """Lists the scans of a folder in natural order: the files of the most frequent ending.
+    """Lists the scans of a folder in the order of their numbers: the files of the most frequent ending.
 
     Args:
         folder: where to look, not deeper.
         suffixes: endings of scans.
 
     Returns:
-        The files; none where there is no such folder.
+        The files, without those that `stray_note` names; none where there is no such folder.
     """
+    most = _of_one_ending(folder, suffixes)
+    strays = strays_among(most)
+    return sort_scans([file for file in most if file not in strays])
+
+
+def stray_note(folder: Path) -> Note | None:
+    """Names the files of a folder that are no scans although they have the ending of scans, such as map.pcd.
+
+    Args:
+        folder: of the scans.
+
+    Returns:
+        The note, or None.
+    """
+    strays = strays_among(_of_one_ending(folder, SCAN_SUFFIXES))
+    if not strays:
+        return None
+    text = f"{folder}: {strays[0].name} is no scan, as its name has no number; {len(strays)} such left out"
+    return Note(text, is_doubt=True)
+
+
+def _of_one_ending(folder: Path, suffixes: tuple[str, ...]) -> list[Path]:
+    """The files of the most frequent ending, unsorted."""
     if not folder.is_dir():
         return []
-    files = [f for f in folder.iterdir() if f.is_file() and f.name[0] != "." and f.name not in _POSE_FILES]
-    most = max(([f for f in files if f.suffix.lower() == suffix] for suffix in suffixes), key=len)
-    return sorted(most, key=lambda file: natural_key(file.name))
+    files = [f for f in folder.iterdir() if f.is_file() and f.name[0] != "." and f.name not in POSE_FILES]
+    return max(([f for f in files if f.suffix.lower() == suffix] for suffix in suffixes), key=len)
 
 
-def numbers_of(files: Sequence[Path], largest: float = 2.0**62) -> list[int] | None:
-    """The numbers that are the names of files.
-
-    Args:
-        files: the scans.
-        largest: no number may be above this.
-
-    Returns:
-        One number a file, or None where a name is no number or too large.
-    """
-    names = [file.stem for file in files]
-    is_good = all(name.isascii() and name.isdecimal() and len(name) < 20 and int(name) <= largest for name in names)
-    return [int(name) for name in names] if is_good else None
-
-
-def match_rows(rows: NDArray[Any], files: list[Path]) -> NDArray[Any] | None:
-    """The row of each scan: in order if there are as many, else by the number that is the file's name.
+def find_pose_file(*homes: Path) -> Path | None:
+    """Finds a file of reference poses by the usual names.
 
     Args:
-        rows: (m, ...) values.
-        files: the n scans.
+        *homes: folders where it may lie.
 
     Returns:
-        (n, ...), or None where there are more or fewer rows, and names that are no numbers of rows.
+        The first one; None where there is none.
     """
-    numbers = range(len(files)) if len(rows) == len(files) else numbers_of(files, len(rows) - 1)
-    return None if numbers is None else rows[list(numbers)]
-
-
-def match_poses(poses: FloatArray, files: list[Path], path: Path) -> FloatArray:
-    """The pose of each scan, see `match_rows`.
-
-    Args:
-        poses: (m, 4, 4).
-        files: the n scans.
-        path: of the poses, for messages.
-
-    Returns:
-        (n, 4, 4).
-
-    Raises:
-        InputError: another number of poses, and names that are no numbers.
-    """
-    matched = match_rows(poses, files)
-    if matched is None:
-        raise InputError(path, f"{len(poses)} poses for {len(files)} scans", "give one pose a scan, in their order")
-    return matched
-
-
-def match_times(path: Path, files: list[Path]) -> FloatArray | None:
-    """The times of the scans out of times.txt; a file that does not fit is ignored.
-
-    Args:
-        path: of times.txt.
-        files: the n scans.
-
-    Returns:
-        (n,) s, or None.
-    """
-    try:
-        times = match_rows(read_table(path)[:, 0], files)
-    except InputError:
-        return None
-    return times if times is not None and np.isfinite(times).all() else None
+    return next((home / name for home in homes for name in POSE_FILES if (home / name).is_file()), None)
 
 
 def read_plain_folder(folder: Path, *, poses: Path | None = None) -> Drive3D:
-    """A folder of scans in natural order, with a pose file and times.txt beside or above them.
+    """A folder of scans in the order of their numbers, with a pose file and times.txt beside or above them.
 
     Args:
         folder: the scans.
-        poses: the pose file in the lidar's frame; None looks for the usual names in the folder and the one above.
+        poses: the pose file; None looks for the usual names in the folder and the one above. Poses that move as those
+            of a camera come into the lidar's frame where a calib.txt with `Tr` lies beside.
 
     Returns:
         The drive.
 
     Raises:
-        InputError: broken files, or another number of poses than of scans.
+        InputError: broken files, or poses that match the scans neither by time nor by number.
     """
     files = scan_files(folder)
     homes = [folder, folder.resolve().parent] if folder.name in ("data", "scans", "lidar", "velodyne") else [folder]
-    path = poses or next((h / n for h in homes for n in _POSE_FILES if (h / n).is_file()), None)
-    found = None if path is None else match_poses(read_poses(path), files, path)
-    times = next((match_times(home / "times.txt", files) for home in homes if (home / "times.txt").is_file()), None)
-    return Drive3D(folder.resolve().name, files, found, times)
+    path = poses or find_pose_file(*homes)
+    times, notes = scan_times(homes, files)
+    drive = Drive3D(folder.resolve().name, files, None, times, notes)
+    if path is None:
+        return drive
+    T, pose_notes = match_reference(read_stamped_poses(path), times, len(files), path)
+    calibration = next((home / "calib.txt" for home in homes if (home / "calib.txt").is_file()), None)
+    if calibration is not None and camera_note(T, path) is not None:
+        T_cam0_lidar = read_camera_calibration(calibration)
+        T = rigid.inverse(T_cam0_lidar) @ T @ T_cam0_lidar
+    return drive._replace(T_world_lidar=T, notes=(*drive.notes, *pose_notes))
 
 
 def read_learned_folder(folder: Path) -> Drive3D:

@@ -131,24 +131,40 @@ def read_lines(path: str | Path) -> list[str]:
     return read_bytes(path).decode("utf-8", errors="replace").splitlines()
 
 
-def to_numbers(rows: Sequence[Sequence[str]], source: str | Path) -> FloatArray:
+def to_numbers(rows: Sequence[Sequence[str]], lines: Sequence[int], source: str | Path) -> FloatArray:
     """Converts words to numbers.
 
     Args:
         rows: n rows of k words each.
+        lines: (n,) the line of each row in its file, from 1.
         source: name of the file, for messages.
 
     Returns:
         (n, k).
 
     Raises:
-        InputError: there is no row, rows differ in length, or a word is no number.
+        InputError: there is no row, rows differ in length, or a word is no number; line and column are named.
     """
-    widths = sorted({len(row) for row in rows})
-    found = f"rows of {' and '.join(map(str, widths))} columns" if rows else "no row"
-    require(len(widths) == 1, source, found, "give rows of equal length")
-    with refusing(source, "not a number ({error})", "write plain decimal numbers", (ValueError,)):
+    require(len(rows) > 0, source, "no row", "write rows of numbers")
+    wrong = next((i for i, row in enumerate(rows) if len(row) != len(rows[0])), None)
+    if wrong is not None:
+        found = f"line {lines[wrong]} has {len(rows[wrong])} columns, line {lines[0]} has {len(rows[0])}"
+        raise InputError(source, found, "give rows of equal length")
+    try:
         return np.array(rows, np.float64)
+    except ValueError as error:
+        words = ((line, column, word) for line, row in zip(lines, rows, strict=True) for column, word in enumerate(row))
+        line, column, word = next(entry for entry in words if not _is_number(entry[2]))
+        found = f"line {line}, column {column + 1}: {word[:40]!r} is not a number"
+        raise InputError(source, found, "write plain decimal numbers") from error
+
+
+def _is_number(word: str) -> bool:
+    try:
+        np.array([word], np.float64)
+    except ValueError:
+        return False
+    return True
 
 
 def read_table(path: str | Path) -> FloatArray:
@@ -163,8 +179,8 @@ def read_table(path: str | Path) -> FloatArray:
     Raises:
         InputError: there is no such file, no row, rows differ in length, or a word is no number.
     """
-    lines = [line for line in read_lines(path) if line.strip()[:1] not in ("", "#")]
-    return to_numbers([line.replace(",", " ").split() for line in lines], path)
+    lines = [(number, line) for number, line in enumerate(read_lines(path), 1) if line.strip()[:1] not in ("", "#")]
+    return to_numbers([line.replace(",", " ").split() for _, line in lines], [number for number, _ in lines], path)
 
 
 def unpack_rows(body: bytes, layout: np.dtype[np.void], count: int, source: str | Path) -> NDArray[Any]:
@@ -188,7 +204,7 @@ def unpack_rows(body: bytes, layout: np.dtype[np.void], count: int, source: str 
     return np.frombuffer(body, layout, count=count)
 
 
-def split_rows(body: bytes, width: int, count: int, source: str | Path) -> FloatArray:
+def split_rows(body: bytes, width: int, count: int, source: str | Path, *, num_lines_before: int = 0) -> FloatArray:
     """Reads rows of numbers as text.
 
     Args:
@@ -196,21 +212,25 @@ def split_rows(body: bytes, width: int, count: int, source: str | Path) -> Float
         width: numbers in a row.
         count: number of rows that the header promises; further rows are ignored.
         source: name of the file, for messages.
+        num_lines_before: lines of the file before the body.
 
     Returns:
         (count, width).
 
     Raises:
-        InputError: there are fewer rows, a row of another width, or a word that is no number.
+        InputError: there are fewer rows, a row of another width, or a word that is no number; the line is named.
     """
-    rows = [line.split() for line in body.decode("latin-1").splitlines() if line.strip()]
+    numbered = ((number, line.decode("latin-1").split()) for number, line in enumerate(body.splitlines(), 1))
+    rows = [(number + num_lines_before, words) for number, words in numbered if words][:count]
     found = f"truncated: the header promises {count} points, {len(rows)} are there"
     require(len(rows) >= count, source, found, "copy the file again")
-    wrong = next((i for i, row in enumerate(rows[:count]) if len(row) != width), None)
+    wrong = next((row for row in rows if len(row[1]) != width), None)
     if wrong is not None:
-        found = f"row {wrong} has {len(rows[wrong])} columns, the header promises {width}"
+        found = f"line {wrong[0]} has {len(wrong[1])} columns, the header promises {width}"
         raise InputError(source, found, "write one number per field in each row")
-    return to_numbers(rows[:count], source) if count else np.zeros((0, width))
+    if not count:
+        return np.zeros((0, width))
+    return to_numbers([words for _, words in rows], [number for number, _ in rows], source)
 
 
 def to_float32(values: ArrayLike) -> NDArray[np.float32]:

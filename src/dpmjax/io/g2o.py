@@ -1,8 +1,8 @@
-"""Pose graphs as g2o files, in the plane (SE2) and in space (SE3:QUAT).
+"""Pose graphs as files of g2o and TORO, in the plane and in space.
 
 An edge `a b` holds `T_a_b`: node a is the target, node b the source. Its information matrix stands as the upper
-triangle, row by row, translation first; in space the order is x y z qx qy qz, and the part of the quaternion is taken
-for that of the rotation vector, as GTSAM does. Quaternions stand as x y z w.
+triangle, translation first; in space the order is x y z qx qy qz, and the part of the quaternion is taken for that of
+the rotation vector, as GTSAM does. Quaternions stand as x y z w.
 """
 
 from __future__ import annotations
@@ -16,64 +16,60 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from dpmjax.io.files import read_lines, refusing, write_atomically
-from dpmjax.io.poses import homogeneous
-from dpmjax.pose_graph.graph import Edges, PoseGraph
-from dpmjax.sequences import FloatArray, require
+from dpmjax.io.graph_tags import IGNORED, TAGS, advice_of, information_of, poses_of
+from dpmjax.pose_graph.graph import Edges, PoseGraph, is_semidefinite, nearest_semidefinite
+from dpmjax.pose_graph.spanning_tree import spanning_tree_poses
+from dpmjax.sequences import FloatArray, InputError, require
 
 
-class _Kind(NamedTuple):
-    """One kind of graph: its tags, the numbers of a pose, the axes of its tangent."""
+class _Line(NamedTuple):
+    """A vertex or an edge: its line in the file, tag, nodes and numbers."""
 
-    vertex: str
-    edge: str
-    pose_size: int
-    tangent_size: int
-
-
-_PLANAR = _Kind("VERTEX_SE2", "EDGE_SE2", 3, 3)
-_SPATIAL = _Kind("VERTEX_SE3:QUAT", "EDGE_SE3:QUAT", 7, 6)
-_ADVICE = "give VERTEX_SE2 and EDGE_SE2, or VERTEX_SE3:QUAT and EDGE_SE3:QUAT lines"
-_IGNORED = ("PARAMS_SE2OFFSET", "PARAMS_SE3OFFSET")
+    number: int
+    tag: str
+    nodes: list[int]
+    values: list[float]
 
 
-def read_g2o(path: str | Path) -> PoseGraph:
+def read_g2o(path: str | Path, *, nearest_psd: bool = False) -> PoseGraph:
     """Reads a pose graph.
 
+    A file of edges alone gets poses along a spanning tree; `optimize_pose_graph` also tries the chordal relaxation.
+
     Args:
-        path: the file. Empty lines, lines with # in front and sensor offsets (PARAMS_...) are ignored.
+        path: the file: VERTEX and EDGE lines of SE2 or SE3:QUAT (g2o), or VERTEX2, EDGE2, VERTEX3, EDGE3 (TORO). Empty
+            lines, lines with # in front and sensor offsets (PARAMS_...) and EQUIV lines are ignored.
+        nearest_psd: replaces an information matrix that is not positive semidefinite by the nearest one that is.
 
     Returns:
         The graph; nodes in the order of the file, those after FIX fixed.
 
     Raises:
-        InputError: no such file, an unknown line, a wrong number of values, both kinds in one file, a node that occurs
-            twice or not at all, or numbers that make no poses or information matrices.
+        InputError: no such file, an unknown line, a wrong number of values, graphs in the plane and in space in one
+            file, a node that occurs twice or not at all, or numbers that make no poses or information matrices; line
+            and edge are named.
     """
-    lines = _read_words(path)
-    tags = {words[0] for _, words in lines} - {"FIX"}
-    kind = _PLANAR if tags <= {_PLANAR.vertex, _PLANAR.edge} else _SPATIAL
-    for number, (tag, *_) in lines:
-        is_known = tag in ("FIX", kind.vertex, kind.edge)
-        require(is_known, f"{path}: line {number}", f"'{tag[:40]}' is not read here", _ADVICE)
-    triangle = np.triu_indices(kind.tangent_size)
-    nodes, poses = _rows(path, (line for line in lines if line[1][0] == kind.vertex), 1, kind.pose_size)
-    ends, values = _rows(
-        path, (line for line in lines if line[1][0] == kind.edge), 2, kind.pose_size + len(triangle[0])
-    )
-    require(len(nodes) > 0, path, "no vertices", _ADVICE)
-    row_of = {int(node): row for row, node in enumerate(nodes[:, 0])}
-    fixed = [number for _, words in lines if words[0] == "FIX" for number in words[1:]]
-    information = np.zeros((len(values), kind.tangent_size, kind.tangent_size))
-    information[:, triangle[0], triangle[1]] = information[:, triangle[1], triangle[0]] = values[:, kind.pose_size :]
+    lines, fixed = _read_lines(path)
+    vertices = [line for line in lines if TAGS[line.tag].num_nodes == 1]
+    edge_lines = [line for line in lines if TAGS[line.tag].num_nodes == 2]
+    require(len(lines) > 0, path, "no vertices and no edges", advice_of(""))
+    if vertices:
+        ids = np.array([line.nodes[0] for line in vertices], np.int64)
+    else:
+        ids = np.unique([node for line in edge_lines for node in line.nodes])
+    row_of = {int(node): row for row, node in enumerate(ids)}
+    size = TAGS[lines[0].tag].tangent_size
+    target, source = (_rows_of(path, edge_lines, row_of, end) for end in (0, 1))
+    measurements, information = _poses(path, edge_lines, size), _information(path, edge_lines, size, nearest_psd)
+    edges = Edges(source, target, measurements, information)
     with (
         refusing(path, "node {error} has no vertex", "add its VERTEX line", (KeyError,)),
         refusing(path, "{error}", "mend the file", (ValueError,)),
     ):
-        target, source = (np.array([row_of[int(node)] for node in column], np.int64) for column in ends.T)
-        is_fixed = np.zeros(len(nodes), bool)
+        is_fixed = np.zeros(len(ids), bool)
         is_fixed[[row_of[int(node)] for node in fixed]] = True
-        edges = Edges(source, target, _poses(values[:, : kind.pose_size]), information)
-        return PoseGraph.create(_poses(poses), edges, is_fixed=is_fixed, ids=nodes[:, 0])
+        poses = _poses(path, vertices, size) if vertices else spanning_tree_poses(len(ids), edges)
+        return PoseGraph.create(poses, edges, is_fixed=is_fixed, ids=ids)
 
 
 def write_g2o(path: str | Path, graph: PoseGraph) -> Path:
@@ -89,48 +85,126 @@ def write_g2o(path: str | Path, graph: PoseGraph) -> Path:
     Raises:
         OSError: the folder cannot be written.
     """
-    kind = _PLANAR if graph.poses.ndim == 2 else _SPATIAL
-    triangle = np.triu_indices(kind.tangent_size)
+    kind = "SE2" if graph.poses.ndim == 2 else "SE3:QUAT"
+    triangle = np.triu_indices(graph.tangent_size)
     edges = graph.edges
     values = np.column_stack([_numbers(edges.measurements), edges.information[:, triangle[0], triangle[1]]])
-    lines = [_line(kind.vertex, (node,), pose) for node, pose in zip(graph.ids, _numbers(graph.poses), strict=True)]
+    vertices = zip(graph.ids, _numbers(graph.poses), strict=True)
+    lines = [_text(f"VERTEX_{kind}", (node,), pose) for node, pose in vertices]
     lines += [f"FIX {node}" for node in graph.ids[graph.is_fixed]]
     for target, source, row in zip(graph.ids[edges.target], graph.ids[edges.source], values, strict=True):
-        lines.append(_line(kind.edge, (target, source), row))
+        lines.append(_text(f"EDGE_{kind}", (target, source), row))
     return write_atomically(path, "\n".join(lines) + "\n")
 
 
-def _read_words(path: str | Path) -> list[tuple[int, list[str]]]:
-    """The words of each line that is read, and its number."""
-    lines = ((number, line.split()) for number, line in enumerate(read_lines(path), 1) if line.strip()[:1] != "#")
-    return [(number, words) for number, words in lines if words and words[0] not in _IGNORED]
+def _read_lines(path: str | Path) -> tuple[list[_Line], list[str]]:
+    """Vertices and edges in the order of the file, and the nodes after FIX."""
+    lines: list[_Line] = []
+    fixed: list[str] = []
+    for number, text in enumerate(read_lines(path), 1):
+        words = text.split()
+        if not words or words[0].startswith("#") or words[0] in IGNORED:
+            continue
+        tag = words[0]
+        if tag == "FIX":
+            fixed += words[1:]
+            continue
+        source = f"{path}: line {number}"
+        require(tag in TAGS, source, f"'{tag[:40]}' is not read here", advice_of(tag))
+        if lines and TAGS[lines[0].tag].tangent_size != TAGS[tag].tangent_size:
+            found = f"'{tag}' is not read here, line {lines[0].number} is '{lines[0].tag}'"
+            raise InputError(source, found, "give a graph in the plane, or one in space")
+        lines.append(_parse(source, number, words))
+    return lines, fixed
 
 
-def _rows(
-    path: str | Path, lines: Iterable[tuple[int, list[str]]], num_nodes: int, num_values: int
-) -> tuple[NDArray[np.int64], FloatArray]:
-    """Node ids and numbers of all lines of one tag."""
-    nodes, values = [], []
-    for number, (tag, *words) in lines:
-        source, count = f"{path}: line {number}", num_nodes + num_values
-        require(len(words) == count, source, f"{len(words)} values after {tag}", f"give {count} values")
-        with refusing(source, "not a number ({error})", "write plain numbers", (ValueError,)):
-            nodes.append([int(word) for word in words[:num_nodes]])
-            values.append([float(word) for word in words[num_nodes:]])
-        is_small = max(map(abs, nodes[-1])) <= np.iinfo(np.int64).max
-        require(is_small, source, "a node number above 2^63", "number the nodes from 0")
-    return np.array(nodes, np.int64).reshape(-1, num_nodes), np.array(values).reshape(-1, num_values)
+def _parse(source: str, number: int, words: list[str]) -> _Line:
+    """A vertex or an edge out of its words."""
+    tag = TAGS[words[0]]
+    count = tag.num_nodes + tag.num_values
+    found = f"{len(words) - 1} values after {words[0]}"
+    if len(words) - 1 == tag.num_nodes + tag.pose_size != count:
+        found += ", the information matrix is missing"
+    require(len(words) - 1 == count, source, found, f"give {count} values")
+    kinds = [int] * tag.num_nodes + [float] * tag.num_values
+    numbers: list[float] = []
+    try:
+        numbers += [kind(word) for kind, word in zip(kinds, words[1:], strict=True)]
+    except ValueError as error:
+        wrong = next(i for i, kind in enumerate(kinds, 1) if not _is_number(kind, words[i]))
+        what = "a whole number" if wrong <= tag.num_nodes else "a number"
+        found = f"column {wrong + 1}, {words[wrong][:40]!r}, is not {what}"
+        raise InputError(source, found, "write plain numbers, with a decimal point") from error
+    nodes, values = [int(number) for number in numbers[: tag.num_nodes]], numbers[tag.num_nodes :]
+    is_small = max(map(abs, nodes)) <= np.iinfo(np.int64).max
+    require(is_small, source, "a node number above 2^63", "number the nodes from 0")
+    return _Line(number, words[0], nodes, values)
 
 
-def _poses(numbers: FloatArray) -> FloatArray:
-    """Poses of the graph from numbers of the file: x y heading, or x y z qx qy qz qw to matrices."""
-    if numbers.shape[1] == 3:
-        return numbers
-    quaternions = numbers[:, 3:]
-    if not np.isfinite(numbers).all() or (np.abs(np.linalg.norm(np.clip(quaternions, -2, 2), axis=1) - 1) > 0.1).any():
-        raise ValueError("a quaternion that is not of length 1, or a number that is not finite")
-    rotations = Rotation.from_quat(quaternions).as_matrix() if len(numbers) else np.zeros((0, 3, 3))
-    return homogeneous(rotations, numbers[:, :3])
+def _is_number(kind: type[int | float], word: str) -> bool:
+    try:
+        kind(word)
+    except ValueError:
+        return False
+    return True
+
+
+def _rows_of(path: str | Path, lines: list[_Line], row_of: dict[int, int], end: int) -> NDArray[np.int64]:
+    """Rows of the first or the second node of each edge."""
+    for line in lines:
+        is_known = line.nodes[end] in row_of
+        require(is_known, f"{path}: line {line.number}", f"node {line.nodes[end]} has no vertex", "add its VERTEX line")
+    return np.array([row_of[line.nodes[end]] for line in lines], np.int64)
+
+
+def _by_tag(lines: list[_Line]) -> Iterable[tuple[str, list[int], FloatArray]]:
+    """Numbers of the lines of each tag, with their places among all lines."""
+    for tag in dict.fromkeys(line.tag for line in lines):
+        places = [place for place, line in enumerate(lines) if line.tag == tag]
+        yield tag, places, np.array([lines[place].values for place in places]).reshape(len(places), -1)
+
+
+def _poses(path: str | Path, lines: list[_Line], size: int) -> FloatArray:
+    """Poses of vertices or edges, in the order of the file."""
+    poses = np.zeros((len(lines), 3) if size == 3 else (len(lines), 4, 4))
+    for tag, places, values in _by_tag(lines):
+        numbers = values[:, : TAGS[tag].pose_size]
+        try:
+            poses[places] = poses_of(numbers)
+        except ValueError as error:
+            place = next(place for place, row in zip(places, numbers, strict=True) if not _is_pose(row[None]))
+            raise InputError(f"{path}: line {lines[place].number}", str(error), "mend the line") from error
+    return poses
+
+
+def _is_pose(numbers: FloatArray) -> bool:
+    try:
+        poses_of(numbers)
+    except ValueError:
+        return False
+    return True
+
+
+def _information(path: str | Path, lines: list[_Line], size: int, nearest_psd: bool) -> FloatArray:
+    """Information matrices in the order of the file."""
+    matrices = np.zeros((len(lines), size, size))
+    for tag, places, values in _by_tag(lines):
+        matrices[places] = information_of(TAGS[tag], values[:, TAGS[tag].pose_size :])
+    is_finite: NDArray[np.bool_] = np.asarray(np.isfinite(matrices.reshape(len(lines), size * size)).all(axis=1))
+    is_good = np.zeros(len(lines), bool)
+    is_good[is_finite] = is_semidefinite(matrices[is_finite])
+    if nearest_psd:
+        matrices[is_finite & ~is_good] = nearest_semidefinite(matrices[is_finite & ~is_good])
+        is_good = is_finite
+    if not is_good.all():
+        place = int(np.argmin(is_good))
+        line, is_number = lines[place], bool(is_finite[place])
+        least = float(np.linalg.eigvalsh(matrices[place])[0]) if is_number else 0.0
+        why = f"not positive semidefinite, its least eigenvalue is {least:.4g}" if is_number else "not finite"
+        found = f"the information of edge {line.nodes[0]} {line.nodes[1]} is {why}"
+        advice = "mend it, or take the nearest such matrix (nearest_psd=True, --nearest-psd)"
+        raise InputError(f"{path}: line {line.number}", found, advice if is_number else "give expected finite numbers")
+    return matrices
 
 
 def _numbers(poses: FloatArray) -> FloatArray:
@@ -140,5 +214,5 @@ def _numbers(poses: FloatArray) -> FloatArray:
     return np.column_stack([poses[:, :3, 3], Rotation.from_matrix(poses[:, :3, :3]).as_quat()])
 
 
-def _line(tag: str, nodes: Iterable[np.integer], values: FloatArray) -> str:
+def _text(tag: str, nodes: Iterable[np.integer], values: FloatArray) -> str:
     return " ".join([tag, *map(str, nodes), *(f"{value:.17g}" for value in values.tolist())])

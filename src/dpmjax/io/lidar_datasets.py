@@ -8,9 +8,11 @@ from pathlib import Path
 import numpy as np
 
 from dpmjax.geometry import rigid
-from dpmjax.io.drives import Drive3D, match_poses, match_rows, match_times, numbers_of, scan_files
+from dpmjax.io.calibration import read_camera_calibration, read_labelled_numbers
+from dpmjax.io.drives import Drive3D, find_pose_file, scan_files
 from dpmjax.io.files import natural_key, read_lines, read_table
-from dpmjax.io.poses import check_poses, from_rows, homogeneous, interpolate_poses, read_poses
+from dpmjax.io.poses import check_poses, from_rows, homogeneous, interpolate_poses, read_stamped_poses
+from dpmjax.io.references import match_poses, match_reference, match_rows, match_times, numbers_of
 from dpmjax.sequences import FloatArray, InputError, require
 
 _CARLA_POSES_PER_FRAME = 100  # KITTI-CARLA writes poses at 1000 Hz and frames at 10 Hz.
@@ -24,7 +26,8 @@ def read_kitti_odometry(folder: Path) -> Drive3D:
     """Lists a sequence of KITTI odometry.
 
     Poses are looked for in poses_lidar.txt (already in the lidar's frame), poses.txt beside velodyne/ (SemanticKITTI's)
-    and poses/NN.txt two folders up, both in the left camera's frame.
+    and poses/NN.txt two folders up, both in the left camera's frame; or a file of another usual name, in the lidar's.
+    Rows of TUM are matched by time, others by the numbers of the scans.
 
     Args:
         folder: the folder that holds velodyne/.
@@ -39,14 +42,17 @@ def read_kitti_odometry(folder: Path) -> Drive3D:
     in_lidar, name = folder / "poses_lidar.txt", folder.resolve().name
     in_camera = [folder / "poses.txt", folder.resolve().parents[1] / "poses" / f"{name}.txt"]
     drive = Drive3D(name, files, times=match_times(folder / "times.txt", files))
-    path = next((p for p in (in_lidar, *in_camera) if p.is_file()), None)
-    if path is None:
+    path = next((p for p in (in_lidar, *in_camera) if p.is_file()), find_pose_file(folder))
+    if path is None or not files:
         return drive
-    poses = read_poses(path)
-    if path != in_lidar:
-        T_cam0_lidar = _read_camera_calibration(folder / "calib.txt")
-        poses = rigid.inverse(T_cam0_lidar) @ poses @ T_cam0_lidar
-    return drive._replace(T_world_lidar=match_poses(poses, files, path))
+    found = read_stamped_poses(path)
+    if path in in_camera:
+        T_cam0_lidar = read_camera_calibration(folder / "calib.txt")
+        found = found._replace(poses=rigid.inverse(T_cam0_lidar) @ found.poses @ T_cam0_lidar)
+    if found.stamps is None:
+        return drive._replace(T_world_lidar=match_poses(found.poses, files, path))
+    T, notes = match_reference(found, drive.times, len(files), path)
+    return drive._replace(T_world_lidar=T, notes=notes)
 
 
 def read_kitti_raw(folder: Path) -> Drive3D:
@@ -216,37 +222,6 @@ def _read_stamps(path: Path, files: list[Path]) -> FloatArray | None:
     return None if matched is None or not len(matched) else (matched - matched[0]).astype(np.float64) * 1e-9
 
 
-def read_labelled_numbers(path: Path) -> dict[str, FloatArray]:
-    """Reads the lines `key: numbers` of a calibration file; other lines are ignored.
-
-    Args:
-        path: the file.
-
-    Returns:
-        The numbers by key.
-
-    Raises:
-        InputError: there is no such file.
-    """
-    found = {}
-    for key, _, numbers in (line.partition(":") for line in read_lines(path)):
-        try:
-            found[key.strip()] = np.array(numbers.split(), np.float64)
-        except ValueError:
-            continue
-    return found
-
-
-def _read_camera_calibration(path: Path) -> FloatArray:
-    """(4, 4) `T_cam0_lidar`: `Tr`, the lidar's frame to the left grey camera's, out of KITTI's calib.txt."""
-    entries = read_labelled_numbers(path)
-    for key in ("Tr", "Tr_velo_to_cam", "Tr_velo_cam"):
-        if key in entries and len(entries[key]) == 12:
-            return from_rows(entries[key], path)[0]
-    advice = "take the calib.txt with a line 'Tr:' of 12 numbers (data_odometry_calib); camera poses need it"
-    raise InputError(path, "no line 'Tr:' of 12 numbers", advice)
-
-
 def _read_imu_calibration(path: Path) -> FloatArray:
     """(4, 4) out of KITTI raw's `R:` and `T:` lines."""
     entries = read_labelled_numbers(path)
@@ -271,8 +246,9 @@ def _poses_from_oxts(records: FloatArray, source: Path) -> FloatArray:
     """
     from scipy.spatial.transform import Rotation
 
-    is_good = np.isfinite(records).all() and (np.abs(records[:, 0]) < 89.0).all()
-    require(is_good, source, "records that are not finite, or a latitude beyond 89 degrees", "copy them again")
+    is_good = np.isfinite(records).all() and (np.abs(records[:, :3]) < (89.0, 361.0, 1e6)).all()
+    found = "records that are not finite, or beyond 89 degrees of latitude, 361 of longitude, or 1000 km of height"
+    require(is_good, source, found, "copy them again")
     latitude, longitude = np.radians(records[:, 0]), np.radians(records[:, 1])
     scale = np.cos(latitude[0]) * _EARTH_RADIUS_M
     east, north = scale * longitude, scale * np.log(np.tan(0.25 * np.pi + 0.5 * latitude))

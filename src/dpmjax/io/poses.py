@@ -8,6 +8,7 @@ from __future__ import annotations
 import io
 import re
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -34,8 +35,35 @@ def read_poses(path: str | Path) -> FloatArray:
     Raises:
         InputError: no such file, another layout, NaN, or a matrix that is no rigid motion.
     """
-    poses = _read(Path(path))
-    return planar_to_homogeneous(poses) if poses.ndim == 2 else poses
+    return read_stamped_poses(path).poses
+
+
+class StampedPoses(NamedTuple):
+    """The poses of a file.
+
+    Attributes:
+        poses: (n, 4, 4).
+        stamps: (n,) as they stand in the file, in any unit; None where it has none.
+    """
+
+    poses: FloatArray
+    stamps: FloatArray | None
+
+
+def read_stamped_poses(path: str | Path) -> StampedPoses:
+    """Reads poses and, out of TUM files, their time stamps.
+
+    Args:
+        path: see `read_poses`.
+
+    Returns:
+        The poses, in whatever frame they are.
+
+    Raises:
+        InputError: see `read_poses`.
+    """
+    poses, stamps = _read(Path(path))
+    return StampedPoses(planar_to_homogeneous(poses) if poses.ndim == 2 else poses, stamps)
 
 
 def read_planar_poses(path: str | Path, num_scans: int, unit: Unit) -> FloatArray:
@@ -58,7 +86,7 @@ def read_planar_poses(path: str | Path, num_scans: int, unit: Unit) -> FloatArra
         named = re.search(r"(?:\bunit |\bx_)(px|m)\b", comments)
         if named and named.group(1) != unit:
             raise InputError(path, f"poses in {named.group(1)}, the scans are in {unit}", f"give poses in {unit}")
-    poses = _read(path)
+    poses, _ = _read(path)
     found = f"{len(poses)} poses for {num_scans} scans"
     require(len(poses) == num_scans, path, found, "give one pose a scan, in the scans' order")
     if poses.ndim == 2:
@@ -232,8 +260,8 @@ def _write_table(path: str | Path, values: FloatArray, form: str | list[str], he
     return write_atomically(path, buffer.getvalue())
 
 
-def _read(path: Path) -> FloatArray:
-    """Checked poses of a file: planar (n, 3), or (n, 4, 4)."""
+def _read(path: Path) -> tuple[FloatArray, FloatArray | None]:
+    """Checked poses of a file, planar (n, 3), or (n, 4, 4); and the stamps of TUM's rows."""
     if path.suffix.lower() == ".npy":
         array = load_arrays(path).get("points", np.zeros(0))
         require(array.dtype.kind in "fiu", path, f"an array of {array.dtype}", f"give {_LAYOUTS}")
@@ -241,15 +269,15 @@ def _read(path: Path) -> FloatArray:
     else:
         values = read_table(path)
     if values.shape[1:] == (3, 3):
-        return se2.from_matrix(check_poses(values, path))
+        return se2.from_matrix(check_poses(values, path)), None
     if values.shape[1:] == (4, 4):
         values = values.reshape(-1, 16)
     width = values.shape[1] if values.ndim == 2 else 0
     found = f"rows of {width} columns" if width else f"an array of {values.shape}"
     require(width in (3, 8, 12, 16) and len(values) > 0, path, found, f"give {_LAYOUTS}")
     if width == 8:
-        return check_poses(_from_tum(values, path), path)
-    return check_poses(values, path) if width == 3 else from_rows(values[:, :12], path)
+        return check_poses(_from_tum(values, path), path), values[:, 0]
+    return (check_poses(values, path) if width == 3 else from_rows(values[:, :12], path)), None
 
 
 def _from_tum(rows: FloatArray, path: Path) -> FloatArray:

@@ -11,15 +11,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dpmjax.geometry import se2
+from dpmjax.io.bags import is_bag
 from dpmjax.io.carmen import read_carmen_log
 from dpmjax.io.deepmapping_folder import read_deepmapping_folder
 from dpmjax.io.files import load_arrays, read_bytes, to_float32
+from dpmjax.io.notes import log_notes
 from dpmjax.io.poses import check_poses
-from dpmjax.sequences import BoolArray, FloatArray, InputError, ScanSequence, Unit, has_angular_order, require
+from dpmjax.io.scan_bags import read_scan_bag
+from dpmjax.sequences import BoolArray, FloatArray, InputError, Note, ScanSequence, Unit, has_angular_order, require
 
 Table = Mapping[str, NDArray[np.generic]]
 _log = logging.getLogger(__name__)
-_FORMATS = "a folder or .tar of .pcd files, a CARMEN .log, .clf or .log.gz, or .npy / .npz arrays"
+_FORMATS = "a folder or .tar of .pcd files, a CARMEN .log, .clf or .log.gz, a bag of ROS, or .npy / .npz arrays"
 _KEYS = "points (n, b, 2), or ranges (n, b) and angles (b,); optional mask, poses, odometry, times, unit"
 _ENDINGS = {"folder": (".tar", ".tar.gz", ".tgz"), "arrays": (".npy", ".npz")}
 _ENDINGS |= {"carmen": (".log", ".clf", ".log.gz", ".clf.gz")}
@@ -33,23 +36,21 @@ _LEAST_BEAMS = 17  # Lines are fitted to up to 17 neighbouring beams.
 def read_sequence(
     path: str | Path,
     *,
-    start: int = 0,
-    stop: int | None = None,
-    stride: int = 1,
+    selection: slice = slice(None),
     unit: Unit | None = None,
     max_range: float | None = None,
+    topic: str | None = None,
 ) -> ScanSequence:
     """Reads a sequence of planar scans, whatever of the known formats it is in.
 
     Args:
-        path: a folder or tar archive of PCD files (`read_deepmapping_folder`), a CARMEN log (`read_carmen_log`), or a
-            NumPy file (`read_arrays`). The ending decides, else the first bytes.
-        start: first scan to keep.
-        stop: scan to stop before; None for the end.
-        stride: keep every `stride`-th scan.
+        path: a folder or tar archive of PCD files (`read_deepmapping_folder`), a CARMEN log (`read_carmen_log`), a
+            NumPy file (`read_arrays`), or a bag of ROS (`read_scan_bag`). The ending decides, else the first bytes.
+        selection: start, stop and stride in scans.
         unit: unit of the file's lengths where the file does not state it; None takes PCD files as pixels / 512 and
             arrays as metres. CARMEN logs are in metres.
         max_range: beams of this length or more (in the sequence's unit) are masked; None leaves it to the reader.
+        topic: of a bag: which scans; may be left out where there is one topic of planar scans.
 
     Returns:
         The sequence: two scans at least of 17 beams at least, each with one valid beam at least.
@@ -60,26 +61,33 @@ def read_sequence(
             explains, or arguments out of range.
     """
     path = Path(path)
+    start, stop, stride = selection.start or 0, selection.stop, 1 if selection.step is None else selection.step
     chosen = f"start {start}, stop {stop}, stride {stride}"
     is_good = start >= 0 and stride >= 1 and (stop is None or stop >= 0)
     require(is_good, path, chosen, "start and stop count from 0, stride from 1")
     require(max_range is None or max_range > 0, path, f"max_range is {max_range}", "give a positive length")
-    whole = _read_any(path, unit, max_range)
+    whole = _read_any(path, unit, max_range, topic)
     if max_range is not None:
         whole = _limit(whole, max_range)
     sequence = whole.take(slice(start, stop, stride))
     found = f"{len(sequence)} of {len(whole)} scans chosen ({chosen})"
     require(len(sequence) >= 2, path, found, "a registration needs two scans at least")
     _check_beams(sequence, path, start, stride)
-    _check_unit(sequence, path)
+    doubt = _check_unit(sequence, path)
     if whole.odometry_poses is None and whole.unit == "m":
         _log.info("%s: no raw odometry", path)
+    sequence = replace(sequence, notes=(*sequence.notes, *doubt))
+    log_notes(sequence.notes)
     return sequence
 
 
-def _read_any(path: Path, unit: Unit | None, max_range: float | None) -> ScanSequence:
+def _read_any(path: Path, unit: Unit | None, max_range: float | None, topic: str | None) -> ScanSequence:
     require(path.exists(), path, "no such file or folder", "check the path")
     kind = _detect(path)
+    require(topic is None or kind == "bag", path, "no bag of ROS", "leave the topic out")
+    if kind == "bag":
+        require(unit != "px", path, "a bag is in metres, not px", "leave the unit out")
+        return read_scan_bag(path, topic)
     if kind == "folder":
         return read_deepmapping_folder(path, unit=unit)
     if kind == "arrays":
@@ -89,9 +97,11 @@ def _read_any(path: Path, unit: Unit | None, max_range: float | None) -> ScanSeq
 
 
 def _detect(path: Path) -> str:
-    """What the path holds, by its ending, else by its first bytes: "folder", "arrays" or "carmen"."""
+    """What the path holds, by its ending, else by its first bytes: "folder", "arrays", "bag" or "carmen"."""
+    has_scans = path.is_dir() and any(file.suffix.lower() == ".pcd" for file in path.iterdir())
+    if is_bag(path) and not has_scans:
+        return "bag"
     if path.is_dir():
-        has_scans = any(file.suffix.lower() == ".pcd" for file in path.iterdir())
         require(has_scans, path, "a folder without .pcd files", f"give {_FORMATS}")
         return "folder"
     name = path.name.lower()
@@ -131,7 +141,8 @@ def _check_beams(sequence: ScanSequence, path: Path, start: int, stride: int) ->
     require(differ.any(), path, "all points of each scan are one and the same", "give scans that see some surroundings")
 
 
-def _check_unit(sequence: ScanSequence, path: Path) -> None:
+def _check_unit(sequence: ScanSequence, path: Path) -> list[Note]:
+    """Refuses lengths that no such unit explains; a note doubts those that another unit explains better."""
     ranges = np.linalg.norm(sequence.points[sequence.mask].astype(np.float64), axis=1)
     median = float(np.median(ranges))
     low, high = _PLAUSIBLE_RANGE[sequence.unit]
@@ -139,8 +150,10 @@ def _check_unit(sequence: ScanSequence, path: Path) -> None:
     advice = "convert millimetres to metres, or name the unit" if is_metric else "name the unit, or give pixels"
     require(low <= median <= high, path, f"the median range is {median:.4g} {sequence.unit}", advice)
     share = float((ranges < _USUAL_M).mean())
-    if is_metric and share < _LEAST_USUAL_SHARE:
-        _log.warning("%s: %.1f %% of the beams are below %g m; are these millimetres?", path, 100 * share, _USUAL_M)
+    if not is_metric or share >= _LEAST_USUAL_SHARE:
+        return []
+    found = f"{100 * share:.1f} % of the beams are below {_USUAL_M:g} m"
+    return [Note(f"{path}: {found}; are these millimetres or centimetres?", is_doubt=True)]
 
 
 def read_arrays(path: str | Path, *, unit: Unit | None = None) -> ScanSequence:
@@ -151,8 +164,9 @@ def read_arrays(path: str | Path, *, unit: Unit | None = None) -> ScanSequence:
     ahead; and optionally `mask` (n, b), `poses` (the reference) and `odometry` as (n, 3) x, y, heading or (n, 3, 3)
     `T_world_scan`, `times` (n,) in seconds, and `unit`, "px" or "m".
 
-    A beam is invalid where `mask` is False, where both coordinates are NaN, or where its range is NaN, infinite or not
-    positive (as scanner drivers write a beam without echo). A beam with one NaN coordinate is an error.
+    A beam is invalid where `mask` is False, where both coordinates are NaN or one is infinite, or where its range is
+    NaN, infinite or not positive (as scanner drivers write a beam without echo). A beam with one NaN coordinate and a
+    finite one is an error.
 
     Args:
         path: the file.
@@ -195,7 +209,7 @@ def _points(table: Table, path: str | Path) -> tuple[FloatArray, BoolArray]:
     is_good = _is_numeric(points, (*points.shape[:2], 2), (*points.shape[:2], 3)) and points.ndim == 3
     require(is_good, path, f"points are {points.shape} {points.dtype}", "give (n, b, 2): scans, beams, x and y")
     planar = points[..., :2].astype(np.float64)
-    return planar, np.isnan(planar).sum(axis=2) < 2
+    return planar, (np.isnan(planar).sum(axis=2) < 2) & ~np.isinf(planar).any(axis=2)
 
 
 def _from_ranges(table: Table, path: str | Path) -> tuple[FloatArray, BoolArray]:

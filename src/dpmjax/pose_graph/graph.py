@@ -151,7 +151,32 @@ def _check_edges(graph: PoseGraph) -> None:
     )
     for name in ("measurements", "information"):
         _require_finite(name, getattr(edges, name))
-    information, scale = edges.information, np.abs(edges.information).max(axis=(1, 2), initial=0.0)
-    is_symmetric = (np.abs(information - np.swapaxes(information, 1, 2)).max(axis=(1, 2)) <= _ROUNDING * scale).all()
-    is_positive = (np.linalg.eigvalsh(information)[:, 0] >= -_ROUNDING * scale).all()
-    _require(bool(is_symmetric and is_positive), "information", "symmetric, positive semidefinite matrices", "others")
+    is_good = bool(is_semidefinite(edges.information).all())
+    _require(is_good, "information", "symmetric, positive semidefinite matrices", "others")
+
+
+def is_semidefinite(information: Floats) -> NDArray[np.bool_]:
+    """Tells which matrices are symmetric and positive semidefinite, up to the rounding of float32.
+
+    Args:
+        information: (e, d, d), finite.
+
+    Returns:
+        (e,).
+    """
+    scale = np.abs(information).max(axis=(1, 2), initial=0.0)
+    is_symmetric = np.abs(information - np.swapaxes(information, 1, 2)).max(axis=(1, 2)) <= _ROUNDING * scale
+    return np.asarray(is_symmetric & (np.linalg.eigvalsh(information)[:, 0] >= -_ROUNDING * scale))
+
+
+def nearest_semidefinite(information: Floats) -> Floats:
+    """Projects symmetric matrices to the nearest positive semidefinite ones, in the Frobenius norm (Higham 1988).
+
+    Args:
+        information: (e, d, d) symmetric, finite.
+
+    Returns:
+        (e, d, d): negative eigenvalues are zero.
+    """
+    values, vectors = np.linalg.eigh(information)
+    return np.asarray((vectors * np.maximum(values, 0.0)[:, None]) @ np.swapaxes(vectors, 1, 2))

@@ -1,0 +1,220 @@
+"""Bags of ROS 1 and ROS 2 by rosbags (extra `ros`): their topics, and messages by number in the order of time."""
+
+from __future__ import annotations
+
+import threading
+import weakref
+from collections.abc import Collection, Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dpmjax.io.extras import import_for
+from dpmjax.io.files import natural_key, refusing
+from dpmjax.sequences import InputError, require
+
+_SUFFIXES = (".bag", ".mcap", ".db3")
+_ADVICE = "copy the bag again, or reindex it (rosbag reindex, ros2 bag reindex)"
+_PACKETS = ("VelodyneScan", "PacketMsg", "VelodynePacket", "RslidarPacket", "UdpFrame", "HesaiScan", "PandarScan")
+
+
+class Topic(NamedTuple):
+    """A topic of a bag.
+
+    Attributes:
+        name: such as /points.
+        kind: type of its messages, such as sensor_msgs/msg/PointCloud2.
+        num_messages: number of messages.
+    """
+
+    name: str
+    kind: str
+    num_messages: int
+
+
+class _Place(NamedTuple):
+    """A message in a bag: time of its header, of its recording, and its number among those of the same time, ns."""
+
+    stamp_ns: int
+    recorded_ns: int
+    number: int
+
+
+def is_bag(path: Path) -> bool:
+    """Returns whether a path is a bag of ROS: a file .bag, .mcap or .db3, or a folder of these."""
+    return path.suffix.lower() in _SUFFIXES if path.is_file() else path.is_dir() and bool(_bag_files(path))
+
+
+def _bag_files(path: Path) -> list[Path]:
+    """The files of a bag; the folder itself where it has ROS 2's metadata.yaml."""
+    if not path.is_dir():
+        return [path]
+    if (path / "metadata.yaml").is_file() and any(path.glob("*.mcap*")) | any(path.glob("*.db3*")):
+        return [path]
+    for suffix in _SUFFIXES:
+        if found := sorted(path.glob(f"*{suffix}"), key=lambda file: natural_key(file.name)):
+            return found
+    return []
+
+
+class Bag:
+    """An open bag; it is closed when nothing refers to it any more.
+
+    Args:
+        path: a file .bag, .mcap or .db3, a folder of the parts of a bag, or a folder with metadata.yaml.
+
+    Attributes:
+        path: the path.
+        topics: names, types and numbers of messages.
+
+    Raises:
+        InputError: no rosbags, or a bag that cannot be read.
+    """
+
+    def __init__(self, path: Path) -> None:
+        highlevel = import_for(path, "rosbags.highlevel", "ros")
+        typesys = import_for(path, "rosbags.typesys", "ros")
+        self.path = path
+        self._lock = threading.Lock()
+        with _refusing(path):
+            # A bag without definitions of its types has the standard ones.
+            types = typesys.get_typestore(typesys.Stores.LATEST)
+            self._reader: Any = highlevel.AnyReader(_bag_files(path), default_typestore=types)
+            self._reader.open()
+        weakref.finalize(self, _close, self._reader)
+        with _refusing(path):
+            topics = self._reader.topics.items()
+            self.topics = [Topic(name, str(info.msgtype), int(info.msgcount)) for name, info in topics]
+        self._places: dict[str, list[_Place]] = {}
+
+    def choose(self, kinds: Collection[str], topic: str | None, what: str) -> Topic:
+        """Chooses the topic of scans.
+
+        Args:
+            kinds: types of messages that are read.
+            topic: the name that the user gives; None takes the only one of these types.
+            what: word for such messages.
+
+        Returns:
+            The topic.
+
+        Raises:
+            InputError: no such topic, one of another type, none at all, or several.
+        """
+        held = ", ".join(f"{each.name} ({each.kind.rpartition('/')[2]})" for each in self.topics) or "none"
+        if topic is not None:
+            named = next((each for each in self.topics if each.name.strip("/") == topic.strip("/")), None)
+            if named is None:
+                raise InputError(self.path, f"no topic {topic}, it has {held}", "name one of those with --topic")
+            found = f"topic {topic} has messages {named.kind} ({named.num_messages})"
+            is_good = named.kind in kinds and named.num_messages > 0
+            require(is_good, self.path, found, f"name a topic of {what}; the bag has {held}")
+            return named
+        fitting = [each for each in self.topics if each.kind in kinds and each.num_messages > 0]
+        require(len(fitting) > 0, self.path, f"no {what}; its topics are {held}", self._advice())
+        names = ", ".join(each.name for each in fitting)
+        require(len(fitting) == 1, self.path, f"{len(fitting)} topics of {what}: {names}", "name one with --topic")
+        return fitting[0]
+
+    def of_kinds(self, *kinds: str) -> list[Topic]:
+        """Finds the topics of some types that hold messages."""
+        return [each for each in self.topics if each.kind in kinds and each.num_messages > 0]
+
+    def stamps(self, topic: str) -> NDArray[np.int64]:
+        """Reads when the messages were taken.
+
+        Args:
+            topic: of messages that begin with a header.
+
+        Returns:
+            (n,) nanoseconds since 1970, increasing: of the headers, or of the recording where these are not set.
+
+        Raises:
+            InputError: the bag is damaged.
+        """
+        if topic not in self._places:
+            self._places[topic] = self._find_places(topic)
+        return np.array([place.stamp_ns for place in self._places[topic]], np.int64)
+
+    def read(self, topic: str, index: int) -> Any:
+        """Reads a message by its number in `stamps`.
+
+        Args:
+            topic: of messages that begin with a header.
+            index: the number.
+
+        Returns:
+            The message of rosbags.
+
+        Raises:
+            InputError: the bag is damaged.
+        """
+        self.stamps(topic)
+        place = self._places[topic][index]
+        with self._lock, _refusing(self.path):
+            start = place.recorded_ns
+            found = list(self._reader.messages(self._connections(topic), start=start, stop=start + 1))
+            connection, _, content = found[place.number]
+            return self._reader.deserialize(content, connection.msgtype)
+
+    def messages(self, topic: str) -> Iterator[Any]:
+        """Reads all messages of a topic in the order of the recording.
+
+        Args:
+            topic: the name.
+
+        Yields:
+            The messages of rosbags.
+
+        Raises:
+            InputError: the bag is damaged.
+        """
+        with self._lock, _refusing(self.path):
+            for connection, _, content in self._reader.messages(self._connections(topic)):
+                yield self._reader.deserialize(content, connection.msgtype)
+
+    def _connections(self, topic: str) -> list[Any]:
+        return [each for each in self._reader.connections if each.topic == topic]
+
+    def _find_places(self, topic: str) -> list[_Place]:
+        """All messages by the time of their headers."""
+        places: list[_Place] = []
+        with self._lock, _refusing(self.path):
+            seen: dict[int, int] = {}
+            for _, recorded_ns, content in self._reader.messages(self._connections(topic)):
+                number = seen.get(recorded_ns, 0)
+                seen[recorded_ns] = number + 1
+                places.append(_Place(self._stamp(content), recorded_ns, number))
+        if any(place.stamp_ns <= 0 for place in places):
+            places = [place._replace(stamp_ns=place.recorded_ns) for place in places]
+        return sorted(places)
+
+    def _stamp(self, content: bytes) -> int:
+        """Time of the header in front of a message: after a number (ROS 1), or after the encoding (ROS 2)."""
+        start, order = (4, "big" if content[1] == 0 else "little") if self._reader.is2 else (4, "little")
+        words = (content[start : start + 4], content[start + 4 : start + 8])
+        seconds, nanoseconds = (int.from_bytes(word, order) for word in words)  # type: ignore[arg-type]
+        return seconds * 10**9 + nanoseconds
+
+    def _advice(self) -> str:
+        """Returns the advice for a bag without scans of the wanted kind."""
+        kinds = [each.kind.rpartition("/")[2] for each in self.topics]
+        if "LaserScan" in kinds or "MultiEchoLaserScan" in kinds:
+            return "planar scans are mapped by dpmjax map2d"
+        if "PointCloud2" in kinds or "CustomMsg" in kinds:
+            return "clouds are mapped by dpmjax slam"
+        if any(kind in _PACKETS for kind in kinds):
+            return "raw packets are not read: play them through the driver and record its PointCloud2"
+        return "record LaserScan, PointCloud2 or Livox's CustomMsg"
+
+
+def _refusing(path: Path) -> Any:
+    """Turns all errors of rosbags on damaged bags into an `InputError`."""
+    return refusing(path, "cannot be read as a bag of ROS ({kind}: {error})", _ADVICE, (Exception,))
+
+
+def _close(reader: Any) -> None:
+    if reader.stack is not None:
+        reader.close()

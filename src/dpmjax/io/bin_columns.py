@@ -1,0 +1,158 @@
+"""Points of raw float32 files, whose number of columns is inferred from the name and the values."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dpmjax.io.files import read_bytes
+from dpmjax.sequences import InputError, Note, require
+
+LAYOUTS = (3, 4, 5, 6)
+USUAL_COLUMNS = 4
+_NUSCENES_ENDING, _NUSCENES_COLUMNS = ".pcd.bin", 5
+# Values that are looked at, bins of their histogram, and values that each bin needs.
+_MOST_VALUES, _MOST_BINS, _LEAST_PER_BIN = 60_000, 64, 50
+# The information that the column gives about a value: the least of the best layout, bits, and its ratio to the next.
+_LEAST_BITS, _LEAST_RATIO = 0.05, 1.3
+# Six columns repeat the order of three: they must tell more by this ratio.
+_SIX_RATIO = 1.1
+
+
+class Columns(NamedTuple):
+    """The layout of raw files.
+
+    Attributes:
+        num_columns: numbers that each point has, x, y and z first.
+        note: how it was inferred, or None for the four columns of KITTI.
+    """
+
+    num_columns: int
+    note: Note | None = None
+
+
+def find_columns(path: Path, content: bytes) -> Columns:
+    """Infers the columns of a raw file.
+
+    The right layout has values of one kind in each column, a wrong one mixes them: so the layout is taken under which
+    the column tells most about the value. `.pcd.bin` files, as those of nuScenes, have five columns unless the values
+    say otherwise.
+
+    Args:
+        path: the file.
+        content: its bytes.
+
+    Returns:
+        The layout, with a note where it is not KITTI's, or where the values fit another as well.
+
+    Raises:
+        InputError: the file has no whole number of points of the layout, or of any.
+    """
+    fitting = [n for n in LAYOUTS if len(content) % (4 * n) == 0]
+    inferred = _columns_by_values(np.frombuffer(content[: len(content) // 4 * 4], "<f4"))
+    is_nuscenes = path.name.lower().endswith(_NUSCENES_ENDING)
+    if inferred is None and is_nuscenes and _NUSCENES_COLUMNS in fitting:
+        return Columns(_NUSCENES_COLUMNS, Note(f"{path}: 5 columns a point, by its ending; --columns decides"))
+    if inferred is not None:
+        check_size(path, len(content), inferred)
+        text = f"{path}: {inferred} columns a point, inferred from the values; --columns decides"
+        return Columns(inferred, None if inferred == USUAL_COLUMNS else Note(text))
+    require(USUAL_COLUMNS in fitting, path, *_no_whole_number(len(content), USUAL_COLUMNS))
+    if len(fitting) == 1 or not content:
+        return Columns(USUAL_COLUMNS)
+    others = " or ".join(str(n) for n in fitting if n != USUAL_COLUMNS)
+    text = f"{path}: 4 columns a point are assumed, {others} would fit as well; --columns decides"
+    return Columns(USUAL_COLUMNS, Note(text, is_doubt=True))
+
+
+def check_size(path: str | Path, size: int, columns: int) -> None:
+    """Refuses a raw file that is cut off, or has other columns.
+
+    Args:
+        path: the file.
+        size: its bytes.
+        columns: numbers of a point.
+
+    Raises:
+        InputError: it has no whole number of points.
+    """
+    require(size % (4 * columns) == 0, path, *_no_whole_number(size, columns))
+
+
+def read_bin(path: Path, columns: int | None) -> NDArray[np.float32]:
+    """Reads x, y and z of a raw file.
+
+    Args:
+        path: the file.
+        columns: numbers of a point; None infers it from the values.
+
+    Returns:
+        (n, 3).
+
+    Raises:
+        InputError: see `find_columns`.
+    """
+    content = read_bytes(path)
+    if columns is None:
+        columns = find_columns(path, content).num_columns
+    check_size(path, len(content), columns)
+    return np.frombuffer(content, "<f4").reshape(-1, columns)[:, :3]
+
+
+def columns_of_drive(files: Iterable[Path]) -> Columns:
+    """Infers the columns of the raw files of a drive by the first one that can be read.
+
+    Args:
+        files: the scans.
+
+    Returns:
+        The layout; KITTI's where no file is raw, or none can be inferred.
+    """
+    for file in files:
+        if file.suffix.lower() != ".bin":
+            break
+        try:
+            content = read_bytes(file)
+            if content:
+                return find_columns(file, content)
+        except InputError:  # named where it is read
+            continue
+    return Columns(USUAL_COLUMNS)
+
+
+def _no_whole_number(size: int, columns: int) -> tuple[str, str]:
+    others = [str(n) for n in LAYOUTS if n != columns and size % (4 * n) == 0]
+    found = f"{size} bytes are no whole number of points of {columns} float32: truncated, or other columns"
+    return found, "copy the file again" + (f", or say --columns {' or '.join(others)}" if others else "")
+
+
+def _columns_by_values(values: NDArray[np.float32]) -> int | None:
+    """The layout under which the column tells most about the value; None where no layout stands out."""
+    values = values[:_MOST_VALUES]
+    num_bins = min(_MOST_BINS, len(values) // (_LEAST_PER_BIN * max(LAYOUTS)))
+    if num_bins < 4:
+        return None
+    finite = np.nan_to_num(values.astype(np.float64))
+    edges = np.unique(np.quantile(finite, np.linspace(0, 1, num_bins + 1)[1:-1]))
+    bins = np.searchsorted(edges, finite, side="right")
+    bits = {n: _information_bits(bins, n, len(edges) + 1) for n in LAYOUTS}
+    if bits[6] < _SIX_RATIO * bits[3]:
+        del bits[6]
+    (best, most), (_, second), *_ = sorted(bits.items(), key=lambda entry: -entry[1])
+    is_clear = most >= _LEAST_BITS and most >= _LEAST_RATIO * second
+    return best if is_clear else None
+
+
+def _information_bits(bins: NDArray[np.int64], columns: int, num_bins: int) -> float:
+    """Mutual information of value and column, without the bias of few samples (Miller and Madow 1955)."""
+    rows = bins[: len(bins) // columns * columns].reshape(-1, columns)
+    counts = np.stack([np.bincount(column, minlength=num_bins) for column in rows.T]).astype(np.float64)
+    joint = counts / counts.sum()
+    independent = joint.sum(axis=1, keepdims=True) * joint.sum(axis=0, keepdims=True)
+    is_there = joint > 0
+    bits = (joint[is_there] * np.log2(joint[is_there] / independent[is_there])).sum()
+    return float(bits - (num_bins - 1) * (columns - 1) / (2 * np.log(2) * counts.sum()))

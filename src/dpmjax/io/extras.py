@@ -1,0 +1,32 @@
+"""Packages of extras, imported where a file needs them."""
+
+from __future__ import annotations
+
+import importlib
+from pathlib import Path
+from types import ModuleType
+
+from dpmjax.sequences import InputError
+
+
+def import_for(source: str | Path, module: str, extra: str) -> ModuleType:
+    """Imports a module of an extra.
+
+    Args:
+        source: the file that needs it, for the message.
+        module: name of the module.
+        extra: of dpmjax, which brings its package.
+
+    Returns:
+        The module.
+
+    Raises:
+        InputError: it cannot be imported.
+    """
+    try:
+        return importlib.import_module(module)
+    except Exception as error:  # a package may be broken in any way
+        package = module.partition(".")[0]
+        is_missing = isinstance(error, ModuleNotFoundError)
+        found = f"needs {package}, which is not installed" if is_missing else f"needs {package}: its import fails"
+        raise InputError(source, found, f"pip install 'dpmjax[{extra}]'") from error

@@ -1,0 +1,248 @@
+"""Times and reference poses of the scans of a drive: matched by time where both have times, else by their counts."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dpmjax.io.files import read_table
+from dpmjax.io.poses import StampedPoses, interpolate_poses
+from dpmjax.io.scan_names import stamps_in_names, stem_of
+from dpmjax.sequences import FloatArray, InputError, Note, require
+
+# The pose nearest in time may be this far from the scan: half the step of the poses, and never more than this, s.
+_LARGEST_TOLERANCE_S, _SMALLEST_TOLERANCE_S = 0.1, 0.001
+# Stamps since 1970 and steps of stamps from 0, of which these are the smallest, in nano-, micro- and milliseconds.
+_UNITS = ((1e9, 1e17, 3e6), (1e6, 1e14, 3e3), (1e3, 1e11, 8.0))
+# Nanoseconds since 1970 are below this for three thousand years.
+_LARGEST_STAMP = 1e20
+# A lidar moves along its x axis, a camera along its z axis: share of the squared way, and the shortest way, m.
+_CAMERA_SHARE, _CAMERA_WAY_M = 0.8, 2.0
+
+
+class Reference(NamedTuple):
+    """The reference poses of the scans.
+
+    Attributes:
+        T_world_lidar: (n, 4, 4); NaN for scans without one.
+        notes: how they were matched.
+    """
+
+    T_world_lidar: FloatArray
+    notes: tuple[Note, ...] = ()
+
+
+def numbers_of(files: Sequence[Path], largest: float = 2.0**62) -> list[int] | None:
+    """The numbers that are the names of files.
+
+    Args:
+        files: the scans.
+        largest: no number may be above this.
+
+    Returns:
+        One number a file, or None where a name is no number or too large.
+    """
+    names = [stem_of(file) for file in files]
+    is_good = all(name.isascii() and name.isdecimal() and len(name) < 20 and int(name) <= largest for name in names)
+    return [int(name) for name in names] if is_good else None
+
+
+def match_rows(rows: NDArray[Any], files: Sequence[Path]) -> NDArray[Any] | None:
+    """Returns the row of each scan of a data set: in order if the counts are equal, else by the file's number.
+
+    Args:
+        rows: (m, ...) values.
+        files: the n scans.
+
+    Returns:
+        (n, ...), or None where there are more or fewer rows, and names that are no numbers of rows.
+    """
+    numbers = range(len(files)) if len(rows) == len(files) else numbers_of(files, len(rows) - 1)
+    return None if numbers is None else rows[list(numbers)]
+
+
+def match_poses(poses: FloatArray, files: Sequence[Path], path: Path) -> FloatArray:
+    """The pose of each scan, see `match_rows`.
+
+    Args:
+        poses: (m, 4, 4).
+        files: the n scans.
+        path: of the poses, for messages.
+
+    Returns:
+        (n, 4, 4).
+
+    Raises:
+        InputError: another number of poses, and names that are no numbers.
+    """
+    matched = match_rows(poses, files)
+    if matched is None:
+        raise InputError(path, f"{len(poses)} poses for {len(files)} scans", "give one pose a scan, in their order")
+    return matched
+
+
+def to_seconds(stamps: FloatArray) -> FloatArray:
+    """Converts time stamps in nano-, micro- or milliseconds to seconds.
+
+    The unit of stamps since 1970 is found by their values, that of others by their median step. Milliseconds are whole
+    numbers.
+
+    Args:
+        stamps: (n,) in order.
+
+    Returns:
+        (n,) s.
+    """
+    if not len(stamps) or not _are_times(stamps):
+        return stamps
+    smallest, steps = float(np.abs(stamps).min()), np.diff(stamps)
+    is_whole = bool((stamps == np.round(stamps)).all())
+    step = float(np.median(np.abs(steps))) if len(steps) else 0.0
+    for per_second, least_stamp, least_step in _UNITS:
+        is_step = step >= least_step and (is_whole or per_second > 1e3)
+        if smallest >= least_stamp or (smallest < 1e8 and is_step):
+            return stamps / per_second
+    return stamps
+
+
+def scan_times(homes: Sequence[Path], files: Sequence[Path]) -> tuple[FloatArray | None, tuple[Note, ...]]:
+    """Finds the times of the scans of a folder: times.txt, or the time stamps that are their names.
+
+    Args:
+        homes: folders where times.txt may lie.
+        files: the n scans.
+
+    Returns:
+        (n,) s or None, and a note where times.txt does not fit.
+    """
+    path = next((home / "times.txt" for home in homes if (home / "times.txt").is_file()), None)
+    notes: tuple[Note, ...] = ()
+    if path is not None:
+        try:
+            stamps = read_table(path)[:, 0]
+            if len(stamps) == len(files) and _are_times(stamps):
+                return to_seconds(stamps), ()
+            found = f"{len(stamps)} rows, or some that are no times, for {len(files)} scans"
+        except InputError as error:
+            found = error.found
+        notes = (Note(f"{path}: {found}; these times are not used", is_doubt=True),)
+    named = stamps_in_names(files)
+    return (None if named is None else to_seconds(named)), notes
+
+
+def match_times(path: Path, files: Sequence[Path]) -> FloatArray | None:
+    """The times of the scans of a data set out of times.txt, see `match_rows`; a file that does not fit is ignored.
+
+    Args:
+        path: of times.txt.
+        files: the n scans.
+
+    Returns:
+        (n,) s, or None.
+    """
+    try:
+        times = match_rows(read_table(path)[:, 0], files)
+    except InputError:
+        return None
+    return to_seconds(times) if times is not None and _are_times(times) else None
+
+
+def match_reference(found: StampedPoses, times: FloatArray | None, num_scans: int, path: Path) -> Reference:
+    """Gives each scan its reference pose.
+
+    If poses and scans have times, poses are interpolated at the times of the scans. The nearest pose must lie within
+    the tolerance: half the step of the poses, at most 0.1 s. Stamps may also be the numbers of the scans. Without times
+    in common, there must be one pose a scan.
+
+    Args:
+        found: the poses of the file.
+        times: (n,) s of the scans; None where they have none.
+        num_scans: number of scans.
+        path: of the poses, for messages.
+
+    Returns:
+        The reference.
+
+    Raises:
+        InputError: no times to match by, and another number of poses than of scans.
+    """
+    count = len(found.poses)
+    stamps = found.stamps if found.stamps is not None and _are_times(found.stamps) else None
+    if stamps is not None and _are_numbers(stamps, times, num_scans):
+        T = np.full((num_scans, 4, 4), np.nan)
+        T[stamps.astype(np.int64)] = found.poses
+        return Reference(T, _note_of(path, "the numbers that are their stamps", T))
+    reason = "the file has no times" if stamps is None else "the scans have no times"
+    if stamps is not None and times is not None:
+        T, tolerance_s = _by_time(to_seconds(stamps), found.poses, times)
+        if np.isfinite(T[:, 0, 0]).any():
+            return Reference(T, _note_of(path, f"time, tolerance {tolerance_s:.3g} s", T))
+        reason = "no scan has the time of a pose"
+    advice = "give a TUM file and times.txt with one time a scan, or one pose a scan"
+    require(count == num_scans, path, f"{count} poses for {num_scans} scans, and {reason}", advice)
+    is_doubt = reason == "no scan has the time of a pose"
+    notes = (Note(f"{path}: {reason}; poses are matched by their order", is_doubt),) if is_doubt else ()
+    return Reference(found.poses, notes)
+
+
+def camera_note(T_world_lidar: FloatArray, source: str | Path) -> Note | None:
+    """Finds poses of a camera, which moves along its own z axis, where those of the lidar are expected.
+
+    Args:
+        T_world_lidar: (n, 4, 4); NaN for scans without one.
+        source: for the note.
+
+    Returns:
+        The note, or None.
+    """
+    T = T_world_lidar[np.isfinite(T_world_lidar).all(axis=(1, 2))]
+    steps = np.einsum("nji,nj->ni", T[:-1, :3, :3], np.diff(T[:, :3, 3], axis=0))
+    with np.errstate(over="ignore"):
+        squares = (steps**2).sum(axis=0)
+        way_m = float(np.linalg.norm(steps, axis=1).sum())
+    if not _CAMERA_WAY_M <= way_m < np.inf or not np.isfinite(squares.sum()):
+        return None
+    share = float(squares[2] / squares.sum())
+    if share < _CAMERA_SHARE:
+        return None
+    found = f"the poses move along their own z axis ({share:.0%} of the way), as a camera does, not a lidar"
+    advice = "their rotations are off by 90 degrees; give poses of the lidar, or a calib.txt with Tr beside them"
+    return Note(f"{source}: {found}; {advice}", is_doubt=True)
+
+
+def _are_times(stamps: FloatArray) -> bool:
+    return bool((np.abs(stamps) < _LARGEST_STAMP).all())
+
+
+def _are_numbers(stamps: FloatArray, times: FloatArray | None, num_scans: int) -> bool:
+    """Returns whether stamps are numbers of scans: whole, no times of the scans, none beyond the last scan."""
+    is_whole = bool((stamps == np.round(stamps)).all() and len(np.unique(stamps)) == len(stamps))
+    if not is_whole or stamps.min() < 0 or stamps.max() >= num_scans or len(stamps) < 1:
+        return False
+    if times is None:
+        return True
+    spans = float(np.ptp(stamps)), float(np.ptp(times))
+    is_other_time = abs(spans[0] - spans[1]) > 1.0 + 0.1 * max(spans)
+    return is_other_time or (len(stamps) == num_scans and abs(stamps.min() - times.min()) > 1.0)
+
+
+def _by_time(stamps: FloatArray, poses: FloatArray, times: FloatArray) -> tuple[FloatArray, float]:
+    """Poses at the times of the scans, NaN where none is near; and the tolerance."""
+    stamps, first = np.unique(stamps, return_index=True)
+    step = float(np.median(np.diff(stamps))) if len(stamps) > 1 else 0.0
+    tolerance_s = max(min(0.5 * step, _LARGEST_TOLERANCE_S), _SMALLEST_TOLERANCE_S)
+    after = np.clip(np.searchsorted(stamps, times), 1, max(len(stamps) - 1, 1))
+    nearest = np.minimum(np.abs(times - stamps[after - 1]), np.abs(times - stamps[np.minimum(after, len(stamps) - 1)]))
+    # Times since 1970 in nanoseconds are good to 256 ns.
+    T = np.where((nearest <= tolerance_s + 1e-6)[:, None, None], interpolate_poses(stamps, poses[first], times), np.nan)
+    return T, tolerance_s
+
+
+def _note_of(path: Path, how: str, T: FloatArray) -> tuple[Note, ...]:
+    num_without = int(np.isnan(T[:, 0, 0]).sum())
+    text = f"{path}: poses are matched by {how}; {num_without} of {len(T)} scans have no reference pose"
+    return (Note(text, is_doubt=num_without > 0),)

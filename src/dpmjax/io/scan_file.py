@@ -1,0 +1,209 @@
+"""One 3-D scan of a file of any kind, checked: metres, in the lidar's own frame, without beams that met nothing."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dpmjax.io.bin_columns import find_columns, read_bin
+from dpmjax.io.clouds import TimedCloud
+from dpmjax.io.drives import SCAN_SUFFIXES
+from dpmjax.io.files import load_arrays, read_bytes, to_float32
+from dpmjax.io.las import read_las
+from dpmjax.io.notes import log_notes
+from dpmjax.io.pcd import parse_pcd
+from dpmjax.io.ply import parse_ply
+from dpmjax.sequences import EmptyScanError, FloatArray, InputError, Note, require
+
+_NPZ_KEYS = ("lidar_pcd", "points", "xyz", "arr_0")
+_NPZ_TIMES = "times"
+# No lidar on the ground measures outside of these, in metres; nearly all points of a scan lie within the usual range.
+_NEAREST_M, _USUAL_M, _FARTHEST_M = 0.1, 120.0, 400.0
+_LEAST_USUAL_SHARE = 0.05
+# Points on a map lie this many times nearer to their middle than to the origin.
+_MAP_RATIO = 5.0
+
+
+def read_lidar_file(path: str | Path, *, bin_columns: int | None = None) -> NDArray[np.float32]:
+    """Reads one scan.
+
+    A scan with hardly any point within 120 m is read, but a warning asks for its unit; so does one whose number of
+    columns is not clear.
+
+    Args:
+        path: `.bin` (float32 rows of x, y, z and more, as of KITTI), `.npy` (n, 3 or more), `.npz` (key `lidar_pcd`,
+            `points`, `xyz` or `arr_0`), `.pcd`, `.ply`, `.las` or `.laz`.
+        bin_columns: numbers a point has in a `.bin` file: 4 with KITTI and MulRan, 5 with nuScenes; None
+            infers it from the values.
+
+    Returns:
+        (n, 3) float32 x, y, z in the lidar's frame, m, without beams that met nothing: points at the origin, and points
+        that are not finite.
+
+    Raises:
+        InputError: names the file and what is wrong: missing, truncated, wrong columns, no points, all of them out of
+            range, lengths that can only be millimetres, or coordinates of a map such as UTM.
+    """
+    points = read_points(path, bin_columns=bin_columns)
+    log_notes(scan_notes(path, points, bin_columns=bin_columns))
+    return points
+
+
+def scan_notes(path: str | Path, points: NDArray[np.float32], *, bin_columns: int | None = None) -> list[Note]:
+    """Tells what was decided about a file of one scan, and doubts.
+
+    Args:
+        path: the file.
+        points: (n, 3) what was read of it, m.
+        bin_columns: as they were given for reading it.
+
+    Returns:
+        Notes on the columns and on the unit.
+
+    Raises:
+        InputError: the file cannot be read any more.
+    """
+    path = Path(path)
+    is_inferred = bin_columns is None and path.suffix.lower() == ".bin"
+    columns = find_columns(path, read_bytes(path)).note if is_inferred else None
+    return [note for note in (columns, unit_note(points, path)) if note is not None]
+
+
+def read_points(path: str | Path, *, bin_columns: int | None = None) -> NDArray[np.float32]:
+    """What `read_lidar_file` reads, without its warnings.
+
+    Args:
+        path: the file.
+        bin_columns: numbers a point has in a `.bin` file; None infers it from the values.
+
+    Returns:
+        (n, 3) float32, m.
+
+    Raises:
+        InputError: see `read_lidar_file`.
+    """
+    return read_timed_cloud(Path(path), bin_columns).points
+
+
+def read_point_times(path: str | Path) -> FloatArray | None:
+    """Reads when each point of a scan was measured.
+
+    Args:
+        path: a `.pcd` or `.ply` with a column t, time, timestamp, timestamps, time_stamp, time_offset or offset_time,
+            a `.las` or `.laz` with GPS times, or a `.npz` with an array `times`.
+
+    Returns:
+        (n,) one for each point of `read_points`, in the unit and from the start that the file has; None where it has
+        none, as all other kinds of files.
+
+    Raises:
+        InputError: see `read_lidar_file`.
+    """
+    path = Path(path)
+    return None if path.suffix.lower() in (".bin", ".npy") else read_timed_cloud(path, None).times
+
+
+def read_timed_cloud(path: Path, bin_columns: int | None) -> TimedCloud:
+    """Reads points and times of a scan of any kind, checked.
+
+    Args:
+        path: the file.
+        bin_columns: numbers a point has in a `.bin` file; None infers it from the values.
+
+    Returns:
+        The cloud.
+
+    Raises:
+        InputError: see `read_lidar_file`.
+    """
+    suffix = path.suffix.lower()
+    if suffix == ".bin":
+        return check_scan(TimedCloud(read_bin(path, bin_columns), None), path)
+    if suffix in (".pcd", ".ply"):
+        content, source = read_bytes(path), str(path)
+        return check_scan(parse_pcd(content, source) if suffix == ".pcd" else parse_ply(content, source), path)
+    if suffix in (".las", ".laz"):
+        return check_scan(read_las(path), path)
+    found = f"an unknown kind of scan, {suffix or 'without ending'}"
+    require(suffix in SCAN_SUFFIXES, path, found, f"give one of {' '.join(SCAN_SUFFIXES)}")
+    return check_scan(_read_arrays(path), path)
+
+
+def _read_arrays(path: Path) -> TimedCloud:
+    """Points and times of a NumPy file."""
+    table = load_arrays(path, None if path.suffix.lower() == ".npy" else (*_NPZ_KEYS, _NPZ_TIMES))
+    values = next((table[key] for key in _NPZ_KEYS if key in table), None)
+    if values is None:
+        raise InputError(path, "no array of points", "call it lidar_pcd or points")
+    is_good = values.ndim in (2, 3) and values.shape[-1] >= 3 and values.dtype.kind in "fiu"
+    found = f"an array of {values.shape} {values.dtype}"
+    require(is_good, path, found, "give points (n, 3), or organised (rows, columns, 3): x, y and z in metres")
+    points = values.reshape(-1, values.shape[-1])
+    times = None
+    if _NPZ_TIMES in table:
+        column = table[_NPZ_TIMES]
+        found = f"times {column.shape} {column.dtype} of {len(points)} points"
+        fits = column.shape in (values.shape[:-1], points.shape[:1]) and column.dtype.kind in "fiu"
+        require(fits, path, found, "give one time a point")
+        times = np.asarray(column, np.float64).ravel()
+    return TimedCloud(to_float32(points[:, :3]), times)
+
+
+def check_scan(cloud: TimedCloud, source: str | Path) -> TimedCloud:
+    """Refuses what is no scan in metres, and takes beams that met nothing away.
+
+    Args:
+        cloud: points of a file.
+        source: for messages.
+
+    Returns:
+        The points, float32, that are finite and not at the origin, with their times.
+
+    Raises:
+        EmptyScanError: no beam met anything.
+        InputError: see `read_lidar_file`.
+    """
+    points, times = cloud
+    is_kept = np.isfinite(points).all(axis=1) & (points != 0).any(axis=1)
+    kept = points[is_kept].astype(np.float64)
+    if not len(kept):
+        why = f": all {len(points)} are zero or not finite" if len(points) else ""
+        raise EmptyScanError(source, f"no point in the scan{why}", "remove the file, or copy it again")
+    ranges = np.linalg.norm(kept, axis=1)
+    median = float(np.median(ranges))
+    require(median <= _FARTHEST_M, source, *_why_too_far(kept, median))
+    is_near = ((ranges > _NEAREST_M) & (ranges < _FARTHEST_M)).any()
+    require(is_near, source, f"all {len(kept)} points are out of range", "give metres in the lidar's own frame")
+    return TimedCloud(np.ascontiguousarray(kept, np.float32), None if times is None else times[is_kept])
+
+
+def _why_too_far(points: FloatArray, median: float) -> tuple[str, str]:
+    """Texts for a scan whose median range is too large: map coordinates, another unit, or garbage."""
+    middle = np.median(points, axis=0)
+    spread = float(np.median(np.linalg.norm(points - middle, axis=1)))
+    found = f"the median range is {median:.4g} m"
+    if spread * _MAP_RATIO < float(np.linalg.norm(middle)):
+        at = " ".join(f"{value:.0f}" for value in middle)
+        advice = f"subtract an origin such as {at}, and give points in the lidar's own frame"
+        return f"{found}, around one place far away: coordinates of a map, such as UTM", advice
+    is_unit = median < 1000 * _FARTHEST_M
+    return found, "convert millimetres or centimetres to metres" if is_unit else "check the number of columns"
+
+
+def unit_note(points: NDArray[np.float32], source: str | Path) -> Note | None:
+    """Doubts the unit where hardly any point is as near as lidars measure.
+
+    Args:
+        points: (n, 3), m.
+        source: for the note.
+
+    Returns:
+        The note, or None.
+    """
+    share = float((np.linalg.norm(points.astype(np.float64), axis=1) < _USUAL_M).mean()) if len(points) else 1.0
+    if share >= _LEAST_USUAL_SHARE:
+        return None
+    found = f"{100 * share:.1f} % of the points lie within {_USUAL_M:g} m"
+    return Note(f"{source}: {found}; are these millimetres or centimetres?", is_doubt=True)

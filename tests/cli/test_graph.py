@@ -1,0 +1,60 @@
+"""The command `dpmjax graph`: files of g2o and TORO are optimised, or refused in one line."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import dpmjax
+from dpmjax.cli import graph
+from dpmjax.cli.command import EXIT_BAD_INPUT, EXIT_FAILED, EXIT_OK
+from dpmjax.cli.result_files import load_json
+from tests.io.test_g2o import EDGES, PLANAR, spatial_text
+
+LOOP = "".join(f"EDGE_SE2 {i} {(i + 1) % 4} 1 0 1.57 4 0 0 4 0 9\n" for i in range(4))
+
+
+def run(*options: object) -> int:
+    return graph.run([str(option) for option in options])
+
+
+@pytest.mark.parametrize("text", [PLANAR, EDGES, LOOP, spatial_text()[0]], ids=["plane", "edges", "loop", "space"])
+def test_graphs_are_optimised(tmp_path: Path, text: str, capsys: pytest.CaptureFixture) -> None:
+    (tmp_path / "a.g2o").write_text(text)
+    assert run(tmp_path / "a.g2o", "-o", tmp_path / "out") == EXIT_OK
+    metrics = load_json(tmp_path / "out" / "metrics.json")
+    found = dpmjax.optimize_pose_graph(dpmjax.read_g2o(tmp_path / "a.g2o"))
+    assert metrics["chi2"] == pytest.approx(found.chi2, abs=1e-12)
+    assert metrics["status"] == "done"
+    np.testing.assert_allclose(dpmjax.read_g2o(tmp_path / "out" / "graph.g2o").poses, found.graph.poses, atol=1e-12)
+    assert len(np.loadtxt(tmp_path / "out" / "trajectory_tum.txt")) == len(found.graph.poses)
+    assert (tmp_path / "out" / "trajectory.png").is_file()
+    assert "chi2" in capsys.readouterr().out
+
+
+def test_indefinite_information_is_refused_or_projected(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    (tmp_path / "a.g2o").write_text(PLANAR + "EDGE_SE2 3 7 -1 -2 -0.5 1 2 0 1 0 1\n")
+    assert run(tmp_path / "a.g2o", "-o", tmp_path / "out") == EXIT_BAD_INPUT
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "a.g2o: line 7: the information of edge 3 7" in line
+    assert "--nearest-psd" in line
+    assert not (tmp_path / "out").exists()
+    assert run(tmp_path / "a.g2o", "--nearest-psd", "-o", tmp_path / "out") == EXIT_OK
+
+
+def test_no_minimum_is_a_failure(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    rng = np.random.default_rng(0)
+    rows = [f"EDGE_SE2 {a} {b} {rng.normal()} {rng.normal()} {rng.uniform(-3, 3)} 1 0 0 1 0 1" for a, b in
+            rng.permuted(np.array([(a, b) for a in range(9) for b in range(a)]), axis=0)]  # fmt: skip
+    (tmp_path / "a.g2o").write_text("\n".join(row for row in rows if row.split()[1] != row.split()[2]))
+    assert run(tmp_path / "a.g2o", "--iterations", 1, "-o", tmp_path / "out") == EXIT_FAILED
+    assert "no minimum after 1 iterations" in capsys.readouterr().err.splitlines()[-1]
+    assert load_json(tmp_path / "out" / "metrics.json")["status"] == "failed"
+
+
+@pytest.mark.parametrize("options", [[], ["--iterations", 0], ["none.g2o"], ["--outlier-chi2", -1]])
+def test_wrong_usage_is_one_line(options: list[object], capsys: pytest.CaptureFixture) -> None:
+    assert run(*options) == EXIT_BAD_INPUT
+    assert "Traceback" not in capsys.readouterr().err

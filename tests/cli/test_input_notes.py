@@ -1,0 +1,113 @@
+"""A run says what was decided about its input, and one without a result fails: log, metrics.json, last line, code."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from dpmjax.cli.command import EXIT_BAD_INPUT, EXIT_FAILED, EXIT_OK
+from dpmjax.cli.result_files import load_json
+from dpmjax.cli.slam_numbers import status_of, why_failed
+from dpmjax.io import write_pcd, write_tum
+from tests.cli.test_slam import run
+from tests.cli.test_slam_fuzz import leave_networks_out
+from tests.slam.test_odometry import motion, planes, seen_from
+
+
+@pytest.fixture(autouse=True)
+def without_networks(monkeypatch: pytest.MonkeyPatch) -> None:
+    leave_networks_out(monkeypatch)
+
+
+def ring(index: int) -> np.ndarray:
+    """A scan of one ring, which has no surface."""
+    angle = np.linspace(-np.pi, np.pi, 900) + 0.01 * index
+    return np.stack([8 * np.cos(angle), 6 * np.sin(angle), 0 * angle], axis=1)
+
+
+def write_room(folder: Path, num_scans: int) -> np.ndarray:
+    folder.mkdir()
+    world, truth = planes(np.random.default_rng(0)), np.array([motion(0.4 * step, 0, 0) for step in range(num_scans)])
+    for number, T in enumerate(truth):
+        write_pcd(folder / f"{number:06}.pcd", seen_from(world, T))
+    return truth
+
+
+def test_a_drive_of_empty_scans_fails(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    for index in range(6):
+        write_pcd(tmp_path / f"{index}.pcd", ring(index))
+    out = tmp_path / "out"
+    assert run(tmp_path, "-o", out) == EXIT_FAILED
+    last = capsys.readouterr().err.replace("\r", "\n").splitlines()[-1]
+    assert "6 of 6 scans without enough points" in last
+    assert last.startswith("dpmjax: error: ")
+    assert load_json(out / "metrics.json")["status"] == "failed"
+
+
+@pytest.mark.parametrize(
+    ("statuses", "found"),
+    [
+        ({"first": 1, "predicted": 5, "restarted": 1}, "none of 7 scans could be aligned"),
+        ({"empty": 16}, "16 of 16 scans without enough points"),
+        ({"first": 1}, None),
+        ({"first": 1, "tracked": 1, "predicted": 9}, None),
+        ({}, None),
+    ],
+)
+def test_a_run_without_a_single_step_has_failed(statuses: dict[str, int], found: str | None) -> None:
+    reason = why_failed(statuses)
+    assert reason is None if found is None else found in str(reason)
+
+
+@pytest.mark.parametrize(
+    ("statuses", "is_interrupted", "status"),
+    [
+        ({"first": 1, "tracked": 9}, False, "done"),
+        ({"first": 1, "tracked": 1, "predicted": 9}, False, "uncertain"),
+        ({"empty": 3}, False, "failed"),
+        ({"empty": 3}, True, "interrupted"),
+    ],
+)
+def test_status_of_a_run(statuses: dict[str, int], is_interrupted: bool, status: str) -> None:
+    assert status_of({"scan_statuses": statuses, "is_interrupted": is_interrupted}) == status
+
+
+def test_notes_are_in_the_log_and_the_numbers_and_errors_are_those_of_matched_scans(
+    tmp_path: Path, capsys: pytest.CaptureFixture
+) -> None:
+    drive, out = tmp_path / "drive", tmp_path / "out"
+    truth = write_room(drive, 6)
+    times, fine = 100 + 0.1 * np.arange(6), 100 + 0.01 * np.arange(36)
+    (drive / "times.txt").write_text("".join(f"{time:.6f}\n" for time in times))
+    poses = np.array([motion(4.0 * time, 0, 0) for time in fine - 100])
+    write_tum(drive / "groundtruth.txt", poses, times=fine)
+    assert run(drive, "-o", out) == EXIT_OK
+    (note,) = load_json(out / "metrics.json")["input_notes"]
+    assert "matched by time, tolerance 0.005 s; 2 of 6 scans have no reference pose" in note
+    assert note in (out / "log.txt").read_text()
+    metrics = load_json(out / "metrics.json")
+    assert metrics["status"] == "done"
+    assert metrics["ate_m"] < 0.05
+    assert len(truth) == metrics["num_scans"]
+
+
+def test_millimetres_and_a_map_are_named_by_the_command(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    write_room(tmp_path / "drive", 3)
+    far = np.random.default_rng(0).normal([5e5, 5.4e6, 300], 1, (500, 3))
+    write_pcd(tmp_path / "drive" / "000000.pcd", far)
+    assert run(tmp_path / "drive", "-o", tmp_path / "out") == EXIT_BAD_INPUT
+    assert "UTM; subtract an origin" in capsys.readouterr().err
+
+
+def test_a_doubt_about_the_unit_is_in_the_log_and_the_numbers(tmp_path: Path) -> None:
+    """Decimetres: nearly all points lie beyond 120."""
+    drive, out = tmp_path / "drive", tmp_path / "out"
+    drive.mkdir()
+    for index in range(3):
+        write_pcd(drive / f"{index}.pcd", 30 * ring(index))
+    assert run(drive, "-o", out) == EXIT_FAILED
+    (note,) = load_json(out / "metrics.json")["input_notes"]
+    assert "are these millimetres or centimetres?" in note
+    assert note in (out / "log.txt").read_text()

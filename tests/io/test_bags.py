@@ -1,0 +1,250 @@
+"""Bags of ROS: clouds of all drivers, planar scans with odometry, topics, and what is refused."""
+
+from __future__ import annotations
+
+import sys
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from dpmjax.geometry import se2
+from dpmjax.io import InputError, open_lidar_sequence, read_sequence, write_tum
+from tests.io.bag_files import EPOCH_NS, KINDS, LAYOUTS, TIMES, BagWriter
+
+STEP_NS, NUM = 100_000_000, 6
+FLAT = 1e-5
+
+
+@pytest.fixture
+def clouds() -> list[np.ndarray]:
+    rng = np.random.default_rng(0)
+    return [rng.uniform(-20, 20, (120, 3)).astype(np.float32) for _ in range(NUM)]
+
+
+def write_clouds(path: Path, kind: str, clouds: list[np.ndarray], **options) -> Path:
+    with BagWriter(path, kind) as bag:
+        for index, points in enumerate(clouds):
+            bag.write_cloud(points, EPOCH_NS + index * STEP_NS, **options)
+    return bag.path
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_clouds_are_read_in_the_order_and_at_the_times_of_their_headers(tmp_path: Path, kind: str, clouds) -> None:
+    with BagWriter(tmp_path / "drive", kind) as bag:
+        bag.write_odometry(np.zeros(3), EPOCH_NS)
+        for index in (0, 2, 1, *range(3, NUM)):  # the second and the third arrive in the other order
+            delay = 250_000_000 if index == 1 else 20_000_000
+            bag.write_cloud(clouds[index], EPOCH_NS + index * STEP_NS, delay_ns=delay)
+    drive = open_lidar_sequence(bag.path)
+    assert drive.name == "drive"
+    np.testing.assert_allclose(drive.times, 1.6e9 + 0.1 * np.arange(NUM), atol=1e-6)
+    for index in (4, 0, 5, 1, 2, 3):
+        np.testing.assert_array_equal(drive.read_scan(index), clouds[index])
+    with ThreadPoolExecutor(4) as pool:
+        numbers = [0, 3, 1, 5] * 5
+        for number, found in zip(numbers, pool.map(drive.read_scan, numbers), strict=True):
+            np.testing.assert_array_equal(found, clouds[number])
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+@pytest.mark.parametrize("is_bigendian", [False, True])
+def test_clouds_of_all_drivers_are_read(tmp_path: Path, layout: str, is_bigendian: bool, clouds) -> None:
+    times = np.linspace(0, 0.1, len(clouds[0])) if layout in TIMES else None
+    path = write_clouds(
+        tmp_path / "a",
+        "bag",
+        clouds[:1],
+        layout=layout,
+        times_s=times,
+        is_bigendian=is_bigendian,
+        num_rows=4,
+        row_tail=7,
+    )
+    drive = open_lidar_sequence(path)
+    np.testing.assert_allclose(drive.read_scan(0), clouds[0], rtol=1e-6)
+    found = drive.read_times(0)
+    if times is None:
+        assert found is None
+    else:
+        np.testing.assert_allclose((found - found[0]) / TIMES[layout][1], times, atol=1e-6)
+
+
+def test_beams_that_met_nothing_are_left_out_with_their_times(tmp_path: Path, clouds) -> None:
+    clouds[0][[3, 5]], clouds[0][7, 1], clouds[1][:] = np.nan, np.inf, 0
+    times = np.linspace(0, 0.1, 120)
+    drive = open_lidar_sequence(write_clouds(tmp_path / "a", "mcap", clouds[:2], times_s=times))
+    np.testing.assert_array_equal(drive.read_scan(0), np.delete(clouds[0], [3, 5, 7], axis=0))
+    np.testing.assert_allclose(drive.read_times(0) / 1e9, np.delete(times, [3, 5, 7]), atol=1e-8)
+    assert drive[1].shape == (0, 3)
+
+
+@pytest.mark.parametrize("kind", ["bag", "mcap"])
+def test_the_message_of_livox_is_read(tmp_path: Path, kind: str, clouds) -> None:
+    times_ns = np.arange(120) * 800_000
+    with BagWriter(tmp_path / "a", kind) as bag:
+        for index, points in enumerate(clouds):
+            bag.write_livox(points, EPOCH_NS + index * STEP_NS, times_ns)
+    drive = open_lidar_sequence(bag.path)
+    np.testing.assert_array_equal(drive.read_scan(2), clouds[2])
+    np.testing.assert_array_equal(drive.read_times(2), times_ns)
+
+
+def test_headers_without_a_time_have_that_of_the_recording(tmp_path: Path, clouds) -> None:
+    with BagWriter(tmp_path / "a", "bag") as bag:
+        for index, points in enumerate(clouds):
+            bag.write_cloud(points, 0, delay_ns=EPOCH_NS + index * STEP_NS)
+    drive = open_lidar_sequence(bag.path)
+    np.testing.assert_allclose(np.diff(drive.times), 0.1, atol=1e-6)
+    np.testing.assert_array_equal(drive.read_scan(3), clouds[3])
+
+
+def test_a_folder_of_parts_is_one_drive(tmp_path: Path, clouds) -> None:
+    for part in range(2):
+        with BagWriter(tmp_path / f"part_{part}", "bag") as bag:
+            for index in range(3 * part, 3 * part + 3):
+                bag.write_cloud(clouds[index], EPOCH_NS + index * STEP_NS)
+    drive = open_lidar_sequence(tmp_path)
+    assert len(drive) == NUM
+    for index in range(NUM):
+        np.testing.assert_array_equal(drive.read_scan(index), clouds[index])
+
+
+def test_a_pose_file_is_matched_by_time(tmp_path: Path, clouds) -> None:
+    path = write_clouds(tmp_path / "a", "db3", clouds)
+    T = np.tile(np.eye(4), (30, 1, 1))
+    T[:, 0, 3] = np.arange(30)
+    write_tum(tmp_path / "truth.txt", T, times=1.6e9 + 0.02 * np.arange(30))
+    drive = open_lidar_sequence(path, poses=tmp_path / "truth.txt")
+    np.testing.assert_allclose(drive.T_world_lidar[:, 0, 3], 5.0 * np.arange(NUM), atol=1e-4)
+
+
+@pytest.mark.parametrize("kind", ["bag", "mcap"])
+def test_poses_beside_a_bag_are_used_where_they_have_its_times(tmp_path: Path, kind: str, clouds) -> None:
+    path = write_clouds(tmp_path / "a", kind, clouds)
+    home = path if path.is_dir() else path.parent
+    T = np.tile(np.eye(4), (30, 1, 1))
+    write_tum(home / "groundtruth.txt", T, times=1.6e9 + 0.02 * np.arange(30))
+    assert open_lidar_sequence(path).has_reference.all()
+    write_tum(home / "groundtruth.txt", T, times=1.5e9 + 0.02 * np.arange(30))
+    drive = open_lidar_sequence(path)
+    assert drive.T_world_lidar is None
+    assert "no scan has the time of a pose; these poses are not used" in drive.notes[0].text
+
+
+def test_topics_are_chosen_or_named(tmp_path: Path, clouds) -> None:
+    with BagWriter(tmp_path / "a", "bag") as bag:
+        for topic in ("/left/points", "/right/points"):
+            bag.write_cloud(clouds[0], EPOCH_NS, topic=topic)
+        bag.write_scan(np.full(40, 3.0), EPOCH_NS)
+    with pytest.raises(InputError, match=r"2 topics of point clouds: /left/points, /right/points; name one"):
+        open_lidar_sequence(bag.path)
+    assert len(open_lidar_sequence(bag.path, topic="right/points")) == 1
+    with pytest.raises(InputError, match=r"no topic /none, it has .*/scan \(LaserScan\)"):
+        open_lidar_sequence(bag.path, topic="/none")
+    with pytest.raises(InputError, match=r"topic /scan has messages sensor_msgs/msg/LaserScan"):
+        open_lidar_sequence(bag.path, topic="/scan")
+    with BagWriter(tmp_path / "b", "mcap") as planar:
+        planar.write_scan(np.full(40, 3.0), EPOCH_NS)
+    with pytest.raises(InputError, match=r"no point clouds.*dpmjax map2d"):
+        open_lidar_sequence(planar.path)
+    path = write_clouds(tmp_path / "c", "mcap", clouds)
+    with pytest.raises(InputError, match=r"no planar scans.*dpmjax slam"):
+        read_sequence(path)
+    np.save(tmp_path / "0.npy", clouds[0])
+    with pytest.raises(InputError, match="no bag of ROS"):
+        open_lidar_sequence(tmp_path / "0.npy", topic="/points")
+
+
+def room(pose: np.ndarray, num_beams: int = 90) -> np.ndarray:
+    """Ranges of a laser to the walls |x| = 6, |y| = 4."""
+    angles = -np.pi + 2 * np.pi / num_beams * np.arange(num_beams) + pose[2]
+    along = np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        reach = (np.array([6.0, 4.0]) * np.sign(along) - pose[:2]) / along
+    return np.where(np.isfinite(reach), reach, np.inf).min(axis=1)
+
+
+POSES = np.column_stack([0.2 * np.arange(NUM), 0.1 * np.arange(NUM), 0.05 * np.arange(NUM)])
+T_BASE_LASER = np.array([0.3, 0.1, 0.4])
+
+
+def points_in_world(scans, poses: np.ndarray) -> np.ndarray:
+    return np.concatenate(
+        [
+            np.asarray(se2.transform_points(pose, points[mask].astype(float)))
+            for pose, points, mask in zip(poses, scans.points, scans.mask, strict=True)
+        ]
+    )
+
+
+def assert_on_walls(points: np.ndarray) -> None:
+    off = np.minimum(np.abs(np.abs(points[:, 0]) - 6), np.abs(np.abs(points[:, 1]) - 4))
+    assert off.max() < 1e-3
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_planar_scans_come_with_the_odometry_of_the_laser(tmp_path: Path, kind: str) -> None:
+    with BagWriter(tmp_path / "a", kind) as bag:
+        bag.write_transform(("base_link", "laser"), T_BASE_LASER, EPOCH_NS, topic="/tf_static")
+        for index, pose in enumerate(POSES):
+            stamp = EPOCH_NS + index * STEP_NS
+            bag.write_transform(("odom", "base_link"), pose, stamp)
+            bag.write_transform(("map", "odom"), np.array([9.0, 9, 1]), stamp)
+            bag.write_scan(room(se2.compose(pose, T_BASE_LASER)), stamp)
+    scans = read_sequence(bag.path)
+    np.testing.assert_allclose(scans.odometry_poses, se2.compose(POSES, T_BASE_LASER), atol=1e-6)
+    np.testing.assert_allclose(scans.times, 1.6e9 + 0.1 * np.arange(NUM), atol=1e-6)
+    assert scans.is_organised
+    assert_on_walls(points_in_world(scans, scans.odometry_poses))
+
+
+def test_a_laser_upside_down_is_turned(tmp_path: Path) -> None:
+    with BagWriter(tmp_path / "a", "bag") as bag:
+        bag.write_transform(("base_link", "laser"), T_BASE_LASER, EPOCH_NS, topic="/tf_static", is_upside_down=True)
+        for index, pose in enumerate(POSES):
+            stamp = EPOCH_NS + index * STEP_NS
+            bag.write_transform(("odom", "base_link"), pose, stamp)
+            # Seen from below, the beams run the other way round.
+            ranges = room(se2.compose(pose, T_BASE_LASER))
+            bag.write_scan(np.roll(ranges[::-1], 1), stamp)
+    scans = read_sequence(bag.path)
+    assert_on_walls(points_in_world(scans, scans.odometry_poses))
+
+
+def test_odometry_is_interpolated_at_the_scans(tmp_path: Path) -> None:
+    with BagWriter(tmp_path / "a", "mcap") as bag:
+        for index, pose in enumerate(POSES):
+            bag.write_odometry(pose, EPOCH_NS + index * STEP_NS)
+            bag.write_scan(room(pose), EPOCH_NS + index * STEP_NS + STEP_NS // 2)
+    scans = read_sequence(bag.path)
+    np.testing.assert_allclose(scans.odometry_poses[:-1], (POSES[1:] + POSES[:-1]) / 2, atol=1e-6)
+
+
+def test_beams_without_echo_and_scans_of_fewer_beams_are_masked(tmp_path: Path) -> None:
+    full = room(POSES[0])
+    full[[0, 1, 2, 3]] = [np.inf, np.nan, 0.0, 30.0]
+    with BagWriter(tmp_path / "a", "bag") as bag:
+        bag.write_scan(full, EPOCH_NS)
+        bag.write_scan(room(POSES[1], 80), EPOCH_NS + STEP_NS)
+    scans = read_sequence(bag.path)
+    assert scans.odometry_poses is None
+    np.testing.assert_array_equal(np.flatnonzero(~scans.mask[0]), [0, 1, 2, 3])
+    np.testing.assert_array_equal(np.flatnonzero(~scans.mask[1]), np.arange(80, 90))
+
+
+def test_without_rosbags_the_extra_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "a.bag").write_bytes(b"#ROSBAG V2.0\n")
+    for name in [name for name in sys.modules if name.startswith("rosbags")]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setitem(sys.modules, "rosbags", None)
+    with pytest.raises(InputError, match=r"needs rosbags, which is not installed; pip install 'dpmjax\[ros\]'"):
+        open_lidar_sequence(tmp_path / "a.bag")
+
+
+@pytest.mark.parametrize("name", ["a.pcap", "a.osf"])
+def test_captures_name_their_converter(tmp_path: Path, name: str) -> None:
+    (tmp_path / name).write_bytes(b"123")
+    with pytest.raises(InputError, match="capture .* which is not read; convert it to a bag"):
+        open_lidar_sequence(tmp_path / name)

@@ -1,0 +1,80 @@
+"""The number of columns of raw files: inferred from the values, by the ending, or said."""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from dpmjax.io import InputError, open_lidar_sequence, read_lidar_file, require_whole_files
+from dpmjax.io.bin_columns import find_columns
+
+NUM = 1200
+
+
+@pytest.fixture
+def table() -> np.ndarray:
+    """Points in a street, intensity, ring and time."""
+    rng = np.random.default_rng(0)
+    azimuth, ring = rng.uniform(-np.pi, np.pi, NUM), rng.integers(0, 32, NUM)
+    ranges = rng.uniform(3, 40, NUM)
+    height = ranges * np.tan(np.radians(ring - 25.0))
+    xyz = [ranges * np.cos(azimuth), ranges * np.sin(azimuth), height]
+    return np.stack([*xyz, rng.integers(0, 255, NUM), ring, np.linspace(0, 0.1, NUM)], axis=1).astype("<f4")
+
+
+@pytest.mark.parametrize("columns", [3, 4, 5, 6])
+def test_columns_are_judged_by_the_values(tmp_path: Path, table: np.ndarray, columns: int) -> None:
+    path = tmp_path / "0.bin"
+    table[:, :columns].tofile(path)  # 1200 points of any number of columns fit all of 3, 4, 5 and 6
+    found = find_columns(path, path.read_bytes())
+    assert found.num_columns == columns
+    assert (found.note is None) == (columns == 4)
+    np.testing.assert_array_equal(read_lidar_file(path), table[:, :3])
+
+
+def test_a_cut_file_is_not_taken_for_one_of_other_columns(tmp_path: Path, table: np.ndarray) -> None:
+    path = tmp_path / "0.bin"
+    path.write_bytes(table[:, :4].tobytes()[:-4])  # 4799 numbers
+    with pytest.raises(InputError, match="no whole number of points of 4 float32"):
+        read_lidar_file(path)
+    path.write_bytes(table[:, :4].tobytes()[:-12])  # 4797 numbers, 3 x 1599
+    with pytest.raises(InputError, match="no whole number of points of 4 float32"):
+        read_lidar_file(path)
+
+
+def test_values_that_do_not_tell_are_said(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    np.random.default_rng(0).normal(0, 10, (NUM, 4)).astype("<f4").tofile(tmp_path / "0.bin")
+    with caplog.at_level(logging.WARNING):
+        read_lidar_file(tmp_path / "0.bin")
+    assert "4 columns a point are assumed, 3 or 5 or 6 would fit as well; --columns decides" in caplog.text
+    caplog.clear()
+    assert len(read_lidar_file(tmp_path / "0.bin", bin_columns=3)) == NUM // 3 * 4
+    assert not caplog.records
+
+
+def test_the_ending_of_nuscenes_tells_where_values_do_not(tmp_path: Path) -> None:
+    path = tmp_path / "n015__LIDAR_TOP__1532402927647951.pcd.bin"
+    np.random.default_rng(0).normal(0, 10, (NUM, 5)).astype("<f4").tofile(path)
+    assert find_columns(path, path.read_bytes()).num_columns == 5
+
+
+def test_one_scan_decides_for_its_drive(tmp_path: Path, table: np.ndarray) -> None:
+    for index in range(3):
+        table[index:, :5].tofile(tmp_path / f"{index}.bin")
+    drive = open_lidar_sequence(tmp_path)
+    (note,) = drive.notes
+    assert note.text.endswith("5 columns a point, inferred from the values; --columns decides")
+    for index in range(3):
+        np.testing.assert_array_equal(drive.read_scan(index), table[index:, :3])
+    require_whole_files(drive)
+    (tmp_path / "2.bin").write_bytes(table[:, :5].tobytes()[:-8])
+    with pytest.raises(InputError, match=r"2\.bin.*of 5 float32"):
+        require_whole_files(drive)
+
+
+def test_real_scan_of_five_columns(real_data: Path) -> None:
+    (path,) = (real_data / "field_3d" / "nuscenes_5_columns").glob("*.bin")
+    assert len(read_lidar_file(path)) == 12800

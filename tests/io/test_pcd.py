@@ -1,0 +1,180 @@
+"""PCD files as the Point Cloud Library and drivers write them: compressed, padded, with characters."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from dpmjax.io import InputError, read_lidar_file, read_pcd
+from dpmjax.io.lzf import unpack_lzf
+from dpmjax.io.scan_file import read_point_times
+
+NUM = 500
+
+
+@pytest.fixture
+def points() -> np.ndarray:
+    """Points of a room: many equal coordinates, so that compression finds copies."""
+    rng = np.random.default_rng(0)
+    return np.round(rng.uniform(-8, 8, (NUM, 3)), 1).astype("<f4")
+
+
+def header(fields: str, sizes: str, types: str, counts: str, encoding: str, num_points: int = NUM) -> bytes:
+    return (
+        f"# .PCD v0.7 - Point Cloud Data file format\nVERSION 0.7\nFIELDS {fields}\nSIZE {sizes}\nTYPE {types}\n"
+        f"COUNT {counts}\nWIDTH {num_points}\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS {num_points}\nDATA {encoding}\n"
+    ).encode()
+
+
+def pack_lzf(data: bytes) -> bytes:
+    """Slow oracle: literals, and copies of the longest match among the last 300 bytes."""
+    out, literals, at = bytearray(), bytearray(), 0
+
+    def flush() -> None:
+        for start in range(0, len(literals), 32):
+            run = literals[start : start + 32]
+            out.extend([len(run) - 1, *run])
+        literals.clear()
+
+    while at < len(data):
+        length, distance = 0, 0
+        for back in range(1, min(at, 300) + 1):
+            n = 0
+            while n < 264 and at + n < len(data) and data[at + n] == data[at - back + n]:
+                n += 1
+            if n > length:
+                length, distance = n, back
+        if length < 3:
+            literals.append(data[at])
+            at += 1
+            continue
+        flush()
+        code, low, high = length - 2, (distance - 1) & 255, (distance - 1) >> 8
+        out.extend([(code << 5) | high, low] if code < 7 else [(7 << 5) | high, code - 7, low])
+        at += length
+    flush()
+    return bytes(out)
+
+
+def compressed(columns: list[np.ndarray]) -> bytes:
+    values = b"".join(column.tobytes() for column in columns)
+    packed = pack_lzf(values)
+    return np.array([len(packed), len(values)], "<u4").tobytes() + packed
+
+
+@pytest.mark.parametrize("content", [b"", b"a", b"abc" * 200, bytes(1000), np.random.default_rng(1).bytes(3000)])
+def test_lzf_gives_back_what_was_packed(content: bytes) -> None:
+    assert unpack_lzf(pack_lzf(content), len(content)) == content
+
+
+@pytest.mark.parametrize("size", [99, 101])
+def test_lzf_of_another_size_is_refused(size: int) -> None:
+    with pytest.raises(ValueError, match="unpacks to"):
+        unpack_lzf(pack_lzf(bytes(100)), size)
+
+
+def test_compressed_columns_are_read_with_their_times(tmp_path: Path, points: np.ndarray) -> None:
+    times = np.arange(NUM, dtype="<f8") * 1e-4
+    rings = (np.arange(NUM) % 16).astype("<u2")
+    head = header("ring x y z timestamp", "2 4 4 4 8", "U F F F F", "1 1 1 1 1", "binary_compressed")
+    (tmp_path / "a.pcd").write_bytes(head + compressed([rings, *points.T, times]))
+    np.testing.assert_array_equal(read_pcd(tmp_path / "a.pcd"), points)
+    np.testing.assert_array_equal(read_point_times(tmp_path / "a.pcd"), times)
+
+
+@pytest.mark.parametrize("has_padding", [False, True])
+def test_compressed_columns_may_leave_the_padding_out(tmp_path: Path, points: np.ndarray, has_padding: bool) -> None:
+    padding = [np.zeros(4 * NUM, "u1")] if has_padding else []
+    head = header("x y z _", "4 4 4 1", "F F F U", "1 1 1 4", "binary_compressed")
+    (tmp_path / "a.pcd").write_bytes(head + compressed([*points.T, *padding]))
+    np.testing.assert_array_equal(read_pcd(tmp_path / "a.pcd"), points)
+
+
+@pytest.mark.parametrize("damage", ["cut", "sizes", "copy before the first byte", "bits"])
+def test_damaged_compression_is_named(tmp_path: Path, points: np.ndarray, damage: str) -> None:
+    head = header("x y z", "4 4 4", "F F F", "1 1 1", "binary_compressed")
+    body = bytearray(compressed(list(points.T)))
+    if damage == "cut":
+        body = body[:-9]
+    elif damage == "sizes":
+        body[4:8] = np.array([2**31], "<u4").tobytes()
+    elif damage == "bits":
+        body[0:4] = np.array([len(body) - 40], "<u4").tobytes()
+    else:
+        body[8:10] = bytes([0x3F, 0xFF])
+    (tmp_path / "a.pcd").write_bytes(head + body)
+    with pytest.raises(InputError, match=r"a\.pcd: .*(truncated|damaged|do not fit)"):
+        read_pcd(tmp_path / "a.pcd")
+
+
+def test_padding_is_no_field(tmp_path: Path, points: np.ndarray) -> None:
+    records = np.zeros(NUM, [("p", "<f4", 3), ("a", "u1", 4), ("i", "<f4"), ("b", "u1", 12)])
+    records["p"] = points
+    head = header("x y z _ intensity _", "4 4 4 1 4 1", "F F F U F U", "1 1 1 4 1 12", "binary")
+    (tmp_path / "a.pcd").write_bytes(head + records.tobytes())
+    np.testing.assert_array_equal(read_pcd(tmp_path / "a.pcd"), points)
+
+
+def test_padding_counted_with_the_size_of_the_next_field_is_set_right(tmp_path: Path, points: np.ndarray) -> None:
+    """The Point Cloud Library writes a padding of 0 before a double that it aligns, and takes it off elsewhere."""
+    kinds = {"p": ("<f4", 3), "intensity": "<f4", "timestamp": "<f8", "ring": "<u2"}
+    layout = {"names": list(kinds), "formats": list(kinds.values()), "offsets": [0, 16, 24, 32], "itemsize": 48}
+    records = np.zeros(NUM, np.dtype(layout))
+    records["p"], records["timestamp"], records["ring"] = points, np.linspace(0, 0.1, NUM), np.arange(NUM) % 64
+    fields, sizes = "x y z _ intensity _ timestamp _ ring _", "4 4 4 1 4 1 8 1 2 1"
+    head = header(fields, sizes, "F F F U F U F U U U", "1 1 1 4 1 0 1 6 1 12", "binary")
+    (tmp_path / "a.pcd").write_bytes(head + records.tobytes())
+    np.testing.assert_array_equal(read_pcd(tmp_path / "a.pcd"), points)
+    np.testing.assert_array_equal(read_point_times(tmp_path / "a.pcd"), np.linspace(0, 0.1, NUM))
+
+
+@pytest.mark.parametrize("is_padded", [False, True])
+def test_rows_of_text_may_leave_the_padding_out(tmp_path: Path, is_padded: bool) -> None:
+    head = header("x y z _ intensity", "4 4 4 1 4", "F F F U F", "1 1 1 4 1", "ascii", 2)
+    padding = "0 0 0 0 " if is_padded else ""
+    (tmp_path / "a.pcd").write_text(head.decode() + f"1 2 3 {padding}9\n4 5 6 {padding}9\n")
+    np.testing.assert_array_equal(read_pcd(tmp_path / "a.pcd"), [[1, 2, 3], [4, 5, 6]])
+
+
+@pytest.mark.parametrize("place", ["last", "first"])
+def test_every_byte_may_be_a_character(tmp_path: Path, place: str) -> None:
+    """A field of one byte is written as the character of its code: blanks, line feeds and digits, too."""
+    xyz = np.arange(256 * 3, dtype=np.float32).reshape(-1, 3) / 4 - 20
+    rows = []
+    for code, row in enumerate(xyz):
+        numbers, letter = " ".join(f"{value:.6f}" for value in row).encode(), bytes([code])
+        rows.append(numbers + b" " + letter + b" \x00\n" if place == "last" else letter + b" " + numbers + b" \x00\n")
+    fields = "x y z tag line" if place == "last" else "tag x y z line"
+    sizes, types = ("4 4 4 1 1", "F F F U U") if place == "last" else ("1 4 4 4 1", "U F F F U")
+    (tmp_path / "a.pcd").write_bytes(header(fields, sizes, types, "1 1 1 1 1", "ascii", 256) + b"".join(rows))
+    np.testing.assert_array_equal(read_pcd(tmp_path / "a.pcd"), xyz)
+
+
+def test_line_and_column_of_a_bad_word_are_named(tmp_path: Path) -> None:
+    head = header("x y z", "4 4 4", "F F F", "1 1 1", "ascii", 3).decode()
+    (tmp_path / "a.pcd").write_text(head + "1 2 3\n\n4 5 6,0\n7 8 9\n")
+    with pytest.raises(InputError, match=r"a\.pcd: line 14, column 3: '6,0' is not a number"):
+        read_pcd(tmp_path / "a.pcd")
+
+
+FIELD = {
+    "livox_ascii_pcd_char_fields/10.pcd": (3384, 18.6),
+    "pcd_padding_count_0/000950.pcd": (5000, 44.5),
+}
+
+
+@pytest.mark.parametrize("name", FIELD)
+def test_real_files_of_users_are_read(real_data: Path, name: str) -> None:
+    num_points, median_m = FIELD[name]
+    found = read_lidar_file(real_data / "field_3d" / name)
+    assert len(found) == num_points
+    assert np.median(np.linalg.norm(found, axis=1)) == pytest.approx(median_m, abs=0.1)
+
+
+def test_a_map_in_national_coordinates_is_refused_with_an_origin(real_data: Path) -> None:
+    path = real_data / "field_3d" / "pcd_binary_compressed" / "samp24-utm.pcd"
+    assert len(read_pcd(path)) == 7492
+    with pytest.raises(InputError, match=r"UTM; subtract an origin such as 513808 5403150 298"):
+        read_lidar_file(path)
