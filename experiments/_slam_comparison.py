@@ -18,7 +18,7 @@ from dpmjax.metrics import align_rigid, path_lengths
 from dpmjax.simulation import HDL64E, OS1_64, DriveConfig, LidarSensor, Scene, TownConfig, simulate_scene
 from dpmjax.slam import SlamMethods, make_methods
 from experiments import _slam_evaluation as evaluation
-from experiments._slam_evaluation import ODOMETRY, OURS, PRECISIONS, Drive, StoppedError
+from experiments._slam_evaluation import NETWORK, ODOMETRY, OURS, PRECISIONS, Drive, StoppedError
 from experiments._slam_localization import evaluate_localization
 from experiments._slam_peers import PEERS, why_missing
 from experiments._slam_refine import MULTIWAY, REFINED, evaluate_refinement
@@ -41,6 +41,7 @@ COLORS = {
     "small_gicp": "#7a5aa6",
     MULTIWAY: "#8c8c8c",
     ODOMETRY: "#6fa3d8",
+    NETWORK: "#e0a030",
     OURS: "#1f4e8c",
     REFINED: "#2e8b57",
 }
@@ -167,6 +168,7 @@ def _runs(drives: Sequence[Drive], methods: SlamMethods, ours: dict[str, dict[st
         for name in PEERS:
             yield drive, name, partial(evaluation.evaluate_peer, drive, name)
         yield drive, OURS, partial(evaluation.evaluate_ours, drive, methods)
+        yield drive, NETWORK, partial(evaluation.evaluate_network, drive, methods)
         yield drive, ODOMETRY, lambda drive=drive: evaluation.odometry_row(drive, ours[drive.sequence.name])
 
 

@@ -26,8 +26,9 @@ from dpmjax.saved_maps import Precision
 from dpmjax.slam import KeyframeMap, SlamMethods, SlamResult
 from experiments._slam_peers import PEERS, POINT_BYTES, FoundLoop, KissIcp, Peer, is_indoors, peer_version
 
-# Odometry is point-to-plane alignment; the networks propose loops, and poses where it fails.
-OURS, ODOMETRY = "ours, odometry and loops", "ours, point-to-plane odometry"
+# Both align with the map of surface elements; the first guess is the motion of before, or the decoder's for every scan.
+OURS, NETWORK = "ours, odometry and loops", "ours, the network proposes every pose"
+ODOMETRY = "ours, before loops"
 PRECISIONS: tuple[Precision, ...] = ("float32", "int8")
 # Sizes of maps are taken so many times on the way.
 NUM_SIZES = 8
@@ -114,6 +115,22 @@ def evaluate_ours(drive: Drive, methods: SlamMethods) -> dict[str, Any]:
         "scan_s": _per_scan(run, run.run_s - sum(run.stages_s.get(stage, 0.0) for stage in _FILE_STAGES)),
         "scan_odometry_s": _per_scan(run, odometry_s),
         **map_sizes(drive.folder.path, result),
+    }
+
+
+def evaluate_network(drive: Drive, methods: SlamMethods) -> dict[str, Any]:
+    """Runs the whole system with the decoder as the source of every first guess (DeepPointMap section 4)."""
+    odometry = replace(methods.config.odometry, proposer="network")
+    methods = methods._replace(config=replace(methods.config, odometry=odometry))
+    part = drive.folder.part("methods", "network")
+    run, result = map_drive(part, drive.sequence, methods, drive.is_stopped)
+    if len(run.reports) < len(drive.sequence):
+        raise StoppedError
+    return {
+        **common_numbers(drive, NETWORK, result.T_world_scan, []),
+        "num_keyframes": len(result.keyframes),
+        "num_from_network": sum(report.status == "network" for report in result.reports),
+        "scan_s": _per_scan(run, run.run_s - sum(run.stages_s.get(stage, 0.0) for stage in _FILE_STAGES)),
     }
 
 

@@ -92,8 +92,8 @@ class RunFolder:
     def __truediv__(self, name: str) -> Path:
         return self.path / name
 
-    def part(self, kind: Literal["agents", "drives"], name: str) -> RunFolder:
-        """Makes the folder of one agent or of one drive; what an earlier run left there goes on."""
+    def part(self, kind: Literal["agents", "drives", "methods"], name: str) -> RunFolder:
+        """Makes the folder of one agent, drive or method; what an earlier run left there goes on."""
         path = self.path / kind / name
         path.mkdir(parents=True, exist_ok=True)
         return RunFolder(path, is_resumed=True)
