@@ -21,7 +21,7 @@ from tests.deeppointmap import toy
 def case(tmp_path_factory):
     """Weights, a map of the first scans of a drive, and a folder with all of them."""
     folder = tmp_path_factory.mktemp("case")
-    drive = toy.drive(num_scans=6)
+    drive = toy.drive(num_scans=6, step_m=1.9)
     model = dpmjax.init_model(jax.random.key(0), toy.SLAM_MODEL)
     dpmjax.save_model(model, folder / "model.safetensors")
     result = dpmjax.run_slam(model, [drive.read_scan(number) for number in range(4)])

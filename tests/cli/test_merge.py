@@ -27,8 +27,8 @@ def case(tmp_path_factory):
     dpmjax.save_model(model, folder / "model.safetensors")
     dpmjax.save_model(dpmjax.init_model(jax.random.key(1), toy.SLAM_MODEL), folder / "other.safetensors")
     for seed, name in ((1, "a"), (2, "b"), (3, "c")):
-        drive = toy.drive(seed, num_scans=3)
-        result = dpmjax.run_slam(model, [drive.read_scan(number) for number in range(3)])
+        drive = toy.drive(seed, num_scans=4, step_m=1.9)
+        result = dpmjax.run_slam(model, [drive.read_scan(number) for number in range(4)])
         dpmjax.save_map(folder / f"{name}.npz", result.map)
     return folder
 

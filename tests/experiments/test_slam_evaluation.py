@@ -30,7 +30,7 @@ METHODS = [
     ODOMETRY,
     *(f"localization, {p}" for p in _slam_evaluation.PRECISIONS),
 ]
-STEP_M, NUM_SCANS = 4.0, 6
+STEP_M, NUM_SCANS = 1.9, 6
 
 
 class SteadyPeer:
@@ -53,7 +53,7 @@ class SteadyPeer:
 @pytest.fixture
 def with_toys(monkeypatch, tmp_path) -> Path:
     """Small drives in place of towns, one peer that runs and one that is not installed; returns the weights."""
-    monkeypatch.setattr(_slam_comparison, "town_drive", lambda *_: toy.drive(1, num_scans=NUM_SCANS))
+    monkeypatch.setattr(_slam_comparison, "town_drive", lambda *_: toy.drive(1, num_scans=NUM_SCANS, step_m=STEP_M))
     peers = {PEER: ("json", SteadyPeer), "absent": ("no_such_module", SteadyPeer)}
     for module in (_slam_comparison, _slam_evaluation, _slam_peers):
         monkeypatch.setattr(module, "PEERS", peers)
@@ -100,7 +100,7 @@ def test_every_method_gets_a_row_and_a_resumed_run_computes_nothing_again(
     assert rows["localization, int8"]["num_scans"] == 3
     for name in ("table.md", "trajectories.png", "map_sizes.png"):
         assert (out / name).stat().st_size > 0
-    assert f"| toy 1 | {NUM_SCANS}, 20 m | {PEER} | 0.000 |" in (out / "table.md").read_text()
+    assert f"| toy 1 | {NUM_SCANS}, 10 m | {PEER} | 0.000 |" in (out / "table.md").read_text()
     monkeypatch.setattr(_slam_evaluation, "map_drive", None)
     monkeypatch.setattr(SteadyPeer, "step", None)
     assert run("--resume", "-o", out) == EXIT_OK
@@ -130,7 +130,7 @@ def test_scans_of_a_town_are_cast_once_for_all_methods() -> None:
 
 
 def test_refinements_are_rows_that_a_resumed_run_may_add(with_toys, tmp_path, monkeypatch, capsys) -> None:
-    out, drive = tmp_path / "out", toy.drive(1, num_scans=NUM_SCANS)
+    out, drive = tmp_path / "out", toy.drive(1, num_scans=NUM_SCANS, step_m=STEP_M)
     assert run("--slam", "town", "--weights", with_toys, "--num-towns", 1, "--localize", 0, "-o", out) == EXIT_OK
 
     def moved(slam_map, read_points, **_):
@@ -155,7 +155,7 @@ def test_sizes_of_maps_are_those_of_the_files(with_toys, tmp_path) -> None:
     out = tmp_path / "out"
     assert run("--slam", "town", "--weights", with_toys, "--num-towns", 1, "--localize", 3, "-o", out) == EXIT_OK
     rows = {row["method"]: row for row in load_json(out / "metrics.json")["rows"]}
-    ours, drive = rows[OURS], toy.drive(1, num_scans=NUM_SCANS)
+    ours, drive = rows[OURS], toy.drive(1, num_scans=NUM_SCANS, step_m=STEP_M)
     for precision in _slam_evaluation.PRECISIONS:
         path = out / "drives" / drive.name / f"map_{precision}.npz"
         assert ours[f"map_bytes_{precision}"][-1] == path.stat().st_size
