@@ -129,7 +129,8 @@ class SmallGicp:
         T = np.eye(4)
         if self._poses:
             before, last = (self._poses * 2)[-2:]
-            start = last @ rigid.inverse(before) @ last if len(self._poses) > 1 else last
+            # The transpose would treble the rounding errors of the rotations at each scan.
+            start = last @ np.linalg.inv(before) @ last if len(self._poses) > 1 else last
             T = self._library.align(self._map, scan, start, num_threads=self._threads).T_target_source
         self._map.insert(scan, T)
         self._poses.append(T)

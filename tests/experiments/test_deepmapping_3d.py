@@ -57,7 +57,7 @@ def test_wrong_usage_names_the_option(options, message, capsys) -> None:
 
 def test_bad_starts_are_one_line_and_leave_no_folder(drive, tmp_path, capsys) -> None:
     assert run("/no/such/folder") == 2
-    assert "no such folder" in capsys.readouterr().err
+    assert "no such file or folder" in capsys.readouterr().err
     short = write_tum(tmp_path / "short.txt", np.tile(np.eye(4), (2, 1, 1)))
     for options, message in (([], "no poses"), (["--init", "guess"], "no such file"), (["--init", short], "2 poses")):
         assert run(drive, "-o", tmp_path / "out", *options) == 2

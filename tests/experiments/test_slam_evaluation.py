@@ -18,7 +18,7 @@ from dpmjax.geometry import rigid
 from dpmjax.io import LidarSequence
 from dpmjax.slam import RefinedKeyframes
 from experiments import _slam_comparison, _slam_evaluation, _slam_peers, _slam_refine, dpm_evaluate
-from experiments._slam_evaluation import ODOMETRY, OURS, Drive, FoundLoop, StoppedError
+from experiments._slam_evaluation import NETWORK, ODOMETRY, OURS, Drive, FoundLoop, StoppedError
 from experiments._slam_refine import MULTIWAY, REFINED
 from tests.deeppointmap import toy
 from tests.slam.truth import laps, pose
@@ -27,6 +27,7 @@ PEER = "steady"
 METHODS = [
     PEER,
     OURS,
+    NETWORK,
     ODOMETRY,
     *(f"localization, {p}" for p in _slam_evaluation.PRECISIONS),
 ]
@@ -145,7 +146,7 @@ def test_refinements_are_rows_that_a_resumed_run_may_add(with_toys, tmp_path, mo
     assert run("--slam", "--resume", "--refine", "-o", out) == EXIT_OK
     assert f"{MULTIWAY} was not run: open3d is not installed" in capsys.readouterr().out
     rows = {row["method"]: row for row in load_json(out / "metrics.json")["rows"]}
-    assert list(rows) == ["steady", OURS, ODOMETRY, REFINED]
+    assert list(rows) == ["steady", OURS, NETWORK, ODOMETRY, REFINED]
     refined = rows[REFINED]
     assert (refined["refine_windows"], refined["num_scans"]) == (1, NUM_SCANS)
     assert refined["ate_m"] > rows[OURS]["ate_m"] + 0.5

@@ -19,6 +19,7 @@ _Put = Callable[[Collection, np.random.Generator, Place], None]
 KINDS = ("office", "hall", "flat", "corridor")
 _THICKNESS_M = 0.12
 _CLEARANCE_M = 0.45  # Nothing stands nearer than this to the route.
+_PILLAR_CLEARANCE_M = 0.2
 _MARGIN_M = 20.0
 _BUILDING_STREAM = 8160
 
@@ -163,8 +164,11 @@ def _fittings(into: Collection, rng: np.random.Generator, room: Room, route: Flo
     jitter = float(rng.choice([0.0, 0.25])) * step
     for y in (room.low[1] + 0.5 * deep + _THICKNESS_M, room.high[1] - 0.5 * deep - _THICKNESS_M):
         for x in np.arange(room.low[0] + rng.uniform(0.5, step), room.high[0] - 1, step):
-            if rng.random() < 0.85:
-                put_box(into, _place(x + rng.normal(0, jitter), y), (wide, deep), (0.0, high))
+            place = _place(x + rng.normal(0, jitter), y) if rng.random() < 0.85 else None
+            if place is not None:
+                beside = np.abs(route - [place.x, place.y]) - [0.5 * wide, 0.5 * deep]
+                if np.max(beside, axis=1).min() > _PILLAR_CLEARANCE_M:
+                    put_box(into, place, (wide, deep), (0.0, high))
     for _ in range(rng.poisson(0.04 * room.size[0])):
         y = float(rng.choice([room.low[1] + 0.45, room.high[1] - 0.45]))
         spot = np.array([rng.uniform(room.low[0], room.high[0]), y])
