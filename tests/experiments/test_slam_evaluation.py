@@ -16,9 +16,10 @@ from dpmjax.cli.result_files import load_json
 from dpmjax.cli.run_folder import RunFolder
 from dpmjax.geometry import rigid
 from dpmjax.io import LidarSequence
+from dpmjax.saved_maps import load_state
 from dpmjax.slam import RefinedKeyframes
 from experiments import _slam_comparison, _slam_evaluation, _slam_peers, _slam_refine, dpm_evaluate
-from experiments._slam_evaluation import ODOMETRY, OURS, Drive, FoundLoop, StoppedError
+from experiments._slam_evaluation import NETWORK, ODOMETRY, OURS, Drive, FoundLoop, StoppedError
 from experiments._slam_refine import MULTIWAY, REFINED
 from tests.deeppointmap import toy
 from tests.slam.truth import laps, pose
@@ -27,6 +28,7 @@ PEER = "steady"
 METHODS = [
     PEER,
     OURS,
+    NETWORK,
     ODOMETRY,
     *(f"localization, {p}" for p in _slam_evaluation.PRECISIONS),
 ]
@@ -98,6 +100,12 @@ def test_every_method_gets_a_row_and_a_resumed_run_computes_nothing_again(
     assert rows[PEER]["ate_m"] == pytest.approx(0.0, abs=1e-6)
     assert rows[OURS]["num_scans"] == NUM_SCANS
     assert rows["localization, int8"]["num_scans"] == 3
+    # Two runs with a state each, which differ in the source of the first guess.
+    proposers = [
+        load_state(path).state.slam_map.origin.config.odometry.proposer for path in out.glob("**/run_state.npz")
+    ]
+    assert sorted(proposers) == ["network", "prediction"]
+    assert 0 <= rows[NETWORK]["num_from_network"] < rows[NETWORK]["num_scans"] == NUM_SCANS
     for name in ("table.md", "trajectories.png", "map_sizes.png"):
         assert (out / name).stat().st_size > 0
     assert f"| toy 1 | {NUM_SCANS}, 10 m | {PEER} | 0.000 |" in (out / "table.md").read_text()
@@ -145,7 +153,7 @@ def test_refinements_are_rows_that_a_resumed_run_may_add(with_toys, tmp_path, mo
     assert run("--slam", "--resume", "--refine", "-o", out) == EXIT_OK
     assert f"{MULTIWAY} was not run: open3d is not installed" in capsys.readouterr().out
     rows = {row["method"]: row for row in load_json(out / "metrics.json")["rows"]}
-    assert list(rows) == ["steady", OURS, ODOMETRY, REFINED]
+    assert list(rows) == ["steady", OURS, NETWORK, ODOMETRY, REFINED]
     refined = rows[REFINED]
     assert (refined["refine_windows"], refined["num_scans"]) == (1, NUM_SCANS)
     assert refined["ate_m"] > rows[OURS]["ate_m"] + 0.5
