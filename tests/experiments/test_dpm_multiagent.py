@@ -121,7 +121,7 @@ def test_parts_overlap_and_hold_all_scans() -> None:
         (["--agents", 0], "--agents"),
         (["--overlap", 2], "--overlap"),
         (["--overlap", "nan"], "--overlap"),
-        (["/no/such/folder"], "no such folder"),
+        (["/no/such/folder"], "no such file or folder"),
         (["a", "b", "--sequence", "00"], "--sequence"),
     ],
 )
