@@ -16,6 +16,7 @@ from dpmjax.cli.result_files import load_json
 from dpmjax.cli.run_folder import RunFolder
 from dpmjax.geometry import rigid
 from dpmjax.io import LidarSequence
+from dpmjax.saved_maps import load_state
 from dpmjax.slam import RefinedKeyframes
 from experiments import _slam_comparison, _slam_evaluation, _slam_peers, _slam_refine, dpm_evaluate
 from experiments._slam_evaluation import NETWORK, ODOMETRY, OURS, Drive, FoundLoop, StoppedError
@@ -99,6 +100,12 @@ def test_every_method_gets_a_row_and_a_resumed_run_computes_nothing_again(
     assert rows[PEER]["ate_m"] == pytest.approx(0.0, abs=1e-6)
     assert rows[OURS]["num_scans"] == NUM_SCANS
     assert rows["localization, int8"]["num_scans"] == 3
+    # Two runs with a state each, which differ in the source of the first guess.
+    proposers = [
+        load_state(path).state.slam_map.origin.config.odometry.proposer for path in out.glob("**/run_state.npz")
+    ]
+    assert sorted(proposers) == ["network", "prediction"]
+    assert 0 <= rows[NETWORK]["num_from_network"] < rows[NETWORK]["num_scans"] == NUM_SCANS
     for name in ("table.md", "trajectories.png", "map_sizes.png"):
         assert (out / name).stat().st_size > 0
     assert f"| toy 1 | {NUM_SCANS}, 10 m | {PEER} | 0.000 |" in (out / "table.md").read_text()
