@@ -278,6 +278,21 @@ def test_sparse_scans_are_tracked_from_the_first_one_on() -> None:
     assert {report.status for report in result.reports[1:]} == {"tracked"}
 
 
+class UnsureMatcher(TruthMatcher):
+    """Proposals are right, but the network does not know."""
+
+    def propose(self, source, target, num_motions):
+        return super().propose(source, target, num_motions)._replace(probability=0.1)
+
+
+def test_a_fast_drive_of_sparse_scans_starts_though_the_network_is_unsure() -> None:
+    # Steps of 3 m: no score is usual yet, and the motion of before is not known.
+    truth = laps(1, side_m=60.0, step_m=3.0)[:12]
+    matcher = UnsureMatcher(truth, gross_share=0.0)
+    result = run(truth, matcher=matcher, geometry=SparseGeometry(truth))
+    assert "predicted" not in {report.status for report in result.reports}
+
+
 def test_the_settings_of_the_paper_ask_the_network_for_every_scan() -> None:
     paper = slam_preset("paper")
     assert slam_preset("default") == SlamConfig()

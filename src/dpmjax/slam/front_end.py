@@ -15,7 +15,6 @@ from dpmjax.deeppointmap.compact_scans import CompactScan
 from dpmjax.geometry import rigid
 from dpmjax.scans.deskew import deskew
 from dpmjax.slam.alignment import Alignment, ThinnedScan, best_of
-from dpmjax.slam.config import FrontEndConfig
 from dpmjax.slam.keyframes import (
     EdgeKind,
     Keyframe,
@@ -175,14 +174,15 @@ def _locate(methods: SlamMethods, state: FrontEndState, local_map: LocalMap, sca
     # Nothing is usual yet where a part of the map begins: sparse scans never score high.
     wanted = max(config.min_score, config.min_score_share * usual if state.scores else 0.0)
     tried = _attempt(methods, state, local_map, scan, usual)
-    best = _better(tried, config)
+    # Nothing supports the prediction before any motion is known.
+    best = _better(tried, config.near_m, config.min_margin if state.scores else 0.0)
     is_matched = best is tried.matched
     numbers = f"score {best.score:.2f} of usually {usual:.2f}"
     if tried.probability is not None:
         numbers += f", P {tried.probability:.2f} by the network"
     network = tried.probability, tried.compact
     is_far = not are_near(predicted, best.T_map_scan, config.near_m, np.inf)
-    if is_far and (tried.probability or 0.0) < config.min_probability:
+    if is_far and state.scores and (tried.probability or 0.0) < config.min_probability:
         # A motion that neither the motion of before nor the decoder supports needs the usual score.
         wanted = methods.config.odometry.good_share * usual
     if best.score >= wanted or _is_confirmed(methods, tried, best):
@@ -221,14 +221,13 @@ def _attempt(
     return _Attempt(tracked, matched, starts[0], proposal.probability, compact)
 
 
-def _better(tried: _Attempt, config: FrontEndConfig) -> Alignment:
+def _better(tried: _Attempt, near_m: float, min_margin: float) -> Alignment:
     """Returns the better pose; another place must fit better by a margin than the one that the prediction supports."""
     tracked, matched = tried.tracked, tried.matched
     if tracked is None or matched is None:
         return best_of([found for found in (tracked, matched) if found is not None])
-    is_same = are_near(tracked.T_map_scan, matched.T_map_scan, config.near_m, config.near_rad)
-    margin = 0.0 if is_same else config.min_margin
-    return matched if matched.score > tracked.score + margin else tracked
+    is_same = are_near(tracked.T_map_scan, matched.T_map_scan, near_m, np.inf)
+    return matched if matched.score > tracked.score + (0.0 if is_same else min_margin) else tracked
 
 
 def _is_confirmed(methods: SlamMethods, tried: _Attempt, best: Alignment) -> bool:
