@@ -19,7 +19,7 @@ class ThinnedScan(NamedTuple):
     """A scan after its one thinning and its one neighbour search.
 
     Attributes:
-        pyramid: what the encoder reads.
+        pyramid: input of the encoder.
         elements: surface elements, metres, in the frame of the lidar, in the order of farthest points.
         measured: surface and free space.
         surface: that surface, and all thinned points.

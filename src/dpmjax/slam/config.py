@@ -127,39 +127,39 @@ class FrontEndConfig:
 
 @dataclass(frozen=True)
 class LoopClosureConfig:
-    """Which keyframes are compared with a new one, and which registrations become edges.
+    """Candidates of loops, and acceptance of their registrations.
 
     Attributes:
         is_on: False leaves the map as odometry makes it.
-        min_path_share: keyframes nearer than this many extents along the path are no candidates.
-        radius_share: candidates are within this many extents ...
-        drift_share: ... plus this share of the path since.
-        max_radius_m: upper bound of that radius (DeepPointMap: 100 m).
-        num_near: at most so many candidates by distance.
-        num_similar: at most so many candidates by retrieval.
-        min_cosine: candidates by retrieval are at least this similar.
-        min_overlap: a candidate is registered from this overlap probability on; 0 asks no network.
-        num_asked: so many candidates are asked at a time, those by distance and by retrieval in turn, ...
-        sure_overlap: ... until one has at least this overlap probability.
-        num_registered: at most so many candidates are registered, until one is believed.
-        min_probability: a registration is believed from this P(correct) on.
-        min_matched_share: share of the points that must meet planes, where the scans verify a registration.
-        max_contradicted_share: share of the points that may lie in free space.
-        min_support: number of consistent registrations, itself among them, that a loop needs to become an edge.
-        pending_path_m: registrations support each other if both ends are nearer than this along the path.
-        sigma_m: standard deviation of a registration by descriptors ...
-        sigma_rad: ... and of its rotation.
-        floor_m: least standard deviation of a loop whose scans were aligned: scans hold walkers and rolling shutter ...
-        floor_rad: ... and of its rotation.
-        drift_m: standard deviation of odometry over one metre; it grows with the root of the path ...
-        drift_rad: ... and that of its rotation.
-        consistent_sigmas: a cycle closes within this many standard deviations.
-        min_drift_share: a loop may also contradict odometry by this share of the path.
-        edge_outlier_chi2: cost at which the optimisation lets a loop edge go.
-        taken_back_weight: a loop edge with a smaller weight after the optimisation is taken back.
-        rest_share: no loop is looked for on this many extents of the path after an accepted one.
-        every_keyframes: the graph is optimised at most once in this many keyframes ...
-        every_share: ... and in this share of all, so that the cost of a scan does not grow with the map.
+        min_path_share: smallest distance of a candidate along the path, in extents.
+        radius_share: radius of the candidates by distance, in extents.
+        drift_share: share of the path since a candidate that is added to the radius.
+        max_radius_m: upper bound of the radius (DeepPointMap: 100 m).
+        num_near: largest number of candidates by distance.
+        num_similar: largest number of candidates by retrieval.
+        min_cosine: smallest similarity of a candidate by retrieval.
+        min_overlap: smallest overlap probability of a candidate that is registered; 0 uses no network.
+        num_asked: number of candidates whose overlap is predicted at a time, of both kinds in turn.
+        sure_overlap: overlap probability from which on no further candidate is looked at.
+        num_registered: largest number of candidates that are registered.
+        min_probability: smallest P(correct) of an accepted registration.
+        min_matched_share: smallest share of points that meet planes, where the scans verify a registration.
+        max_contradicted_share: largest share of points in free space.
+        min_support: number of consistent registrations, itself among them, that make a loop an edge.
+        pending_path_m: largest distance along the path between the ends of registrations that support each other.
+        sigma_m: standard deviation of a registration by descriptors.
+        sigma_rad: standard deviation of its rotation.
+        floor_m: lower bound of the standard deviation of an aligned loop: scans hold walkers and motion.
+        floor_rad: lower bound of the standard deviation of its rotation.
+        drift_m: standard deviation of odometry over one metre; it grows with the root of the path.
+        drift_rad: standard deviation of its rotation over one metre.
+        consistent_sigmas: number of standard deviations within which a cycle closes.
+        min_drift_share: share of the path by which a loop may contradict odometry in any case.
+        edge_outlier_chi2: cost from which on the optimisation reduces the weight of a loop edge.
+        taken_back_weight: smallest weight of a loop edge that stays after the optimisation.
+        rest_share: path after an accepted loop on which no other is looked for, in extents.
+        every_keyframes: smallest number of keyframes between two optimisations.
+        every_share: the same as a share of all keyframes, so that the cost of a scan does not grow with the map.
     """
 
     is_on: bool = True
@@ -220,10 +220,10 @@ class SlamConfig:
 
 
 class MapOrigin(NamedTuple):
-    """What made a map.
+    """Origin of a map.
 
     Attributes:
-        fingerprint: of the matcher; its descriptions cannot be compared with those of another one.
+        fingerprint: of the matcher; keyframes of another matcher cannot be compared.
         config: settings of SLAM.
         weights: name of the weights, for messages; may be empty.
     """

@@ -160,7 +160,7 @@ def _pass_over(state: FrontEndState, slam_map: KeyframeMap) -> tuple[FrontEndSta
 
 
 class _Attempt(NamedTuple):
-    # The pose from the prediction or another motion, that from the decoder, and what the decoder said.
+    # The best pose from the prediction and other motions; the best pose from the decoder's motions, and these.
     tracked: Alignment | None
     matched: Alignment | None = None
     T_map_scan: Pose | None = None

@@ -82,7 +82,7 @@ class KeyframeMap:
 
 
 class Submap(NamedTuple):
-    """Keyframes around one of them, to be registered as a whole.
+    """Keyframes around a central one, which are registered as a whole.
 
     Attributes:
         scans: of the keyframes; the first is the central one.
@@ -127,7 +127,7 @@ def with_origin(slam_map: KeyframeMap, origin: MapOrigin) -> KeyframeMap:
 
     Args:
         slam_map: the map.
-        origin: what is about to read or extend it.
+        origin: of the matcher that reads or extends it.
 
     Returns:
         The map after.
@@ -283,7 +283,7 @@ def turn_rad(T_a_b: Pose) -> float:
 
 
 def are_near(T_a: Pose, T_b: Pose, most_m: float, most_rad: float) -> bool:
-    """Whether two poses of one thing differ by at most a distance and a turn.
+    """Returns True if two poses of one thing differ by at most a distance and a turn.
 
     Args:
         T_a: a pose.

@@ -44,7 +44,7 @@ def close_loops(methods: SlamMethods, slam_map: KeyframeMap, state: LoopState) -
 
 
 def is_resting(slam_map: KeyframeMap, loops: Sequence[Loop], row: int, config: LoopClosureConfig) -> bool:
-    """Whether a loop was accepted just before: another one would tell little.
+    """Returns True shortly after an accepted loop: another one would add little.
 
     Args:
         slam_map: the map.
@@ -73,7 +73,7 @@ def examine_candidates(
         slam_map: the map.
         loops: so far; in the order of the keyframes of each chain.
         row: of the keyframe.
-        candidates: what it is compared with.
+        candidates: older keyframes that may show the same place.
 
     Returns:
         All loops after.
@@ -101,7 +101,7 @@ def num_accepted(loops: Iterable[Loop]) -> int:
 def _register_candidates(
     methods: SlamMethods, slam_map: KeyframeMap, row: int, candidates: list[LoopCandidate]
 ) -> list[Loop]:
-    """Registers the candidates that most probably overlap, one after the other, until one is believed."""
+    """Registers the candidates that most probably overlap, one by one, until one is accepted."""
     config, front = methods.config.loops, methods.config.front_end
     loops = [
         Loop(row, candidate.row, candidate.found_by, _unregistered(overlap, config), overlap)
@@ -130,7 +130,7 @@ def _register_candidates(
 def _overlaps(
     methods: SlamMethods, slam_map: KeyframeMap, row: int, candidates: list[LoopCandidate]
 ) -> list[float | None]:
-    """Asks for the overlap of some candidates at a time, until one surely overlaps; None for those not asked."""
+    """Predicts the overlap of some candidates at a time, until one surely overlaps; None for the remaining ones."""
     config = methods.config.loops
     if config.min_overlap == 0:
         return [1.0] * len(candidates)
@@ -151,7 +151,7 @@ def _unregistered(overlap: float | None, config: LoopClosureConfig) -> LoopStatu
 
 
 def _edge_information(match: Match, config: LoopClosureConfig) -> Float[np.ndarray, "6 6"]:
-    """Returns what the planes tell, with a floor; descriptors alone are as exact as the configuration says."""
+    """Returns the information by the planes, with an upper bound; for descriptors alone, that of the configuration."""
     if match.information is None:
         return diagonal_information(config.sigma_m, config.sigma_rad)
     return with_least_covariance(match.information, config.floor_m, config.floor_rad)

@@ -1,4 +1,4 @@
-"""Which registrations of loop candidates are believed: by their own numbers, by odometry, and by one another.
+"""Acceptance of the registrations of loop candidates: by their own numbers, by odometry, and by one another.
 
 A single registration may be wrong in a place that looks like another. It becomes an edge only together with others, of
 other keyframes, that agree with it over the odometry between them (pairwise consistency, Mangelson et al. 2018).
@@ -28,7 +28,7 @@ def status_of(slam_map: KeyframeMap, loop: Loop, match: Match, config: LoopClosu
         config: thresholds.
 
     Returns:
-        "waits for support", or why the registration is not believed.
+        "waits for support", or the reason of the rejection.
     """
     if match.probability < config.min_probability:
         return "improbable"
@@ -48,7 +48,7 @@ def status_of(slam_map: KeyframeMap, loop: Loop, match: Match, config: LoopClosu
 
 
 def scans_agree(match: Match, config: LoopClosureConfig) -> bool:
-    """Whether enough points of the scans meet planes under a registration, and few lie in free space.
+    """Returns True if enough points of the scans meet planes under a registration, and few lie in free space.
 
     Args:
         match: the registration.
@@ -62,7 +62,7 @@ def scans_agree(match: Match, config: LoopClosureConfig) -> bool:
 
 
 def shares_suffice(matched_share: float, contradicted_share: float, config: LoopClosureConfig) -> bool:
-    """Whether enough points meet planes, and few lie in free space.
+    """Returns True if enough points meet planes, and few lie in free space.
 
     Args:
         matched_share: of the points that are compared.
@@ -113,7 +113,7 @@ def accept_consistent(
 
 
 def are_consistent(slam_map: KeyframeMap, loop: Loop, other: Loop, config: LoopClosureConfig) -> bool:
-    """Whether two loops of different keyframes and the odometry between their ends make a cycle that closes.
+    """Returns True if two loops of different keyframes and the odometry between their ends make a cycle that closes.
 
     Args:
         slam_map: the map.
@@ -140,7 +140,7 @@ def are_consistent(slam_map: KeyframeMap, loop: Loop, other: Loop, config: LoopC
 
 
 def _is_near_along(slam_map: KeyframeMap, row: int, other: int, config: LoopClosureConfig) -> bool:
-    """Whether two keyframes are near each other along one unbroken path."""
+    """Returns True if two keyframes are near each other along one unbroken path."""
     a, b = slam_map.keyframes[row], slam_map.keyframes[other]
     return a.segment == b.segment and abs(a.path_m - b.path_m) <= config.pending_path_m
 

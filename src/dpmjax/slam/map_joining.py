@@ -1,6 +1,6 @@
 """Joining of maps: loops between them are found by what places look like, and maps that meet become one graph.
 
-Nothing is known of where one map lies in another (DeepPointMap section 4, multi-agent SLAM). Candidates are keyframes
+The relative pose of two maps is unknown (DeepPointMap section 4, multi-agent SLAM). Candidates are keyframes
 of the other maps that look alike. They are registered, verified and accepted as all loops are: only together with
 others that agree with them over the odometry of both maps.
 """

@@ -1,4 +1,4 @@
-"""Optimisation of a map: odometry and loops agree as well as they can; loops that contradict the rest go."""
+"""Optimisation of a map: poses that agree best with odometry and loops; contradicting loops are removed."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ CERTAIN = 1e9
 
 
 def optimize_map(slam_map: KeyframeMap, state: LoopState, config: LoopClosureConfig) -> tuple[KeyframeMap, LoopState]:
-    """Optimises all poses, and takes back loops that contradict the rest.
+    """Optimises all poses, and removes loops that contradict the other edges.
 
     Parts that loops join for the first time are first moved to where a loop says. A predicted motion gives way where
     measured ones join its ends.

@@ -1,4 +1,4 @@
-"""What SLAM is made of: who recognises places, who aligns scans, and the settings."""
+"""The parts of SLAM: matcher, geometry and settings."""
 
 from __future__ import annotations
 
@@ -26,5 +26,5 @@ class SlamMethods(NamedTuple):
 
     @property
     def origin(self) -> MapOrigin:
-        """What maps note of these methods."""
+        """The origin that maps of these methods note."""
         return MapOrigin(self.matcher.fingerprint, self.config, self.weights)

@@ -1,4 +1,4 @@
-"""What SLAM reports: one record for each scan and one for each loop candidate, each with the reason of its decision."""
+"""Reports of SLAM: a record for each scan and for each loop candidate, with the reason of its decision."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ LoopStatus = Literal[
 
 
 class ScanReport(NamedTuple):
-    """How a scan was placed.
+    """The pose of a scan and how it was found.
 
     Attributes:
         scan: its number.
@@ -43,7 +43,7 @@ class ScanReport(NamedTuple):
         T_keyframe_scan: relative pose; loops move the keyframe only.
         is_keyframe: whether it became one.
         score: agreement of the scan with the local map.
-        probability: P(correct) of the network; None where it was not asked.
+        probability: P(correct) of the network; None where it did not run.
         num_accepted: number of loops that were accepted at this scan.
         num_points: number of points of the scan.
         T_turn: predicted motion that a scan with times was deskewed by; None for a scan without times.
@@ -70,7 +70,7 @@ class Loop(NamedTuple):
         target: row of an older one.
         found_by: how it became a candidate; "map" is a loop of the map that was extended.
         status: what became of it.
-        overlap: probability of overlap; 1 where no network is asked, None where another candidate surely overlaps.
+        overlap: probability of overlap; 1 where no network predicts it, None where another candidate surely overlaps.
         probability: P(correct) of the registration; None without one.
         rmse: of the registration, metres; None without one.
         T_target_source: the registration; None without one.

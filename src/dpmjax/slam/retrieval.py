@@ -37,12 +37,12 @@ def most_similar(
 ) -> tuple[Int[np.ndarray, " m"], Float[np.ndarray, " m"]]:
     """Finds the vectors with the largest cosine.
 
-    What all vectors share tells nothing about a place, so their mean is taken off first where there are enough.
+    The mean of many vectors says nothing about a place, so it is subtracted first.
 
     Args:
         vectors: unit vectors.
         query: any length of vector.
-        count: at most so many.
+        count: largest number of vectors.
         is_allowed: False for vectors that are no candidates.
 
     Returns:

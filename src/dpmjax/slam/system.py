@@ -39,7 +39,7 @@ class SlamState(NamedTuple):
 
 
 class SlamResult(NamedTuple):
-    """What `run_slam` returns.
+    """Result of `run_slam`.
 
     Attributes:
         T_world_scan: (n, 4, 4) float64, of every scan; the world is the frame of the first one, or of the map that was
