@@ -227,7 +227,7 @@ def _are_numbers(stamps: FloatArray, times: FloatArray | None, num_scans: int) -
         return True
     spans = float(np.ptp(stamps)), float(np.ptp(times))
     is_other_time = abs(spans[0] - spans[1]) > 1.0 + 0.1 * max(spans)
-    return is_other_time or (len(stamps) == num_scans and abs(stamps.min() - times.min()) > 1.0)
+    return is_other_time or (len(stamps) == num_scans and bool(abs(stamps.min() - times.min()) > 1.0))
 
 
 def _by_time(stamps: FloatArray, poses: FloatArray, times: FloatArray) -> tuple[FloatArray, float]:
