@@ -24,8 +24,8 @@ from dpmjax.types import PointPyramid
 MAX_VIEWED = 4000
 """Number of elements of the local map that are compared with the free space of a scan."""
 
-MAX_ELEMENTS = 8000
-"""Largest number of surface elements of a scan."""
+MAX_ELEMENTS = 3000
+"""Largest number of surface elements of a scan: rings of denser scans hold on to each other."""
 
 NEIGHBOURHOODS = SurfaceConfig(sparse_radius_share=1.5)
 """Scans of 1,000 points have neighbours farther away than others."""
