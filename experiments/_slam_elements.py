@@ -1,50 +1,97 @@
-"""Methods of SLAM whose map keeps fewer surface elements of a scan, for ablations; the scan itself keeps all."""
+"""Methods of SLAM for ablations: maps of fewer surface elements, and descriptors without surface elements."""
 
 from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
 
 import jax
 import numpy as np
 
 from dpmjax.deeppointmap.compact_scans import CompactScan
-from dpmjax.slam import Geometry, Matcher, SlamMethods, ThinnedScan
+from dpmjax.slam import Alignment, Geometry, LocalMap, Match, Matcher, SlamMethods, Submap, ThinnedScan
+from dpmjax.slam.keyframes import diagonal_information
 
 
-class _FewerOfKeyframes:
+def with_network(methods: SlamMethods) -> SlamMethods:
+    """Returns methods whose decoder is the source of every first guess."""
+    odometry = replace(methods.config.odometry, proposer="network")
+    return methods._replace(config=replace(methods.config, odometry=odometry))
+
+
+def with_fewer_elements(methods: SlamMethods, num_elements: int) -> SlamMethods:
+    """Returns methods whose map keeps at most `num_elements` surface elements of each scan; the scan itself has all."""
+    matcher = _FewerOfKeyframes(methods.matcher, num_elements)
+    return methods._replace(matcher=matcher, geometry=_FewerOfScans(methods.geometry, num_elements))
+
+
+def without_elements(methods: SlamMethods) -> SlamMethods:
+    """Returns methods without surface elements: each pose and each loop stays as the decoder proposes it."""
+    sigmas = methods.config.loops.sigma_m, methods.config.loops.sigma_rad
+    alone = methods._replace(
+        matcher=_DecoderAlone(methods.matcher),
+        geometry=_Unmoved(methods.geometry, diagonal_information(*sigmas)),
+    )
+    return with_network(alone)
+
+
+class _Wrapped:
+    """A matcher or a geometry of which some functions are replaced."""
+
+    def __init__(self, wrapped: Any) -> None:
+        self._wrapped = wrapped
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._wrapped, name)
+
+
+class _FewerOfKeyframes(_Wrapped):
     """A matcher whose keyframes keep the first elements, in the order of farthest points, and their features."""
 
     def __init__(self, matcher: Matcher, num_elements: int) -> None:
-        self._matcher, self._num = matcher, num_elements
-
-    def __getattr__(self, name: str) -> object:
-        return getattr(self._matcher, name)
+        super().__init__(matcher)
+        self._num = num_elements
 
     def encode(self, scan: ThinnedScan) -> CompactScan:
-        whole = self._matcher.encode(scan)
+        whole = self._wrapped.encode(scan)
         unit_m, *arrays = whole.elements
         elements = type(whole.elements)(unit_m, *(array[: self._num] for array in arrays))
-        features, steps, directions = (
-            array[: self._num] for array in (whole.features, whole.feature_steps, whole.directions)
-        )
-        return CompactScan(elements, features, steps, directions, whole.image)
+        described = (array[: self._num] for array in (whole.features, whole.feature_steps, whole.directions))
+        return CompactScan(elements, *described, whole.image)
 
 
-class _FewerOfScans:
+class _FewerOfScans(_Wrapped):
     """A geometry whose scans leave their first elements in the local map."""
 
     def __init__(self, geometry: Geometry, num_elements: int) -> None:
-        self._geometry, self._num = geometry, num_elements
-
-    def __getattr__(self, name: str) -> object:
-        return getattr(self._geometry, name)
+        super().__init__(geometry)
+        self._num = num_elements
 
     def thin(self, points: np.ndarray) -> ThinnedScan | None:
-        whole = self._geometry.thin(points)
+        whole = self._wrapped.thin(points)
         if whole is None:
             return None
         return whole._replace(elements=jax.tree.map(lambda array: array[: self._num], whole.elements))
 
 
-def with_fewer_elements(methods: SlamMethods, num_elements: int) -> SlamMethods:
-    """Returns methods whose map keeps at most `num_elements` surface elements of each scan."""
-    matcher = _FewerOfKeyframes(methods.matcher, num_elements)
-    return methods._replace(matcher=matcher, geometry=_FewerOfScans(methods.geometry, num_elements))
+class _Unmoved(_Wrapped):
+    """A geometry that returns the first of the given poses and accepts it."""
+
+    def __init__(self, geometry: Geometry, information: np.ndarray) -> None:
+        super().__init__(geometry)
+        self._information = information
+
+    def align(self, local_map: LocalMap, scan: ThinnedScan, T_map_scan: np.ndarray) -> Alignment:
+        return Alignment(T_map_scan, 1.0, 0.0, 1.0, self._information)
+
+    def search(self, local_map: LocalMap, scan: ThinnedScan, T_map_scan: np.ndarray) -> Alignment:
+        return self.align(local_map, scan, T_map_scan[0])
+
+
+class _DecoderAlone(_Wrapped):
+    """A matcher that registers the central scans of submaps by their descriptors, and verifies nothing."""
+
+    def register(self, pairs: Sequence[tuple[Submap, Submap]]) -> list[Match]:
+        proposals = [self._wrapped.propose(source.scans[0], target.scans[0], 1) for source, target in pairs]
+        return [Match(proposal.T_target_source[0], proposal.probability, np.nan) for proposal in proposals]

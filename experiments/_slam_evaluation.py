@@ -25,6 +25,7 @@ from dpmjax.io import LidarSequence
 from dpmjax.metrics import find_revisits, loop_recall, path_lengths, registration_recall
 from dpmjax.saved_maps import Precision
 from dpmjax.slam import KeyframeMap, SlamMethods, SlamResult
+from experiments._slam_elements import with_network
 from experiments._slam_peers import PEERS, POINT_BYTES, FoundLoop, Peer, is_indoors, peer_version
 
 # Both align with the map of surface elements; the first guess is the motion of before, or the decoder's for every scan.
@@ -106,12 +107,6 @@ def evaluate_ours(drive: Drive, methods: SlamMethods) -> dict[str, Any]:
 def evaluate_network(drive: Drive, methods: SlamMethods) -> dict[str, Any]:
     """Runs the whole system with the decoder as the source of every first guess (DeepPointMap section 4)."""
     return map_row(drive, drive.folder.part("methods", "network"), NETWORK, with_network(methods))[1]
-
-
-def with_network(methods: SlamMethods) -> SlamMethods:
-    """Returns methods whose decoder is the source of every first guess."""
-    odometry = replace(methods.config.odometry, proposer="network")
-    return methods._replace(config=replace(methods.config, odometry=odometry))
 
 
 def map_row(drive: Drive, folder: RunFolder, method: str, methods: SlamMethods) -> tuple[SlamResult, dict[str, Any]]:

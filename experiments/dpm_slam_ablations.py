@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 
 EXPERIMENT = "dpm_slam_ablations"
 NUM_ELEMENTS = (64, 128, 256, 512, 1024)
-WHOLE, NETWORK, DECODER = "whole", "network proposes every pose", "without surface elements"
+WHOLE, NETWORK, DECODER = "whole", "network proposes every pose", "decoder alone, without surface elements"
 NEAREST, NO_OFFSETS = "features of the nearest keyframe alone", "without the offset head"
 SETTINGS = (WHOLE, NETWORK, DECODER, NEAREST, *(f"{num} elements" for num in NUM_ELEMENTS), NO_OFFSETS)
 
@@ -96,22 +96,15 @@ def evaluate(drive: Drive, model: Model, setting: str) -> dict[str, Any]:
 
 def ablated(model: Model, setting: str) -> SlamMethods:
     """Returns the methods of a setting."""
-    from dpmjax.scans.surface_alignment import AlignmentConfig, AlignmentLevel
     from dpmjax.slam import make_methods
-    from experiments._slam_elements import with_fewer_elements
-    from experiments._slam_evaluation import with_network
+    from experiments._slam_elements import with_fewer_elements, with_network, without_elements
 
     methods = make_methods(model)
     config = methods.config
     if setting == NETWORK:
         return with_network(methods)
     if setting == DECODER:
-        # No element is within this radius, so that each pose stays as the decoder proposes it.
-        unmoved = AlignmentConfig(levels=(AlignmentLevel(1e-6, 1, 1),))
-        verification = replace(model.config.verification, coarse=unmoved, fine=unmoved, refinement=unmoved)
-        model = replace(model, config=replace(model.config, verification=verification))
-        odometry = replace(config.odometry, proposer="network", narrow=unmoved, wide=unmoved)
-        return make_methods(model, replace(config, odometry=odometry))
+        return without_elements(methods)
     if setting == NEAREST:
         return make_methods(model, replace(config, front_end=replace(config.front_end, num_submap=1)))
     if setting == NO_OFFSETS:
