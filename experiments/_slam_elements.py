@@ -9,9 +9,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from dpmjax.deeppointmap.compact_scans import CompactScan
 from dpmjax.slam import Alignment, Geometry, LocalMap, Match, Matcher, SlamMethods, Submap, ThinnedScan
-from dpmjax.slam.keyframes import diagonal_information
 
 
 def with_network(methods: SlamMethods) -> SlamMethods:
@@ -28,12 +26,10 @@ def with_fewer_elements(methods: SlamMethods, num_elements: int) -> SlamMethods:
 
 def without_elements(methods: SlamMethods) -> SlamMethods:
     """Returns methods without surface elements: each pose and each loop stays as the decoder proposes it."""
-    sigmas = methods.config.loops.sigma_m, methods.config.loops.sigma_rad
-    alone = methods._replace(
-        matcher=_DecoderAlone(methods.matcher),
-        geometry=_Unmoved(methods.geometry, diagonal_information(*sigmas)),
-    )
-    return with_network(alone)
+    loops = methods.config.loops
+    information = np.diag(np.repeat([loops.sigma_m**-2.0, loops.sigma_rad**-2.0], 3))
+    geometry = _Unmoved(methods.geometry, information)
+    return with_network(methods._replace(matcher=_DecoderAlone(methods.matcher), geometry=geometry))
 
 
 class _Wrapped:
@@ -53,12 +49,12 @@ class _FewerOfKeyframes(_Wrapped):
         super().__init__(matcher)
         self._num = num_elements
 
-    def encode(self, scan: ThinnedScan) -> CompactScan:
+    def encode(self, scan: ThinnedScan) -> Any:
         whole = self._wrapped.encode(scan)
         unit_m, *arrays = whole.elements
         elements = type(whole.elements)(unit_m, *(array[: self._num] for array in arrays))
-        described = (array[: self._num] for array in (whole.features, whole.feature_steps, whole.directions))
-        return CompactScan(elements, *described, whole.image)
+        described = {name: getattr(whole, name)[: self._num] for name in ("features", "feature_steps", "directions")}
+        return whole._replace(elements=elements, **described)
 
 
 class _FewerOfScans(_Wrapped):
