@@ -31,8 +31,8 @@ def is_route(path: Path) -> bool:
 def route_drive(path: Path, seed: int) -> LidarSequence:
     """Simulates a town along a trajectory, and a drive through it; scans are simulated when they are first read.
 
-    Streets follow the trajectory, the ground its heights: where it passes a place twice, their mean. The car drives in
-    the middle of its lane at a steady speed, and tilts with the ground; rotations and times of the file do not count.
+    Streets follow the trajectory, the ground its slopes; all passes of a place have one height. The car keeps its lane
+    at a steady speed, and tilts with the ground: rotations and times of the file do not count.
 
     Args:
         path: poses of a lidar or of a camera as TUM or KITTI, metres.
