@@ -51,7 +51,7 @@ def with_equal_passes(positions: FloatArray) -> FloatArray:
 def _passes(places: FloatArray, way: FloatArray) -> np.ndarray:
     """(m, 2) rows of each place and of the nearest one of another pass."""
     distances, rows = KDTree(places).query(places, min(_NUM_NEAR, len(places)), distance_upper_bound=_NEAR_M)
-    is_found = np.isfinite(distances)
+    is_found, rows = np.isfinite(distances), np.asarray(rows)
     is_other = is_found & (np.abs(way[np.where(is_found, rows, 0)] - way[:, None]) > _LEAST_WAY_M)
     has_other = is_other.any(axis=1)
     first = is_other.argmax(axis=1)
