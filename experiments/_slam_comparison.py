@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from dpmjax import io, load_model, viz
-from dpmjax.cli import DriveSelection, RunFolder, do_row, is_route, keep_scans, open_drive, why_not_importable
+from dpmjax.cli import DriveSelection, RunFolder, do_row, keep_scans, open_drive, why_not_importable
 from dpmjax.io import LidarSequence
 from dpmjax.metrics import align_rigid, path_lengths
 from dpmjax.simulation import HDL64E, OS1_64, DriveConfig, LidarSensor, Scene, TownConfig, simulate_scene
@@ -103,7 +103,7 @@ def open_drives(choice: DriveChoice) -> list[LidarSequence]:
             rows = slice(None, None, part.jump)
             drives += [drive.take(rows).take(slice(part.num_scans)) for drive in simulated]
         else:
-            names: Sequence[str | None] = ([] if is_route(Path(entry)) else io.list_lidar_sequences(entry)) or [None]
+            names: Sequence[str | None] = io.list_lidar_sequences(entry) or [None]
             drives += [open_drive(replace(part, data=Path(entry), sequence=name)) for name in names]
     titles = [drive.name for drive in drives]
     if len(set(titles)) < len(titles):

@@ -66,7 +66,7 @@ class Config(RunOptions):
     may_change: ClassVar[frozenset[str]] = frozenset({"refine"})
 
     paths: Annotated[Positional[tuple[str, ...]], arg(metavar="town|PATH ...")] = ("town",)
-    """Folders of scans with poses, or simulated towns; with --slam also files of poses."""
+    """Folders of scans with poses, files of poses along which a town is simulated, or towns of the seeds."""
     weights: Annotated[str, arg(metavar="NAME|FILE")] = "dpm_small"
     """Name of a shipped model, or a .safetensors file."""
     slam: FlagCreatePairsOff[bool] = False

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from scipy.spatial import KDTree
 
+from dpmjax.cli.drive_sources import find_sources
 from dpmjax.cli.drives import DriveSelection, open_drive
 from dpmjax.cli.route_drives import STEP_M, keep_scans, route_drive
 from dpmjax.geometry import rigid
@@ -72,6 +73,12 @@ def test_poses_of_a_camera_and_of_a_lidar_far_from_the_origin_make_the_same_driv
     ]
     for other in drives[1:]:
         np.testing.assert_allclose(other.T_world_lidar, drives[0].T_world_lidar, atol=1e-4)
+
+
+def test_drives_to_train_and_to_evaluate_on_may_be_trajectories(without_rays) -> None:
+    path = write_tum(without_rays / "hill.txt", hill())
+    (source,) = find_sources([str(path)], [])
+    np.testing.assert_array_equal(source.open().T_world_lidar, route_drive(path, seed=0).T_world_lidar)
 
 
 def test_another_seed_makes_another_town(without_rays) -> None:
