@@ -36,8 +36,13 @@ if TYPE_CHECKING:
 EXPERIMENT = "dpm_slam_ablations"
 NUM_ELEMENTS = (64, 128, 256, 512, 1024)
 WHOLE, NETWORK, DECODER = "whole", "network proposes every pose", "decoder alone, without surface elements"
-NEAREST, NO_OFFSETS = "features of the nearest keyframe alone", "without the offset head"
-SETTINGS = (WHOLE, NETWORK, DECODER, NEAREST, *(f"{num} elements" for num in NUM_ELEMENTS), NO_OFFSETS)
+NEAREST, NO_OFFSETS = "features of the nearest keyframe alone", ", without the offset head"
+SETTINGS = (
+    WHOLE,
+    NEAREST,
+    *(f"{num} elements" for num in NUM_ELEMENTS),
+    *(f"{proposer}{offsets}" for proposer in (NETWORK, DECODER) for offsets in ("", NO_OFFSETS)),
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -99,17 +104,17 @@ def ablated(model: Model, setting: str) -> SlamMethods:
     from dpmjax.slam import make_methods
     from experiments._slam_elements import with_fewer_elements, with_network, without_elements
 
-    methods = make_methods(model)
-    config = methods.config
+    if setting.endswith(NO_OFFSETS):
+        decoder = replace(model.config.decoder, predicts_offsets=False)
+        model = replace(model, config=replace(model.config, decoder=decoder))
+    methods, setting = make_methods(model), setting.removesuffix(NO_OFFSETS)
     if setting == NETWORK:
         return with_network(methods)
     if setting == DECODER:
         return without_elements(methods)
     if setting == NEAREST:
-        return make_methods(model, replace(config, front_end=replace(config.front_end, num_submap=1)))
-    if setting == NO_OFFSETS:
-        decoder = replace(model.config.decoder, predicts_offsets=False)
-        return make_methods(replace(model, config=replace(model.config, decoder=decoder)))
+        front_end = replace(methods.config.front_end, num_submap=1)
+        return methods._replace(config=replace(methods.config, front_end=front_end))
     return methods if setting == WHOLE else with_fewer_elements(methods, int(setting.split()[0]))
 
 
