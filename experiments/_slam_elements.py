@@ -9,7 +9,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from dpmjax.slam import Alignment, Geometry, LocalMap, Match, Matcher, SlamMethods, Submap, ThinnedScan
+from dpmjax.slam import Alignment, Geometry, LocalMap, Match, Matcher, SlamConfig, SlamMethods, Submap, ThinnedScan
 
 
 def with_network(methods: SlamMethods) -> SlamMethods:
@@ -22,6 +22,19 @@ def with_fewer_elements(methods: SlamMethods, num_elements: int) -> SlamMethods:
     """Returns methods whose map keeps at most `num_elements` surface elements of each scan; the scan itself has all."""
     matcher = _FewerOfKeyframes(methods.matcher, num_elements)
     return methods._replace(matcher=matcher, geometry=_FewerOfScans(methods.geometry, num_elements))
+
+
+def with_wider_radii(config: SlamConfig, factor: float) -> SlamConfig:
+    """Returns settings whose radii of alignment fit elements that are farther apart by a factor."""
+
+    def wider(alignment: Any) -> Any:
+        levels = (replace(level, radius_m=factor * level.radius_m) for level in alignment.levels)
+        return replace(alignment, levels=tuple(levels))
+
+    odometry = config.odometry
+    radius_m = factor * odometry.plane_radius_m
+    odometry = replace(odometry, narrow=wider(odometry.narrow), wide=wider(odometry.wide), plane_radius_m=radius_m)
+    return replace(config, odometry=odometry)
 
 
 def without_elements(methods: SlamMethods) -> SlamMethods:
