@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
@@ -9,7 +10,19 @@ from typing import Any
 import jax
 import numpy as np
 
-from dpmjax.slam import Alignment, Geometry, LocalMap, Match, Matcher, SlamConfig, SlamMethods, Submap, ThinnedScan
+from dpmjax import Model
+from dpmjax.slam import (
+    Alignment,
+    Geometry,
+    LocalMap,
+    Match,
+    Matcher,
+    SlamConfig,
+    SlamMethods,
+    Submap,
+    ThinnedScan,
+    make_methods,
+)
 
 
 def with_network(methods: SlamMethods) -> SlamMethods:
@@ -18,15 +31,18 @@ def with_network(methods: SlamMethods) -> SlamMethods:
     return methods._replace(config=replace(methods.config, odometry=odometry))
 
 
-def with_fewer_elements(methods: SlamMethods, num_elements: int) -> SlamMethods:
-    """Returns methods whose map keeps at most `num_elements` surface elements of each scan; the scan itself has all."""
-    matcher = _FewerOfKeyframes(methods.matcher, num_elements)
-    return methods._replace(matcher=matcher, geometry=_FewerOfScans(methods.geometry, num_elements))
+def with_fewer_elements(model: Model, num_elements: int) -> SlamMethods:
+    """Returns methods whose map keeps at most `num_elements` surface elements of each scan; the scan itself has all.
+
+    Fewer elements of the same surface are farther apart, by the root of the ratio: radii of odometry grow with it.
+    """
+    factor = max(math.sqrt(model.config.pyramid.stages[0].num_points / num_elements), 1.0)
+    whole = make_methods(model, _with_wider_radii(SlamConfig(), factor))
+    matcher = _FewerOfKeyframes(whole.matcher, num_elements)
+    return whole._replace(matcher=matcher, geometry=_FewerOfScans(whole.geometry, num_elements))
 
 
-def with_wider_radii(config: SlamConfig, factor: float) -> SlamConfig:
-    """Returns settings whose radii of alignment fit elements that are farther apart by a factor."""
-
+def _with_wider_radii(config: SlamConfig, factor: float) -> SlamConfig:
     def wider(alignment: Any) -> Any:
         levels = (replace(level, radius_m=factor * level.radius_m) for level in alignment.levels)
         return replace(alignment, levels=tuple(levels))

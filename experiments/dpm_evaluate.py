@@ -103,7 +103,9 @@ class Config(RunOptions):
     @property
     def selection(self) -> DriveSelection:
         """The scans of each drive, with --slam."""
-        return DriveSelection(num_scans=self.n_scans, jump=self.jump, is_kitti_corrected=self.kitti_angle_correction)
+        return DriveSelection(
+            num_scans=self.n_scans, jump=self.jump, is_kitti_corrected=self.kitti_angle_correction, seed=self.seed
+        )
 
 
 def main(config: Config) -> list[dict[str, Any]]:

@@ -9,7 +9,6 @@ results/dpm_slam_ablations/<time>/: table.md, metrics.json (ATE, loops, their re
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -103,7 +102,7 @@ def evaluate(drive: Drive, model: Model, setting: str) -> dict[str, Any]:
 def ablated(model: Model, setting: str) -> SlamMethods:
     """Returns the methods of a setting."""
     from dpmjax.slam import make_methods
-    from experiments._slam_elements import with_fewer_elements, with_network, with_wider_radii, without_elements
+    from experiments._slam_elements import with_fewer_elements, with_network, without_elements
 
     if setting.endswith(NO_OFFSETS):
         decoder = replace(model.config.decoder, predicts_offsets=False)
@@ -116,12 +115,7 @@ def ablated(model: Model, setting: str) -> SlamMethods:
     if setting == NEAREST:
         front_end = replace(methods.config.front_end, num_submap=1)
         return methods._replace(config=replace(methods.config, front_end=front_end))
-    if setting == WHOLE:
-        return methods
-    num_elements = int(setting.split()[0])
-    # Fewer elements of the same surface are farther apart by the root of the ratio.
-    factor = math.sqrt(model.config.pyramid.stages[0].num_points / num_elements)
-    return with_fewer_elements(make_methods(model, with_wider_radii(methods.config, factor)), num_elements)
+    return methods if setting == WHOLE else with_fewer_elements(model, int(setting.split()[0]))
 
 
 def table(rows: Sequence[dict[str, Any]]) -> str:
