@@ -21,8 +21,8 @@ _TIE_WEIGHT = 0.01
 def with_equal_passes(positions: FloatArray) -> FloatArray:
     """Returns the trajectory with heights that are equal where it passes a place again; slopes change least.
 
-    It solves a sparse least-squares problem: steps of height as they are, but at most 20 % of the way (a receiver that
-    stands still may rise by metres), and no step between two passes.
+    A sparse least-squares problem keeps the steps of height, and sets those between two passes to zero. Slopes are
+    limited to 20 %, because the height of a receiver that stands still may drift by metres.
 
     Args:
         positions: (n, 3) m, in order, at least 1 m long.
