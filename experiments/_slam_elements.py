@@ -7,10 +7,10 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
-import jax
 import numpy as np
 
 from dpmjax import Model
+from dpmjax.scans import surface_of_elements
 from dpmjax.slam import (
     Alignment,
     Geometry,
@@ -23,6 +23,7 @@ from dpmjax.slam import (
     ThinnedScan,
     make_methods,
 )
+from dpmjax.types import SurfaceElements
 
 
 def with_network(methods: SlamMethods) -> SlamMethods:
@@ -32,7 +33,7 @@ def with_network(methods: SlamMethods) -> SlamMethods:
 
 
 def with_fewer_elements(model: Model, num_elements: int) -> SlamMethods:
-    """Returns methods whose map keeps at most `num_elements` surface elements of each scan; the scan itself has all.
+    """Returns methods whose scans and keyframes have at most `num_elements` surface elements.
 
     Fewer elements of the same surface are farther apart, by the root of the ratio: radii of odometry grow with it.
     """
@@ -87,7 +88,7 @@ class _FewerOfKeyframes(_Wrapped):
 
 
 class _FewerOfScans(_Wrapped):
-    """A geometry whose scans leave their first elements in the local map."""
+    """A geometry whose scans have their first elements only."""
 
     def __init__(self, geometry: Geometry, num_elements: int) -> None:
         super().__init__(geometry)
@@ -97,7 +98,10 @@ class _FewerOfScans(_Wrapped):
         whole = self._wrapped.thin(points)
         if whole is None:
             return None
-        return whole._replace(elements=jax.tree.map(lambda array: array[: self._num], whole.elements))
+        surface, num = whole.measured.surface, self._num
+        mask = np.ones(len(surface.points[:num]), bool)
+        few = SurfaceElements(surface.points[:num], surface.normals[:num], surface.flatness[:num], mask)
+        return whole._replace(measured=whole.measured._replace(surface=surface_of_elements(few)))
 
 
 class _Unmoved(_Wrapped):

@@ -65,7 +65,7 @@ def test_a_map_of_fewer_elements_holds_the_first_ones(model, num_elements: int) 
 def test_without_elements_poses_and_loops_stay_as_they_are_proposed(model) -> None:
     drive, methods = toy.drive(1, num_scans=2), ablations.ablated(model, ablations.DECODER)
     slam_map, scan = step_slam(methods, init_slam(), drive[0])[0].slam_map, methods.geometry.thin(drive[1])
-    local_map = local_map_of(slam_map, methods.config.odometry)
+    local_map = local_map_of(slam_map, (), methods.config.odometry)
     T = np.tile(np.eye(4), (2, 1, 1))
     T[:, :3, 3] = [0.1, -0.2, 0.05], [3.0, 0.0, 0.0]
     for found in (methods.geometry.search(local_map, scan, T), methods.geometry.align(local_map, scan, T[0])):
