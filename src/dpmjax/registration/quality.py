@@ -20,11 +20,14 @@ import scipy.special
 from dpmjax.geometry import se2
 from dpmjax.registration.planar_scans import Floats, Indices, PlanarScans
 from dpmjax.registration.range_profiles import compare_pairs, make_profiles
+from dpmjax.registration.step_prior import StepPrior
 from dpmjax.registration.step_scores import pair_scores
 
 # Maps whose code lengths differ by less than this part are equally good as maps (how walls lie in the cells is worth
 # some percent); then their surfaces decide.
 _SAME_MAP = 0.1
+# Nats a beam that a nat a step counts as; and standard deviations of a step that cost nothing.
+_STEP_WEIGHT, _ALLOWED = 0.2, 3.0
 # Hits and passages that are counted at most; more would only take longer.
 _MAX_BEAMS = 40_000
 _SAMPLES_A_BEAM = 32
@@ -66,13 +69,17 @@ class Score(NamedTuple):
     Attributes:
         code_length: nats a beam for the map (`map_code_length`): whether the map is right as a whole.
         misfit: share of beams off the surfaces of near scans (`view_misfit`): how sharp it is.
+        surprise: mean nats a step beyond what its prior allows: how far it tears the odometry; 0 without a prior.
     """
 
     code_length: float
     misfit: float
+    surprise: float = 0.0
 
 
-def choose_trajectory(scans: PlanarScans, candidates: Mapping[str, Floats]) -> tuple[str, dict[str, Score]]:
+def choose_trajectory(
+    scans: PlanarScans, candidates: Mapping[str, Floats], *, prior: StepPrior | None = None
+) -> tuple[str, dict[str, Score]]:
     """The best trajectory: among those whose maps are about as short to describe as the shortest, the sharpest.
 
     With so much range noise that no map can be trusted, surfaces tell nothing, and the shortest is the best.
@@ -80,6 +87,7 @@ def choose_trajectory(scans: PlanarScans, candidates: Mapping[str, Floats]) -> t
     Args:
         scans: n scans.
         candidates: (n, 3) poses by name.
+        prior: of their steps; None: none.
 
     Returns:
         The name of the best, and the scores of all.
@@ -90,12 +98,24 @@ def choose_trajectory(scans: PlanarScans, candidates: Mapping[str, Floats]) -> t
     if not candidates:
         raise ValueError("candidates: expected at least one trajectory")
     scores = {
-        name: Score(map_code_length(scans, poses), view_misfit(scans, poses)) for name, poses in candidates.items()
+        name: Score(map_code_length(scans, poses), view_misfit(scans, poses), _surprise(poses, prior))
+        for name, poses in candidates.items()
     }
-    shortest = min(score.code_length for score in scores.values())
+    lengths = {name: score.code_length + _STEP_WEIGHT * score.surprise for name, score in scores.items()}
     same_map = 0.0 if scans.noise > _MAX_NOISE * scans.typical_range else _SAME_MAP
-    as_short = [name for name, score in scores.items() if score.code_length <= (1.0 + same_map) * shortest]
+    as_short = [name for name, length in lengths.items() if length <= (1.0 + same_map) * min(lengths.values())]
     return min(as_short, key=lambda name: scores[name].misfit), scores
+
+
+def _surprise(poses: Floats, prior: StepPrior | None) -> float:
+    """Returns the mean cost of the steps beyond that of three standard deviations."""
+    if prior is None:
+        return 0.0
+    steps = np.asarray(se2.relative(poses[:-1], poses[1:]))
+    allowed = prior.costs(
+        prior.steps + _ALLOWED * np.where(np.isfinite(prior.deviations), prior.deviations, 0.0) * [1.0, 0.0, 0.0]
+    )
+    return float(np.maximum(prior.costs(steps) - allowed, 0.0).mean())
 
 
 def map_code_length(scans: PlanarScans, poses: Floats) -> float:

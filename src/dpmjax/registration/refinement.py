@@ -19,13 +19,17 @@ from dpmjax.checks import as_beams
 from dpmjax.geometry import se2
 from dpmjax.pose_graph.graph import Edges, join_edges
 from dpmjax.pose_graph.normal_equations import solve_blocks
+from dpmjax.registration.held_steps import held_steps, matched_steps, open_projections, pose_steps, settle_steps
 from dpmjax.registration.incremental import incremental_icp
 from dpmjax.registration.line_adjustment import adjust_to_lines
-from dpmjax.registration.loop_closure import LoopConfig, close_loops, matched_steps, pose_steps
+from dpmjax.registration.loop_closure import LoopConfig, close_loops
 from dpmjax.registration.pair_alignment import FINE, PairSystem, Schedule, linearise_pair, match_pairs
 from dpmjax.registration.planar_scans import Floats, Indices, PlanarScans, planar_scans
 from dpmjax.registration.quality import choose_trajectory
+from dpmjax.registration.range_profiles import RangeProfiles, make_profiles
+from dpmjax.registration.step_prior import StepPrior
 from dpmjax.registration.step_scores import fitting_scans, interpolate
+from dpmjax.registration.step_slides import slide_steps
 from dpmjax.types import ScanSet
 
 # Distances of one round are kept below this by leaving out beams of the sources: about two seconds on two cores.
@@ -41,6 +45,7 @@ _ROUNDS = Schedule(gate=(0.09, 0.015), kernel=(0.06, 0.0015), num_iterations=14)
 _MIN_FITNESS, _MIN_EIGENVALUE = 0.35, 0.005
 # Scans are adjusted to common lines above this range noise, in typical ranges.
 _MIN_NOISE = 1.5e-4
+_NO_EDGES = Edges(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 3, 3)))
 
 
 @dataclass(frozen=True)
@@ -82,7 +87,11 @@ class Refined(NamedTuple):
 
 
 def refine(
-    scans: PlanarScans | ScanSet | ArrayLike, poses: ArrayLike, config: RefinementConfig | None = None
+    scans: PlanarScans | ScanSet | ArrayLike,
+    poses: ArrayLike,
+    config: RefinementConfig | None = None,
+    *,
+    prior: StepPrior | None = None,
 ) -> Refined:
     """Closes loops where the start leaves doubt, then aligns all scans together, and to common lines if there is noise.
 
@@ -96,6 +105,7 @@ def refine(
             `planar_scans(scans, is_ordered=False)`.
         poses: start, (n, 3) x, y, heading or (n, 3, 3) matrices, in the unit of the scans.
         config: settings.
+        prior: of the steps of ordered scans; None: that of the start, at the usual deviations.
 
     Returns:
         Refined; the first pose is that of the start, unless loops are kept.
@@ -107,41 +117,81 @@ def refine(
     scans = scans if isinstance(scans, PlanarScans) else planar_scans(as_beams("scans", scans))
     start = se2.as_poses("poses", poses, len(scans))
     candidates, num_loops = {"start": start}, {"start": 0}
+    if scans.is_ordered:
+        prior = prior or StepPrior.of_poses(start, scans.typical_range)
     if scans.is_ordered and config.loops is not None and not _is_sound(scans, start):
-        # The steps again, with those of the start as guess and as prior, where the scans leave a direction open.
-        chained, steps = incremental_icp(scans, odometry=start)
+        # The steps again, with those of the start as guess, and with the prior where the scans leave a direction open.
+        chained, steps = incremental_icp(scans, odometry=start, prior=prior)
         rows = np.flatnonzero(fitting_scans(scans, chained))
         if len(rows) < len(scans):
-            fitting = refine(scans.take(rows).replace(is_ordered=True), start[rows], config)
+            some = scans.take(rows).replace(is_ordered=True)
+            fitting = refine(some, start[rows], config, prior=prior.through(rows))
             return fitting._replace(poses=interpolate(len(scans), rows, fitting.poses))
-        matched = matched_steps(steps, scans.typical_range)
-        candidates["loops"], _, weights = close_loops(scans, chained, config.loops, steps=matched)
+        settled, slides = settle_steps(scans, steps, prior)
+        matched = matched_steps(settled, slides, scans.typical_range)
+        candidates["loops"], _, weights = close_loops(scans, se2.chain(settled.poses), config.loops, steps=matched)
         num_loops["loops"] = int((weights > 0.25).sum())
-    aligned = {name: _align_all(scans, candidate, config) for name, candidate in candidates.items()}
-    kept = "start" if len(aligned) == 1 else choose_trajectory(scans, aligned)[0]
+    aligned = {name: _align_all(scans, candidate, config, prior) for name, candidate in candidates.items()}
+    kept = "start" if len(aligned) == 1 else choose_trajectory(scans, aligned, prior=prior)[0]
     best = aligned[kept]
     if scans.noise > _MIN_NOISE * scans.typical_range:
         best = adjust_to_lines(scans, best)
     return Refined(best, num_loops[kept])
 
 
-def _align_all(scans: PlanarScans, poses: Floats, config: RefinementConfig) -> Floats:
+def _align_all(scans: PlanarScans, poses: Floats, config: RefinementConfig, prior: StepPrior | None) -> Floats:
     """Multi-view point-to-line alignment of all scans from nearby poses; the first pose is held."""
-    scales = _ROUNDS.gates_and_kernels(scans.typical_range, 1.25 * scans.noise)
-    steps = pose_steps(poses, scans.typical_range)
+    scales, profiles = _ROUNDS.gates_and_kernels(scans.typical_range, 1.25 * scans.noise), make_profiles(scans)
+    start = pose_steps(poses, scans.typical_range)
     # In units of one beam's information, as the systems of the pairs are.
-    trust = max(scans.noise, 0.00075 * scans.typical_range) ** 2 if scans.is_ordered else 1e-9
-    steps = steps._replace(information=steps.information * trust)
+    trust = 1e-9 if prior is None else max(scans.noise, 0.00075 * scans.typical_range) ** 2
     for round_number, scale in enumerate(zip(*scales, strict=True)):
         if round_number % config.refresh == 0:
-            source, target = choose_pairs(scans, poses, config)
-        edges, system = _linearise(scans, source, target, poses, scale)
+            pairs = _choose_aligned(profiles, poses, config, prior)
+            steps = join_edges(start, pairs.held)
+            steps = steps._replace(information=trust * steps.information)
+        edges, system = _linearise(scans, pairs.source, pairs.target, poses, scale)
+        edges = edges._replace(information=pairs.across @ edges.information @ pairs.across)
         here = se2.relative(poses[steps.target], poses[steps.source])
         pull = np.einsum("eij,ej->ei", steps.information, se2.relative(steps.measurements, here))
-        gradient = np.concatenate([np.asarray(system.gradient), pull])
-        edges = join_edges(edges, steps._replace(measurements=here))
+        gradient = np.einsum("eij,ej->ei", pairs.across, np.asarray(system.gradient))
+        edges, gradient = join_edges(edges, steps._replace(measurements=here)), np.concatenate([gradient, pull])
         poses = se2.compose(poses, solve_step(len(poses), edges, gradient))
     return poses
+
+
+class _AlignedPairs(NamedTuple):
+    """Pairs of scans that are aligned (p), and the steps that the scans do not fix.
+
+    Attributes:
+        source: (p,) rows.
+        target: (p,) rows.
+        across: (p, 3, 3) projections of tangents that drop the open direction of a pair.
+        held: edges of open and of torn steps.
+    """
+
+    source: Indices
+    target: Indices
+    across: Floats
+    held: Edges
+
+
+def _choose_aligned(
+    profiles: RangeProfiles, poses: Floats, config: RefinementConfig, prior: StepPrior | None
+) -> _AlignedPairs:
+    """Chooses the pairs to align at these poses; a torn step is held at its most probable place instead."""
+    scans, later = profiles.scans, np.arange(1, len(poses))
+    source, target = choose_pairs(scans, poses, config)
+    steps = se2.relative(poses[:-1], poses[1:])
+    if prior is None:
+        return _AlignedPairs(source, target, np.broadcast_to(np.eye(3), (len(source), 3, 3)), _NO_EDGES)
+    slides = slide_steps(profiles, later, later - 1, steps, prior)
+    crossed = np.append(0, np.cumsum(slides.is_torn))
+    is_kept = (crossed[source] == crossed[target]) | (source - target > max(config.temporal, default=0))
+    source, target = source[is_kept], target[is_kept]
+    relative = se2.relative(poses[target], poses[source])
+    across = open_projections(slide_steps(profiles, source, target, relative), relative)
+    return _AlignedPairs(source, target, across, held_steps(slides, poses, scans.typical_range))
 
 
 def solve_step(num_poses: int, edges: Edges, gradient: Floats) -> Floats:
