@@ -15,21 +15,22 @@ import numpy as np
 from dpmjax.geometry import se2
 from dpmjax.registration.incremental import match_near
 from dpmjax.registration.pair_alignment import COARSE, FINE, match_pairs
-from dpmjax.registration.planar_scans import Floats, PlanarScans
+from dpmjax.registration.planar_scans import Floats, Indices, PlanarScans
 from dpmjax.registration.range_profiles import make_profiles
 from dpmjax.registration.step_prior import StepPrior
-from dpmjax.registration.step_scores import pair_scores
 from dpmjax.registration.step_slides import slide_steps
 
 # Score above which a step is clear.
 _CLEAR_SCORE = 0.45
+# Longer steps are no guesses, typical ranges.
+_FARTHEST = 2.0
 # Least number of clear steps to calibrate with, and to recognise a fault with.
 _LEAST_STEPS = 5
 # Shortest moves (typical ranges) and turns (radians) that tell a scale or a sign.
 _LEAST_MOVE, _LEAST_TURN = 0.02, 0.08
 # Floors of the standard deviations of a step: typical ranges, radians; and per unit of length moved or turned.
 _FLOOR, _LENGTH_FLOOR, _TURN_FLOOR = (0.002, 0.005), 0.02, 0.02
-# A step agrees with the scans within these: share of the longer move and typical ranges; share of the larger turn, radians.
+# A step agrees with the scans within these: share of the longer move, typical ranges; share of the larger turn, radians.
 _MOVE_AGREEMENT, _TURN_AGREEMENT = (0.3, 0.01), (0.3, 0.03)
 # Shares of the clear steps that must agree under a fault, and may agree without it.
 _FAULT_SHARE, _SOUND_SHARE = 0.7, 0.4
@@ -53,30 +54,51 @@ _FAULTS: dict[str, Callable[[Floats], Floats]] = {
 
 
 class ClearSteps(NamedTuple):
-    """Steps that the scans fix by themselves.
+    """Steps between neighbours in time that the scans fix by themselves.
 
     Attributes:
-        rows: (m,) of the steps; step i leads from scan i to scan i + 1.
+        rows: (m,) step i leads from scan i to scan i + 1.
         steps: (m, 3) T_scan_next.
     """
 
-    rows: np.ndarray
+    rows: Indices
     steps: Floats
 
 
 class Odometry(NamedTuple):
-    """Calibrated odometry.
+    """Odometry, or a given trajectory, as evidence.
 
     Attributes:
-        prior: expected steps, scale corrected, and their standard deviations.
-        fault: a sentence on what is wrong with the axes or units of the odometry or the scans; None: nothing.
-        is_mirrored: the fault is that the scans are mirrored, and the expected steps are those of the mirrored
-            odometry.
+        poses: (n, 3) T_world_scan, a fault of its axes or units corrected.
+        prior: the steps at the scale of the scans, with their standard deviations.
+        fault: sentence on what was wrong with axes or units; None: nothing.
     """
 
+    poses: Floats
     prior: StepPrior
-    fault: str | None
-    is_mirrored: bool
+    fault: str | None = None
+
+    @property
+    def is_mirrored(self) -> bool:
+        """True where the scans are mirrored against the odometry; it does not tell which of the two is right."""
+        return self.fault == MIRRORED
+
+
+def calibrate_odometry(scans: PlanarScans, poses: Floats) -> Odometry:
+    """Estimates scale, noise and faults of odometry from the steps that the scans fix by themselves.
+
+    Args:
+        scans: n scans in time order, two at least.
+        poses: (n, 3) raw x, y, heading.
+
+    Returns:
+        Odometry; with the usual deviations where few steps are clear.
+    """
+    unit, clear = scans.typical_range, match_clear_steps(scans, poses)
+    fault = _find_fault(clear, poses, unit)
+    corrected = poses if fault is None else _FAULTS[fault](poses)
+    usual = StepPrior.of_poses(corrected, unit)
+    return Odometry(corrected, usual if len(clear.rows) < _LEAST_STEPS else _calibrate(clear, usual.steps, unit), fault)
 
 
 def match_clear_steps(scans: PlanarScans, odometry: Floats) -> ClearSteps:
@@ -91,35 +113,15 @@ def match_clear_steps(scans: PlanarScans, odometry: Floats) -> ClearSteps:
     """
     source, target = scans.take(slice(1, None)), scans.take(slice(len(scans) - 1))
     ways = [odometry, *(change(odometry) for change in _FAULTS.values())]
-    guesses = np.stack([se2.relative(poses[:-1], poses[1:]) for poses in ways], axis=1)
-    reach = np.hypot(guesses[..., 0], guesses[..., 1]) < 2.0 * scans.typical_range
-    near = match_near(source, target, "plane").poses
-    rough = match_pairs(source, target, np.where(reach[..., None], guesses, 0.0), COARSE).poses
-    steps = match_pairs(source, target, np.stack([near, rough], axis=1), FINE).poses
+    told = np.stack([se2.relative(poses[:-1], poses[1:]) for poses in ways], axis=1)
+    is_within = np.hypot(told[..., 0], told[..., 1]) < _FARTHEST * scans.typical_range
+    rough = match_pairs(source, target, np.where(is_within[..., None], told, 0.0), COARSE).poses
+    guesses = np.stack([match_near(source, target, "plane").poses, rough], axis=1)
+    steps = match_pairs(source, target, guesses, FINE).poses
     profiles, later = make_profiles(scans), np.arange(1, len(scans))
     slides = slide_steps(profiles, later, later - 1, steps)
-    is_clear = pair_scores(profiles, later, later - 1, steps) > _CLEAR_SCORE
-    is_clear &= ~slides.is_torn & ~slides.is_open
+    is_clear = (slides.scores > _CLEAR_SCORE) & ~slides.is_torn & ~slides.is_open
     return ClearSteps(np.flatnonzero(is_clear), steps[is_clear])
-
-
-def calibrate_odometry(scans: PlanarScans, odometry: Floats) -> Odometry:
-    """Estimates scale, noise and faults of odometry from the clear steps of the scans.
-
-    Args:
-        scans: n scans in time order, two at least.
-        odometry: (n, 3) raw poses x, y, heading.
-
-    Returns:
-        Odometry; with few clear steps the usual deviations, and no fault.
-    """
-    unit = scans.typical_range
-    clear = match_clear_steps(scans, odometry)
-    fault = _find_fault(clear, odometry, unit)
-    poses = odometry if fault is None else _FAULTS[fault](odometry)
-    usual = StepPrior.of_poses(poses, unit)
-    prior = usual if len(clear.rows) < _LEAST_STEPS else _calibrate(clear, usual.steps, unit)
-    return Odometry(prior, fault, fault == MIRRORED)
 
 
 def _find_fault(clear: ClearSteps, odometry: Floats, unit: float) -> str | None:

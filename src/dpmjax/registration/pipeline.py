@@ -21,10 +21,12 @@ from dpmjax.deepmapping.config import DeepMappingConfig
 from dpmjax.deepmapping.engine import Fit, Progress, fit
 from dpmjax.deepmapping.planar import Fitted, as_scan_set, fit_deepmapping
 from dpmjax.geometry import se2
+from dpmjax.registration.assessment import Assessment, assess_trajectory
 from dpmjax.registration.global_registration import nearest_tour, register_globally
 from dpmjax.registration.incremental import incremental_icp, scan_odometry
+from dpmjax.registration.odometry import Odometry, calibrate_odometry
 from dpmjax.registration.planar_scans import Floats, Indices, PlanarScans, planar_scans
-from dpmjax.registration.quality import Assessment, Score, assess_trajectory, choose_trajectory
+from dpmjax.registration.quality import Score, choose_trajectory
 from dpmjax.registration.recordings import Recording, choose_scans
 from dpmjax.registration.refinement import refine
 from dpmjax.types import ScanSet
@@ -178,28 +180,52 @@ def register_scans(
     first_poses = _checked_start(start, odometry_poses, len(all_scans.points), config)
     recording = _choose_scans(all_scans, odometry_poses, first_poses, config, hooks)
     lines = planar_scans(_take(all_scans, recording.chosen), is_ordered=config.is_ordered)
-    start_name, poses = _start_poses(lines, first_poses, odometry_poses, recording, hooks)
+    evidence = _find_evidence(lines, first_poses, odometry_poses, recording, hooks)
+    start_name, poses = _start_poses(lines, first_poses, evidence, recording, hooks)
     warm_start = None if start_name == START_NAMES["zero"] else poses
     fitted = _fit(recording, warm_start, config, key=key, hooks=hooks)
     found = {start_name: poses}
     if fitted.num_steps > 0:
         found[DEEPMAPPING] = fitted.poses
     if config.refine and not hooks.stop():
-        found |= _refined_candidates(lines, found, hooks)
+        found |= _refined_candidates(lines, found, evidence, hooks)
     hooks.on_progress("choice and assessment", 0.0)
-    kept, scores = choose_trajectory(lines, found)
-    assessment = assess_trajectory(lines, found[kept])
+    kept, scores, assessment = _choose(lines, found, evidence)
     has_other = isinstance(start, str) and start == "auto" and config.refine and odometry_poses is not None
-    if has_other and not assessment.is_trusted and not hooks.stop():
+    if has_other and not assessment.is_trusted and assessment.fault is None and not hooks.stop():
         hooks.on_progress("the map from odometry cannot be trusted: registration without it", 0.0)
         name = START_NAMES["icp-plane"]
         found[f"{name}, refined"] = refine(lines, incremental_icp(lines).poses).poses
-        kept, scores = choose_trajectory(lines, found)
-        assessment = assess_trajectory(lines, found[kept])
+        kept, scores, assessment = _choose(lines, found, evidence)
     if recording.motion is not None:
         hooks.on_progress("poses between the registered scans", 0.0)
     candidates = {name: Candidate(found[name], score) for name, score in scores.items()}
     return RegisteredScans(recording.aligned(found[kept]), kept, start_name, candidates, assessment, fitted, recording)
+
+
+def _choose(
+    scans: PlanarScans, candidates: dict[str, Floats], evidence: Odometry | None
+) -> tuple[str, dict[str, Score], Assessment]:
+    """Returns the name of the best candidate, the scores of all, and the assessment of the best."""
+    prior = None if evidence is None else evidence.prior
+    fault = evidence.fault if evidence is not None and evidence.is_mirrored else None
+    kept, scores = choose_trajectory(scans, candidates, prior=prior)
+    return kept, scores, assess_trajectory(scans, candidates[kept], prior=prior, fault=fault)
+
+
+def _find_evidence(
+    scans: PlanarScans,
+    start: str | Floats,
+    odometry: Floats | None,
+    recording: Recording,
+    hooks: RegistrationHooks,
+) -> Odometry | None:
+    """Calibrates the odometry, or the given poses without any; None where the start uses the scans alone."""
+    given = odometry if isinstance(start, str) else (start if odometry is None else odometry)
+    if given is None or (isinstance(start, str) and start != "odometry") or len(scans) < 2 or not scans.is_ordered:
+        return None
+    hooks.on_progress("calibration of the odometry", 0.0)
+    return calibrate_odometry(scans, given[recording.chosen])
 
 
 def _checked_start(
@@ -240,7 +266,7 @@ def _take(scans: ScanSet, rows: Indices) -> ScanSet:
 
 
 def _start_poses(
-    scans: PlanarScans, start: str | Floats, odometry: Floats | None, recording: Recording, hooks: RegistrationHooks
+    scans: PlanarScans, start: str | Floats, evidence: Odometry | None, recording: Recording, hooks: RegistrationHooks
 ) -> tuple[str, Floats]:
     """Returns the name of the start and the poses of the registered scans."""
     if not isinstance(start, str):
@@ -254,8 +280,8 @@ def _start_poses(
             return name, register_globally(scans).poses
         case "icp-plane" | "icp-point":
             return name, incremental_icp(scans, "plane" if start == "icp-plane" else "point").poses
-    assert odometry is not None
-    return name, odometry[recording.chosen]
+    assert evidence is not None
+    return name, evidence.poses
 
 
 def fit_in_order(
@@ -310,23 +336,24 @@ def _fit(
 
 
 def _refined_candidates(
-    scans: PlanarScans, candidates: dict[str, Floats], hooks: RegistrationHooks
+    scans: PlanarScans, candidates: dict[str, Floats], evidence: Odometry | None, hooks: RegistrationHooks
 ) -> dict[str, Floats]:
     """Returns the start and the fit, each refined; a fit that is a worse map than the refined start is left out.
 
     Near a good start the fit gives the sharper map. The start keeps the motion that a robot's odometry has measured.
     """
     (start, start_poses), *fits = candidates.items()
+    prior = None if evidence is None else evidence.prior
     found: dict[str, Floats] = {}
 
     def add_refined(name: str, poses: Floats) -> None:
         hooks.on_progress(f"{name}, refined", 0.0)
-        found[f"{name}, refined"] = refine(scans, poses).poses
+        found[f"{name}, refined"] = refine(scans, poses, prior=prior).poses
 
     if start != START_NAMES["zero"]:
         add_refined(start, start_poses)
     for name, poses in fits:
-        scores = choose_trajectory(scans, {name: poses, **found})[1]
+        scores = choose_trajectory(scans, {name: poses, **found}, prior=prior)[1]
         nats = [score.code_length for score in scores.values()]
         if nats[0] <= _LEAST_PROMISING * nats[-1]:
             add_refined(name, poses)

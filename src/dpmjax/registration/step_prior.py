@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -18,6 +18,11 @@ _USUAL_DEVIATION = (0.0225, 0.15)
 _SIMILAR_TURN, _LEAST_CLEAR, _LEAST_DEVIATION = 0.15, 5, 0.015
 # Degrees of freedom of the cost of a step: wheels slip, and logs have gaps.
 _FREEDOM = 3.0
+
+
+def step_cost(chi2: Any) -> Any:
+    """Returns the nats of a step that is off by this squared number of standard deviations: those of Student's t."""
+    return 0.5 * (_FREEDOM + 3.0) * np.log1p(chi2 / _FREEDOM)
 
 
 class StepPrior(NamedTuple):
@@ -48,7 +53,7 @@ class StepPrior(NamedTuple):
         off = steps - self.steps.reshape(shape)
         off[..., 2] = se2.wrap_angle(off[..., 2])
         chi2 = ((off / self.deviations.reshape(shape)) ** 2).sum(-1)
-        return np.asarray(0.5 * (_FREEDOM + 3.0) * np.log1p(chi2 / _FREEDOM), np.float64)
+        return np.asarray(step_cost(chi2), np.float64)
 
     def as_pose_prior(self, residual: float | Floats) -> PosePrior:
         """Returns the prior of alignments whose beams have this standard deviation, in the unit of the points."""

@@ -37,6 +37,7 @@ class Slides(NamedTuple):
         deviations: (k,) standard deviation of the shift about that place, in the unit of the points.
         is_torn: (k,) True where another place is clearly better than the given one.
         is_open: (k,) True where places far apart are about as good.
+        scores: (k,) score at the place that the shift leads to.
     """
 
     directions: Floats
@@ -44,6 +45,7 @@ class Slides(NamedTuple):
     deviations: Floats
     is_torn: Bool[np.ndarray, " k"]
     is_open: Bool[np.ndarray, " k"]
+    scores: Floats
 
     def moved(self, steps: Floats) -> Floats:
         """Returns the steps (k, 3) at their most probable places."""
@@ -79,7 +81,7 @@ def slide_steps(
     unit, count = profiles.scans.typical_range, round(_REACH / _SPACING)
     if not len(steps):
         none = np.zeros(0, bool)
-        return Slides(np.zeros((0, 2)), np.zeros(0), np.zeros(0), none, none)
+        return Slides(np.zeros((0, 2)), np.zeros(0), np.zeros(0), none, none, np.zeros(0))
     directions = weak_directions(profiles.scans)[target]
     shifts = _SPACING * unit * np.arange(-count, count + 1)
     places = np.repeat(np.asarray(steps, np.float64)[:, None], len(shifts), axis=1)
@@ -93,4 +95,5 @@ def slide_steps(
     probability /= probability.sum(axis=1, keepdims=True)
     deviations = np.sqrt((probability * (shifts - shifts[best][:, None]) ** 2).sum(axis=1))
     is_open = deviations > _OPEN_DEVIATION * unit
-    return Slides(directions, np.where(is_torn | is_open, shifts[best], 0.0), deviations, is_torn, is_open)
+    best = np.where(is_torn | is_open, best, count)
+    return Slides(directions, shifts[best], deviations, is_torn, is_open, scores[row, best])
