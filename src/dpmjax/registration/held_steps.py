@@ -1,4 +1,4 @@
-"""Edges between neighbours in time: what the scans fix of a step, and what holds it in the directions they leave open."""
+"""Edges between neighbours in time: what the scans fix of a step, and what holds it where they leave it open."""
 
 from __future__ import annotations
 
@@ -23,6 +23,12 @@ def pose_steps(poses: Floats, typical_range: float) -> Edges:
     relative, later = se2.relative(poses[:-1], poses[1:]), np.arange(1, len(poses))
     information = np.diag((np.array(_STEP_DEVIATION)[[0, 0, 1]] * [typical_range, typical_range, 1.0]) ** -2.0)
     return Edges(later, later - 1, relative, np.broadcast_to(information, (len(later), 3, 3)))
+
+
+def prior_steps(prior: StepPrior) -> Edges:
+    """Returns edges between neighbours in time of a prior (n - 1 steps)."""
+    later, variances = np.arange(1, len(prior.steps) + 1), prior.deviations**2
+    return Edges(later, later - 1, prior.steps, np.eye(3) / variances[:, None])
 
 
 def matched_steps(matches: PairMatches, slides: Slides, typical_range: float) -> Edges:

@@ -30,7 +30,7 @@ _LEAST_STEPS = 5
 _LEAST_MOVE, _LEAST_TURN = 0.02, 0.08
 # Floors of the standard deviations of a step: typical ranges, radians; and per unit of length moved or turned.
 _FLOOR, _LENGTH_FLOOR, _TURN_FLOOR = (0.002, 0.005), 0.02, 0.02
-# A step agrees with the scans within these: share of the longer move, typical ranges; share of the larger turn, radians.
+# A step agrees with the scans within these: share of the longer move, typical ranges; of the larger turn, radians.
 _MOVE_AGREEMENT, _TURN_AGREEMENT = (0.3, 0.01), (0.3, 0.03)
 # Shares of the clear steps that must agree under a fault, and may agree without it.
 _FAULT_SHARE, _SOUND_SHARE = 0.7, 0.4

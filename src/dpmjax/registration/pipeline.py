@@ -12,7 +12,6 @@ from functools import partial
 from typing import Literal, NamedTuple, get_args
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -27,7 +26,7 @@ from dpmjax.registration.incremental import incremental_icp, scan_odometry
 from dpmjax.registration.odometry import Odometry, calibrate_odometry
 from dpmjax.registration.planar_scans import Floats, Indices, PlanarScans, planar_scans
 from dpmjax.registration.quality import Score, choose_trajectory
-from dpmjax.registration.recordings import Recording, choose_scans
+from dpmjax.registration.recordings import Recording, choose_scans, take_scans
 from dpmjax.registration.refinement import refine
 from dpmjax.types import ScanSet
 
@@ -123,7 +122,8 @@ class RegisteredScans(NamedTuple):
         kept: name of the candidate that the poses come from.
         start: name of the candidate that the fit started from.
         candidates: all candidates by name; DeepMapping is one if it has done a step.
-        assessment: of the kept candidate: `assessment.is_trusted` tells whether its map can be trusted.
+        assessment: of the kept candidate: `is_trusted` tells whether its map can be trusted, `uncertain_scans` (rows of
+            all scans) for which of the registered scans it cannot, and `fault` what contradicts the odometry.
         fitted: DeepMapping of the registered scans; untrained where the fit was stopped before its first step.
         recording: all scans, and the rows of those that were registered.
     """
@@ -179,7 +179,7 @@ def register_scans(
     odometry_poses = None if odometry is None else se2.as_poses("odometry", odometry, len(all_scans.points))
     first_poses = _checked_start(start, odometry_poses, len(all_scans.points), config)
     recording = _choose_scans(all_scans, odometry_poses, first_poses, config, hooks)
-    lines = planar_scans(_take(all_scans, recording.chosen), is_ordered=config.is_ordered)
+    lines = planar_scans(take_scans(all_scans, recording.chosen), is_ordered=config.is_ordered)
     evidence = _find_evidence(lines, first_poses, odometry_poses, recording, hooks)
     start_name, poses = _start_poses(lines, first_poses, evidence, recording, hooks)
     warm_start = None if start_name == START_NAMES["zero"] else poses
@@ -200,6 +200,8 @@ def register_scans(
     if recording.motion is not None:
         hooks.on_progress("poses between the registered scans", 0.0)
     candidates = {name: Candidate(found[name], score) for name, score in scores.items()}
+    uncertain = tuple(recording.chosen[list(assessment.uncertain_scans)].tolist())
+    assessment = assessment._replace(uncertain_scans=uncertain)
     return RegisteredScans(recording.aligned(found[kept]), kept, start_name, candidates, assessment, fitted, recording)
 
 
@@ -252,17 +254,14 @@ def _choose_scans(
 ) -> Recording:
     """Chooses the scans that are registered by the odometry, or by the scans where the start uses them alone."""
     motion = None if isinstance(start, str) and start in STARTS_FROM_SCANS else odometry
-    if config.min_distance is None or not config.is_ordered:
-        return Recording(scans, np.arange(len(scans.points)))
+    if not config.is_ordered:
+        return Recording(scans, np.arange(len(scans.points)), None, np.arange(len(scans.points)))
+    if config.min_distance is None:
+        return choose_scans(scans, None, 1.0, 1.0)
     if motion is None and len(scans.points) > _MAX_WHOLE:
         hooks.on_progress("odometry from the scans", 0.0)
         motion = scan_odometry(planar_scans(scans))
     return choose_scans(scans, motion, config.min_distance, config.min_turn)
-
-
-def _take(scans: ScanSet, rows: Indices) -> ScanSet:
-    # On the host: each number of rows would be a program of its own.
-    return ScanSet(jnp.asarray(np.asarray(scans.points)[rows]), jnp.asarray(np.asarray(scans.mask)[rows]))
 
 
 def _start_poses(
@@ -313,7 +312,7 @@ def fit_in_order(
     order = np.arange(len(scans.points)) if is_ordered or start is None else nearest_tour(start)
     first_poses = None if start is None else start[order]
     engine = fit if engine_of is None else engine_of(order)
-    fitted = fit_deepmapping(_take(scans, order), config, key=key, start=first_poses, engine=engine)
+    fitted = fit_deepmapping(take_scans(scans, order), config, key=key, start=first_poses, engine=engine)
     return fitted._replace(poses=fitted.poses[np.argsort(order)])
 
 
@@ -331,7 +330,7 @@ def _fit(
             return hooks.engine(recording.chosen[order])
         return partial(fit, on_report=report, stop=hooks.stop)
 
-    scans = _take(recording.scans, recording.chosen)
+    scans = take_scans(recording.scans, recording.chosen)
     return fit_in_order(scans, config.fit, key=key, start=start, is_ordered=config.is_ordered, engine_of=engine_of)
 
 

@@ -19,7 +19,14 @@ from dpmjax.checks import as_beams
 from dpmjax.geometry import se2
 from dpmjax.pose_graph.graph import Edges, join_edges
 from dpmjax.pose_graph.normal_equations import solve_blocks
-from dpmjax.registration.held_steps import held_steps, matched_steps, open_projections, pose_steps, settle_steps
+from dpmjax.registration.held_steps import (
+    held_steps,
+    matched_steps,
+    open_projections,
+    pose_steps,
+    prior_steps,
+    settle_steps,
+)
 from dpmjax.registration.incremental import incremental_icp
 from dpmjax.registration.line_adjustment import adjust_to_lines
 from dpmjax.registration.loop_closure import LoopConfig, close_loops
@@ -142,13 +149,13 @@ def refine(
 def _align_all(scans: PlanarScans, poses: Floats, config: RefinementConfig, prior: StepPrior | None) -> Floats:
     """Multi-view point-to-line alignment of all scans from nearby poses; the first pose is held."""
     scales, profiles = _ROUNDS.gates_and_kernels(scans.typical_range, 1.25 * scans.noise), make_profiles(scans)
-    start = pose_steps(poses, scans.typical_range)
+    expected = pose_steps(poses, scans.typical_range) if prior is None else prior_steps(prior)
     # In units of one beam's information, as the systems of the pairs are.
     trust = 1e-9 if prior is None else max(scans.noise, 0.00075 * scans.typical_range) ** 2
     for round_number, scale in enumerate(zip(*scales, strict=True)):
         if round_number % config.refresh == 0:
             pairs = _choose_aligned(profiles, poses, config, prior)
-            steps = join_edges(start, pairs.held)
+            steps = join_edges(expected, pairs.held)
             steps = steps._replace(information=trust * steps.information)
         edges, system = _linearise(scans, pairs.source, pairs.target, poses, scale)
         edges = edges._replace(information=pairs.across @ edges.information @ pairs.across)

@@ -36,7 +36,7 @@ class Slides(NamedTuple):
         shifts: (k,) shift to the most probable place of a torn or open step, in the unit of the points; 0 for others.
         deviations: (k,) standard deviation of the shift about that place, in the unit of the points.
         is_torn: (k,) True where another place is clearly better than the given one.
-        is_open: (k,) True where places far apart are about as good.
+        is_open: (k,) True where the scores alone leave places far apart.
         scores: (k,) score at the place that the shift leads to.
     """
 
@@ -88,12 +88,19 @@ def slide_steps(
     places[..., :2] += shifts[:, None] * directions[:, None]
     source, target = (np.repeat(rows, len(shifts)) for rows in (source, target))
     scores = pair_scores(profiles, source, target, places.reshape(-1, 3)).reshape(len(steps), -1)
-    nats = scores / _SCORE_SCALE - (0.0 if prior is None else prior.costs(places))
+    nats = scores / _SCORE_SCALE
+    is_open = _deviations(nats, shifts, nats.argmax(axis=1)) > _OPEN_DEVIATION * unit
+    if prior is not None:
+        nats -= prior.costs(places)
     row, best = np.arange(len(steps)), nats.argmax(axis=1)
     is_torn = (nats[row, best] - nats[:, count] > _LEAST_GAIN) & (np.abs(shifts[best]) > _LEAST_SHIFT * unit)
-    probability = np.exp(nats - nats[row, best][:, None])
-    probability /= probability.sum(axis=1, keepdims=True)
-    deviations = np.sqrt((probability * (shifts - shifts[best][:, None]) ** 2).sum(axis=1))
-    is_open = deviations > _OPEN_DEVIATION * unit
+    deviations = _deviations(nats, shifts, best)
     best = np.where(is_torn | is_open, best, count)
     return Slides(directions, shifts[best], deviations, is_torn, is_open, scores[row, best])
+
+
+def _deviations(nats: Floats, shifts: Floats, best: Indices) -> Floats:
+    """Returns the standard deviations (k,) of shifts (s,) about the best one, by log probabilities (k, s)."""
+    probability = np.exp(nats - nats.max(axis=1, keepdims=True))
+    probability /= probability.sum(axis=1, keepdims=True)
+    return np.sqrt((probability * (shifts - shifts[best][:, None]) ** 2).sum(axis=1))
