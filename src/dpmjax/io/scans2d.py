@@ -30,9 +30,9 @@ _ENDINGS |= {"carmen": (".log", ".clf", ".log.gz", ".clf.gz")}
 _PLAUSIBLE_RANGE = {"m": (0.05, 500.0), "px": (2.0, 20000.0)}
 # Few planar lidars measure farther; a sequence with hardly any shorter beam may be in millimetres.
 _USUAL_M, _LEAST_USUAL_SHARE = 100.0, 0.05
-# Beams within this share of the largest range have it; so many, and this share of all, are the code for no echo, if
-# this share of the scans has other beams.
-_SAME_RANGE, _LEAST_MAXIMA, _LEAST_OTHERS = 1e-5, (20, 0.005), 0.5
+# Beams within this share of the largest range have it. They are the code for no echo where there are so many, this
+# share of all, in so many scans, and this share of the scans has other beams.
+_SAME_RANGE, _LEAST_MAXIMA, _LEAST_SHARE, _LEAST_SCANS, _LEAST_OTHERS = 1e-5, 20, 0.005, 3, 0.5
 _LARGEST_SPAN = 1.05 * 2.0 * np.pi  # Angles of one scan that span more are no radians.
 _LEAST_BEAMS = 17  # Lines are fitted to up to 17 neighbouring beams.
 
@@ -135,8 +135,8 @@ def _without_maxima(sequence: ScanSequence, path: Path) -> ScanSequence:
     limit = (1.0 - _SAME_RANGE) * ranges.max()
     is_maximum = ranges >= limit
     num_maxima, share = int(is_maximum.sum()), is_maximum.sum() / max(sequence.mask.sum(), 1)
-    has_others = (sequence.mask & ~is_maximum).any(axis=1).mean() > _LEAST_OTHERS
-    if num_maxima < _LEAST_MAXIMA[0] or share < _LEAST_MAXIMA[1] or not has_others:
+    is_code = num_maxima >= _LEAST_MAXIMA and share >= _LEAST_SHARE and is_maximum.any(axis=1).sum() >= _LEAST_SCANS
+    if not is_code or (sequence.mask & ~is_maximum).any(axis=1).mean() < _LEAST_OTHERS:
         return sequence
     text = (
         f"{path}: {100 * share:.1f} % of the beams have the largest range, {ranges.max():.4g} {sequence.unit}: no echo"
@@ -183,9 +183,9 @@ def read_arrays(path: str | Path, *, unit: Unit | None = None) -> ScanSequence:
     ahead; and optionally `mask` (n, b), `poses` (the reference) and `odometry` as (n, 3) x, y, heading or (n, 3, 3)
     `T_world_scan`, `times` (n,) in seconds, and `unit`, "px" or "m".
 
-    Angles that span more than a turn are taken as degrees. A beam is invalid where `mask` is False, where both coordinates are NaN or one is infinite, or where its range is
-    NaN, infinite or not positive (as scanner drivers write a beam without echo). A beam with one NaN coordinate and a
-    finite one is an error.
+    Angles that span more than a turn are taken as degrees. A beam is invalid where `mask` is False, where both
+    coordinates are NaN or one is infinite, or where its range is NaN, infinite or not positive (as scanner drivers
+    write a beam without echo). A beam with one NaN coordinate and a finite one is an error.
 
     Args:
         path: the file.

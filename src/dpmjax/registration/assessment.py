@@ -73,8 +73,8 @@ class _Pairs(NamedTuple):
     relative: Floats
     scores: Floats
 
-    def take(self, rows: Indices) -> _Pairs:
-        return _Pairs(*(x[rows] for x in self))
+    def take(self, is_taken: NDArray[np.bool_]) -> _Pairs:
+        return _Pairs(self.source[is_taken], self.target[is_taken], self.relative[is_taken], self.scores[is_taken])
 
 
 def assess_trajectory(
@@ -102,7 +102,8 @@ def assess_trajectory(
     best = np.full(len(poses), -np.inf)
     np.maximum.at(best, np.concatenate([source, target]), np.tile(pairs.scores, 2))
     is_used = (best[source] > _LEAST_SCORE) & (best[target] > _LEAST_SCORE)
-    pairs, contradicted, visible = pairs.take(is_used), views.contradicted[is_used], views.visible[is_used]
+    pairs = pairs.take(is_used)
+    contradicted, visible = (np.asarray(x)[is_used] for x in (views.contradicted, views.visible))
     size = (len(poses), len(poses))
     costs = scipy.sparse.csr_array((2.0 - pairs.scores, (pairs.source, pairs.target)), size)
     tree = scipy.sparse.csr_array(scipy.sparse.csgraph.minimum_spanning_tree(costs))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import jax
 import numpy as np
 
 from dpmjax.geometry import se2
@@ -82,7 +83,7 @@ def held_steps(slides: Slides, poses: Floats, typical_range: float) -> Edges:
     information += np.where(slides.is_torn[:, None, None], across @ np.diag(firm**-2.0) @ across, 0.0)
     rows = np.flatnonzero(slides.is_torn | slides.is_open)
     held = steps._replace(measurements=slides.moved(steps.measurements), information=information)
-    return Edges(*(x[rows] for x in held))
+    return jax.tree.map(lambda x: x[rows], held)
 
 
 def settle_steps(scans: PlanarScans, matches: PairMatches, prior: StepPrior) -> tuple[PairMatches, Slides]:

@@ -124,9 +124,8 @@ def refine(
     scans = scans if isinstance(scans, PlanarScans) else planar_scans(as_beams("scans", scans))
     start = se2.as_poses("poses", poses, len(scans))
     candidates, num_loops = {"start": start}, {"start": 0}
-    if scans.is_ordered:
-        prior = prior or StepPrior.of_poses(start, scans.typical_range)
-    if scans.is_ordered and config.loops is not None and not _is_sound(scans, start):
+    prior = (prior or StepPrior.of_poses(start, scans.typical_range)) if scans.is_ordered else None
+    if prior is not None and config.loops is not None and not _is_sound(scans, start):
         # The steps again, with those of the start as guess, and with the prior where the scans leave a direction open.
         chained, steps = incremental_icp(scans, odometry=start, prior=prior)
         rows = np.flatnonzero(fitting_scans(scans, chained))

@@ -9,7 +9,7 @@ from jaxtyping import Float
 
 from dpmjax.geometry import se2
 from dpmjax.registration.pair_alignment import PairMatches, PosePrior
-from dpmjax.registration.planar_scans import Floats
+from dpmjax.registration.planar_scans import Floats, Indices
 
 # Standard deviations of a step of poses that nothing is known about: typical ranges, radians.
 _USUAL_DEVIATION = (0.0225, 0.15)
@@ -43,10 +43,6 @@ class StepPrior(NamedTuple):
         deviation = np.array(_USUAL_DEVIATION)[[0, 0, 1]] * [typical_range, typical_range, 1.0]
         return cls(steps, np.broadcast_to(deviation, steps.shape))
 
-    def take(self, rows: Floats | slice) -> StepPrior:
-        """Returns some of the steps."""
-        return StepPrior(self.steps[rows], self.deviations[rows])
-
     def costs(self, steps: Float[np.ndarray, "k *m 3"]) -> Floats:
         """(k, *m) heavy-tailed costs of steps in nats; 0 where they are as expected."""
         shape = (len(self.steps),) + (1,) * (steps.ndim - 2) + (3,)
@@ -59,7 +55,7 @@ class StepPrior(NamedTuple):
         """Returns the prior of alignments whose beams have this standard deviation, in the unit of the points."""
         return PosePrior(self.steps, (residual / self.deviations) ** 2)
 
-    def through(self, rows: np.ndarray) -> StepPrior:
+    def through(self, rows: Indices) -> StepPrior:
         """Returns the prior of the steps between these rows (m,) of the n scans, in order."""
         poses = se2.chain(self.steps)
         variances = np.concatenate([np.zeros((1, 3)), np.cumsum(self.deviations**2, axis=0)])

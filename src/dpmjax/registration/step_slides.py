@@ -83,7 +83,7 @@ def slide_steps(
         none = np.zeros(0, bool)
         return Slides(np.zeros((0, 2)), np.zeros(0), np.zeros(0), none, none, np.zeros(0))
     directions = weak_directions(profiles.scans)[target]
-    shifts = _SPACING * unit * np.arange(-count, count + 1)
+    shifts = np.asarray(_SPACING * unit * np.arange(-count, count + 1), np.float64)
     places = np.repeat(np.asarray(steps, np.float64)[:, None], len(shifts), axis=1)
     places[..., :2] += shifts[:, None] * directions[:, None]
     source, target = (np.repeat(rows, len(shifts)) for rows in (source, target))
