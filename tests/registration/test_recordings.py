@@ -9,8 +9,9 @@ import pytest
 
 from dpmjax.geometry import se2
 from dpmjax.registration import planar_scans
-from dpmjax.registration.recordings import align_between, choose_by_motion, fill_between
+from dpmjax.registration.recordings import align_between, choose_by_motion, choose_scans, fill_between
 from dpmjax.simulation import simulate_sequence
+from dpmjax.types import ScanSet
 from tests.registration.conftest import scans_of
 
 

@@ -22,15 +22,26 @@ _MIN_COMMON = 10
 
 
 def planar_errors(sequence: ScanSequence, poses: Floats) -> dict[str, float]:
-    """Returns ATE and point distance in the unit of the scans; nothing where there is no reference."""
+    """Returns ATE, the error of the worst scan after the same alignment, and point distance, in the unit of the scans.
+
+    Args:
+        sequence: the scans.
+        poses: (n, 3) T_world_scan.
+
+    Returns:
+        The numbers by name; nothing where there is no reference.
+    """
     from dpmjax.geometry import se2
 
     reference = sequence.reference_poses
     if reference is None:
         return {}
     distance = metrics.point_distance(sequence.points, sequence.mask, se2.to_matrix(poses), se2.to_matrix(reference))
+    T_reference_world = np.asarray(metrics.align_rigid(poses[:, :2], reference[:, :2]))
+    off = poses[:, :2] @ T_reference_world[:2, :2].T + T_reference_world[:2, 2] - reference[:, :2]
     return {
         f"ate_{sequence.unit}": float(metrics.absolute_trajectory_error(poses[:, :2], reference[:, :2])),
+        f"worst_scan_{sequence.unit}": float(np.hypot(*off.T).max()),
         f"point_distance_{sequence.unit}": float(distance),
     }
 
