@@ -131,6 +131,8 @@ def _limit(sequence: ScanSequence, max_range: float) -> ScanSequence:
 
 def _without_maxima(sequence: ScanSequence, path: Path) -> ScanSequence:
     """Masks the beams at the largest range of all, where many have exactly this one: no echo within reach."""
+    if not sequence.mask.any():
+        return sequence
     ranges = np.where(sequence.mask, np.linalg.norm(sequence.points.astype(np.float64), axis=2), 0.0)
     limit = (1.0 - _SAME_RANGE) * ranges.max()
     is_maximum = ranges >= limit
@@ -244,7 +246,7 @@ def _from_ranges(table: Table, path: str | Path) -> tuple[FloatArray, BoolArray,
     found = "angles hold NaN, infinite or huge values"
     require((np.abs(theta) < 1e6).all(), path, found, "give a direction to every beam, in radians")
     notes = []
-    if np.ptp(theta, axis=-1).max() > _LARGEST_SPAN:
+    if theta.size and np.ptp(theta, axis=-1).max() > _LARGEST_SPAN:
         theta = np.radians(theta)
         notes.append(Note(f"{path}: the angles span more than one turn in radians; taken as degrees", is_doubt=True))
     mask = np.isfinite(distance) & (distance > 0)
