@@ -1,4 +1,4 @@
-"""Real scans of a corridor, where they exist: what is kept is no worse than the odometry, and a mirrored map is named."""
+"""Real scans of a corridor, where they exist: the kept map is better than the odometry, and a mirrored one is named."""
 
 from __future__ import annotations
 

@@ -22,7 +22,7 @@ from dpmjax.registration.step_prior import StepPrior
 # Maps whose code lengths differ by less than this part are equally good as maps (how walls lie in the cells is worth
 # some percent); then their surfaces decide.
 _SAME_MAP = 0.1
-# Nats a beam that a nat a step counts as; and standard deviations of a step that cost nothing.
+# Nats a beam, and share of misfits, that a nat a step counts as; and standard deviations of a step that cost nothing.
 _STEP_WEIGHT, _ALLOWED = 0.2, 3.0
 # Hits and passages that are counted at most; more would only take longer.
 _MAX_BEAMS = 40_000
@@ -83,7 +83,7 @@ def choose_trajectory(
     lengths = {name: score.code_length + _STEP_WEIGHT * score.surprise for name, score in scores.items()}
     same_map = 0.0 if scans.noise > MAX_NOISE * scans.typical_range else _SAME_MAP
     as_short = [name for name, length in lengths.items() if length <= (1.0 + same_map) * min(lengths.values())]
-    return min(as_short, key=lambda name: scores[name].misfit), scores
+    return min(as_short, key=lambda name: scores[name].misfit + _STEP_WEIGHT * scores[name].surprise), scores
 
 
 def _surprise(poses: Floats, prior: StepPrior | None) -> float:

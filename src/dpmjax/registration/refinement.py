@@ -52,6 +52,8 @@ _ROUNDS = Schedule(gate=(0.09, 0.015), kernel=(0.06, 0.0015), num_iterations=14)
 _MIN_FITNESS, _MIN_EIGENVALUE = 0.35, 0.005
 # Scans are adjusted to common lines above this range noise, in typical ranges.
 _MIN_NOISE = 1.5e-4
+# Gauss-Newton steps that put open steps back after the adjustment to lines.
+_NUM_RESTORATIONS = 3
 _NO_EDGES = Edges(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 3, 3)))
 
 
@@ -141,7 +143,8 @@ def refine(
     kept = "start" if len(aligned) == 1 else choose_trajectory(scans, aligned, prior=prior)[0]
     best = aligned[kept]
     if scans.noise > _MIN_NOISE * scans.typical_range:
-        best = adjust_to_lines(scans, best)
+        adjusted = adjust_to_lines(scans, best)
+        best = adjusted if prior is None else _restore_open(make_profiles(scans), best, adjusted, config, prior)
     return Refined(best, num_loops[kept])
 
 
@@ -163,6 +166,28 @@ def _align_all(scans: PlanarScans, poses: Floats, config: RefinementConfig, prio
         gradient = np.einsum("eij,ej->ei", pairs.across, np.asarray(system.gradient))
         edges, gradient = join_edges(edges, steps._replace(measurements=here)), np.concatenate([gradient, pull])
         poses = se2.compose(poses, solve_step(len(poses), edges, gradient))
+    return poses
+
+
+def _restore_open(
+    profiles: RangeProfiles, aligned: Floats, adjusted: Floats, config: RefinementConfig, prior: StepPrior
+) -> Floats:
+    """Returns the adjusted poses, but along open directions the steps of the aligned ones: lines do not hold them."""
+    scans, unit = profiles.scans, profiles.scans.typical_range
+    pairs, poses = _choose_aligned(profiles, aligned, config, prior), adjusted
+    if not len(pairs.held.source):
+        return adjusted
+    scale = tuple(x[-1] for x in _ROUNDS.gates_and_kernels(unit, 1.25 * scans.noise))
+    edges, _ = _linearise(scans, pairs.source, pairs.target, adjusted, (scale[0], scale[1]))
+    edges = edges._replace(information=pairs.across @ edges.information @ pairs.across)
+    kept, information = se2.relative(aligned[pairs.held.target], aligned[pairs.held.source]), pairs.held.information
+    # As firm as if all beams of a scan measured the open direction.
+    information = information * (scans.mask.shape[1] / np.trace(information, axis1=1, axis2=2))[:, None, None]
+    edges = join_edges(edges, Edges(pairs.held.source, pairs.held.target, kept, information))
+    for _ in range(_NUM_RESTORATIONS):
+        here = se2.relative(poses[edges.target], poses[edges.source])
+        pull = np.einsum("eij,ej->ei", edges.information, se2.relative(edges.measurements, here))
+        poses = se2.compose(poses, solve_step(len(poses), edges._replace(measurements=here), pull))
     return poses
 
 
