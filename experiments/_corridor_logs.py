@@ -8,8 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dpmjax.geometry import se2
-from dpmjax.simulation import scan_world
-from dpmjax.simulation.trajectory2d import simulate_odometry
+from dpmjax.simulation import scan_world, simulate_odometry
 
 Floats = NDArray[np.float64]
 

@@ -11,8 +11,7 @@ from dpmjax.registration.odometry import calibrate_odometry
 from dpmjax.registration.range_profiles import make_profiles
 from dpmjax.registration.step_prior import StepPrior
 from dpmjax.registration.step_slides import slide_steps
-from dpmjax.simulation import scan_world
-from dpmjax.simulation.trajectory2d import simulate_odometry
+from dpmjax.simulation import scan_world, simulate_odometry
 
 # A scan reaches the end rooms from none of the scans 8 to 15.
 IN_CORRIDOR, NUM_SCANS, STEP_PX, REACH_PX = slice(8, 15), 24, 25.0, 120.0
