@@ -34,8 +34,8 @@ _FLOOR, _LENGTH_FLOOR, _TURN_FLOOR = (0.002, 0.005), 0.02, 0.02
 _MOVE_AGREEMENT, _TURN_AGREEMENT = (0.3, 0.01), (0.3, 0.03)
 # Shares of the clear steps that must agree under a fault, and may agree without it.
 _FAULT_SHARE, _SOUND_SHARE = 0.7, 0.4
-# Scales beyond these are no calibration.
-_SCALES = (0.7, 1.4)
+# Scales beyond these are no calibration, nor those nearer to 1 than so many of their standard errors.
+_SCALES, _CLEAR_SCALE = (0.7, 1.4), 4.0
 
 
 def _turned_in_degrees(poses: Floats) -> Floats:
@@ -171,8 +171,13 @@ def _calibrate(clear: ClearSteps, expected: Floats, unit: float) -> StepPrior:
 
 
 def _robust_scale(ratios: Floats) -> float:
-    scale = float(np.median(ratios)) if len(ratios) >= _LEAST_STEPS else 1.0
-    return scale if _SCALES[0] < scale < _SCALES[1] else 1.0
+    """Returns the median of ratios where it differs clearly from 1: few noisy steps would bend a long way."""
+    if len(ratios) < _LEAST_STEPS:
+        return 1.0
+    scale = float(np.median(ratios))
+    error = _spread(np.abs(ratios - scale)) / len(ratios) ** 0.5
+    is_clear = abs(scale - 1.0) > _CLEAR_SCALE * error
+    return scale if is_clear and _SCALES[0] < scale < _SCALES[1] else 1.0
 
 
 def _spread(off: Floats) -> float:
