@@ -192,7 +192,8 @@ def register_scans(
     hooks.on_progress("choice and assessment", 0.0)
     kept, scores, assessment = _choose(lines, found, evidence)
     has_other = isinstance(start, str) and start == "auto" and config.refine and odometry_poses is not None
-    if has_other and not assessment.is_trusted and assessment.fault is None and not hooks.stop():
+    has_other = has_other and not (evidence is not None and evidence.is_mirrored)
+    if has_other and not assessment.is_trusted and not hooks.stop():
         hooks.on_progress("the map from odometry cannot be trusted: registration without it", 0.0)
         name = START_NAMES["icp-plane"]
         found[f"{name}, refined"] = refine(lines, incremental_icp(lines).poses).poses
@@ -209,10 +210,14 @@ def _choose(
     scans: PlanarScans, candidates: dict[str, Floats], evidence: Odometry | None
 ) -> tuple[str, dict[str, Score], Assessment]:
     """Returns the name of the best candidate, the scores of all, and the assessment of the best."""
-    prior = None if evidence is None else evidence.prior
-    fault = evidence.fault if evidence is not None and evidence.is_mirrored else None
-    kept, scores = choose_trajectory(scans, candidates, prior=prior)
-    return kept, scores, assess_trajectory(scans, candidates[kept], prior=prior, fault=fault)
+    if evidence is None:
+        kept, scores = choose_trajectory(scans, candidates)
+        return kept, scores, assess_trajectory(scans, candidates[kept])
+    kept, scores = choose_trajectory(scans, candidates, prior=evidence.prior)
+    # Units are corrected; of a mirrored log nothing tells which side is right.
+    fault = evidence.fault if evidence.is_mirrored else None
+    assessment = assess_trajectory(scans, candidates[kept], prior=evidence.prior, fault=fault)
+    return kept, scores, assessment._replace(fault=evidence.fault)
 
 
 def _find_evidence(
