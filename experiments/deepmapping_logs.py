@@ -1,11 +1,12 @@
-"""Runs `dpmjax map2d` on every CARMEN log of some folders, from several starts, and writes one table.
+"""Runs `dpmjax map2d` on the logs of some folders and on simulated corridors, and writes one table.
 
     python -m experiments.deepmapping_logs path/to/logs -o out
     python -m experiments.deepmapping_logs path/to/recordings --inits auto --corrected path/to/logs
+    python -m experiments.deepmapping_logs path/to/logs path/to/scans.npz --corridors 100 101 102 --inits auto icp-plane
 
 Each run keeps its own folder below OUT, with its pictures; a run that is finished already is not done again. A log that
 has hand-checked relations beside it (aces.clf.gz, aces.relations) is measured by them too, and a recording by the log
-of the same name in `--corrected`.
+of the same name in `--corrected`. A map is right where no scan is farther than half a metre from its reference pose.
 """
 
 from __future__ import annotations
@@ -19,18 +20,23 @@ from typing import Annotated, Any
 
 from tyro.conf import Positional, arg
 
-from dpmjax.cli import EXIT_BAD_INPUT, METRICS, RunFolder, load_json, run_command, write_metrics
+from dpmjax.cli import EXIT_BAD_INPUT, METRICS, RunFolder, load_json, run_command, spans_of, write_metrics
+from dpmjax.registration import DEEPMAPPING
+from experiments._corridor_logs import write_corridor_log
 
 EXPERIMENT = "deepmapping_logs"
-ENDINGS = (".log", ".clf", ".log.gz", ".clf.gz")
+ENDINGS = (".log", ".clf", ".log.gz", ".clf.gz", ".npz")
+_RIGHT_M = 0.5
 
 
 @dataclass(frozen=True)
 class Config:
     """Options of the table."""
 
-    logs: Positional[tuple[Path, ...]]
-    """Folders of .log or .clf files, plain or .gz."""
+    logs: Positional[tuple[Path, ...]] = ()
+    """Folders of .log or .clf files, plain or .gz, or of .npz arrays; or single files."""
+    corridors: tuple[int, ...] = ()
+    """Seeds of simulated corridors."""
     output: Annotated[Path, arg(aliases=["-o"], metavar="OUT")] = Path("results/deepmapping_logs")
     """Folder for the runs and metrics.json."""
     inits: tuple[str, ...] = ("odometry", "icp-plane", "global")
@@ -45,7 +51,11 @@ class Config:
 
 def main(config: Config) -> list[dict[str, Any]]:
     """Runs what is missing and prints the table."""
-    logs = [log for folder in config.logs for log in logs_of(folder)]
+    logs = [log for path in config.logs for log in ([path] if path.is_file() else logs_of(path))]
+    made = config.output / "corridors"
+    logs += [write_corridor_log(made / f"corridor{seed}.npz", seed) for seed in config.corridors]
+    if not logs:
+        raise ValueError("no log: name a folder of logs, a log, or --corridors")
     if len(names := {log.name.removesuffix(".gz") for log in logs}) < len(logs):
         raise ValueError(f"{len(logs)} logs have {len(names)} different names; a name has one row for each start")
     corrected = {} if config.corrected is None else {drive_of(log): log for log in logs_of(config.corrected)}
@@ -55,14 +65,14 @@ def main(config: Config) -> list[dict[str, Any]]:
             # A row has the commit of its own run, which may be an earlier one.
             rows.append({"log": log.name.removesuffix(".gz"), "init": init, **metrics})
             write_metrics(RunFolder(config.output, is_resumed=True), {}, seed=config.seed, rows=rows)
-    print(markdown(rows))
+    print(markdown(rows), *trust_lines(rows), sep="\n")
     return rows
 
 
 def logs_of(folder: Path) -> list[Path]:
-    """Returns the CARMEN logs of a folder, by name."""
+    """Returns the logs of a folder, by name."""
     if not (logs := sorted(p for p in folder.glob("*") if p.name.endswith(ENDINGS))):
-        raise ValueError(f"{folder}: no {', '.join(ENDINGS)} file there; name a folder of CARMEN logs")
+        raise ValueError(f"{folder}: no {', '.join(ENDINGS)} file there; name a folder of logs")
     return logs
 
 
@@ -89,12 +99,25 @@ def _run(log: Path, init: str, corrected: Path | None, config: Config) -> dict[s
     return load_json(folder / METRICS)
 
 
+def is_right(row: dict[str, Any]) -> bool | None:
+    """Returns True where no scan of the kept map is far from its reference; None without a reference."""
+    return row["worst_scan_m"] < _RIGHT_M if "worst_scan_m" in row else None
+
+
+def trust_lines(rows: list[dict[str, Any]]) -> list[str]:
+    """Returns the shares of trusted maps that are right, and of right maps that are trusted."""
+    known = [(is_right(row), row["assessment"]["is_trusted"]) for row in rows if is_right(row) is not None]
+    both = sum(bool(right and trusted) for right, trusted in known)
+    counts = (("trusted", "right", sum(t for _, t in known)), ("right", "trusted", sum(bool(r) for r, _ in known)))
+    return [f"{both} of {count} maps that are {first} are {second}" for first, second, count in counts]
+
+
 def markdown(rows: list[dict[str, Any]]) -> str:
     """Returns the table as Markdown; an empty cell is a number that the log has no reference for."""
     lines = [
-        "| log | scans (registered) | start | ATE before, m | ATE after, m | relations before | relations after "
-        "| kept | trusted | s | GB |",
-        "|---|---|---|---|---|---|---|---|---|---|---|",
+        "| log | scans (registered) | start | ATE before, m | DeepMapping, m | ATE after, m | worst scan, m "
+        "| relations before | relations after | kept | trusted | uncertain scans | s | GB |",
+        "|---|---|---|---|---|---|---|---|---|---|---|---|---|---|",
     ]
     for row in rows:
         relations = (
@@ -102,16 +125,17 @@ def markdown(rows: list[dict[str, Any]]) -> str:
             for when in ("_initial", "")
         )
         kind = "ate_corrected" if "ate_corrected_m" in row else "ate"
-        ates = (f"{row[name]:.2f}" if name in row else "" for name in (f"{kind}_initial_m", f"{kind}_m"))
-        trusted = "yes" if row["assessment"]["is_trusted"] else "no"
+        fit = row["candidates"].get(DEEPMAPPING, {}).get("ate_m")
+        ates = [row.get(f"{kind}_initial_m"), fit, row.get(f"{kind}_m"), row.get("worst_scan_m")]
         cells = (
             row["log"],
             f"{row['num_scans']} ({row['num_registered']})",
             row["init"],
-            *ates,
+            *("" if ate is None else f"{ate:.2f}" for ate in ates),
             *relations,
             row["kept"],
-            trusted,
+            "yes" if row["assessment"]["is_trusted"] else "no",
+            ", ".join(spans_of(row["assessment"]["uncertain_scans"])),
             f"{row['wall_s']:.0f}",
             f"{row['peak_rss_gb']:.1f}",
         )

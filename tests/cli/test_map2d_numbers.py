@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from dpmjax.cli.map2d_numbers import corrected_numbers
+from dpmjax.cli.map2d_numbers import corrected_numbers, planar_errors, report
 from dpmjax.geometry import se2
 from dpmjax.simulation import simulate_sequence
 
@@ -29,3 +29,24 @@ def test_a_corrected_log_measures_the_scans_that_both_have() -> None:
     assert found["relations_corrected_m"] == pytest.approx(24.0 / 11.0)
     with pytest.raises(ValueError, match="0 scans have the time"):
         corrected_numbers(times + 0.3, moved, corrected)
+
+
+def test_the_worst_scan_is_the_farthest_from_its_reference() -> None:
+    walk = simulate_sequence(0, 24, num_beams=64, seed=4)
+    poses = walk.reference_poses.copy()
+    poses[20, :2] += [3.0, 4.0]
+    found = planar_errors(walk, np.asarray(se2.compose(np.array([50.0, -3.0, 1.0]), poses)))
+    # The best alignment takes a part of the five pixels.
+    assert 4.5 < found["worst_scan_px"] < 5.0
+    assert planar_errors(walk, walk.reference_poses)["worst_scan_px"] < 1e-9
+
+
+def test_the_last_lines_name_the_uncertain_scans_and_the_fault() -> None:
+    numbers = {"code_length": 1.0, "misfit": 0.2}
+    assessment = {"is_trusted": False, "weakest_connection": 0.3, "contradiction": 0.01}
+    assessment |= {"uncertain_scans": [3, 4, 5, 9], "fault": "the scans are mirrored"}
+    text = report("m", {"candidates": {"odometry": numbers}, "kept": "odometry", "assessment": assessment})
+    assert "DO NOT TRUST" in text
+    assert "uncertain where 4 scans are" in text
+    assert text.endswith("3-5, 9")
+    assert "the scans are mirrored\n" in text

@@ -10,6 +10,8 @@ import pytest
 
 from dpmjax.cli.command import run_command
 from dpmjax.geometry import se2
+from dpmjax.io import read_sequence
+from dpmjax.metrics import absolute_trajectory_error
 from dpmjax.simulation import simulate_sequence
 from experiments import (
     _deepmapping_methods,
@@ -18,6 +20,7 @@ from experiments import (
     deepmapping_logs,
     deepmapping_suite,
 )
+from experiments._corridor_logs import write_corridor_log
 from experiments._deepmapping_methods import (
     DEEPMAPPING,
     METHODS,
@@ -282,6 +285,25 @@ def test_a_whole_recording_is_measured_by_its_relations_and_its_corrected_log(tm
     assert row["num_corrected"] == 48
     assert row["ate_corrected_m"] < min(0.1, row["ate_corrected_initial_m"])
     assert len((tmp_path / "out" / "robot.clf_odometry" / "trajectory_tum.txt").read_text().splitlines()) >= 48
+
+
+def test_shares_of_trust_count_maps_that_are_right_at_every_scan() -> None:
+    rows = [
+        {"worst_scan_m": worst, "assessment": {"is_trusted": trusted}}
+        for worst, trusted in ((0.1, True), (0.2, False), (0.9, True), (2.0, False))
+    ]
+    lines = deepmapping_logs.trust_lines([*rows, {"assessment": {"is_trusted": True}}])
+    assert lines == ["1 of 2 maps that are trusted are right", "1 of 2 maps that are right are trusted"]
+
+
+def test_a_corridor_log_is_one_of_its_seed(tmp_path) -> None:
+    one, same, other = (read_sequence(write_corridor_log(tmp_path / f"{k}.npz", k // 2)) for k in range(3))
+    np.testing.assert_array_equal(one.points, same.points)
+    assert (one.reference_poses != other.reference_poses).any()
+    assert one.unit == "m"
+    steps = se2.relative(one.reference_poses[:-1], one.reference_poses[1:])
+    assert 0.5 < np.median(steps[:, 0]) < 2.0
+    assert absolute_trajectory_error(one.odometry_poses[:, :2], one.reference_poses[:, :2]) > 0.1
 
 
 @pytest.mark.slow

@@ -223,3 +223,25 @@ def test_import_is_light():
     code = f"import sys, dpmjax.io as d; d.ScanSequence; print(*[m for m in {heavy} if m in sys.modules])"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == ""
+
+
+def test_the_largest_range_of_many_beams_is_no_echo(tmp_path, caplog):
+    rng = np.random.default_rng(0)
+    ranges = rng.uniform(1.0, 7.0, (6, NUM_BEAMS))
+    is_blind = rng.random(ranges.shape) < 0.3
+    read = read_sequence(save(tmp_path, "a.npz", ranges=np.where(is_blind, 8.0, ranges), angles=ANGLES))
+    np.testing.assert_array_equal(read.mask, ~is_blind)
+    assert "no echo" in read.notes[0].text
+    # Other codes of no echo, and ranges of which the largest is but one.
+    for code in (0.0, -1.0, np.inf, np.nan):
+        read = read_sequence(save(tmp_path, "a.npz", ranges=np.where(is_blind, code, ranges), angles=ANGLES))
+        np.testing.assert_array_equal(read.mask, ~is_blind)
+        assert not read.notes
+
+
+def test_angles_in_degrees_are_recognised(tmp_path):
+    ranges = np.linalg.norm(POINTS, axis=2)
+    degrees = read_sequence(save(tmp_path, "a.npz", ranges=ranges, angles=np.degrees(ANGLES)))
+    np.testing.assert_allclose(degrees.points, POINTS, rtol=1e-5)
+    assert "degrees" in degrees.notes[0].text
+    assert degrees.notes[0].is_doubt

@@ -9,8 +9,9 @@ import pytest
 
 from dpmjax.geometry import se2
 from dpmjax.registration import planar_scans
-from dpmjax.registration.recordings import align_between, choose_by_motion, fill_between
+from dpmjax.registration.recordings import align_between, choose_by_motion, choose_scans, fill_between
 from dpmjax.simulation import simulate_sequence
+from dpmjax.types import ScanSet
 from tests.registration.conftest import scans_of
 
 
@@ -116,3 +117,20 @@ def test_a_scan_that_does_not_fit_keeps_its_pose() -> None:
     points[2] = 30.0 * points[2] / np.linalg.norm(points[2], axis=-1, keepdims=True)  # a crowd around the robot
     aligned = align_between(planar_scans(points, sequence.mask), np.array([0, 4]), true)
     np.testing.assert_array_equal(aligned[2], true[2])
+
+
+def test_scans_recorded_twice_and_a_standing_robot_add_no_scan() -> None:
+    walk = simulate_sequence(0, 12, num_beams=64, seed=5)
+    scans, true = ScanSet(walk.points, walk.mask), np.asarray(walk.reference_poses)
+    twice = ScanSet(np.repeat(walk.points, 2, axis=0), np.repeat(walk.mask, 2, axis=0))
+    for motion in (None, np.repeat(true, 2, axis=0)):
+        found = choose_scans(twice, motion, 1.0, 0.5)
+        np.testing.assert_array_equal(found.chosen, np.arange(0, 24, 2))
+        np.testing.assert_array_equal(found.between(true), np.repeat(true, 2, axis=0))
+    assert len(choose_scans(scans, true, 1.0, 0.5).chosen) == 12
+    # The same place with other noise, five times.
+    standing = np.repeat(np.arange(12), np.where(np.arange(12) == 4, 5, 1))
+    noisy = walk.points[standing] * np.random.default_rng(0).normal(1.0, 1e-3, (16, 64, 1)).astype(np.float32)
+    found = choose_scans(ScanSet(noisy, walk.mask[standing]), true[standing], 1.0, 0.5)
+    np.testing.assert_array_equal(standing[found.chosen], np.arange(12))
+    np.testing.assert_allclose(found.between(true), true[standing], atol=1e-9)

@@ -10,8 +10,8 @@ from dpmjax.io import ScanSequence
 from dpmjax.metrics import absolute_trajectory_error
 from dpmjax.pose_graph.graph import Edges
 from dpmjax.registration import LoopConfig, RefinementConfig, close_loops, planar_scans, refine
+from dpmjax.registration.joint_alignment import _rounded_up, choose_pairs
 from dpmjax.registration.loop_closure import LoopResult, count_support, find_candidates
-from dpmjax.registration.refinement import _rounded_up, choose_pairs
 from dpmjax.simulation import simulate_sequence
 from dpmjax.types import ScanSet
 

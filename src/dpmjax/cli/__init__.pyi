@@ -23,6 +23,7 @@ from .machine import select_device as select_device
 from .machine import usable_cores as usable_cores
 from .machine import versions as versions
 from .map2d_numbers import planar_errors as planar_errors
+from .map2d_numbers import spans_of as spans_of
 from .map2d_run import Map2dRun as Map2dRun
 from .map2d_run import read_map2d_run as read_map2d_run
 from .optional import require_importable as require_importable

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -15,20 +15,33 @@ from dpmjax.sequences import Relations, ScanSequence
 Floats = NDArray[np.float64]
 
 UNITS = ("m", "deg")
+# Spans of uncertain scans that are printed.
+_NUM_SPANS = 8
 # Scans that a recording and a corrected log of it must have in common.
 _MIN_COMMON = 10
 
 
 def planar_errors(sequence: ScanSequence, poses: Floats) -> dict[str, float]:
-    """Returns ATE and point distance in the unit of the scans; nothing where there is no reference."""
+    """Returns ATE, the error of the worst scan after the same alignment, and point distance, in the unit of the scans.
+
+    Args:
+        sequence: the scans.
+        poses: (n, 3) T_world_scan.
+
+    Returns:
+        The numbers by name; nothing where there is no reference.
+    """
     from dpmjax.geometry import se2
 
     reference = sequence.reference_poses
     if reference is None:
         return {}
     distance = metrics.point_distance(sequence.points, sequence.mask, se2.to_matrix(poses), se2.to_matrix(reference))
+    T_reference_world = np.asarray(metrics.align_rigid(poses[:, :2], reference[:, :2]))
+    off = poses[:, :2] @ T_reference_world[:2, :2].T + T_reference_world[:2, 2] - reference[:, :2]
     return {
         f"ate_{sequence.unit}": float(metrics.absolute_trajectory_error(poses[:, :2], reference[:, :2])),
+        f"worst_scan_{sequence.unit}": float(np.hypot(*off.T).max()),
         f"point_distance_{sequence.unit}": float(distance),
     }
 
@@ -105,6 +118,27 @@ def corrected_numbers(times: Floats, poses: Floats, corrected: ScanSequence, suf
     }
 
 
+def _trust_lines(assessment: Mapping[str, Any]) -> list[str]:
+    """Returns the verdict, the fault of the odometry, and the scans that are exempt."""
+    trust = "can be trusted" if assessment["is_trusted"] else "DO NOT TRUST this map"
+    weakest, contradiction = assessment["weakest_connection"], assessment["contradiction"]
+    lines = [f"{trust}: weakest connection {weakest:.2f}, {contradiction:.1%} of the beams contradict beyond the usual"]
+    if assessment["fault"] is not None:
+        lines.append(assessment["fault"])
+    if count := len(assessment["uncertain_scans"]):
+        spans = spans_of(assessment["uncertain_scans"])
+        shown = ", ".join(spans[:_NUM_SPANS]) + (" ..." if len(spans) > _NUM_SPANS else "")
+        lines.append(f"uncertain where {count} scans are, which slide along a corridor or fit no other: {shown}")
+    return lines
+
+
+def spans_of(rows: Sequence[int]) -> list[str]:
+    """Returns increasing numbers as spans, such as 3-5 and 9."""
+    breaks = np.flatnonzero(np.diff(rows) > 1) + 1
+    parts = np.split(np.asarray(rows), breaks)
+    return [f"{part[0]}-{part[-1]}" if len(part) > 1 else f"{part[0]}" for part in parts]
+
+
 def report(unit: str, numbers: Mapping[str, Any]) -> str:
     """Returns the last lines on the console: errors and scores of each candidate, assessment of the kept one."""
     candidates, assessment = numbers["candidates"], numbers["assessment"]
@@ -113,12 +147,7 @@ def report(unit: str, numbers: Mapping[str, Any]) -> str:
     for name, found in candidates.items():
         mark, ate = "*" if name == numbers["kept"] else " ", found.get(f"ate_{unit}", math.nan)
         lines.append(f"{mark} {name:{width}}  {ate:10.3g}  {found['code_length']:11.3f}  {found['misfit']:19.1%}")
-    trust = "can be trusted" if assessment["is_trusted"] else "DO NOT TRUST this map"
-    weakest, contradiction = assessment["weakest_connection"], assessment["contradiction"]
-    lines += [
-        f"kept: {numbers['kept']} (chosen by the scans alone)",
-        f"{trust}: weakest connection {weakest:.2f}, {contradiction:.1%} of the beams contradict beyond the usual",
-    ]
+    lines += [f"kept: {numbers['kept']} (chosen without the reference)", *_trust_lines(assessment)]
     if "num_relations" in numbers:
         kinds = (f"{numbers[f'relations_initial_{kind}']:.3g} -> {numbers[f'relations_{kind}']:.3g}" for kind in UNITS)
         lines.append(f"mean error of {numbers['num_relations']} hand-checked relations: {' m, '.join(kinds)} degrees")

@@ -30,6 +30,10 @@ _ENDINGS |= {"carmen": (".log", ".clf", ".log.gz", ".clf.gz")}
 _PLAUSIBLE_RANGE = {"m": (0.05, 500.0), "px": (2.0, 20000.0)}
 # Few planar lidars measure farther; a sequence with hardly any shorter beam may be in millimetres.
 _USUAL_M, _LEAST_USUAL_SHARE = 100.0, 0.05
+# Beams within this share of the largest range have it. They are the code for no echo where there are so many, this
+# share of all, in so many scans, and this share of the scans has other beams.
+_SAME_RANGE, _LEAST_MAXIMA, _LEAST_SHARE, _LEAST_SCANS, _LEAST_OTHERS = 1e-5, 20, 0.005, 3, 0.5
+_LARGEST_SPAN = 1.05 * 2.0 * np.pi  # Angles of one scan that span more are no radians.
 _LEAST_BEAMS = 17  # Lines are fitted to up to 17 neighbouring beams.
 
 
@@ -49,7 +53,8 @@ def read_sequence(
         selection: start, stop and stride in scans.
         unit: unit of the file's lengths where the file does not state it; None takes PCD files as pixels / 512 and
             arrays as metres. CARMEN logs are in metres.
-        max_range: beams of this length or more (in the sequence's unit) are masked; None leaves it to the reader.
+        max_range: beams of this length or more (in the sequence's unit) are masked; None leaves it to the reader, and
+            masks the beams of the largest range where many have exactly this one.
         topic: of a bag: which scans; may be left out where there is one topic of planar scans.
 
     Returns:
@@ -67,8 +72,7 @@ def read_sequence(
     require(is_good, path, chosen, "start and stop count from 0, stride from 1")
     require(max_range is None or max_range > 0, path, f"max_range is {max_range}", "give a positive length")
     whole = _read_any(path, unit, max_range, topic)
-    if max_range is not None:
-        whole = _limit(whole, max_range)
+    whole = _without_maxima(whole, path) if max_range is None else _limit(whole, max_range)
     sequence = whole.take(slice(start, stop, stride))
     found = f"{len(sequence)} of {len(whole)} scans chosen ({chosen})"
     require(len(sequence) >= 2, path, found, "a registration needs two scans at least")
@@ -125,6 +129,23 @@ def _limit(sequence: ScanSequence, max_range: float) -> ScanSequence:
     return replace(sequence, mask=mask, points=np.where(mask[..., None], sequence.points, np.float32(0)))
 
 
+def _without_maxima(sequence: ScanSequence, path: Path) -> ScanSequence:
+    """Masks the beams at the largest range of all, where many have exactly this one: no echo within reach."""
+    if not sequence.mask.any():
+        return sequence
+    ranges = np.where(sequence.mask, np.linalg.norm(sequence.points.astype(np.float64), axis=2), 0.0)
+    limit = (1.0 - _SAME_RANGE) * ranges.max()
+    is_maximum = ranges >= limit
+    num_maxima, share = int(is_maximum.sum()), is_maximum.sum() / max(sequence.mask.sum(), 1)
+    is_code = num_maxima >= _LEAST_MAXIMA and share >= _LEAST_SHARE and is_maximum.any(axis=1).sum() >= _LEAST_SCANS
+    if not is_code or (sequence.mask & ~is_maximum).any(axis=1).mean() < _LEAST_OTHERS:
+        return sequence
+    text = (
+        f"{path}: {100 * share:.1f} % of the beams have the largest range, {ranges.max():.4g} {sequence.unit}: no echo"
+    )
+    return replace(_limit(sequence, limit), notes=(*sequence.notes, Note(text)))
+
+
 def _check_beams(sequence: ScanSequence, path: Path, start: int, stride: int) -> None:
     num_beams = sequence.mask.shape[1]
     advice = f"give {_LEAST_BEAMS} beams or more; arrays are (scans, beams, 2)"
@@ -164,9 +185,9 @@ def read_arrays(path: str | Path, *, unit: Unit | None = None) -> ScanSequence:
     ahead; and optionally `mask` (n, b), `poses` (the reference) and `odometry` as (n, 3) x, y, heading or (n, 3, 3)
     `T_world_scan`, `times` (n,) in seconds, and `unit`, "px" or "m".
 
-    A beam is invalid where `mask` is False, where both coordinates are NaN or one is infinite, or where its range is
-    NaN, infinite or not positive (as scanner drivers write a beam without echo). A beam with one NaN coordinate and a
-    finite one is an error.
+    Angles that span more than a turn are taken as degrees. A beam is invalid where `mask` is False, where both
+    coordinates are NaN or one is infinite, or where its range is NaN, infinite or not positive (as scanner drivers
+    write a beam without echo). A beam with one NaN coordinate and a finite one is an error.
 
     Args:
         path: the file.
@@ -180,7 +201,7 @@ def read_arrays(path: str | Path, *, unit: Unit | None = None) -> ScanSequence:
             other than for invalid beams.
     """
     table = load_arrays(path)
-    points, mask = _points(table, path) if "points" in table else _from_ranges(table, path)
+    points, mask, notes = (*_points(table, path), ()) if "points" in table else _from_ranges(table, path)
     given = table.get("mask", mask)
     is_good = given.shape == mask.shape and given.dtype.kind in "biu"
     require(is_good, path, f"mask is {given.shape} {given.dtype}", f"give {mask.shape} booleans")
@@ -197,7 +218,7 @@ def read_arrays(path: str | Path, *, unit: Unit | None = None) -> ScanSequence:
     poses, odometry = (_planar(table, key, len(points), path) for key in ("poses", "odometry"))
     stamps = times.astype(np.float64) if "times" in table else None
     is_organised, unit = has_angular_order(stored, mask), unit or _unit(table, path)
-    return ScanSequence(Path(path).stem, stored, mask, unit, is_organised, poses, odometry, stamps)
+    return ScanSequence(Path(path).stem, stored, mask, unit, is_organised, poses, odometry, stamps, notes)
 
 
 def _is_numeric(array: NDArray[np.generic], *shapes: tuple[int, ...]) -> bool:
@@ -212,7 +233,7 @@ def _points(table: Table, path: str | Path) -> tuple[FloatArray, BoolArray]:
     return planar, (np.isnan(planar).sum(axis=2) < 2) & ~np.isinf(planar).any(axis=2)
 
 
-def _from_ranges(table: Table, path: str | Path) -> tuple[FloatArray, BoolArray]:
+def _from_ranges(table: Table, path: str | Path) -> tuple[FloatArray, BoolArray, tuple[Note, ...]]:
     found = f"keys are {', '.join(table) or 'none'}"
     require("ranges" in table and "angles" in table, path, found, f"give {_KEYS}")
     ranges, angles = table["ranges"], table["angles"]
@@ -224,9 +245,13 @@ def _from_ranges(table: Table, path: str | Path) -> tuple[FloatArray, BoolArray]
     distance, theta = ranges.astype(np.float64), angles.astype(np.float64)
     found = "angles hold NaN, infinite or huge values"
     require((np.abs(theta) < 1e6).all(), path, found, "give a direction to every beam, in radians")
+    notes = []
+    if theta.size and np.ptp(theta, axis=-1).max() > _LARGEST_SPAN:
+        theta = np.radians(theta)
+        notes.append(Note(f"{path}: the angles span more than one turn in radians; taken as degrees", is_doubt=True))
     mask = np.isfinite(distance) & (distance > 0)
     distance = np.where(mask, distance, 0.0)
-    return distance[..., None] * np.stack([np.cos(theta), np.sin(theta)], axis=-1), mask
+    return distance[..., None] * np.stack([np.cos(theta), np.sin(theta)], axis=-1), mask, tuple(notes)
 
 
 def _unit(table: Table, path: str | Path) -> Unit:

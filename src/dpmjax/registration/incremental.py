@@ -10,6 +10,7 @@ from dpmjax.geometry import se2
 from dpmjax.registration.pair_alignment import COARSE, FINE, Metric, PairMatches, PosePrior, match_pairs
 from dpmjax.registration.planar_scans import Floats, PlanarScans
 from dpmjax.registration.sequence_search import search_sequence
+from dpmjax.registration.step_prior import StepPrior, usual_motion
 
 # Share of the typical range that a coarse match is off by; and that of a direction that the scans leave open.
 _COARSE_RESIDUAL = 0.015
@@ -21,13 +22,8 @@ _OPEN_RESIDUAL = 0.0075
 _TURN_STEP, _MAX_TURN = 15.0, 90.0
 # A pair with a better fitness is not searched further; one with a lower fitness even then is searched at longer steps.
 _GOOD_FITNESS, _POOR_FITNESS = 0.75, 0.4
-# Clear steps predict the translation of an open one if their turns differ by less, in radians.
-_SIMILAR_TURN = 0.15
 # A step is open if its weakest eigenvalue is below this share of the beams.
 _MIN_EIGENVALUE = 0.01
-# Standard deviation of a step of the odometry: of its translation in typical ranges, and of its turn as the weight of a
-# beam sees it.
-_ODOMETRY_SIGMA = (0.0225, 0.015)
 
 
 class IncrementalResult(NamedTuple):
@@ -43,7 +39,7 @@ class IncrementalResult(NamedTuple):
 
 
 def incremental_icp(
-    scans: PlanarScans, metric: Metric = "plane", *, odometry: Floats | None = None
+    scans: PlanarScans, metric: Metric = "plane", *, odometry: Floats | None = None, prior: StepPrior | None = None
 ) -> IncrementalResult:
     """Registers each scan to the one before and chains the steps.
 
@@ -53,7 +49,8 @@ def incremental_icp(
     Args:
         scans: n scans in time order.
         metric: distance to lines ("plane") or to points ("point").
-        odometry: (n, 3) raw poses. Their steps serve as guesses and as prior; without them the steps are searched.
+        odometry: (n, 3) raw poses. Their steps serve as guesses; without them the steps are searched.
+        prior: of the steps; None: that of the odometry, if there is any, at the usual deviations.
 
     Returns:
         IncrementalResult.
@@ -63,17 +60,19 @@ def incremental_icp(
     if len(scans) == 1:
         return IncrementalResult(np.zeros((1, 3)), match_pairs(source, target, np.zeros((0, 1, 3)), FINE))
     if odometry is None:
-        rough, prior = _search_steps(source, target, metric)
+        rough = _search_steps(source, target, metric)
+        prior = usual_motion(rough, unit)
     else:
-        rough, prior = _match_odometry(source, target, se2.relative(odometry[:-1], odometry[1:]), metric)
+        prior = prior or StepPrior.of_poses(odometry, unit)
+        guesses = np.asarray(se2.relative(odometry[:-1], odometry[1:]))
+        rough = _match_odometry(source, target, guesses, prior.as_pose_prior(_COARSE_RESIDUAL * unit), metric)
     # Where the scans fix a step, the prior is weighed against their noise alone; an open step leans on the prior.
     num_beams = np.maximum(np.asarray(source.is_on_line.sum(1)), 1)
     is_open = rough.weakest_eigenvalue() < _MIN_EIGENVALUE * num_beams / COARSE.source_stride
-    residual = np.where(is_open, _OPEN_RESIDUAL * unit, 3.0 * scans.noise) / (_COARSE_RESIDUAL * unit)
-    prior = PosePrior(prior.mean, np.asarray(prior.information) * residual[:, None] ** 2)
-    predicted = np.concatenate([np.asarray(prior.mean)[:, :2], rough.poses[:, 2:]], axis=1)
+    belief = prior.as_pose_prior(np.where(is_open, _OPEN_RESIDUAL * unit, 3.0 * scans.noise)[:, None])
+    predicted = np.concatenate([prior.steps[:, :2], rough.poses[:, 2:]], axis=1)
     guesses = np.stack([rough.poses, np.where(is_open[:, None], predicted, rough.poses)], axis=1)
-    steps = match_pairs(source, target, guesses, FINE, prior, metric=metric)
+    steps = match_pairs(source, target, guesses, FINE, belief, metric=metric)
     poses = se2.chain(steps.poses) if odometry is not None else search_sequence(scans, steps).poses
     return IncrementalResult(poses, steps)
 
@@ -90,29 +89,27 @@ def scan_odometry(scans: PlanarScans) -> Floats:
     Returns:
         (n, 3) T_world_scan, the first one zero.
     """
-    return se2.chain(_match_near(scans.take(slice(1, None)), scans.take(slice(len(scans) - 1)), "plane").poses)
+    return se2.chain(match_near(scans.take(slice(1, None)), scans.take(slice(len(scans) - 1)), "plane").poses)
 
 
-def _match_near(source: PlanarScans, target: PlanarScans, metric: Metric) -> PairMatches:
-    """Coarse matches from no motion and small turns."""
+def match_near(source: PlanarScans, target: PlanarScans, metric: Metric) -> PairMatches:
+    """Returns coarse matches from no motion and small turns."""
     fan = np.radians(_TURN_STEP) * np.outer([0.0, -0.5, 0.5], [0.0, 0.0, 1.0])
     return match_pairs(source, target, np.broadcast_to(fan, (len(source), 3, 3)), COARSE, metric=metric)
 
 
 def _match_odometry(
-    source: PlanarScans, target: PlanarScans, guess: Floats, metric: Metric
-) -> tuple[PairMatches, PosePrior]:
-    """Coarse matches around the steps of the odometry, and these steps as prior."""
-    sigma = np.array(_ODOMETRY_SIGMA)[[0, 0, 1]] / _COARSE_RESIDUAL
-    prior = PosePrior(guess, np.broadcast_to(sigma**-2.0, guess.shape))
+    source: PlanarScans, target: PlanarScans, guess: Floats, prior: PosePrior, metric: Metric
+) -> PairMatches:
+    """Returns coarse matches around the steps of the odometry."""
     fan = np.radians(_TURN_STEP) * np.outer([0.0, -0.5, 0.5, -1.5, 1.5], [0.0, 0.0, 1.0])
-    return match_pairs(source, target, guess[:, None] + fan, COARSE, prior, metric=metric), prior
+    return match_pairs(source, target, guess[:, None] + fan, COARSE, prior, metric=metric)
 
 
-def _search_steps(source: PlanarScans, target: PlanarScans, metric: Metric) -> tuple[PairMatches, PosePrior]:
-    """Coarse matches from small motions, then from larger ones where the fitness is poor; and the prior of them all."""
-    unit, rough = source.typical_range, _match_near(source, target, metric)
-    prior = _predict_open_steps(rough, unit)
+def _search_steps(source: PlanarScans, target: PlanarScans, metric: Metric) -> PairMatches:
+    """Returns coarse matches from small motions, then from larger ones where the fitness is poor."""
+    unit, rough = source.typical_range, match_near(source, target, metric)
+    prior = usual_motion(rough, unit).as_pose_prior(_COARSE_RESIDUAL * unit)
     # Around the predicted translations, then far from zero.
     near, far = _fan(unit, (0.0, 0.15), 4), _fan(unit, (0.3, 0.525), 8, turn_share=0.5)
     centre = np.asarray(prior.mean) * [1.0, 1.0, 0.0]
@@ -126,7 +123,7 @@ def _search_steps(source: PlanarScans, target: PlanarScans, metric: Metric) -> t
         better = wide.fitness > rough.fitness[rows]
         for kept, found in zip(rough, wide, strict=True):
             kept[rows[better]] = found[better]
-    return rough, _predict_open_steps(rough, unit)
+    return rough
 
 
 def _fan(typical_range: float, radii: tuple[float, ...], num_ways: int, *, turn_share: float = 1.0) -> Floats:
@@ -136,26 +133,3 @@ def _fan(typical_range: float, radii: tuple[float, ...], num_ways: int, *, turn_
     ways = 2 * np.pi * np.arange(num_ways) / num_ways
     shifts = [(r * np.cos(w), r * np.sin(w)) for r in radii for w in (ways if r else ways[:1])]
     return np.array([(typical_range * x, typical_range * y, turn) for turn in turns for x, y in shifts])
-
-
-def _predict_open_steps(matches: PairMatches, typical_range: float) -> PosePrior:
-    """A prior for steps that the scans leave open: the median translation of the clear steps with a similar turn.
-
-    In a corridor two scans fit at every shift along it; a robot that has made straight steps of one metre elsewhere
-    will have made another one there.
-
-    Returns:
-        PosePrior of the translations; without five clear steps it is no belief.
-    """
-    eigenvalue = matches.weakest_eigenvalue()
-    is_clear = (eigenvalue >= np.median(eigenvalue)) & (matches.fitness >= np.median(matches.fitness))
-    clear, turns = matches.poses[is_clear], matches.poses[:, 2]
-    mean, information = np.zeros((len(turns), 3)), np.zeros((len(turns), 3))
-    for row, turn in enumerate(turns):
-        alike = clear[np.abs(se2.wrap_angle(clear[:, 2] - turn)) < _SIMILAR_TURN]
-        alike = alike if len(alike) >= 5 else clear
-        if len(alike) >= 5:
-            mean[row, :2] = np.median(alike[:, :2], axis=0)
-            spread = 1.4826 * np.median(np.abs(alike[:, :2] - mean[row, :2]), axis=0) / typical_range
-            information[row, :2] = (_COARSE_RESIDUAL / (spread + 0.015)) ** 2
-    return PosePrior(mean, information)

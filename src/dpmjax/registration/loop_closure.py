@@ -19,6 +19,7 @@ from jaxtyping import Array, Bool, Float, Int
 from dpmjax.geometry import se2
 from dpmjax.pose_graph.graph import Edges, PoseGraph, join_edges
 from dpmjax.pose_graph.optimize import ROBUST, optimize_pose_graph
+from dpmjax.registration.held_steps import BEAM_DEVIATION, pose_steps
 from dpmjax.registration.pair_alignment import PairMatches, PosePrior, Schedule, match_pairs
 from dpmjax.registration.planar_scans import Floats, Indices, PlanarScans, batches
 from dpmjax.registration.range_profiles import contradicted_share, make_profiles
@@ -38,8 +39,6 @@ _MIN_FITNESS, _MAX_CONTRADICTED = 0.4, 0.08
 _MIN_EIGENVALUE = 0.03
 # So many loops between scans nearby in time must agree with a loop: within this translation in typical ranges, radians.
 _MIN_SUPPORT, _NEIGHBOURHOOD, _AGREEMENT = 2, 6, (0.045, 0.08)
-# Accuracy of a fitted beam, and of a step of the start: translation in typical ranges, radians.
-_SIGMA, _STEP_SIGMA = 0.03, (0.045, 0.15)
 # So many loops must contradict a step before the trajectory is torn there.
 _STEP_TRUST = 30.0
 
@@ -106,20 +105,6 @@ def close_loops(
     return LoopResult(poses, loops, weights)
 
 
-def pose_steps(poses: Floats, typical_range: float) -> Edges:
-    """Edges between neighbours in time of these poses."""
-    relative, later = se2.relative(poses[:-1], poses[1:]), np.arange(1, len(poses))
-    information = np.diag((np.array(_STEP_SIGMA)[[0, 0, 1]] * [typical_range, typical_range, 1.0]) ** -2.0)
-    return Edges(later, later - 1, relative, np.broadcast_to(information, (len(later), 3, 3)))
-
-
-def matched_steps(matches: PairMatches, typical_range: float) -> Edges:
-    """Edges between neighbours in time from their matches; the trust in a step is the least that they have."""
-    least = pose_steps(se2.chain(matches.poses), typical_range)
-    information = matches.information / (_SIGMA * typical_range) ** 2 + least.information
-    return least._replace(measurements=matches.poses, information=information)
-
-
 def _find_loops(scans: PlanarScans, poses: Floats, config: LoopConfig) -> Edges:
     """Loops between scans of one trajectory, each supported by its neighbours; perhaps none."""
     unit = scans.typical_range
@@ -132,7 +117,7 @@ def _find_loops(scans: PlanarScans, poses: Floats, config: LoopConfig) -> Edges:
     num_beams = np.maximum(np.asarray(scans.is_on_line.sum(1))[source], 1)
     is_held = matches.weakest_eigenvalue() / num_beams > _MIN_EIGENVALUE
     fits = (matches.fitness > _MIN_FITNESS) & (contradicted < _MAX_CONTRADICTED) & is_held
-    information = matches.information[fits] / (_SIGMA * unit) ** 2
+    information = matches.information[fits] / (BEAM_DEVIATION * unit) ** 2
     edges = Edges(source[fits], target[fits], matches.poses[fits], information)
     is_supported = count_support(edges, poses, unit) >= _MIN_SUPPORT
     return jax.tree.map(lambda x: x[is_supported], edges)

@@ -12,7 +12,6 @@ from functools import partial
 from typing import Literal, NamedTuple, get_args
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -21,11 +20,13 @@ from dpmjax.deepmapping.config import DeepMappingConfig
 from dpmjax.deepmapping.engine import Fit, Progress, fit
 from dpmjax.deepmapping.planar import Fitted, as_scan_set, fit_deepmapping
 from dpmjax.geometry import se2
+from dpmjax.registration.assessment import Assessment, assess_trajectory
 from dpmjax.registration.global_registration import nearest_tour, register_globally
 from dpmjax.registration.incremental import incremental_icp, scan_odometry
+from dpmjax.registration.odometry import Odometry, calibrate_odometry
 from dpmjax.registration.planar_scans import Floats, Indices, PlanarScans, planar_scans
-from dpmjax.registration.quality import Assessment, Score, assess_trajectory, choose_trajectory
-from dpmjax.registration.recordings import Recording, choose_scans
+from dpmjax.registration.quality import Score, choose_trajectory
+from dpmjax.registration.recordings import Recording, choose_scans, take_scans
 from dpmjax.registration.refinement import refine
 from dpmjax.types import ScanSet
 
@@ -121,7 +122,8 @@ class RegisteredScans(NamedTuple):
         kept: name of the candidate that the poses come from.
         start: name of the candidate that the fit started from.
         candidates: all candidates by name; DeepMapping is one if it has done a step.
-        assessment: of the kept candidate: `assessment.is_trusted` tells whether its map can be trusted.
+        assessment: of the kept candidate: `is_trusted` tells whether its map can be trusted, `uncertain_scans` (rows of
+            all scans) for which of the registered scans it cannot, and `fault` what contradicts the odometry.
         fitted: DeepMapping of the registered scans; untrained where the fit was stopped before its first step.
         recording: all scans, and the rows of those that were registered.
     """
@@ -177,29 +179,60 @@ def register_scans(
     odometry_poses = None if odometry is None else se2.as_poses("odometry", odometry, len(all_scans.points))
     first_poses = _checked_start(start, odometry_poses, len(all_scans.points), config)
     recording = _choose_scans(all_scans, odometry_poses, first_poses, config, hooks)
-    lines = planar_scans(_take(all_scans, recording.chosen), is_ordered=config.is_ordered)
-    start_name, poses = _start_poses(lines, first_poses, odometry_poses, recording, hooks)
+    lines = planar_scans(take_scans(all_scans, recording.chosen), is_ordered=config.is_ordered)
+    evidence = _find_evidence(lines, first_poses, odometry_poses, recording, hooks)
+    start_name, poses = _start_poses(lines, first_poses, evidence, recording, hooks)
     warm_start = None if start_name == START_NAMES["zero"] else poses
     fitted = _fit(recording, warm_start, config, key=key, hooks=hooks)
     found = {start_name: poses}
     if fitted.num_steps > 0:
         found[DEEPMAPPING] = fitted.poses
     if config.refine and not hooks.stop():
-        found |= _refined_candidates(lines, found, hooks)
+        found |= _refined_candidates(lines, found, evidence, hooks)
     hooks.on_progress("choice and assessment", 0.0)
-    kept, scores = choose_trajectory(lines, found)
-    assessment = assess_trajectory(lines, found[kept])
+    kept, scores, assessment = _choose(lines, found, evidence)
     has_other = isinstance(start, str) and start == "auto" and config.refine and odometry_poses is not None
+    has_other = has_other and not (evidence is not None and evidence.is_mirrored)
     if has_other and not assessment.is_trusted and not hooks.stop():
         hooks.on_progress("the map from odometry cannot be trusted: registration without it", 0.0)
         name = START_NAMES["icp-plane"]
         found[f"{name}, refined"] = refine(lines, incremental_icp(lines).poses).poses
-        kept, scores = choose_trajectory(lines, found)
-        assessment = assess_trajectory(lines, found[kept])
+        kept, scores, assessment = _choose(lines, found, evidence)
     if recording.motion is not None:
         hooks.on_progress("poses between the registered scans", 0.0)
     candidates = {name: Candidate(found[name], score) for name, score in scores.items()}
+    uncertain = tuple(recording.chosen[list(assessment.uncertain_scans)].tolist())
+    assessment = assessment._replace(uncertain_scans=uncertain)
     return RegisteredScans(recording.aligned(found[kept]), kept, start_name, candidates, assessment, fitted, recording)
+
+
+def _choose(
+    scans: PlanarScans, candidates: dict[str, Floats], evidence: Odometry | None
+) -> tuple[str, dict[str, Score], Assessment]:
+    """Returns the name of the best candidate, the scores of all, and the assessment of the best."""
+    if evidence is None:
+        kept, scores = choose_trajectory(scans, candidates)
+        return kept, scores, assess_trajectory(scans, candidates[kept])
+    kept, scores = choose_trajectory(scans, candidates, prior=evidence.prior)
+    # Units are corrected; of a mirrored log nothing tells which side is right.
+    fault = evidence.fault if evidence.is_mirrored else None
+    assessment = assess_trajectory(scans, candidates[kept], prior=evidence.prior, fault=fault)
+    return kept, scores, assessment._replace(fault=evidence.fault)
+
+
+def _find_evidence(
+    scans: PlanarScans,
+    start: str | Floats,
+    odometry: Floats | None,
+    recording: Recording,
+    hooks: RegistrationHooks,
+) -> Odometry | None:
+    """Calibrates the odometry, or the given poses without any; None where the start uses the scans alone."""
+    given = odometry if isinstance(start, str) else (start if odometry is None else odometry)
+    if given is None or (isinstance(start, str) and start != "odometry") or len(scans) < 2 or not scans.is_ordered:
+        return None
+    hooks.on_progress("calibration of the odometry", 0.0)
+    return calibrate_odometry(scans, given[recording.chosen])
 
 
 def _checked_start(
@@ -226,21 +259,18 @@ def _choose_scans(
 ) -> Recording:
     """Chooses the scans that are registered by the odometry, or by the scans where the start uses them alone."""
     motion = None if isinstance(start, str) and start in STARTS_FROM_SCANS else odometry
-    if config.min_distance is None or not config.is_ordered:
-        return Recording(scans, np.arange(len(scans.points)))
+    if not config.is_ordered:
+        return Recording(scans, np.arange(len(scans.points)), None, np.arange(len(scans.points)))
+    if config.min_distance is None:
+        return choose_scans(scans, None, 1.0, 1.0)
     if motion is None and len(scans.points) > _MAX_WHOLE:
         hooks.on_progress("odometry from the scans", 0.0)
         motion = scan_odometry(planar_scans(scans))
     return choose_scans(scans, motion, config.min_distance, config.min_turn)
 
 
-def _take(scans: ScanSet, rows: Indices) -> ScanSet:
-    # On the host: each number of rows would be a program of its own.
-    return ScanSet(jnp.asarray(np.asarray(scans.points)[rows]), jnp.asarray(np.asarray(scans.mask)[rows]))
-
-
 def _start_poses(
-    scans: PlanarScans, start: str | Floats, odometry: Floats | None, recording: Recording, hooks: RegistrationHooks
+    scans: PlanarScans, start: str | Floats, evidence: Odometry | None, recording: Recording, hooks: RegistrationHooks
 ) -> tuple[str, Floats]:
     """Returns the name of the start and the poses of the registered scans."""
     if not isinstance(start, str):
@@ -254,8 +284,8 @@ def _start_poses(
             return name, register_globally(scans).poses
         case "icp-plane" | "icp-point":
             return name, incremental_icp(scans, "plane" if start == "icp-plane" else "point").poses
-    assert odometry is not None
-    return name, odometry[recording.chosen]
+    assert evidence is not None
+    return name, evidence.poses
 
 
 def fit_in_order(
@@ -287,7 +317,7 @@ def fit_in_order(
     order = np.arange(len(scans.points)) if is_ordered or start is None else nearest_tour(start)
     first_poses = None if start is None else start[order]
     engine = fit if engine_of is None else engine_of(order)
-    fitted = fit_deepmapping(_take(scans, order), config, key=key, start=first_poses, engine=engine)
+    fitted = fit_deepmapping(take_scans(scans, order), config, key=key, start=first_poses, engine=engine)
     return fitted._replace(poses=fitted.poses[np.argsort(order)])
 
 
@@ -305,28 +335,29 @@ def _fit(
             return hooks.engine(recording.chosen[order])
         return partial(fit, on_report=report, stop=hooks.stop)
 
-    scans = _take(recording.scans, recording.chosen)
+    scans = take_scans(recording.scans, recording.chosen)
     return fit_in_order(scans, config.fit, key=key, start=start, is_ordered=config.is_ordered, engine_of=engine_of)
 
 
 def _refined_candidates(
-    scans: PlanarScans, candidates: dict[str, Floats], hooks: RegistrationHooks
+    scans: PlanarScans, candidates: dict[str, Floats], evidence: Odometry | None, hooks: RegistrationHooks
 ) -> dict[str, Floats]:
     """Returns the start and the fit, each refined; a fit that is a worse map than the refined start is left out.
 
     Near a good start the fit gives the sharper map. The start keeps the motion that a robot's odometry has measured.
     """
     (start, start_poses), *fits = candidates.items()
+    prior = None if evidence is None else evidence.prior
     found: dict[str, Floats] = {}
 
     def add_refined(name: str, poses: Floats) -> None:
         hooks.on_progress(f"{name}, refined", 0.0)
-        found[f"{name}, refined"] = refine(scans, poses).poses
+        found[f"{name}, refined"] = refine(scans, poses, prior=prior).poses
 
     if start != START_NAMES["zero"]:
         add_refined(start, start_poses)
     for name, poses in fits:
-        scores = choose_trajectory(scans, {name: poses, **found})[1]
+        scores = choose_trajectory(scans, {name: poses, **found}, prior=prior)[1]
         nats = [score.code_length for score in scores.values()]
         if nats[0] <= _LEAST_PROMISING * nats[-1]:
             add_refined(name, poses)

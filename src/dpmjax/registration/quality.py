@@ -1,9 +1,8 @@
-"""Quality of a registration without the truth: scores of trajectories, the choice among them, and trust in one.
+"""Quality of a registration without the truth: scores of trajectories, and the choice among them.
 
-A map is as good as few nats write all its beams down (`map_code_length`) and as near scans agree (`view_misfit`).
-It is wrong where a weak connection holds it together, or where beams pass through what others have hit; so trust rests
-on the weakest connection of the best tree of pairs, and on how much more all other pairs contradict each other than
-those of the tree (`assess_trajectory`).
+A map is as good as few nats write all its beams down (`map_code_length`) and as near scans agree (`view_misfit`), and a
+trajectory as good as its steps are those of the odometry, within its noise. `assessment.py` tells whether the best one
+can be trusted.
 """
 
 from __future__ import annotations
@@ -12,19 +11,19 @@ from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
-import scipy.sparse
-import scipy.sparse.csgraph
 import scipy.spatial
 import scipy.special
 
 from dpmjax.geometry import se2
 from dpmjax.registration.planar_scans import Floats, Indices, PlanarScans
 from dpmjax.registration.range_profiles import compare_pairs, make_profiles
-from dpmjax.registration.step_scores import pair_scores
+from dpmjax.registration.step_prior import StepPrior
 
 # Maps whose code lengths differ by less than this part are equally good as maps (how walls lie in the cells is worth
 # some percent); then their surfaces decide.
 _SAME_MAP = 0.1
+# Nats a beam, and share of misfits, that a nat a step counts as; and standard deviations of a step that cost nothing.
+_STEP_WEIGHT, _ALLOWED = 0.2, 3.0
 # Hits and passages that are counted at most; more would only take longer.
 _MAX_BEAMS = 40_000
 _SAMPLES_A_BEAM = 32
@@ -35,29 +34,12 @@ _CELL = 0.015
 _LEAST_TOLERANCE = 0.001
 # Bearings of the profiles that it is measured by: exact to less than that tolerance.
 _NUM_BEARINGS = 4096
-# Limits of `assess_trajectory`, calibrated on right and wrong maps of simulated worlds and of thinned logs
-# (docs/notebook/deepmapping_notes.md).
 # Number of nearest scans, by position and once more by position and heading, that each scan is compared with.
 _NUM_NEAREST = 12
 # Typical ranges that a radian of heading counts as in the second of these searches.
 _HEADING_WEIGHT = 0.5
-# Score of its best pair above which a scan belongs to the map.
-_LEAST_SCORE = 0.1
-# Least share of the scans that the connected map must hold.
-_LEAST_REGISTERED = 0.9
-# Least score of the weakest connection between two parts of a trusted map.
-_MIN_CONNECTION = 0.1
-# Least number of scans of a part, and least share of the connected scans; the larger of the two decides.
-_PART_SCANS, _PART_SHARE = 3, 0.02
-# In maps of no more connected scans than this, a single scan is a part.
-_FEW_SCANS = 60
-# The largest contradiction (`Assessment`) of a trusted map is the floor plus the factor times the contradicted share of
-# the connections that hold the map, because sensor and people contradict there too; it is never above the maximum.
-_CONTRADICTION_FLOOR = 0.02
-_CONTRADICTION_FACTOR = 1.6
-_MAX_CONTRADICTION = 0.055
 # Range noise in typical ranges above which right and wrong maps look alike: no map is trusted there.
-_MAX_NOISE = 0.0225
+MAX_NOISE = 0.0225
 
 
 class Score(NamedTuple):
@@ -66,13 +48,17 @@ class Score(NamedTuple):
     Attributes:
         code_length: nats a beam for the map (`map_code_length`): whether the map is right as a whole.
         misfit: share of beams off the surfaces of near scans (`view_misfit`): how sharp it is.
+        surprise: mean nats a step beyond what its prior allows: how far it tears the odometry; 0 without a prior.
     """
 
     code_length: float
     misfit: float
+    surprise: float = 0.0
 
 
-def choose_trajectory(scans: PlanarScans, candidates: Mapping[str, Floats]) -> tuple[str, dict[str, Score]]:
+def choose_trajectory(
+    scans: PlanarScans, candidates: Mapping[str, Floats], *, prior: StepPrior | None = None
+) -> tuple[str, dict[str, Score]]:
     """The best trajectory: among those whose maps are about as short to describe as the shortest, the sharpest.
 
     With so much range noise that no map can be trusted, surfaces tell nothing, and the shortest is the best.
@@ -80,6 +66,7 @@ def choose_trajectory(scans: PlanarScans, candidates: Mapping[str, Floats]) -> t
     Args:
         scans: n scans.
         candidates: (n, 3) poses by name.
+        prior: of their steps; None: none.
 
     Returns:
         The name of the best, and the scores of all.
@@ -90,12 +77,24 @@ def choose_trajectory(scans: PlanarScans, candidates: Mapping[str, Floats]) -> t
     if not candidates:
         raise ValueError("candidates: expected at least one trajectory")
     scores = {
-        name: Score(map_code_length(scans, poses), view_misfit(scans, poses)) for name, poses in candidates.items()
+        name: Score(map_code_length(scans, poses), view_misfit(scans, poses), _surprise(poses, prior))
+        for name, poses in candidates.items()
     }
-    shortest = min(score.code_length for score in scores.values())
-    same_map = 0.0 if scans.noise > _MAX_NOISE * scans.typical_range else _SAME_MAP
-    as_short = [name for name, score in scores.items() if score.code_length <= (1.0 + same_map) * shortest]
-    return min(as_short, key=lambda name: scores[name].misfit), scores
+    lengths = {name: score.code_length + _STEP_WEIGHT * score.surprise for name, score in scores.items()}
+    same_map = 0.0 if scans.noise > MAX_NOISE * scans.typical_range else _SAME_MAP
+    as_short = [name for name, length in lengths.items() if length <= (1.0 + same_map) * min(lengths.values())]
+    return min(as_short, key=lambda name: scores[name].misfit + _STEP_WEIGHT * scores[name].surprise), scores
+
+
+def _surprise(poses: Floats, prior: StepPrior | None) -> float:
+    """Returns the mean cost of the steps beyond that of three standard deviations."""
+    if prior is None:
+        return 0.0
+    steps = np.asarray(se2.relative(poses[:-1], poses[1:]))
+    allowed = prior.costs(
+        prior.steps + _ALLOWED * np.where(np.isfinite(prior.deviations), prior.deviations, 0.0) * [1.0, 0.0, 0.0]
+    )
+    return float(np.maximum(prior.costs(steps) - allowed, 0.0).mean())
 
 
 def map_code_length(scans: PlanarScans, poses: Floats) -> float:
@@ -163,65 +162,14 @@ def view_misfit(scans: PlanarScans, poses: Floats) -> float:
         fractions for near misses. 1 where no scan sees what another has seen.
     """
     tolerance = max(scans.noise, _LEAST_TOLERANCE * scans.typical_range)
-    source, target = _near_pairs(poses, scans.typical_range)
+    source, target = near_pairs(poses, scans.typical_range)
     profiles, relative = make_profiles(scans, _NUM_BEARINGS), se2.relative(poses[target], poses[source])
     views = compare_pairs(profiles, source, target, relative, match_tolerance=tolerance)
     return 1.0 - float(np.sum(views.matched) / max(float(np.sum(views.visible)), 1.0))
 
 
-class Assessment(NamedTuple):
-    """How far a registration can be trusted, without the truth.
-
-    Attributes:
-        weakest_connection: score, at most 1, of the weakest connection that holds two parts of the map together.
-        contradiction: share of beams that end in the free space of another scan, beyond that of the connections that
-            hold the map: scans that meet again by the poses alone must not contradict more than those.
-        is_trusted: both are within what right maps reach, and there is not too much noise to tell.
-    """
-
-    weakest_connection: float
-    contradiction: float
-    is_trusted: bool
-
-
-def assess_trajectory(scans: PlanarScans, poses: Floats) -> Assessment:
-    """Tells whether the registration of scans can be trusted.
-
-    The best pairs of scans make a tree that holds the map together. It must have no weak connection between two parts,
-    and the other pairs must contradict hardly more than those of the tree. Scans that fit no other are left out, if
-    they are few.
-
-    Args:
-        scans: n scans, two at least.
-        poses: (n, 3) x, y, heading.
-
-    Returns:
-        Assessment.
-    """
-    profiles, (source, target) = make_profiles(scans), _near_pairs(poses, scans.typical_range)
-    relative = se2.relative(poses[target], poses[source])
-    scores = pair_scores(profiles, source, target, relative)
-    views = compare_pairs(profiles, source, target, relative)
-    best = np.full(len(poses), -np.inf)
-    np.maximum.at(best, np.concatenate([source, target]), np.concatenate([scores, scores]))
-    is_used = (best[source] > _LEAST_SCORE) & (best[target] > _LEAST_SCORE)
-    source, target, scores = source[is_used], target[is_used], scores[is_used]
-    contradicted, visible = (np.asarray(x)[is_used] for x in (views.contradicted, views.visible))
-    size = (len(poses), len(poses))
-    costs = scipy.sparse.csr_array((2.0 - scores, (source, target)), size)
-    tree = scipy.sparse.csr_array(scipy.sparse.csgraph.minimum_spanning_tree(costs))
-    holding = tree.tocoo()
-    holds = np.isin(source * len(poses) + target, holding.row.astype(np.int64) * len(poses) + holding.col)
-    shares = [contradicted[rows].sum() / max(visible[rows].sum(), 1.0) for rows in (holds, ~holds)]
-    excess, num_connected, weakest = shares[1] - shares[0], *_weakest_connection(tree)
-    limit = min(_CONTRADICTION_FLOOR + _CONTRADICTION_FACTOR * shares[0], _MAX_CONTRADICTION)
-    is_clear = excess <= limit and scans.noise <= _MAX_NOISE * scans.typical_range
-    is_whole = num_connected >= _LEAST_REGISTERED * len(poses) and weakest >= _MIN_CONNECTION
-    return Assessment(weakest, float(excess), bool(is_clear and is_whole))
-
-
-def _near_pairs(poses: Floats, typical_range: float) -> tuple[Indices, Indices]:
-    """Source and target of each scan and its nearest ones, each pair once."""
+def near_pairs(poses: Floats, typical_range: float) -> tuple[Indices, Indices]:
+    """Returns source and target of each scan and its nearest ones, each pair once."""
     heading = _HEADING_WEIGHT * typical_range * np.column_stack([np.cos(poses[:, 2]), np.sin(poses[:, 2])])
     count, row = min(_NUM_NEAREST + 1, len(poses)), np.arange(len(poses))
     pairs = []
@@ -231,20 +179,3 @@ def _near_pairs(poses: Floats, typical_range: float) -> tuple[Indices, Indices]:
     found = np.unique(np.sort(np.concatenate(pairs), axis=1), axis=0)
     target, source = found[found[:, 0] < found[:, 1]].astype(np.int64).T
     return source, target
-
-
-def _weakest_connection(tree: scipy.sparse.csr_array) -> tuple[int, float]:
-    """Scans of the largest connected tree, and the lowest score between two of its parts that are no single scans."""
-    label = scipy.sparse.csgraph.connected_components(tree, directed=False)[1]
-    root = int(np.flatnonzero(label == np.bincount(label).argmax())[0])
-    order, parent = scipy.sparse.csgraph.breadth_first_order(tree, root, directed=False)
-    size = np.ones(tree.shape[0], np.int64)
-    for scan in order[:0:-1]:
-        size[parent[scan]] += size[scan]
-    count, below = len(order), order[1:]
-    if not len(below):
-        return count, 0.0
-    cost = np.asarray((tree + tree.T)[below, parent[below]]).reshape(-1)
-    smaller = np.minimum(size[below], count - size[below])
-    is_part = smaller >= (1 if count <= _FEW_SCANS else max(_PART_SCANS, _PART_SHARE * count))
-    return count, float(2.0 - cost[is_part].max()) if is_part.any() else 1.0

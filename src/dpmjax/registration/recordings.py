@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 from numpy.typing import NDArray
@@ -27,6 +28,8 @@ _ODOMETRY_SIGMA = (0.005, 0.01)
 _LOOSE_SIGMA, _TURNS = (0.01, 0.1), (-0.15, -0.1, -0.05, 0.0, 0.05, 0.1, 0.15)
 # A scan keeps to odometry where a lower share of its beams fits, or where more of them contradict the chosen scan.
 _MIN_FITNESS, _MAX_CONTRADICTED = 0.5, 0.05
+# A robot stands still that moves by less than this share of the way between registered scans.
+_STANDING = 0.02
 # Scans that are aligned at a time.
 _BLOCK = 1024
 
@@ -37,26 +40,56 @@ class Recording(NamedTuple):
     Attributes:
         scans: all n scans.
         chosen: rows of the k registered scans, in order.
-        motion: (n, 3) poses whose steps are the motion between registered scans; None where all are registered.
+        motion: (n, 3) poses whose steps are the motion between registered scans; None where all are registered but
+            repeated ones.
+        originals: (n,) row of the scan that each scan repeats beam by beam; its own row where it repeats none.
     """
 
     scans: ScanSet
     chosen: Indices
-    motion: Floats | None = None
+    motion: Floats | None
+    originals: Indices
 
     def between(self, poses: Floats) -> Floats:
         """Returns poses of all scans, by those of the registered ones and the motion between them."""
-        return poses if self.motion is None else fill_between(self.chosen, poses, self.motion)
+        rows = np.unique(self.originals)
+        if self.motion is not None:
+            poses = fill_between(np.searchsorted(rows, self.chosen), poses, self.motion[rows])
+        return poses[np.searchsorted(rows, self.originals)]
 
     def aligned(self, poses: Floats) -> Floats:
         """Returns the same, each scan aligned with the nearest registered one."""
+        poses = self.between(poses)
         if self.motion is None:
             return poses
-        return align_between(planar_scans(self.scans), self.chosen, self.between(poses))
+        rows = np.unique(self.originals)
+        scans = planar_scans(take_scans(self.scans, rows))
+        aligned = align_between(scans, np.searchsorted(rows, self.chosen), poses[rows])
+        return aligned[np.searchsorted(rows, self.originals)]
+
+
+def take_scans(scans: ScanSet, rows: Indices) -> ScanSet:
+    """Returns the scans of these rows."""
+    # On the host: each number of rows would be a program of its own.
+    return ScanSet(jnp.asarray(np.asarray(scans.points)[rows]), jnp.asarray(np.asarray(scans.mask)[rows]))
+
+
+def find_originals(scans: ScanSet) -> Indices:
+    """Finds scans that repeat the one before beam by beam: recorded twice, or by a robot that waits in a simulation.
+
+    Args:
+        scans: n scans in the order of time.
+
+    Returns:
+        (n,) row of the first scan of each such run.
+    """
+    points, mask = np.asarray(scans.points), np.asarray(scans.mask)
+    repeats = np.append(False, (points[1:] == points[:-1]).all((1, 2)) & (mask[1:] == mask[:-1]).all(1))
+    return np.maximum.accumulate(np.where(repeats, 0, np.arange(len(points))))
 
 
 def choose_scans(scans: ScanSet, motion: Floats | None, min_distance: float, min_turn: float) -> Recording:
-    """Chooses the scans of a recording that are registered: those that lie apart, or all where most do.
+    """Chooses the scans of a recording that are registered: those that lie apart, or all that move where most do.
 
     Args:
         scans: n scans in the order of time.
@@ -65,13 +98,17 @@ def choose_scans(scans: ScanSet, motion: Floats | None, min_distance: float, min
         min_turn: as `choose_by_motion`.
 
     Returns:
-        Recording.
+        Recording; a scan that repeats the one before is not registered, and has its pose.
     """
-    count = len(scans.points)
-    chosen = np.arange(count) if motion is None else choose_by_motion(motion, min_distance, min_turn)
-    if motion is None or 2 * len(chosen) >= count:
-        return Recording(scans, np.arange(count))
-    return Recording(scans, chosen, motion)
+    originals = find_originals(scans)
+    rows = np.unique(originals)
+    if motion is None:
+        return Recording(scans, rows, None, originals)
+    chosen = choose_by_motion(motion[rows], min_distance, min_turn)
+    if 2 * len(chosen) >= len(rows):
+        # A robot that stands still measures noise alone.
+        chosen = choose_by_motion(motion[rows], _STANDING * min_distance, _STANDING * min_turn)
+    return Recording(scans, rows[chosen], None if len(chosen) == len(rows) else motion, originals)
 
 
 def choose_by_motion(odometry: Float[np.ndarray, "n 3"], min_distance: float, min_turn: float) -> Indices:

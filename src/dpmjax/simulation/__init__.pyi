@@ -34,6 +34,7 @@ from .town.scan import PANDAR64 as PANDAR64
 from .town.scan import VLP16 as VLP16
 from .town.scan import LidarSensor as LidarSensor
 from .town.scan import scan_town as scan_town
+from .trajectory2d import simulate_odometry as simulate_odometry
 from .trajectory2d import simulate_trajectory as simulate_trajectory
 from .world2d import World as World
 from .world2d import make_world as make_world

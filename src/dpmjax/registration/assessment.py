@@ -1,0 +1,179 @@
+"""Trust in a registration without the truth.
+
+A map is wrong where a weak connection holds it together, where beams pass through what others have hit, and where a
+step may slide along a corridor. So trust rests on the weakest connection of the best tree of pairs; on how much more
+all other pairs contradict each other than those of the tree; and on the standard deviation of each scan's place against
+the largest part of the map that has no open connection.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import scipy.sparse
+import scipy.sparse.csgraph
+from numpy.typing import NDArray
+
+from dpmjax.geometry import se2
+from dpmjax.registration.planar_scans import Floats, Indices, PlanarScans
+from dpmjax.registration.quality import MAX_NOISE, near_pairs
+from dpmjax.registration.range_profiles import RangeProfiles, compare_pairs, make_profiles
+from dpmjax.registration.step_prior import StepPrior
+from dpmjax.registration.step_scores import pair_scores
+from dpmjax.registration.step_slides import slide_steps
+
+# Limits of `assess_trajectory`, calibrated on right and wrong maps of simulated worlds and of thinned logs
+# (docs/notebook/deepmapping_notes.md).
+# Score of its best pair above which a scan belongs to the map.
+_LEAST_SCORE = 0.1
+# Least share of the scans that the connected map must hold.
+_LEAST_REGISTERED = 0.9
+# Least score of the weakest connection between two parts of a trusted map.
+_MIN_CONNECTION = 0.1
+# Least number of scans of a part, and least share of the connected scans; the larger of the two decides.
+_PART_SCANS, _PART_SHARE = 3, 0.02
+# In maps of no more connected scans than this, a single scan is a part.
+_FEW_SCANS = 60
+# The largest contradiction (`Assessment`) of a trusted map is the floor plus the factor times the contradicted share of
+# the connections that hold the map, because sensor and people contradict there too; it is never above the maximum.
+_CONTRADICTION_FLOOR = 0.02
+_CONTRADICTION_FACTOR = 1.6
+_MAX_CONTRADICTION = 0.055
+# Largest standard deviation of a scan's place against the map, typical ranges.
+_MAX_DEVIATION = 0.02
+
+
+class Assessment(NamedTuple):
+    """How far a registration can be trusted, without the truth.
+
+    Attributes:
+        weakest_connection: score, at most 1, of the weakest connection that holds two parts of the map together.
+        contradiction: share of beams that end in the free space of another scan, beyond that of the connections that
+            hold the map: scans that meet again by the poses alone must not contradict more than those.
+        is_trusted: both are within what right maps reach, no scan may slide, the scans are not mirrored, and there is
+            not too much noise to tell.
+        uncertain_scans: rows of the scans for which trust does not hold: they fit no other scan, or they may slide
+            along a corridor together.
+        fault: sentence on axes or units that contradict the odometry; None: none found.
+    """
+
+    weakest_connection: float
+    contradiction: float
+    is_trusted: bool
+    uncertain_scans: tuple[int, ...] = ()
+    fault: str | None = None
+
+
+class _Pairs(NamedTuple):
+    """Pairs of near scans (p): rows, T_target_source, and their scores."""
+
+    source: Indices
+    target: Indices
+    relative: Floats
+    scores: Floats
+
+    def take(self, is_taken: NDArray[np.bool_]) -> _Pairs:
+        return _Pairs(self.source[is_taken], self.target[is_taken], self.relative[is_taken], self.scores[is_taken])
+
+
+def assess_trajectory(
+    scans: PlanarScans, poses: Floats, *, prior: StepPrior | None = None, fault: str | None = None
+) -> Assessment:
+    """Tells whether the registration of scans can be trusted.
+
+    The best pairs of scans make a tree that holds the map together. It must have no weak connection between two parts,
+    and the other pairs must contradict hardly more than those of the tree. Scans that fit no other are left out, if
+    they are few. No scan may be free to slide against the others.
+
+    Args:
+        scans: n scans, two at least.
+        poses: (n, 3) x, y, heading.
+        prior: of the steps of ordered scans; None: the scans alone.
+        fault: of the odometry or the scans against it; no map is trusted with one.
+
+    Returns:
+        Assessment.
+    """
+    profiles, (source, target) = make_profiles(scans), near_pairs(poses, scans.typical_range)
+    relative = np.asarray(se2.relative(poses[target], poses[source]))
+    pairs = _Pairs(source, target, relative, pair_scores(profiles, source, target, relative))
+    views = compare_pairs(profiles, source, target, relative)
+    best = np.full(len(poses), -np.inf)
+    np.maximum.at(best, np.concatenate([source, target]), np.tile(pairs.scores, 2))
+    is_used = (best[source] > _LEAST_SCORE) & (best[target] > _LEAST_SCORE)
+    pairs = pairs.take(is_used)
+    contradicted, visible = (np.asarray(x)[is_used] for x in (views.contradicted, views.visible))
+    size = (len(poses), len(poses))
+    costs = scipy.sparse.csr_array((2.0 - pairs.scores, (pairs.source, pairs.target)), size)
+    tree = scipy.sparse.csr_array(scipy.sparse.csgraph.minimum_spanning_tree(costs))
+    holding = tree.tocoo()
+    holds = np.isin(pairs.source * len(poses) + pairs.target, holding.row.astype(np.int64) * len(poses) + holding.col)
+    shares = [contradicted[rows].sum() / max(visible[rows].sum(), 1.0) for rows in (holds, ~holds)]
+    excess, num_connected, weakest = shares[1] - shares[0], *_weakest_connection(tree)
+    limit = min(_CONTRADICTION_FLOOR + _CONTRADICTION_FACTOR * shares[0], _MAX_CONTRADICTION)
+    is_clear = excess <= limit and scans.noise <= MAX_NOISE * scans.typical_range
+    is_whole = num_connected >= _LEAST_REGISTERED * len(poses) and weakest >= _MIN_CONNECTION
+    is_alone = best <= _LEAST_SCORE
+    deviations = _deviations(profiles, poses, pairs, prior)
+    deviations[_torn_scans(profiles, poses, ~is_alone, prior)] = np.inf
+    may_slide = (deviations > _MAX_DEVIATION * scans.typical_range) & ~is_alone
+    is_trusted = is_clear and is_whole and not may_slide.any() and fault is None
+    uncertain = tuple(np.flatnonzero(is_alone | may_slide).tolist())
+    return Assessment(weakest, float(excess), bool(is_trusted), uncertain, fault)
+
+
+def _deviations(profiles: RangeProfiles, poses: Floats, pairs: _Pairs, prior: StepPrior | None) -> Floats:
+    """Returns the standard deviation of each scan's place against the largest part without open connections (n,).
+
+    A pair that has no other place along its weak direction is closed. The variances of open steps add up along the best
+    way from a scan to that part; without a way the deviation is infinite.
+    """
+    num_scans, later = len(poses), np.arange(1, len(poses))
+    if prior is not None:
+        # A step between neighbours in time counts with its prior.
+        pairs = pairs.take(pairs.source != pairs.target + 1)
+    slides = slide_steps(profiles, pairs.source, pairs.target, pairs.relative)
+    is_closed = ~slides.is_torn & ~slides.is_open & (pairs.scores > _MIN_CONNECTION)
+    source, target, variances = pairs.source[is_closed], pairs.target[is_closed], np.zeros(is_closed.sum())
+    if prior is not None:
+        steps = slide_steps(profiles, later, later - 1, np.asarray(se2.relative(poses[:-1], poses[1:])), prior)
+        rows = later[~steps.is_torn]
+        source, target = np.concatenate([source, rows]), np.concatenate([target, rows - 1])
+        of_steps = np.where(steps.is_open, steps.deviations**2, 0.0)[~steps.is_torn]
+        variances = np.concatenate([variances, of_steps])
+    # In a sparse graph a zero is no edge.
+    ways = scipy.sparse.csr_array((np.maximum(variances, 1e-12), (source, target)), (num_scans, num_scans))
+    closed = scipy.sparse.csr_array((variances == 0.0, (source, target)), (num_scans, num_scans))
+    closed.eliminate_zeros()
+    label = scipy.sparse.csgraph.connected_components(closed, directed=False)[1]
+    largest = np.flatnonzero(label == np.bincount(label).argmax())
+    found = scipy.sparse.csgraph.dijkstra(ways, directed=False, indices=largest, min_only=True)
+    return np.sqrt(np.asarray(found, np.float64))
+
+
+def _torn_scans(profiles: RangeProfiles, poses: Floats, is_used: NDArray[np.bool_], prior: StepPrior | None) -> Indices:
+    """Returns the rows of both scans of each step that belongs elsewhere by the scans and the prior together."""
+    if prior is None:
+        return np.zeros(0, np.int64)
+    later = np.arange(1, len(poses))
+    steps = slide_steps(profiles, later, later - 1, np.asarray(se2.relative(poses[:-1], poses[1:])), prior)
+    is_torn = steps.is_torn & (steps.scores > _MIN_CONNECTION) & is_used[later] & is_used[later - 1]
+    return np.concatenate([later[is_torn], later[is_torn] - 1])
+
+
+def _weakest_connection(tree: scipy.sparse.csr_array) -> tuple[int, float]:
+    """Scans of the largest connected tree, and the lowest score between two of its parts that are no single scans."""
+    label = scipy.sparse.csgraph.connected_components(tree, directed=False)[1]
+    root = int(np.flatnonzero(label == np.bincount(label).argmax())[0])
+    order, parent = scipy.sparse.csgraph.breadth_first_order(tree, root, directed=False)
+    size = np.ones(tree.shape[0], np.int64)
+    for scan in order[:0:-1]:
+        size[parent[scan]] += size[scan]
+    count, below = len(order), order[1:]
+    if not len(below):
+        return count, 0.0
+    cost = np.asarray((tree + tree.T)[below, parent[below]]).reshape(-1)
+    smaller = np.minimum(size[below], count - size[below])
+    is_part = smaller >= (1 if count <= _FEW_SCANS else max(_PART_SCANS, _PART_SHARE * count))
+    return count, float(2.0 - cost[is_part].max()) if is_part.any() else 1.0
