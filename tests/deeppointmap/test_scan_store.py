@@ -53,6 +53,17 @@ def test_a_bad_scan_is_empty_and_named(tmp_path) -> None:
 
 def test_poses_follow_the_motions_of_the_scans() -> None:
     store = ScanStore([prepare_drive(short(), toy.TRAINING)])
-    scans, T_world_scan = store.read(np.arange(4), toy.TRAINING, np.random.default_rng(1))
-    found = T_world_scan @ scans.T_augmented_lidar
+    scans, placed = store.read(np.arange(4), toy.TRAINING, np.random.default_rng(1))
+    found = placed.T_world_scan @ scans.T_augmented_lidar
     np.testing.assert_allclose(found, store.table.T_world_lidar, atol=1e-4)
+
+
+def test_descriptors_are_placed_where_the_encoder_finds_them() -> None:
+    store, model = ScanStore([prepare_drive(short(), toy.TRAINING)]), init_model(jax.random.key(0), toy.TRAINING.model)
+    scans, placed = store.read(np.arange(4), toy.TRAINING, np.random.default_rng(1))
+    for number, T_world_scan in enumerate(placed.T_world_scan):
+        pyramid = jax.tree.map(operator.itemgetter(number), scans.pyramids)
+        cloud = encode_stored(model, pyramid, scans.T_augmented_lidar[number])
+        np.testing.assert_array_equal(cloud.mask, placed.mask[number])
+        found = rigid.transform_points(T_world_scan, np.asarray(cloud.positions))[placed.mask[number]]
+        np.testing.assert_allclose(found, placed.positions_world[number][placed.mask[number]], atol=1e-3)

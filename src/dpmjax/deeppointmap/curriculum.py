@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field, replace
 from typing import Literal, get_args
 
@@ -207,8 +208,9 @@ PRESETS = {
         curriculum=tuple(map(CurriculumStage, (2, 4, 8, 16), (6000, 3000, 3000, 3000))),
         # Pairs within 20 m are nearly all right after some thousand steps.
         sampling=SamplingConfig(num_scans=16, max_distance_m=25.0),
-        # Sparse lidars leave 2,000 points of a scan, dense ones 16,000.
-        augment=replace(NEAR_THE_LIDAR, max_drop_ratio=0.7),
+        augment=replace(
+            NEAR_THE_LIDAR, max_drop_ratio=0.5, sparse_probability=0.4, max_tilt_rad=math.radians(15), tilt_power=3.0
+        ),
         # Thousands of steps, not the published hundred thousand: more positives, a stronger direct loss on the encoder.
         objective=ObjectiveConfig(coarse_weight=0.5, positive_radius_m=1.5, max_close=4),
         warmup_steps=200,

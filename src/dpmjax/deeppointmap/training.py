@@ -254,7 +254,7 @@ def _side(
 
 def _merged(clouds: DescriptorCloud, scans: MapOfScans) -> DescriptorCloud:
     chosen: DescriptorCloud = jax.tree.map(lambda x: x[scans.rows], clouds)
-    return merge_clouds(replace(chosen, mask=chosen.mask & scans.mask[:, None]), scans.T_map_scan)
+    return merge_clouds(replace(chosen, mask=chosen.mask & scans.mask), scans.T_map_scan)
 
 
 def _learning_rate(state: TrainingState, config: TrainingConfig) -> Float[Array, ""]:
