@@ -58,8 +58,8 @@ class Config(RunOptions):
     steps: Annotated[int | None, arg(metavar="N")] = None
     """Train for about N steps in all, stages in proportion; without it, the preset decides."""
     groups: Annotated[tuple[int, ...], arg(metavar="N ...")] = ()
-    """Largest group of scans of each stage of the curriculum, stages of equal length, such as 8 16 8 16 for weights that
-    register pairs already; without it, the preset decides."""
+    """Largest group of scans of each stage of the curriculum, stages of equal length, such as 8 16 8 16 for weights
+    that register pairs already; without it, the preset decides."""
     num_towns: Annotated[int, arg(metavar="N")] = 4
     """How many towns to train on, where town is among the data."""
     town_length_m: Annotated[float, arg(metavar="M")] = 600.0
