@@ -199,12 +199,12 @@ def _steps(into: Collection, rng: np.random.Generator, room: Room, plan: Plan) -
     """Steps, a ceiling that rises with them, and pilasters along the walls, often at equal steps."""
     deep, wide = rng.uniform(0.26, 0.34), 0.98 * room.size[1]
     for (start, low), (end, high) in itertools.pairwise(plan.floor):
-        for x in np.arange(start, end, deep) if high > low else ():
-            top = float(plan.floor_at(x + deep))
+        steps = np.arange(start, end, deep) if high > low else np.zeros(0)
+        for x, top in zip(steps, plan.floor_at(steps + deep), strict=True):
             put_box(into, _place(x + 0.5 * deep, 0.0), (deep, wide), (top - 0.5, top))
     clear = room.height - plan.floor[-1][1]
-    for x in np.arange(room.low[0], room.high[0], 1.5):
-        under = float(plan.floor_at(x + 1.5)) + clear
+    parts = np.arange(room.low[0], room.high[0], 1.5)
+    for x, under in zip(parts, plan.floor_at(parts + 1.5) + clear, strict=True):
         if under < room.height - 0.1:
             put_box(into, _place(x + 0.75, 0.0), (1.5, wide), (under, room.height))
     step, out = rng.uniform(2.0, 6.0), rng.uniform(0.05, 0.3)
