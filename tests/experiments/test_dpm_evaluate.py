@@ -129,7 +129,7 @@ def test_calibration_is_stored_in_a_copy_of_the_model(weights, tmp_path, monkeyp
     assert 0 <= metrics["auc_overlap"] <= 1
     assert (tmp_path / "out" / "reliability_overlap.png").stat().st_size > 0
     assert (
-        "Confidence calibrated on 3 towns and 2 ambiguous places, 220 pairs; overlap fitted on 2 towns, 32 pairs"
+        "Confidence calibrated on 3 towns and 2 ambiguous places, 260 pairs; overlap fitted on 2 towns, 32 pairs"
         in dpmjax.weights.read_card(tmp_path / "out" / "model.safetensors")
     )
 

@@ -41,6 +41,8 @@ class SamplingConfig:
         pair_probability: probability that a group is one pair of scans, in every stage.
         max_side: largest number of scans of one map. Half of the groups up to this size are split into one scan
             against all others.
+        max_descriptors: largest number of descriptors of one map (ours): thinning leaves a fifth of a map of 16 scans,
+            and attention over the others would cost twenty times as much.
     """
 
     num_scans: int = 32
@@ -48,9 +50,10 @@ class SamplingConfig:
     max_distance_m: float = 20.0
     pair_probability: float = 0.34
     max_side: int = 16
+    max_descriptors: int = 1024
 
     def __post_init__(self) -> None:
-        require_fields(self, "max_side", low=1)
+        require_fields(self, "max_side", "max_descriptors", low=1)
         require_fields(self, "num_scans", low=2)
         require_fields(self, "pair_probability", low=0, high=1)
         if not 0 <= self.min_distance_m < self.max_distance_m:
