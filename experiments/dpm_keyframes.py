@@ -133,7 +133,7 @@ def choose_keyframes(positions: np.ndarray, spacings_m: Sequence[float]) -> np.n
 
 
 def merged(clouds: DescriptorCloud, rows: np.ndarray, poses: np.ndarray, capacity: int) -> DescriptorCloud:
-    """Returns the thinned union of some keyframes in the frame of the first, padded to one size."""
+    """Returns the thinned union of some keyframes in the frame of the first; the size is a power of two."""
     from dpmjax.deeppointmap import merge_clouds
     from dpmjax.deeppointmap.matching import thin_merged
 
@@ -141,7 +141,12 @@ def merged(clouds: DescriptorCloud, rows: np.ndarray, poses: np.ndarray, capacit
     some = jax.tree.map(lambda leaf: leaf[padded], clouds)
     some = some.replace(mask=some.mask & (np.arange(capacity) < len(rows))[:, None])
     T_map_scan = np.linalg.inv(poses[rows[0]]) @ poses[padded]
-    return thin_merged(merge_clouds(some, jnp.asarray(T_map_scan, jnp.float32)), some.mask.shape[1])
+    union = thin_merged(merge_clouds(some, jnp.asarray(T_map_scan, jnp.float32)), some.mask.shape[1])
+    # Those that are there stand in front: attention over the others costs several times as much.
+    num_rows = 1 << max(int(union.mask.sum()) - 1, 0).bit_length()
+    order = np.argsort(~np.asarray(union.mask), kind="stable")[:num_rows]
+    compact: DescriptorCloud = jax.tree.map(lambda leaf: leaf[order], union)
+    return compact
 
 
 @jax.jit
