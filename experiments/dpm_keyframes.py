@@ -4,10 +4,10 @@
     python -m experiments.dpm_keyframes path/to/drive --weights path/to/model.safetensors --keyframes 1 4
 
 Keyframes are chosen by the true poses, as far apart as those of SLAM. Each scan is registered to the union of the N
-nearest keyframes before it, the nearest first; a descriptor that lies within one spacing of a nearer keyframe's is left
+nearest keyframes before it, the nearest first. A descriptor that lies within one spacing of a nearer keyframe's is left
 out. Nothing is searched or verified: the first hypothesis of the decoder counts. A cell of the table has the number of
-scans that are more than 2 m or 5 degrees off, the median error, and the error that one scan in twenty exceeds. Results
-go to results/dpm_keyframes/<time>/: table.md, metrics.json.
+scans that are more than 2 m or 5 degrees off, and the median and the 95th percentile of the error. Results go to
+results/dpm_keyframes/<time>/: table.md, metrics.json.
 """
 
 from __future__ import annotations
@@ -142,7 +142,7 @@ def merged(clouds: DescriptorCloud, rows: np.ndarray, poses: np.ndarray, capacit
     some = some.replace(mask=some.mask & (np.arange(capacity) < len(rows))[:, None])
     T_map_scan = np.linalg.inv(poses[rows[0]]) @ poses[padded]
     union = thin_merged(merge_clouds(some, jnp.asarray(T_map_scan, jnp.float32)), some.mask.shape[1])
-    # Those that are there stand in front: attention over the others costs several times as much.
+    # Valid rows stand in front: attention over masked ones costs several times as much.
     num_rows = 1 << max(int(union.mask.sum()) - 1, 0).bit_length()
     order = np.argsort(~np.asarray(union.mask), kind="stable")[:num_rows]
     compact: DescriptorCloud = jax.tree.map(lambda leaf: leaf[order], union)

@@ -127,8 +127,8 @@ def _group_at(
     chosen = rng.choice(others, min(sum(shape) - 1, len(others)), replace=False)
     members = rng.permutation(np.concatenate([[anchor], chosen]))
     num_source = min(shape[0], len(members) - 1)
-    # The scan nearest to the other map stands first, as the nearest keyframe does in use: it is the frame of its map,
-    # and thinning keeps all of it.
+    # The scan nearest to the other map stands first, as the nearest keyframe does in SLAM. It is the frame of its map,
+    # and thinning keeps all its descriptors.
     target = _nearest_first(table, members[num_source:], int(members[0]))
     return Group(_nearest_first(table, members[:num_source], int(target[0])), target)
 

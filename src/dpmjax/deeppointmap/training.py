@@ -258,7 +258,7 @@ def _merged(clouds: DescriptorCloud, scans: MapOfScans, max_descriptors: int) ->
     union = merge_clouds(replace(chosen, mask=chosen.mask & scans.mask), scans.T_map_scan)
     if len(union.mask) <= max_descriptors:
         return union
-    # Those that are there stand in front, the nearest scan first.
+    # Valid rows stand in front, those of the nearest scan first.
     order = jnp.argsort(~union.mask, stable=True)[:max_descriptors]
     compact: DescriptorCloud = jax.tree.map(lambda x: x[order], union)
     return compact

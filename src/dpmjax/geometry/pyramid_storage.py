@@ -137,8 +137,8 @@ def sampled_positions(
     Returns:
         Normalised coordinates before any motion, and False for points that are not there.
     """
-    rows = stored.samples[..., :num].astype(np.int64)
-    points = np.take_along_axis(stored.points, rows[..., None], axis=-2)
+    rows = np.asarray(stored.samples)[..., :num].astype(np.int64)
+    points = np.take_along_axis(np.asarray(stored.points), rows[..., None], axis=-2)
     mask = np.arange(num) < np.asarray(stored.num_points)[..., None]
     return points * np.asarray(stored.unit)[..., None, None], mask
 
