@@ -7,7 +7,8 @@ The places are simulated corridors, tunnels, halls, open fields and streets with
 lidars of 16, 32 and 64 beams. Pairs 1 to 5 m, 5 to 10 m and 10 to 20 m apart, and as many without overlap, are
 registered as scans, and as clouds of surface elements. A registration within 2 m and 5 degrees is right, and sure with
 a confidence of 0.9 or more. Further models are the same network with other calibrations: they rate the same
-registrations. Results go to results/dpm_confidence/<time>/: table.md, metrics.json.
+registrations; with --resume, other ones rate those of an earlier run. Results go to results/dpm_confidence/<time>/:
+table.md, metrics.json.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 import jax
 import numpy as np
@@ -48,6 +49,8 @@ RATED = {"scans": "is_right", "clouds": "is_right_of_clouds"}
 @dataclass(frozen=True, kw_only=True)
 class Config(RunOptions):
     """Options of the run."""
+
+    may_change: ClassVar[frozenset[str]] = frozenset({"models"})
 
     models: Annotated[Positional[tuple[str, ...]], arg(metavar="NAME|FILE ...")] = ("dpm_small",)
     """Calibrated models of one network: names of shipped ones, or .safetensors files."""
