@@ -114,7 +114,7 @@ def _by_kind(rows: Sequence[dict[str, Any]]) -> dict[str, list[dict[str, Any]]]:
 
 def rate(rows: Sequence[dict[str, Any]], calibration: Calibration, rated: str) -> dict[str, Any]:
     """Returns the numbers of registrations that a calibration is sure of, and its expected calibration error."""
-    from dpmjax.deeppointmap.confidence import Evidence, calibrated_probability
+    from dpmjax.deeppointmap import Evidence, calibrated_probability
     from dpmjax.metrics import brier_score, expected_calibration_error
 
     confidence, is_right, distance_m = [], [], []

@@ -20,7 +20,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
 from tyro.conf import Positional, arg
 
 from dpmjax.cli import (
@@ -41,8 +40,6 @@ if TYPE_CHECKING:
     from dpmjax.io import LidarSequence
 
 EXPERIMENT = "dpm_keyframes"
-VOXEL_M = 0.3
-"""Voxels in which a scan counts as one point each, for its extent."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -86,12 +83,12 @@ def main(config: Config) -> list[dict[str, Any]]:
 def evaluate(model: Model, drive: LidarSequence, nums_keyframes: Sequence[int]) -> dict[str, Any]:
     """Returns the errors of all scans after the first for each number of keyframes."""
     from dpmjax import registration_recall
-    from dpmjax.deeppointmap import encode_scans
+    from dpmjax.deeppointmap import encode_scans, match_clouds
 
     poses = np.asarray(drive.T_world_lidar, np.float64)
     scans = [drive.read_scan(number) for number in range(len(drive))]
     clouds = jax.device_get(encode_scans(model, scans).described)
-    is_keyframe = choose_keyframes(poses[:, :3, 3], [keyframe_spacing_m(points) for points in scans])
+    is_keyframe = choose_keyframes(poses[:, :3, 3], [keyframe_spacing_m(points, model) for points in scans])
     row: dict[str, Any] = {"num_scans": len(drive) - 1, "num_keyframes": int(is_keyframe.sum())}
     for num in nums_keyframes:
         found, true = [], []
@@ -100,7 +97,9 @@ def evaluate(model: Model, drive: LidarSequence, nums_keyframes: Sequence[int]) 
             distances = np.linalg.norm(poses[rows, :3, 3] - poses[number, :3, 3], axis=1)
             near = rows[np.argsort(distances, kind="stable")][:num]
             source = jax.tree.map(operator.itemgetter(number), clouds)
-            found.append(np.asarray(first_motion(model, source, merged(clouds, near, poses, num)), np.float64))
+            target = merged(clouds, near, poses, num)
+            hypotheses = match_clouds(model, source, target, config=model.config.matching)
+            found.append(np.asarray(hypotheses.T_target_source[0], np.float64))
             true.append(np.linalg.inv(poses[near[0]]) @ poses[number])
         recall = registration_recall(np.stack(found), np.stack(true))
         errors = np.asarray(recall.translation_errors_m)
@@ -113,13 +112,14 @@ def evaluate(model: Model, drive: LidarSequence, nums_keyframes: Sequence[int]) 
     return row
 
 
-def keyframe_spacing_m(points: np.ndarray) -> float:
+def keyframe_spacing_m(points: np.ndarray, model: Model) -> float:
     """Returns the spacing of keyframes at a scan: a share of the median range of its points, as SLAM has it."""
-    from dpmjax.scans.preprocess import first_of_each_voxel
-    from dpmjax.slam.config import FrontEndConfig
+    from dpmjax.scans import preprocess_scan_on_host
+    from dpmjax.slam import FrontEndConfig
 
-    config = FrontEndConfig()
-    extent_m = float(np.median(np.linalg.norm(points[first_of_each_voxel(points, VOXEL_M)], axis=1)))
+    config, thinned = FrontEndConfig(), preprocess_scan_on_host(points, None, model.config.preprocess)
+    ranges = np.linalg.norm(np.asarray(thinned.points)[np.asarray(thinned.mask)], axis=1)
+    extent_m = float(np.median(ranges)) if len(ranges) else 0.0
     return float(np.clip(config.keyframe_share * extent_m, config.min_keyframe_m, config.max_keyframe_m))
 
 
@@ -134,8 +134,7 @@ def choose_keyframes(positions: np.ndarray, spacings_m: Sequence[float]) -> np.n
 
 def merged(clouds: DescriptorCloud, rows: np.ndarray, poses: np.ndarray, capacity: int) -> DescriptorCloud:
     """Returns the thinned union of some keyframes in the frame of the first; the size is a power of two."""
-    from dpmjax.deeppointmap import merge_clouds
-    from dpmjax.deeppointmap.matching import thin_merged
+    from dpmjax.deeppointmap import merge_clouds, thin_merged
 
     padded = np.concatenate([rows, np.full(capacity - len(rows), rows[0])])
     some = jax.tree.map(lambda leaf: leaf[padded], clouds)
@@ -147,14 +146,6 @@ def merged(clouds: DescriptorCloud, rows: np.ndarray, poses: np.ndarray, capacit
     order = np.argsort(~np.asarray(union.mask), kind="stable")[:num_rows]
     compact: DescriptorCloud = jax.tree.map(lambda leaf: leaf[order], union)
     return compact
-
-
-@jax.jit
-def first_motion(model: Model, source: DescriptorCloud, target: DescriptorCloud) -> Float[Array, "4 4"]:
-    """Returns the best hypothesis of the decoder."""
-    from dpmjax.deeppointmap.scan_registration import trace_match
-
-    return trace_match(model, source, target, config=model.config.matching).T_target_source[0]
 
 
 def write_results(folder: RunFolder, config: Config, rows: Sequence[dict[str, Any]]) -> str:

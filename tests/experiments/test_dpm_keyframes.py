@@ -17,11 +17,12 @@ def test_keyframes_keep_their_distance() -> None:
 
 
 def test_the_spacing_follows_the_extent_of_the_scan() -> None:
+    model = dpmjax.init_model(jax.random.key(0), toy.MODEL)
     points = np.random.default_rng(0).normal(size=(4000, 3))
     points *= 10 / np.linalg.norm(points, axis=1, keepdims=True)
-    assert abs(dpm_keyframes.keyframe_spacing_m(points) - 3.0) < 0.01
-    assert dpm_keyframes.keyframe_spacing_m(0.1 * points) == 0.5
-    assert dpm_keyframes.keyframe_spacing_m(10 * points) == 5.0
+    assert abs(dpm_keyframes.keyframe_spacing_m(points, model) - 3.0) < 0.1
+    assert dpm_keyframes.keyframe_spacing_m(0.12 * points, model) == 0.5
+    assert dpm_keyframes.keyframe_spacing_m(5 * points, model) == 5.0
 
 
 def test_a_union_holds_the_descriptors_that_thinning_leaves() -> None:
