@@ -5,11 +5,13 @@
 Pairs of scans of held-out towns, overlapping and not, are registered; a logistic regression on a few features of each
 registration (consensus support, share of points that meet surfaces, share in free space ...) then predicts whether the
 motion is right within 2 m and 5 degrees. Pairs whose walls hold one direction only have a regression of their own, on
-two features; further simulated corridors add such pairs. Overlap is another regression, on the evidence of the match
-(similarities of descriptors, consensus support ...) of pairs of further towns, half of them less than 20 m apart.
-Results go to results/dpm_calibrate/<time>/: model.safetensors, which is the model with all of them; metrics.json, with
-the Brier scores, and the AUC of overlap, of places that were left out of the fits; reliability.png and
-reliability_overlap.png.
+two features, and so have matches of clouds of surface elements, without the scans. Ambiguous places add pairs:
+corridors, tunnels, halls, open fields and streets with queues of moving cars, by lidars of 16, 32 and 64 beams. Overlap
+is another regression, on the evidence of the match (similarities of descriptors, consensus support ...) of pairs of
+further towns, half of them less than 20 m apart. Results go to results/dpm_calibrate/<time>/: model.safetensors, which
+is the model with all of them; metrics.json, with the Brier scores, and the AUC of overlap, of places that were left out
+of the fits; reliability.png, reliability_clouds.png and reliability_overlap.png. `python -m experiments.dpm_confidence`
+checks the confidence on other places.
 """
 
 from __future__ import annotations
@@ -24,17 +26,15 @@ from tqdm import tqdm
 from tyro.conf import Positional, arg
 
 from dpmjax.cli import RunOptions, check_least, do_row, open_run_folder, recording, run_command, write_metrics
-from dpmjax.io import LidarSequence
 
 EXPERIMENT = "dpm_calibrate"
 MODEL = "model.safetensors"
 OVERLAP_LABELS = ("overlap probability", "share of overlapping pairs")
-TOWN_BANDS = ("near", "middle", "far")
+TOWN_BANDS_M = ((2.0, 10.0), (10.0, 20.0), (60.0, np.inf))
 # The two ends of a corridor may look alike: no evidence tells a pair without overlap from a right one.
-CORRIDOR_BANDS = ("near", "middle")
-KINDS = ("of_clouds", "of_scans", "of_weak_scans")
+AMBIGUOUS_BANDS_M = ((1.0, 10.0), (10.0, 20.0))
 # Far from the seeds of the towns of training, also of its held-out one.
-FIRST_TOWN, FIRST_CORRIDOR, FIRST_OVERLAP_TOWN = 3_000_000, 3_100_000, 3_500_000
+FIRST_TOWN, FIRST_AMBIGUOUS, FIRST_OVERLAP_TOWN = 3_000_000, 3_100_000, 3_500_000
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -49,40 +49,35 @@ class Config(RunOptions):
     """Pairs of each town that are 2 to 10 m apart, as many 10 to 20 m apart, and as many without overlap."""
     town_length_m: Annotated[float, arg(metavar="M")] = 400.0
     """Length of the drive through each town."""
-    corridors: Annotated[int, arg(metavar="N")] = 8
-    """Number of corridors with a lidar of 16 beams, each with as many pairs of the first two kinds."""
+    ambiguous: Annotated[int, arg(metavar="N")] = 30
+    """Number of ambiguous places, each with as many pairs 1 to 10 m and 10 to 20 m apart."""
     overlap_towns: Annotated[int, arg(metavar="N")] = 24
-    """Number of towns for overlap."""
+    """Number of towns for overlap; 0 keeps the overlap probability of the model."""
     overlap_pairs: Annotated[int, arg(metavar="N")] = 96
     """Pairs of each of them."""
 
     def __post_init__(self) -> None:
         """Checks ranges."""
-        check_least(self, towns=2, pairs=5, corridors=2, overlap_towns=2, overlap_pairs=16, town_length_m=150, seed=0)
+        check_least(self, towns=2, pairs=5, ambiguous=2, overlap_towns=0, overlap_pairs=16, town_length_m=150, seed=0)
+        if self.overlap_towns == 1:
+            raise ValueError("--overlap-towns: expected 0, or 2 or more: each is left out once, got 1")
 
 
 def main(config: Config) -> dict[str, Any]:
     """Registers and compares the pairs, fits, and writes the model."""
     from dpmjax import load_model, save_model, viz
-    from dpmjax.simulation import SceneMixture
     from dpmjax.weights import read_card
     from experiments import _dpm_overlap
 
     model = load_model(config.model)
     folder = open_run_folder(config, EXPERIMENT)
     rows, overlap_rows = [], []
-    num_registered = (config.towns * len(TOWN_BANDS) + config.corridors * len(CORRIDOR_BANDS)) * config.pairs
-    total = num_registered + config.overlap_towns * config.overlap_pairs
+    num_pairs = config.pairs * (config.towns * len(TOWN_BANDS_M) + config.ambiguous * len(AMBIGUOUS_BANDS_M))
+    total = num_pairs + config.overlap_towns * config.overlap_pairs
     with recording(folder), tqdm(total=total, unit=" pairs") as bar:
-        kinds = [kind for kind, _ in SceneMixture().kinds]
-        for number in range(config.towns):
-            case = {"town": FIRST_TOWN + number, "kind": kinds[number % len(kinds)]}
-            work = partial(_town, config, model, **case, bar=bar)
+        for case in _cases(config):
+            work = partial(_registrations, config, model, **case, bar=bar)
             rows.append(do_row(folder.path, case, work, seed=config.seed))
-            bar.update(sum(len(row["is_right"]) for row in rows) - bar.n)
-        for corridor in range(FIRST_CORRIDOR, FIRST_CORRIDOR + config.corridors):
-            work = partial(_corridor, config, model, corridor=corridor, bar=bar)
-            rows.append(do_row(folder.path, {"corridor": corridor}, work, seed=config.seed))
             bar.update(sum(len(row["is_right"]) for row in rows) - bar.n)
         num_done = sum(len(row["is_right"]) for row in rows)
         for town in range(FIRST_OVERLAP_TOWN, FIRST_OVERLAP_TOWN + config.overlap_towns):
@@ -90,62 +85,51 @@ def main(config: Config) -> dict[str, Any]:
             overlap_rows.append(do_row(folder.path, {"overlap_town": town}, work, seed=config.seed))
             bar.update(num_done + sum(len(row["is_overlap"]) for row in overlap_rows) - bar.n)
         calibration, numbers, held_out = fit(rows)
-        overlap, overlap_numbers, overlap_held_out = _dpm_overlap.fit(overlap_rows)
-        numbers |= overlap_numbers
-        calibrated = model.replace(config=replace(model.config, calibration=calibration, overlap=overlap))
-        card = read_card(Path(config.model)) if config.model.endswith(".safetensors") else config.model
+        calibrated = model.replace(config=replace(model.config, calibration=calibration))
         note = (
-            f"Confidence calibrated on {config.towns} towns, {numbers['num_pairs']} pairs, and {config.corridors} "
-            f"corridors; overlap fitted on {config.overlap_towns} towns, {numbers['num_overlap_pairs']} pairs."
+            f"Confidence calibrated on {config.towns} towns and {config.ambiguous} ambiguous places, "
+            f"{numbers['num_pairs']} pairs"
         )
-        save_model(calibrated, folder / MODEL, card=f"{card} {note}".strip())
+        title = "places left out of the fit"
+        if overlap_rows:
+            overlap, overlap_numbers, overlap_held_out = _dpm_overlap.fit(overlap_rows)
+            numbers |= overlap_numbers
+            calibrated = calibrated.replace(config=replace(calibrated.config, overlap=overlap))
+            note += f"; overlap fitted on {config.overlap_towns} towns, {numbers['num_overlap_pairs']} pairs"
+            values = overlap_held_out["probability"], overlap_held_out["is_overlap"]
+            figure = viz.reliability_figure(*values, title=f"overlap, {title}", labels=OVERLAP_LABELS)
+            viz.save_figure(figure, folder / "reliability_overlap.png")
+        card = read_card(Path(config.model)) if config.model.endswith(".safetensors") else config.model
+        save_model(calibrated, folder / MODEL, card=f"{card} {note}.".strip())
         write_metrics(folder, {"model": config.model, **numbers}, seed=config.seed)
-        title = "towns left out of the fit"
-        figure = viz.reliability_figure(held_out["confidence"], held_out["is_right"], title=title)
-        viz.save_figure(figure, folder / "reliability.png")
-        values = overlap_held_out["probability"], overlap_held_out["is_overlap"]
-        figure = viz.reliability_figure(*values, title=f"overlap, {title}", labels=OVERLAP_LABELS)
-        viz.save_figure(figure, folder / "reliability_overlap.png")
+        for kind, name in (("of_scans", "reliability.png"), ("of_clouds", "reliability_clouds.png")):
+            found = held_out[kind]
+            figure = viz.reliability_figure(found["confidence"], found["is_right"], title=title)
+            viz.save_figure(figure, folder / name)
     print(", ".join(f"{name} {value:.3f}" for name, value in numbers.items() if isinstance(value, float)))
     print(f"results in {folder.path}")
     return numbers
 
 
-def _town(config: Config, model: Any, *, town: int, kind: str, bar: tqdm) -> dict[str, Any]:
+def _cases(config: Config) -> list[dict[str, Any]]:
+    from dpmjax.simulation import SceneMixture
+    from experiments._dpm_places import ambiguous_case
+
+    kinds = [kind for kind, _ in SceneMixture().kinds]
+    towns = [{"town": FIRST_TOWN + number, "kind": kinds[number % len(kinds)]} for number in range(config.towns)]
+    return towns + [ambiguous_case(number, FIRST_AMBIGUOUS) for number in range(config.ambiguous)]
+
+
+def _registrations(config: Config, model: Any, *, kind: str, bar: tqdm, **case: int) -> dict[str, Any]:
     from dpmjax.simulation import simulate_drive
+    from experiments._dpm_places import ambiguous_drive, measure_pairs
 
-    drive = simulate_drive(town, length_m=config.town_length_m, kind=kind)
-    return _registrations(config, model, drive, TOWN_BANDS, bar)
-
-
-def _corridor(config: Config, model: Any, *, corridor: int, bar: tqdm) -> dict[str, Any]:
-    from dpmjax.simulation import VLP16, SceneMixture, simulate_scenes
-
-    mixture = SceneMixture(
-        kinds=(("corridor", 1.0),), sensors=((VLP16, 1.0),), indoor_scale=(1.0, 1.0), length_m=config.town_length_m
-    )
-    return _registrations(config, model, simulate_scenes([corridor], mixture)[0], CORRIDOR_BANDS, bar)
-
-
-def _registrations(
-    config: Config, model: Any, drive: LidarSequence, bands: tuple[str, ...], bar: tqdm
-) -> dict[str, Any]:
-    from dpmjax.deeppointmap import draw_scan_pairs, read_scan_pairs, register_in_stages
-    from dpmjax.metrics import registration_recall
-
-    found: dict[str, list[Any]] = {name: [] for name in (*KINDS, "is_right_of_clouds", "is_right")}
-    for band in bands:
-        drawn = draw_scan_pairs(drive, band, config.pairs, seed=config.seed)
-        for pair in read_scan_pairs(drive, drawn, seed=config.seed):
-            result = register_in_stages(model, pair)
-            motions = np.stack([result.descriptors, result.verified])
-            is_right = registration_recall(motions, np.stack([pair.T_target_source] * 2)).is_right
-            for name, features in result.evidence._asdict().items():
-                found[name].append(None if features is None else features.tolist())
-            found["is_right_of_clouds"].append(bool(is_right[0]))
-            found["is_right"].append(bool(is_right[1]))
-            bar.update(1)
-    return found
+    if "town" in case:
+        drive, bands_m = simulate_drive(case["town"], length_m=config.town_length_m, kind=kind), TOWN_BANDS_M
+    else:
+        drive = ambiguous_drive(case["place"], kind, case["beams"], config.town_length_m)
+        bands_m = AMBIGUOUS_BANDS_M
+    return measure_pairs(model, drive, bands_m, config.pairs, seed=config.seed, on_pair=lambda: bar.update(1))
 
 
 def _overlap_town(config: Config, model: Any, town: int, bar: tqdm) -> dict[str, Any]:
@@ -157,24 +141,23 @@ def _overlap_town(config: Config, model: Any, town: int, bar: tqdm) -> dict[str,
     return measure_town(model, drives, config.overlap_pairs, config.seed, bar)
 
 
-def fit(rows: list[dict[str, Any]]) -> tuple[Any, dict[str, Any], dict[str, np.ndarray]]:
-    """Returns the calibration of all places, its numbers, and the confidence of each town when it is left out."""
+def fit(rows: list[dict[str, Any]]) -> tuple[Any, dict[str, Any], dict[str, dict[str, np.ndarray]]]:
+    """Returns the calibration of all places, its numbers, and the confidence of each place when it is left out.
+
+    Each model is fitted on the pairs that it rates: scans on those whose walls hold all directions.
+    """
     from dpmjax.deeppointmap import CLOUD_FEATURES, SCAN_FEATURES, WEAK_FEATURES, Calibration, fit_logistic
     from experiments._dpm_overlap import held_out_probability
+    from experiments._dpm_places import KINDS
 
-    towns = [row for row in rows if "town" in row]
-    numbers: dict[str, Any] = {"num_pairs": sum(len(row["is_right"]) for row in towns)}
+    numbers: dict[str, Any] = {"num_pairs": sum(len(row["is_right"]) for row in rows)}
     models, held_out = {}, {}
-    # In corridors the descriptors and what scans see are wrong in ways of their own.
-    for kind, names, places in zip(
-        KINDS, (CLOUD_FEATURES, SCAN_FEATURES, WEAK_FEATURES), (towns, towns, rows), strict=True
-    ):
-        label = "is_right_of_clouds" if kind == "of_clouds" else "is_right"
+    for kind, names in zip(KINDS, (CLOUD_FEATURES, SCAN_FEATURES, WEAK_FEATURES), strict=True):
         pairs = [
-            (place, features, is_right)
-            for place, row in enumerate(places)
-            for features, is_right in zip(row[kind], row[label], strict=True)
-            if features is not None
+            (place, row[kind][number], row["is_right_of_clouds" if kind == "of_clouds" else "is_right"][number])
+            for place, row in enumerate(rows)
+            for number, weak in enumerate(row["of_weak_scans"])
+            if row[kind][number] is not None and (kind != "of_scans" or weak is None)
         ]
         if kind == "of_weak_scans" and len({is_right for _, _, is_right in pairs}) < 2:
             continue
@@ -188,7 +171,7 @@ def fit(rows: list[dict[str, Any]]) -> tuple[Any, dict[str, Any], dict[str, np.n
             f"brier_{kind}": float(np.mean((confidence - is_right) ** 2)),
             f"brier_of_a_constant_{kind}": float(np.mean((is_right.mean() - is_right) ** 2)),
         }
-    return Calibration(**models), numbers, held_out["of_scans"]
+    return Calibration(**models), numbers, held_out
 
 
 if __name__ == "__main__":

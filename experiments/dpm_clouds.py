@@ -74,7 +74,7 @@ def main(config: Config) -> list[dict[str, Any]]:
     low, high = model.config.num_descriptors, model.config.pyramid.stages[0].num_points
     if not low <= min(config.elements) <= max(config.elements) <= high:
         raise ValueError(f"--elements: expected from {low} to {high}, got {config.elements}")
-    drives = {drive.name: drive for drive in open_drives(config)}
+    drives = {drive.name: drive for drive in open_drives(config.paths, config.num_scenes)}
     folder = open_run_folder(config, EXPERIMENT)
 
     def work(sequence: str, band: str) -> dict[str, Any]:
@@ -88,15 +88,15 @@ def main(config: Config) -> list[dict[str, Any]]:
     return rows
 
 
-def open_drives(config: Config) -> list[LidarSequence]:
-    """Opens the drives; a `ValueError` names one without poses."""
+def open_drives(paths: Sequence[str], num_scenes: int = 0) -> list[LidarSequence]:
+    """Opens the drives, and simulates scenes where a path is scenes; a `ValueError` names one without poses."""
     from dpmjax.io import list_lidar_sequences, open_lidar_sequence
     from dpmjax.simulation import draw_scene, simulate_scene
 
     drives: list[LidarSequence] = []
-    for path in config.paths:
+    for path in paths:
         if path == "scenes" and not Path(path).exists():
-            seeds = range(FIRST_SCENE, FIRST_SCENE + config.num_scenes)
+            seeds = range(FIRST_SCENE, FIRST_SCENE + num_scenes)
             drives += [simulate_scene(draw_scene(seed)) for seed in seeds]
             continue
         drives += [open_lidar_sequence(path, sequence=name) for name in list_lidar_sequences(path) or [None]]

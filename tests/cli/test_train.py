@@ -144,6 +144,11 @@ def test_options_out_of_range_are_refused(options, message: str) -> None:
         Config(**options)
 
 
+def test_groups_take_the_place_of_the_stages_of_the_preset() -> None:
+    settings = training_settings(Config(groups=(8, 16, 8), steps=60))
+    assert [(stage.max_group, stage.num_steps) for stage in settings.curriculum] == [(8, 20), (16, 20), (8, 20)]
+
+
 def test_a_run_from_weights_has_their_network_and_begins_with_their_parameters(tmp_path: Path) -> None:
     weights = load_model("dpm_small")
     settings = training_settings(Config(weights="dpm_small"), weights)

@@ -7,7 +7,7 @@ import pytest
 
 from dpmjax.deeppointmap import CurriculumStage, SamplingConfig, TrainingConfig, training_preset
 from dpmjax.deeppointmap.layouts import stage_layouts
-from dpmjax.deeppointmap.sampling import Group, ScanTable, arrange_groups, draw_groups
+from dpmjax.deeppointmap.sampling import Group, PlacedScans, ScanTable, arrange_groups, draw_groups
 
 
 def table(num: int = 60, step_m: float = 2.0) -> ScanTable:
@@ -15,6 +15,13 @@ def table(num: int = 60, step_m: float = 2.0) -> ScanTable:
     poses = np.tile(np.eye(4), (2 * num, 1, 1))
     poses[:, 0, 3] = step_m * np.tile(np.arange(num), 2)
     return ScanTable(poses, np.repeat([0, 1], num))
+
+
+def placed(T_world_scan: np.ndarray) -> PlacedScans:
+    """Scans of four descriptors each, 1 m apart on a line across the way."""
+    positions = np.stack([np.zeros(4), np.arange(4.0), np.zeros(4)], axis=1)
+    positions_world = positions @ T_world_scan[:, :3, :3].swapaxes(1, 2) + T_world_scan[:, None, :3, 3]
+    return PlacedScans(T_world_scan, positions_world, np.ones((len(T_world_scan), 4), bool))
 
 
 @pytest.mark.parametrize("max_group", [2, 4, 8, 16, 32])
@@ -51,20 +58,38 @@ def test_groups_are_smaller_where_scans_are_rare() -> None:
     assert 4 in group.rows
     assert len(group.rows) <= 3
     assert len(group.target) >= 1
-    (batch,) = arrange_groups([group], ((3, 5),), np.tile(np.eye(4), (len(group.rows), 1, 1)))
+    (batch,) = arrange_groups([group], ((3, 5),), placed(table(step_m=15.0).T_world_lidar[group.rows]))
     assert batch.source.rows.shape == (1, 3)
-    assert batch.target.mask.sum() + batch.source.mask.sum() == len(group.rows)
+    assert batch.target.mask.any(-1).sum() + batch.source.mask.any(-1).sum() == len(group.rows)
 
 
 def test_groups_of_one_shape_stand_together_with_their_true_motions() -> None:
     layout, scans = ((1, 1), (1, 2), (1, 1)), table()
     groups = [Group(np.array([3]), np.array([5])), None, Group(np.array([8]), np.array([4]))]
     rows = np.concatenate([group.rows for group in groups if group is not None])
-    pairs, others = arrange_groups(groups, layout, scans.T_world_lidar[rows])
+    pairs, others = arrange_groups(groups, layout, placed(scans.T_world_lidar[rows]))
     np.testing.assert_array_equal(pairs.mask, [True, True])
     np.testing.assert_array_equal(others.mask, [False])
     np.testing.assert_array_equal(rows[pairs.source.rows[:, 0]], [3, 8])
     np.testing.assert_array_equal(pairs.T_target_source[:, 0, 3], [-4, 8])
+
+
+def test_the_scan_nearest_to_the_other_map_stands_first() -> None:
+    scans = table()
+    for seed in range(10):
+        (group,) = draw_groups(scans, 20, ((2, 6),), SamplingConfig(), np.random.default_rng(seed))
+        x = scans.positions[:, 0]
+        assert np.all(np.diff(np.abs(x[group.source] - x[group.target[0]])) >= 0)
+        assert np.ptp(x[group.rows]) > np.abs(x[group.source[0]] - x[group.target[0]])
+
+
+def test_a_map_describes_no_place_twice() -> None:
+    """As the map that a scan is matched against in use: a copy of a place of a nearer scan is left out."""
+    T = np.tile(np.eye(4), (4, 1, 1))
+    T[:, 0, 3] = [0.0, 0.1, 0.2, 5.0]
+    (batch,) = arrange_groups([Group(np.array([0]), np.array([1, 2, 3]))], ((1, 3),), placed(T))
+    np.testing.assert_array_equal(batch.target.mask[0].sum(1), [4, 0, 4])
+    np.testing.assert_array_equal(batch.source.mask[0].sum(1), [4])
 
 
 def test_a_lonely_scan_has_no_group() -> None:

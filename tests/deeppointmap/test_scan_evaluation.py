@@ -16,7 +16,7 @@ from dpmjax.deeppointmap import (
     overlap_evaluation,
     read_scan_pairs,
 )
-from dpmjax.metrics import area_under_curve, brier_score
+from dpmjax.metrics import area_under_curve, brier_score, expected_calibration_error
 from tests.deeppointmap import toy
 
 
@@ -93,6 +93,14 @@ def test_area_under_curve_counts_pairs_and_ties_count_half() -> None:
     slow = np.mean([(p > n) + 0.5 * (p == n) for p in score[label] for n in score[~label]])
     assert area_under_curve(score.astype(float), label) == pytest.approx(slow)
     assert np.isnan(area_under_curve(np.ones(3), np.ones(3, bool)))
+
+
+def test_calibration_error_is_the_gap_of_each_bin() -> None:
+    probability = np.array([0.95, 1.0, 0.91, 0.2, 0.25])
+    is_true = np.array([True, True, False, False, True])
+    expected = (abs(0.95 + 1.0 + 0.91 - 2) + abs(0.2 + 0.25 - 1)) / 5
+    assert expected_calibration_error(probability, is_true) == pytest.approx(expected)
+    assert np.isnan(expected_calibration_error(np.zeros(0), np.zeros(0, bool)))
 
 
 def test_brier_score_is_the_mean_squared_error() -> None:

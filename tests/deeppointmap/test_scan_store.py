@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import functools
 from dataclasses import replace
 
+import jax
 import numpy as np
 
-from dpmjax.deeppointmap import ScanStore, prepare_drive
+from dpmjax.deeppointmap import ScanStore, init_model, prepare_drive
+from dpmjax.deeppointmap.model import encode_stored
+from dpmjax.geometry import rigid
 from dpmjax.io import InputError
 from dpmjax.sequences import LidarSequence
 from tests.deeppointmap import toy
@@ -53,6 +57,15 @@ def test_a_bad_scan_is_empty_and_named(tmp_path) -> None:
 
 def test_poses_follow_the_motions_of_the_scans() -> None:
     store = ScanStore([prepare_drive(short(), toy.TRAINING)])
-    scans, T_world_scan = store.read(np.arange(4), toy.TRAINING, np.random.default_rng(1))
-    found = T_world_scan @ scans.T_augmented_lidar
+    scans, placed = store.read(np.arange(4), toy.TRAINING, np.random.default_rng(1))
+    found = placed.T_world_scan @ scans.T_augmented_lidar
     np.testing.assert_allclose(found, store.table.T_world_lidar, atol=1e-4)
+
+
+def test_descriptors_are_placed_where_the_encoder_finds_them() -> None:
+    store, model = ScanStore([prepare_drive(short(), toy.TRAINING)]), init_model(jax.random.key(0), toy.TRAINING.model)
+    scans, placed = store.read(np.arange(4), toy.TRAINING, np.random.default_rng(1))
+    clouds = jax.vmap(functools.partial(encode_stored, model))(scans.pyramids, scans.T_augmented_lidar)
+    np.testing.assert_array_equal(clouds.mask, placed.mask)
+    found = rigid.transform_points(placed.T_world_scan, np.asarray(clouds.positions))
+    np.testing.assert_allclose(found[placed.mask], placed.positions_world[placed.mask], atol=1e-3)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import os
 import subprocess
 import sys
@@ -93,7 +94,7 @@ def test_parts_of_the_training_can_be_left_out() -> None:
     assert without(config, "curriculum").curriculum == (CurriculumStage(16, config.num_steps),)
     assert without(config, "coarse-loss").objective.coarse_weight == 0
     bare = without(config, "occlusion").augment
-    assert (bare.sector_probability, bare.box_probability, bare.max_drop_ratio) == (0, 0, 0.7)
+    assert (bare.sector_probability, bare.box_probability, bare.max_drop_ratio) == (0, 0, 0.5)
     assert not without(config, "offset-head").model.decoder.predicts_offsets
 
 
@@ -118,6 +119,17 @@ def test_places_without_a_group_change_nothing(maker, start) -> None:
     kept = jax.tree.map(lambda leaf: leaf[:, [0, 2]], pairs)
     expected = loss(start.params, replace(batch, groups=(kept,)))
     np.testing.assert_allclose(loss(start.params, masked), expected, **ACCUMULATED)
+
+
+def test_a_map_without_the_rows_that_thinning_removes_has_the_same_loss(maker, start) -> None:
+    """Down to as many rows as there are descriptors."""
+    batch, config = maker(3), toy.TRAINING
+    masks = [side.mask for group in batch.groups for side in (group.source, group.target)]
+    most = max(int(mask.sum(axis=(-1, -2)).max()) for mask in masks)
+    assert most < max(mask[0, 0].size for mask in masks)
+    compact = replace(config, sampling=replace(config.sampling, max_descriptors=most))
+    losses = [jax.jit(functools.partial(batch_loss, config=some))(start.params, batch) for some in (config, compact)]
+    jax.tree.map(functools.partial(np.testing.assert_allclose, **ACCUMULATED), *losses)
 
 
 @pytest.mark.slow

@@ -8,13 +8,21 @@ import pytest
 from tqdm import tqdm
 
 import dpmjax
-from dpmjax import deeppointmap, simulation
+from dpmjax import simulation
 from dpmjax.cli import drive_sources, evaluation_rows
 from dpmjax.cli.command import EXIT_BAD_INPUT, EXIT_OK, run_command
 from dpmjax.cli.result_files import load_json
-from dpmjax.deeppointmap import OVERLAP_FEATURES, SCAN_FEATURES, WEAK_FEATURES, Evidence
+from dpmjax.deeppointmap import (
+    CLOUD_FEATURES,
+    OVERLAP_FEATURES,
+    SCAN_FEATURES,
+    WEAK_FEATURES,
+    Calibration,
+    Evidence,
+    LogisticModel,
+)
 from dpmjax.deeppointmap.scan_evaluation import StagedRegistration, StageSeconds
-from experiments import _dpm_overlap, dpm_calibrate, dpm_evaluate
+from experiments import _dpm_overlap, _dpm_places, dpm_calibrate, dpm_confidence, dpm_evaluate
 from tests.deeppointmap import toy
 
 
@@ -76,7 +84,8 @@ def test_calibration_is_stored_in_a_copy_of_the_model(weights, tmp_path, monkeyp
         return toy.drive(seed)
 
     monkeypatch.setattr(simulation, "simulate_drive", simulate_drive)
-    monkeypatch.setattr(simulation, "simulate_scenes", lambda seeds, mixture: [toy.drive(seed) for seed in seeds])
+    monkeypatch.setattr(_dpm_places, "simulate_scene", lambda scene: toy.drive(scene.seed))
+    monkeypatch.setattr(_dpm_places, "encode", lambda model, points, num_elements: points)
     rng = np.random.default_rng(0)
 
     def found(model, pair):
@@ -91,8 +100,21 @@ def test_calibration_is_stored_in_a_copy_of_the_model(weights, tmp_path, monkeyp
         )
         return StagedRegistration(T, T, T, evidence, StageSeconds(*[0.0] * 5))
 
-    monkeypatch.setattr(deeppointmap, "register_in_stages", found)
-    sizes = ["--towns", 3, "--pairs", 20, "--corridors", 2, "--overlap-towns", 2, "--overlap-pairs", 16]
+    motions = []
+
+    def staged(model, pair):
+        motions.append(found(model, pair))
+        return motions[-1]
+
+    class Found:
+        """The match of the same two scans as clouds: right where they are."""
+
+        def __init__(self) -> None:
+            self.T_target_source = motions[-1].descriptors
+
+    monkeypatch.setattr(_dpm_places, "register_in_stages", staged)
+    monkeypatch.setattr(_dpm_places, "register", lambda model, *clouds, refine: Found())
+    sizes = ["--towns", 3, "--pairs", 20, "--ambiguous", 2, "--overlap-towns", 2, "--overlap-pairs", 16]
     assert run(dpm_calibrate, [weights, *sizes, "-o", tmp_path / "out"]) == EXIT_OK
     assert len(set(kinds[:3])) == 3  # of towns for confidence; those for overlap are of any kind
     assert set(kinds[3:]) == {None}
@@ -107,9 +129,31 @@ def test_calibration_is_stored_in_a_copy_of_the_model(weights, tmp_path, monkeyp
     assert 0 <= metrics["auc_overlap"] <= 1
     assert (tmp_path / "out" / "reliability_overlap.png").stat().st_size > 0
     assert (
-        "Confidence calibrated on 3 towns, 180 pairs, and 2 corridors; overlap fitted on 2 towns, 32 pairs"
+        "Confidence calibrated on 3 towns and 2 ambiguous places, 260 pairs; overlap fitted on 2 towns, 32 pairs"
         in dpmjax.weights.read_card(tmp_path / "out" / "model.safetensors")
     )
+
+
+def test_a_calibration_is_rated_by_what_it_is_sure_of() -> None:
+    """Three sure registrations, of which one is wrong; clouds rest on features of their own."""
+    of_scans = LogisticModel(SCAN_FEATURES, (0.0,) * 7 + (10.0, 0.0), 0.0)
+    calibration = Calibration(LogisticModel(CLOUD_FEATURES, (0.0,) * 4, -5.0), of_scans)
+    scores = [1.0, 1.0, 1.0, -1.0]
+    row = {
+        "of_clouds": [[0.0] * 4] * 4,
+        "of_scans": [[0.0] * 7 + [score, 0.0] for score in scores],
+        "of_weak_scans": [None] * 4,
+        "is_right": [True, True, False, False],
+        "is_right_of_clouds": [False] * 4,
+        "distance_m": [2.0, 8.0, 3.0, 4.0],
+    }
+    numbers = dpm_confidence.rate([row], calibration, "scans")
+    assert (numbers["num_pairs"], numbers["num_sure"], numbers["num_sure_wrong"]) == (4, 3, 1)
+    assert (numbers["num_near"], numbers["num_near_sure_right"]) == (3, 1)
+    assert numbers["calibration_error"] == pytest.approx(0.25, abs=1e-3)
+    assert dpm_confidence.rate([row], calibration, "clouds")["num_sure"] == 0
+    lines = dpm_confidence.table([{"model": "m", "rated": "scans", "kind": "all", **numbers}]).splitlines()
+    assert len({line.count("|") for line in lines}) == 1
 
 
 def test_half_of_the_overlap_pairs_of_a_town_overlap(weights) -> None:

@@ -181,13 +181,35 @@ def test_same_key_same_scan() -> None:
 
 
 def test_wrong_numbers_are_named() -> None:
-    for name, value in (("max_drop_ratio", 1.5), ("box_probability", -1.0), ("max_tilt_rad", -0.1)):
+    for name, value in (
+        ("max_drop_ratio", 1.5),
+        ("box_probability", -1.0),
+        ("max_tilt_rad", -0.1),
+        ("tilt_power", 0.5),
+    ):
         with pytest.raises(ValueError, match=f"^{name}: expected"):
             AugmentConfig(**{name: value})
     with pytest.raises(ValueError, match="^width_deg: expected"):
         SectorConfig(width_deg=(3.0, 1.0))
     with pytest.raises(ValueError, match="^max_count: expected"):
         BoxConfig(max_count=0)
+
+
+def test_sparse_scans_keep_as_many_points_as_is_drawn() -> None:
+    config = replace(NOTHING, sparse_probability=1.0, sparse_points=(50.0, 2000.0))
+    kept = augment_all(config, cloud(600, 500)).cloud.mask.sum(axis=1)
+    # Uniform in the logarithm: 62 % of the draws are below the 500 points that there are.
+    assert 40 <= kept.min() < 80
+    assert 0.4 < (kept < 500).mean() < 0.85
+    assert (augment_all(NOTHING, cloud()).cloud.mask.sum(axis=1) == 250).all()
+
+
+def test_a_power_lets_most_scans_stand_upright() -> None:
+    config = AugmentConfig(max_tilt_rad=0.26, tilt_power=3.0)
+    T = random_motions_on_host(config, 4000, np.random.default_rng(0))
+    tilt = np.abs(np.arcsin(T[:, 0, 2]))
+    assert 0.25 < tilt.max() <= 0.26
+    assert np.median(tilt) == pytest.approx(0.26 / 8, rel=0.1)
 
 
 def test_one_scan_in_ten_is_occluded_as_the_paper_says() -> None:

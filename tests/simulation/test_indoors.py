@@ -7,7 +7,7 @@ import pytest
 from dpmjax.simulation import BuildingConfig, LidarSensor, WalkConfig, make_building, scan_town, walk
 
 SENSOR = LidarSensor("test", tuple(np.linspace(20.0, -20.0, 16)), 360, min_range_m=0.2, drop_rate=0.0, mixed_rate=0.0)
-KINDS = ("office", "hall", "flat", "corridor")
+KINDS = ("office", "hall", "flat", "corridor", "tunnel", "garage", "stairs")
 
 
 @pytest.fixture(scope="module", params=KINDS)
@@ -47,7 +47,8 @@ def test_nothing_stands_on_the_walk(building):
     for bodies in building.primitives[:3]:
         mask = np.asarray(bodies.mask)
         centres, half, turn = (np.asarray(x, np.float64)[mask] for x in bodies[:3])
-        low = centres[:, 2] - half[:, 2] < 1.9
+        floor = building.plan.floor_at(centres[:, 0])
+        low = (centres[:, 2] - half[:, 2] < floor + 1.9) & (centres[:, 2] + half[:, 2] > floor + 0.35)
         offset = building.route[::5, None] - centres[None, low, :2]
         along = np.abs(offset[..., 0] * turn[low, 0] + offset[..., 1] * turn[low, 1]) - half[low, 0]
         across = np.abs(offset[..., 1] * turn[low, 0] - offset[..., 0] * turn[low, 1]) - half[low, 1]
@@ -67,12 +68,24 @@ def test_a_lidar_sees_the_rooms_and_nothing_outside_of_the_walls(building):
     assert inside_of_rooms(building.plan, world, margin=-0.15).mean() > 0.995
 
 
+def test_stairs_are_climbed_with_the_lidar_above_their_steps() -> None:
+    building = make_building(2, BuildingConfig("stairs", 60.0))
+    poses = walk(building, WalkConfig(bob_m=0.0, tilt_deg=0.0)).T_world_lidar
+    assert np.ptp(poses[:, 2, 3]) > 1.0
+    cloud = scan_town(building.primitives, poses[5], 0.0, key=jax.random.key(0), sensor=SENSOR)
+    points = np.asarray(cloud.points)[np.asarray(cloud.mask)] @ poses[5, :3, :3].T + poses[5, :3, 3]
+    above = points[:, 2] - building.plan.floor_at(points[:, 0])
+    assert (above > -0.15).all()
+    assert (above < 0.25).mean() > 0.03
+
+
 def test_a_carried_lidar_tilts_and_a_robot_does_not(building):
     person, robot = walk(building), walk(building, WalkConfig(tilt_deg=0.5, bob_m=0.0))
     np.testing.assert_allclose(np.linalg.det(person.T_world_lidar[:, :3, :3]), 1.0, atol=1e-9)
     assert np.degrees(np.arccos(person.T_world_lidar[:, 2, 2])).max() > 5
     assert np.degrees(np.arccos(robot.T_world_lidar[:, 2, 2])).max() < 3
-    np.testing.assert_allclose(robot.T_world_lidar[:, 2, 3], 1.3)
+    positions = robot.T_world_lidar[:, :3, 3]
+    np.testing.assert_allclose(positions[:, 2] - building.plan.floor_at(positions[:, 0]), 1.3)
     assert np.linalg.norm(np.diff(person.T_world_lidar[:, :2, 3], axis=0), axis=1).max() < 0.55
 
 

@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 
 from dpmjax.simulation import (
+    TRAINING_MIXTURE,
+    BuildingConfig,
     LidarSensor,
     SceneMixture,
     TownConfig,
@@ -46,6 +48,28 @@ def test_a_scene_gives_scans_with_poses(kind):
     np.testing.assert_array_equal(first, again)
     assert len(first) > 0.3 * SENSOR.num_rays
     assert kind in sequence.name
+
+
+def test_two_lidars_take_turns_along_one_way():
+    other = replace(SENSOR, name="other", view_deg=90.0)
+    mixture = replace(SMALL, kinds=(("suburb", 1.0),), sensors=((SENSOR, 1.0),))
+    scene = draw_scene(4, mixture)
+    alone, both = simulate_scene(scene), simulate_scene(replace(scene, other_sensor=other))
+    np.testing.assert_array_equal(alone.T_world_lidar, both.T_world_lidar)
+    np.testing.assert_array_equal(alone.read_scan(2), both.read_scan(2))
+    narrow = both.read_scan(3)
+    assert 0 < len(narrow) < 0.5 * len(alone.read_scan(3))
+    # A column is a degree wide, and the turn begins anywhere in it.
+    assert np.degrees(np.abs(np.arctan2(narrow[:, 1], narrow[:, 0]))).max() < 46
+
+
+def test_the_training_mixture_is_a_third_indoors_and_mixes_lidars():
+    drawn = [draw_scene(seed, TRAINING_MIXTURE) for seed in range(400)]
+    assert np.mean([isinstance(scene.place, BuildingConfig) for scene in drawn]) == pytest.approx(1 / 3, abs=0.06)
+    num_mixed = sum(scene.other_sensor is not None for scene in drawn)
+    assert all(scene.other_sensor != scene.sensor for scene in drawn)
+    assert num_mixed / 400 == pytest.approx(0.7 * (1 - sum(w**2 for _, w in TRAINING_MIXTURE.sensors)), abs=0.08)
+    assert all(scene.other_sensor is None for scene in map(draw_scene, range(50)))
 
 
 @pytest.mark.parametrize(("kind", "name"), [("flat", "indoor_scale"), ("country", "scale")])

@@ -12,10 +12,11 @@ import numpy as np
 from dpmjax.cli.route_drives import is_route, route_drive
 from dpmjax.deeppointmap import SamplingConfig, why_useless
 from dpmjax.io import LidarSequence, list_lidar_sequences, open_lidar_sequence
-from dpmjax.simulation import simulate_drive
+from dpmjax.simulation import SceneMixture, simulate_drive
 
 LOGGER = logging.getLogger("dpmjax.drives")
 TOWN = "town"
+DEFAULT_MIXTURE = SceneMixture()
 
 
 @dataclass(frozen=True)
@@ -28,6 +29,7 @@ class Source:
         town_seed: seed of the town.
         town_length_m: length of the drive through the town.
         town_kind: kind of place; None draws one.
+        town_mixture: what the town is drawn from.
     """
 
     path: Path | None = None
@@ -35,11 +37,14 @@ class Source:
     town_seed: int = 0
     town_length_m: float = 600.0
     town_kind: str | None = None
+    town_mixture: SceneMixture = DEFAULT_MIXTURE
 
     def open(self) -> LidarSequence:
         """Opens or simulates the drive; of one with reference poses, the scans that have one."""
         if self.path is None:
-            return simulate_drive(self.town_seed, length_m=self.town_length_m, kind=self.town_kind)
+            return simulate_drive(
+                self.town_seed, length_m=self.town_length_m, kind=self.town_kind, mixture=self.town_mixture
+            )
         if is_route(self.path):
             return route_drive(self.path, self.town_seed)
         drive = open_lidar_sequence(self.path, sequence=self.name)

@@ -21,7 +21,7 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from contextlib import nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
@@ -57,6 +57,9 @@ class Config(RunOptions):
     preset decides."""
     steps: Annotated[int | None, arg(metavar="N")] = None
     """Train for about N steps in all, stages in proportion; without it, the preset decides."""
+    groups: Annotated[tuple[int, ...], arg(metavar="N ...")] = ()
+    """Largest group of scans of each stage of the curriculum, stages of equal length, such as 8 16 8 16 for weights
+    that register pairs already; without it, the preset decides."""
     num_towns: Annotated[int, arg(metavar="N")] = 4
     """How many towns to train on, where town is among the data."""
     town_length_m: Annotated[float, arg(metavar="M")] = 600.0
@@ -91,6 +94,7 @@ class Config(RunOptions):
             ValueError: if an option is out of range.
         """
         check_least(self, steps=3, num_towns=1, selection_pairs=1, held_out_pairs=1, recall_every=1, seed=0)
+        check_least(self, groups=2)
         check_least(self, town_length_m=100, num_processes=1, process_id=0)
         if self.hours is not None and not 0 < self.hours < float("inf"):
             raise ValueError(f"--hours: expected more than 0, got {self.hours}")
@@ -113,13 +117,15 @@ def main(config: Config) -> None:
     from dpmjax.cli.train_results import draw, measure, print_summary, write_model
     from dpmjax.cli.train_run import run_training
     from dpmjax.deeppointmap import ScanStore, TrainingHooks
+    from dpmjax.simulation import TRAINING_MIXTURE
     from dpmjax.weights import load_model
 
     with together():
         weights = None if config.weights is None else load_model(config.weights)
         settings = training_settings(config, weights)
         seeds = range(config.seed, config.seed + config.num_towns)
-        towns = [Source(town_seed=seed, town_length_m=config.town_length_m) for seed in seeds]
+        town = Source(town_length_m=config.town_length_m, town_mixture=TRAINING_MIXTURE)
+        towns = [replace(town, town_seed=seed) for seed in seeds]
         sources = find_sources(config.data, towns, settings.sampling)
         folder = open_run_folder(config, NAME) if is_first() else None
     with recording(folder) if folder is not None else nullcontext(), StopFlag() as stop:
@@ -175,9 +181,7 @@ def plateau_seconds(config: Config, settings: TrainingConfig) -> float | None:
 
 def training_settings(config: Config, weights: Model | None = None) -> TrainingConfig:
     """Returns the preset, with the options applied; the network is that of the weights, if there are any."""
-    from dataclasses import replace
-
-    from dpmjax.deeppointmap import training_preset, without
+    from dpmjax.deeppointmap import CurriculumStage, training_preset, without
 
     settings = training_preset(config.preset)
     if weights is not None:
@@ -185,6 +189,9 @@ def training_settings(config: Config, weights: Model | None = None) -> TrainingC
     if config.frame is not None:
         encoder = replace(settings.model.encoder, frame=config.frame)
         settings = replace(settings, model=replace(settings.model, encoder=encoder))
+    if config.groups:
+        num_steps = max(1, settings.num_steps // len(config.groups))
+        settings = replace(settings, curriculum=tuple(CurriculumStage(group, num_steps) for group in config.groups))
     for part in config.without:
         settings = without(settings, part)
     if config.bfloat16:

@@ -9,6 +9,7 @@ from .confidence import WEAK_FEATURES as WEAK_FEATURES
 from .confidence import Calibration as Calibration
 from .confidence import Evidence as Evidence
 from .confidence import LogisticModel as LogisticModel
+from .confidence import calibrated_probability as calibrated_probability
 from .confidence import fit_logistic as fit_logistic
 from .confidence import fit_weights as fit_weights
 from .confidence import logistic_probability as logistic_probability
@@ -28,6 +29,7 @@ from .evaluation import evaluate_registration as evaluate_registration
 from .matching import MatchConfig as MatchConfig
 from .matching import match_descriptors as match_descriptors
 from .matching import merge_clouds as merge_clouds
+from .matching import thin_merged as thin_merged
 from .model import Model as Model
 from .model import correlate as correlate
 from .model import elements_of_pyramid as elements_of_pyramid

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field, replace
 from typing import Literal, get_args
 
@@ -40,6 +41,8 @@ class SamplingConfig:
         pair_probability: probability that a group is one pair of scans, in every stage.
         max_side: largest number of scans of one map. Half of the groups up to this size are split into one scan
             against all others.
+        max_descriptors: largest number of descriptors of one map (ours): thinning leaves a fifth of a map of 16 scans,
+            and attention over the others would cost twenty times as much.
     """
 
     num_scans: int = 32
@@ -47,9 +50,10 @@ class SamplingConfig:
     max_distance_m: float = 20.0
     pair_probability: float = 0.34
     max_side: int = 16
+    max_descriptors: int = 1024
 
     def __post_init__(self) -> None:
-        require_fields(self, "max_side", low=1)
+        require_fields(self, "max_side", "max_descriptors", low=1)
         require_fields(self, "num_scans", low=2)
         require_fields(self, "pair_probability", low=0, high=1)
         if not 0 <= self.min_distance_m < self.max_distance_m:
@@ -207,8 +211,9 @@ PRESETS = {
         curriculum=tuple(map(CurriculumStage, (2, 4, 8, 16), (6000, 3000, 3000, 3000))),
         # Pairs within 20 m are nearly all right after some thousand steps.
         sampling=SamplingConfig(num_scans=16, max_distance_m=25.0),
-        # Sparse lidars leave 2,000 points of a scan, dense ones 16,000.
-        augment=replace(NEAR_THE_LIDAR, max_drop_ratio=0.7),
+        augment=replace(
+            NEAR_THE_LIDAR, max_drop_ratio=0.5, sparse_probability=0.4, max_tilt_rad=math.radians(15), tilt_power=3.0
+        ),
         # Thousands of steps, not the published hundred thousand: more positives, a stronger direct loss on the encoder.
         objective=ObjectiveConfig(coarse_weight=0.5, positive_radius_m=1.5, max_close=4),
         warmup_steps=200,

@@ -15,6 +15,7 @@ import numpy as np
 from dpmjax.deeppointmap.curriculum import TrainingConfig
 from dpmjax.deeppointmap.layouts import stage_layouts
 from dpmjax.deeppointmap.sampling import (
+    PlacedScans,
     RegistrationSample,
     arrange_groups,
     draw_groups,
@@ -95,8 +96,9 @@ class SampleMaker:
         # Always as many scans as the layout has: another number would be compiled again.
         num_spare = sum(map(sum, layout)) - len(rows)
         padded = np.concatenate([rows, np.full(num_spare, rows[0])])
-        scans, T_world_scan = self._store.read(padded, self._config, rng)
-        return RegistrationSample(scans, arrange_groups(groups, layout, T_world_scan[: len(rows)]))
+        scans, placed = self._store.read(padded, self._config, rng)
+        placed = PlacedScans(*(values[: len(rows)] for values in placed))
+        return RegistrationSample(scans, arrange_groups(groups, layout, placed))
 
     def _anchor(self, step: int, number: int) -> int:
         # Every scan is the first anchor once in an epoch, in another order for each device.

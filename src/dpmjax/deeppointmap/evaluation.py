@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from dpmjax.deeppointmap.curriculum import TrainingConfig
-from dpmjax.deeppointmap.matching import merge_clouds
+from dpmjax.deeppointmap.matching import merge_clouds, thinned_mask
 from dpmjax.deeppointmap.model import Model, encode_stored
 from dpmjax.deeppointmap.model_config import ModelConfig
 from dpmjax.deeppointmap.sampling import SampleScans
@@ -164,8 +164,8 @@ def draw_evaluation_pairs(
     pairs = tuple(_draw(thinned, num_pairs, kind, rng) for kind in kinds)
     settings = TrainingConfig(model=config, augment=UPRIGHT, num_variants=1)
     store = ScanStore([prepare_drive(thinned, settings)])
-    scans, T_world_scan = store.read(np.arange(len(thinned)), settings, rng)
-    return EvaluationPairs(scans, T_world_scan, pairs, config.scale_m)
+    scans, placed = store.read(np.arange(len(thinned)), settings, rng)
+    return EvaluationPairs(scans, placed.T_world_scan, pairs, config.scale_m)
 
 
 def _draw(drive: LidarSequence, num_pairs: int, kind: PairKind, rng: np.random.Generator) -> Pairs:
@@ -223,7 +223,10 @@ def _maps(
     clouds: DescriptorCloud, rows: Int[np.ndarray, "p s"], T_world_scan: Float[np.ndarray, "n 4 4"]
 ) -> DescriptorCloud:
     T_map_scan = rigid.inverse(T_world_scan[rows[:, :1]]) @ T_world_scan[rows]
-    return _merge_all(clouds, jnp.asarray(rows), jnp.asarray(T_map_scan, jnp.float32))
+    merged = _merge_all(clouds, jnp.asarray(rows), jnp.asarray(T_map_scan, jnp.float32))
+    unions = zip(np.asarray(merged.positions), np.asarray(merged.mask), strict=True)
+    masks = [thinned_mask(positions, mask, clouds.mask.shape[1]) for positions, mask in unions]
+    return merged.replace(mask=jnp.asarray(np.stack(masks)))
 
 
 @jax.jit

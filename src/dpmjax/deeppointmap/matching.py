@@ -343,10 +343,7 @@ def merge_clouds(clouds: DescriptorCloud, T_map_cloud: Float[AnyArray, "s 4 4"])
 
 
 def thin_merged(merged: DescriptorCloud, num_a_cloud: int) -> DescriptorCloud:
-    """Removes descriptors of places that an earlier cloud of the union describes, on the host.
-
-    The softmax over a target would be split between copies of one place. A descriptor is removed if one of an earlier
-    cloud is nearer than the spacing of the first cloud: the median distance between its nearest descriptors.
+    """Removes descriptors of places that an earlier cloud of the union describes, on the host; see `thinned_mask`.
 
     Args:
         merged: from `merge_clouds`, without further surface elements.
@@ -355,13 +352,33 @@ def thin_merged(merged: DescriptorCloud, num_a_cloud: int) -> DescriptorCloud:
     Returns:
         The union with a smaller mask.
     """
-    positions, mask = np.asarray(merged.positions), np.array(merged.mask)
+    mask = thinned_mask(np.asarray(merged.positions), np.asarray(merged.mask), num_a_cloud)
+    return replace(merged, mask=jnp.asarray(mask))
+
+
+def thinned_mask(
+    positions: Float[np.ndarray, "n 3"], mask: Bool[np.ndarray, " n"], num_a_cloud: int
+) -> Bool[np.ndarray, " n"]:
+    """Finds the descriptors of a union whose place no earlier cloud describes.
+
+    The softmax over a target would be split between copies of one place. A descriptor is removed if one of an earlier
+    cloud is nearer than the spacing of the first cloud: the median distance between its nearest descriptors.
+
+    Args:
+        positions: of the clouds of the union, one after the other, in one frame, metres.
+        mask: False for descriptors that are not there.
+        num_a_cloud: number of descriptors of each cloud.
+
+    Returns:
+        The mask without the removed ones.
+    """
+    mask = np.array(mask)
     first = positions[:num_a_cloud][mask[:num_a_cloud]]
     if len(first) < 2:
-        return merged
+        return mask
     spacing_m = np.median(np.asarray(cKDTree(first).query(first, 2)[0])[:, 1])
     for start in range(num_a_cloud, len(positions), num_a_cloud):
         rows = np.arange(start, start + num_a_cloud)[mask[start : start + num_a_cloud]]
         if len(rows):
             mask[rows] = cKDTree(positions[:start][mask[:start]]).query(positions[rows])[0] > spacing_m
-    return replace(merged, mask=jnp.asarray(mask))
+    return mask

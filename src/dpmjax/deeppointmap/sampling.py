@@ -18,6 +18,7 @@ from jaxtyping import Bool, Float, Int
 
 from dpmjax.deeppointmap.curriculum import SamplingConfig
 from dpmjax.deeppointmap.layouts import GroupShape, Layout
+from dpmjax.deeppointmap.matching import thinned_mask
 from dpmjax.geometry import rigid
 from dpmjax.geometry.pyramid_storage import StoredPyramid
 from dpmjax.types import AnyArray
@@ -126,7 +127,15 @@ def _group_at(
     chosen = rng.choice(others, min(sum(shape) - 1, len(others)), replace=False)
     members = rng.permutation(np.concatenate([[anchor], chosen]))
     num_source = min(shape[0], len(members) - 1)
-    return Group(members[:num_source], members[num_source:])
+    # The scan nearest to the other map stands first, as the nearest keyframe does in SLAM. It is the frame of its map,
+    # and thinning keeps all its descriptors.
+    target = _nearest_first(table, members[num_source:], int(members[0]))
+    return Group(_nearest_first(table, members[:num_source], int(target[0])), target)
+
+
+def _nearest_first(table: ScanTable, rows: Int[np.ndarray, " k"], row: int) -> Int[np.ndarray, " k"]:
+    distances = np.linalg.norm(table.positions[rows] - table.positions[row], axis=1)
+    return rows[np.argsort(distances, kind="stable")]
 
 
 @flax.struct.dataclass
@@ -134,13 +143,13 @@ class MapOfScans:
     """One map of each group.
 
     Attributes:
-        rows: its scans, as rows of the sample; 0 where `mask` is False.
-        mask: False where a map has fewer scans.
+        rows: its scans, as rows of the sample; 0 where a map has fewer scans.
+        mask: False where a map has fewer scans or descriptors, and where `matching.thinned_mask` removes one.
         T_map_scan: poses of the scans in the frame of the map, metres.
     """
 
     rows: Int[AnyArray, "*b s"]
-    mask: Bool[AnyArray, "*b s"]
+    mask: Bool[AnyArray, "*b s n"]
     T_map_scan: Float[AnyArray, "*b s 4 4"]
 
 
@@ -174,6 +183,20 @@ class SampleScans:
     T_augmented_lidar: Float[AnyArray, "*b 4 4"]
 
 
+class PlacedScans(NamedTuple):
+    """True places of the scans of a sample.
+
+    Attributes:
+        T_world_scan: float64 poses of the scans after their motions, metres.
+        positions_world: positions of their descriptors, metres.
+        mask: False for descriptors that are not there.
+    """
+
+    T_world_scan: Float[np.ndarray, "s 4 4"]
+    positions_world: Float[np.ndarray, "s n 3"]
+    mask: Bool[np.ndarray, "s n"]
+
+
 @flax.struct.dataclass
 class RegistrationSample:
     """Groups of scans that form two maps each; a batch has one more axis in front.
@@ -187,16 +210,13 @@ class RegistrationSample:
     groups: tuple[GroupBatch, ...]
 
 
-def arrange_groups(
-    groups: Sequence[Group | None], layout: Layout, T_world_scan: Float[np.ndarray, "s 4 4"]
-) -> tuple[GroupBatch, ...]:
+def arrange_groups(groups: Sequence[Group | None], layout: Layout, placed: PlacedScans) -> tuple[GroupBatch, ...]:
     """Arranges groups as NumPy arrays, whose shapes depend on the layout only.
 
     Args:
         groups: from `draw_groups`.
         layout: sizes of the groups.
-        T_world_scan: float64 poses of the scans of all groups: the source of the first group, its target, the source of
-            the second, ...
+        placed: the scans of all groups: the source of the first group, its target, the source of the second, ...
 
     Returns:
         One batch for each shape in the layout, in its order.
@@ -204,6 +224,7 @@ def arrange_groups(
     Raises:
         ValueError: if there are not as many poses as scans in the groups.
     """
+    T_world_scan = placed.T_world_scan
     ends = np.cumsum([0 if group is None else len(group.rows) for group in groups])
     if ends[-1] != len(T_world_scan):
         raise ValueError(f"T_world_scan: expected {ends[-1]} poses, one for each scan, got {len(T_world_scan)}")
@@ -215,7 +236,7 @@ def arrange_groups(
     for shape in dict.fromkeys(layout):
         places = [rows for rows, its_shape in zip(rows_of, layout, strict=True) if its_shape == shape]
         sides = [
-            _maps_of_scans([None if rows is None else rows[side] for rows in places], T_world_scan, shape[side])
+            _maps_of_scans([None if rows is None else rows[side] for rows in places], placed, shape[side])
             for side in (0, 1)
         ]
         T = np.tile(np.eye(4), (len(places), 1, 1))
@@ -239,15 +260,17 @@ def stack(trees: Sequence[TreeT]) -> TreeT:
     return jax.tree.map(lambda *leaves: np.stack(leaves), *trees)
 
 
-def _maps_of_scans(
-    rows: Sequence[Int[np.ndarray, " k"] | None], T_world_scan: Float[np.ndarray, "s 4 4"], capacity: int
-) -> MapOfScans:
+def _maps_of_scans(rows: Sequence[Int[np.ndarray, " k"] | None], placed: PlacedScans, capacity: int) -> MapOfScans:
+    num_descriptors = placed.mask.shape[1]
     padded = np.zeros((len(rows), capacity), np.int32)
-    mask = np.zeros((len(rows), capacity), bool)
+    mask = np.zeros((len(rows), capacity, num_descriptors), bool)
     T_map_scan = np.tile(np.eye(4, dtype=np.float32), (len(rows), capacity, 1, 1))
     for number, scans in enumerate(rows):
         if scans is not None:
             padded[number, : len(scans)] = scans
-            mask[number, : len(scans)] = True
-            T_map_scan[number, : len(scans)] = rigid.inverse(T_world_scan[scans[0]]) @ T_world_scan[scans]
+            positions, is_there = placed.positions_world[scans].reshape(-1, 3), placed.mask[scans].reshape(-1)
+            thinned = thinned_mask(positions, is_there, num_descriptors)
+            mask[number, : len(scans)] = thinned.reshape(len(scans), -1)
+            T_world_first = placed.T_world_scan[scans[0]]
+            T_map_scan[number, : len(scans)] = rigid.inverse(T_world_first) @ placed.T_world_scan[scans]
     return MapOfScans(padded, mask, T_map_scan)

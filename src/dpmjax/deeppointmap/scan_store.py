@@ -26,8 +26,8 @@ from jaxtyping import Array, Float, Int
 
 from dpmjax.deeppointmap.curriculum import TrainingConfig
 from dpmjax.deeppointmap.encoding import pyramid_of_cloud
-from dpmjax.deeppointmap.sampling import SampleScans, ScanTable
-from dpmjax.geometry.pyramid_storage import pack_pyramid, record_type, stored_pyramids
+from dpmjax.deeppointmap.sampling import PlacedScans, SampleScans, ScanTable
+from dpmjax.geometry.pyramid_storage import pack_pyramid, record_type, sampled_positions, stored_pyramids
 from dpmjax.scans.augment import AugmentConfig, augment_scan, random_motions_on_host
 from dpmjax.scans.preprocess import preprocess_scan_on_host
 from dpmjax.sequences import LidarSequence
@@ -35,7 +35,7 @@ from dpmjax.types import PointCloud
 
 LOGGER = logging.getLogger("dpmjax.training")
 VARIANT_STREAM = 3104
-FORMAT = 1
+FORMAT = 2
 """Raise it when the same scans and settings shall give other files."""
 
 
@@ -80,7 +80,7 @@ class ScanStore:
 
     def read(
         self, rows: Int[np.ndarray, " s"], config: TrainingConfig, rng: np.random.Generator
-    ) -> tuple[SampleScans, Float[np.ndarray, "s 4 4"]]:
+    ) -> tuple[SampleScans, PlacedScans]:
         """Reads a random variant of each scan, and draws its motion.
 
         Args:
@@ -89,7 +89,7 @@ class ScanStore:
             rng: source of the draws.
 
         Returns:
-            The scans, and their poses after the motions, float64.
+            The scans, and their true places after the motions.
         """
         variants = rng.integers(config.num_variants, size=len(rows))
         motions = random_motions_on_host(config.augment, len(rows), rng)
@@ -98,8 +98,12 @@ class ScanStore:
             for row, variant in zip(rows, variants, strict=True)
         ]
         pyramids = stored_pyramids(np.stack(records), config.model.pyramid)
-        T_world_augmented = self.table.T_world_lidar[rows] @ np.linalg.inv(motions)
-        return SampleScans(pyramids, motions.astype(np.float32)), T_world_augmented
+        T_world_lidar = self.table.T_world_lidar[rows]
+        positions, mask = sampled_positions(pyramids, config.model.num_descriptors)
+        turned = config.model.scale_m * positions @ T_world_lidar[:, :3, :3].swapaxes(1, 2)
+        positions_world = turned + T_world_lidar[:, None, :3, 3]
+        placed = PlacedScans(T_world_lidar @ np.linalg.inv(motions), positions_world, mask)
+        return SampleScans(pyramids, motions.astype(np.float32)), placed
 
 
 def prepare_drive(
@@ -207,7 +211,7 @@ def _key(drive: LidarSequence, config: TrainingConfig, seed: int) -> str:
     model = config.model
     settings = [dataclasses.asdict(part) for part in (model.preprocess, model.pyramid, config.augment)]
     # What changes in the step does not change the file.
-    for name in ("max_yaw_rad", "max_tilt_rad", "translation_sigma_m"):
+    for name in ("max_yaw_rad", "max_tilt_rad", "tilt_power", "translation_sigma_m"):
         del settings[-1][name]
     content = json.dumps([FORMAT, settings, model.scale_m, config.num_variants, seed], sort_keys=True)
     digest = hashlib.sha256(content.encode())

@@ -185,7 +185,8 @@ def batch_loss(
         clouds = _in_parts(functools.partial(_encoded, model), sample.scans, config.scans_at_once)
 
         def of_group(group: GroupBatch) -> tuple[Array, ObjectiveTerms]:
-            maps = _merged(clouds, group.source), _merged(clouds, group.target)
+            num = config.sampling.max_descriptors
+            maps = _merged(clouds, group.source, num), _merged(clouds, group.target, num)
             return _map_pair_loss(model, *maps, group.T_target_source, config.objective)
 
         return [
@@ -252,9 +253,15 @@ def _side(
     )
 
 
-def _merged(clouds: DescriptorCloud, scans: MapOfScans) -> DescriptorCloud:
+def _merged(clouds: DescriptorCloud, scans: MapOfScans, max_descriptors: int) -> DescriptorCloud:
     chosen: DescriptorCloud = jax.tree.map(lambda x: x[scans.rows], clouds)
-    return merge_clouds(replace(chosen, mask=chosen.mask & scans.mask[:, None]), scans.T_map_scan)
+    union = merge_clouds(replace(chosen, mask=chosen.mask & scans.mask), scans.T_map_scan)
+    if len(union.mask) <= max_descriptors:
+        return union
+    # Valid rows stand in front, those of the nearest scan first.
+    order = jnp.argsort(~union.mask, stable=True)[:max_descriptors]
+    compact: DescriptorCloud = jax.tree.map(lambda x: x[order], union)
+    return compact
 
 
 def _learning_rate(state: TrainingState, config: TrainingConfig) -> Float[Array, ""]:

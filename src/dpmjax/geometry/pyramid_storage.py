@@ -12,7 +12,7 @@ from typing import Any
 import flax.struct
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int, UInt
+from jaxtyping import Array, Bool, Float, Int, UInt
 
 from dpmjax.geometry import rigid
 from dpmjax.geometry.pyramid import PyramidConfig, interpolation_weights
@@ -123,6 +123,24 @@ def stored_pyramids(records: np.ndarray, config: PyramidConfig) -> StoredPyramid
         ),
         interpolation=tuple(field(f"interpolation_{step}") for step in range(config.num_interpolations)),
     )
+
+
+def sampled_positions(
+    stored: StoredPyramid, num: int
+) -> tuple[Float[np.ndarray, "*b num 3"], Bool[np.ndarray, "*b num"]]:
+    """Computes the positions of the first sampled points on the host.
+
+    Args:
+        stored: pyramids of NumPy arrays.
+        num: number of points, at most that of level 1.
+
+    Returns:
+        Normalised coordinates before any motion, and False for points that are not there.
+    """
+    rows = np.asarray(stored.samples)[..., :num].astype(np.int64)
+    points = np.take_along_axis(np.asarray(stored.points), rows[..., None], axis=-2)
+    mask = np.arange(num) < np.asarray(stored.num_points)[..., None]
+    return points * np.asarray(stored.unit)[..., None, None], mask
 
 
 def moved_pyramid(stored: StoredPyramid, T_new_old: Float[AnyArray, "4 4"]) -> PointPyramid:

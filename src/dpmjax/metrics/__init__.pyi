@@ -13,6 +13,7 @@ from .poses import relative_pose_error as relative_pose_error
 from .position_bound import position_bound as position_bound
 from .probabilities import area_under_curve as area_under_curve
 from .probabilities import brier_score as brier_score
+from .probabilities import expected_calibration_error as expected_calibration_error
 from .proportions import Proportion as Proportion
 from .proportions import mcnemar_p_value as mcnemar_p_value
 from .proportions import wilson_interval as wilson_interval

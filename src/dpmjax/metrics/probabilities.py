@@ -37,3 +37,25 @@ def brier_score(probability: Float[AnyArray, " n"], is_true: Bool[AnyArray, " n"
     """
     errors = np.asarray(probability, np.float64) - np.asarray(is_true, np.float64)
     return float(np.mean(errors**2)) if len(errors) else float("nan")
+
+
+def expected_calibration_error(
+    probability: Float[AnyArray, " n"], is_true: Bool[AnyArray, " n"], *, num_bins: int = 10
+) -> float:
+    """Computes the expected calibration error (Naeini et al. 2015).
+
+    Args:
+        probability: of each event, in [0, 1].
+        is_true: outcome of each event.
+        num_bins: number of bins of equal width.
+
+    Returns:
+        The difference between mean probability and share of true events in a bin, averaged over the events; 0 for a
+        calibrated forecast; NaN without events.
+    """
+    probabilities, labels = np.asarray(probability, np.float64), np.asarray(is_true, np.float64)
+    if len(labels) == 0:
+        return float("nan")
+    bins = np.minimum((probabilities * num_bins).astype(int), num_bins - 1)
+    gaps = np.bincount(bins, probabilities - labels, num_bins)
+    return float(np.abs(gaps).sum() / len(labels))

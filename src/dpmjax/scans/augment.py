@@ -72,7 +72,7 @@ class BoxConfig:
         _require_intervals(self, "centre_z_m", low=-math.inf)
 
 
-def _require_intervals(config: SectorConfig | BoxConfig, *names: str, low: float = 0.0) -> None:
+def _require_intervals(config: SectorConfig | BoxConfig | AugmentConfig, *names: str, low: float = 0.0) -> None:
     for name in names:
         interval: Interval = getattr(config, name)
         if not low <= interval[0] <= interval[1]:
@@ -85,6 +85,8 @@ class AugmentConfig:
 
     Attributes:
         max_drop_ratio: each scan loses a share of its points, uniform between 0 and this.
+        sparse_probability: probability that a scan is thinned further, as by a lidar of few beams.
+        sparse_points: bounds of the number of points that such a scan keeps at most, uniform in its logarithm.
         sector_probability: probability that sectors occlude a scan. A scan has sectors or boxes, never both; one
             scan in ten is occluded (DeepPointMap section 3.3), by either at equal odds.
         sectors: settings of the sectors.
@@ -92,24 +94,31 @@ class AugmentConfig:
         boxes: settings of the boxes.
         max_yaw_rad: largest rotation about z, to either side.
         max_tilt_rad: largest rotation about x and about y, to either side.
+        tilt_power: the uniform number that gives a tilt is raised to this power: above 1, most scans stand upright.
         translation_sigma_m: standard deviation of the translation in x and y; half of it in z.
         jitter_sigma_m: standard deviation of the noise of each coordinate.
         jitter_clip_sigmas: the noise is clipped at this many standard deviations.
     """
 
     max_drop_ratio: float = 0.5
+    sparse_probability: float = 0.0
+    sparse_points: Interval = (300.0, 20000.0)
     sector_probability: float = 0.05
     sectors: SectorConfig = field(default_factory=SectorConfig)
     box_probability: float = 0.05
     boxes: BoxConfig = field(default_factory=BoxConfig)
     max_yaw_rad: float = math.pi
     max_tilt_rad: float = math.pi / 10
+    tilt_power: float = 1.0
     translation_sigma_m: float = 3.0
     jitter_sigma_m: float = 0.005
     jitter_clip_sigmas: float = 3.0
 
     def __post_init__(self) -> None:
         require_fields(self, "max_drop_ratio", "sector_probability", "box_probability", low=0, high=1)
+        require_fields(self, "sparse_probability", low=0, high=1)
+        require_fields(self, "tilt_power", low=1)
+        _require_intervals(self, "sparse_points", low=1.0)
         if self.sector_probability + self.box_probability > 1:
             both = f"{self.sector_probability} and {self.box_probability}"
             raise ValueError(f"sector_probability, box_probability: expected a sum of at most 1, got {both}")
@@ -147,7 +156,7 @@ def augment_scan(cloud: PointCloud, config: AugmentConfig, *, key: PRNGKeyArray)
     """
     drop_key, occlusion_key, motion_key, jitter_key = jax.random.split(key, 4)
     points = jnp.where(cloud.mask[:, None], cloud.points, 0)
-    is_lost = _is_dropped(len(points), config, drop_key) | _is_occluded(points, config, occlusion_key)
+    is_lost = _is_dropped(cloud.mask, config, drop_key) | _is_occluded(points, config, occlusion_key)
     mask = cloud.mask & ~is_lost
     T_augmented_lidar = random_motion(config, key=motion_key).astype(points.dtype)
     noise, limit = jax.random.normal(jitter_key, points.shape, points.dtype), config.jitter_clip_sigmas
@@ -187,6 +196,8 @@ def random_motions_on_host(config: AugmentConfig, num: int, rng: np.random.Gener
 def _motion(angles: AnyArray, translation: AnyArray, config: AugmentConfig) -> Any:
     # From uniform and normal numbers (..., 3), of NumPy or of JAX.
     xp = namespace_of(angles)
+    power = xp.array([config.tilt_power, config.tilt_power, 1.0])
+    angles = xp.sign(angles) * xp.abs(angles) ** power
     angles = angles * xp.array([config.max_tilt_rad, config.max_tilt_rad, config.max_yaw_rad])
     translation = translation * config.translation_sigma_m * xp.array([1, 1, 0.5])
     (sx, sy, sz), (cx, cy, cz) = (xp.moveaxis(f(angles), -1, 0) for f in (xp.sin, xp.cos))
@@ -201,9 +212,14 @@ def _motion(angles: AnyArray, translation: AnyArray, config: AugmentConfig) -> A
     return xp.stack([xp.stack(row, axis=-1) for row in T], axis=-2)
 
 
-def _is_dropped(num_points: int, config: AugmentConfig, key: PRNGKeyArray) -> Bool[Array, " n"]:
-    draws = jax.random.uniform(key, (num_points + 1,))
-    return draws[1:] < draws[0] * config.max_drop_ratio
+def _is_dropped(mask: Bool[AnyArray, " n"], config: AugmentConfig, key: PRNGKeyArray) -> Bool[Array, " n"]:
+    draws = jax.random.uniform(key, (len(mask) + 1,))
+    kept = 1 - draws[0] * config.max_drop_ratio
+    coin, place = jax.random.uniform(jax.random.fold_in(key, 1), (2,))
+    low, high = jnp.log(jnp.array(config.sparse_points))
+    share = jnp.exp(low + place * (high - low)) / jnp.maximum(jnp.sum(mask) * kept, 1)
+    kept *= jnp.where(coin < config.sparse_probability, jnp.minimum(share, 1), 1)
+    return draws[1:] < 1 - kept
 
 
 def _is_occluded(points: Float[Array, "n 3"], config: AugmentConfig, key: PRNGKeyArray) -> Bool[Array, " n"]:

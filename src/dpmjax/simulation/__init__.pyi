@@ -12,6 +12,7 @@ from .raycast2d import cast_rays as cast_rays
 from .raycast2d import cast_scans as cast_scans
 from .raycast2d import scan_world as scan_world
 from .raycast2d import simulate_sequence as simulate_sequence
+from .scenes import TRAINING_MIXTURE as TRAINING_MIXTURE
 from .scenes import Scene as Scene
 from .scenes import SceneMixture as SceneMixture
 from .scenes import draw_scene as draw_scene
@@ -31,6 +32,7 @@ from .town.scan import HDL64E as HDL64E
 from .town.scan import OS1_64 as OS1_64
 from .town.scan import OS1_128 as OS1_128
 from .town.scan import PANDAR64 as PANDAR64
+from .town.scan import SOLID_STATE as SOLID_STATE
 from .town.scan import VLP16 as VLP16
 from .town.scan import LidarSensor as LidarSensor
 from .town.scan import scan_town as scan_town

@@ -15,7 +15,16 @@ from dpmjax.simulation.indoors.walking import WalkConfig, walk
 from dpmjax.simulation.town.driving import DriveConfig, drive, scan_along
 from dpmjax.simulation.town.kinds import KINDS as OUTDOOR_KINDS
 from dpmjax.simulation.town.make import Town, TownConfig, make_town
-from dpmjax.simulation.town.scan import HDL32E, HDL64E, OS1_64, OS1_128, PANDAR64, VLP16, LidarSensor
+from dpmjax.simulation.town.scan import (
+    HDL32E,
+    HDL64E,
+    OS1_64,
+    OS1_128,
+    PANDAR64,
+    SOLID_STATE,
+    VLP16,
+    LidarSensor,
+)
 
 _SCENE_STREAM = 8170
 _Entry = TypeVar("_Entry")
@@ -35,6 +44,7 @@ class SceneMixture:
             logarithm.
         indoor_scale: the same indoors, where networks made for tens of metres see more of a scene that is enlarged.
         moving_rate: share of the drives whose lidar moves during its turn.
+        other_lidar_rate: share of the drives in which every other scan is of a second lidar.
 
     Raises:
         ValueError: an unknown kind, weights that are negative or all zero, or lengths or scales that are not positive.
@@ -64,6 +74,7 @@ class SceneMixture:
     scale: tuple[float, float] = (1.0, 1.0)
     indoor_scale: tuple[float, float] = (1.0, 4.0)
     moving_rate: float = 0.4
+    other_lidar_rate: float = 0.0
 
     def __post_init__(self) -> None:
         for name, entries in (("kinds", self.kinds), ("sensors", self.sensors)):
@@ -92,6 +103,7 @@ class Scene:
         sensor: the lidar.
         scale: factor of points and poses.
         is_moving: the lidar moves during its turn, and the scans are not corrected for it.
+        other_sensor: lidar of every other scan; None where all are of one.
 
     Raises:
         ValueError: a motion that does not belong to the place.
@@ -103,10 +115,43 @@ class Scene:
     sensor: LidarSensor = field(repr=False)
     scale: float = 1.0
     is_moving: bool = False
+    other_sensor: LidarSensor | None = field(default=None, repr=False)
 
     def __post_init__(self) -> None:
         if isinstance(self.place, BuildingConfig) != isinstance(self.motion, WalkConfig):
             raise ValueError("motion must be a WalkConfig in a building and a DriveConfig in a town")
+
+
+TRAINING_MIXTURE = SceneMixture(
+    kinds=(
+        ("suburb", 0.19),
+        ("canyon", 0.09),
+        ("country", 0.08),
+        ("car_park", 0.07),
+        ("campus", 0.09),
+        ("wood", 0.06),
+        ("field", 0.05),
+        ("jam", 0.04),
+        ("office", 0.08),
+        ("hall", 0.06),
+        ("flat", 0.04),
+        ("corridor", 0.05),
+        ("tunnel", 0.03),
+        ("garage", 0.04),
+        ("stairs", 0.03),
+    ),
+    sensors=(
+        (HDL64E, 0.22),
+        (OS1_64, 0.14),
+        (OS1_128, 0.1),
+        (PANDAR64, 0.1),
+        (HDL32E, 0.18),
+        (VLP16, 0.2),
+        (SOLID_STATE, 0.06),
+    ),
+    other_lidar_rate=0.7,
+)
+"""What networks are trained on: a third indoors, and drives in which two lidars take turns."""
 
 
 def draw_scene(seed: int, mixture: SceneMixture = SceneMixture()) -> Scene:
@@ -136,12 +181,17 @@ def draw_scene(seed: int, mixture: SceneMixture = SceneMixture()) -> Scene:
         look, bob = (3.0, 0.0) if is_robot else (25.0, 0.03)
         walking = WalkConfig(1.0, rate, float(height), float(tilt), look, bob)
         place = BuildingConfig(kind, 0.25 * mixture.length_m)
-        return Scene(seed, place, walking, sensor, scale, is_moving)
+        return Scene(seed, place, walking, sensor, scale, is_moving, _other_sensor(rng, mixture, sensor))
     town = TownConfig(kind, str(rng.choice(_ROUTES)), mixture.length_m, float(rng.uniform(75, 130)))
     # Most cars carry their lidar on the roof; small robots carry it low.
     height = sensor.height_m + rng.normal(0, 0.12) if rng.random() < 0.7 else rng.uniform(0.5, 2.5)
     driving = DriveConfig(8.0, 8.0 / mixture.spacing_m, mixture.length_m, bool(rng.random() < 0.3), float(height))
-    return Scene(seed, town, driving, sensor, scale, is_moving)
+    return Scene(seed, town, driving, sensor, scale, is_moving, _other_sensor(rng, mixture, sensor))
+
+
+def _other_sensor(rng: np.random.Generator, mixture: SceneMixture, sensor: LidarSensor) -> LidarSensor | None:
+    is_drawn, other = rng.random() < mixture.other_lidar_rate, _choice(rng, mixture.sensors)
+    return other if is_drawn and other != sensor else None
 
 
 def _choice(rng: np.random.Generator, entries: tuple[tuple[_Entry, float], ...]) -> _Entry:
@@ -165,9 +215,17 @@ def simulate_scene(scene: Scene) -> LidarSequence:
     else:
         world = make_town(scene.seed, scene.place)
         way = drive(world, cast(DriveConfig, scene.motion), seed=scene.seed)
-    name = f"{world.name}-{scene.sensor.name}"
-    sequence = scan_along(name, world.primitives, way, seed=scene.seed, sensor=scene.sensor, is_moving=scene.is_moving)
-    return _scaled(sequence, scene.scale)
+    sensors = [scene.sensor] if scene.other_sensor is None else [scene.sensor, scene.other_sensor]
+    name = f"{world.name}-{'+'.join(sensor.name for sensor in sensors)}"
+    sequences = [
+        scan_along(name, world.primitives, way, seed=scene.seed, sensor=sensor, is_moving=scene.is_moving)
+        for sensor in sensors
+    ]
+    return _scaled(_taking_turns(sequences), scene.scale)
+
+
+def _taking_turns(sequences: list[LidarSequence]) -> LidarSequence:
+    return replace(sequences[0], read_scan=lambda index: sequences[index % len(sequences)].read_scan(index))
 
 
 def _scaled(sequence: LidarSequence, scale: float) -> LidarSequence:
@@ -190,7 +248,12 @@ def simulate_scenes(seeds: Sequence[int], mixture: SceneMixture = SceneMixture()
 
 
 def simulate_drive(
-    seed: int, *, length_m: float = 600.0, kind: str | None = None, sensor: LidarSensor | None = None
+    seed: int,
+    *,
+    length_m: float = 600.0,
+    kind: str | None = None,
+    sensor: LidarSensor | None = None,
+    mixture: SceneMixture = SceneMixture(),
 ) -> LidarSequence:
     """Draws and builds one scene of the mixture, of a given kind of place or with a given lidar.
 
@@ -199,6 +262,7 @@ def simulate_drive(
         length_m: length of the way outdoors; indoors a quarter of it.
         kind: kind of place; None draws one.
         sensor: the lidar; None draws one.
+        mixture: what is drawn from; its `length_m` does not count.
 
     Returns:
         The sequence, with exact poses and times; a scan is simulated when it is read.
@@ -206,7 +270,7 @@ def simulate_drive(
     Raises:
         ValueError: a negative seed, an unknown kind, or a length that is not positive.
     """
-    mixture = SceneMixture(length_m=length_m)
+    mixture = replace(mixture, length_m=length_m)
     if kind is not None:
         mixture = replace(mixture, kinds=((kind, 1.0),))
     if sensor is not None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
@@ -11,12 +12,12 @@ import numpy as np
 from dpmjax.sequences import FloatArray
 from dpmjax.simulation.indoors.plan import Door, Plan, Room, make_plan, make_route
 from dpmjax.simulation.town import primitives
-from dpmjax.simulation.town.objects import Collection, Place, put_box, put_person, put_pole
+from dpmjax.simulation.town.objects import Collection, Place, put_box, put_car, put_person, put_pole
 from dpmjax.simulation.town.primitives import CELL_M, Ground, TownPrimitives, Traffic, pack_bodies
 from dpmjax.simulation.town.vegetation import plant_bushes
 
 _Put = Callable[[Collection, np.random.Generator, Place], None]
-KINDS = ("office", "hall", "flat", "corridor")
+KINDS = ("office", "hall", "flat", "corridor", "tunnel", "garage", "stairs")
 _THICKNESS_M = 0.12
 _CLEARANCE_M = 0.45  # Nothing stands nearer than this to the route.
 _PILLAR_CLEARANCE_M = 0.2
@@ -29,7 +30,7 @@ class BuildingConfig:
     """What a building is like.
 
     Attributes:
-        kind: office, hall, flat or corridor.
+        kind: office, hall, flat, corridor, tunnel, garage (with parked cars) or stairs.
         route_length_m: least length of the walk.
 
     Raises:
@@ -54,7 +55,7 @@ class Building:
         name: with its seed, for titles.
         plan: rooms and doors.
         route: (k, 2) points of the walk at steps of a decimetre, m; nothing stands in the way.
-        primitives: what a beam meets, on the device; the floor is at z = 0.
+        primitives: what a beam meets, on the device; the floor begins at z = 0.
     """
 
     name: str
@@ -85,8 +86,12 @@ def make_building(seed: int, config: BuildingConfig = BuildingConfig()) -> Build
     for number, room in enumerate(plan.rooms):
         _walls(into, rng, room, [door for door in plan.doors if number in door.rooms])
         _ceiling(into, rng, room)
-        if config.kind == "corridor" and number == 0:
+        if config.kind in ("corridor", "tunnel") and number == 0:
             _fittings(into, rng, room, route)
+        elif config.kind == "garage":
+            _parking(into, rng, room, route)
+        elif config.kind == "stairs":
+            _steps(into, rng, room, plan)
         else:
             _furniture(into, rng, room, route, is_hall=config.kind == "hall")
     tables = (np.array(rows, np.float64) for rows in (into.boxes, into.cylinders, into.spheroids))
@@ -98,7 +103,8 @@ def make_building(seed: int, config: BuildingConfig = BuildingConfig()) -> Build
 
 def _floor(plan: Plan) -> Ground:
     low = np.min([room.low for room in plan.rooms], axis=0) - _MARGIN_M
-    return Ground(jnp.zeros((256, 256)), jnp.asarray(low, jnp.float32), jnp.float32(CELL_M))
+    heights = np.tile(plan.floor_at(low[0] + CELL_M * np.arange(256)), (256, 1))
+    return Ground(jnp.asarray(heights, jnp.float32), jnp.asarray(low, jnp.float32), jnp.float32(CELL_M))
 
 
 def _nobody() -> Traffic:
@@ -173,6 +179,39 @@ def _fittings(into: Collection, rng: np.random.Generator, room: Room, route: Flo
         y = float(rng.choice([room.low[1] + 0.45, room.high[1] - 0.45]))
         spot = np.array([rng.uniform(room.low[0], room.high[0]), y])
         _put_if_free(into, rng, (spot, 0.0), route, [_put_cabinet, _put_plant, put_person])
+
+
+def _parking(into: Collection, rng: np.random.Generator, room: Room, route: FloatArray) -> None:
+    """Rows of parked cars between columns at equal steps."""
+    step, taken, row_m = rng.uniform(4.8, 8.0), rng.uniform(0.2, 0.9), rng.uniform(8.0, 11.0)
+    y_rows = np.arange(room.low[1] + 3.0, room.high[1] - 2.5, row_m)
+    for y in y_rows:
+        for x in np.arange(room.low[0] + rng.uniform(0.5, 2.0), room.high[0] - 0.5, step):
+            _put_if_free(into, rng, (np.array([x, y + 2.8]), 0.0), route, [_put_column])
+        for x in np.arange(room.low[0] + 2.0, room.high[0] - 1.5, 2.6):
+            if rng.random() < taken:
+                heading = 0.5 * np.pi * float(rng.choice([-1.0, 1.0])) + rng.normal(0, 0.04)
+                spot = np.array([x, y]) + rng.normal(0, 0.15, 2)
+                _put_if_free(into, rng, (spot, heading), route, [put_car])
+
+
+def _steps(into: Collection, rng: np.random.Generator, room: Room, plan: Plan) -> None:
+    """Steps, a ceiling that rises with them, and pilasters along the walls, often at equal steps."""
+    deep, wide = rng.uniform(0.26, 0.34), 0.98 * room.size[1]
+    for (start, low), (end, high) in itertools.pairwise(plan.floor):
+        steps = np.arange(start, end, deep) if high > low else np.zeros(0)
+        for x, top in zip(steps, plan.floor_at(steps + deep), strict=True):
+            put_box(into, _place(x + 0.5 * deep, 0.0), (deep, wide), (top - 0.5, top))
+    clear = room.height - plan.floor[-1][1]
+    parts = np.arange(room.low[0], room.high[0], 1.5)
+    for x, under in zip(parts, plan.floor_at(parts + 1.5) + clear, strict=True):
+        if under < room.height - 0.1:
+            put_box(into, _place(x + 0.75, 0.0), (1.5, wide), (under, room.height))
+    step, out = rng.uniform(2.0, 6.0), rng.uniform(0.05, 0.3)
+    for y in (room.low[1] + 0.5 * out + _THICKNESS_M, room.high[1] - 0.5 * out - _THICKNESS_M):
+        for x in np.arange(room.low[0] + rng.uniform(0.5, step), room.high[0] - 0.5, step):
+            if rng.random() < 0.85:
+                put_box(into, _place(x, y), (rng.uniform(0.15, 1.0), out), (-0.5, room.height))
 
 
 def _furniture(into: Collection, rng: np.random.Generator, room: Room, route: FloatArray, *, is_hall: bool) -> None:

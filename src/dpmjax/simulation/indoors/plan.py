@@ -60,10 +60,24 @@ class Plan:
     Attributes:
         rooms: all rooms.
         doors: all doors; every room can be reached.
+        floor: x and height of the floor at its bends, m; it is level across x.
     """
 
     rooms: tuple[Room, ...]
     doors: tuple[Door, ...]
+    floor: tuple[tuple[float, float], ...] = ((0.0, 0.0),)
+
+    def floor_at(self, x: FloatArray) -> FloatArray:
+        """Computes the heights of the floor, m.
+
+        Args:
+            x: places, m.
+
+        Returns:
+            One height for each; stairs count as slopes.
+        """
+        bends, heights = np.array(self.floor).T
+        return np.interp(x, bends, heights)
 
 
 def make_plan(rng: np.random.Generator, kind: str) -> Plan:
@@ -73,15 +87,21 @@ def make_plan(rng: np.random.Generator, kind: str) -> Plan:
         rng: source of all choices.
         kind: "office": rooms on both sides of a corridor; "hall": one to three halls in a row, with side rooms;
             "flat": small rooms on both sides of a short corridor; "corridor": one long corridor or tunnel with up to
-            three side rooms.
+            three side rooms; "tunnel": a longer tunnel; "garage": one low and wide room; "stairs": flights of stairs
+            and landings in a row.
 
     Returns:
         The plan.
     """
     if kind == "hall":
         return _row_of_halls(rng)
-    if kind == "corridor":
-        return _long_corridor(rng)
+    if kind in ("corridor", "tunnel"):
+        return _long_corridor(rng, is_tunnel=kind == "tunnel" or rng.random() < 0.3, stretch=1 + (kind == "tunnel"))
+    if kind == "garage":
+        half = 0.5 * rng.uniform(16, 40)
+        return Plan((Room((0.0, -half), (rng.uniform(30, 70), half), rng.uniform(2.2, 3.2)),), ())
+    if kind == "stairs":
+        return _flights(rng)
     small = kind == "flat"
     width, height = rng.uniform(1.2, 2.0) if small else rng.uniform(1.8, 3.5), rng.uniform(2.4, 3.4)
     length = rng.uniform(7, 12) if small else rng.uniform(22, 50)
@@ -117,12 +137,23 @@ def _row_of_halls(rng: np.random.Generator) -> Plan:
     return Plan(tuple(rooms), tuple(doors))
 
 
-def _long_corridor(rng: np.random.Generator) -> Plan:
-    is_tunnel = rng.random() < 0.3
+def _flights(rng: np.random.Generator) -> Plan:
+    half, x, z = 0.5 * rng.uniform(2.2, 7), rng.uniform(3, 8), 0.0
+    floor = [(0.0, z), (x, z)]
+    for _ in range(rng.integers(1, 4)):
+        run = rng.uniform(2.5, 6)
+        x, z = x + run, z + rng.uniform(0.5, 0.65) * run
+        floor.append((x, z))
+        x += rng.uniform(2, 8)
+        floor.append((x, z))
+    return Plan((Room((0.0, -half), (x, half), z + rng.uniform(2.4, 4)),), (), tuple(floor))
+
+
+def _long_corridor(rng: np.random.Generator, *, is_tunnel: bool, stretch: float) -> Plan:
     width, height = (
         (rng.uniform(4, 8), rng.uniform(3.5, 6)) if is_tunnel else (rng.uniform(1.8, 4), rng.uniform(2.4, 3.4))
     )
-    length = rng.uniform(40, 120)
+    length = stretch * rng.uniform(40, 120)
     rooms, doors = [Room((0.0, -0.5 * width), (length, 0.5 * width), height)], []
     for x in np.arange(4, length - 10, length / 3)[: rng.integers(4)] + rng.uniform(0, 6):
         side, wide = int(rng.choice([-1, 1])), rng.uniform(3, 6)

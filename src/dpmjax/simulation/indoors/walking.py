@@ -55,7 +55,7 @@ def walk(building: Building, config: WalkConfig = WalkConfig(), *, seed: int = 0
         seed: of the sway.
 
     Returns:
-        Poses and times; z is up, and the floor is at z = 0.
+        Poses and times; z is up, and the floor begins at z = 0.
     """
     rng = np.random.default_rng([_WALK_STREAM, seed])
     route = building.route
@@ -70,7 +70,7 @@ def walk(building: Building, config: WalkConfig = WalkConfig(), *, seed: int = 0
     poses[:, :3, :3] = Rotation.from_euler("ZYX", np.column_stack([yaw, tilt])).as_matrix()
     poses[:, :2, 3] = at_way(route, way)
     steps = np.sin(2 * np.pi * _STEPS_PER_S * times) + _SINK * _slow(rng, times)
-    poses[:, 2, 3] = config.height_m + config.bob_m * steps
+    poses[:, 2, 3] = building.plan.floor_at(poses[:, 0, 3]) + config.height_m + config.bob_m * steps
     return Drive(poses, times)
 
 

@@ -90,6 +90,7 @@ _TOWERS = Quarter((3.5, 8.0), (18, 40), (15, 25), (15, 55), (0, 6), 0.93, 0.05, 
 _OFFICES = Quarter((6.0, 16.0), (25, 60), (14, 24), (9, 24), (8, 30), 0.85, 0.2, 0.3, 2.0, 15.0, 1.5, 0.5)
 _FARMS = Quarter((8.0, 25.0), (10, 22), (8, 14), (4, 8), (25, 90), 0.3, 0.45, 0.05, 2.5, 0.0, 3.5)
 _MARKETS = Quarter((16.0, 40.0), (30, 60), (20, 40), (6, 12), (15, 50), 0.45, 0.25, 0.3, 0.8, 18.0, 1.0, 1.0)
+_MEADOW = Quarter((20.0, 40.0), (8, 20), (8, 14), (4, 8), (90, 200), 0.12, 0.15, 0.02, 0.2, 0.0, 0.3)
 _FOREST = Quarter((10.0, 20.0), (7, 12), (6, 10), (3, 6), (60, 150), 0.15, 0.1, 0.03, 2.0, 0.0, 2.0)
 
 KINDS: dict[str, Kind] = {
@@ -153,6 +154,31 @@ KINDS: dict[str, Kind] = {
         cars_per_km=2.0,
         queues_per_km=0.0,
         has_pavement=False,
+    ),
+    "field": Kind(
+        (_MEADOW,),
+        half_width=(2.6, 4.0),
+        steepness=(0.005, 0.03),
+        roughness=2.5,
+        trees_per_ha=6.0,
+        bushes_per_ha=12.0,
+        woodland=0.08,
+        verge_step=30.0,
+        cars_per_km=2.0,
+        queues_per_km=0.0,
+        has_pavement=False,
+    ),
+    "jam": Kind(
+        (_MARKETS, _FARMS, _TOWERS),
+        (0.4, 0.3, 0.3),
+        half_width=(6.5, 9.0),
+        steepness=(0.003, 0.012),
+        trees_per_ha=30.0,
+        bushes_per_ha=30.0,
+        cars_per_km=25.0,
+        trucks=0.2,
+        queues_per_km=14.0,
+        bridges_per_km=0.4,
     ),
 }
 """Kinds of place by name."""

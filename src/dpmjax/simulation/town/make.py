@@ -31,7 +31,8 @@ class TownConfig:
     """What a town is like.
 
     Attributes:
-        kind: of the place: suburb, canyon (tall houses), country, car_park, campus or wood.
+        kind: of the place: suburb, canyon (tall houses), country, car_park, campus, wood, field, or jam (queues of
+            cars).
         route: kind of the drive's route; "there_and_back" drives the same street in both directions.
         route_length_m: wanted length of the route, met within a block or two.
         block_m: side of a block.

@@ -1,4 +1,4 @@
-"""Spinning lidars, and one turn of a lidar in the town: rays, hits, noise and lost returns.
+"""Lidars, and one turn of a lidar in the town: rays, hits, noise and lost returns.
 
 A scan is pure and jitted; `vmap` it over poses.
 """
@@ -52,9 +52,10 @@ class LidarSensor:
         height_m: mounting height above the ground, for drives.
         beam_bias_m: standard deviation of the constant range errors of the beams, which calibration leaves.
         mixed_rate: share of the beams on an edge that return a range between foreground and background.
+        view_deg: width of the view around straight ahead; less than 360 for a lidar that does not spin.
 
     Raises:
-        ValueError: no beams, fewer than 8 columns, or ranges that are not 0 <= min < max.
+        ValueError: no beams, fewer than 8 columns, ranges that are not 0 <= min < max, or no view.
     """
 
     name: str
@@ -68,6 +69,7 @@ class LidarSensor:
     height_m: float = 1.73
     beam_bias_m: float = 0.01
     mixed_rate: float = 0.25
+    view_deg: float = 360.0
 
     def __post_init__(self) -> None:
         if not self.elevations_deg or self.num_azimuths < 8:
@@ -75,6 +77,8 @@ class LidarSensor:
             raise ValueError(f"a sensor needs beams and at least 8 azimuths, got {counts}")
         if not 0 <= self.min_range_m < self.max_range_m:
             raise ValueError(f"ranges must be 0 <= min < max, got {self.min_range_m} and {self.max_range_m}")
+        if not 0 < self.view_deg <= 360:
+            raise ValueError(f"view_deg must be above 0 and at most 360, got {self.view_deg}")
 
     @property
     def num_rays(self) -> int:
@@ -103,6 +107,8 @@ _PANDAR64_DEG = (15.0, 11.0, 8.0, 5.0, 3.0, *_spread(2.0, -6.0, 49), *_spread(-7
 PANDAR64 = LidarSensor("pandar64", _PANDAR64_DEG, 1800, half_loss_m=110.0, height_m=1.9)
 HDL32E = LidarSensor("hdl32e", _spread(10.67, -30.67, 32), 1080, max_range_m=80.0, height_m=1.84)
 VLP16 = LidarSensor("vlp16", _spread(15.0, -15.0, 16), 1800, range_noise_m=0.03)
+# A lidar that does not spin: RoboSense's M1 by its data sheet, every other line.
+SOLID_STATE = LidarSensor("solid_state", _spread(12.5, -12.5, 64), 1800, half_loss_m=110.0, view_deg=120.0)
 
 
 def scan_town(
@@ -160,7 +166,7 @@ def _scan_near(
     ranges = _mix_edges(_by_beam(hits.ranges, sensor), sensor, mix, part)
     rough = jnp.asarray(_ROUGHNESS_M)[_by_beam(hits.surfaces, sensor)]
     ranges += jnp.sqrt(sensor.range_noise_m**2 + rough**2) * ndtri(noise) + _beam_bias(sensor)
-    is_back = loss < probability
+    is_back = (loss < probability) & _is_in_view(sensor)
     mask = is_back & (ranges >= sensor.min_range_m) & (ranges <= sensor.max_range_m)
     return PointCloud(points=jnp.where(mask[:, None], ranges[:, None] * directions, 0.0), mask=mask)
 
@@ -169,6 +175,12 @@ def _beam_bias(sensor: LidarSensor) -> NDArray[np.float32]:
     """Constant error of the range of each ray, m; the same in every scan."""
     biases = np.random.default_rng(_BIAS_STREAM).normal(size=len(sensor.elevations_deg))
     return np.repeat(np.float32(sensor.beam_bias_m) * biases.astype(np.float32), sensor.num_azimuths)
+
+
+def _is_in_view(sensor: LidarSensor) -> NDArray[np.bool_]:
+    """True for the rays within the view."""
+    azimuths_deg = 180 - 360 / sensor.num_azimuths * (np.arange(sensor.num_azimuths) + 0.5)
+    return np.tile(np.abs(azimuths_deg) <= 0.5 * sensor.view_deg, len(sensor.elevations_deg))
 
 
 def _mix_edges(ranges: Float[Array, " b"], sensor: LidarSensor, choice: Array, part: Array) -> Float[Array, " b"]:
