@@ -32,8 +32,8 @@ def returning(T: np.ndarray, scans: dm.DepthScans) -> Callable[..., dm.Fit]:
     poses = np.array(T)
     poses[:, :3, 3] /= typical_range(scans.points, scans.mask)
 
-    def engine(problem, data, *, key, num_starts):
-        return dm.fit(problem, data, key=key, num_starts=num_starts, stop=lambda: True)._replace(poses=poses)
+    def engine(problem, data, *, key):
+        return dm.fit(problem, data, key=key, stop=lambda: True)._replace(poses=poses)
 
     return engine
 

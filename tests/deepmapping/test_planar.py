@@ -148,7 +148,6 @@ def test_beams_that_are_zero_or_not_finite_are_masked() -> None:
         (ScanSet(jnp.full((2, 5, 2), jnp.nan), jnp.ones((2, 5), bool)), {}, "scans: expected finite"),
         (np.ones((2, 5, 2)), {"start": np.zeros((3, 3))}, "start: expected shape"),
         (np.ones((2, 5, 2)), {"start": np.full((2, 3), np.nan)}, "start: expected finite"),
-        (np.ones((2, 5, 2)), {"num_starts": 0}, "num_starts"),
     ],
 )
 def test_bad_input_is_named(as_user, scans, options, message) -> None:

@@ -104,7 +104,6 @@ def register_clouds(
     *,
     key: jax.Array,
     start: ArrayLike | None = None,
-    num_starts: int = 1,
     engine: Callable[..., Fit] = fit,
 ) -> CloudFitted:
     """Registers 3-D lidar scans by optimising L-Net and M-Net on them alone (DeepMapping eq. 6, in SE(3)).
@@ -117,8 +116,7 @@ def register_clouds(
         config: settings; None: `cloud_preset("fast")`.
         key: of the whole run.
         start: (n, 4, 4) T_world_scan to start from; None: cold start.
-        num_starts: starts with other weights, side by side; the worse half by the loss is dropped again and again.
-        engine: what trains, called as `engine(problem, data, key=key, num_starts=num_starts)`;
+        engine: what trains, called as `engine(problem, data, key=key)`;
             `functools.partial(fit, on_report=..., stop=...)` reports each call of the step and can be stopped.
 
     Returns:
@@ -129,7 +127,7 @@ def register_clouds(
     """
     config = config or CloudMappingConfig()
     data, unit = cloud_data(scans, start, num_points=config.num_points)
-    return as_fitted(engine(cloud_problem(config, data), data, key=key, num_starts=num_starts), data, unit)
+    return as_fitted(engine(cloud_problem(config, data), data, key=key), data, unit)
 
 
 def as_fitted(done: Fit, data: MappingData, unit: float) -> CloudFitted:

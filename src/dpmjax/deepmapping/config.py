@@ -141,7 +141,6 @@ class DeepMappingConfig:
         occupancy: shape of M-Net.
         steps_per_call: the largest number of steps that are compiled into one call.
         map_margin: side of the map over the extent of the scans at the start of a phase.
-        halve_at: shares of the first phase at which the worse half of several starts is dropped.
     """
 
     cold_phases: tuple[PhaseConfig, ...] = (LOCALIZE, REFINE)
@@ -154,7 +153,6 @@ class DeepMappingConfig:
     occupancy: OccupancyConfig = field(default_factory=lambda: OccupancyConfig(kind="grid"))
     steps_per_call: int = 25
     map_margin: float = 1.15
-    halve_at: tuple[float, ...] = (0.25, 0.5, 0.75)
 
     def __post_init__(self) -> None:
         for phases in (self.cold_phases, self.warm_phases):

@@ -89,7 +89,6 @@ def fit_depth(
     *,
     key: jax.Array,
     start: ArrayLike | None = None,
-    num_starts: int = 1,
     engine: Callable[..., Fit] = fit,
 ) -> DepthFitted:
     """Registers depth images by optimising L-Net and M-Net on them alone (DeepMapping section 4.2).
@@ -99,8 +98,7 @@ def fit_depth(
         config: settings; None: `depth_preset("fast")`.
         key: of the whole run.
         start: (n, 4, 4) T_world_camera to start from; None: cold start.
-        num_starts: starts with other weights, side by side; the worse half by the loss is dropped again and again.
-        engine: what trains, called as `engine(problem, data, key=key, num_starts=num_starts)`;
+        engine: what trains, called as `engine(problem, data, key=key)`;
             `functools.partial(fit, on_report=..., stop=...)` reports each call of the step and can be stopped.
 
     Returns:
@@ -114,7 +112,7 @@ def fit_depth(
     unit = typical_range(scans.points, scans.mask)
     T_start = None if start is None else start_poses(start, len(scans.points), unit)
     data = MappingData(replace(scans, points=scans.points / unit), T_start)
-    fitted = engine(depth_problem(config, data), data, key=key, num_starts=num_starts)
+    fitted = engine(depth_problem(config, data), data, key=key)
     return DepthFitted(fitted_poses(fitted.poses, unit), fitted.state.params, fitted.report, unit)
 
 

@@ -245,10 +245,7 @@ def resume(
     on_report: Callable[[Progress], None] | None = None,
     stop: Callable[[], bool] | None = None,
 ) -> Fit:
-    """Steps a state through all phases that are left; a second fit of the same shapes compiles nothing.
-
-    Of several starts, the worse half by the loss is dropped at `problem.halve_at`, and the best one is kept at the end
-    of the fit. A problem without `halve_at` keeps all of them to the end.
+    """Steps a state through the remaining phases; a second fit of the same shapes compiles nothing.
 
     Args:
         problem: what to fit.
@@ -269,14 +266,11 @@ def resume(
         # JAX keeps the program of each phase and number of starts.
         program = _advance.lower(problem, _scalar(state.phase), state, data).compile()
         compiled = time.perf_counter()
-        before = _scalar(state.step)
         state, report = jax.block_until_ready(program(state, data))
         compile_s, run_s = compile_s + compiled - begun, run_s + time.perf_counter() - compiled
         if on_report is not None:
             share = min(1.0, _scalar(state.step) / total)
             on_report(Progress(problem.phases[_scalar(state.phase)], state, report, share, run_s, compile_s))
-        if num_kept := _num_kept(problem, state, before):
-            state, report = _keep_best(state, report, num_kept)
     return Fit(state, _current_poses(problem, _scalar(state.phase), state, data), report, run_s, compile_s)
 
 
@@ -362,22 +356,3 @@ def _advance(problem: Problem, phase_index: int, state: FitState, data: Any) -> 
         return state, Report(losses, terms, problem.poses(problem.config, phase, state.params, data))
 
     return _over_starts(call, state, data)
-
-
-def _num_kept(problem: Problem, state: FitState, steps_before: int) -> int:
-    """Returns the number of starts to go on with where some are to be dropped; else 0."""
-    num_starts = state.step.size
-    if num_starts == 1 or not problem.halve_at:
-        return 0
-    if is_finished(problem, state):
-        return 1
-    steps, first = _scalar(state.step), problem.phases[0].num_steps
-    is_due = any(steps_before < share * first <= steps for share in problem.halve_at)
-    return -(-num_starts // 2) if is_due else 0
-
-
-def _keep_best(state: FitState, report: Report, num_kept: int) -> tuple[FitState, Report]:
-    """Returns the starts of the smallest mean loss of the last call; a single one loses its leading axis."""
-    losses = np.nan_to_num(np.asarray(report.losses).mean(axis=-1), nan=np.inf)
-    best = np.sort(np.argsort(losses, kind="stable")[:num_kept])
-    return jax.tree.map(lambda leaf: leaf[best[0]] if num_kept == 1 else leaf[best], (state, report))

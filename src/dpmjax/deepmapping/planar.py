@@ -126,7 +126,6 @@ def fit_deepmapping(
     *,
     key: jax.Array,
     start: ArrayLike | None = None,
-    num_starts: int = 1,
     engine: Callable[..., Fit] = fit,
 ) -> Fitted:
     """Registers planar scans by optimising L-Net and M-Net on them alone (DeepMapping eq. 6).
@@ -136,8 +135,7 @@ def fit_deepmapping(
         config: settings; None: `preset("fast")`.
         key: of the whole run.
         start: (n, 3) x, y, heading or (n, 3, 3) matrices to start from; None: cold start from zero.
-        num_starts: starts with other weights, side by side; the worse half by the loss is dropped again and again.
-        engine: what trains, called as `engine(problem, data, key=key, num_starts=num_starts)`;
+        engine: what trains, called as `engine(problem, data, key=key)`;
             `functools.partial(fit, on_report=..., stop=...)` reports each call of the step and can be stopped.
 
     Returns:
@@ -149,7 +147,7 @@ def fit_deepmapping(
     """
     config = config or DeepMappingConfig()
     data, unit = planar_data(scans, start)
-    return as_fitted(engine(planar_problem(config, data), data, key=key, num_starts=num_starts), unit, config)
+    return as_fitted(engine(planar_problem(config, data), data, key=key), unit, config)
 
 
 def as_fitted(done: Fit, unit: float, config: DeepMappingConfig) -> Fitted:
@@ -164,9 +162,7 @@ def as_fitted(done: Fit, unit: float, config: DeepMappingConfig) -> Fitted:
         Fitted.
     """
     poses = np.asarray(done.poses, np.float64) * [unit, unit, 1.0]
-    # Several starts have done the same number of steps.
-    num_steps = int(np.max(done.state.step))
-    return Fitted(poses, done.state.params, done.report, unit, config, num_steps)
+    return Fitted(poses, done.state.params, done.report, unit, config, int(done.state.step))
 
 
 def localize_scans(

@@ -36,7 +36,6 @@ class Problem:
         poses: (config, phase, params, data) -> poses of the whole data set.
         next_phase: (config, phase, params, data) -> Params at the start of the phase after `phase`.
         steps_per_call: the largest number of steps that are compiled into one call.
-        halve_at: shares of the first phase at which the worse half of several starts is dropped; empty: all are kept.
     """
 
     config: Any
@@ -47,7 +46,6 @@ class Problem:
     poses: Callable[..., Any]
     next_phase: Callable[..., Any]
     steps_per_call: int
-    halve_at: tuple[float, ...] = ()
 
 
 class MappingData(NamedTuple):
@@ -111,7 +109,7 @@ def mapping_problem(config: DeepMappingConfig, data: MappingData, functions: Map
     """
     return Problem(
         config, phases_of(config, data), optimizer=make_optimizer, **functions._asdict(),
-        steps_per_call=config.steps_per_call, halve_at=config.halve_at,
+        steps_per_call=config.steps_per_call,
     )  # fmt: skip
 
 

@@ -92,7 +92,7 @@ def toy_problem(config: ToyConfig) -> Problem:
         config: settings.
 
     Returns:
-        The problem; all starts are kept.
+        The problem.
     """
     return Problem(config, (config,), _init, _optimizer, _loss, _poses, _next_phase, steps_per_call=config.num_steps)
 

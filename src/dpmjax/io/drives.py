@@ -1,4 +1,4 @@
-"""The files of a drive of 3-D scans with their poses and times; plain folders; reading on; writing as KITTI."""
+"""The files of a drive of 3-D scans with their poses and times; plain folders; reading on."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from dpmjax.geometry import rigid
 from dpmjax.io.calibration import read_camera_calibration
-from dpmjax.io.files import load_arrays, write_atomically
-from dpmjax.io.poses import check_poses, homogeneous, read_stamped_poses, write_kitti
+from dpmjax.io.files import load_arrays
+from dpmjax.io.poses import check_poses, homogeneous, read_stamped_poses
 from dpmjax.io.references import camera_note, match_reference, scan_times
 from dpmjax.io.scan_names import sort_scans, strays_among
 from dpmjax.sequences import FloatArray, InputError, LidarSequence, Note, require
@@ -23,8 +23,6 @@ SCAN_SUFFIXES = (".bin", ".npy", ".npz", ".pcd", ".ply", ".las", ".laz")
 POSE_FILES = ("poses_lidar.txt", "poses_lidar.npy", "poses.txt", "poses.npy", "trajectory.txt", "trajectory_tum.txt",
               "trajectory.npy", "gt_poses.txt", "groundtruth.txt")  # fmt: skip
 """Usual names of files of reference poses in the lidar's frame."""
-# Axes of a camera that looks along x of the lidar: x right, y down, z forward. Written sequences have it in the lidar.
-_T_CAM0_LIDAR = np.array([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]])
 
 
 class Drive3D(NamedTuple):
@@ -195,38 +193,3 @@ def iterate_scans(sequence: LidarSequence) -> Iterator[IndexedScan]:
     require(is_usable, sequence.name, f"all {len(bad)} scans are bad: {listed}", "check the files")
     if bad:
         _log.warning("%s: %d of %d scans left out: %s", sequence.name, len(bad), sequence.num_scans, listed)
-
-
-def write_kitti_sequence(root: str | Path, name: str, sequence: LidarSequence) -> Path:
-    """Writes a sequence as KITTI odometry lays it out: sequences/NAME/{velodyne,calib.txt,times.txt}, poses/NAME.txt.
-
-    Reflectance is written as 0. Poses are those of the camera of the written calib.txt, from the first scan on.
-
-    Args:
-        root: folder of the data set.
-        name: of the sequence, like "00".
-        sequence: the scans; it must have poses. Bad scans are left out, with their poses.
-
-    Returns:
-        The sequence's folder.
-
-    Raises:
-        InputError: no poses, or not one good scan.
-    """
-    if sequence.T_world_lidar is None:
-        raise InputError(sequence.name, "no poses", "a KITTI sequence needs a pose for each scan")
-    root = Path(root)
-    folder = root / "sequences" / name
-    kept: list[int] = []
-    for index, points in iterate_scans(sequence):
-        rows = np.zeros((len(points), 4), "<f4")
-        rows[:, :3] = points
-        write_atomically(folder / "velodyne" / f"{len(kept):06d}.bin", rows.tobytes())
-        kept.append(index)
-    T_first_lidar = rigid.inverse(sequence.T_world_lidar[kept[0]]) @ sequence.T_world_lidar[kept]
-    write_kitti(root / "poses" / f"{name}.txt", _T_CAM0_LIDAR @ T_first_lidar @ rigid.inverse(_T_CAM0_LIDAR))
-    numbers = " ".join(f"{value:.12e}" for value in _T_CAM0_LIDAR[:3].ravel())
-    write_atomically(folder / "calib.txt", f"Tr: {numbers}\n")
-    times = np.arange(len(kept)) / 10.0 if sequence.times is None else sequence.times[kept]
-    write_atomically(folder / "times.txt", "".join(f"{time:.6f}\n" for time in times))
-    return folder

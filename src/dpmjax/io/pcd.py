@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from dpmjax.io.clouds import PADDING, CloudLayout, TimedCloud, times_of, unpack_columns
-from dpmjax.io.files import read_bytes, refusing, split_rows, to_float32, write_atomically
+from dpmjax.io.files import refusing, split_rows, to_float32, write_atomically
 from dpmjax.io.lzf import MOST_EXPANSION, unpack_lzf
 from dpmjax.sequences import InputError, require
 
@@ -19,21 +19,6 @@ _ENCODINGS = ("ascii", "binary", "binary_compressed")
 # A field of one byte is a number or, by the Point Cloud Library, the character of this code, a line feed too.
 _MOST_COLUMNS = 100
 _CHARACTER, _NUMBER = rb"(?:-?\d{1,3}(?=[ \t\r\n]|\Z)|.)", rb"(\S+)"
-
-
-def read_pcd(path: str | Path) -> NDArray[np.float32]:
-    """Reads the points of a PCD file.
-
-    Args:
-        path: the file.
-
-    Returns:
-        (m, 3) float32 x, y, z in the file's unit; z is zero where the file has none, and NaN is left as it is.
-
-    Raises:
-        InputError: the file is missing, or `parse_pcd` refuses it.
-    """
-    return parse_pcd(read_bytes(path), str(path)).points
 
 
 def parse_pcd(content: bytes, source: str) -> TimedCloud:

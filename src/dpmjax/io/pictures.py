@@ -1,4 +1,4 @@
-"""PNG files as data: depth images of 16 bits, and floor plans as worlds."""
+"""Depth images of 16 bits in PNG files."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from dpmjax.io.files import read_bytes, refusing, write_atomically
-from dpmjax.sequences import FloatArray, World, require
+from dpmjax.io.files import read_bytes, refusing
+from dpmjax.sequences import FloatArray, require
 
 _MOST_PIXELS = 1 << 26
 
@@ -32,42 +32,6 @@ def read_depth_png(path: str | Path) -> NDArray[np.int64]:
     require(is_good, path, f"pixels are {image.shape} of {bits} bits", "give a PNG of one channel of 16 bits")
     # matplotlib divides by the largest number of 16 bits.
     return np.rint(image * 65535.0).astype(np.int64)
-
-
-def read_world_png(path: str | Path) -> World:
-    """Reads a floor plan: pixels darker than half are solid, the lowest picture row is row 0.
-
-    Args:
-        path: a PNG picture.
-
-    Returns:
-        The world; free pockets that cannot be reached from the largest free space are solid.
-
-    Raises:
-        InputError: the file is missing, no picture, or solid everywhere.
-    """
-    image, _ = _read_png(path)
-    gray = image if image.ndim == 2 else image[..., : 1 if image.shape[2] < 3 else 3].mean(axis=2)
-    is_obstacle = gray[::-1] < 0.5 * max(1.0, gray.max())
-    require(not is_obstacle.all(), path, "no white pixel", "free space must be white, obstacles black")
-    return World(Path(path).stem, is_obstacle).fill_pockets()
-
-
-def write_world_png(path: str | Path, world: World) -> Path:
-    """Saves the world as a picture: white is free, black is solid, y up as in a plot.
-
-    Args:
-        path: file to write, atomically.
-        world: the world.
-
-    Returns:
-        The path.
-    """
-    from matplotlib.image import imsave
-
-    buffer = io.BytesIO()
-    imsave(buffer, ~world.is_obstacle[::-1], cmap="gray", vmin=0, vmax=1, format="png")
-    return write_atomically(path, buffer.getvalue())
 
 
 def _read_png(path: str | Path) -> tuple[FloatArray, int]:
