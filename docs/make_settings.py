@@ -56,7 +56,7 @@ SCANS_2D = Group("2-D scans", (
         "num_steps": ("steps", "more for large sets or noise; `deepmapping.with_steps(config, n)` scales all phases"),
         "occupancy_weight": ("0 to 1", "weight of M-Net's loss beside the Chamfer distance; 0 leaves M-Net out"),
         "learning_rate": ("", "lower if the loss jumps, higher if 800 steps do not move the poses far enough"),
-        "map_learning_rate": ("", "of M-Net"),
+
         "scans_per_step": ("scans", "fewer: less memory, noisier steps"),
         "beams_per_step": ("beams", "fewer: faster steps, noisier"),
         "max_offset": ("scans", "higher if places are seen again soon; lower if neighbouring scans hardly overlap"),

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 if TYPE_CHECKING:
-    from dpmjax.deepmapping import DepthMappingConfig
+    from dpmjax.deepmapping import DeepMappingConfig
     from dpmjax.io import DepthSequence
 
 METHODS = (
@@ -31,7 +31,7 @@ _ICP_POINTS = 800
 def run_method(
     name: str,
     sequence: DepthSequence,
-    settings: DepthMappingConfig,
+    settings: DeepMappingConfig,
     found: Mapping[str, NDArray[np.float64]],
     *,
     seed: int,

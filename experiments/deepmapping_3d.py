@@ -43,7 +43,7 @@ from dpmjax.cli import (
 from experiments._cloud_input import DriveWindow, FirstPoses, read_drive, starting_poses
 
 if TYPE_CHECKING:
-    from dpmjax.deepmapping import CloudFitted, CloudMappingConfig, CloudScans
+    from dpmjax.deepmapping import CloudFitted, CloudScans, DeepMappingConfig
     from dpmjax.io import LidarSequence
 
 Floats = NDArray[np.float64]
@@ -115,7 +115,7 @@ def main(config: Config) -> dict[str, Any]:
     started = time.perf_counter()
     sequence = read_drive(config.drive_window())
     start = starting_poses(config.first_poses(), sequence, config.selection())
-    scans = read_scans(sequence, fit_settings(config))
+    scans = read_scans(sequence)
     folder = open_run_folder(config, EXPERIMENT)
     with recording(folder), StopFlag() as stop:
         print(f"{sequence.name}: {len(sequence)} scans of {scans.points.shape[1]} points, from {config.init}")
@@ -147,16 +147,16 @@ def main(config: Config) -> dict[str, Any]:
     return metrics
 
 
-def read_scans(sequence: LidarSequence, settings: CloudMappingConfig) -> CloudScans:
+def read_scans(sequence: LidarSequence) -> CloudScans:
     """Reads and thins the scans."""
     from dpmjax.deepmapping import as_cloud_scans
 
     clouds = [sequence.read_scan(number) for number in tqdm(range(len(sequence)), desc="read", unit=" scans")]
     with tqdm(total=len(clouds), desc="thin", unit=" scans") as bar:
-        return as_cloud_scans(clouds, settings.num_points, on_scan=lambda: bar.update(1))
+        return as_cloud_scans(clouds, on_scan=lambda: bar.update(1))
 
 
-def fit_settings(config: Config) -> CloudMappingConfig:
+def fit_settings(config: Config) -> DeepMappingConfig:
     """Returns the preset, with the given number of steps."""
     from dpmjax import deepmapping
 

@@ -47,7 +47,7 @@ from dpmjax.cli import (
 from experiments._rgbd_methods import METHODS, errors_of, run_method, spread_of
 
 if TYPE_CHECKING:
-    from dpmjax.deepmapping import DepthMappingConfig
+    from dpmjax.deepmapping import DeepMappingConfig
     from dpmjax.io import DepthSequence
     from dpmjax.simulation import DepthWalkConfig
 
@@ -178,7 +178,7 @@ def _hard_walk(config: Config, index: int, walk: DepthWalkConfig) -> DepthSequen
     return simulation.simulate_depth_sequence(apartment, views, seed=seed, config=walk)
 
 
-def fit_settings(config: Config, sequence: DepthSequence) -> DepthMappingConfig:
+def fit_settings(config: Config, sequence: DepthSequence) -> DeepMappingConfig:
     """The preset, with the motion of the data."""
     from dpmjax.deepmapping import depth_preset
 
@@ -186,7 +186,7 @@ def fit_settings(config: Config, sequence: DepthSequence) -> DepthMappingConfig:
     return depth_preset(config.preset, motion="planar" if is_planar else "full")
 
 
-def run_one(trajectory: int, *, folder: RunFolder, config: Config, settings: DepthMappingConfig) -> dict[str, Any]:
+def run_one(trajectory: int, *, folder: RunFolder, config: Config, settings: DeepMappingConfig) -> dict[str, Any]:
     """All methods on one trajectory; a fit from the result of another method is timed without that method.
 
     The first `run_s` of each number of images contains its compilation.

@@ -56,7 +56,7 @@ def start(truth) -> np.ndarray:
     return truth @ np.asarray(se3.exp(jnp.asarray(rng.normal(size=(NUM_SCANS, 6)) * 0.03)), np.float64)
 
 
-def small(num_steps: int = 4) -> dm.CloudMappingConfig:
+def small(num_steps: int = 4) -> dm.DeepMappingConfig:
     """The fast preset in small."""
     config = dm.cloud_preset("fast")
     cold = [replace(phase, num_steps=2, beams_per_step=32) for phase in config.cold_phases]

@@ -42,7 +42,7 @@ def scans(walk) -> dm.DepthScans:
     return dm.as_depth_scans(walk.points, walk.mask)
 
 
-def small(motion: str) -> dm.DepthMappingConfig:
+def small(motion: str) -> dm.DeepMappingConfig:
     """The fast preset in small."""
     config = dm.depth_preset("fast", motion=motion)
     phases = [replace(phase, num_steps=4, beams_per_step=64) for phase in config.cold_phases]

@@ -11,6 +11,7 @@ import pytest
 
 from dpmjax import deepmapping as dm
 from dpmjax import io, simulation
+from dpmjax.deepmapping import depth_initialization
 from dpmjax.deepmapping.depth_adjustment import adjust_poses
 from dpmjax.deepmapping.depth_initialization import _best_that_differ, _explained, _Images, _window
 from dpmjax.deepmapping.depth_motion_search import Views, propose_motions, surface_directions
@@ -77,34 +78,35 @@ def test_adjusted_poses_are_never_less_consistent(walk, scans) -> None:
 
 def test_images_without_a_pose_count_nothing(walk, scans) -> None:
     T = walk.T_world_camera[:3]
-    rows, window = _window(3, _Images(scans, scans.pixels, 1.0), dm.PLANAR_SEARCH)
+    rows, window = _window(3, _Images(scans, scans.pixels, 1.0), 24)
     share = _explained(jnp.asarray(T[rows], jnp.float32)[None], window, jnp.asarray(0.02))
     alone = _Images(dm.DepthScans(scans.points[:3], scans.mask[:3], scans.pinhole), take(scans.pixels, 3), 1.0)
     np.testing.assert_allclose(
         share, _explained(jnp.asarray(T, jnp.float32)[None], alone, jnp.asarray(0.02)), **ROUNDING
     )
-    last = replace(dm.PLANAR_SEARCH, num_window=2)
-    assert _window(3, _Images(scans, scans.pixels, 1.0), last)[0].tolist() == [1, 2]
+    assert _window(3, _Images(scans, scans.pixels, 1.0), 2)[0].tolist() == [1, 2]
 
 
-def test_of_alike_trajectories_the_best_goes_on(walk, scans) -> None:
+def test_of_alike_trajectories_the_best_goes_on(walk, scans, monkeypatch) -> None:
     truth = walk.T_world_camera
     far, turned, near = truth.copy(), truth.copy(), truth.copy()
     far[1:, 0, 3] += 0.2
     turned[3] = turned[3] @ np.asarray(motion_matrices(jnp.array([[0.0, 0.0, 0.3]])))[0]
     near[1:, 0, 3] += 0.02
     candidates = np.stack([near, far, turned, truth])[None]
-    images, config = _Images(scans, scans.pixels, 1.0), replace(dm.PLANAR_SEARCH, margin=100.0)
+    images, config = _Images(scans, scans.pixels, 1.0), dm.PLANAR_SEARCH
+    monkeypatch.setattr(depth_initialization, "_MARGIN", 100.0)
     kept = _best_that_differ(candidates, images, config)
     np.testing.assert_array_equal(kept[0], truth)
     assert {T.tobytes() for T in kept} == {T.tobytes() for T in (far, turned, truth)}
     assert len(_best_that_differ(candidates, images, replace(config, num_trajectories=2))) == 2
-    assert len(_best_that_differ(candidates, images, replace(config, margin=1e-6))) == 1
+    monkeypatch.setattr(depth_initialization, "_MARGIN", 1e-6)
+    assert len(_best_that_differ(candidates, images, config)) == 1
 
 
 @pytest.mark.slow
 def test_images_are_registered_without_a_first_guess(walk, scans) -> None:
-    config = dm.DepthInitializationConfig(num_candidates=512, num_kept=16, num_points=100, num_references=2)
+    config = dm.DepthInitializationConfig(num_candidates=512, num_kept=16)
     T = dm.initialize_depth(scans, config, key=KEY)
     relative = np.linalg.inv(walk.T_world_camera[0]) @ walk.T_world_camera
     assert absolute_trajectory_error(T[:, :3, 3], relative[:, :3, 3]) < 0.02

@@ -77,7 +77,7 @@ def test_picture_is_dark_at_walls_and_light_in_free_space(tiny_walk, warm) -> No
 def test_steps_of_the_paper_preset_lower_its_loss(tiny_data) -> None:
     config = dm.preset("paper")
     (phase,) = config.cold_phases
-    assert (phase.num_free, phase.is_free_factor_shared, phase.occupancy_weight, phase.num_offsets) == (
+    assert (phase.num_free, phase.is_sampled_as_published, phase.occupancy_weight, phase.num_offsets) == (
         19,
         True,
         0.1,

@@ -12,10 +12,9 @@ import pytest
 
 import dpmjax
 from dpmjax import deepmapping as dm
-from dpmjax.deepmapping.batches import draw_rows
+from dpmjax.deepmapping.batches import draw_rows, join_windows, window_rows
 from dpmjax.deepmapping.engine import init
 from dpmjax.deepmapping.planar import planar_data, planar_problem
-from dpmjax.deepmapping.windows import join_windows, window_rows
 from dpmjax.geometry import se2
 from dpmjax.nets.localization import LocalizationConfig, LocalizationNet
 from dpmjax.nets.occupancy import OccupancyConfig

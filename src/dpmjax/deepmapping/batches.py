@@ -1,13 +1,21 @@
-"""Which scans a step sees, and at which distances in time they are compared."""
+"""Scans of a step: all, blocks of neighbours in time, or windows that are registered alone and joined at shared scans.
+
+Within a window all scans are near the first one, so that the Chamfer distance has its minimum within reach from zero
+poses. Over a whole walk L-Net has to unroll the chain at once, and may lay two rooms that look alike on each other.
+"""
 
 from __future__ import annotations
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Int
+import numpy as np
+from jaxtyping import Array, Float, Int
+from numpy.typing import NDArray
 
 from dpmjax.deepmapping.config import PhaseConfig
-from dpmjax.deepmapping.windows import window_rows
+from dpmjax.geometry import se2
 
 # Scans that are drawn together where a set is too large for one step.
 _BLOCK = 32
@@ -27,7 +35,7 @@ def scans_in_block(phase: PhaseConfig, num_scans: int) -> int:
         return min(num_scans, phase.scans_per_window)
     if num_scans <= phase.scans_per_step:
         return num_scans
-    return phase.scans_per_step if phase.is_free_factor_shared else _BLOCK
+    return phase.scans_per_step if phase.is_sampled_as_published else _BLOCK
 
 
 def draw_rows(
@@ -49,7 +57,7 @@ def draw_rows(
         return jnp.asarray(rows.reshape(-1)), jnp.repeat(jnp.arange(len(rows)), rows.shape[1])
     if num_scans <= phase.scans_per_step:
         return jnp.arange(num_scans), jnp.zeros(num_scans, jnp.int32)
-    if phase.is_free_factor_shared:
+    if phase.is_sampled_as_published:
         # The published order: batches follow each other in time, none is mixed.
         # The last one reaches back, so that it is as long as the others and no scan is left out.
         first = step % -(-num_scans // phase.scans_per_step) * phase.scans_per_step
@@ -75,3 +83,57 @@ def draw_offsets(phase: PhaseConfig, furthest: int, *, key: jax.Array) -> Int[Ar
     count = min(phase.num_offsets, largest) - 1
     others = jax.random.choice(key, jnp.arange(2, max(largest, 2) + 1), (count,), replace=False)
     return jnp.concatenate([jnp.ones(1, others.dtype), others])
+
+
+def window_rows(num_scans: int, scans_per_window: int) -> NDArray[np.intp]:
+    """The scans of each window; the last scan of a window is the first of the next.
+
+    Args:
+        num_scans: of the set, in the order of time.
+        scans_per_window: at least 2.
+
+    Returns:
+        (w, m) indices, m the smaller of both numbers; the last window reaches back, to be as long as the others.
+    """
+    length = min(scans_per_window, num_scans)
+    count = max(1, -(-(num_scans - 1) // (length - 1))) if length > 1 else 1
+    first = np.minimum(np.arange(count) * (length - 1), num_scans - length)
+    return first[:, None] + np.arange(length)
+
+
+def join_windows(poses: Float[Array, "w m 3"], num_scans: int) -> Float[Array, "n 3"]:
+    """Poses of all scans in one world, that of the first window.
+
+    Args:
+        poses: of each window's scans, in a world of its own: x, y, heading.
+        num_scans: of the set.
+
+    Returns:
+        The poses; neighbours within a window keep their motion.
+    """
+    rows = window_rows(num_scans, poses.shape[1])
+    # The last scan of the window before, as an index of this window.
+    shared = np.maximum(np.concatenate([rows[:1, 0], rows[:-1, -1]]) - rows[:, 0], 0)
+    here = jnp.take_along_axis(poses, jnp.asarray(shared)[:, None, None], axis=1)[:, 0]
+
+    def join(last: Array, window: tuple[Array, Array]) -> tuple[Array, Array]:
+        in_window, at_shared = window
+        joined = se2.compose(last, se2.relative(at_shared, in_window))
+        return joined[-1], joined
+
+    _, joined = jax.lax.scan(join, poses[0, 0], (poses, here))
+    window = np.minimum(np.arange(num_scans) // max(rows.shape[1] - 1, 1), len(rows) - 1)
+    return joined[window, np.arange(num_scans) - rows[window, 0]]
+
+
+def in_windows(array: Any, rows: NDArray[np.intp]) -> Any:
+    """The rows of an array side by side, as an array of windows.
+
+    Args:
+        array: (w * m, ...).
+        rows: (w, m) of `window_rows`.
+
+    Returns:
+        (w, m, ...).
+    """
+    return array.reshape(*rows.shape, *array.shape[1:])

@@ -16,12 +16,12 @@ from jaxtyping import Array, Float, Int
 from numpy.typing import ArrayLike, NDArray
 
 from dpmjax.deepmapping.batches import draw_offsets, draw_rows, scans_in_block
-from dpmjax.deepmapping.cloud_config import CloudMappingConfig
 from dpmjax.deepmapping.cloud_scans import CloudScans, as_cloud_scans, find_partners
-from dpmjax.deepmapping.config import PhaseConfig
+from dpmjax.deepmapping.config import DeepMappingConfig, PhaseConfig, PlaneComparison
 from dpmjax.deepmapping.engine import Fit, Report, fit
 from dpmjax.deepmapping.objective import Terms, WorldBatch, chamfer_term, interpolate_log
 from dpmjax.deepmapping.plane_distance import Cloud, clouds_of, misfit_of_pairs, take_rows, trajectory_misfit
+from dpmjax.deepmapping.presets import cloud_preset
 from dpmjax.deepmapping.problem import MappingData, MappingFunctions, Params, Problem, mapping_loss, mapping_problem
 from dpmjax.deepmapping.spatial import (
     fitted_poses,
@@ -60,15 +60,12 @@ class CloudFitted(NamedTuple):
     start_misfit: float | None
 
 
-def cloud_data(
-    scans: CloudScans | Sequence[ArrayLike], start: ArrayLike | None = None, *, num_points: int = 2048
-) -> tuple[MappingData, float]:
+def cloud_data(scans: CloudScans | Sequence[ArrayLike], start: ArrayLike | None = None) -> tuple[MappingData, float]:
     """Scans and poses with the typical range of the scans as the unit of length, as the problem takes them.
 
     Args:
         scans: (m_i, 3) points in the lidar frames; or CloudScans.
         start: (n, 4, 4) T_world_scan to start from; None: cold start.
-        num_points: capacity of each scan where they are thinned.
 
     Returns:
         The data, and the typical range in the unit of the scans.
@@ -76,7 +73,7 @@ def cloud_data(
     Raises:
         ValueError: as `as_cloud_scans`, or `start` has a wrong shape or is not finite.
     """
-    scans = scans if isinstance(scans, CloudScans) else as_cloud_scans(scans, num_points)
+    scans = scans if isinstance(scans, CloudScans) else as_cloud_scans(scans)
     unit = typical_range(scans.points, scans.mask)
     T_start = None if start is None else start_poses(start, len(scans.points), unit)
     scaled = replace(scans, points=scans.points / unit, spacing=scans.spacing / unit)
@@ -85,7 +82,7 @@ def cloud_data(
     return MappingData(scaled, T_start), unit
 
 
-def cloud_problem(config: CloudMappingConfig, data: MappingData) -> Problem:
+def cloud_problem(config: DeepMappingConfig, data: MappingData) -> Problem:
     """DeepMapping of lidar clouds; poses are (n, 4, 4) T_world_scan.
 
     Args:
@@ -94,13 +91,18 @@ def cloud_problem(config: CloudMappingConfig, data: MappingData) -> Problem:
 
     Returns:
         The problem.
+
+    Raises:
+        ValueError: the motion is not "full".
     """
+    if config.motion != "full":
+        raise ValueError(f"motion: expected 'full' of clouds, got {config.motion!r}")
     return mapping_problem(config, data, MappingFunctions(init_spatial, _loss, spatial_poses, next_spatial_phase))
 
 
 def register_clouds(
     scans: CloudScans | Sequence[ArrayLike],
-    config: CloudMappingConfig | None = None,
+    config: DeepMappingConfig | None = None,
     *,
     key: jax.Array,
     start: ArrayLike | None = None,
@@ -125,8 +127,8 @@ def register_clouds(
     Raises:
         ValueError: as `cloud_data`.
     """
-    config = config or CloudMappingConfig()
-    data, unit = cloud_data(scans, start, num_points=config.num_points)
+    config = config or cloud_preset("fast")
+    data, unit = cloud_data(scans, start)
     return as_fitted(engine(cloud_problem(config, data), data, key=key), data, unit)
 
 
@@ -168,7 +170,7 @@ def _draw_partners(scans: CloudScans, rows: Int[Array, " m"], count: int, *, key
 
 
 def _loss(
-    config: CloudMappingConfig,
+    config: DeepMappingConfig,
     phase: PhaseConfig,
     params: Params,
     data: MappingData,
@@ -181,7 +183,9 @@ def _loss(
     count = scans.mask.shape[0]
     rows, block = draw_rows(phase, count, step, key=row_key)
     offsets = draw_offsets(phase, scans_in_block(phase, count) - 1, key=offset_key)
-    partners = _draw_partners(scans, rows, phase.num_revisits, key=partner_key)
+    comparison = phase.comparison
+    num_revisits = comparison.num_revisits if isinstance(comparison, PlaneComparison) else 0
+    partners = _draw_partners(scans, rows, num_revisits, key=partner_key)
     seen = jnp.concatenate([rows, jnp.maximum(partners, 0).reshape(-1)])
     T = poses_of_scans(config, phase, params, scans, seen)
     clouds = take_rows(clouds_of(scans), seen)
@@ -189,15 +193,14 @@ def _loss(
     own = jnp.arange(len(rows))
     points = rigid.transform_points(T[own], samples.points[own])
     world = WorldBatch(points, T[own, :3, 3], samples.mask[own], rows, block, progress)
-    if phase.plane_width is None:
-        limit = None if phase.chamfer_limit is None else interpolate_log(phase.chamfer_limit, progress)
-        pair_term = chamfer_term(world, offsets, limit)
+    if not isinstance(comparison, PlaneComparison):
+        pair_term = chamfer_term(world, offsets, comparison)
     else:
         later = jnp.minimum(own + offsets[:, None], len(rows) - 1)
         is_later = (rows[later] == rows + offsets[:, None]) & (block[later] == block)
         others = jnp.concatenate([later.reshape(-1), jnp.arange(len(rows), len(seen))])
         pairs = jnp.stack([jnp.resize(own, others.shape), others], axis=-1)
         is_pair = jnp.concatenate([is_later.reshape(-1), partners.reshape(-1) >= 0])
-        width = interpolate_log(phase.plane_width, progress)
+        width = interpolate_log(comparison.width, progress)
         pair_term = misfit_of_pairs(T, samples, clouds, pairs, is_pair, (width, scans.spacing))
     return mapping_loss(config, phase, params, world, pair_term, key=free_key)

@@ -1,13 +1,12 @@
 """First poses of depth images without a guess: trajectories that grow side by side, image after image.
 
 Each proposes several motions of the next image. The trajectories that explain the largest share of the points go on,
-as far as they differ: what one image leaves open, later ones decide. Every few images the poses of each are adjusted;
+as far as they differ: what one image leaves open, later ones decide. After each image the poses of each are adjusted;
 in the end at a finer tolerance, by which the best trajectory is chosen.
 """
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import NamedTuple
 
 import jax
@@ -19,8 +18,15 @@ from scipy.spatial.transform import Rotation
 
 from dpmjax.deepmapping.config import Motion
 from dpmjax.deepmapping.depth_adjustment import adjust_poses
-from dpmjax.deepmapping.depth_config import FULL_SEARCH, PLANAR_SEARCH, DepthInitializationConfig
-from dpmjax.deepmapping.depth_motion_search import Views, motion_cost, propose_motions, surface_directions
+from dpmjax.deepmapping.depth_motion_search import (
+    FULL_SEARCH,
+    PLANAR_SEARCH,
+    DepthInitializationConfig,
+    Views,
+    motion_cost,
+    propose_motions,
+    surface_directions,
+)
 from dpmjax.deepmapping.projective_consistency import (
     DepthScans,
     PixelSample,
@@ -32,7 +38,18 @@ from dpmjax.geometry.rays import typical_range
 _APART = (0.085, 0.075)
 # Cost of motions, in explained points: images that look at new things explain less than those that stay.
 _MOTION_COST = 3.0
-# So many trajectories are adjusted in the end, at so many tolerances.
+# Searches for an image where few trajectories are left, each with other points; where more are left, one for each, and
+# this number more for the best ones.
+_NUM_TRIES = 4
+# A trajectory that explains less of the points than the best one by more than this share is dropped.
+_MARGIN = 0.25
+# Points of each image in a search, and those by which trajectories are compared and adjusted.
+_NUM_POINTS, _NUM_COMPARED = 100, 300
+# While trajectories grow, they are compared and adjusted by this number of last images.
+_NUM_WINDOW = 24
+# Steps of an adjustment.
+_NUM_ITERATIONS = 6
+# Number of trajectories that are adjusted in the end, and of tolerances.
 _NUM_LAST, _NUM_TOLERANCES = 4, 3
 
 
@@ -62,15 +79,15 @@ def initialize_depth(
     sample_key, search_key = jax.random.split(key)
     surfaces, directions = scans.surfaces, jnp.asarray(surface_directions(scans, motion))
     unit = typical_range(scans.points, scans.mask)
-    images = _Images(scans, _sample(scans, config.num_compared, key=sample_key), unit)
+    images = _Images(scans, _sample(scans, _NUM_COMPARED, key=sample_key), unit)
     views = [
-        Views(_sample(scans, config.num_points, key=jax.random.fold_in(sample_key, k)), surfaces, directions)
-        for k in range(config.num_trajectories + config.num_tries)
+        Views(_sample(scans, _NUM_POINTS, key=jax.random.fold_in(sample_key, k)), surfaces, directions)
+        for k in range(config.num_trajectories + _NUM_TRIES)
     ]
     T = np.eye(4)[None, None]
     for scan in range(1, scans.mask.shape[0]):
         # One search for each trajectory, and more for the best ones, each with other points.
-        num_searches = config.num_tries if len(T) < config.num_tries else len(T) + config.num_tries
+        num_searches = _NUM_TRIES if len(T) < _NUM_TRIES else len(T) + _NUM_TRIES
         continued = []
         for k, search_key_k in enumerate(jax.random.split(jax.random.fold_in(search_key, scan), num_searches)):
             before = T[k % len(T)]
@@ -78,15 +95,10 @@ def initialize_depth(
             poses = np.broadcast_to(before, (len(T_last_next), *before.shape))
             continued.append(np.concatenate([poses, (before[-1] @ T_last_next)[:, None]], axis=1))
         T = _best_that_differ(np.stack(continued), images, config)
-        if scan % config.adjusted_every == 0:
-            T = _adjusted(T, images, config.tolerance[1], config, motion)
-    T, whole, images = (
-        T[:_NUM_LAST],
-        replace(config, num_window=scans.mask.shape[0]),
-        _Images(scans, scans.pixels, unit),
-    )
+        T = _adjusted(T, images, config.tolerance[1], motion)
+    T, images = T[:_NUM_LAST], _Images(scans, scans.pixels, unit)
     for tolerance in np.geomspace(config.tolerance[1], config.final_tolerance, _NUM_TOLERANCES):
-        T = _adjusted(T, images, float(tolerance), whole, motion)
+        T = _adjusted(T, images, float(tolerance), motion, num_window=scans.mask.shape[0])
     scores = _explained(jnp.asarray(T, jnp.float32), images, jnp.asarray(config.final_tolerance))
     return T[np.argmax(np.asarray(scores) - _mean_cost(T, config))]
 
@@ -100,9 +112,9 @@ def _sample(scans: DepthScans, count: int, *, key: jax.Array) -> PixelSample:
     return PixelSample(jnp.asarray(np.stack(some)), jnp.ones((num_scans, count), bool))
 
 
-def _window(num_placed: int, images: _Images, config: DepthInitializationConfig) -> tuple[NDArray[np.intp], _Images]:
+def _window(num_placed: int, images: _Images, num_window: int) -> tuple[NDArray[np.intp], _Images]:
     """Rows of the last images with a pose, and these images; while there are few, later ones that show nothing."""
-    length = min(config.num_window, images.scans.mask.shape[0])
+    length = min(num_window, images.scans.mask.shape[0])
     rows = max(num_placed - length, 0) + np.arange(length)
     is_placed = jnp.asarray(rows < num_placed)
     scans, sample, unit = images
@@ -133,13 +145,13 @@ def _best_that_differ(
     T: NDArray[np.float64], images: _Images, config: DepthInitializationConfig
 ) -> NDArray[np.float64]:
     """The best of (t, k, m, 4, 4) trajectories that differ from all better ones, best first."""
-    rows, window = _window(T.shape[2], images, config)
+    rows, window = _window(T.shape[2], images, _NUM_WINDOW)
     tolerance = jnp.asarray(config.tolerance[1])
     scores = np.concatenate([_explained(jnp.asarray(t[:, rows], jnp.float32), window, tolerance) for t in T])
     T = T.reshape(-1, *T.shape[2:])
     scores = scores - _mean_cost(T, config)
     far, turn = _APART[0] * config.max_translation, _APART[1] * np.deg2rad(config.max_turn_deg)
-    is_left, kept = scores >= scores.max() - config.margin, list[NDArray[np.float64]]()
+    is_left, kept = scores >= scores.max() - _MARGIN, list[NDArray[np.float64]]()
     while is_left.any() and len(kept) < config.num_trajectories:
         best = T[np.argmax(np.where(is_left, scores, -np.inf))]
         kept.append(best)
@@ -150,14 +162,14 @@ def _best_that_differ(
 
 
 def _adjusted(
-    T: NDArray[np.float64], images: _Images, tolerance: float, config: DepthInitializationConfig, motion: Motion
+    T: NDArray[np.float64], images: _Images, tolerance: float, motion: Motion, *, num_window: int = _NUM_WINDOW
 ) -> NDArray[np.float64]:
     """Trajectories whose last poses are adjusted, where that makes them more consistent; the first of all stays."""
-    rows, window = _window(T.shape[1], images, config)
+    rows, window = _window(T.shape[1], images, num_window)
     num_placed = rows[-1] - rows[0] + 1
     T = T.copy()
     for one in T:
         before = jnp.asarray(one[rows], jnp.float32)
-        motions = adjust_poses(before, *window, tolerance, num_iterations=config.num_iterations, motion=motion)
+        motions = adjust_poses(before, *window, tolerance, num_iterations=_NUM_ITERATIONS, motion=motion)
         one[rows[:num_placed]] @= np.asarray(motions, np.float64)[:num_placed]
     return T

@@ -14,10 +14,10 @@ from jaxtyping import Array, Bool, Float, Int
 from numpy.typing import ArrayLike, NDArray
 
 from dpmjax.checks import as_beams
-from dpmjax.deepmapping.batches import draw_offsets, draw_rows, scans_in_block
+from dpmjax.deepmapping.batches import draw_offsets, draw_rows, in_windows, join_windows, scans_in_block, window_rows
 from dpmjax.deepmapping.config import DeepMappingConfig, PhaseConfig
 from dpmjax.deepmapping.engine import Fit, Report, fit
-from dpmjax.deepmapping.objective import Terms, WorldBatch, chamfer_term, interpolate_log
+from dpmjax.deepmapping.objective import Terms, WorldBatch, chamfer_term
 from dpmjax.deepmapping.problem import (
     MapFrame,
     MappingData,
@@ -29,7 +29,6 @@ from dpmjax.deepmapping.problem import (
     mapping_problem,
     phases_of,
 )
-from dpmjax.deepmapping.windows import in_windows, join_windows, window_rows
 from dpmjax.geometry import se2
 from dpmjax.geometry.rays import typical_range
 from dpmjax.nets.localization import LocalizationNet
@@ -278,7 +277,5 @@ def _loss(
     points, mask = some.points[rows], some.mask[rows]
     world = WorldBatch(se2.transform_points(poses, points), poses[:, :2], mask, rows, block, progress)
     free_key, offset_key = jax.random.split(loss_key)
-    limit = None if phase.chamfer_limit is None else interpolate_log(phase.chamfer_limit, progress)
     offsets = draw_offsets(phase, scans_in_block(phase, scans.mask.shape[0]) - 1, key=offset_key)
-    chamfer = chamfer_term(world, offsets, limit)
-    return mapping_loss(config, phase, params, world, chamfer, key=free_key)
+    return mapping_loss(config, phase, params, world, chamfer_term(world, offsets, phase.comparison), key=free_key)

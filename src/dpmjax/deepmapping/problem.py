@@ -18,6 +18,12 @@ from dpmjax.nets.occupancy import make_map_net
 
 # Points that M-Net's hidden layers hold at once when it is an MLP: 16 MB a layer of 512.
 _MLP_CHUNK = 1 << 13
+# Learning rates of M-Net: a step changes few nodes of a grid, and all weights of an MLP.
+_MAP_LEARNING_RATE = {"grid": 0.1, "mlp": 1e-3}
+# Weight of the mean square of a grid's nodes.
+_GRID_DECAY = 1e-3
+# Share of a phase with free poses after which all levels of a grid are on.
+_ANNEAL_UNTIL = 0.7
 
 
 @dataclass(frozen=True)
@@ -136,10 +142,10 @@ def make_optimizer(config: DeepMappingConfig, phase: PhaseConfig) -> optax.Gradi
     Returns:
         The optimiser of Params.
     """
-    del config
     decay = optax.cosine_decay_schedule(phase.learning_rate, phase.num_steps, phase.final_learning_rate)
     moving = optax.adam(decay, *phase.adam_decay)
-    map_adam = optax.adam(phase.map_learning_rate, 0.8 if phase.poses == "free" else 0.9, phase.adam_decay[1])
+    map_rate = _MAP_LEARNING_RATE["grid" if config.occupancy.kind == "grid" else "mlp"]
+    map_adam = optax.adam(map_rate, 0.8 if phase.poses == "free" else 0.9, phase.adam_decay[1])
     labels: Any = Params(localization="network", poses="free", occupancy="map", start="fixed", frame="fixed")  # type: ignore[arg-type]
     return optax.multi_transform(
         {
@@ -208,7 +214,7 @@ def bind_map(params: Params, config: DeepMappingConfig, level_weights: Float[Arr
 
 
 def level_weights(phase: PhaseConfig, num_levels: int, progress: Float[Array, ""]) -> Float[Array, " l"]:
-    """Weights of the levels of the map: coarse ones first, all of them from `anneal_until` on.
+    """Weights of the levels of the map: where the poses are free, coarse levels first.
 
     Args:
         phase: of the fit.
@@ -218,9 +224,9 @@ def level_weights(phase: PhaseConfig, num_levels: int, progress: Float[Array, ""
     Returns:
         0 (off) to 1 for each level.
     """
-    if phase.anneal_until == 0.0:
+    if phase.poses == "network":
         return jnp.ones(num_levels)
-    return jnp.clip(progress / phase.anneal_until * num_levels - jnp.arange(num_levels) + 1.5, 0.0, 1.0)
+    return jnp.clip(progress / _ANNEAL_UNTIL * num_levels - jnp.arange(num_levels) + 1.5, 0.0, 1.0)
 
 
 def mapping_loss(
@@ -252,7 +258,7 @@ def mapping_loss(
         factors = free_factors(world, phase, distance, key=key)
         occupancy = occupancy_term(world, logits, factors)
         loss = gamma * occupancy + (1.0 - gamma) * pair_term
-    if phase.map_decay > 0.0:
-        squares = sum(jnp.sum(x**2) for x in jax.tree.leaves(params.occupancy))
-        loss += phase.map_decay * squares / world.mask.size
+        if config.occupancy.kind == "grid":
+            squares = sum(jnp.sum(x**2) for x in jax.tree.leaves(params.occupancy))
+            loss += _GRID_DECAY * squares / world.mask.size
     return loss, Terms(occupancy, pair_term)
