@@ -152,7 +152,7 @@ def _multiway(task: Task) -> Floats:
 def _swarm(task: Task) -> Floats:
     import jax
 
-    from experiments.baselines.swarm import swarm_chain
+    from experiments.baselines.direct import swarm_chain
 
     return swarm_chain(task.scans, key=jax.random.key(task.seed))
 

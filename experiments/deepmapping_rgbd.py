@@ -163,7 +163,7 @@ def read_trajectory(config: Config, index: int) -> DepthSequence:
 def walk_surface_spread(config: Config, index: int) -> float:
     """How well the surfaces hold a hard walk, mm; its images without noise are those of the same seed."""
     from dpmjax import simulation
-    from experiments._rgbd_surfaces import surface_spread
+    from experiments._rgbd_methods import surface_spread
 
     hard = simulation.HARD_WALK
     clean = replace(hard, depth_noise_m=0.0, dropout_share=0.0)

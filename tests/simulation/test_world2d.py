@@ -9,9 +9,8 @@ from scipy.ndimage import label
 from scipy.stats import kstest
 
 from dpmjax.simulation import World, cast_rays, make_world, simulate_sequence, simulate_trajectory
-from dpmjax.simulation.people2d import simulate_people, stop_at_people
 from dpmjax.simulation.raycast2d import beam_angles
-from dpmjax.simulation.trajectory2d import simulate_odometry
+from dpmjax.simulation.trajectory2d import simulate_odometry, simulate_people, stop_at_people
 
 WORLDS = [0, 1, 2]
 NAMED = ["grove", "grove-4", "crowd"]

@@ -8,13 +8,15 @@ import signal
 import sys
 import threading
 import traceback
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import fields
 from functools import partial
 from types import FrameType
 from typing import Any, TypeVar
 
 import tyro
+from tqdm import tqdm
 
 from dpmjax.cli import program
 from dpmjax.cli.machine import select_device
@@ -190,3 +192,23 @@ def _interrupt(number: int, frame: FrameType | None) -> None:
 def _say(message: str, exit_code: int) -> int:
     print("dpmjax:", " ".join(message.split()), file=sys.stderr, flush=True)
     return exit_code
+
+
+@contextmanager
+def progress_bar(description: str, unit: str) -> Iterator[Callable[[int, int], None]]:
+    """Shows a bar while the block runs.
+
+    Args:
+        description: shown before the bar.
+        unit: of the numbers, with a space before it.
+
+    Yields:
+        A callback that takes the number that is done and the number of all.
+    """
+    with tqdm(desc=description, unit=unit, dynamic_ncols=True) as bar:
+
+        def on_progress(num_done: int, num_all: int) -> None:
+            bar.total = num_all
+            bar.update(num_done - bar.n)
+
+        yield on_progress

@@ -4,24 +4,29 @@ from __future__ import annotations
 
 import collections
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
+import numpy as np
 from tqdm import tqdm
 
+from dpmjax.cli.drives import ScanReader
 from dpmjax.cli.run_folder import RunFolder
 from dpmjax.cli.slam_files import write_scans, write_trajectory
-from dpmjax.cli.slam_outcome import SlamRun
-from dpmjax.cli.slam_reader import ScanReader
+from dpmjax.cli.slam_numbers import SlamRun
 from dpmjax.saved_maps import load_state, save_state
 from dpmjax.sequences import LidarSequence
 from dpmjax.slam import SlamMethods, SlamResult, SlamState, finish_slam, init_slam, place_scans, step_slam
 
 if TYPE_CHECKING:
-    from dpmjax.slam import ScanReport
+    from dpmjax.slam import ScanReport, SlamState
     from dpmjax.slam.front_end import AnyScan
+
+    OnScan = Callable[[AnyScan, SlamState, ScanReport], None]
+
 
 STATE = "run_state.npz"
 # Seconds between writings of the state: a killed run repeats the scans since the last one.
@@ -201,3 +206,31 @@ def _progress(state: SlamState, reports: list[ScanReport], watch: Stopwatch) -> 
     if reports[-1].status not in ("first", "tracked"):
         parts.append(reports[-1].status)
     return ", ".join([*parts, f"compiled {watch.compile_s:.0f} s"])
+
+
+@contextmanager
+def live_viewer(folder: RunFolder, name: str, *, is_on: bool) -> Iterator[OnScan | None]:
+    """Opens the viewer; yields what shows a scan, or None where the viewer is off."""
+    if not is_on:
+        yield None
+        return
+    from dpmjax import viz
+    from dpmjax.slam.front_end import corrected_points
+
+    viewer = viz.LiveViewer(name, folder / "slam.rrd")
+
+    def show(scan: AnyScan, state: SlamState, report: ScanReport) -> None:
+        slam_map = state.slam_map
+        if not len(slam_map):
+            return
+        points, T = corrected_points(scan, report.T_turn), slam_map.T_world_keyframe[report.keyframe]
+        viewer.show_scan(report.scan, points, T @ report.T_keyframe_scan)
+        if report.is_keyframe:
+            ends = [(loop.source, loop.target) for loop in state.loops.loops if loop.status == "accepted"]
+            positions = slam_map.T_world_keyframe[np.array(ends, np.int64).reshape(-1, 2), :3, 3]
+            viewer.show_map(slam_map.T_world_keyframe, points, positions)
+
+    try:
+        yield show
+    finally:
+        viewer.close()

@@ -17,7 +17,7 @@ import optax
 from jaxtyping import Array, Float
 
 from dpmjax.deepmapping.problem import Problem
-from dpmjax.nets.scalar import ScalarNet, ScalarNetConfig
+from dpmjax.nets.localization import ScalarNet, ScalarNetConfig
 from dpmjax.types import AnyArray
 
 

@@ -18,7 +18,7 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from dpmjax.checks import as_float, as_points, require_shape
-from dpmjax.geometry.namespace import matmul, namespace_of
+from dpmjax.geometry.rigid import matmul, namespace_of
 from dpmjax.types import AnyArray
 
 DEGENERATE_IN_EPS = 32

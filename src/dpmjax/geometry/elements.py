@@ -5,7 +5,7 @@ from __future__ import annotations
 import jax.numpy as jnp
 from jax import lax
 
-from dpmjax.geometry.plane_fits import fit_planes
+from dpmjax.geometry.planes import fit_planes
 from dpmjax.types import PointPyramid, SurfaceElements
 
 MIN_NEIGHBOURS = 4

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from dpmjax.checks import require_count
-from dpmjax.geometry.host_tree import HostTree
+from dpmjax.geometry.neighbours import HostTree
 from dpmjax.geometry.pyramid import RADIUS_SLACK, WEIGHT_EPSILON, PyramidConfig, PyramidStage
 from dpmjax.geometry.sampling import farthest_point_sample
 from dpmjax.types import Interpolation, PointPyramid, PyramidLevel

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Array, Float
 from numpy.typing import NDArray
 
-from dpmjax.geometry.namespace import namespace_of
+from dpmjax.geometry.rigid import namespace_of
 from dpmjax.types import AnyArray
 
 Poses = NDArray[np.float64]

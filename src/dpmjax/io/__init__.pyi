@@ -17,7 +17,7 @@ from .poses import read_poses as read_poses
 from .poses import write_kitti as write_kitti
 from .poses import write_poses_npy as write_poses_npy
 from .poses import write_tum as write_tum
-from .relations import read_relations as read_relations
+from .references import read_relations as read_relations
 from .scan_file import read_lidar_file as read_lidar_file
 from .scan_file import scan_notes as scan_notes
 from .scan_file import unit_note as unit_note

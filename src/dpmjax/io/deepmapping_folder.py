@@ -12,7 +12,7 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 
 from dpmjax.io.files import natural_key, read_bytes, refusing
-from dpmjax.io.mat import parse_mat
+from dpmjax.io.foreign_arrays import parse_mat
 from dpmjax.io.pcd import parse_pcd
 from dpmjax.sequences import FloatArray, ScanSequence, Unit, has_angular_order, require
 

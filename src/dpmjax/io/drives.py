@@ -11,9 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dpmjax.geometry import rigid
-from dpmjax.io.calibration import read_camera_calibration
-from dpmjax.io.files import load_arrays
-from dpmjax.io.poses import check_poses, homogeneous, read_stamped_poses
+from dpmjax.io.files import load_arrays, read_lines
+from dpmjax.io.poses import check_poses, from_rows, homogeneous, read_stamped_poses
 from dpmjax.io.references import camera_note, match_reference, scan_times
 from dpmjax.io.scan_names import sort_scans, strays_among
 from dpmjax.sequences import FloatArray, InputError, LidarSequence, Note, require
@@ -193,3 +192,44 @@ def iterate_scans(sequence: LidarSequence) -> Iterator[IndexedScan]:
     require(is_usable, sequence.name, f"all {len(bad)} scans are bad: {listed}", "check the files")
     if bad:
         _log.warning("%s: %d of %d scans left out: %s", sequence.name, len(bad), sequence.num_scans, listed)
+
+
+def read_labelled_numbers(path: Path) -> dict[str, FloatArray]:
+    """Reads the lines `key: numbers` of a calibration file; other lines are ignored.
+
+    Args:
+        path: the file.
+
+    Returns:
+        The numbers by key.
+
+    Raises:
+        InputError: there is no such file.
+    """
+    found = {}
+    for key, _, numbers in (line.partition(":") for line in read_lines(path)):
+        try:
+            found[key.strip()] = np.array(numbers.split(), np.float64)
+        except ValueError:
+            continue
+    return found
+
+
+def read_camera_calibration(path: Path) -> FloatArray:
+    """Reads `Tr`, the lidar's frame to the left grey camera's, out of KITTI's calib.txt.
+
+    Args:
+        path: the file.
+
+    Returns:
+        (4, 4) `T_cam0_lidar`.
+
+    Raises:
+        InputError: there is no such file, or no such line in it.
+    """
+    entries = read_labelled_numbers(path)
+    for key in ("Tr", "Tr_velo_to_cam", "Tr_velo_cam"):
+        if key in entries and len(entries[key]) == 12:
+            return np.asarray(from_rows(entries[key], path)[0])
+    advice = "take the calib.txt with a line 'Tr:' of 12 numbers (data_odometry_calib); camera poses need it"
+    raise InputError(path, "no line 'Tr:' of 12 numbers", advice)

@@ -17,8 +17,8 @@ from scipy.spatial.transform import Rotation
 
 from dpmjax.io.files import read_lines, refusing, write_atomically
 from dpmjax.io.graph_tags import IGNORED, TAGS, advice_of, information_of, poses_of
+from dpmjax.pose_graph.chordal import spanning_tree_poses
 from dpmjax.pose_graph.graph import Edges, PoseGraph, is_semidefinite, nearest_semidefinite
-from dpmjax.pose_graph.spanning_tree import spanning_tree_poses
 from dpmjax.sequences import FloatArray, InputError, require
 
 

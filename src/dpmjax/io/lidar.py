@@ -14,11 +14,11 @@ from dpmjax.io.bags import is_bag
 from dpmjax.io.bin_columns import check_size, columns_of_drive
 from dpmjax.io.drives import Drive3D, find_pose_file, read_learned_folder, read_plain_folder, scan_files, stray_note
 from dpmjax.io.files import natural_key
-from dpmjax.io.lidar_bags import open_lidar_bag
 from dpmjax.io.lidar_datasets import read_kitti_360, read_kitti_carla, read_kitti_odometry, read_kitti_raw, read_mulran
 from dpmjax.io.notes import log_notes
 from dpmjax.io.poses import read_stamped_poses
 from dpmjax.io.references import camera_note, match_reference
+from dpmjax.io.scan_bags import open_lidar_bag
 from dpmjax.io.scan_file import read_point_times, read_points, unit_note
 from dpmjax.sequences import InputError, LidarSequence, Note, require
 

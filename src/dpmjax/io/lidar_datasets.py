@@ -8,8 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from dpmjax.geometry import rigid
-from dpmjax.io.calibration import read_camera_calibration, read_labelled_numbers
-from dpmjax.io.drives import Drive3D, find_pose_file, scan_files
+from dpmjax.io.drives import Drive3D, find_pose_file, read_camera_calibration, read_labelled_numbers, scan_files
 from dpmjax.io.files import natural_key, read_lines, read_table
 from dpmjax.io.poses import check_poses, from_rows, homogeneous, interpolate_poses, read_stamped_poses
 from dpmjax.io.references import match_poses, match_reference, match_rows, match_times, numbers_of

@@ -12,7 +12,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from dpmjax.checks import as_float, as_mask, as_points, require_positive, require_shape
-from dpmjax.geometry.namespace import safe_sqrt
+from dpmjax.geometry.rigid import safe_sqrt
 from dpmjax.types import AnyArray
 
 SINGULAR_IN_EPS = 8

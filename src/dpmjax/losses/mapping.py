@@ -10,8 +10,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from dpmjax.checks import as_float, as_mask, as_points
-from dpmjax.geometry.namespace import safe_sqrt
 from dpmjax.geometry.neighbours import k_nearest
+from dpmjax.geometry.rigid import safe_sqrt
 from dpmjax.types import AnyArray
 
 

@@ -11,12 +11,12 @@ from .poses import point_distance as point_distance
 from .poses import registration_recall as registration_recall
 from .poses import relative_pose_error as relative_pose_error
 from .position_bound import position_bound as position_bound
-from .probabilities import area_under_curve as area_under_curve
-from .probabilities import brier_score as brier_score
 from .proportions import Proportion as Proportion
+from .proportions import area_under_curve as area_under_curve
+from .proportions import brier_score as brier_score
 from .proportions import mcnemar_p_value as mcnemar_p_value
 from .proportions import wilson_interval as wilson_interval
-from .relations import RelationErrors as RelationErrors
-from .relations import relation_errors as relation_errors
+from .segments import RelationErrors as RelationErrors
 from .segments import SegmentError as SegmentError
+from .segments import relation_errors as relation_errors
 from .segments import segment_error as segment_error

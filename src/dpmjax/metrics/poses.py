@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float
 
 from dpmjax.geometry import rigid
 from dpmjax.geometry.alignment import best_motion
-from dpmjax.geometry.namespace import matmul, namespace_of, safe_sqrt
+from dpmjax.geometry.rigid import matmul, namespace_of, safe_sqrt
 from dpmjax.metrics.inputs import as_floats, checked_poses, checked_positions, is_traced, require_same_shape
 from dpmjax.types import AnyArray
 

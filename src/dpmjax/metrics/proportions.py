@@ -1,11 +1,11 @@
-"""Shares of right answers: their confidence intervals, and whether one method is right more often than another."""
+"""Shares and probabilities: intervals and comparisons of shares, area under the curve, Brier score."""
 
 from __future__ import annotations
 
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Bool, Float
 from scipy import special
 
 from dpmjax.types import AnyArray
@@ -78,3 +78,34 @@ def mcnemar_p_value(is_right_a: Bool[AnyArray, " n"], is_right_b: Bool[AnyArray,
         raise ValueError(f"expected two arrays of the same shape (n,), got {a.shape} and {b.shape}")
     only_a, only_b = int((a & ~b).sum()), int((b & ~a).sum())
     return min(1.0, 2.0 * float(special.bdtr(min(only_a, only_b), only_a + only_b, 0.5)))
+
+
+def area_under_curve(score: Float[AnyArray, " n"], is_positive: Bool[AnyArray, " n"]) -> float:
+    """Computes the area under the ROC curve: how often a positive example scores higher than a negative one.
+
+    Args:
+        score: of each example.
+        is_positive: label of each example.
+
+    Returns:
+        In [0, 1]; ties count half; NaN without an example of each label.
+    """
+    scores, labels = np.asarray(score), np.asarray(is_positive, bool)
+    positive, negative = scores[labels], scores[~labels]
+    if min(len(positive), len(negative)) == 0:
+        return float("nan")
+    return float(((positive[:, None] > negative) + 0.5 * (positive[:, None] == negative)).mean())
+
+
+def brier_score(probability: Float[AnyArray, " n"], is_true: Bool[AnyArray, " n"]) -> float:
+    """Computes the mean squared difference of probabilities and outcomes (Brier 1950).
+
+    Args:
+        probability: of each event, in [0, 1].
+        is_true: outcome of each event.
+
+    Returns:
+        0 for a certain and right forecast, 0.25 for a half each time; NaN without events.
+    """
+    errors = np.asarray(probability, np.float64) - np.asarray(is_true, np.float64)
+    return float(np.mean(errors**2)) if len(errors) else float("nan")

@@ -14,8 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from dpmjax.sequences import BoolArray, FloatArray, ScanSequence, World
-from dpmjax.simulation.people2d import simulate_people, stop_at_people
-from dpmjax.simulation.trajectory2d import simulate_odometry, simulate_trajectory
+from dpmjax.simulation.trajectory2d import simulate_odometry, simulate_people, simulate_trajectory, stop_at_people
 from dpmjax.simulation.world2d import make_world
 
 

@@ -19,7 +19,6 @@ from .drives import trajectory_figure as trajectory_figure
 from .figures import Limits as Limits
 from .figures import save_figure as save_figure
 from .live_viewer import LiveViewer as LiveViewer
-from .localization import localization_figure as localization_figure
 from .maps import Panel as Panel
 from .maps import registered_scans_figure as registered_scans_figure
 from .rasters import ErrorMap as ErrorMap
@@ -27,6 +26,7 @@ from .rasters import error_maps_figure as error_maps_figure
 from .rasters import from_above_figure as from_above_figure
 from .rasters import occupancy_figure as occupancy_figure
 from .registrations import RegisteredPair as RegisteredPair
+from .registrations import localization_figure as localization_figure
 from .registrations import registered_pairs_figure as registered_pairs_figure
 from .registrations import reliability_figure as reliability_figure
 from .slam_comparison import TrackPanel as TrackPanel
