@@ -21,7 +21,7 @@ from . import viz as viz
 from . import weights as weights
 from .compile_cache import enable_compile_cache as enable_compile_cache
 from .deepmapping.clouds import register_clouds as register_clouds
-from .deepmapping.depth_registration import register_depth as register_depth
+from .deepmapping.depth import register_depth as register_depth
 from .deepmapping.planar import fit_deepmapping as fit_deepmapping
 from .deepmapping.relocalization import relocalize as relocalize
 from .deeppointmap.batches import encode_scans as encode_scans

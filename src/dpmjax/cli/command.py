@@ -64,7 +64,7 @@ class StopFlag:
 
     @property
     def is_requested(self) -> bool:
-        """Whether a signal came."""
+        """Returns True after a signal."""
         return self.received is not None
 
     def request(self, signal_number: int) -> None:
@@ -122,8 +122,8 @@ def run_command(
 ) -> int:
     """Parses the command line, runs `main`, and returns the exit code.
 
-    0: done. 2: wrong usage or bad input, told in one line on stderr. 1: failed on the way; what was finished is in the
-    run folder. 130, 143: stopped by Ctrl-C or SIGTERM, results written. With `--resume`, options that are not given are
+    0: success. 2: wrong usage or bad input, with one line on stderr. 1: failure after partial results in the run
+        folder. 130, 143: stopped by Ctrl-C or SIGTERM, with results. With `--resume`, options that are not given are
     those of the run that is resumed.
 
     Args:

@@ -75,7 +75,7 @@ def open_drive(selection: DriveSelection) -> LidarSequence:
 
 
 def report_notes(notes: Iterable[Note]) -> dict[str, list[str]]:
-    """Writes what was decided about the input to the log; prints it, but for doubts, which the console has already.
+    """Writes the notes on the input to the log, and prints those that are no doubts: the console shows doubts already.
 
     Args:
         notes: of a drive.

@@ -121,8 +121,8 @@ EXTRAS = {
 def why_not_importable(module: str) -> str | None:
     """Returns why a module cannot be imported; None where it can.
 
-    The module is imported, because an installed package may be broken: a missing library of the system, or a compiled
-    part that was built for another version of NumPy, shows at the import only, and as any kind of error.
+    The module is imported, because an installed package may be broken. A missing library of the system, or a compiled
+    part for another version of NumPy, raises an error at the import only, and of any kind.
 
     Args:
         module: name of a package or of a module in it.

@@ -154,7 +154,7 @@ class HistoryFile:
     """The table of a run, one row a record, each on disk as soon as it is known.
 
     Args:
-        path: the CSV file; it is replaced, but for the rows to keep.
+        path: the CSV file; it is replaced, except for the rows to keep.
         columns: names of the columns, the first counts steps.
         keep_until: in a resumed run, rows with a larger first column are dropped; they will be computed again.
     """

@@ -25,7 +25,7 @@ CHECKPOINTS, BEST, AGENTS, DRIVES = "checkpoints", "checkpoints_best", "agents",
 RESULT_FOLDERS = (CHECKPOINTS, BEST, AGENTS, DRIVES, "rows")
 RESULT_SUFFIXES = (".json", ".csv", ".txt", ".npy", ".npz", ".png", ".ply", ".g2o", ".rrd")
 LOGGERS = ("dpmjax", "experiments", "__main__")
-# Options that do not change what is computed.
+# Options that do not change the result.
 FREE_OPTIONS = frozenset(
     {"output", "resume", "force", "device", "coordinator", "num_processes", "process_id", "visualize"}
 )
@@ -247,7 +247,7 @@ def recording(folder: RunFolder) -> Iterator[None]:
         loggers[-1].info("stopped by %s", stop or "SIGINT")
         raise
     except Exception as error:
-        # The console shows the error too, and leaves out what is below a warning.
+        # The console shows the error too, and only warnings and errors.
         loggers[-1].info("failed", exc_info=error)
         raise RunFailedError(folder.path, error) from error
     finally:

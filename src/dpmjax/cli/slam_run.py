@@ -192,7 +192,7 @@ def run_scans(
 
 
 def write_interim(folder: RunFolder, sequence: LidarSequence, state: SlamState, reports: list[ScanReport]) -> None:
-    """Writes trajectory and scans.csv as they are now."""
+    """Writes the present trajectory and scans.csv."""
     slam_map = state.slam_map
     times = None if sequence.times is None else sequence.times[: len(reports)]
     write_trajectory(folder.path, place_scans(slam_map.T_world_keyframe, reports), times)

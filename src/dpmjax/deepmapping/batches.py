@@ -58,8 +58,8 @@ def draw_rows(
     if num_scans <= phase.scans_per_step:
         return jnp.arange(num_scans), jnp.zeros(num_scans, jnp.int32)
     if phase.is_sampled_as_published:
-        # The published order: batches follow each other in time, none is mixed.
-        # The last one reaches back, so that it is as long as the others and no scan is left out.
+        # The published order: batches follow each other in time, none is mixed. The last batch reaches back, so that
+        # all have one length and no scan is left out.
         first = step % -(-num_scans // phase.scans_per_step) * phase.scans_per_step
         first = jnp.minimum(first, num_scans - phase.scans_per_step)
         return first + jnp.arange(phase.scans_per_step), jnp.zeros(phase.scans_per_step, jnp.int32)
@@ -93,7 +93,7 @@ def window_rows(num_scans: int, scans_per_window: int) -> NDArray[np.intp]:
         scans_per_window: at least 2.
 
     Returns:
-        (w, m) indices, m the smaller of both numbers; the last window reaches back, to be as long as the others.
+        (w, m) indices, m the smaller of both numbers; the last window reaches back, so that all have one length.
     """
     length = min(scans_per_window, num_scans)
     count = max(1, -(-(num_scans - 1) // (length - 1))) if length > 1 else 1

@@ -14,10 +14,11 @@ from scipy.spatial import cKDTree
 from dpmjax.scans import SurfaceConfig, scan_surface
 from dpmjax.scans.preprocess import first_of_each_voxel
 
-# In typical ranges: the vehicle, what is too far, side of the voxels and reach of the neighbours for the normals.
+# In typical ranges: nearest and farthest point, side of the voxels, and reach of the neighbours for the normals.
 _NEAREST, _FARTHEST, _VOXEL, _NEIGHBOURS = 0.03, 3.0, 0.01, 0.1
 _NUM_NEIGHBOURS = 24
-# Scans with more than so many others between them meet again, if they are nearer than so many typical ranges.
+# Scans with more than this number of scans between them meet again, if they are nearer than this number of typical
+# ranges.
 _REVISIT_GAP, _REVISIT_DISTANCE = 8, 0.5
 _NUM_PARTNERS = 8
 

@@ -110,8 +110,7 @@ def register_clouds(
 ) -> CloudFitted:
     """Registers 3-D lidar scans by optimising L-Net and M-Net on them alone (DeepMapping eq. 6, in SE(3)).
 
-    Where a start is given, the fit is kept only if its planes meet better than those of the start; no ground truth is
-    used.
+    The fit replaces a given start only if its planes meet better than those of the start; no ground truth is used.
 
     Args:
         scans: (m_i, 3) points in the lidar frames, any unit, in the order of time; or CloudScans.

@@ -69,15 +69,16 @@ class PhaseConfig:
         num_offsets: number of later scans that each scan is compared to.
         max_offset: the largest distance in time of two scans that are compared; neighbours are always compared.
         num_free: number of free samples on each beam, drawn between sensor and hit.
-        is_sampled_as_published: a free sample lies at the same share of every beam, and batches follow each other in
-            time, as in the published program; otherwise each beam has samples of its own, and batches are random.
+        is_sampled_as_published: sampling as in the published program: a free sample lies at the same share of every
+            beam, and batches follow each other in time. Otherwise each beam has samples of its own, and batches are
+            random.
         surface_distance: distance of one more free sample from the hit, at the start and at the end of the phase;
             None: no such sample.
         comparison: method that compares pairs of scans. Only depth images can be compared by projection, and only
             clouds by planes.
-        scans_per_window: for planar scans. The set is cut into windows of this number of neighbours in time, each with
-            an L-Net (or free poses) of its own, and joined at the scans that windows share. A step holds all windows.
-            None: one L-Net for the whole set.
+        scans_per_window: for planar scans. The set is cut into windows of this number of neighbours in time. Each
+            window has an L-Net (or free poses) of its own, and windows are joined at the scans that they share. A step
+            holds all windows. None: one L-Net for the whole set.
     """
 
     name: str

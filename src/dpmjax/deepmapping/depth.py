@@ -122,8 +122,8 @@ def as_depth_scans(points: ArrayLike, mask: ArrayLike | None = None) -> DepthSca
         The images with their camera.
 
     Raises:
-        ValueError: the shapes are not (n, h, w, 3) and (n, h, w) with n >= 2, an image has no valid pixel, or what the
-            mask calls valid is not finite or not in front of the camera (z above 0).
+        ValueError: the shapes are not (n, h, w, 3) and (n, h, w) with n >= 2, an image has no valid pixel, or a valid
+            point is not finite or not in front of the camera (z above 0).
     """
     cloud = np.asarray(points, np.float32)
     if cloud.ndim != 4 or cloud.shape[-1] != 3 or len(cloud) < 2:

@@ -1,7 +1,7 @@
 """The motions by which a depth image may follow earlier ones: a search of the largest projective consistency.
 
-Motions are drawn and varied from coarse to fine against the last images. Images of walls hardly tell how far a camera
-has moved along them: the best motions that differ are slid along the surfaces of the image. The best of those are
+Motions are drawn and varied from coarse to fine against the last images. An image of a wall hardly depends on the
+motion along the wall: the best motions that differ are slid along the surfaces of the image. The best of those are
 adjusted against more images, and many that differ are proposed: what this image leaves open, later ones decide.
 """
 
@@ -55,7 +55,7 @@ class DepthInitializationConfig:
     Attributes:
         max_translation: the largest translation between neighbouring images along each axis.
         max_turn_deg: the largest turn between neighbouring images about the vertical axis of the camera, degrees.
-        max_tilt_deg: the largest turn about the other axes, degrees; full motion only.
+        max_tilt_deg: the largest tilt (turn about a horizontal axis), degrees; full motion only.
         num_trajectories: the largest number of trajectories that go on from image to image.
         num_candidates: number of motions of the first round, spread evenly.
         num_kept: number of the best motions that go on to the next round, before the slides.
@@ -189,7 +189,7 @@ def propose_motions(
 
 
 def motion_cost(length: Any, turn: Any, config: DepthInitializationConfig) -> Any:
-    """What motions cost, in consistency: the shortest one is taken where images leave it open.
+    """Returns the costs of motions, in consistency: the shortest motion is taken where images leave it open.
 
     Args:
         length: of motions between neighbouring images, unit of the points.

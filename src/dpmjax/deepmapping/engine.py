@@ -29,7 +29,7 @@ class FitState:
     """Everything that a fit needs to go on; of several starts every leaf has a leading axis.
 
     Attributes:
-        params: what the problem trains.
+        params: trained parameters of the problem.
         optimizer: state of the optimiser.
         key: of the start; step k uses `fold_in(key, k)`, so that a resumed run equals an unbroken one.
         phase: index of the phase.
@@ -106,7 +106,7 @@ def init(problem: Problem, data: Any, *, key: jax.Array, num_starts: int = 1) ->
     """Makes a fresh state at the start of the first phase.
 
     Args:
-        problem: what to fit.
+        problem: problem to fit.
         data: of the problem.
         key: of the run.
         num_starts: number of starts that differ in their keys; with 1, there is no leading axis.
@@ -126,7 +126,7 @@ def step(problem: Problem, state: FitState, data: Any, *, phase: int | None = No
     """Does one call of steps.
 
     Args:
-        problem: what to fit; static under `jit`.
+        problem: problem to fit; static under `jit`.
         state: from `init` or from an earlier call.
         data: of the problem.
         phase: index of the phase of the state, static under `jit`; `begin_phase` enters the next one. None: the
@@ -151,7 +151,7 @@ def begin_phase(problem: Problem, state: FitState, data: Any, *, phase: int) -> 
     """Makes the state at the start of a phase from the state at the end of the phase before.
 
     Args:
-        problem: what to fit; static under `jit`.
+        problem: problem to fit; static under `jit`.
         state: at the end of phase `phase - 1`.
         data: of the problem.
         phase: index of the phase that begins, from 1; static under `jit`.
@@ -177,7 +177,7 @@ def solve(problem: Problem, data: Any, *, key: jax.Array) -> tuple[FitState, Rep
     Several data sets of equal shapes: `jax.vmap(lambda data, key: solve(problem, data, key=key))(data, keys)`.
 
     Args:
-        problem: what to fit; static under `jit`.
+        problem: problem to fit; static under `jit`.
         data: of the problem.
         key: of the run.
 
@@ -201,7 +201,7 @@ def is_finished(problem: Problem, state: FitState) -> bool:
     """Tells whether all steps of the last phase are done.
 
     Args:
-        problem: what is fitted.
+        problem: fitted problem.
         state: of the fit.
 
     Returns:
@@ -223,7 +223,7 @@ def fit(
     """Steps a fresh state through all phases.
 
     Args:
-        problem: what to fit.
+        problem: problem to fit.
         data: of the problem, with the poses to start from where it has some.
         key: of the run.
         num_starts: number of starts that advance side by side.
@@ -248,7 +248,7 @@ def resume(
     """Steps a state through the remaining phases; a second fit of the same shapes compiles nothing.
 
     Args:
-        problem: what to fit.
+        problem: problem to fit.
         state: from `init` or from an earlier fit.
         data: of the problem.
         on_report: called after each call of the step.
@@ -283,7 +283,7 @@ def num_calls(problem: Problem, phase: Any) -> int:
     """Counts the calls of the step that a phase takes.
 
     Args:
-        problem: what is fitted.
+        problem: fitted problem.
         phase: of the fit.
 
     Returns:
@@ -296,7 +296,7 @@ def steps_per_call(problem: Problem, phase: Any) -> int:
     """Counts the steps of one call: the calls share those of the phase evenly; the last one hardly goes beyond.
 
     Args:
-        problem: what is fitted.
+        problem: fitted problem.
         phase: of the fit.
 
     Returns:

@@ -22,7 +22,7 @@ from dpmjax.types import ScanSet
 
 # Learning rate of Adam at the start; it falls to a hundredth by a cosine.
 _LEARNING_RATE = 2e-3
-# Scans are turned to random headings up to this: `relocalize` tries all turns, and L-Net must know one of them.
+# Scans are turned to random headings up to this: `relocalize` tries all turns, and L-Net needs only one of them.
 _MAX_TURN_DEG = 20.0
 # Scans are re-projected to points around their own (`shift_scan`), up to this distance in typical ranges, so that L-Net
 # learns the surroundings of the trajectory.
@@ -38,8 +38,8 @@ class LocalizationTrainingConfig:
     Attributes:
         num_steps: number of steps of Adam.
         scans_per_step: number of scans of a step, drawn with replacement.
-        num_rendered: number of scans that are rendered from the map at random free places; they make up half of each
-            step, so that L-Net learns the places that the trajectory has seen but not passed.
+        num_rendered: number of scans that are rendered from the map at random free places. They make up half of each
+            step: L-Net learns places that the trajectory has seen but not passed.
     """
 
     num_steps: int = 5000
@@ -54,7 +54,7 @@ class LocalizationTrainingConfig:
 
 
 def has_windows(fitted: Fitted) -> bool:
-    """Whether the fit has an L-Net for each of several windows instead of one for all scans.
+    """Returns True where the fit has an L-Net for each of several windows instead of one for all scans.
 
     Args:
         fitted: result of `fit_deepmapping` or of `train_localization`.
@@ -190,7 +190,7 @@ def shift_scan(points: Float[Array, "b 2"], mask: Bool[Array, " b"], shift: Floa
 
     Args:
         points: in the sensor frame.
-        mask: beams that measured something; the others keep their points.
+        mask: True for beams with a measurement; other beams keep their points.
         shift: position of the new sensor in the frame of the old one.
 
     Returns:

@@ -19,13 +19,13 @@ from dpmjax.types import ScanSet
 
 NUM_NODES = 513
 """Nodes of the raster along each side of the map's frame."""
-# Log odds beyond which a node counts as seen, free or occupied; M-Net leaves at zero what it has never seen.
+# Log odds beyond which a node counts as seen, free or occupied; M-Net is zero at places that no beam has reached.
 _SEEN = 0.3
 # Nodes on the way of a rendered beam that may be unseen, as a share of all.
 _MAX_UNSEEN = 0.1
 # Longest rendered beam in nodes.
 _MAX_NODES = 400
-# A rendered scan needs so many of its beams, as a share.
+# Smallest share of the beams of a rendered scan that must hit the map.
 _LEAST_BEAMS = 0.5
 
 

@@ -72,8 +72,8 @@ def as_scan_set(scans: ScanSet | ArrayLike, *, min_scans: int = 2) -> ScanSet:
         The scans, zeros where nothing was measured.
 
     Raises:
-        ValueError: the shape is not (n, b, 2), there are too few scans, a scan has no valid beam, or what the
-            mask of a ScanSet calls valid is not finite.
+        ValueError: the shape is not (n, b, 2), there are too few scans, a scan has no valid beam, or a valid beam of a
+            ScanSet is not finite.
     """
     beams = as_beams("scans", scans)
     if beams.points.shape[0] < min_scans:

@@ -1,4 +1,6 @@
-"""What the engine fits: a record of pure functions, and the parts that problems with an L-Net and an M-Net share."""
+"""A problem for the engine: a record of pure functions; and the parts that problems with an L-Net and an M-Net
+share.
+"""
 
 from __future__ import annotations
 
@@ -30,8 +32,8 @@ _ANNEAL_UNTIL = 0.7
 class Problem:
     """A problem whose parameters are trained on one data set; training them is the registration.
 
-    The functions are pure and belong to a module, so that problems of equal settings are equal: a Problem is a static
-    argument of the compiled step, and the data are not part of it.
+    The functions are pure and belong to a module, so that problems of equal settings are equal. A Problem is a static
+    argument of the compiled step; the data are not part of it.
 
     Attributes:
         config: settings, given to every function as its first argument; hashable.
@@ -67,7 +69,7 @@ class MappingData(NamedTuple):
 
 
 class MappingFunctions(NamedTuple):
-    """What planar scans and depth images differ in; the functions are those of a Problem."""
+    """Functions of a Problem that depend on the sensor."""
 
     init: Callable[..., Params]
     loss: Callable[..., tuple[Float[Array, ""], Terms]]
@@ -133,7 +135,7 @@ def phases_of(config: DeepMappingConfig, data: MappingData) -> tuple[PhaseConfig
 
 
 def make_optimizer(config: DeepMappingConfig, phase: PhaseConfig) -> optax.GradientTransformation:
-    """Adam for what a phase optimises; the rest stands still, and its moments are kept.
+    """Returns Adam for the parameters of a phase; other parameters stay, and so do their moments.
 
     Args:
         config: settings of the fit.

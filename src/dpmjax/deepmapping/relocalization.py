@@ -41,7 +41,7 @@ _OFFSETS = np.array(sorted(product(range(-2, 3), repeat=3), key=np.linalg.norm))
 
 
 class MapFields(NamedTuple):
-    """What hits and free samples cost at the nodes of a raster over the frame of the map, one raster a level.
+    """Costs of hits and of free samples at the nodes of a raster over the frame of the map, one raster a level.
 
     Attributes:
         hit: nats of a hit.
@@ -59,8 +59,8 @@ class FoundPoses(NamedTuple):
 
     Attributes:
         poses: x, y, heading in typical ranges and radians.
-        nats: mean cost of a beam, that of its hit and the mean of its free samples, weighted by the root of the range:
-            near beams end on some surface everywhere. log 4 where the map is unknown.
+        nats: mean cost of a beam: of its hit, plus the mean of its free samples. Beams are weighted by the root of the
+            range, because near beams end on some surface everywhere. log 4 where the map is unknown.
     """
 
     poses: Float[Array, "m 3"]
@@ -153,8 +153,8 @@ class Relocalized(NamedTuple):
 
     Attributes:
         pose: (3,) or (m, 3) x, y, heading in (-pi, pi], unit of the points.
-        nats: () or (m,) what a beam costs by the map at this pose: 0 where M-Net explains it fully, log 4 where it
-            knows nothing.
+        nats: () or (m,) mean cost of a beam at this pose: 0 where M-Net explains it fully, log 4 where the map is
+            unknown.
         is_known: () or (m,) False where the map does not explain the scan: its view was never seen, or the pose is
             wrong.
     """
@@ -172,14 +172,14 @@ class Relocalized(NamedTuple):
 def relocalize(fitted: Fitted, scan: ScanSet | ArrayLike, *, max_nats: float = 0.4) -> Relocalized:
     """Estimates poses of new scans, and finds those outside of the mapped places (DeepMapping section 4.1, figure 7).
 
-    Nothing is assumed about the heading. L-Net proposes a pose for each of several turns of the scan; a search around
-    the proposals takes the pose at which M-Net explains the scan best. After the free poses of the fast preset L-Net
-    lags behind the poses; `train_localization` brings it back to them.
+    The heading may be any. L-Net proposes a pose for each of several turns of the scan; a search around the proposals
+    takes the pose at which M-Net explains the scan best. After the free poses of the fast preset L-Net lags behind the
+    poses; `train_localization` brings it back to them.
 
     Args:
         fitted: result of `fit_deepmapping` from zero poses with one L-Net for all scans, or of `train_localization`;
             M-Net must have been trained, as all presets do, or no scan is known.
-        scan: (b, 2) one scan, or (m, b, 2), in the sensor frame, unit and order of the beams as in the fit; beams with
+        scan: (b, 2) one scan, or (m, b, 2), in the sensor frame; unit and order of the beams as in the fit. Beams with
             coordinates that are not finite, or both zero, measured nothing.
         max_nats: a scan whose beams cost more at its best pose is not known.
 
@@ -187,8 +187,8 @@ def relocalize(fitted: Fitted, scan: ScanSet | ArrayLike, *, max_nats: float = 0
         Relocalized, in the world of the fit's own poses.
 
     Raises:
-        ValueError: the shape is another one, a scan has no valid beam, each window of the fit has an L-Net of its own,
-            or L-Net's outputs are corrections of given start poses, or `max_nats` is not positive.
+        ValueError: the shape is another one, a scan has no valid beam, the fit has several L-Nets, L-Net's outputs
+            correct given start poses, or `max_nats` is not positive.
     """
     if not max_nats > 0.0:
         raise ValueError(f"max_nats: expected a positive number, got {max_nats}")
@@ -226,7 +226,7 @@ def propose_poses(
         fit_config: settings of the fit.
 
     Returns:
-        x, y, heading of the scans as they are, in typical ranges and radians.
+        x, y, heading of the scans that are not turned, in typical ranges and radians.
     """
     beams = choose_beams(scans.mask.shape[1], fit_config.cold_phases[0])
     mask, turns = scans.mask[:, beams], 2.0 * jnp.pi * jnp.arange(num_turns) / num_turns

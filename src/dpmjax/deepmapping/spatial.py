@@ -1,6 +1,7 @@
-"""What problems in space share, depth images and lidar clouds: poses T_start @ motion, their start, their map frame.
+"""Common parts of the problems in space, of depth images and lidar clouds: poses T_start @ motion, their start, their
+map frame.
 
-The start is kept as it is given; L-Net's output, or what is optimised freely, is a motion after it.
+The given start does not change; L-Net's output, or the free parameter, is a motion after it.
 """
 
 from __future__ import annotations

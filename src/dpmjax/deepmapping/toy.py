@@ -1,4 +1,4 @@
-"""Why DeepMapping optimises a network instead of the poses, in one dimension (DeepMapping supplement D, figure 14).
+"""Optimisation of a network instead of its output, in one dimension (DeepMapping supplement D, figure 14).
 
 The same function is minimised twice by plain gradient descent from the same start: over x, and over the weights and
 the input of a network whose output is x. Both are problems of the engine; many seeds are many starts.
@@ -67,7 +67,7 @@ def toy_loss(x: Float[AnyArray, "..."]) -> Float[Array, "..."]:
 
 
 def global_minimum() -> tuple[float, float]:
-    """Where L is smallest, and its value there: (-1.417, -23.757), in float64.
+    """Finds the minimum of L and its value: (-1.417, -23.757), in float64.
 
     Beyond |x| = 12 the parabola alone is above 47, more than the smallest value plus both amplitudes.
 
