@@ -91,7 +91,7 @@ def as_beams(name: str, value: ScanSet | ArrayLike) -> ScanSet:
         The scans, zeros where nothing was measured.
 
     Raises:
-        ValueError: the shape is another one, or what the mask of a ScanSet calls valid is not finite.
+        ValueError: the shape is another one, or a valid beam of a ScanSet is not finite.
     """
     points: Any = value.points if isinstance(value, ScanSet) else np.asarray(value, np.float32)
     if points.ndim != 3 or points.shape[-1] != 2:

@@ -111,10 +111,10 @@ def turned_directions(
 
     Args:
         directions: unit horizontal directions in the frame of the cloud.
-        T_map_cloud: motion from that frame to the other one.
+        T_map_cloud: motion from that frame to a second one.
 
     Returns:
-        Unit horizontal directions in the other frame; (1, 0) for one that becomes vertical.
+        Unit horizontal directions in the second frame; (1, 0) for one that becomes vertical.
     """
     R = jnp.asarray(T_map_cloud)[..., None, :2, :2]
     return ray_directions(jnp.sum(R * directions[..., None, :], axis=-1))

@@ -62,8 +62,8 @@ class Consensus:
     Attributes:
         T_target_source: the motions; where there are fewer, the first is repeated with support 0.
         is_inlier: which pairs are nearer than `inlier_m` under each.
-        support: sum of 1 - error / inlier_m over the inliers; pairs of nearly the same points count as one. The caller
-            knows how much support arises by chance.
+        support: sum of 1 - error / inlier_m over the inliers; pairs of nearly the same points count as one. Only the
+            caller can estimate the support that arises by chance.
     """
 
     T_target_source: Float[Array, "*b h 4 4"]

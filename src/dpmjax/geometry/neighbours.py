@@ -36,7 +36,7 @@ def k_nearest(
         mask: False for points that are not there; they may hold anything.
 
     Returns:
-        Neighbours (m, k). Where there are fewer than k valid points the rest is masked: index 0, distance infinite.
+        Neighbours (m, k). With fewer than k valid points, the remaining columns are masked: index 0, distance infinite.
         A query that is not finite has no neighbours. `squared_distances` is differentiable in both clouds.
 
     Raises:

@@ -130,7 +130,7 @@ def step_to_planes(
         points: points where the moved side and the fixed planes are compared, in the fixed frame.
         normals: of the planes, same frame.
         residuals: signed distances of the moved side to the fixed one, along the normals.
-        weights: weights of the pairs; the other arrays must be finite where a weight is 0 too.
+        weights: weights of the pairs; all arrays must be finite, also where a weight is 0.
 
     Returns:
         The step; 0 where no pair counts.

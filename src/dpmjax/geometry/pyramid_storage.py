@@ -24,7 +24,7 @@ LARGEST = np.iinfo(np.int16).max
 
 @flax.struct.dataclass
 class StoredPyramid:
-    """A pyramid as it is stored; valid points stand in front on every level.
+    """A stored pyramid; valid points come first on every level.
 
     Attributes:
         num_points: number of valid points of level 0.
@@ -54,7 +54,7 @@ def record_type(config: PyramidConfig, capacity: int) -> np.dtype:
         A structured type of NumPy.
 
     Raises:
-        ValueError: if rows of so many points do not fit 16 bits.
+        ValueError: if row numbers of this many points exceed 16 bits.
     """
     if capacity > MAX_STORED_POINTS:
         raise ValueError(f"capacity: expected at most {MAX_STORED_POINTS}, got {capacity}")

@@ -64,10 +64,10 @@ def inverse(T_a_b: Any) -> Any:
 
 
 def compose(T_a_b: Float[AnyArray, "*#n d d"], T_b_c: Float[AnyArray, "*#n d d"]) -> Float[Array, "*n d d"]:
-    """One motion after the other, at full precision on every device.
+    """Chains two motions, at full precision on every device.
 
     Args:
-        T_a_b: maps b to a; its leading axes broadcast with those of the other.
+        T_a_b: maps b to a; leading axes broadcast.
         T_b_c: maps c to b.
 
     Returns:

@@ -16,11 +16,11 @@ from dpmjax.types import AnyArray
 def farthest_point_sample(
     points: Float[AnyArray, "n d"], num_samples: int, mask: Bool[AnyArray, " n"] | None = None
 ) -> Int[Array, " s"]:
-    """Indices of points of which each is the farthest from all before it, starting at the first valid point.
+    """Chooses points, each the farthest from all before it, from the first valid point on.
 
     Each valid point comes at most once, even where points coincide; of equally far ones the lower index comes first.
-    Where there are fewer valid points than samples, the rest repeats the first index; without any valid point, all
-    are 0. The choice has no derivative.
+    With fewer valid points than samples, the remaining entries repeat the first index; without any valid point, all are
+    0. The choice has no derivative.
 
     Args:
         points: candidates, n >= 1.

@@ -143,7 +143,7 @@ def from_matrix(T_a_b: Any) -> Any:
 
 
 def as_poses(name: str, value: Any, count: int) -> NDArray[np.float64]:
-    """Makes poses x, y, heading of what a user has: these, or matrices; on the host.
+    """Makes poses x, y, heading from such poses or from matrices, on the host.
 
     Args:
         name: of the argument, for messages.

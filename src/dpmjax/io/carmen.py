@@ -4,8 +4,8 @@ A scan has two poses (`carmen_lines`). A log as recorded has both at the places 
 odometry, and there is no reference. In a log that a SLAM program has corrected, the first pose is the reference and the
 second the raw odometry; where both are equal, the raw odometry is lost.
 
-Some published logs have lines with the time stamp and odometry of another moment: the time stamps are out of order
-there, and the odometry jumps by metres there and back. Those entries are interpolated.
+Some published logs have lines with the time stamp and odometry of another moment. There the time stamps are out of
+order, and the odometry jumps by metres and back. Those entries are interpolated.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ class ScanLine(NamedTuple):
 
 
 class CarmenLines(NamedTuple):
-    """What is read of a log.
+    """Contents of a log.
 
     Attributes:
         scans: in the order of the file.
@@ -213,7 +213,7 @@ def _reference_and_odometry(log: CarmenLines) -> tuple[FloatArray | None, FloatA
 
 
 def _is_at_wheels(log: CarmenLines, poses: FloatArray) -> bool:
-    """Whether most poses lie where the ODOM line next in time is."""
+    """Returns True where most poses lie at the ODOM line next in time."""
     if not len(log.odometry):
         return False
     ordered = log.odometry[np.argsort(log.odometry[:, 0], kind="stable")]

@@ -28,8 +28,8 @@ def read_deepmapping_folder(path: str | Path, *, unit: Unit | None = None) -> Sc
 
     Args:
         path: the folder, or the archive.
-        unit: "px" (or None) multiplies coordinates by 512, as the authors' files need; "m" takes them as they are, for
-            other people's PCD scans.
+        unit: "px" (or None) multiplies coordinates by 512, as the authors' files need; "m" takes them unchanged, for
+            other PCD scans.
 
     Returns:
         The scans in natural order of their names; scans with fewer points than the longest are padded with masked

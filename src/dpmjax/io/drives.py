@@ -32,7 +32,7 @@ class Drive3D(NamedTuple):
         files: the scans.
         T_world_lidar: (n, 4, 4), NaN for scans without a pose; or None.
         times: (n,) s, or None.
-        notes: what was decided about the files, and doubts.
+        notes: decisions about the files, and doubts.
     """
 
     name: str

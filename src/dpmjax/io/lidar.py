@@ -45,7 +45,7 @@ def open_lidar_sequence(
 ) -> LidarSequence:
     """Opens a drive of 3-D scans, whatever of the known layouts it is in; scans are read when they are wanted.
 
-    What was decided about the files is in the notes of the sequence; doubts are logged as warnings.
+    The notes of the sequence hold the decisions about the files; doubts are logged as warnings.
 
     Args:
         path: the folder of a drive, the root of a data set that holds several, or a bag of ROS.
@@ -59,8 +59,8 @@ def open_lidar_sequence(
         The sequence, with poses in the lidar's frame and times where the source has them.
 
     Raises:
-        InputError: one line with the file, what was found and what to do: no such folder, an unknown layout, no scan,
-            poses that cannot be brought into the lidar's frame, or a selection of no scan.
+        InputError: one line with the file, the finding and the advice: no such folder, an unknown layout, no scan,
+            poses without a known lidar frame, or an empty selection.
     """
     path, poses = Path(path), None if poses is None else Path(poses)
     is_good = bin_columns is None or bin_columns >= 3
@@ -208,7 +208,7 @@ def _read_plain(path: Path, scans: str, poses: Path | None) -> Drive3D:
 
 
 def _kind(path: Path) -> str | None:
-    """Which layout a folder has, found by the files in it; None for none."""
+    """Finds the layout of a folder by its files; None for none."""
     if (path / "generated" / "frames").is_dir() or (path / "full_poses_lidar.txt").is_file():
         return "kitti_carla"
     if (path / "Ouster").is_dir() or (path / "sensor_data" / "Ouster").is_dir():

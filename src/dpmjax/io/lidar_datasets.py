@@ -24,9 +24,9 @@ _MULRAN_OUSTER_RPY_DEG = (0.0001, 0.0003, 179.6654)
 def read_kitti_odometry(folder: Path) -> Drive3D:
     """Lists a sequence of KITTI odometry.
 
-    Poses are looked for in poses_lidar.txt (already in the lidar's frame), poses.txt beside velodyne/ (SemanticKITTI's)
-    and poses/NN.txt two folders up, both in the left camera's frame; or a file of another usual name, in the lidar's.
-    Rows of TUM are matched by time, others by the numbers of the scans.
+    Poses are searched in poses_lidar.txt (in the lidar's frame), in poses.txt beside velodyne/ (SemanticKITTI) and in
+    poses/NN.txt two folders up (both in the left camera's frame), and in files of other usual names (in the lidar's
+    frame). Rows of TUM are matched by time, others by the numbers of the scans.
 
     Args:
         folder: the folder that holds velodyne/.

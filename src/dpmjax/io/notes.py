@@ -1,4 +1,4 @@
-"""Notes of readers in the log: what was decided about the input, and doubts."""
+"""Notes of readers in the log: decisions about the input, and doubts."""
 
 from __future__ import annotations
 

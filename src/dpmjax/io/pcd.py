@@ -73,7 +73,7 @@ def parse_pcd(content: bytes, source: str) -> TimedCloud:
         source: its name, for messages.
 
     Returns:
-        The points, with their times where the file has them; z is zero where it has none, and NaN is left as it is.
+        The points, with their times where the file has them; z is zero where it has none, and NaN stays.
 
     Raises:
         InputError: a broken header, no x or y column, a body that is truncated or does not unpack, or a word that is no

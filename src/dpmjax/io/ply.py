@@ -28,7 +28,7 @@ def parse_ply(content: bytes, source: str) -> TimedCloud:
         source: its name, for messages.
 
     Returns:
-        The points, with their times where the file has them; NaN is left as it is.
+        The points, with their times where the file has them; NaN stays.
 
     Raises:
         InputError: a broken header, no x, y, z, or a truncated body.

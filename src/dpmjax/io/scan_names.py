@@ -58,7 +58,7 @@ def strays_among(files: Sequence[Path]) -> list[Path]:
         files: of one ending.
 
     Returns:
-        The files that are no scans; empty where as many files have no number as have one.
+        The files that are no scans; empty where half of the files or more have no number.
     """
     plain = [file for file in files if not re.search(r"\d", stem_of(file))]
     num_numbered = len(files) - len(plain)

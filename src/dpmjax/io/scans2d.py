@@ -56,9 +56,9 @@ def read_sequence(
         The sequence: two scans at least of 17 beams at least, each with one valid beam at least.
 
     Raises:
-        InputError: one line with the file, what was found and what to do: no such file, an unknown format, damage, too
-            few scans or beams, a scan without a valid beam, scans of a single point, lengths that no such unit
-            explains, or arguments out of range.
+        InputError: one line with the file, the finding and the advice: no such file, an unknown format, damage, too few
+            scans or beams, a scan without a valid beam, scans of a single point, impossible lengths, or arguments out
+            of range.
     """
     path = Path(path)
     start, stop, stride = selection.start or 0, selection.stop, 1 if selection.step is None else selection.step
@@ -97,7 +97,9 @@ def _read_any(path: Path, unit: Unit | None, max_range: float | None, topic: str
 
 
 def _detect(path: Path) -> str:
-    """What the path holds, by its ending, else by its first bytes: "folder", "arrays", "bag" or "carmen"."""
+    """Finds the kind of input at a path by its ending, else by its first bytes: "folder", "arrays", "bag" or
+    "carmen".
+    """
     has_scans = path.is_dir() and any(file.suffix.lower() == ".pcd" for file in path.iterdir())
     if is_bag(path) and not has_scans:
         return "bag"
@@ -164,9 +166,9 @@ def read_arrays(path: str | Path, *, unit: Unit | None = None) -> ScanSequence:
     ahead; and optionally `mask` (n, b), `poses` (the reference) and `odometry` as (n, 3) x, y, heading or (n, 3, 3)
     `T_world_scan`, `times` (n,) in seconds, and `unit`, "px" or "m".
 
-    A beam is invalid where `mask` is False, where both coordinates are NaN or one is infinite, or where its range is
-    NaN, infinite or not positive (as scanner drivers write a beam without echo). A beam with one NaN coordinate and a
-    finite one is an error.
+    A beam is invalid where `mask` is False, both coordinates are NaN, one is infinite, or its range is NaN, infinite or
+    not positive (drivers of scanners write this for a beam without echo). A beam with one NaN coordinate and a finite
+    one is an error.
 
     Args:
         path: the file.

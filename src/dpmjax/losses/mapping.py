@@ -1,6 +1,6 @@
 """Losses of DeepMapping: the Chamfer distance between clouds, and the occupancy loss of beams.
 
-What a beam hit is occupied, what it passed is free.
+Hits of beams are occupied, and the space that beams passed is free.
 """
 
 from __future__ import annotations

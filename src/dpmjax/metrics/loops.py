@@ -34,7 +34,7 @@ class LoopRecall(NamedTuple):
         same_way: of those driven in the direction of before, or across it.
         opposite: of those driven the other way.
         num_revisits: number of all.
-        num_opposite: number of those driven the other way.
+        num_opposite: number of revisits in the opposite direction.
     """
 
     recall: float
@@ -55,7 +55,7 @@ def find_revisits(
         min_path_m: so long is the way between the two.
 
     Returns:
-        Which scans come back, and in which direction.
+        Finds the scans at places seen before, and their direction.
 
     Raises:
         ValueError: the shape is not (n, 4, 4), or a number is not finite.

@@ -60,12 +60,12 @@ def wilson_interval(num_right: int, num_all: int, *, confidence: float = 0.95) -
 def mcnemar_p_value(is_right_a: Bool[AnyArray, " n"], is_right_b: Bool[AnyArray, " n"]) -> float:
     """Returns the p-value of McNemar's exact test: two methods answered the same n questions.
 
-    Only the questions that one of the two answers right count. Where both methods are equally good, each of these is
-    as likely one's as the other's, so their number is binomial with a probability of a half (McNemar 1947).
+    Only the questions that one of the two answers right count. If both methods are equally good, either one is right in
+    such a case with the probability of a half, and their number is binomial (McNemar 1947).
 
     Args:
         is_right_a: answers of one method.
-        is_right_b: answers of the other method to the same questions, in the same order.
+        is_right_b: answers of a second method to the same questions, in the same order.
 
     Returns:
         Probability, two-sided, that two equally good methods differ at least as much; 1 where no answer differs.

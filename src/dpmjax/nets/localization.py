@@ -57,7 +57,7 @@ class DilatedConvolution(nn.Module):
 
     @nn.compact
     def __call__(self, x: Float[Array, "*size c"]) -> Float[Array, "*size_out f"]:
-        """Same size as the input, divided by the stride.
+        """The output has the size of the input divided by the stride.
 
         Args:
             x: channels of the beams (b, c) or of the pixels (h, w, c).
@@ -127,13 +127,13 @@ _KERNELS: dict[str, tuple[float, Any, Any]] = {
 
 @dataclass(frozen=True)
 class ScalarNetConfig:
-    """Shape of the network; the features are the paper's, which does not tell the initialisation.
+    """Shape of the network. The features are the paper's; its initialisation is unpublished.
 
     Attributes:
         features: channels of the hidden layers, each followed by an ELU.
         initialization: "xavier-relu": Xavier-uniform with the gain of ReLU, as in the published L-Net; "xavier":
-            without the gain; "he"; "lecun" (Flax's default); "pytorch": PyTorch's default. Biases are zero but for
-            "pytorch", where they are as uniform as the weights.
+            without the gain; "he"; "lecun" (Flax's default); "pytorch": PyTorch's default. Biases are zero, or for
+            "pytorch" uniform like the weights.
     """
 
     features: tuple[int, ...] = (10, 20, 30, 40)

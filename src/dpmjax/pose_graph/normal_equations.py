@@ -142,7 +142,7 @@ def solve_symmetric(matrix: sp.csc_matrix, right: Floats, extra: Floats | float 
     Args:
         matrix: (m, m) symmetric, rows in the order of elimination.
         right: (m,) or (m, k) right sides.
-        extra: (m,) what is added to the diagonal.
+        extra: (m,) damping, added to the diagonal.
 
     Returns:
         The solution, with the shape of `right`; NaN where the matrix is singular.

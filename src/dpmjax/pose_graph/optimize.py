@@ -1,7 +1,7 @@
 """Robust Levenberg-Marquardt over all poses of a graph, in the plane and in space.
 
 Without a kernel this is plain least squares. With one, every edge has a Geman-McClure kernel that is narrowed step by
-step (graduated non-convexity): all edges count at first, then wrong ones are let go.
+step (graduated non-convexity): all edges count at first, then wrong ones lose their weight.
 """
 
 from __future__ import annotations
@@ -30,9 +30,9 @@ class PoseGraphConfig:
     Attributes:
         outlier_chi2: the most that a contradicted edge costs (squared Mahalanobis distance; 10 is about the 98 %
             quantile in the plane). None for plain least squares.
-        max_iterations: at most so many linear solves.
+        max_iterations: the largest number of linear solves.
         tolerance: the optimisation ends when a step lowers the cost by less than this share.
-        widening: the kernel starts so many times wider.
+        widening: width of the kernel at the start, in final widths.
         is_chordal_start: also try the chordal relaxation as a start; it is taken where its cost is lower.
         damping: Levenberg-Marquardt damping at the start, as a share of the diagonal.
     """
@@ -65,7 +65,7 @@ class OptimizedPoseGraph(NamedTuple):
         chi2: sum of r^T W r over all edges, each times its weight.
         chi2_initial: the same at the poses that were given, all weights one.
         iterations: linear solves, rejected ones included.
-        weights: (e,) of each edge in the end, 0 (let go) to 1; all one without a kernel.
+        weights: (e,) final weight of each edge, 0 (rejected) to 1; all one without a kernel.
         is_converged: False where the iterations ran out, or no step lowered the cost.
     """
 

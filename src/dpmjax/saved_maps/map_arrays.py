@@ -1,4 +1,4 @@
-"""A keyframe map as named arrays, and back. Ragged arrays stand one after the other, with the rows of each keyframe."""
+"""A keyframe map as named arrays, and back. Ragged arrays are concatenated, with the rows of each keyframe."""
 
 from __future__ import annotations
 

@@ -32,7 +32,7 @@ class FeatureCodes(NamedTuple):
         mean: of the features.
         basis: (r, c) principal components.
         step: of the coefficients.
-        codes: (r, d) of all descriptors, one component after the other.
+        codes: (r, d) of all descriptors, component by component.
     """
 
     mean: Float[np.ndarray, " c"]

@@ -28,11 +28,11 @@ def to_columns(records: Sequence[Any], name: str, *, without: Collection[str] = 
 
     Args:
         records: named tuples of numbers, texts, arrays of one shape, or None.
-        name: what the names of the arrays begin with.
+        name: prefix of the names of the arrays.
         without: fields that are left out.
 
     Returns:
-        The arrays. What is None takes no room; a mask beside it says where.
+        The arrays. A None takes no room; a mask marks it.
     """
     columns = {name: np.array(len(records))}
     for field in [field for field in records[0]._fields if field not in without] if records else ():

@@ -45,7 +45,7 @@ class Apartment:
     is_seen_through: BoolArray
 
     def is_free(self, places: FloatArray, clearance_m: float) -> BoolArray:
-        """Which places are free for the robot below the camera; lower furniture counts too.
+        """Finds the free places for the robot below the camera; lower furniture counts too.
 
         Args:
             places: (m, 2) x, z, m.

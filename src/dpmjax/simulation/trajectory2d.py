@@ -1,7 +1,7 @@
 """Walks of the robot and of people through a planar world, with the step statistics of DeepMapping section 4.1.
 
-The lidar sees all round, so the robot may move in any direction: it steers by the direction of the step, and the
-heading turns by an independent uniform angle, which keeps the statistics of the paper exact.
+The lidar sees all round, so the robot may move in any direction. It steers by the direction of the step, and the
+heading turns by an independent uniform angle: the statistics of the paper hold exactly.
 """
 
 from __future__ import annotations
@@ -177,7 +177,7 @@ def _aim(route: FloatArray, along: int, here: FloatArray, clearance: FloatArray)
 
 
 def _is_clear(start: FloatArray, end: FloatArray, clearance: FloatArray) -> bool:
-    """Whether a straight step keeps the clearance, sampled every half pixel (a quarter is lost at most)."""
+    """Returns True where a straight step keeps the clearance, sampled every half pixel (a quarter is lost at most)."""
     count = int(np.linalg.norm(end - start) * 2) + 2
     samples = np.floor(np.linspace(start, end, count)).astype(np.int64)
     height, width = clearance.shape

@@ -25,14 +25,14 @@ MIN_HEIGHT_M = -1.0
 
 
 class AgentTrack(NamedTuple):
-    """What one agent has seen and where it went.
+    """Points and trajectory of one agent.
 
     Attributes:
         label: for the legend.
         color: of the agent.
         positions: (n, 3) metres.
         reference: (n, 3) in the same frame; None where there is none.
-        points: (m, 3) what it saw.
+        points: (m, 3) measured points.
         heights_m: (m,) of the points above the lidar.
     """
 
@@ -115,7 +115,7 @@ def _draw_panel(axes: Axes, panel: AgentPanel, limits: Limits, size: tuple[float
 
 
 def _limits_of(panel: AgentPanel) -> Limits:
-    """The trajectories, and most of what was seen: a few far points must not make the map small."""
+    """Limits of the trajectories and of most points: a few far points must not make the map small."""
     shown = [agent.positions[:, :2] for agent in panel.agents]
     points = np.concatenate([agent.points[:, :2] for agent in panel.agents])
     if len(points):

@@ -26,7 +26,7 @@ SIZE_COLORS = (LOSS_COLOR, ACCENT, "#2a9d6f", "#e09f3e")
 
 @dataclass(frozen=True)
 class History:
-    """What a fit reported, one entry a record.
+    """Course of a fit, one entry a record.
 
     Attributes:
         seconds: (k,) run time, never decreasing, compile time left out.

@@ -98,7 +98,7 @@ def height_map_figure(
 ) -> Figure:
     """Draws a map from above: what stands highest in each pixel, by its height above the lidar that passed there.
 
-    Where the path is under a roof, what is more than a metre above the lidar is left out, so that the walls are seen.
+    Under a roof, points more than a metre above the lidar are left out, so that the walls are visible.
 
     Args:
         title: of the picture.
@@ -170,7 +170,7 @@ def _colormap() -> Colormap:
 def _is_roofed(
     points: Float[np.ndarray, "n 3"], heights_m: Float[np.ndarray, " n"], path: Float[np.ndarray, "k 3"]
 ) -> bool:
-    """Whether there is something above most of the path, within a metre."""
+    """Returns True where points lie above most of the path, within a metre."""
     above = np.unique(np.floor(points[heights_m > _ROOF_M, :2]).astype(np.int64), axis=0)
     cells = np.unique(np.floor(path[:, :2]).astype(np.int64), axis=0)
     num_below = len(cells) + len(above) - len(np.unique(np.vstack([cells, above]), axis=0))

@@ -22,7 +22,7 @@ _COLUMNS = 4
 _CURVE_COLORS = ("#8a929b", "#e08a1e", "#1f4e8c", "#4f8fcf", "#2a9d5c")
 _MARGIN = 0.12
 _PANEL_IN, _LEGEND_IN, _ENTRY_IN = 3.1, 0.6, 1.9
-# A method that is lost must not make the others small.
+# A lost method must not make the remaining trajectories small.
 _SHARE_OUTSIDE = 0.5
 
 
@@ -70,7 +70,7 @@ def trajectories_figure(panels: Mapping[str, TrackPanel], colors: Mapping[str, s
 
 
 def _panels(num: int, height_in: float, *, is_y_shared: bool = False) -> tuple[Figure, list[Axes]]:
-    """Makes a figure of so many panels, with space for a legend below them."""
+    """Makes a figure of several panels, with space for a legend below them."""
     columns = min(num, _COLUMNS)
     num_rows = math.ceil(num / columns)
     figure = new_figure(_PANEL_IN * columns, height_in * num_rows + _LEGEND_IN)
@@ -91,7 +91,7 @@ def _add_legend(figure: Figure, entries: Mapping[str, Artist]) -> None:
 
 
 def _shown(panel: TrackPanel) -> NDArray[np.float64]:
-    """The reference decides what is shown; a lost trajectory leaves the panel."""
+    """The reference sets the limits; a lost trajectory leaves the panel."""
     everything = np.concatenate([positions[:, :2] for positions in panel.tracks.values()] or [np.zeros((1, 2))])
     if panel.reference is None:
         return np.asarray(everything, np.float64)

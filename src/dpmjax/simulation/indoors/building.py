@@ -26,7 +26,7 @@ _BUILDING_STREAM = 8160
 
 @dataclass(frozen=True)
 class BuildingConfig:
-    """What a building is like.
+    """Properties of a building.
 
     Attributes:
         kind: office, hall, flat or corridor.
@@ -68,7 +68,7 @@ def make_building(seed: int, config: BuildingConfig = BuildingConfig()) -> Build
 
     Args:
         seed: of all choices, not negative.
-        config: what the building is like.
+        config: properties of the building.
 
     Returns:
         The building.

@@ -20,7 +20,7 @@ _SINK = 2.5  # Slow changes of the height, over those of a step.
 
 @dataclass(frozen=True)
 class WalkConfig:
-    """How the lidar is carried.
+    """Motion of the lidar.
 
     Attributes:
         speed_m_s: of the walk.
