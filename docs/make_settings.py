@@ -156,7 +156,7 @@ def page() -> str:
     parts = [
         "# Settings\n",
         "<!-- Written by docs/make_settings.py: change that file, not this one. -->\n",
-        "Settings that a user may want to change, with their defaults. Each record is a frozen dataclass:\n"
+        "Settings that a user may change, with their defaults. Each record is a frozen dataclass:\n"
         "`dataclasses.replace(config, name=value)` changes one setting. Docstrings describe the remaining settings.\n"
         "The median range of a scan is about 12 m in a street and 4 m in a room; nine beams in ten stay below the\n"
         "typical range.\n",

@@ -126,7 +126,7 @@ def errors_of(T: NDArray[np.float64], sequence: DepthSequence) -> dict[str, floa
     return {"ate_mm": 1e3 * ate, "point_distance_mm": 1e3 * distance, "largest_turn_error_deg": float(turn.max())}
 
 
-# Standard deviations: of the length of a move if nothing is seen, and of what a pixel says at depth 0.
+# Standard deviations: of the length of a move without any measurement, and of a pixel at depth 0.
 _MOVE_M, _FLOOR_M = 0.3, 0.002
 # Pixels whose depths differ by more than this share see different surfaces.
 _SAME_DEPTH = 0.03
@@ -185,7 +185,7 @@ def _add_pair(
     pair: tuple[int, int],
     depth_noise_m: float,
 ) -> None:
-    """Adds what the points of one image say on the surfaces (normals, and where there are some) of another one."""
+    """Adds the information of the points of one image on the surfaces (normals and mask) of another image."""
     T = sequence.T_world_camera
     assert T is not None
     one, other = pair

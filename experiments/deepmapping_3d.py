@@ -8,7 +8,7 @@
 
 DATA is any folder of scans (KITTI, KITTI-360, MulRan, plain ...). Results go to results/deepmapping_3d/<time>/ (latest
 links to the newest): metrics.json, trajectories as TUM, KITTI and npy, map.ply, map.png (from above, before and after),
-loss.png. Of the start and the fit, that one is kept whose planes meet better, judged without ground truth.
+loss.png. The start or the fit is kept, by the share of planes that meet, without ground truth.
 """
 
 from __future__ import annotations
@@ -99,7 +99,7 @@ class Config(RunOptions):
         return DriveWindow(self.data, self.sequence, self.scene, self.selection(), self.seed)
 
     def first_poses(self) -> FirstPoses:
-        """Where the poses start."""
+        """Poses to start from."""
         is_simulated = self.data is None and self.init == "poses"
         usual = _SIMULATED_NOISE_M if is_simulated else 0.0
         noise = usual if self.init_noise is None else self.init_noise

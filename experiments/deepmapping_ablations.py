@@ -1,4 +1,4 @@
-"""Which part of DeepMapping does what: the ablations of the paper (supplement A, figures 10 to 13), and two more.
+"""Ablations of DeepMapping: those of the paper (supplement A, figures 10 to 13), and two more.
 
     python -m experiments.deepmapping_ablations --limit 5
     python -m experiments.deepmapping_ablations --only lnet chamfer --steps 300
@@ -6,9 +6,9 @@
 
 As in the paper on short walks of a depth camera (here through simulated apartments), from zero: L-Net and M-Net are
 trained together. lnet: CNN or PointNet; mnet: MLP or ResMLP, or our grid; depth: 4 to 7 layers of 64; width: 32 to 128
-with 4 layers; chamfer: with and without; free: number of free samples a ray. All others stay as they are; the basis is
-a small CNN and an MLP of 6 layers of 64, so that a run takes half a minute on a CPU. Each run is written to rows/ when
-it is done; ablations.png has the box plots.
+with 4 layers; chamfer: with and without; free: number of free samples a ray. All further settings are fixed. The basis
+is a small CNN and an MLP of 6 layers of 64: a run takes half a minute on a CPU. Each run is written to rows/ when it is
+done; ablations.png has the box plots.
 """
 
 from __future__ import annotations
@@ -67,7 +67,7 @@ class Config(RunOptions):
 
 
 def main(config: Config) -> dict[str, Any]:
-    """Runs what is missing, variant by variant, then writes the table and the box plots."""
+    """Runs the missing cases, variant by variant, then writes the table and the box plots."""
     folder = open_run_folder(config, EXPERIMENT)
     cases = [
         {"ablation": ablation, "variant": variant, "trajectory": trajectory}

@@ -98,12 +98,12 @@ def main(config: Config) -> dict[str, Any]:
 
 
 class Queries(NamedTuple):
-    """What became of the scans, (m,) each.
+    """Results of the scans, (m,) each.
 
     Attributes:
         errors: distance to the truth, px.
         turns: error of the heading, degrees.
-        is_known: the fit says that it knows the view.
+        is_known: True where the view is in the map, by the fit.
         is_mapped: taken where some beam of the fit's scans has passed.
         nats: cost of a beam by the map.
     """
@@ -152,7 +152,7 @@ def free_poses(grid: NDArray[np.bool_], sequence: ScanSequence, config: Config) 
 
 
 def is_mapped(truth: NDArray[np.float64], fitted: Fitted, sequence: ScanSequence) -> NDArray[np.bool_]:
-    """Whether some beam of the fit's scans has passed the places of true poses."""
+    """Returns True for places of true poses that some beam of the fit's scans has passed."""
     from dpmjax.deepmapping import draw_map
     from dpmjax.metrics import align_rigid
 
@@ -181,7 +181,7 @@ def errors_at(
 
 
 def summarise(queries: Queries, truth: NDArray[np.float64], sequence: ScanSequence) -> dict[str, Any]:
-    """Numbers of all mapped free space, of what is called known, and by the distance from the trajectory."""
+    """Numbers of all mapped free space, of the known scans, and by the distance from the trajectory."""
     from scipy.spatial import KDTree
 
     distance, _ = KDTree(sequence.reference_poses[:, :2]).query(truth[:, :2])

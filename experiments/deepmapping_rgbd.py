@@ -8,8 +8,8 @@
     python -m experiments.deepmapping_rgbd --resume -o out
 
 The simulated apartments follow the dataset's protocol: places 300 mm apart, views every 30 degrees, 8 or 16 views. With
---walks hard, 16 views of other apartments, one for each walk: moves and turns at once with jitter, depth noise and
-missing pixels, and only walks on which not moving at all exceeds 450 mm. No setting was chosen on them.
+--walks hard, each walk has 16 views of an apartment of its own: moves and turns at once with jitter, depth noise and
+missing pixels. Walks on which no motion at all has an ATE below 450 mm are left out. No setting was chosen on them.
 
 Each trajectory is written to rows/ as soon as all methods have done it; metrics.json has the share of walks with an ATE
 below 450 mm (the paper's threshold; on most of its walks not moving at all stays below it), and of walks that are
@@ -105,7 +105,7 @@ class Config(RunOptions):
 
 
 def main(config: Config) -> dict[str, Any]:
-    """Runs what is missing, then writes the table and the pictures."""
+    """Runs the missing cases, then writes the table and the pictures."""
     if "multiway" in config.methods:
         require_importable("open3d", "--methods multiway")
     settings = fit_settings(config, read_trajectory(config, 0))
@@ -126,7 +126,7 @@ def main(config: Config) -> dict[str, Any]:
 
 
 def num_trajectories(config: Config) -> int:
-    """As many as asked for; of a folder of images no more than there are windows."""
+    """The requested number, and of a folder of images at most the number of windows."""
     from dpmjax import io
 
     if config.data is None or io.is_active_vision(config.data):
@@ -161,7 +161,9 @@ def read_trajectory(config: Config, index: int) -> DepthSequence:
 
 
 def walk_surface_spread(config: Config, index: int) -> float:
-    """How well the surfaces hold a hard walk, mm; its images without noise are those of the same seed."""
+    """Returns the spread of a hard walk that the surfaces leave, mm; its images without noise are those of the same
+    seed.
+    """
     from dpmjax import simulation
     from experiments._rgbd_methods import surface_spread
 

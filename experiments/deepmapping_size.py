@@ -4,7 +4,7 @@
     python -m experiments.deepmapping_size --sizes 64 256 1024 -o out
 
 Steps take at most 256 scans in windows of 32 neighbours in time and every fourth beam, so that M-Net sees a random part
-of the rays: a step costs the same however many scans there are, and an epoch (every scan seen once) grows linearly. The
+of the rays. A step costs the same for any number of scans, and an epoch (every scan seen once) grows linearly. The
 report has both, the peak of memory, and the exponents; size.png draws them.
 """
 
@@ -56,7 +56,7 @@ class Config(RunOptions):
 
 
 def main(config: Config) -> dict[str, Any]:
-    """Measures what is missing, fits the exponents, draws."""
+    """Measures the missing sizes, fits the exponents, draws."""
     folder = open_run_folder(config, EXPERIMENT)
     with recording(folder):
         rows = []
@@ -84,7 +84,7 @@ _KEYS = ("num_scans", "network", "free", "data_gb", "peak_rss_gb")
 
 
 def curves(rows: list[dict[str, Any]]) -> dict[str, Any]:
-    """What is drawn and fitted, by name."""
+    """Series of the picture and of the fit, by name."""
     columns = {
         f"{title}, {net} (s)": np.array([row[phase][f"{title}_s"] for row in rows])
         for title in ("step", "epoch")

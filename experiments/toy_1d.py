@@ -175,7 +175,7 @@ def choose_seed(network_x: NDArray[np.floating], direct_x: NDArray[np.floating])
 
 
 def is_at_minimum(x: NDArray[np.floating]) -> NDArray[np.bool_]:
-    """Which ends are at the global minimum."""
+    """Returns True for ends at the global minimum."""
     from dpmjax.deepmapping import global_minimum
 
     return np.abs(np.asarray(x, np.float64) - global_minimum()[0]) < _SAME_PLACE
@@ -200,7 +200,7 @@ def measure_seconds(toy: ToyConfig, config: Config) -> dict[str, Any]:
 
 
 def torch_seconds(toy: ToyConfig, seed: int) -> float:
-    """The same descent of one seed as it is usually written in PyTorch."""
+    """The same descent of one seed as a plain loop in PyTorch."""
     import torch
 
     torch.manual_seed(seed)

@@ -63,7 +63,7 @@ def minimize_toy(
         max_iterations: the largest number of iterations.
 
     Returns:
-        Where the solver ends.
+        The end of the descent.
 
     Raises:
         ValueError: the method is unknown.

@@ -1,7 +1,8 @@
 """Multiway registration by Open3D, a baseline of DeepMapping: `pip install dpmjax[baselines]`.
 
-Pairs by iterated closest points, neighbours in time as sure and others as doubtful edges of a pose graph, whose line
-process lets the wrong ones go (Choi, Zhou and Koltun, Robust Reconstruction of Indoor Scenes, CVPR 2015).
+Pairs are registered by iterated closest points. Neighbours in time are sure edges of a pose graph, all further pairs
+doubtful ones; a line process removes wrong edges (Choi, Zhou and Koltun, Robust Reconstruction of Indoor Scenes, CVPR
+2015).
 """
 
 from __future__ import annotations

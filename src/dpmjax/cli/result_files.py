@@ -72,7 +72,7 @@ def do_row(folder: Path, case: dict[str, Any], work: Callable[[], dict[str, Any]
     Args:
         folder: of the run.
         case: identifies the row and becomes part of it.
-        work: makes the rest of the row.
+        work: makes the remaining entries of the row.
         seed: of the run.
 
     Returns:
@@ -100,7 +100,7 @@ def do_rows(
     Args:
         folder: of the run.
         cases: what identifies the rows.
-        work: makes the rest of a row; it is called with the entries of the case as keywords.
+        work: makes the remaining entries of a row; it is called with the entries of the case as keywords.
         seed: of the run.
         is_stopped: whether to end before the next row.
 
@@ -151,7 +151,7 @@ def commits_note(rows: Sequence[Mapping[str, Any]], commit: str | None) -> str |
 
 
 class HistoryFile:
-    """The table of a run, one row a record, each on disk as soon as it is known.
+    """The table of a run, one row a record, each on disk at once.
 
     Args:
         path: the CSV file; it is replaced, except for the rows to keep.
