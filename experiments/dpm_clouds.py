@@ -109,14 +109,14 @@ def open_drives(config: Config) -> list[LidarSequence]:
 def evaluate(model: Model, drive: LidarSequence, band: str, config: Config) -> dict[str, Any]:
     """Returns errors in metres and seconds by stage, and the quality of the offsets, on the pairs of a band."""
     from dpmjax import encode, register, registration_recall
-    from dpmjax.deeppointmap import offset_quality
-    from experiments._dpm_pairs import draw_pairs, read_pairs
+    from dpmjax.deeppointmap import draw_scan_pairs, offset_quality, read_scan_pairs
 
     stages = {"decoder": None, **{f"elements_{num}": num for num in config.elements}}
     motions: dict[str, list[np.ndarray]] = {stage: [] for stage in stages}
     seconds: dict[str, list[float]] = {stage: [] for stage in stages}
     pairs = []
-    for pair in read_pairs(drive, draw_pairs(drive, band, config.pairs, config.seed), config.seed):
+    drawn = draw_scan_pairs(drive, band, config.pairs, seed=config.seed)
+    for pair in read_scan_pairs(drive, drawn, seed=config.seed):
         clouds = [encode(model, points, num_elements=max(config.elements)) for points in (pair.source, pair.target)]
         pairs.append((*clouds, pair.T_target_source.astype(np.float32)))
         for stage, num in stages.items():
