@@ -68,10 +68,10 @@ def run_method(
     if name == "zero":
         return np.tile(np.eye(4), (len(sequence), 1, 1))
     if name == "placed":
-        return dm.initialize_depth(scans, motion=settings.motion, key=key)
+        return dm.initialize_depth(scans, dm.depth_search(settings.motion), key=key)
     if name == "placed-no-prior":
-        search = dm.FULL_SEARCH if settings.motion == "full" else dm.PLANAR_SEARCH
-        return dm.initialize_depth(scans, replace(search, translation_weight=0.0), motion=settings.motion, key=key)
+        search = replace(dm.depth_search(settings.motion), translation_weight=0.0)
+        return dm.initialize_depth(scans, search, key=key)
     if name == "multiway":
         return multiway_images(sequence.points, sequence.mask)
     if name == "icp":

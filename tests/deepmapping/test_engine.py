@@ -29,7 +29,7 @@ from dpmjax.deepmapping import (
     steps_per_call,
 )
 from dpmjax.deepmapping.batches import draw_offsets
-from dpmjax.nets.localization import LocalizationConfig
+from dpmjax.nets.localization import LocalizationNetConfig
 from dpmjax.nets.occupancy import OccupancyConfig
 from tests.tolerances import ACCUMULATED, DOUBLE
 
@@ -200,7 +200,7 @@ BRIEF = replace(
         replace(
             dm.preset("fast"),
             occupancy=OccupancyConfig(kind="grid", resolutions=(8, 16)),
-            localization=LocalizationConfig(features=(8, 16), strides=(1, 2), is_circular=True, hidden=(16,)),
+            localization=LocalizationNetConfig(features=(8, 16), strides=(1, 2), is_circular=True, hidden=(16,)),
         ),
         6,
     ),

@@ -16,7 +16,7 @@ from dpmjax.deepmapping.planar import as_scan_set, planar_problem
 from dpmjax.deepmapping.problem import MappingData
 from dpmjax.geometry import se2
 from dpmjax.metrics import absolute_trajectory_error
-from dpmjax.nets.localization import LocalizationConfig
+from dpmjax.nets.localization import LocalizationNetConfig
 from dpmjax.nets.occupancy import OccupancyConfig
 from dpmjax.types import ScanSet
 
@@ -26,7 +26,7 @@ SMALL = dm.with_steps(
     replace(
         dm.preset("fast"),
         occupancy=OccupancyConfig(kind="grid", resolutions=(16, 32, 64, 128)),
-        localization=LocalizationConfig(features=(16, 32), strides=(1, 2), is_circular=True, hidden=(32,)),
+        localization=LocalizationNetConfig(features=(16, 32), strides=(1, 2), is_circular=True, hidden=(32,)),
     ),
     150,
 )

@@ -19,7 +19,7 @@ from dpmjax.deepmapping.planar import planar_data, planar_problem
 from dpmjax.deepmapping.problem import MapFrame
 from dpmjax.deepmapping.relocalization import largest_nearby, propose_poses
 from dpmjax.geometry import se2
-from dpmjax.nets.localization import LocalizationConfig
+from dpmjax.nets.localization import LocalizationNetConfig
 from dpmjax.nets.occupancy import OccupancyConfig
 from dpmjax.simulation import cast_scans, make_world, scan_world, simulate_sequence
 from dpmjax.types import ScanSet
@@ -37,7 +37,7 @@ def fitted(tiny_walk) -> dm.Fitted:
     config = replace(
         dm.preset("fast"),
         occupancy=OccupancyConfig(kind="grid", resolutions=(CELLS,)),
-        localization=LocalizationConfig(features=(16, 32), strides=(1, 2), is_circular=True, hidden=(32,)),
+        localization=LocalizationNetConfig(features=(16, 32), strides=(1, 2), is_circular=True, hidden=(32,)),
         cold_phases=(replace(dm.preset("fast").cold_phases[0], scans_per_window=None),),
     )
     data, unit = planar_data(ScanSet(tiny_walk.points, tiny_walk.mask))

@@ -18,9 +18,8 @@ from .depth import depth_problem as depth_problem
 from .depth import fit_depth as fit_depth
 from .depth import register_depth as register_depth
 from .depth_initialization import initialize_depth as initialize_depth
-from .depth_motion_search import FULL_SEARCH as FULL_SEARCH
-from .depth_motion_search import PLANAR_SEARCH as PLANAR_SEARCH
 from .depth_motion_search import DepthInitializationConfig as DepthInitializationConfig
+from .depth_motion_search import depth_search as depth_search
 from .engine import Fit as Fit
 from .engine import FitState as FitState
 from .engine import Progress as Progress

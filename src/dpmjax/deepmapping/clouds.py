@@ -20,7 +20,7 @@ from dpmjax.deepmapping.cloud_scans import CloudScans, as_cloud_scans, find_part
 from dpmjax.deepmapping.config import DeepMappingConfig, PhaseConfig, PlaneComparison
 from dpmjax.deepmapping.engine import Fit, Report, fit
 from dpmjax.deepmapping.objective import Terms, WorldBatch, chamfer_term, interpolate_log
-from dpmjax.deepmapping.plane_distance import Cloud, clouds_of, misfit_of_pairs, take_rows, trajectory_misfit
+from dpmjax.deepmapping.plane_distance import PlaneCloud, clouds_of, misfit_of_pairs, take_rows, trajectory_misfit
 from dpmjax.deepmapping.presets import cloud_preset
 from dpmjax.deepmapping.problem import MappingData, MappingFunctions, Params, Problem, mapping_loss, mapping_problem
 from dpmjax.deepmapping.spatial import (
@@ -128,20 +128,11 @@ def register_clouds(
     """
     config = config or cloud_preset("fast")
     data, unit = cloud_data(scans, start)
-    return as_fitted(engine(cloud_problem(config, data), data, key=key), data, unit)
+    return _as_fitted(engine(cloud_problem(config, data), data, key=key), data, unit)
 
 
-def as_fitted(done: Fit, data: MappingData, unit: float) -> CloudFitted:
-    """The result of a fit in the unit of the points; of the fit and the start, what fits better by the scans.
-
-    Args:
-        done: a fit of `cloud_problem`.
-        data: of the fit.
-        unit: the typical range.
-
-    Returns:
-        CloudFitted.
-    """
+def _as_fitted(done: Fit, data: MappingData, unit: float) -> CloudFitted:
+    """Returns the fit or its start, the one that fits better by the scans, in the unit of the points."""
     misfit, start_misfit = float(trajectory_misfit(data.scans, done.poses, _MISFIT_KERNEL_WIDTH)), None
     T, kept = fitted_poses(done.poses, unit), "fit"
     if data.start is not None:
@@ -152,14 +143,14 @@ def as_fitted(done: Fit, data: MappingData, unit: float) -> CloudFitted:
     return CloudFitted(T, done.state.params, done.report, unit, kept, misfit, start_misfit)  # type: ignore[arg-type]
 
 
-def _draw_points(scans: Cloud, count: int, *, key: jax.Array) -> Cloud:
+def _draw_points(scans: PlaneCloud, count: int, *, key: jax.Array) -> PlaneCloud:
     """Other points of each scan in every step."""
     num_scans, capacity = scans.mask.shape
     if count >= capacity:
         return scans
     first = jax.random.randint(key, (num_scans, 1), 0, capacity)
     rows = (first + jnp.arange(count)) % capacity
-    return Cloud(*(jax.vmap(lambda leaf, row: leaf[row])(leaf, rows) for leaf in scans))
+    return PlaneCloud(*(jax.vmap(lambda leaf, row: leaf[row])(leaf, rows) for leaf in scans))
 
 
 def _draw_partners(scans: CloudScans, rows: Int[Array, " m"], count: int, *, key: jax.Array) -> Int[Array, "r m"]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from typing import Literal
 
-from dpmjax.nets.localization import LocalizationConfig
+from dpmjax.nets.localization import LocalizationNetConfig
 from dpmjax.nets.occupancy import OccupancyConfig
 
 Motion = Literal["planar", "full"]
@@ -154,8 +154,8 @@ class DeepMappingConfig:
 
     cold_phases: tuple[PhaseConfig, ...] = (LOCALIZE, REFINE)
     warm_phases: tuple[PhaseConfig, ...] = (REFINE,)
-    localization: LocalizationConfig = field(
-        default_factory=lambda: LocalizationConfig(
+    localization: LocalizationNetConfig = field(
+        default_factory=lambda: LocalizationNetConfig(
             features=(32, 64, 128), strides=(1, 2, 2), is_circular=True, hidden=(128, 64), output_scale=0.1
         )
     )

@@ -18,6 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from dpmjax.deepmapping.batches import draw_offsets
 from dpmjax.deepmapping.config import DeepMappingConfig, PhaseConfig, ProjectiveComparison
 from dpmjax.deepmapping.depth_initialization import initialize_depth
+from dpmjax.deepmapping.depth_motion_search import depth_search
 from dpmjax.deepmapping.engine import Fit, Report, fit
 from dpmjax.deepmapping.objective import Terms, WorldBatch, chamfer_term, interpolate_log
 from dpmjax.deepmapping.presets import depth_preset
@@ -82,7 +83,7 @@ def register_depth(
     config = config or depth_preset("fast")
     scans = images if isinstance(images, DepthScans) else as_depth_scans(images)
     if start is None:
-        start = initialize_depth(scans, motion=config.motion, key=key)
+        start = initialize_depth(scans, depth_search(config.motion), key=key)
     # Search and fit share the key: a fit from given poses gives the same as one from the same poses, found here. The
     # published numbers rest on it.
     fitted = fit_depth(scans, config, key=key, start=start, engine=engine)

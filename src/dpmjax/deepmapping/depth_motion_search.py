@@ -53,6 +53,7 @@ class DepthInitializationConfig:
     """Settings of the search. Lengths are in the unit of the points, metres by default.
 
     Attributes:
+        motion: degrees of freedom of the camera.
         max_translation: the largest translation between neighbouring images along each axis.
         max_turn_deg: the largest turn between neighbouring images about the vertical axis of the camera, degrees.
         max_tilt_deg: the largest tilt (turn about a horizontal axis), degrees; full motion only.
@@ -70,6 +71,7 @@ class DepthInitializationConfig:
         turn_weight: cost of the largest turn, in matching points.
     """
 
+    motion: Motion = "planar"
     max_translation: float = 0.7
     max_turn_deg: float = 75.0
     max_tilt_deg: float = 30.0
@@ -89,19 +91,35 @@ class DepthInitializationConfig:
             raise ValueError(f"all counts must be at least 1, got {self}")
 
 
-PLANAR_SEARCH = DepthInitializationConfig()
-"""A level camera on wheels."""
+def depth_search(motion: Motion) -> DepthInitializationConfig:
+    """Returns the settings of the search for first poses.
 
-FULL_SEARCH = DepthInitializationConfig(
-    num_trajectories=8,
-    num_candidates=16384,
-    num_varied=48,
-    tolerance=(0.12, 0.03),
-    final_tolerance=0.015,
-    translation_weight=0.2,
-    turn_weight=0.3,
-)
-"""A hand-held camera: six numbers to search instead of three, small moves between images, a real sensor's noise."""
+    Args:
+        motion: "planar": a level camera on wheels. "full": a hand-held camera, with six numbers to search instead of
+            three, small moves between images, and the noise of a real sensor.
+
+    Returns:
+        The settings.
+    """
+    if motion == "planar":
+        return DepthInitializationConfig()
+    return DepthInitializationConfig(
+        motion="full",
+        num_trajectories=8,
+        num_candidates=16384,
+        num_varied=48,
+        tolerance=(0.12, 0.03),
+        final_tolerance=0.015,
+        translation_weight=0.2,
+        turn_weight=0.3,
+    )
+
+
+class Camera(NamedTuple):
+    """The camera of all images, and their typical range in the unit of the points."""
+
+    pinhole: Pinhole
+    unit: Float[Array, ""] | float
 
 
 class Views(NamedTuple):
@@ -153,23 +171,19 @@ def surface_directions(scans: DepthScans, motion: Motion) -> NDArray[np.float32]
 def propose_motions(
     T_world_camera: NDArray[np.float64],
     views: Views,
-    pinhole: Pinhole,
+    camera: Camera,
     config: DepthInitializationConfig,
-    motion: Motion,
     *,
-    unit: float,
     key: jax.Array,
 ) -> NDArray[np.float64]:
-    """The best motions of the next image that differ.
+    """Returns the best motions of the next image that differ.
 
     Args:
         T_world_camera: (m, 4, 4) poses of the images before it.
         views: all images, n > m.
-        pinhole: of the camera.
-        config: of the search.
-        motion: "planar" or "full".
-        unit: typical range of the images, unit of the points.
-        key: of the search.
+        camera: camera of the images.
+        config: settings of the search.
+        key: key of the search.
 
     Returns:
         (k, 4, 4) T_last_next, the best one first.
@@ -184,7 +198,7 @@ def propose_motions(
         jnp.asarray(before >= 0, jnp.float32),
         _take(views, rows),
     )
-    found = _search(references, _take(views, scan), pinhole, unit, key, config=config, motion=motion)
+    found = _search(references, _take(views, scan), camera, key, config=config)
     return np.asarray(found, np.float64)
 
 
@@ -268,14 +282,13 @@ def _adjusted(
     T_last_scan: Float[Array, "4 4"],
     references: References,
     view: Views,
-    pinhole: Pinhole,
-    unit: Float[Array, ""],
+    camera: Camera,
     tolerance: Float[Array, ""],
     config: DepthInitializationConfig,
-    motion: Motion,
 ) -> Float[Array, "4 4"]:
     """A motion so that points of the image lie on the surfaces of its references, and theirs on its own."""
-    scales = motion_scales(motion, unit, tolerance)
+    pinhole = camera.pinhole
+    scales = motion_scales(config.motion, camera.unit, tolerance)
 
     def gaps(values: Float[Array, " k"], T: Float[Array, "4 4"]) -> tuple[Float[Array, " p"], Float[Array, " p"]]:
         T_last_moved = rigid.compose(T, motion_matrices((scales * values)[None])[0])
@@ -302,20 +315,18 @@ def _adjusted(
     return rigid.compose(T_last_scan, motions[0])
 
 
-@partial(jax.jit, static_argnames=("config", "motion"))
+@partial(jax.jit, static_argnames="config")
 def _search(
     references: References,
     view: Views,
-    pinhole: Pinhole,
-    unit: Float[Array, ""],
+    camera: Camera,
     key: jax.Array,
     *,
     config: DepthInitializationConfig,
-    motion: Motion,
 ) -> Float[Array, "k 4 4"]:
     """The best T_last_scan of the image that differ."""
     turn, tilt, far = np.deg2rad(config.max_turn_deg), np.deg2rad(config.max_tilt_deg), config.max_translation
-    widths = jnp.array([far, far, turn] if motion == "planar" else [far, far, far, tilt, turn, tilt])
+    widths = jnp.array([far, far, turn] if config.motion == "planar" else [far, far, far, tilt, turn, tilt])
     first_key, round_key = jax.random.split(key)
     values = widths * jax.random.uniform(first_key, (config.num_candidates, len(widths)), minval=-1.0, maxval=1.0)
     T = motion_matrices(values.at[0].set(0.0))
@@ -324,7 +335,7 @@ def _search(
 
     def scores_of(T: Float[Array, "m 4 4"], compared: References, tolerance: Float[Array, ""]) -> Float[Array, " m"]:
         return jax.lax.map(
-            lambda one: _score_motion(one, compared, view, pinhole, tolerance, config), T, batch_size=128
+            lambda one: _score_motion(one, compared, view, camera.pinhole, tolerance, config), T, batch_size=128
         )
 
     for step in range(_NUM_ROUNDS - 1):
@@ -341,7 +352,7 @@ def _search(
     for tolerance in adjusted_at:
 
         def adjust(one: Float[Array, "4 4"], tolerance: Float[Array, ""] = tolerance) -> Float[Array, "4 4"]:
-            return _adjusted(one, references, view, pinhole, unit, tolerance, config, motion)
+            return _adjusted(one, references, view, camera, tolerance, config)
 
         T = jax.lax.map(adjust, T, batch_size=16)
     return _distinct(T, scores_of(T, references, adjusted_at[-1]), config.num_distinct, _SLID_APART, config)

@@ -146,20 +146,11 @@ def fit_deepmapping(
     """
     config = config or DeepMappingConfig()
     data, unit = planar_data(scans, start)
-    return as_fitted(engine(planar_problem(config, data), data, key=key), unit, config)
+    return _as_fitted(engine(planar_problem(config, data), data, key=key), unit, config)
 
 
-def as_fitted(done: Fit, unit: float, config: DeepMappingConfig) -> Fitted:
-    """The result of a fit in the unit of the points.
-
-    Args:
-        done: a fit of `planar_problem`.
-        unit: the typical range.
-        config: settings of the fit.
-
-    Returns:
-        Fitted.
-    """
+def _as_fitted(done: Fit, unit: float, config: DeepMappingConfig) -> Fitted:
+    """Returns the result of a fit in the unit of the points."""
     poses = np.asarray(done.poses, np.float64) * [unit, unit, 1.0]
     return Fitted(poses, done.state.params, done.report, unit, config, int(done.state.step))
 

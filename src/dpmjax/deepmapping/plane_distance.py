@@ -24,7 +24,7 @@ _MIN_COSINE = 0.3
 _JUDGED_OFFSETS, _JUDGED_POINTS = (1, 2, 4, 8), 512
 
 
-class Cloud(NamedTuple):
+class PlaneCloud(NamedTuple):
     """Points of one scan with their planes, or of several with a leading axis; as in CloudScans."""
 
     points: Float[Array, "... c 3"]
@@ -33,20 +33,20 @@ class Cloud(NamedTuple):
     flatness: Float[Array, "... c"]
 
 
-def clouds_of(scans: CloudScans) -> Cloud:
+def clouds_of(scans: CloudScans) -> PlaneCloud:
     """The points of all scans with their planes."""
-    return Cloud(scans.points, scans.mask, scans.normals, scans.flatness)
+    return PlaneCloud(scans.points, scans.mask, scans.normals, scans.flatness)
 
 
-def take_rows(cloud: Cloud, rows: Int[Array, " m"]) -> Cloud:
+def take_rows(cloud: PlaneCloud, rows: Int[Array, " m"]) -> PlaneCloud:
     """Some of the scans."""
-    return Cloud(*(leaf[rows] for leaf in cloud))
+    return PlaneCloud(*(leaf[rows] for leaf in cloud))
 
 
 def plane_misfit(
     T_target_source: Float[Array, "4 4"],
-    source: Cloud,
-    target: Cloud,
+    source: PlaneCloud,
+    target: PlaneCloud,
     width: Float[Array, ""] | float,
     spacing: Float[Array, ""] | float,
 ) -> Float[Array, ""]:
@@ -84,8 +84,8 @@ def plane_misfit(
 
 def misfit_of_pairs(
     T_world_scan: Float[Array, "m 4 4"],
-    samples: Cloud,
-    scans: Cloud,
+    samples: PlaneCloud,
+    scans: PlaneCloud,
     pairs: Int[Array, "p 2"],
     is_pair: Bool[Array, " p"],
     sizes: tuple[Float[Array, ""] | float, Float[Array, ""] | float],

@@ -15,7 +15,7 @@ from dpmjax.deepmapping.config import (
     PlaneComparison,
     ProjectiveComparison,
 )
-from dpmjax.nets.localization import LocalizationConfig
+from dpmjax.nets.localization import LocalizationNetConfig
 from dpmjax.nets.occupancy import OccupancyConfig
 
 # M-Net of the fast presets in space.
@@ -115,7 +115,7 @@ def preset(name: Literal["fast", "paper"], *, is_organised: bool = True) -> Deep
     _check_preset(name)
     config = DeepMappingConfig()
     if name == "paper":
-        config = _as_published(config, JOINT, LocalizationConfig())
+        config = _as_published(config, JOINT, LocalizationNetConfig())
     if not is_organised:
         config = replace(config, localization=replace(config.localization, kind="point"))
     return config
@@ -138,14 +138,16 @@ def depth_preset(name: Literal["fast", "paper"], *, motion: Motion = "planar") -
     config = DeepMappingConfig(
         cold_phases=(LOCALIZE_DEPTH, UNROLL_DEPTH, REFINE_DEPTH),
         warm_phases=(REFINE_DEPTH,),
-        localization=LocalizationConfig(features=(32, 64, 128), strides=(2, 2, 1), hidden=(128, 64)),
+        localization=LocalizationNetConfig(features=(32, 64, 128), strides=(2, 2, 1), hidden=(128, 64)),
         occupancy=_SPATIAL_GRID,
         steps_per_call=50,
         map_margin=1.2,
         motion=motion,
     )
     if name == "paper":
-        return _as_published(config, JOINT_DEPTH, LocalizationConfig(features=(64, 128, 256, 1024), strides=(1,) * 4))
+        return _as_published(
+            config, JOINT_DEPTH, LocalizationNetConfig(features=(64, 128, 256, 1024), strides=(1,) * 4)
+        )
     if motion == "planar":
         return config
     # Real depth images in SE(3) do not agree to half a percent of the depth, and their first poses are rougher.
@@ -169,15 +171,17 @@ def cloud_preset(name: Literal["fast", "paper"]) -> DeepMappingConfig:
     config = DeepMappingConfig(
         cold_phases=(LOCALIZE_CLOUDS, UNROLL_CLOUDS, REFINE_CLOUDS),
         warm_phases=(REFINE_CLOUDS,),
-        localization=LocalizationConfig(kind="point", features=(32, 64, 128), hidden=(128, 64)),
+        localization=LocalizationNetConfig(kind="point", features=(32, 64, 128), hidden=(128, 64)),
         occupancy=_SPATIAL_GRID,
         map_margin=1.05,
         motion="full",
     )
-    return config if name == "fast" else _as_published(config, JOINT_CLOUDS, LocalizationConfig(kind="point"))
+    return config if name == "fast" else _as_published(config, JOINT_CLOUDS, LocalizationNetConfig(kind="point"))
 
 
-def _as_published(config: DeepMappingConfig, phase: PhaseConfig, localization: LocalizationConfig) -> DeepMappingConfig:
+def _as_published(
+    config: DeepMappingConfig, phase: PhaseConfig, localization: LocalizationNetConfig
+) -> DeepMappingConfig:
     """Returns settings with one phase and the paper's networks."""
     config = replace(config, localization=localization, occupancy=OccupancyConfig(), steps_per_call=1)
     return replace(config, cold_phases=(phase,), warm_phases=(phase,))

@@ -18,7 +18,7 @@ HE_LIKE = nn.initializers.variance_scaling(2.0, "fan_avg", "uniform")
 
 
 @dataclass(frozen=True)
-class LocalizationConfig:
+class LocalizationNetConfig:
     """Shape of L-Net. The defaults are the paper's (section 4.1) with the dilation of the published program.
 
     Attributes:
@@ -78,7 +78,7 @@ class DilatedConvolution(nn.Module):
 class LocalizationNet(nn.Module):
     """L-Net for one scan or depth image; `vmap` over the set."""
 
-    config: LocalizationConfig
+    config: LocalizationNetConfig
     num_outputs: int = 3
 
     @nn.compact
