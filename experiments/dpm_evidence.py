@@ -1,4 +1,4 @@
-"""Fits the weights by which `register` judges motions: what two scans see of each other when a motion is right.
+"""Fits the weights by which `register` scores motions: the evidence of two scans for a right motion.
 
     python -m experiments.dpm_evidence
 
@@ -127,7 +127,7 @@ def measure_scene(
 
 
 def judged(model: Any, measured: list[Any], hypotheses: Any, T_true: np.ndarray) -> dict[str, Any]:
-    """Returns what all hypotheses of a pair are judged by, aligned as `register` aligns them."""
+    """Returns the evidence of all hypotheses of a pair, aligned as `register` aligns them."""
     from dpmjax.deeppointmap import distinct_motions, evidence_shares
     from dpmjax.metrics import registration_recall
     from dpmjax.scans import align_surfaces_from, correlate_views
