@@ -76,28 +76,30 @@ def minimize_toy(
     return solvers[method](fun=toy_loss, maxiter=max_iterations).run(x0).params
 
 
+# Particles start within this: translation along each axis in typical ranges, and radians.
+_SPREAD = (0.15, 0.5)
+# Pairs that are worked on together.
+_PAIRS_AT_ONCE = 32
+
+
 @dataclass(frozen=True)
 class SwarmConfig:
-    """Settings. Lengths are in typical ranges of the scans.
+    """Settings of the swarms.
 
     Attributes:
         num_particles: relative poses that are tried at a time.
         num_iterations: of a swarm.
         num_rounds: swarms from fresh particles; the best round of each pair is kept.
-        spread: particles start within this: translation along each axis, radians.
         num_beams: beams of each scan that are compared.
-        pairs_at_once: pairs that are worked on together.
     """
 
     num_particles: int = 32
     num_iterations: int = 60
     num_rounds: int = 3
-    spread: tuple[float, float] = (0.15, 0.5)
     num_beams: int = 86
-    pairs_at_once: int = 32
 
     def __post_init__(self) -> None:
-        if min(self.num_particles, self.num_iterations, self.num_rounds, self.num_beams, self.pairs_at_once) < 1:
+        if min(self.num_particles, self.num_iterations, self.num_rounds, self.num_beams) < 1:
             raise ValueError(f"all counts must be at least 1, got {self}")
 
 
@@ -119,7 +121,7 @@ def swarm_chain(scans: ScanSet, config: SwarmConfig | None = None, *, key: jax.A
     points, mask = jnp.asarray(scans.points), jnp.asarray(scans.mask)
     stride = max(1, -(-mask.shape[1] // config.num_beams))
     unit = typical_range(scans.points, scans.mask)
-    widths = jnp.array([config.spread[0] * unit, config.spread[0] * unit, config.spread[1]])
+    widths = jnp.array([_SPREAD[0] * unit, _SPREAD[0] * unit, _SPREAD[1]])
     steps = _swarm_pairs(points[:, ::stride], mask[:, ::stride], widths, key, config=config)
     return se2.chain(np.asarray(steps, np.float64))
 
@@ -147,7 +149,7 @@ def _swarm_pairs(
 
     keys = jax.random.split(key, len(mask) - 1)
     pairs = (points[:-1], mask[:-1], points[1:], mask[1:], keys)
-    return jax.lax.map(best_of_rounds, pairs, batch_size=config.pairs_at_once)
+    return jax.lax.map(best_of_rounds, pairs, batch_size=_PAIRS_AT_ONCE)
 
 
 def _swarm(misfit: Any, key: jax.Array, *, config: SwarmConfig) -> tuple[Float[Array, " 3"], Float[Array, ""]]:
