@@ -41,12 +41,12 @@ class Proof(NamedTuple):
     """Result of a drive with gross errors.
 
     Attributes:
-        num_scans: of the drive.
+        num_scans: number of scans of the drive.
         ate_m: of all scans.
         ate_odometry_m: the same before loops.
         num_loops: accepted.
-        num_wrong: of them, beyond 2 m or 5 degrees.
-        num_opposite: of them, between scans that look opposite ways.
+        num_wrong: number of wrong ones, beyond 2 m or 5 degrees.
+        num_opposite: number of those between scans of opposite headings.
     """
 
     num_scans: int

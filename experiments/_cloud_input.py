@@ -27,7 +27,7 @@ class DriveWindow:
         sequence: name of the drive where the folder holds several.
         scene: the simulated place, "room" or "street".
         rows: scans to use.
-        seed: of the simulated place.
+        seed: seed of the simulated place.
     """
 
     data: Path | None
@@ -45,7 +45,7 @@ class FirstPoses:
         source: "poses" (of the drive), "zero", or the path of a trajectory.
         noise_m: root mean square of the noise of the positions, metres.
         noise_deg: the same of the orientations, where there is noise.
-        seed: of the noise.
+        seed: seed of the noise.
     """
 
     source: str
@@ -89,7 +89,7 @@ def starting_poses(first: FirstPoses, sequence: LidarSequence, rows: slice) -> F
     Args:
         first: where they come from.
         sequence: the scans of the window.
-        rows: of the window in its drive; a trajectory may have a pose for each scan of either.
+        rows: rows of the window in its drive; a trajectory may have a pose for each scan of either.
 
     Returns:
         The poses.

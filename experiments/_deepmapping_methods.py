@@ -41,7 +41,7 @@ class Task:
         sequence: the scans; methods do not look at its reference.
         planar: the same scans with a line at every beam.
         is_ordered: the scans lie in the order of time.
-        steps: of the fit; None: the preset decides.
+        steps: steps of the fit; None: the preset decides.
         seed: seed of everything random.
     """
 
@@ -199,7 +199,7 @@ class Method(NamedTuple):
     Attributes:
         title: what it is.
         run: makes its candidates; poses alone are one candidate under `title`.
-        package: of the extra `baselines`, which it needs.
+        package: package of the extra `baselines`, which it needs.
     """
 
     title: str

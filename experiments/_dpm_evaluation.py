@@ -122,7 +122,7 @@ def pooled_rows(rows: Sequence[Mapping[str, Any]], drives: Sequence[str]) -> lis
     """Pools the rows of pairs over drives, with and without those that were watched during the training.
 
     Args:
-        rows: of `dpm_evaluate`.
+        rows: rows of `dpm_evaluate`.
         drives: names of the drives to pool.
 
     Returns:

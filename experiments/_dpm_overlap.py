@@ -39,7 +39,7 @@ def measure_town(model: Model, drives: Sequence[LidarSequence], num_pairs: int, 
         model: encoder and decoder.
         drives: through the town, and through the other one.
         num_pairs: number of pairs, about.
-        seed: of the run.
+        seed: seed of the run.
         bar: gets the pairs.
     """
     rng = np.random.default_rng([TOWN_STREAM, seed])

@@ -52,9 +52,9 @@ def run_method(
             in the paper. "icp": each image onto the one before; "deepmapping-icp": from there. "multiway": Open3D's
             multiway registration. Of a start and the fit from it, the one of the larger projective consistency is kept.
         sequence: depth images.
-        settings: of DeepMapping.
+        settings: settings of DeepMapping.
         found: results of other methods for this sequence: a start that is there is not computed again.
-        seed: of everything random.
+        seed: seed of everything random.
 
     Returns:
         The poses.

@@ -195,9 +195,9 @@ def run_one(trajectory: int, *, folder: RunFolder, config: Config, settings: Dee
 
     Args:
         trajectory: its number.
-        folder: of the run; gets the pictures.
+        folder: folder of the run; gets the pictures.
         config: options.
-        settings: of DeepMapping.
+        settings: settings of DeepMapping.
 
     Returns:
         The rest of the row.

@@ -30,8 +30,8 @@ def optimize_directly(
     Args:
         scans: n planar scans.
         config: settings; its last warm phase gives the loss.
-        num_iterations: of L-BFGS.
-        key: for the map's weights and the samples.
+        num_iterations: number of iterations of L-BFGS.
+        key: key for the map's weights and the samples.
 
     Returns:
         (n, 3) poses, unit of the scans.
@@ -88,7 +88,7 @@ class SwarmConfig:
 
     Attributes:
         num_particles: relative poses that are tried at a time.
-        num_iterations: of a swarm.
+        num_iterations: number of iterations of a swarm.
         num_rounds: swarms from fresh particles; the best round of each pair is kept.
         num_beams: beams of each scan that are compared.
     """
@@ -112,7 +112,7 @@ def swarm_chain(scans: ScanSet, config: SwarmConfig | None = None, *, key: jax.A
     Args:
         scans: n scans in order of time.
         config: settings.
-        key: of the swarms.
+        key: key of the swarms.
 
     Returns:
         (n, 3) T_world_scan, x, y, heading; the first one zero.

@@ -55,7 +55,7 @@ def multiway_images(
     """Poses of depth images by Open3D's multiway registration; a ModuleNotFoundError without Open3D.
 
     Args:
-        points: of n images in order of time, each in the frame of its camera.
+        points: points of n images in order of time, each in the frame of its camera.
         mask: True where something was measured.
 
     Returns:

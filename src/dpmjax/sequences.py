@@ -173,7 +173,7 @@ class World:
     """A planar world of unit pixels.
 
     Attributes:
-        name: for titles.
+        name: name for titles.
         is_obstacle: (h, w) bool, True where a pixel is solid; row 0 is the lowest.
         num_people: people who walk about in it while a sequence of scans is taken.
 
@@ -218,8 +218,8 @@ class Camera:
     """A pinhole camera without distortion; its frame is x to the right, y down, z forward.
 
     Attributes:
-        width: of the image, pixels.
-        height: of the image, pixels.
+        width: width of the image, pixels.
+        height: height of the image, pixels.
         fx: focal length along x, pixels.
         fy: focal length along y, pixels.
         cx: column of the optical axis, pixels from the centre of the first.
@@ -261,7 +261,7 @@ class DepthSequence:
     """Depth images as organised clouds, in the order in which they were taken.
 
     Attributes:
-        name: for titles and messages.
+        name: name for titles and messages.
         points: (n, h, w, 3) float32 metres in the camera frame (x right, y down, z forward); zero where masked.
         mask: (n, h, w) bool.
         is_planar: the camera moved on a plane: x, z and the angle about y.

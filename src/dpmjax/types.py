@@ -48,7 +48,7 @@ class Neighbours(NamedTuple):
 
     Attributes:
         indices: row in the searched points; 0 where `mask` is False.
-        squared_distances: in the unit of the points, squared; infinite where `mask` is False.
+        squared_distances: squared distances, in squared units of the points; infinite where `mask` is False.
         mask: True where a neighbour exists (fewer valid points than `k`, or none within the radius: False).
     """
 
@@ -151,7 +151,7 @@ class Registration:
         confidence: in [0, 1]. With a calibrated model, `register` makes it the probability that the motion is right
             within 2 m and 5 degrees; else it is `mean_score`, which is no probability and 0 without any inlier.
         mean_score: mean score of the first inliers, in [0, 1]; 0 without any.
-        rmse: of the inliers after alignment, metres; infinite without any.
+        rmse: root mean square error of the inliers after alignment, metres; infinite without any.
         support: consensus support of the motion: sum of 1 - error / tolerance over distinct pairs.
         num_inliers: how many pairs the motion rests on, both directions counted.
         source_indices: row of each pair in the source; first the pairs of eq. 1, then the same of eq. 2.
@@ -217,7 +217,7 @@ class PointPyramid:
 
     Attributes:
         levels: the input and one level for each stage.
-        interpolation: from the coarsest level upwards.
+        interpolation: interpolation from the coarsest level upwards.
     """
 
     levels: tuple[PyramidLevel, ...]

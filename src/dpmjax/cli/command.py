@@ -129,7 +129,7 @@ def run_command(
     Args:
         main: takes the options. Errors of the user are raised as `ValueError` before the run folder is opened.
         config_type: frozen dataclass. Of `OutputOptions`, the folder is checked and the device selected before `main`.
-        name: of the subcommand of `dpmjax`, or of the module in `experiments`; and of the folder in `results`.
+        name: name of the subcommand of `dpmjax`, or of the module in `experiments`; and of the folder in `results`.
         description: the module's docstring; `--help` begins with it.
         args: the command line; None takes that of the process.
 
@@ -200,7 +200,7 @@ def progress_bar(description: str, unit: str) -> Iterator[Callable[[int, int], N
 
     Args:
         description: shown before the bar.
-        unit: of the numbers, with a space before it.
+        unit: unit of the numbers, with a space before it.
 
     Yields:
         A callback that takes the number that is done and the number of all.

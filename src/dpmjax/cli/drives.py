@@ -33,7 +33,7 @@ class DriveSelection:
         is_kitti_corrected: the beams are raised by 0.205 degrees, as KITTI's HDL-64E needs.
         columns: numbers a point has in `.bin` files; None infers it from the values.
         topic: which clouds of a bag of ROS; None takes the only ones.
-        seed: of the simulated town.
+        seed: seed of the simulated town.
     """
 
     data: Path | None = None
@@ -78,7 +78,7 @@ def report_notes(notes: Iterable[Note]) -> dict[str, list[str]]:
     """Writes the notes on the input to the log, and prints those that are no doubts: the console shows doubts already.
 
     Args:
-        notes: of a drive.
+        notes: notes of a drive.
 
     Returns:
         The entry of `metrics.json`.
@@ -178,7 +178,7 @@ def open_map(path: Path, methods: SlamMethods) -> KeyframeMap:
 
     Args:
         path: a file of `save_map`.
-        methods: of the weights that must have made it.
+        methods: methods of the weights that must have made it.
 
     Returns:
         The map.
@@ -200,7 +200,7 @@ def keyframe_points(slam_map: KeyframeMap, row: int) -> np.ndarray:
 
     Args:
         slam_map: the map.
-        row: of the keyframe.
+        row: row of the keyframe.
 
     Returns:
         (n, 3) metres, in the frame of the keyframe's lidar.

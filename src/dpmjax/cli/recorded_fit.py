@@ -48,7 +48,7 @@ class FitRecorder:
         """Makes an engine for one fit.
 
         Args:
-            folder: of the run; gets `metrics.csv` and checkpoints.
+            folder: folder of the run; gets `metrics.csv` and checkpoints.
             length: unit of the ATE.
             stop: called before each call of the step with the run time so far, seconds; the fit ends where it is True.
         """

@@ -204,9 +204,9 @@ def write_metrics(
     """Writes `metrics.json`: plain names with units, then the seed, the versions, the device and the machine.
 
     Args:
-        folder: of the run.
+        folder: folder of the run.
         metrics: numbers by name.
-        seed: of the run; None where nothing is random.
+        seed: seed of the run; None where nothing is random.
         rows: rows made by `do_row`; the file names those of another commit than its own.
 
     Returns:
@@ -225,7 +225,7 @@ def recording(folder: RunFolder) -> Iterator[None]:
     """Logs to `log.txt` what happens in the block, and the traceback if it fails.
 
     Args:
-        folder: of the run.
+        folder: folder of the run.
 
     Yields:
         Nothing.

@@ -19,7 +19,7 @@ class SlamRun(NamedTuple):
 
     Attributes:
         state: after the last scan.
-        reports: of all scans.
+        reports: reports of all scans.
         stages_s: seconds of each stage in this process, without compilation.
         compile_s: seconds of compilation.
         run_s: seconds of all scans of this process, without compilation.
@@ -65,7 +65,7 @@ def localization_errors(
     """Compares the pose of each scan in the frame of its keyframe with the reference.
 
     Args:
-        found: of n scans.
+        found: results of n scans.
         slam_map: the map that they were looked for in.
         T_reference_keyframe: (k, 4, 4) reference poses of all keyframes.
         T_reference_scan: (n, 4, 4) reference poses of the scans, in the same world.

@@ -49,7 +49,7 @@ class Beginning(NamedTuple):
 
     Attributes:
         state: after the scans that are done.
-        reports: of the scans of the drive that are done.
+        reports: reports of the scans of the drive that are done.
     """
 
     state: SlamState
@@ -123,7 +123,7 @@ def map_drive(
     """Maps a drive from its beginning, or goes on from the state in its folder.
 
     Args:
-        folder: for the state and interim results.
+        folder: folder for the state and interim results.
         sequence: the drive.
         methods: matcher, geometry and settings.
         is_stopped: whether to end before the next scan.

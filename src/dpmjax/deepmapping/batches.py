@@ -25,8 +25,8 @@ def scans_in_block(phase: PhaseConfig, num_scans: int) -> int:
     """Neighbours in time that a step sees together.
 
     Args:
-        phase: of the fit.
-        num_scans: of the set.
+        phase: phase of the fit.
+        num_scans: number of scans of the set.
 
     Returns:
         Their number.
@@ -44,10 +44,10 @@ def draw_rows(
     """Scans of a step: all windows, or all scans where they are few enough, else blocks of neighbours in time.
 
     Args:
-        phase: of the fit.
-        num_scans: of the set.
+        phase: phase of the fit.
+        num_scans: number of scans of the set.
         step: steps done in the phase.
-        key: of the step.
+        key: key of the step.
 
     Returns:
         Index of each scan in the set, and the block it belongs to.
@@ -72,9 +72,9 @@ def draw_offsets(phase: PhaseConfig, furthest: int, *, key: jax.Array) -> Int[Ar
     """Distances in time of the scans that are compared: 1, so that neighbours always meet, and others at random.
 
     Args:
-        phase: of the fit; `num_offsets` and `max_offset` are clamped to what there is.
+        phase: phase of the fit; `num_offsets` and `max_offset` are clamped to the available scans.
         furthest: the largest distance that there is.
-        key: of this step.
+        key: key of this step.
 
     Returns:
         Different whole numbers, 1 to `furthest`.
@@ -89,8 +89,8 @@ def window_rows(num_scans: int, scans_per_window: int) -> NDArray[np.intp]:
     """The scans of each window; the last scan of a window is the first of the next.
 
     Args:
-        num_scans: of the set, in the order of time.
-        scans_per_window: at least 2.
+        num_scans: number of scans of the set, in the order of time.
+        scans_per_window: scans of a window, at least 2.
 
     Returns:
         (w, m) indices, m the smaller of both numbers; the last window reaches back, so that all have one length.
@@ -105,8 +105,8 @@ def join_windows(poses: Float[Array, "w m 3"], num_scans: int) -> Float[Array, "
     """Poses of all scans in one world, that of the first window.
 
     Args:
-        poses: of each window's scans, in a world of its own: x, y, heading.
-        num_scans: of the set.
+        poses: poses of each window's scans, in a world of its own: x, y, heading.
+        num_scans: number of scans of the set.
 
     Returns:
         The poses; neighbours within a window keep their motion.

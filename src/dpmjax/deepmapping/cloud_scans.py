@@ -28,10 +28,10 @@ class CloudScans:
     """Lidar scans of equal capacity; the rows of each are in random order, those that are not there at the end.
 
     Attributes:
-        points: in the lidar frames, any unit; in typical ranges inside of the fit.
+        points: points in the lidar frames, any unit; in typical ranges inside of the fit.
         mask: False for rows that are not there.
         normals: unit normals of the planes around the points, on the side of the lidar.
-        flatness: in [0, 1], how much the neighbourhood is a plane.
+        flatness: planarity of the neighbourhood, in [0, 1].
         spacing: median distance of a point to the nearest other one of its scan.
         partners: scans near in space, though not in time, at the poses to start from; -1: none.
     """

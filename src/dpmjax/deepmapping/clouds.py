@@ -43,8 +43,8 @@ class CloudFitted(NamedTuple):
 
     Attributes:
         T_world_scan: (n, 4, 4) float64, unit of the points: of the fit, or the start where that fits better.
-        params: of L-Net and M-Net.
-        report: of the last call of the step.
+        params: parameters of L-Net and M-Net.
+        report: report of the last call of the step.
         unit: the length that the parameters count in, unit of the points.
         kept: source of the poses, the fit or the start.
         misfit: share of planes that do not meet the planes of other scans, 0 to 1, at the poses of the fit.
@@ -87,7 +87,7 @@ def cloud_problem(config: DeepMappingConfig, data: MappingData) -> Problem:
 
     Args:
         config: settings of the fit.
-        data: of `cloud_data`.
+        data: data of `cloud_data`.
 
     Returns:
         The problem.
@@ -115,7 +115,7 @@ def register_clouds(
     Args:
         scans: (m_i, 3) points in the lidar frames, any unit, in the order of time; or CloudScans.
         config: settings; None: `cloud_preset("fast")`.
-        key: of the whole run.
+        key: key of the whole run.
         start: (n, 4, 4) T_world_scan to start from; None: cold start.
         engine: what trains, called as `engine(problem, data, key=key)`;
             `functools.partial(fit, on_report=..., stop=...)` reports each call of the step and can be stopped.

@@ -70,9 +70,9 @@ def register_depth(
     Args:
         images: (n, h, w, 3) points in the camera frames (x right, y down, z forward), any unit; or DepthScans.
         config: settings of the fit; None: `depth_preset("fast")`. Its `motion` holds for the search, too.
-        key: of the search and of the fit.
+        key: key of the search and of the fit.
         start: (n, 4, 4) T_world_camera to start from; None: `initialize_depth` searches first poses.
-        engine: of the fit, as in `fit_depth`.
+        engine: engine of the fit, as in `fit_depth`.
 
     Returns:
         RegisteredDepth, in the world of the start.
@@ -100,8 +100,8 @@ class DepthFitted(NamedTuple):
 
     Attributes:
         T_world_camera: (n, 4, 4) float64, unit of the points.
-        params: of L-Net and M-Net.
-        report: of the last call of the step.
+        params: parameters of L-Net and M-Net.
+        report: report of the last call of the step.
         unit: the length that the parameters count in, unit of the points.
     """
 
@@ -157,7 +157,7 @@ def fit_depth(
     Args:
         scans: (n, h, w, 3) in the camera frames, any unit, or DepthScans with their mask.
         config: settings; None: `depth_preset("fast")`.
-        key: of the whole run.
+        key: key of the whole run.
         start: (n, 4, 4) T_world_camera to start from; None: cold start.
         engine: what trains, called as `engine(problem, data, key=key)`;
             `functools.partial(fit, on_report=..., stop=...)` reports each call of the step and can be stopped.

@@ -72,9 +72,9 @@ def gap_equations(
     """Information and slope of half the sum of squared gaps, of which a large one weighs little.
 
     Args:
-        gap: in tolerances; a gap of 1 weighs 0.6, one of 2 weighs 0.14.
-        weight: of each gap besides, 0 where there is none.
-        slopes: of the gaps over each value.
+        gap: gap in tolerances; a gap of 1 weighs 0.6, one of 2 weighs 0.14.
+        weight: weight of each gap besides, 0 where there is none.
+        slopes: slopes of the gaps over each value.
 
     Returns:
         The normal equations, (*k, *k) and (*k).
@@ -96,10 +96,10 @@ def improve_motions(
 
     Args:
         equations: normal equations of values in `scales`, applied after given motions.
-        score: of motions; more is better.
+        score: score of motions; more is better.
         scales: unit of each value of a motion.
         count: number of motions.
-        num_iterations: of steps.
+        num_iterations: number of steps.
 
     Returns:
         The motions.

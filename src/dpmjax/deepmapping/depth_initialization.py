@@ -57,7 +57,7 @@ def initialize_depth(
     """Searches first poses of all images, the first at the origin.
 
     Args:
-        scans: in order of time; neighbours overlap.
+        scans: scans in order of time; neighbours overlap.
         config: settings of the search; None: `depth_search("planar")`.
         key: key of the search.
 

@@ -206,9 +206,9 @@ def motion_cost(length: Any, turn: Any, config: DepthInitializationConfig) -> An
     """Returns the costs of motions, in consistency: the shortest motion is taken where images leave it open.
 
     Args:
-        length: of motions between neighbouring images, unit of the points.
+        length: length of motions between neighbouring images, unit of the points.
         turn: their angles, radians.
-        config: of the search.
+        config: settings of the search.
 
     Returns:
         The cost of each.

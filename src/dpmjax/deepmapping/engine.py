@@ -31,7 +31,7 @@ class FitState:
     Attributes:
         params: trained parameters of the problem.
         optimizer: state of the optimiser.
-        key: of the start; step k uses `fold_in(key, k)`, so that a resumed run equals an unbroken one.
+        key: key of the start; step k uses `fold_in(key, k)`, so that a resumed run equals an unbroken one.
         phase: index of the phase.
         phase_step: steps done in it.
         step: steps done in all.
@@ -49,9 +49,9 @@ class Report(NamedTuple):
     """Result of one call of the step; of several starts every leaf has a leading axis.
 
     Attributes:
-        losses: of each step of the call.
+        losses: losses of each step of the call.
         terms: parts of the loss before weighting, of each step.
-        poses: of the whole data set after the call.
+        poses: poses of the whole data set after the call.
     """
 
     losses: Float[Array, "... t"]
@@ -70,7 +70,7 @@ class Progress(NamedTuple):
     Attributes:
         phase: settings of the phase.
         state: after the call.
-        report: of the call.
+        report: report of the call.
         share: steps done of all steps, 0 to 1.
         run_s: seconds of stepping so far, of this `fit`.
         compile_s: seconds of compiling so far.
@@ -88,9 +88,9 @@ class Fit(NamedTuple):
     """Result of `fit`.
 
     Attributes:
-        state: at the end, or where it was stopped.
-        poses: of the whole data set, as the state has them.
-        report: of the last call; None if no step was done.
+        state: state at the end, or where it was stopped.
+        poses: poses of the whole data set, as the state has them.
+        report: report of the last call; None if no step was done.
         run_s: seconds of stepping.
         compile_s: seconds of compiling.
     """
@@ -107,8 +107,8 @@ def init(problem: Problem, data: Any, *, key: jax.Array, num_starts: int = 1) ->
 
     Args:
         problem: problem to fit.
-        data: of the problem.
-        key: of the run.
+        data: data of the problem.
+        key: key of the run.
         num_starts: number of starts that differ in their keys; with 1, there is no leading axis.
 
     Returns:
@@ -127,8 +127,8 @@ def step(problem: Problem, state: FitState, data: Any, *, phase: int | None = No
 
     Args:
         problem: problem to fit; static under `jit`.
-        state: from `init` or from an earlier call.
-        data: of the problem.
+        state: state from `init` or from an earlier call.
+        data: data of the problem.
         phase: index of the phase of the state, static under `jit`; `begin_phase` enters the next one. None: the
             index is read from the state on the host, and a phase that is over is left first.
 
@@ -152,8 +152,8 @@ def begin_phase(problem: Problem, state: FitState, data: Any, *, phase: int) -> 
 
     Args:
         problem: problem to fit; static under `jit`.
-        state: at the end of phase `phase - 1`.
-        data: of the problem.
+        state: state at the end of phase `phase - 1`.
+        data: data of the problem.
         phase: index of the phase that begins, from 1; static under `jit`.
 
     Returns:
@@ -178,8 +178,8 @@ def solve(problem: Problem, data: Any, *, key: jax.Array) -> tuple[FitState, Rep
 
     Args:
         problem: problem to fit; static under `jit`.
-        data: of the problem.
-        key: of the run.
+        data: data of the problem.
+        key: key of the run.
 
     Returns:
         The state at the end, and the report of the last call of the step.
@@ -202,7 +202,7 @@ def is_finished(problem: Problem, state: FitState) -> bool:
 
     Args:
         problem: fitted problem.
-        state: of the fit.
+        state: state of the fit.
 
     Returns:
         True if no step is left.
@@ -224,8 +224,8 @@ def fit(
 
     Args:
         problem: problem to fit.
-        data: of the problem, with the poses to start from where it has some.
-        key: of the run.
+        data: data of the problem, with the poses to start from where it has some.
+        key: key of the run.
         num_starts: number of starts that advance side by side.
         on_report: called after each call of the step.
         stop: called before each call of the step; the fit ends where it returns True.
@@ -249,8 +249,8 @@ def resume(
 
     Args:
         problem: problem to fit.
-        state: from `init` or from an earlier fit.
-        data: of the problem.
+        state: state from `init` or from an earlier fit.
+        data: data of the problem.
         on_report: called after each call of the step.
         stop: called before each call of the step; the fit ends where it returns True.
 
@@ -284,7 +284,7 @@ def num_calls(problem: Problem, phase: Any) -> int:
 
     Args:
         problem: fitted problem.
-        phase: of the fit.
+        phase: phase of the fit.
 
     Returns:
         The number of calls.
@@ -297,7 +297,7 @@ def steps_per_call(problem: Problem, phase: Any) -> int:
 
     Args:
         problem: fitted problem.
-        phase: of the fit.
+        phase: phase of the fit.
 
     Returns:
         The number of steps.

@@ -78,7 +78,7 @@ def train_localization(
         fitted: any fit, also from given poses.
         scans: (n, b, 2) the scans of the fit.
         config: settings.
-        key: of the batches.
+        key: key of the batches.
 
     Returns:
         The fit with another L-Net and with zero start poses; poses and map are the same.
@@ -173,7 +173,7 @@ def turn_scan(points: Float[Array, "b 2"], turn: Float[Array, ""]) -> Float[Arra
     """The scan of a sensor whose heading is larger by `turn`: every point turned back by it.
 
     Args:
-        points: in the sensor frame.
+        points: points in the sensor frame.
         turn: radians.
 
     Returns:
@@ -189,7 +189,7 @@ def shift_scan(points: Float[Array, "b 2"], mask: Bool[Array, " b"], shift: Floa
     Occlusion is ignored: the points are sorted by their new angles, and ranges are interpolated between them.
 
     Args:
-        points: in the sensor frame.
+        points: points in the sensor frame.
         mask: True for beams with a measurement; other beams keep their points.
         shift: position of the new sensor in the frame of the old one.
 

@@ -34,7 +34,7 @@ class MapRaster(NamedTuple):
 
     Attributes:
         logits: rows along x, columns along y.
-        frame: of the map, which the raster fills.
+        frame: frame of the map, which the raster fills.
     """
 
     logits: Float[Array, "r r"]
@@ -51,7 +51,7 @@ def make_raster(params: Params, config: DeepMappingConfig) -> MapRaster:
     """Evaluates M-Net at all nodes.
 
     Args:
-        params: of a fit.
+        params: parameters of a fit.
         config: settings of the fit.
 
     Returns:
@@ -67,8 +67,8 @@ def nearest_nodes(frame: MapFrame, points: Float[Array, "... 2"]) -> tuple[Int[A
     """Finds the nodes that points lie at.
 
     Args:
-        frame: of the map.
-        points: in the world, typical ranges.
+        frame: frame of the map.
+        points: points in the world, typical ranges.
 
     Returns:
         Index of the nearest node in the flat raster, and whether the point is inside of it.
@@ -85,10 +85,10 @@ def render_scans(
     """Renders scans at random free places of the map, at heading zero.
 
     Args:
-        raster: of the map.
+        raster: raster of the map.
         scans: (n, b, 2) in typical ranges; rendered scans have their beams.
         count: places that are tried.
-        key: of the places.
+        key: key of the places.
 
     Returns:
         Scans and poses; of the places those where enough beams meet something that M-Net knows.
@@ -155,7 +155,7 @@ def draw_map(
         fitted: the fit.
         points: (n, b, 2) its scans in the sensor frames, unit of the poses.
         mask: (n, b) False for beams that measured nothing.
-        num_cells: along the longer side.
+        num_cells: number of cells along the longer side.
 
     Returns:
         MapPicture in the frame of `fitted.poses`.

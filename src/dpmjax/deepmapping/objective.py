@@ -30,7 +30,7 @@ class WorldBatch(NamedTuple):
         mask: (m, b) False for beams that measured nothing.
         rows: (m,) index of each scan in the set; consecutive within a block.
         block: (m,) which block each belongs to.
-        progress: of the phase, 0 at its start, 1 at its end.
+        progress: progress of the phase, 0 at its start, 1 at its end.
     """
 
     points: Float[Array, "m b d"]
@@ -74,9 +74,9 @@ def free_factors(
 
     Args:
         world: the scans.
-        phase: of the fit.
+        phase: phase of the fit.
         surface_distance: mean distance of one more sample from the hit; None: no such sample.
-        key: of this step.
+        key: key of this step.
 
     Returns:
         Factors in [0, 1).

@@ -41,8 +41,8 @@ class Fitted(NamedTuple):
 
     Attributes:
         poses: (n, 3) x, y, heading, float64.
-        params: of L-Net and M-Net.
-        report: of the last call of the step.
+        params: parameters of L-Net and M-Net.
+        report: report of the last call of the step.
         unit: the length that the parameters count in, unit of the points.
         config: settings of the fit.
         num_steps: steps done in all, those of a resumed run too; with 0, the networks are untrained.
@@ -111,7 +111,7 @@ def planar_problem(config: DeepMappingConfig, data: MappingData) -> Problem:
 
     Args:
         config: settings of the fit.
-        data: of `planar_data`.
+        data: data of `planar_data`.
 
     Returns:
         The problem.
@@ -132,7 +132,7 @@ def fit_deepmapping(
     Args:
         scans: (n, b, 2) in the sensor frames, any unit; all-zero or non-finite beams are left out. Or a ScanSet.
         config: settings; None: `preset("fast")`.
-        key: of the whole run.
+        key: key of the whole run.
         start: (n, 3) x, y, heading or (n, 3, 3) matrices to start from; None: cold start from zero.
         engine: what trains, called as `engine(problem, data, key=key)`;
             `functools.partial(fit, on_report=..., stop=...)` reports each call of the step and can be stopped.
@@ -162,7 +162,7 @@ def localize_scans(
 
     Args:
         params: weights of L-Net.
-        points: in the sensor frames, in typical ranges, beams thinned as in the fit.
+        points: points in the sensor frames, in typical ranges, beams thinned as in the fit.
         mask: False for beams that measured nothing.
         config: settings of the fit.
 
@@ -176,8 +176,8 @@ def choose_beams(num_beams: int, phase: PhaseConfig, first: Int[Array, ""] | int
     """Indices of evenly spaced beams, about `beams_per_step` of them.
 
     Args:
-        num_beams: of a scan.
-        phase: of the fit.
+        num_beams: number of beams of a scan.
+        phase: phase of the fit.
         first: shifts all beams, by less than their spacing.
 
     Returns:

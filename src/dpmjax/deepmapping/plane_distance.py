@@ -59,7 +59,7 @@ def plane_misfit(
         T_target_source: maps the source's points into the frame of the target.
         source: some points of a scan.
         target: scan with the planes.
-        width: of the kernel, unit of the points.
+        width: width of the kernel, unit of the points.
         spacing: typical distance of a point of the target to its neighbours.
 
     Returns:
@@ -121,7 +121,7 @@ def trajectory_misfit(
     Args:
         scans: the scans.
         T_world_scan: their poses, unit of the points.
-        width: of the kernel, unit of the points.
+        width: width of the kernel, unit of the points.
 
     Returns:
         0 (all planes meet) to 1 (none does); no reference is needed.

@@ -94,7 +94,7 @@ class Params:
         poses: free poses, or free motions after `start`; in a phase of windows with free poses, of each window.
         occupancy: weights of M-Net.
         start: poses that L-Net's outputs are relative to; not trained.
-        frame: of the map; not trained.
+        frame: frame of the map; not trained.
     """
 
     localization: Any
@@ -109,8 +109,8 @@ def mapping_problem(config: DeepMappingConfig, data: MappingData, functions: Map
 
     Args:
         config: settings of the fit.
-        data: with the start.
-        functions: of planar scans or of depth images.
+        data: data with the start.
+        functions: functions of planar scans or of depth images.
 
     Returns:
         The problem.
@@ -126,7 +126,7 @@ def phases_of(config: DeepMappingConfig, data: MappingData) -> tuple[PhaseConfig
 
     Args:
         config: settings of the fit.
-        data: with the start, or without.
+        data: data with the start, or without.
 
     Returns:
         The phases.
@@ -139,7 +139,7 @@ def make_optimizer(config: DeepMappingConfig, phase: PhaseConfig) -> optax.Gradi
 
     Args:
         config: settings of the fit.
-        phase: of the fit.
+        phase: phase of the fit.
 
     Returns:
         The optimiser of Params.
@@ -191,7 +191,7 @@ def bind_map(params: Params, config: DeepMappingConfig, level_weights: Float[Arr
     """M-Net as a function of points in the world, in typical ranges.
 
     Args:
-        params: of the fit.
+        params: parameters of the fit.
         config: settings of the fit.
         level_weights: 0 (off) to 1 for each level of a grid; None: all on.
 
@@ -219,8 +219,8 @@ def level_weights(phase: PhaseConfig, num_levels: int, progress: Float[Array, ""
     """Weights of the levels of the map: where the poses are free, coarse levels first.
 
     Args:
-        phase: of the fit.
-        num_levels: of the map.
+        phase: phase of the fit.
+        num_levels: number of levels of the map.
         progress: 0 at the start of the phase, 1 at its end.
 
     Returns:
@@ -244,11 +244,11 @@ def mapping_loss(
 
     Args:
         config: settings of the fit.
-        phase: of the fit.
-        params: with M-Net and its frame.
+        phase: phase of the fit.
+        params: parameters with M-Net and its frame.
         world: the scans of the batch in the world.
         pair_term: eq. 7, or another comparison of pairs of scans.
-        key: of the free samples.
+        key: key of the free samples.
 
     Returns:
         The loss with the decay of the map, and its terms before weighting.

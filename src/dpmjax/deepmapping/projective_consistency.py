@@ -59,7 +59,7 @@ class DepthScans:
     Attributes:
         points: metres, or typical ranges inside of the fit.
         mask: True where something was measured.
-        pinhole: of the camera that took all of them.
+        pinhole: camera of all images.
     """
 
     points: Float[Array, "n h w 3"]
@@ -84,7 +84,7 @@ def image_surface(depth: Float[Array, "h w"]) -> Float[Array, "4 r c"]:
     One over the depth is linear on a plane.
 
     Args:
-        depth: along z, 0 where nothing was measured.
+        depth: depth along z, 0 where nothing was measured.
 
     Returns:
         Value at the upper left pixel of each four, slopes along columns and rows, and the twist. All are 0 where the
@@ -227,7 +227,7 @@ def both_ways(
         T_other_camera: motion of points of the first image into the frame of the second camera.
         samples: points of the first and of the second image.
         surfaces: `image_surface` of the first and of the second camera.
-        pinhole: of both cameras.
+        pinhole: pinhole of both cameras.
         tolerance: share of the depth by which matching points may differ.
 
     Returns:

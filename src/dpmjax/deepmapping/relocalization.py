@@ -46,7 +46,7 @@ class MapFields(NamedTuple):
     Attributes:
         hit: nats of a hit.
         free: nats of a free sample.
-        frame: of the map.
+        frame: frame of the map.
     """
 
     hit: Float[Array, "l r r"]
@@ -89,8 +89,8 @@ def largest_nearby(values: Float[Array, "r r"], radius: Float[Array, ""]) -> Flo
     """The largest value in the square around each node, by doubling; the raster is closed at its ends.
 
     Args:
-        values: at the nodes.
-        radius: of the square in nodes; one less than a power of two, or the next smaller of these.
+        values: values at the nodes.
+        radius: radius of the square in nodes; one less than a power of two, or the next smaller of these.
 
     Returns:
         The maxima.

@@ -107,8 +107,8 @@ def poses_of_scans(
 
     Args:
         config: settings of the fit.
-        phase: of the fit; tells whether L-Net gives the motions.
-        params: of the fit.
+        phase: phase of the fit; L-Net gives the motions, or they are free.
+        params: parameters of the fit.
         scans: all scans.
         rows: indices of the scans; None: all.
 

@@ -29,8 +29,8 @@ class ToyConfig:
         form: "network": weights and input of the network are optimised; "direct": x itself, from the network's first
             output, so that both forms start alike.
         net: the network.
-        learning_rate: of gradient descent.
-        num_steps: of gradient descent.
+        learning_rate: learning rate of gradient descent.
+        num_steps: number of steps of gradient descent.
     """
 
     form: Literal["network", "direct"] = "network"
@@ -50,7 +50,7 @@ class ToyParams:
     """Parameters of the example.
 
     Attributes:
-        x: of the direct form.
+        x: value of the direct form.
         net: weights of the network.
         z: input of the network, drawn from a standard normal distribution.
     """
@@ -102,7 +102,7 @@ def network_value(config: ToyConfig, params: ToyParams) -> Float[Array, ""]:
 
     Args:
         config: settings.
-        params: with the weights and the input of the network.
+        params: parameters with the weights and the input of the network.
 
     Returns:
         x = f(z).

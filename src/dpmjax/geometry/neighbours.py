@@ -196,7 +196,7 @@ class HostTree:
 
         Args:
             queries: finite.
-            k: at most the number of points.
+            k: number of neighbours, at most the number of points.
 
         Returns:
             Rows of the points and their distances, nearest first; equally near points come in any order.

@@ -40,7 +40,7 @@ def image_normals(
     """Normals of organised clouds: of the plane through each pixel, the one right of it and the one below it.
 
     Args:
-        points: in the camera frame, depth along z.
+        points: points in the camera frame, depth along z.
         mask: True where something was measured.
 
     Returns:

@@ -128,7 +128,7 @@ def step_to_planes(
 
     Args:
         points: points where the moved side and the fixed planes are compared, in the fixed frame.
-        normals: of the planes, same frame.
+        normals: normals of the planes, same frame.
         residuals: signed distances of the moved side to the fixed one, along the normals.
         weights: weights of the pairs; all arrays must be finite, also where a weight is 0.
 
@@ -156,7 +156,7 @@ def motion_about(step: PlaneStep) -> Any:
     """Makes the motion of a step: a rotation about its centre, then its translation.
 
     Args:
-        step: from `step_to_planes`.
+        step: result of `step_to_planes`.
 
     Returns:
         (..., 4, 4) homogeneous matrices of the kind of the step; the derivative is right at the zero step too.

@@ -35,7 +35,7 @@ def build_pyramid_on_host(
         points: normalised coordinates, n >= 1, float32.
         mask: False for points that are not there; they may hold anything. All are there for None.
         config: sizes and radii.
-        num_threads: of the neighbour search.
+        num_threads: number of threads of the neighbour search.
 
     Returns:
         The pyramid.

@@ -31,8 +31,8 @@ class StoredPyramid:
         unit: normalised coordinate that 1 stands for.
         points: positions of level 0, in units.
         samples: rows of level 0 that are level 1; the further levels are the first of these.
-        neighbours: for each stage and block, the rows of the neighbours.
-        interpolation: for each step up, the rows of the nearest points of the coarser level.
+        neighbours: neighbours for each stage and block, the rows of the neighbours.
+        interpolation: interpolation for each step up, the rows of the nearest points of the coarser level.
     """
 
     num_points: Int[AnyArray, "*b"]
@@ -77,7 +77,7 @@ def pack_pyramid(pyramid: PointPyramid, record: np.void) -> None:
 
     Args:
         pyramid: one scan; the valid points of level 0 stand in front.
-        record: of `record_type`.
+        record: record of `record_type`.
 
     Raises:
         ValueError: if a masked point stands before a valid one.

@@ -146,7 +146,7 @@ def as_poses(name: str, value: Any, count: int) -> NDArray[np.float64]:
     """Makes poses x, y, heading from such poses or from matrices, on the host.
 
     Args:
-        name: of the argument, for messages.
+        name: name of the argument, for messages.
         value: (count, 3) x, y, heading, or (count, 3, 3) homogeneous matrices.
         count: number of poses.
 

@@ -126,7 +126,7 @@ class Bag:
         """Reads when the messages were taken.
 
         Args:
-            topic: of messages that begin with a header.
+            topic: topic of messages that begin with a header.
 
         Returns:
             (n,) nanoseconds since 1970, increasing: of the headers, or of the recording where these are not set.
@@ -142,7 +142,7 @@ class Bag:
         """Reads a message by its number in `stamps`.
 
         Args:
-            topic: of messages that begin with a header.
+            topic: topic of messages that begin with a header.
             index: the number.
 
         Returns:

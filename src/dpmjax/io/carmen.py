@@ -57,7 +57,7 @@ class CarmenLines(NamedTuple):
     """Contents of a log.
 
     Attributes:
-        scans: in the order of the file.
+        scans: scans in the order of the file.
         is_newer: the scans are ROBOTLASER1 lines.
         odometry: (m, 4) time, x, y, theta of the ODOM lines.
         is_of_slam: there are NEFF lines, which the SLAM program GMapping writes: the poses are its own.

@@ -73,7 +73,7 @@ def read_active_vision(
     Args:
         path: folder of the scene.
         num_views: 8 or 16 in the paper.
-        seed: of the walk.
+        seed: seed of the walk.
         height: rows of a cloud.
         width: columns of a cloud.
         max_depth_m: deeper pixels are masked; the published program drops 7 m and more.

@@ -28,7 +28,7 @@ class Drive3D(NamedTuple):
     """The files of a drive, one a scan in order, with poses and times where there are any.
 
     Attributes:
-        name: for titles.
+        name: name for titles.
         files: the scans.
         T_world_lidar: (n, 4, 4), NaN for scans without a pose; or None.
         times: (n,) s, or None.
@@ -61,7 +61,7 @@ def stray_note(folder: Path) -> Note | None:
     """Names the files of a folder that are no scans although they have the ending of scans, such as map.pcd.
 
     Args:
-        folder: of the scans.
+        folder: folder of the scans.
 
     Returns:
         The note, or None.
@@ -159,7 +159,7 @@ class IndexedScan(NamedTuple):
     """A scan and its number in the sequence.
 
     Attributes:
-        number: of the scan in the sequence.
+        number: number of the scan in the sequence.
         points: (n, 3) float32, lidar frame, m.
     """
 

@@ -15,7 +15,7 @@ def import_for(source: str | Path, module: str, extra: str) -> ModuleType:
     Args:
         source: the file that needs it, for the message.
         module: name of the module.
-        extra: of dpmjax, which brings its package.
+        extra: extra of dpmjax, which brings its package.
 
     Returns:
         The module.

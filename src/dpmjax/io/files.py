@@ -189,7 +189,7 @@ def unpack_rows(body: bytes, layout: np.dtype[np.void], count: int, source: str 
 
     Args:
         body: the bytes.
-        layout: of one record.
+        layout: layout of one record.
         count: number of records that the header promises.
         source: name of the file, for messages.
 

@@ -53,7 +53,7 @@ def open_lidar_sequence(
         poses: a pose file in the lidar's frame (KITTI or TUM rows, `.npy`) instead of the data set's own.
         selection: start, stop and stride in scans.
         bin_columns: numbers a point has in `.bin` files; None infers it from the first one.
-        topic: of a bag: which clouds; may be left out where there is one topic of clouds.
+        topic: topic of a bag: which clouds; may be left out where there is one topic of clouds.
 
     Returns:
         The sequence, with poses in the lidar's frame and times where the source has them.

@@ -235,7 +235,7 @@ def _poses_from_oxts(records: FloatArray, source: Path) -> FloatArray:
 
     Args:
         records: (n, 6) latitude, longitude (degrees), altitude (m), roll, pitch, yaw (radians).
-        source: for messages.
+        source: source for messages.
 
     Returns:
         (n, 4, 4) `T_world_imu`, world in metres, x east, y north, z up.

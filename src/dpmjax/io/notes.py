@@ -14,7 +14,7 @@ def log_notes(notes: Iterable[Note]) -> None:
     """Logs doubts as warnings, and other notes as information.
 
     Args:
-        notes: of a reader.
+        notes: notes of a reader.
     """
     for note in notes:
         _log.log(logging.WARNING if note.is_doubt else logging.INFO, "%s", note.text)

@@ -195,7 +195,7 @@ def from_rows(rows: FloatArray, source: str | Path) -> FloatArray:
 
     Args:
         rows: (n, 12) or (12,), the first three rows of each matrix, row-major.
-        source: for messages.
+        source: source for messages.
 
     Returns:
         (n, 4, 4).
@@ -212,7 +212,7 @@ def check_poses(poses: FloatArray, source: str | Path) -> FloatArray:
 
     Args:
         poses: (n, 4, 4), or planar (n, 3, 3) or (n, 3).
-        source: for messages.
+        source: source for messages.
 
     Returns:
         The poses.

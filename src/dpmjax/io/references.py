@@ -71,7 +71,7 @@ def match_poses(poses: FloatArray, files: Sequence[Path], path: Path) -> FloatAr
     Args:
         poses: (m, 4, 4).
         files: the n scans.
-        path: of the poses, for messages.
+        path: path of the poses, for messages.
 
     Returns:
         (n, 4, 4).
@@ -138,7 +138,7 @@ def match_times(path: Path, files: Sequence[Path]) -> FloatArray | None:
     """The times of the scans of a data set out of times.txt, see `match_rows`; a file that does not fit is ignored.
 
     Args:
-        path: of times.txt.
+        path: path of times.txt.
         files: the n scans.
 
     Returns:
@@ -162,7 +162,7 @@ def match_reference(found: StampedPoses, times: FloatArray | None, num_scans: in
         found: the poses of the file.
         times: (n,) s of the scans; None where they have none.
         num_scans: number of scans.
-        path: of the poses, for messages.
+        path: path of the poses, for messages.
 
     Returns:
         The reference.
@@ -194,7 +194,7 @@ def camera_note(T_world_lidar: FloatArray, source: str | Path) -> Note | None:
 
     Args:
         T_world_lidar: (n, 4, 4); NaN for scans without one.
-        source: for the note.
+        source: source for the note.
 
     Returns:
         The note, or None.

@@ -112,8 +112,8 @@ def matrix_of(position: Any, orientation: Any) -> FloatArray:
     """Builds a pose of a position and a quaternion.
 
     Args:
-        position: with x, y, z.
-        orientation: with x, y, z, w.
+        position: position with x, y, z.
+        orientation: orientation with x, y, z, w.
 
     Returns:
         (4, 4).

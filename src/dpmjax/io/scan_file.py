@@ -155,7 +155,7 @@ def check_scan(cloud: TimedCloud, source: str | Path) -> TimedCloud:
 
     Args:
         cloud: points of a file.
-        source: for messages.
+        source: source for messages.
 
     Returns:
         The points, float32, that are finite and not at the origin, with their times.
@@ -196,7 +196,7 @@ def unit_note(points: NDArray[np.float32], source: str | Path) -> Note | None:
 
     Args:
         points: (n, 3), m.
-        source: for the note.
+        source: source for the note.
 
     Returns:
         The note, or None.

@@ -29,7 +29,7 @@ def sort_scans(files: Sequence[Path]) -> list[Path]:
     in 0, as programs print them. Otherwise, both sides of the point are counted on their own, as of 1.9 and 1.10.
 
     Args:
-        files: in any order.
+        files: files in any order.
 
     Returns:
         The files in order.
@@ -55,7 +55,7 @@ def strays_among(files: Sequence[Path]) -> list[Path]:
     """Finds files without a number among three numbered ones at least, such as `map.pcd` among 0001.pcd, 0002.pcd.
 
     Args:
-        files: of one ending.
+        files: files of one ending.
 
     Returns:
         The files that are no scans; empty where half of the files or more have no number.

@@ -50,7 +50,7 @@ def read_sequence(
         unit: unit of the file's lengths where the file does not state it; None takes PCD files as pixels / 512 and
             arrays as metres. CARMEN logs are in metres.
         max_range: beams of this length or more (in the sequence's unit) are masked; None leaves it to the reader.
-        topic: of a bag: which scans; may be left out where there is one topic of planar scans.
+        topic: topic of a bag: which scans; may be left out where there is one topic of planar scans.
 
     Returns:
         The sequence: two scans at least of 17 beams at least, each with one valid beam at least.

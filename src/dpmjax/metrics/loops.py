@@ -30,9 +30,9 @@ class LoopRecall(NamedTuple):
     """Shares of the revisits that have a loop; NaN without any revisit.
 
     Attributes:
-        recall: of all revisits.
-        same_way: of those driven in the direction of before, or across it.
-        opposite: of those driven the other way.
+        recall: recall of all revisits.
+        same_way: recall of revisits in the same direction, or across it.
+        opposite: recall of revisits in the opposite direction.
         num_revisits: number of all.
         num_opposite: number of revisits in the opposite direction.
     """
@@ -87,7 +87,7 @@ def loop_recall(
     Args:
         T_world_scan: true poses.
         newer_ends: first and last scan of the newer end of each loop; equal where it joins single scans.
-        revisits: from `find_revisits` on the same poses.
+        revisits: result of `find_revisits` on the same poses.
         reach_m: a keyframe every few metres is enough, so loops count for the scans around them.
 
     Returns:

@@ -84,7 +84,7 @@ def area_under_curve(score: Float[AnyArray, " n"], is_positive: Bool[AnyArray, "
     """Computes the area under the ROC curve: how often a positive example scores higher than a negative one.
 
     Args:
-        score: of each example.
+        score: score of each example.
         is_positive: label of each example.
 
     Returns:
@@ -101,7 +101,7 @@ def brier_score(probability: Float[AnyArray, " n"], is_true: Bool[AnyArray, " n"
     """Computes the mean squared difference of probabilities and outcomes (Brier 1950).
 
     Args:
-        probability: of each event, in [0, 1].
+        probability: probability of each event, in [0, 1].
         is_true: outcome of each event.
 
     Returns:

@@ -21,7 +21,7 @@ class SegmentError(NamedTuple):
     """Mean errors of segments, relative to their lengths.
 
     Attributes:
-        translation_percent: of the length; NaN without any segment.
+        translation_percent: error of the translation in percent of the length; NaN without any segment.
         rotation_deg_per_100m: degrees a hundred metres; NaN without any segment.
         num_segments: how many were compared.
     """
@@ -103,8 +103,8 @@ def relation_errors(
     """Compares a trajectory with relations; the benchmark reports the mean of each kind of error.
 
     Args:
-        relations: of the same recording.
-        times: of the scans, seconds, of the same clock.
+        relations: relations of the same recording.
+        times: times of the scans, seconds, of the same clock.
         poses: x, y, heading of T_world_scan, metres.
         tolerance_s: a scan is that of a relation if its time is so near.
 

@@ -196,7 +196,7 @@ class AttentionLayer(nn.Module):
 
         Args:
             features: the stacked rows of both clouds.
-            embeddings: of the positions, row for row.
+            embeddings: embeddings of the positions, row for row.
             masks: masks of both clouds.
 
         Returns:

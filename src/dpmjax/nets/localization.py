@@ -24,7 +24,7 @@ class LocalizationNetConfig:
     Attributes:
         kind: "conv" for beams or pixels in order, "point" (PointNet, supplement A) for any set of points.
         features: channels of the layers before the maximum over the beams.
-        strides: of the same layers; "point" ignores them.
+        strides: strides of the same layers; "point" ignores them.
         dilation: distance of the three taps of a convolution along each axis, in beams or pixels.
         is_circular: the last beam is the neighbour of the first (a full turn); else zeros follow.
         hidden: channels of the layers after the maximum.

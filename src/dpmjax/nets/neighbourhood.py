@@ -54,7 +54,7 @@ def maximum_of_normalised(
 
     Args:
         of_points: one row for each point that may be a neighbour.
-        offsets: from each query to its neighbours, in units of the radius.
+        offsets: offsets from each query to its neighbours, in units of the radius.
         kernel: linear map of the offsets.
         neighbours: rows of `of_points`, at least one for each query.
         scale: factor of each channel, after the norm.

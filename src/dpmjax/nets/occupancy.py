@@ -164,8 +164,8 @@ def init_map_net(config: OccupancyConfig, *, key: jax.Array, num_dimensions: int
 
     Args:
         config: shape of M-Net.
-        key: for the weights.
-        num_dimensions: of the world, 2 or 3.
+        key: key for the weights.
+        num_dimensions: number of dimensions of the world, 2 or 3.
 
     Returns:
         Parameters for `make_map_net(config).apply`.

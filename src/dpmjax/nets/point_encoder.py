@@ -84,7 +84,7 @@ class NeighbourhoodMaximum(nn.Module):
             positions: positions of that level.
             queries: positions of the queries.
             neighbours: rows of the neighbours of each query.
-            directions: of the frames of the queries; None for that of the lidar.
+            directions: directions of the frames of the queries; None for that of the lidar.
 
         Returns:
             Features of the queries.
@@ -133,7 +133,7 @@ class InvertedResidual(nn.Module):
             features: features of the level.
             positions: positions of the level.
             neighbours: rows of the neighbours in the same level.
-            directions: of the frames of the points; None for that of the lidar.
+            directions: directions of the frames of the points; None for that of the lidar.
 
         Returns:
             New features of the level.
@@ -185,7 +185,7 @@ def without_masked(level: PyramidLevel) -> PyramidLevel:
     """Sets positions of masked points, which may hold anything, to zero: they cannot reach a gradient.
 
     Args:
-        level: of a pyramid.
+        level: level of a pyramid.
 
     Returns:
         The level.
@@ -232,7 +232,7 @@ class FeaturePropagation(nn.Module):
         Args:
             fine: features of the finer level.
             coarse: features of the coarser level.
-            interpolation: from the coarser to the finer level.
+            interpolation: interpolation from the coarser to the finer level.
 
         Returns:
             New features of the finer level.
@@ -261,7 +261,7 @@ class PointEncoder(nn.Module):
         """Encodes one pyramid.
 
         Args:
-            pyramid: in normalised coordinates; masked points may hold anything.
+            pyramid: pyramid in normalised coordinates; masked points may hold anything.
 
         Returns:
             float32 features, one row for each point of that level; zero where its mask is False.

@@ -56,7 +56,7 @@ def chordal_poses(graph: PoseGraph, pattern: BlockPattern) -> Floats:
 
     Args:
         graph: the graph; poses of nodes that are not held may be anything.
-        pattern: of its edges, nodes in the order target, source.
+        pattern: pattern of its edges, nodes in the order target, source.
 
     Returns:
         Poses in the form of the graph's; not finite where the measurements leave a pose open.

@@ -35,7 +35,7 @@ def save_map(
 
     Args:
         path: must end in `.npz`; an existing file is replaced.
-        slam_map: of a run, `result.map`, with at least one keyframe.
+        slam_map: map of a run, `result.map`, with at least one keyframe.
         precision: "float32" is exact: a run that goes on from the file equals an unbroken one. "int8" is the smallest,
             for localisation: it rounds features and elements to codes, and omits keyframes that others cover
             (`slam.thin_map`).
@@ -83,7 +83,7 @@ def map_arrays(slam_map: KeyframeMap, precision: Precision) -> Arrays:
     """Makes the arrays of the file of a map.
 
     Args:
-        slam_map: with at least one keyframe.
+        slam_map: map with at least one keyframe.
         precision: see `save_map`.
 
     Returns:
@@ -132,8 +132,8 @@ def map_of_arrays(path: str | Path, arrays: Arrays) -> KeyframeMap:
     """Makes a map of the arrays of a file.
 
     Args:
-        path: of the file, for messages.
-        arrays: from `map_arrays`; others may be among them.
+        path: path of the file, for messages.
+        arrays: arrays from `map_arrays`; others may be among them.
 
     Returns:
         The map.

@@ -52,7 +52,7 @@ def from_columns(
 
     Args:
         record_type: the named tuple.
-        columns: from `to_columns`; others may be among them.
+        columns: columns from `to_columns`; others may be among them.
         name: as given there.
         without: as given there.
 
@@ -96,7 +96,7 @@ class RunState(NamedTuple):
 
     Attributes:
         state: after the keyframe.
-        reports: of all scans of the run until then.
+        reports: reports of all scans of the run until then.
     """
 
     state: SlamState
@@ -109,7 +109,7 @@ def save_state(path: str | Path, state: SlamState, reports: Sequence[ScanReport]
     Args:
         path: an existing file is replaced.
         state: after a keyframe.
-        reports: of all scans of the run until then.
+        reports: reports of all scans of the run until then.
 
     Returns:
         The path.

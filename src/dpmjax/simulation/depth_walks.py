@@ -73,8 +73,8 @@ def simulate_depth_sequence(
     Args:
         apartment: seed for `make_apartment`, or an apartment.
         num_views: 8 or 16 in the paper.
-        seed: of walk and noise.
-        config: of clouds and motion; those of the paper without noise where None.
+        seed: seed of walk and noise.
+        config: settings of clouds and motion; those of the paper without noise where None.
 
     Returns:
         The sequence; its motion is planar.

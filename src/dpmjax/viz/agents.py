@@ -28,8 +28,8 @@ class AgentTrack(NamedTuple):
     """Points and trajectory of one agent.
 
     Attributes:
-        label: for the legend.
-        color: of the agent.
+        label: label for the legend.
+        color: color of the agent.
         positions: (n, 3) metres.
         reference: (n, 3) in the same frame; None where there is none.
         points: (m, 3) measured points.
@@ -48,8 +48,8 @@ class AgentPanel(NamedTuple):
     """Agents that share one frame.
 
     Attributes:
-        title: of the panel.
-        agents: at least one.
+        title: title of the panel.
+        agents: agents, at least one.
         loops: (l, 2, 3) positions of both ends of each loop between agents.
     """
 
@@ -62,7 +62,7 @@ def agents_figure(title: str, panels: Sequence[AgentPanel]) -> Figure:
     """Draws what agents have mapped, from above; agents that never met have panels of their own.
 
     Args:
-        title: of the picture.
+        title: title of the picture.
         panels: one for each component.
 
     Returns:

@@ -56,8 +56,8 @@ def history_figure(history: History, unit: str) -> Figure:
     where all its values are positive and span more than a factor of ten.
 
     Args:
-        history: of the fit.
-        unit: of the ATE.
+        history: history of the fit.
+        unit: unit of the ATE.
 
     Returns:
         The figure.

@@ -36,7 +36,7 @@ class Track(NamedTuple):
     """One trajectory of a picture.
 
     Attributes:
-        label: for the legend.
+        label: label for the legend.
         positions: (n, 3) metres; all tracks of a picture are in one frame.
         errors_m: (n,) distance of each scan to the reference; None where there is none.
     """
@@ -55,7 +55,7 @@ def trajectory_figure(
     """Draws trajectories from above with the reference and the loops; and the errors beside them.
 
     Args:
-        title: of the picture.
+        title: title of the picture.
         tracks: the last one is the result; those before are drawn thinner.
         reference: positions in the same frame; None where there is none.
         loops: positions of both ends of each accepted loop.
@@ -101,7 +101,7 @@ def height_map_figure(
     Under a roof, points more than a metre above the lidar are left out, so that the walls are visible.
 
     Args:
-        title: of the picture.
+        title: title of the picture.
         points: metres, in the world.
         heights_m: of each point above the lidar.
         path: positions of the lidar.
@@ -196,8 +196,8 @@ def plane_limits(positions: Float[np.ndarray, "n 2"], margin_share: float) -> Li
     """Returns a rectangle round positions; that of a straight road has a useful height too.
 
     Args:
-        positions: at least one.
-        margin_share: of the longer side, added on all sides.
+        positions: positions, at least one.
+        margin_share: margin as a share of the longer side, added on all sides.
 
     Returns:
         The limits.
@@ -213,7 +213,7 @@ def size_in(limits: Limits) -> tuple[float, float]:
     """Returns width and height of the panel of a map.
 
     Args:
-        limits: of the map.
+        limits: limits of the map.
 
     Returns:
         Inches.

@@ -22,7 +22,7 @@ class LiveViewer:
     Keyframes are children of their poses: a loop that moves the map moves the picture.
 
     Args:
-        name: of the recording.
+        name: name of the recording.
         path: file that is written where there is no screen; a throw-away, for viewers of other versions cannot read it.
 
     Raises:
@@ -42,7 +42,7 @@ class LiveViewer:
         """Shows the newest scan.
 
         Args:
-            number: of the scan.
+            number: number of the scan.
             points: metres, in the frame of the lidar.
             T_world_scan: its pose.
         """

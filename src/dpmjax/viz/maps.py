@@ -97,7 +97,7 @@ def registered_scans_figure(panels: Sequence[Panel], unit: str) -> Figure:
     order, so that late scans do not hide early ones.
 
     Args:
-        panels: at least one; all of the same scans.
+        panels: panels, at least one; all of the same scans.
         unit: unit of lengths, "px" or "m".
 
     Returns:

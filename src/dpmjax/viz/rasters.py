@@ -88,7 +88,7 @@ class ErrorMap(NamedTuple):
     """One panel.
 
     Attributes:
-        title: of the network.
+        title: title of the network.
         subtitle: its numbers.
         error: (h, w) distance to the truth; NaN where no scan was taken. Row 0 has the smallest y.
     """
@@ -109,7 +109,7 @@ def error_maps_figure(
     """Draws errors of re-localisation in the manner of DeepMapping figure 7: black is right, the lighter the worse.
 
     Args:
-        maps: at least one, all of one shape.
+        maps: maps, at least one, all of one shape.
         extent: x_min, x_max, y_min, y_max of the grids' outer edges, in `unit`.
         trajectory_world: (n, 2) where the scans of the fit were taken.
         unit: unit of lengths.

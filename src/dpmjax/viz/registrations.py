@@ -49,7 +49,7 @@ def reliability_figure(
         confidence: (n,) in [0, 1].
         is_right: (n,) which of them are right.
         title: title of the picture.
-        labels: of both axes.
+        labels: labels of both axes.
 
     Returns:
         The figure.

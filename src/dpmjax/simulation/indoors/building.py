@@ -51,7 +51,7 @@ class Building:
     """A storey of a building.
 
     Attributes:
-        name: with its seed, for titles.
+        name: name with its seed, for titles.
         plan: rooms and doors.
         route: (k, 2) points of the walk at steps of a decimetre, m; nothing stands in the way.
         primitives: what a beam meets, on the device; the floor is at z = 0.
@@ -67,7 +67,7 @@ def make_building(seed: int, config: BuildingConfig = BuildingConfig()) -> Build
     """Builds the building of a seed; the same one every time.
 
     Args:
-        seed: of all choices, not negative.
+        seed: seed of all choices, not negative.
         config: properties of the building.
 
     Returns:

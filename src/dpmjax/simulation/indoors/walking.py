@@ -52,7 +52,7 @@ def walk(building: Building, config: WalkConfig = WalkConfig(), *, seed: int = 0
     Args:
         building: the building.
         config: how.
-        seed: of the sway.
+        seed: seed of the sway.
 
     Returns:
         Poses and times; z is up, and the floor is at z = 0.
