@@ -68,8 +68,6 @@ class Config(RunOptions):
     """Where the poses start: those of the folder, all at one place, or a trajectory of the scans or of the window."""
     init_noise: Annotated[float | None, arg(metavar="M")] = None
     """Noise that is added to the start, metres; without it, 0.2 in a simulated place, else none."""
-    init_noise_deg: Annotated[float, arg(metavar="DEG")] = 1.0
-    """The same of the orientation, where noise is added."""
     window: Annotated[str, arg(metavar="A:B")] = ":"
     """Scans to use, A to B - 1; one end may be left out."""
     jump: Annotated[int, arg(aliases=["-j"], metavar="N")] = 1
@@ -81,7 +79,7 @@ class Config(RunOptions):
 
     def __post_init__(self) -> None:
         """Checks ranges."""
-        check_least(self, steps=1, jump=1, init_noise=0, init_noise_deg=0, seed=0)
+        check_least(self, steps=1, jump=1, init_noise=0, seed=0)
         self.selection()
         if self.sequence is not None and self.data is None:
             raise ValueError("--sequence chooses a drive of DATA: give its folder too")
@@ -103,7 +101,7 @@ class Config(RunOptions):
         is_simulated = self.data is None and self.init == "poses"
         usual = _SIMULATED_NOISE_M if is_simulated else 0.0
         noise = usual if self.init_noise is None else self.init_noise
-        return FirstPoses(self.init, noise, self.init_noise_deg, self.seed)
+        return FirstPoses(self.init, noise, self.seed)
 
 
 def main(config: Config) -> dict[str, Any]:

@@ -14,7 +14,7 @@ import itertools
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,9 +39,7 @@ class Config:
     run: Annotated[Positional[Path], arg(metavar="RUN")]
     """Folder of a run of `dpmjax map2d` on a built-in world."""
     stride_px: Annotated[int, arg(metavar="PX")] = 6
-    """A scan is taken at the centre of every square of so many pixels that is free."""
-    heading: Literal["random", "nearest", "east"] = "random"
-    """Orientation of these scans, which is not told: random, that of the nearest scan of the fit, or along x."""
+    """A scan is taken at the centre of every free square of this side."""
     steps: Annotated[int, arg(metavar="N")] = 5000
     """Training steps of L-Net on the poses of the run."""
     seed: int = 0
@@ -67,7 +65,7 @@ def main(config: Config) -> dict[str, Any]:
         raise ValueError(f"{config.run} is a run on {run.sequence.name}, whose world is needed; use a built-in one")
     sequence, fitted = run.sequence, run.fitted
     grid = make_world(run.world).is_obstacle
-    truth = free_poses(grid, sequence, config)
+    truth = free_poses(grid, config)
     points, mask = scan_world(grid, truth, num_beams=sequence.points.shape[1])
     begun = time.perf_counter()
     training = LocalizationTrainingConfig(num_steps=config.steps)
@@ -82,7 +80,6 @@ def main(config: Config) -> dict[str, Any]:
         "world": sequence.name,
         "num_scans": len(sequence),
         "num_poses": len(truth),
-        "heading": config.heading,
         **summarise(queries, truth, sequence),
         "training_s": training_s,
         "relocalization_s": time.perf_counter() - begun,
@@ -135,19 +132,12 @@ def draw(
     viz.save_figure(figure, config.run / "relocalization.png")
 
 
-def free_poses(grid: NDArray[np.bool_], sequence: ScanSequence, config: Config) -> NDArray[np.float64]:
-    """(m, 3) poses at the centres of the free squares."""
-    from scipy.spatial import KDTree
-
+def free_poses(grid: NDArray[np.bool_], config: Config) -> NDArray[np.float64]:
+    """Returns (m, 3) poses of random headings at the centres of the free squares."""
     half = config.stride_px // 2
     rows, columns = np.nonzero(~grid[half :: config.stride_px, half :: config.stride_px])
     places = np.column_stack([columns, rows]) * config.stride_px + half + 0.5
-    if config.heading == "nearest":
-        _, nearest = KDTree(sequence.reference_poses[:, :2]).query(places)
-        headings = sequence.reference_poses[nearest, 2]
-    else:
-        rng = np.random.default_rng([config.seed, 7])
-        headings = rng.uniform(-np.pi, np.pi, len(places)) if config.heading == "random" else np.zeros(len(places))
+    headings = np.random.default_rng([config.seed, 7]).uniform(-np.pi, np.pi, len(places))
     return np.column_stack([places, headings])
 
 

@@ -82,8 +82,6 @@ class Config(RunOptions):
     """Images a trajectory; 0: 8 and 16 in turn, 16 of hard walks."""
     window_step: Annotated[int, arg(metavar="N")] = 0
     """Windows of a folder begin so many images apart; 0: half their length."""
-    depth_noise_m: Annotated[float, arg(metavar="M")] = 0.0
-    """Depth noise of the simulated camera at one metre; hard walks have their own."""
     pictures: Annotated[int, arg(metavar="N")] = 4
     """Trajectories to draw from above."""
 
@@ -98,7 +96,7 @@ class Config(RunOptions):
             raise ValueError(f"--limit: expected at least 1, got {self.limit}")
         if self.views != 0 and self.views < 2:
             raise ValueError(f"--views: expected 0 or at least 2, got {self.views}")
-        check_least(self, depth_noise_m=0, window_step=0)
+        check_least(self, window_step=0)
         unknown = [name for name in self.methods if name not in METHODS]
         if unknown or not self.methods:
             raise ValueError(f"--methods: expected some of {', '.join(METHODS)}, got {', '.join(unknown) or 'none'}")
@@ -148,8 +146,7 @@ def read_trajectory(config: Config, index: int) -> DepthSequence:
     if config.is_hard:
         return _hard_walk(config, index, simulation.HARD_WALK)
     if config.data is None:
-        walk = simulation.DepthWalkConfig(depth_noise_m=config.depth_noise_m)
-        return simulation.simulate_depth_sequence(seed % _NUM_APARTMENTS, views, seed=seed, config=walk)
+        return simulation.simulate_depth_sequence(seed % _NUM_APARTMENTS, views, seed=seed)
     if io.is_active_vision(config.data):
         return io.read_active_vision(config.data, views, seed=seed)
     sequence, views = io.read_pose_folder(config.data), config.views or 8

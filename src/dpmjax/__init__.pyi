@@ -43,8 +43,8 @@ from .geometry.alignment import weighted_svd as weighted_svd
 from .geometry.neighbours import k_nearest as k_nearest
 from .geometry.neighbours import radius_search as radius_search
 from .geometry.normals import estimate_normals as estimate_normals
-from .geometry.rays import sample_free_space as sample_free_space
 from .geometry.sampling import farthest_point_sample as farthest_point_sample
+from .geometry.sampling import sample_free_space as sample_free_space
 from .geometry.sampling import voxel_sample as voxel_sample
 from .io.g2o import read_g2o as read_g2o
 from .io.g2o import write_g2o as write_g2o

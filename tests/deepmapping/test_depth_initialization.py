@@ -17,7 +17,7 @@ from dpmjax.deepmapping.depth_initialization import _best_that_differ, _explaine
 from dpmjax.deepmapping.depth_motion_search import Camera, Views, propose_motions, surface_directions
 from dpmjax.deepmapping.projective_consistency import PixelSample
 from dpmjax.deepmapping.spatial import motion_matrices
-from dpmjax.geometry.rays import typical_range
+from dpmjax.geometry.sampling import typical_range
 from dpmjax.metrics import absolute_trajectory_error
 from tests.tolerances import ROUNDING
 

@@ -32,7 +32,7 @@ from dpmjax.deepmapping.spatial import (
     start_poses,
 )
 from dpmjax.geometry import rigid
-from dpmjax.geometry.rays import typical_range
+from dpmjax.geometry.sampling import typical_range
 
 # Kernel width, in typical ranges, of the misfit by which the start and the fit are compared.
 _MISFIT_KERNEL_WIDTH = 0.004

@@ -32,7 +32,7 @@ from dpmjax.deepmapping.projective_consistency import (
 )
 from dpmjax.deepmapping.spatial import fitted_poses, init_spatial, next_spatial_phase, spatial_poses, start_poses
 from dpmjax.geometry import rigid
-from dpmjax.geometry.rays import typical_range
+from dpmjax.geometry.sampling import typical_range
 
 
 class RegisteredDepth(NamedTuple):

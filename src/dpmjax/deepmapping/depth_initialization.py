@@ -30,7 +30,7 @@ from dpmjax.deepmapping.projective_consistency import (
     PixelSample,
     explained_share,
 )
-from dpmjax.geometry.rays import typical_range
+from dpmjax.geometry.sampling import typical_range
 
 # Trajectories differ by such a share of the largest translation, root mean square, or of the largest turn.
 _APART = (0.085, 0.075)

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from dpmjax.deepmapping.config import CHAMFER, ChamferComparison, Comparison, PhaseConfig
-from dpmjax.geometry.rays import sample_free_space
+from dpmjax.geometry.sampling import sample_free_space
 from dpmjax.losses import chamfer_distance, occupancy_loss
 
 MapLogits = Callable[[Float[Array, "n d"]], Float[Array, " n"]]

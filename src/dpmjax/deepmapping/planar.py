@@ -30,7 +30,7 @@ from dpmjax.deepmapping.problem import (
     phases_of,
 )
 from dpmjax.geometry import se2
-from dpmjax.geometry.rays import typical_range
+from dpmjax.geometry.sampling import typical_range
 from dpmjax.nets.localization import LocalizationNet
 from dpmjax.nets.occupancy import init_map_net
 from dpmjax.types import ScanSet

@@ -11,8 +11,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from dpmjax.io.extras import import_for
 from dpmjax.io.files import natural_key, refusing
+from dpmjax.io.messages import import_for
 from dpmjax.sequences import InputError, require
 
 _SUFFIXES = (".bag", ".mcap", ".db3")

@@ -15,7 +15,7 @@ from dpmjax.io.bin_columns import check_size, columns_of_drive
 from dpmjax.io.drives import Drive3D, find_pose_file, read_learned_folder, read_plain_folder, scan_files, stray_note
 from dpmjax.io.files import natural_key
 from dpmjax.io.lidar_datasets import read_kitti_360, read_kitti_carla, read_kitti_odometry, read_kitti_raw, read_mulran
-from dpmjax.io.notes import log_notes
+from dpmjax.io.messages import log_notes
 from dpmjax.io.poses import read_stamped_poses
 from dpmjax.io.references import camera_note, match_reference
 from dpmjax.io.scan_bags import open_lidar_bag

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from dpmjax.io.bags import Bag
 from dpmjax.io.clouds import TimedCloud
 from dpmjax.io.files import refusing
-from dpmjax.io.notes import log_notes
+from dpmjax.io.messages import log_notes
 from dpmjax.io.poses import interpolate_poses
 from dpmjax.io.ros_messages import (
     LASER_SCAN,

@@ -12,7 +12,7 @@ from dpmjax.io.clouds import TimedCloud
 from dpmjax.io.drives import SCAN_SUFFIXES
 from dpmjax.io.files import load_arrays, read_bytes, to_float32
 from dpmjax.io.las import read_las
-from dpmjax.io.notes import log_notes
+from dpmjax.io.messages import log_notes
 from dpmjax.io.pcd import parse_pcd
 from dpmjax.io.ply import parse_ply
 from dpmjax.sequences import EmptyScanError, FloatArray, InputError, Note, require

@@ -15,7 +15,7 @@ from dpmjax.io.bags import is_bag
 from dpmjax.io.carmen import read_carmen_log
 from dpmjax.io.deepmapping_folder import read_deepmapping_folder
 from dpmjax.io.files import load_arrays, read_bytes, to_float32
-from dpmjax.io.notes import log_notes
+from dpmjax.io.messages import log_notes
 from dpmjax.io.poses import check_poses
 from dpmjax.io.scan_bags import read_scan_bag
 from dpmjax.sequences import BoolArray, FloatArray, InputError, Note, ScanSequence, Unit, has_angular_order, require
