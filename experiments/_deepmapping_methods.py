@@ -197,7 +197,7 @@ class Method(NamedTuple):
     """A column of the comparison.
 
     Attributes:
-        title: what it is.
+        title: name in tables.
         run: makes its candidates; poses alone are one candidate under `title`.
         package: package of the extra `baselines`, which it needs.
     """

@@ -43,7 +43,7 @@ def kiss_matcher(source: np.ndarray, target: np.ndarray) -> np.ndarray:
 
 
 def search_alone(source: np.ndarray, target: np.ndarray, config: VerificationConfig) -> np.ndarray:
-    """Returns `T_target_source` of what `register` does around the network: it searches among the views from above."""
+    """Returns `T_target_source` by the search of `register` among the views from above, without a network."""
     measured = measure_scan(source, config), measure_scan(target, config)
     chosen = choose_motion(*measured, np.eye(4)[None], config)
     return refine_motion(*measured, chosen, config).T_target_source

@@ -37,7 +37,7 @@ def measure_town(model: Model, drives: Sequence[LidarSequence], num_pairs: int, 
 
     Args:
         model: encoder and decoder.
-        drives: through the town, and through the other one.
+        drives: drives through the town, and through a second one.
         num_pairs: number of pairs, about.
         seed: seed of the run.
         bar: gets the pairs.

@@ -3,10 +3,10 @@
     python -m experiments.toy_1d
     python -m experiments.toy_1d --seeds 100 -o out
 
-Writes toy.png (figure 14), endings.png (where all seeds end) and metrics.json: the share of seeds that reach the
-global minimum in the network form and in the direct form (plain descent and three solvers of jaxopt) from the same
-starts, for several initialisations and learning rates, and the seconds beside a plain PyTorch loop where torch is
-installed.
+Writes toy.png (figure 14), endings.png (the ends of all seeds) and metrics.json. The metrics are the share of seeds
+that reach the global minimum in the network form and in the direct form (plain descent and three solvers of jaxopt)
+from the same starts. They cover several initialisations and learning rates, and the seconds beside a plain PyTorch loop
+where torch is installed.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """CARMEN logs: planar scans of a front laser, the robot's odometry, and the poses that a SLAM program gave them.
 
-A scan has two poses (`carmen_lines`). A log as recorded has both at the places of its ODOM lines: they are the raw
+A scan has two poses. A log as recorded has both at the places of its ODOM lines: they are the raw
 odometry, and there is no reference. In a log that a SLAM program has corrected, the first pose is the reference and the
 second the raw odometry; where both are equal, the raw odometry is lost.
 
