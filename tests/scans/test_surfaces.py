@@ -11,7 +11,7 @@ from dpmjax.scans.surface_alignment import (
     align_surfaces_from,
     nearest_planes,
 )
-from dpmjax.scans.surfaces import SurfaceConfig, scan_surface, with_further_points
+from dpmjax.scans.surfaces import MIN_FLATNESS, SurfaceConfig, scan_surface, surface_at
 from tests.scans.surface_scenes import motion, seen_from, street
 
 
@@ -132,14 +132,29 @@ def test_wrong_shape_is_named(as_user) -> None:
         scan_surface(np.zeros((4, 2)))
 
 
-def test_points_without_normals_follow_the_samples_and_are_paired_with_any_plane() -> None:
-    surface, further = scan_surface(street(0)), street(3)[:500].astype(np.float64)
-    more = with_further_points(surface, further)
-    num = len(surface.samples)
-    np.testing.assert_array_equal(more.samples[:num], surface.samples)
-    assert set(more.samples[num:]) == set(range(len(surface.points), len(surface.points) + 500))
-    planes = nearest_planes(more, surface, np.eye(4)[None], AlignmentLevel(3.0, num + 500, 1))
-    assert (planes.cosines[0, num:] == 1).all()
-    np.testing.assert_allclose(planes.cosines[0, :num], 1)
-    aligned = align_surfaces(more, scan_surface(street(1)), motion(2, (0.2, 0.1, 0)))
-    assert np.linalg.norm(aligned.T_target_source[:3, 3]) < 0.05
+def street_under_foliage() -> np.ndarray:
+    return np.concatenate([street(0), np.random.default_rng(0).uniform(15, 25, (200, 3))])
+
+
+def test_a_surface_at_some_points_has_the_normals_of_all() -> None:
+    points = street_under_foliage()
+    whole = scan_surface(points)
+    rows = np.random.default_rng(1).permutation(len(whole.points))[:700]
+    some = surface_at(whole.points, rows)
+    is_flat = whole.flatness[rows] > MIN_FLATNESS
+    np.testing.assert_array_equal(some.points, whole.points[rows])
+    np.testing.assert_allclose(some.flatness[is_flat], whole.flatness[rows][is_flat], atol=1e-12)
+    np.testing.assert_allclose(np.abs((some.normals * whole.normals[rows]).sum(axis=1)[is_flat]), 1)
+
+
+def test_points_of_no_surface_are_the_last_samples_and_are_paired_with_any_plane() -> None:
+    points = street_under_foliage()
+    whole = scan_surface(points)
+    some = surface_at(whole.points, np.arange(len(whole.points)))
+    num_flat = int((some.flatness > 0).sum())
+    assert 100 < len(some.points) - num_flat < 400
+    assert sorted(some.samples) == list(range(len(some.points)))
+    assert (some.flatness[some.samples[:num_flat]] > MIN_FLATNESS).all()
+    assert not some.normals[some.samples[num_flat:]].any()
+    planes = nearest_planes(some, whole, np.eye(4)[None], AlignmentLevel(3.0, len(some.points), 1))
+    assert (planes.cosines[0, num_flat:] == 1).all()

@@ -14,6 +14,7 @@ from dpmjax.scans.compact import compact_elements, compact_image
 from dpmjax.slam import Alignment, KeyframeMap, LocalMap, OdometryConfig, SurfaceGeometry, ThinnedScan
 from dpmjax.slam.keyframes import Keyframe, add_keyframe, diagonal_information, orthonormal, turn_rad
 from dpmjax.slam.local_map import local_map_of
+from dpmjax.types import SurfaceElements
 
 
 def planes(rng: np.random.Generator, *, is_corridor: bool = False, num: int = 4000) -> np.ndarray:
@@ -43,13 +44,15 @@ def seen_from(points: np.ndarray, T_world_scan: np.ndarray) -> np.ndarray:
 def compacted(scan: ThinnedScan) -> CompactScan:
     """The scan as a map keeps it, without descriptors."""
     none = np.zeros((0, 1), np.int8), np.zeros(0, np.float32), np.zeros(0, np.int8)
-    return CompactScan(compact_elements(scan.elements), *none, compact_image(scan.measured.image))
+    surface = scan.measured.surface
+    elements = SurfaceElements(surface.points, surface.normals, surface.flatness, np.ones(len(surface.points), bool))
+    return CompactScan(compact_elements(elements), *none, compact_image(scan.measured.image))
 
 
 def map_of_one(scan: ThinnedScan) -> LocalMap:
     """The local map after the first keyframe."""
     keyframe = Keyframe(0, np.eye(4), 0.0, 0, scan.extent_m, compacted(scan))
-    return local_map_of(add_keyframe(KeyframeMap(), keyframe, np.eye(4), np.ones(1), None), OdometryConfig())
+    return local_map_of(add_keyframe(KeyframeMap(), keyframe, np.eye(4), np.ones(1), None), (), OdometryConfig())
 
 
 @pytest.fixture(scope="module")
@@ -160,9 +163,12 @@ def test_empty_scans_are_none(geometry) -> None:
 def test_a_thinned_scan_is_of_points_of_the_scan(geometry) -> None:
     points = planes(np.random.default_rng(0))
     scan = geometry.thin(points)
-    positions = scan.elements.positions[scan.elements.mask]
-    assert cKDTree(points).query(positions)[0].max() < 1e-4
-    assert len(positions) == model_preset("small").pyramid.stages[0].num_points
+    surface, spread = scan.measured.surface, model_preset("small").pyramid.stages[0].num_points
+    assert cKDTree(points).query(surface.points)[0].max() < 1e-4
+    assert len(surface.points) > 2 * spread
+    # The first lie farther apart than the others.
+    apart = [cKDTree(some).query(some, 2)[0][:, 1] for some in (surface.points[:spread], surface.points[spread:])]
+    assert apart[0].min() > 2 * apart[1].min()
     np.testing.assert_allclose(scan.extent_m, np.median(np.linalg.norm(points, axis=1)), rtol=0.2)
     # A scan that is far from empty is one whatever its number of points.
     assert geometry.thin(planes(np.random.default_rng(0), num=100)) is not None

@@ -11,8 +11,10 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from dpmjax.deeppointmap.compact_scans import CompactScan
+from dpmjax.deeppointmap.verification import MeasuredScan
 from dpmjax.geometry import rigid
 from dpmjax.scans.compact import CompactElements, CompactImage, expand_elements
+from dpmjax.scans.surfaces import surface_of_elements
 from dpmjax.slam import Alignment, LocalMap, Match, Proposal, Submap, ThinnedScan
 
 EMPTY = np.zeros((0, 3))
@@ -68,6 +70,10 @@ def laps(num_laps: int, side_m: float = 100.0, step_m: float = 1.0) -> np.ndarra
     return np.array(poses)
 
 
+def number_of_scan(scan: ThinnedScan) -> int:
+    return round(float(scan.measured.surface.points[0, 0]))
+
+
 @dataclass(frozen=True)
 class TruthGeometry:
     """Alignment is right up to noise where a start is near the truth, and fails elsewhere."""
@@ -82,15 +88,15 @@ class TruthGeometry:
         if not len(points):
             return None
         elements = expand_elements(compact_of(int(points[0, 0])).elements)
-        return ThinnedScan(None, elements, None, None, 10.0)
+        return ThinnedScan(None, MeasuredScan(surface_of_elements(elements), None), 10.0)
 
     def align(self, local_map: LocalMap, scan: ThinnedScan, T_map_scan: np.ndarray) -> Alignment:
         return self.search(local_map, scan, T_map_scan[None])
 
     def search(self, local_map: LocalMap, scan: ThinnedScan, T_map_scan: np.ndarray) -> Alignment:
-        # Relative to the last scan of the local map: odometry drifts.
-        T_map_last, elements = (local_map.recent or local_map.keyframes[:1])[-1]
-        last, number = (round(float(one.positions[0, 0])) for one in (elements, scan.elements))
+        # Relative to the last keyframe: odometry drifts.
+        T_map_last, elements = local_map.keyframes[0]
+        last, number = round(float(elements.positions[0, 0])), number_of_scan(scan)
         rng = np.random.default_rng([self.seed, number, last])
         T = T_map_last @ rigid.inverse(self.T_world_scan[last]) @ self.T_world_scan[number]
         apart_m = np.linalg.norm(T_map_scan[:, :3, 3] - T[:3, 3], axis=1).min()
@@ -119,7 +125,7 @@ class TruthMatcher:
     fingerprint: str = "truth"
 
     def encode(self, scan: ThinnedScan) -> CompactScan:
-        return compact_of(round(float(scan.elements.positions[0, 0])))
+        return compact_of(number_of_scan(scan))
 
     def propose(self, source: CompactScan, target: CompactScan, num_motions: int) -> Proposal:
         match = self._match(number_of(source), number_of(target))

@@ -16,9 +16,11 @@ from dpmjax.io.files import load_arrays, refusing, write_atomically
 from dpmjax.saved_maps.map_file import map_arrays, map_of_arrays
 from dpmjax.sequences import InputError, require
 from dpmjax.slam.front_end import FrontEndState
+from dpmjax.slam.local_map import PlacedElements
 from dpmjax.slam.loop_state import LoopState
 from dpmjax.slam.reports import Loop, ScanReport
 from dpmjax.slam.system import SlamState
+from dpmjax.types import SurfaceElements
 
 Arrays = dict[str, np.ndarray]
 
@@ -87,7 +89,8 @@ def prefixed(columns: Mapping[str, np.ndarray], name: str) -> Arrays:
 
 ADVICE = "start the run again without --resume"
 OF_LOOPS = ("loops",)
-OF_FRONT_END = ("local_map", "scores")
+OF_ELEMENTS = ("positions", "normals", "planarity", "mask")
+OF_FRONT_END = ("local_map", "recent", "scores")
 """Fields that are written apart, or made again from the map."""
 
 
@@ -123,6 +126,7 @@ def save_state(path: str | Path, state: SlamState, reports: Sequence[ScanReport]
     arrays |= to_columns(state.loops.loops, "loop") | to_columns([state.loops], "loops", without=OF_LOOPS)
     arrays |= to_columns([state.front_end], "front_end", without=OF_FRONT_END)
     arrays["scores"] = np.array(state.front_end.scores)
+    arrays |= prefixed(_arrays_of_recent(state.front_end.recent), "recent")
     content = io.BytesIO()
     np.savez(content, allow_pickle=False, **arrays)
     return write_atomically(path, content.getvalue())
@@ -149,6 +153,23 @@ def load_state(path: str | Path) -> RunState:
     with refusing(path, "damaged: {error}", ADVICE, (Exception,)):
         (loops,) = from_columns(LoopState, arrays, "loops", without=OF_LOOPS)
         (front_end,) = from_columns(FrontEndState, arrays, "front_end", without=OF_FRONT_END)
-        front_end = front_end._replace(scores=tuple(arrays["scores"].tolist()))
+        recent = _recent_of_arrays(part_of(arrays, "recent"))
+        front_end = front_end._replace(scores=tuple(arrays["scores"].tolist()), recent=recent)
         loops = loops._replace(loops=tuple(from_columns(Loop, arrays, "loop")))
         return RunState(SlamState(front_end, slam_map, loops), tuple(from_columns(ScanReport, arrays, "report")))
+
+
+def _arrays_of_recent(recent: Sequence[PlacedElements]) -> Arrays:
+    """Returns the elements of all scans in one array a field, and the number of each scan."""
+    arrays = {"T_map_scan": np.array([placed.T_map_scan for placed in recent]).reshape(-1, 4, 4)}
+    arrays["num_elements"] = np.array([len(placed.elements.mask) for placed in recent], np.int64)
+    for name in OF_ELEMENTS if recent else ():
+        arrays[name] = np.concatenate([getattr(placed.elements, name) for placed in recent])
+    return arrays
+
+
+def _recent_of_arrays(arrays: Arrays) -> tuple[PlacedElements, ...]:
+    ends = np.cumsum(arrays["num_elements"])[:-1]
+    columns = [np.split(arrays[name], ends) for name in OF_ELEMENTS if name in arrays]
+    elements = [SurfaceElements(*fields) for fields in zip(*columns, strict=True)]
+    return tuple(PlacedElements(*placed) for placed in zip(arrays["T_map_scan"], elements, strict=True))

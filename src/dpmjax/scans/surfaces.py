@@ -98,6 +98,29 @@ def scan_surface(points: Float[np.ndarray, "n 3"], config: SurfaceConfig = Surfa
     return Surface(points, normals, flatness, _samples(normals, flatness), tree)
 
 
+def surface_at(
+    points: Float[np.ndarray, "n 3"], rows: Int[np.ndarray, " e"], config: SurfaceConfig = SurfaceConfig()
+) -> Surface:
+    """Estimates the surface of a thinned scan at some of its points, from the neighbours among all of them.
+
+    Points that are no part of a surface are the last samples and have no normal: an alignment moves them onto planes.
+
+    Args:
+        points: metres, in the frame of the lidar.
+        rows: which points.
+        config: neighbourhoods; range and density are those of the points.
+
+    Returns:
+        The surface; its points are `points[rows]`.
+    """
+    chosen = points[rows].astype(np.float64)
+    normals, flatness = _normals(chosen, HostTree(points), config)
+    is_flat = flatness > MIN_FLATNESS
+    normals = np.where(is_flat[:, None], normals, 0)
+    samples = np.concatenate([_samples(normals, flatness), np.flatnonzero(~is_flat)])
+    return Surface(chosen, normals, np.where(is_flat, flatness, 0), samples, HostTree(chosen))
+
+
 def surface_of_elements(elements: SurfaceElements) -> Surface:
     """Makes a surface of elements whose normals are known.
 
@@ -114,37 +137,18 @@ def surface_of_elements(elements: SurfaceElements) -> Surface:
     return Surface(points, normals, planarity, _samples(normals, planarity), HostTree(points))
 
 
-def with_further_points(surface: Surface, points: Float[np.ndarray, "m 3"]) -> Surface:
-    """Adds points without normals, which an alignment moves onto planes but finds no planes at.
-
-    Args:
-        surface: of a scan.
-        points: of the same scan, metres.
-
-    Returns:
-        The surface with more samples, which follow those of before in random order; its tree is that of before.
-    """
-    further = len(surface.points) + np.random.default_rng(0).permutation(len(points))
-    return Surface(
-        np.concatenate([surface.points, points]),
-        np.concatenate([surface.normals, np.zeros((len(points), 3))]),
-        np.concatenate([surface.flatness, np.zeros(len(points))]),
-        np.concatenate([surface.samples, further]),
-        surface.tree,
-    )
-
-
 def _normals(
     points: Float[np.ndarray, "n 3"], tree: HostTree, config: SurfaceConfig
 ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, " n"]]:
-    num_neighbours = min(config.num_neighbours, len(points))
+    """Fits planes to the neighbours of points among those of a tree."""
+    num_neighbours = min(config.num_neighbours, len(tree.points))
     if num_neighbours < MIN_NEIGHBOURS:
         return np.zeros((len(points), 3)), np.zeros(len(points))
     farthest_m = tree.nearest(points[:: max(1, len(points) // NUM_PROBED)], num_neighbours)[1][:, -1]
     radius_m = max(config.neighbour_radius_m, config.sparse_radius_share * float(np.median(farthest_m)))
     rows, distances = tree.nearest(points, num_neighbours)
     is_near = distances < radius_m
-    x, y, z = (column[rows] - column[:, None] for column in points.T)
+    x, y, z = (column[rows] - own[:, None] for column, own in zip(tree.points.T, points.T, strict=True))
     fit = fit_planes((x, y, z), is_near)
     return fit.normals, np.where(is_near.sum(axis=1) >= MIN_NEIGHBOURS, fit.flatness, 0)
 

@@ -9,10 +9,9 @@ import numpy as np
 from jaxtyping import Float
 
 from dpmjax.deeppointmap.verification import MeasuredScan
-from dpmjax.scans.surfaces import Surface
 from dpmjax.slam.keyframes import Pose
 from dpmjax.slam.local_map import LocalMap
-from dpmjax.types import PointPyramid, SurfaceElements
+from dpmjax.types import PointPyramid
 
 
 class ThinnedScan(NamedTuple):
@@ -20,16 +19,12 @@ class ThinnedScan(NamedTuple):
 
     Attributes:
         pyramid: input of the encoder.
-        elements: surface elements, metres, in the frame of the lidar, in the order of farthest points.
-        measured: surface and free space.
-        surface: that surface, and all thinned points.
+        measured: surface elements, in the order of farthest points at first, and free space; frame of the lidar.
         extent_m: median range of the thinned points.
     """
 
     pyramid: PointPyramid
-    elements: SurfaceElements
     measured: MeasuredScan
-    surface: Surface
     extent_m: float
 
 

@@ -15,6 +15,7 @@ from dpmjax.deeppointmap.compact_scans import CompactScan
 from dpmjax.geometry import rigid
 from dpmjax.scans.deskew import deskew
 from dpmjax.slam.alignment import Alignment, ThinnedScan, best_of
+from dpmjax.slam.config import OdometryConfig
 from dpmjax.slam.keyframes import (
     EdgeKind,
     Keyframe,
@@ -28,7 +29,15 @@ from dpmjax.slam.keyframes import (
     turn_rad,
     with_origin,
 )
-from dpmjax.slam.local_map import LocalMap, local_map_of, nearest_keyframe, with_scan
+from dpmjax.slam.local_map import (
+    LocalMap,
+    PlacedElements,
+    joined_surface,
+    local_map_of,
+    nearest_keyframe,
+    placed_scan,
+    with_scan,
+)
 from dpmjax.slam.methods import SlamMethods
 from dpmjax.slam.reports import ScanReport, ScanStatus
 from dpmjax.types import AnyArray
@@ -43,7 +52,8 @@ class FrontEndState(NamedTuple):
     Attributes:
         num_scans: number of scans so far, those of a loaded map among them.
         is_begun: True from the first keyframe of this run on.
-        local_map: keyframes and recent scans; None where it has to be made from the map.
+        recent: the last scans that were accepted some distance apart, oldest first.
+        local_map: nearest keyframes and recent scans; None where it has to be made from the map.
         T_keyframe_last: pose of the last scan.
         T_before_last: motion of the last scan since the scan before.
         scores: of recent scans that were accepted.
@@ -52,6 +62,7 @@ class FrontEndState(NamedTuple):
 
     num_scans: int = 0
     is_begun: bool = False
+    recent: tuple[PlacedElements, ...] = ()
     local_map: LocalMap | None = None
     T_keyframe_last: Pose = np.eye(4)
     T_before_last: Pose = np.eye(4)
@@ -120,7 +131,7 @@ def step(
         reason = "a new part of the map begins here" if len(slam_map) else "the map begins here"
         located = Located(np.eye(4), "first", reason, 1.0, diagonal_information(UNKNOWN_M, np.pi))
         return _make_keyframe(methods, state, slam_map, thinned, located._replace(T_turn=T_turn))
-    local_map = local_map_of(slam_map, methods.config.odometry) if state.local_map is None else state.local_map
+    local_map = state.local_map or local_map_of(slam_map, state.recent, methods.config.odometry)
     state = state._replace(local_map=local_map)
     located = _locate(methods, state, local_map, thinned)
     # The next prediction uses this pose three times, so a rounding error would triple from scan to scan.
@@ -129,9 +140,10 @@ def step(
         return _make_keyframe(methods, state, slam_map, thinned, located)
     after = _advanced(methods, state, located)
     if located.status != "predicted":
-        spacing_m = methods.config.odometry.recent_share * thinned.extent_m
-        placed = thinned.elements, located.T_keyframe_scan, spacing_m
-        after = after._replace(local_map=with_scan(local_map, *placed, methods.config.odometry))
+        recent = with_scan(state.recent, *_placed(methods, thinned, located.T_keyframe_scan))
+        if recent is not state.recent:
+            surface = joined_surface((*local_map.keyframes, *recent))
+            after = after._replace(recent=recent, local_map=local_map._replace(surface=surface))
     return after, slam_map, _report(state, slam_map, located, is_keyframe=False)
 
 
@@ -157,6 +169,12 @@ def _pass_over(state: FrontEndState, slam_map: KeyframeMap) -> tuple[FrontEndSta
     located = Located(state.T_keyframe_last @ state.T_before_last, "empty", "too few points", 0.0, guess)
     after = state._replace(num_scans=state.num_scans + 1, T_keyframe_last=located.T_keyframe_scan)
     return after, slam_map, _report(state, slam_map, located, is_keyframe=False)
+
+
+def _placed(methods: SlamMethods, scan: ThinnedScan, T_map_scan: Pose) -> tuple[PlacedElements, float, OdometryConfig]:
+    """Returns a scan for the local map, its smallest distance from the last one, and the settings."""
+    config = methods.config.odometry
+    return placed_scan(scan.measured.surface, T_map_scan), config.recent_share * scan.extent_m, config
 
 
 class _Attempt(NamedTuple):
@@ -265,7 +283,16 @@ def _make_keyframe(
     keyframe = Keyframe(state.num_scans, T_odometry, path_m, segment, scan.extent_m, compact)
     slam_map = with_origin(slam_map, methods.origin)
     slam_map = add_keyframe(slam_map, keyframe, T_world, methods.matcher.vector(compact), edge)
-    after = _advanced(methods, state, located)._replace(is_begun=True, local_map=None, T_keyframe_last=np.eye(4))
+    # In the frame of the new keyframe; the scans of another segment have no place in it.
+    moved = (
+        [] if is_guess else [entry._replace(T_map_scan=rigid.inverse(T) @ entry.T_map_scan) for entry in state.recent]
+    )
+    after = _advanced(methods, state, located)._replace(
+        is_begun=True,
+        recent=with_scan(tuple(moved), *_placed(methods, scan, np.eye(4))),
+        local_map=None,
+        T_keyframe_last=np.eye(4),
+    )
     return after, slam_map, _report(state, slam_map, located._replace(T_keyframe_scan=np.eye(4)), is_keyframe=True)
 
 

@@ -1,6 +1,6 @@
-"""The local map: surface elements of the nearest keyframes and of the scans since the last one.
+"""The local map: surface elements of the nearest keyframes and of the last scans.
 
-It is made from the map alone at each keyframe, so that the map is the state of odometry.
+Keyframes keep few elements, the last scans all of theirs: density around the lidar makes odometry exact.
 """
 
 from __future__ import annotations
@@ -39,57 +39,68 @@ class LocalMap(NamedTuple):
     Attributes:
         keyframes: the last keyframe and the nearest others, nearest first.
         compact: descriptors of these keyframes.
-        recent: scans since the last keyframe, oldest first.
-        surface: the planes of all of them.
+        surface: the planes of these keyframes and of the last scans.
     """
 
     keyframes: tuple[PlacedElements, ...]
     compact: tuple[CompactScan, ...]
-    recent: tuple[PlacedElements, ...]
     surface: Surface
 
 
-def local_map_of(slam_map: KeyframeMap, config: OdometryConfig) -> LocalMap:
+def local_map_of(slam_map: KeyframeMap, recent: Sequence[PlacedElements], config: OdometryConfig) -> LocalMap:
     """Gathers the keyframes around the last one, among those that the graph joins to it.
 
     Args:
         slam_map: with at least one keyframe.
+        recent: the last scans, in the frame of the last keyframe.
         config: number of keyframes.
 
     Returns:
-        The local map, without any scan since the last keyframe.
+        The local map.
     """
     rows = nearest_in_graph(slam_map, len(slam_map) - 1, config.num_keyframes, np.inf)
     T_map_keyframe = rigid.inverse(slam_map.T_world_keyframe[-1]) @ slam_map.T_world_keyframe[rows]
     compact = tuple(slam_map.keyframes[row].compact for row in rows)
-    placed = [
+    placed = tuple(
         PlacedElements(T, expand_elements(scan.elements)) for T, scan in zip(T_map_keyframe, compact, strict=True)
-    ]
-    return LocalMap(tuple(placed), compact, (), joined_surface(placed))
+    )
+    return LocalMap(placed, compact, joined_surface((*placed, *recent)))
+
+
+def placed_scan(surface: Surface, T_map_scan: Pose) -> PlacedElements:
+    """Keeps the flat elements of a scan, in float32 as a file has them.
+
+    Args:
+        surface: of the scan.
+        T_map_scan: pose of the scan.
+
+    Returns:
+        The placed elements.
+    """
+    is_flat = surface.flatness > MIN_FLATNESS
+    arrays = (array[is_flat].astype(np.float32) for array in (surface.points, surface.normals, surface.flatness))
+    return PlacedElements(T_map_scan, SurfaceElements(*arrays, np.ones(is_flat.sum(), bool)))
 
 
 def with_scan(
-    local_map: LocalMap, elements: SurfaceElements, T_map_scan: Pose, spacing_m: float, config: OdometryConfig
-) -> LocalMap:
+    recent: tuple[PlacedElements, ...], placed: PlacedElements, spacing_m: float, config: OdometryConfig
+) -> tuple[PlacedElements, ...]:
     """Adds a scan that is far enough from the last one, and drops the oldest scan beyond the number that is kept.
 
     Args:
-        local_map: the local map.
-        elements: of the scan, in its frame.
-        T_map_scan: pose of the scan.
+        recent: the last scans, oldest first.
+        placed: the scan.
         spacing_m: smallest distance from the last scan, unless the scan is turned.
         config: number of scans, and turn.
 
     Returns:
-        The local map after.
+        The last scans after; the same tuple where the scan does not join.
     """
-    T_map_last = (local_map.recent or local_map.keyframes[:1])[-1].T_map_scan
-    T_last_scan = rigid.inverse(T_map_last) @ T_map_scan
-    if np.linalg.norm(T_last_scan[:3, 3]) < spacing_m and turn_rad(T_last_scan) < config.recent_rad:
-        return local_map
-    recent = (*local_map.recent, PlacedElements(T_map_scan, elements))[-config.num_recent :]
-    placed = (*local_map.keyframes, *recent)
-    return local_map._replace(recent=recent, surface=joined_surface(placed)) if config.num_recent else local_map
+    if recent:
+        T_last_scan = rigid.inverse(recent[-1].T_map_scan) @ placed.T_map_scan
+        if np.linalg.norm(T_last_scan[:3, 3]) < spacing_m and turn_rad(T_last_scan) < config.recent_rad:
+            return recent
+    return (*recent, placed)[-config.num_recent :] if config.num_recent else recent
 
 
 def nearest_keyframe(local_map: LocalMap, position_map: Float[np.ndarray, " 3"]) -> int:

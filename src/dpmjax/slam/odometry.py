@@ -4,26 +4,28 @@ from __future__ import annotations
 
 import itertools
 
-import jax
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from scipy.spatial.transform import Rotation
 
 from dpmjax.deeppointmap.encoding import pyramid_of_scan
-from dpmjax.deeppointmap.model import elements_of_pyramid
 from dpmjax.deeppointmap.model_config import ModelConfig
 from dpmjax.deeppointmap.verification import MeasuredScan
 from dpmjax.scans.free_space import range_image, view_points
 from dpmjax.scans.plane_information import plane_information, with_least_covariance
 from dpmjax.scans.surface_alignment import AlignmentLevel, align_surfaces_from, nearest_planes, pair_with_planes
-from dpmjax.scans.surfaces import Surface, surface_of_elements, with_further_points
+from dpmjax.scans.surfaces import Surface, surface_at
 from dpmjax.slam.alignment import Alignment, ThinnedScan, best_of
 from dpmjax.slam.config import OdometryConfig
 from dpmjax.slam.keyframes import Pose, orthonormal
 from dpmjax.slam.local_map import LocalMap
+from dpmjax.types import PointPyramid
 
 MAX_VIEWED = 4000
 """Number of elements of the local map that are compared with the free space of a scan."""
+
+MAX_ELEMENTS = 8000
+"""Largest number of surface elements of a scan."""
 
 NUM_FINE = 3
 """Number of starts of a search that are aligned finely."""
@@ -50,23 +52,16 @@ class SurfaceGeometry:
         Returns:
             The thinned scan; None if it is empty.
         """
-        scale_m = self._model_config.scale_m
         if len(points) < self.config.min_num_points:
             return None
         pyramid = pyramid_of_scan(points, self._model_config)
-        num_elements = self._model_config.pyramid.stages[0].num_points
-        elements = jax.device_get(elements_of_pyramid(pyramid, self._model_config, num_elements=num_elements))
-        surface = surface_of_elements(elements)
-        if len(surface.samples) < self.config.min_num_points:
+        level = pyramid.levels[0]
+        thinned = np.asarray(level.positions)[np.asarray(level.mask)] * np.float64(self._model_config.scale_m)
+        surface = surface_at(thinned, _spread_rows(pyramid))
+        if np.count_nonzero(surface.flatness) < self.config.min_num_points:
             return None
-        level, chosen = pyramid.levels[0], np.asarray(pyramid.levels[1].sample_indices)
-        is_further = np.array(level.mask)
-        thinned = np.asarray(level.positions)[is_further] * np.float64(scale_m)
-        is_further[chosen[np.asarray(elements.mask)]] = False
-        further = np.asarray(level.positions)[is_further] * np.float64(scale_m)
         extent_m = float(np.median(np.linalg.norm(thinned, axis=1)))
-        measured = MeasuredScan(surface, range_image(thinned))
-        return ThinnedScan(pyramid, elements, measured, with_further_points(surface, further), extent_m)
+        return ThinnedScan(pyramid, MeasuredScan(surface, range_image(thinned)), extent_m)
 
     def align(self, local_map: LocalMap, scan: ThinnedScan, T_map_scan: Pose) -> Alignment:
         """Aligns from a first guess that is nearly right; see `Geometry`.
@@ -127,7 +122,7 @@ class SurfaceGeometry:
         return found
 
     def _aligned(self, local_map: LocalMap, scan: ThinnedScan, starts: Float[np.ndarray, "s 4 4"]) -> list[Alignment]:
-        found = align_surfaces_from(scan.surface, local_map.surface, orthonormal(starts), self.config.narrow)
+        found = align_surfaces_from(scan.measured.surface, local_map.surface, orthonormal(starts), self.config.narrow)
         return [self._scored(local_map, scan.measured, each.T_target_source) for each in found]
 
     def _scored(self, local_map: LocalMap, measured: MeasuredScan, T: Pose) -> Alignment:
@@ -156,6 +151,17 @@ class SurfaceGeometry:
         shares = np.bincount(direction, weights=meets[0], minlength=3) / np.maximum(counts, 1)
         # A direction of few elements counts less: their share is hardly known.
         return float(np.average(shares, weights=np.minimum(counts, counts.max() / 3) + 1e-9))
+
+
+def _spread_rows(pyramid: PointPyramid) -> Int[np.ndarray, " e"]:
+    """Chooses points of the first level: those of the second, which lie far apart, and others in random order."""
+    mask, chosen = np.asarray(pyramid.levels[0].mask), np.asarray(pyramid.levels[1].sample_indices)
+    # Rows of the masked array.
+    row_of = np.cumsum(mask) - 1
+    first = row_of[chosen[np.asarray(pyramid.levels[1].mask)]]
+    rest = np.setdiff1d(np.arange(mask.sum()), first)
+    rest = np.random.default_rng(0).permutation(rest)
+    return np.concatenate([first, rest])[:MAX_ELEMENTS]
 
 
 def _contradicted_share(local_map: LocalMap, measured: MeasuredScan, T_map_scan: Pose) -> float:
