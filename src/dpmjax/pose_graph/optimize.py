@@ -14,8 +14,7 @@ import numpy as np
 from dpmjax.checks import require_count, require_positive
 from dpmjax.pose_graph.chordal import chordal_poses
 from dpmjax.pose_graph.graph import Floats, PoseGraph
-from dpmjax.pose_graph.normal_equations import BlockPattern, solve_symmetric
-from dpmjax.pose_graph.residuals import Linearisation, linearise
+from dpmjax.pose_graph.normal_equations import BlockPattern, Linearisation, linearise, solve_symmetric
 
 _NARROWING = 1.6
 _LEAST_DAMPING, _MOST_DAMPING = 1e-12, 1e6
