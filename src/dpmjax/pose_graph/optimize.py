@@ -16,7 +16,10 @@ from dpmjax.pose_graph.chordal import chordal_poses
 from dpmjax.pose_graph.graph import Floats, PoseGraph
 from dpmjax.pose_graph.normal_equations import BlockPattern, Linearisation, linearise, solve_symmetric
 
-_NARROWING = 1.6
+# Width of the kernel at the start, in final widths; each step narrows it.
+_FIRST_WIDENING, _NARROWING = 1000.0, 1.6
+# Levenberg-Marquardt damping at the start, as a share of the diagonal.
+_FIRST_DAMPING = 1e-6
 _LEAST_DAMPING, _MOST_DAMPING = 1e-12, 1e6
 # Below this share of the stiffest diagonal entry, damping goes by the stiffest entry.
 _LEAST_STIFFNESS = 1e-6
@@ -31,29 +34,24 @@ class PoseGraphConfig:
             quantile in the plane). None for plain least squares.
         max_iterations: the largest number of linear solves.
         tolerance: the optimisation ends when a step lowers the cost by less than this share.
-        widening: width of the kernel at the start, in final widths.
         is_chordal_start: also try the chordal relaxation as a start; it is taken where its cost is lower.
-        damping: Levenberg-Marquardt damping at the start, as a share of the diagonal.
     """
 
     outlier_chi2: float | None = None
     max_iterations: int = 100
     tolerance: float = 1e-5
-    widening: float = 1000.0
     is_chordal_start: bool = True
-    damping: float = 1e-6
 
     def __post_init__(self) -> None:
         """Checks the numbers."""
         require_count("max_iterations", self.max_iterations)
-        for name in ("tolerance", "damping", "widening"):
-            require_positive(name, getattr(self, name))
+        require_positive("tolerance", self.tolerance)
         if self.outlier_chi2 is not None:
             require_positive("outlier_chi2", self.outlier_chi2)
 
 
 ROBUST = PoseGraphConfig(outlier_chi2=10.0, tolerance=1e-8, is_chordal_start=False)
-"""Wrong edges are let go; the poses that are given are the only start."""
+"""Wrong edges lose their weight; the given poses are the only start."""
 
 
 class OptimizedPoseGraph(NamedTuple):
@@ -118,7 +116,7 @@ def optimize_pose_graph(
     if config.is_chordal_start and len(graph.edges.source):
         chordal = linearise(chordal_poses(graph, pattern), still, graph.edges)
         at = chordal if _cost(chordal.chi2, width) < _cost(at.chi2, width) else at
-    state = _State(at, config.damping, 1.0 if config.outlier_chi2 is None else config.widening)
+    state = _State(at, _FIRST_DAMPING, 1.0 if config.outlier_chi2 is None else _FIRST_WIDENING)
     iterations = 0
     while iterations < config.max_iterations and not state.is_converged and state.damping < _MOST_DAMPING:
         state = _iterate(state, graph, pattern, width, config)
