@@ -97,9 +97,7 @@ def _read_any(path: Path, unit: Unit | None, max_range: float | None, topic: str
 
 
 def _detect(path: Path) -> str:
-    """Finds the kind of input at a path by its ending, else by its first bytes: "folder", "arrays", "bag" or
-    "carmen".
-    """
+    """Returns "folder", "arrays", "bag" or "carmen", by the ending of the path, else by its first bytes."""
     has_scans = path.is_dir() and any(file.suffix.lower() == ".pcd" for file in path.iterdir())
     if is_bag(path) and not has_scans:
         return "bag"
