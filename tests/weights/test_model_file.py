@@ -19,7 +19,7 @@ import pytest
 from dpmjax.deeppointmap import Model, ModelConfig, init_model, model_preset
 from dpmjax.weights import load_model, read_card, save_model
 from dpmjax.weights.__main__ import main
-from dpmjax.weights.model_file import config_from_json
+from dpmjax.weights.config_json import config_from_json
 from dpmjax.weights.torch_import import read_torch_file
 from tests.deeppointmap import toy
 from tests.optional import import_or_skip

@@ -185,7 +185,7 @@ def load_config(path: Path, config_type: type[ConfigT]) -> ConfigT:
     Raises:
         ValueError: its `config.json` holds an option that `config_type` does not have, or is no JSON.
     """
-    from dpmjax.weights.model_file import config_from_json
+    from dpmjax.weights.config_json import config_from_json
 
     stored = {name: value for name, value in load_json(path / CONFIG).items() if name not in FREE_OPTIONS}
     try:

@@ -21,7 +21,7 @@ from dpmjax.sequences import InputError, require
 from dpmjax.slam.config import MapOrigin, SlamConfig
 from dpmjax.slam.keyframes import KeyframeMap
 from dpmjax.slam.map_thinning import thin_map
-from dpmjax.weights.model_file import config_from_json
+from dpmjax.weights.config_json import config_from_json
 
 FORMAT, VERSION = "dpmjax map", 3
 SPACING_SHARE = 0.8
