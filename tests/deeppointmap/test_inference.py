@@ -147,10 +147,11 @@ def test_the_scale_of_a_scene_follows_the_larger_scan(model, extent_m: float, sc
     assert scene_scale([small, points], model.config) == scale
 
 
-def test_refinement_of_a_cloud_without_elements_is_refused(model, scans) -> None:
+def test_a_cloud_without_elements_is_not_refined(model, scans) -> None:
+    bare = dpmjax.encode(model, scans[1]).described
     for source in (scans[0], prepare_scan(model, scans[0])):
-        with pytest.raises(ValueError, match="refine: expected scans, or clouds with surface elements"):
-            dpmjax.register(model, source, dpmjax.encode(model, scans[1]).described, refine=True)
+        refined, coarse = (dpmjax.register(model, source, bare, refine=refine) for refine in (True, False))
+        jax.tree.map(np.testing.assert_array_equal, refined, coarse)
 
 
 def test_further_elements_follow_the_descriptors_and_change_no_match(scans) -> None:
@@ -165,7 +166,7 @@ def test_further_elements_follow_the_descriptors_and_change_no_match(scans) -> N
     np.testing.assert_array_equal(larger[0].positions[:32], clouds[0].positions)
     alone = elements_of_pyramid(pyramid_of_scan(scans[0], config), config, num_elements=64)
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, **ROUNDING), alone, larger[0].elements)
-    expected, found = (dpmjax.register(model, *pair) for pair in (clouds, larger))
+    expected, found = (dpmjax.register(model, *pair, refine=False) for pair in (clouds, larger))
     jax.tree.map(np.testing.assert_array_equal, expected, found)
     bare = [cloud.described for cloud in clouds]
     jax.tree.map(np.testing.assert_array_equal, expected, dpmjax.register(model, *bare))

@@ -9,16 +9,17 @@ from dpmjax.geometry import rigid
 from dpmjax.metrics import absolute_trajectory_error
 from dpmjax.scans.plane_information import plane_information, with_least_covariance
 from dpmjax.scans.surface_alignment import PlanePairs
-from dpmjax.slam import KeyframeMap, LoopClosureConfig
+from dpmjax.slam import KeyframeMap, LoopClosureConfig, SlamConfig, SlamMethods
 from dpmjax.slam.keyframes import Keyframe, MapEdge, add_keyframe, diagonal_information, submap_around
-from dpmjax.slam.loop_candidates import find_candidates
+from dpmjax.slam.loop_candidates import find_candidates, nearest_pairs
+from dpmjax.slam.loop_closure import MAX_AGAIN, search_again
 from dpmjax.slam.loop_consistency import are_consistent
 from dpmjax.slam.loop_state import LoopState
 from dpmjax.slam.map_optimization import optimize_map
 from dpmjax.slam.reports import Loop
 from dpmjax.slam.retrieval import most_similar, pooled_vector
 from dpmjax.types import DescriptorCloud
-from tests.slam.truth import compact_of, laps, noise, number_of, pose
+from tests.slam.truth import TruthGeometry, TruthMatcher, compact_of, laps, noise, number_of, pose
 
 CONFIG = LoopClosureConfig()
 
@@ -85,6 +86,48 @@ def test_candidates_are_old_and_near() -> None:
     for candidate in near:
         assert slam_map.keyframes[row].path_m - slam_map.keyframes[candidate].path_m > 40.0
     assert not find_candidates(slam_map, 3, CONFIG)
+
+
+def test_nearest_pairs_are_those_of_a_search_by_hand() -> None:
+    truth = laps(2, side_m=40.0, step_m=1.7)
+    slam_map = map_of(truth, segments=[0] * 60 + [1] * (len(truth) - 60))
+    expected = []
+    for row in range(len(truth)):
+        apart = []
+        for other in range(row):
+            is_chained = (row < 60) == (other < 60)
+            if not is_chained or 2.0 * (row - other) > CONFIG.min_path_share * 10.0:
+                apart.append((float(np.linalg.norm(truth[row, :3, 3] - truth[other, :3, 3])), other))
+        if apart and min(apart)[0] < 10.0:
+            expected.append((min(apart)[0], row, min(apart)[1]))
+    found = nearest_pairs(slam_map, CONFIG)
+    np.testing.assert_allclose([pair[0] for pair in found], sorted(pair[0] for pair in expected), atol=1e-9)
+    assert {pair[1] for pair in found} == {pair[1] for pair in expected}
+    assert nearest_pairs(map_of(truth[:1]), CONFIG) == []
+
+
+def test_keyframes_that_an_optimisation_brings_together_are_compared_then() -> None:
+    truth = laps(2, side_m=40.0, step_m=2.0)
+    slam_map, half = map_of(truth), len(truth) // 2
+    matcher = TruthMatcher(truth, gross_share=0.0)
+    methods = SlamMethods(matcher, TruthGeometry(truth), SlamConfig())
+    witness = [loop_between(truth, half + 4, 4), loop_between(truth, len(truth) - 1, half - 1)]
+    state = LoopState(tuple(witness), len(truth), False)
+    after = search_again(methods, slam_map, state)
+    new = [loop for loop in after.loops if loop not in witness]
+    assert 0 < len(new) <= MAX_AGAIN
+    assert [loop.source for loop in after.loops] == sorted(loop.source for loop in after.loops)
+    assert after.is_stale
+    for loop in new:
+        assert loop.T_target_source is not None
+        apart = rigid.inverse(truth[loop.target]) @ truth[loop.source]
+        assert np.linalg.norm(apart[:3, 3] - loop.T_target_source[:3, 3]) < 0.6
+    # Nothing is compared twice, and what is compared ends.
+    for _ in range(100):
+        before, after = after, search_again(methods, slam_map, after)
+        pairs = [(loop.source, loop.target) for loop in after.loops]
+        assert len(set(pairs)) == len(pairs)
+    assert after.loops == before.loops
 
 
 def test_right_loops_agree_and_wrong_ones_do_not() -> None:

@@ -106,7 +106,7 @@ def register(
     target: ScanOrCloud,
     *,
     config: MatchConfig | None = None,
-    refine: bool = False,
+    refine: bool = True,
     scale: Scale = 1.0,
 ) -> Registration:
     """Registers two scans or maps without a first guess (DeepPointMap section 3.2).
@@ -123,8 +123,8 @@ def register(
         target: the same; one may be a scan and the other a map.
         config: choice of pairs and inliers; None takes that of the model.
         refine: whether to end with a fine point-to-plane alignment: of two scans, or else of the surface elements of
-            both clouds. Without it, the motion of two scans is that of the short alignment that verified it, and any
-            other that of the descriptors.
+            both clouds, if they have some. Without it, the motion of two scans is that of the short alignment that
+            verified it, and any other that of the descriptors.
         scale: factor by which raw scans are enlarged for the encoder, or by which descriptors were; "auto" chooses 1,
             2 or 4 from the extent of both scans. Prepared scans know theirs. The result is in metres.
 
@@ -136,8 +136,8 @@ def register(
         identity and the confidence 0; with fewer than three distinct pairs `rmse` is infinite.
 
     Raises:
-        ValueError: if the points are no real numbers (n, 3), if features have another width than the model, if
-            `refine` meets a cloud without surface elements, if both have another scale, or if "auto" meets descriptors.
+        ValueError: if the points are no real numbers (n, 3), if features have another width than the model, if both
+            have another scale, or if "auto" meets descriptors.
     """
     return register_each(model, [(source, target)], config=config, refine=refine, scale=scale)[0]
 
@@ -147,7 +147,7 @@ def register_each(
     pairs: Sequence[tuple[ScanOrCloud, ScanOrCloud]],
     *,
     config: MatchConfig | None = None,
-    refine: bool = False,
+    refine: bool = True,
     scale: Scale = 1.0,
 ) -> list[Registration]:
     """Registers pairs as `register` does; threads verify one pair while JAX matches the next.
@@ -165,8 +165,6 @@ def register_each(
     Raises:
         ValueError: as `register` says.
     """
-    if refine:
-        _require_elements(pairs)
     scale = _scale_of(pairs, scale, model)
     prepared = _prepared(model, pairs, scale, num_elements=_num_elements(model) if refine else None)
     matching, verification = config or model.config.matching, model.config.verification
@@ -182,7 +180,7 @@ def register_each(
             if isinstance(source, PreparedScan) and isinstance(target, PreparedScan):
                 scans = source.measured, target.measured
                 motions = pool.submit(_verified, *scans, hypotheses, verification, refine=refine)
-            elif refine:
+            elif refine and all(cloud.normals is not None for cloud in clouds):
                 motions = pool.submit(_refined, *clouds, in_cloud_units, pair_scale)
             started.append((hypotheses, motions))
         return [
@@ -249,15 +247,6 @@ class _Motions(NamedTuple):
     evidence: Verification | None = None
     verification: Verification | None = None
     weak: WeakDirection | None = None
-
-
-def _require_elements(pairs: Sequence[tuple[ScanOrCloud, ScanOrCloud]]) -> None:
-    for pair in pairs:
-        if not any(isinstance(scan, DescriptorCloud) for scan in pair):
-            continue
-        clouds = [_descriptors(scan) for scan in pair if isinstance(scan, DescriptorCloud | PreparedScan)]
-        if any(cloud.normals is None for cloud in clouds):
-            raise ValueError("refine: expected scans, or clouds with surface elements, got a cloud without normals")
 
 
 def _num_elements(model: Model) -> int:

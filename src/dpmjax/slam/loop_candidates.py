@@ -25,6 +25,27 @@ class LoopCandidate(NamedTuple):
     found_by: Literal["distance", "retrieval"]
 
 
+class _Path(NamedTuple):
+    # Of all keyframes.
+    path_m: Float[np.ndarray, " k"]
+    segments: Int[np.ndarray, " k"]
+    extents_m: Float[np.ndarray, " k"]
+
+    @classmethod
+    def of(cls, slam_map: KeyframeMap) -> _Path:
+        columns = [(frame.path_m, frame.segment, frame.extent_m) for frame in slam_map.keyframes]
+        return cls(*(np.array(column) for column in zip(*columns, strict=True)))
+
+    def since_m(self, row: int) -> Float[np.ndarray, " k"]:
+        """Returns the path from each keyframe to one; infinite where the track was lost between them."""
+        return np.where(self.segments == self.segments[row], self.path_m[row] - self.path_m, np.inf)
+
+    def is_old(self, row: int, config: LoopClosureConfig) -> Bool[np.ndarray, " k"]:
+        """Returns True for keyframes that a loop may join to one."""
+        is_before = np.arange(len(self.path_m)) < row
+        return is_before & (self.since_m(row) > config.min_path_share * self.extents_m[row])
+
+
 def find_candidates(slam_map: KeyframeMap, row: int, config: LoopClosureConfig) -> list[LoopCandidate]:
     """Finds older keyframes that may show the place of a keyframe.
 
@@ -39,11 +60,8 @@ def find_candidates(slam_map: KeyframeMap, row: int, config: LoopClosureConfig) 
     Returns:
         Candidates by distance, nearest first, and those by retrieval, most similar first, in turn; each row once.
     """
-    keyframe = slam_map.keyframes[row]
-    path_m = np.array([other.path_m for other in slam_map.keyframes])
-    is_chained = np.array([other.segment == keyframe.segment for other in slam_map.keyframes])
-    since_m = np.where(is_chained, keyframe.path_m - path_m, np.inf)
-    is_old = (np.arange(len(slam_map)) < row) & (since_m > config.min_path_share * keyframe.extent_m)
+    keyframe, path = slam_map.keyframes[row], _Path.of(slam_map)
+    is_old, since_m = path.is_old(row, config), path.since_m(row)
     apart_m = distances_to(slam_map, slam_map.T_world_keyframe[row, :3, 3])
     radius_m = config.radius_share * keyframe.extent_m + config.drift_share * since_m
     is_near = is_old & (apart_m <= np.minimum(radius_m, config.max_radius_m))
@@ -54,6 +72,27 @@ def find_candidates(slam_map: KeyframeMap, row: int, config: LoopClosureConfig) 
     by_retrieval = [LoopCandidate(int(other), "retrieval") for other in similar if other not in near]
     in_turn = itertools.chain.from_iterable(itertools.zip_longest(by_distance, by_retrieval))
     return [candidate for candidate in in_turn if candidate is not None]
+
+
+def nearest_pairs(slam_map: KeyframeMap, config: LoopClosureConfig) -> list[tuple[float, int, int]]:
+    """Finds, for each keyframe, the nearest older one that a loop may join to it, by the estimated poses alone.
+
+    Args:
+        slam_map: the map.
+        config: smallest distance along the path.
+
+    Returns:
+        Distance in metres and both rows, newer first, where it is within the extent of the newer scan; nearest first.
+    """
+    pairs, path = [], _Path.of(slam_map)
+    positions = slam_map.T_world_keyframe[:, :3, 3]
+    for row, keyframe in enumerate(slam_map.keyframes):
+        is_old = path.is_old(row, config)[:row]
+        apart_m = np.where(is_old, np.linalg.norm(positions[:row] - positions[row], axis=1), np.inf)
+        target = int(np.argmin(apart_m)) if row else 0
+        if row and apart_m[target] < keyframe.extent_m:
+            pairs.append((float(apart_m[target]), row, target))
+    return sorted(pairs)
 
 
 def find_meetings(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from bisect import bisect_right
 from collections.abc import Iterable, Sequence
 
 import numpy as np
@@ -10,13 +11,16 @@ from jaxtyping import Float
 from dpmjax.scans.plane_information import with_least_covariance
 from dpmjax.slam.config import LoopClosureConfig
 from dpmjax.slam.keyframes import KeyframeMap, Submap, diagonal_information, submap_around
-from dpmjax.slam.loop_candidates import LoopCandidate, find_candidates
+from dpmjax.slam.loop_candidates import LoopCandidate, find_candidates, nearest_pairs
 from dpmjax.slam.loop_consistency import accept_consistent, status_of
 from dpmjax.slam.loop_state import LoopState
 from dpmjax.slam.map_optimization import optimize_map
 from dpmjax.slam.matcher import Match
 from dpmjax.slam.methods import SlamMethods
 from dpmjax.slam.reports import Loop, LoopStatus
+
+MAX_AGAIN = 4
+"""Number of registrations after an optimisation."""
 
 
 def close_loops(methods: SlamMethods, slam_map: KeyframeMap, state: LoopState) -> tuple[KeyframeMap, LoopState]:
@@ -39,8 +43,40 @@ def close_loops(methods: SlamMethods, slam_map: KeyframeMap, state: LoopState) -
     state = LoopState(loops, state.num_optimized, is_stale)
     wait = max(config.every_keyframes, int(config.every_share * len(slam_map)))
     if is_stale and len(slam_map) - state.num_optimized >= wait:
-        return optimize_map(slam_map, state, config)
+        slam_map, state = optimize_map(slam_map, state, config)
+        return slam_map, search_again(methods, slam_map, state)
     return slam_map, state
+
+
+def search_again(methods: SlamMethods, slam_map: KeyframeMap, state: LoopState) -> LoopState:
+    """Registers keyframes that lie near earlier ones since the optimisation, and were not compared with them before.
+
+    Args:
+        methods: matcher and settings.
+        slam_map: after the optimisation.
+        state: its loops.
+
+    Returns:
+        The candidates after, in the order of their sources.
+    """
+    config, loops = methods.config.loops, state.loops
+    compared = {(loop.source, loop.target) for loop in loops if loop.overlap is not None}
+    keyframes = slam_map.keyframes
+    joined_m = np.array([keyframes[loop.source].path_m for loop in loops if loop.status == "accepted"])
+    new = [
+        (row, target)
+        for _, row, target in nearest_pairs(slam_map, config)
+        if (row, target) not in compared
+        and not (np.abs(joined_m - keyframes[row].path_m) < keyframes[row].extent_m).any()
+    ]
+    for row, target in new[:MAX_AGAIN]:
+        first = bisect_right(loops, row, key=lambda loop: loop.source)
+        candidate = LoopCandidate(target, "distance")
+        (loop,) = _register_candidates(methods, slam_map, row, [candidate])
+        loops = (*loops[:first], loop, *loops[first:])
+        if loop.status == "waits for support":
+            loops = accept_consistent(slam_map, loops, first, config)
+    return state._replace(loops=loops, is_stale=num_accepted(loops) > num_accepted(state.loops))
 
 
 def is_resting(slam_map: KeyframeMap, loops: Sequence[Loop], row: int, config: LoopClosureConfig) -> bool:

@@ -6,6 +6,8 @@ other keyframes, that agree with it over the odometry between them (pairwise con
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
+
 import numpy as np
 
 from dpmjax.geometry import rigid
@@ -82,7 +84,7 @@ def accept_consistent(
 
     Args:
         slam_map: the map.
-        loops: all candidates.
+        loops: all candidates, in the order of their sources.
         number: of the loop, which is registered.
         config: uncertainties and the number that is enough.
 
@@ -90,11 +92,9 @@ def accept_consistent(
         All candidates after.
     """
     others, num_witnesses = [], 0
-    for other in range(len(loops) - 1, -1, -1):
-        if not _is_near_along(slam_map, loops[number].source, loops[other].source, config):
-            break
+    for other in _near_along(slam_map, loops, number, config):
         is_witness = loops[other].status == "accepted"
-        if other == number or not (is_witness or loops[other].status == "waits for support"):
+        if not (is_witness or loops[other].status == "waits for support"):
             continue
         if num_witnesses < MAX_WITNESSES or not is_witness:
             others.append(other)
@@ -137,6 +137,15 @@ def are_consistent(slam_map: KeyframeMap, loop: Loop, other: Loop, config: LoopC
     # A turn of either registration moves the other end by the length of the odometry between them.
     sigma_m = float(np.hypot(sigma_m, config.sigma_rad * max(paths_m)))
     return are_near(one_way, other_way, config.consistent_sigmas * sigma_m, config.consistent_sigmas * sigma_rad)
+
+
+def _near_along(slam_map: KeyframeMap, loops: Sequence[Loop], number: int, config: LoopClosureConfig) -> Iterator[int]:
+    """Yields the other loops whose sources are near along the path: those before, latest first, then those after."""
+    for others in (range(number - 1, -1, -1), range(number + 1, len(loops))):
+        for other in others:
+            if not _is_near_along(slam_map, loops[number].source, loops[other].source, config):
+                break
+            yield other
 
 
 def _is_near_along(slam_map: KeyframeMap, row: int, other: int, config: LoopClosureConfig) -> bool:

@@ -14,7 +14,7 @@ from dpmjax.deeppointmap.verification import MeasuredScan
 from dpmjax.scans.free_space import range_image, view_points
 from dpmjax.scans.plane_information import plane_information, with_least_covariance
 from dpmjax.scans.surface_alignment import AlignmentLevel, align_surfaces_from, nearest_planes, pair_with_planes
-from dpmjax.scans.surfaces import Surface, surface_at
+from dpmjax.scans.surfaces import Surface, SurfaceConfig, surface_at
 from dpmjax.slam.alignment import Alignment, ThinnedScan, best_of
 from dpmjax.slam.config import OdometryConfig
 from dpmjax.slam.keyframes import Pose, orthonormal
@@ -26,6 +26,9 @@ MAX_VIEWED = 4000
 
 MAX_ELEMENTS = 8000
 """Largest number of surface elements of a scan."""
+
+NEIGHBOURHOODS = SurfaceConfig(sparse_radius_share=1.5)
+"""Scans of 1,000 points have neighbours farther away than others."""
 
 NUM_FINE = 3
 """Number of starts of a search that are aligned finely."""
@@ -57,7 +60,7 @@ class SurfaceGeometry:
         pyramid = pyramid_of_scan(points, self._model_config)
         level = pyramid.levels[0]
         thinned = np.asarray(level.positions)[np.asarray(level.mask)] * np.float64(self._model_config.scale_m)
-        surface = surface_at(thinned, _spread_rows(pyramid))
+        surface = surface_at(thinned, _spread_rows(pyramid), NEIGHBOURHOODS)
         if np.count_nonzero(surface.flatness) < self.config.min_num_points:
             return None
         extent_m = float(np.median(np.linalg.norm(thinned, axis=1)))
