@@ -15,7 +15,7 @@ from dpmjax.slam.local_map import PlacedElements, joined_surface, local_map_of, 
 from dpmjax.types import SurfaceElements
 from tests.slam.truth import compact_of, laps, number_of, pose
 
-CONFIG = OdometryConfig(num_keyframes=5, num_recent=3, recent_rad=0.2)
+CONFIG = OdometryConfig(num_keyframes=5, num_recent=3)
 TRUTH = laps(1, side_m=20.0, step_m=2.0)
 SPACING_M = 0.8
 
@@ -78,9 +78,9 @@ def test_a_local_map_moves_with_the_frame_of_the_map() -> None:
 
 def test_a_scan_that_adds_nothing_does_not_join() -> None:
     recent = (PlacedElements(np.eye(4), elements_at(5.0)),)
-    for T in (pose(0, 0, 0), pose(0.99 * SPACING_M, 0, 0), pose(0, 0, 0.19)):
+    for T in (pose(0, 0, 0), pose(0.99 * SPACING_M, 0, 0), pose(0, 0, 0.16)):
         assert with_scan(recent, PlacedElements(T, elements_at(5.0)), SPACING_M, CONFIG) is recent
-    for T in (pose(1.01 * SPACING_M, 0, 0), pose(0, 0, 0.21)):
+    for T in (pose(1.01 * SPACING_M, 0, 0), pose(0, 0, 0.18)):
         placed = PlacedElements(T, elements_at(5.0))
         joined = with_scan(recent, placed, SPACING_M, CONFIG)
         assert joined == (*recent, placed)

@@ -11,7 +11,7 @@ from dpmjax.scans.plane_information import plane_information, with_least_covaria
 from dpmjax.scans.surface_alignment import PlanePairs
 from dpmjax.slam import KeyframeMap, LoopClosureConfig, SlamConfig, SlamMethods
 from dpmjax.slam.keyframes import Keyframe, MapEdge, add_keyframe, diagonal_information, submap_around
-from dpmjax.slam.loop_candidates import find_candidates, nearest_pairs
+from dpmjax.slam.loop_candidates import MIN_PATH_SHARE, find_candidates, nearest_pairs
 from dpmjax.slam.loop_closure import MAX_AGAIN, search_again
 from dpmjax.slam.loop_consistency import are_consistent
 from dpmjax.slam.loop_state import LoopState
@@ -96,14 +96,14 @@ def test_nearest_pairs_are_those_of_a_search_by_hand() -> None:
         apart = []
         for other in range(row):
             is_chained = (row < 60) == (other < 60)
-            if not is_chained or 2.0 * (row - other) > CONFIG.min_path_share * 10.0:
+            if not is_chained or 2.0 * (row - other) > MIN_PATH_SHARE * 10.0:
                 apart.append((float(np.linalg.norm(truth[row, :3, 3] - truth[other, :3, 3])), other))
         if apart and min(apart)[0] < 10.0:
             expected.append((min(apart)[0], row, min(apart)[1]))
-    found = nearest_pairs(slam_map, CONFIG)
+    found = nearest_pairs(slam_map)
     np.testing.assert_allclose([pair[0] for pair in found], sorted(pair[0] for pair in expected), atol=1e-9)
     assert {pair[1] for pair in found} == {pair[1] for pair in expected}
-    assert nearest_pairs(map_of(truth[:1]), CONFIG) == []
+    assert nearest_pairs(map_of(truth[:1])) == []
 
 
 def test_keyframes_that_an_optimisation_brings_together_are_compared_then() -> None:

@@ -14,6 +14,7 @@ from dpmjax.scans.compact import compact_elements, compact_image
 from dpmjax.slam import Alignment, KeyframeMap, LocalMap, OdometryConfig, SurfaceGeometry, ThinnedScan
 from dpmjax.slam.keyframes import Keyframe, add_keyframe, diagonal_information, orthonormal, turn_rad
 from dpmjax.slam.local_map import local_map_of
+from dpmjax.slam.odometry import CONTRADICTION_WEIGHT, MAX_ELEMENTS
 from dpmjax.types import SurfaceElements
 
 
@@ -149,7 +150,7 @@ def test_an_element_of_the_map_in_free_space_lowers_the_score(geometry, room) ->
     assert seen.contradicted_share < 0.002
     assert missed.contradicted_share > 0.008
     for found in (seen, missed):
-        assert found.score == found.matched_share - geometry.config.contradiction_weight * found.contradicted_share
+        assert found.score == found.matched_share - CONTRADICTION_WEIGHT * found.contradicted_share
 
 
 def test_empty_scans_are_none(geometry) -> None:
@@ -165,7 +166,7 @@ def test_a_thinned_scan_is_of_points_of_the_scan(geometry) -> None:
     scan = geometry.thin(points)
     surface, spread = scan.measured.surface, model_preset("small").pyramid.stages[0].num_points
     assert cKDTree(points).query(surface.points)[0].max() < 1e-4
-    assert len(surface.points) > 2 * spread
+    assert len(surface.points) == MAX_ELEMENTS
     # The first lie farther apart than the others.
     apart = [cKDTree(some).query(some, 2)[0][:, 1] for some in (surface.points[:spread], surface.points[spread:])]
     assert apart[0].min() > 2 * apart[1].min()

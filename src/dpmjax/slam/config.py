@@ -27,54 +27,35 @@ class OdometryConfig:
         min_num_points: a scan with fewer flat surface elements counts as empty.
         num_keyframes: number of the nearest keyframes in the local map.
         num_recent: number of scans since the last keyframe in the local map.
-        recent_share: smallest distance of these scans, as a share of the extent.
-        recent_rad: turn from which on a scan joins them at a smaller distance.
         narrow: alignment from a first guess that is nearly right.
         wide: alignment from other starts.
-        num_samples: number of surface elements that the score of a pose compares.
         plane_radius_m: largest distance between an element and the element of the map whose plane it meets.
         plane_distance_m: largest distance to that plane.
-        min_cosine: smallest cosine between both normals.
-        contradiction_weight: weight of the share of points in free space in the score.
         good_share: share of the usual score from which on no other start is tried.
         num_hypotheses: number of motions that the decoder proposes.
-        step_factors: factors of the predicted step among the other starts.
-        ahead_shares: steps along the x axis of the lidar among them, as shares of the extent.
-        turns_deg: turns about the vertical among them.
-        tilts_deg: turns about the two other axes among them.
-        floor_m: lower bound of the standard deviation of a translation.
-        floor_rad: lower bound of the standard deviation of a rotation.
+        turns_deg: turns about the vertical among the other starts.
+        tilts_deg: turns about the two other axes among the other starts.
     """
 
     proposer: Proposer = "prediction"
     min_num_points: int = 100
     num_keyframes: int = 12
     num_recent: int = 8
-    recent_share: float = 0.08
-    recent_rad: float = 0.17
     narrow: AlignmentConfig = NARROW
     wide: AlignmentConfig = WIDE
-    num_samples: int = 1000
     plane_radius_m: float = 1.5
     plane_distance_m: float = 0.15
-    min_cosine: float = 0.7
-    contradiction_weight: float = 2.0
     good_share: float = 0.85
     num_hypotheses: int = 3
-    step_factors: tuple[float, ...] = (0.0, 0.5, 1.0, 1.5, 2.0, 3.0, 4.0)
-    ahead_shares: tuple[float, ...] = (-0.08, 0.08, 0.16)
     turns_deg: tuple[float, ...] = (-10.0, 10.0, -20.0, 20.0, -35.0, 35.0, -50.0, 50.0)
     tilts_deg: tuple[float, ...] = (-8.0, 8.0)
-    floor_m: float = 0.01
-    floor_rad: float = 0.001
 
     def __post_init__(self) -> None:
         require_one_of("proposer", self.proposer, get_args(Proposer))
-        require_positive_fields(self, "recent_share", "recent_rad", "plane_radius_m", "plane_distance_m")
-        require_positive_fields(self, "floor_m", "floor_rad")
-        require_fields(self, "min_num_points", "num_keyframes", "num_samples", "num_hypotheses", low=1)
-        require_fields(self, "num_recent", "contradiction_weight", low=0)
-        require_fields(self, "min_cosine", "good_share", low=0, high=1)
+        require_positive_fields(self, "plane_radius_m", "plane_distance_m")
+        require_fields(self, "min_num_points", "num_keyframes", "num_hypotheses", low=1)
+        require_fields(self, "num_recent", low=0)
+        require_fields(self, "good_share", low=0, high=1)
 
 
 @dataclass(frozen=True)
@@ -85,9 +66,6 @@ class FrontEndConfig:
         min_score_share: smallest accepted share of the usual score.
         min_score: smallest accepted score.
         min_probability: smallest P(correct) of the decoder's motion that accepts a pose of a lower share.
-        near_m: largest distance between that motion and the pose.
-        near_rad: largest turn between them.
-        min_margin: difference of the scores from which on the decoder's motion replaces another one.
         num_submap: largest number of keyframes that are merged for a registration.
         submap_radius_m: largest distance of these keyframes (DeepPointMap's published configuration).
         num_lost: number of scans without an accepted pose after which a new segment begins, which loops may join.
@@ -95,17 +73,11 @@ class FrontEndConfig:
         keyframe_rad: turn between keyframes at a smaller distance.
         max_keyframe_m: upper bound of the distance of keyframes (DeepPointMap: 3 to 10 m).
         min_keyframe_m: lower bound of the distance of keyframes.
-        usual_window: number of scans whose median is the usual score.
-        guess_m: standard deviation of a predicted translation.
-        guess_rad: standard deviation of a predicted rotation.
     """
 
     min_score_share: float = 0.4
     min_score: float = 0.2
     min_probability: float = 0.5
-    near_m: float = 2.0
-    near_rad: float = 0.087
-    min_margin: float = 0.1
     num_submap: int = 4
     submap_radius_m: float = 20.0
     num_lost: int = 6
@@ -113,15 +85,11 @@ class FrontEndConfig:
     keyframe_rad: float = 0.6
     max_keyframe_m: float = 5.0
     min_keyframe_m: float = 0.5
-    usual_window: int = 20
-    guess_m: float = 1.0
-    guess_rad: float = 0.2
 
     def __post_init__(self) -> None:
         require_fields(self, "min_score_share", "min_probability", low=0, high=1)
-        require_fields(self, "near_m", "near_rad", "min_margin", low=0)
-        require_fields(self, "num_submap", "num_lost", "usual_window", low=1)
-        require_positive_fields(self, "submap_radius_m", "keyframe_share", "keyframe_rad", "guess_m", "guess_rad")
+        require_fields(self, "num_submap", "num_lost", low=1)
+        require_positive_fields(self, "submap_radius_m", "keyframe_share", "keyframe_rad")
         require_fields(self, "min_keyframe_m", low=1e-3, high=self.max_keyframe_m)
 
 
@@ -131,77 +99,47 @@ class LoopClosureConfig:
 
     Attributes:
         is_on: False leaves the map as odometry makes it.
-        min_path_share: smallest distance of a candidate along the path, in extents.
-        radius_share: radius of the candidates by distance, in extents.
-        drift_share: share of the path since a candidate that is added to the radius.
         max_radius_m: upper bound of the radius (DeepPointMap: 100 m).
         num_near: largest number of candidates by distance.
         num_similar: largest number of candidates by retrieval.
         min_cosine: smallest similarity of a candidate by retrieval.
         min_overlap: smallest overlap probability of a candidate that is registered; 0 uses no network.
         num_asked: number of candidates whose overlap is predicted at a time, of both kinds in turn.
-        sure_overlap: overlap probability from which on no further candidate is looked at.
         num_registered: largest number of candidates that are registered.
         min_probability: smallest P(correct) of an accepted registration.
         min_matched_share: smallest share of points that meet planes, where the scans verify a registration.
         max_contradicted_share: largest share of points in free space.
         min_support: number of consistent registrations, itself among them, that make a loop an edge.
-        pending_path_m: largest distance along the path between the ends of registrations that support each other.
         sigma_m: standard deviation of a registration by descriptors.
         sigma_rad: standard deviation of its rotation.
-        floor_m: lower bound of the standard deviation of an aligned loop: scans hold walkers and motion.
-        floor_rad: lower bound of the standard deviation of its rotation.
         drift_m: standard deviation of odometry over one metre; it grows with the root of the path.
-        drift_rad: standard deviation of its rotation over one metre.
-        consistent_sigmas: number of standard deviations within which a cycle closes.
-        min_drift_share: share of the path by which a loop may contradict odometry in any case.
         edge_outlier_chi2: cost from which on the optimisation reduces the weight of a loop edge.
-        taken_back_weight: smallest weight of a loop edge that stays after the optimisation.
-        rest_share: path after an accepted loop on which no other is looked for, in extents.
-        every_keyframes: smallest number of keyframes between two optimisations.
-        every_share: the same as a share of all keyframes, so that the cost of a scan does not grow with the map.
     """
 
     is_on: bool = True
-    min_path_share: float = 4.0
-    radius_share: float = 1.5
-    drift_share: float = 0.03
     max_radius_m: float = 100.0
     num_near: int = 6
     num_similar: int = 6
     min_cosine: float = 0.8
     min_overlap: float = 0.3
     num_asked: int = 4
-    sure_overlap: float = 0.9
     num_registered: int = 2
     min_probability: float = 0.5
     min_matched_share: float = 0.35
     max_contradicted_share: float = 0.1
     min_support: int = 2
-    pending_path_m: float = 40.0
     sigma_m: float = 0.2
     sigma_rad: float = 0.02
-    floor_m: float = 0.05
-    floor_rad: float = 0.005
     drift_m: float = 0.05
-    drift_rad: float = 0.004
-    consistent_sigmas: float = 3.0
-    min_drift_share: float = 0.1
     edge_outlier_chi2: float = 25.0
-    taken_back_weight: float = 0.25
-    rest_share: float = 0.3
-    every_keyframes: int = 8
-    every_share: float = 0.05
 
     def __post_init__(self) -> None:
-        require_fields(self, "min_overlap", "sure_overlap", "min_probability", low=0, high=1)
-        require_fields(self, "min_matched_share", "max_contradicted_share", "taken_back_weight", low=0, high=1)
-        require_fields(self, "min_support", "every_keyframes", "num_registered", "num_asked", low=1)
-        require_fields(self, "num_near", "num_similar", "min_path_share", "drift_share", "min_drift_share", low=0)
-        require_fields(self, "rest_share", "every_share", low=0)
-        require_positive_fields(self, "radius_share", "max_radius_m", "pending_path_m", "consistent_sigmas")
-        require_positive_fields(self, "sigma_m", "sigma_rad", "floor_m", "floor_rad", "drift_m", "drift_rad")
-        require_positive_fields(self, "edge_outlier_chi2")
+        require_fields(self, "min_overlap", "min_probability", low=0, high=1)
+        require_fields(self, "min_matched_share", "max_contradicted_share", low=0, high=1)
+        require_fields(self, "min_support", "num_registered", "num_asked", low=1)
+        require_fields(self, "num_near", "num_similar", low=0)
+        require_positive_fields(self, "max_radius_m")
+        require_positive_fields(self, "sigma_m", "sigma_rad", "drift_m", "edge_outlier_chi2")
 
 
 @dataclass(frozen=True)

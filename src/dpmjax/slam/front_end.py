@@ -42,6 +42,27 @@ from dpmjax.slam.methods import SlamMethods
 from dpmjax.slam.reports import ScanReport, ScanStatus
 from dpmjax.types import AnyArray
 
+RECENT_SHARE = 0.08
+"""Smallest distance between the last scans of the local map, as a share of the extent."""
+
+NEAR_M = 2.0
+"""Poses farther apart are of other places."""
+
+NEAR_RAD = 0.087
+"""Largest turn between the decoder's motion and the pose that it confirms."""
+
+MIN_MARGIN = 0.1
+"""Difference of the scores from which on the decoder's motion replaces another one."""
+
+USUAL_WINDOW = 20
+"""Number of scans whose median is the usual score."""
+
+GUESS_M = 1.0
+"""Standard deviation of a predicted translation."""
+
+GUESS_RAD = 0.2
+"""Standard deviation of a predicted rotation."""
+
 UNKNOWN_M = 1000.0
 """Standard deviation of a place that nothing is known of."""
 
@@ -174,7 +195,7 @@ def _pass_over(state: FrontEndState, slam_map: KeyframeMap) -> tuple[FrontEndSta
 def _placed(methods: SlamMethods, scan: ThinnedScan, T_map_scan: Pose) -> tuple[PlacedElements, float, OdometryConfig]:
     """Returns a scan for the local map, its smallest distance from the last one, and the settings."""
     config = methods.config.odometry
-    return placed_scan(scan.measured.surface, T_map_scan), config.recent_share * scan.extent_m, config
+    return placed_scan(scan.measured.surface, T_map_scan), RECENT_SHARE * scan.extent_m, config
 
 
 class _Attempt(NamedTuple):
@@ -193,13 +214,13 @@ def _locate(methods: SlamMethods, state: FrontEndState, local_map: LocalMap, sca
     wanted = max(config.min_score, config.min_score_share * usual if state.scores else 0.0)
     tried = _attempt(methods, state, local_map, scan, usual)
     # Nothing supports the prediction before any motion is known.
-    best = _better(tried, config.near_m, config.min_margin if state.scores else 0.0)
+    best = _better(tried, MIN_MARGIN if state.scores else 0.0)
     is_matched = best is tried.matched
     numbers = f"score {best.score:.2f} of usually {usual:.2f}"
     if tried.probability is not None:
         numbers += f", P {tried.probability:.2f} by the network"
     network = tried.probability, tried.compact
-    is_far = not are_near(predicted, best.T_map_scan, config.near_m, np.inf)
+    is_far = not are_near(predicted, best.T_map_scan, NEAR_M, np.inf)
     if is_far and state.scores and (tried.probability or 0.0) < config.min_probability:
         # A motion that neither the motion of before nor the decoder supports needs the usual score.
         wanted = methods.config.odometry.good_share * usual
@@ -207,9 +228,9 @@ def _locate(methods: SlamMethods, state: FrontEndState, local_map: LocalMap, sca
         status: ScanStatus = "network" if is_matched else "tracked"
         return Located(best.T_map_scan, status, numbers, best.score, best.information, *network)
     status = "restarted" if state.num_lost + 1 >= config.num_lost else "predicted"
-    guess = diagonal_information(config.guess_m, config.guess_rad)
+    guess = diagonal_information(GUESS_M, GUESS_RAD)
     # The best alignment is the better guess, unless a robot hardly moves like that.
-    is_likely = are_near(predicted, best.T_map_scan, 3 * config.guess_m, 3 * config.guess_rad)
+    is_likely = are_near(predicted, best.T_map_scan, 3 * GUESS_M, 3 * GUESS_RAD)
     return Located(best.T_map_scan if is_likely else predicted, status, numbers, best.score, guess, *network)
 
 
@@ -239,12 +260,12 @@ def _attempt(
     return _Attempt(tracked, matched, starts[0], proposal.probability, compact)
 
 
-def _better(tried: _Attempt, near_m: float, min_margin: float) -> Alignment:
+def _better(tried: _Attempt, min_margin: float) -> Alignment:
     """Returns the better pose; another place must fit better by a margin than the one that the prediction supports."""
     tracked, matched = tried.tracked, tried.matched
     if tracked is None or matched is None:
         return best_of([found for found in (tracked, matched) if found is not None])
-    is_same = are_near(tracked.T_map_scan, matched.T_map_scan, near_m, np.inf)
+    is_same = are_near(tracked.T_map_scan, matched.T_map_scan, NEAR_M, np.inf)
     return matched if matched.score > tracked.score + (0.0 if is_same else min_margin) else tracked
 
 
@@ -254,7 +275,7 @@ def _is_confirmed(methods: SlamMethods, tried: _Attempt, best: Alignment) -> boo
     if tried.tracked is None or tried.T_map_scan is None or (tried.probability or 0.0) < config.min_probability:
         return False
     ends = (tried.tracked.T_map_scan, tried.T_map_scan)
-    are_equal = all(are_near(T, best.T_map_scan, config.near_m, config.near_rad) for T in ends)
+    are_equal = all(are_near(T, best.T_map_scan, NEAR_M, NEAR_RAD) for T in ends)
     return are_equal and best.score >= config.min_score
 
 
@@ -306,7 +327,7 @@ def _advanced(methods: SlamMethods, state: FrontEndState, located: Located) -> F
         return after._replace(num_lost=0, scores=())
     return after._replace(
         T_before_last=rigid.inverse(state.T_keyframe_last) @ T,
-        scores=(*state.scores, located.score)[-methods.config.front_end.usual_window :],
+        scores=(*state.scores, located.score)[-USUAL_WINDOW:],
         num_lost=0,
     )
 

@@ -20,6 +20,9 @@ from dpmjax.slam.config import OdometryConfig
 from dpmjax.slam.keyframes import KeyframeMap, Pose, nearest_in_graph, turn_rad
 from dpmjax.types import SurfaceElements
 
+RECENT_RAD = 0.17
+"""Turn from which on a scan joins the local map at a smaller distance."""
+
 
 class PlacedElements(NamedTuple):
     """Surface elements of a scan and its pose.
@@ -78,8 +81,10 @@ def placed_scan(surface: Surface, T_map_scan: Pose) -> PlacedElements:
         The placed elements.
     """
     is_flat = surface.flatness > MIN_FLATNESS
-    arrays = (array[is_flat].astype(np.float32) for array in (surface.points, surface.normals, surface.flatness))
-    return PlacedElements(T_map_scan, SurfaceElements(*arrays, np.ones(is_flat.sum(), bool)))
+    positions, normals, planarity = (
+        array[is_flat].astype(np.float32) for array in (surface.points, surface.normals, surface.flatness)
+    )
+    return PlacedElements(T_map_scan, SurfaceElements(positions, normals, planarity, np.ones(is_flat.sum(), bool)))
 
 
 def with_scan(
@@ -98,7 +103,7 @@ def with_scan(
     """
     if recent:
         T_last_scan = rigid.inverse(recent[-1].T_map_scan) @ placed.T_map_scan
-        if np.linalg.norm(T_last_scan[:3, 3]) < spacing_m and turn_rad(T_last_scan) < config.recent_rad:
+        if np.linalg.norm(T_last_scan[:3, 3]) < spacing_m and turn_rad(T_last_scan) < RECENT_RAD:
             return recent
     return (*recent, placed)[-config.num_recent :] if config.num_recent else recent
 

@@ -12,6 +12,15 @@ from dpmjax.slam.config import LoopClosureConfig
 from dpmjax.slam.keyframes import KeyframeMap, distances_to
 from dpmjax.slam.retrieval import most_similar
 
+MIN_PATH_SHARE = 4.0
+"""Smallest distance of a candidate along the path, in extents."""
+
+RADIUS_SHARE = 1.5
+"""Radius of the candidates by distance, in extents."""
+
+DRIFT_SHARE = 0.03
+"""Share of the path since a candidate that is added to the radius."""
+
 
 class LoopCandidate(NamedTuple):
     """An older keyframe that may show the same place.
@@ -40,10 +49,10 @@ class _Path(NamedTuple):
         """Returns the path from each keyframe to one; infinite where the track was lost between them."""
         return np.where(self.segments == self.segments[row], self.path_m[row] - self.path_m, np.inf)
 
-    def is_old(self, row: int, config: LoopClosureConfig) -> Bool[np.ndarray, " k"]:
+    def is_old(self, row: int) -> Bool[np.ndarray, " k"]:
         """Returns True for keyframes that a loop may join to one."""
         is_before = np.arange(len(self.path_m)) < row
-        return is_before & (self.since_m(row) > config.min_path_share * self.extents_m[row])
+        return is_before & (self.since_m(row) > MIN_PATH_SHARE * self.extents_m[row])
 
 
 def find_candidates(slam_map: KeyframeMap, row: int, config: LoopClosureConfig) -> list[LoopCandidate]:
@@ -61,9 +70,9 @@ def find_candidates(slam_map: KeyframeMap, row: int, config: LoopClosureConfig) 
         Candidates by distance, nearest first, and those by retrieval, most similar first, in turn; each row once.
     """
     keyframe, path = slam_map.keyframes[row], _Path.of(slam_map)
-    is_old, since_m = path.is_old(row, config), path.since_m(row)
+    is_old, since_m = path.is_old(row), path.since_m(row)
     apart_m = distances_to(slam_map, slam_map.T_world_keyframe[row, :3, 3])
-    radius_m = config.radius_share * keyframe.extent_m + config.drift_share * since_m
+    radius_m = RADIUS_SHARE * keyframe.extent_m + DRIFT_SHARE * since_m
     is_near = is_old & (apart_m <= np.minimum(radius_m, config.max_radius_m))
     near = np.argsort(np.where(is_near, apart_m, np.inf), kind="stable")[: int(is_near.sum())]
     near = _spread(near, slam_map, keyframe.extent_m / 2, config.num_near)
@@ -74,12 +83,11 @@ def find_candidates(slam_map: KeyframeMap, row: int, config: LoopClosureConfig) 
     return [candidate for candidate in in_turn if candidate is not None]
 
 
-def nearest_pairs(slam_map: KeyframeMap, config: LoopClosureConfig) -> list[tuple[float, int, int]]:
+def nearest_pairs(slam_map: KeyframeMap) -> list[tuple[float, int, int]]:
     """Finds, for each keyframe, the nearest older one that a loop may join to it, by the estimated poses alone.
 
     Args:
         slam_map: the map.
-        config: smallest distance along the path.
 
     Returns:
         Distance in metres and both rows, newer first, where it is within the extent of the newer scan; nearest first.
@@ -87,7 +95,7 @@ def nearest_pairs(slam_map: KeyframeMap, config: LoopClosureConfig) -> list[tupl
     pairs, path = [], _Path.of(slam_map)
     positions = slam_map.T_world_keyframe[:, :3, 3]
     for row, keyframe in enumerate(slam_map.keyframes):
-        is_old = path.is_old(row, config)[:row]
+        is_old = path.is_old(row)[:row]
         apart_m = np.where(is_old, np.linalg.norm(positions[:row] - positions[row], axis=1), np.inf)
         target = int(np.argmin(apart_m)) if row else 0
         if row and apart_m[target] < keyframe.extent_m:

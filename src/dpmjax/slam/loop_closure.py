@@ -19,6 +19,24 @@ from dpmjax.slam.matcher import Match
 from dpmjax.slam.methods import SlamMethods
 from dpmjax.slam.reports import Loop, LoopStatus
 
+SURE_OVERLAP = 0.9
+"""Overlap probability from which on no further candidate is looked at."""
+
+FLOOR_M = 0.05
+"""Lower bound of the standard deviation of an aligned loop: scans hold walkers and motion."""
+
+FLOOR_RAD = 0.005
+"""Lower bound of the standard deviation of the rotation of an aligned loop."""
+
+REST_SHARE = 0.3
+"""Path after an accepted loop on which no other is looked for, in extents."""
+
+EVERY_KEYFRAMES = 8
+"""Smallest number of keyframes between two optimisations."""
+
+EVERY_SHARE = 0.05
+"""Share of all keyframes between two optimisations: the cost of a scan does not grow with the map."""
+
 MAX_AGAIN = 4
 """Number of registrations after an optimisation."""
 
@@ -36,12 +54,12 @@ def close_loops(methods: SlamMethods, slam_map: KeyframeMap, state: LoopState) -
     """
     config = methods.config.loops
     row = len(slam_map) - 1
-    if not config.is_on or row < 1 or is_resting(slam_map, state.loops, row, config):
+    if not config.is_on or row < 1 or is_resting(slam_map, state.loops, row):
         return slam_map, state
     loops = examine_candidates(methods, slam_map, state.loops, row, find_candidates(slam_map, row, config))
     is_stale = state.is_stale or num_accepted(loops) > num_accepted(state.loops)
     state = LoopState(loops, state.num_optimized, is_stale)
-    wait = max(config.every_keyframes, int(config.every_share * len(slam_map)))
+    wait = max(EVERY_KEYFRAMES, int(EVERY_SHARE * len(slam_map)))
     if is_stale and len(slam_map) - state.num_optimized >= wait:
         slam_map, state = optimize_map(slam_map, state, config)
         return slam_map, search_again(methods, slam_map, state)
@@ -65,7 +83,7 @@ def search_again(methods: SlamMethods, slam_map: KeyframeMap, state: LoopState) 
     joined_m = np.array([keyframes[loop.source].path_m for loop in loops if loop.status == "accepted"])
     new = [
         (row, target)
-        for _, row, target in nearest_pairs(slam_map, config)
+        for _, row, target in nearest_pairs(slam_map)
         if (row, target) not in compared
         and not (np.abs(joined_m - keyframes[row].path_m) < keyframes[row].extent_m).any()
     ]
@@ -79,14 +97,13 @@ def search_again(methods: SlamMethods, slam_map: KeyframeMap, state: LoopState) 
     return state._replace(loops=loops, is_stale=num_accepted(loops) > num_accepted(state.loops))
 
 
-def is_resting(slam_map: KeyframeMap, loops: Sequence[Loop], row: int, config: LoopClosureConfig) -> bool:
+def is_resting(slam_map: KeyframeMap, loops: Sequence[Loop], row: int) -> bool:
     """Returns True shortly after an accepted loop: another one would add little.
 
     Args:
         slam_map: the map.
         loops: so far.
         row: of a keyframe.
-        config: how long to rest.
 
     Returns:
         True where the last accepted loop is near along the path.
@@ -94,7 +111,7 @@ def is_resting(slam_map: KeyframeMap, loops: Sequence[Loop], row: int, config: L
     for loop in reversed(loops):
         if loop.status == "accepted":
             keyframe, last = slam_map.keyframes[row], slam_map.keyframes[loop.source]
-            rest_m = config.rest_share * keyframe.extent_m
+            rest_m = REST_SHARE * keyframe.extent_m
             return keyframe.segment == last.segment and keyframe.path_m - last.path_m < rest_m
     return False
 
@@ -175,7 +192,7 @@ def _overlaps(
     for start in range(0, len(candidates), config.num_asked):
         some = scans[start : start + config.num_asked]
         found += methods.matcher.overlaps(slam_map.keyframes[row].compact, some).tolist()
-        if max(filter(None, found), default=0.0) >= config.sure_overlap:
+        if max(filter(None, found), default=0.0) >= SURE_OVERLAP:
             break
     return found + [None] * (len(candidates) - len(found))
 
@@ -190,4 +207,4 @@ def _edge_information(match: Match, config: LoopClosureConfig) -> Float[np.ndarr
     """Returns the information by the planes, with an upper bound; for descriptors alone, that of the configuration."""
     if match.information is None:
         return diagonal_information(config.sigma_m, config.sigma_rad)
-    return with_least_covariance(match.information, config.floor_m, config.floor_rad)
+    return with_least_covariance(match.information, FLOOR_M, FLOOR_RAD)

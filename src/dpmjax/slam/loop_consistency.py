@@ -16,6 +16,18 @@ from dpmjax.slam.keyframes import KeyframeMap, are_near
 from dpmjax.slam.matcher import Match
 from dpmjax.slam.reports import Loop, LoopStatus
 
+PENDING_PATH_M = 40.0
+"""Largest distance along the path between the ends of registrations that support each other."""
+
+DRIFT_RAD = 0.004
+"""Standard deviation of the rotation of odometry over one metre."""
+
+CONSISTENT_SIGMAS = 3.0
+"""Number of standard deviations within which a cycle closes."""
+
+MIN_DRIFT_SHARE = 0.1
+"""Share of the path by which a loop may contradict odometry in any case."""
+
 MAX_WITNESSES = 6
 """So many accepted loops are asked whether they agree with a new one."""
 
@@ -42,8 +54,8 @@ def status_of(slam_map: KeyframeMap, loop: Loop, match: Match, config: LoopClosu
         T_world = slam_map.T_world_keyframe
         predicted = rigid.inverse(T_world[loop.target]) @ T_world[loop.source]
         sigma_m, sigma_rad = _drift(path_m, config)
-        most_m = config.consistent_sigmas * sigma_m + config.min_drift_share * path_m
-        most_rad = config.consistent_sigmas * sigma_rad + config.min_drift_share
+        most_m = CONSISTENT_SIGMAS * sigma_m + MIN_DRIFT_SHARE * path_m
+        most_rad = CONSISTENT_SIGMAS * sigma_rad + MIN_DRIFT_SHARE
         if not are_near(predicted, match.T_target_source, most_m, most_rad):
             return "against odometry"
     return "waits for support"
@@ -92,7 +104,7 @@ def accept_consistent(
         All candidates after.
     """
     others, num_witnesses = [], 0
-    for other in _near_along(slam_map, loops, number, config):
+    for other in _near_along(slam_map, loops, number):
         is_witness = loops[other].status == "accepted"
         if not (is_witness or loops[other].status == "waits for support"):
             continue
@@ -127,7 +139,7 @@ def are_consistent(slam_map: KeyframeMap, loop: Loop, other: Loop, config: LoopC
     if loop.source == other.source or loop.T_target_source is None or other.T_target_source is None:
         return False
     rows = list(zip(loop[:2], other[:2], strict=True))
-    if not all(_is_near_along(slam_map, a, b, config) for a, b in rows):
+    if not all(_is_near_along(slam_map, a, b) for a, b in rows):
         return False
     ends = [(slam_map.keyframes[a], slam_map.keyframes[b]) for a, b in rows]
     paths_m = [abs(a.path_m - b.path_m) for a, b in ends]
@@ -136,27 +148,27 @@ def are_consistent(slam_map: KeyframeMap, loop: Loop, other: Loop, config: LoopC
     sigma_m, sigma_rad = _drift(sum(paths_m), config)
     # A turn of either registration moves the other end by the length of the odometry between them.
     sigma_m = float(np.hypot(sigma_m, config.sigma_rad * max(paths_m)))
-    return are_near(one_way, other_way, config.consistent_sigmas * sigma_m, config.consistent_sigmas * sigma_rad)
+    return are_near(one_way, other_way, CONSISTENT_SIGMAS * sigma_m, CONSISTENT_SIGMAS * sigma_rad)
 
 
-def _near_along(slam_map: KeyframeMap, loops: Sequence[Loop], number: int, config: LoopClosureConfig) -> Iterator[int]:
+def _near_along(slam_map: KeyframeMap, loops: Sequence[Loop], number: int) -> Iterator[int]:
     """Yields the other loops whose sources are near along the path: those before, latest first, then those after."""
     for others in (range(number - 1, -1, -1), range(number + 1, len(loops))):
         for other in others:
-            if not _is_near_along(slam_map, loops[number].source, loops[other].source, config):
+            if not _is_near_along(slam_map, loops[number].source, loops[other].source):
                 break
             yield other
 
 
-def _is_near_along(slam_map: KeyframeMap, row: int, other: int, config: LoopClosureConfig) -> bool:
+def _is_near_along(slam_map: KeyframeMap, row: int, other: int) -> bool:
     """Returns True if two keyframes are near each other along one unbroken path."""
     a, b = slam_map.keyframes[row], slam_map.keyframes[other]
-    return a.segment == b.segment and abs(a.path_m - b.path_m) <= config.pending_path_m
+    return a.segment == b.segment and abs(a.path_m - b.path_m) <= PENDING_PATH_M
 
 
 def _drift(path_m: float, config: LoopClosureConfig) -> tuple[float, float]:
     """Returns standard deviations of a cycle of two registrations and a path of odometry: metres, radians."""
     return (
         float(np.sqrt(2 * config.sigma_m**2 + config.drift_m**2 * path_m)),
-        float(np.sqrt(2 * config.sigma_rad**2 + config.drift_rad**2 * path_m)),
+        float(np.sqrt(2 * config.sigma_rad**2 + DRIFT_RAD**2 * path_m)),
     )

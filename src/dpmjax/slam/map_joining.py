@@ -15,7 +15,6 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from dpmjax.geometry import rigid
-from dpmjax.slam.config import LoopClosureConfig
 from dpmjax.slam.keyframes import KeyframeMap, MapEdge, connected_parts, with_origin, with_poses
 from dpmjax.slam.loop_candidates import find_meetings
 from dpmjax.slam.loop_closure import examine_candidates, is_resting, num_accepted
@@ -118,10 +117,10 @@ def take_component(joined: JoinedMaps, component: int) -> KeyframeMap:
 def _compared(
     methods: SlamMethods, joined: KeyframeMap, loops: tuple[Loop, ...], row: int, is_other: np.ndarray
 ) -> tuple[Loop, ...]:
-    config: LoopClosureConfig = methods.config.loops
-    if is_resting(joined, loops, row, config):
+    if is_resting(joined, loops, row):
         return loops
-    return examine_candidates(methods, joined, loops, row, find_meetings(joined, row, is_other, config))
+    candidates = find_meetings(joined, row, is_other, methods.config.loops)
+    return examine_candidates(methods, joined, loops, row, candidates)
 
 
 def _side_by_side(maps: Sequence[KeyframeMap]) -> KeyframeMap:

@@ -22,6 +22,9 @@ from dpmjax.slam.keyframes import (
 from dpmjax.slam.loop_state import LoopState
 from dpmjax.slam.reports import Loop
 
+TAKEN_BACK_WEIGHT = 0.25
+"""Smallest weight of a loop edge that stays after the optimisation."""
+
 CERTAIN = 1e9
 """So many loops would have to contradict an edge of odometry before it is let go."""
 
@@ -57,7 +60,7 @@ def optimize_map(slam_map: KeyframeMap, state: LoopState, config: LoopClosureCon
     loops = list(state.loops)
     kept = []
     for number, edge, weight in zip(accepted, edges, solved.weights[: len(edges)], strict=True):
-        if weight < config.taken_back_weight:
+        if weight < TAKEN_BACK_WEIGHT:
             loops[number] = loops[number]._replace(status="taken back")
         else:
             kept.append(edge)

@@ -21,11 +21,32 @@ from dpmjax.slam.keyframes import Pose, orthonormal
 from dpmjax.slam.local_map import LocalMap
 from dpmjax.types import PointPyramid
 
+NUM_SAMPLES = 1000
+"""Number of surface elements that the score of a pose compares."""
+
+MIN_COSINE = 0.7
+"""Smallest cosine between the normals of an element and of the plane it meets."""
+
+CONTRADICTION_WEIGHT = 2.0
+"""Weight of the share of points in free space in the score."""
+
+STEP_FACTORS = (0.0, 0.5, 1.0, 1.5, 2.0, 3.0, 4.0)
+"""Factors of the predicted step among the other starts."""
+
+AHEAD_SHARES = (-0.08, 0.08, 0.16)
+"""Steps along the x axis of the lidar among the other starts, as shares of the extent."""
+
+FLOOR_M = 0.01
+"""Lower bound of the standard deviation of a translation."""
+
+FLOOR_RAD = 0.001
+"""Lower bound of the standard deviation of a rotation."""
+
 MAX_VIEWED = 4000
 """Number of elements of the local map that are compared with the free space of a scan."""
 
-MAX_ELEMENTS = 8000
-"""Largest number of surface elements of a scan."""
+MAX_ELEMENTS = 3000
+"""Largest number of surface elements of a scan: rings of denser scans hold on to each other."""
 
 NEIGHBOURHOODS = SurfaceConfig(sparse_radius_share=1.5)
 """Scans of 1,000 points have neighbours farther away than others."""
@@ -90,7 +111,7 @@ class SurfaceGeometry:
         Returns:
             The pose under which most elements meet planes and fewest lie in free space.
         """
-        num_samples = self.config.num_samples // 3
+        num_samples = NUM_SAMPLES // 3
         coarse = []
         for found in align_surfaces_from(scan.measured.surface, local_map.surface, T_map_scan, self.config.wide):
             matched = self._matched_share(local_map, scan.measured.surface, found.T_target_source, num_samples)
@@ -108,15 +129,15 @@ class SurfaceGeometry:
         Returns:
             The motions.
         """
-        config, R, step = self.config, T_last_scan[:3, :3], T_last_scan[:3, 3]
-        motions = [(R, factor * step) for factor in config.step_factors]
-        motions += [(R, np.array([share * extent_m, 0.0, 0.0])) for share in config.ahead_shares]
-        for turn_deg in config.turns_deg:
+        R, step = T_last_scan[:3, :3], T_last_scan[:3, 3]
+        motions = [(R, factor * step) for factor in STEP_FACTORS]
+        motions += [(R, np.array([share * extent_m, 0.0, 0.0])) for share in AHEAD_SHARES]
+        for turn_deg in self.config.turns_deg:
             turned = R @ Rotation.from_euler("z", turn_deg, degrees=True).as_matrix()
             motions += [(turned, np.zeros(3)), (turned, step)]
         # A vehicle that rocks does not turn on: its tilt comes back.
         motions.append((np.eye(3), step))
-        for axis, tilt_deg in itertools.product("xy", config.tilts_deg):
+        for axis, tilt_deg in itertools.product("xy", self.config.tilts_deg):
             tilt = Rotation.from_euler(axis, tilt_deg, degrees=True).as_matrix()
             motions += [(R @ tilt, step), (tilt, step)]
         found = np.tile(np.eye(4), (len(motions), 1, 1))
@@ -130,13 +151,13 @@ class SurfaceGeometry:
 
     def _scored(self, local_map: LocalMap, measured: MeasuredScan, T: Pose) -> Alignment:
         config, surface = self.config, measured.surface
-        matched = self._matched_share(local_map, surface, T, config.num_samples)
+        matched = self._matched_share(local_map, surface, T, NUM_SAMPLES)
         contradicted = _contradicted_share(local_map, measured, T)
-        score = matched - config.contradiction_weight * contradicted
-        level = AlignmentLevel(config.plane_radius_m, config.num_samples, 1)
+        score = matched - CONTRADICTION_WEIGHT * contradicted
+        level = AlignmentLevel(config.plane_radius_m, NUM_SAMPLES, 1)
         pairs = pair_with_planes(surface, local_map.surface, T, level)
         information = plane_information(pairs, T, max_residual_m=config.plane_distance_m)
-        information = with_least_covariance(information, config.floor_m, config.floor_rad)
+        information = with_least_covariance(information, FLOOR_M, FLOOR_RAD)
         return Alignment(T, matched, contradicted, score, information)
 
     def _matched_share(self, local_map: LocalMap, surface: Surface, T_map_scan: Pose, num_samples: int) -> float:
@@ -148,7 +169,7 @@ class SurfaceGeometry:
         level = AlignmentLevel(config.plane_radius_m, num_samples, 1)
         planes = nearest_planes(surface, local_map.surface, T_map_scan[None], level)
         meets = planes.is_paired & (np.abs(planes.residuals) < config.plane_distance_m)
-        meets &= planes.cosines > config.min_cosine
+        meets &= planes.cosines > MIN_COSINE
         direction = np.argmax(np.abs(surface.normals[surface.samples[:num_samples]]), axis=1)
         counts = np.bincount(direction, minlength=3)
         shares = np.bincount(direction, weights=meets[0], minlength=3) / np.maximum(counts, 1)
