@@ -14,7 +14,7 @@ from dpmjax import io, simulation
 from dpmjax.deepmapping import depth_initialization
 from dpmjax.deepmapping.depth_adjustment import SampledImages, adjust_poses
 from dpmjax.deepmapping.depth_initialization import _best_that_differ, _explained, _window
-from dpmjax.deepmapping.depth_motion_search import Camera, Views, propose_motions, surface_directions
+from dpmjax.deepmapping.depth_motion_search import SearchCamera, Views, propose_motions, surface_directions
 from dpmjax.deepmapping.projective_consistency import PixelSample
 from dpmjax.deepmapping.spatial import motion_matrices
 from dpmjax.geometry.sampling import typical_range
@@ -145,7 +145,7 @@ def test_what_a_wall_leaves_open_is_proposed_side_by_side() -> None:
     scans = two_views_of_a_wall()
     views = Views(scans.pixels, scans.surfaces, jnp.asarray(surface_directions(scans, "planar")))
     config = dm.DepthInitializationConfig(num_candidates=256, num_kept=8, num_varied=8, num_distinct=8)
-    T = propose_motions(np.eye(4)[None], views, Camera(scans.pinhole, 2.0), config, key=KEY)
+    T = propose_motions(np.eye(4)[None], views, SearchCamera(scans.pinhole, 2.0), config, key=KEY)
     assert T.shape == (8, 4, 4)
     np.testing.assert_allclose(T[:, :3, 3] @ ACROSS, 0.0, atol=0.005)
     np.testing.assert_allclose(T[:, 0, 2], 0.0, atol=0.005)

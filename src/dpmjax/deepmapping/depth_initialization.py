@@ -17,8 +17,8 @@ from scipy.spatial.transform import Rotation
 from dpmjax.deepmapping.config import Motion
 from dpmjax.deepmapping.depth_adjustment import SampledImages, adjust_poses
 from dpmjax.deepmapping.depth_motion_search import (
-    Camera,
     DepthInitializationConfig,
+    SearchCamera,
     Views,
     depth_search,
     motion_cost,
@@ -69,7 +69,7 @@ def initialize_depth(
     surfaces, directions = scans.surfaces, jnp.asarray(surface_directions(scans, config.motion))
     unit = typical_range(scans.points, scans.mask)
     images = SampledImages(scans, _sample(scans, _NUM_COMPARED, key=sample_key), unit)
-    camera = Camera(scans.pinhole, unit)
+    camera = SearchCamera(scans.pinhole, unit)
     views = [
         Views(_sample(scans, _NUM_POINTS, key=jax.random.fold_in(sample_key, k)), surfaces, directions)
         for k in range(config.num_trajectories + _NUM_TRIES)

@@ -115,7 +115,7 @@ def depth_search(motion: Motion) -> DepthInitializationConfig:
     )
 
 
-class Camera(NamedTuple):
+class SearchCamera(NamedTuple):
     """The camera of all images, and their typical range in the unit of the points."""
 
     pinhole: Pinhole
@@ -171,7 +171,7 @@ def surface_directions(scans: DepthScans, motion: Motion) -> NDArray[np.float32]
 def propose_motions(
     T_world_camera: NDArray[np.float64],
     views: Views,
-    camera: Camera,
+    camera: SearchCamera,
     config: DepthInitializationConfig,
     *,
     key: jax.Array,
@@ -282,7 +282,7 @@ def _adjusted(
     T_last_scan: Float[Array, "4 4"],
     references: References,
     view: Views,
-    camera: Camera,
+    camera: SearchCamera,
     tolerance: Float[Array, ""],
     config: DepthInitializationConfig,
 ) -> Float[Array, "4 4"]:
@@ -319,7 +319,7 @@ def _adjusted(
 def _search(
     references: References,
     view: Views,
-    camera: Camera,
+    camera: SearchCamera,
     key: jax.Array,
     *,
     config: DepthInitializationConfig,
