@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import collections
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -121,10 +122,36 @@ def agents_numbers(result: AgentsResult, sequences: Sequence[LidarSequence]) -> 
         "num_agents": len(agents),
         "num_components": len(components),
         "num_loops_between": len(accepted),
+        "num_wrong_loops_between": num_wrong(result, accepted, references),
+        "meetings": meetings(result, accepted),
         "ate_m": components[0]["ate_m"] if len(components) == 1 else None,
         "components": components,
         "agents": agents,
     }
+
+
+def meetings(result: AgentsResult, accepted: Sequence[Loop]) -> list[dict[str, Any]]:
+    """Returns which two agents have met, and by how many loops."""
+    agent_of = result.joined.map_of_keyframe
+    met = collections.Counter(tuple(sorted(int(agent_of[row]) + 1 for row in loop[:2])) for loop in accepted)
+    return [{"agents": list(pair), "num_loops": number} for pair, number in sorted(met.items())]
+
+
+def num_wrong(result: AgentsResult, accepted: Sequence[Loop], references: Sequence[np.ndarray | None]) -> int | None:
+    """Returns how many loops between agents are wrong beyond 2 m or 5 degrees; None without a reference for each."""
+    from dpmjax.metrics import registration_recall
+
+    known = [
+        reference[agent.keyframes]
+        for agent, reference in zip(result.agents, references, strict=True)
+        if reference is not None
+    ]
+    if len(known) < len(references):
+        return None
+    T = np.concatenate(known)
+    source, target = (np.array([loop[end] for loop in accepted], int) for end in (0, 1))
+    found = np.reshape([loop.T_target_source for loop in accepted], (-1, 4, 4))
+    return int((~registration_recall(found, rigid.inverse(T[target]) @ T[source]).is_right).sum())
 
 
 def members_of(result: AgentsResult) -> list[list[int]]:
@@ -214,3 +241,34 @@ def summary(metrics: dict[str, Any]) -> str:
         ate = component["ate_m"]
         lines.append(f"agents {members}: {text}" + ("" if ate is None else f", ATE together {ate:.3f} m"))
     return "\n".join([*lines, f"{metrics['num_loops_between']} loops between agents"])
+
+
+def table(rows: Sequence[dict[str, Any]]) -> str:
+    """Returns a table as Markdown, one line for each drive that was cut."""
+    lines = [
+        "| drive | scans | ATE of each agent (alone), m | loops between (wrong) | in one frame: ATE, m "
+        "| sent by each, MB | points of all scans, MB |",
+        "|---|---|---|---|---|---|---|",
+    ]
+    return "\n".join([*lines, *map(_drive_line, rows)])
+
+
+def _drive_line(row: dict[str, Any]) -> str:
+    agents = row["agents"]
+    errors = "; ".join(f"{a['ate_m']:.3f} ({a['ate_alone_m']:.3f})" if "ate_m" in a else "-" for a in agents)
+    met = [f"{' and '.join(map(str, one['agents']))}: {one['num_loops']}" for one in row["meetings"]]
+    wrong = "" if row["num_wrong_loops_between"] is None else f" ({row['num_wrong_loops_between']})"
+    together = [
+        f"{', '.join(map(str, one['agents']))}: " + ("-" if one["ate_m"] is None else f"{one['ate_m']:.3f}")
+        for one in row["components"]
+    ]
+    cells = (
+        row["sequence"],
+        ", ".join(str(agent["num_scans"]) for agent in agents),
+        errors,
+        (", ".join(met) or "none") + wrong,
+        "; ".join(together),
+        ", ".join(f"{agent.get('map_bytes_int8', agent['keyframe_bytes']) / 1e6:.2f}" for agent in agents),
+        ", ".join(f"{agent['scan_bytes'] / 1e6:.0f}" for agent in agents),
+    )
+    return f"| {' | '.join(cells)} |"

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from dpmjax import io, load_model, viz
-from dpmjax.cli import DriveSelection, RunFolder, do_row, open_drive, why_not_importable
+from dpmjax.cli import DriveSelection, RunFolder, do_row, keep_scans, open_drive, why_not_importable
 from dpmjax.io import LidarSequence
 from dpmjax.metrics import align_rigid, path_lengths
 from dpmjax.simulation import HDL64E, OS1_64, DriveConfig, LidarSensor, Scene, TownConfig, simulate_scene
@@ -47,7 +47,9 @@ COLORS = {
 }
 SIZES = {
     "map_bytes_points": "points of all scans",
+    "map_bytes_local_maps": "local maps of KISS-SLAM",
     "map_bytes_voxels": "voxel map of KISS-ICP",
+    "map_bytes_gaussians": "Gaussian voxel map of small_gicp",
     "map_bytes_float32": "ours, float32",
     "map_bytes_int8": "ours, int8",
 }
@@ -61,7 +63,7 @@ class DriveChoice:
     """Drives that are compared.
 
     Attributes:
-        paths: folders of scans, or `TOWN` for simulated towns.
+        paths: folders of scans, files of poses along which towns are simulated, or `TOWN` for towns of the seeds.
         selection: scans of each folder and of each town.
         town_seeds: seeds of the towns.
         town_lengths_m: length of each town's route.
@@ -97,9 +99,9 @@ def open_drives(choice: DriveChoice) -> list[LidarSequence]:
     for entry in choice.paths:
         if entry == TOWN and not Path(entry).exists():
             towns = zip(choice.town_seeds, choice.town_lengths_m, strict=True)
-            simulated = [town_drive(seed, number, length_m) for number, (seed, length_m) in enumerate(towns)]
+            simulated = [keep_scans(town_drive(seed, number, length)) for number, (seed, length) in enumerate(towns)]
             rows = slice(None, None, part.jump)
-            drives += [drive.take(rows).take(slice(part.num_scans)) for drive in _with_kept_scans(simulated)]
+            drives += [drive.take(rows).take(slice(part.num_scans)) for drive in simulated]
         else:
             names: Sequence[str | None] = io.list_lidar_sequences(entry) or [None]
             drives += [open_drive(replace(part, data=Path(entry), sequence=name)) for name in names]
@@ -114,22 +116,6 @@ def town_drive(seed: int, number: int, length_m: float) -> LidarSequence:
     kind, route, sensor = TOWNS[number % len(TOWNS)]
     driving = DriveConfig(rate_hz=TOWN_RATE_HZ, sensor_height_m=sensor.height_m, max_turn_deg_s=TOWN_TURN_DEG_S)
     return simulate_scene(Scene(seed, TownConfig(kind, route, length_m, TOWN_BLOCK_M), driving, sensor))
-
-
-def _with_kept_scans(drives: Sequence[LidarSequence]) -> list[LidarSequence]:
-    """Keeps the scans of the drive that was read last in memory: to cast them again for each method takes long."""
-    kept: dict[str, dict[int, np.ndarray]] = {}
-
-    def read(drive: LidarSequence, index: int) -> np.ndarray:
-        if drive.name not in kept:
-            kept.clear()
-        scans = kept.setdefault(drive.name, {})
-        if index not in scans:
-            scans[index] = drive.read_scan(index)
-            scans[index].flags.writeable = False
-        return scans[index]
-
-    return [replace(drive, read_scan=partial(read, drive)) for drive in drives]
 
 
 def missing_peers(comparison: Comparison) -> dict[str, str]:
@@ -193,12 +179,12 @@ def tables(rows: Sequence[dict[str, Any]]) -> str:
     text = "\n".join(
         [
             "| drive | scans, way | method | ATE, m | t_rel, % | loops (wrong) "
-            "| recall of loops: all; same way; opposite | s / scan |",
+            "| recall of loops: all; same way; opposite | s / scan: all; first, last tenth |",
             "|---|---|---|---|---|---|---|---|",
             *map(_track_line, tracks),
             "",
             f"| drive | way | {' | '.join(f'{name}, MB' for name in SIZES.values())} |",
-            "|---|---|---|---|---|---|---|",
+            "|---" * (2 + len(SIZES)) + "|",
             *map(partial(_size_line, tracks), dict.fromkeys(row["sequence"] for row in tracks)),
         ]
     )
@@ -215,23 +201,25 @@ def tables(rows: Sequence[dict[str, Any]]) -> str:
 def _track_line(row: dict[str, Any]) -> str:
     loops = f"{row['num_loops']}" + (f" ({row['num_wrong_loops']})" if "num_wrong_loops" in row else "")
     shares = [row.get(f"loop_recall{suffix}") for suffix in ("", "_same_way", "_opposite")]
-    recall = "; ".join(_number(share) for share in shares) if row.get("num_revisits") else "no scan comes back"
+    recall = "; ".join(number(share) for share in shares) if row.get("num_revisits") else "no scan comes back"
     if "num_known_pairs" in row:
         loops += f", {row['num_known_pairs_found']} of {row['num_known_pairs']} known pairs"
-    if row["method"] not in (OURS, "KISS-SLAM"):
+    if row["method"] not in (OURS, NETWORK, "KISS-SLAM"):
         loops = recall = ""
+    tenths = row.get("scan_s_tenths")
+    growth = f"; {number(tenths[0], 3)}, {number(tenths[-1], 3)}" if tenths else ""
     return (
         f"| {row['sequence']} | {row['num_scans']}, {row['path_m']:.0f} m | {row['method']} "
-        f"| {_number(row.get('ate_m'), 3)} | {_number(row.get('t_rel_percent'))} | {loops} | {recall} "
-        f"| {_number(row['scan_s'], 3)} |"
+        f"| {number(row.get('ate_m'), 3)} | {number(row.get('t_rel_percent'))} | {loops} | {recall} "
+        f"| {number(row['scan_s'], 3)}{growth} |"
     )
 
 
 def _size_line(rows: Sequence[dict[str, Any]], sequence: str) -> str:
     of_drive = {row["method"]: row for row in rows if row["sequence"] == sequence}
-    merged = {**of_drive.get("KISS-ICP", {}), **of_drive.get(OURS, {})}
-    sizes = [merged[name][-1] / 1e6 if merged.get(name) else None for name in SIZES]
-    cells = " | ".join(_number(size) for size in sizes)
+    merged = {name: row[name] for row in of_drive.values() for name in SIZES if row.get(name)}
+    sizes = [merged[name][-1] / 1e6 if name in merged else None for name in SIZES]
+    cells = " | ".join(number(size) for size in sizes)
     return f"| {sequence} | {next(iter(of_drive.values()))['path_m']:.0f} m | {cells} |"
 
 
@@ -246,11 +234,12 @@ def _place_line(row: dict[str, Any]) -> str:
     ]
     return (
         f"| {row['sequence']} | {row['method'].partition(', ')[2]}, {row['map_bytes'] / 1e6:.2f} MB "
-        f"| {' | '.join(counts)} | {_number(row['median_error_m'], 3)} | {_number(row['scan_s'])} |"
+        f"| {' | '.join(counts)} | {number(row['median_error_m'], 3)} | {number(row['scan_s'])} |"
     )
 
 
-def _number(value: float | None, decimals: int = 2) -> str:
+def number(value: float | None, decimals: int = 2) -> str:
+    """Returns a number for a table; a dash for none."""
     return "-" if value is None or not np.isfinite(value) else f"{value:.{decimals}f}"
 
 

@@ -8,6 +8,7 @@ A loop is wrong beyond 2 m or 5 degrees. A scan comes back where it is within 5 
 
 from __future__ import annotations
 
+import collections
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -24,7 +25,8 @@ from dpmjax.io import LidarSequence
 from dpmjax.metrics import find_revisits, loop_recall, path_lengths, registration_recall
 from dpmjax.saved_maps import Precision
 from dpmjax.slam import KeyframeMap, SlamMethods, SlamResult
-from experiments._slam_peers import PEERS, POINT_BYTES, FoundLoop, KissIcp, Peer, is_indoors, peer_version
+from experiments._slam_elements import with_network
+from experiments._slam_peers import PEERS, POINT_BYTES, FoundLoop, Peer, is_indoors, peer_version
 
 # Both align with the map of surface elements; the first guess is the motion of before, or the decoder's for every scan.
 OURS, NETWORK = "ours, odometry and loops", "ours, the network proposes every pose"
@@ -95,48 +97,47 @@ def file_name(method: str) -> str:
 
 def evaluate_ours(drive: Drive, methods: SlamMethods) -> dict[str, Any]:
     """Runs the whole system, and writes its files."""
-    run, result = map_drive(drive.folder, drive.sequence, methods, drive.is_stopped)
-    if len(run.reports) < len(drive.sequence):
-        raise StoppedError
-    loops = [loop for loop in result.loops if loop.status == "accepted"]
-    ends = result.keyframes
-    found = [
-        FoundLoop((ends[loop.source],) * 2, (ends[loop.target],) * 2, loop.T_target_source)
-        for loop in loops
-        if loop.T_target_source is not None
-    ]
+    result, row = map_row(drive, drive.folder, OURS, methods)
     write_loops(drive.folder / "loops.csv", result.loops, result.keyframes)
     write_scans(drive.folder / "scans.csv", result.reports, result.keyframes, drive.sequence.sources)
     save_trajectory(drive, ODOMETRY, result.T_odometry_scan)
-    odometry_s = sum(run.stages_s.get(stage, 0.0) for stage in _ODOMETRY_STAGES)
-    return {
-        **common_numbers(drive, OURS, result.T_world_scan, found),
-        "num_keyframes": len(result.keyframes),
-        "scan_s": _per_scan(run, run.run_s - sum(run.stages_s.get(stage, 0.0) for stage in _FILE_STAGES)),
-        "scan_odometry_s": _per_scan(run, odometry_s),
-        **map_sizes(drive.folder.path, result),
-    }
+    return {**row, **map_sizes(drive.folder.path, result)}
 
 
 def evaluate_network(drive: Drive, methods: SlamMethods) -> dict[str, Any]:
     """Runs the whole system with the decoder as the source of every first guess (DeepPointMap section 4)."""
-    odometry = replace(methods.config.odometry, proposer="network")
-    methods = methods._replace(config=replace(methods.config, odometry=odometry))
-    part = drive.folder.part("methods", "network")
-    run, result = map_drive(part, drive.sequence, methods, drive.is_stopped)
+    return map_row(drive, drive.folder.part("methods", "network"), NETWORK, with_network(methods))[1]
+
+
+def map_row(drive: Drive, folder: RunFolder, method: str, methods: SlamMethods) -> tuple[SlamResult, dict[str, Any]]:
+    """Maps a drive, or goes on from the state in the folder, and measures trajectory, loops and seconds."""
+    run, result = map_drive(folder, drive.sequence, methods, drive.is_stopped)
     if len(run.reports) < len(drive.sequence):
         raise StoppedError
-    return {
-        **common_numbers(drive, NETWORK, result.T_world_scan, []),
+    ends = result.keyframes
+    found = [
+        FoundLoop((ends[loop.source],) * 2, (ends[loop.target],) * 2, loop.T_target_source)
+        for loop in result.loops
+        if loop.status == "accepted" and loop.T_target_source is not None
+    ]
+    return result, {
+        **common_numbers(drive, method, result.T_world_scan, found),
         "num_keyframes": len(result.keyframes),
-        "num_from_network": sum(report.status == "network" for report in result.reports),
+        "scan_statuses": dict(collections.Counter(report.status for report in result.reports)),
         "scan_s": _per_scan(run, run.run_s - sum(run.stages_s.get(stage, 0.0) for stage in _FILE_STAGES)),
+        "scan_odometry_s": _per_scan(run, sum(run.stages_s.get(stage, 0.0) for stage in _ODOMETRY_STAGES)),
+        "scan_s_tenths": tenths(run.scan_s) if len(run.scan_s) == len(run.reports) else None,
     }
 
 
 def _per_scan(run: SlamRun, seconds: float) -> float | None:
     """Of a run that was resumed at its end, no time is known."""
     return seconds / run.num_done if run.num_done else None
+
+
+def tenths(scan_s: Sequence[float]) -> list[float]:
+    """Returns the mean seconds of a scan in each tenth of a drive, which must not grow with the map."""
+    return [float(part.mean()) for part in np.array_split(np.asarray(scan_s), 10) if len(part)]
 
 
 def odometry_row(drive: Drive, ours: dict[str, Any]) -> dict[str, Any]:
@@ -149,27 +150,27 @@ def evaluate_peer(drive: Drive, name: str) -> dict[str, Any]:
     """Runs another program; reading is not timed. A scan without points stays where the last one was."""
     peer: Peer = PEERS[name][1](is_indoors=drive.is_indoors)
     taken: list[int] = []
-    seconds = 0.0
+    seconds: list[float] = []
     num_scans = len(drive.sequence)
-    sizes: dict[str, list[int]] = {"map_scans": [], "map_bytes_voxels": []}
+    sizes: dict[str, list[int]] = {"map_scans": [], f"map_bytes_{peer.map_name}": []}
     at = set(size_marks(num_scans))
     for number in tqdm(range(num_scans), desc=f"{drive.sequence.name}, {name}", unit=" scans", dynamic_ncols=True):
         if drive.is_stopped():
             raise StoppedError
         points = drive.sequence.read_points(number).astype(np.float64)
+        clock = time.perf_counter()
         if len(points):
-            clock = time.perf_counter()
             peer.step(points)
-            seconds += time.perf_counter() - clock
             taken.append(number)
-            if isinstance(peer, KissIcp):
-                peer.grow_map(points)
-        if isinstance(peer, KissIcp) and number + 1 in at:
+        seconds.append(time.perf_counter() - clock)
+        if len(points):
+            peer.grow_map(points)
+        if number + 1 in at:
             sizes["map_scans"].append(number + 1)
-            sizes["map_bytes_voxels"].append(peer.map_bytes())
+            sizes[f"map_bytes_{peer.map_name}"].append(peer.map_bytes())
     clock = time.perf_counter()
     T, loops = peer.finish()
-    seconds += time.perf_counter() - clock
+    finish_s = time.perf_counter() - clock
     rows = np.maximum(np.searchsorted(taken, np.arange(num_scans), side="right") - 1, 0)
     numbers = np.array(taken)
     loops = [
@@ -177,8 +178,8 @@ def evaluate_peer(drive: Drive, name: str) -> dict[str, Any]:
         for loop in loops
     ]
     row = common_numbers(drive, name, T[rows], loops)
-    row |= {"scan_s": seconds / num_scans, "peer_version": peer_version(name)}
-    return {**row, **(sizes if isinstance(peer, KissIcp) else {})}
+    row |= {"scan_s": (sum(seconds) + finish_s) / num_scans, "scan_s_tenths": tenths(seconds)}
+    return {**row, "peer_version": peer_version(name), **sizes}
 
 
 def common_numbers(drive: Drive, method: str, T_world_scan: np.ndarray, loops: Sequence[FoundLoop]) -> dict[str, Any]:

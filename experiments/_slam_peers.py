@@ -21,8 +21,9 @@ from dpmjax.geometry import rigid
 MAX_RANGE_M, INDOOR_MAX_RANGE_M = 60.0, 30.0
 # Where half of the points are nearer, the place is indoors.
 INDOORS_M = 5.0
-POINT_BYTES = 12
-_UNLIMITED_M = 1e9
+# Three coordinates; with the six numbers of a covariance.
+POINT_BYTES, GAUSSIAN_BYTES = 12, 36
+_UNLIMITED_M, _UNLIMITED_SCANS = 1e9, 10**9
 
 
 class FoundLoop(NamedTuple):
@@ -40,10 +41,22 @@ class FoundLoop(NamedTuple):
 
 
 class Peer(Protocol):
-    """A program that takes scans one after the other."""
+    """A program that takes scans one after the other.
+
+    Attributes:
+        map_name: kind of the map, for the column of its bytes.
+    """
+
+    map_name: str
 
     def step(self, points: np.ndarray) -> None:
         """Takes a scan, (n, 3) float64, not empty."""
+
+    def grow_map(self, points: np.ndarray) -> None:
+        """Adds the last scan to a map of the whole way, where the program forgets what is far away; not timed."""
+
+    def map_bytes(self) -> int:
+        """Returns the bytes of the map of the whole way so far, with floats of 4 bytes."""
 
     def finish(self) -> tuple[np.ndarray, list[FoundLoop]]:
         """Returns (n, 4, 4) poses of all scans, and the loops."""
@@ -51,6 +64,8 @@ class Peer(Protocol):
 
 class KissIcp:
     """KISS-ICP (Vizzo et al. 2023), and its voxel map of the whole way: the program itself forgets what is far away."""
+
+    map_name = "voxels"
 
     def __init__(self, *, is_indoors: bool) -> None:
         from kiss_icp.config import load_config
@@ -69,20 +84,23 @@ class KissIcp:
         self._poses.append(self._odometry.last_pose)
 
     def grow_map(self, points: np.ndarray) -> None:
-        """Adds the last scan to the map of the whole way; it is no part of the program, and not timed."""
+        """Adds the last scan to the voxel map of the whole way; see `Peer`."""
         frame = self._odometry.preprocessor.preprocess(points, np.zeros(0), np.eye(4))
-        self._whole.update(self._odometry.voxelize(frame)[1], self._poses[-1])
+        thinned, T = self._odometry.voxelize(frame)[1], self._poses[-1]
+        self._whole.add_points(thinned @ T[:3, :3].T + T[:3, 3])
 
     def finish(self) -> tuple[np.ndarray, list[FoundLoop]]:
         return np.array(self._poses), []
 
     def map_bytes(self) -> int:
-        """Returns the size of the map of the whole way so far."""
+        """Returns the bytes of its points; see `Peer`."""
         return POINT_BYTES * len(self._whole.point_cloud())
 
 
 class KissSlam:
     """KISS-SLAM (Guadagnino et al. 2025): the same odometry, local maps of 100 m, loops between them, a pose graph."""
+
+    map_name = "local_maps"
 
     def __init__(self, *, is_indoors: bool) -> None:
         from kiss_slam.config import load_config
@@ -96,6 +114,15 @@ class KissSlam:
     def step(self, points: np.ndarray) -> None:
         with _silence():
             self._slam.process_scan(points, np.zeros(0))
+
+    def grow_map(self, points: np.ndarray) -> None:
+        """Does nothing: the program keeps its local maps."""
+
+    def map_bytes(self) -> int:
+        """Returns the bytes of the points of all local maps, without their normals; see `Peer`."""
+        clouds = [local_map.pcd for local_map in self._slam.local_map_graph.local_maps() if local_map.pcd is not None]
+        num_points = sum(len(cloud.point.positions) for cloud in clouds) + len(self._slam.voxel_grid.point_cloud())
+        return POINT_BYTES * num_points
 
     def finish(self) -> tuple[np.ndarray, list[FoundLoop]]:
         with _silence():
@@ -116,12 +143,16 @@ class KissSlam:
 class SmallGicp:
     """Odometry by small_gicp (Koide 2024): each scan onto its incremental Gaussian voxel map, from a steady motion."""
 
+    map_name = "gaussians"
+
     def __init__(self, *, is_indoors: bool) -> None:
         import small_gicp
 
         self._library, self._threads = small_gicp, os.cpu_count() or 1
         self._point_m, voxel_m = (0.125, 0.5) if is_indoors else (0.25, 1.0)
-        self._map = small_gicp.GaussianVoxelMap(voxel_m)
+        self._map, self._whole = (small_gicp.GaussianVoxelMap(voxel_m) for _ in range(2))
+        self._whole.set_lru(horizon=_UNLIMITED_SCANS)
+        self._scan: Any = None
         self._poses: list[np.ndarray] = []
 
     def step(self, points: np.ndarray) -> None:
@@ -134,6 +165,15 @@ class SmallGicp:
             T = self._library.align(self._map, scan, start, num_threads=self._threads).T_target_source
         self._map.insert(scan, T)
         self._poses.append(T)
+        self._scan = scan
+
+    def grow_map(self, points: np.ndarray) -> None:
+        """Adds the last scan to the Gaussian voxel map of the whole way; see `Peer`."""
+        self._whole.insert(self._scan, self._poses[-1])
+
+    def map_bytes(self) -> int:
+        """Returns the bytes of the mean and the covariance of each voxel; see `Peer`."""
+        return GAUSSIAN_BYTES * int(self._whole.size())
 
     def finish(self) -> tuple[np.ndarray, list[FoundLoop]]:
         return np.array(self._poses), []

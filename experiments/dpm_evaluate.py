@@ -4,6 +4,7 @@
     python -m experiments.dpm_evaluate town                             towns that no training has seen
     python -m experiments.dpm_evaluate --slam path/to/drive another/drive
     python -m experiments.dpm_evaluate --slam town --num-towns 5 --town-length-m 1000 4000
+    python -m experiments.dpm_evaluate --slam path/to/drive kitti_00.txt kitti_07.txt      towns along real routes
     python -m experiments.dpm_evaluate --resume                         go on where the last run stopped
 
 A path is any folder of scans with poses (KITTI, KITTI-360, MulRan, plain ...). Random pairs of scans, 2 to 10 m and 10
@@ -14,10 +15,12 @@ more methods see the same pairs: the search and the verification of `register` w
 
 With --slam, the whole system and its odometry run beside KISS-ICP, KISS-SLAM and odometry by small_gicp (extra
 `peers`); then random scans are looked for in the map of each drive's first half. Poses are needed for the errors only.
+A file of poses (TUM or KITTI) stands for a town that is simulated along it; scans are kept in results/simulated.
 --refine adds two rows: the keyframes of our run polished by DeepMapping, and by multiway registration (Open3D, extra
 `baselines`), from the same poses.
-table.md has ATE, KITTI's t_rel, loops, their recall, seconds a scan, bytes of maps and localisations; trajectories.png
-and map_sizes.png show them, and drives/ holds the trajectories of every method and the files of our run.
+table.md has ATE, KITTI's t_rel, loops, their recall, bytes of maps, localisations and seconds a scan: of all scans, and
+of the first and the last tenth, which show whether they grow. trajectories.png and map_sizes.png show the trajectories
+and the bytes of maps; drives/ holds the trajectories of every method and the files of our run.
 experiments/_slam_evaluation.py says how loops are counted.
 """
 
@@ -63,7 +66,7 @@ class Config(RunOptions):
     may_change: ClassVar[frozenset[str]] = frozenset({"refine"})
 
     paths: Annotated[Positional[tuple[str, ...]], arg(metavar="town|PATH ...")] = ("town",)
-    """Folders of scans with poses, or simulated towns."""
+    """Folders of scans with poses, files of poses along which a town is simulated, or towns of the seeds."""
     weights: Annotated[str, arg(metavar="NAME|FILE")] = "dpm_small"
     """Name of a shipped model, or a .safetensors file."""
     slam: FlagCreatePairsOff[bool] = False
@@ -100,7 +103,9 @@ class Config(RunOptions):
     @property
     def selection(self) -> DriveSelection:
         """The scans of each drive, with --slam."""
-        return DriveSelection(num_scans=self.n_scans, jump=self.jump, is_kitti_corrected=self.kitti_angle_correction)
+        return DriveSelection(
+            num_scans=self.n_scans, jump=self.jump, is_kitti_corrected=self.kitti_angle_correction, seed=self.seed
+        )
 
 
 def main(config: Config) -> list[dict[str, Any]]:

@@ -3,18 +3,22 @@
     python -m experiments.dpm_multiagent                         a simulated town, cut into three parts
     python -m experiments.dpm_multiagent path/to/drive           a drive of your own, cut into three parts
     python -m experiments.dpm_multiagent monday tuesday friday   one agent a folder
+    python -m experiments.dpm_multiagent --cut kitti_00.txt kitti_05.txt   each cut into three parts, a row each (5.3)
     python -m experiments.dpm_multiagent --resume                go on where the last run stopped, or was killed
 
 Agents exchange keyframes. Loops between them are found by what places look like; no position is given. Agents that meet
 share one frame, others keep their own. Results go to results/dpm_multiagent/<time>/ (latest links to the newest):
 agent_1 ... as TUM, KITTI and npy, graph.g2o, loops.csv, map_1.npz ... for those that met, metrics.json with errors and
-bytes, agents.png.
+bytes, agents.png. With --cut, drives/ has these files of each drive, and table.md a row a drive. A file of poses (TUM,
+KITTI) stands for a town that is simulated along it.
 """
 
 from __future__ import annotations
 
 import time
+from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -26,6 +30,7 @@ from dpmjax.cli import (
     RunOptions,
     StopFlag,
     check_least,
+    do_row,
     open_drive,
     open_run_folder,
     recording,
@@ -45,7 +50,9 @@ class Config(RunOptions):
     """Options of the run."""
 
     data: Annotated[Positional[tuple[Path, ...]], arg(metavar="[DATA ...]")] = ()
-    """Folders of scans: one is cut into parts, of several each is an agent. Without any: a simulated town."""
+    """Drives: one is cut into parts, of several each is an agent. Without any: a simulated town."""
+    cut: FlagCreatePairsOff[bool] = False
+    """Cut each of several drives into parts, one run a drive."""
     sequence: Annotated[str | None, arg(aliases=["-s"], metavar="NAME")] = None
     """Which drive, where DATA holds several."""
     agents: Annotated[int, arg(metavar="N")] = 3
@@ -84,32 +91,64 @@ class Config(RunOptions):
 
 
 def main(config: Config) -> dict[str, Any]:
-    """Lets the agents run, joins their maps, writes; returns the content of `metrics.json`."""
-    from dpmjax.cli import map_drive, progress_bar
-    from dpmjax.slam import join_agents
-    from experiments._slam_agents import summary
+    """Lets the agents of each run map, joins their maps, writes; returns the content of `metrics.json`."""
+    from experiments._slam_agents import summary, table
+    from experiments._slam_evaluation import StoppedError
 
     started = time.perf_counter()
-    methods = agent_methods(config)
-    sequences = open_agents(config)
+    methods, runs = agent_methods(config), open_runs(config)
     folder = open_run_folder(config, EXPERIMENT)
     with recording(folder), StopFlag() as stop:
-        agents: list[SlamResult] = []
-        for number, sequence in enumerate(sequences, start=1):
-            if not stop.is_requested:
-                part = folder.part("agents", f"agent_{number}")
-                _, agent = map_drive(part, sequence, methods, lambda: stop.is_requested)
-                agents.append(agent)
-        sequences = [
-            sequence.take(slice(0, len(agent.reports))) for sequence, agent in zip(sequences, agents, strict=False)
-        ]
-        with progress_bar("loops between agents", " keyframes") as on_keyframe:
-            result = join_agents(methods, agents, on_keyframe=on_keyframe)
-        metrics = write_results(folder, config, result, sequences)
-        metrics |= {"is_interrupted": stop.is_requested, "wall_s": time.perf_counter() - started}
-        write_metrics(folder, metrics, seed=config.seed)
-        print(f"{summary(metrics)}\nresults in {folder.path}")
-    return metrics
+        if not config.cut:
+            metrics = map_agents(folder, config, methods, runs[0], stop)
+            metrics |= {"is_interrupted": stop.is_requested, "wall_s": time.perf_counter() - started}
+            write_metrics(folder, metrics, seed=config.seed)
+            print(f"{summary(metrics)}\nresults in {folder.path}")
+            return metrics
+        rows: list[dict[str, Any]] = []
+        for sequences in runs:
+            name = sequences[0].name
+            part = folder.part("drives", name)
+            work = partial(cut_row, part, config, methods, sequences, stop)
+            with suppress(StoppedError):
+                rows.append(do_row(folder.path, {"sequence": name}, work, seed=config.seed))
+            write_metrics(folder, {"weights": config.weights}, seed=config.seed, rows=rows)
+        (folder / "table.md").write_text(table(rows) + "\n", encoding="utf-8")
+        print(f"{table(rows)}\nresults in {folder.path}")
+    return {"rows": rows}
+
+
+def cut_row(
+    folder: RunFolder, config: Config, methods: SlamMethods, sequences: list[LidarSequence], stop: StopFlag
+) -> dict[str, Any]:
+    """Returns the numbers of a drive that is cut into parts; a run that a signal stops makes no row."""
+    from experiments._slam_evaluation import StoppedError
+
+    numbers = {} if stop.is_requested else map_agents(folder, config, methods, sequences, stop)
+    if stop.is_requested:
+        raise StoppedError
+    return numbers
+
+
+def map_agents(
+    folder: RunFolder, config: Config, methods: SlamMethods, sequences: list[LidarSequence], stop: StopFlag
+) -> dict[str, Any]:
+    """Lets the agents of one run map, joins their maps, writes their files; returns the numbers."""
+    from dpmjax.cli import map_drive, progress_bar
+    from dpmjax.slam import join_agents
+
+    agents: list[SlamResult] = []
+    for number, sequence in enumerate(sequences, start=1):
+        if not stop.is_requested:
+            part = folder.part("agents", f"agent_{number}")
+            _, agent = map_drive(part, sequence, methods, lambda: stop.is_requested)
+            agents.append(agent)
+    sequences = [
+        sequence.take(slice(0, len(agent.reports))) for sequence, agent in zip(sequences, agents, strict=False)
+    ]
+    with progress_bar("loops between agents", " keyframes") as on_keyframe:
+        result = join_agents(methods, agents, on_keyframe=on_keyframe)
+    return write_results(folder, config, result, sequences)
 
 
 def agent_methods(config: Config) -> SlamMethods:
@@ -120,12 +159,16 @@ def agent_methods(config: Config) -> SlamMethods:
     return make_methods(load_model(config.weights))
 
 
-def open_agents(config: Config) -> list[LidarSequence]:
-    """Opens the scans of each agent; bad input that can be known before the run is a `ValueError`."""
+def open_runs(config: Config) -> list[list[LidarSequence]]:
+    """Opens the scans of the agents of each run; bad input that can be known before a run is a `ValueError`."""
     from experiments._slam_agents import cut_sequence
 
     drives = [open_drive(replace(config.selection, data=data)) for data in config.data or (None,)]
-    return drives if len(drives) > 1 else cut_sequence(drives[0], config.agents, config.overlap)
+    if len(drives) > 1 and not config.cut:
+        return [drives]
+    if len({drive.name for drive in drives}) < len(drives):
+        raise ValueError(f"two drives have the same name ({', '.join(drive.name for drive in drives)})")
+    return [cut_sequence(drive, config.agents, config.overlap) for drive in drives]
 
 
 def write_results(

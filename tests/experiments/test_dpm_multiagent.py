@@ -76,6 +76,30 @@ def test_a_drive_is_cut_and_joined_again(tmp_path) -> None:
     assert (out / "agents.png").stat().st_size > 0
 
 
+def test_drives_are_cut_one_by_one_and_a_resumed_run_computes_nothing_again(tmp_path, monkeypatch) -> None:
+    whole, half = write_drive(tmp_path / "whole", range(len(TRUTH))), write_drive(tmp_path / "half", range(40))
+    out = tmp_path / "out"
+    assert run("--cut", whole, half, "-o", out, "--overlap", 0.5, "--agents", 2) == EXIT_OK
+    rows = load_json(out / "metrics.json")["rows"]
+    assert [row["sequence"] for row in rows] == ["whole", "half"]
+    for row in rows:
+        assert row["num_wrong_loops_between"] == 0
+        assert row["meetings"] == [{"agents": [1, 2], "num_loops": row["num_loops_between"]}]
+        assert all(agent["keyframe_bytes"] > 0 for agent in row["agents"])
+        assert (out / "drives" / row["sequence"] / "agents.png").stat().st_size > 0
+    text = (out / "table.md").read_text()
+    assert f"1 and 2: {rows[0]['num_loops_between']} (0)" in text
+    monkeypatch.setattr(dpm_multiagent, "map_agents", None)
+    assert run("--resume", "-o", out) == EXIT_OK
+    assert load_json(out / "metrics.json")["rows"] == rows
+
+
+def test_two_drives_of_one_name_are_not_cut_in_one_run(tmp_path, capsys) -> None:
+    folders = [write_drive(tmp_path / parent / "drive", range(9)) for parent in ("a", "b")]
+    assert run("--cut", *folders, "-o", tmp_path / "out") == EXIT_BAD_INPUT
+    assert "same name (drive, drive)" in capsys.readouterr().err
+
+
 def test_folders_that_never_meet_stay_apart(tmp_path) -> None:
     first = write_drive(tmp_path / "monday", range(20))
     second = write_drive(tmp_path / "tuesday", range(40, 60))

@@ -21,6 +21,7 @@ from dpmjax.simulation import (
     scan_town,
     simulate_lidar_sequence,
 )
+from dpmjax.simulation.town.heights import with_equal_passes
 from tests.data_sets import write_kitti_sequence
 
 SENSOR = LidarSensor("test", HDL64E.elevations_deg[::4], 360, max_range_m=80.0)
@@ -230,3 +231,24 @@ def test_beam_tables_go_down(sensor):
 def test_senseless_wishes_are_refused(make):
     with pytest.raises(ValueError, match=r"must|needs"):
         make()
+
+
+def test_passes_of_one_place_have_one_height_and_slopes_hardly_change():
+    """Two laps whose heights drift by 4 m, and a jump where the car stands still."""
+    angle = np.linspace(0, 4 * np.pi, 801)
+    hills = 3.0 * np.sin(2 * angle)
+    route = np.column_stack([80 * np.cos(angle), 80 * np.sin(angle), hills + 4.0 * angle / angle[-1]])
+    found = with_equal_passes(route)
+    way = np.linspace(0, 4 * np.pi, len(found))
+    lap = len(found) // 2
+    assert np.abs(found[lap:, 2] - np.interp(way[lap:] - 2 * np.pi, way, found[:, 2])).max() < 0.1
+    climbs = np.diff(found[:, 2]) - np.diff(3.0 * np.sin(2 * way))
+    assert np.abs(climbs).max() < 0.02
+    jump = np.where(np.arange(801) >= 400, route[:, 2] + 7.0, route[:, 2])
+    steep = with_equal_passes(np.column_stack([route[:, :2], jump]))
+    assert np.abs(np.diff(steep[:, 2])).max() < 0.25
+
+
+def test_a_route_that_passes_no_place_twice_keeps_its_heights():
+    route = np.column_stack([np.arange(50.0), np.zeros(50), np.linspace(5, 7, 50)])
+    np.testing.assert_allclose(with_equal_passes(route), route, atol=1e-9)

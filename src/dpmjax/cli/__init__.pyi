@@ -36,6 +36,7 @@ from .result_files import do_rows as do_rows
 from .result_files import load_json as load_json
 from .result_files import read_history as read_history
 from .result_files import write_json as write_json
+from .route_drives import keep_scans as keep_scans
 from .run_folder import METRICS as METRICS
 from .run_folder import OutputOptions as OutputOptions
 from .run_folder import RunFolder as RunFolder

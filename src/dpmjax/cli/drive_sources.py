@@ -1,4 +1,4 @@
-"""Drives of a command line: simulated towns, or folders of scans with poses."""
+"""Drives of a command line: simulated towns, folders of scans with poses, or poses that a town is simulated along."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from dpmjax.cli.route_drives import is_route, route_drive
 from dpmjax.deeppointmap import SamplingConfig, why_useless
 from dpmjax.io import LidarSequence, list_lidar_sequences, open_lidar_sequence
 from dpmjax.simulation import simulate_drive
@@ -22,7 +23,7 @@ class Source:
     """Origin of a drive.
 
     Attributes:
-        path: folder of scans; None for a simulated town.
+        path: folder of scans, or a file of poses along which a town is simulated; None for any town.
         name: name of the sequence in the folder; None where it holds one.
         town_seed: seed of the town.
         town_length_m: length of the drive through the town.
@@ -39,6 +40,8 @@ class Source:
         """Opens or simulates the drive; of one with reference poses, the scans that have one."""
         if self.path is None:
             return simulate_drive(self.town_seed, length_m=self.town_length_m, kind=self.town_kind)
+        if is_route(self.path):
+            return route_drive(self.path, self.town_seed)
         drive = open_lidar_sequence(self.path, sequence=self.name)
         return drive if drive.T_world_lidar is None else drive.take(np.flatnonzero(drive.has_reference))
 
@@ -47,7 +50,7 @@ def find_sources(data: Sequence[str], towns: Sequence[Source], sampling: Samplin
     """Returns the drives of the entries of a command line, checked; those of the towns where an entry is `town`.
 
     Args:
-        data: folders, or `town` for the towns.
+        data: folders or files of poses, or `town` for the towns.
         towns: such as the seeds of the run give.
         sampling: distances at which a drive must have pairs of scans; None takes the published ones.
 

@@ -26,7 +26,7 @@ class DriveSelection:
     """Scans of one drive.
 
     Attributes:
-        data: folder of scans, or a bag of ROS; None for a simulated town.
+        data: folder of scans, a bag of ROS, or a file of poses along which a town is simulated; None for any town.
         sequence: name of the drive, where the folder holds several.
         num_scans: number of scans; None for all.
         jump: every `jump`-th scan is taken.
@@ -56,12 +56,15 @@ def open_drive(selection: DriveSelection) -> LidarSequence:
         The drive.
 
     Raises:
-        InputError: no such folder, no such drive, a file that is missing or cut off, or a first scan that is bad.
+        InputError: no such folder, drive or poses, a file that is missing or cut off, or a first scan that is bad.
     """
     from dpmjax import io
+    from dpmjax.cli.route_drives import is_route, route_drive
 
     if selection.data is None:
         drive = demo_drive(selection.seed)
+    elif is_route(selection.data):
+        drive = route_drive(selection.data, selection.seed)
     else:
         drive = io.open_lidar_sequence(
             selection.data, sequence=selection.sequence, bin_columns=selection.columns, topic=selection.topic

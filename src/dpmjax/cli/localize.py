@@ -50,7 +50,7 @@ class Config(RunOptions):
     map: Annotated[Positional[Path], arg(metavar="MAP", help_behavior_hint="required")] = Path()
     """Map, a file of dpmjax.save_map."""
     scans: Annotated[Positional[Path], arg(metavar="SCANS", help_behavior_hint="required")] = Path()
-    """Folder of scans, or a bag of ROS."""
+    """Folder of scans, a bag of ROS, or a file of poses: a town is simulated along it."""
     sequence: Annotated[str | None, arg(aliases=["-s"], metavar="NAME")] = None
     """Which drive of a folder that holds several."""
     weights: Annotated[str, arg(metavar="NAME|FILE")] = "dpm_small"

@@ -2,6 +2,7 @@
 
     dpmjax slam                                         a simulated town, once round and on
     dpmjax slam path/to/drive -o out                    KITTI, KITTI-360, MulRan, any folder of scans
+    dpmjax slam route.txt                               a town simulated along a trajectory (poses as TUM or KITTI)
     dpmjax slam drive.bag --topic /points               a bag of ROS 1 or 2 (.bag, .mcap, a folder; extra ros)
     dpmjax slam kitti/dataset --sequence 07 -n 500      the first 500 scans of a sequence
     dpmjax slam day2 --map results/slam/latest/map.npz  extend the map of an earlier run
@@ -46,7 +47,7 @@ class Config(RunOptions):
     may_change: ClassVar[frozenset[str]] = frozenset({"n_scans", "refine"})
 
     data: Annotated[Positional[Path | None], arg(metavar="[DATA]")] = None
-    """Folder of scans, or a bag of ROS. Without it: a simulated town of the seed."""
+    """Folder of scans, a bag of ROS, or a file of poses: a town is simulated along it. Without it: any town."""
     sequence: Annotated[str | None, arg(aliases=["-s"], metavar="NAME")] = None
     """Which drive, where DATA holds several."""
     topic: Annotated[str | None, arg(aliases=["-t"], metavar="NAME")] = None

@@ -23,7 +23,7 @@ class SlamRun(NamedTuple):
         stages_s: seconds of each stage in this process, without compilation.
         compile_s: seconds of compilation.
         run_s: seconds of all scans of this process, without compilation.
-        num_done: number of scans of this process.
+        scan_s: seconds of each scan of this process, without compilation, reading and writing.
         failure: what ended the run early; None where nothing did.
     """
 
@@ -32,8 +32,13 @@ class SlamRun(NamedTuple):
     stages_s: dict[str, float]
     compile_s: float
     run_s: float
-    num_done: int
+    scan_s: tuple[float, ...]
     failure: Exception | None
+
+    @property
+    def num_done(self) -> int:
+        """Number of scans of this process."""
+        return len(self.scan_s)
 
 
 MAX_ERROR_M, MAX_ERROR_DEG = 2.0, 5.0

@@ -78,11 +78,15 @@ class Stopwatch:
 
     def timed(self, stage: str, work: Callable[..., Any], *arguments: Any) -> Any:
         """Calls `work` and counts its time for a stage."""
-        started, compiled = time.perf_counter(), self.compile_s
+        started = self.now_s()
         try:
             return work(*arguments)
         finally:
-            self.stages_s[stage] += time.perf_counter() - started - (self.compile_s - compiled)
+            self.stages_s[stage] += self.now_s() - started
+
+    def now_s(self) -> float:
+        """Returns the time of a clock that stands still during compilation."""
+        return time.perf_counter() - self.compile_s
 
     def _on_event(self, event: str, duration_secs: float, **_: str | int) -> None:
         if event.startswith("/jax/core/compile/"):
@@ -154,8 +158,9 @@ def run_scans(
     watch = Stopwatch()
     timed = methods._replace(matcher=Timed(methods.matcher, watch), geometry=Timed(methods.geometry, watch))
     state, reports = beginning.state, list(beginning.reports)
-    first, failure, started = len(reports), None, time.perf_counter()
-    flushed = saved = started
+    first, failure, started = len(reports), None, watch.now_s()
+    flushed = saved = time.perf_counter()
+    scan_s: list[float] = []
     resumable: Beginning | None = None
     bar = tqdm(total=len(sequence), initial=first, desc=sequence.name, unit=" scans", dynamic_ncols=True)
     scans = reader.iterate(first)
@@ -164,7 +169,9 @@ def run_scans(
             if hooks.is_stopped():
                 break
             scan = watch.timed("read", next, scans)
+            before = watch.now_s()
             state, report = step_slam(timed, state, scan)
+            scan_s.append(watch.now_s() - before)
             reports.append(report)
             if report.is_keyframe:
                 resumable = Beginning(state, tuple(reports))
@@ -185,10 +192,9 @@ def run_scans(
         if resumable is not None:
             watch.timed("write", save_state, folder / STATE, *resumable)
         bar.close()
-    run_s = time.perf_counter() - started - watch.compile_s
+    run_s = watch.now_s() - started
     watch.stages_s["rest"] = run_s - sum(watch.stages_s.values())
-    num_done = len(reports) - first
-    return SlamRun(state, tuple(reports), dict(watch.stages_s), watch.compile_s, run_s, num_done, failure)
+    return SlamRun(state, tuple(reports), dict(watch.stages_s), watch.compile_s, run_s, tuple(scan_s), failure)
 
 
 def write_interim(folder: RunFolder, sequence: LidarSequence, state: SlamState, reports: list[ScanReport]) -> None:

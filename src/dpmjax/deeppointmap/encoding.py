@@ -81,6 +81,8 @@ def pyramid_of_scan(
 ) -> PointPyramid:
     """Computes the first half of `encode` on the host: preprocessing, normalisation and the point pyramid.
 
+    A `ValueError` says if the points are no real numbers (n, 3), or if the scale is not positive.
+
     Args:
         points: (n, 3), metres, in the frame of the lidar; points that are not finite are dropped.
         config: preprocessing, pyramid, and scale of its coordinates.
@@ -88,6 +90,20 @@ def pyramid_of_scan(
 
     Returns:
         The pyramid, in normalised coordinates.
+    """
+    return pyramid_of_cloud(thin_scan(points, config, scale=scale), config)
+
+
+def thin_scan(points: PointCloud | Float[AnyArray, "n 3"], config: ModelConfig, *, scale: float = 1.0) -> PointCloud:
+    """Preprocesses a raw scan for the encoder, on the host.
+
+    Args:
+        points: (n, 3), metres, in the frame of the lidar; points that are not finite are dropped.
+        config: preprocessing.
+        scale: factor by which the points are enlarged first.
+
+    Returns:
+        The points that are left, metres times the scale; arrays of NumPy.
 
     Raises:
         ValueError: if the points are no real numbers (n, 3), or if the scale is not positive.
@@ -102,8 +118,7 @@ def pyramid_of_scan(
         raise ValueError(f"points: expected real numbers, got dtype {array.dtype}")
     if scale != 1:
         array = array * np.float32(scale)
-    cloud = preprocess_scan_on_host(array, None if mask is None else np.asarray(mask), config.preprocess)
-    return pyramid_of_cloud(cloud, config)
+    return preprocess_scan_on_host(array, None if mask is None else np.asarray(mask), config.preprocess)
 
 
 def pyramid_of_cloud(cloud: PointCloud, config: ModelConfig, *, num_threads: int = 2) -> PointPyramid:

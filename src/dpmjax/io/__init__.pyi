@@ -4,6 +4,7 @@ from .depth import is_active_vision as is_active_vision
 from .depth import read_active_vision as read_active_vision
 from .depth import read_pose_folder as read_pose_folder
 from .drives import iterate_scans as iterate_scans
+from .drives import read_lidar_trajectory as read_lidar_trajectory
 from .files import InputError as InputError
 from .files import write_atomically as write_atomically
 from .lidar import LidarSequence as LidarSequence

@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dpmjax.geometry import rigid
-from dpmjax.io.files import load_arrays, read_lines
-from dpmjax.io.poses import check_poses, from_rows, homogeneous, read_stamped_poses
+from dpmjax.io.files import load_arrays, read_lines, read_table
+from dpmjax.io.poses import check_poses, from_rows, homogeneous, read_poses, read_stamped_poses
 from dpmjax.io.references import camera_note, match_reference, scan_times
 from dpmjax.io.scan_names import sort_scans, strays_among
 from dpmjax.sequences import FloatArray, InputError, LidarSequence, Note, require
@@ -22,6 +22,8 @@ SCAN_SUFFIXES = (".bin", ".npy", ".npz", ".pcd", ".ply", ".las", ".laz")
 POSE_FILES = ("poses_lidar.txt", "poses_lidar.npy", "poses.txt", "poses.npy", "trajectory.txt", "trajectory_tum.txt",
               "trajectory.npy", "gt_poses.txt", "groundtruth.txt")  # fmt: skip
 """Usual names of files of reference poses in the lidar's frame."""
+# Axes of a camera that looks along x of the lidar: x right, y down, z forward.
+_T_CAM0_LIDAR = np.array([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]])
 
 
 class Drive3D(NamedTuple):
@@ -153,6 +155,25 @@ def read_learned_folder(folder: Path) -> Drive3D:
         return Drive3D(folder.resolve().name, files)
     stacked = np.stack([known if pose is None else pose for pose in poses])
     return Drive3D(folder.resolve().name, files, check_poses(stacked, folder))
+
+
+def read_lidar_trajectory(path: str | Path) -> FloatArray:
+    """Reads the poses of a drive; those of a camera, which moves along its z axis, are turned into the lidar's axes.
+
+    Args:
+        path: rows of TUM or KITTI, metres.
+
+    Returns:
+        (n, 4, 4) poses, x forward, y left, z up.
+
+    Raises:
+        InputError: no such file, planar poses, or another layout.
+    """
+    path = Path(path)
+    advice = "give poses in space: TUM (stamp tx ty tz qx qy qz qw) or KITTI (12 numbers a row)"
+    require(read_table(path).shape[1] > 3, path, "rows of 3 columns", advice)
+    T = read_poses(path)
+    return T if camera_note(T, path) is None else rigid.inverse(_T_CAM0_LIDAR) @ T @ _T_CAM0_LIDAR
 
 
 class IndexedScan(NamedTuple):

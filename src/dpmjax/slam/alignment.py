@@ -11,19 +11,19 @@ from jaxtyping import Float
 from dpmjax.deeppointmap.verification import MeasuredScan
 from dpmjax.slam.keyframes import Pose
 from dpmjax.slam.local_map import LocalMap
-from dpmjax.types import PointPyramid
+from dpmjax.types import PointCloud
 
 
 class ThinnedScan(NamedTuple):
-    """A scan after its one thinning and its one neighbour search.
+    """A scan after its one thinning.
 
     Attributes:
-        pyramid: input of the encoder.
-        measured: surface elements, in the order of farthest points at first, and free space; frame of the lidar.
+        cloud: thinned points, metres, in the frame of the lidar; input of the encoder.
+        measured: their surface and free space.
         extent_m: median range of the thinned points.
     """
 
-    pyramid: PointPyramid
+    cloud: PointCloud
     measured: MeasuredScan
     extent_m: float
 

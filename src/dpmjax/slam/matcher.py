@@ -14,6 +14,7 @@ from jaxtyping import Float
 from dpmjax.deeppointmap.batches import overlap_pairs
 from dpmjax.deeppointmap.compact_scans import CompactScan, compact_scan, expand_scan
 from dpmjax.deeppointmap.confidence import gather_evidence, with_confidence
+from dpmjax.deeppointmap.encoding import pyramid_of_cloud
 from dpmjax.deeppointmap.matching import merge_clouds, thin_merged
 from dpmjax.deeppointmap.model import Model, encode_pyramid, model_fingerprint
 from dpmjax.deeppointmap.scan_registration import PreparedScan, distinct_motions, match_clouds, register_each
@@ -152,8 +153,9 @@ class NetworkMatcher:
         Returns:
             The compact scan.
         """
-        num_elements = self._model.config.pyramid.stages[0].num_points
-        cloud = encode_pyramid(self._model, scan.pyramid, num_elements=num_elements)
+        config = self._model.config
+        pyramid = pyramid_of_cloud(scan.cloud, config)
+        cloud = encode_pyramid(self._model, pyramid, num_elements=config.pyramid.stages[0].num_points)
         return compact_scan(jax.device_get(cloud), scan.measured.image)
 
     def vector(self, scan: CompactScan) -> Float[np.ndarray, " c"]:

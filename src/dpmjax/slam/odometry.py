@@ -8,18 +8,18 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.spatial.transform import Rotation
 
-from dpmjax.deeppointmap.encoding import pyramid_of_scan
+from dpmjax.deeppointmap.encoding import thin_scan
 from dpmjax.deeppointmap.model_config import ModelConfig
 from dpmjax.deeppointmap.verification import MeasuredScan
 from dpmjax.scans.free_space import range_image, view_points
 from dpmjax.scans.plane_information import plane_information, with_least_covariance
+from dpmjax.scans.preprocess import first_of_each_voxel
 from dpmjax.scans.surface_alignment import AlignmentLevel, align_surfaces_from, nearest_planes, pair_with_planes
 from dpmjax.scans.surfaces import Surface, SurfaceConfig, surface_at
 from dpmjax.slam.alignment import Alignment, ThinnedScan, best_of
 from dpmjax.slam.config import OdometryConfig
 from dpmjax.slam.keyframes import Pose, orthonormal
 from dpmjax.slam.local_map import LocalMap
-from dpmjax.types import PointPyramid
 
 NUM_SAMPLES = 1000
 """Number of surface elements that the score of a pose compares."""
@@ -51,6 +51,9 @@ MAX_ELEMENTS = 3000
 NEIGHBOURHOODS = SurfaceConfig(sparse_radius_share=1.5)
 """Scans of 1,000 points have neighbours farther away than others."""
 
+SPREAD_M = 1.5
+"""One element of each voxel of this size comes first: ground near the lidar is dense."""
+
 NUM_FINE = 3
 """Number of starts of a search that are aligned finely."""
 
@@ -68,7 +71,7 @@ class SurfaceGeometry:
         self.config = config or OdometryConfig()
 
     def thin(self, points: Float[np.ndarray, "n 3"]) -> ThinnedScan | None:
-        """Builds the pyramid of the encoder and takes the surface elements from it; see `Geometry`.
+        """Thins a scan as the encoder does, and estimates its surface; see `Geometry`.
 
         Args:
             points: finite, metres, in the frame of the lidar.
@@ -78,14 +81,13 @@ class SurfaceGeometry:
         """
         if len(points) < self.config.min_num_points:
             return None
-        pyramid = pyramid_of_scan(points, self._model_config)
-        level = pyramid.levels[0]
-        thinned = np.asarray(level.positions)[np.asarray(level.mask)] * np.float64(self._model_config.scale_m)
-        surface = surface_at(thinned, _spread_rows(pyramid), NEIGHBOURHOODS)
+        cloud = thin_scan(points, self._model_config)
+        thinned = np.asarray(cloud.points)[np.asarray(cloud.mask)].astype(np.float64)
+        surface = surface_at(thinned, _spread_rows(thinned), NEIGHBOURHOODS)
         if np.count_nonzero(surface.flatness) < self.config.min_num_points:
             return None
         extent_m = float(np.median(np.linalg.norm(thinned, axis=1)))
-        return ThinnedScan(pyramid, MeasuredScan(surface, range_image(thinned)), extent_m)
+        return ThinnedScan(cloud, MeasuredScan(surface, range_image(thinned)), extent_m)
 
     def align(self, local_map: LocalMap, scan: ThinnedScan, T_map_scan: Pose) -> Alignment:
         """Aligns from a first guess that is nearly right; see `Geometry`.
@@ -177,15 +179,12 @@ class SurfaceGeometry:
         return float(np.average(shares, weights=np.minimum(counts, counts.max() / 3) + 1e-9))
 
 
-def _spread_rows(pyramid: PointPyramid) -> Int[np.ndarray, " e"]:
-    """Chooses points of the first level: those of the second, which lie far apart, and others in random order."""
-    mask, chosen = np.asarray(pyramid.levels[0].mask), np.asarray(pyramid.levels[1].sample_indices)
-    # Rows of the masked array.
-    row_of = np.cumsum(mask) - 1
-    first = row_of[chosen[np.asarray(pyramid.levels[1].mask)]]
-    rest = np.setdiff1d(np.arange(mask.sum()), first)
-    rest = np.random.default_rng(0).permutation(rest)
-    return np.concatenate([first, rest])[:MAX_ELEMENTS]
+def _spread_rows(points: Float[np.ndarray, "n 3"]) -> Int[np.ndarray, " e"]:
+    """Chooses points in random order: first one of each coarse voxel, then others."""
+    rng, is_first = np.random.default_rng(0), np.zeros(len(points), bool)
+    is_first[first_of_each_voxel(points, SPREAD_M)] = True
+    parts = (rng.permutation(np.flatnonzero(part)) for part in (is_first, ~is_first))
+    return np.concatenate(list(parts))[:MAX_ELEMENTS]
 
 
 def _contradicted_share(local_map: LocalMap, measured: MeasuredScan, T_map_scan: Pose) -> float:

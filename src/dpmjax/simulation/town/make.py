@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike
 from dpmjax.sequences import FloatArray
 from dpmjax.simulation.town import primitives
 from dpmjax.simulation.town.furnish import furnish
+from dpmjax.simulation.town.heights import with_equal_passes
 from dpmjax.simulation.town.kinds import KINDS, Kind
 from dpmjax.simulation.town.plots import Plots
 from dpmjax.simulation.town.primitives import CELL_M, LANE_STEP_M, Terrain, TownPrimitives, Traffic, pack_bodies, padded
@@ -78,7 +79,7 @@ def make_town(seed: int, config: TownConfig = TownConfig(), *, trajectory: Array
         seed: of all choices, not negative.
         config: what the town is like; with a trajectory, its route and slopes do not count.
         trajectory: (n, 4, 4) `T_world_lidar` of a real drive, z up (of KITTI: in the lidar's frame, not the camera's).
-            One street is laid along it, and the ground goes 1.73 m below it.
+            One street is laid along it, and the ground goes 1.73 m below it, at one height for all passes of a place.
 
     Returns:
         The town.
@@ -95,7 +96,7 @@ def make_town(seed: int, config: TownConfig = TownConfig(), *, trajectory: Array
     else:
         positions = _positions(trajectory)
         streets = streets_along(positions[:, :2], rng)
-        support = positions - [0.0, 0.0, _SENSOR_HEIGHT_M]
+        support = with_equal_passes(positions) - [0.0, 0.0, _SENSOR_HEIGHT_M]
     terrain = make_terrain(rng, streets, support, kind)
     standing = furnish(rng, streets, Plots(terrain), kind)
     tables = (np.array(rows, np.float64) for rows in (standing.boxes, standing.cylinders, standing.spheroids))
