@@ -39,7 +39,7 @@ class Config:
 
 
 def main(config: Config) -> int:
-    """Runs what was asked for; returns 0, 1 where a benchmark failed, 2 where a name is unknown."""
+    """Runs the chosen benchmarks; returns 0, 1 after a failure, 2 for an unknown name."""
     modules = discover()
     unknown = sorted(set(config.only) - set(modules))
     if unknown:
@@ -85,7 +85,7 @@ def discover() -> dict[str, str]:
 
 
 def run_in_child(module: str, quick: bool) -> dict[str, Any] | None:
-    """Runs one benchmark in a fresh process; None where it failed, which it has then told on stderr."""
+    """Runs one benchmark in a fresh process; None where it failed, with a message on stderr."""
     with tempfile.TemporaryDirectory() as folder:
         output = Path(folder) / "rows.json"
         command = [sys.executable, "-m", "benchmarks.child", module, str(output), "quick" if quick else "full"]

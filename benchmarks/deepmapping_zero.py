@@ -21,7 +21,7 @@ from dpmjax.simulation import simulate_sequence
 
 NAME = "deepmapping_zero"
 _FIRST_SEED = 700
-# Section 4.1: a run below this ATE is a success, and what the paper reports.
+# Section 4.1: a run below this ATE is a success; numbers of the paper.
 _SUCCESS_PX, _PAPER = 20.0, {"success": 0.842, "median ate": 5.7, "median wall": 1740.0}
 
 

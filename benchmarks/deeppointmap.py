@@ -35,7 +35,7 @@ QUICK = ("products", "encode tiny", "match tiny", "everything tiny")
 
 
 class Figure(NamedTuple):
-    """What a number is to be held against, in its unit.
+    """Reference of a number, in its unit.
 
     Attributes:
         theirs: the authors' program, measured once on two cores of an AMD EPYC with random weights (paper size, a KITTI

@@ -48,7 +48,7 @@ SCANS_IN_MAP = 8
 
 
 def make_scans(folder: Path, quick: bool) -> list[Row]:
-    """Returns the sizes of the scans that it writes for the other stages: a simulated one, one of KITTI if found."""
+    """Writes scans for the later stages and returns their sizes: a simulated one, one of KITTI if found."""
     sensor = HDL64E.with_azimuths(256) if quick else HDL64E
     scans = {"town": simulate_lidar_sequence(0, sensor=sensor).read_scan(10)}
     for name in () if quick else KITTI:
@@ -160,7 +160,7 @@ def time_products(folder: Path, quick: bool) -> list[Row]:
 
 
 def _model(preset: str) -> dpmjax.Model:
-    # Speed does not depend on what the weights are.
+    # Speed does not depend on the values of the weights.
     return dpmjax.init_model(jax.random.key(0), dpmjax.model_preset(preset))
 
 

@@ -1,6 +1,6 @@
 """The rows that a benchmark returns, how they are printed, and the times among them.
 
-The first call of a function is timed apart from the others, and results are waited for.
+The first call of a function is timed apart from later ones, and timing includes the wait for results.
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ class Row(NamedTuple):
     """One measured number.
 
     Attributes:
-        case: what was measured, by which program ("k_nearest 4096x4096: dpmjax").
-        metric: what the number is ("median", "compile", "ate").
+        case: measured case and program ("k_nearest 4096x4096: dpmjax").
+        metric: kind of the number ("median", "compile", "ate").
         value: the number.
         unit: its unit; "" for a pure number.
     """
@@ -48,10 +48,10 @@ def _format_line(cells: Sequence[str], widths: Sequence[int]) -> str:
 
 
 class Timing(NamedTuple):
-    """How long calls took, in seconds.
+    """Seconds of calls.
 
     Attributes:
-        compile_s: the first call minus the median of the others: compilation and first allocation. Zero where nothing
+        compile_s: the first call minus the median of later ones: compilation and first allocation. Zero where nothing
             was left to compile.
         median_s: of the calls after the first.
         min_s: of the calls after the first.

@@ -1,9 +1,9 @@
 """Loop closure and graph alone, over whole drives: truth plus noise stands in place of the matcher and of odometry.
 
 Routes of 4 km wander through towns of blocks, a scan a metre, and come back to streets in both directions. Odometry is
-wrong by 1 cm and 1 mrad (standard deviations) a scan. Registrations are wrong by 10 cm and 10 mrad; one in five is
-grossly wrong, with a P(correct) as high as that of the others, and the overlap probability of one pair in five is
-random. A loop that was accepted is wrong beyond 2 m or 5 degrees.
+wrong by 1 cm and 1 mrad (standard deviations) a scan. Registrations have errors of 10 cm and 10 mrad. One in five is
+grossly wrong, with a P(correct) as high as that of right ones; the overlap probability of one pair in five is random. A
+loop that was accepted is wrong beyond 2 m or 5 degrees.
 
 The second part drives 5,100 scans and counts the CPU time of a scan and the memory around scan 500 and around scan
 5,000. It drives twice and counts the second time: in the first the optimiser compiles for each size of graph. The parts
@@ -38,15 +38,15 @@ REPLACED_MS = 200.0
 
 
 class Proof(NamedTuple):
-    """What a drive with gross errors ended with.
+    """Result of a drive with gross errors.
 
     Attributes:
-        num_scans: of the drive.
+        num_scans: number of scans of the drive.
         ate_m: of all scans.
         ate_odometry_m: the same before loops.
         num_loops: accepted.
-        num_wrong: of them, beyond 2 m or 5 degrees.
-        num_opposite: of them, between scans that look opposite ways.
+        num_wrong: number of wrong ones, beyond 2 m or 5 degrees.
+        num_opposite: number of those between scans of opposite headings.
     """
 
     num_scans: int
@@ -127,12 +127,12 @@ def summary_rows(case: str, proofs: Sequence[Proof]) -> list[Row]:
 
 
 class Cost(NamedTuple):
-    """What a scan costs at one moment of a drive.
+    """Cost of a scan at one moment of a drive.
 
     Attributes:
         cpu_ms: mean over the scans around it.
         map_mb: keyframes, edges and loop candidates.
-        front_end_mb: the local map after a keyframe, and everything else that the next scan needs.
+        front_end_mb: the local map after a keyframe, and all further preparation of the next scan.
         resident_mb: memory of the whole process.
     """
 

@@ -51,13 +51,12 @@ SCANS_2D = Group("2-D scans", (
         "warm_phases": ("", "phases from given poses; see PhaseConfig"),
         "steps_per_call": ("steps", "lower: progress and Ctrl-C react sooner; higher: less overhead on a GPU"),
         "map_margin": ("share", "higher if the poses move far: M-Net covers this multiple of the scans' extent"),
-        "halve_at": ("shares of the first phase", "when the worse half of `num_starts` starts is dropped"),
     }),
     Section("PhaseConfig", "dpmjax.deepmapping", "`DeepMappingConfig(cold_phases=..., warm_phases=...)`", {
         "num_steps": ("steps", "more for large sets or noise; `deepmapping.with_steps(config, n)` scales all phases"),
         "occupancy_weight": ("0 to 1", "weight of M-Net's loss beside the Chamfer distance; 0 leaves M-Net out"),
         "learning_rate": ("", "lower if the loss jumps, higher if 800 steps do not move the poses far enough"),
-        "map_learning_rate": ("", "of M-Net"),
+
         "scans_per_step": ("scans", "fewer: less memory, noisier steps"),
         "beams_per_step": ("beams", "fewer: faster steps, noisier"),
         "max_offset": ("scans", "higher if places are seen again soon; lower if neighbouring scans hardly overlap"),
@@ -157,7 +156,7 @@ def page() -> str:
     parts = [
         "# Settings\n",
         "<!-- Written by docs/make_settings.py: change that file, not this one. -->\n",
-        "Settings that a user may want to change, with their defaults. Each record is a frozen dataclass:\n"
+        "Settings that a user may change, with their defaults. Each record is a frozen dataclass:\n"
         "`dataclasses.replace(config, name=value)` changes one setting. Docstrings describe the remaining settings.\n"
         "The median range of a scan is about 12 m in a street and 4 m in a room; nine beams in ten stay below the\n"
         "typical range.\n",

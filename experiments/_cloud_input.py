@@ -27,7 +27,7 @@ class DriveWindow:
         sequence: name of the drive where the folder holds several.
         scene: the simulated place, "room" or "street".
         rows: scans to use.
-        seed: of the simulated place.
+        seed: seed of the simulated place.
     """
 
     data: Path | None
@@ -37,20 +37,22 @@ class DriveWindow:
     seed: int
 
 
+# Root mean square of the noise of orientations, where noise is added.
+_NOISE_DEG = 1.0
+
+
 @dataclass(frozen=True)
 class FirstPoses:
     """Poses to start from.
 
     Attributes:
         source: "poses" (of the drive), "zero", or the path of a trajectory.
-        noise_m: root mean square of the noise of the positions, metres.
-        noise_deg: the same of the orientations, where there is noise.
-        seed: of the noise.
+        noise_m: root mean square of the noise of the positions, metres; orientations then have `_NOISE_DEG`.
+        seed: seed of the noise.
     """
 
     source: str
     noise_m: float
-    noise_deg: float
     seed: int
 
 
@@ -89,7 +91,7 @@ def starting_poses(first: FirstPoses, sequence: LidarSequence, rows: slice) -> F
     Args:
         first: where they come from.
         sequence: the scans of the window.
-        rows: of the window in its drive; a trajectory may have a pose for each scan of either.
+        rows: rows of the window in its drive; a trajectory may have a pose for each scan of either.
 
     Returns:
         The poses.
@@ -102,7 +104,7 @@ def starting_poses(first: FirstPoses, sequence: LidarSequence, rows: slice) -> F
         T = sequence.T_world_lidar
     else:
         T = read_start(first.source, len(sequence), rows)
-    return T if first.noise_m == 0.0 else add_noise(T, first.noise_m, first.noise_deg, first.seed)
+    return T if first.noise_m == 0.0 else add_noise(T, first.noise_m, first.seed)
 
 
 def read_start(path: str, num_scans: int, rows: slice) -> Floats:
@@ -118,12 +120,12 @@ def read_start(path: str, num_scans: int, rows: slice) -> Floats:
     return chosen
 
 
-def add_noise(T: Floats, noise_m: float, noise_deg: float, seed: int) -> Floats:
+def add_noise(T: Floats, noise_m: float, seed: int) -> Floats:
     """Moves each pose by a random motion whose root mean square is given."""
     from scipy.spatial.transform import Rotation
 
     rng = np.random.default_rng(seed)
-    turns = Rotation.from_rotvec(rng.normal(size=(len(T), 3)) * math.radians(noise_deg) / math.sqrt(3.0))
+    turns = Rotation.from_rotvec(rng.normal(size=(len(T), 3)) * math.radians(_NOISE_DEG) / math.sqrt(3.0))
     moved = T.copy()
     moved[:, :3, 3] += rng.normal(size=(len(T), 3)) * noise_m / math.sqrt(3.0)
     moved[:, :3, :3] = T[:, :3, :3] @ turns.as_matrix()

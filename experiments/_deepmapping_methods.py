@@ -1,7 +1,7 @@
 """The methods that the tables of DeepMapping compare: baselines, parts of the pipeline, and their combinations.
 
-A candidate is a set of poses under the name of what produced it. "DeepMapping" names what L-Net or M-Net produced;
-a search, an ICP or a refinement is called that.
+A candidate is a set of poses under the name of its method. "DeepMapping" is the name for results of L-Net or M-Net; a
+search, an ICP or a refinement has its own name.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ class Task:
         sequence: the scans; methods do not look at its reference.
         planar: the same scans with a line at every beam.
         is_ordered: the scans lie in the order of time.
-        steps: of the fit; None: the preset decides.
+        steps: steps of the fit; None: the preset decides.
         seed: seed of everything random.
     """
 
@@ -152,7 +152,7 @@ def _multiway(task: Task) -> Floats:
 def _swarm(task: Task) -> Floats:
     import jax
 
-    from experiments.baselines.swarm import swarm_chain
+    from experiments.baselines.direct import swarm_chain
 
     return swarm_chain(task.scans, key=jax.random.key(task.seed))
 
@@ -197,9 +197,9 @@ class Method(NamedTuple):
     """A column of the comparison.
 
     Attributes:
-        title: what it is.
+        title: name in tables.
         run: makes its candidates; poses alone are one candidate under `title`.
-        package: of the extra `baselines`, which it needs.
+        package: package of the extra `baselines`, which it needs.
     """
 
     title: str

@@ -1,9 +1,10 @@
-"""Rows of `dpm_evaluate` besides the model's own: the search without a network and KISS-Matcher; the table."""
+"""Rows of `dpm_evaluate` beside the model's own: the search without a network, KISS-Matcher; pooled and as a table."""
 
 from __future__ import annotations
 
+import itertools
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -21,7 +22,7 @@ from dpmjax.deeppointmap import (
     refine_motion,
 )
 from dpmjax.io import LidarSequence
-from experiments._dpm_pooled import KISS, NETWORK, SEARCH, VERIFIED
+from dpmjax.metrics import mcnemar_p_value, wilson_interval
 
 # KISS-Matcher's voxels, metres; indoors is where half of the points are nearer than INDOORS_M.
 VOXEL_M, INDOOR_VOXEL_M, INDOORS_M = 0.3, 0.2, 5.0
@@ -42,7 +43,7 @@ def kiss_matcher(source: np.ndarray, target: np.ndarray) -> np.ndarray:
 
 
 def search_alone(source: np.ndarray, target: np.ndarray, config: VerificationConfig) -> np.ndarray:
-    """Returns `T_target_source` of what `register` does around the network: it searches among the views from above."""
+    """Returns `T_target_source` by the search of `register` among the views from above, without a network."""
     measured = measure_scan(source, config), measure_scan(target, config)
     chosen = choose_motion(*measured, np.eye(4)[None], config)
     return refine_motion(*measured, chosen, config).T_target_source
@@ -102,3 +103,80 @@ def _number(value: float | None, decimals: int = 2) -> str:
 
 def _length(metres: float | None) -> str:
     return "-" if metres is None or np.isnan(metres) else f"{metres:.3f} m"
+
+
+NETWORK, VERIFIED = "network alone", "network, search and verification"
+SEARCH, KISS = "search and verification, no network", "KISS-Matcher"
+# The row and its entry that say which pairs a method has registered right.
+_ANSWERS = {
+    NETWORK: ("DeepPointMap", "is_right_descriptors"),
+    VERIFIED: ("DeepPointMap", "is_right"),
+    SEARCH: ("search", "is_right"),
+    KISS: ("KISS-Matcher", "is_right"),
+}
+MONITORED = ("kitti_00_drive",)
+"""Real drives whose recall was watched during the training of `dpm_small`: they are no unseen data."""
+
+
+def pooled_rows(rows: Sequence[Mapping[str, Any]], drives: Sequence[str]) -> list[dict[str, Any]]:
+    """Pools the rows of pairs over drives, with and without those that were watched during the training.
+
+    Args:
+        rows: rows of `dpm_evaluate`.
+        drives: names of the drives to pool.
+
+    Returns:
+        One row for each set of drives, band and method that has registered all pairs of the set. `p_values` holds, by
+        the name of another method, the p-value of the difference.
+    """
+    sets = {"all drives": list(drives)}
+    unseen = [name for name in drives if name not in MONITORED]
+    if len(unseen) < len(drives):
+        sets[f"all drives but {', '.join(sorted(set(drives) - set(unseen)))}"] = unseen
+    pooled: list[dict[str, Any]] = []
+    for (title, names), band in itertools.product(sets.items(), BAND_NAMES):
+        answers = {method: _answers(rows, method, names, band) for method in _ANSWERS}
+        known = {method: of_all for method, of_all in answers.items() if of_all is not None and len(of_all)}
+        for method, is_right in known.items():
+            share, low, high = wilson_interval(int(is_right.sum()), len(is_right))
+            others = {name: mcnemar_p_value(is_right, other) for name, other in known.items() if name != method}
+            numbers = {"num_pairs": len(is_right), "num_right": int(is_right.sum())}
+            interval = {"recall": share, "recall_low": low, "recall_high": high}
+            case = {"drives": title, "sequences": names, "band": band, "method": method}
+            pooled.append({**case, **numbers, **interval, "p_values": others})
+    return pooled
+
+
+def _answers(rows: Sequence[Mapping[str, Any]], method: str, drives: Sequence[str], band: str) -> np.ndarray | None:
+    """Returns which pairs of all drives are right; None where the method has not registered those of every drive."""
+    name, entry = _ANSWERS[method]
+    by_drive = {row["sequence"]: row for row in rows if row["method"] == name and row["band"] == band}
+    if any(entry not in by_drive.get(drive, {}) for drive in drives):
+        return None
+    return np.concatenate([np.zeros(0, bool), *(np.asarray(by_drive[drive][entry], bool) for drive in drives)])
+
+
+def pooled_table(pooled: Sequence[Mapping[str, Any]]) -> str:
+    """Returns the pooled rows as Markdown; without any, an empty string."""
+    if not pooled:
+        return ""
+    lines = [
+        "| pooled over | distance | pairs | method | right | recall (95 % interval) | p against the other methods |",
+        "|---|---|---|---|---|---|---|",
+    ]
+    for row in pooled:
+        p_values = "; ".join(f"{name} {_p_value(p)}" for name, p in row["p_values"].items())
+        lines.append(
+            f"| {row['drives']} | {BAND_NAMES[row['band']]} | {row['num_pairs']} | {row['method']} "
+            f"| {row['num_right']} | {row['recall']:.3f} ({row['recall_low']:.3f} to {row['recall_high']:.3f}) "
+            f"| {p_values or '-'} |"
+        )
+    notes = "Intervals: Wilson. p: McNemar's exact test, two-sided, on the same pairs."
+    notes += " All motions but those of the network alone and of KISS-Matcher are refined."
+    if watched := sorted({name for row in pooled for name in row["sequences"]} & set(MONITORED)):
+        notes += f" The recall on {', '.join(watched)} was watched during the training: it is no unseen drive."
+    return "\n".join([*lines, "", notes])
+
+
+def _p_value(p: float) -> str:
+    return "< 0.001" if p < 0.001 else f"{p:.3f}"

@@ -32,14 +32,14 @@ TOWN_STREAM = 4134
 def measure_town(model: Model, drives: Sequence[LidarSequence], num_pairs: int, seed: int, bar: tqdm) -> dict[str, Any]:
     """Returns evidence and distance of the pairs of a town.
 
-    Half of the pairs are less than 20 m apart, a quarter is 20 to 40 m apart, an eighth is farther, and an eighth has
-    one scan of another town.
+    Half of the pairs are less than 20 m apart, a quarter 20 to 40 m, an eighth farther; an eighth has one scan of
+    another town.
 
     Args:
         model: encoder and decoder.
-        drives: through the town, and through the other one.
+        drives: drives through the town, and through a second one.
         num_pairs: number of pairs, about.
-        seed: of the run.
+        seed: seed of the run.
         bar: gets the pairs.
     """
     rng = np.random.default_rng([TOWN_STREAM, seed])
@@ -85,7 +85,7 @@ def fit(rows: Sequence[dict[str, Any]]) -> tuple[LogisticModel, dict[str, Any], 
 def held_out_probability(
     names: tuple[str, ...], features: np.ndarray, labels: np.ndarray, towns: np.ndarray
 ) -> np.ndarray:
-    """Returns the probability of each example by a fit on the other towns."""
+    """Returns the probability of each example by a fit on all towns but its own."""
     found = np.empty(len(towns))
     for town in np.unique(towns):
         part = towns == town

@@ -8,7 +8,7 @@
 
 DATA is any folder of scans (KITTI, KITTI-360, MulRan, plain ...). Results go to results/deepmapping_3d/<time>/ (latest
 links to the newest): metrics.json, trajectories as TUM, KITTI and npy, map.ply, map.png (from above, before and after),
-loss.png. Of the start and the fit, that one is kept whose planes meet better, judged without ground truth.
+loss.png. The start or the fit is kept, by the share of planes that meet, without ground truth.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ from dpmjax.cli import (
 from experiments._cloud_input import DriveWindow, FirstPoses, read_drive, starting_poses
 
 if TYPE_CHECKING:
-    from dpmjax.deepmapping import CloudFitted, CloudMappingConfig, CloudScans
+    from dpmjax.deepmapping import CloudFitted, CloudScans, DeepMappingConfig
     from dpmjax.io import LidarSequence
 
 Floats = NDArray[np.float64]
@@ -68,8 +68,6 @@ class Config(RunOptions):
     """Where the poses start: those of the folder, all at one place, or a trajectory of the scans or of the window."""
     init_noise: Annotated[float | None, arg(metavar="M")] = None
     """Noise that is added to the start, metres; without it, 0.2 in a simulated place, else none."""
-    init_noise_deg: Annotated[float, arg(metavar="DEG")] = 1.0
-    """The same of the orientation, where noise is added."""
     window: Annotated[str, arg(metavar="A:B")] = ":"
     """Scans to use, A to B - 1; one end may be left out."""
     jump: Annotated[int, arg(aliases=["-j"], metavar="N")] = 1
@@ -81,7 +79,7 @@ class Config(RunOptions):
 
     def __post_init__(self) -> None:
         """Checks ranges."""
-        check_least(self, steps=1, jump=1, init_noise=0, init_noise_deg=0, seed=0)
+        check_least(self, steps=1, jump=1, init_noise=0, seed=0)
         self.selection()
         if self.sequence is not None and self.data is None:
             raise ValueError("--sequence chooses a drive of DATA: give its folder too")
@@ -99,11 +97,11 @@ class Config(RunOptions):
         return DriveWindow(self.data, self.sequence, self.scene, self.selection(), self.seed)
 
     def first_poses(self) -> FirstPoses:
-        """Where the poses start."""
+        """Poses to start from."""
         is_simulated = self.data is None and self.init == "poses"
         usual = _SIMULATED_NOISE_M if is_simulated else 0.0
         noise = usual if self.init_noise is None else self.init_noise
-        return FirstPoses(self.init, noise, self.init_noise_deg, self.seed)
+        return FirstPoses(self.init, noise, self.seed)
 
 
 def main(config: Config) -> dict[str, Any]:
@@ -115,7 +113,7 @@ def main(config: Config) -> dict[str, Any]:
     started = time.perf_counter()
     sequence = read_drive(config.drive_window())
     start = starting_poses(config.first_poses(), sequence, config.selection())
-    scans = read_scans(sequence, fit_settings(config))
+    scans = read_scans(sequence)
     folder = open_run_folder(config, EXPERIMENT)
     with recording(folder), StopFlag() as stop:
         print(f"{sequence.name}: {len(sequence)} scans of {scans.points.shape[1]} points, from {config.init}")
@@ -147,16 +145,16 @@ def main(config: Config) -> dict[str, Any]:
     return metrics
 
 
-def read_scans(sequence: LidarSequence, settings: CloudMappingConfig) -> CloudScans:
+def read_scans(sequence: LidarSequence) -> CloudScans:
     """Reads and thins the scans."""
     from dpmjax.deepmapping import as_cloud_scans
 
     clouds = [sequence.read_scan(number) for number in tqdm(range(len(sequence)), desc="read", unit=" scans")]
     with tqdm(total=len(clouds), desc="thin", unit=" scans") as bar:
-        return as_cloud_scans(clouds, settings.num_points, on_scan=lambda: bar.update(1))
+        return as_cloud_scans(clouds, on_scan=lambda: bar.update(1))
 
 
-def fit_settings(config: Config) -> CloudMappingConfig:
+def fit_settings(config: Config) -> DeepMappingConfig:
     """Returns the preset, with the given number of steps."""
     from dpmjax import deepmapping
 

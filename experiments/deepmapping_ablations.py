@@ -1,14 +1,14 @@
-"""Which part of DeepMapping does what: the ablations of the paper (supplement A, figures 10 to 13), and two more.
+"""Ablations of DeepMapping: those of the paper (supplement A, figures 10 to 13), and two more.
 
     python -m experiments.deepmapping_ablations --limit 5
     python -m experiments.deepmapping_ablations --only lnet chamfer --steps 300
     python -m experiments.deepmapping_ablations --resume -o out
 
 As in the paper on short walks of a depth camera (here through simulated apartments), from zero: L-Net and M-Net are
-trained together. lnet: CNN or PointNet; mnet: MLP or ResMLP, or our grid; depth: 4 to 7 layers of 64; width: 32 to 128
-with 4 layers; chamfer: with and without; free: number of free samples a ray. All others stay as they are; the basis is
-a small CNN and an MLP of 6 layers of 64, so that a run takes half a minute on a CPU. Each run is written to rows/ when
-it is done; ablations.png has the box plots.
+trained together. The variants are lnet (CNN or PointNet), mnet (MLP or ResMLP, or our grid), depth (4 to 7 layers of
+64), width (32 to 128 with 4 layers), chamfer (with and without) and free (number of free samples a ray). All further
+settings are fixed. The basis is a small CNN and an MLP of 6 layers of 64: a run takes half a minute on a CPU. Each run
+is written to rows/ when it is done; ablations.png has the box plots.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from dpmjax.cli import RunFolder, RunOptions, StopFlag, do_rows, open_run_folder
 from experiments._rgbd_methods import errors_of
 
 if TYPE_CHECKING:
-    from dpmjax.deepmapping import DepthMappingConfig
+    from dpmjax.deepmapping import DeepMappingConfig
 
 EXPERIMENT = "deepmapping_ablations"
 _SUCCESS_MM = 450.0
@@ -67,7 +67,7 @@ class Config(RunOptions):
 
 
 def main(config: Config) -> dict[str, Any]:
-    """Runs what is missing, variant by variant, then writes the table and the box plots."""
+    """Runs the missing cases, variant by variant, then writes the table and the box plots."""
     folder = open_run_folder(config, EXPERIMENT)
     cases = [
         {"ablation": ablation, "variant": variant, "trajectory": trajectory}
@@ -93,9 +93,9 @@ def main(config: Config) -> dict[str, Any]:
     return {}
 
 
-def settings_of(ablation: str, variant: str, config: Config) -> DepthMappingConfig:
+def settings_of(ablation: str, variant: str, config: Config) -> DeepMappingConfig:
     """The basis with one thing changed."""
-    from dpmjax.deepmapping import JOINT_DEPTH, DepthMappingConfig, depth_preset
+    from dpmjax.deepmapping import JOINT_DEPTH, depth_preset
     from dpmjax.nets import OccupancyConfig
 
     phase = replace(
@@ -105,7 +105,7 @@ def settings_of(ablation: str, variant: str, config: Config) -> DepthMappingConf
         final_learning_rate=0.1,
         beams_per_step=config.points,
         num_free=4,
-        is_free_factor_shared=False,
+        is_sampled_as_published=False,
     )
     fast, number = depth_preset("fast"), int(variant) if variant.isdigit() else 0
     localization = replace(fast.localization, kind="point") if variant == "PointNet" else fast.localization
@@ -116,7 +116,6 @@ def settings_of(ablation: str, variant: str, config: Config) -> DepthMappingConf
         "width": OccupancyConfig(features=(number,) * 4),
     }
     changes: dict[str, dict[str, Any]] = {
-        "grid": {"map_learning_rate": 0.1, "map_decay": 1e-3},
         "without": {"occupancy_weight": 1.0},
         "free": {"num_free": number},
     }
@@ -126,7 +125,8 @@ def settings_of(ablation: str, variant: str, config: Config) -> DepthMappingConf
         maps.get(changed, OccupancyConfig(features=(64,) * 6)),
     )
     per_call = min(50, config.steps)
-    return DepthMappingConfig((phase,), (phase,), localization, occupancy, steps_per_call=per_call)
+    networks = {"localization": localization, "occupancy": occupancy}
+    return replace(fast, cold_phases=(phase,), warm_phases=(phase,), steps_per_call=per_call, **networks)
 
 
 def run_one(ablation: str, variant: str, trajectory: int, *, config: Config) -> dict[str, Any]:

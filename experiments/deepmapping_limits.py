@@ -1,12 +1,13 @@
-"""Where each method works: success over the distance of the scans, the range noise, and with or without their order.
+"""Limits of each method: success over the distance of the scans and the range noise, with and without their order.
 
     python -m experiments.deepmapping_limits --limit 3       three trajectories a cell
     python -m experiments.deepmapping_limits --resume        go on where the last run stopped
 
-Trajectories of 256 poses in the built-in worlds, thinned to every 1st, 2nd, 4th, 8th and 16th scan, with range noise of
-0, 1, 3 and 10 px, in order and shuffled. The hard cells come first. With --worlds grove crowd they lead through worlds
-without straight walls, and through offices in which people walk. Results: metrics.json, table.md (every candidate, and
-how often the best one was kept or one within 0.1 px), and a picture for each world and order (rooms_ordered.png).
+Trajectories of 256 poses in the built-in worlds are thinned to every 1st, 2nd, 4th, 8th and 16th scan, with range noise
+of 0, 1, 3 and 10 px, in order and shuffled. The hard cells come first. With --worlds grove crowd they lead through
+worlds without straight walls, and through offices in which people walk. Results: metrics.json, table.md (every
+candidate, and how often the best one was kept or one within 0.1 px), and a picture for each world and order
+(rooms_ordered.png).
 """
 
 from __future__ import annotations
@@ -68,7 +69,7 @@ class Config(tables.TableOptions):
 
 
 def main(config: Config) -> list[dict[str, Any]]:
-    """Runs what is missing, cell by cell."""
+    """Runs the missing cases, cell by cell."""
     axes = {
         "world": config.worlds,
         "stride": config.strides,
@@ -102,7 +103,7 @@ def success_grids(rows: Sequence[dict[str, Any]], config: Config) -> dict[str, N
 
 
 def _successes(row: dict[str, Any]) -> dict[str, bool]:
-    """Whether each candidate of a row is right, and the kept one of several."""
+    """Returns which candidates of a row are right, and whether the kept one is."""
     found = {_column(row, name): numbers["ate_px"] < shared.SUCCESS_PX for name, numbers in row["candidates"].items()}
     return found if len(found) == 1 else found | {_column(row, "kept"): row["success"]}
 
@@ -119,7 +120,9 @@ def summary(rows: Sequence[dict[str, Any]]) -> list[str]:
 
 
 def table(rows: Sequence[dict[str, Any]]) -> str:
-    """Returns the median ATE of every method and candidate in every cell, as Markdown; what was kept is named last."""
+    """Returns the median ATE of every method and candidate in every cell, as Markdown; the kept candidate comes
+    last.
+    """
     columns = dict.fromkeys(_column(row, name) for row in rows for name in row["candidates"])
     lines = [
         f"| world | order | every | noise, px | {' | '.join(columns)} | best kept |",

@@ -14,7 +14,7 @@ import itertools
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,9 +39,7 @@ class Config:
     run: Annotated[Positional[Path], arg(metavar="RUN")]
     """Folder of a run of `dpmjax map2d` on a built-in world."""
     stride_px: Annotated[int, arg(metavar="PX")] = 6
-    """A scan is taken at the centre of every square of so many pixels that is free."""
-    heading: Literal["random", "nearest", "east"] = "random"
-    """Orientation of these scans, which is not told: random, that of the nearest scan of the fit, or along x."""
+    """A scan is taken at the centre of every free square of this side."""
     steps: Annotated[int, arg(metavar="N")] = 5000
     """Training steps of L-Net on the poses of the run."""
     seed: int = 0
@@ -67,7 +65,7 @@ def main(config: Config) -> dict[str, Any]:
         raise ValueError(f"{config.run} is a run on {run.sequence.name}, whose world is needed; use a built-in one")
     sequence, fitted = run.sequence, run.fitted
     grid = make_world(run.world).is_obstacle
-    truth = free_poses(grid, sequence, config)
+    truth = free_poses(grid, config)
     points, mask = scan_world(grid, truth, num_beams=sequence.points.shape[1])
     begun = time.perf_counter()
     training = LocalizationTrainingConfig(num_steps=config.steps)
@@ -82,7 +80,6 @@ def main(config: Config) -> dict[str, Any]:
         "world": sequence.name,
         "num_scans": len(sequence),
         "num_poses": len(truth),
-        "heading": config.heading,
         **summarise(queries, truth, sequence),
         "training_s": training_s,
         "relocalization_s": time.perf_counter() - begun,
@@ -98,12 +95,12 @@ def main(config: Config) -> dict[str, Any]:
 
 
 class Queries(NamedTuple):
-    """What became of the scans, (m,) each.
+    """Results of the scans, (m,) each.
 
     Attributes:
         errors: distance to the truth, px.
         turns: error of the heading, degrees.
-        is_known: the fit says that it knows the view.
+        is_known: True where the view is in the map, by the fit.
         is_mapped: taken where some beam of the fit's scans has passed.
         nats: cost of a beam by the map.
     """
@@ -135,24 +132,17 @@ def draw(
     viz.save_figure(figure, config.run / "relocalization.png")
 
 
-def free_poses(grid: NDArray[np.bool_], sequence: ScanSequence, config: Config) -> NDArray[np.float64]:
-    """(m, 3) poses at the centres of the free squares."""
-    from scipy.spatial import KDTree
-
+def free_poses(grid: NDArray[np.bool_], config: Config) -> NDArray[np.float64]:
+    """Returns (m, 3) poses of random headings at the centres of the free squares."""
     half = config.stride_px // 2
     rows, columns = np.nonzero(~grid[half :: config.stride_px, half :: config.stride_px])
     places = np.column_stack([columns, rows]) * config.stride_px + half + 0.5
-    if config.heading == "nearest":
-        _, nearest = KDTree(sequence.reference_poses[:, :2]).query(places)
-        headings = sequence.reference_poses[nearest, 2]
-    else:
-        rng = np.random.default_rng([config.seed, 7])
-        headings = rng.uniform(-np.pi, np.pi, len(places)) if config.heading == "random" else np.zeros(len(places))
+    headings = np.random.default_rng([config.seed, 7]).uniform(-np.pi, np.pi, len(places))
     return np.column_stack([places, headings])
 
 
 def is_mapped(truth: NDArray[np.float64], fitted: Fitted, sequence: ScanSequence) -> NDArray[np.bool_]:
-    """Whether some beam of the fit's scans has passed the places of true poses."""
+    """Returns True for places of true poses that some beam of the fit's scans has passed."""
     from dpmjax.deepmapping import draw_map
     from dpmjax.metrics import align_rigid
 
@@ -181,7 +171,7 @@ def errors_at(
 
 
 def summarise(queries: Queries, truth: NDArray[np.float64], sequence: ScanSequence) -> dict[str, Any]:
-    """Numbers of all mapped free space, of what is called known, and by the distance from the trajectory."""
+    """Numbers of all mapped free space, of the known scans, and by the distance from the trajectory."""
     from scipy.spatial import KDTree
 
     distance, _ = KDTree(sequence.reference_poses[:, :2]).query(truth[:, :2])

@@ -8,15 +8,15 @@
     python -m experiments.deepmapping_rgbd --resume -o out
 
 The simulated apartments follow the dataset's protocol: places 300 mm apart, views every 30 degrees, 8 or 16 views. With
---walks hard, 16 views of other apartments, one for each walk: moves and turns at once with jitter, depth noise and
-missing pixels, and only walks on which not moving at all exceeds 450 mm. No setting was chosen on them.
+--walks hard, each walk has 16 views of an apartment of its own: moves and turns at once with jitter, depth noise and
+missing pixels. Walks on which no motion at all has an ATE below 450 mm are left out. No setting was chosen on them.
 
-Each trajectory is written to rows/ as soon as all methods have done it; metrics.json has the share of walks with an ATE
-below 450 mm (the paper's threshold; on most of its walks not moving at all stays below it), and of walks that are
-right: ATE below a tenth of the spread of the cameras, turns between neighbours within 2 degrees, points within 100 mm.
-Images of bare walls leave open how far the camera moved along them; of hard walks the table also says which share is
-right of those that the surfaces in the images hold to a tenth of the spread (experiments/_rgbd_surfaces.py says how).
-errors.png has the box plots, map_K.png some trajectories from above.
+Each trajectory is written to rows/ as soon as all methods have done it. metrics.json has the share of walks with an ATE
+below 450 mm (the paper's threshold, which no motion at all meets on most of its walks), and of right walks. Right is an
+ATE below a tenth of the spread of the cameras, turns between neighbours within 2 degrees, and points within 100 mm.
+Images of bare walls leave the motion along them open. For hard walks the table also has the share of right walks among
+those that the surfaces hold to a tenth of the spread (`_rgbd_methods.surface_spread`). errors.png has the box plots,
+map_K.png some trajectories from above.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ from dpmjax.cli import (
 from experiments._rgbd_methods import METHODS, errors_of, run_method, spread_of
 
 if TYPE_CHECKING:
-    from dpmjax.deepmapping import DepthMappingConfig
+    from dpmjax.deepmapping import DeepMappingConfig
     from dpmjax.io import DepthSequence
     from dpmjax.simulation import DepthWalkConfig
 
@@ -82,8 +82,6 @@ class Config(RunOptions):
     """Images a trajectory; 0: 8 and 16 in turn, 16 of hard walks."""
     window_step: Annotated[int, arg(metavar="N")] = 0
     """Windows of a folder begin so many images apart; 0: half their length."""
-    depth_noise_m: Annotated[float, arg(metavar="M")] = 0.0
-    """Depth noise of the simulated camera at one metre; hard walks have their own."""
     pictures: Annotated[int, arg(metavar="N")] = 4
     """Trajectories to draw from above."""
 
@@ -98,14 +96,14 @@ class Config(RunOptions):
             raise ValueError(f"--limit: expected at least 1, got {self.limit}")
         if self.views != 0 and self.views < 2:
             raise ValueError(f"--views: expected 0 or at least 2, got {self.views}")
-        check_least(self, depth_noise_m=0, window_step=0)
+        check_least(self, window_step=0)
         unknown = [name for name in self.methods if name not in METHODS]
         if unknown or not self.methods:
             raise ValueError(f"--methods: expected some of {', '.join(METHODS)}, got {', '.join(unknown) or 'none'}")
 
 
 def main(config: Config) -> dict[str, Any]:
-    """Runs what is missing, then writes the table and the pictures."""
+    """Runs the missing cases, then writes the table and the pictures."""
     if "multiway" in config.methods:
         require_importable("open3d", "--methods multiway")
     settings = fit_settings(config, read_trajectory(config, 0))
@@ -126,7 +124,7 @@ def main(config: Config) -> dict[str, Any]:
 
 
 def num_trajectories(config: Config) -> int:
-    """As many as asked for; of a folder of images no more than there are windows."""
+    """The requested number, and of a folder of images at most the number of windows."""
     from dpmjax import io
 
     if config.data is None or io.is_active_vision(config.data):
@@ -148,8 +146,7 @@ def read_trajectory(config: Config, index: int) -> DepthSequence:
     if config.is_hard:
         return _hard_walk(config, index, simulation.HARD_WALK)
     if config.data is None:
-        walk = simulation.DepthWalkConfig(depth_noise_m=config.depth_noise_m)
-        return simulation.simulate_depth_sequence(seed % _NUM_APARTMENTS, views, seed=seed, config=walk)
+        return simulation.simulate_depth_sequence(seed % _NUM_APARTMENTS, views, seed=seed)
     if io.is_active_vision(config.data):
         return io.read_active_vision(config.data, views, seed=seed)
     sequence, views = io.read_pose_folder(config.data), config.views or 8
@@ -161,9 +158,11 @@ def read_trajectory(config: Config, index: int) -> DepthSequence:
 
 
 def walk_surface_spread(config: Config, index: int) -> float:
-    """How well the surfaces hold a hard walk, mm; its images without noise are those of the same seed."""
+    """Returns the spread of a hard walk that the surfaces leave, mm; its images without noise are those of the same
+    seed.
+    """
     from dpmjax import simulation
-    from experiments._rgbd_surfaces import surface_spread
+    from experiments._rgbd_methods import surface_spread
 
     hard = simulation.HARD_WALK
     clean = replace(hard, depth_noise_m=0.0, dropout_share=0.0)
@@ -178,7 +177,7 @@ def _hard_walk(config: Config, index: int, walk: DepthWalkConfig) -> DepthSequen
     return simulation.simulate_depth_sequence(apartment, views, seed=seed, config=walk)
 
 
-def fit_settings(config: Config, sequence: DepthSequence) -> DepthMappingConfig:
+def fit_settings(config: Config, sequence: DepthSequence) -> DeepMappingConfig:
     """The preset, with the motion of the data."""
     from dpmjax.deepmapping import depth_preset
 
@@ -186,16 +185,16 @@ def fit_settings(config: Config, sequence: DepthSequence) -> DepthMappingConfig:
     return depth_preset(config.preset, motion="planar" if is_planar else "full")
 
 
-def run_one(trajectory: int, *, folder: RunFolder, config: Config, settings: DepthMappingConfig) -> dict[str, Any]:
+def run_one(trajectory: int, *, folder: RunFolder, config: Config, settings: DeepMappingConfig) -> dict[str, Any]:
     """All methods on one trajectory; a fit from the result of another method is timed without that method.
 
     The first `run_s` of each number of images contains its compilation.
 
     Args:
         trajectory: its number.
-        folder: of the run; gets the pictures.
+        folder: folder of the run; gets the pictures.
         config: options.
-        settings: of DeepMapping.
+        settings: settings of DeepMapping.
 
     Returns:
         The rest of the row.

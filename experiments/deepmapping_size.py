@@ -4,7 +4,7 @@
     python -m experiments.deepmapping_size --sizes 64 256 1024 -o out
 
 Steps take at most 256 scans in windows of 32 neighbours in time and every fourth beam, so that M-Net sees a random part
-of the rays: a step costs the same however many scans there are, and an epoch (every scan seen once) grows linearly. The
+of the rays. A step costs the same for any number of scans, and an epoch (every scan seen once) grows linearly. The
 report has both, the peak of memory, and the exponents; size.png draws them.
 """
 
@@ -14,10 +14,9 @@ import subprocess
 import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
-from tyro.conf import arg
 
 from dpmjax.cli import (
     RunOptions,
@@ -34,6 +33,8 @@ from dpmjax.cli import (
 EXPERIMENT = "deepmapping_size"
 # The exponent is that of large sizes: below, a step does not hold its full number of scans.
 _FULL_STEP = 256
+# Calls of 25 steps of each phase; the quickest counts.
+_NUM_CALLS = 3
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,28 +45,22 @@ class Config(RunOptions):
 
     sizes: tuple[int, ...] = (64, 128, 256, 512, 1024, 2048, 4096)
     """Numbers of scans."""
-    calls: Annotated[int, arg(metavar="N")] = 3
-    """Calls of 25 steps of each phase; the quickest counts."""
 
     def __post_init__(self) -> None:
         """Checks ranges."""
         if not self.sizes or min(self.sizes) < 2:
             raise ValueError(f"--sizes: expected numbers of at least 2, got {self.sizes}")
-        if self.calls < 1:
-            raise ValueError(f"--calls: expected at least 1, got {self.calls}")
 
 
 def main(config: Config) -> dict[str, Any]:
-    """Measures what is missing, fits the exponents, draws."""
+    """Measures the missing sizes, fits the exponents, draws."""
     folder = open_run_folder(config, EXPERIMENT)
     with recording(folder):
         rows = []
         for size in sorted(config.sizes):
             file = folder / f"size_{size}.json"
             if not (folder.is_resumed and file.exists()):
-                code = (
-                    f"from experiments.deepmapping_size import measure; measure({size}, {config.calls}, {config.seed},"
-                )
+                code = f"from experiments.deepmapping_size import measure; measure({size}, {config.seed},"
                 command = [sys.executable, "-c", f"{code} {str(file.resolve())!r})"]
                 subprocess.run(command, check=True, cwd=Path(__file__).parents[1])
             rows.append(load_json(file))
@@ -84,7 +79,7 @@ _KEYS = ("num_scans", "network", "free", "data_gb", "peak_rss_gb")
 
 
 def curves(rows: list[dict[str, Any]]) -> dict[str, Any]:
-    """What is drawn and fitted, by name."""
+    """Series of the picture and of the fit, by name."""
     columns = {
         f"{title}, {net} (s)": np.array([row[phase][f"{title}_s"] for row in rows])
         for title in ("step", "epoch")
@@ -107,7 +102,7 @@ def exponents(rows: list[dict[str, Any]]) -> dict[str, float | None]:
     }
 
 
-def measure(num_scans: int, num_calls: int, seed: int, output: str) -> None:
+def measure(num_scans: int, seed: int, output: str) -> None:
     """Seconds a step of both phases, and the peak of memory of this process, as JSON."""
     import jax
 
@@ -129,7 +124,7 @@ def measure(num_scans: int, num_calls: int, seed: int, output: str) -> None:
             data,
             key=jax.random.key(seed),
             on_report=lambda progress, run_s=run_s: run_s.append(progress.run_s),
-            stop=lambda run_s=run_s: len(run_s) > num_calls,
+            stop=lambda run_s=run_s: len(run_s) > _NUM_CALLS,
         )
         if not np.isfinite(np.asarray(done.poses)).all():
             raise RuntimeError(f"poses of {num_scans} scans are not finite")

@@ -56,7 +56,7 @@ def list_trajectories() -> list[dict[str, int]]:
 
 
 def main(config: Config) -> list[dict[str, Any]]:
-    """Runs what is missing, writes the table after every trajectory."""
+    """Runs the missing cases, and writes the table after every trajectory."""
     cells = list_trajectories()[: config.limit]
     return tables.run_table(config, EXPERIMENT, cells, partial(_prepare, config), partial(_write, config.seed))
 

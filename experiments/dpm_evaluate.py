@@ -198,8 +198,7 @@ def write_results(
 ) -> str:
     """Writes table.md and metrics.json; returns the tables."""
     from dpmjax.cli import calibration_numbers
-    from experiments._dpm_evaluation import table
-    from experiments._dpm_pooled import pooled_rows, pooled_table
+    from experiments._dpm_evaluation import pooled_rows, pooled_table, table
 
     recorded = [drive.name for drive in drives if Path(drive.sources[0]).exists()]
     pooled = pooled_rows(rows, recorded or [drive.name for drive in drives])

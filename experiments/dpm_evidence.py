@@ -1,13 +1,12 @@
-"""Fits the weights by which `register` judges motions: what two scans see of each other when a motion is right.
+"""Fits the weights by which `register` scores motions: the evidence of two scans for a right motion.
 
     python -m experiments.dpm_evidence
 
-Pairs of scans of simulated scenes are registered: out of doors and inside, whole and thinned to 1,400 points within
-30 m. All hypotheses of a pair, those of the network and those of the search among views from above, are aligned and
-compared with the truth; a logistic regression on `evidence_shares` predicts which are right. Results go to
-results/dpm_evidence/<time>/: metrics.json with the weights for `dpmjax.deeppointmap.EvidenceWeights`, and
-table.md, the share of pairs whose right hypothesis has the highest score of all, scene by scene, each by a fit on the
-other scenes.
+Pairs of scans of simulated scenes are registered: out of doors and inside, whole and thinned to 1,400 points within 30
+m. All hypotheses of a pair, by the network and by the search among views from above, are aligned and compared with the
+truth. A logistic regression on `evidence_shares` predicts which are right. Results go to results/dpm_evidence/<time>/.
+metrics.json has the weights for `dpmjax.deeppointmap.EvidenceWeights`. table.md has the share of pairs whose right
+hypothesis has the highest score, scene by scene, each by a fit without this scene.
 """
 
 from __future__ import annotations
@@ -98,7 +97,7 @@ def main(config: Config) -> dict[str, Any]:
 def measure_scene(
     config: Config, model: Any, *, scene: int, kind: str, sensor: str, points: str
 ) -> dict[str, list[dict[str, Any]]]:
-    """Returns the pairs of a scene: what each hypothesis is judged by, and whether it is right."""
+    """Returns the pairs of a scene: the evidence of each hypothesis, and whether it is right."""
     from dpmjax import simulation
     from dpmjax.deeppointmap import draw_rows_apart, match_clouds, prepare_scan, scan_distances
 
@@ -128,7 +127,7 @@ def measure_scene(
 
 
 def judged(model: Any, measured: list[Any], hypotheses: Any, T_true: np.ndarray) -> dict[str, Any]:
-    """Returns what all hypotheses of a pair are judged by, aligned as `register` aligns them."""
+    """Returns the evidence of all hypotheses of a pair, aligned as `register` aligns them."""
     from dpmjax.deeppointmap import distinct_motions, evidence_shares
     from dpmjax.metrics import registration_recall
     from dpmjax.scans import align_surfaces_from, correlate_views
@@ -144,7 +143,7 @@ def judged(model: Any, measured: list[Any], hypotheses: Any, T_true: np.ndarray)
 
 
 def fit(rows: list[dict[str, Any]]) -> tuple[Any, list[dict[str, Any]]]:
-    """Returns the weights by all scenes, and a table of the choices by the weights of the other scenes."""
+    """Returns the weights by all scenes, and a table of the choices by weights without the scene."""
     from dpmjax.deeppointmap import EvidenceWeights, fit_weights
 
     _, *present = astuple(EvidenceWeights())

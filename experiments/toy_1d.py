@@ -3,10 +3,10 @@
     python -m experiments.toy_1d
     python -m experiments.toy_1d --seeds 100 -o out
 
-Writes toy.png (figure 14), endings.png (where all seeds end) and metrics.json: the share of seeds that reach the
-global minimum in the network form and in the direct form (plain descent and three solvers of jaxopt) from the same
-starts, for several initialisations and learning rates, and the seconds beside a plain PyTorch loop where torch is
-installed.
+Writes toy.png (figure 14), endings.png (the ends of all seeds) and metrics.json. The metrics are the share of seeds
+that reach the global minimum in the network form and in the direct form (plain descent and three solvers of jaxopt)
+from the same starts. They cover several initialisations and learning rates, and the seconds beside a plain PyTorch loop
+where torch is installed.
 """
 
 from __future__ import annotations
@@ -175,7 +175,7 @@ def choose_seed(network_x: NDArray[np.floating], direct_x: NDArray[np.floating])
 
 
 def is_at_minimum(x: NDArray[np.floating]) -> NDArray[np.bool_]:
-    """Which ends are at the global minimum."""
+    """Returns True for ends at the global minimum."""
     from dpmjax.deepmapping import global_minimum
 
     return np.abs(np.asarray(x, np.float64) - global_minimum()[0]) < _SAME_PLACE
@@ -200,7 +200,7 @@ def measure_seconds(toy: ToyConfig, config: Config) -> dict[str, Any]:
 
 
 def torch_seconds(toy: ToyConfig, seed: int) -> float:
-    """The same descent of one seed as it is usually written in PyTorch."""
+    """The same descent of one seed as a plain loop in PyTorch."""
     import torch
 
     torch.manual_seed(seed)

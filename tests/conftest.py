@@ -34,7 +34,7 @@ import pytest
 PACKAGE = Path(__file__).parents[1] / "src" / "dpmjax"
 ROOMS = {path.stem for path in PACKAGE.iterdir()} - {"__init__", "types", "deepmapping"}
 OF_DEPTH = ("depth_initialization", "depth_motion_search", "depth_adjustment")
-CHECKED_OF_DEEPMAPPING = ("objective", "occupancy_map", *OF_DEPTH)
+CHECKED_OF_DEEPMAPPING = ("objective", "map_raster", *OF_DEPTH)
 jaxtyping.install_import_hook(
     [f"dpmjax.{room}" for room in (*sorted(ROOMS), *(f"deepmapping.{name}" for name in CHECKED_OF_DEEPMAPPING))],
     "beartype.beartype(conf=beartype.BeartypeConf(is_pep484_tower=True))",

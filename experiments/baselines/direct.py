@@ -1,22 +1,25 @@
-"""Direct optimisation without L-Net by jaxopt: of DeepMapping's loss (a baseline of the paper), and of the toy.
+"""Optimisation of poses without L-Net: baselines of the DeepMapping paper, and of the toy.
 
+L-BFGS by jaxopt on DeepMapping's loss; a chain of scans by particle swarms of evosax (both in the extra `baselines`).
 By Adam the direct form is `fit_deepmapping` with the settings of `as_direct`.
 """
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
-import jaxopt
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 from numpy.typing import NDArray
 
 from dpmjax import ScanSet
 from dpmjax.deepmapping import DeepMappingConfig, init, planar_data, planar_problem, toy_loss
+from dpmjax.geometry import se2, typical_range
+from dpmjax.losses import chamfer_distance
 
 
 def optimize_directly(
@@ -27,12 +30,14 @@ def optimize_directly(
     Args:
         scans: n planar scans.
         config: settings; its last warm phase gives the loss.
-        num_iterations: of L-BFGS.
-        key: for the map's weights and the samples.
+        num_iterations: number of iterations of L-BFGS.
+        key: key for the map's weights and the samples.
 
     Returns:
         (n, 3) poses, unit of the scans.
     """
+    import jaxopt
+
     data, unit = planar_data(scans, np.zeros((len(scans.points), 3)))
     phase = replace(config.warm_phases[-1], scans_per_step=len(scans.points))
     problem = planar_problem(replace(config, warm_phases=(phase,)), data)
@@ -58,12 +63,109 @@ def minimize_toy(
         max_iterations: the largest number of iterations.
 
     Returns:
-        Where the solver ends.
+        The end of the descent.
 
     Raises:
         ValueError: the method is unknown.
     """
+    import jaxopt
+
     solvers = {"gradient-descent": jaxopt.GradientDescent, "lbfgs": jaxopt.LBFGS, "bfgs": jaxopt.BFGS}
     if method not in solvers:
         raise ValueError(f"method: expected one of {', '.join(solvers)}, got {method!r}")
     return solvers[method](fun=toy_loss, maxiter=max_iterations).run(x0).params
+
+
+# Particles start within this: translation along each axis in typical ranges, and radians.
+_SPREAD = (0.15, 0.5)
+# Pairs that are worked on together.
+_PAIRS_AT_ONCE = 32
+
+
+@dataclass(frozen=True)
+class SwarmConfig:
+    """Settings of the swarms.
+
+    Attributes:
+        num_particles: relative poses that are tried at a time.
+        num_iterations: number of iterations of a swarm.
+        num_rounds: swarms from fresh particles; the best round of each pair is kept.
+        num_beams: beams of each scan that are compared.
+    """
+
+    num_particles: int = 32
+    num_iterations: int = 60
+    num_rounds: int = 3
+    num_beams: int = 86
+
+    def __post_init__(self) -> None:
+        if min(self.num_particles, self.num_iterations, self.num_rounds, self.num_beams) < 1:
+            raise ValueError(f"all counts must be at least 1, got {self}")
+
+
+def swarm_chain(scans: ScanSet, config: SwarmConfig | None = None, *, key: jax.Array) -> NDArray[np.float64]:
+    """Poses of planar scans, each onto the one before by a swarm that minimises their Chamfer distance (eq. 5).
+
+    A swarm over all poses at once does not converge; over one relative pose of three numbers it does. Without evosax it
+    ends in a ModuleNotFoundError.
+
+    Args:
+        scans: n scans in order of time.
+        config: settings.
+        key: key of the swarms.
+
+    Returns:
+        (n, 3) T_world_scan, x, y, heading; the first one zero.
+    """
+    config = config or SwarmConfig()
+    points, mask = jnp.asarray(scans.points), jnp.asarray(scans.mask)
+    stride = max(1, -(-mask.shape[1] // config.num_beams))
+    unit = typical_range(scans.points, scans.mask)
+    widths = jnp.array([_SPREAD[0] * unit, _SPREAD[0] * unit, _SPREAD[1]])
+    steps = _swarm_pairs(points[:, ::stride], mask[:, ::stride], widths, key, config=config)
+    return se2.chain(np.asarray(steps, np.float64))
+
+
+@partial(jax.jit, static_argnames="config")
+def _swarm_pairs(
+    points: Float[Array, "n b 2"],
+    mask: Bool[Array, "n b"],
+    widths: Float[Array, " 3"],
+    key: jax.Array,
+    *,
+    config: SwarmConfig,
+) -> Float[Array, "m 3"]:
+    """T_before_scan of every scan but the first."""
+
+    def best_of_rounds(pair: tuple[jax.Array, ...]) -> Array:
+        before, before_mask, after, after_mask, pair_key = pair
+
+        def misfit(pose: Float[Array, " 3"]) -> Array:
+            return chamfer_distance(se2.transform_points(pose, after), before, after_mask, before_mask)
+
+        swarm = partial(_swarm, lambda x: jax.vmap(misfit)(x * widths), config=config)
+        found, values = jax.lax.map(swarm, jax.random.split(pair_key, config.num_rounds))
+        return found[values.argmin()] * widths
+
+    keys = jax.random.split(key, len(mask) - 1)
+    pairs = (points[:-1], mask[:-1], points[1:], mask[1:], keys)
+    return jax.lax.map(best_of_rounds, pairs, batch_size=_PAIRS_AT_ONCE)
+
+
+def _swarm(misfit: Any, key: jax.Array, *, config: SwarmConfig) -> tuple[Float[Array, " 3"], Float[Array, ""]]:
+    """The best particle of one swarm in the box from -1 to 1, and its misfit."""
+    from evosax.algorithms import PSO
+
+    start_key, init_key, key = jax.random.split(key, 3)
+    algorithm = PSO(population_size=config.num_particles, solution=jnp.zeros(3))
+    particles = jax.random.uniform(start_key, (config.num_particles, 3), minval=-1.0, maxval=1.0)
+    state = algorithm.init(init_key, particles, misfit(particles), algorithm.default_params)
+
+    def iterate(state: Any, key: jax.Array) -> tuple[Any, None]:
+        ask_key, tell_key = jax.random.split(key)
+        particles, state = algorithm.ask(ask_key, state, algorithm.default_params)
+        state, _ = algorithm.tell(tell_key, particles, misfit(particles), state, algorithm.default_params)
+        return state, None
+
+    state, _ = jax.lax.scan(iterate, state, jax.random.split(key, config.num_iterations))
+    return state.best_solution, state.best_fitness

@@ -1,13 +1,13 @@
 """Multiway registration by Open3D, a baseline of DeepMapping: `pip install dpmjax[baselines]`.
 
-Pairs by iterated closest points, neighbours in time as sure and others as doubtful edges of a pose graph, whose line
-process lets the wrong ones go (Choi, Zhou and Koltun, Robust Reconstruction of Indoor Scenes, CVPR 2015).
+Pairs are registered by iterated closest points. Neighbours in time are sure edges of a pose graph, all further pairs
+doubtful ones; a line process removes wrong edges (Choi, Zhou and Koltun, Robust Reconstruction of Indoor Scenes, CVPR
+2015).
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -20,35 +20,22 @@ from dpmjax.geometry import rigid, se2, typical_range
 Floats = NDArray[np.float64]
 
 
-@dataclass(frozen=True)
-class MultiwayConfig:
-    """Settings. Lengths are in typical ranges of the scans.
-
-    Attributes:
-        coarse: largest distance of matched points, first round.
-        fine: second round, and that of the graph.
-        radius: scans that the start puts nearer than this are matched too.
-        prune: doubtful edges below this confidence are taken out.
-    """
-
-    coarse: float = 0.09
-    fine: float = 0.0225
-    radius: float = 0.3
-    prune: float = 0.25
-
-
-POLISH = MultiwayConfig(coarse=0.03, fine=0.01, radius=0.3)
-"""Where the start is good: smaller distances."""
+# Largest distances of matched points in the first round, and in the second round and the graph, in typical ranges of
+# the scans: from a rough start, and from a good one.
+_FROM_ROUGH, _FROM_GOOD = (0.09, 0.0225), (0.03, 0.01)
+# Scans that the start puts nearer than this share of the typical range are matched too.
+_RADIUS = 0.3
+# Doubtful edges below this confidence are removed.
+_PRUNE = 0.25
 # Points of a lidar cloud are thinned to this share of the typical range: 0.3 m in a street.
 _VOXEL_SHARE = 0.01
 
 
-def multiway(scans: ScanSet, config: MultiwayConfig | None = None) -> Floats:
+def multiway(scans: ScanSet) -> Floats:
     """Poses of planar scans by Open3D's multiway registration; a ModuleNotFoundError without Open3D.
 
     Args:
         scans: n scans in order of time.
-        config: settings.
 
     Returns:
         (n, 3) T_world_scan, x, y, heading; the first one zero.
@@ -57,20 +44,19 @@ def multiway(scans: ScanSet, config: MultiwayConfig | None = None) -> Floats:
     points = [p[m] for p, m in zip(np.asarray(scans.points), np.asarray(scans.mask), strict=True)]
     flat = [np.concatenate([p, np.zeros((len(p), 1))], axis=1) for p in points]
     clouds = [_cloud(p) for p in flat]
-    poses = _registered(clouds, unit, config or MultiwayConfig(), is_planar=True)
+    poses = _registered(clouds, unit, _FROM_ROUGH, is_planar=True)
     planar = np.stack([poses[:, 0, 3], poses[:, 1, 3], np.arctan2(poses[:, 1, 0], poses[:, 0, 0])], -1)
     return se2.relative(planar[0], planar)
 
 
 def multiway_images(
-    points: Float[np.ndarray, "n h w 3"], mask: Bool[np.ndarray, "n h w"], config: MultiwayConfig | None = None
+    points: Float[np.ndarray, "n h w 3"], mask: Bool[np.ndarray, "n h w"]
 ) -> Float[NDArray[np.float64], "n 4 4"]:
     """Poses of depth images by Open3D's multiway registration; a ModuleNotFoundError without Open3D.
 
     Args:
-        points: of n images in order of time, each in the frame of its camera.
+        points: points of n images in order of time, each in the frame of its camera.
         mask: True where something was measured.
-        config: settings.
 
     Returns:
         T_world_camera, the first one the identity.
@@ -79,20 +65,18 @@ def multiway_images(
     clouds = [_cloud(p[m]) for p, m in zip(np.asarray(points), np.asarray(mask), strict=True)]
     for cloud in clouds:
         cloud.estimate_normals()
-    return _registered(clouds, unit, config or MultiwayConfig(), is_planar=False)
+    return _registered(clouds, unit, _FROM_ROUGH, is_planar=False)
 
 
 def multiway_clouds(
     clouds: Sequence[Float[NDArray[np.floating], "_n 3"]],
     T_world_cloud: Float[NDArray[np.float64], "n 4 4"],
-    config: MultiwayConfig = POLISH,
 ) -> Float[NDArray[np.float64], "n 4 4"]:
     """Polishes the poses of lidar clouds by Open3D's multiway registration; a ModuleNotFoundError without Open3D.
 
     Args:
         clouds: points of n clouds in order of time, each in the frame of its lidar.
         T_world_cloud: where they start.
-        config: settings.
 
     Returns:
         T_world_cloud; the first one stays.
@@ -102,11 +86,11 @@ def multiway_clouds(
     for cloud in thinned:
         cloud.estimate_normals()
     T_first_cloud = rigid.inverse(T_world_cloud[0]) @ T_world_cloud
-    return T_world_cloud[0] @ _registered(thinned, unit, config, is_planar=False, start=T_first_cloud)
+    return T_world_cloud[0] @ _registered(thinned, unit, _FROM_GOOD, is_planar=False, start=T_first_cloud)
 
 
 def _registered(
-    clouds: list[Any], unit: float, config: MultiwayConfig, *, is_planar: bool, start: Floats | None = None
+    clouds: list[Any], unit: float, shares: tuple[float, float], *, is_planar: bool, start: Floats | None = None
 ) -> Floats:
     """Returns the poses of clouds, (n, 4, 4), the first one the identity; flat ones by points, others by planes.
 
@@ -114,7 +98,7 @@ def _registered(
     """
     import open3d
 
-    coarse, fine = config.coarse * unit, config.fine * unit
+    coarse, fine = (share * unit for share in shares)
     registration = open3d.pipelines.registration
     estimation = registration.TransformationEstimationPointToPlane()
     if is_planar:  # planes of flat clouds leave three directions open
@@ -130,7 +114,7 @@ def _registered(
         graph.nodes.append(_node(T_world[-1]))
     placed = np.stack(T_world) if start is None else start
     apart = np.linalg.norm(placed[:, None, :3, 3] - placed[None, :, :3, 3], axis=-1)
-    for source, target in np.argwhere(np.triu(apart < config.radius * unit, k=2)).tolist():
+    for source, target in np.argwhere(np.triu(apart < _RADIUS * unit, k=2)).tolist():
         guess = rigid.inverse(placed[target]) @ placed[source]
         graph.edges.append(_edge(clouds, (source, target), guess, (coarse, fine), estimation, is_doubtful=True))
     with open3d.utility.VerbosityContextManager(open3d.utility.VerbosityLevel.Error):
@@ -139,7 +123,7 @@ def _registered(
             registration.GlobalOptimizationLevenbergMarquardt(),
             registration.GlobalOptimizationConvergenceCriteria(),
             registration.GlobalOptimizationOption(
-                max_correspondence_distance=fine, edge_prune_threshold=config.prune, reference_node=0
+                max_correspondence_distance=fine, edge_prune_threshold=_PRUNE, reference_node=0
             ),
         )
     return np.stack([node.pose for node in graph.nodes])

@@ -1,6 +1,6 @@
 """Lidar scans to one consistent map: DeepMapping and DeepPointMap as pure JAX functions.
 
-How the data flows, and the package that each step lives in:
+Flow of the data, and the package of each step:
 
 1. `io` reads scans from disk, `simulation` makes worlds: NumPy arrays on the host.
 2. `scans` and `types` turn each scan into a cloud of fixed capacity with a mask.

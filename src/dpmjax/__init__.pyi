@@ -21,7 +21,7 @@ from . import viz as viz
 from . import weights as weights
 from .compile_cache import enable_compile_cache as enable_compile_cache
 from .deepmapping.clouds import register_clouds as register_clouds
-from .deepmapping.depth_registration import register_depth as register_depth
+from .deepmapping.depth import register_depth as register_depth
 from .deepmapping.planar import fit_deepmapping as fit_deepmapping
 from .deepmapping.relocalization import relocalize as relocalize
 from .deeppointmap.batches import encode_scans as encode_scans
@@ -43,8 +43,8 @@ from .geometry.alignment import weighted_svd as weighted_svd
 from .geometry.neighbours import k_nearest as k_nearest
 from .geometry.neighbours import radius_search as radius_search
 from .geometry.normals import estimate_normals as estimate_normals
-from .geometry.rays import sample_free_space as sample_free_space
 from .geometry.sampling import farthest_point_sample as farthest_point_sample
+from .geometry.sampling import sample_free_space as sample_free_space
 from .geometry.sampling import voxel_sample as voxel_sample
 from .io.g2o import read_g2o as read_g2o
 from .io.g2o import write_g2o as write_g2o

@@ -18,7 +18,7 @@ def as_float(name: str, value: AnyArray) -> jax.Array:
     """Makes a JAX float array; floating dtypes are kept, integers become the default float.
 
     Args:
-        name: of the argument, for messages.
+        name: name of the argument, for messages.
         value: the array.
 
     Returns:
@@ -39,7 +39,7 @@ def as_points(name: str, value: AnyArray, dimensions: tuple[int, ...] | None = N
     """Makes float points.
 
     Args:
-        name: of the argument, for messages.
+        name: name of the argument, for messages.
         value: the array.
         dimensions: what d may be; anything above 0 for None.
 
@@ -61,9 +61,9 @@ def as_mask(name: str, value: AnyArray | None, shape: tuple[int, ...]) -> jax.Ar
     """Makes a boolean mask.
 
     Args:
-        name: of the argument, for messages.
+        name: name of the argument, for messages.
         value: the array; None stands for all True.
-        shape: of the mask.
+        shape: shape of the mask.
 
     Returns:
         The mask.
@@ -84,14 +84,14 @@ def as_beams(name: str, value: ScanSet | ArrayLike) -> ScanSet:
     """Makes planar scans with a mask; beams with coordinates that are not finite, or both zero, measured nothing.
 
     Args:
-        name: of the argument, for messages.
+        name: name of the argument, for messages.
         value: (n, b, 2) beam end points in the sensor frames; or a ScanSet, whose mask is kept.
 
     Returns:
         The scans, zeros where nothing was measured.
 
     Raises:
-        ValueError: the shape is another one, or what the mask of a ScanSet calls valid is not finite.
+        ValueError: the shape is another one, or a valid beam of a ScanSet is not finite.
     """
     points: Any = value.points if isinstance(value, ScanSet) else np.asarray(value, np.float32)
     if points.ndim != 3 or points.shape[-1] != 2:
@@ -111,7 +111,7 @@ def require_shape(name: str, array: jax.Array, shape: tuple[int, ...]) -> None:
     """Checks a shape.
 
     Args:
-        name: of the argument, for the message.
+        name: name of the argument, for the message.
         array: the argument.
         shape: the shape it must have.
 
@@ -126,7 +126,7 @@ def require_positive(name: str, value: float | AnyArray) -> None:
     """Checks that a number is above zero; a traced number is let through.
 
     Args:
-        name: of the argument, for the message.
+        name: name of the argument, for the message.
         value: the argument.
 
     Raises:
@@ -140,7 +140,7 @@ def require_count(name: str, value: int) -> None:
     """Checks that an integer is at least one.
 
     Args:
-        name: of the argument, for the message.
+        name: name of the argument, for the message.
         value: the argument.
 
     Raises:
@@ -183,7 +183,7 @@ def require_one_of(name: str, value: str, options: Iterable[str]) -> None:
     """Checks that a word is one of those that there are.
 
     Args:
-        name: of the argument, for messages.
+        name: name of the argument, for messages.
         value: the word.
         options: the words that there are.
 

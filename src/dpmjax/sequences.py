@@ -1,4 +1,4 @@
-"""What readers and simulators return: scans, depth images, worlds and drives, with the poses that belong to them.
+"""Results of readers and simulators: scans, depth images, worlds and drives, with their poses.
 
 NumPy only, on the host. `dpmjax.io` and `dpmjax.simulation` make these records.
 """
@@ -21,13 +21,13 @@ Selection = slice | NDArray[np.integer]
 
 
 class InputError(ValueError):
-    """The user's input is not usable: one line that names the file, what was found there and what to do.
+    """The user's input is not usable: one line with the file, the finding and the advice.
 
     The command line prints the line and ends with exit code 2; nothing has been written by then.
 
     Args:
         source: the file or folder at fault.
-        found: what was found, without a final full stop.
+        found: the finding, without a final full stop.
         advice: what to do about it, without a final full stop.
     """
 
@@ -41,11 +41,11 @@ class EmptyScanError(InputError):
 
 
 class Note(NamedTuple):
-    """What a reader decided about its input, or doubts.
+    """A decision of a reader about its input, or a doubt.
 
     Attributes:
         text: one line that names the file.
-        is_doubt: the input may be wrong; False for a decision that is only told.
+        is_doubt: the input may be wrong; False for a mere decision.
     """
 
     text: str
@@ -58,7 +58,7 @@ def require(is_good: bool | np.bool_, source: str | Path, found: str, advice: st
     Args:
         is_good: the check.
         source: see `InputError`.
-        found: what was found where the check fails.
+        found: the finding where the check fails.
         advice: what to do then.
 
     Raises:
@@ -95,7 +95,7 @@ class ScanSequence:
         reference_poses: (n, 3) float64 x, y, heading of the sensor in the world (`unit`, radians), or None.
         odometry_poses: (n, 3) float64, raw odometry in its own world, or None where the source has none.
         times: (n,) float64 seconds, or None.
-        notes: what the reader decided about the input, and doubts.
+        notes: decisions of the reader about the input, and doubts.
 
     Raises:
         ValueError: shapes that do not belong together, or a unit other than "px" and "m".
@@ -144,11 +144,11 @@ class Relations(NamedTuple):
 
 
 def has_angular_order(points: NDArray[np.float32], mask: BoolArray) -> bool:
-    """Whether the beams of scans are ordered by angle, as 1-D convolutions and neighbour normals need it.
+    """Returns True where the beams of scans are ordered by angle, as 1-D convolutions and neighbour normals need it.
 
-    A scan is in order when at least 95 % of the turns from one valid beam to the next go the same way round and
-    together they make one turn at most (with 5 % to spare, for noise). The sequence is in order when at least 90 % of
-    its scans are. Scans with fewer than three valid beams do not count.
+    A scan is in order when at least 95 % of the turns from one valid beam to the next have one direction, and their sum
+    is one turn at most (plus 5 % for noise). The sequence is in order when at least 90 % of its scans are. Scans with
+    fewer than three valid beams do not count.
 
     Args:
         points: (n, b, 2) in the sensor frame.
@@ -173,7 +173,7 @@ class World:
     """A planar world of unit pixels.
 
     Attributes:
-        name: for titles.
+        name: name for titles.
         is_obstacle: (h, w) bool, True where a pixel is solid; row 0 is the lowest.
         num_people: people who walk about in it while a sequence of scans is taken.
 
@@ -218,8 +218,8 @@ class Camera:
     """A pinhole camera without distortion; its frame is x to the right, y down, z forward.
 
     Attributes:
-        width: of the image, pixels.
-        height: of the image, pixels.
+        width: width of the image, pixels.
+        height: height of the image, pixels.
         fx: focal length along x, pixels.
         fy: focal length along y, pixels.
         cx: column of the optical axis, pixels from the centre of the first.
@@ -261,7 +261,7 @@ class DepthSequence:
     """Depth images as organised clouds, in the order in which they were taken.
 
     Attributes:
-        name: for titles and messages.
+        name: name for titles and messages.
         points: (n, h, w, 3) float32 metres in the camera frame (x right, y down, z forward); zero where masked.
         mask: (n, h, w) bool.
         is_planar: the camera moved on a plane: x, z and the angle about y.
@@ -299,13 +299,13 @@ class LidarSequence:
     Attributes:
         name: short name of the source, for titles and folders.
         sources: where each scan comes from: a file, in general.
-        read_scan: read_scan(i) gives scan i as (n, 3) float32 points in the lidar's frame (x forward, y left, z up), m;
-            raises an InputError that names the file where the scan is bad.
+        read_scan: read_scan(i) gives scan i as (n, 3) float32 points in the lidar's frame (x forward, y left, z up), m.
+            A bad scan raises an InputError that names the file.
         T_world_lidar: (num_scans, 4, 4) float64 reference poses, NaN for scans without one; or None.
         times: (num_scans,) float64 s, or None.
         read_times: read_times(i) gives when each point of scan i was measured, (n,) float64 in the unit of its file, or
             None where the file does not say; the same errors. None: no scan says.
-        notes: what the reader decided about the input, and doubts.
+        notes: decisions of the reader about the input, and doubts.
 
     Raises:
         ValueError: poses or times that are not one a scan.

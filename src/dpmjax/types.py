@@ -48,7 +48,7 @@ class Neighbours(NamedTuple):
 
     Attributes:
         indices: row in the searched points; 0 where `mask` is False.
-        squared_distances: in the unit of the points, squared; infinite where `mask` is False.
+        squared_distances: squared distances, in squared units of the points; infinite where `mask` is False.
         mask: True where a neighbour exists (fewer valid points than `k`, or none within the radius: False).
     """
 
@@ -66,7 +66,7 @@ class SurfaceElements:
         normals: unit vectors, either side; any where `planarity` is 0.
         planarity: in [0, 1]: (l2 - l1) / l3 of the eigenvalues of the covariance of the neighbourhood, smallest first;
             0 where there is no plane.
-        mask: True for elements that are there; the others may hold anything.
+        mask: True for valid elements; invalid ones may hold anything.
     """
 
     positions: Float[AnyArray, "n 3"]
@@ -79,12 +79,12 @@ class SurfaceElements:
 class DescriptorCloud:
     """A scan, or a union of scans, as sparse points that carry learned features (DeepPointMap section 3.1).
 
-    The points of a scan are in the order of farthest-point sampling. The first m have features; the others, if there
-    are any, are surface elements only, for alignment.
+    The points of a scan are in the order of farthest-point sampling. The first m have features; further ones are
+    surface elements only, for alignment.
 
     Attributes:
         positions: metres, in the frame of the lidar or of the map.
-        features: what the network says of the surroundings of each of the first m points.
+        features: learned description of the surroundings of each of the first m points.
         mask: True for points that are there.
         directions: cosine and sine of the azimuth of the frame of each descriptor (`EncoderConfig.frame`), in the
             frame of the cloud; a map keeps those of its scans. None for a single scan with frames along its rays, whose
@@ -116,15 +116,15 @@ class DescriptorCloud:
 
 
 class Verification(NamedTuple):
-    """How well two scans agree under a motion; shares are in [0, 1].
+    """Agreement of two scans under a motion; shares are in [0, 1].
 
     Attributes:
-        visible_share: share of the points of both scans that lie in the field of view of the other.
-        matched_share: share of the source points that meet a plane of the target; of the target points that meet one of
-            the source where the target holds less than half as many points (a map that was saved at int8).
-        contradicted_share: share of the visible points that lie in the free space of the other scan.
-        score: log odds that the motion is right, by walls and level ground that meet and by free space, where the other
-            scan sees.
+        visible_share: share of the points of both scans inside the mutual field of view.
+        matched_share: share of the source points that meet a plane of the target. Where the target holds less than half
+            the points of the source (a map saved at int8), the share of the target points that meet a plane of the
+            source.
+        contradicted_share: share of the visible points that lie in the free space seen by the opposite scan.
+        score: log odds that the motion is right, by walls and level ground that meet and by free space.
         gap: how much more it is than the score of the best other hypothesis that was tried, or than 0.
         num_tried: number of hypotheses that were tried.
         num_slid: number of further motions along a weak axis; 0 where the walls hold all directions.
@@ -151,7 +151,7 @@ class Registration:
         confidence: in [0, 1]. With a calibrated model, `register` makes it the probability that the motion is right
             within 2 m and 5 degrees; else it is `mean_score`, which is no probability and 0 without any inlier.
         mean_score: mean score of the first inliers, in [0, 1]; 0 without any.
-        rmse: of the inliers after alignment, metres; infinite without any.
+        rmse: root mean square error of the inliers after alignment, metres; infinite without any.
         support: consensus support of the motion: sum of 1 - error / tolerance over distinct pairs.
         num_inliers: how many pairs the motion rests on, both directions counted.
         source_indices: row of each pair in the source; first the pairs of eq. 1, then the same of eq. 2.
@@ -188,7 +188,8 @@ class PyramidLevel:
         mask: True for points that are there.
         sample_indices: row of each point in the level before.
         neighbours: for each block (m, k) rows, nearest first, those beyond the radius replaced by the nearest. Block 0
-            looks into the level before, the others into this one. Points that are not there are nobody's neighbours.
+            has neighbours in the level before, every later block in this level. Points that are not there are nobody's
+            neighbours.
     """
 
     positions: Float[AnyArray, "m 3"]
@@ -199,7 +200,7 @@ class PyramidLevel:
 
 @flax.struct.dataclass
 class Interpolation:
-    """How features of a coarser level are carried to the next finer one.
+    """Interpolation of features from a coarser level to the next finer one.
 
     Attributes:
         indices: the three nearest points of the coarser level.
@@ -216,7 +217,7 @@ class PointPyramid:
 
     Attributes:
         levels: the input and one level for each stage.
-        interpolation: from the coarsest level upwards.
+        interpolation: interpolation from the coarsest level upwards.
     """
 
     levels: tuple[PyramidLevel, ...]

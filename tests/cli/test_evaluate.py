@@ -16,7 +16,7 @@ from dpmjax.cli.command import EXIT_BAD_INPUT, EXIT_OK
 from dpmjax.cli.evaluate import run, table
 from dpmjax.cli.result_files import load_json
 from dpmjax.deeppointmap import SamplingConfig, scan_evaluation
-from dpmjax.io import write_kitti_sequence
+from tests.data_sets import write_kitti_sequence
 from tests.deeppointmap import toy
 
 

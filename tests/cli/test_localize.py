@@ -9,11 +9,12 @@ import pytest
 import dpmjax
 from dpmjax.cli import localize
 from dpmjax.cli.command import EXIT_BAD_INPUT, EXIT_FAILED, EXIT_OK
-from dpmjax.cli.localize_numbers import localization_errors
 from dpmjax.cli.result_files import load_json, read_history
+from dpmjax.cli.slam_numbers import localization_errors
 from dpmjax.geometry import rigid
-from dpmjax.io import open_lidar_sequence, read_poses, write_kitti_sequence
+from dpmjax.io import open_lidar_sequence, read_poses
 from dpmjax.slam import Match, NetworkMatcher, Submap, make_methods
+from tests.data_sets import write_kitti_sequence
 from tests.deeppointmap import toy
 
 

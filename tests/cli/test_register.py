@@ -10,7 +10,8 @@ import dpmjax
 from dpmjax.cli.command import EXIT_BAD_INPUT, EXIT_OK
 from dpmjax.cli.register import report, run
 from dpmjax.cli.result_files import load_json
-from dpmjax.io import read_lidar_file, read_ply, write_pcd
+from dpmjax.io import read_lidar_file, write_pcd
+from tests.data_sets import read_ply
 from tests.deeppointmap import toy
 
 

@@ -11,10 +11,9 @@ import pytest
 import dpmjax
 from dpmjax.cli import slam
 from dpmjax.cli.command import EXIT_BAD_INPUT, EXIT_OK
-from dpmjax.cli.drives import DriveSelection, open_drive, with_raised_beams
-from dpmjax.cli.optional import why_not_importable
+from dpmjax.cli.drives import DriveSelection, ScanReader, open_drive, with_raised_beams
+from dpmjax.cli.machine import why_not_importable
 from dpmjax.cli.result_files import load_json
-from dpmjax.cli.slam_reader import ScanReader
 from dpmjax.io import write_tum
 from dpmjax.scans import offsets_by_azimuth
 from dpmjax.slam import SlamConfig, slam_preset

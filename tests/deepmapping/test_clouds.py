@@ -14,10 +14,10 @@ from dpmjax.deepmapping.batches import draw_rows
 from dpmjax.deepmapping.cloud_scans import find_partners
 from dpmjax.deepmapping.clouds import cloud_data, cloud_problem
 from dpmjax.deepmapping.engine import init
-from dpmjax.deepmapping.plane_distance import Cloud, clouds_of, misfit_of_pairs, plane_misfit, trajectory_misfit
+from dpmjax.deepmapping.plane_distance import PlaneCloud, clouds_of, misfit_of_pairs, plane_misfit, trajectory_misfit
 from dpmjax.geometry import se3
 from dpmjax.metrics import absolute_trajectory_error
-from dpmjax.nets.localization import LocalizationConfig
+from dpmjax.nets.localization import LocalizationNetConfig
 from dpmjax.nets.occupancy import OccupancyConfig
 from tests.tolerances import ACCUMULATED, ROUNDING
 
@@ -56,7 +56,7 @@ def start(truth) -> np.ndarray:
     return truth @ np.asarray(se3.exp(jnp.asarray(rng.normal(size=(NUM_SCANS, 6)) * 0.03)), np.float64)
 
 
-def small(num_steps: int = 4) -> dm.CloudMappingConfig:
+def small(num_steps: int = 4) -> dm.DeepMappingConfig:
     """The fast preset in small."""
     config = dm.cloud_preset("fast")
     cold = [replace(phase, num_steps=2, beams_per_step=32) for phase in config.cold_phases]
@@ -65,7 +65,7 @@ def small(num_steps: int = 4) -> dm.CloudMappingConfig:
         config,
         cold_phases=(cold[0], cold[2]),
         warm_phases=(warm,),
-        localization=LocalizationConfig(kind="point", features=(8, 16), hidden=(16,)),
+        localization=LocalizationNetConfig(kind="point", features=(8, 16), hidden=(16,)),
         occupancy=OccupancyConfig(kind="grid", resolutions=(4, 8)),
         steps_per_call=max(2, num_steps // 2),
     )
@@ -82,10 +82,10 @@ def ate(T: np.ndarray, truth: np.ndarray) -> float:
 def test_misfit_of_a_point_is_the_kernel_of_its_distance_to_the_plane() -> None:
     floor = np.stack(np.meshgrid(np.arange(-2.0, 3.0), np.arange(-2.0, 3.0)), -1).reshape(-1, 2)
     up = np.tile([0.0, 0.0, 1.0], (25, 1))
-    target = Cloud(
+    target = PlaneCloud(
         jnp.asarray(np.column_stack([floor, np.zeros(25)])), jnp.ones(25, bool), jnp.asarray(up), jnp.ones(25)
     )
-    source = Cloud(jnp.array([[0.3, 0.2, 0.1]]), jnp.ones(1, bool), jnp.array([[0.0, 0.0, 1.0]]), jnp.ones(1))
+    source = PlaneCloud(jnp.array([[0.3, 0.2, 0.1]]), jnp.ones(1, bool), jnp.array([[0.0, 0.0, 1.0]]), jnp.ones(1))
     found = plane_misfit(jnp.eye(4), source, target, 0.2, 1.0)
     np.testing.assert_allclose(found, 0.1**2 / (0.1**2 + 0.2**2), **ROUNDING)
     far = replace_points(source, [[0.3, 0.2, 5.0]])
@@ -94,7 +94,7 @@ def test_misfit_of_a_point_is_the_kernel_of_its_distance_to_the_plane() -> None:
     np.testing.assert_allclose(plane_misfit(jnp.eye(4), other_side, target, 0.2, 1.0), 1.0, **ROUNDING)
 
 
-def replace_points(cloud: Cloud, points: list[list[float]]) -> Cloud:
+def replace_points(cloud: PlaneCloud, points: list[list[float]]) -> PlaneCloud:
     return cloud._replace(points=jnp.asarray(points))
 
 
@@ -102,7 +102,7 @@ def test_the_gradient_vanishes_at_the_true_poses_of_exact_planes(truth, scans) -
     # Only points whose neighbourhood lies on one wall have its exact normal.
     exact = clouds_of(replace(scans, flatness=jnp.where(is_exact(scans, truth), scans.flatness, 0.0)))
 
-    def misfit(twists: jnp.ndarray, cloud: Cloud) -> jnp.ndarray:
+    def misfit(twists: jnp.ndarray, cloud: PlaneCloud) -> jnp.ndarray:
         T = jnp.asarray(truth, jnp.float32) @ se3.exp(twists)
         return misfit_of_pairs(T, cloud, cloud, all_pairs(NUM_SCANS), jnp.ones(10, bool), (0.1, scans.spacing))
 
@@ -119,7 +119,7 @@ def is_exact(scans: dm.CloudScans, truth: np.ndarray) -> jnp.ndarray:
 
 def test_no_plane_is_a_misfit_with_a_finite_gradient(scans) -> None:
     empty = clouds_of(replace(scans, mask=jnp.zeros_like(scans.mask)))
-    first = Cloud(*(leaf[0] for leaf in empty))
+    first = PlaneCloud(*(leaf[0] for leaf in empty))
     value, gradient = jax.value_and_grad(plane_misfit)(jnp.eye(4), first, first, 0.1, 0.1)
     assert float(value) == 1.0
     assert np.isfinite(np.asarray(gradient)).all()

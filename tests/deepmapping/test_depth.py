@@ -24,7 +24,7 @@ from dpmjax.deepmapping.projective_consistency import (
 )
 from dpmjax.deepmapping.spatial import motion_matrices
 from dpmjax.metrics import absolute_trajectory_error
-from dpmjax.nets.localization import LocalizationConfig
+from dpmjax.nets.localization import LocalizationNetConfig
 from dpmjax.nets.occupancy import OccupancyConfig
 from tests.tolerances import ROUNDING
 
@@ -42,7 +42,7 @@ def scans(walk) -> dm.DepthScans:
     return dm.as_depth_scans(walk.points, walk.mask)
 
 
-def small(motion: str) -> dm.DepthMappingConfig:
+def small(motion: str) -> dm.DeepMappingConfig:
     """The fast preset in small."""
     config = dm.depth_preset("fast", motion=motion)
     phases = [replace(phase, num_steps=4, beams_per_step=64) for phase in config.cold_phases]
@@ -50,7 +50,7 @@ def small(motion: str) -> dm.DepthMappingConfig:
         config,
         cold_phases=(phases[0], phases[2]),
         warm_phases=(phases[2],),
-        localization=LocalizationConfig(features=(8, 16), strides=(2, 1), hidden=(16,)),
+        localization=LocalizationNetConfig(features=(8, 16), strides=(2, 1), hidden=(16,)),
         occupancy=OccupancyConfig(kind="grid", resolutions=(4, 8)),
         steps_per_call=2,
     )

@@ -11,12 +11,13 @@ import pytest
 
 from dpmjax import deepmapping as dm
 from dpmjax import io, simulation
-from dpmjax.deepmapping.depth_adjustment import adjust_poses
-from dpmjax.deepmapping.depth_initialization import _best_that_differ, _explained, _Images, _window
-from dpmjax.deepmapping.depth_motion_search import Views, propose_motions, surface_directions
+from dpmjax.deepmapping import depth_initialization
+from dpmjax.deepmapping.depth_adjustment import SampledImages, adjust_poses
+from dpmjax.deepmapping.depth_initialization import _best_that_differ, _explained, _window
+from dpmjax.deepmapping.depth_motion_search import SearchCamera, Views, propose_motions, surface_directions
 from dpmjax.deepmapping.projective_consistency import PixelSample
 from dpmjax.deepmapping.spatial import motion_matrices
-from dpmjax.geometry.rays import typical_range
+from dpmjax.geometry.sampling import typical_range
 from dpmjax.metrics import absolute_trajectory_error
 from tests.tolerances import ROUNDING
 
@@ -53,7 +54,11 @@ def test_adjusted_poses_come_back_to_the_truth(walk, scans, motion: str) -> None
     start = moved(truth, 0.01, motion)
     unit = typical_range(scans.points, scans.mask)
     motions = adjust_poses(
-        jnp.asarray(start, jnp.float32), scans, scans.pixels, unit, 0.02, num_iterations=10, motion=motion
+        jnp.asarray(start, jnp.float32),
+        SampledImages(scans, scans.pixels, unit),
+        0.02,
+        num_iterations=10,
+        motion=motion,
     )
     T = start @ np.asarray(motions, np.float64)
     np.testing.assert_array_equal(T[0], start[0])
@@ -67,7 +72,11 @@ def test_adjusted_poses_are_never_less_consistent(walk, scans) -> None:
     for seed in range(5):
         start = moved(walk.T_world_camera, 0.2, "planar", seed)
         motions = adjust_poses(
-            jnp.asarray(start, jnp.float32), scans, scans.pixels, unit, 0.02, num_iterations=4, motion="planar"
+            jnp.asarray(start, jnp.float32),
+            SampledImages(scans, scans.pixels, unit),
+            0.02,
+            num_iterations=4,
+            motion="planar",
         )
         before, after = (
             float(dm.projective_consistency(scans, T, 0.02)) for T in (start, start @ np.asarray(motions, np.float64))
@@ -77,34 +86,35 @@ def test_adjusted_poses_are_never_less_consistent(walk, scans) -> None:
 
 def test_images_without_a_pose_count_nothing(walk, scans) -> None:
     T = walk.T_world_camera[:3]
-    rows, window = _window(3, _Images(scans, scans.pixels, 1.0), dm.PLANAR_SEARCH)
+    rows, window = _window(3, SampledImages(scans, scans.pixels, 1.0), 24)
     share = _explained(jnp.asarray(T[rows], jnp.float32)[None], window, jnp.asarray(0.02))
-    alone = _Images(dm.DepthScans(scans.points[:3], scans.mask[:3], scans.pinhole), take(scans.pixels, 3), 1.0)
+    alone = SampledImages(dm.DepthScans(scans.points[:3], scans.mask[:3], scans.pinhole), take(scans.pixels, 3), 1.0)
     np.testing.assert_allclose(
         share, _explained(jnp.asarray(T, jnp.float32)[None], alone, jnp.asarray(0.02)), **ROUNDING
     )
-    last = replace(dm.PLANAR_SEARCH, num_window=2)
-    assert _window(3, _Images(scans, scans.pixels, 1.0), last)[0].tolist() == [1, 2]
+    assert _window(3, SampledImages(scans, scans.pixels, 1.0), 2)[0].tolist() == [1, 2]
 
 
-def test_of_alike_trajectories_the_best_goes_on(walk, scans) -> None:
+def test_of_alike_trajectories_the_best_goes_on(walk, scans, monkeypatch) -> None:
     truth = walk.T_world_camera
     far, turned, near = truth.copy(), truth.copy(), truth.copy()
     far[1:, 0, 3] += 0.2
     turned[3] = turned[3] @ np.asarray(motion_matrices(jnp.array([[0.0, 0.0, 0.3]])))[0]
     near[1:, 0, 3] += 0.02
     candidates = np.stack([near, far, turned, truth])[None]
-    images, config = _Images(scans, scans.pixels, 1.0), replace(dm.PLANAR_SEARCH, margin=100.0)
+    images, config = SampledImages(scans, scans.pixels, 1.0), dm.depth_search("planar")
+    monkeypatch.setattr(depth_initialization, "_MARGIN", 100.0)
     kept = _best_that_differ(candidates, images, config)
     np.testing.assert_array_equal(kept[0], truth)
     assert {T.tobytes() for T in kept} == {T.tobytes() for T in (far, turned, truth)}
     assert len(_best_that_differ(candidates, images, replace(config, num_trajectories=2))) == 2
-    assert len(_best_that_differ(candidates, images, replace(config, margin=1e-6))) == 1
+    monkeypatch.setattr(depth_initialization, "_MARGIN", 1e-6)
+    assert len(_best_that_differ(candidates, images, config)) == 1
 
 
 @pytest.mark.slow
 def test_images_are_registered_without_a_first_guess(walk, scans) -> None:
-    config = dm.DepthInitializationConfig(num_candidates=512, num_kept=16, num_points=100, num_references=2)
+    config = dm.DepthInitializationConfig(num_candidates=512, num_kept=16)
     T = dm.initialize_depth(scans, config, key=KEY)
     relative = np.linalg.inv(walk.T_world_camera[0]) @ walk.T_world_camera
     assert absolute_trajectory_error(T[:, :3, 3], relative[:, :3, 3]) < 0.02
@@ -135,7 +145,7 @@ def test_what_a_wall_leaves_open_is_proposed_side_by_side() -> None:
     scans = two_views_of_a_wall()
     views = Views(scans.pixels, scans.surfaces, jnp.asarray(surface_directions(scans, "planar")))
     config = dm.DepthInitializationConfig(num_candidates=256, num_kept=8, num_varied=8, num_distinct=8)
-    T = propose_motions(np.eye(4)[None], views, scans.pinhole, config, "planar", unit=2.0, key=KEY)
+    T = propose_motions(np.eye(4)[None], views, SearchCamera(scans.pinhole, 2.0), config, key=KEY)
     assert T.shape == (8, 4, 4)
     np.testing.assert_allclose(T[:, :3, 3] @ ACROSS, 0.0, atol=0.005)
     np.testing.assert_allclose(T[:, 0, 2], 0.0, atol=0.005)

@@ -32,8 +32,8 @@ def returning(T: np.ndarray, scans: dm.DepthScans) -> Callable[..., dm.Fit]:
     poses = np.array(T)
     poses[:, :3, 3] /= typical_range(scans.points, scans.mask)
 
-    def engine(problem, data, *, key, num_starts):
-        return dm.fit(problem, data, key=key, num_starts=num_starts, stop=lambda: True)._replace(poses=poses)
+    def engine(problem, data, *, key):
+        return dm.fit(problem, data, key=key, stop=lambda: True)._replace(poses=poses)
 
     return engine
 
@@ -58,7 +58,7 @@ def test_a_fit_that_is_not_finite_is_not_kept(walk, scans) -> None:
 @pytest.mark.slow
 def test_without_a_start_the_search_is_the_start(walk, scans) -> None:
     found = dm.register_depth(scans, CONFIG, key=KEY, engine=returning(walk.T_world_camera, scans))
-    np.testing.assert_array_equal(found.start, dm.initialize_depth(scans, motion="planar", key=KEY))
+    np.testing.assert_array_equal(found.start, dm.initialize_depth(scans, key=KEY))
 
 
 def test_bad_input_is_named(scans) -> None:

@@ -7,8 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from dpmjax.deepmapping.config import JOINT, REFINE, DeepMappingConfig, PhaseConfig
+from dpmjax.deepmapping.config import REFINE, DeepMappingConfig, PhaseConfig
 from dpmjax.deepmapping.objective import WorldBatch, chamfer_term, free_factors, interpolate_log, occupancy_term
+from dpmjax.deepmapping.presets import JOINT
 from dpmjax.deepmapping.problem import MapFrame, Params, mapping_loss
 from dpmjax.nets.occupancy import OccupancyConfig, init_map_net
 from tests.tolerances import ACCUMULATED, ROUNDING
@@ -98,7 +99,7 @@ def test_free_factors_lie_between_sensor_and_hit(config: PhaseConfig) -> None:
 def test_shared_factors_are_the_same_for_all_beams_and_scans() -> None:
     shared = factors_of(make_world(), JOINT, 0.0)
     np.testing.assert_array_equal(shared, np.broadcast_to(shared[:1, :1], shared.shape))
-    own = factors_of(make_world(), replace(JOINT, is_free_factor_shared=False), 0.0)
+    own = factors_of(make_world(), replace(JOINT, is_sampled_as_published=False), 0.0)
     assert len(np.unique(own)) > 0.99 * own.size
 
 
@@ -170,10 +171,10 @@ def test_masked_beams_never_matter() -> None:
 def test_map_decay_is_the_mean_square_of_the_nodes() -> None:
     config = DeepMappingConfig(occupancy=OccupancyConfig(kind="grid", resolutions=(4,)))
     nodes = jax.tree.map(lambda leaf: leaf + 2.0, init_map_net(config.occupancy, key=KEY))
-    phase = replace(REFINE, occupancy_weight=0.0, map_decay=0.3)
-    # 5 x 5 nodes of 2 each, over the beams of the step.
-    expected = 0.25 + 0.3 * 25 * 4.0 / (NUM_SCANS * NUM_POINTS)
-    np.testing.assert_allclose(loss_of(make_world(), phase, nodes, config)[0], expected, **ROUNDING)
+    loss, terms = loss_of(make_world(), replace(JOINT, occupancy_weight=0.4), nodes, config)
+    # 5 x 5 nodes of 2 each, over the beams of the step, with the weight 0.001.
+    expected = 0.4 * terms.occupancy + 0.6 * 0.25 + 1e-3 * 25 * 4.0 / (NUM_SCANS * NUM_POINTS)
+    np.testing.assert_allclose(loss, expected, **ROUNDING)
 
 
 @pytest.mark.parametrize(

@@ -16,7 +16,7 @@ from dpmjax.deepmapping.planar import as_scan_set, planar_problem
 from dpmjax.deepmapping.problem import MappingData
 from dpmjax.geometry import se2
 from dpmjax.metrics import absolute_trajectory_error
-from dpmjax.nets.localization import LocalizationConfig
+from dpmjax.nets.localization import LocalizationNetConfig
 from dpmjax.nets.occupancy import OccupancyConfig
 from dpmjax.types import ScanSet
 
@@ -26,7 +26,7 @@ SMALL = dm.with_steps(
     replace(
         dm.preset("fast"),
         occupancy=OccupancyConfig(kind="grid", resolutions=(16, 32, 64, 128)),
-        localization=LocalizationConfig(features=(16, 32), strides=(1, 2), is_circular=True, hidden=(32,)),
+        localization=LocalizationNetConfig(features=(16, 32), strides=(1, 2), is_circular=True, hidden=(32,)),
     ),
     150,
 )
@@ -77,7 +77,7 @@ def test_picture_is_dark_at_walls_and_light_in_free_space(tiny_walk, warm) -> No
 def test_steps_of_the_paper_preset_lower_its_loss(tiny_data) -> None:
     config = dm.preset("paper")
     (phase,) = config.cold_phases
-    assert (phase.num_free, phase.is_free_factor_shared, phase.occupancy_weight, phase.num_offsets) == (
+    assert (phase.num_free, phase.is_sampled_as_published, phase.occupancy_weight, phase.num_offsets) == (
         19,
         True,
         0.1,
@@ -148,7 +148,6 @@ def test_beams_that_are_zero_or_not_finite_are_masked() -> None:
         (ScanSet(jnp.full((2, 5, 2), jnp.nan), jnp.ones((2, 5), bool)), {}, "scans: expected finite"),
         (np.ones((2, 5, 2)), {"start": np.zeros((3, 3))}, "start: expected shape"),
         (np.ones((2, 5, 2)), {"start": np.full((2, 3), np.nan)}, "start: expected finite"),
-        (np.ones((2, 5, 2)), {"num_starts": 0}, "num_starts"),
     ],
 )
 def test_bad_input_is_named(as_user, scans, options, message) -> None:

@@ -15,12 +15,11 @@ from dpmjax import deepmapping as dm
 from dpmjax.deepmapping.engine import init
 from dpmjax.deepmapping.localization_training import shift_scan, turn_scan
 from dpmjax.deepmapping.map_raster import make_raster, render_scans
-from dpmjax.deepmapping.map_search import largest_nearby
 from dpmjax.deepmapping.planar import planar_data, planar_problem
 from dpmjax.deepmapping.problem import MapFrame
-from dpmjax.deepmapping.relocalization import propose_poses
+from dpmjax.deepmapping.relocalization import largest_nearby, propose_poses
 from dpmjax.geometry import se2
-from dpmjax.nets.localization import LocalizationConfig
+from dpmjax.nets.localization import LocalizationNetConfig
 from dpmjax.nets.occupancy import OccupancyConfig
 from dpmjax.simulation import cast_scans, make_world, scan_world, simulate_sequence
 from dpmjax.types import ScanSet
@@ -38,7 +37,7 @@ def fitted(tiny_walk) -> dm.Fitted:
     config = replace(
         dm.preset("fast"),
         occupancy=OccupancyConfig(kind="grid", resolutions=(CELLS,)),
-        localization=LocalizationConfig(features=(16, 32), strides=(1, 2), is_circular=True, hidden=(32,)),
+        localization=LocalizationNetConfig(features=(16, 32), strides=(1, 2), is_circular=True, hidden=(32,)),
         cold_phases=(replace(dm.preset("fast").cold_phases[0], scans_per_window=None),),
     )
     data, unit = planar_data(ScanSet(tiny_walk.points, tiny_walk.mask))
@@ -206,11 +205,7 @@ def test_bad_input_is_named(fitted, tiny_walk) -> None:
         dpmjax.relocalize(warm, tiny_walk.points)
     with pytest.raises(ValueError, match="the 20 scans of the fit"):
         dm.train_localization(fitted, tiny_walk.points[:5], key=KEY)
-    with pytest.raises(ValueError, match="drop"):
-        dm.LocalizationTrainingConfig(drop=1.0)
+    with pytest.raises(ValueError, match="num_rendered"):
+        dm.LocalizationTrainingConfig(num_rendered=-1)
     with pytest.raises(ValueError, match="max_nats"):
-        dm.RelocalizationConfig(max_nats=0.0)
-    with pytest.raises(ValueError, match="num_turns"):
-        dm.RelocalizationConfig(num_turns=0)
-    with pytest.raises(ValueError, match="num_kept"):
-        dm.MapSearchConfig(num_kept=0)
+        dpmjax.relocalize(fitted, tiny_walk.points, max_nats=0.0)

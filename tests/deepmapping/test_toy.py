@@ -9,7 +9,7 @@ import pytest
 
 from dpmjax.deepmapping.engine import fit
 from dpmjax.deepmapping.toy import ToyConfig, global_minimum, network_value, toy_loss, toy_problem
-from dpmjax.nets.scalar import ScalarNet, ScalarNetConfig
+from dpmjax.nets.localization import ScalarNet, ScalarNetConfig
 from experiments.baselines.direct import minimize_toy
 from tests.tolerances import ACCUMULATED, ROUNDING
 

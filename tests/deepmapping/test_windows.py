@@ -12,12 +12,11 @@ import pytest
 
 import dpmjax
 from dpmjax import deepmapping as dm
-from dpmjax.deepmapping.batches import draw_rows
+from dpmjax.deepmapping.batches import draw_rows, join_windows, window_rows
 from dpmjax.deepmapping.engine import init
 from dpmjax.deepmapping.planar import planar_data, planar_problem
-from dpmjax.deepmapping.windows import join_windows, window_rows
 from dpmjax.geometry import se2
-from dpmjax.nets.localization import LocalizationConfig, LocalizationNet
+from dpmjax.nets.localization import LocalizationNet, LocalizationNetConfig
 from dpmjax.nets.occupancy import OccupancyConfig
 from dpmjax.types import ScanSet
 
@@ -27,7 +26,7 @@ SIZES = [(2, 2), (3, 2), (9, 5), (10, 5), (12, 5), (20, 17), (5, 17), (4, 4), (1
 SMALL = replace(
     dm.preset("fast"),
     occupancy=OccupancyConfig(kind="grid", resolutions=(16, 32, 64, 128)),
-    localization=LocalizationConfig(
+    localization=LocalizationNetConfig(
         features=(16, 32), strides=(1, 2), is_circular=True, hidden=(32,), output_scale=0.1
     ),
 )

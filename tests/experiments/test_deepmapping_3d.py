@@ -71,7 +71,7 @@ def test_bad_starts_are_one_line_and_leave_no_folder(drive, tmp_path, capsys) ->
 
 def test_noise_has_the_size_that_was_asked_for() -> None:
     T = np.tile(np.eye(4), (4000, 1, 1))
-    moved = add_noise(T, 0.2, 1.0, seed=0)
+    moved = add_noise(T, 0.2, seed=0)
     assert np.sqrt((moved[:, :3, 3] ** 2).sum(1).mean()) == pytest.approx(0.2, rel=0.05)
     angles = np.arccos(np.clip((np.trace(moved[:, :3, :3], axis1=1, axis2=2) - 1) / 2, -1, 1))
     assert np.degrees(np.sqrt((angles**2).mean())) == pytest.approx(1.0, rel=0.05)

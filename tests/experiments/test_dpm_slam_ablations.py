@@ -9,9 +9,9 @@ import pytest
 import dpmjax
 from dpmjax.cli.command import EXIT_BAD_INPUT, EXIT_OK, run_command
 from dpmjax.cli.result_files import load_json
-from dpmjax.io import write_kitti_sequence
 from dpmjax.slam import Submap, init_slam, local_map_of, step_slam
 from experiments import dpm_slam_ablations as ablations
+from tests.data_sets import write_kitti_sequence
 from tests.deeppointmap import toy
 
 NUM_SCANS = 4

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from dpmjax.sequences import ACTIVE_VISION, DepthSequence
-from experiments._rgbd_surfaces import surface_spread
+from experiments._rgbd_methods import surface_spread
 
 MOVES = np.array([0.0, 0.3, 0.6, 0.9])
 

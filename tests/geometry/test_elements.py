@@ -6,7 +6,7 @@ import jax
 import numpy as np
 import pytest
 
-from dpmjax.geometry.elements import pyramid_elements
+from dpmjax.geometry.normals import pyramid_elements
 from dpmjax.geometry.pyramid import PyramidConfig, PyramidStage, build_pyramid
 from dpmjax.geometry.pyramid_host import build_pyramid_on_host
 from dpmjax.types import SurfaceElements

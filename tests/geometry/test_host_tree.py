@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.distance import cdist
 
-from dpmjax.geometry.host_tree import WAIT_POLICY, HostTree
+from dpmjax.geometry.neighbours import WAIT_POLICY, HostTree
 
 
 @pytest.mark.parametrize("num_threads", [1, 3])
@@ -35,6 +35,6 @@ def test_without_points_queries_or_neighbours_nothing_is_found(num_points: int, 
 def test_other_libraries_keep_their_policy_of_waiting(policy: str | None) -> None:
     variables = {name: value for name, value in os.environ.items() if name != WAIT_POLICY}
     variables |= {} if policy is None else {WAIT_POLICY: policy}
-    program = f"import os, dpmjax.geometry.host_tree; print(os.environ.get({WAIT_POLICY!r}))"
+    program = f"import os, dpmjax.geometry.neighbours; print(os.environ.get({WAIT_POLICY!r}))"
     printed = subprocess.run([sys.executable, "-c", program], env=variables, capture_output=True, check=True, text=True)
     assert printed.stdout.strip() == str(policy)

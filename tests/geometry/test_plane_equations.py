@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from dpmjax.geometry.plane_equations import PlaneStep, geman_mcclure, motion_about, step_to_planes
+from dpmjax.geometry.planes import PlaneStep, geman_mcclure, motion_about, step_to_planes
 from tests.tolerances import ACCUMULATED, DOUBLE
 
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from dpmjax.geometry.plane_fits import fit_planes
+from dpmjax.geometry.planes import fit_planes
 
 
 def neighbourhoods(rng: np.random.Generator, spread: tuple[float, float, float], count: int = 200) -> np.ndarray:

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from dpmjax import sample_free_space
-from dpmjax.geometry.rays import typical_range
+from dpmjax.geometry.sampling import typical_range
 from tests.tolerances import ROUNDING
 
 

@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 from dpmjax.io import InputError
-from dpmjax.io.carmen import read_carmen_log
-from dpmjax.io.carmen_lines import scan_angles
+from dpmjax.io.carmen import read_carmen_log, scan_angles
 
 
 def flaser(ranges, corrected=(0, 0, 0), odometry=(9, 9, 1), time=0.0):

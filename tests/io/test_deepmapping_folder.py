@@ -5,8 +5,9 @@ import tarfile
 import numpy as np
 import pytest
 
-from dpmjax.io import InputError, read_pcd, write_deepmapping_folder, write_pcd
+from dpmjax.io import InputError, write_pcd
 from dpmjax.io.deepmapping_folder import read_deepmapping_folder
+from tests.data_sets import read_pcd, write_deepmapping_folder
 
 POINTS = np.array([[1, 2, 3], [4, 5, 6], [-7, 8.5, 0]], np.float32)
 
@@ -138,12 +139,6 @@ def test_bad_folders_and_archives_are_refused(tmp_path, small):
     (folder / "gt_pose.mat").write_bytes(b"no matlab")
     with pytest.raises(InputError, match=r"gt_pose\.mat"):
         read_deepmapping_folder(folder)
-
-
-def test_writer_does_not_mix_two_sequences(tmp_path, small):
-    write_pcd(tmp_path / "777.pcd", POINTS)
-    with pytest.raises(InputError, match=r"777\.pcd"):
-        write_deepmapping_folder(tmp_path, small)
 
 
 def test_authors_trajectory_reads_as_they_describe_it(real_data):

@@ -19,7 +19,8 @@ from scipy.io import savemat
 
 import dpmjax
 from dpmjax import io
-from dpmjax.sequences import InputError, LidarSequence, ScanSequence, World
+from dpmjax.sequences import InputError, LidarSequence, ScanSequence
+from tests.data_sets import write_deepmapping_folder
 from tests.io.bag_files import EPOCH_NS, KINDS, BagWriter
 from tests.io.test_las import write_las
 from tests.io.test_pcd import compressed
@@ -72,7 +73,7 @@ def write_pcd_folder(folder, rng):
     scans = ScanSequence(
         "s", 30 * points_2d(rng).astype(np.float32), mask, "px", reference_poses=rng.normal(size=(4, 3))
     )
-    return io.write_deepmapping_folder(folder / "scans", scans)
+    return write_deepmapping_folder(folder / "scans", scans)
 
 
 def write_pcd_tar(folder, rng):
@@ -261,10 +262,6 @@ def write_graph(folder, _, *, text):
     return folder / "a.g2o"
 
 
-def write_plan(folder, rng):
-    return io.write_world_png(folder / "a.png", World("w", rng.random((20, 30)) < 0.3))
-
-
 def read_drive(path):
     sequence = io.open_lidar_sequence(path)
     return [sequence, list(io.iterate_scans(sequence))]
@@ -317,7 +314,6 @@ CASES: dict[str, tuple[Write, Read]] = {
     "graph, spatial": (partial(write_graph, text=SPATIAL_GRAPH), dpmjax.read_g2o),
     "depth folder": (write_pose_folder, lambda path: io.read_pose_folder(path, height=6, width=8)),
     "depth scene": (write_scene, lambda path: io.read_active_vision(path, 3, height=6, width=8)),
-    "floor plan": (write_plan, io.read_world_png),
 }
 
 HUGE = (b"99999999999", b"-1", b"1e308", b"nan", b"inf", b"0", b"", b"x", b"4294967297", b"1e999", b"\xff", b"-nan")

@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from dpmjax.io import InputError, read_ply, write_ply
+from dpmjax.io import InputError, write_ply
+from tests.data_sets import read_ply
 from tests.optional import import_or_skip
 
 POINTS = np.array([[1, 2, 3], [-4, 5.5, 6], [0.25, 0, -1]], np.float32)

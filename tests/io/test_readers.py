@@ -8,8 +8,9 @@ import sys
 import numpy as np
 import pytest
 
-from dpmjax.io import InputError, ScanSequence, read_sequence, write_deepmapping_folder
+from dpmjax.io import InputError, ScanSequence, read_sequence
 from dpmjax.sequences import has_angular_order
+from tests.data_sets import write_deepmapping_folder
 
 NUM_BEAMS = 20
 ANGLES = np.linspace(-2, 2, NUM_BEAMS)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from dpmjax.deepmapping import preset
-from dpmjax.nets.localization import LocalizationConfig, LocalizationNet
+from dpmjax.nets.localization import LocalizationNet, LocalizationNetConfig
 from dpmjax.nets.occupancy import OccupancyConfig, double_resolution, init_map_net, interpolate_grid, make_map_net
 from tests.tolerances import ACCUMULATED
 
@@ -45,7 +45,7 @@ def test_weights_start_xavier_uniform_with_the_gain_of_relu() -> None:
 
 
 def test_convolution_is_that_of_the_textbook() -> None:
-    config = LocalizationConfig(features=(5,), strides=(2,), hidden=())
+    config = LocalizationNetConfig(features=(5,), strides=(2,), hidden=())
     net, points = LocalizationNet(config), jax.random.normal(KEY, (20, 2))
     params = jax.jit(net.init)(KEY, points, jnp.ones(20, bool))["params"]
     weight = np.asarray(params["DilatedConvolution_0"]["Dense_0"]["kernel"], np.float64).reshape(3, 2, 5)
@@ -59,7 +59,7 @@ def test_convolution_is_that_of_the_textbook() -> None:
 
 @pytest.mark.parametrize("kind", ["conv", "point"])
 def test_masked_beams_never_matter_and_no_beam_is_finite(kind) -> None:
-    net = LocalizationNet(LocalizationConfig(kind=kind, features=(8, 16), strides=(1, 2), hidden=(8,)))
+    net = LocalizationNet(LocalizationNetConfig(kind=kind, features=(8, 16), strides=(1, 2), hidden=(8,)))
     points, mask = jax.random.normal(KEY, (32, 2)), jnp.arange(32) % 3 > 0
     params = jax.jit(net.init)(KEY, points, mask)
     filled = jnp.where(mask[:, None], points, jnp.nan)
@@ -72,7 +72,7 @@ def test_masked_beams_never_matter_and_no_beam_is_finite(kind) -> None:
 
 
 def test_pointnet_does_not_see_the_order() -> None:
-    net = LocalizationNet(LocalizationConfig(kind="point", features=(8, 16), hidden=(8,)))
+    net = LocalizationNet(LocalizationNetConfig(kind="point", features=(8, 16), hidden=(8,)))
     points, mask = jax.random.normal(KEY, (32, 2)), jnp.arange(32) % 3 > 0
     params, order = jax.jit(net.init)(KEY, points, mask), np.random.default_rng(0).permutation(32)
     apply = jax.jit(net.apply)
@@ -80,7 +80,7 @@ def test_pointnet_does_not_see_the_order() -> None:
 
 
 def test_circular_convolution_does_not_see_where_the_turn_begins() -> None:
-    net = LocalizationNet(LocalizationConfig(features=(8, 16), strides=(1, 1), is_circular=True, hidden=(8,)))
+    net = LocalizationNet(LocalizationNetConfig(features=(8, 16), strides=(1, 1), is_circular=True, hidden=(8,)))
     points, mask = jax.random.normal(KEY, (32, 2)), jnp.ones(32, bool)
     params, apply = jax.jit(net.init)(KEY, points, mask), jax.jit(net.apply)
     np.testing.assert_allclose(
@@ -89,7 +89,7 @@ def test_circular_convolution_does_not_see_where_the_turn_begins() -> None:
 
 
 def test_image_convolution_is_that_of_the_textbook() -> None:
-    config = LocalizationConfig(features=(4,), strides=(2,), dilation=2, hidden=())
+    config = LocalizationNetConfig(features=(4,), strides=(2,), dilation=2, hidden=())
     net, points, mask = LocalizationNet(config), jax.random.normal(KEY, (6, 8, 3)), jnp.ones((6, 8), bool)
     params = jax.jit(net.init)(KEY, points, mask)["params"]
     weight = np.asarray(params["DilatedConvolution_0"]["Dense_0"]["kernel"], np.float64).reshape(3, 3, 3, 4)
@@ -166,4 +166,4 @@ def test_levels_that_are_off_do_not_count() -> None:
 
 def test_strides_belong_to_layers() -> None:
     with pytest.raises(ValueError, match="strides"):
-        LocalizationConfig(strides=(1, 1))
+        LocalizationNetConfig(strides=(1, 1))

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 import dpmjax
 from dpmjax.pose_graph import Edges, PoseGraph, PoseGraphConfig, optimize_pose_graph
-from dpmjax.pose_graph.residuals import linearise
+from dpmjax.pose_graph.normal_equations import linearise
 
 KINDS = pytest.mark.parametrize("tangent", [3, 6], ids=["plane", "space"])
 GTSAM_CHI2 = {"M3500": 137.9149, "intel": 45.0042, "sphere2500": 1351.4019, "parking-garage": 1.26838}

@@ -63,7 +63,7 @@ class Untrained:
         self.rows = rows
         return self.train
 
-    def train(self, problem: Problem, data: MappingData, *, key: jax.Array, num_starts: int) -> Fit:
+    def train(self, problem: Problem, data: MappingData, *, key: jax.Array) -> Fit:
         self.start, self.config = None if data.start is None else np.asarray(data.start), problem.config
         np.testing.assert_array_equal(jax.random.key_data(key), jax.random.key_data(KEY))
         phase, count = np.int32(0), np.int32(self.num_steps)

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 import dpmjax
-from dpmjax.geometry.host_tree import HostTree
+from dpmjax.geometry.neighbours import HostTree
 from dpmjax.io import InputError
 from dpmjax.saved_maps import load_state, save_map, save_state
-from dpmjax.saved_maps.columns import from_columns, part_of, prefixed, to_columns
+from dpmjax.saved_maps.run_state import from_columns, part_of, prefixed, to_columns
 from dpmjax.slam import ScanReport, SlamConfig, SlamMethods, SlamState, finish_slam, init_slam, make_methods, step_slam
 from tests.deeppointmap import toy
 from tests.slam.test_odometry import motion, planes, seen_from

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from dpmjax.io import iterate_scans, open_lidar_sequence, write_kitti_sequence
+from dpmjax.io import iterate_scans, open_lidar_sequence
 from dpmjax.simulation import (
     HDL32E,
     HDL64E,
@@ -22,6 +22,7 @@ from dpmjax.simulation import (
     simulate_lidar_sequence,
 )
 from dpmjax.simulation.town.heights import with_equal_passes
+from tests.data_sets import write_kitti_sequence
 
 SENSOR = LidarSensor("test", HDL64E.elevations_deg[::4], 360, max_range_m=80.0)
 SHORT = TownConfig(route_length_m=500)

@@ -8,11 +8,9 @@ import pytest
 from scipy.ndimage import label
 from scipy.stats import kstest
 
-from dpmjax.io import InputError, read_world_png, write_world_png
 from dpmjax.simulation import World, cast_rays, make_world, simulate_sequence, simulate_trajectory
-from dpmjax.simulation.people2d import simulate_people, stop_at_people
 from dpmjax.simulation.raycast2d import beam_angles
-from dpmjax.simulation.trajectory2d import simulate_odometry
+from dpmjax.simulation.trajectory2d import simulate_odometry, simulate_people, stop_at_people
 
 WORLDS = [0, 1, 2]
 NAMED = ["grove", "grove-4", "crowd"]
@@ -104,20 +102,6 @@ def test_people_walk_in_free_space():
     assert (steps > 1.0).all()
     assert len(np.unique(people[:, 0], axis=0)) == 3
     assert simulate_people(replace(crowd, num_people=0), 20, rng=np.random.default_rng(0)).shape == (0, 20, 2)
-
-
-def test_world_survives_its_picture(tmp_path):
-    path = write_world_png(tmp_path / "world.png", world(0))
-    np.testing.assert_array_equal(read_world_png(path).is_obstacle, world(0).is_obstacle)
-
-
-@pytest.mark.parametrize("content", [None, b"", b"no picture"])
-def test_bad_picture_is_refused(tmp_path, content):
-    path = tmp_path / "bad.png"
-    if content is not None:
-        path.write_bytes(content)
-    with pytest.raises(InputError, match=r"bad\.png"):
-        read_world_png(path)
 
 
 @pytest.mark.parametrize("index", WORLDS)

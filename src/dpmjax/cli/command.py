@@ -8,13 +8,15 @@ import signal
 import sys
 import threading
 import traceback
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import fields
 from functools import partial
 from types import FrameType
 from typing import Any, TypeVar
 
 import tyro
+from tqdm import tqdm
 
 from dpmjax.cli import program
 from dpmjax.cli.machine import select_device
@@ -62,7 +64,7 @@ class StopFlag:
 
     @property
     def is_requested(self) -> bool:
-        """Whether a signal came."""
+        """Returns True after a signal."""
         return self.received is not None
 
     def request(self, signal_number: int) -> None:
@@ -120,14 +122,14 @@ def run_command(
 ) -> int:
     """Parses the command line, runs `main`, and returns the exit code.
 
-    0: done. 2: wrong usage or bad input, told in one line on stderr. 1: failed on the way; what was finished is in the
-    run folder. 130, 143: stopped by Ctrl-C or SIGTERM, results written. With `--resume`, options that are not given are
+    0: success. 2: wrong usage or bad input, with one line on stderr. 1: failure after partial results in the run
+        folder. 130, 143: stopped by Ctrl-C or SIGTERM, with results. With `--resume`, options that are not given are
     those of the run that is resumed.
 
     Args:
         main: takes the options. Errors of the user are raised as `ValueError` before the run folder is opened.
         config_type: frozen dataclass. Of `OutputOptions`, the folder is checked and the device selected before `main`.
-        name: of the subcommand of `dpmjax`, or of the module in `experiments`; and of the folder in `results`.
+        name: name of the subcommand of `dpmjax`, or of the module in `experiments`; and of the folder in `results`.
         description: the module's docstring; `--help` begins with it.
         args: the command line; None takes that of the process.
 
@@ -190,3 +192,23 @@ def _interrupt(number: int, frame: FrameType | None) -> None:
 def _say(message: str, exit_code: int) -> int:
     print("dpmjax:", " ".join(message.split()), file=sys.stderr, flush=True)
     return exit_code
+
+
+@contextmanager
+def progress_bar(description: str, unit: str) -> Iterator[Callable[[int, int], None]]:
+    """Shows a bar while the block runs.
+
+    Args:
+        description: shown before the bar.
+        unit: unit of the numbers, with a space before it.
+
+    Yields:
+        A callback that takes the number that is done and the number of all.
+    """
+    with tqdm(desc=description, unit=unit, dynamic_ncols=True) as bar:
+
+        def on_progress(num_done: int, num_all: int) -> None:
+            bar.total = num_all
+            bar.update(num_done - bar.n)
+
+        yield on_progress

@@ -1,9 +1,10 @@
-"""The scans that a command takes: a drive in any layout or a simulated town, a part of it, and its checks."""
+"""Input of the commands: drives of 3-D scans, read ahead in a thread, and saved maps."""
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterable
+from collections.abc import Generator, Iterable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -12,6 +13,9 @@ import numpy as np
 
 if TYPE_CHECKING:
     from dpmjax.sequences import LidarSequence, Note
+    from dpmjax.slam import KeyframeMap, SlamMethods
+    from dpmjax.slam.front_end import AnyScan
+
 
 LOGGER = logging.getLogger(__name__)
 TOWN_ROUTE_M, TOWN_DRIVE_M, TOWN_RATE_HZ, TOWN_AZIMUTHS = 400.0, 480.0, 3.0, 900
@@ -29,7 +33,7 @@ class DriveSelection:
         is_kitti_corrected: the beams are raised by 0.205 degrees, as KITTI's HDL-64E needs.
         columns: numbers a point has in `.bin` files; None infers it from the values.
         topic: which clouds of a bag of ROS; None takes the only ones.
-        seed: of the simulated town.
+        seed: seed of the simulated town.
     """
 
     data: Path | None = None
@@ -74,10 +78,10 @@ def open_drive(selection: DriveSelection) -> LidarSequence:
 
 
 def report_notes(notes: Iterable[Note]) -> dict[str, list[str]]:
-    """Writes what was decided about the input to the log; prints it, but for doubts, which the console has already.
+    """Writes the notes on the input to the log, and prints those that are no doubts: the console shows doubts already.
 
     Args:
-        notes: of a drive.
+        notes: notes of a drive.
 
     Returns:
         The entry of `metrics.json`.
@@ -109,3 +113,102 @@ def demo_drive(seed: int) -> LidarSequence:
     town = TownConfig("suburb", "loop", TOWN_ROUTE_M, 90.0)
     driving = DriveConfig(rate_hz=TOWN_RATE_HZ, length_m=TOWN_DRIVE_M)
     return simulate_scene(Scene(seed, town, driving, HDL64E.with_azimuths(TOWN_AZIMUTHS)))
+
+
+TURN_S = 0.1
+
+
+class ScanReader:
+    """Reads scans, timed ones where they are deskewed.
+
+    Args:
+        sequence: the drive.
+        is_deskewed: whether points get times, for deskewing.
+        jump: number of scans of the drive for each that is read, where it has no times.
+    """
+
+    def __init__(self, sequence: LidarSequence, *, is_deskewed: bool = False, jump: int = 1) -> None:
+        self._sequence, self._is_deskewed, self._jump = sequence, is_deskewed, jump
+
+    def __call__(self, index: int) -> AnyScan:
+        """Reads a scan."""
+        from dpmjax.scans import offsets_by_azimuth
+        from dpmjax.slam import TimedScan
+
+        points = self._sequence.read_points(index)
+        if not self._is_deskewed or not len(points):
+            return points
+        offsets = self._offsets_by_times(index)
+        return TimedScan(points, offsets_by_azimuth(points, self._turn_share(index)) if offsets is None else offsets)
+
+    def iterate(self, start: int) -> Generator[AnyScan, None, None]:
+        """Reads scan after scan, the next one while the caller works on this one."""
+        numbers = range(start, len(self._sequence))
+        with ThreadPoolExecutor(1) as pool:
+            waiting = pool.submit(self, start) if numbers else None
+            for index in numbers:
+                done, waiting = waiting, pool.submit(self, index + 1) if index + 1 in numbers else None
+                assert done is not None
+                yield done.result()
+
+    def _offsets_by_times(self, index: int) -> np.ndarray | None:
+        """Returns the offsets by the times in the file; None where it has none that can be used."""
+        from dpmjax.scans import offsets_by_times
+
+        times = None if self._sequence.read_times is None else self._sequence.read_times(index)
+        if times is None:
+            return None
+        interval_s = self._interval_s(index)
+        offsets = offsets_by_times(times, interval_s)
+        return offsets if offsets is None or interval_s is not None else offsets / self._jump
+
+    def _turn_share(self, index: int) -> float:
+        """Returns the time of a turn, as a share of the time between the two scans before."""
+        interval_s = self._interval_s(index)
+        return 1.0 / self._jump if interval_s is None else min(TURN_S / interval_s, 1.0)
+
+    def _interval_s(self, index: int) -> float | None:
+        """Returns the time between the two scans before, whose motion predicts this one; None where it is unknown."""
+        times = self._sequence.times
+        if times is None or index < 2:
+            return None
+        interval_s = float(times[index - 1] - times[index - 2])
+        return interval_s if interval_s > 0 else None
+
+
+def open_map(path: Path, methods: SlamMethods) -> KeyframeMap:
+    """Reads a saved map.
+
+    Args:
+        path: a file of `save_map`.
+        methods: methods of the weights that must have made it.
+
+    Returns:
+        The map.
+
+    Raises:
+        ValueError: no such file, no map, or a map of other weights.
+    """
+    from dpmjax.saved_maps import load_map
+
+    slam_map, origin = load_map(path), methods.origin
+    if slam_map.origin is not None and slam_map.origin.fingerprint != origin.fingerprint:
+        found = f"made with weights {slam_map.origin}, these are {origin}"
+        raise ValueError(f"{path}: {found}; name the weights that made it with --weights")
+    return slam_map
+
+
+def keyframe_points(slam_map: KeyframeMap, row: int) -> np.ndarray:
+    """Returns the surface elements of a keyframe.
+
+    Args:
+        slam_map: the map.
+        row: row of the keyframe.
+
+    Returns:
+        (n, 3) metres, in the frame of the keyframe's lidar.
+    """
+    from dpmjax.scans.compact import expand_elements
+
+    elements = expand_elements(slam_map.keyframes[row].compact.elements)
+    return np.asarray(elements.positions)[np.asarray(elements.mask)]

@@ -43,7 +43,7 @@ def open_evaluation_drives(data: Sequence[str], towns: Sequence[Source]) -> list
 
     Args:
         data: folders, or `town` for the towns.
-        towns: from `evaluation_towns`.
+        towns: towns from `evaluation_towns`.
 
     Returns:
         The drives, each with poses, near pairs and a name of its own.

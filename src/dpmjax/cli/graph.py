@@ -1,7 +1,7 @@
 """Optimises a pose graph in the plane or in space: files of g2o and TORO, edges alone, too.
 
     dpmjax graph parking-garage.g2o               least squares
-    dpmjax graph city.g2o --outlier-chi2 10       wrong edges are let go (Geman-McClure kernel)
+    dpmjax graph city.g2o --outlier-chi2 10       wrong edges are rejected (Geman-McClure)
     dpmjax graph edges.g2o --nearest-psd          mends information matrices that are not positive semidefinite
 
 The start is the poses of the file or the chordal relaxation, whichever has the lower cost; a file of edges alone starts
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from dpmjax.pose_graph import OptimizedPoseGraph, PoseGraph
 
 NAME = "graph"
-# Edges below this weight count as let go.
+# Edges below this weight count as rejected.
 LET_GO = 0.5
 
 

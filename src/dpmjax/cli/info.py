@@ -11,8 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from dpmjax.cli.command import run_command
-from dpmjax.cli.machine import device_name, environment
-from dpmjax.cli.optional import EXTRAS, why_not_importable
+from dpmjax.cli.machine import EXTRAS, device_name, environment, why_not_importable
 
 NAME = "info"
 

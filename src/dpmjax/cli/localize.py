@@ -24,9 +24,9 @@ from tyro.conf import FlagCreatePairsOff, Positional, arg
 
 from dpmjax.cli.command import StopFlag, check_least, run_command
 from dpmjax.cli.drives import DriveSelection, open_drive, report_notes
-from dpmjax.cli.localize_numbers import localization_errors
 from dpmjax.cli.result_files import HistoryFile, read_history
 from dpmjax.cli.run_folder import RunFolder, RunOptions, open_run_folder, recording, write_metrics
+from dpmjax.cli.slam_numbers import localization_errors
 from dpmjax.sequences import InputError
 
 if TYPE_CHECKING:
@@ -90,7 +90,7 @@ class Config(RunOptions):
 
 def main(config: Config) -> list[dict[str, str]]:
     """Looks for the scans that are missing, and writes table, trajectory, numbers and picture."""
-    from dpmjax.cli.map_input import open_map
+    from dpmjax.cli.drives import open_map
     from dpmjax.slam import localize_each, make_methods
     from dpmjax.weights import load_model
 
@@ -230,7 +230,7 @@ def write_results(
 
 def map_points(slam_map: KeyframeMap) -> np.ndarray:
     """Returns surface points of the map, thinned at random."""
-    from dpmjax.cli.map_input import keyframe_points
+    from dpmjax.cli.drives import keyframe_points
 
     points = np.concatenate(
         [keyframe_points(slam_map, row) @ T[:3, :3].T + T[:3, 3] for row, T in enumerate(slam_map.T_world_keyframe)]

@@ -1,13 +1,15 @@
-"""What a result depends on besides its options: the machine, the versions, the device; and how much memory was used."""
+"""The machine under a command: versions, device, memory, cores, and packages of the extras that cannot be used."""
 
 from __future__ import annotations
 
+import importlib
 import importlib.metadata
 import os
 import platform
 import resource
 import subprocess
 import sys
+import warnings
 from pathlib import Path
 from typing import Any, Literal
 
@@ -97,3 +99,52 @@ def _fields(path: str) -> dict[str, str]:
     except OSError:
         return {}
     return {name.strip(): value.strip() for name, _, value in (line.partition(":") for line in lines)}
+
+
+EXTRAS = {
+    "evosax": "baselines",
+    "jaxopt": "baselines",
+    "open3d": "baselines",
+    "gtsam": "gtsam",
+    "kiss_matcher": "kiss",
+    "laspy": "las",
+    "lazrs": "las",
+    "rosbags": "ros",
+    "kiss_icp": "peers",
+    "kiss_slam": "peers",
+    "rerun": "viewer",
+    "torch": "torch",
+}
+"""The extra of dpmjax that brings a package."""
+
+
+def why_not_importable(module: str) -> str | None:
+    """Returns why a module cannot be imported; None where it can.
+
+    The module is imported, because an installed package may be broken. A missing library of the system, or a compiled
+    part for another version of NumPy, raises an error at the import only, and of any kind.
+
+    Args:
+        module: name of a package or of a module in it.
+
+    Returns:
+        One line: the package that is not installed and the command that installs it, or the error of the import.
+    """
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            importlib.import_module(module)
+    except ModuleNotFoundError as error:
+        missing = error.name or module
+        package = f"dpmjax[{EXTRAS[missing]}]" if missing in EXTRAS else missing
+        return f"{missing} is not installed (pip install '{package}')"
+    except Exception as error:
+        lines = str(error).splitlines() or [type(error).__name__]
+        return f"{module} is installed, but its import fails: {lines[0]}"
+    return None
+
+
+def require_importable(module: str, option: str) -> None:
+    """Raises a ValueError that names the option, where a module that the option needs cannot be imported."""
+    if (reason := why_not_importable(module)) is not None:
+        raise ValueError(f"{option}: {reason}")

@@ -49,8 +49,8 @@ class Config(OutputOptions):
 
 def main(config: Config) -> dict[str, Any]:
     """Reads the maps, merges them, writes; returns the content of `metrics.json`."""
-    from dpmjax.cli.map_input import open_map
-    from dpmjax.cli.progress import progress_bar
+    from dpmjax.cli.command import progress_bar
+    from dpmjax.cli.drives import open_map
     from dpmjax.slam import make_methods, merge_maps
     from dpmjax.weights import load_model
 
@@ -161,7 +161,7 @@ def panel_of(paths: Sequence[Path], merged: MergedMaps, part: int) -> AgentPanel
 def track_of(path: Path, merged: MergedMaps, number: int) -> AgentTrack:
     """Returns the keyframes of a map and the points of their surfaces, in its colour."""
     from dpmjax import viz
-    from dpmjax.cli.map_input import keyframe_points
+    from dpmjax.cli.drives import keyframe_points
     from dpmjax.cli.slam_files import gather_map
 
     slam_map = merged.joined.slam_map

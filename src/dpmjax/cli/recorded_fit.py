@@ -48,7 +48,7 @@ class FitRecorder:
         """Makes an engine for one fit.
 
         Args:
-            folder: of the run; gets `metrics.csv` and checkpoints.
+            folder: folder of the run; gets `metrics.csv` and checkpoints.
             length: unit of the ATE.
             stop: called before each call of the step with the run time so far, seconds; the fit ends where it is True.
         """
@@ -61,14 +61,13 @@ class FitRecorder:
         data: Any,
         *,
         key: jax.Array,
-        num_starts: int = 1,
         measure: Callable[[NDArray[np.float64]], float] = lambda _: math.nan,
     ) -> Fit:
         """Fits, or continues where the checkpoints of the folder end; `measure` gives the ATE of its poses."""
         from dpmjax.checkpoints import Checkpoints
         from dpmjax.deepmapping import init, resume
 
-        folder, state = self._folder, init(problem, data, key=key, num_starts=num_starts)
+        folder, state = self._folder, init(problem, data, key=key)
         checkpoints = Checkpoints(Path(folder.path) / CHECKPOINTS)
         if folder.is_resumed:
             state = checkpoints.restore_latest(state, fallback=state)

@@ -70,10 +70,10 @@ def do_row(folder: Path, case: dict[str, Any], work: Callable[[], dict[str, Any]
     made it.
 
     Args:
-        folder: of the run.
+        folder: folder of the run.
         case: identifies the row and becomes part of it.
-        work: makes the rest of the row.
-        seed: of the run.
+        work: makes the remaining entries of the row.
+        seed: seed of the run.
 
     Returns:
         The row. The commit of a row that carries none is "unknown".
@@ -98,10 +98,10 @@ def do_rows(
     """Makes one row a case by `do_row`, under a progress bar.
 
     Args:
-        folder: of the run.
+        folder: folder of the run.
         cases: what identifies the rows.
-        work: makes the rest of a row; it is called with the entries of the case as keywords.
-        seed: of the run.
+        work: makes the remaining entries of a row; it is called with the entries of the case as keywords.
+        seed: seed of the run.
         is_stopped: whether to end before the next row.
 
     Returns:
@@ -126,8 +126,8 @@ def commits_note(rows: Sequence[Mapping[str, Any]], commit: str | None) -> str |
     """Names the rows that another commit has made than the one that writes the file.
 
     Args:
-        rows: with `git_hash`, and `method` where there are several.
-        commit: of the program that writes the file, None where it is not known.
+        rows: rows with `git_hash`, and `method` where there are several.
+        commit: commit of the program that writes the file, None where it is not known.
 
     Returns:
         One sentence, or None where all rows are of `commit`.
@@ -151,10 +151,10 @@ def commits_note(rows: Sequence[Mapping[str, Any]], commit: str | None) -> str |
 
 
 class HistoryFile:
-    """The table of a run, one row a record, each on disk as soon as it is known.
+    """The table of a run, one row a record, each on disk at once.
 
     Args:
-        path: the CSV file; it is replaced, but for the rows to keep.
+        path: the CSV file; it is replaced, except for the rows to keep.
         columns: names of the columns, the first counts steps.
         keep_until: in a resumed run, rows with a larger first column are dropped; they will be computed again.
     """

@@ -25,7 +25,7 @@ CHECKPOINTS, BEST, AGENTS, DRIVES = "checkpoints", "checkpoints_best", "agents",
 RESULT_FOLDERS = (CHECKPOINTS, BEST, AGENTS, DRIVES, "rows")
 RESULT_SUFFIXES = (".json", ".csv", ".txt", ".npy", ".npz", ".png", ".ply", ".g2o", ".rrd")
 LOGGERS = ("dpmjax", "experiments", "__main__")
-# Options that do not change what is computed.
+# Options that do not change the result.
 FREE_OPTIONS = frozenset(
     {"output", "resume", "force", "device", "coordinator", "num_processes", "process_id", "visualize"}
 )
@@ -204,9 +204,9 @@ def write_metrics(
     """Writes `metrics.json`: plain names with units, then the seed, the versions, the device and the machine.
 
     Args:
-        folder: of the run.
+        folder: folder of the run.
         metrics: numbers by name.
-        seed: of the run; None where nothing is random.
+        seed: seed of the run; None where nothing is random.
         rows: rows made by `do_row`; the file names those of another commit than its own.
 
     Returns:
@@ -225,7 +225,7 @@ def recording(folder: RunFolder) -> Iterator[None]:
     """Logs to `log.txt` what happens in the block, and the traceback if it fails.
 
     Args:
-        folder: of the run.
+        folder: folder of the run.
 
     Yields:
         Nothing.
@@ -247,7 +247,7 @@ def recording(folder: RunFolder) -> Iterator[None]:
         loggers[-1].info("stopped by %s", stop or "SIGINT")
         raise
     except Exception as error:
-        # The console shows the error too, and leaves out what is below a warning.
+        # The console shows the error too, and only warnings and errors.
         loggers[-1].info("failed", exc_info=error)
         raise RunFailedError(folder.path, error) from error
     finally:

@@ -27,13 +27,12 @@ from tyro.conf import FlagCreatePairsOff, Positional, arg
 
 from dpmjax.cli.command import StopFlag, check_least, run_command
 from dpmjax.cli.drives import DriveSelection, open_drive, report_notes
-from dpmjax.cli.machine import peak_rss_gb
-from dpmjax.cli.optional import require_importable
+from dpmjax.cli.machine import peak_rss_gb, require_importable
 from dpmjax.cli.run_folder import RunFolder, RunOptions, open_run_folder, recording, write_metrics
 from dpmjax.sequences import InputError
 
 if TYPE_CHECKING:
-    from dpmjax.cli.slam_outcome import SlamRun
+    from dpmjax.cli.slam_numbers import SlamRun
     from dpmjax.sequences import LidarSequence
     from dpmjax.slam import KeyframeMap, SlamMethods, SlamResult, SlamState
 
@@ -103,10 +102,9 @@ class Config(RunOptions):
 
 def main(config: Config) -> dict[str, Any]:
     """Reads, maps, writes; returns the content of `metrics.json`."""
+    from dpmjax.cli.drives import ScanReader
     from dpmjax.cli.slam_numbers import counted, status_of, summary, why_failed
-    from dpmjax.cli.slam_reader import ScanReader
-    from dpmjax.cli.slam_run import Hooks, find_beginning, run_scans
-    from dpmjax.cli.slam_viewer import live_viewer
+    from dpmjax.cli.slam_run import Hooks, find_beginning, live_viewer, run_scans
     from dpmjax.slam import finish_slam
 
     if config.visualize:
@@ -157,7 +155,7 @@ class Drive(NamedTuple):
 
     def read_keyframe(self, slam_map: KeyframeMap, row: int) -> np.ndarray:
         """Reads the points of a keyframe; those of the extended map are the points of its surface."""
-        from dpmjax.cli.map_input import keyframe_points
+        from dpmjax.cli.drives import keyframe_points
 
         if row < self.num_keyframes_before:
             return keyframe_points(slam_map, row)
@@ -179,7 +177,7 @@ def slam_methods(config: Config) -> SlamMethods:
 
 def starting_state(config: Config, methods: SlamMethods) -> SlamState:
     """Returns the state before the first scan; a `ValueError` for a map of other weights."""
-    from dpmjax.cli.map_input import open_map
+    from dpmjax.cli.drives import open_map
     from dpmjax.slam import init_slam
 
     return init_slam(None if config.map is None else open_map(config.map, methods))
@@ -216,7 +214,7 @@ def refine(
     """Refines the trajectory by DeepMapping, writes it as refined_*.txt, and returns its numbers."""
     import jax
 
-    from dpmjax.cli.progress import progress_bar
+    from dpmjax.cli.command import progress_bar
     from dpmjax.cli.slam_files import write_trajectory
     from dpmjax.cli.slam_numbers import trajectory_errors
     from dpmjax.slam import place_scans, refine_keyframes

@@ -128,7 +128,7 @@ def gather_map(views: Iterable[tuple[np.ndarray, np.ndarray]]) -> Cloud:
     """Puts scans into the world, one point a voxel; voxels grow where the map gets too large.
 
     Args:
-        views: points of a scan and its pose, one after the other.
+        views: pairs of the points of a scan and its pose.
 
     Returns:
         The points of all scans, thinned.

@@ -1,18 +1,98 @@
-"""The numbers of a SLAM run: errors against the reference, statuses and seconds; and the lines on the console."""
+"""Numbers of SLAM and of localization for metrics.json: errors, counts, seconds; and the record of a run."""
 
 from __future__ import annotations
 
 import collections
 import math
-from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 if TYPE_CHECKING:
-    from dpmjax.cli.slam_outcome import SlamRun
     from dpmjax.sequences import LidarSequence
-    from dpmjax.slam import KeyframeMap, SlamResult
+    from dpmjax.slam import KeyframeMap, Localization, ScanReport, SlamResult, SlamState
+
+
+class SlamRun(NamedTuple):
+    """A run until its end or its stop.
+
+    Attributes:
+        state: after the last scan.
+        reports: reports of all scans.
+        stages_s: seconds of each stage in this process, without compilation.
+        compile_s: seconds of compilation.
+        run_s: seconds of all scans of this process, without compilation.
+        scan_s: seconds of each scan of this process, without compilation, reading and writing.
+        failure: what ended the run early; None where nothing did.
+    """
+
+    state: SlamState
+    reports: tuple[ScanReport, ...]
+    stages_s: dict[str, float]
+    compile_s: float
+    run_s: float
+    scan_s: tuple[float, ...]
+    failure: Exception | None
+
+    @property
+    def num_done(self) -> int:
+        """Number of scans of this process."""
+        return len(self.scan_s)
+
+
+MAX_ERROR_M, MAX_ERROR_DEG = 2.0, 5.0
+"""Errors up to which a localisation is right."""
+
+
+class LocalizationErrors(NamedTuple):
+    """Errors of n scans against the reference.
+
+    Attributes:
+        is_found: (n,) bool.
+        is_right: (n,) True where the scan was found within 2 m and 5 degrees.
+        translation_m: (n,) NaN where it was not found.
+        rotation_deg: (n,) NaN where it was not found.
+    """
+
+    is_found: np.ndarray
+    is_right: np.ndarray
+    translation_m: np.ndarray
+    rotation_deg: np.ndarray
+
+
+def localization_errors(
+    found: Sequence[Localization],
+    slam_map: KeyframeMap,
+    T_reference_keyframe: np.ndarray,
+    T_reference_scan: np.ndarray,
+) -> LocalizationErrors:
+    """Compares the pose of each scan in the frame of its keyframe with the reference.
+
+    Args:
+        found: results of n scans.
+        slam_map: the map that they were looked for in.
+        T_reference_keyframe: (k, 4, 4) reference poses of all keyframes.
+        T_reference_scan: (n, 4, 4) reference poses of the scans, in the same world.
+
+    Returns:
+        The errors.
+    """
+    from dpmjax.geometry import rigid
+    from dpmjax.metrics import registration_recall
+
+    is_found = np.array([one.is_in_map for one in found], bool)
+    is_right, errors = np.zeros(len(found), bool), np.full((2, len(found)), np.nan)
+    if is_found.any():
+        keyframes = np.array([one.keyframe for one in found if one.is_in_map], np.int64)
+        T_world_scan = np.array([one.T_world_scan for one in found if one.is_in_map])
+        T = rigid.inverse(slam_map.T_world_keyframe[keyframes]) @ T_world_scan
+        true = rigid.inverse(T_reference_keyframe[keyframes]) @ T_reference_scan[is_found]
+        recall = registration_recall(T, true, max_translation_m=MAX_ERROR_M, max_rotation_deg=MAX_ERROR_DEG)
+        is_right[is_found] = recall.is_right
+        errors[:, is_found] = recall.translation_errors_m, recall.rotation_errors_deg
+    return LocalizationErrors(is_found, is_right, *errors)
+
 
 UNSURE = {
     "network": "placed by the network, because alignment with the scans before failed",

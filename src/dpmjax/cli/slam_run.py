@@ -4,24 +4,29 @@ from __future__ import annotations
 
 import collections
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
+import numpy as np
 from tqdm import tqdm
 
+from dpmjax.cli.drives import ScanReader
 from dpmjax.cli.run_folder import RunFolder
 from dpmjax.cli.slam_files import write_scans, write_trajectory
-from dpmjax.cli.slam_outcome import SlamRun
-from dpmjax.cli.slam_reader import ScanReader
+from dpmjax.cli.slam_numbers import SlamRun
 from dpmjax.saved_maps import load_state, save_state
 from dpmjax.sequences import LidarSequence
 from dpmjax.slam import SlamMethods, SlamResult, SlamState, finish_slam, init_slam, place_scans, step_slam
 
 if TYPE_CHECKING:
-    from dpmjax.slam import ScanReport
+    from dpmjax.slam import ScanReport, SlamState
     from dpmjax.slam.front_end import AnyScan
+
+    OnScan = Callable[[AnyScan, SlamState, ScanReport], None]
+
 
 STATE = "run_state.npz"
 # Seconds between writings of the state: a killed run repeats the scans since the last one.
@@ -44,7 +49,7 @@ class Beginning(NamedTuple):
 
     Attributes:
         state: after the scans that are done.
-        reports: of the scans of the drive that are done.
+        reports: reports of the scans of the drive that are done.
     """
 
     state: SlamState
@@ -122,7 +127,7 @@ def map_drive(
     """Maps a drive from its beginning, or goes on from the state in its folder.
 
     Args:
-        folder: for the state and interim results.
+        folder: folder for the state and interim results.
         sequence: the drive.
         methods: matcher, geometry and settings.
         is_stopped: whether to end before the next scan.
@@ -193,7 +198,7 @@ def run_scans(
 
 
 def write_interim(folder: RunFolder, sequence: LidarSequence, state: SlamState, reports: list[ScanReport]) -> None:
-    """Writes trajectory and scans.csv as they are now."""
+    """Writes the present trajectory and scans.csv."""
     slam_map = state.slam_map
     times = None if sequence.times is None else sequence.times[: len(reports)]
     write_trajectory(folder.path, place_scans(slam_map.T_world_keyframe, reports), times)
@@ -207,3 +212,31 @@ def _progress(state: SlamState, reports: list[ScanReport], watch: Stopwatch) -> 
     if reports[-1].status not in ("first", "tracked"):
         parts.append(reports[-1].status)
     return ", ".join([*parts, f"compiled {watch.compile_s:.0f} s"])
+
+
+@contextmanager
+def live_viewer(folder: RunFolder, name: str, *, is_on: bool) -> Iterator[OnScan | None]:
+    """Opens the viewer; yields what shows a scan, or None where the viewer is off."""
+    if not is_on:
+        yield None
+        return
+    from dpmjax import viz
+    from dpmjax.slam.front_end import corrected_points
+
+    viewer = viz.LiveViewer(name, folder / "slam.rrd")
+
+    def show(scan: AnyScan, state: SlamState, report: ScanReport) -> None:
+        slam_map = state.slam_map
+        if not len(slam_map):
+            return
+        points, T = corrected_points(scan, report.T_turn), slam_map.T_world_keyframe[report.keyframe]
+        viewer.show_scan(report.scan, points, T @ report.T_keyframe_scan)
+        if report.is_keyframe:
+            ends = [(loop.source, loop.target) for loop in state.loops.loops if loop.status == "accepted"]
+            positions = slam_map.T_world_keyframe[np.array(ends, np.int64).reshape(-1, 2), :3, 3]
+            viewer.show_map(slam_map.T_world_keyframe, points, positions)
+
+    try:
+        yield show
+    finally:
+        viewer.close()

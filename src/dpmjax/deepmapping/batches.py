@@ -1,13 +1,21 @@
-"""Which scans a step sees, and at which distances in time they are compared."""
+"""Scans of a step: all, blocks of neighbours in time, or windows that are registered alone and joined at shared scans.
+
+Within a window all scans are near the first one, so that the Chamfer distance has its minimum within reach from zero
+poses. Over a whole walk L-Net has to unroll the chain at once, and may lay two rooms that look alike on each other.
+"""
 
 from __future__ import annotations
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Int
+import numpy as np
+from jaxtyping import Array, Float, Int
+from numpy.typing import NDArray
 
 from dpmjax.deepmapping.config import PhaseConfig
-from dpmjax.deepmapping.windows import window_rows
+from dpmjax.geometry import se2
 
 # Scans that are drawn together where a set is too large for one step.
 _BLOCK = 32
@@ -17,8 +25,8 @@ def scans_in_block(phase: PhaseConfig, num_scans: int) -> int:
     """Neighbours in time that a step sees together.
 
     Args:
-        phase: of the fit.
-        num_scans: of the set.
+        phase: phase of the fit.
+        num_scans: number of scans of the set.
 
     Returns:
         Their number.
@@ -27,7 +35,7 @@ def scans_in_block(phase: PhaseConfig, num_scans: int) -> int:
         return min(num_scans, phase.scans_per_window)
     if num_scans <= phase.scans_per_step:
         return num_scans
-    return phase.scans_per_step if phase.is_free_factor_shared else _BLOCK
+    return phase.scans_per_step if phase.is_sampled_as_published else _BLOCK
 
 
 def draw_rows(
@@ -36,10 +44,10 @@ def draw_rows(
     """Scans of a step: all windows, or all scans where they are few enough, else blocks of neighbours in time.
 
     Args:
-        phase: of the fit.
-        num_scans: of the set.
+        phase: phase of the fit.
+        num_scans: number of scans of the set.
         step: steps done in the phase.
-        key: of the step.
+        key: key of the step.
 
     Returns:
         Index of each scan in the set, and the block it belongs to.
@@ -49,9 +57,9 @@ def draw_rows(
         return jnp.asarray(rows.reshape(-1)), jnp.repeat(jnp.arange(len(rows)), rows.shape[1])
     if num_scans <= phase.scans_per_step:
         return jnp.arange(num_scans), jnp.zeros(num_scans, jnp.int32)
-    if phase.is_free_factor_shared:
-        # The published order: batches follow each other in time, none is mixed.
-        # The last one reaches back, so that it is as long as the others and no scan is left out.
+    if phase.is_sampled_as_published:
+        # The published order: batches follow each other in time, none is mixed. The last batch reaches back, so that
+        # all have one length and no scan is left out.
         first = step % -(-num_scans // phase.scans_per_step) * phase.scans_per_step
         first = jnp.minimum(first, num_scans - phase.scans_per_step)
         return first + jnp.arange(phase.scans_per_step), jnp.zeros(phase.scans_per_step, jnp.int32)
@@ -64,9 +72,9 @@ def draw_offsets(phase: PhaseConfig, furthest: int, *, key: jax.Array) -> Int[Ar
     """Distances in time of the scans that are compared: 1, so that neighbours always meet, and others at random.
 
     Args:
-        phase: of the fit; `num_offsets` and `max_offset` are clamped to what there is.
+        phase: phase of the fit; `num_offsets` and `max_offset` are clamped to the available scans.
         furthest: the largest distance that there is.
-        key: of this step.
+        key: key of this step.
 
     Returns:
         Different whole numbers, 1 to `furthest`.
@@ -75,3 +83,57 @@ def draw_offsets(phase: PhaseConfig, furthest: int, *, key: jax.Array) -> Int[Ar
     count = min(phase.num_offsets, largest) - 1
     others = jax.random.choice(key, jnp.arange(2, max(largest, 2) + 1), (count,), replace=False)
     return jnp.concatenate([jnp.ones(1, others.dtype), others])
+
+
+def window_rows(num_scans: int, scans_per_window: int) -> NDArray[np.intp]:
+    """The scans of each window; the last scan of a window is the first of the next.
+
+    Args:
+        num_scans: number of scans of the set, in the order of time.
+        scans_per_window: scans of a window, at least 2.
+
+    Returns:
+        (w, m) indices, m the smaller of both numbers; the last window reaches back, so that all have one length.
+    """
+    length = min(scans_per_window, num_scans)
+    count = max(1, -(-(num_scans - 1) // (length - 1))) if length > 1 else 1
+    first = np.minimum(np.arange(count) * (length - 1), num_scans - length)
+    return first[:, None] + np.arange(length)
+
+
+def join_windows(poses: Float[Array, "w m 3"], num_scans: int) -> Float[Array, "n 3"]:
+    """Poses of all scans in one world, that of the first window.
+
+    Args:
+        poses: poses of each window's scans, in a world of its own: x, y, heading.
+        num_scans: number of scans of the set.
+
+    Returns:
+        The poses; neighbours within a window keep their motion.
+    """
+    rows = window_rows(num_scans, poses.shape[1])
+    # The last scan of the window before, as an index of this window.
+    shared = np.maximum(np.concatenate([rows[:1, 0], rows[:-1, -1]]) - rows[:, 0], 0)
+    here = jnp.take_along_axis(poses, jnp.asarray(shared)[:, None, None], axis=1)[:, 0]
+
+    def join(last: Array, window: tuple[Array, Array]) -> tuple[Array, Array]:
+        in_window, at_shared = window
+        joined = se2.compose(last, se2.relative(at_shared, in_window))
+        return joined[-1], joined
+
+    _, joined = jax.lax.scan(join, poses[0, 0], (poses, here))
+    window = np.minimum(np.arange(num_scans) // max(rows.shape[1] - 1, 1), len(rows) - 1)
+    return joined[window, np.arange(num_scans) - rows[window, 0]]
+
+
+def in_windows(array: Any, rows: NDArray[np.intp]) -> Any:
+    """The rows of an array side by side, as an array of windows.
+
+    Args:
+        array: (w * m, ...).
+        rows: (w, m) of `window_rows`.
+
+    Returns:
+        (w, m, ...).
+    """
+    return array.reshape(*rows.shape, *array.shape[1:])

@@ -14,10 +14,11 @@ from scipy.spatial import cKDTree
 from dpmjax.scans import SurfaceConfig, scan_surface
 from dpmjax.scans.preprocess import first_of_each_voxel
 
-# In typical ranges: the vehicle, what is too far, side of the voxels and reach of the neighbours for the normals.
+# In typical ranges: nearest and farthest point, side of the voxels, and reach of the neighbours for the normals.
 _NEAREST, _FARTHEST, _VOXEL, _NEIGHBOURS = 0.03, 3.0, 0.01, 0.1
 _NUM_NEIGHBOURS = 24
-# Scans with more than so many others between them meet again, if they are nearer than so many typical ranges.
+# Scans with more than this number of scans between them meet again, if they are nearer than this number of typical
+# ranges.
 _REVISIT_GAP, _REVISIT_DISTANCE = 8, 0.5
 _NUM_PARTNERS = 8
 
@@ -27,10 +28,10 @@ class CloudScans:
     """Lidar scans of equal capacity; the rows of each are in random order, those that are not there at the end.
 
     Attributes:
-        points: in the lidar frames, any unit; in typical ranges inside of the fit.
+        points: points in the lidar frames, any unit; in typical ranges inside of the fit.
         mask: False for rows that are not there.
         normals: unit normals of the planes around the points, on the side of the lidar.
-        flatness: in [0, 1], how much the neighbourhood is a plane.
+        flatness: planarity of the neighbourhood, in [0, 1].
         spacing: median distance of a point to the nearest other one of its scan.
         partners: scans near in space, though not in time, at the poses to start from; -1: none.
     """

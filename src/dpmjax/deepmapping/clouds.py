@@ -16,12 +16,12 @@ from jaxtyping import Array, Float, Int
 from numpy.typing import ArrayLike, NDArray
 
 from dpmjax.deepmapping.batches import draw_offsets, draw_rows, scans_in_block
-from dpmjax.deepmapping.cloud_config import CloudMappingConfig
 from dpmjax.deepmapping.cloud_scans import CloudScans, as_cloud_scans, find_partners
-from dpmjax.deepmapping.config import PhaseConfig
+from dpmjax.deepmapping.config import DeepMappingConfig, PhaseConfig, PlaneComparison
 from dpmjax.deepmapping.engine import Fit, Report, fit
 from dpmjax.deepmapping.objective import Terms, WorldBatch, chamfer_term, interpolate_log
-from dpmjax.deepmapping.plane_distance import Cloud, clouds_of, misfit_of_pairs, take_rows, trajectory_misfit
+from dpmjax.deepmapping.plane_distance import PlaneCloud, clouds_of, misfit_of_pairs, take_rows, trajectory_misfit
+from dpmjax.deepmapping.presets import cloud_preset
 from dpmjax.deepmapping.problem import MappingData, MappingFunctions, Params, Problem, mapping_loss, mapping_problem
 from dpmjax.deepmapping.spatial import (
     fitted_poses,
@@ -32,7 +32,7 @@ from dpmjax.deepmapping.spatial import (
     start_poses,
 )
 from dpmjax.geometry import rigid
-from dpmjax.geometry.rays import typical_range
+from dpmjax.geometry.sampling import typical_range
 
 # Kernel width, in typical ranges, of the misfit by which the start and the fit are compared.
 _MISFIT_KERNEL_WIDTH = 0.004
@@ -43,8 +43,8 @@ class CloudFitted(NamedTuple):
 
     Attributes:
         T_world_scan: (n, 4, 4) float64, unit of the points: of the fit, or the start where that fits better.
-        params: of L-Net and M-Net.
-        report: of the last call of the step.
+        params: parameters of L-Net and M-Net.
+        report: report of the last call of the step.
         unit: the length that the parameters count in, unit of the points.
         kept: source of the poses, the fit or the start.
         misfit: share of planes that do not meet the planes of other scans, 0 to 1, at the poses of the fit.
@@ -60,15 +60,12 @@ class CloudFitted(NamedTuple):
     start_misfit: float | None
 
 
-def cloud_data(
-    scans: CloudScans | Sequence[ArrayLike], start: ArrayLike | None = None, *, num_points: int = 2048
-) -> tuple[MappingData, float]:
+def cloud_data(scans: CloudScans | Sequence[ArrayLike], start: ArrayLike | None = None) -> tuple[MappingData, float]:
     """Scans and poses with the typical range of the scans as the unit of length, as the problem takes them.
 
     Args:
         scans: (m_i, 3) points in the lidar frames; or CloudScans.
         start: (n, 4, 4) T_world_scan to start from; None: cold start.
-        num_points: capacity of each scan where they are thinned.
 
     Returns:
         The data, and the typical range in the unit of the scans.
@@ -76,7 +73,7 @@ def cloud_data(
     Raises:
         ValueError: as `as_cloud_scans`, or `start` has a wrong shape or is not finite.
     """
-    scans = scans if isinstance(scans, CloudScans) else as_cloud_scans(scans, num_points)
+    scans = scans if isinstance(scans, CloudScans) else as_cloud_scans(scans)
     unit = typical_range(scans.points, scans.mask)
     T_start = None if start is None else start_poses(start, len(scans.points), unit)
     scaled = replace(scans, points=scans.points / unit, spacing=scans.spacing / unit)
@@ -85,40 +82,42 @@ def cloud_data(
     return MappingData(scaled, T_start), unit
 
 
-def cloud_problem(config: CloudMappingConfig, data: MappingData) -> Problem:
+def cloud_problem(config: DeepMappingConfig, data: MappingData) -> Problem:
     """DeepMapping of lidar clouds; poses are (n, 4, 4) T_world_scan.
 
     Args:
         config: settings of the fit.
-        data: of `cloud_data`.
+        data: data of `cloud_data`.
 
     Returns:
         The problem.
+
+    Raises:
+        ValueError: the motion is not "full".
     """
+    if config.motion != "full":
+        raise ValueError(f"motion: expected 'full' of clouds, got {config.motion!r}")
     return mapping_problem(config, data, MappingFunctions(init_spatial, _loss, spatial_poses, next_spatial_phase))
 
 
 def register_clouds(
     scans: CloudScans | Sequence[ArrayLike],
-    config: CloudMappingConfig | None = None,
+    config: DeepMappingConfig | None = None,
     *,
     key: jax.Array,
     start: ArrayLike | None = None,
-    num_starts: int = 1,
     engine: Callable[..., Fit] = fit,
 ) -> CloudFitted:
     """Registers 3-D lidar scans by optimising L-Net and M-Net on them alone (DeepMapping eq. 6, in SE(3)).
 
-    Where a start is given, the fit is kept only if its planes meet better than those of the start; no ground truth is
-    used.
+    The fit replaces a given start only if its planes meet better than those of the start; no ground truth is used.
 
     Args:
         scans: (m_i, 3) points in the lidar frames, any unit, in the order of time; or CloudScans.
         config: settings; None: `cloud_preset("fast")`.
-        key: of the whole run.
+        key: key of the whole run.
         start: (n, 4, 4) T_world_scan to start from; None: cold start.
-        num_starts: starts with other weights, side by side; the worse half by the loss is dropped again and again.
-        engine: what trains, called as `engine(problem, data, key=key, num_starts=num_starts)`;
+        engine: what trains, called as `engine(problem, data, key=key)`;
             `functools.partial(fit, on_report=..., stop=...)` reports each call of the step and can be stopped.
 
     Returns:
@@ -127,22 +126,13 @@ def register_clouds(
     Raises:
         ValueError: as `cloud_data`.
     """
-    config = config or CloudMappingConfig()
-    data, unit = cloud_data(scans, start, num_points=config.num_points)
-    return as_fitted(engine(cloud_problem(config, data), data, key=key, num_starts=num_starts), data, unit)
+    config = config or cloud_preset("fast")
+    data, unit = cloud_data(scans, start)
+    return _as_fitted(engine(cloud_problem(config, data), data, key=key), data, unit)
 
 
-def as_fitted(done: Fit, data: MappingData, unit: float) -> CloudFitted:
-    """The result of a fit in the unit of the points; of the fit and the start, what fits better by the scans.
-
-    Args:
-        done: a fit of `cloud_problem`.
-        data: of the fit.
-        unit: the typical range.
-
-    Returns:
-        CloudFitted.
-    """
+def _as_fitted(done: Fit, data: MappingData, unit: float) -> CloudFitted:
+    """Returns the fit or its start, the one that fits better by the scans, in the unit of the points."""
     misfit, start_misfit = float(trajectory_misfit(data.scans, done.poses, _MISFIT_KERNEL_WIDTH)), None
     T, kept = fitted_poses(done.poses, unit), "fit"
     if data.start is not None:
@@ -153,14 +143,14 @@ def as_fitted(done: Fit, data: MappingData, unit: float) -> CloudFitted:
     return CloudFitted(T, done.state.params, done.report, unit, kept, misfit, start_misfit)  # type: ignore[arg-type]
 
 
-def _draw_points(scans: Cloud, count: int, *, key: jax.Array) -> Cloud:
+def _draw_points(scans: PlaneCloud, count: int, *, key: jax.Array) -> PlaneCloud:
     """Other points of each scan in every step."""
     num_scans, capacity = scans.mask.shape
     if count >= capacity:
         return scans
     first = jax.random.randint(key, (num_scans, 1), 0, capacity)
     rows = (first + jnp.arange(count)) % capacity
-    return Cloud(*(jax.vmap(lambda leaf, row: leaf[row])(leaf, rows) for leaf in scans))
+    return PlaneCloud(*(jax.vmap(lambda leaf, row: leaf[row])(leaf, rows) for leaf in scans))
 
 
 def _draw_partners(scans: CloudScans, rows: Int[Array, " m"], count: int, *, key: jax.Array) -> Int[Array, "r m"]:
@@ -170,7 +160,7 @@ def _draw_partners(scans: CloudScans, rows: Int[Array, " m"], count: int, *, key
 
 
 def _loss(
-    config: CloudMappingConfig,
+    config: DeepMappingConfig,
     phase: PhaseConfig,
     params: Params,
     data: MappingData,
@@ -183,7 +173,9 @@ def _loss(
     count = scans.mask.shape[0]
     rows, block = draw_rows(phase, count, step, key=row_key)
     offsets = draw_offsets(phase, scans_in_block(phase, count) - 1, key=offset_key)
-    partners = _draw_partners(scans, rows, phase.num_revisits, key=partner_key)
+    comparison = phase.comparison
+    num_revisits = comparison.num_revisits if isinstance(comparison, PlaneComparison) else 0
+    partners = _draw_partners(scans, rows, num_revisits, key=partner_key)
     seen = jnp.concatenate([rows, jnp.maximum(partners, 0).reshape(-1)])
     T = poses_of_scans(config, phase, params, scans, seen)
     clouds = take_rows(clouds_of(scans), seen)
@@ -191,15 +183,14 @@ def _loss(
     own = jnp.arange(len(rows))
     points = rigid.transform_points(T[own], samples.points[own])
     world = WorldBatch(points, T[own, :3, 3], samples.mask[own], rows, block, progress)
-    if phase.plane_width is None:
-        limit = None if phase.chamfer_limit is None else interpolate_log(phase.chamfer_limit, progress)
-        pair_term = chamfer_term(world, offsets, limit)
+    if not isinstance(comparison, PlaneComparison):
+        pair_term = chamfer_term(world, offsets, comparison)
     else:
         later = jnp.minimum(own + offsets[:, None], len(rows) - 1)
         is_later = (rows[later] == rows + offsets[:, None]) & (block[later] == block)
         others = jnp.concatenate([later.reshape(-1), jnp.arange(len(rows), len(seen))])
         pairs = jnp.stack([jnp.resize(own, others.shape), others], axis=-1)
         is_pair = jnp.concatenate([is_later.reshape(-1), partners.reshape(-1) >= 0])
-        width = interpolate_log(phase.plane_width, progress)
+        width = interpolate_log(comparison.width, progress)
         pair_term = misfit_of_pairs(T, samples, clouds, pairs, is_pair, (width, scans.spacing))
     return mapping_loss(config, phase, params, world, pair_term, key=free_key)

@@ -1,17 +1,55 @@
-"""Settings of DeepMapping: the phases of a fit, the networks and presets of planar scans, what all presets share."""
+"""Settings of DeepMapping: the phases of a fit, the comparisons of scans, the networks."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import Literal, TypeVar
+from typing import Literal
 
-from dpmjax.nets.localization import LocalizationConfig
+from dpmjax.nets.localization import LocalizationNetConfig
 from dpmjax.nets.occupancy import OccupancyConfig
 
-ConfigT = TypeVar("ConfigT", bound="DeepMappingConfig")
-
 Motion = Literal["planar", "full"]
-"""Motion of a depth camera: x, z and the angle about y, as in the paper; or a twist in SE(3)."""
+"""Motion of a sensor: x, z and the angle about y, as in the paper; or a twist in SE(3)."""
+
+
+@dataclass(frozen=True)
+class ChamferComparison:
+    """Pairs of scans are compared by the Chamfer distance (DeepMapping eq. 7).
+
+    Attributes:
+        limit: larger distances count as this one, at the start and at the end of the phase, so that points that only
+            one scan has seen do not pull; None: no limit.
+    """
+
+    limit: tuple[float, float] | None = None
+
+
+@dataclass(frozen=True)
+class ProjectiveComparison:
+    """Pairs of depth images are compared by projection; the first images follow the last, so that any two can meet.
+
+    Attributes:
+        tolerance: share of the depth by which matching points may differ, at the start and at the end of the phase.
+    """
+
+    tolerance: tuple[float, float]
+
+
+@dataclass(frozen=True)
+class PlaneComparison:
+    """Pairs of lidar clouds are compared by the distances of points to planes.
+
+    Attributes:
+        width: width of the robust kernel, at the start and at the end of the phase.
+        num_revisits: number of scans near in space but not in time that each scan is compared to.
+    """
+
+    width: tuple[float, float]
+    num_revisits: int = 0
+
+
+Comparison = ChamferComparison | ProjectiveComparison | PlaneComparison
+CHAMFER = ChamferComparison()
 
 
 @dataclass(frozen=True)
@@ -19,35 +57,28 @@ class PhaseConfig:
     """One phase of the fit. Lengths are in typical ranges: the range that nine beams in ten stay below.
 
     Attributes:
-        name: shown in logs and pictures.
+        name: name in logs and pictures.
         poses: "network": L-Net gives the poses; "free": the poses themselves are optimised.
-        num_steps: steps of Adam.
-        occupancy_weight: gamma in gamma BCE + (1 - gamma) Chamfer; 0 leaves M-Net out.
-        learning_rate: of L-Net or of the poses.
-        final_learning_rate: share of it that is left at the end (cosine).
-        map_learning_rate: of M-Net.
-        adam_decay: Adam's decay rates of both moments, for poses or L-Net.
-        scans_per_step: scans in a step, in blocks of neighbours in time.
-        beams_per_step: beams, or pixels of a depth image, of each scan in a step.
+        num_steps: number of steps of Adam.
+        occupancy_weight: gamma in gamma BCE + (1 - gamma) comparison; 0 leaves M-Net out.
+        learning_rate: learning rate of L-Net or of the poses.
+        final_learning_rate: learning rate at the end as a share of the first one; it falls by a cosine.
+        adam_decay: Adam's decay rates of both moments, for the poses or L-Net.
+        scans_per_step: number of scans in a step, in blocks of neighbours in time.
+        beams_per_step: number of beams, or pixels of a depth image, of each scan in a step.
         num_offsets: number of later scans that each scan is compared to.
-        max_offset: the largest distance in time to a scan that it is compared to; the next one is always compared.
-        num_free: free samples a beam, drawn between sensor and hit.
-        is_free_factor_shared: one factor a sample for all beams and scans (the published program), else one each.
+        max_offset: the largest distance in time of two scans that are compared; neighbours are always compared.
+        num_free: number of free samples on each beam, drawn between sensor and hit.
+        is_sampled_as_published: sampling as in the published program: a free sample lies at the same share of every
+            beam, and batches follow each other in time. Otherwise each beam has samples of its own, and batches are
+            random.
         surface_distance: distance of one more free sample from the hit, at the start and at the end of the phase;
             None: no such sample.
-        anneal_until: share of the phase after which all levels of the map are on.
-        map_decay: weight of the mean square of a grid's nodes.
-        chamfer_limit: larger distances count as this one in the Chamfer term, at the start and at the end of the phase,
-            so that what only one scan has seen does not pull; None: no limit.
-        projection_tolerance: for depth images. Images are compared by projection instead of by the Chamfer distance:
-            share of the depth by which matching points may differ, at the start and at the end of the phase. The
-            images after the last are then the first ones, so that any two can meet. None: Chamfer distance.
-        plane_width: for clouds. Scans are compared by the distance of points to planes instead of by the Chamfer
-            distance: width of the robust kernel, at the start and at the end of the phase. None: Chamfer distance.
-        num_revisits: for clouds compared by planes: scans near in space but not in time that each scan is compared to.
-        scans_per_window: for planar scans. The set is cut into windows of so many neighbours in time, each with its
-            own L-Net (or free poses), and joined at the scans that windows share. A step holds all windows.
-            None: one L-Net for the whole set.
+        comparison: method that compares pairs of scans. Only depth images can be compared by projection, and only
+            clouds by planes.
+        scans_per_window: for planar scans. The set is cut into windows of this number of neighbours in time. Each
+            window has an L-Net (or free poses) of its own, and windows are joined at the scans that they share. A step
+            holds all windows. None: one L-Net for the whole set.
     """
 
     name: str
@@ -56,21 +87,15 @@ class PhaseConfig:
     occupancy_weight: float
     learning_rate: float
     final_learning_rate: float = 1.0
-    map_learning_rate: float = 1e-3
     adam_decay: tuple[float, float] = (0.9, 0.999)
     scans_per_step: int = 256
     beams_per_step: int = 64
     num_offsets: int = 3
     max_offset: int = 3
     num_free: int = 1
-    is_free_factor_shared: bool = False
+    is_sampled_as_published: bool = False
     surface_distance: tuple[float, float] | None = None
-    anneal_until: float = 0.0
-    map_decay: float = 0.0
-    chamfer_limit: tuple[float, float] | None = None
-    projection_tolerance: tuple[float, float] | None = None
-    plane_width: tuple[float, float] | None = None
-    num_revisits: int = 0
+    comparison: Comparison = CHAMFER
     scans_per_window: int | None = None
 
     def __post_init__(self) -> None:
@@ -106,55 +131,38 @@ REFINE = PhaseConfig(
     occupancy_weight=0.5,
     learning_rate=2.5e-3,
     final_learning_rate=0.02,
-    map_learning_rate=0.1,
     adam_decay=(0.9, 0.99),
     num_free=1,
     surface_distance=(0.1, 0.004),
-    anneal_until=0.7,
-    map_decay=1e-3,
 )
 """Free poses and a map that sharpens from coarse to fine."""
-
-JOINT = PhaseConfig(
-    name="L-Net and M-Net",
-    poses="network",
-    num_steps=6000,
-    occupancy_weight=0.1,
-    learning_rate=1e-3,
-    map_learning_rate=1e-3,
-    scans_per_step=128,
-    beams_per_step=1 << 30,
-    num_free=19,
-    is_free_factor_shared=True,
-)
-"""The paper: 3000 epochs of two batches for 256 scans, all beams, 19 free samples, gamma 0.1, windows of 4 scans."""
 
 
 @dataclass(frozen=True)
 class DeepMappingConfig:
-    """Settings of the fit of planar scans.
+    """Settings of a fit: by default of planar scans; `depth_preset` and `cloud_preset` make those in space.
 
     Attributes:
-        cold_phases: phases from zero poses.
-        warm_phases: phases from given poses.
+        cold_phases: phases of a fit from zero poses.
+        warm_phases: phases of a fit from given poses.
         localization: shape of L-Net.
         occupancy: shape of M-Net.
         steps_per_call: the largest number of steps that are compiled into one call.
-        map_margin: side of the map over the extent of the scans at the start of a phase.
-        halve_at: shares of the first phase at which the worse half of several starts is dropped.
+        map_margin: side of the map as a multiple of the extent of the scans at the start of a phase.
+        motion: degrees of freedom of a depth camera; "full" for clouds.
     """
 
     cold_phases: tuple[PhaseConfig, ...] = (LOCALIZE, REFINE)
     warm_phases: tuple[PhaseConfig, ...] = (REFINE,)
-    localization: LocalizationConfig = field(
-        default_factory=lambda: LocalizationConfig(
+    localization: LocalizationNetConfig = field(
+        default_factory=lambda: LocalizationNetConfig(
             features=(32, 64, 128), strides=(1, 2, 2), is_circular=True, hidden=(128, 64), output_scale=0.1
         )
     )
     occupancy: OccupancyConfig = field(default_factory=lambda: OccupancyConfig(kind="grid"))
     steps_per_call: int = 25
     map_margin: float = 1.15
-    halve_at: tuple[float, ...] = (0.25, 0.5, 0.75)
+    motion: Motion = "planar"
 
     def __post_init__(self) -> None:
         for phases in (self.cold_phases, self.warm_phases):
@@ -163,65 +171,8 @@ class DeepMappingConfig:
                 raise ValueError(f"scans_per_window: phases with L-Net share its weights, got windows of {lengths}")
 
 
-@dataclass(frozen=True)
-class SpatialMappingConfig(DeepMappingConfig):
-    """Settings of a fit in space, of depth images or clouds; attributes as in DeepMappingConfig.
-
-    Attributes:
-        motion: degrees of freedom of the sensor.
-    """
-
-    motion: Motion = "full"
-    occupancy: OccupancyConfig = field(
-        default_factory=lambda: OccupancyConfig(kind="grid", resolutions=(8, 16, 32, 64))
-    )
-
-
-def preset(name: Literal["fast", "paper"], *, is_organised: bool = True) -> DeepMappingConfig:
-    """The settings of a preset.
-
-    Args:
-        name: "fast" (a minute on two cores) or "paper" (its architecture, losses and sampling).
-        is_organised: the beams are in order; else L-Net is a PointNet.
-
-    Returns:
-        The settings.
-
-    Raises:
-        ValueError: the name is unknown.
-    """
-    check_preset(name)
-    config = DeepMappingConfig()
-    if name == "paper":
-        config = as_published(config, JOINT, LocalizationConfig())
-    if not is_organised:
-        config = replace(config, localization=replace(config.localization, kind="point"))
-    return config
-
-
-def as_published(config: ConfigT, phase: PhaseConfig, localization: LocalizationConfig) -> ConfigT:
-    """The settings with the paper's networks.
-
-    Args:
-        config: settings of a fit.
-        phase: its only phase.
-        localization: shape of L-Net.
-
-    Returns:
-        The settings.
-    """
-    config = replace(config, localization=localization, occupancy=OccupancyConfig(), steps_per_call=1)
-    return replace(config, cold_phases=(phase,), warm_phases=(phase,))
-
-
-def check_preset(name: str) -> None:
-    """Raises a ValueError where the name of a preset is unknown."""
-    if name not in ("fast", "paper"):
-        raise ValueError(f"preset: expected 'fast' or 'paper', got {name!r}")
-
-
-def as_direct(config: ConfigT) -> ConfigT:
-    """The paper's baseline: the same losses and steps, but the poses themselves are optimised, never L-Net.
+def as_direct(config: DeepMappingConfig) -> DeepMappingConfig:
+    """Returns settings of the paper's baseline: the same losses and steps, but free poses instead of L-Net.
 
     Args:
         config: settings of a fit.
@@ -233,8 +184,8 @@ def as_direct(config: ConfigT) -> ConfigT:
     return replace(config, cold_phases=tuple(cold), warm_phases=tuple(warm))
 
 
-def with_steps(config: ConfigT, num_steps: int) -> ConfigT:
-    """The same settings with another number of steps, divided among the phases as before.
+def with_steps(config: DeepMappingConfig, num_steps: int) -> DeepMappingConfig:
+    """Returns settings with another number of steps, divided among the phases as before.
 
     Args:
         config: settings of a fit.

@@ -30,6 +30,20 @@ _DAMPING, _LEAST_DAMPING, _BETTER, _WORSE = 1e-3, 1e-5, 4.0, 8.0
 _LONGEST_STEP = 4.0
 
 
+class SampledImages(NamedTuple):
+    """Depth images with some points of each.
+
+    Attributes:
+        scans: the images.
+        sample: points by which trajectories are compared and adjusted.
+        unit: typical range of the images, unit of the points.
+    """
+
+    scans: DepthScans
+    sample: PixelSample
+    unit: Float[Array, ""] | float
+
+
 class _Progress(NamedTuple):
     """Motions so far, their score, and the damping of the next step."""
 
@@ -58,9 +72,9 @@ def gap_equations(
     """Information and slope of half the sum of squared gaps, of which a large one weighs little.
 
     Args:
-        gap: in tolerances; a gap of 1 weighs 0.6, one of 2 weighs 0.14.
-        weight: of each gap besides, 0 where there is none.
-        slopes: of the gaps over each value.
+        gap: gap in tolerances; a gap of 1 weighs 0.6, one of 2 weighs 0.14.
+        weight: weight of each gap besides, 0 where there is none.
+        slopes: slopes of the gaps over each value.
 
     Returns:
         The normal equations, (*k, *k) and (*k).
@@ -82,10 +96,10 @@ def improve_motions(
 
     Args:
         equations: normal equations of values in `scales`, applied after given motions.
-        score: of motions; more is better.
+        score: score of motions; more is better.
         scales: unit of each value of a motion.
         count: number of motions.
-        num_iterations: of steps.
+        num_iterations: number of steps.
 
     Returns:
         The motions.
@@ -110,9 +124,7 @@ def improve_motions(
 @partial(jax.jit, static_argnames=("num_iterations", "motion"))
 def adjust_poses(
     T_world_camera: Float[Array, "n 4 4"],
-    scans: DepthScans,
-    sample: PixelSample,
-    unit: Float[Array, ""] | float,
+    images: SampledImages,
     tolerance: Float[Array, ""] | float,
     *,
     num_iterations: int,
@@ -122,9 +134,7 @@ def adjust_poses(
 
     Args:
         T_world_camera: poses to start from, off by few tolerances.
-        scans: depth images, unit of the poses.
-        sample: some points of each image.
-        unit: typical range of the images, unit of the points.
+        images: depth images, unit of the poses.
         tolerance: share of the depth; the unit of the gaps in `gap_equations`.
         num_iterations: each one is kept only if the projective consistency grows.
         motion: degrees of freedom of the camera.
@@ -132,6 +142,7 @@ def adjust_poses(
     Returns:
         Motions to apply after the poses, T_world_camera @ them; that of the first image is none.
     """
+    scans, sample, unit = images
     tolerance, count = jnp.asarray(tolerance), T_world_camera.shape[0]
     scales, offsets = motion_scales(motion, unit, tolerance), jnp.arange(1, count // 2 + 1)
     # The first image stays.

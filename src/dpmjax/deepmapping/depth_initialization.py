@@ -1,14 +1,11 @@
 """First poses of depth images without a guess: trajectories that grow side by side, image after image.
 
 Each proposes several motions of the next image. The trajectories that explain the largest share of the points go on,
-as far as they differ: what one image leaves open, later ones decide. Every few images the poses of each are adjusted;
+as far as they differ: what one image leaves open, later ones decide. After each image the poses of each are adjusted;
 in the end at a finer tolerance, by which the best trajectory is chosen.
 """
 
 from __future__ import annotations
-
-from dataclasses import replace
-from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -18,75 +15,80 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from dpmjax.deepmapping.config import Motion
-from dpmjax.deepmapping.depth_adjustment import adjust_poses
-from dpmjax.deepmapping.depth_config import FULL_SEARCH, PLANAR_SEARCH, DepthInitializationConfig
-from dpmjax.deepmapping.depth_motion_search import Views, motion_cost, propose_motions, surface_directions
+from dpmjax.deepmapping.depth_adjustment import SampledImages, adjust_poses
+from dpmjax.deepmapping.depth_motion_search import (
+    DepthInitializationConfig,
+    SearchCamera,
+    Views,
+    depth_search,
+    motion_cost,
+    propose_motions,
+    surface_directions,
+)
 from dpmjax.deepmapping.projective_consistency import (
     DepthScans,
     PixelSample,
     explained_share,
 )
-from dpmjax.geometry.rays import typical_range
+from dpmjax.geometry.sampling import typical_range
 
 # Trajectories differ by such a share of the largest translation, root mean square, or of the largest turn.
 _APART = (0.085, 0.075)
 # Cost of motions, in explained points: images that look at new things explain less than those that stay.
 _MOTION_COST = 3.0
-# So many trajectories are adjusted in the end, at so many tolerances.
+# Searches for an image where few trajectories are left, each with other points; where more are left, one for each, and
+# this number more for the best ones.
+_NUM_TRIES = 4
+# A trajectory that explains less of the points than the best one by more than this share is dropped.
+_MARGIN = 0.25
+# Points of each image in a search, and those by which trajectories are compared and adjusted.
+_NUM_POINTS, _NUM_COMPARED = 100, 300
+# While trajectories grow, they are compared and adjusted by this number of last images.
+_NUM_WINDOW = 24
+# Steps of an adjustment.
+_NUM_ITERATIONS = 6
+# Number of trajectories that are adjusted in the end, and of tolerances.
 _NUM_LAST, _NUM_TOLERANCES = 4, 3
 
 
-class _Images(NamedTuple):
-    """Depth images, some points of each by which trajectories are compared and adjusted, and their typical range."""
-
-    scans: DepthScans
-    sample: PixelSample
-    unit: float
-
-
 def initialize_depth(
-    scans: DepthScans, config: DepthInitializationConfig | None = None, *, motion: Motion = "planar", key: jax.Array
+    scans: DepthScans, config: DepthInitializationConfig | None = None, *, key: jax.Array
 ) -> NDArray[np.float64]:
-    """First poses of all images, the first at the origin.
+    """Searches first poses of all images, the first at the origin.
 
     Args:
-        scans: in order of time; neighbours overlap.
-        config: of the search; None: `PLANAR_SEARCH` or `FULL_SEARCH`, by the motion.
-        motion: "planar" or "full".
-        key: of the search.
+        scans: scans in order of time; neighbours overlap.
+        config: settings of the search; None: `depth_search("planar")`.
+        key: key of the search.
 
     Returns:
         (n, 4, 4) T_world_camera, unit of the points.
     """
-    config = config or (PLANAR_SEARCH if motion == "planar" else FULL_SEARCH)
+    config = config or depth_search("planar")
     sample_key, search_key = jax.random.split(key)
-    surfaces, directions = scans.surfaces, jnp.asarray(surface_directions(scans, motion))
+    surfaces, directions = scans.surfaces, jnp.asarray(surface_directions(scans, config.motion))
     unit = typical_range(scans.points, scans.mask)
-    images = _Images(scans, _sample(scans, config.num_compared, key=sample_key), unit)
+    images = SampledImages(scans, _sample(scans, _NUM_COMPARED, key=sample_key), unit)
+    camera = SearchCamera(scans.pinhole, unit)
     views = [
-        Views(_sample(scans, config.num_points, key=jax.random.fold_in(sample_key, k)), surfaces, directions)
-        for k in range(config.num_trajectories + config.num_tries)
+        Views(_sample(scans, _NUM_POINTS, key=jax.random.fold_in(sample_key, k)), surfaces, directions)
+        for k in range(config.num_trajectories + _NUM_TRIES)
     ]
     T = np.eye(4)[None, None]
     for scan in range(1, scans.mask.shape[0]):
         # One search for each trajectory, and more for the best ones, each with other points.
-        num_searches = config.num_tries if len(T) < config.num_tries else len(T) + config.num_tries
+        num_searches = _NUM_TRIES if len(T) < _NUM_TRIES else len(T) + _NUM_TRIES
         continued = []
         for k, search_key_k in enumerate(jax.random.split(jax.random.fold_in(search_key, scan), num_searches)):
             before = T[k % len(T)]
-            T_last_next = propose_motions(before, views[k], scans.pinhole, config, motion, unit=unit, key=search_key_k)
+            T_last_next = propose_motions(before, views[k], camera, config, key=search_key_k)
             poses = np.broadcast_to(before, (len(T_last_next), *before.shape))
             continued.append(np.concatenate([poses, (before[-1] @ T_last_next)[:, None]], axis=1))
         T = _best_that_differ(np.stack(continued), images, config)
-        if scan % config.adjusted_every == 0:
-            T = _adjusted(T, images, config.tolerance[1], config, motion)
-    T, whole, images = (
-        T[:_NUM_LAST],
-        replace(config, num_window=scans.mask.shape[0]),
-        _Images(scans, scans.pixels, unit),
-    )
+        T = _adjusted(T, images, config.tolerance[1], config.motion)
+    T, images = T[:_NUM_LAST], SampledImages(scans, scans.pixels, unit)
     for tolerance in np.geomspace(config.tolerance[1], config.final_tolerance, _NUM_TOLERANCES):
-        T = _adjusted(T, images, float(tolerance), whole, motion)
+        T = _adjusted(T, images, float(tolerance), config.motion, num_window=scans.mask.shape[0])
     scores = _explained(jnp.asarray(T, jnp.float32), images, jnp.asarray(config.final_tolerance))
     return T[np.argmax(np.asarray(scores) - _mean_cost(T, config))]
 
@@ -100,15 +102,15 @@ def _sample(scans: DepthScans, count: int, *, key: jax.Array) -> PixelSample:
     return PixelSample(jnp.asarray(np.stack(some)), jnp.ones((num_scans, count), bool))
 
 
-def _window(num_placed: int, images: _Images, config: DepthInitializationConfig) -> tuple[NDArray[np.intp], _Images]:
+def _window(num_placed: int, images: SampledImages, num_window: int) -> tuple[NDArray[np.intp], SampledImages]:
     """Rows of the last images with a pose, and these images; while there are few, later ones that show nothing."""
-    length = min(config.num_window, images.scans.mask.shape[0])
+    length = min(num_window, images.scans.mask.shape[0])
     rows = max(num_placed - length, 0) + np.arange(length)
     is_placed = jnp.asarray(rows < num_placed)
     scans, sample, unit = images
     seen = DepthScans(scans.points[rows], scans.mask[rows] & is_placed[:, None, None], scans.pinhole)
     some = PixelSample(sample.points[rows], sample.mask[rows] & is_placed[:, None])
-    return np.minimum(rows, num_placed - 1), _Images(seen, some, unit)
+    return np.minimum(rows, num_placed - 1), SampledImages(seen, some, unit)
 
 
 def _mean_cost(T: NDArray[np.float64], config: DepthInitializationConfig) -> NDArray[np.float64]:
@@ -124,22 +126,22 @@ def _turns(T: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 @jax.jit
-def _explained(T: Float[Array, "m n 4 4"], images: _Images, tolerance: Float[Array, ""]) -> Float[Array, " m"]:
+def _explained(T: Float[Array, "m n 4 4"], images: SampledImages, tolerance: Float[Array, ""]) -> Float[Array, " m"]:
     """Explained share of each trajectory."""
     return jax.lax.map(lambda one: explained_share(one, images.sample, images.scans, images.unit, tolerance), T)
 
 
 def _best_that_differ(
-    T: NDArray[np.float64], images: _Images, config: DepthInitializationConfig
+    T: NDArray[np.float64], images: SampledImages, config: DepthInitializationConfig
 ) -> NDArray[np.float64]:
     """The best of (t, k, m, 4, 4) trajectories that differ from all better ones, best first."""
-    rows, window = _window(T.shape[2], images, config)
+    rows, window = _window(T.shape[2], images, _NUM_WINDOW)
     tolerance = jnp.asarray(config.tolerance[1])
     scores = np.concatenate([_explained(jnp.asarray(t[:, rows], jnp.float32), window, tolerance) for t in T])
     T = T.reshape(-1, *T.shape[2:])
     scores = scores - _mean_cost(T, config)
     far, turn = _APART[0] * config.max_translation, _APART[1] * np.deg2rad(config.max_turn_deg)
-    is_left, kept = scores >= scores.max() - config.margin, list[NDArray[np.float64]]()
+    is_left, kept = scores >= scores.max() - _MARGIN, list[NDArray[np.float64]]()
     while is_left.any() and len(kept) < config.num_trajectories:
         best = T[np.argmax(np.where(is_left, scores, -np.inf))]
         kept.append(best)
@@ -150,14 +152,14 @@ def _best_that_differ(
 
 
 def _adjusted(
-    T: NDArray[np.float64], images: _Images, tolerance: float, config: DepthInitializationConfig, motion: Motion
+    T: NDArray[np.float64], images: SampledImages, tolerance: float, motion: Motion, *, num_window: int = _NUM_WINDOW
 ) -> NDArray[np.float64]:
     """Trajectories whose last poses are adjusted, where that makes them more consistent; the first of all stays."""
-    rows, window = _window(T.shape[1], images, config)
+    rows, window = _window(T.shape[1], images, num_window)
     num_placed = rows[-1] - rows[0] + 1
     T = T.copy()
     for one in T:
         before = jnp.asarray(one[rows], jnp.float32)
-        motions = adjust_poses(before, *window, tolerance, num_iterations=config.num_iterations, motion=motion)
+        motions = adjust_poses(before, window, tolerance, num_iterations=_NUM_ITERATIONS, motion=motion)
         one[rows[:num_placed]] @= np.asarray(motions, np.float64)[:num_placed]
     return T

@@ -1,12 +1,13 @@
 """The motions by which a depth image may follow earlier ones: a search of the largest projective consistency.
 
-Motions are drawn and varied from coarse to fine against the last images. Images of walls hardly tell how far a camera
-has moved along them: the best motions that differ are slid along the surfaces of the image. The best of those are
+Motions are drawn and varied from coarse to fine against the last images. An image of a wall hardly depends on the
+motion along the wall: the best motions that differ are slid along the surfaces of the image. The best of those are
 adjusted against more images, and many that differ are proposed: what this image leaves open, later ones decide.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -18,7 +19,6 @@ from numpy.typing import NDArray
 
 from dpmjax.deepmapping.config import Motion
 from dpmjax.deepmapping.depth_adjustment import gap_equations, improve_motions, motion_scales
-from dpmjax.deepmapping.depth_config import DepthInitializationConfig
 from dpmjax.deepmapping.projective_consistency import (
     Agreement,
     DepthScans,
@@ -31,14 +31,95 @@ from dpmjax.deepmapping.spatial import motion_matrices
 from dpmjax.geometry import rigid
 from dpmjax.geometry.normals import image_normals
 
+# Rounds of motions, each varied half as widely as the one before.
+_NUM_ROUNDS = 4
+# Best motions of the last round that differ and are slid; places of each along each direction of the surfaces; best
+# motions after the slides that differ and are adjusted.
+_NUM_SLID, _NUM_SLIDES, _NUM_ADJUSTED = 8, 51, 32
+# Earlier images that an image is compared to before the slides, and from the slides on.
+_NUM_REFERENCES, _NUM_CHECKED = 4, 8
 # Motions differ by such shares of the largest translation and turn: those that are slid, and those that are kept then.
 _DIFFERENT, _SLID_APART = (0.35, 0.1), (0.12, 0.06)
-# Motions are slid so many largest translations far, and may then be so long.
+# Motions are slid by this number of largest translations, and may then be as long as the second number of them.
 _SLIDE, _LONGEST = 1.4, 1.5
 # Width of the first variations in shares of the limits; halved from round to round.
 _FIRST_SPREAD = 0.25
-# Adjusted at so many tolerances, with so many steps at each.
+# Number of tolerances of an adjustment, and of steps at each.
 _NUM_TOLERANCES, _NUM_ITERATIONS = 4, 2
+
+
+@dataclass(frozen=True)
+class DepthInitializationConfig:
+    """Settings of the search. Lengths are in the unit of the points, metres by default.
+
+    Attributes:
+        motion: degrees of freedom of the camera.
+        max_translation: the largest translation between neighbouring images along each axis.
+        max_turn_deg: the largest turn between neighbouring images about the vertical axis of the camera, degrees.
+        max_tilt_deg: the largest tilt (turn about a horizontal axis), degrees; full motion only.
+        num_trajectories: the largest number of trajectories that go on from image to image.
+        num_candidates: number of motions of the first round, spread evenly.
+        num_kept: number of the best motions that go on to the next round, before the slides.
+        num_varied: number of new motions around each kept one in a round.
+        num_distinct: number of the best adjusted motions that differ, by which a trajectory is continued. Where an
+            image leaves open how far the camera moved along a wall, they lie side by side along it.
+        tolerance: share of the depth by which matching points may differ, in the first and in the last round; the last
+            one also while trajectories grow.
+        final_tolerance: the same, in the last adjustment and where the best trajectory is chosen.
+        translation_weight: cost of the largest translation, in matching points. Along a bare wall only this cost
+            chooses how far the camera has moved: the shortest translation.
+        turn_weight: cost of the largest turn, in matching points.
+    """
+
+    motion: Motion = "planar"
+    max_translation: float = 0.7
+    max_turn_deg: float = 75.0
+    max_tilt_deg: float = 30.0
+    num_trajectories: int = 16
+    num_candidates: int = 1024
+    num_kept: int = 32
+    num_varied: int = 20
+    num_distinct: int = 16
+    tolerance: tuple[float, float] = (0.12, 0.02)
+    final_tolerance: float = 0.006
+    translation_weight: float = 0.05
+    turn_weight: float = 0.0
+
+    def __post_init__(self) -> None:
+        counts = (self.num_trajectories, self.num_candidates, self.num_kept, self.num_varied, self.num_distinct)
+        if min(counts) < 1:
+            raise ValueError(f"all counts must be at least 1, got {self}")
+
+
+def depth_search(motion: Motion) -> DepthInitializationConfig:
+    """Returns the settings of the search for first poses.
+
+    Args:
+        motion: "planar": a level camera on wheels. "full": a hand-held camera, with six numbers to search instead of
+            three, small moves between images, and the noise of a real sensor.
+
+    Returns:
+        The settings.
+    """
+    if motion == "planar":
+        return DepthInitializationConfig()
+    return DepthInitializationConfig(
+        motion="full",
+        num_trajectories=8,
+        num_candidates=16384,
+        num_varied=48,
+        tolerance=(0.12, 0.03),
+        final_tolerance=0.015,
+        translation_weight=0.2,
+        turn_weight=0.3,
+    )
+
+
+class SearchCamera(NamedTuple):
+    """The camera of all images, and their typical range in the unit of the points."""
+
+    pinhole: Pinhole
+    unit: Float[Array, ""] | float
 
 
 class Views(NamedTuple):
@@ -90,29 +171,25 @@ def surface_directions(scans: DepthScans, motion: Motion) -> NDArray[np.float32]
 def propose_motions(
     T_world_camera: NDArray[np.float64],
     views: Views,
-    pinhole: Pinhole,
+    camera: SearchCamera,
     config: DepthInitializationConfig,
-    motion: Motion,
     *,
-    unit: float,
     key: jax.Array,
 ) -> NDArray[np.float64]:
-    """The best motions of the next image that differ.
+    """Returns the best motions of the next image that differ.
 
     Args:
         T_world_camera: (m, 4, 4) poses of the images before it.
         views: all images, n > m.
-        pinhole: of the camera.
-        config: of the search.
-        motion: "planar" or "full".
-        unit: typical range of the images, unit of the points.
-        key: of the search.
+        camera: camera of the images.
+        config: settings of the search.
+        key: key of the search.
 
     Returns:
         (k, 4, 4) T_last_next, the best one first.
     """
     scan, num_scans = len(T_world_camera), views.surfaces.shape[0]
-    num_checked = min(max(config.num_references, config.num_checked), num_scans - 1)
+    num_checked = min(max(_NUM_REFERENCES, _NUM_CHECKED), num_scans - 1)
     # A window of fixed length: where there are fewer images before, the first is repeated without weight.
     before = scan - 1 - np.arange(num_checked)
     rows = np.maximum(before, 0)
@@ -121,17 +198,17 @@ def propose_motions(
         jnp.asarray(before >= 0, jnp.float32),
         _take(views, rows),
     )
-    found = _search(references, _take(views, scan), pinhole, unit, key, config=config, motion=motion)
+    found = _search(references, _take(views, scan), camera, key, config=config)
     return np.asarray(found, np.float64)
 
 
 def motion_cost(length: Any, turn: Any, config: DepthInitializationConfig) -> Any:
-    """What motions cost, in consistency: the shortest one is taken where images leave it open.
+    """Returns the costs of motions, in consistency: the shortest motion is taken where images leave it open.
 
     Args:
-        length: of motions between neighbouring images, unit of the points.
+        length: length of motions between neighbouring images, unit of the points.
         turn: their angles, radians.
-        config: of the search.
+        config: settings of the search.
 
     Returns:
         The cost of each.
@@ -194,7 +271,7 @@ def _slid(
     T: Float[Array, "k 4 4"], directions: Float[Array, "a 3"], config: DepthInitializationConfig
 ) -> Float[Array, "m 4 4"]:
     """The motions, each moved to and fro along each axis of the image."""
-    lengths = _SLIDE * config.max_translation * jnp.linspace(-1.0, 1.0, config.num_slides)
+    lengths = _SLIDE * config.max_translation * jnp.linspace(-1.0, 1.0, _NUM_SLIDES)
     moves = (lengths[:, None, None] * directions).reshape(-1, 3)
     T_scan_slid = jnp.tile(jnp.eye(4), (len(moves), 1, 1)).at[:, :3, 3].set(moves)
     slid = rigid.compose(T[:, None], T_scan_slid).reshape(-1, 4, 4)
@@ -205,14 +282,13 @@ def _adjusted(
     T_last_scan: Float[Array, "4 4"],
     references: References,
     view: Views,
-    pinhole: Pinhole,
-    unit: Float[Array, ""],
+    camera: SearchCamera,
     tolerance: Float[Array, ""],
     config: DepthInitializationConfig,
-    motion: Motion,
 ) -> Float[Array, "4 4"]:
     """A motion so that points of the image lie on the surfaces of its references, and theirs on its own."""
-    scales = motion_scales(motion, unit, tolerance)
+    pinhole = camera.pinhole
+    scales = motion_scales(config.motion, camera.unit, tolerance)
 
     def gaps(values: Float[Array, " k"], T: Float[Array, "4 4"]) -> tuple[Float[Array, " p"], Float[Array, " p"]]:
         T_last_moved = rigid.compose(T, motion_matrices((scales * values)[None])[0])
@@ -239,46 +315,44 @@ def _adjusted(
     return rigid.compose(T_last_scan, motions[0])
 
 
-@partial(jax.jit, static_argnames=("config", "motion"))
+@partial(jax.jit, static_argnames="config")
 def _search(
     references: References,
     view: Views,
-    pinhole: Pinhole,
-    unit: Float[Array, ""],
+    camera: SearchCamera,
     key: jax.Array,
     *,
     config: DepthInitializationConfig,
-    motion: Motion,
 ) -> Float[Array, "k 4 4"]:
     """The best T_last_scan of the image that differ."""
     turn, tilt, far = np.deg2rad(config.max_turn_deg), np.deg2rad(config.max_tilt_deg), config.max_translation
-    widths = jnp.array([far, far, turn] if motion == "planar" else [far, far, far, tilt, turn, tilt])
+    widths = jnp.array([far, far, turn] if config.motion == "planar" else [far, far, far, tilt, turn, tilt])
     first_key, round_key = jax.random.split(key)
     values = widths * jax.random.uniform(first_key, (config.num_candidates, len(widths)), minval=-1.0, maxval=1.0)
     T = motion_matrices(values.at[0].set(0.0))
-    tolerances = jnp.geomspace(*config.tolerance, config.num_rounds + _NUM_TOLERANCES)
-    nearest = _take(references, slice(config.num_references))
+    tolerances = jnp.geomspace(*config.tolerance, _NUM_ROUNDS + _NUM_TOLERANCES)
+    nearest = _take(references, slice(_NUM_REFERENCES))
 
     def scores_of(T: Float[Array, "m 4 4"], compared: References, tolerance: Float[Array, ""]) -> Float[Array, " m"]:
         return jax.lax.map(
-            lambda one: _score_motion(one, compared, view, pinhole, tolerance, config), T, batch_size=128
+            lambda one: _score_motion(one, compared, view, camera.pinhole, tolerance, config), T, batch_size=128
         )
 
-    for step in range(config.num_rounds - 1):
+    for step in range(_NUM_ROUNDS - 1):
         best = T[jax.lax.top_k(scores_of(T, nearest, tolerances[step]), config.num_kept)[1]]
         noise = jax.random.normal(jax.random.fold_in(round_key, step), (config.num_varied, len(best), len(widths)))
         # The kept motions themselves are candidates of the next round.
         spread = _FIRST_SPREAD * 0.5**step * widths
         moves = motion_matrices((spread * noise.at[0].set(0.0)).reshape(-1, len(widths)))
         T = rigid.compose(best, moves.reshape(config.num_varied, len(best), 4, 4)).reshape(-1, 4, 4)
-    scores = scores_of(T, nearest, tolerances[config.num_rounds - 1])
-    T = _slid(_distinct(T, scores, config.num_slid, _DIFFERENT, config), view.directions, config)
-    adjusted_at = tolerances[config.num_rounds :]
-    T = _distinct(T, scores_of(T, references, adjusted_at[0]), config.num_adjusted, _SLID_APART, config)
+    scores = scores_of(T, nearest, tolerances[_NUM_ROUNDS - 1])
+    T = _slid(_distinct(T, scores, _NUM_SLID, _DIFFERENT, config), view.directions, config)
+    adjusted_at = tolerances[_NUM_ROUNDS:]
+    T = _distinct(T, scores_of(T, references, adjusted_at[0]), _NUM_ADJUSTED, _SLID_APART, config)
     for tolerance in adjusted_at:
 
         def adjust(one: Float[Array, "4 4"], tolerance: Float[Array, ""] = tolerance) -> Float[Array, "4 4"]:
-            return _adjusted(one, references, view, pinhole, unit, tolerance, config, motion)
+            return _adjusted(one, references, view, camera, tolerance, config)
 
         T = jax.lax.map(adjust, T, batch_size=16)
     return _distinct(T, scores_of(T, references, adjusted_at[-1]), config.num_distinct, _SLID_APART, config)

@@ -29,9 +29,9 @@ class FitState:
     """Everything that a fit needs to go on; of several starts every leaf has a leading axis.
 
     Attributes:
-        params: what the problem trains.
+        params: trained parameters of the problem.
         optimizer: state of the optimiser.
-        key: of the start; step k uses `fold_in(key, k)`, so that a resumed run equals an unbroken one.
+        key: key of the start; step k uses `fold_in(key, k)`, so that a resumed run equals an unbroken one.
         phase: index of the phase.
         phase_step: steps done in it.
         step: steps done in all.
@@ -49,9 +49,9 @@ class Report(NamedTuple):
     """Result of one call of the step; of several starts every leaf has a leading axis.
 
     Attributes:
-        losses: of each step of the call.
+        losses: losses of each step of the call.
         terms: parts of the loss before weighting, of each step.
-        poses: of the whole data set after the call.
+        poses: poses of the whole data set after the call.
     """
 
     losses: Float[Array, "... t"]
@@ -70,7 +70,7 @@ class Progress(NamedTuple):
     Attributes:
         phase: settings of the phase.
         state: after the call.
-        report: of the call.
+        report: report of the call.
         share: steps done of all steps, 0 to 1.
         run_s: seconds of stepping so far, of this `fit`.
         compile_s: seconds of compiling so far.
@@ -88,9 +88,9 @@ class Fit(NamedTuple):
     """Result of `fit`.
 
     Attributes:
-        state: at the end, or where it was stopped.
-        poses: of the whole data set, as the state has them.
-        report: of the last call; None if no step was done.
+        state: state at the end, or where it was stopped.
+        poses: poses of the whole data set, as the state has them.
+        report: report of the last call; None if no step was done.
         run_s: seconds of stepping.
         compile_s: seconds of compiling.
     """
@@ -106,9 +106,9 @@ def init(problem: Problem, data: Any, *, key: jax.Array, num_starts: int = 1) ->
     """Makes a fresh state at the start of the first phase.
 
     Args:
-        problem: what to fit.
-        data: of the problem.
-        key: of the run.
+        problem: problem to fit.
+        data: data of the problem.
+        key: key of the run.
         num_starts: number of starts that differ in their keys; with 1, there is no leading axis.
 
     Returns:
@@ -126,9 +126,9 @@ def step(problem: Problem, state: FitState, data: Any, *, phase: int | None = No
     """Does one call of steps.
 
     Args:
-        problem: what to fit; static under `jit`.
-        state: from `init` or from an earlier call.
-        data: of the problem.
+        problem: problem to fit; static under `jit`.
+        state: state from `init` or from an earlier call.
+        data: data of the problem.
         phase: index of the phase of the state, static under `jit`; `begin_phase` enters the next one. None: the
             index is read from the state on the host, and a phase that is over is left first.
 
@@ -151,9 +151,9 @@ def begin_phase(problem: Problem, state: FitState, data: Any, *, phase: int) -> 
     """Makes the state at the start of a phase from the state at the end of the phase before.
 
     Args:
-        problem: what to fit; static under `jit`.
-        state: at the end of phase `phase - 1`.
-        data: of the problem.
+        problem: problem to fit; static under `jit`.
+        state: state at the end of phase `phase - 1`.
+        data: data of the problem.
         phase: index of the phase that begins, from 1; static under `jit`.
 
     Returns:
@@ -177,9 +177,9 @@ def solve(problem: Problem, data: Any, *, key: jax.Array) -> tuple[FitState, Rep
     Several data sets of equal shapes: `jax.vmap(lambda data, key: solve(problem, data, key=key))(data, keys)`.
 
     Args:
-        problem: what to fit; static under `jit`.
-        data: of the problem.
-        key: of the run.
+        problem: problem to fit; static under `jit`.
+        data: data of the problem.
+        key: key of the run.
 
     Returns:
         The state at the end, and the report of the last call of the step.
@@ -201,8 +201,8 @@ def is_finished(problem: Problem, state: FitState) -> bool:
     """Tells whether all steps of the last phase are done.
 
     Args:
-        problem: what is fitted.
-        state: of the fit.
+        problem: fitted problem.
+        state: state of the fit.
 
     Returns:
         True if no step is left.
@@ -223,9 +223,9 @@ def fit(
     """Steps a fresh state through all phases.
 
     Args:
-        problem: what to fit.
-        data: of the problem, with the poses to start from where it has some.
-        key: of the run.
+        problem: problem to fit.
+        data: data of the problem, with the poses to start from where it has some.
+        key: key of the run.
         num_starts: number of starts that advance side by side.
         on_report: called after each call of the step.
         stop: called before each call of the step; the fit ends where it returns True.
@@ -245,15 +245,12 @@ def resume(
     on_report: Callable[[Progress], None] | None = None,
     stop: Callable[[], bool] | None = None,
 ) -> Fit:
-    """Steps a state through all phases that are left; a second fit of the same shapes compiles nothing.
-
-    Of several starts, the worse half by the loss is dropped at `problem.halve_at`, and the best one is kept at the end
-    of the fit. A problem without `halve_at` keeps all of them to the end.
+    """Steps a state through the remaining phases; a second fit of the same shapes compiles nothing.
 
     Args:
-        problem: what to fit.
-        state: from `init` or from an earlier fit.
-        data: of the problem.
+        problem: problem to fit.
+        state: state from `init` or from an earlier fit.
+        data: data of the problem.
         on_report: called after each call of the step.
         stop: called before each call of the step; the fit ends where it returns True.
 
@@ -269,14 +266,11 @@ def resume(
         # JAX keeps the program of each phase and number of starts.
         program = _advance.lower(problem, _scalar(state.phase), state, data).compile()
         compiled = time.perf_counter()
-        before = _scalar(state.step)
         state, report = jax.block_until_ready(program(state, data))
         compile_s, run_s = compile_s + compiled - begun, run_s + time.perf_counter() - compiled
         if on_report is not None:
             share = min(1.0, _scalar(state.step) / total)
             on_report(Progress(problem.phases[_scalar(state.phase)], state, report, share, run_s, compile_s))
-        if num_kept := _num_kept(problem, state, before):
-            state, report = _keep_best(state, report, num_kept)
     return Fit(state, _current_poses(problem, _scalar(state.phase), state, data), report, run_s, compile_s)
 
 
@@ -289,8 +283,8 @@ def num_calls(problem: Problem, phase: Any) -> int:
     """Counts the calls of the step that a phase takes.
 
     Args:
-        problem: what is fitted.
-        phase: of the fit.
+        problem: fitted problem.
+        phase: phase of the fit.
 
     Returns:
         The number of calls.
@@ -302,8 +296,8 @@ def steps_per_call(problem: Problem, phase: Any) -> int:
     """Counts the steps of one call: the calls share those of the phase evenly; the last one hardly goes beyond.
 
     Args:
-        problem: what is fitted.
-        phase: of the fit.
+        problem: fitted problem.
+        phase: phase of the fit.
 
     Returns:
         The number of steps.
@@ -362,22 +356,3 @@ def _advance(problem: Problem, phase_index: int, state: FitState, data: Any) -> 
         return state, Report(losses, terms, problem.poses(problem.config, phase, state.params, data))
 
     return _over_starts(call, state, data)
-
-
-def _num_kept(problem: Problem, state: FitState, steps_before: int) -> int:
-    """Returns the number of starts to go on with where some are to be dropped; else 0."""
-    num_starts = state.step.size
-    if num_starts == 1 or not problem.halve_at:
-        return 0
-    if is_finished(problem, state):
-        return 1
-    steps, first = _scalar(state.step), problem.phases[0].num_steps
-    is_due = any(steps_before < share * first <= steps for share in problem.halve_at)
-    return -(-num_starts // 2) if is_due else 0
-
-
-def _keep_best(state: FitState, report: Report, num_kept: int) -> tuple[FitState, Report]:
-    """Returns the starts of the smallest mean loss of the last call; a single one loses its leading axis."""
-    losses = np.nan_to_num(np.asarray(report.losses).mean(axis=-1), nan=np.inf)
-    best = np.sort(np.argsort(losses, kind="stable")[:num_kept])
-    return jax.tree.map(lambda leaf: leaf[best[0]] if num_kept == 1 else leaf[best], (state, report))

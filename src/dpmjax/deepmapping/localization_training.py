@@ -20,45 +20,41 @@ from dpmjax.deepmapping.planar import Fitted, as_scan_set, choose_beams, localiz
 from dpmjax.geometry import se2
 from dpmjax.types import ScanSet
 
+# Learning rate of Adam at the start; it falls to a hundredth by a cosine.
+_LEARNING_RATE = 2e-3
+# Scans are turned to random headings up to this: `relocalize` tries all turns, and L-Net needs only one of them.
+_MAX_TURN_DEG = 20.0
+# Scans are re-projected to points around their own (`shift_scan`), up to this distance in typical ranges, so that L-Net
+# learns the surroundings of the trajectory.
+_MAX_SHIFT = 0.2
+# Largest share of the beams that is hidden from L-Net; the share differs from scan to scan.
+_LARGEST_DROP = 0.2
+
 
 @dataclass(frozen=True)
 class LocalizationTrainingConfig:
     """Settings of the training of L-Net on the poses of a fit.
 
     Attributes:
-        num_steps: steps of Adam.
-        learning_rate: at the start; it falls to a hundredth (cosine).
-        scans_per_step: drawn with replacement.
-        num_rendered: scans that are rendered from the map at random free places; they make up half of each step, so
-            that L-Net knows the places that the trajectory has seen but not passed.
-        max_turn_deg: scans are turned to random headings up to this: `relocalize` tries all turns, and L-Net needs to
-            know but one of them.
-        max_shift: scans are re-projected to points around their own (`shift_scan`), up to this distance in typical
-            ranges, so that L-Net learns the surroundings of the trajectory.
-        drop: largest share of the beams that is hidden from L-Net; the share differs from scan to scan.
+        num_steps: number of steps of Adam.
+        scans_per_step: number of scans of a step, drawn with replacement.
+        num_rendered: number of scans that are rendered from the map at random free places. They make up half of each
+            step: L-Net learns places that the trajectory has seen but not passed.
     """
 
     num_steps: int = 5000
-    learning_rate: float = 2e-3
     scans_per_step: int = 64
     num_rendered: int = 4096
-    max_turn_deg: float = 20.0
-    max_shift: float = 0.2
-    drop: float = 0.2
 
     def __post_init__(self) -> None:
         require_count("num_steps", self.num_steps)
         require_count("scans_per_step", self.scans_per_step)
         if self.num_rendered < 0:
             raise ValueError(f"num_rendered: expected zero or more, got {self.num_rendered}")
-        if not self.max_shift >= 0.0:
-            raise ValueError(f"max_shift: expected zero or more, got {self.max_shift}")
-        if not 0.0 <= self.drop < 1.0:
-            raise ValueError(f"drop: expected 0 to below 1, got {self.drop}")
 
 
 def has_windows(fitted: Fitted) -> bool:
-    """Whether the fit has an L-Net for each of several windows instead of one for all scans.
+    """Returns True where the fit has an L-Net for each of several windows instead of one for all scans.
 
     Args:
         fitted: result of `fit_deepmapping` or of `train_localization`.
@@ -82,7 +78,7 @@ def train_localization(
         fitted: any fit, also from given poses.
         scans: (n, b, 2) the scans of the fit.
         config: settings.
-        key: of the batches.
+        key: key of the batches.
 
     Returns:
         The fit with another L-Net and with zero start poses; poses and map are the same.
@@ -118,7 +114,7 @@ def _train(
     fit_config: DeepMappingConfig,
     config: LocalizationTrainingConfig,
 ) -> Any:
-    optimizer = optax.adam(optax.cosine_decay_schedule(config.learning_rate, config.num_steps, 0.01))
+    optimizer = optax.adam(optax.cosine_decay_schedule(_LEARNING_RATE, config.num_steps, 0.01))
 
     def loss_of(params: Any, step_key: jax.Array) -> Array:
         parts = [
@@ -152,13 +148,13 @@ def _draw_training_batch(
     rows = jax.random.randint(row_key, (config.scans_per_step,), 0, num_scans)
     beams = choose_beams(num_beams, fit_config.cold_phases[0], jax.random.randint(first_key, (), 0, num_beams))
     points, mask = scans.points[rows][:, beams], scans.mask[rows][:, beams]
-    limit = np.deg2rad(config.max_turn_deg)
+    limit = np.deg2rad(_MAX_TURN_DEG)
     turn = jax.random.uniform(turn_key, rows.shape, minval=-limit, maxval=limit) - poses[rows, 2]
-    shift = _draw_shifts(shift_key, len(rows), config.max_shift)
+    shift = _draw_shifts(shift_key, len(rows), _MAX_SHIFT)
     points = jax.vmap(shift_scan)(points, mask, shift)
     moved = jax.vmap(turn_scan)(shift[:, None], -poses[rows, 2])[:, 0]
     points = jax.vmap(turn_scan)(points, turn)
-    share = config.drop * jax.random.uniform(share_key, (*rows.shape, 1))
+    share = _LARGEST_DROP * jax.random.uniform(share_key, (*rows.shape, 1))
     hidden = jax.random.uniform(drop_key, mask.shape) < share
     # A scan of one beam must keep it.
     seen = jnp.where((mask & ~hidden).any(-1, keepdims=True), mask & ~hidden, mask)
@@ -177,7 +173,7 @@ def turn_scan(points: Float[Array, "b 2"], turn: Float[Array, ""]) -> Float[Arra
     """The scan of a sensor whose heading is larger by `turn`: every point turned back by it.
 
     Args:
-        points: in the sensor frame.
+        points: points in the sensor frame.
         turn: radians.
 
     Returns:
@@ -193,8 +189,8 @@ def shift_scan(points: Float[Array, "b 2"], mask: Bool[Array, " b"], shift: Floa
     Occlusion is ignored: the points are sorted by their new angles, and ranges are interpolated between them.
 
     Args:
-        points: in the sensor frame.
-        mask: beams that measured something; the others keep their points.
+        points: points in the sensor frame.
+        mask: True for beams with a measurement; other beams keep their points.
         shift: position of the new sensor in the frame of the old one.
 
     Returns:

@@ -1,4 +1,4 @@
-"""M-Net evaluated once on a raster, and scans rendered from it at places where none was taken."""
+"""Rasters of M-Net: for scans rendered at places where none was taken, and as a picture (DeepMapping figure 5)."""
 
 from __future__ import annotations
 
@@ -9,20 +9,23 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
+from numpy.typing import NDArray
 
 from dpmjax.deepmapping.config import DeepMappingConfig
+from dpmjax.deepmapping.planar import Fitted
 from dpmjax.deepmapping.problem import MapFrame, Params, bind_map
+from dpmjax.geometry import se2
 from dpmjax.types import ScanSet
 
 NUM_NODES = 513
 """Nodes of the raster along each side of the map's frame."""
-# Log odds beyond which a node counts as seen, free or occupied; M-Net leaves at zero what it has never seen.
+# Log odds beyond which a node counts as seen, free or occupied; M-Net is zero at places that no beam has reached.
 _SEEN = 0.3
 # Nodes on the way of a rendered beam that may be unseen, as a share of all.
 _MAX_UNSEEN = 0.1
 # Longest rendered beam in nodes.
 _MAX_NODES = 400
-# A rendered scan needs so many of its beams, as a share.
+# Smallest share of the beams of a rendered scan that must hit the map.
 _LEAST_BEAMS = 0.5
 
 
@@ -31,7 +34,7 @@ class MapRaster(NamedTuple):
 
     Attributes:
         logits: rows along x, columns along y.
-        frame: of the map, which the raster fills.
+        frame: frame of the map, which the raster fills.
     """
 
     logits: Float[Array, "r r"]
@@ -48,7 +51,7 @@ def make_raster(params: Params, config: DeepMappingConfig) -> MapRaster:
     """Evaluates M-Net at all nodes.
 
     Args:
-        params: of a fit.
+        params: parameters of a fit.
         config: settings of the fit.
 
     Returns:
@@ -64,8 +67,8 @@ def nearest_nodes(frame: MapFrame, points: Float[Array, "... 2"]) -> tuple[Int[A
     """Finds the nodes that points lie at.
 
     Args:
-        frame: of the map.
-        points: in the world, typical ranges.
+        frame: frame of the map.
+        points: points in the world, typical ranges.
 
     Returns:
         Index of the nearest node in the flat raster, and whether the point is inside of it.
@@ -82,10 +85,10 @@ def render_scans(
     """Renders scans at random free places of the map, at heading zero.
 
     Args:
-        raster: of the map.
+        raster: raster of the map.
         scans: (n, b, 2) in typical ranges; rendered scans have their beams.
         count: places that are tried.
-        key: of the places.
+        key: key of the places.
 
     Returns:
         Scans and poses; of the places those where enough beams meet something that M-Net knows.
@@ -123,3 +126,63 @@ def _follow_beams(
         return ranges[first], (logits.max(axis=0) > _SEEN) & (unseen <= 1 + _MAX_UNSEEN * first)
 
     return jax.lax.map(follow, (places, towards), batch_size=16)
+
+
+# Samples on a beam for what counts as explored.
+_SAMPLES = 64
+
+
+class MapPicture(NamedTuple):
+    """A raster of the world; row 0 has the smallest y.
+
+    Attributes:
+        probability: (h, w) of being occupied.
+        explored: (h, w) a beam has passed or ended there.
+        extent: x_min, x_max, y_min, y_max in the unit of the points.
+    """
+
+    probability: NDArray[np.float32]
+    explored: NDArray[np.bool_]
+    extent: tuple[float, float, float, float]
+
+
+def draw_map(
+    fitted: Fitted, points: NDArray[np.floating], mask: NDArray[np.bool_], *, num_cells: int = 500
+) -> MapPicture:
+    """Evaluates M-Net wherever a beam has been.
+
+    Args:
+        fitted: the fit.
+        points: (n, b, 2) its scans in the sensor frames, unit of the poses.
+        mask: (n, b) False for beams that measured nothing.
+        num_cells: number of cells along the longer side.
+
+    Returns:
+        MapPicture in the frame of `fitted.poses`.
+    """
+    poses = fitted.poses
+    world = se2.transform_points(poses, points)
+    hits = world[mask]
+    low, high = hits.min(axis=0), hits.max(axis=0)
+    margin = 0.03 * float((high - low).max())
+    low, high = low - margin, high + margin
+    cell = float((high - low).max()) / num_cells
+    width, height = (np.ceil((high - low) / cell)).astype(int)
+    explored = np.zeros((height, width), bool)
+    sensors = np.broadcast_to(poses[:, None, :2], world.shape)[mask]
+    for share in np.linspace(0.0, 1.0, _SAMPLES):
+        column, row = ((sensors + share * (hits - sensors) - low) / cell).astype(int).T
+        explored[np.clip(row, 0, height - 1), np.clip(column, 0, width - 1)] = True
+    x, y = low[0] + cell * (np.arange(width) + 0.5), low[1] + cell * (np.arange(height) + 0.5)
+    centres = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2) / fitted.unit
+    occupied = jax.jit(lambda params, points: jax.nn.sigmoid(bind_map(params, fitted.config)(points)))
+    probability = np.asarray(occupied(fitted.params, centres.astype(np.float32))).reshape(height, width)
+    extent = (float(low[0]), float(low[0] + cell * width), float(low[1]), float(low[1] + cell * height))
+    return MapPicture(probability, _close_gaps(explored), extent)
+
+
+def _close_gaps(explored: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Between two beams that pass on either side a cell counts as explored too."""
+    from scipy.ndimage import binary_closing
+
+    return binary_closing(explored, iterations=2) | explored

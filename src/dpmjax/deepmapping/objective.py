@@ -1,6 +1,6 @@
 """The terms of DeepMapping's loss, of scans in the world (sections 3.2 and 3.4).
 
-`occupancy_term` asks M-Net about the hits (occupied) and about samples on the beams (free). `chamfer_term` compares
+`occupancy_term` compares M-Net with the hits (occupied) and with samples on the beams (free). `chamfer_term` compares
 each scan with later ones.
 """
 
@@ -14,8 +14,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from dpmjax.deepmapping.config import PhaseConfig
-from dpmjax.geometry.rays import sample_free_space
+from dpmjax.deepmapping.config import CHAMFER, ChamferComparison, Comparison, PhaseConfig
+from dpmjax.geometry.sampling import sample_free_space
 from dpmjax.losses import chamfer_distance, occupancy_loss
 
 MapLogits = Callable[[Float[Array, "n d"]], Float[Array, " n"]]
@@ -30,7 +30,7 @@ class WorldBatch(NamedTuple):
         mask: (m, b) False for beams that measured nothing.
         rows: (m,) index of each scan in the set; consecutive within a block.
         block: (m,) which block each belongs to.
-        progress: of the phase, 0 at its start, 1 at its end.
+        progress: progress of the phase, 0 at its start, 1 at its end.
     """
 
     points: Float[Array, "m b d"]
@@ -74,16 +74,16 @@ def free_factors(
 
     Args:
         world: the scans.
-        phase: of the fit.
+        phase: phase of the fit.
         surface_distance: mean distance of one more sample from the hit; None: no such sample.
-        key: of this step.
+        key: key of this step.
 
     Returns:
         Factors in [0, 1).
     """
     uniform_key, surface_key = jax.random.split(key)
     shape = (*world.mask.shape, phase.num_free)
-    if phase.is_free_factor_shared:
+    if phase.is_sampled_as_published:
         factors = jnp.broadcast_to(jax.random.uniform(uniform_key, shape[2:]), shape)
     else:
         factors = jax.random.uniform(uniform_key, shape)
@@ -116,20 +116,24 @@ def occupancy_term(world: WorldBatch, map_logits: MapLogits, factors: Float[Arra
     return hit + occupancy_loss(logits[num_hits:], jnp.zeros(()), free_weights)
 
 
-def chamfer_term(
-    world: WorldBatch, offsets: Int[Array, " o"], max_distance: Float[Array, ""] | None = None
-) -> Float[Array, ""]:
+def chamfer_term(world: WorldBatch, offsets: Int[Array, " o"], comparison: Comparison = CHAMFER) -> Float[Array, ""]:
     """DeepMapping eq. 7: mean Chamfer distance between each scan and the scans `offsets` later in its block.
 
     Args:
         world: the scans.
         offsets: distances in time.
-        max_distance: larger distances count as this one; None: no limit.
+        comparison: comparison of the phase, with its limit of the distances.
 
     Returns:
         The mean over all pairs, in typical ranges; 0 without a pair.
+
+    Raises:
+        ValueError: the comparison is of other scans.
     """
+    if not isinstance(comparison, ChamferComparison):
+        raise ValueError(f"comparison: expected a ChamferComparison of these scans, got {comparison}")
     num_scans = world.rows.shape[0]
+    max_distance = None if comparison.limit is None else interpolate_log(comparison.limit, world.progress)
 
     def compare(offset: Int[Array, ""]) -> tuple[Float[Array, ""], Int[Array, ""]]:
         later = jnp.minimum(jnp.arange(num_scans) + offset, num_scans - 1)

@@ -14,10 +14,10 @@ from jaxtyping import Array, Bool, Float, Int
 from numpy.typing import ArrayLike, NDArray
 
 from dpmjax.checks import as_beams
-from dpmjax.deepmapping.batches import draw_offsets, draw_rows, scans_in_block
+from dpmjax.deepmapping.batches import draw_offsets, draw_rows, in_windows, join_windows, scans_in_block, window_rows
 from dpmjax.deepmapping.config import DeepMappingConfig, PhaseConfig
 from dpmjax.deepmapping.engine import Fit, Report, fit
-from dpmjax.deepmapping.objective import Terms, WorldBatch, chamfer_term, interpolate_log
+from dpmjax.deepmapping.objective import Terms, WorldBatch, chamfer_term
 from dpmjax.deepmapping.problem import (
     MapFrame,
     MappingData,
@@ -29,9 +29,8 @@ from dpmjax.deepmapping.problem import (
     mapping_problem,
     phases_of,
 )
-from dpmjax.deepmapping.windows import in_windows, join_windows, window_rows
 from dpmjax.geometry import se2
-from dpmjax.geometry.rays import typical_range
+from dpmjax.geometry.sampling import typical_range
 from dpmjax.nets.localization import LocalizationNet
 from dpmjax.nets.occupancy import init_map_net
 from dpmjax.types import ScanSet
@@ -42,8 +41,8 @@ class Fitted(NamedTuple):
 
     Attributes:
         poses: (n, 3) x, y, heading, float64.
-        params: of L-Net and M-Net.
-        report: of the last call of the step.
+        params: parameters of L-Net and M-Net.
+        report: report of the last call of the step.
         unit: the length that the parameters count in, unit of the points.
         config: settings of the fit.
         num_steps: steps done in all, those of a resumed run too; with 0, the networks are untrained.
@@ -73,8 +72,8 @@ def as_scan_set(scans: ScanSet | ArrayLike, *, min_scans: int = 2) -> ScanSet:
         The scans, zeros where nothing was measured.
 
     Raises:
-        ValueError: the shape is not (n, b, 2), there are too few scans, a scan has no valid beam, or what the
-            mask of a ScanSet calls valid is not finite.
+        ValueError: the shape is not (n, b, 2), there are too few scans, a scan has no valid beam, or a valid beam of a
+            ScanSet is not finite.
     """
     beams = as_beams("scans", scans)
     if beams.points.shape[0] < min_scans:
@@ -112,7 +111,7 @@ def planar_problem(config: DeepMappingConfig, data: MappingData) -> Problem:
 
     Args:
         config: settings of the fit.
-        data: of `planar_data`.
+        data: data of `planar_data`.
 
     Returns:
         The problem.
@@ -126,7 +125,6 @@ def fit_deepmapping(
     *,
     key: jax.Array,
     start: ArrayLike | None = None,
-    num_starts: int = 1,
     engine: Callable[..., Fit] = fit,
 ) -> Fitted:
     """Registers planar scans by optimising L-Net and M-Net on them alone (DeepMapping eq. 6).
@@ -134,10 +132,9 @@ def fit_deepmapping(
     Args:
         scans: (n, b, 2) in the sensor frames, any unit; all-zero or non-finite beams are left out. Or a ScanSet.
         config: settings; None: `preset("fast")`.
-        key: of the whole run.
+        key: key of the whole run.
         start: (n, 3) x, y, heading or (n, 3, 3) matrices to start from; None: cold start from zero.
-        num_starts: starts with other weights, side by side; the worse half by the loss is dropped again and again.
-        engine: what trains, called as `engine(problem, data, key=key, num_starts=num_starts)`;
+        engine: what trains, called as `engine(problem, data, key=key)`;
             `functools.partial(fit, on_report=..., stop=...)` reports each call of the step and can be stopped.
 
     Returns:
@@ -149,24 +146,13 @@ def fit_deepmapping(
     """
     config = config or DeepMappingConfig()
     data, unit = planar_data(scans, start)
-    return as_fitted(engine(planar_problem(config, data), data, key=key, num_starts=num_starts), unit, config)
+    return _as_fitted(engine(planar_problem(config, data), data, key=key), unit, config)
 
 
-def as_fitted(done: Fit, unit: float, config: DeepMappingConfig) -> Fitted:
-    """The result of a fit in the unit of the points.
-
-    Args:
-        done: a fit of `planar_problem`.
-        unit: the typical range.
-        config: settings of the fit.
-
-    Returns:
-        Fitted.
-    """
+def _as_fitted(done: Fit, unit: float, config: DeepMappingConfig) -> Fitted:
+    """Returns the result of a fit in the unit of the points."""
     poses = np.asarray(done.poses, np.float64) * [unit, unit, 1.0]
-    # Several starts have done the same number of steps.
-    num_steps = int(np.max(done.state.step))
-    return Fitted(poses, done.state.params, done.report, unit, config, num_steps)
+    return Fitted(poses, done.state.params, done.report, unit, config, int(done.state.step))
 
 
 def localize_scans(
@@ -176,7 +162,7 @@ def localize_scans(
 
     Args:
         params: weights of L-Net.
-        points: in the sensor frames, in typical ranges, beams thinned as in the fit.
+        points: points in the sensor frames, in typical ranges, beams thinned as in the fit.
         mask: False for beams that measured nothing.
         config: settings of the fit.
 
@@ -190,8 +176,8 @@ def choose_beams(num_beams: int, phase: PhaseConfig, first: Int[Array, ""] | int
     """Indices of evenly spaced beams, about `beams_per_step` of them.
 
     Args:
-        num_beams: of a scan.
-        phase: of the fit.
+        num_beams: number of beams of a scan.
+        phase: phase of the fit.
         first: shifts all beams, by less than their spacing.
 
     Returns:
@@ -282,7 +268,5 @@ def _loss(
     points, mask = some.points[rows], some.mask[rows]
     world = WorldBatch(se2.transform_points(poses, points), poses[:, :2], mask, rows, block, progress)
     free_key, offset_key = jax.random.split(loss_key)
-    limit = None if phase.chamfer_limit is None else interpolate_log(phase.chamfer_limit, progress)
     offsets = draw_offsets(phase, scans_in_block(phase, scans.mask.shape[0]) - 1, key=offset_key)
-    chamfer = chamfer_term(world, offsets, limit)
-    return mapping_loss(config, phase, params, world, chamfer, key=free_key)
+    return mapping_loss(config, phase, params, world, chamfer_term(world, offsets, phase.comparison), key=free_key)

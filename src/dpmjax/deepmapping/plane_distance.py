@@ -1,7 +1,7 @@
-"""Distances of points to the planes of other scans: how pairs of lidar scans are compared, and how poses are judged.
+"""Distances of points to the planes of other scans: the comparison of lidar scans, and of trajectories.
 
-The rings of two lidar scans do not meet the same points. The nearest point of the other scan lies beside the surface
-between its rings, and the Chamfer distance pulls ring onto ring; a plane through the nearest point does not.
+The rings of two lidar scans do not meet the same points. The nearest point of another scan lies on a ring, beside the
+surface between rings, and the Chamfer distance pulls ring onto ring; a plane through the nearest point does not.
 """
 
 from __future__ import annotations
@@ -20,11 +20,11 @@ from dpmjax.geometry.neighbours import k_nearest
 _REACH_WIDTHS, _REACH_SPACINGS = 5.0, 2.0
 # Planes whose normals have a smaller cosine do not match; the two sides of a wall do not either.
 _MIN_COSINE = 0.3
-# Poses are judged by pairs of scans at these distances in time, and by so many points of each scan.
+# Trajectories are compared by pairs of scans at these distances in time, and by this number of points of each scan.
 _JUDGED_OFFSETS, _JUDGED_POINTS = (1, 2, 4, 8), 512
 
 
-class Cloud(NamedTuple):
+class PlaneCloud(NamedTuple):
     """Points of one scan with their planes, or of several with a leading axis; as in CloudScans."""
 
     points: Float[Array, "... c 3"]
@@ -33,33 +33,33 @@ class Cloud(NamedTuple):
     flatness: Float[Array, "... c"]
 
 
-def clouds_of(scans: CloudScans) -> Cloud:
+def clouds_of(scans: CloudScans) -> PlaneCloud:
     """The points of all scans with their planes."""
-    return Cloud(scans.points, scans.mask, scans.normals, scans.flatness)
+    return PlaneCloud(scans.points, scans.mask, scans.normals, scans.flatness)
 
 
-def take_rows(cloud: Cloud, rows: Int[Array, " m"]) -> Cloud:
+def take_rows(cloud: PlaneCloud, rows: Int[Array, " m"]) -> PlaneCloud:
     """Some of the scans."""
-    return Cloud(*(leaf[rows] for leaf in cloud))
+    return PlaneCloud(*(leaf[rows] for leaf in cloud))
 
 
 def plane_misfit(
     T_target_source: Float[Array, "4 4"],
-    source: Cloud,
-    target: Cloud,
+    source: PlaneCloud,
+    target: PlaneCloud,
     width: Float[Array, ""] | float,
     spacing: Float[Array, ""] | float,
 ) -> Float[Array, ""]:
     """Share of the source's planes that do not meet a plane of the target, softly: 0 all do, 1 none.
 
-    A point's misfit is r^2 / (r^2 + width^2) of its distance r to the plane through the nearest point of the target
-    (Geman and McClure 1985), and 1 where there is no such plane. Flat neighbourhoods count more.
+    A point at the distance r from the plane through the nearest point of the target has the misfit r^2 / (r^2 +
+    width^2) (Geman and McClure 1985). The misfit is 1 without such a plane. Flat neighbourhoods count more.
 
     Args:
         T_target_source: maps the source's points into the frame of the target.
         source: some points of a scan.
-        target: the other scan.
-        width: of the kernel, unit of the points.
+        target: scan with the planes.
+        width: width of the kernel, unit of the points.
         spacing: typical distance of a point of the target to its neighbours.
 
     Returns:
@@ -84,13 +84,13 @@ def plane_misfit(
 
 def misfit_of_pairs(
     T_world_scan: Float[Array, "m 4 4"],
-    samples: Cloud,
-    scans: Cloud,
+    samples: PlaneCloud,
+    scans: PlaneCloud,
     pairs: Int[Array, "p 2"],
     is_pair: Bool[Array, " p"],
     sizes: tuple[Float[Array, ""] | float, Float[Array, ""] | float],
 ) -> Float[Array, ""]:
-    """Mean misfit of pairs of scans, each seen from the other.
+    """Mean misfit of pairs of scans, in both directions.
 
     Args:
         T_world_scan: poses.
@@ -121,7 +121,7 @@ def trajectory_misfit(
     Args:
         scans: the scans.
         T_world_scan: their poses, unit of the points.
-        width: of the kernel, unit of the points.
+        width: width of the kernel, unit of the points.
 
     Returns:
         0 (all planes meet) to 1 (none does); no reference is needed.

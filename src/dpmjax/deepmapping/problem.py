@@ -1,4 +1,6 @@
-"""What the engine fits: a record of pure functions, and the parts that problems with an L-Net and an M-Net share."""
+"""A problem for the engine: a record of pure functions; and the parts that problems with an L-Net and an M-Net
+share.
+"""
 
 from __future__ import annotations
 
@@ -18,14 +20,20 @@ from dpmjax.nets.occupancy import make_map_net
 
 # Points that M-Net's hidden layers hold at once when it is an MLP: 16 MB a layer of 512.
 _MLP_CHUNK = 1 << 13
+# Learning rates of M-Net: a step changes few nodes of a grid, and all weights of an MLP.
+_MAP_LEARNING_RATE = {"grid": 0.1, "mlp": 1e-3}
+# Weight of the mean square of a grid's nodes.
+_GRID_DECAY = 1e-3
+# Share of a phase with free poses after which all levels of a grid are on.
+_ANNEAL_UNTIL = 0.7
 
 
 @dataclass(frozen=True)
 class Problem:
     """A problem whose parameters are trained on one data set; training them is the registration.
 
-    The functions are pure and belong to a module, so that problems of equal settings are equal: a Problem is a static
-    argument of the compiled step, and the data are not part of it.
+    The functions are pure and belong to a module, so that problems of equal settings are equal. A Problem is a static
+    argument of the compiled step; the data are not part of it.
 
     Attributes:
         config: settings, given to every function as its first argument; hashable.
@@ -36,7 +44,6 @@ class Problem:
         poses: (config, phase, params, data) -> poses of the whole data set.
         next_phase: (config, phase, params, data) -> Params at the start of the phase after `phase`.
         steps_per_call: the largest number of steps that are compiled into one call.
-        halve_at: shares of the first phase at which the worse half of several starts is dropped; empty: all are kept.
     """
 
     config: Any
@@ -47,7 +54,6 @@ class Problem:
     poses: Callable[..., Any]
     next_phase: Callable[..., Any]
     steps_per_call: int
-    halve_at: tuple[float, ...] = ()
 
 
 class MappingData(NamedTuple):
@@ -63,7 +69,7 @@ class MappingData(NamedTuple):
 
 
 class MappingFunctions(NamedTuple):
-    """What planar scans and depth images differ in; the functions are those of a Problem."""
+    """Functions of a Problem that depend on the sensor."""
 
     init: Callable[..., Params]
     loss: Callable[..., tuple[Float[Array, ""], Terms]]
@@ -88,7 +94,7 @@ class Params:
         poses: free poses, or free motions after `start`; in a phase of windows with free poses, of each window.
         occupancy: weights of M-Net.
         start: poses that L-Net's outputs are relative to; not trained.
-        frame: of the map; not trained.
+        frame: frame of the map; not trained.
     """
 
     localization: Any
@@ -103,15 +109,15 @@ def mapping_problem(config: DeepMappingConfig, data: MappingData, functions: Map
 
     Args:
         config: settings of the fit.
-        data: with the start.
-        functions: of planar scans or of depth images.
+        data: data with the start.
+        functions: functions of planar scans or of depth images.
 
     Returns:
         The problem.
     """
     return Problem(
         config, phases_of(config, data), optimizer=make_optimizer, **functions._asdict(),
-        steps_per_call=config.steps_per_call, halve_at=config.halve_at,
+        steps_per_call=config.steps_per_call,
     )  # fmt: skip
 
 
@@ -120,7 +126,7 @@ def phases_of(config: DeepMappingConfig, data: MappingData) -> tuple[PhaseConfig
 
     Args:
         config: settings of the fit.
-        data: with the start, or without.
+        data: data with the start, or without.
 
     Returns:
         The phases.
@@ -129,19 +135,19 @@ def phases_of(config: DeepMappingConfig, data: MappingData) -> tuple[PhaseConfig
 
 
 def make_optimizer(config: DeepMappingConfig, phase: PhaseConfig) -> optax.GradientTransformation:
-    """Adam for what a phase optimises; the rest stands still, and its moments are kept.
+    """Returns Adam for the parameters of a phase; other parameters stay, and so do their moments.
 
     Args:
         config: settings of the fit.
-        phase: of the fit.
+        phase: phase of the fit.
 
     Returns:
         The optimiser of Params.
     """
-    del config
     decay = optax.cosine_decay_schedule(phase.learning_rate, phase.num_steps, phase.final_learning_rate)
     moving = optax.adam(decay, *phase.adam_decay)
-    map_adam = optax.adam(phase.map_learning_rate, 0.8 if phase.poses == "free" else 0.9, phase.adam_decay[1])
+    map_rate = _MAP_LEARNING_RATE["grid" if config.occupancy.kind == "grid" else "mlp"]
+    map_adam = optax.adam(map_rate, 0.8 if phase.poses == "free" else 0.9, phase.adam_decay[1])
     labels: Any = Params(localization="network", poses="free", occupancy="map", start="fixed", frame="fixed")  # type: ignore[arg-type]
     return optax.multi_transform(
         {
@@ -185,7 +191,7 @@ def bind_map(params: Params, config: DeepMappingConfig, level_weights: Float[Arr
     """M-Net as a function of points in the world, in typical ranges.
 
     Args:
-        params: of the fit.
+        params: parameters of the fit.
         config: settings of the fit.
         level_weights: 0 (off) to 1 for each level of a grid; None: all on.
 
@@ -210,19 +216,19 @@ def bind_map(params: Params, config: DeepMappingConfig, level_weights: Float[Arr
 
 
 def level_weights(phase: PhaseConfig, num_levels: int, progress: Float[Array, ""]) -> Float[Array, " l"]:
-    """Weights of the levels of the map: coarse ones first, all of them from `anneal_until` on.
+    """Weights of the levels of the map: where the poses are free, coarse levels first.
 
     Args:
-        phase: of the fit.
-        num_levels: of the map.
+        phase: phase of the fit.
+        num_levels: number of levels of the map.
         progress: 0 at the start of the phase, 1 at its end.
 
     Returns:
         0 (off) to 1 for each level.
     """
-    if phase.anneal_until == 0.0:
+    if phase.poses == "network":
         return jnp.ones(num_levels)
-    return jnp.clip(progress / phase.anneal_until * num_levels - jnp.arange(num_levels) + 1.5, 0.0, 1.0)
+    return jnp.clip(progress / _ANNEAL_UNTIL * num_levels - jnp.arange(num_levels) + 1.5, 0.0, 1.0)
 
 
 def mapping_loss(
@@ -238,11 +244,11 @@ def mapping_loss(
 
     Args:
         config: settings of the fit.
-        phase: of the fit.
-        params: with M-Net and its frame.
+        phase: phase of the fit.
+        params: parameters with M-Net and its frame.
         world: the scans of the batch in the world.
         pair_term: eq. 7, or another comparison of pairs of scans.
-        key: of the free samples.
+        key: key of the free samples.
 
     Returns:
         The loss with the decay of the map, and its terms before weighting.
@@ -254,7 +260,7 @@ def mapping_loss(
         factors = free_factors(world, phase, distance, key=key)
         occupancy = occupancy_term(world, logits, factors)
         loss = gamma * occupancy + (1.0 - gamma) * pair_term
-    if phase.map_decay > 0.0:
-        squares = sum(jnp.sum(x**2) for x in jax.tree.leaves(params.occupancy))
-        loss += phase.map_decay * squares / world.mask.size
+        if config.occupancy.kind == "grid":
+            squares = sum(jnp.sum(x**2) for x in jax.tree.leaves(params.occupancy))
+            loss += _GRID_DECAY * squares / world.mask.size
     return loss, Terms(occupancy, pair_term)

@@ -59,7 +59,7 @@ class DepthScans:
     Attributes:
         points: metres, or typical ranges inside of the fit.
         mask: True where something was measured.
-        pinhole: of the camera that took all of them.
+        pinhole: camera of all images.
     """
 
     points: Float[Array, "n h w 3"]
@@ -84,11 +84,11 @@ def image_surface(depth: Float[Array, "h w"]) -> Float[Array, "4 r c"]:
     One over the depth is linear on a plane.
 
     Args:
-        depth: along z, 0 where nothing was measured.
+        depth: depth along z, 0 where nothing was measured.
 
     Returns:
-        Value at the upper left pixel of each four, slopes along columns and rows, and the twist; all 0 where the four
-        pixels do not lie on one surface. r = h - 1, c = w - 1.
+        Value at the upper left pixel of each four, slopes along columns and rows, and the twist. All are 0 where the
+        four pixels do not lie on one surface. r = h - 1, c = w - 1.
     """
     inverse = jnp.where(depth > 0.0, 1.0 / jnp.where(depth > 0.0, depth, 1.0), 0.0)
     corners = jnp.stack([inverse[:-1, :-1], inverse[:-1, 1:], inverse[1:, :-1], inverse[1:, 1:]])
@@ -118,7 +118,7 @@ def fit_pinhole(points: NDArray[np.floating], mask: NDArray[np.bool_]) -> Pinhol
 
 
 class Agreement(NamedTuple):
-    """How far points agree with depth images: `total / comparable` is their consistency, -18 to 1.
+    """Agreement of points with depth images: `total / comparable` is their consistency, -18 to 1.
 
     Attributes:
         total: matches less the cost of contradictions.
@@ -142,15 +142,15 @@ def image_agreement(
 ) -> Agreement:
     """Matches less contradictions of points with the depth image of another camera.
 
-    A point that lands on the surface that the other camera sees matches it. A point in front of that surface
-    contradicts it, because the other camera looked through it (the self-contradictory occupancy of DeepMapping
-    figure 3, tested on the image instead of the map). A point behind the surface is hidden and counts 0.
+    A point that lands on the surface of the image matches it. A point in front of that surface
+    contradicts it, because the other camera looked through it. This is the self-contradictory occupancy of DeepMapping
+    figure 3, tested on the image instead of the map. A point behind the surface is hidden and counts 0.
 
     Args:
-        T_other_camera: maps the points into the frame of the other camera.
+        T_other_camera: motion of the points into the frame of a second camera.
         sample: points of one image.
-        surface_other: `image_surface` of the other camera.
-        pinhole: of the other camera.
+        surface_other: `image_surface` of that camera.
+        pinhole: pinhole of that camera.
         tolerance: share of the depth by which matching points may differ.
 
     Returns:
@@ -167,7 +167,7 @@ def image_agreement(
 
 
 def _match_and_contradiction(gap: Float[Array, "*n"]) -> tuple[Float[Array, "*n"], Float[Array, "*n"]]:
-    """How far points match a surface, and contradict it; gap in tolerances."""
+    """Returns match and contradiction of points with a surface, 0 to 1 each; the gap is in tolerances."""
     return jnp.exp(-(gap**2)), jax.nn.sigmoid(3.0 * (gap - 2.0))
 
 
@@ -177,13 +177,13 @@ def surface_gap(
     surface_other: Float[Array, "4 r c"],
     pinhole: Pinhole,
 ) -> tuple[Float[Array, " p"], Bool[Array, " p"]]:
-    """How far points lie in front of the surface that another camera sees.
+    """Computes the distances of points in front of the surface that another camera sees.
 
     Args:
-        T_other_camera: maps the points into the frame of the other camera.
+        T_other_camera: motion of the points into the frame of a second camera.
         sample: points of one image.
-        surface_other: `image_surface` of the other camera.
-        pinhole: of the other camera.
+        surface_other: `image_surface` of that camera.
+        pinhole: pinhole of that camera.
 
     Returns:
         The distance in shares of the surface's depth, below 0 behind it; and whether the point lands on a surface,
@@ -221,13 +221,13 @@ def both_ways(
     pinhole: Pinhole,
     tolerance: Float[Array, ""],
 ) -> Agreement:
-    """Agreement of a pair of images: the first seen by the other, and the other by the first.
+    """Agreement of a pair of images, in both directions.
 
     Args:
-        T_other_camera: maps points of the first image into the frame of the other camera.
-        samples: points of the first and of the other image.
-        surfaces: `image_surface` of the first and of the other camera.
-        pinhole: of both cameras.
+        T_other_camera: motion of points of the first image into the frame of the second camera.
+        samples: points of the first and of the second image.
+        surfaces: `image_surface` of the first and of the second camera.
+        pinhole: pinhole of both cameras.
         tolerance: share of the depth by which matching points may differ.
 
     Returns:

@@ -6,8 +6,8 @@ the one stays around which the map of M-Net explains the scan best. What the map
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
 from functools import partial
+from itertools import product
 from typing import Any, NamedTuple
 
 import jax
@@ -16,17 +16,136 @@ import numpy as np
 from jaxtyping import Array, Float
 from numpy.typing import ArrayLike, NDArray
 
-from dpmjax.checks import require_count
 from dpmjax.deepmapping.config import DeepMappingConfig
 from dpmjax.deepmapping.localization_training import has_windows, turn_scan
-from dpmjax.deepmapping.map_raster import make_raster
-from dpmjax.deepmapping.map_search import MapSearchConfig, map_fields, search_map
+from dpmjax.deepmapping.map_raster import NUM_NODES, MapRaster, make_raster, nearest_nodes
 from dpmjax.deepmapping.planar import Fitted, as_scan_set, choose_beams, localize_scans
+from dpmjax.deepmapping.problem import MapFrame
 from dpmjax.geometry import se2
 from dpmjax.types import ScanSet
 
+# Step of the coarsest grid of poses, along x and y in typical ranges, and in radians of heading; each level halves it.
+_FIRST_STEP, _NUM_LEVELS = 0.08, 5
+# Hypotheses that are kept after the first level, and the largest number of beams that are compared.
+_NUM_KEPT, _NUM_BEAMS = 6, 64
+# Headings at which L-Net sees each scan, evenly all round.
+_NUM_TURNS = 24
 # Scans that L-Net sees at once where there are many.
 _CHUNK = 1024
+# Places on a beam at which the map must be free: shares of its length.
+_FREE_SHARES = (0.3, 0.6, 0.85)
+# The most that one hit or one free sample can cost, nats: people and noise must not decide.
+_MAX_NATS = 3.0
+# Offsets of a grid of poses in its steps, the pose itself first: of equal poses the first is taken.
+_OFFSETS = np.array(sorted(product(range(-2, 3), repeat=3), key=np.linalg.norm))
+
+
+class MapFields(NamedTuple):
+    """Costs of hits and of free samples at the nodes of a raster over the frame of the map, one raster a level.
+
+    Attributes:
+        hit: nats of a hit.
+        free: nats of a free sample.
+        frame: frame of the map.
+    """
+
+    hit: Float[Array, "l r r"]
+    free: Float[Array, "l r r"]
+    frame: MapFrame
+
+
+class FoundPoses(NamedTuple):
+    """The best pose of each scan.
+
+    Attributes:
+        poses: x, y, heading in typical ranges and radians.
+        nats: mean cost of a beam: of its hit, plus the mean of its free samples. Beams are weighted by the root of the
+            range, because near beams end on some surface everywhere. log 4 where the map is unknown.
+    """
+
+    poses: Float[Array, "m 3"]
+    nats: Float[Array, " m"]
+
+
+@jax.jit
+def map_fields(raster: MapRaster) -> MapFields:
+    """Computes the costs of hits and of free samples, blurred for each level by the step of its grid.
+
+    Args:
+        raster: raster of the map.
+
+    Returns:
+        MapFields.
+    """
+    # A hit on a surface lies between a free and an occupied node, so one node is the least.
+    radii = jnp.maximum(0.5 * _FIRST_STEP * 0.5 ** np.arange(_NUM_LEVELS) / raster.spacing, 1.0)
+    highest = jnp.stack([largest_nearby(raster.logits, radius) for radius in radii])
+    lowest = -jnp.stack([largest_nearby(-raster.logits, radius) for radius in radii])
+    hit, free = jax.nn.softplus(-highest), jax.nn.softplus(lowest)
+    return MapFields(jnp.minimum(hit, _MAX_NATS), jnp.minimum(free, _MAX_NATS), raster.frame)
+
+
+def largest_nearby(values: Float[Array, "r r"], radius: Float[Array, ""]) -> Float[Array, "r r"]:
+    """The largest value in the square around each node, by doubling; the raster is closed at its ends.
+
+    Args:
+        values: values at the nodes.
+        radius: radius of the square in nodes; one less than a power of two, or the next smaller of these.
+
+    Returns:
+        The maxima.
+    """
+    for reach in 2 ** np.arange(int(np.log2(NUM_NODES))):
+        moved = values
+        for axis in (0, 1):
+            moved = jnp.maximum(jnp.maximum(jnp.roll(moved, reach, axis), jnp.roll(moved, -reach, axis)), moved)
+        values = jnp.where(2 * reach - 1 <= radius, moved, values)
+    return values
+
+
+def _nats(
+    scan: ScanSet, pose: Float[Array, " 3"], hit: Float[Array, "r r"], free: Float[Array, "r r"], frame: MapFrame
+) -> Array:
+    """Mean cost of a beam of one scan at one pose."""
+    shares = jnp.asarray((1.0, *_FREE_SHARES))[:, None, None]
+    world = se2.transform_points(pose, (shares * scan.points).reshape(-1, 2)).reshape(len(shares), -1, 2)
+    row, inside = nearest_nodes(frame, world)
+    unknown = jnp.log(2.0)
+    of_hit = jnp.where(inside[0], hit.reshape(-1)[row[0]], unknown)
+    of_free = jnp.where(inside[1:], free.reshape(-1)[row[1:]], unknown).mean(0)
+    weight = jnp.where(scan.mask, jnp.sum(jnp.where(scan.mask[:, None], scan.points, 1.0) ** 2, axis=-1) ** 0.25, 0.0)
+    return jnp.sum(weight * (of_hit + of_free)) / jnp.maximum(weight.sum(), 1e-9)
+
+
+@jax.jit
+def search_map(scans: ScanSet, proposals: Float[Array, "m p 3"], fields: MapFields) -> FoundPoses:
+    """Searches the poses of scans around proposals, coarse to fine.
+
+    Args:
+        scans: (m, b, 2) in typical ranges.
+        proposals: poses to begin at.
+        fields: costs of hits and free samples in the map.
+
+    Returns:
+        FoundPoses.
+    """
+    stride = -(-scans.mask.shape[1] // _NUM_BEAMS)
+    thinned = ScanSet(scans.points[:, ::stride], scans.mask[:, ::stride])
+    poses = jax.lax.map(lambda one: _search_one(one[0], one[1], fields), (thinned, proposals), batch_size=8)
+    cost = partial(_nats, hit=fields.hit[-1], free=fields.free[-1], frame=fields.frame)
+    return FoundPoses(poses, jax.lax.map(lambda one: cost(*one), (scans, poses), batch_size=64))
+
+
+def _search_one(scan: ScanSet, proposals: Float[Array, "p 3"], fields: MapFields) -> Float[Array, " 3"]:
+    poses = proposals
+    for level in range(_NUM_LEVELS):
+        around = poses[:, None] + _FIRST_STEP * 0.5**level * _OFFSETS
+        cost = partial(_nats, scan, hit=fields.hit[level], free=fields.free[level], frame=fields.frame)
+        nats = jax.vmap(jax.vmap(cost))(around)
+        # The best pose around each hypothesis, and the best of these hypotheses.
+        poses = jnp.take_along_axis(around, nats.argmin(axis=1)[:, None, None], axis=1)[:, 0]
+        poses = poses[jnp.argsort(nats.min(axis=1))[:_NUM_KEPT]]
+    return poses[0]
 
 
 class Relocalized(NamedTuple):
@@ -34,8 +153,8 @@ class Relocalized(NamedTuple):
 
     Attributes:
         pose: (3,) or (m, 3) x, y, heading in (-pi, pi], unit of the points.
-        nats: () or (m,) what a beam costs by the map at this pose: 0 where M-Net explains it fully, log 4 where it
-            knows nothing.
+        nats: () or (m,) mean cost of a beam at this pose: 0 where M-Net explains it fully, log 4 where the map is
+            unknown.
         is_known: () or (m,) False where the map does not explain the scan: its view was never seen, or the pose is
             wrong.
     """
@@ -50,48 +169,29 @@ class Relocalized(NamedTuple):
         return se2.to_matrix(self.pose)
 
 
-@dataclass(frozen=True)
-class RelocalizationConfig:
-    """Settings of `relocalize`.
+def relocalize(fitted: Fitted, scan: ScanSet | ArrayLike, *, max_nats: float = 0.4) -> Relocalized:
+    """Estimates poses of new scans, and finds those outside of the mapped places (DeepMapping section 4.1, figure 7).
 
-    Attributes:
-        num_turns: headings at which L-Net sees each scan, evenly all round.
-        max_nats: a scan whose beams cost more is not known.
-        search: settings of the search around L-Net's proposals.
-    """
-
-    num_turns: int = 24
-    max_nats: float = 0.4
-    search: MapSearchConfig = field(default_factory=MapSearchConfig)
-
-    def __post_init__(self) -> None:
-        require_count("num_turns", self.num_turns)
-        if not self.max_nats > 0.0:
-            raise ValueError(f"max_nats: expected a positive number, got {self.max_nats}")
-
-
-def relocalize(fitted: Fitted, scan: ScanSet | ArrayLike, config: RelocalizationConfig | None = None) -> Relocalized:
-    """Estimates poses of new scans, and tells which of them the fit does not know (DeepMapping section 4.1, figure 7).
-
-    Nothing is assumed about the heading. L-Net proposes a pose for each of several turns of the scan; a search around
-    the proposals takes the pose at which M-Net explains the scan best. After the free poses of the fast preset L-Net
-    lags behind the poses; `train_localization` brings it back to them.
+    The heading may be any. L-Net proposes a pose for each of several turns of the scan; a search around the proposals
+    takes the pose at which M-Net explains the scan best. After the free poses of the fast preset L-Net lags behind the
+    poses; `train_localization` brings it back to them.
 
     Args:
         fitted: result of `fit_deepmapping` from zero poses with one L-Net for all scans, or of `train_localization`;
             M-Net must have been trained, as all presets do, or no scan is known.
-        scan: (b, 2) one scan, or (m, b, 2), in the sensor frame, unit and order of the beams as in the fit; beams with
+        scan: (b, 2) one scan, or (m, b, 2), in the sensor frame; unit and order of the beams as in the fit. Beams with
             coordinates that are not finite, or both zero, measured nothing.
-        config: settings.
+        max_nats: a scan whose beams cost more at its best pose is not known.
 
     Returns:
         Relocalized, in the world of the fit's own poses.
 
     Raises:
-        ValueError: the shape is another one, a scan has no valid beam, each window of the fit has an L-Net of its own,
-            or L-Net's outputs are corrections of given start poses.
+        ValueError: the shape is another one, a scan has no valid beam, the fit has several L-Nets, L-Net's outputs
+            correct given start poses, or `max_nats` is not positive.
     """
-    config = config or RelocalizationConfig()
+    if not max_nats > 0.0:
+        raise ValueError(f"max_nats: expected a positive number, got {max_nats}")
     if has_windows(fitted):
         raise ValueError("fitted: each of its L-Nets knows one window of the walk; call train_localization first")
     if np.any(np.asarray(fitted.params.start) != 0.0):
@@ -100,16 +200,16 @@ def relocalize(fitted: Fitted, scan: ScanSet | ArrayLike, config: Relocalization
         )
     is_one = not isinstance(scan, ScanSet) and np.ndim(scan) == 2
     scans = as_scan_set(np.asarray(scan)[None] if is_one else scan, min_scans=1)
-    fields = map_fields(make_raster(fitted.params, fitted.config), config=config.search)
+    fields = map_fields(make_raster(fitted.params, fitted.config))
     parts = []
     for k in range(0, len(scans.points), _CHUNK):
         part = ScanSet(scans.points[k : k + _CHUNK] / fitted.unit, scans.mask[k : k + _CHUNK])
-        turned = partial(propose_poses, fitted.params.localization, part, num_turns=config.num_turns)
-        parts.append(search_map(part, turned(fit_config=fitted.config), fields, config=config.search))
+        turned = partial(propose_poses, fitted.params.localization, part, num_turns=_NUM_TURNS)
+        parts.append(search_map(part, turned(fit_config=fitted.config), fields))
     poses, nats = (np.concatenate([np.asarray(x, np.float64) for x in each]) for each in zip(*parts, strict=True))
     poses[:, :2] *= fitted.unit
     poses[:, 2] = se2.wrap_angle(poses[:, 2])
-    found = Relocalized(poses, nats, nats <= config.max_nats)
+    found = Relocalized(poses, nats, nats <= max_nats)
     return Relocalized(*(x[0] for x in found)) if is_one else found
 
 
@@ -126,7 +226,7 @@ def propose_poses(
         fit_config: settings of the fit.
 
     Returns:
-        x, y, heading of the scans as they are, in typical ranges and radians.
+        x, y, heading of the scans that are not turned, in typical ranges and radians.
     """
     beams = choose_beams(scans.mask.shape[1], fit_config.cold_phases[0])
     mask, turns = scans.mask[:, beams], 2.0 * jnp.pi * jnp.arange(num_turns) / num_turns

@@ -1,6 +1,7 @@
-"""What problems in space share, depth images and lidar clouds: poses T_start @ motion, their start, their map frame.
+"""Common parts of the problems in space, of depth images and lidar clouds: poses T_start @ motion, their start, their
+map frame.
 
-The start is kept as it is given; L-Net's output, or what is optimised freely, is a motion after it.
+The given start does not change; L-Net's output, or the free parameter, is a motion after it.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 from numpy.typing import ArrayLike, NDArray
 
-from dpmjax.deepmapping.config import PhaseConfig, SpatialMappingConfig
+from dpmjax.deepmapping.config import DeepMappingConfig, PhaseConfig
 from dpmjax.deepmapping.problem import MapFrame, MappingData, Params, choose_frame
 from dpmjax.geometry import rigid, se3
 from dpmjax.nets.localization import LocalizationNet
@@ -86,12 +87,12 @@ def fitted_poses(poses: ArrayLike, unit: float) -> NDArray[np.float64]:
     return T
 
 
-def _net(config: SpatialMappingConfig) -> LocalizationNet:
+def _net(config: DeepMappingConfig) -> LocalizationNet:
     return LocalizationNet(config.localization, 3 if config.motion == "planar" else 6)
 
 
 def _motions(
-    config: SpatialMappingConfig, phase: PhaseConfig, params: Params, scans: SpatialScans, rows: Int[Array, " m"] | None
+    config: DeepMappingConfig, phase: PhaseConfig, params: Params, scans: SpatialScans, rows: Int[Array, " m"] | None
 ) -> Float[Array, "m k"]:
     if phase.poses == "free":
         return params.poses if rows is None else params.poses[rows]
@@ -100,14 +101,14 @@ def _motions(
 
 
 def poses_of_scans(
-    config: SpatialMappingConfig, phase: PhaseConfig, params: Params, scans: SpatialScans, rows: Int[Array, " m"] | None
+    config: DeepMappingConfig, phase: PhaseConfig, params: Params, scans: SpatialScans, rows: Int[Array, " m"] | None
 ) -> Float[Array, "m 4 4"]:
     """Poses of some scans.
 
     Args:
         config: settings of the fit.
-        phase: of the fit; tells whether L-Net gives the motions.
-        params: of the fit.
+        phase: phase of the fit; L-Net gives the motions, or they are free.
+        params: parameters of the fit.
         scans: all scans.
         rows: indices of the scans; None: all.
 
@@ -120,20 +121,20 @@ def poses_of_scans(
 
 
 def spatial_poses(
-    config: SpatialMappingConfig, phase: PhaseConfig, params: Params, data: MappingData
+    config: DeepMappingConfig, phase: PhaseConfig, params: Params, data: MappingData
 ) -> Float[Array, "n 4 4"]:
     """Poses of all scans, as a Problem has them."""
     return poses_of_scans(config, phase, params, data.scans, None)
 
 
-def _choose_frame(config: SpatialMappingConfig, scans: SpatialScans, T: Float[Array, "n 4 4"]) -> MapFrame:
+def _choose_frame(config: DeepMappingConfig, scans: SpatialScans, T: Float[Array, "n 4 4"]) -> MapFrame:
     """The cube that the scans cover at these poses."""
     count = scans.mask.shape[0]
     world = rigid.transform_points(T, scans.points.reshape(count, -1, 3))
     return choose_frame(world, scans.mask.reshape(count, -1), config.map_margin)
 
 
-def init_spatial(config: SpatialMappingConfig, key: jax.Array, data: MappingData) -> Params:
+def init_spatial(config: DeepMappingConfig, key: jax.Array, data: MappingData) -> Params:
     """Fresh parameters, as a Problem has them; without a start all sensors are at one place."""
     net_key, map_key = jax.random.split(key)
     scans, start = data
@@ -154,7 +155,7 @@ def init_spatial(config: SpatialMappingConfig, key: jax.Array, data: MappingData
     return params
 
 
-def next_spatial_phase(config: SpatialMappingConfig, phase: PhaseConfig, params: Params, data: MappingData) -> Params:
+def next_spatial_phase(config: DeepMappingConfig, phase: PhaseConfig, params: Params, data: MappingData) -> Params:
     """The poses reached are the new start, in a map frame around them; as a Problem has it."""
     T = spatial_poses(config, phase, params, data)
     return replace(params, poses=jnp.zeros_like(params.poses), start=T, frame=_choose_frame(config, data.scans, T))

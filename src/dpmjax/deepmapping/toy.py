@@ -1,4 +1,4 @@
-"""Why DeepMapping optimises a network instead of the poses, in one dimension (DeepMapping supplement D, figure 14).
+"""Optimisation of a network instead of its output, in one dimension (DeepMapping supplement D, figure 14).
 
 The same function is minimised twice by plain gradient descent from the same start: over x, and over the weights and
 the input of a network whose output is x. Both are problems of the engine; many seeds are many starts.
@@ -17,7 +17,7 @@ import optax
 from jaxtyping import Array, Float
 
 from dpmjax.deepmapping.problem import Problem
-from dpmjax.nets.scalar import ScalarNet, ScalarNetConfig
+from dpmjax.nets.localization import ScalarNet, ScalarNetConfig
 from dpmjax.types import AnyArray
 
 
@@ -29,8 +29,8 @@ class ToyConfig:
         form: "network": weights and input of the network are optimised; "direct": x itself, from the network's first
             output, so that both forms start alike.
         net: the network.
-        learning_rate: of gradient descent.
-        num_steps: of gradient descent.
+        learning_rate: learning rate of gradient descent.
+        num_steps: number of steps of gradient descent.
     """
 
     form: Literal["network", "direct"] = "network"
@@ -50,7 +50,7 @@ class ToyParams:
     """Parameters of the example.
 
     Attributes:
-        x: of the direct form.
+        x: value of the direct form.
         net: weights of the network.
         z: input of the network, drawn from a standard normal distribution.
     """
@@ -67,7 +67,7 @@ def toy_loss(x: Float[AnyArray, "..."]) -> Float[Array, "..."]:
 
 
 def global_minimum() -> tuple[float, float]:
-    """Where L is smallest, and its value there: (-1.417, -23.757), in float64.
+    """Finds the minimum of L and its value: (-1.417, -23.757), in float64.
 
     Beyond |x| = 12 the parabola alone is above 47, more than the smallest value plus both amplitudes.
 
@@ -92,7 +92,7 @@ def toy_problem(config: ToyConfig) -> Problem:
         config: settings.
 
     Returns:
-        The problem; all starts are kept.
+        The problem.
     """
     return Problem(config, (config,), _init, _optimizer, _loss, _poses, _next_phase, steps_per_call=config.num_steps)
 
@@ -102,7 +102,7 @@ def network_value(config: ToyConfig, params: ToyParams) -> Float[Array, ""]:
 
     Args:
         config: settings.
-        params: with the weights and the input of the network.
+        params: parameters with the weights and the input of the network.
 
     Returns:
         x = f(z).

@@ -22,7 +22,7 @@ from dpmjax.geometry import rigid
 from dpmjax.geometry.alignment import weighted_svd
 from dpmjax.geometry.bearing import directions_of, turned_directions
 from dpmjax.geometry.consensus import ConsensusConfig, find_consensus, motion_support
-from dpmjax.geometry.namespace import safe_sqrt
+from dpmjax.geometry.rigid import safe_sqrt
 from dpmjax.types import AnyArray, DescriptorCloud, Registration
 
 PredictOffsets = Callable[[Int[Array, " k"], Int[Array, " k"]], tuple[Float[Array, "k 3"], Float[Array, "k 3"]]]

@@ -20,7 +20,7 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray
 from dpmjax.checks import require_shape
 from dpmjax.deeppointmap.model_config import ModelConfig
 from dpmjax.geometry.bearing import from_ray_frame, ray_directions
-from dpmjax.geometry.elements import pyramid_elements
+from dpmjax.geometry.normals import pyramid_elements
 from dpmjax.geometry.pyramid_host import build_pyramid_on_host
 from dpmjax.geometry.pyramid_storage import StoredPyramid, moved_pyramid
 from dpmjax.nets.decoder import DescriptorDecoder

@@ -1,4 +1,4 @@
-"""Geometry of points and poses: knows nothing of networks, losses or files."""
+"""Geometry of points and poses, without networks, losses and files."""
 
 import lazy_loader as _lazy
 

@@ -2,8 +2,8 @@
 
 With weighted means removed, the rotation that maximises trace(R H) for the cross covariance H = sum_i w_i s_i t_i^T
 comes from H = U S V^T as R = V diag(1, .., det) U^T (Kabsch 1976, Umeyama 1991; DeepPointMap section 3.3). The
-derivative of the singular vectors has poles wherever two singular values meet; that of R has them only where their
-signed *sum* is zero, that is where R itself is ambiguous. So R carries a derivative of its own.
+derivative of the singular vectors has poles wherever two singular values meet. That of R has poles only where their
+signed *sum* is zero, and there R itself is ambiguous. So R carries a derivative of its own.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from dpmjax.checks import as_float, as_points, require_shape
-from dpmjax.geometry.namespace import matmul, namespace_of
+from dpmjax.geometry.rigid import matmul, namespace_of
 from dpmjax.types import AnyArray
 
 DEGENERATE_IN_EPS = 32
@@ -30,10 +30,10 @@ def weighted_svd(
 ) -> Float[Array, "d1 d1"]:
     """The rigid motion `T_target_source` that minimises sum_i weights[i] * |T source[i] - target[i]|^2.
 
-    The rotation is proper (determinant +1) even where a reflection would fit better. Where the data leave it open
-    (all points on one line in 3-D; one pair; a perfect mirror image) it is a best one, near the identity; so one
-    valid pair gives a translation, and none gives the identity. Value and gradient are finite in all these cases:
-    along directions that the data leave open the derivative is zero.
+    The rotation is proper (determinant +1) even where a reflection would fit better. Where several motions fit equally
+    well (all points on one line in 3-D; one pair; a perfect mirror image), it is one of them near the identity: one
+    valid pair gives a translation, none the identity. Value and gradient are finite in all these cases: along
+    directions that the data leave open the derivative is zero.
 
     Args:
         source: (n, 2) or (n, 3), in the source frame.
@@ -127,7 +127,7 @@ def _best_rotation_3d(H: Any, xp: ModuleType) -> Any:
     # The 2x2 minors measure the product of the two largest singular values: none left means rank one or zero.
     minors = xp.cross(H, xp.roll(H, -1, axis=0))
     is_rank_one = xp.sum(minors**2) <= (tolerance / 4) ** 2
-    # There, a small pull towards the identity settles what the data leave open.
+    # There, a small pull towards the identity selects one of the solutions.
     H = xp.where(is_rank_one, H + tolerance * xp.eye(3, dtype=H.dtype), H)
     return _nearest_rotation(H) if xp is jnp else _rotation_and_parts(H)[0]
 

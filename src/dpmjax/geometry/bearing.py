@@ -23,7 +23,7 @@ def ray_directions(positions: Float[AnyArray, "... d"]) -> Float[Array, "... 2"]
     """Computes the unit horizontal direction of the ray from the lidar to each position.
 
     Args:
-        positions: in the frame of the lidar, d is 2 or 3.
+        positions: positions in the frame of the lidar, d is 2 or 3.
 
     Returns:
         Cosine and sine of the azimuth; (1, 0) on the vertical axis of the lidar.
@@ -44,7 +44,7 @@ def wall_normals(offsets: Float[AnyArray, "... k 3"], rays: Float[AnyArray, "...
     to the lidar.
 
     Args:
-        offsets: of the neighbours from each point, normalised coordinates.
+        offsets: offsets of the neighbours from each point, normalised coordinates.
         rays: unit directions of the rays to the points, same frame.
 
     Returns:
@@ -80,7 +80,7 @@ def to_ray_frame(vectors: Float[AnyArray, "... 3"], directions: Float[AnyArray, 
     """Turns vectors about the vertical into the frames of rays.
 
     Args:
-        vectors: in the frame of the cloud.
+        vectors: vectors in the frame of the cloud.
         directions: unit direction of the ray of each vector, same frame.
 
     Returns:
@@ -111,10 +111,10 @@ def turned_directions(
 
     Args:
         directions: unit horizontal directions in the frame of the cloud.
-        T_map_cloud: motion from that frame to the other one.
+        T_map_cloud: motion from that frame to a second one.
 
     Returns:
-        Unit horizontal directions in the other frame; (1, 0) for one that becomes vertical.
+        Unit horizontal directions in the second frame; (1, 0) for one that becomes vertical.
     """
     R = jnp.asarray(T_map_cloud)[..., None, :2, :2]
     return ray_directions(jnp.sum(R * directions[..., None, :], axis=-1))

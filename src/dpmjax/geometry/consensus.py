@@ -33,7 +33,7 @@ class ConsensusConfig:
             Points nearer to each other than this, on either side, are not compared.
         inlier_m: a pair farther apart than this under a motion does not support it.
         num_seeds: how many pairs propose a motion.
-        num_partners: from how many other pairs each.
+        num_partners: number of pairs that support each pair.
         num_rounds: how often a motion is fitted again to what supports it.
         num_motions: how many motions are returned.
         distinct_m: of two motions that put the source points nearer to each other than this, on average, only the one
@@ -62,8 +62,8 @@ class Consensus:
     Attributes:
         T_target_source: the motions; where there are fewer, the first is repeated with support 0.
         is_inlier: which pairs are nearer than `inlier_m` under each.
-        support: sum of 1 - error / inlier_m over the inliers; pairs of nearly the same points count as one. The caller
-            knows how much support arises by chance.
+        support: sum of 1 - error / inlier_m over the inliers; pairs of nearly the same points count as one. Only the
+            caller can estimate the support that arises by chance.
     """
 
     T_target_source: Float[Array, "*b h 4 4"]

@@ -1,4 +1,4 @@
-"""Nearest neighbours by exhaustive search: exact, masked, and with bounded memory.
+"""Nearest neighbours: by exhaustive search, exact, masked and with bounded memory; by a tree on the host.
 
 Squared distances come from coordinate differences, never from the expanded square: that one loses metres of a
 100 m scan to cancellation in float32. Which points are nearest has no derivative; the distances to them have.
@@ -7,9 +7,11 @@ Squared distances come from coordinate differences, never from the expanded squa
 from __future__ import annotations
 
 import functools
+import os
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
@@ -34,7 +36,7 @@ def k_nearest(
         mask: False for points that are not there; they may hold anything.
 
     Returns:
-        Neighbours (m, k). Where there are fewer than k valid points the rest is masked: index 0, distance infinite.
+        Neighbours (m, k). With fewer than k valid points, the remaining columns are masked: index 0, distance infinite.
         A query that is not finite has no neighbours. `squared_distances` is differentiable in both clouds.
 
     Raises:
@@ -160,3 +162,48 @@ def _search_top_k(
     if num_queries <= chunk:
         return jax.vmap(search)(queries)
     return lax.map(search, queries, batch_size=chunk)
+
+
+WAIT_POLICY = "OMP_WAIT_POLICY"
+if WAIT_POLICY in os.environ:
+    import small_gicp
+else:
+    # Its threads would wait in a loop for milliseconds after each search, on cores that JAX needs by then. OpenMP reads
+    # the policy once, when the library is loaded.
+    os.environ[WAIT_POLICY] = "PASSIVE"
+    import small_gicp
+
+    del os.environ[WAIT_POLICY]
+
+
+class HostTree:
+    """Points in a k-d tree.
+
+    Attributes:
+        points: the points, float64.
+        num_threads: threads of building and searching.
+    """
+
+    def __init__(self, points: Float[np.ndarray, "n 3"], *, num_threads: int = 2) -> None:
+        self.points = np.ascontiguousarray(points, np.float64)
+        self.num_threads = num_threads
+        self._tree = small_gicp.KdTree(self.points, num_threads=num_threads) if len(points) > 0 else None
+
+    def nearest(
+        self, queries: Float[np.ndarray, "m 3"], k: int
+    ) -> tuple[Int[np.ndarray, "m k"], Float[np.ndarray, "m k"]]:
+        """Finds the nearest points of each query.
+
+        Args:
+            queries: finite.
+            k: number of neighbours, at most the number of points.
+
+        Returns:
+            Rows of the points and their distances, nearest first; equally near points come in any order.
+        """
+        if self._tree is None or k == 0 or len(queries) == 0:
+            return np.zeros((len(queries), k), np.int64), np.zeros((len(queries), k))
+        rows, squared = self._tree.batch_knn_search(
+            np.ascontiguousarray(queries, np.float64), k, num_threads=self.num_threads
+        )
+        return rows.view(np.int64), np.sqrt(squared)

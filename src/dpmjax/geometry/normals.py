@@ -13,7 +13,8 @@ from jaxtyping import Array, Bool, Float
 
 from dpmjax.checks import as_mask, as_points, require_count, require_positive
 from dpmjax.geometry.neighbours import k_nearest
-from dpmjax.types import AnyArray, Neighbours
+from dpmjax.geometry.planes import fit_planes
+from dpmjax.types import AnyArray, Neighbours, PointPyramid, SurfaceElements
 
 # Neighbouring pixels whose depths differ by more than this share lie on different surfaces.
 _SAME_SURFACE = 0.3
@@ -24,8 +25,8 @@ class Normals(NamedTuple):
 
     Attributes:
         normals: unit vectors that face the origin of the frame (the sensor); zero where `mask` is False.
-        flatness: in [0, 1], how much the neighbourhood is a line (2-D) or a plane (3-D): with the eigenvalues of its
-            covariance, smallest first, (l2 - l1) / l2 in 2-D and (l2 - l1) / l3 in 3-D; zero where `mask` is False.
+        flatness: linearity (2-D) or planarity (3-D) of the neighbourhood in [0, 1]: with the eigenvalues of its
+            covariance, smallest first, (l2 - l1) / l2 in 2-D and (l2 - l1) / l3 in 3-D. Zero where `mask` is False.
         mask: True where the point is valid and has d valid neighbours or more (itself included) that do not coincide.
     """
 
@@ -40,7 +41,7 @@ def image_normals(
     """Normals of organised clouds: of the plane through each pixel, the one right of it and the one below it.
 
     Args:
-        points: in the camera frame, depth along z.
+        points: points in the camera frame, depth along z.
         mask: True where something was measured.
 
     Returns:
@@ -129,3 +130,46 @@ def _smallest_axis_3d(covariance: Float[Array, "n 3 3"]) -> tuple[Float[Array, "
     smallest, middle, largest = eigenvalues[:, 0], eigenvalues[:, 1], eigenvalues[:, 2]
     flatness = (middle - smallest) / jnp.where(largest > 0, largest, 1)
     return eigenvectors[:, :, 0], jnp.clip(flatness, 0, 1)
+
+
+MIN_NEIGHBOURS = 4
+"""A plane needs this many neighbours, the point itself among them."""
+
+
+def pyramid_elements(pyramid: PointPyramid, num_elements: int) -> SurfaceElements:
+    """Fits a plane to each of the first points of level 1, through their neighbours in the input of the pyramid.
+
+    No further search is needed: the neighbours are those of the first block. The points of every coarser level are the
+    first of level 1, in the order of farthest points.
+
+    Args:
+        pyramid: one scan; masked points may hold anything.
+        num_elements: number of elements, at most the number of points of level 1.
+
+    Returns:
+        Elements in the frame and the unit of the pyramid. Normals face the origin and have no derivative; they are 0
+        where there are too few neighbours for a plane.
+
+    Raises:
+        ValueError: if level 1 has fewer points.
+    """
+    points, level = pyramid.levels[0], pyramid.levels[1]
+    if not 1 <= num_elements <= len(level.mask):
+        raise ValueError(f"num_elements: expected from 1 to {len(level.mask)}, got {num_elements}")
+    positions, mask = jnp.asarray(level.positions)[:num_elements], jnp.asarray(level.mask)[:num_elements]
+    rows = jnp.asarray(level.neighbours[0])[:num_elements]
+    offsets = lax.stop_gradient(jnp.asarray(points.positions)[rows] - positions[:, None])
+    offsets = jnp.where(mask[:, None, None], offsets, 0)
+    # Neighbours beyond the radius of the block were replaced by the nearest, which is the point itself.
+    is_near = (rows != rows[:, :1]).at[:, 0].set(True)
+    fit = fit_planes((offsets[..., 0], offsets[..., 1], offsets[..., 2]), is_near)
+    positions = jnp.where(mask[:, None], positions, 0)
+    faces_away = jnp.sum(fit.normals * positions, axis=1) > 0
+    normals = jnp.where(faces_away[:, None], -fit.normals, fit.normals)
+    is_plane = mask & (jnp.sum(is_near, axis=1) >= MIN_NEIGHBOURS)
+    return SurfaceElements(
+        positions=positions,
+        normals=jnp.where(is_plane[:, None], normals, 0),
+        planarity=jnp.where(is_plane, fit.flatness, 0),
+        mask=mask,
+    )

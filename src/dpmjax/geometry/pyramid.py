@@ -32,7 +32,8 @@ class PyramidStage:
 
     Attributes:
         num_points: how many points are kept, by farthest-point sampling.
-        radii: of the neighbourhoods, normalised: the first looks into the level before, the others into this one.
+        radii: of the neighbourhoods, normalised: the first block has neighbours in the level before, every later block
+            in this level.
         num_neighbours: how many neighbours each of them holds.
     """
 
@@ -80,8 +81,8 @@ def build_pyramid(
 ) -> PointPyramid:
     """The pyramid of one cloud (DeepPointMap section 3.1; PointNeXt, Qian et al. 2022).
 
-    Farthest-point sampling starts at the first valid point. Where a level has more room than there are points, the
-    rest of it is masked, and every index and weight there is 0. Positions have a derivative, choices have none.
+    Farthest-point sampling starts at the first valid point. Rows of a level beyond its points are masked, and their
+    indices and weights are 0. Positions have a derivative, choices have none.
 
     Args:
         points: normalised coordinates, n >= 1.

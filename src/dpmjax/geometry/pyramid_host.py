@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from dpmjax.checks import require_count
-from dpmjax.geometry.host_tree import HostTree
+from dpmjax.geometry.neighbours import HostTree
 from dpmjax.geometry.pyramid import RADIUS_SLACK, WEIGHT_EPSILON, PyramidConfig, PyramidStage
 from dpmjax.geometry.sampling import farthest_point_sample
 from dpmjax.types import Interpolation, PointPyramid, PyramidLevel
@@ -28,14 +28,14 @@ def build_pyramid_on_host(
 ) -> PointPyramid:
     """Builds the pyramid of `build_pyramid` as arrays of NumPy; the two are the same up to rounding.
 
-    Neighbours are measured in float64. So two that are equally near up to the rounding of float32 may come in the other
-    order; points that coincide come in that of the array, here as there.
+    Neighbours are measured in float64. So two points that are equally near up to the rounding of float32 may be
+    swapped; points that coincide keep the order of the array in both builders.
 
     Args:
         points: normalised coordinates, n >= 1, float32.
         mask: False for points that are not there; they may hold anything. All are there for None.
         config: sizes and radii.
-        num_threads: of the neighbour search.
+        num_threads: number of threads of the neighbour search.
 
     Returns:
         The pyramid.
@@ -74,8 +74,8 @@ def farthest_points_on_host(
 ) -> Int[np.ndarray, " s"]:
     """The first min(num_samples, number of valid points) of `farthest_point_sample`.
 
-    Where the first valid point is also the one farthest from the origin (`preprocess_scan` sees to that), points are
-    kept in buckets of a tree (QuickFPS, Han et al. 2023): four times faster, with the same result.
+    `preprocess_scan` puts the point farthest from the origin first. Then points are kept in buckets of a tree
+    (QuickFPS, Han et al. 2023): four times faster, with the same result.
 
     Args:
         points: candidates.
@@ -130,7 +130,7 @@ class _Searchable:
         """Returns the min(k, n) nearest of each query, nearest first; of equally near ones the lower index first."""
         points = self.tree.points
         num_found = min(k, len(points))
-        # One more shows whether the last is tied with what was left out.
+        # One more neighbour shows whether the last one is tied with an excluded one.
         indices, distances = self.tree.nearest(queries, min(num_found + 1, len(points)) if num_found > 0 else 0)
         tied = np.flatnonzero(np.any(distances[:, 1:] == distances[:, :-1], axis=1))
         for start in range(0, len(tied), TIED_ROWS_AT_ONCE):

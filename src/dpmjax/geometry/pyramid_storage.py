@@ -24,15 +24,15 @@ LARGEST = np.iinfo(np.int16).max
 
 @flax.struct.dataclass
 class StoredPyramid:
-    """A pyramid as it is stored; valid points stand in front on every level.
+    """A stored pyramid; valid points come first on every level.
 
     Attributes:
         num_points: number of valid points of level 0.
         unit: normalised coordinate that 1 stands for.
         points: positions of level 0, in units.
         samples: rows of level 0 that are level 1; the further levels are the first of these.
-        neighbours: for each stage and block, the rows of the neighbours.
-        interpolation: for each step up, the rows of the nearest points of the coarser level.
+        neighbours: neighbours for each stage and block, the rows of the neighbours.
+        interpolation: interpolation for each step up, the rows of the nearest points of the coarser level.
     """
 
     num_points: Int[AnyArray, "*b"]
@@ -54,7 +54,7 @@ def record_type(config: PyramidConfig, capacity: int) -> np.dtype:
         A structured type of NumPy.
 
     Raises:
-        ValueError: if rows of so many points do not fit 16 bits.
+        ValueError: if row numbers of this many points exceed 16 bits.
     """
     if capacity > MAX_STORED_POINTS:
         raise ValueError(f"capacity: expected at most {MAX_STORED_POINTS}, got {capacity}")
@@ -77,7 +77,7 @@ def pack_pyramid(pyramid: PointPyramid, record: np.void) -> None:
 
     Args:
         pyramid: one scan; the valid points of level 0 stand in front.
-        record: of `record_type`.
+        record: record of `record_type`.
 
     Raises:
         ValueError: if a masked point stands before a valid one.

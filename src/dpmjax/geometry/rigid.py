@@ -2,14 +2,48 @@
 
 from __future__ import annotations
 
+from types import ModuleType
 from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
-from dpmjax.geometry.namespace import namespace_of
 from dpmjax.types import AnyArray
+
+
+def namespace_of(*arrays: Any) -> ModuleType:
+    """Returns `jax.numpy` if one array or more is JAX's, else `numpy`."""
+    return jnp if any(isinstance(array, jax.Array) for array in arrays) else np
+
+
+def matmul(a: Any, b: Any) -> Any:
+    """Multiplies matrices at full precision on every device.
+
+    Args:
+        a: (..., n, k), of NumPy or of JAX.
+        b: (..., k, m).
+
+    Returns:
+        (..., n, m), of JAX if one of the two is.
+    """
+    return jnp.matmul(a, b, precision=jax.lax.Precision.HIGHEST) if namespace_of(a, b) is jnp else np.matmul(a, b)
+
+
+def safe_sqrt(squared: Any) -> Any:
+    """Computes square roots whose derivative at 0 is 0.
+
+    Args:
+        squared: any shape, of NumPy or of JAX; numbers below 0 count as 0.
+
+    Returns:
+        The roots, same shape.
+    """
+    xp = namespace_of(squared)
+    # The slope of the square root is infinite at zero: guard its input, then its output.
+    is_zero = squared <= 0
+    return xp.where(is_zero, 0, xp.sqrt(xp.where(is_zero, 1, squared)))
 
 
 def inverse(T_a_b: Any) -> Any:
@@ -30,10 +64,10 @@ def inverse(T_a_b: Any) -> Any:
 
 
 def compose(T_a_b: Float[AnyArray, "*#n d d"], T_b_c: Float[AnyArray, "*#n d d"]) -> Float[Array, "*n d d"]:
-    """One motion after the other, at full precision on every device.
+    """Chains two motions, at full precision on every device.
 
     Args:
-        T_a_b: maps b to a; its leading axes broadcast with those of the other.
+        T_a_b: maps b to a; leading axes broadcast.
         T_b_c: maps c to b.
 
     Returns:

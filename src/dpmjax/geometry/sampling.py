@@ -1,4 +1,4 @@
-"""Choosing points: far apart from each other, or one of each voxel. Both depend on coordinates only."""
+"""Choice of points: farthest from each other, one of each voxel, or free space on the beams of a range sensor."""
 
 from __future__ import annotations
 
@@ -6,21 +6,22 @@ import functools
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from dpmjax.checks import as_mask, as_points, require_count, require_positive
+from dpmjax.checks import as_float, as_mask, as_points, require_count, require_positive, require_shape
 from dpmjax.types import AnyArray
 
 
 def farthest_point_sample(
     points: Float[AnyArray, "n d"], num_samples: int, mask: Bool[AnyArray, " n"] | None = None
 ) -> Int[Array, " s"]:
-    """Indices of points of which each is the farthest from all before it, starting at the first valid point.
+    """Chooses points, each the farthest from all before it, from the first valid point on.
 
     Each valid point comes at most once, even where points coincide; of equally far ones the lower index comes first.
-    Where there are fewer valid points than samples, the rest repeats the first index; without any valid point, all
-    are 0. The choice has no derivative.
+    With fewer valid points than samples, the remaining entries repeat the first index; without any valid point, all are
+    0. The choice has no derivative.
 
     Args:
         points: candidates, n >= 1.
@@ -109,3 +110,50 @@ def _voxel_sample(
     for column in sorted_voxels:
         is_new = is_new.at[1:].set(is_new[1:] | (column[1:] != column[:-1]))
     return jnp.zeros(num_points, bool).at[index].set(is_new & ~is_masked)
+
+
+def sample_free_space(
+    origin: Float[AnyArray, " d"], points: Float[AnyArray, "b d"], factors: Float[AnyArray, "*beams s"]
+) -> Float[Array, "b s d"]:
+    """Points on the segments from the sensor to its hits (DeepMapping section 3.2, figure 3).
+
+    Args:
+        origin: the sensor's centre, in the frame and unit of `points`.
+        points: where the beams end.
+        factors: fractions of the segments, in (0, 1), either (s,) shared by all beams or (b, s) for each beam.
+
+    Returns:
+        `origin + factor * (point - origin)` for every beam and factor.
+
+    Raises:
+        ValueError: the shapes do not match.
+    """
+    points = as_points("points", points)
+    origin, factors = as_float("origin", origin), as_float("factors", factors)
+    num_beams, dim = points.shape
+    require_shape("origin", origin, (dim,))
+    if factors.ndim not in (1, 2) or (factors.ndim == 2 and factors.shape[0] != num_beams):
+        raise ValueError(f"factors: expected shape (s,) or ({num_beams}, s), got {factors.shape}")
+    return origin + factors[..., None] * (points - origin)[:, None, :]
+
+
+def typical_range(points: Float[AnyArray, "n *beams d"], mask: Bool[AnyArray, "n *beams"]) -> float:
+    """The range that nine beams in ten of a scan stay below, as the median over the scans.
+
+    Args:
+        points: beam end points or pixels, each scan in its own sensor frame.
+        mask: True where a beam measured something; scans without any do not count.
+
+    Returns:
+        The range, in the unit of the points.
+
+    Raises:
+        ValueError: no beam measured anything.
+    """
+    ranges, mask = np.linalg.norm(np.asarray(points), axis=-1), np.asarray(mask)
+    of_scans = [
+        np.percentile(beams[is_valid], 90) for beams, is_valid in zip(ranges, mask, strict=True) if is_valid.any()
+    ]
+    if not of_scans:
+        raise ValueError("mask: expected at least one valid beam, got none")
+    return float(np.median(of_scans))

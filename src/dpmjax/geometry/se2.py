@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Array, Float
 from numpy.typing import NDArray
 
-from dpmjax.geometry.namespace import namespace_of
+from dpmjax.geometry.rigid import namespace_of
 from dpmjax.types import AnyArray
 
 Poses = NDArray[np.float64]
@@ -143,10 +143,10 @@ def from_matrix(T_a_b: Any) -> Any:
 
 
 def as_poses(name: str, value: Any, count: int) -> NDArray[np.float64]:
-    """Makes poses x, y, heading of what a user has: these, or matrices; on the host.
+    """Makes poses x, y, heading from such poses or from matrices, on the host.
 
     Args:
-        name: of the argument, for messages.
+        name: name of the argument, for messages.
         value: (count, 3) x, y, heading, or (count, 3, 3) homogeneous matrices.
         count: number of poses.
 

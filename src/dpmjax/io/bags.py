@@ -11,8 +11,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from dpmjax.io.extras import import_for
 from dpmjax.io.files import natural_key, refusing
+from dpmjax.io.messages import import_for
 from dpmjax.sequences import InputError, require
 
 _SUFFIXES = (".bag", ".mcap", ".db3")
@@ -126,7 +126,7 @@ class Bag:
         """Reads when the messages were taken.
 
         Args:
-            topic: of messages that begin with a header.
+            topic: topic of messages that begin with a header.
 
         Returns:
             (n,) nanoseconds since 1970, increasing: of the headers, or of the recording where these are not set.
@@ -142,7 +142,7 @@ class Bag:
         """Reads a message by its number in `stamps`.
 
         Args:
-            topic: of messages that begin with a header.
+            topic: topic of messages that begin with a header.
             index: the number.
 
         Returns:

@@ -24,7 +24,7 @@ class CloudLayout(NamedTuple):
         fields: names of the fields; a name may occur twice.
         layout: one record; its fields are called "0", "1" and so on, and are arrays.
         num_points: number of records.
-        encoding: of the body, as the header names it.
+        encoding: encoding of the body, as the header names it.
         size: bytes of the header.
         num_lines: lines of the header.
     """
@@ -94,7 +94,7 @@ def find_time_field(names: Iterable[str]) -> str | None:
     """Finds the field in which a driver writes when a point was measured.
 
     Args:
-        names: of the fields.
+        names: names of the fields.
 
     Returns:
         The first known name, None where there is none.

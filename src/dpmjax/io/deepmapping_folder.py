@@ -6,16 +6,14 @@ zeros, or one that is not finite.
 
 from __future__ import annotations
 
-import io
 import tarfile
 from pathlib import Path, PurePosixPath
-from typing import Any
 
 import numpy as np
 
-from dpmjax.io.files import natural_key, read_bytes, refusing, write_atomically
-from dpmjax.io.mat import parse_mat
-from dpmjax.io.pcd import parse_pcd, write_pcd
+from dpmjax.io.files import natural_key, read_bytes, refusing
+from dpmjax.io.foreign_arrays import parse_mat
+from dpmjax.io.pcd import parse_pcd
 from dpmjax.sequences import FloatArray, ScanSequence, Unit, has_angular_order, require
 
 _PIXELS_PER_UNIT = 512.0
@@ -30,8 +28,8 @@ def read_deepmapping_folder(path: str | Path, *, unit: Unit | None = None) -> Sc
 
     Args:
         path: the folder, or the archive.
-        unit: "px" (or None) multiplies coordinates by 512, as the authors' files need; "m" takes them as they are, for
-            other people's PCD scans.
+        unit: "px" (or None) multiplies coordinates by 512, as the authors' files need; "m" takes them unchanged, for
+            other PCD scans.
 
     Returns:
         The scans in natural order of their names; scans with fewer points than the longest are padded with masked
@@ -62,38 +60,6 @@ def read_deepmapping_folder(path: str | Path, *, unit: Unit | None = None) -> Sc
     reference = None if pose_name is None else _read_poses(files[pose_name], f"{path}/{pose_name}", len(names))
     is_organised = has_angular_order(points, mask)
     return ScanSequence(Path(path).stem, points, mask, unit or "px", is_organised, reference)
-
-
-def write_deepmapping_folder(path: str | Path, sequence: ScanSequence) -> Path:
-    """Writes a sequence in the authors' layout, so that it is interchangeable with theirs.
-
-    Args:
-        path: folder to write to; it is made where missing.
-        sequence: scans in px (written as pixels / 512) or in m (written as they are); masked beams become zeros.
-
-    Returns:
-        The folder with `000.pcd`, `001.pcd`, ... and, where the sequence has a reference, `gt_pose.mat`.
-
-    Raises:
-        InputError: the folder holds other PCD files, which would be read along with ours.
-    """
-    from scipy.io import savemat
-
-    folder = Path(path)
-    digits = max(3, len(str(len(sequence) - 1)))
-    names = [f"{index:0{digits}d}.pcd" for index in range(len(sequence))]
-    others = sorted({file.name for file in folder.glob("*.pcd")} - set(names)) if folder.is_dir() else []
-    found = f"{len(others)} other .pcd files, such as {next(iter(others), None)}"
-    require(len(others) == 0, folder, found, "give an empty folder")
-    scale = _PIXELS_PER_UNIT if sequence.unit == "px" else 1.0
-    stored = np.where(sequence.mask[..., None], sequence.points, 0.0) / scale
-    for name, points in zip(names, stored, strict=True):
-        write_pcd(folder / name, points)
-    if sequence.reference_poses is not None:
-        buffer: Any = io.BytesIO()  # Older stubs of SciPy know names of files only.
-        savemat(buffer, {"pose": sequence.reference_poses})
-        write_atomically(folder / _POSE_FILE, buffer.getvalue())
-    return folder
 
 
 def _list_files(path: Path) -> dict[str, bytes]:

@@ -21,8 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dpmjax.io.files import natural_key, read_bytes, read_lines, read_table, refusing
-from dpmjax.io.mat import parse_mat
-from dpmjax.io.pictures import read_depth_png
+from dpmjax.io.foreign_arrays import parse_mat, read_depth_png
 from dpmjax.io.poses import homogeneous
 from dpmjax.sequences import ACTIVE_VISION, BoolArray, Camera, DepthSequence, FloatArray, InputError, require
 
@@ -68,12 +67,13 @@ def read_pose_folder(path: str | Path, *, height: int = 30, width: int = 40, max
 def read_active_vision(
     path: str | Path, num_views: int = 16, *, seed: int = 0, height: int = 27, width: int = 48, max_depth_m: float = 7.0
 ) -> DepthSequence:
-    """Reads one random trajectory through a scene (DeepMapping section 4.2); every second step moves, the others turn.
+    """Reads one random trajectory through a scene (DeepMapping section 4.2); every second step is a move, every other
+    one a turn.
 
     Args:
         path: folder of the scene.
         num_views: 8 or 16 in the paper.
-        seed: of the walk.
+        seed: seed of the walk.
         height: rows of a cloud.
         width: columns of a cloud.
         max_depth_m: deeper pixels are masked; the published program drops 7 m and more.
@@ -102,7 +102,7 @@ def read_active_vision(
 
 
 def is_active_vision(path: Path) -> bool:
-    """Whether a folder is a scene of the Active Vision Dataset.
+    """Returns True where a folder is a scene of the Active Vision Dataset.
 
     Args:
         path: the folder.
@@ -171,7 +171,7 @@ def _make_camera(path: Path, width: int, height: int, intrinsics: Iterable[float
 
 
 def _walk(known: list[str], links: dict[str, Any], num_views: int, rng: np.random.Generator) -> list[str]:
-    """Names of the images; where no step of one kind is known, one of the other kind is taken."""
+    """Names of the images; where no move is known, a turn is taken, and the reverse."""
     is_known = set(known)
 
     def reachable(name: str, kinds: tuple[str, ...]) -> list[str]:

@@ -1,4 +1,4 @@
-"""The files of a drive of 3-D scans with their poses and times; plain folders; reading on; writing as KITTI."""
+"""The files of a drive of 3-D scans with their poses and times; plain folders; reading on."""
 
 from __future__ import annotations
 
@@ -11,9 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dpmjax.geometry import rigid
-from dpmjax.io.calibration import read_camera_calibration
-from dpmjax.io.files import load_arrays, read_table, write_atomically
-from dpmjax.io.poses import check_poses, homogeneous, read_poses, read_stamped_poses, write_kitti
+from dpmjax.io.files import load_arrays, read_lines, read_table
+from dpmjax.io.poses import check_poses, from_rows, homogeneous, read_poses, read_stamped_poses
 from dpmjax.io.references import camera_note, match_reference, scan_times
 from dpmjax.io.scan_names import sort_scans, strays_among
 from dpmjax.sequences import FloatArray, InputError, LidarSequence, Note, require
@@ -23,7 +22,7 @@ SCAN_SUFFIXES = (".bin", ".npy", ".npz", ".pcd", ".ply", ".las", ".laz")
 POSE_FILES = ("poses_lidar.txt", "poses_lidar.npy", "poses.txt", "poses.npy", "trajectory.txt", "trajectory_tum.txt",
               "trajectory.npy", "gt_poses.txt", "groundtruth.txt")  # fmt: skip
 """Usual names of files of reference poses in the lidar's frame."""
-# Axes of a camera that looks along x of the lidar: x right, y down, z forward. Written sequences have it in the lidar.
+# Axes of a camera that looks along x of the lidar: x right, y down, z forward.
 _T_CAM0_LIDAR = np.array([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]])
 
 
@@ -31,11 +30,11 @@ class Drive3D(NamedTuple):
     """The files of a drive, one a scan in order, with poses and times where there are any.
 
     Attributes:
-        name: for titles.
+        name: name for titles.
         files: the scans.
         T_world_lidar: (n, 4, 4), NaN for scans without a pose; or None.
         times: (n,) s, or None.
-        notes: what was decided about the files, and doubts.
+        notes: decisions about the files, and doubts.
     """
 
     name: str
@@ -64,7 +63,7 @@ def stray_note(folder: Path) -> Note | None:
     """Names the files of a folder that are no scans although they have the ending of scans, such as map.pcd.
 
     Args:
-        folder: of the scans.
+        folder: folder of the scans.
 
     Returns:
         The note, or None.
@@ -181,7 +180,7 @@ class IndexedScan(NamedTuple):
     """A scan and its number in the sequence.
 
     Attributes:
-        number: of the scan in the sequence.
+        number: number of the scan in the sequence.
         points: (n, 3) float32, lidar frame, m.
     """
 
@@ -216,36 +215,42 @@ def iterate_scans(sequence: LidarSequence) -> Iterator[IndexedScan]:
         _log.warning("%s: %d of %d scans left out: %s", sequence.name, len(bad), sequence.num_scans, listed)
 
 
-def write_kitti_sequence(root: str | Path, name: str, sequence: LidarSequence) -> Path:
-    """Writes a sequence as KITTI odometry lays it out: sequences/NAME/{velodyne,calib.txt,times.txt}, poses/NAME.txt.
-
-    Reflectance is written as 0. Poses are those of the camera of the written calib.txt, from the first scan on.
+def read_labelled_numbers(path: Path) -> dict[str, FloatArray]:
+    """Reads the lines `key: numbers` of a calibration file; other lines are ignored.
 
     Args:
-        root: folder of the data set.
-        name: of the sequence, like "00".
-        sequence: the scans; it must have poses. Bad scans are left out, with their poses.
+        path: the file.
 
     Returns:
-        The sequence's folder.
+        The numbers by key.
 
     Raises:
-        InputError: no poses, or not one good scan.
+        InputError: there is no such file.
     """
-    if sequence.T_world_lidar is None:
-        raise InputError(sequence.name, "no poses", "a KITTI sequence needs a pose for each scan")
-    root = Path(root)
-    folder = root / "sequences" / name
-    kept: list[int] = []
-    for index, points in iterate_scans(sequence):
-        rows = np.zeros((len(points), 4), "<f4")
-        rows[:, :3] = points
-        write_atomically(folder / "velodyne" / f"{len(kept):06d}.bin", rows.tobytes())
-        kept.append(index)
-    T_first_lidar = rigid.inverse(sequence.T_world_lidar[kept[0]]) @ sequence.T_world_lidar[kept]
-    write_kitti(root / "poses" / f"{name}.txt", _T_CAM0_LIDAR @ T_first_lidar @ rigid.inverse(_T_CAM0_LIDAR))
-    numbers = " ".join(f"{value:.12e}" for value in _T_CAM0_LIDAR[:3].ravel())
-    write_atomically(folder / "calib.txt", f"Tr: {numbers}\n")
-    times = np.arange(len(kept)) / 10.0 if sequence.times is None else sequence.times[kept]
-    write_atomically(folder / "times.txt", "".join(f"{time:.6f}\n" for time in times))
-    return folder
+    found = {}
+    for key, _, numbers in (line.partition(":") for line in read_lines(path)):
+        try:
+            found[key.strip()] = np.array(numbers.split(), np.float64)
+        except ValueError:
+            continue
+    return found
+
+
+def read_camera_calibration(path: Path) -> FloatArray:
+    """Reads `Tr`, the lidar's frame to the left grey camera's, out of KITTI's calib.txt.
+
+    Args:
+        path: the file.
+
+    Returns:
+        (4, 4) `T_cam0_lidar`.
+
+    Raises:
+        InputError: there is no such file, or no such line in it.
+    """
+    entries = read_labelled_numbers(path)
+    for key in ("Tr", "Tr_velo_to_cam", "Tr_velo_cam"):
+        if key in entries and len(entries[key]) == 12:
+            return np.asarray(from_rows(entries[key], path)[0])
+    advice = "take the calib.txt with a line 'Tr:' of 12 numbers (data_odometry_calib); camera poses need it"
+    raise InputError(path, "no line 'Tr:' of 12 numbers", advice)

@@ -29,7 +29,8 @@ def refusing(source: str | Path, found: str, advice: str, kinds: tuple[type[Exce
 
     Args:
         source: see `InputError`.
-        found: what was found; "{error}" in it becomes the parser's message, and "{kind}" the class of its error.
+        found: finding about the file; "{error}" in it becomes the parser's message, and "{kind}" the class of its
+            error.
         advice: see `InputError`.
         kinds: the errors that damaged input can raise.
 
@@ -188,7 +189,7 @@ def unpack_rows(body: bytes, layout: np.dtype[np.void], count: int, source: str 
 
     Args:
         body: the bytes.
-        layout: of one record.
+        layout: layout of one record.
         count: number of records that the header promises.
         source: name of the file, for messages.
 

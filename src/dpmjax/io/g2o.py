@@ -1,8 +1,8 @@
 """Pose graphs as files of g2o and TORO, in the plane and in space.
 
-An edge `a b` holds `T_a_b`: node a is the target, node b the source. Its information matrix stands as the upper
-triangle, translation first; in space the order is x y z qx qy qz, and the part of the quaternion is taken for that of
-the rotation vector, as GTSAM does. Quaternions stand as x y z w.
+An edge `a b` holds `T_a_b`: node a is the target, node b the source. Its information matrix is the upper triangle,
+translation first. In space the order is x y z qx qy qz; the block of the quaternion is used for the rotation vector, as
+in GTSAM. Quaternions stand as x y z w.
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ from scipy.spatial.transform import Rotation
 
 from dpmjax.io.files import read_lines, refusing, write_atomically
 from dpmjax.io.graph_tags import IGNORED, TAGS, advice_of, information_of, poses_of
+from dpmjax.pose_graph.chordal import spanning_tree_poses
 from dpmjax.pose_graph.graph import Edges, PoseGraph, is_semidefinite, nearest_semidefinite
-from dpmjax.pose_graph.spanning_tree import spanning_tree_poses
 from dpmjax.sequences import FloatArray, InputError, require
 
 
@@ -46,8 +46,7 @@ def read_g2o(path: str | Path, *, nearest_psd: bool = False) -> PoseGraph:
 
     Raises:
         InputError: no such file, an unknown line, a wrong number of values, graphs in the plane and in space in one
-            file, a node that occurs twice or not at all, or numbers that make no poses or information matrices; line
-            and edge are named.
+            file, a repeated or missing node, or invalid poses or information matrices; line and edge are named.
     """
     lines, fixed = _read_lines(path)
     vertices = [line for line in lines if TAGS[line.tag].num_nodes == 1]

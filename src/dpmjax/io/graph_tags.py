@@ -109,7 +109,7 @@ def information_of(tag: Tag, numbers: FloatArray) -> FloatArray:
     """Converts numbers of a file to information matrices.
 
     Args:
-        tag: of the lines.
+        tag: tag of the lines.
         numbers: (n, k) entries in the order of the tag.
 
     Returns:

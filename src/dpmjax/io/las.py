@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 
 from dpmjax.io.clouds import TimedCloud
-from dpmjax.io.extras import import_for
 from dpmjax.io.files import read_bytes, refusing, to_float32
+from dpmjax.io.messages import import_for
 from dpmjax.sequences import InputError, require
 
 _ADVICE = "copy the file again, or save it anew as LAS 1.2 or 1.4"

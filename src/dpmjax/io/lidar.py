@@ -14,11 +14,11 @@ from dpmjax.io.bags import is_bag
 from dpmjax.io.bin_columns import check_size, columns_of_drive
 from dpmjax.io.drives import Drive3D, find_pose_file, read_learned_folder, read_plain_folder, scan_files, stray_note
 from dpmjax.io.files import natural_key
-from dpmjax.io.lidar_bags import open_lidar_bag
 from dpmjax.io.lidar_datasets import read_kitti_360, read_kitti_carla, read_kitti_odometry, read_kitti_raw, read_mulran
-from dpmjax.io.notes import log_notes
+from dpmjax.io.messages import log_notes
 from dpmjax.io.poses import read_stamped_poses
 from dpmjax.io.references import camera_note, match_reference
+from dpmjax.io.scan_bags import open_lidar_bag
 from dpmjax.io.scan_file import read_point_times, read_points, unit_note
 from dpmjax.sequences import InputError, LidarSequence, Note, require
 
@@ -45,7 +45,7 @@ def open_lidar_sequence(
 ) -> LidarSequence:
     """Opens a drive of 3-D scans, whatever of the known layouts it is in; scans are read when they are wanted.
 
-    What was decided about the files is in the notes of the sequence; doubts are logged as warnings.
+    The notes of the sequence hold the decisions about the files; doubts are logged as warnings.
 
     Args:
         path: the folder of a drive, the root of a data set that holds several, or a bag of ROS.
@@ -53,14 +53,14 @@ def open_lidar_sequence(
         poses: a pose file in the lidar's frame (KITTI or TUM rows, `.npy`) instead of the data set's own.
         selection: start, stop and stride in scans.
         bin_columns: numbers a point has in `.bin` files; None infers it from the first one.
-        topic: of a bag: which clouds; may be left out where there is one topic of clouds.
+        topic: topic of a bag: which clouds; may be left out where there is one topic of clouds.
 
     Returns:
         The sequence, with poses in the lidar's frame and times where the source has them.
 
     Raises:
-        InputError: one line with the file, what was found and what to do: no such folder, an unknown layout, no scan,
-            poses that cannot be brought into the lidar's frame, or a selection of no scan.
+        InputError: one line with the file, the finding and the advice: no such folder, an unknown layout, no scan,
+            poses without a known lidar frame, or an empty selection.
     """
     path, poses = Path(path), None if poses is None else Path(poses)
     is_good = bin_columns is None or bin_columns >= 3
@@ -208,7 +208,7 @@ def _read_plain(path: Path, scans: str, poses: Path | None) -> Drive3D:
 
 
 def _kind(path: Path) -> str | None:
-    """Which layout a folder has, found by the files in it; None for none."""
+    """Finds the layout of a folder by its files; None for none."""
     if (path / "generated" / "frames").is_dir() or (path / "full_poses_lidar.txt").is_file():
         return "kitti_carla"
     if (path / "Ouster").is_dir() or (path / "sensor_data" / "Ouster").is_dir():

@@ -8,8 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from dpmjax.geometry import rigid
-from dpmjax.io.calibration import read_camera_calibration, read_labelled_numbers
-from dpmjax.io.drives import Drive3D, find_pose_file, scan_files
+from dpmjax.io.drives import Drive3D, find_pose_file, read_camera_calibration, read_labelled_numbers, scan_files
 from dpmjax.io.files import natural_key, read_lines, read_table
 from dpmjax.io.poses import check_poses, from_rows, homogeneous, interpolate_poses, read_stamped_poses
 from dpmjax.io.references import match_poses, match_reference, match_rows, match_times, numbers_of
@@ -25,9 +24,9 @@ _MULRAN_OUSTER_RPY_DEG = (0.0001, 0.0003, 179.6654)
 def read_kitti_odometry(folder: Path) -> Drive3D:
     """Lists a sequence of KITTI odometry.
 
-    Poses are looked for in poses_lidar.txt (already in the lidar's frame), poses.txt beside velodyne/ (SemanticKITTI's)
-    and poses/NN.txt two folders up, both in the left camera's frame; or a file of another usual name, in the lidar's.
-    Rows of TUM are matched by time, others by the numbers of the scans.
+    Poses are searched in poses_lidar.txt (in the lidar's frame), in poses.txt beside velodyne/ (SemanticKITTI) and in
+    poses/NN.txt two folders up (both in the left camera's frame), and in files of other usual names (in the lidar's
+    frame). Rows of TUM are matched by time, others by the numbers of the scans.
 
     Args:
         folder: the folder that holds velodyne/.
@@ -236,7 +235,7 @@ def _poses_from_oxts(records: FloatArray, source: Path) -> FloatArray:
 
     Args:
         records: (n, 6) latitude, longitude (degrees), altitude (m), roll, pitch, yaw (radians).
-        source: for messages.
+        source: source for messages.
 
     Returns:
         (n, 4, 4) `T_world_imu`, world in metres, x east, y north, z up.

@@ -1,4 +1,4 @@
-"""PCD 0.7 files, the format of the Point Cloud Library: ascii, binary or compressed, with padding."""
+"""PCD 0.7 files, the format of the Point Cloud Library: ascii, binary or compressed by LZF, with padding."""
 
 from __future__ import annotations
 
@@ -10,30 +10,59 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from dpmjax.io.clouds import PADDING, CloudLayout, TimedCloud, times_of, unpack_columns
-from dpmjax.io.files import read_bytes, refusing, split_rows, to_float32, write_atomically
-from dpmjax.io.lzf import MOST_EXPANSION, unpack_lzf
+from dpmjax.io.files import refusing, split_rows, to_float32, write_atomically
 from dpmjax.sequences import InputError, require
+
+MOST_EXPANSION = 88
+"""Three packed bytes unpack to 264 at most."""
+
+
+def unpack_lzf(packed: bytes, size: int) -> bytes:
+    """Unpacks a block of LZF.
+
+    A control byte below 32 begins a run of that many literal bytes and one more. Any other begins a copy. Its upper
+    three bits are the length less two; 7 adds the next byte. Its lower five bits and the next byte are the distance
+    less one.
+
+    Args:
+        packed: the block.
+        size: number of bytes that it holds.
+
+    Returns:
+        The bytes.
+
+    Raises:
+        ValueError: the block is damaged, or holds another number of bytes.
+        IndexError: the block ends within a copy.
+    """
+    out, at, end = bytearray(), 0, len(packed)
+    while at < end and len(out) <= size:
+        control = packed[at]
+        at += 1
+        if control < 32:
+            out += packed[at : at + control + 1]
+            at += control + 1
+            continue
+        length = control >> 5
+        if length == 7:
+            length += packed[at]
+            at += 1
+        start = len(out) - ((control & 31) << 8) - packed[at] - 1
+        at, length = at + 1, length + 2
+        if start < 0:
+            raise ValueError(f"a copy of bytes before the first one, at byte {at}")
+        piece = out[start : start + length]
+        out += piece if len(piece) == length else (piece * (length // len(piece) + 1))[:length]
+    if at != end or len(out) != size:
+        raise ValueError(f"unpacks to {len(out)} bytes, not to {size}")
+    return bytes(out)
+
 
 _TYPES = {"F": "f", "I": "i", "U": "u"}
 _ENCODINGS = ("ascii", "binary", "binary_compressed")
 # A field of one byte is a number or, by the Point Cloud Library, the character of this code, a line feed too.
 _MOST_COLUMNS = 100
 _CHARACTER, _NUMBER = rb"(?:-?\d{1,3}(?=[ \t\r\n]|\Z)|.)", rb"(\S+)"
-
-
-def read_pcd(path: str | Path) -> NDArray[np.float32]:
-    """Reads the points of a PCD file.
-
-    Args:
-        path: the file.
-
-    Returns:
-        (m, 3) float32 x, y, z in the file's unit; z is zero where the file has none, and NaN is left as it is.
-
-    Raises:
-        InputError: the file is missing, or `parse_pcd` refuses it.
-    """
-    return parse_pcd(read_bytes(path), str(path)).points
 
 
 def parse_pcd(content: bytes, source: str) -> TimedCloud:
@@ -44,7 +73,7 @@ def parse_pcd(content: bytes, source: str) -> TimedCloud:
         source: its name, for messages.
 
     Returns:
-        The points, with their times where the file has them; z is zero where it has none, and NaN is left as it is.
+        The points, with their times where the file has them; z is zero where it has none, and NaN stays.
 
     Raises:
         InputError: a broken header, no x or y column, a body that is truncated or does not unpack, or a word that is no

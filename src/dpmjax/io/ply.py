@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from dpmjax.io.clouds import CloudLayout, TimedCloud, times_of, unpack_columns
-from dpmjax.io.files import read_bytes, refusing, split_rows, to_float32, write_atomically
+from dpmjax.io.files import refusing, split_rows, to_float32, write_atomically
 from dpmjax.sequences import require
 
 _TYPES = {
@@ -20,21 +20,6 @@ _TYPES = {
 _ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
 
 
-def read_ply(path: str | Path) -> NDArray[np.float32]:
-    """Reads the points of a PLY file.
-
-    Args:
-        path: the file; the vertex element must come first, other elements and properties are ignored.
-
-    Returns:
-        (n, 3) float32 x, y, z in the file's unit; NaN is left as it is.
-
-    Raises:
-        InputError: the file is missing, has a broken header or no x, y, z, or is truncated.
-    """
-    return parse_ply(read_bytes(path), str(path)).points
-
-
 def parse_ply(content: bytes, source: str) -> TimedCloud:
     """Reads the points out of the bytes of a PLY file.
 
@@ -43,10 +28,10 @@ def parse_ply(content: bytes, source: str) -> TimedCloud:
         source: its name, for messages.
 
     Returns:
-        The points, with their times where the file has them; NaN is left as it is.
+        The points, with their times where the file has them; NaN stays.
 
     Raises:
-        InputError: see `read_ply`.
+        InputError: a broken header, no x, y, z, or a truncated body.
     """
     header = _parse_header(content, source)
     body = content[header.size :]

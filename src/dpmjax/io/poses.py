@@ -72,13 +72,13 @@ def read_planar_poses(path: str | Path, num_scans: int, unit: Unit) -> FloatArra
     Args:
         path: see `read_poses`.
         num_scans: how many poses there must be.
-        unit: unit of the scans; a text file whose comment names the other unit is refused.
+        unit: unit of the scans; a text file whose comment names a different unit is refused.
 
     Returns:
         (num_scans, 3) float64 x, y in `unit`, heading in radians.
 
     Raises:
-        InputError: see `read_poses`; or a wrong count, the other unit, or poses that leave the plane.
+        InputError: see `read_poses`; or a wrong count, a different unit, or poses that leave the plane.
     """
     path = Path(path)
     if path.is_file() and path.suffix.lower() != ".npy":
@@ -195,7 +195,7 @@ def from_rows(rows: FloatArray, source: str | Path) -> FloatArray:
 
     Args:
         rows: (n, 12) or (12,), the first three rows of each matrix, row-major.
-        source: for messages.
+        source: source for messages.
 
     Returns:
         (n, 4, 4).
@@ -212,7 +212,7 @@ def check_poses(poses: FloatArray, source: str | Path) -> FloatArray:
 
     Args:
         poses: (n, 4, 4), or planar (n, 3, 3) or (n, 3).
-        source: for messages.
+        source: source for messages.
 
     Returns:
         The poses.

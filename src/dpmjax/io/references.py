@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from dpmjax.io.files import read_table
 from dpmjax.io.poses import StampedPoses, interpolate_poses
 from dpmjax.io.scan_names import stamps_in_names, stem_of
-from dpmjax.sequences import FloatArray, InputError, Note, require
+from dpmjax.sequences import FloatArray, InputError, Note, Relations, require
 
 # The pose nearest in time may be this far from the scan: half the step of the poses, and never more than this, s.
 _LARGEST_TOLERANCE_S, _SMALLEST_TOLERANCE_S = 0.1, 0.001
@@ -71,7 +71,7 @@ def match_poses(poses: FloatArray, files: Sequence[Path], path: Path) -> FloatAr
     Args:
         poses: (m, 4, 4).
         files: the n scans.
-        path: of the poses, for messages.
+        path: path of the poses, for messages.
 
     Returns:
         (n, 4, 4).
@@ -138,7 +138,7 @@ def match_times(path: Path, files: Sequence[Path]) -> FloatArray | None:
     """The times of the scans of a data set out of times.txt, see `match_rows`; a file that does not fit is ignored.
 
     Args:
-        path: of times.txt.
+        path: path of times.txt.
         files: the n scans.
 
     Returns:
@@ -162,7 +162,7 @@ def match_reference(found: StampedPoses, times: FloatArray | None, num_scans: in
         found: the poses of the file.
         times: (n,) s of the scans; None where they have none.
         num_scans: number of scans.
-        path: of the poses, for messages.
+        path: path of the poses, for messages.
 
     Returns:
         The reference.
@@ -194,7 +194,7 @@ def camera_note(T_world_lidar: FloatArray, source: str | Path) -> Note | None:
 
     Args:
         T_world_lidar: (n, 4, 4); NaN for scans without one.
-        source: for the note.
+        source: source for the note.
 
     Returns:
         The note, or None.
@@ -246,3 +246,28 @@ def _note_of(path: Path, how: str, T: FloatArray) -> tuple[Note, ...]:
     num_without = int(np.isnan(T[:, 0, 0]).sum())
     text = f"{path}: poses are matched by {how}; {num_without} of {len(T)} scans have no reference pose"
     return (Note(text, is_doubt=num_without > 0),)
+
+
+_ADVICE = "a line reads t1 t2 x y z roll pitch yaw: seconds, metres, radians"
+_FLAT = 1e-3
+
+
+def read_relations(path: str | Path) -> Relations:
+    """Reads relations in the plane.
+
+    Args:
+        path: text of eight numbers a line; comments begin with #.
+
+    Returns:
+        The relations.
+
+    Raises:
+        InputError: the file is missing, has another number of columns, holds words that are no numbers, or relations
+            that leave the plane.
+    """
+    table = read_table(path)
+    require(table.shape[1] == 8, path, f"{table.shape[-1]} numbers a line, not 8", _ADVICE)
+    require(bool(np.isfinite(table).all()), path, "NaN or infinite values", "remove the line")
+    is_flat = bool((np.abs(table[:, 4:7]) < _FLAT).all())
+    require(is_flat, path, "relations with a height or a tilt", "give those of a planar log")
+    return Relations(table[:, 0], table[:, 1], table[:, [2, 3, 7]])

@@ -43,7 +43,7 @@ def cloud_of(message: Any, kind: str) -> TimedCloud:
         kind: its type.
 
     Returns:
-        The points, with the times of the first field of a known name, in its unit; NaN is left as it is.
+        The points, with the times of the first field of a known name, in its unit; NaN stays.
 
     Raises:
         ValueError: fields outside of a point, no x, y, z, or fewer bytes than points.
@@ -112,8 +112,8 @@ def matrix_of(position: Any, orientation: Any) -> FloatArray:
     """Builds a pose of a position and a quaternion.
 
     Args:
-        position: with x, y, z.
-        orientation: with x, y, z, w.
+        position: position with x, y, z.
+        orientation: orientation with x, y, z, w.
 
     Returns:
         (4, 4).

@@ -12,7 +12,7 @@ from dpmjax.io.clouds import TimedCloud
 from dpmjax.io.drives import SCAN_SUFFIXES
 from dpmjax.io.files import load_arrays, read_bytes, to_float32
 from dpmjax.io.las import read_las
-from dpmjax.io.notes import log_notes
+from dpmjax.io.messages import log_notes
 from dpmjax.io.pcd import parse_pcd
 from dpmjax.io.ply import parse_ply
 from dpmjax.sequences import EmptyScanError, FloatArray, InputError, Note, require
@@ -29,8 +29,7 @@ _MAP_RATIO = 5.0
 def read_lidar_file(path: str | Path, *, bin_columns: int | None = None) -> NDArray[np.float32]:
     """Reads one scan.
 
-    A scan with hardly any point within 120 m is read, but a warning asks for its unit; so does one whose number of
-    columns is not clear.
+    A scan with hardly any point within 120 m, or with an unclear number of columns, is read with a warning.
 
     Args:
         path: `.bin` (float32 rows of x, y, z and more, as of KITTI), `.npy` (n, 3 or more), `.npz` (key `lidar_pcd`,
@@ -43,8 +42,8 @@ def read_lidar_file(path: str | Path, *, bin_columns: int | None = None) -> NDAr
         that are not finite.
 
     Raises:
-        InputError: names the file and what is wrong: missing, truncated, wrong columns, no points, all of them out of
-            range, lengths that can only be millimetres, or coordinates of a map such as UTM.
+        InputError: names the file and the fault: missing, truncated, wrong columns, no points, no point in range,
+            lengths in millimetres, or coordinates of a map such as UTM.
     """
     points = read_points(path, bin_columns=bin_columns)
     log_notes(scan_notes(path, points, bin_columns=bin_columns))
@@ -52,11 +51,11 @@ def read_lidar_file(path: str | Path, *, bin_columns: int | None = None) -> NDAr
 
 
 def scan_notes(path: str | Path, points: NDArray[np.float32], *, bin_columns: int | None = None) -> list[Note]:
-    """Tells what was decided about a file of one scan, and doubts.
+    """Lists the decisions about a file of one scan, and doubts.
 
     Args:
         path: the file.
-        points: (n, 3) what was read of it, m.
+        points: (n, 3) points of the file, m.
         bin_columns: as they were given for reading it.
 
     Returns:
@@ -72,7 +71,7 @@ def scan_notes(path: str | Path, points: NDArray[np.float32], *, bin_columns: in
 
 
 def read_points(path: str | Path, *, bin_columns: int | None = None) -> NDArray[np.float32]:
-    """What `read_lidar_file` reads, without its warnings.
+    """Reads a scan as `read_lidar_file`, without warnings.
 
     Args:
         path: the file.
@@ -152,11 +151,11 @@ def _read_arrays(path: Path) -> TimedCloud:
 
 
 def check_scan(cloud: TimedCloud, source: str | Path) -> TimedCloud:
-    """Refuses what is no scan in metres, and takes beams that met nothing away.
+    """Refuses points that are no scan in metres, and removes beams without a hit.
 
     Args:
         cloud: points of a file.
-        source: for messages.
+        source: source for messages.
 
     Returns:
         The points, float32, that are finite and not at the origin, with their times.
@@ -197,7 +196,7 @@ def unit_note(points: NDArray[np.float32], source: str | Path) -> Note | None:
 
     Args:
         points: (n, 3), m.
-        source: for the note.
+        source: source for the note.
 
     Returns:
         The note, or None.

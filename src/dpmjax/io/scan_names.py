@@ -29,7 +29,7 @@ def sort_scans(files: Sequence[Path]) -> list[Path]:
     in 0, as programs print them. Otherwise, both sides of the point are counted on their own, as of 1.9 and 1.10.
 
     Args:
-        files: in any order.
+        files: files in any order.
 
     Returns:
         The files in order.
@@ -55,10 +55,10 @@ def strays_among(files: Sequence[Path]) -> list[Path]:
     """Finds files without a number among three numbered ones at least, such as `map.pcd` among 0001.pcd, 0002.pcd.
 
     Args:
-        files: of one ending.
+        files: files of one ending.
 
     Returns:
-        The files that are no scans; empty where as many files have no number as have one.
+        The files that are no scans; empty where half of the files or more have no number.
     """
     plain = [file for file in files if not re.search(r"\d", stem_of(file))]
     num_numbered = len(files) - len(plain)

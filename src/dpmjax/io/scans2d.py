@@ -15,7 +15,7 @@ from dpmjax.io.bags import is_bag
 from dpmjax.io.carmen import read_carmen_log
 from dpmjax.io.deepmapping_folder import read_deepmapping_folder
 from dpmjax.io.files import load_arrays, read_bytes, to_float32
-from dpmjax.io.notes import log_notes
+from dpmjax.io.messages import log_notes
 from dpmjax.io.poses import check_poses
 from dpmjax.io.scan_bags import read_scan_bag
 from dpmjax.sequences import BoolArray, FloatArray, InputError, Note, ScanSequence, Unit, has_angular_order, require
@@ -55,15 +55,15 @@ def read_sequence(
             arrays as metres. CARMEN logs are in metres.
         max_range: beams of this length or more (in the sequence's unit) are masked; None leaves it to the reader, and
             masks the beams of the largest range where many have exactly this one.
-        topic: of a bag: which scans; may be left out where there is one topic of planar scans.
+        topic: topic of a bag: which scans; may be left out where there is one topic of planar scans.
 
     Returns:
         The sequence: two scans at least of 17 beams at least, each with one valid beam at least.
 
     Raises:
-        InputError: one line with the file, what was found and what to do: no such file, an unknown format, damage, too
-            few scans or beams, a scan without a valid beam, scans of a single point, lengths that no such unit
-            explains, or arguments out of range.
+        InputError: one line with the file, the finding and the advice: no such file, an unknown format, damage, too few
+            scans or beams, a scan without a valid beam, scans of a single point, impossible lengths, or arguments out
+            of range.
     """
     path = Path(path)
     start, stop, stride = selection.start or 0, selection.stop, 1 if selection.step is None else selection.step
@@ -101,7 +101,7 @@ def _read_any(path: Path, unit: Unit | None, max_range: float | None, topic: str
 
 
 def _detect(path: Path) -> str:
-    """What the path holds, by its ending, else by its first bytes: "folder", "arrays", "bag" or "carmen"."""
+    """Returns "folder", "arrays", "bag" or "carmen", by the ending of the path, else by its first bytes."""
     has_scans = path.is_dir() and any(file.suffix.lower() == ".pcd" for file in path.iterdir())
     if is_bag(path) and not has_scans:
         return "bag"

@@ -12,7 +12,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from dpmjax.checks import as_float, as_mask, as_points, require_positive, require_shape
-from dpmjax.geometry.namespace import safe_sqrt
+from dpmjax.geometry.rigid import safe_sqrt
 from dpmjax.types import AnyArray
 
 SINGULAR_IN_EPS = 8
@@ -106,8 +106,8 @@ def offset_loss(
     """Mean Mahalanobis distance between predicted and true offsets (DeepPointMap eq. 6).
 
     The covariance is that of the residuals themselves, with n - 1 in the denominator, and is held constant for the
-    derivative: so the loss asks for residuals that are small against the others, and the scale of the gradient does not
-    shrink with them. Where it cannot be inverted (too few residuals, or all of them in one plane) it is the identity,
+    derivative: so the loss compares residuals with each other, and the scale of the gradient does not shrink with them.
+        Where it cannot be inverted (too few residuals, or all of them in one plane) it is the identity,
     and the loss is the mean distance.
 
     The mean is over all pairs, as in the published configuration, not first over those of each descriptor as in eq. 6.

@@ -1,6 +1,6 @@
 """Losses of DeepMapping: the Chamfer distance between clouds, and the occupancy loss of beams.
 
-What a beam hit is occupied, what it passed is free.
+Hits of beams are occupied, and the space that beams passed is free.
 """
 
 from __future__ import annotations
@@ -10,8 +10,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from dpmjax.checks import as_float, as_mask, as_points
-from dpmjax.geometry.namespace import safe_sqrt
 from dpmjax.geometry.neighbours import k_nearest
+from dpmjax.geometry.rigid import safe_sqrt
 from dpmjax.types import AnyArray
 
 

@@ -9,7 +9,7 @@ import jax
 import numpy as np
 
 from dpmjax.checks import as_float
-from dpmjax.geometry.namespace import namespace_of
+from dpmjax.geometry.rigid import namespace_of
 from dpmjax.types import AnyArray
 
 

@@ -30,11 +30,11 @@ class LoopRecall(NamedTuple):
     """Shares of the revisits that have a loop; NaN without any revisit.
 
     Attributes:
-        recall: of all revisits.
-        same_way: of those driven in the direction of before, or across it.
-        opposite: of those driven the other way.
+        recall: recall of all revisits.
+        same_way: recall of revisits in the same direction, or across it.
+        opposite: recall of revisits in the opposite direction.
         num_revisits: number of all.
-        num_opposite: number of those driven the other way.
+        num_opposite: number of revisits in the opposite direction.
     """
 
     recall: float
@@ -55,7 +55,7 @@ def find_revisits(
         min_path_m: so long is the way between the two.
 
     Returns:
-        Which scans come back, and in which direction.
+        Finds the scans at places seen before, and their direction.
 
     Raises:
         ValueError: the shape is not (n, 4, 4), or a number is not finite.
@@ -87,7 +87,7 @@ def loop_recall(
     Args:
         T_world_scan: true poses.
         newer_ends: first and last scan of the newer end of each loop; equal where it joins single scans.
-        revisits: from `find_revisits` on the same poses.
+        revisits: result of `find_revisits` on the same poses.
         reach_m: a keyframe every few metres is enough, so loops count for the scans around them.
 
     Returns:

@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float
 
 from dpmjax.geometry import rigid
 from dpmjax.geometry.alignment import best_motion
-from dpmjax.geometry.namespace import matmul, namespace_of, safe_sqrt
+from dpmjax.geometry.rigid import matmul, namespace_of, safe_sqrt
 from dpmjax.metrics.inputs import as_floats, checked_poses, checked_positions, is_traced, require_same_shape
 from dpmjax.types import AnyArray
 
@@ -24,7 +24,7 @@ class RelativePoseError(NamedTuple):
     """Errors of the motion between pairs of poses.
 
     Attributes:
-        translation_rmse: in the unit of the poses.
+        translation_rmse: root mean square error of the translation, in the unit of the poses.
         rotation_rmse: radians.
         num_pairs: how many pairs were compared.
     """
@@ -144,7 +144,7 @@ def point_distance(
     """Mean distance of corresponding map points, after the rigid alignment of positions (DeepMapping section 4).
 
     Args:
-        points: of each scan, in its own frame.
+        points: points of each scan, in its own frame.
         mask: False for points that are not there; they may hold anything. A traced mask without any point gives 0.
         T_estimated: `T_world_scan` of each scan.
         T_reference: the same, in the reference's world.

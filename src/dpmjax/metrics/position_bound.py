@@ -1,4 +1,4 @@
-"""How well scans of a known planar world can be placed at all: the Cramér-Rao bound under range noise."""
+"""Smallest possible error of positions in a known planar world: the Cramér-Rao bound under range noise."""
 
 from __future__ import annotations
 
@@ -23,14 +23,13 @@ def position_bound(
 
     The information of a scan is J^T J / noise^2, where J is the derivative of its ranges by x, y and heading (Kay 1993,
     eq. 3.31). An estimate that must find the world too cannot do better. The root mean square over the scans of a
-    trajectory bounds its absolute trajectory error, except for what the alignment of the trajectories takes away (three
-    of 3 n unknowns).
+    trajectory bounds its absolute trajectory error, up to the alignment of the trajectories (three of 3 n unknowns).
 
     Args:
         cast_ranges: ranges (m, b) of noise-free scans from poses (m, 3) in the world.
         poses: (n, 3) x, y in the unit of the ranges, heading in radians.
         range_noise: standard deviation of the noise of one range.
-        step: ranges are differentiated over so much to either side; in a world of pixels, half a pixel.
+        step: half step of the numeric derivative of ranges; in a world of pixels, half a pixel.
 
     Returns:
         (n,) root of the summed variances of x and y; infinite where the scan leaves a direction open.

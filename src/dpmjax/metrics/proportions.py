@@ -1,11 +1,11 @@
-"""Shares of right answers: their confidence intervals, and whether one method is right more often than another."""
+"""Shares and probabilities: intervals and comparisons of shares, area under the curve, Brier score."""
 
 from __future__ import annotations
 
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Bool, Float
 from scipy import special
 
 from dpmjax.types import AnyArray
@@ -60,12 +60,12 @@ def wilson_interval(num_right: int, num_all: int, *, confidence: float = 0.95) -
 def mcnemar_p_value(is_right_a: Bool[AnyArray, " n"], is_right_b: Bool[AnyArray, " n"]) -> float:
     """Returns the p-value of McNemar's exact test: two methods answered the same n questions.
 
-    Only the questions that one of the two answers right count. Where both methods are equally good, each of these is
-    as likely one's as the other's, so their number is binomial with a probability of a half (McNemar 1947).
+    Only the questions that one of the two answers right count. If both methods are equally good, either one is right in
+    such a case with the probability of a half, and their number is binomial (McNemar 1947).
 
     Args:
         is_right_a: answers of one method.
-        is_right_b: answers of the other method to the same questions, in the same order.
+        is_right_b: answers of a second method to the same questions, in the same order.
 
     Returns:
         Probability, two-sided, that two equally good methods differ at least as much; 1 where no answer differs.
@@ -78,3 +78,56 @@ def mcnemar_p_value(is_right_a: Bool[AnyArray, " n"], is_right_b: Bool[AnyArray,
         raise ValueError(f"expected two arrays of the same shape (n,), got {a.shape} and {b.shape}")
     only_a, only_b = int((a & ~b).sum()), int((b & ~a).sum())
     return min(1.0, 2.0 * float(special.bdtr(min(only_a, only_b), only_a + only_b, 0.5)))
+
+
+def area_under_curve(score: Float[AnyArray, " n"], is_positive: Bool[AnyArray, " n"]) -> float:
+    """Computes the area under the ROC curve: how often a positive example scores higher than a negative one.
+
+    Args:
+        score: score of each example.
+        is_positive: label of each example.
+
+    Returns:
+        In [0, 1]; ties count half; NaN without an example of each label.
+    """
+    scores, labels = np.asarray(score), np.asarray(is_positive, bool)
+    positive, negative = scores[labels], scores[~labels]
+    if min(len(positive), len(negative)) == 0:
+        return float("nan")
+    return float(((positive[:, None] > negative) + 0.5 * (positive[:, None] == negative)).mean())
+
+
+def brier_score(probability: Float[AnyArray, " n"], is_true: Bool[AnyArray, " n"]) -> float:
+    """Computes the mean squared difference of probabilities and outcomes (Brier 1950).
+
+    Args:
+        probability: probability of each event, in [0, 1].
+        is_true: outcome of each event.
+
+    Returns:
+        0 for a certain and right forecast, 0.25 for a half each time; NaN without events.
+    """
+    errors = np.asarray(probability, np.float64) - np.asarray(is_true, np.float64)
+    return float(np.mean(errors**2)) if len(errors) else float("nan")
+
+
+def expected_calibration_error(
+    probability: Float[AnyArray, " n"], is_true: Bool[AnyArray, " n"], *, num_bins: int = 10
+) -> float:
+    """Computes the expected calibration error (Naeini et al. 2015).
+
+    Args:
+        probability: of each event, in [0, 1].
+        is_true: outcome of each event.
+        num_bins: number of bins of equal width.
+
+    Returns:
+        The difference between mean probability and share of true events in a bin, averaged over the events; 0 for a
+        calibrated forecast; NaN without events.
+    """
+    probabilities, labels = np.asarray(probability, np.float64), np.asarray(is_true, np.float64)
+    if len(labels) == 0:
+        return float("nan")
+    bins = np.minimum((probabilities * num_bins).astype(int), num_bins - 1)
+    gaps = np.bincount(bins, probabilities - labels, num_bins)
+    return float(np.abs(gaps).sum() / len(labels))

@@ -134,7 +134,7 @@ class PairAttention(nn.Module):
 
     Attributes:
         num_heads: divides the number of channels.
-        is_crossed: whether each cloud attends to the other one instead of to itself.
+        is_crossed: True for cross attention between both clouds; False for self-attention.
         compute_dtype: type of the matrix products.
     """
 
@@ -149,7 +149,7 @@ class PairAttention(nn.Module):
         """Applies attention to both clouds.
 
         Args:
-            features: the rows of both clouds, one below the other, so that each matrix is multiplied once.
+            features: the stacked rows of both clouds, so that each matrix is multiplied once.
             masks: masks of both clouds.
 
         Returns:
@@ -195,8 +195,8 @@ class AttentionLayer(nn.Module):
         """Applies the layer to both clouds.
 
         Args:
-            features: the rows of both clouds, one below the other.
-            embeddings: of the positions, row for row.
+            features: the stacked rows of both clouds.
+            embeddings: embeddings of the positions, row for row.
             masks: masks of both clouds.
 
         Returns:

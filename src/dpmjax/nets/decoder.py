@@ -49,7 +49,7 @@ class DecoderConfig:
 
 
 class Head(nn.Module):
-    """What the heads have in common.
+    """Common part of the heads.
 
     Attributes:
         num_channels: channels of one descriptor.
@@ -191,7 +191,7 @@ class DescriptorDecoder(nn.Module):
 
         Args:
             a: a correlated cloud.
-            b: the other correlated cloud.
+            b: the correlated target cloud.
 
         Returns:
             The logit.

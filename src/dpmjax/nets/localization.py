@@ -1,27 +1,30 @@
-"""L-Net: a scan or a depth image goes in, the pose of its sensor comes out (DeepMapping sections 3.3 and 4.2)."""
+"""L-Net: the pose of the sensor of a scan or a depth image (DeepMapping sections 3.3, 4.2); the network of the toy."""
 
 from __future__ import annotations
 
 import itertools
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal, get_args
 
 import flax.linen as nn
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
+
+from dpmjax.checks import require_one_of
 
 HE_LIKE = nn.initializers.variance_scaling(2.0, "fan_avg", "uniform")
 """Xavier-uniform with the gain of ReLU, as in the published networks."""
 
 
 @dataclass(frozen=True)
-class LocalizationConfig:
+class LocalizationNetConfig:
     """Shape of L-Net. The defaults are the paper's (section 4.1) with the dilation of the published program.
 
     Attributes:
         kind: "conv" for beams or pixels in order, "point" (PointNet, supplement A) for any set of points.
         features: channels of the layers before the maximum over the beams.
-        strides: of the same layers; "point" ignores them.
+        strides: strides of the same layers; "point" ignores them.
         dilation: distance of the three taps of a convolution along each axis, in beams or pixels.
         is_circular: the last beam is the neighbour of the first (a full turn); else zeros follow.
         hidden: channels of the layers after the maximum.
@@ -54,7 +57,7 @@ class DilatedConvolution(nn.Module):
 
     @nn.compact
     def __call__(self, x: Float[Array, "*size c"]) -> Float[Array, "*size_out f"]:
-        """Same size as the input, divided by the stride.
+        """The output has the size of the input divided by the stride.
 
         Args:
             x: channels of the beams (b, c) or of the pixels (h, w, c).
@@ -75,7 +78,7 @@ class DilatedConvolution(nn.Module):
 class LocalizationNet(nn.Module):
     """L-Net for one scan or depth image; `vmap` over the set."""
 
-    config: LocalizationConfig
+    config: LocalizationNetConfig
     num_outputs: int = 3
 
     @nn.compact
@@ -108,3 +111,56 @@ class LocalizationNet(nn.Module):
             x = nn.relu(nn.Dense(features, kernel_init=HE_LIKE)(x))
         last = nn.initializers.variance_scaling(2.0 * config.output_scale**2, "fan_avg", "uniform")
         return nn.Dense(self.num_outputs, kernel_init=last)(x)
+
+
+Initialization = Literal["xavier-relu", "xavier", "he", "lecun", "pytorch"]
+
+# Scale, fan and distribution of `variance_scaling`.
+_KERNELS: dict[str, tuple[float, Any, Any]] = {
+    "xavier-relu": (2.0, "fan_avg", "uniform"),
+    "xavier": (1.0, "fan_avg", "uniform"),
+    "he": (2.0, "fan_in", "normal"),
+    "lecun": (1.0, "fan_in", "truncated_normal"),
+    "pytorch": (1.0 / 3.0, "fan_in", "uniform"),
+}
+
+
+@dataclass(frozen=True)
+class ScalarNetConfig:
+    """Shape of the network. The features are the paper's; its initialisation is unpublished.
+
+    Attributes:
+        features: channels of the hidden layers, each followed by an ELU.
+        initialization: "xavier-relu": Xavier-uniform with the gain of ReLU, as in the published L-Net; "xavier":
+            without the gain; "he"; "lecun" (Flax's default); "pytorch": PyTorch's default. Biases are zero, or for
+            "pytorch" uniform like the weights.
+    """
+
+    features: tuple[int, ...] = (10, 20, 30, 40)
+    initialization: Initialization = "xavier-relu"
+
+    def __post_init__(self) -> None:
+        require_one_of("initialization", self.initialization, get_args(Initialization))
+
+
+class ScalarNet(nn.Module):
+    """A multi-layer perceptron from one number to one number."""
+
+    config: ScalarNetConfig
+
+    @nn.compact
+    def __call__(self, z: Float[Array, ""]) -> Float[Array, ""]:
+        """The value x that the auxiliary variable z stands for."""
+        x = z[None]
+        for features in self.config.features:
+            x = nn.elu(self._linear(features, x))
+        return self._linear(1, x)[0]
+
+    def _linear(self, features: int, x: Float[Array, " c"]) -> Float[Array, " f"]:
+        kernel_init = nn.initializers.variance_scaling(*_KERNELS[self.config.initialization])
+        bound = x.shape[0] ** -0.5 if self.config.initialization == "pytorch" else 0.0
+
+        def bias_init(key: jax.Array, shape: Any, dtype: Any = float) -> Array:
+            return jax.random.uniform(key, shape, dtype, -bound, bound)
+
+        return nn.Dense(features, kernel_init=kernel_init, bias_init=bias_init)(x)

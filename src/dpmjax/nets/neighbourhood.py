@@ -1,9 +1,9 @@
 """The maximum over neighbours of normalised differences: the inner loop of the encoder, with its own backward pass.
 
 The automatic derivative of gather, norm and maximum over (m, k, f) numbers takes fifteen times as long as the value on
-a CPU. The forward pass here visits one neighbour after the other, on (m, f) numbers that stay in the cache. The
-backward pass handles (m, f) winners and (m, k) pairs, never both at once: with the length |x| of each pair kept, the
-derivative of the norm is a multiple of x = of_points + offset kernel, whose sums over the pairs are sums of numbers.
+a CPU. The forward pass here visits the neighbours in turn, on (m, f) numbers that stay in the cache. The backward pass
+handles (m, f) winners and (m, k) pairs, never both at once. With the stored length |x| of each pair, the derivative of
+the norm is a multiple of x = of_points + offset kernel, and its sums over the pairs are sums of numbers.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ _UNROLL = 4
 
 
 class Residuals(NamedTuple):
-    """What the backward pass needs: the inputs; for each query and channel the winner and its normalised number; and
+    """Values for the backward pass: the inputs; for each query and channel the winner and its normalised number; and
     for each pair 1 / |x|.
     """
 
@@ -54,7 +54,7 @@ def maximum_of_normalised(
 
     Args:
         of_points: one row for each point that may be a neighbour.
-        offsets: from each query to its neighbours, in units of the radius.
+        offsets: offsets from each query to its neighbours, in units of the radius.
         kernel: linear map of the offsets.
         neighbours: rows of `of_points`, at least one for each query.
         scale: factor of each channel, after the norm.

@@ -3,8 +3,8 @@
 `MapMLP` is the paper's. `MapGrid` is a network of one layer over multi-resolution hat functions: a sum of learned grids
 from coarse to fine, each interpolated between its nodes. It is as continuous as the MLP. Each level has twice the cells
 of the one before, so that the sum is one grid of the finest level. A sample costs four reads (in 3-D eight) instead of
-half a million multiplications, and a step changes the map only near the samples. The levels are switched on one after
-the other: first the basin of the poses is wide, later the map is sharp.
+half a million multiplications, and a step changes the map only near the samples. The levels are switched on from coarse
+to fine: first the basin of the poses is wide, later the map is sharp.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ class OccupancyConfig:
     Attributes:
         kind: "mlp" (the paper's), "resmlp" (supplement A) or "grid".
         features: channels of the hidden layers of the MLP, or of the residual blocks.
-        resolutions: cells along a side of each level of the grid, each twice as many as before, the first even.
+        resolutions: number of cells along a side of each level of the grid, each twice the one before, the first even.
     """
 
     kind: Literal["mlp", "resmlp", "grid"] = "mlp"
@@ -44,14 +44,14 @@ class OccupancyConfig:
 
     @property
     def num_levels(self) -> int:
-        """Levels that can be switched on one after the other."""
+        """Number of levels that can be switched on."""
         return len(self.resolutions) if self.kind == "grid" else 1
 
 
 class MapMLP(nn.Module):
     """The paper's M-Net, or residual blocks of two layers each (supplement A).
 
-    Where the width changes, the way around a residual block is a linear map.
+    A residual block that changes the width has a linear map as its short cut.
     """
 
     features: tuple[int, ...]
@@ -164,8 +164,8 @@ def init_map_net(config: OccupancyConfig, *, key: jax.Array, num_dimensions: int
 
     Args:
         config: shape of M-Net.
-        key: for the weights.
-        num_dimensions: of the world, 2 or 3.
+        key: key for the weights.
+        num_dimensions: number of dimensions of the world, 2 or 3.
 
     Returns:
         Parameters for `make_map_net(config).apply`.

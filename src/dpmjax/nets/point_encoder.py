@@ -33,11 +33,11 @@ class EncoderConfig:
         stem_channels: channels of the input level; each stage down doubles them.
         expansion: width of the hidden layer in inverted residual blocks, relative to its input.
         output_channels: channels of a descriptor.
-        frame: frame of the offsets between points. "lidar": the axes of the lidar (the published networks, which have
-            to learn that a scan may be rotated). "bearing": along and across the ray from the lidar to each point.
-            "local": along and across the normal of the wall at each point. With the last two, descriptors are
-            invariant to rotations of the scan about the vertical, and the offsets between descriptors are predicted in
-            these frames, too. Local frames do not turn where the lidar moves past a wall.
+        frame: frame of the offsets between points. "lidar": the axes of the lidar, as in the published networks, which
+            learn rotations by augmentation. "bearing": along and across the ray from the lidar to each point. "local":
+            along and across the normal of the wall at each point. With the last two, descriptors are invariant to
+            rotations of the scan about the vertical, and the offsets between descriptors are predicted in these frames,
+            too. Local frames do not turn where the lidar moves past a wall.
         compute_dtype: type of the matrix products over features.
     """
 
@@ -84,7 +84,7 @@ class NeighbourhoodMaximum(nn.Module):
             positions: positions of that level.
             queries: positions of the queries.
             neighbours: rows of the neighbours of each query.
-            directions: of the frames of the queries; None for that of the lidar.
+            directions: directions of the frames of the queries; None for that of the lidar.
 
         Returns:
             Features of the queries.
@@ -133,7 +133,7 @@ class InvertedResidual(nn.Module):
             features: features of the level.
             positions: positions of the level.
             neighbours: rows of the neighbours in the same level.
-            directions: of the frames of the points; None for that of the lidar.
+            directions: directions of the frames of the points; None for that of the lidar.
 
         Returns:
             New features of the level.
@@ -185,7 +185,7 @@ def without_masked(level: PyramidLevel) -> PyramidLevel:
     """Sets positions of masked points, which may hold anything, to zero: they cannot reach a gradient.
 
     Args:
-        level: of a pyramid.
+        level: level of a pyramid.
 
     Returns:
         The level.
@@ -232,7 +232,7 @@ class FeaturePropagation(nn.Module):
         Args:
             fine: features of the finer level.
             coarse: features of the coarser level.
-            interpolation: from the coarser to the finer level.
+            interpolation: interpolation from the coarser to the finer level.
 
         Returns:
             New features of the finer level.
@@ -261,7 +261,7 @@ class PointEncoder(nn.Module):
         """Encodes one pyramid.
 
         Args:
-            pyramid: in normalised coordinates; masked points may hold anything.
+            pyramid: pyramid in normalised coordinates; masked points may hold anything.
 
         Returns:
             float32 features, one row for each point of that level; zero where its mask is False.

@@ -1,7 +1,7 @@
 """Robust Levenberg-Marquardt over all poses of a graph, in the plane and in space.
 
 Without a kernel this is plain least squares. With one, every edge has a Geman-McClure kernel that is narrowed step by
-step (graduated non-convexity): all edges count at first, then wrong ones are let go.
+step (graduated non-convexity): all edges count at first, then wrong ones lose their weight.
 """
 
 from __future__ import annotations
@@ -14,10 +14,12 @@ import numpy as np
 from dpmjax.checks import require_count, require_positive
 from dpmjax.pose_graph.chordal import chordal_poses
 from dpmjax.pose_graph.graph import Floats, PoseGraph
-from dpmjax.pose_graph.normal_equations import BlockPattern, solve_symmetric
-from dpmjax.pose_graph.residuals import Linearisation, linearise
+from dpmjax.pose_graph.normal_equations import BlockPattern, Linearisation, linearise, solve_symmetric
 
-_NARROWING = 1.6
+# Width of the kernel at the start, in final widths; each step narrows it.
+_FIRST_WIDENING, _NARROWING = 1000.0, 1.6
+# Levenberg-Marquardt damping at the start, as a share of the diagonal.
+_FIRST_DAMPING = 1e-6
 _LEAST_DAMPING, _MOST_DAMPING = 1e-12, 1e6
 # Below this share of the stiffest diagonal entry, damping goes by the stiffest entry.
 _LEAST_STIFFNESS = 1e-6
@@ -30,31 +32,26 @@ class PoseGraphConfig:
     Attributes:
         outlier_chi2: the most that a contradicted edge costs (squared Mahalanobis distance; 10 is about the 98 %
             quantile in the plane). None for plain least squares.
-        max_iterations: at most so many linear solves.
+        max_iterations: the largest number of linear solves.
         tolerance: the optimisation ends when a step lowers the cost by less than this share.
-        widening: the kernel starts so many times wider.
         is_chordal_start: also try the chordal relaxation as a start; it is taken where its cost is lower.
-        damping: Levenberg-Marquardt damping at the start, as a share of the diagonal.
     """
 
     outlier_chi2: float | None = None
     max_iterations: int = 100
     tolerance: float = 1e-5
-    widening: float = 1000.0
     is_chordal_start: bool = True
-    damping: float = 1e-6
 
     def __post_init__(self) -> None:
         """Checks the numbers."""
         require_count("max_iterations", self.max_iterations)
-        for name in ("tolerance", "damping", "widening"):
-            require_positive(name, getattr(self, name))
+        require_positive("tolerance", self.tolerance)
         if self.outlier_chi2 is not None:
             require_positive("outlier_chi2", self.outlier_chi2)
 
 
 ROBUST = PoseGraphConfig(outlier_chi2=10.0, tolerance=1e-8, is_chordal_start=False)
-"""Wrong edges are let go; the poses that are given are the only start."""
+"""Wrong edges lose their weight; the given poses are the only start."""
 
 
 class OptimizedPoseGraph(NamedTuple):
@@ -65,7 +62,7 @@ class OptimizedPoseGraph(NamedTuple):
         chi2: sum of r^T W r over all edges, each times its weight.
         chi2_initial: the same at the poses that were given, all weights one.
         iterations: linear solves, rejected ones included.
-        weights: (e,) of each edge in the end, 0 (let go) to 1; all one without a kernel.
+        weights: (e,) final weight of each edge, 0 (rejected) to 1; all one without a kernel.
         is_converged: False where the iterations ran out, or no step lowered the cost.
     """
 
@@ -119,7 +116,7 @@ def optimize_pose_graph(
     if config.is_chordal_start and len(graph.edges.source):
         chordal = linearise(chordal_poses(graph, pattern), still, graph.edges)
         at = chordal if _cost(chordal.chi2, width) < _cost(at.chi2, width) else at
-    state = _State(at, config.damping, 1.0 if config.outlier_chi2 is None else config.widening)
+    state = _State(at, _FIRST_DAMPING, 1.0 if config.outlier_chi2 is None else _FIRST_WIDENING)
     iterations = 0
     while iterations < config.max_iterations and not state.is_converged and state.damping < _MOST_DAMPING:
         state = _iterate(state, graph, pattern, width, config)

@@ -13,9 +13,9 @@ from jaxtyping import Array, Bool, Float, Int
 from dpmjax.checks import as_float, as_mask, as_points, require_shape
 from dpmjax.geometry import rigid, se2, se3
 from dpmjax.geometry.alignment import weighted_svd
-from dpmjax.geometry.namespace import safe_sqrt
 from dpmjax.geometry.neighbours import k_nearest
 from dpmjax.geometry.normals import estimate_normals
+from dpmjax.geometry.rigid import safe_sqrt
 from dpmjax.types import AnyArray
 
 _NORMAL_NEIGHBOURS = 6

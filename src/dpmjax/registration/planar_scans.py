@@ -1,7 +1,7 @@
 """The scan record of this room: planar scans with a line at every beam, and the lengths that settings refer to.
 
-All lengths in settings are in typical ranges of the scans (`dpmjax.geometry.rays.typical_range`: the range that nine
-in ten beams on a line stay below), so pixels, rooms and streets need no settings of their own.
+All lengths in settings are in typical ranges of the scans (`dpmjax.geometry.sampling.typical_range`: the range that
+nine in ten beams on a line stay below), so pixels, rooms and streets need no settings of their own.
 
 A line with a normal is fitted at every beam and is honest under range noise. Two neighbouring beams give the exact
 normal of a noise-free wall, but nonsense as soon as the noise is as large as the distance between the beams. So several
@@ -22,7 +22,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 from numpy.typing import NDArray
 
-from dpmjax.geometry.rays import typical_range
+from dpmjax.geometry.sampling import typical_range
 from dpmjax.sequences import has_angular_order
 from dpmjax.types import AnyArray, ScanSet
 

@@ -1,4 +1,4 @@
-"""A keyframe map as named arrays, and back. Ragged arrays stand one after the other, with the rows of each keyframe."""
+"""A keyframe map as named arrays, and back. Ragged arrays are concatenated, with the rows of each keyframe."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ class ArrayReader:
         """Returns an array.
 
         Args:
-            name: of the array.
+            name: name of the array.
             *shape: expected sizes; None for any.
             kind: expected kind of its numbers, as NumPy abbreviates it; several letters allow several.
 
@@ -65,7 +65,7 @@ class ArrayReader:
         """Returns the rows of each keyframe in ragged arrays.
 
         Args:
-            name: of the array of their numbers.
+            name: name of the array of their numbers.
             num_keyframes: number of keyframes.
 
         Returns:
@@ -116,8 +116,8 @@ def unpack_graph(reader: ArrayReader, scans: Sequence[CompactScan], origin: MapO
     """Makes the map.
 
     Args:
-        reader: of arrays from `pack_graph`.
-        scans: of the keyframes.
+        reader: reader of arrays from `pack_graph`.
+        scans: scans of the keyframes.
         origin: what made the map.
 
     Returns:
@@ -167,7 +167,7 @@ def pack_scans(scans: Sequence[CompactScan], precision: Precision) -> Arrays:
     """Makes the arrays of the compact scans.
 
     Args:
-        scans: at least one, of one number of descriptors and channels.
+        scans: scans, at least one, of one number of descriptors and channels.
         precision: see `save_map`.
 
     Returns:
@@ -191,7 +191,7 @@ def unpack_scans(reader: ArrayReader, precision: Precision) -> list[CompactScan]
     """Makes the compact scans.
 
     Args:
-        reader: of arrays from `pack_scans`.
+        reader: reader of arrays from `pack_scans`.
         precision: that was given to `pack_scans`.
 
     Returns:

@@ -29,10 +29,10 @@ class FeatureCodes(NamedTuple):
     """Features as coefficients of principal components: `mean + step * codes @ basis`.
 
     Attributes:
-        mean: of the features.
+        mean: mean of the features.
         basis: (r, c) principal components.
-        step: of the coefficients.
-        codes: (r, d) of all descriptors, one component after the other.
+        step: step of the coefficients.
+        codes: (r, d) of all descriptors, component by component.
     """
 
     mean: Float[np.ndarray, " c"]
@@ -45,7 +45,7 @@ def encode_features(features: Float[np.ndarray, "d c"]) -> FeatureCodes:
     """Rounds features to codes.
 
     Args:
-        features: of all descriptors of a map.
+        features: features of all descriptors of a map.
 
     Returns:
         The codes.
@@ -68,7 +68,7 @@ def decode_features(stored: FeatureCodes) -> Float[np.ndarray, "d c"]:
     """Makes the features again.
 
     Args:
-        stored: from `encode_features`.
+        stored: result of `encode_features`.
 
     Returns:
         float32.
@@ -96,7 +96,7 @@ def encode_elements(keyframes: Sequence[CompactElements]) -> ElementCodes:
     """Rounds surface elements to codes.
 
     Args:
-        keyframes: of one number of elements.
+        keyframes: keyframes of one number of elements.
 
     Returns:
         The codes.
@@ -113,7 +113,7 @@ def decode_elements(stored: ElementCodes) -> list[CompactElements]:
     """Makes the surface elements again.
 
     Args:
-        stored: from `encode_elements`.
+        stored: result of `encode_elements`.
 
     Returns:
         Elements of each keyframe.

@@ -1,7 +1,7 @@
 """Saved maps: one `.npz` file of plain arrays, checked on load.
 
-Ragged arrays stand one after the other, with the number of rows of each keyframe. `header` is JSON in UTF-8: format,
-version, precision, fingerprint of the weights, and the settings of SLAM.
+Ragged arrays are concatenated, with the number of rows of each keyframe. `header` is JSON in UTF-8: format, version,
+precision, fingerprint of the weights, and the settings of SLAM.
 """
 
 from __future__ import annotations
@@ -35,10 +35,10 @@ def save_map(
 
     Args:
         path: must end in `.npz`; an existing file is replaced.
-        slam_map: of a run, `result.map`, with at least one keyframe.
-        precision: "float32" keeps everything exactly: a run that goes on from the file equals an unbroken one. "int8"
-            is the smallest, for localisation: it rounds features and elements to codes, and leaves out keyframes that
-            others cover (`slam.thin_map`).
+        slam_map: map of a run, `result.map`, with at least one keyframe.
+        precision: "float32" is exact: a run that goes on from the file equals an unbroken one. "int8" is the smallest,
+            for localisation: it rounds features and elements to codes, and omits keyframes that others cover
+            (`slam.thin_map`).
         spacing_share: keyframes nearer to others than this share of their extent are left out; 0 keeps all. None takes
             0.8 for "int8" and 0 for "float32".
 
@@ -55,7 +55,7 @@ def save_map(
 
 
 def map_bytes(slam_map: KeyframeMap, precision: Precision = "float32", *, spacing_share: float | None = None) -> bytes:
-    """Makes the content of the file of a map; its length is what the map costs.
+    """Makes the content of the file of a map; its length is the cost of the map.
 
     Args:
         slam_map: see `save_map`.
@@ -83,7 +83,7 @@ def map_arrays(slam_map: KeyframeMap, precision: Precision) -> Arrays:
     """Makes the arrays of the file of a map.
 
     Args:
-        slam_map: with at least one keyframe.
+        slam_map: map with at least one keyframe.
         precision: see `save_map`.
 
     Returns:
@@ -132,8 +132,8 @@ def map_of_arrays(path: str | Path, arrays: Arrays) -> KeyframeMap:
     """Makes a map of the arrays of a file.
 
     Args:
-        path: of the file, for messages.
-        arrays: from `map_arrays`; others may be among them.
+        path: path of the file, for messages.
+        arrays: arrays from `map_arrays`; others may be among them.
 
     Returns:
         The map.

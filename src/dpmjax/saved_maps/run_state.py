@@ -6,14 +6,13 @@ It is written after a keyframe. A run that was killed goes on from the file and 
 from __future__ import annotations
 
 import io
-from collections.abc import Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from dpmjax.io.files import load_arrays, refusing, write_atomically
-from dpmjax.saved_maps.columns import Arrays, from_columns, part_of, prefixed, to_columns
 from dpmjax.saved_maps.map_file import map_arrays, map_of_arrays
 from dpmjax.sequences import InputError, require
 from dpmjax.slam.front_end import FrontEndState
@@ -22,6 +21,71 @@ from dpmjax.slam.loop_state import LoopState
 from dpmjax.slam.reports import Loop, ScanReport
 from dpmjax.slam.system import SlamState
 from dpmjax.types import SurfaceElements
+
+Arrays = dict[str, np.ndarray]
+
+
+def to_columns(records: Sequence[Any], name: str, *, without: Collection[str] = ()) -> Arrays:
+    """Turns records of one type into one array a field.
+
+    Args:
+        records: named tuples of numbers, texts, arrays of one shape, or None.
+        name: prefix of the names of the arrays.
+        without: fields that are left out.
+
+    Returns:
+        The arrays. A None takes no room; a mask marks it.
+    """
+    columns = {name: np.array(len(records))}
+    for field in [field for field in records[0]._fields if field not in without] if records else ():
+        values = [getattr(record, field) for record in records]
+        is_there = np.array([value is not None for value in values])
+        if is_there.any():
+            columns[f"{name}.{field}"] = np.array([value for value in values if value is not None])
+        if not is_there.all():
+            columns[f"{name}.{field}.is_there"] = is_there
+    return columns
+
+
+def from_columns(
+    record_type: Any, columns: Mapping[str, np.ndarray], name: str, *, without: Collection[str] = ()
+) -> list[Any]:
+    """Turns columns back into records.
+
+    Args:
+        record_type: the named tuple.
+        columns: columns from `to_columns`; others may be among them.
+        name: as given there.
+        without: as given there.
+
+    Returns:
+        The records: numbers and texts of Python, arrays of NumPy; None for a field that was left out.
+
+    Raises:
+        ValueError: if a field is missing.
+    """
+    num = int(columns[name])
+    fields = []
+    for field in record_type._fields:
+        key, mask = f"{name}.{field}", f"{name}.{field}.is_there"
+        if num and field not in without and key not in columns and mask not in columns:
+            raise ValueError(f"{key} is missing")
+        column = columns.get(key, np.zeros(0))
+        found = iter(column.tolist() if column.ndim == 1 else column)
+        is_there = columns.get(mask, np.full(num, key in columns))
+        fields.append([next(found) if there else None for there in is_there])
+    return [record_type(*values) for values in zip(*fields, strict=True)] if num else []
+
+
+def part_of(columns: Mapping[str, np.ndarray], name: str) -> Arrays:
+    """Returns the arrays whose names begin with `name` and a dot, without it."""
+    return {key.removeprefix(f"{name}."): value for key, value in columns.items() if key.startswith(f"{name}.")}
+
+
+def prefixed(columns: Mapping[str, np.ndarray], name: str) -> Arrays:
+    """Returns the same arrays with `name` and a dot before their names."""
+    return {f"{name}.{key}": value for key, value in columns.items()}
+
 
 ADVICE = "start the run again without --resume"
 OF_LOOPS = ("loops",)
@@ -35,7 +99,7 @@ class RunState(NamedTuple):
 
     Attributes:
         state: after the keyframe.
-        reports: of all scans of the run until then.
+        reports: reports of all scans of the run until then.
     """
 
     state: SlamState
@@ -48,7 +112,7 @@ def save_state(path: str | Path, state: SlamState, reports: Sequence[ScanReport]
     Args:
         path: an existing file is replaced.
         state: after a keyframe.
-        reports: of all scans of the run until then.
+        reports: reports of all scans of the run until then.
 
     Returns:
         The path.

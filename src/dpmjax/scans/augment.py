@@ -17,7 +17,7 @@ from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from dpmjax.checks import require_fields
 from dpmjax.geometry import rigid
-from dpmjax.geometry.namespace import namespace_of
+from dpmjax.geometry.rigid import namespace_of
 from dpmjax.scans.preprocess import farthest_first
 from dpmjax.types import AnyArray, PointCloud
 

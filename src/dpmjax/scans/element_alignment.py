@@ -20,9 +20,8 @@ from jax import lax
 from jaxtyping import Float, Int
 
 from dpmjax.geometry import rigid
-from dpmjax.geometry.host_tree import HostTree
-from dpmjax.geometry.neighbours import k_nearest
-from dpmjax.geometry.plane_equations import PlaneStep, geman_mcclure, motion_about, step_to_planes
+from dpmjax.geometry.neighbours import HostTree, k_nearest
+from dpmjax.geometry.planes import PlaneStep, geman_mcclure, motion_about, step_to_planes
 from dpmjax.scans.surface_alignment import MIN_PAIRS, AlignmentConfig, AlignmentLevel
 from dpmjax.scans.surfaces import MIN_FLATNESS
 from dpmjax.types import AnyArray, SurfaceElements

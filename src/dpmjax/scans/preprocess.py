@@ -17,8 +17,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from dpmjax.checks import as_mask, as_points, require_count, require_fields, require_positive_fields
-from dpmjax.geometry.host_tree import HostTree
-from dpmjax.geometry.neighbours import k_nearest
+from dpmjax.geometry.neighbours import HostTree, k_nearest
 from dpmjax.geometry.sampling import voxel_sample
 from dpmjax.types import AnyArray, PointCloud
 

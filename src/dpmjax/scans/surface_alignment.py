@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from dpmjax.checks import require_count, require_fields, require_positive
-from dpmjax.geometry.plane_equations import PlaneStep, geman_mcclure, motion_about, step_to_planes
+from dpmjax.geometry.planes import PlaneStep, geman_mcclure, motion_about, step_to_planes
 from dpmjax.scans.surfaces import Surface
 
 MIN_PAIRS = 20

@@ -9,8 +9,8 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from dpmjax.checks import require_count, require_positive_fields
-from dpmjax.geometry.host_tree import HostTree
-from dpmjax.geometry.plane_fits import fit_planes
+from dpmjax.geometry.neighbours import HostTree
+from dpmjax.geometry.planes import fit_planes
 from dpmjax.scans.preprocess import first_of_each_voxel
 from dpmjax.types import SurfaceElements
 

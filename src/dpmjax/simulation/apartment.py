@@ -27,7 +27,7 @@ class Apartment:
     """Boxes that stand in a rectangle.
 
     Attributes:
-        name: for titles.
+        name: name for titles.
         centres: (b, 3) metres.
         half_sizes: (b, 3) metres.
         yaws: (b,) radians about y.
@@ -45,7 +45,7 @@ class Apartment:
     is_seen_through: BoolArray
 
     def is_free(self, places: FloatArray, clearance_m: float) -> BoolArray:
-        """Which places are free for the robot below the camera; lower furniture counts too.
+        """Finds the free places for the robot below the camera; lower furniture counts too.
 
         Args:
             places: (m, 2) x, z, m.
@@ -170,8 +170,8 @@ def cast_depth(
     Args:
         T_world_camera: pose of the camera.
         rays: directions in the camera frame with z = 1, so that a length along a ray is a depth.
-        centres: of the boxes in the world, metres.
-        half_sizes: of the boxes; a box of size 0 is never met.
+        centres: centres of the boxes in the world, metres.
+        half_sizes: half sizes of the boxes; a box of size 0 is never met.
         yaws: turn of each box about y, radians.
 
     Returns:

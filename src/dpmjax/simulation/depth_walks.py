@@ -15,7 +15,7 @@ from dpmjax.checks import require_fields
 from dpmjax.sequences import ACTIVE_VISION, BoolArray, DepthSequence, FloatArray
 from dpmjax.simulation.apartment import Apartment, cast_depth, make_apartment
 
-# DeepMapping section 4.2: distance of places, angle between views, share of the steps that move; the others turn.
+# DeepMapping section 4.2: distance of places, angle between views, share of the steps that are moves instead of turns.
 _GRID_M, _TURN_DEG, _MOVE_SHARE = 0.3, 30.0, 0.5
 _REVERSAL_SHARE = 0.2
 """So many turns go the other way than the one before."""
@@ -30,7 +30,7 @@ _MAX_WALKS = 1000
 
 @dataclass(frozen=True)
 class DepthWalkConfig:
-    """What the clouds of a walk are like, and how the camera moves.
+    """Properties of the clouds of a walk, and of the motion of the camera.
 
     Attributes:
         height: rows of a cloud.
@@ -38,7 +38,7 @@ class DepthWalkConfig:
         depth_noise_m: standard deviation of the depth at one metre; it grows with the square of the depth, as a
             structured-light camera's does.
         dropout_share: share of the pixels without a depth at three metres; it grows with the square of the depth, too.
-        steps: "one": from view to view one move of 0.3 m or one turn of 30 degrees, as in the Active Vision Dataset.
+        steps: "one": one move of 0.3 m or one turn of 30 degrees between views, as in the Active Vision Dataset.
             "both": moves and turns at once, both with jitter.
         min_spread_m: walks are drawn until the cameras are this far from their mean (root mean square): the ATE of not
             moving at all.
@@ -73,8 +73,8 @@ def simulate_depth_sequence(
     Args:
         apartment: seed for `make_apartment`, or an apartment.
         num_views: 8 or 16 in the paper.
-        seed: of walk and noise.
-        config: of clouds and motion; those of the paper without noise where None.
+        seed: seed of walk and noise.
+        config: settings of clouds and motion; those of the paper without noise where None.
 
     Returns:
         The sequence; its motion is planar.

@@ -14,13 +14,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from dpmjax.sequences import BoolArray, FloatArray, ScanSequence, World
-from dpmjax.simulation.people2d import simulate_people, stop_at_people
-from dpmjax.simulation.trajectory2d import simulate_odometry, simulate_trajectory
+from dpmjax.simulation.trajectory2d import simulate_odometry, simulate_people, simulate_trajectory, stop_at_people
 from dpmjax.simulation.world2d import make_world
 
 
 class RayHits(NamedTuple):
-    """Where beams end.
+    """Hits of beams.
 
     Attributes:
         points: (m, 2) float64 x, y in the world, px; one coordinate lies exactly on a pixel edge.
@@ -72,9 +71,9 @@ def cast_scans(is_obstacle: BoolArray, poses: ArrayLike, *, num_beams: int = 256
 def cast_rays(is_obstacle: BoolArray, origins: ArrayLike, angles: ArrayLike) -> RayHits:
     """Follows beams through the pixel grid to the first obstacle edge, or to the border of the image.
 
-    Grid traversal in the manner of Amanatides and Woo (1987), in which a beam crosses a whole square of pixels known to
-    be free at once: exact, and a few dozen steps for all beams together. A beam through the common corner of two
-    diagonal neighbours is stopped by the one beside it in x.
+    Grid traversal of Amanatides and Woo (1987); a beam crosses a whole square of free pixels at once. The result is
+    exact after a few dozen steps for all beams together. A beam through the common corner of two diagonal neighbours is
+    stopped by the one beside it in x.
 
     Args:
         is_obstacle: (h, w), True where a pixel is solid.

@@ -1,7 +1,7 @@
-"""How the robot moves: a wandering walk through a planar world with the step statistics of DeepMapping section 4.1.
+"""Walks of the robot and of people through a planar world, with the step statistics of DeepMapping section 4.1.
 
-The lidar sees all round, so the robot may move in any direction: it steers by the direction of the step, and the
-heading turns by an independent uniform angle, which keeps the statistics of the paper exact.
+The lidar sees all round, so the robot may move in any direction. It steers by the direction of the step, and the
+heading turns by an independent uniform angle: the statistics of the paper hold exactly.
 """
 
 from __future__ import annotations
@@ -177,10 +177,55 @@ def _aim(route: FloatArray, along: int, here: FloatArray, clearance: FloatArray)
 
 
 def _is_clear(start: FloatArray, end: FloatArray, clearance: FloatArray) -> bool:
-    """Whether a straight step keeps the clearance, sampled every half pixel (a quarter is lost at most)."""
+    """Returns True where a straight step keeps the clearance, sampled every half pixel (a quarter is lost at most)."""
     count = int(np.linalg.norm(end - start) * 2) + 2
     samples = np.floor(np.linspace(start, end, count)).astype(np.int64)
     height, width = clearance.shape
     if (samples < 0).any() or (samples >= [width, height]).any():
         return False
     return bool((clearance[samples[:, 1], samples[:, 0]] >= _CLEARANCE_PX + 0.25).all())
+
+
+_RADIUS_PX = 11.0
+# People who would stand nearer to the sensor than this have stepped out of the way, and are not in that scan.
+_LEAST_DISTANCE_PX = 2.0 * _RADIUS_PX
+
+
+def simulate_people(world: World, num_scans: int, *, rng: np.random.Generator) -> FloatArray:
+    """Lets the people of a world walk, at the pace of the robot and by its rules.
+
+    Args:
+        world: where to walk, and how many people do.
+        num_scans: moments at which they are wanted.
+        rng: source of all choices.
+
+    Returns:
+        (num_people, num_scans, 2) x, y in px in the frame of the world.
+    """
+    walks = [simulate_trajectory(world, num_scans, rng=stream)[:, :2] for stream in rng.spawn(world.num_people)]
+    return np.array(walks, np.float64).reshape(world.num_people, num_scans, 2)
+
+
+def stop_at_people(ranges: FloatArray, poses: FloatArray, angles: FloatArray, people: FloatArray) -> FloatArray:
+    """Shortens the beams that meet a person before they meet the world.
+
+    Args:
+        ranges: (n, b) of the world without people, px.
+        poses: (n, 3) x, y, heading of the sensor.
+        angles: (b,) of the beams in the sensor frame, radians.
+        people: (p, n, 2) centres of the people, px.
+
+    Returns:
+        (n, b) px.
+    """
+    heading = poses[:, 2:] + angles
+    beams = np.stack([np.cos(heading), np.sin(heading)], axis=-1)
+    for centres in people:
+        to_person = centres - poses[:, :2]
+        along = np.einsum("nbk,nk->nb", beams, to_person)
+        distance = np.linalg.norm(to_person, axis=-1)[:, None]
+        # Half of the chord that the beam cuts out of the disc, squared; negative where it passes by.
+        half_chord = _RADIUS_PX**2 - (distance**2 - along**2)
+        is_met = (half_chord > 0) & (along > 0) & (distance > _LEAST_DISTANCE_PX)
+        ranges = np.where(is_met, np.minimum(ranges, along - np.sqrt(np.maximum(half_chord, 0.0))), ranges)
+    return ranges

@@ -1,10 +1,10 @@
 """Binary worlds of 1024 x 1024 pixels in the manner of DeepMapping Figure 4, each made by its seed.
 
-Three kinds, one after the other as the index grows: 0 an office (rooms cut out of rooms), 1 a yard (free-standing
-blocks, open to the border of the image), 2 a clinic (a corridor between two rows of rooms). All are furnished with
-round, square and three-cornered obstacles, so that no two places look alike. Two more kinds have names only: a grove
-(trees, bushes and rocks within the edge of a forest, no straight wall anywhere) and a crowd (an office in which people
-walk about). The frame is that of `raycast`: row 0 is the lowest.
+The index selects one of three kinds in turn. 0 is an office (rooms cut out of rooms), 1 a yard (free-standing blocks,
+open to the border of the image), 2 a clinic (a corridor between two rows of rooms). All are furnished with round,
+square and three-cornered obstacles, so that no two places look alike. Two more kinds have names only: a grove (trees,
+bushes and rocks within the edge of a forest, without a straight wall) and a crowd (an office with walking people). The
+frame is that of `raycast`: row 0 is the lowest.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from dpmjax.sequences import BoolArray, FloatArray, World
 SIZE_PX = 1024
 _WALL_PX = 10
 _DOOR_PX = 72
-# Deviations of an outline as shares of its radius, two numbers a wave: 2, 3 ... waves round the outline.
+# Deviations of an outline as shares of its radius, two numbers a wave: two and more waves round the outline.
 _BLOB_WAVES = 0.3 / np.arange(2, 9)
 _EDGE_WAVES = 0.08 / np.arange(2, 60) ** 0.8
 # People in a crowd.
@@ -150,7 +150,7 @@ def _paint_frame(grid: BoolArray) -> None:
 
 
 def _paint_span(grid: BoolArray, along: int, at: float, span: tuple[float, float], doors: list[float]) -> None:
-    """A wall along x (0) or y (1) at the other coordinate `at`, over `span`, with gaps that start at `doors`."""
+    """A wall along x (0) or y (1) at the second coordinate `at`, over `span`, with gaps that start at `doors`."""
     line = np.zeros(SIZE_PX, bool)
     line[max(int(span[0]), 0) : int(span[1])] = True
     for door in doors:
@@ -190,7 +190,9 @@ def _paint_blob(
 
 
 def _paint_outline(grid: BoolArray, centre: FloatArray, radius: float, waves: FloatArray) -> None:
-    """What lies within a radius that varies with the direction: cosines and sines (2, k) of 2, 3 ... waves round."""
+    """Finds pixels within a radius that varies with the direction: cosines and sines (2, k) of two and more waves
+    round.
+    """
     turn = np.linspace(-np.pi, np.pi, 4096)
     phase = turn[:, None] * np.arange(2, 2 + waves.shape[1])
     outline = radius * np.exp(np.cos(phase) @ waves[0] + np.sin(phase) @ waves[1])

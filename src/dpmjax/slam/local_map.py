@@ -13,7 +13,7 @@ from jaxtyping import Float
 
 from dpmjax.deeppointmap.compact_scans import CompactScan
 from dpmjax.geometry import rigid
-from dpmjax.geometry.host_tree import HostTree
+from dpmjax.geometry.neighbours import HostTree
 from dpmjax.scans.compact import expand_elements
 from dpmjax.scans.surfaces import MIN_FLATNESS, Surface
 from dpmjax.slam.config import OdometryConfig

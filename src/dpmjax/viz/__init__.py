@@ -1,6 +1,6 @@
 """Pictures: registered scans, the learned map, the course of a fit. NumPy in, `matplotlib` figures and PNG files out.
 
-Nothing here needs a screen or touches `pyplot`; matplotlib itself is imported when the first picture is drawn.
+The pictures need neither a screen nor `pyplot`; matplotlib is imported with the first picture.
 """
 
 import lazy_loader as _lazy

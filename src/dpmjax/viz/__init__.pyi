@@ -1,7 +1,3 @@
-from .agents import COLORS as COLORS
-from .agents import AgentPanel as AgentPanel
-from .agents import AgentTrack as AgentTrack
-from .agents import agents_figure as agents_figure
 from .comparison import MatchedScans as MatchedScans
 from .comparison import endings_figure as endings_figure
 from .comparison import error_boxes_figure as error_boxes_figure
@@ -19,7 +15,6 @@ from .drives import trajectory_figure as trajectory_figure
 from .figures import Limits as Limits
 from .figures import save_figure as save_figure
 from .live_viewer import LiveViewer as LiveViewer
-from .localization import localization_figure as localization_figure
 from .maps import Panel as Panel
 from .maps import registered_scans_figure as registered_scans_figure
 from .rasters import ErrorMap as ErrorMap
@@ -27,8 +22,13 @@ from .rasters import error_maps_figure as error_maps_figure
 from .rasters import from_above_figure as from_above_figure
 from .rasters import occupancy_figure as occupancy_figure
 from .registrations import RegisteredPair as RegisteredPair
+from .registrations import localization_figure as localization_figure
 from .registrations import registered_pairs_figure as registered_pairs_figure
 from .registrations import reliability_figure as reliability_figure
-from .slam_comparison import TrackPanel as TrackPanel
-from .slam_comparison import growth_figure as growth_figure
-from .slam_comparison import trajectories_figure as trajectories_figure
+from .trajectories import COLORS as COLORS
+from .trajectories import AgentPanel as AgentPanel
+from .trajectories import AgentTrack as AgentTrack
+from .trajectories import TrackPanel as TrackPanel
+from .trajectories import agents_figure as agents_figure
+from .trajectories import growth_figure as growth_figure
+from .trajectories import trajectories_figure as trajectories_figure

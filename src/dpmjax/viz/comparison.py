@@ -56,8 +56,8 @@ def success_grids_figure(
 
     Args:
         grids: (r, c) rates from 0 to 1 by method, at least one; NaN: not run.
-        rows: what the rows are, with the name of each.
-        columns: what the columns are, with the name of each.
+        rows: title of the rows, and the name of each.
+        columns: title of the columns, and the name of each.
 
     Returns:
         The figure.

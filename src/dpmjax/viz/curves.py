@@ -26,7 +26,7 @@ SIZE_COLORS = (LOSS_COLOR, ACCENT, "#2a9d6f", "#e09f3e")
 
 @dataclass(frozen=True)
 class History:
-    """What a fit reported, one entry a record.
+    """Course of a fit, one entry a record.
 
     Attributes:
         seconds: (k,) run time, never decreasing, compile time left out.
@@ -56,8 +56,8 @@ def history_figure(history: History, unit: str) -> Figure:
     where all its values are positive and span more than a factor of ten.
 
     Args:
-        history: of the fit.
-        unit: of the ATE.
+        history: history of the fit.
+        unit: unit of the ATE.
 
     Returns:
         The figure.

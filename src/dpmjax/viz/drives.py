@@ -36,7 +36,7 @@ class Track(NamedTuple):
     """One trajectory of a picture.
 
     Attributes:
-        label: for the legend.
+        label: label for the legend.
         positions: (n, 3) metres; all tracks of a picture are in one frame.
         errors_m: (n,) distance of each scan to the reference; None where there is none.
     """
@@ -55,7 +55,7 @@ def trajectory_figure(
     """Draws trajectories from above with the reference and the loops; and the errors beside them.
 
     Args:
-        title: of the picture.
+        title: title of the picture.
         tracks: the last one is the result; those before are drawn thinner.
         reference: positions in the same frame; None where there is none.
         loops: positions of both ends of each accepted loop.
@@ -98,10 +98,10 @@ def height_map_figure(
 ) -> Figure:
     """Draws a map from above: what stands highest in each pixel, by its height above the lidar that passed there.
 
-    Where the path is under a roof, what is more than a metre above the lidar is left out, so that the walls are seen.
+    Under a roof, points more than a metre above the lidar are left out, so that the walls are visible.
 
     Args:
-        title: of the picture.
+        title: title of the picture.
         points: metres, in the world.
         heights_m: of each point above the lidar.
         path: positions of the lidar.
@@ -170,7 +170,7 @@ def _colormap() -> Colormap:
 def _is_roofed(
     points: Float[np.ndarray, "n 3"], heights_m: Float[np.ndarray, " n"], path: Float[np.ndarray, "k 3"]
 ) -> bool:
-    """Whether there is something above most of the path, within a metre."""
+    """Returns True where points lie above most of the path, within a metre."""
     above = np.unique(np.floor(points[heights_m > _ROOF_M, :2]).astype(np.int64), axis=0)
     cells = np.unique(np.floor(path[:, :2]).astype(np.int64), axis=0)
     num_below = len(cells) + len(above) - len(np.unique(np.vstack([cells, above]), axis=0))
@@ -196,8 +196,8 @@ def plane_limits(positions: Float[np.ndarray, "n 2"], margin_share: float) -> Li
     """Returns a rectangle round positions; that of a straight road has a useful height too.
 
     Args:
-        positions: at least one.
-        margin_share: of the longer side, added on all sides.
+        positions: positions, at least one.
+        margin_share: margin as a share of the longer side, added on all sides.
 
     Returns:
         The limits.
@@ -213,7 +213,7 @@ def size_in(limits: Limits) -> tuple[float, float]:
     """Returns width and height of the panel of a map.
 
     Args:
-        limits: of the map.
+        limits: limits of the map.
 
     Returns:
         Inches.

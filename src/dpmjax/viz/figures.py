@@ -1,4 +1,4 @@
-"""What all pictures share: an empty figure, the frame of a map, a scale bar, and the way onto the disk."""
+"""Common parts of pictures: an empty figure, the frame of a map, a scale bar, and the file."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def style_axes(axes: Axes) -> None:
 
 
 def annotate_corner(axes: Axes, text: str, offset: tuple[float, float], **style: Any) -> None:
-    """Writes text at the upper left corner of the axes, so many points right of it and above it."""
+    """Writes text at the upper left corner of the axes, shifted right and up by points."""
     style = {"fontsize": 8.5, "color": MUTED, **style}
     axes.annotate(text, (0, 1), xytext=offset, xycoords="axes fraction", textcoords="offset points", **style)
 

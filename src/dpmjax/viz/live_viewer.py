@@ -19,10 +19,10 @@ _TRAJECTORY, _LOOP = (31, 78, 140), (42, 157, 92)
 class LiveViewer:
     """Shows scans, keyframes, trajectory and loops while they are found.
 
-    Keyframes hang on their poses: a loop that moves the map moves what is shown.
+    Keyframes are children of their poses: a loop that moves the map moves the picture.
 
     Args:
-        name: of the recording.
+        name: name of the recording.
         path: file that is written where there is no screen; a throw-away, for viewers of other versions cannot read it.
 
     Raises:
@@ -42,7 +42,7 @@ class LiveViewer:
         """Shows the newest scan.
 
         Args:
-            number: of the scan.
+            number: number of the scan.
             points: metres, in the frame of the lidar.
             T_world_scan: its pose.
         """
@@ -74,7 +74,7 @@ class LiveViewer:
         self._log("world/loops", lines(loops, colors=[_LOOP]))
 
     def close(self) -> None:
-        """Writes what is left."""
+        """Writes the remaining data."""
         self._recording.flush()
 
     def _log_pose(self, entity: str, T: Float[np.ndarray, "4 4"]) -> None:
@@ -88,7 +88,7 @@ class LiveViewer:
 
 
 def has_screen() -> bool:
-    """Whether a window can be opened.
+    """Returns True where a window can be opened.
 
     Returns:
         False on a Linux machine without a display.

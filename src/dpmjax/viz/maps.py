@@ -48,7 +48,7 @@ class Panel:
         poses: (n, 3) x, y, heading (radians) of the sensor in the world of this panel.
         ate: absolute trajectory error in the unit of the figure, or None.
         point_distance: mean point distance in the unit of the figure, or None.
-        is_reference: the other panels are laid onto this one.
+        is_reference: all panels are aligned with this one.
     """
 
     title: str
@@ -91,13 +91,13 @@ class Panel:
 def registered_scans_figure(panels: Sequence[Panel], unit: str) -> Figure:
     """Draws the panels side by side in one frame with one scale.
 
-    Each panel is laid onto the reference panel (or, where there is none, onto the last) by the rigid motion that brings
-    its trajectory closest; then all have the same limits. One colour a scan, running with time; trajectory in black,
-    its start marked with a dot. At most `MAX_POINTS_PER_PANEL` points are drawn, chosen evenly by a fixed seed and in
-    random order, so that late scans do not hide early ones.
+    The rigid motion that brings its trajectory closest aligns each panel with the reference panel, or without one with
+    the last. All panels have the same limits. One colour a scan, running with time; trajectory in black, its start
+    marked with a dot. At most `MAX_POINTS_PER_PANEL` points are drawn, chosen evenly by a fixed seed and in random
+    order, so that late scans do not hide early ones.
 
     Args:
-        panels: at least one; all of the same scans.
+        panels: panels, at least one; all of the same scans.
         unit: unit of lengths, "px" or "m".
 
     Returns:

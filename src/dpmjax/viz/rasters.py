@@ -45,8 +45,8 @@ def occupancy_figure(
             ended; and x_min, x_max, y_min, y_max of the grid's outer edges in the world, in `unit`.
         trajectory_world: (n, 2) sensor positions, or None.
         unit: unit of lengths, "px" or "m".
-        T_view_world: (3, 3) rigid motion into the frame of the picture; None draws the world as it is.
-        limits: what is shown of that frame; None shows the grid.
+        T_view_world: (3, 3) rigid motion into the frame of the picture; None draws the world unchanged.
+        limits: shown part of that frame; None shows the grid.
 
     Returns:
         The figure.
@@ -88,7 +88,7 @@ class ErrorMap(NamedTuple):
     """One panel.
 
     Attributes:
-        title: of the network.
+        title: title of the network.
         subtitle: its numbers.
         error: (h, w) distance to the truth; NaN where no scan was taken. Row 0 has the smallest y.
     """
@@ -109,7 +109,7 @@ def error_maps_figure(
     """Draws errors of re-localisation in the manner of DeepMapping figure 7: black is right, the lighter the worse.
 
     Args:
-        maps: at least one, all of one shape.
+        maps: maps, at least one, all of one shape.
         extent: x_min, x_max, y_min, y_max of the grids' outer edges, in `unit`.
         trajectory_world: (n, 2) where the scans of the fit were taken.
         unit: unit of lengths.
@@ -152,7 +152,7 @@ def from_above_figure(
     """Draws depth images from above, without the ceiling, one colour an image, for several sets of poses.
 
     Args:
-        panels: title and (n, 4, 4) T_world_camera in metres; the last is the frame that the others are laid onto.
+        panels: title and (n, 4, 4) T_world_camera in metres; all are aligned with the last.
         points: (n, h, w, 3) in the camera frames (y down).
         mask: (n, h, w).
         below_m: points with a smaller y than this are the ceiling.

@@ -1,4 +1,4 @@
-"""The published PyTorch checkpoints of DeepPointMap, read without PyTorch and without running what is in the file.
+"""The published PyTorch checkpoints of DeepPointMap, read without PyTorch and without running code of the file.
 
 A file that PyTorch saved is a ZIP archive of raw storages and one pickle that maps tensors to parts of storages. The
 pickle may name only tensors and dictionaries; anything else is refused. Files from before PyTorch 1.6 are no archives;

@@ -27,7 +27,7 @@ _BUILDING_STREAM = 8160
 
 @dataclass(frozen=True)
 class BuildingConfig:
-    """What a building is like.
+    """Properties of a building.
 
     Attributes:
         kind: office, hall, flat, corridor, tunnel, garage (with parked cars) or stairs.
@@ -52,7 +52,7 @@ class Building:
     """A storey of a building.
 
     Attributes:
-        name: with its seed, for titles.
+        name: name with its seed, for titles.
         plan: rooms and doors.
         route: (k, 2) points of the walk at steps of a decimetre, m; nothing stands in the way.
         primitives: what a beam meets, on the device; the floor begins at z = 0.
@@ -68,8 +68,8 @@ def make_building(seed: int, config: BuildingConfig = BuildingConfig()) -> Build
     """Builds the building of a seed; the same one every time.
 
     Args:
-        seed: of all choices, not negative.
-        config: what the building is like.
+        seed: seed of all choices, not negative.
+        config: properties of the building.
 
     Returns:
         The building.

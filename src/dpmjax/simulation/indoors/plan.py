@@ -21,7 +21,7 @@ class Room:
     Attributes:
         low: x and y of one corner, m.
         high: x and y of the opposite corner, m.
-        height: of the ceiling, m.
+        height: height of the ceiling, m.
     """
 
     low: tuple[float, float]

@@ -20,7 +20,7 @@ _SINK = 2.5  # Slow changes of the height, over those of a step.
 
 @dataclass(frozen=True)
 class WalkConfig:
-    """How the lidar is carried.
+    """Motion of the lidar.
 
     Attributes:
         speed_m_s: of the walk.
@@ -52,7 +52,7 @@ def walk(building: Building, config: WalkConfig = WalkConfig(), *, seed: int = 0
     Args:
         building: the building.
         config: how.
-        seed: of the sway.
+        seed: seed of the sway.
 
     Returns:
         Poses and times; z is up, and the floor begins at z = 0.

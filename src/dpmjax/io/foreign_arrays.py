@@ -1,7 +1,8 @@
-"""MATLAB files of level 5 (-v6, -v7): numbers, text, structs, cells. SciPy's reader crashes on damaged files."""
+"""Arrays in files of other programs: variables of MATLAB, and depth images of 16 bits in PNG files."""
 
 from __future__ import annotations
 
+import io
 import math
 import struct
 import zlib
@@ -12,7 +13,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dpmjax.io.files import LARGEST_COMPRESSION, refusing
+from dpmjax.io.files import LARGEST_COMPRESSION, read_bytes, refusing
+from dpmjax.sequences import FloatArray, require
 
 _MATRIX, _COMPRESSED = 14, 15
 _CELL, _STRUCT, _OBJECT, _CHAR, _SPARSE = range(1, 6)
@@ -89,3 +91,40 @@ def _parse_value(category: int, parts: list[tuple[int, bytes]], shape: tuple[int
 
 def _numbers(element: tuple[int, bytes], order: str) -> NDArray[Any]:
     return np.frombuffer(element[1], order + _STORAGE[element[0]])
+
+
+_MOST_PIXELS = 1 << 26
+
+
+def read_depth_png(path: str | Path) -> NDArray[np.int64]:
+    """Reads the 16-bit numbers of a one-channel PNG.
+
+    Args:
+        path: the picture.
+
+    Returns:
+        (rows, columns).
+
+    Raises:
+        InputError: the file is missing, damaged, or has another kind of pixels.
+    """
+    image, bits = _read_png(path)
+    is_good = image.ndim == 2 and bits == 16
+    require(is_good, path, f"pixels are {image.shape} of {bits} bits", "give a PNG of one channel of 16 bits")
+    # matplotlib divides by the largest number of 16 bits.
+    return np.rint(image * 65535.0).astype(np.int64)
+
+
+def _read_png(path: str | Path) -> tuple[FloatArray, int]:
+    """The picture with values in [0, 1], and the bits of a channel."""
+    from matplotlib.image import imread
+
+    content = read_bytes(path)
+    # Pillow raises many kinds of errors.
+    with refusing(path, "not a readable PNG ({error})", "copy the picture again", (Exception,)):
+        if not content.startswith(b"\x89PNG\r\n\x1a\n"):
+            raise ValueError("no PNG signature")
+        width, height, bits = struct.unpack(">IIB", content[16:25])
+        if not 0 < width * height <= _MOST_PIXELS:
+            raise ValueError(f"a size of {width} x {height}")
+        return np.asarray(imread(io.BytesIO(content), format="png"), np.float64), bits

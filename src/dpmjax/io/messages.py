@@ -1,12 +1,26 @@
-"""Packages of extras, imported where a file needs them."""
+"""Messages of readers: notes in the log, and the error of a missing package."""
 
 from __future__ import annotations
 
 import importlib
+import logging
+from collections.abc import Iterable
 from pathlib import Path
 from types import ModuleType
 
-from dpmjax.sequences import InputError
+from dpmjax.sequences import InputError, Note
+
+_log = logging.getLogger(__name__)
+
+
+def log_notes(notes: Iterable[Note]) -> None:
+    """Logs doubts as warnings, and other notes as information.
+
+    Args:
+        notes: notes of a reader.
+    """
+    for note in notes:
+        _log.log(logging.WARNING if note.is_doubt else logging.INFO, "%s", note.text)
 
 
 def import_for(source: str | Path, module: str, extra: str) -> ModuleType:
@@ -15,7 +29,7 @@ def import_for(source: str | Path, module: str, extra: str) -> ModuleType:
     Args:
         source: the file that needs it, for the message.
         module: name of the module.
-        extra: of dpmjax, which brings its package.
+        extra: extra of dpmjax, which brings its package.
 
     Returns:
         The module.

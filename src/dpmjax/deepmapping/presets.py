@@ -1,0 +1,193 @@
+"""Presets of DeepMapping: phases and networks of planar scans, of depth images and of lidar clouds."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Literal
+
+from dpmjax.deepmapping.config import (
+    LOCALIZE,
+    REFINE,
+    ChamferComparison,
+    DeepMappingConfig,
+    Motion,
+    PhaseConfig,
+    PlaneComparison,
+    ProjectiveComparison,
+)
+from dpmjax.nets.localization import LocalizationNetConfig
+from dpmjax.nets.occupancy import OccupancyConfig
+
+# M-Net of the fast presets in space.
+_SPATIAL_GRID = OccupancyConfig(kind="grid", resolutions=(8, 16, 32, 64))
+
+JOINT = PhaseConfig(
+    name="L-Net and M-Net",
+    poses="network",
+    num_steps=6000,
+    occupancy_weight=0.1,
+    learning_rate=1e-3,
+    scans_per_step=128,
+    beams_per_step=1 << 30,
+    num_free=19,
+    is_sampled_as_published=True,
+)
+"""The paper: 3000 epochs of two batches for 256 scans, all beams, 19 free samples, gamma 0.1, windows of 4 scans."""
+
+LOCALIZE_DEPTH = replace(
+    LOCALIZE, num_steps=400, learning_rate=1e-3, beams_per_step=400, num_offsets=2, max_offset=3, scans_per_window=None
+)
+"""Cold start of depth images."""
+
+UNROLL_DEPTH = replace(
+    LOCALIZE_DEPTH,
+    name="free poses, Chamfer",
+    poses="free",
+    num_steps=300,
+    learning_rate=1e-2,
+    final_learning_rate=0.02,
+    comparison=ChamferComparison(limit=(0.5, 0.05)),
+)
+"""The Chamfer distance pulls views of low overlap onto each other; with its falling limit, that pull vanishes."""
+
+REFINE_DEPTH = replace(
+    REFINE,
+    name="free poses and map",
+    num_steps=150,
+    occupancy_weight=0.1,
+    learning_rate=2e-3,
+    beams_per_step=200,
+    num_offsets=3,
+    max_offset=1 << 30,
+    surface_distance=(0.05, 0.01),
+    comparison=ProjectiveComparison(tolerance=(0.05, 0.005)),
+)
+"""Free poses and a map that sharpens from coarse to fine. The nearest point of another image is some centimetres beside
+the surface between its pixels, and it pulls points that only one image has seen; a projection does neither."""
+
+JOINT_DEPTH = replace(
+    JOINT, num_steps=3000, occupancy_weight=0.9, scans_per_step=256, num_offsets=1, max_offset=1, num_free=35
+)
+"""The paper: all pixels, 35 free samples a ray, gamma 0.9, windows of 2."""
+
+LOCALIZE_CLOUDS = replace(
+    LOCALIZE, num_steps=300, learning_rate=1e-3, beams_per_step=256, num_offsets=2, max_offset=3, scans_per_window=None
+)
+"""Cold start of clouds."""
+
+UNROLL_CLOUDS = replace(UNROLL_DEPTH, num_steps=200, beams_per_step=256, scans_per_step=64)
+"""The same of clouds."""
+
+REFINE_CLOUDS = replace(
+    REFINE,
+    name="free poses, planes and map",
+    num_steps=300,
+    occupancy_weight=0.1,
+    learning_rate=2e-3,
+    final_learning_rate=0.01,
+    scans_per_step=64,
+    beams_per_step=128,
+    num_offsets=3,
+    max_offset=8,
+    surface_distance=(0.05, 0.01),
+    comparison=PlaneComparison(width=(0.04, 0.002), num_revisits=1),
+)
+"""Free poses, planes and a map that sharpens. The Chamfer distance pulls the sparse rings of two scans onto each other;
+the distance to the plane between the rings does not."""
+
+JOINT_CLOUDS = replace(JOINT, num_steps=3000, scans_per_step=64, beams_per_step=2048)
+"""The paper's losses and sampling, in 3-D."""
+
+
+def preset(name: Literal["fast", "paper"], *, is_organised: bool = True) -> DeepMappingConfig:
+    """Returns the settings of a preset for planar scans.
+
+    Args:
+        name: "fast" (a minute on two cores) or "paper" (its architecture, losses and sampling).
+        is_organised: the beams are in order; else L-Net is a PointNet.
+
+    Returns:
+        The settings.
+
+    Raises:
+        ValueError: the name is unknown.
+    """
+    _check_preset(name)
+    config = DeepMappingConfig()
+    if name == "paper":
+        config = _as_published(config, JOINT, LocalizationNetConfig())
+    if not is_organised:
+        config = replace(config, localization=replace(config.localization, kind="point"))
+    return config
+
+
+def depth_preset(name: Literal["fast", "paper"], *, motion: Motion = "planar") -> DeepMappingConfig:
+    """Returns the settings of a preset for depth images.
+
+    Args:
+        name: "fast" (seconds to a minute on two cores) or "paper" (its networks and sampling).
+        motion: degrees of freedom of the camera.
+
+    Returns:
+        The settings.
+
+    Raises:
+        ValueError: the name is unknown.
+    """
+    _check_preset(name)
+    config = DeepMappingConfig(
+        cold_phases=(LOCALIZE_DEPTH, UNROLL_DEPTH, REFINE_DEPTH),
+        warm_phases=(REFINE_DEPTH,),
+        localization=LocalizationNetConfig(features=(32, 64, 128), strides=(2, 2, 1), hidden=(128, 64)),
+        occupancy=_SPATIAL_GRID,
+        steps_per_call=50,
+        map_margin=1.2,
+        motion=motion,
+    )
+    if name == "paper":
+        return _as_published(
+            config, JOINT_DEPTH, LocalizationNetConfig(features=(64, 128, 256, 1024), strides=(1,) * 4)
+        )
+    if motion == "planar":
+        return config
+    # Real depth images in SE(3) do not agree to half a percent of the depth, and their first poses are rougher.
+    refine = replace(REFINE_DEPTH, comparison=ProjectiveComparison(tolerance=(0.1, 0.02)))
+    return replace(config, cold_phases=(*config.cold_phases[:-1], refine), warm_phases=(refine,))
+
+
+def cloud_preset(name: Literal["fast", "paper"]) -> DeepMappingConfig:
+    """Returns the settings of a preset for lidar clouds.
+
+    Args:
+        name: "fast" (a minute on two cores for some dozens of scans) or "paper" (its networks, losses and sampling).
+
+    Returns:
+        The settings.
+
+    Raises:
+        ValueError: the name is unknown.
+    """
+    _check_preset(name)
+    config = DeepMappingConfig(
+        cold_phases=(LOCALIZE_CLOUDS, UNROLL_CLOUDS, REFINE_CLOUDS),
+        warm_phases=(REFINE_CLOUDS,),
+        localization=LocalizationNetConfig(kind="point", features=(32, 64, 128), hidden=(128, 64)),
+        occupancy=_SPATIAL_GRID,
+        map_margin=1.05,
+        motion="full",
+    )
+    return config if name == "fast" else _as_published(config, JOINT_CLOUDS, LocalizationNetConfig(kind="point"))
+
+
+def _as_published(
+    config: DeepMappingConfig, phase: PhaseConfig, localization: LocalizationNetConfig
+) -> DeepMappingConfig:
+    """Returns settings with one phase and the paper's networks."""
+    config = replace(config, localization=localization, occupancy=OccupancyConfig(), steps_per_call=1)
+    return replace(config, cold_phases=(phase,), warm_phases=(phase,))
+
+
+def _check_preset(name: str) -> None:
+    """Raises a ValueError where the name of a preset is unknown."""
+    if name not in ("fast", "paper"):
+        raise ValueError(f"preset: expected 'fast' or 'paper', got {name!r}")

@@ -1,0 +1,262 @@
+"""Pictures of several trajectories: of methods beside each other, and of agents in their maps; growth of maps."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from jaxtyping import Float, UInt8
+from numpy.typing import NDArray
+
+from dpmjax.viz.drives import add_axes, plane_limits, size_in
+from dpmjax.viz.figures import INK, MUTED, Limits, add_scale_bar, frame_map, new_figure, style_axes
+
+if TYPE_CHECKING:
+    from matplotlib.artist import Artist
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+
+_COLUMNS = 4
+_CURVE_COLORS = ("#8a929b", "#e08a1e", "#1f4e8c", "#4f8fcf", "#2a9d5c")
+_MARGIN = 0.12
+_PANEL_IN, _LEGEND_IN, _ENTRY_IN = 3.1, 0.6, 1.9
+# A lost method must not make the remaining trajectories small.
+_SHARE_OUTSIDE = 0.5
+
+
+class TrackPanel(NamedTuple):
+    """The trajectories of one drive, all in one frame.
+
+    Attributes:
+        tracks: (n, 3) positions by method, metres.
+        reference: (n, 3) true positions; None where there are none.
+    """
+
+    tracks: Mapping[str, Float[np.ndarray, "n 3"]]
+    reference: Float[np.ndarray, "n 3"] | None
+
+
+def trajectories_figure(panels: Mapping[str, TrackPanel], colors: Mapping[str, str]) -> Figure:
+    """Draws a small panel for each drive, from above, with all methods and the reference.
+
+    Args:
+        panels: by name of the drive.
+        colors: by method; the legend has their order.
+
+    Returns:
+        The figure.
+
+    Raises:
+        ValueError: no panel, or a method without a colour.
+    """
+    methods = {method for panel in panels.values() for method in panel.tracks}
+    if not panels or not methods <= set(colors):
+        raise ValueError(f"expected panels, and colours of {sorted(methods)}; got colours of {sorted(colors)}")
+    figure, grid = _panels(len(panels), _PANEL_IN)
+    for axes, (name, panel) in zip(grid, panels.items(), strict=True):
+        if panel.reference is not None:
+            axes.plot(*panel.reference[:, :2].T, color="#b9c0c8", lw=3.6, solid_capstyle="round", label="reference")
+        for method in [method for method in colors if method in panel.tracks]:
+            axes.plot(*panel.tracks[method][:, :2].T, color=colors[method], lw=1.0, label=method)
+        frame_map(axes, plane_limits(_shown(panel), _MARGIN))
+        add_scale_bar(axes, plane_limits(_shown(panel), _MARGIN), "m")
+        axes.set_title(name, fontsize=8.5, color=INK)
+    shown = [zip(*axes.get_legend_handles_labels(), strict=True) for axes in grid]
+    entries = {label: handle for handles in shown for handle, label in handles}
+    _add_legend(figure, entries)
+    return figure
+
+
+def _panels(num: int, height_in: float, *, is_y_shared: bool = False) -> tuple[Figure, list[Axes]]:
+    """Makes a figure of several panels, with space for a legend below them."""
+    columns = min(num, _COLUMNS)
+    num_rows = math.ceil(num / columns)
+    figure = new_figure(_PANEL_IN * columns, height_in * num_rows + _LEGEND_IN)
+    grid = figure.subplots(num_rows, columns, squeeze=False, sharey=is_y_shared).ravel().tolist()
+    for axes in grid[num:]:
+        axes.set_axis_off()
+    return figure, grid[:num]
+
+
+def _add_legend(figure: Figure, entries: Mapping[str, Artist]) -> None:
+    """Adds one legend for all panels, below them."""
+    figure.tight_layout(rect=(0, _LEGEND_IN / figure.get_figheight(), 1, 1))
+    num_columns = max(int(figure.get_figwidth() / _ENTRY_IN), 1)
+    figure.legend(
+        entries.values(), entries.keys(), loc="lower center", ncols=num_columns, frameon=False, fontsize=8,
+        labelcolor=MUTED,
+    )  # fmt: skip
+
+
+def _shown(panel: TrackPanel) -> NDArray[np.float64]:
+    """The reference sets the limits; a lost trajectory leaves the panel."""
+    everything = np.concatenate([positions[:, :2] for positions in panel.tracks.values()] or [np.zeros((1, 2))])
+    if panel.reference is None:
+        return np.asarray(everything, np.float64)
+    low, high = panel.reference[:, :2].min(axis=0), panel.reference[:, :2].max(axis=0)
+    spare = _SHARE_OUTSIDE * (high - low).max()
+    return np.vstack([panel.reference[:, :2], np.clip(everything, low - spare, high + spare)])
+
+
+def growth_figure(
+    panels: Mapping[str, Mapping[str, tuple[Float[np.ndarray, " k"], Float[np.ndarray, " k"]]]],
+) -> Figure:
+    """Draws how many bytes the forms of a map take against metres driven, on a logarithmic axis.
+
+    Args:
+        panels: by name of the drive and of the form: metres driven, and bytes.
+
+    Returns:
+        The figure.
+
+    Raises:
+        ValueError: no panel.
+    """
+    if not panels:
+        raise ValueError("panels: expected at least one")
+    figure, grid = _panels(len(panels), 0.85 * _PANEL_IN, is_y_shared=True)
+    names = list(dict.fromkeys(name for curves in panels.values() for name in curves))
+    colors = {name: _CURVE_COLORS[number % len(_CURVE_COLORS)] for number, name in enumerate(names)}
+    entries: dict[str, Artist] = {}
+    for axes, (drive, curves) in zip(grid, panels.items(), strict=True):
+        for name, (metres, sizes) in curves.items():
+            (entries[name],) = axes.plot(metres, sizes / 1e6, "-o", ms=2.5, lw=1.3, color=colors[name])
+        axes.set_yscale("log")
+        axes.set_xlim(left=0)
+        axes.set_title(drive, fontsize=8.5, color=INK)
+        axes.set_xlabel("distance driven, m", fontsize=8, color=MUTED)
+        style_axes(axes)
+    grid[0].set_ylabel("map, MB", fontsize=8, color=MUTED)
+    _add_legend(figure, entries)
+    return figure
+
+
+COLORS = ("#1f4e8c", "#d1495b", "#2a9d5c", "#e08a1e", "#7b4fa3", "#0f8b8d", "#8d6b3f", "#c04a9b")
+"""Of the agents, in turn."""
+
+GAP_IN, TITLE_IN, LEGEND_IN, DOTS_PER_IN = 0.2, 0.6, 0.8, 100
+
+MIN_HEIGHT_M = -1.0
+"""Lower points, below the lidar, are ground, which would hide everything."""
+
+
+class AgentTrack(NamedTuple):
+    """Points and trajectory of one agent.
+
+    Attributes:
+        label: label for the legend.
+        color: color of the agent.
+        positions: (n, 3) metres.
+        reference: (n, 3) in the same frame; None where there is none.
+        points: (m, 3) measured points.
+        heights_m: (m,) of the points above the lidar.
+    """
+
+    label: str
+    color: str
+    positions: Float[np.ndarray, "n 3"]
+    reference: Float[np.ndarray, "n 3"] | None
+    points: Float[np.ndarray, "m 3"]
+    heights_m: Float[np.ndarray, " m"]
+
+
+class AgentPanel(NamedTuple):
+    """Agents that share one frame.
+
+    Attributes:
+        title: title of the panel.
+        agents: agents, at least one.
+        loops: (l, 2, 3) positions of both ends of each loop between agents.
+    """
+
+    title: str
+    agents: Sequence[AgentTrack]
+    loops: Float[np.ndarray, "l 2 3"]
+
+
+def agents_figure(title: str, panels: Sequence[AgentPanel]) -> Figure:
+    """Draws what agents have mapped, from above; agents that never met have panels of their own.
+
+    Args:
+        title: title of the picture.
+        panels: one for each component.
+
+    Returns:
+        The figure.
+    """
+    limits = [_limits_of(panel) for panel in panels]
+    sizes = [size_in(each) for each in limits]
+    width_in = sum(size[0] + GAP_IN for size in sizes) + GAP_IN
+    height_in = max(size[1] for size in sizes)
+    figure = new_figure(width_in, height_in + TITLE_IN + LEGEND_IN)
+    left_in = GAP_IN
+    for panel, size, each in zip(panels, sizes, limits, strict=True):
+        axes = add_axes(figure, (left_in, LEGEND_IN + height_in - size[1], *size))
+        _draw_panel(axes, panel, each, size)
+        left_in += size[0] + GAP_IN
+    place = (GAP_IN / width_in, 1 - 0.1 / (height_in + TITLE_IN + LEGEND_IN))
+    figure.text(*place, title, fontsize=11, color=INK, ha="left", va="top", fontweight="bold")
+    return figure
+
+
+def _draw_panel(axes: Axes, panel: AgentPanel, limits: Limits, size: tuple[float, float]) -> None:
+    from matplotlib.collections import LineCollection
+
+    axes.imshow(
+        _raster(panel, limits, int(DOTS_PER_IN * size[0]), int(DOTS_PER_IN * size[1])),
+        origin="lower",
+        extent=limits,
+        interpolation="nearest",
+    )
+    references = [agent.reference for agent in panel.agents if agent.reference is not None]
+    for number, reference in enumerate(references):
+        label = None if number else "reference"
+        axes.plot(*reference[:, :2].T, color=INK, lw=0.6, ls=(0, (5, 3)), label=label, zorder=6)
+    for agent in panel.agents:
+        axes.plot(*agent.positions[:, :2].T, color="white", lw=4.4, zorder=3, solid_capstyle="round")
+        axes.plot(*agent.positions[:, :2].T, color=agent.color, lw=2.6, label=agent.label, zorder=4)
+        axes.plot(*agent.positions[:1, :2].T, "o", ms=5.5, color=agent.color, mec="white", zorder=8)
+    if len(panel.loops):
+        lines = LineCollection(list(panel.loops[:, :, :2]), colors=INK, linewidths=0.9, zorder=7)
+        lines.set_label(f"{len(panel.loops)} loop{'s' * (len(panel.loops) != 1)} between them")
+        axes.add_collection(lines)
+        axes.plot(*panel.loops.reshape(-1, 3)[:, :2].T, ".", ms=3.5, color=INK, zorder=7)
+    frame_map(axes, limits)
+    add_scale_bar(axes, limits, "m")
+    axes.set_title(panel.title, fontsize=9, color=MUTED, loc="left")
+    columns = max(int(size[0] / 1.6), 1)
+    axes.legend(
+        loc="upper left", bbox_to_anchor=(-0.02, -0.01), ncols=columns, frameon=False, fontsize=8, labelcolor=MUTED
+    )
+
+
+def _limits_of(panel: AgentPanel) -> Limits:
+    """Limits of the trajectories and of most points: a few far points must not make the map small."""
+    shown = [agent.positions[:, :2] for agent in panel.agents]
+    points = np.concatenate([agent.points[:, :2] for agent in panel.agents])
+    if len(points):
+        shown.append(np.quantile(points, [0.01, 0.99], axis=0))
+    return plane_limits(np.concatenate(shown), 0.03)
+
+
+def _raster(panel: AgentPanel, limits: Limits, columns: int, rows: int) -> UInt8[np.ndarray, "r c 3"]:
+    """The picture: each pixel has the colour of those who have seen something there, stronger for more points."""
+    from matplotlib.colors import to_rgb
+
+    color, total = np.zeros((rows * columns, 3)), np.zeros(rows * columns)
+    for agent in panel.agents:
+        points = agent.points[agent.heights_m > MIN_HEIGHT_M, :2]
+        place = (points - [limits.x_min, limits.y_min]) / [limits.width / columns, limits.height / rows]
+        column, row = np.floor(place).astype(np.int64).T
+        is_inside = (column >= 0) & (column < columns) & (row >= 0) & (row < rows)
+        count = np.bincount(row[is_inside] * columns + column[is_inside], minlength=rows * columns)
+        color += count[:, None] * np.array(to_rgb(agent.color))
+        total += count
+    is_seen = total > 0
+    strong = np.quantile(total[is_seen], 0.9) if is_seen.any() else 1.0
+    alpha = np.where(is_seen, 0.35 + 0.6 * np.clip(total / max(strong, 1.0), 0, 1), 0.0)[:, None]
+    mixed = alpha * color / np.maximum(total, 1)[:, None] + 1 - alpha
+    return np.asarray(np.round(255 * mixed), np.uint8).reshape(rows, columns, 3)

@@ -1,0 +1,56 @@
+"""Writers of data sets in the layouts of their authors, for tests of the readers and of the commands."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from scipy.io import savemat
+
+from dpmjax.geometry import rigid
+from dpmjax.io import LidarSequence, ScanSequence, iterate_scans, write_kitti, write_pcd
+from dpmjax.io.files import read_bytes
+from dpmjax.io.pcd import parse_pcd
+from dpmjax.io.ply import parse_ply
+
+# Axes of a camera that looks along x of the lidar: x right, y down, z forward. Written drives have it in the lidar.
+_T_CAM0_LIDAR = np.array([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]])
+
+
+def write_deepmapping_folder(folder: Path, sequence: ScanSequence) -> Path:
+    """Writes `000.pcd` and so on in pixels / 512 or in metres, invalid beams as zeros, and gt_pose.mat."""
+    folder.mkdir(parents=True, exist_ok=True)
+    stored = np.where(sequence.mask[..., None], sequence.points, 0.0) / (512.0 if sequence.unit == "px" else 1.0)
+    for index, points in enumerate(stored):
+        write_pcd(folder / f"{index:03d}.pcd", points)
+    if sequence.reference_poses is not None:
+        savemat(folder / "gt_pose.mat", {"pose": sequence.reference_poses})
+    return folder
+
+
+def write_kitti_sequence(root: Path, name: str, sequence: LidarSequence) -> Path:
+    """Writes sequences/NAME/{velodyne,calib.txt,times.txt} and poses/NAME.txt of the good scans."""
+    folder = root / "sequences" / name
+    (folder / "velodyne").mkdir(parents=True)
+    kept = []
+    for index, points in iterate_scans(sequence):
+        rows = np.zeros((len(points), 4), "<f4")
+        rows[:, :3] = points
+        (folder / "velodyne" / f"{len(kept):06d}.bin").write_bytes(rows.tobytes())
+        kept.append(index)
+    T_first_lidar = rigid.inverse(sequence.T_world_lidar[kept[0]]) @ sequence.T_world_lidar[kept]
+    write_kitti(root / "poses" / f"{name}.txt", _T_CAM0_LIDAR @ T_first_lidar @ rigid.inverse(_T_CAM0_LIDAR))
+    (folder / "calib.txt").write_text("Tr: " + " ".join(f"{value:.12e}" for value in _T_CAM0_LIDAR[:3].ravel()) + "\n")
+    times = np.arange(len(kept)) / 10.0 if sequence.times is None else sequence.times[kept]
+    (folder / "times.txt").write_text("".join(f"{time:.6f}\n" for time in times))
+    return folder
+
+
+def read_pcd(path: Path) -> np.ndarray:
+    """Reads the points of a PCD file, NaN too."""
+    return parse_pcd(read_bytes(path), str(path)).points
+
+
+def read_ply(path: Path) -> np.ndarray:
+    """Reads the points of a PLY file, NaN too."""
+    return parse_ply(read_bytes(path), str(path)).points
