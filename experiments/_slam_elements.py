@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from dpmjax import Model
-from dpmjax.scans import surface_of_elements
+from dpmjax.scans import surface_at
 from dpmjax.slam import (
     Alignment,
     Geometry,
@@ -23,7 +23,6 @@ from dpmjax.slam import (
     ThinnedScan,
     make_methods,
 )
-from dpmjax.types import SurfaceElements
 
 
 def with_network(methods: SlamMethods) -> SlamMethods:
@@ -98,10 +97,9 @@ class _FewerOfScans(_Wrapped):
         whole = self._wrapped.thin(points)
         if whole is None:
             return None
-        surface, num = whole.measured.surface, self._num
-        mask = np.ones(len(surface.points[:num]), bool)
-        few = SurfaceElements(surface.points[:num], surface.normals[:num], surface.flatness[:num], mask)
-        return whole._replace(measured=whole.measured._replace(surface=surface_of_elements(few)))
+        points = whole.measured.surface.points
+        few = surface_at(points, np.arange(min(self._num, len(points))))
+        return whole._replace(measured=whole.measured._replace(surface=few))
 
 
 class _Unmoved(_Wrapped):

@@ -21,6 +21,6 @@ from .surface_alignment import align_surfaces_from as align_surfaces_from
 from .surfaces import Surface as Surface
 from .surfaces import SurfaceConfig as SurfaceConfig
 from .surfaces import scan_surface as scan_surface
-from .surfaces import surface_of_elements as surface_of_elements
+from .surfaces import surface_at as surface_at
 from .view_correlation import ViewCorrelationConfig as ViewCorrelationConfig
 from .view_correlation import correlate_views as correlate_views
