@@ -1,9 +1,10 @@
 """Trust in a registration without the truth.
 
 A map is wrong where a weak connection holds it together, where beams pass through what others have hit, and where a
-step may slide along a corridor. So trust rests on the weakest connection of the best tree of pairs; on how much more
-all other pairs contradict each other than those of the tree; and on the standard deviation of each scan's place against
-the largest part of the map that has no open connection.
+step may slide along a corridor. Trust therefore rests on three quantities. The first is the score of the weakest
+connection of the best tree of pairs. The second is the share of contradicting beams of the pairs outside the tree,
+beyond that of the pairs in it. The third is the standard deviation of each scan's place against the largest part of the
+map that has no open connection.
 """
 
 from __future__ import annotations
@@ -45,12 +46,12 @@ _MAX_DEVIATION = 0.02
 
 
 class Assessment(NamedTuple):
-    """How far a registration can be trusted, without the truth.
+    """Trust in a registration, computed without the truth.
 
     Attributes:
         weakest_connection: score, at most 1, of the weakest connection that holds two parts of the map together.
-        contradiction: share of beams that end in the free space of another scan, beyond that of the connections that
-            hold the map: scans that meet again by the poses alone must not contradict more than those.
+        contradiction: share of beams that end in the free space of another scan, in pairs that the poses alone bring
+            together, less the same share of the connections that hold the map.
         is_trusted: both are within what right maps reach, no scan may slide, the scans are not mirrored, and there is
             not too much noise to tell.
         uncertain_scans: rows of the scans for which trust does not hold: they fit no other scan, or they may slide
@@ -82,9 +83,9 @@ def assess_trajectory(
 ) -> Assessment:
     """Tells whether the registration of scans can be trusted.
 
-    The best pairs of scans make a tree that holds the map together. It must have no weak connection between two parts,
-    and the other pairs must contradict hardly more than those of the tree. Scans that fit no other are left out, if
-    they are few. No scan may be free to slide against the others.
+    The best pairs of scans make a tree that holds the map together. It must have no weak connection between two parts.
+    Pairs outside the tree must contradict hardly more than the pairs in it. Scans that fit no other scan are left out,
+    if they are few. No scan may be free to slide against the map.
 
     Args:
         scans: n scans, two at least.

@@ -1,8 +1,9 @@
 """Global registration: poses of all scans without a first guess, and if need be without an order.
 
 Scans in the order of time are registered as a sequence (`sequence_search.py`). Without an order, or where steps are
-weak or noisy, a few dozen scans that are most like all others, the keyframes, are searched against each other
-exhaustively and assembled into one map; the other scans are then searched against some of them and placed in it.
+weak or noisy, a few dozen keyframes are searched against each other exhaustively and assembled into one map. The
+keyframes are spread evenly in time; without an order they are the scans most similar to all scans. The remaining scans
+are then searched against some of the keyframes and placed in the map.
 """
 
 from __future__ import annotations
@@ -37,15 +38,15 @@ from dpmjax.registration.range_profiles import RangeProfiles, compare_pairs, mak
 from dpmjax.registration.step_scores import weak_steps
 from dpmjax.registration.wall_directions import WallDirections
 
-# Every scan that is no keyframe is searched against the keyframes with the so many most similar views, and against the
-# keyframes before and after it, or without an order against so many scans with the most similar views ...
+# Numbers of search partners of a scan that is no keyframe: keyframes with the most similar views, and, without an
+# order, scans with the most similar views. With an order the keyframes before and after it replace the latter.
 _NUM_ANCHORS, _NUM_NEAREST_VIEWS = 2, 3
-# ... around so many likely headings; and keyframes against each other around so many.
+# Numbers of likely headings around which these pairs, and pairs of keyframes, are searched.
 _NUM_LIKELY_TURNS, _NUM_KEYFRAME_TURNS = 3, 6
 # A sequence is registered like a set where more than this share of its steps is weak, or where the range noise is more
 # than this in typical ranges: a chain of steps drifts then.
 _MAX_WEAK, _MAX_NOISE = 0.25, 0.0225
-# Keyframes are chosen among so many scans, spread evenly.
+# Without an order, keyframes are chosen among this number of evenly spread scans.
 _MAX_ELIGIBLE = 1024
 # A scan whose best neighbour matches less than this share of the usual beams is unregistered; scans are of one cluster
 # if they match more than this share.
@@ -57,9 +58,10 @@ class GlobalConfig:
     """Settings of the global registration. Lengths are in typical ranges of the scans.
 
     Attributes:
-        max_keyframes: so many scans are searched all against all.
-        max_unregistered: so many unregistered scans are searched against all keyframes, and those that remain against
-            as many of the other scans; a cluster of up to half as many, which matches no other, is unregistered too.
+        max_keyframes: largest number of keyframes, which are searched all against all.
+        max_unregistered: largest number of unregistered scans that are searched against all keyframes, and then against
+            the same number of similar scans that are no keyframes. A cluster of up to half of `max_unregistered` scans
+            that matches no further scan is unregistered too.
         search: of pairs.
     """
 
@@ -107,8 +109,8 @@ def register_globally(scans: PlanarScans, config: GlobalConfig | None = None) ->
     """Poses of all scans from no guess.
 
     Args:
-        scans: n scans. Where they are ordered, neighbours in the array are taken as neighbours in time; else no order
-            is used, and shuffled scans give the same map, up to 1,024 of them.
+        scans: n scans. If they are ordered, neighbours in the array are neighbours in time. Otherwise no order is used,
+            and up to 1,024 shuffled scans give the same map.
         config: settings.
 
     Returns:
@@ -211,7 +213,7 @@ def place_others(task: _Task, poses: Floats, found: Candidates, more: Candidates
         task: the scans.
         poses: (n, 3); right for the keyframes.
         found: candidates of the keyframes.
-        more: candidates of the other scans.
+        more: candidates of the scans that are no keyframes.
 
     Returns:
         (n, 3) poses, and `more` with the candidates of scans that had to be searched again.
@@ -224,7 +226,8 @@ def place_others(task: _Task, poses: Floats, found: Candidates, more: Candidates
         return place_in_map(poses, task.keyframes, Hypotheses.of(candidates), scorer)
 
     poses = place(poses, more)
-    # A scan that sees no keyframe, and a keyframe that sees no other one, have their neighbours among the others.
+    # A scan that sees no keyframe has its neighbours among the remaining scans; so has a keyframe that sees no second
+    # one.
     for partners in (task.keyframes, task.others):
         lost = find_unregistered(task.profiles, poses, task.config)
         if not len(lost):

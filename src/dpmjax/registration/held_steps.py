@@ -1,4 +1,4 @@
-"""Edges between neighbours in time: what the scans fix of a step, and what holds it where they leave it open."""
+"""Edges between neighbours in time: from the beams where these fix a step, from slides and priors where they do not."""
 
 from __future__ import annotations
 

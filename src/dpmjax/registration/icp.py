@@ -218,7 +218,7 @@ def _step_to_planes(pairs: _Pairs, centre: Float[Array, " d"]) -> Float[Array, "
     weighted = pairs.weights[:, None] * jacobian
     system = jnp.einsum("ni,nj->ij", weighted, jacobian, precision="highest")
     diagonal = jnp.diagonal(system)
-    # Directions that no plane holds stay as they are.
+    # Directions that no plane constrains stay unchanged.
     damping = 1e-4 * diagonal + 1e-6 * diagonal.max() + jnp.finfo(residual.dtype).tiny
     gradient = jnp.einsum("ni,n->i", weighted, residual, precision="highest")
     return _about(jnp.linalg.solve(system + jnp.diag(damping), -gradient), centre)

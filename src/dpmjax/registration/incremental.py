@@ -44,7 +44,7 @@ def incremental_icp(
     """Registers each scan to the one before and chains the steps.
 
     Without odometry, steps that are not clear are searched, and the poses are those of the best sequence of hypotheses
-    (`sequence_search.py`); scans that fit none around them (a swapped line of the log) are interpolated.
+    (`sequence_search.py`). Scans that fit no scan around them (a swapped line of the log) are interpolated.
 
     Args:
         scans: n scans in time order.

@@ -44,10 +44,10 @@ class AlignmentConfig:
 
     Attributes:
         temporal: offsets of the neighbours in time; only of ordered scans.
-        num_spatial: at most so many neighbours in space, each from another visit.
+        num_spatial: largest number of neighbours in space, each from another visit.
         radius: within which neighbours in space are looked for.
         max_turn: largest difference of heading of two neighbours in space, radians.
-        refresh: neighbours are chosen anew after so many rounds.
+        refresh: number of rounds after which the neighbours are chosen anew.
     """
 
     temporal: tuple[int, ...] = (1, 2, 3)

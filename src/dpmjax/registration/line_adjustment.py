@@ -1,8 +1,8 @@
 """Line adjustment: all poses against lines that all scans make together, as in a bundle adjustment.
 
 The line of one scan is as noisy as its beams. Here every beam is compared with a straight line through the beams of all
-scans nearby, weighted by their range noise (a grazing beam knows its wall well, because its noise runs along the wall).
-The lines are eliminated: their weights make each residual a function of poses alone.
+scans nearby. Their weights come from the range noise: a grazing beam measures its wall well, because its noise runs
+along the wall. The lines are eliminated: their weights make each residual a function of poses alone.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from dpmjax.registration.planar_scans import Floats, Indices, PlanarScans
 _einsum = partial(jnp.einsum, precision="highest")
 
 
-# Of a neighbour the nearest beam and so many to either side may be part of the line.
+# The nearest beam of a neighbour, and this number of beams to either side of it, may be part of the line.
 _NUM_BESIDE = 2
 # In standard deviations of the range noise: half the length of line that a beam is compared with; beams farther than
 # this off a line are not part of it; walls stray so far from a straight line, so grazing beams are trusted no further.
@@ -34,7 +34,7 @@ _WINDOW, _GATE, _ROUGHNESS = 6.0, 4.0, 0.2
 _OUTLIER = 3.0
 # A wall is bent if its points stray by more than this, as a mean square in standard deviations.
 _MAX_CHI2 = 1.15
-# Points are a line if they spread so many times more along than across (variances).
+# Points are a line if their variance along it is this many times the variance across it.
 _MIN_SLENDERNESS = 2.0
 # Gauss-Newton steps of each round.
 _NUM_ITERATIONS = 2
@@ -45,7 +45,8 @@ class LineAdjustmentConfig:
     """Settings of the line adjustment.
 
     Attributes:
-        num_neighbours: lines are made of the scan itself and so many others, evenly by nearness within `radius`.
+        num_neighbours: number of neighbouring scans that share lines with a scan, spread evenly by nearness within
+            `radius`.
         radius: within which scans share lines, in typical ranges of the scans.
         num_rounds: times that the beams of a line are chosen.
     """
@@ -81,7 +82,7 @@ class _Lines(NamedTuple):
 
 
 def _levers(points: Float[Array, "... 2"]) -> Float[Array, "... 2"]:
-    """How points move when their scan turns."""
+    """Returns the derivatives of points with respect to the heading of their scan."""
     return jnp.stack([-points[..., 1], points[..., 0]], -1)
 
 

@@ -1,8 +1,8 @@
 """Loop closure: pairs of scans far apart in time are matched without trust in the drifted poses, then optimised.
 
-A single pair of half-circle scans in a corridor fits in many wrong ways. Three things make a loop believable: the
-target is a small submap of several scans, neighbouring loops agree with it, and the robust graph rejects what still
-contradicts the rest.
+A single pair of half-circle scans in a corridor fits in many wrong ways. Three checks make a loop reliable: the target
+is a small submap of several scans, neighbouring loops agree with it, and the robust graph rejects loops that still
+contradict it.
 """
 
 from __future__ import annotations
@@ -27,19 +27,20 @@ from dpmjax.registration.step_scores import weak_steps
 
 _SEARCH = Schedule(gate=(0.18, 0.045), kernel=(0.09, 0.0225), num_iterations=7, source_stride=5, target_stride=3)
 _REFINE = Schedule(gate=(0.075, 0.0225), kernel=(0.0225, 0.0045), num_iterations=10, target_stride=2)
-# Candidates are matched so many at a time, all batches of one shape.
+# Number of candidates that are matched at a time, all batches of one shape.
 _BATCH = 512
 # Two views that overlap well are nearer than twice this, in typical ranges, whatever the drift.
 _NEARBY = 0.15
-# The target is a submap of so many scans to either side.
+# Number of scans before and after the target that its submap holds.
 _SUBMAP_WIDTH = 2
-# Robust share of the beams that must find their partner, and share that may contradict the other scan.
+# Least robust share of matched beams, and largest share of beams that contradict their partner scan.
 _MIN_FITNESS, _MAX_CONTRADICTED = 0.4, 0.08
 # Share of the beams that the weakest eigenvalue of a pair must reach.
 _MIN_EIGENVALUE = 0.03
-# So many loops between scans nearby in time must agree with a loop: within this translation in typical ranges, radians.
+# Least number of agreeing loops; the number of scans within which they lie; and the limits of agreement: translation in
+# typical ranges, radians.
 _MIN_SUPPORT, _NEIGHBOURHOOD, _AGREEMENT = 2, 6, (0.045, 0.08)
-# So many loops must contradict a step before the trajectory is torn there.
+# Number of loops that must contradict a step before the trajectory is torn there.
 _STEP_TRUST = 30.0
 
 
@@ -52,7 +53,7 @@ class LoopConfig:
         drift: error of a pose as a share of the way since; it sets where loops are looked for.
         max_radius: largest distance of a candidate.
         min_way: way between the two scans of a loop.
-        max_candidates: at most so many pairs a round.
+        max_candidates: largest number of pairs in a round.
     """
 
     num_rounds: int = 3
@@ -133,7 +134,7 @@ def find_candidates(poses: Floats, config: LoopConfig, typical_range: float) -> 
     keep = (apart > config.min_way * typical_range) & (distance < nearby + config.drift * apart) & (second - first > 5)
     source, target = second[keep], first[keep]
     if len(source) > config.max_candidates:
-        # Nearer pairs are likelier to overlap; the rest is drawn so that far ones get their chance.
+        # Nearer pairs overlap more often; random factors on their distances keep some far pairs among the candidates.
         rng = np.random.default_rng(0)
         order = np.argsort(distance[keep] * rng.uniform(0.1, 1.0, len(source)))[: config.max_candidates]
         source, target = source[np.sort(order)], target[np.sort(order)]
@@ -150,7 +151,7 @@ def _match(scans: PlanarScans, poses: Floats, source: Indices, target: Indices, 
     unit, way = scans.typical_range, _way_along(poses)
     submaps, ones = _build_submaps(scans, poses, target), scans.take(source)
     predicted = se2.relative(poses[target], poses[source])
-    # The prediction is believed as far as the drift allows: it decides along a corridor, where scans cannot.
+    # The prior has the standard deviation of the drift: it fixes the position along a corridor, where scans cannot.
     sigma = 0.045 * unit + 0.5 * config.drift * (way[source] - way[target])
     belief = np.stack([sigma, sigma, np.full_like(sigma, np.inf)], axis=-1) ** -2.0
     prior = PosePrior(predicted, (0.015 * unit) ** 2 * belief)

@@ -1,12 +1,13 @@
 """One map from scored relative poses of pairs, grown scan by scan; every new pose is scored against all placed scans.
 
-A wrong pair scores well for its two scans; it rarely does against all others. So the best pair starts a map, every free
-scan has the pose hypotheses of its pairs, and the one with the best score against all placed scans is taken next. Then
-each scan may move once all the others stand, and a robust graph over all pairs that agree averages their small errors.
+A wrong pair scores well for its two scans; it rarely does against all others. So the best pair starts a map, and every
+free scan has the pose hypotheses of its pairs. The hypothesis with the best score against all placed scans is taken
+next. Once all scans are placed, each may move to a better hypothesis, and a robust graph over all pairs that agree
+averages their small errors.
 
-Where places look alike, a map can go wrong by a single connection. Everything behind it is right in itself and wrong
-together, and no scan alone gains by moving. So the map is cut at its weakest connections, and the smaller block moves
-to the best of the poses that any pair across the cut supports.
+A single wrong connection between similar places can spoil a map. The scans behind it form a block that is consistent in
+itself and misplaced as a whole, and no scan alone gains by moving. So the map is cut at its weakest connections, and
+the smaller block moves to the best of the poses that any pair across the cut supports.
 """
 
 from __future__ import annotations
@@ -29,11 +30,11 @@ from dpmjax.registration.range_profiles import RangeProfiles, compare_pairs
 _CONTRADICTION_WEIGHT = 4.0
 # How much more the matched beams of neighbours in time count, where there is an order.
 _NEXT_WEIGHT = 4.0
-# Scans farther apart than this, in typical ranges, do not score each other, and of the others so many nearest ones do.
+# Largest distance of scans that score each other, in typical ranges, and largest number of nearest scans that do.
 _RADIUS, _NUM_SCORERS = 1.2, 32
 # Poses times placed scans that are compared at a time: 8 MB a table.
 _BLOCK = 1 << 20
-# Maps grown from so many different pairs; the best one is kept.
+# Number of maps, each grown from a different pair; the best one is kept.
 _NUM_SEEDS = 6
 # Rounds in which scans may change their pose.
 _NUM_REVISIONS = 3
@@ -119,7 +120,7 @@ def add_up(scores: Floats) -> Floats:
 
 
 def is_firmly_more(score: Floats | np.float64, reference: Floats | np.float64) -> NDArray[np.bool_]:
-    """Whether a score is more than 2 % above a reference: below that it is the same pose by another pair."""
+    """Returns True where a score is more than 2 % above a reference: below that it is the same pose by another pair."""
     return np.asarray(score > reference + 0.02 * np.abs(reference))
 
 
@@ -212,7 +213,7 @@ def _revise(poses: Floats, hypotheses: Hypotheses, scorer: PoseScorer) -> tuple[
 
 
 def move_blocks(poses: Floats, hypotheses: Hypotheses, scorer: PoseScorer) -> tuple[Floats, int]:
-    """Cuts the map at its weakest connections, one after the other, and moves blocks that score better elsewhere.
+    """Cuts the map at its weakest connections in turn, and moves blocks that have a better score at a new pose.
 
     Args:
         poses: (n, 3) a map of all scans.

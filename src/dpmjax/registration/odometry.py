@@ -34,7 +34,7 @@ _FLOOR, _LENGTH_FLOOR, _TURN_FLOOR = (0.002, 0.005), 0.02, 0.02
 _MOVE_AGREEMENT, _TURN_AGREEMENT = (0.3, 0.01), (0.3, 0.03)
 # Shares of the clear steps that must agree under a fault, and may agree without it.
 _FAULT_SHARE, _SOUND_SHARE = 0.7, 0.4
-# Scales beyond these are no calibration, nor those nearer to 1 than so many of their standard errors.
+# A scale is used within these limits, if it differs from 1 by more than this number of its standard errors.
 _SCALES, _CLEAR_SCALE = (0.7, 1.4), 4.0
 
 
@@ -71,7 +71,7 @@ class Odometry(NamedTuple):
     Attributes:
         poses: (n, 3) T_world_scan, a fault of its axes or units corrected.
         prior: the steps at the scale of the scans, with their standard deviations.
-        fault: sentence on what was wrong with axes or units; None: nothing.
+        fault: sentence on a wrong axis or unit; None: none found.
     """
 
     poses: Floats
