@@ -59,9 +59,9 @@ class GlobalConfig:
 
     Attributes:
         max_keyframes: largest number of keyframes, which are searched all against all.
-        max_unregistered: largest number of unregistered scans that are searched against all keyframes, and then against
-            the same number of similar scans that are no keyframes. A cluster of up to half of `max_unregistered` scans
-            that matches no further scan is unregistered too.
+        max_unregistered: largest number of unregistered scans that are searched against all keyframes. Those still
+            unregistered are then searched against an equal number of further scans. A cluster of up to half of
+            `max_unregistered` scans, which matches no scan outside it, is unregistered too.
         search: of pairs.
     """
 

@@ -1,7 +1,7 @@
 """Robust alignment of pairs of planar scans, many at once: the kernel under the chain, the loop search and refinement.
 
 A pose is a vector (x, y, heading). Errors of a pair are linearised in the tangent space of T_target_source on the
-right, T_target_source @ exp(delta), so that every pair costs a 3 x 3 matrix and a 3-vector.
+right, T_target_source @ exp(delta). So every pair costs a 3 x 3 matrix and a 3-vector.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from dpmjax.geometry.neighbours import k_nearest
 from dpmjax.registration.planar_scans import Floats, PlanarScans, batches
 from dpmjax.types import AnyArray
 
-# GPUs multiply in TF32 unless told otherwise: centimetres at a hundred metres.
+# GPUs multiply in TF32 by default, with errors of centimetres at a hundred metres.
 _matmul = partial(jnp.matmul, precision="highest")
 # How many distances one batch of pairs may hold at once: 128 MB of float32 with what XLA keeps beside them.
 _LIVE_DISTANCES = 1 << 24
@@ -30,7 +30,7 @@ Metric = Literal["point", "plane"]
 
 @dataclass(frozen=True)
 class Schedule:
-    """How the search distance of a matching shrinks from iteration to iteration, in typical ranges of the scans.
+    """Search distances of a matching, which shrink from iteration to iteration, in typical ranges of the scans.
 
     Attributes:
         gate: largest distance of matched points, first and last iteration.
@@ -80,11 +80,11 @@ class PairMatches(NamedTuple):
 
 
 class PosePrior(NamedTuple):
-    """Belief in relative poses before a beam is compared; it decides directions that the scans leave open.
+    """Prior of relative poses, which fixes the directions that the scans leave open.
 
     Attributes:
         mean: expected relative pose (x, y, heading).
-        information: inverse variances of its three parts, in units of one beam's information; zero: no belief.
+        information: inverse variances of its three parts, in units of one beam's information; zero: no prior.
     """
 
     mean: Float[AnyArray, "... 3"]
@@ -186,10 +186,10 @@ def match_pairs(
 
     Args:
         source: p scans.
-        target: p scans, or submaps of as many points as wanted.
+        target: p scans, or submaps with any number of points.
         guesses: (p, h, 3) relative poses T_target_source to start from.
         schedule: how the search distance shrinks.
-        prior: belief in the relative poses, (p, 3) each; None: none.
+        prior: prior of the relative poses, (p, 3) each; None: none.
         metric: distance to the target's lines ("plane") or points.
 
     Returns:

@@ -1,8 +1,8 @@
 """Exhaustive search of the relative pose of two planar scans: all turns, all shifts, hits and free space, by FFT.
 
 Each scan is drawn twice: where it has hit, and as evidence (positive at its surfaces, negative in its free space). The
-score of a pose is the sum of the evidence of each scan at the hits of the other one; one inverse FFT gives it for all
-shifts of one turn. The best poses are then refined on ever finer local grids, by the profiles of both scans.
+score of a pose is the sum of the evidence of each scan at the hits of its partner. One inverse FFT computes this score
+for all shifts of one turn. The best poses are then refined on ever finer local grids, by the profiles of both scans.
 """
 
 from __future__ import annotations
@@ -88,7 +88,7 @@ class Candidates(NamedTuple):
 
 
 def join_candidates(*candidates: Candidates) -> Candidates:
-    """Joins candidates of different pairs, of as many poses each."""
+    """Joins candidates of different pairs, with the same number of poses in each pair."""
     return Candidates(*(np.concatenate(parts) for parts in zip(*candidates, strict=True)))
 
 
@@ -196,7 +196,7 @@ def _search_turn(
         score = jnp.fft.irfft2(spectrum, s=(size, size)) + outside
         score = score.reshape(num_blocks, block, num_blocks, block)
         value, which = jax.lax.top_k(score.max((1, 3)).reshape(-1), config.num_peaks)
-        # Where in its block each maximum lies; a search of all blocks for it would take longer than the rest.
+        # Position of each maximum in its block; a search of all blocks for it would take longer than all other steps.
         best_blocks = score[which // num_blocks, :, which % num_blocks].reshape(config.num_peaks, -1)
         inner = (best_blocks == value[:, None]).argmax(-1)
         row = which // num_blocks * block + inner // block

@@ -1,7 +1,7 @@
 """Registration of planar scans by one call: a start, DeepMapping from it, refinement, and the choice among the results.
 
 `register_scans` joins the functions of this room with DeepMapping; no other file of the room imports `deepmapping`. A
-candidate is a trajectory under the name of what produced it: "DeepMapping" is what L-Net or M-Net produced.
+candidate is a trajectory under the name of the method that produced it: "DeepMapping" is the result of L-Net or M-Net.
 """
 
 from __future__ import annotations
@@ -67,7 +67,8 @@ class RegistrationConfig:
         refine: the start and the fit are refined, too, and the better map counts.
         fit: settings of DeepMapping; presets are `dpmjax.deepmapping.preset`.
         min_distance: scans of a recording are registered where they lie at least this far apart, in the unit of the
-            scans, or are turned by `min_turn`; the others follow the motion between these. None: all are registered.
+            scans, or are turned by `min_turn`. The remaining scans follow the motion between these. None: all are
+            registered.
         min_turn: scans of a recording that are turned at least this far against each other are registered, radians.
 
     Raises:
@@ -161,9 +162,10 @@ def register_scans(
             ScanSet.
         config: settings.
         key: of the fit.
-        start: where the poses start: "odometry"; "icp-plane" and "icp-point", incremental ICP; "global", an exhaustive
-            search of scan pairs, which needs no order; "zero"; or (n, 3) x, y, heading or (n, 3, 3) matrices. "auto":
-            the odometry where there is one, else incremental point-to-line ICP; "global" for scans without an order.
+        start: initial poses, (n, 3) x, y, heading or (n, 3, 3) matrices, or a name. The names "odometry" and "zero"
+            need no search; "icp-plane" and "icp-point" are incremental ICP. The name "global" is an exhaustive search
+            of scan pairs, which needs no order. The name "auto" is the odometry where there is one, else incremental
+            point-to-line ICP; it is "global" for scans without an order.
         odometry: (n, 3) or (n, 3, 3) raw odometry of ordered scans.
         hooks: functions that are called: progress, a request to stop, the engine of the fit.
 
@@ -171,8 +173,8 @@ def register_scans(
         RegisteredScans.
 
     Raises:
-        ValueError: the scans, the start or the odometry have a wrong shape or are not finite; a scan has no valid beam;
-            there is no odometry to start from; or the start needs an order that the scans do not have.
+        ValueError: the scans, the start or the odometry have a wrong shape or are not finite, or a scan has no valid
+            beam. Also if there is no odometry to start from, or if the start needs an order that the scans do not have.
     """
     config, hooks = config or RegistrationConfig(), hooks or RegistrationHooks()
     all_scans = as_scan_set(scans)

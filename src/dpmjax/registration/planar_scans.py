@@ -1,7 +1,7 @@
 """The scan record of this room: planar scans with a line at every beam, and the lengths that settings refer to.
 
-All lengths in settings are in typical ranges of the scans (`dpmjax.geometry.sampling.typical_range`: the range that
-nine in ten beams on a line stay below), so pixels, rooms and streets need no settings of their own.
+All lengths in settings are in typical ranges of the scans, so pixels, rooms and streets need no settings of their own.
+The typical range is the range that nine in ten beams on a line stay below (`dpmjax.geometry.sampling.typical_range`).
 
 A line with a normal is fitted at every beam and is honest under range noise. Two neighbouring beams give the exact
 normal of a noise-free wall, but nonsense as soon as the noise is as large as the distance between the beams. So several
@@ -31,14 +31,14 @@ Indices = NDArray[np.int64]
 
 # A run of beams counts as straight if it bends by less than this part of its length (0.03 degrees).
 _BEND = 5e-4
-# The noise is a median over at most so many beams: a sort of millions would take longer than all the rest.
+# Approximate number of beams in the median of the noise: a sort of millions would take longer than all other steps.
 _NOISE_SAMPLES = 65536
 # The widest run of beams that competes has 2 ** (this + 1) beams.
 _NUM_DOUBLINGS = 4
 
 
 class Tolerances(NamedTuple):
-    """How exactly hits of two scans are compared, in the unit of the points.
+    """Tolerances for the comparison of hits of two scans, in the unit of the points.
 
     Attributes:
         match: standard deviation of a hit about the surface that it belongs to.
@@ -94,7 +94,7 @@ class PlanarScans(flax.struct.PyTreeNode):
 
     @property
     def tolerances(self) -> Tolerances:
-        """How exactly hits of these scans can be compared: by the typical range, or by the noise if that is more."""
+        """Tolerances of these scans: from the typical range, or from the noise where that gives more."""
         reach, noise = self.typical_range, self.noise
         return Tolerances.of(match=max(0.006 * reach, 0.5 * noise), contradict=max(0.018 * reach, 5.0 * noise))
 
@@ -146,7 +146,7 @@ def planar_scans(points: AnyArray | ScanSet, mask: AnyArray | None = None, *, is
         values = np.take_along_axis(values, order[..., None], axis=1)
         valid = np.take_along_axis(valid, order, axis=1)
     fitted = _fit_lines(ScanSet(points=jnp.asarray(values), mask=jnp.asarray(valid)))
-    # Beams on lines end on walls; the others would let people and clutter decide on the unit.
+    # Beams on lines end on walls; with all beams, people and clutter would change the unit.
     is_used = np.asarray(fitted.is_on_line if fitted.is_on_line.any() else fitted.mask)
     length = jnp.full(len(values), typical_range(np.asarray(fitted.points), is_used), jnp.float32)
     return fitted.replace(typical_ranges=length, is_ordered=is_ordered)
@@ -160,7 +160,7 @@ def batches(count: int, size: int) -> Iterator[tuple[slice, Indices]]:
         size: rows of a batch.
 
     Yields:
-        The slice of a batch, and its rows (size,), of which as many are new as the slice is long.
+        The slice of a batch, and its rows (size,): those of the slice first, then their repetitions.
     """
     for start in range(0, count, size):
         stop = min(start + size, count)
@@ -237,7 +237,7 @@ def _join(first: _Moments, second: _Moments) -> _Moments:
 
 
 def _runs(scans: ScanSet) -> list[_Moments]:
-    """Runs of 3, 4, 8, 16 ... beams, each run joined from two shorter ones."""
+    """Returns runs of 3, 4, 8, 16 and further powers of two beams, each run joined from two shorter ones."""
     one = _Moments(1.0, scans.points, jnp.zeros((*scans.mask.shape, 2, 2)), scans.mask)
     two = _join(one, _start_at(one, 1))
     runs = [_join(two, _start_at(one, 2))]

@@ -1,8 +1,8 @@
 """Quality of a registration without the truth: scores of trajectories, and the choice among them.
 
-A map is as good as few nats write all its beams down (`map_code_length`) and as near scans agree (`view_misfit`), and a
-trajectory as good as its steps are those of the odometry, within its noise. `assessment.py` tells whether the best one
-can be trusted.
+A map is good if few nats encode all its beams (`map_code_length`) and if near scans agree (`view_misfit`). A trajectory
+is good if its steps are those of the odometry, within its noise. `assessment.py` tells whether the best one can be
+trusted.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ MAX_NOISE = 0.0225
 
 
 class Score(NamedTuple):
-    """What is wrong with a trajectory; lower is better.
+    """Errors of a trajectory in three measures; lower is better.
 
     Attributes:
         code_length: nats a beam for the map (`map_code_length`): whether the map is right as a whole.
@@ -61,7 +61,8 @@ def choose_trajectory(
 ) -> tuple[str, dict[str, Score]]:
     """The best trajectory: among those whose maps are about as short to describe as the shortest, the sharpest.
 
-    With so much range noise that no map can be trusted, surfaces tell nothing, and the shortest is the best.
+    With range noise above `MAX_NOISE`, surfaces do not separate right maps from wrong ones, and the shortest map is the
+    best.
 
     Args:
         scans: n scans.
@@ -101,11 +102,10 @@ def map_code_length(scans: PlanarScans, poses: Floats) -> float:
     """Nats a beam that the map of all scans needs at these poses; lower is better.
 
     The world is cut into cells. Each beam calls the cells that it passes free and the one where it ends occupied. A
-    cell that all beams call the same costs next to nothing; one that has been called both, or that no other beam has
+    cell that all beams call the same costs next to nothing. A cell that has been called both, or that no other beam has
     seen, costs nats (a Krichevsky-Trofimov code for each cell). A doubled wall costs twice: it contradicts beams that
-    pass through it, and it opens new cells. It is the occupancy loss of DeepMapping with the best possible M-Net.
-    Only beams on a line are coded. How the walls lie in the cells must not decide, so the mean over turned grids is
-    taken.
+    pass through it, and it opens new cells. It is the occupancy loss of DeepMapping with the best possible M-Net. Only
+    beams on a line are coded. How the walls lie in the cells must not decide, so the mean over turned grids is taken.
 
     Args:
         scans: n scans.
@@ -148,18 +148,18 @@ def _code_length(hits: Floats, sensors: Floats, cell: float) -> float:
 
 
 def view_misfit(scans: PlanarScans, poses: Floats) -> float:
-    """How badly near scans agree at these poses; lower is better.
+    """Returns the disagreement of near scans at these poses; lower is better.
 
     Each scan predicts the ranges of the scans near it, straight between its own beams. So it needs no walls: between
-    two beams the outline of a tree is straight enough. What one of them cannot see does not count.
+    two beams the outline of a tree is straight enough. Beams that are hidden from the predicting scan do not count.
 
     Args:
         scans: n scans.
         poses: (n, 3) x, y, heading.
 
     Returns:
-        The share of visible beams, 0 to 1, that do not end on the other scan's surface within the range noise;
-        fractions for near misses. 1 where no scan sees what another has seen.
+        The share of visible beams, 0 to 1, that do not end on the predicting scan's surface within the range noise.
+        Near misses count as fractions. The share is 1 where no scan sees a surface that another scan has seen.
     """
     tolerance = max(scans.noise, _LEAST_TOLERANCE * scans.typical_range)
     source, target = near_pairs(poses, scans.typical_range)

@@ -1,6 +1,6 @@
-"""Range profiles: scans as functions of the bearing, and what the hits of one scan match or contradict in another.
+"""Range profiles: scans as functions of the bearing, and hits of one scan that match or contradict another scan.
 
-A profile tells for every bearing where the surface is, how slanted it is, and what is free in front of it. A hit of
+A profile has, for every bearing, the range and the slant of the surface, and the free space in front of it. A hit of
 another scan lies on that surface (a match), in that free space (a contradiction), or where the scan cannot see.
 """
 
@@ -19,7 +19,7 @@ from dpmjax.geometry import se2
 from dpmjax.registration.planar_scans import Floats, Indices, PlanarScans, Tolerances, batches
 from dpmjax.types import AnyArray
 
-# Two beams around a bearing that are farther apart than so many times an even spread leave a gap: nothing is seen.
+# A bearing is not seen where the two beams around it are farther apart than this many times an even spread.
 _MAX_GAP = 2.5
 # Surfaces that are more slanted than this count as no more slanted, and do not correct the range of a beam.
 _MIN_COSINE = 0.3
@@ -40,8 +40,8 @@ class RangeProfiles(flax.struct.PyTreeNode):
     Attributes:
         scans: the scans, their ranges smoothed along the fitted lines.
         surface: range of the surface, on the chord between the two beams around the bearing.
-        near: the smaller range of the two; what is nearer is free.
-        far: the larger one; what is farther is hidden.
+        near: the smaller range of the two beams; nearer points are free.
+        far: the larger range of the two beams; farther points are hidden.
         slant: cosine of the angle between beam and surface normal, at least 0.3.
         is_seen: there are two beams around.
     """
@@ -65,9 +65,9 @@ class ViewComparison(NamedTuple):
     """Beams of two scans that match or contradict each other at a relative pose, both directions added.
 
     Attributes:
-        matched: hits on the other's surface, on the side that the other sees; fractions for near misses.
-        contradicted: hits in the other's free space.
-        visible: hits at bearings that the other has measured, not farther than its surface.
+        matched: hits on the surface of the partner scan, on the side that faces it; near misses count as fractions.
+        contradicted: hits in the free space of the partner scan.
+        visible: hits at bearings that the partner scan has measured, not farther than its surface.
     """
 
     matched: Float[AnyArray, "..."]

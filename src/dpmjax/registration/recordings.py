@@ -1,8 +1,8 @@
-"""Whole recordings: the scans that are registered, and poses for all the others.
+"""Whole recordings: choice of the scans that are registered, and poses of all scans.
 
 A robot's log has thousands of scans, most of them a hand's breadth from the one before. Only those are registered that
-lie some way or turn apart. Each other scan follows the odometry between the two around it, and is then aligned with the
-nearer one of them.
+lie some way or turn apart. Each remaining scan follows the odometry between the registered scans before and after it,
+and is then aligned with the nearer of the two.
 """
 
 from __future__ import annotations
@@ -116,8 +116,8 @@ def choose_by_motion(odometry: Float[np.ndarray, "n 3"], min_distance: float, mi
 
     Args:
         odometry: poses x, y, heading of all scans, in the order of time.
-        min_distance: a scan is chosen where it lies at least so far from the one chosen before ...
-        min_turn: ... or is turned at least so far against it, radians.
+        min_distance: least distance of a scan from the last chosen one, above which it is chosen.
+        min_turn: least turn of a scan against the last chosen one, above which it is chosen, too; radians.
 
     Returns:
         Rows of the chosen scans in order; the first and the last scan are among them.
@@ -142,7 +142,7 @@ def choose_by_motion(odometry: Float[np.ndarray, "n 3"], min_distance: float, mi
 def fill_between(chosen: Indices, poses: Float[np.ndarray, "k 3"], odometry: Float[np.ndarray, "n 3"]) -> Floats:
     """Returns poses of all scans: those of the chosen ones, and odometry in between, corrected at both ends.
 
-    What odometry is off by at the next chosen scan is spread over the scans before it, in proportion to the way and the
+    The error of odometry at the next chosen scan is spread over the scans before it, in proportion to the way and the
     turns until there.
 
     Args:
@@ -212,7 +212,8 @@ def _align_with(
     turns: tuple[float, ...],
     sigma: tuple[float, float],
 ) -> tuple[Floats, NDArray[np.bool_]]:
-    """Poses of the sources aligned with their targets, and whether they fit; from some turns of what is expected."""
+    """Aligns the sources with their targets from some turns of the expected poses; returns the poses, and True where
+    they fit."""
     source, target = pairs
     expected = np.asarray(se2.relative(poses[target], poses[source]))
     spread = np.array(sigma)[[0, 0, 1]] * [scans.typical_range, scans.typical_range, 1.0]

@@ -118,7 +118,7 @@ def refine(
 
 
 def _is_sound(scans: PlanarScans, poses: Floats) -> bool:
-    """Whether all steps fit and are fixed in every direction, so that a chain of them cannot have gone far astray."""
+    """Returns True if all steps fit and are fixed in every direction, so that a chain of them has little drift."""
     guesses = se2.relative(poses[:-1], poses[1:])[:, None]
     steps = match_pairs(scans.take(slice(1, None)), scans.take(slice(len(poses) - 1)), guesses, FINE)
     share = steps.weakest_eigenvalue() / np.maximum(np.asarray(scans.is_on_line.sum(1))[1:], 1)
