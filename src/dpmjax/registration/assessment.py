@@ -50,10 +50,10 @@ class Assessment(NamedTuple):
 
     Attributes:
         weakest_connection: score, at most 1, of the weakest connection that holds two parts of the map together.
-        contradiction: share of beams that end in the free space of another scan, in pairs that the poses alone bring
-            together, less the same share of the connections that hold the map.
-        is_trusted: both are within what right maps reach, no scan may slide, the scans are not mirrored, and there is
-            not too much noise to tell.
+        contradiction: share of contradicting beams in the pairs outside the tree of best pairs, less that of the pairs
+            in it. A beam contradicts where it ends in the free space of another scan.
+        is_trusted: both values are within the limits of right maps, no scan may slide, the scans are not mirrored, and
+            the range noise is below its limit.
         uncertain_scans: rows of the scans for which trust does not hold: they fit no other scan, or they may slide
             along a corridor together.
         fault: sentence on axes or units that contradict the odometry; None: none found.

@@ -162,10 +162,10 @@ def register_scans(
             ScanSet.
         config: settings.
         key: of the fit.
-        start: initial poses, (n, 3) x, y, heading or (n, 3, 3) matrices, or a name. The names "odometry" and "zero"
-            need no search; "icp-plane" and "icp-point" are incremental ICP. The name "global" is an exhaustive search
-            of scan pairs, which needs no order. The name "auto" is the odometry where there is one, else incremental
-            point-to-line ICP; it is "global" for scans without an order.
+        start: initial poses, (n, 3) x, y, heading or (n, 3, 3) matrices, or a name. The name "odometry" is the given
+            odometry, "zero" sets all poses to zero, and "icp-plane" and "icp-point" are incremental ICP. The name
+            "global" is an exhaustive search of scan pairs, which needs no order. The name "auto" is the odometry where
+            there is one, else incremental point-to-line ICP; it is "global" for scans without an order.
         odometry: (n, 3) or (n, 3, 3) raw odometry of ordered scans.
         hooks: functions that are called: progress, a request to stop, the engine of the fit.
 

@@ -1,8 +1,8 @@
 """Quality of a registration without the truth: scores of trajectories, and the choice among them.
 
 A map is good if few nats encode all its beams (`map_code_length`) and if near scans agree (`view_misfit`). A trajectory
-is good if its steps are those of the odometry, within its noise. `assessment.py` tells whether the best one can be
-trusted.
+is good if its steps are those of the odometry, within its noise. `assessment.py` decides whether the best trajectory
+can be trusted.
 """
 
 from __future__ import annotations

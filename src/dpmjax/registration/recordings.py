@@ -116,8 +116,8 @@ def choose_by_motion(odometry: Float[np.ndarray, "n 3"], min_distance: float, mi
 
     Args:
         odometry: poses x, y, heading of all scans, in the order of time.
-        min_distance: least distance of a scan from the last chosen one, above which it is chosen.
-        min_turn: least turn of a scan against the last chosen one, above which it is chosen, too; radians.
+        min_distance: a scan at this distance or more from the last chosen one is chosen.
+        min_turn: a scan turned by this or more against the last chosen one is chosen, too; radians.
 
     Returns:
         Rows of the chosen scans in order; the first and the last scan are among them.
@@ -212,8 +212,7 @@ def _align_with(
     turns: tuple[float, ...],
     sigma: tuple[float, float],
 ) -> tuple[Floats, NDArray[np.bool_]]:
-    """Aligns the sources with their targets from some turns of the expected poses; returns the poses, and True where
-    they fit."""
+    """Returns poses of the sources aligned with their targets, from some turns of the expected poses, and their fit."""
     source, target = pairs
     expected = np.asarray(se2.relative(poses[target], poses[source]))
     spread = np.array(sigma)[[0, 0, 1]] * [scans.typical_range, scans.typical_range, 1.0]

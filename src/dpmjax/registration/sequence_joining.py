@@ -1,8 +1,8 @@
 """Joins the parts of a sequence that weak steps connect: from submap to submap, and by loops that agree.
 
-A step is weak where the scans on both sides share few beams, and whatever is behind it may be metres off. So the two
-submaps on either side are searched against each other. Then submaps of different parts are searched against each other:
-a single such pair may be wrong, but wrong pairs disagree about the weak step and right ones agree (consensus, as in
+A step is weak where the scans on both sides share few beams, and all scans behind it may be metres off. So the two
+submaps on either side are searched against each other. Then submaps of different parts are searched against each other.
+A single such pair may be wrong, but wrong pairs disagree about the weak step and right ones agree (consensus, as in
 pairwise consistent sets of loops).
 """
 
@@ -28,8 +28,9 @@ _SIDE_LENGTH, _MAX_TURN, _MAX_SHIFT, _NUM_CELLS, _NUM_CANDIDATES = 2.0, 2.2, 1.6
 _PRIOR_WEIGHT, _LOOP_PRIOR_WEIGHT = 0.1, 0.3
 # Submaps lie a typical range apart, or farther if they were more than this.
 _MAX_SUBMAPS = 80
-# A pair of submaps is searched where it may overlap: by the distance, the drift along the way, and so much more for
-# each weak step between them, in typical ranges; around so many likely turns.
+# Pairs of submaps are searched within a distance that adds up: a constant, a share of the way between them, and a
+# length for each weak step between them. Least way between the two where they lie on either side of one weak step.
+# Lengths are in typical ranges. Number of likely turns that are searched.
 _NEAR, _DRIFT, _WEAK_STEP, _LEAST_WAY, _NUM_TURNS = 1.0, 0.1, 1.0, 1.5, 6
 # Pairs with a lower score do not vote; votes within these (typical ranges, radians) are one.
 _LEAST_VOTE, _AGREEMENT = 0.3, (0.15, 0.12)
@@ -70,7 +71,7 @@ class _Votes(NamedTuple):
 def join_parts(
     profiles: RangeProfiles, poses: Floats, rows: Indices, prior: MotionPrior, config: CorrelativeConfig
 ) -> Floats:
-    """Moves what is behind each weak step to the pose that most scans support.
+    """Moves the scans behind each weak step to the pose that most scans support.
 
     Args:
         profiles: n scans in time order.
@@ -97,7 +98,7 @@ def join_parts(
 
 
 def _search_across(sequence: _Sequence, steps: Indices, config: CorrelativeConfig) -> None:
-    """Moves what is behind each weak step by a search of the submap behind it against the one before it."""
+    """Moves the scans behind each weak step by a search of the submap behind it against the one before it."""
     poses, rows, unit = sequence.poses, sequence.rows, sequence.profiles.scans.typical_range
     ends = np.concatenate([[-1], steps, [len(rows) - 1]])
     sides = []
@@ -168,7 +169,7 @@ def _find_votes(sequence: _Sequence, submaps: _Submaps, config: CorrelativeConfi
 
 
 def _follow_votes(sequence: _Sequence, submaps: _Submaps, votes: _Votes, step: int) -> None:
-    """Moves what is behind a weak step to the pose that most loops across it agree on."""
+    """Moves the scans behind a weak step to the pose that most loops across it agree on."""
     poses, unit, prior = sequence.poses, sequence.profiles.scans.typical_range, sequence.prior
     before, after = sequence.rows[step], sequence.rows[step + 1]
     here, gap = se2.relative(poses[before], poses[after]), int(after - before)

@@ -1,9 +1,10 @@
 """Poses of a sequence of scans by a beam search: each scan against the last placed ones, several hypotheses a step.
 
 A step between two scans that share few beams has several poses that fit. They are found by an exhaustive search of the
-pair (`pair_search.py`) and judged by matched less contradicting beams against all of the last placed scans, which the
-fitness of an ICP does not see. The best few sequences of poses are kept from scan to scan. A scan that fits none of the
-last ones (a swapped line of the log, a lens that was covered) stays unregistered, and the sequence goes on behind it.
+pair (`pair_search.py`). Their score is matched less contradicting beams against all of the last placed scans; the
+fitness of an ICP has no contradicting beams. The best few sequences of poses are kept from scan to scan. A scan that
+fits none of the last ones (a swapped line of the log, a lens that was covered) stays unregistered, and the sequence
+goes on behind it.
 """
 
 from __future__ import annotations
@@ -36,16 +37,16 @@ _MAX_TURN = 1.7
 # A step is clear where its score, fitness and the weakest eigenvalue (share of the beams) are above these, and the
 # share of visible beams that contradict is below the last one.
 _CLEAR_SCORE, _CLEAR_FITNESS, _CLEAR_EIGENVALUE, _CLEAR_CONTRADICTION = 0.45, 0.5, 0.02, 0.05
-# Weak steps are also searched from the scans before and behind them, up to so many scans apart; those with a score
-# below the second number, farther.
+# Weak steps are also searched from the scans before and behind them, up to the first number of scans apart; steps with
+# a score below the second number, up to the third number apart.
 _WEAK_SPAN, _BAD_SCORE, _BAD_SPAN = 3, 0.12, 5
 # Where neither step of a scan has a better score, the scans before and behind it are searched against each other.
 _SURE_SCORE = 0.5
-# So many scans between two weak steps are left out.
+# Largest number of scans between two weak steps that are left out.
 _NUM_ALONE = 2
 # Hypotheses of a scan that are nearer to each other, in typical ranges and radians, are one.
 _SAME = (0.02, 0.02)
-# Two sequences whose last so many scans agree within this are one.
+# Two sequences are one if this number of their last scans agrees within these tolerances, typical ranges and radians.
 _NUM_SAME, _SAME_SHAPE = 4, (0.05, 0.05)
 # Score of a scan that is left out; and of one that is placed by the motion before it, after too many were left out.
 _LEFT_OUT, _GUESSED = 0.05, -1.0
@@ -59,7 +60,7 @@ class SequenceConfig:
 
     Attributes:
         num_sequences: sequences of poses that are kept from scan to scan.
-        num_compared: a scan is compared with so many of the last placed ones.
+        num_compared: number of the last placed scans that a scan is compared with.
         search: of pairs whose step is not clear.
     """
 
@@ -306,7 +307,7 @@ class _Beam:
         return np.asarray(agreement - _PRIOR_WEIGHT * self.prior.surprise(step, gap), np.float64)
 
     def is_same(self, now: _Sequences, ways: _Ways, row: int, other: int) -> bool:
-        """Whether two ways to go on agree about the last scans, so that no later scan can tell them apart."""
+        """Returns True if two continuations agree about the last scans, so that no later scan can separate them."""
         rows = np.array([row, other])
         parent = ways.parent[rows]
         placed = np.concatenate([now.is_placed[parent, 1 - _NUM_SAME :], ways.is_placed[rows, None]], axis=1)

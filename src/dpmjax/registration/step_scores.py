@@ -1,4 +1,4 @@
-"""How well a step between two scans is supported: by their beams, and by the usual motion of the sequence."""
+"""Support of a step between two scans: by their beams, and by the usual motion of the sequence."""
 
 from __future__ import annotations
 
@@ -22,18 +22,19 @@ LEAST_VISIBLE = 0.3
 WEAK_SCORE = 0.25
 # Scales of the motion prior: usual steps that a step is shorter, longer or off to the side; radians.
 _SHORT, _LONG, _SIDEWAYS, _TURN = 0.6, 1.5, 0.5, 0.8
-# Two scans fit each other above this score, so many scans apart; a group of so many that fits no other is left out.
+# Score above which two scans fit each other, and the largest number of steps between them. Largest size of a group that
+# is left out where it fits no further scan.
 _FITTING_SCORE, _FITTING_SPAN, _SMALL_GROUP = 0.0, 3, 3
 # Range noise, in typical ranges, above which no two scans are equal.
 _LEAST_NOISE = 1.5e-4
 
 
 class Evidence(NamedTuple):
-    """What the beams of pairs of scans say about their relative poses, as shares of all beams of both.
+    """Agreement of pairs of scans at their relative poses, as shares of all beams of both.
 
     Attributes:
         agreement: (p,) matched less weighted contradicting beams.
-        visible: (p,) beams of which the other scan can tell.
+        visible: (p,) beams that end in the visible region of their partner scan.
     """
 
     agreement: Floats

@@ -22,7 +22,7 @@ from dpmjax.registration.step_scores import pair_scores
 _REACH, _SPACING = 0.36, 0.012
 # Difference of scores that divides the probability of a place by e.
 _SCORE_SCALE = 0.02
-# A step is torn where another place farther than this (typical ranges) is more probable by so many nats.
+# A step is torn where another place farther than this (typical ranges) is more probable by this number of nats.
 _LEAST_SHIFT, _LEAST_GAIN = 0.03, 2.5
 # A step is open where its standard deviation along the weak direction is above this, in typical ranges.
 _OPEN_DEVIATION = 0.02

@@ -44,6 +44,6 @@ def submap_scans(scans: PlanarScans, poses: Floats, centres: Indices, members: l
 
 
 def along_way(poses: Floats, rows: Indices, length: float) -> Indices:
-    """Those of the rows, from the first one on, that the robot reaches within a way of this length."""
+    """Returns the rows, from the first one on, that the robot reaches within a way of this length."""
     way = np.append(0.0, np.cumsum(np.hypot(*np.diff(poses[rows, :2], axis=0).T)))
     return rows[way <= length]

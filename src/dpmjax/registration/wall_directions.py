@@ -1,6 +1,6 @@
 """Likely turns between scans, from the directions of the walls that each of them sees.
 
-The histogram of these directions turns with the scan and does not change where the scan moves along the same walls, so
+The histogram of these directions turns with the scan and does not change where the scan moves along the same walls. So
 two histograms are correlated over all turns (angle histograms, Weiss and von Puttkamer 1995). A scan with a limited
 field of view misses walls, which lowers the peak of the right turn and does not shift it.
 """
@@ -91,7 +91,7 @@ class WallDirections:
             source: (p,) rows.
             target: (p,) rows.
             num_turns: number of headings in a circle, multiples of 2 pi / num_turns of T_target_source.
-            num_peaks: headings around so many peaks of the similarity are chosen.
+            num_peaks: number of peaks of the similarity, around which headings are chosen.
 
         Returns:
             (p, num_turns); all of them where a scan has no walls.

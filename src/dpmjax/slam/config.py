@@ -22,8 +22,9 @@ class OdometryConfig:
     """Registration of a scan against the local map, point to plane.
 
     Attributes:
-        proposer: source of the first guess. "prediction": the motion of before; where it fails, other motions and the
-            decoder. "network": the decoder registers each scan to the nearest keyframe (DeepPointMap section 4).
+        proposer: source of the first guess. With "prediction" it is the last motion; if that fails, further motions and
+            those of the decoder are tried. With "network" the decoder registers each scan to the nearest keyframe
+            (DeepPointMap section 4).
         min_num_points: a scan with fewer flat surface elements counts as empty.
         num_keyframes: number of the nearest keyframes in the local map.
         num_recent: number of scans since the last keyframe in the local map.
@@ -33,8 +34,8 @@ class OdometryConfig:
         plane_distance_m: largest distance to that plane.
         good_share: share of the usual score from which on no other start is tried.
         num_hypotheses: number of motions that the decoder proposes.
-        turns_deg: turns about the vertical among the other starts.
-        tilts_deg: turns about the two other axes among the other starts.
+        turns_deg: turns about the vertical among the further starts.
+        tilts_deg: turns about the x and y axes among the further starts.
     """
 
     proposer: Proposer = "prediction"
@@ -181,9 +182,9 @@ def slam_preset(name: SlamPreset) -> SlamConfig:
     """Returns named settings of SLAM.
 
     Args:
-        name: "default", or "paper" for the thresholds of DeepPointMap's published configuration: the decoder registers
-            every scan, keyframes are up to 10 m apart, one loop candidate by distance is registered from an overlap
-            probability of 0.7 on and accepted alone.
+        name: "default", or "paper" for the thresholds of DeepPointMap's published configuration. There the decoder
+            registers every scan, and keyframes are up to 10 m apart. One loop candidate by distance is registered from
+            an overlap probability of 0.7 on and accepted alone.
 
     Returns:
         The settings.

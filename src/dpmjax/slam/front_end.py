@@ -1,4 +1,4 @@
-"""The front end: one scan after the other gets a pose, and some become keyframes (DeepPointMap section 4).
+"""The front end: each scan in turn gets a pose, and some become keyframes (DeepPointMap section 4).
 
 A first guess comes from the motion of before or from the decoder. The alignment with the local map makes it exact, and
 the share of elements that meet planes decides whether the pose is accepted.
@@ -173,7 +173,7 @@ def corrected_points(scan: AnyScan, T_turn: Pose | None) -> Float[np.ndarray, "n
 
     Args:
         scan: points in metres, in the frame of the lidar, perhaps with times.
-        T_turn: motion from one scan to the next; None leaves the points as they are.
+        T_turn: motion from one scan to the next; None leaves the points unchanged.
 
     Returns:
         The points.

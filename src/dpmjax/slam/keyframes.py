@@ -46,7 +46,7 @@ class MapEdge(NamedTuple):
 
     Attributes:
         source: row of a keyframe.
-        target: row of the other.
+        target: row of the second keyframe.
         T_target_source: float64.
         information: (6, 6) inverse covariance in the tangent of the source, translation first.
         kind: what measured it; a "guess" is a motion that was only predicted.
@@ -287,7 +287,7 @@ def are_near(T_a: Pose, T_b: Pose, most_m: float, most_rad: float) -> bool:
 
     Args:
         T_a: a pose.
-        T_b: the other, in the same frame.
+        T_b: the second pose, in the same frame.
         most_m: distance.
         most_rad: turn.
 

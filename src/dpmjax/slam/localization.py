@@ -49,7 +49,7 @@ class LocalizationConfig:
         same_place_m: largest distance between registrations that agree.
         same_place_rad: largest turn between registrations that agree.
         min_probability: a registration supports a place from this P(correct) on, if the scans agree.
-        min_support: number of registrations that must end at the same place, one of them with scans that agree. One
+        min_support: number of registrations that must end at the same place; the scans of at least one must agree. One
             registration suffices where no other keyframe is near.
         min_best: smallest P(correct) of the best of them. Streets look alike: several may agree on a wrong place.
         max_rival_share: another place may have this share of the sum of the best one.

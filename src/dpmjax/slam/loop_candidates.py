@@ -1,4 +1,4 @@
-"""Candidates of loops: older keyframes near the new one, by the estimated poses and by what they look like."""
+"""Candidates of loops: older keyframes near the new one by the estimated poses, or similar to it by retrieval."""
 
 from __future__ import annotations
 
@@ -111,7 +111,7 @@ def find_meetings(
     Args:
         slam_map: several maps in one record.
         row: of the keyframe.
-        is_other: the keyframes of the other maps.
+        is_other: True for keyframes of other maps.
         config: numbers.
 
     Returns:

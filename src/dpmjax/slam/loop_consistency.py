@@ -146,13 +146,13 @@ def are_consistent(slam_map: KeyframeMap, loop: Loop, other: Loop, config: LoopC
     T_source_other, T_target_other = (rigid.inverse(a.T_odometry_keyframe) @ b.T_odometry_keyframe for a, b in ends)
     one_way, other_way = loop.T_target_source @ T_source_other, T_target_other @ other.T_target_source
     sigma_m, sigma_rad = _drift(sum(paths_m), config)
-    # A turn of either registration moves the other end by the length of the odometry between them.
+    # A rotation error of a registration moves the far end in proportion to the length of the odometry between them.
     sigma_m = float(np.hypot(sigma_m, config.sigma_rad * max(paths_m)))
     return are_near(one_way, other_way, CONSISTENT_SIGMAS * sigma_m, CONSISTENT_SIGMAS * sigma_rad)
 
 
 def _near_along(slam_map: KeyframeMap, loops: Sequence[Loop], number: int) -> Iterator[int]:
-    """Yields the other loops whose sources are near along the path: those before, latest first, then those after."""
+    """Yields all further loops whose sources are near along the path: those before, latest first, then those after."""
     for others in (range(number - 1, -1, -1), range(number + 1, len(loops))):
         for other in others:
             if not _is_near_along(slam_map, loops[number].source, loops[other].source):

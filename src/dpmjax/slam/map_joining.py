@@ -1,8 +1,8 @@
-"""Joining of maps: loops between them are found by what places look like, and maps that meet become one graph.
+"""Joining of maps: loops between them are found by retrieval, and maps that meet become one graph.
 
-The relative pose of two maps is unknown (DeepPointMap section 4, multi-agent SLAM). Candidates are keyframes
-of the other maps that look alike. They are registered, verified and accepted as all loops are: only together with
-others that agree with them over the odometry of both maps.
+The relative pose of two maps is unknown (DeepPointMap section 4, multi-agent SLAM). Candidates are similar keyframes of
+different maps. They are registered, verified and accepted like all loops: only together with loops that agree with them
+over the odometry of both maps.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ class JoinedMaps(NamedTuple):
     """Several maps in one record; those that meet have one frame.
 
     Attributes:
-        slam_map: the keyframes of all maps, one map after the other; scans of later maps are numbered on.
+        slam_map: the keyframes of all maps, map by map; the scan numbers of each map continue those of the map before.
         map_of_keyframe: (k,) which map each keyframe comes from.
         component_of_map: which maps are joined: equal numbers, counted from 0. Maps of other components have frames
             of their own, and their poses cannot be compared.
@@ -49,8 +49,7 @@ def join_maps(
 ) -> JoinedMaps:
     """Finds loops between maps and optimises those that meet as one graph.
 
-    The result does not depend on the order of the maps, but for the order of its rows and for its frames: a component
-    has the frame of its first map.
+    The order of the maps changes only the order of the rows and the frames: a component has the frame of its first map.
 
     Args:
         methods: matcher and settings; the matcher that made the maps.

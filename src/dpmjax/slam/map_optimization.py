@@ -26,11 +26,11 @@ TAKEN_BACK_WEIGHT = 0.25
 """Smallest weight of a loop edge that stays after the optimisation."""
 
 CERTAIN = 1e9
-"""So many loops would have to contradict an edge of odometry before it is let go."""
+"""Number of contradicting loops that would remove an edge of odometry."""
 
 
 def optimize_map(slam_map: KeyframeMap, state: LoopState, config: LoopClosureConfig) -> tuple[KeyframeMap, LoopState]:
-    """Optimises all poses, and removes loops that contradict the other edges.
+    """Optimises all poses, and removes loops that contradict the remaining edges.
 
     Parts that loops join for the first time are first moved to where a loop says. A predicted motion gives way where
     measured ones join its ends.

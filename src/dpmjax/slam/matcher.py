@@ -124,7 +124,7 @@ class Matcher(Protocol):
 
         Args:
             source: a scan.
-            targets: the others; at least one.
+            targets: the scans that it is compared with; at least one.
 
         Returns:
             The probabilities.

@@ -1,4 +1,4 @@
-"""The whole system: scans in, one map out. Front end, loop closure and optimisation, one scan after the other."""
+"""The whole system: scans in, one map out. Front end, loop closure and optimisation, scan by scan."""
 
 from __future__ import annotations
 
@@ -82,7 +82,7 @@ def make_methods(model: Model, config: SlamConfig | None = None, *, weights: str
 
 
 def as_methods(model: Model | SlamMethods, config: SlamConfig | None) -> SlamMethods:
-    """Returns methods as they are, and makes those of a model.
+    """Returns given methods unchanged, and makes the methods of a model.
 
     Args:
         model: a trained model, or methods.
@@ -195,7 +195,7 @@ def place_scans(
 def iterate_slam(
     methods: SlamMethods, scans: Iterable[AnyScan], state: SlamState | None = None
 ) -> Iterator[tuple[SlamState, ScanReport]]:
-    """Places scans one after the other, for progress and for files that grow.
+    """Places scans one by one, for progress and for files that grow.
 
     Args:
         methods: from `make_methods`.
