@@ -182,7 +182,7 @@ def resident_mb() -> float:
 
 def front_end_mb(methods: SlamMethods, state: SlamState) -> float:
     """Returns the size of the state of odometry; the search tree is made of the points."""
-    local_map = local_map_of(state.slam_map, methods.config.odometry)
+    local_map = local_map_of(state.slam_map, state.front_end.recent, methods.config.odometry)
     local_map = local_map._replace(surface=local_map.surface._replace(tree=None))
     return _megabytes(state.front_end._replace(local_map=local_map))
 

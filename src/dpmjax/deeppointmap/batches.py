@@ -56,7 +56,7 @@ def register_pairs(
     targets: Sequence[ScanOrCloud],
     *,
     config: MatchConfig | None = None,
-    refine: bool = True,
+    refine: bool | None = None,
     scale: Scale = 1.0,
 ) -> Registration:
     """Registers many pairs as `register` does; a scan that is in several pairs is prepared once.

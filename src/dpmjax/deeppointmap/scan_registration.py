@@ -106,7 +106,7 @@ def register(
     target: ScanOrCloud,
     *,
     config: MatchConfig | None = None,
-    refine: bool = True,
+    refine: bool | None = None,
     scale: Scale = 1.0,
 ) -> Registration:
     """Registers two scans or maps without a first guess (DeepPointMap section 3.2).
@@ -124,7 +124,8 @@ def register(
         config: choice of pairs and inliers; None takes that of the model.
         refine: whether to end with a fine point-to-plane alignment: of two scans, or else of the surface elements of
             both clouds, if they have some. Without it, the motion of two scans is that of the short alignment that
-            verified it, and any other that of the descriptors.
+            verified it, and any other that of the descriptors. None refines with a calibrated model: published
+            weights give the published motion.
         scale: factor by which raw scans are enlarged for the encoder, or by which descriptors were; "auto" chooses 1,
             2 or 4 from the extent of both scans. Prepared scans know theirs. The result is in metres.
 
@@ -147,7 +148,7 @@ def register_each(
     pairs: Sequence[tuple[ScanOrCloud, ScanOrCloud]],
     *,
     config: MatchConfig | None = None,
-    refine: bool = True,
+    refine: bool | None = None,
     scale: Scale = 1.0,
 ) -> list[Registration]:
     """Registers pairs as `register` does; threads verify one pair while JAX matches the next.
@@ -165,6 +166,7 @@ def register_each(
     Raises:
         ValueError: as `register` says.
     """
+    refine = model.config.calibration is not None if refine is None else refine
     scale = _scale_of(pairs, scale, model)
     prepared = _prepared(model, pairs, scale, num_elements=_num_elements(model) if refine else None)
     matching, verification = config or model.config.matching, model.config.verification

@@ -196,7 +196,7 @@ class NetworkMatcher:
             One match a pair.
         """
         prepared = [(_merged(source), _merged(target)) for source, target in pairs]
-        found = register_each(self._model, prepared)
+        found = register_each(self._model, prepared, refine=True)
         return [self._match(*pair, match) for pair, match in zip(pairs, found, strict=True)]
 
     def overlaps(self, source: CompactScan, targets: Sequence[CompactScan]) -> Float[np.ndarray, " n"]:
