@@ -18,9 +18,9 @@ With --slam, the whole system and its odometry run beside KISS-ICP, KISS-SLAM an
 file of poses (TUM or KITTI) stands for a town that is simulated along it; scans are kept in results/simulated. The
 option --refine adds two rows: the keyframes of our run, refined by DeepMapping, and by multiway registration (Open3D,
 extra `baselines`), from the same poses. The file table.md has ATE, KITTI's t_rel, loops, their recall, bytes of maps,
-localisations and seconds a scan: of all scans, and of the first and the last tenth, which show whether they grow.
-trajectories.png and map_sizes.png show the trajectories and the bytes of maps; drives/ holds the trajectories of every
-method and the files of our run. experiments/_slam_evaluation.py says how loops are counted.
+localisations and seconds a scan. The seconds are of all scans, and of the first and the last tenth, which show whether
+they grow. trajectories.png and map_sizes.png show the trajectories and the bytes of maps; drives/ holds the
+trajectories of every method and the files of our run. experiments/_slam_evaluation.py says how loops are counted.
 """
 
 from __future__ import annotations
