@@ -1,7 +1,7 @@
 """The methods that the tables of DeepMapping compare: baselines, parts of the pipeline, and their combinations.
 
-A candidate is a set of poses under the name of its method. "DeepMapping" is the name for results of L-Net or M-Net; a
-search, an ICP or a refinement has its own name.
+A candidate is a set of poses under the name of its method. "DeepMapping" is the name for results of L-Net or M-Net.
+A search, an ICP or a refinement has its own name.
 """
 
 from __future__ import annotations

@@ -174,7 +174,7 @@ def joint_ate_m(result: AgentsResult, references: Sequence[np.ndarray | None], m
 
 
 def agent_panels(result: AgentsResult, sequences: Sequence[LidarSequence]) -> list[AgentPanel]:
-    """Gathers what is drawn: clouds, tracks and loops of each component."""
+    """Gathers the data of the picture: clouds, tracks and loops of each component."""
     from dpmjax import viz
 
     panels = []

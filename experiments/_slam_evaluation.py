@@ -2,7 +2,7 @@
 
 A loop is wrong beyond 2 m or 5 degrees. A scan comes back where it is within 5 m (indoors 2 m) of an earlier one after
 50 m (15 m) of way. The recall of loops is the share of these scans that have a right loop whose newer end is within
-10 m (3 m) along the path; it is the recall at 100 % precision where no loop is wrong. KISS-SLAM joins local maps of
+10 m (3 m) along the path. It is the recall at 100 % precision if no loop is wrong. KISS-SLAM joins local maps of
 100 m, and each of its loops counts for all scans of the newer one.
 """
 
@@ -32,7 +32,7 @@ from experiments._slam_peers import PEERS, POINT_BYTES, FoundLoop, Peer, is_indo
 OURS, NETWORK = "ours, odometry and loops", "ours, the network proposes every pose"
 ODOMETRY = "ours, before loops"
 PRECISIONS: tuple[Precision, ...] = ("float32", "int8")
-# Sizes of maps are taken so many times on the way.
+# Sizes of maps are measured this number of times during a drive.
 NUM_SIZES = 8
 # Stages of a run that no other program's time has.
 _FILE_STAGES = ("read", "write", "viewer")
@@ -131,7 +131,7 @@ def map_row(drive: Drive, folder: RunFolder, method: str, methods: SlamMethods) 
 
 
 def _per_scan(run: SlamRun, seconds: float) -> float | None:
-    """Of a run that was resumed at its end, no time is known."""
+    """Returns the seconds a scan; None for a run that was resumed at its end."""
     return seconds / run.num_done if run.num_done else None
 
 

@@ -1,8 +1,9 @@
 """Other programs on the same scans: KISS-ICP, KISS-SLAM, odometry by small_gicp. Extra `peers`; imported when used.
 
-Each has its own settings as they come. Only what must fit the place is set: the largest range, 60 m outdoors and 30 m
-indoors, with voxels of a hundredth of it (KISS-ICP's own rule); small_gicp's voxels are those of its documentation, and
-half as large indoors. None of them corrects scans for the motion of the lidar, as ours does not either.
+Each has its own default settings. Only the settings that must fit the place are changed. The largest range is 60 m
+outdoors and 30 m indoors, with voxels of a hundredth of it (KISS-ICP's own rule). The voxels of small_gicp are those of
+its documentation, and half as large indoors. None of them corrects scans for the motion of the lidar, as ours does not
+either.
 """
 
 from __future__ import annotations
@@ -41,7 +42,7 @@ class FoundLoop(NamedTuple):
 
 
 class Peer(Protocol):
-    """A program that takes scans one after the other.
+    """A program that takes scans in their order.
 
     Attributes:
         map_name: kind of the map, for the column of its bytes.
@@ -53,7 +54,7 @@ class Peer(Protocol):
         """Takes a scan, (n, 3) float64, not empty."""
 
     def grow_map(self, points: np.ndarray) -> None:
-        """Adds the last scan to a map of the whole way, where the program forgets what is far away; not timed."""
+        """Adds the last scan to a map of the whole way, where the program drops far points; not timed."""
 
     def map_bytes(self) -> int:
         """Returns the bytes of the map of the whole way so far, with floats of 4 bytes."""
@@ -63,7 +64,7 @@ class Peer(Protocol):
 
 
 class KissIcp:
-    """KISS-ICP (Vizzo et al. 2023), and its voxel map of the whole way: the program itself forgets what is far away."""
+    """KISS-ICP (Vizzo et al. 2023), with a voxel map of the whole way: the program itself drops far points."""
 
     map_name = "voxels"
 
@@ -201,13 +202,13 @@ def peer_version(name: str) -> str:
 
 
 def is_indoors(points: np.ndarray) -> bool:
-    """Whether a scan is one of a room."""
+    """Returns True for a scan of a room."""
     return bool(len(points) and np.median(np.linalg.norm(points, axis=1)) < INDOORS_M)
 
 
 @contextlib.contextmanager
 def _silence() -> Iterator[None]:
-    """Takes away what a program prints, also its compiled part."""
+    """Suppresses the output of a program, also of its compiled part."""
     saved = [(number, os.dup(number)) for number in (1, 2)]
     try:
         with open(os.devnull, "w") as nowhere, contextlib.redirect_stdout(nowhere):
@@ -221,7 +222,7 @@ def _silence() -> Iterator[None]:
 
 
 class _RecordedCloser:
-    """The loop closer of KISS-SLAM, which keeps what it accepts."""
+    """The loop closer of KISS-SLAM, with a record of the loops that it accepts."""
 
     def __init__(self, closer: Any) -> None:
         self._closer = closer

@@ -5,10 +5,11 @@
     python -m experiments.deepmapping_ablations --resume -o out
 
 As in the paper on short walks of a depth camera (here through simulated apartments), from zero: L-Net and M-Net are
-trained together. The variants are lnet (CNN or PointNet), mnet (MLP or ResMLP, or our grid), depth (4 to 7 layers of
-64), width (32 to 128 with 4 layers), chamfer (with and without) and free (number of free samples a ray). All further
-settings are fixed. The basis is a small CNN and an MLP of 6 layers of 64: a run takes half a minute on a CPU. Each run
-is written to rows/ when it is done; ablations.png has the box plots.
+trained together. The variants of the networks are lnet (CNN or PointNet) and mnet (MLP or ResMLP, or our grid). Those
+of their size are depth (4 to 7 layers of 64) and width (32 to 128 with 4 layers). Those of the loss are chamfer (with
+and without) and free (number of free samples a ray). All further settings are fixed. The basis is a small CNN and an
+MLP of 6 layers of 64: a run takes half a minute on a CPU. Each run is written to rows/ when it is done; ablations.png
+has the box plots.
 """
 
 from __future__ import annotations

@@ -50,7 +50,7 @@ class Config:
 
 
 def main(config: Config) -> list[dict[str, Any]]:
-    """Runs what is missing and prints the table."""
+    """Runs the missing rows and prints the table."""
     logs = [log for path in config.logs for log in ([path] if path.is_file() else logs_of(path))]
     made = config.output / "corridors"
     logs += [write_corridor_log(made / f"corridor{seed}.npz", seed) for seed in config.corridors]

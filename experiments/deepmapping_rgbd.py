@@ -11,12 +11,12 @@ The simulated apartments follow the dataset's protocol: places 300 mm apart, vie
 --walks hard, each walk has 16 views of an apartment of its own: moves and turns at once with jitter, depth noise and
 missing pixels. Walks on which no motion at all has an ATE below 450 mm are left out. No setting was chosen on them.
 
-Each trajectory is written to rows/ as soon as all methods have done it. metrics.json has the share of walks with an ATE
-below 450 mm (the paper's threshold, which no motion at all meets on most of its walks), and of right walks. Right is an
-ATE below a tenth of the spread of the cameras, turns between neighbours within 2 degrees, and points within 100 mm.
-Images of bare walls leave the motion along them open. For hard walks the table also has the share of right walks among
-those that the surfaces hold to a tenth of the spread (`_rgbd_methods.surface_spread`). errors.png has the box plots,
-map_K.png some trajectories from above.
+Each trajectory is written to rows/ as soon as all methods have done it. The file metrics.json has the share of walks
+with an ATE below 450 mm, and of right walks. The paper's threshold is 450 mm; no motion at all meets it on most of its
+walks. Right is an ATE below a tenth of the spread of the cameras, turns between neighbours within 2 degrees, and points
+within 100 mm. Images of bare walls leave the motion along them open. For hard walks the table also has the share of
+right walks among those that the surfaces hold to a tenth of the spread (`_rgbd_methods.surface_spread`). The file
+errors.png has the box plots, map_K.png some trajectories from above.
 """
 
 from __future__ import annotations

@@ -2,16 +2,16 @@
 
     python -m experiments.dpm_calibrate results/train/latest/model.safetensors
 
-Pairs of scans of held-out towns, overlapping and not, are registered; a logistic regression on a few features of each
-registration (consensus support, share of points that meet surfaces, share in free space ...) then predicts whether the
-motion is right within 2 m and 5 degrees. Pairs whose walls hold one direction only have a regression of their own, on
-two features, and so have matches of clouds of surface elements, without the scans. Ambiguous places add pairs:
+Pairs of scans of held-out towns, overlapping and not, are registered. A logistic regression then predicts whether the
+motion is right within 2 m and 5 degrees. Its few features include the consensus support, the share of points that meet
+surfaces and the share of points in free space. Pairs whose walls hold one direction only have a regression of their
+own, on two features, and so have matches of clouds of surface elements, without the scans. Ambiguous places add pairs:
 corridors, tunnels, halls, open fields and streets with queues of moving cars, by lidars of 16, 32 and 64 beams. Overlap
 is another regression, on the evidence of the match (similarities of descriptors, consensus support ...) of pairs of
-further towns, half of them less than 20 m apart. Results go to results/dpm_calibrate/<time>/: model.safetensors, which
-is the model with all of them; metrics.json, with the Brier scores, and the AUC of overlap, of places that were left out
-of the fits; reliability.png, reliability_clouds.png and reliability_overlap.png. `python -m experiments.dpm_confidence`
-checks the confidence on other places.
+further towns, half of them less than 20 m apart. Results go to results/dpm_calibrate/<time>/: model.safetensors,
+metrics.json, reliability.png, reliability_clouds.png and reliability_overlap.png. The file model.safetensors is the
+model with all regressions. The file metrics.json has the Brier scores, and the AUC of overlap, of places that were left
+out of the fits. `python -m experiments.dpm_confidence` checks the confidence on other places.
 """
 
 from __future__ import annotations

@@ -4,11 +4,11 @@
     python -m experiments.dpm_confidence dpm_small results/dpm_calibrate/latest/model.safetensors
 
 The places are simulated corridors, tunnels, halls, open fields and streets with queues of moving cars, scanned by
-lidars of 16, 32 and 64 beams. Pairs 1 to 5 m, 5 to 10 m and 10 to 20 m apart, and as many without overlap, are
-registered as scans, and as clouds of surface elements. A registration within 2 m and 5 degrees is right, and sure with
-a confidence of 0.9 or more. Further models are the same network with other calibrations: they rate the same
-registrations; with --resume, other ones rate those of an earlier run. Results go to results/dpm_confidence/<time>/:
-table.md, metrics.json.
+lidars of 16, 32 and 64 beams. Pairs are 1 to 5 m, 5 to 10 m and 10 to 20 m apart, and the same number has no overlap.
+They are registered as scans, and as clouds of surface elements. A registration within 2 m and 5 degrees is right, and
+sure with a confidence of 0.9 or more. Further models are the same network with other calibrations: they rate the same
+registrations. With --resume, other models rate the registrations of an earlier run. Results go to
+results/dpm_confidence/<time>/: table.md, metrics.json.
 """
 
 from __future__ import annotations

@@ -8,20 +8,19 @@
     python -m experiments.dpm_evaluate --resume                         go on where the last run stopped
 
 A path is any folder of scans with poses (KITTI, KITTI-360, MulRan, plain ...). Random pairs of scans, 2 to 10 m and 10
-to 20 m apart and turned by any yaw, are registered; a registration within 2 m and 5 degrees is right. Results go to
+to 20 m apart and turned by any yaw, are registered. A registration within 2 m and 5 degrees is right. Results go to
 results/dpm_evaluate/<time>/: table.md, metrics.json, reliability.png, failures.png (the worst pairs from above). Two
 more methods see the same pairs: the search and the verification of `register` without the network, and KISS-Matcher
 (extra `kiss`). Rows of all recorded drives together have confidence intervals and say which methods differ.
 
 With --slam, the whole system and its odometry run beside KISS-ICP, KISS-SLAM and odometry by small_gicp (extra
-`peers`); then random scans are looked for in the map of each drive's first half. Poses are needed for the errors only.
-A file of poses (TUM or KITTI) stands for a town that is simulated along it; scans are kept in results/simulated.
---refine adds two rows: the keyframes of our run polished by DeepMapping, and by multiway registration (Open3D, extra
-`baselines`), from the same poses.
-table.md has ATE, KITTI's t_rel, loops, their recall, bytes of maps, localisations and seconds a scan: of all scans, and
-of the first and the last tenth, which show whether they grow. trajectories.png and map_sizes.png show the trajectories
-and the bytes of maps; drives/ holds the trajectories of every method and the files of our run.
-experiments/_slam_evaluation.py says how loops are counted.
+`peers`). Then random scans are localised in the map of each drive's first half. Poses are needed for the errors only. A
+file of poses (TUM or KITTI) stands for a town that is simulated along it; scans are kept in results/simulated. The
+option --refine adds two rows: the keyframes of our run, refined by DeepMapping, and by multiway registration (Open3D,
+extra `baselines`), from the same poses. The file table.md has ATE, KITTI's t_rel, loops, their recall, bytes of maps,
+localisations and seconds a scan. The seconds are of all scans, and of the first and the last tenth, which show whether
+they grow. trajectories.png and map_sizes.png show the trajectories and the bytes of maps; drives/ holds the
+trajectories of every method and the files of our run. experiments/_slam_evaluation.py says how loops are counted.
 """
 
 from __future__ import annotations

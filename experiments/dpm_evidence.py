@@ -5,8 +5,8 @@
 Pairs of scans of simulated scenes are registered: out of doors and inside, whole and thinned to 1,400 points within 30
 m. All hypotheses of a pair, by the network and by the search among views from above, are aligned and compared with the
 truth. A logistic regression on `evidence_shares` predicts which are right. Results go to results/dpm_evidence/<time>/.
-metrics.json has the weights for `dpmjax.deeppointmap.EvidenceWeights`. table.md has the share of pairs whose right
-hypothesis has the highest score, scene by scene, each by a fit without this scene.
+The file metrics.json has the weights for `dpmjax.deeppointmap.EvidenceWeights`. The file table.md has the share of
+pairs whose right hypothesis has the highest score, scene by scene, each by a fit without this scene.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Makes one map of the drives of several agents, each of which maps alone (DeepPointMap, sections 4 and 5.3).
+"""Makes one map of the drives of several agents that map independently (DeepPointMap, sections 4 and 5.3).
 
     python -m experiments.dpm_multiagent                         a simulated town, cut into three parts
     python -m experiments.dpm_multiagent path/to/drive           a drive of your own, cut into three parts
@@ -6,11 +6,11 @@
     python -m experiments.dpm_multiagent --cut kitti_00.txt kitti_05.txt   each cut into three parts, a row each (5.3)
     python -m experiments.dpm_multiagent --resume                go on where the last run stopped, or was killed
 
-Agents exchange keyframes. Loops between them are found by what places look like; no position is given. Agents that meet
-share one frame, others keep their own. Results go to results/dpm_multiagent/<time>/ (latest links to the newest):
-agent_1 ... as TUM, KITTI and npy, graph.g2o, loops.csv, map_1.npz ... for those that met, metrics.json with errors and
-bytes, agents.png. With --cut, drives/ has these files of each drive, and table.md a row a drive. A file of poses (TUM,
-KITTI) stands for a town that is simulated along it.
+Agents exchange keyframes. Loops between them are found by the appearance of places; no position is given. Agents that
+meet share one frame, others keep their own. Results go to results/dpm_multiagent/<time>/ (latest links to the newest):
+a trajectory of each agent (agent_1 and so on) as TUM, KITTI and npy, graph.g2o, loops.csv and agents.png. Agents that
+met have a common map (map_1.npz and so on). Errors and bytes are in metrics.json. With --cut, drives/ has these files
+of each drive, and table.md a row a drive. A file of poses (TUM, KITTI) stands for a town that is simulated along it.
 """
 
 from __future__ import annotations

@@ -4,9 +4,9 @@
     python -m experiments.toy_1d --seeds 100 -o out
 
 Writes toy.png (figure 14), endings.png (the ends of all seeds) and metrics.json. The metrics are the share of seeds
-that reach the global minimum in the network form and in the direct form (plain descent and three solvers of jaxopt)
-from the same starts. They cover several initialisations and learning rates, and the seconds beside a plain PyTorch loop
-where torch is installed.
+that reach the global minimum, in the network form and in the direct form, from the same starts. The direct form is
+solved by plain descent and by three solvers of jaxopt. The metrics cover several initialisations and learning rates,
+and the seconds beside a plain PyTorch loop where torch is installed.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Multiway registration by Open3D, a baseline of DeepMapping: `pip install dpmjax[baselines]`.
 
 Pairs are registered by iterated closest points. Neighbours in time are sure edges of a pose graph, all further pairs
-doubtful ones; a line process removes wrong edges (Choi, Zhou and Koltun, Robust Reconstruction of Indoor Scenes, CVPR
+uncertain ones. A line process removes wrong edges (Choi, Zhou and Koltun, Robust Reconstruction of Indoor Scenes, CVPR
 2015).
 """
 

@@ -122,13 +122,14 @@ def run_command(
 ) -> int:
     """Parses the command line, runs `main`, and returns the exit code.
 
-    0: success. 2: wrong usage or bad input, with one line on stderr. 1: failure after partial results in the run
-        folder. 130, 143: stopped by Ctrl-C or SIGTERM, with results. With `--resume`, options that are not given are
-    those of the run that is resumed.
+    Code 0 is success. Code 2 is wrong usage or bad input, with one line on stderr. Code 1 is a failure after partial
+    results in the run folder. Codes 130 and 143 are stops by Ctrl-C or SIGTERM, with results. With `--resume`, options
+    that are not given are those of the run that is resumed.
 
     Args:
         main: takes the options. Errors of the user are raised as `ValueError` before the run folder is opened.
-        config_type: frozen dataclass. Of `OutputOptions`, the folder is checked and the device selected before `main`.
+        config_type: frozen dataclass. For a subclass of `OutputOptions`, the folder is checked and the device selected
+            before `main`.
         name: name of the subcommand of `dpmjax`, or of the module in `experiments`; and of the folder in `results`.
         description: the module's docstring; `--help` begins with it.
         args: the command line; None takes that of the process.

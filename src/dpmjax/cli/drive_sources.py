@@ -29,7 +29,7 @@ class Source:
         town_seed: seed of the town.
         town_length_m: length of the drive through the town.
         town_kind: kind of place; None draws one.
-        town_mixture: what the town is drawn from.
+        town_mixture: distribution from which the town is drawn.
     """
 
     path: Path | None = None

@@ -6,11 +6,11 @@
     dpmjax evaluate --resume                       continue the latest run
 
 Random pairs of scans, 2 to 10 m and 10 to 20 m apart, are registered, each scan turned by any yaw. A registration
-within 2 m and 5 degrees is right. Results go to results/evaluate/<time>/ (latest links to the newest): table.md, with
-the recall of the network alone, after the verification by the scans, and after the final alignment; metrics.json, with
-every pair; reliability.png: how often registrations of each confidence are right, pairs more than 60 m apart included;
-failures.png: wrong registrations, from above. The AUC of overlap compares pairs less than 20 m apart (revisits where
-the drive has some) with pairs more than 40 m apart.
+within 2 m and 5 degrees is right. Results go to results/evaluate/<time>/ (latest links to the newest). table.md has the
+recall of the network alone, after the verification by the scans, and after the final alignment. metrics.json has every
+pair. reliability.png shows the share of right registrations for each confidence, pairs more than 60 m apart included.
+failures.png shows wrong registrations from above. The AUC of overlap compares pairs less than 20 m apart (revisits
+where the drive has some) with pairs more than 40 m apart.
 """
 
 from __future__ import annotations

@@ -209,7 +209,7 @@ def numbers_of(
 
 
 def measures_of(config: Config, sequence: ScanSequence) -> Callable[[Floats, str], dict[str, float]]:
-    """Reads what the result is measured by, beside its own reference.
+    """Reads the further references that the result is measured by, beside its own.
 
     Args:
         config: options of the run.

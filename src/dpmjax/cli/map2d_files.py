@@ -1,4 +1,4 @@
-"""The files of a map of planar scans: trajectories, and pictures of the candidates and of what M-Net learned."""
+"""The files of a map of planar scans: trajectories, and pictures of the candidates and of M-Net's occupancy."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def draw_map(
 
 
 def draw_occupancy(folder: RunFolder, registered: ScanSequence, result: RegisteredScans, limits: viz.Limits) -> None:
-    """Draws occupancy.png: what M-Net learned, in the frame and within the limits of map.png."""
+    """Draws occupancy.png: the occupancy that M-Net predicts, in the frame and within the limits of map.png."""
     picture = deepmapping.draw_map(result.fitted, registered.points, registered.mask)
     kept, reference = result.candidates[result.kept].poses, registered.reference_poses
     anchor, trajectory = kept if reference is None else reference, result.fitted.poses[:, :2]

@@ -60,7 +60,8 @@ def before_and_after(sequence: ScanSequence, start: Floats, poses: Floats) -> di
     if reference is None:
         return {"success": None}
     after, before = planar_errors(sequence, poses), planar_errors(sequence, start)
-    # The paper's threshold is 20 pixels, 2 % of its world; of a real place, 2 % of what its trajectory spans.
+    # The paper's threshold is 20 pixels, 2 % of its world. The threshold of a real place is 2 % of the span of its
+    # trajectory.
     threshold = 20.0 if unit == "px" else 0.02 * float(np.linalg.norm(np.ptp(reference[:, :2], axis=0)))
     return {
         **after,

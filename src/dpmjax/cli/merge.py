@@ -7,9 +7,10 @@
 Maps are files of `dpmjax.save_map`, such as map.npz of `dpmjax slam`, all made with the same weights. Loops between
 them are found by the appearance of places; no position is needed. A merged map has the frame of its first map.
 
-Results go to results/merge/<time>/ (latest links to the newest): map.npz, loops.csv (each candidate of a loop between
-two maps and its outcome), graph.g2o, metrics.json, and map.png (all maps from above, each in its colour, with the
-loops). Where some maps show no common place, the maps are map_1.npz, map_2.npz and so on.
+Results go to results/merge/<time>/ (latest links to the newest): map.npz, loops.csv, graph.g2o, metrics.json and
+map.png. The file loops.csv has each candidate of a loop between two maps and its outcome. The picture map.png shows all
+maps from above, each in its colour, with the loops. Where some maps show no common place, the maps are map_1.npz,
+map_2.npz and so on.
 """
 
 from __future__ import annotations

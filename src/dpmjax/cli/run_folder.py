@@ -57,7 +57,7 @@ class RunOptions(OutputOptions):
     """The same of every command that can be interrupted and resumed.
 
     Attributes:
-        may_change: options that a resumed run may change, besides those that do not change what is computed.
+        may_change: options that a resumed run may change, besides those that do not affect the computation.
     """
 
     may_change: ClassVar[frozenset[str]] = frozenset()
@@ -69,7 +69,7 @@ class RunOptions(OutputOptions):
 
 
 class RunFailedError(RuntimeError):
-    """A run broke off after its folder was made; what it had written is in `path`, the traceback in its log."""
+    """A run broke off after its folder was made; `path` has the files written so far, and its log has the traceback."""
 
     def __init__(self, path: Path, error: Exception) -> None:
         is_input = isinstance(error, InputError)

@@ -9,8 +9,9 @@
     dpmjax slam --resume                                go on where the last run stopped, or was killed
 
 Results go to results/slam/<time>/ (latest links to the newest): trajectories of every scan as TUM, KITTI and npy,
-scans.csv and loops.csv with the reason of every decision, graph.g2o, keyframes.txt, map.npz (to extend, and for
-`dpmjax localize`), map.ply, trajectory.png, map.png and metrics.json. Ctrl-C ends the run and writes them too.
+graph.g2o, keyframes.txt, map.npz, map.ply, trajectory.png, map.png and metrics.json. The tables scans.csv and loops.csv
+have the reason of every decision. The file map.npz can be extended, and serves `dpmjax localize`. Ctrl-C ends the run
+and writes all files too.
 """
 
 from __future__ import annotations

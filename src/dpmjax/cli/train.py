@@ -9,9 +9,9 @@
     dpmjax train --coordinator host0:8476 --num-processes 2 --process-id 0
                                                                   on two hosts; --process-id 1 on the other
 
-Results go to results/train/<time>/ (latest links to the newest): model.safetensors for dpmjax.load_model,
-metrics.csv, metrics.json, checkpoints, and pictures: loss.png, matches.png. Recall is the share of pairs of a held-out
-town, turned by any yaw, that are registered within 2 m and 5 degrees: of scans and of maps, 2 to 10 and 10 to 20 m
+Results go to results/train/<time>/ (latest links to the newest): model.safetensors for dpmjax.load_model, metrics.csv,
+metrics.json, checkpoints, and pictures: loss.png, matches.png. Recall is the share of pairs of a held-out town, turned
+by any yaw, that are registered within 2 m and 5 degrees. The pairs are of scans and of maps, 2 to 10 and 10 to 20 m
 apart. The model is the one of the step with the best mean recall on other towns (metrics.json: best_step). Afterwards
 `python -m experiments.dpm_calibrate MODEL` calibrates its overlap and its confidence.
 """

@@ -96,7 +96,7 @@ def overlap_pairs(model: Model, sources: Sequence[ScanOrCloud], targets: Sequenc
 
 
 def evidence_pairs(model: Model, sources: Sequence[ScanOrCloud], targets: Sequence[ScanOrCloud]) -> Float[Array, "n f"]:
-    """Computes what the overlap probability of many pairs rests on.
+    """Computes the features of the overlap probability of many pairs.
 
     A `ValueError` says if the lengths differ or are 0.
 

@@ -28,7 +28,7 @@ MAX_CODE = np.iinfo(np.int8).max
 
 
 class CompactScan(NamedTuple):
-    """What a map keeps of a scan, as arrays of NumPy.
+    """Compact form in which a map stores a scan, as arrays of NumPy.
 
     Attributes:
         elements: surface elements in the order of farthest points; the first m have features.

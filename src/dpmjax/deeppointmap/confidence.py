@@ -74,7 +74,8 @@ class Calibration:
     Attributes:
         of_clouds: of registrations of descriptor clouds.
         of_scans: of registrations that the scans have verified.
-        of_weak_scans: of those whose walls hold one direction only, as in corridors; None rates them as the others.
+        of_weak_scans: of verified scans whose walls hold one direction only, as in corridors; None uses `of_scans` for
+            them.
     """
 
     of_clouds: LogisticModel
@@ -83,7 +84,7 @@ class Calibration:
 
 
 class Evidence(NamedTuple):
-    """What the confidence rests on.
+    """Features from which the confidence is computed.
 
     Attributes:
         of_clouds: `CLOUD_FEATURES`.
@@ -134,7 +135,7 @@ def weak_features(verification: Verification) -> Float[np.ndarray, "2"]:
 
 
 def calibrated_probability(calibration: Calibration, evidence: Evidence) -> float:
-    """Computes the probability that a registration is right by the model for what it rests on.
+    """Computes the probability that a registration is right, by the model that fits its features.
 
     Args:
         calibration: fitted models.

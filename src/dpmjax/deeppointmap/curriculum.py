@@ -42,7 +42,7 @@ class SamplingConfig:
         max_side: largest number of scans of one map. Half of the groups up to this size are split into one scan
             against all others.
         max_descriptors: largest number of descriptors of one map (ours): thinning leaves a fifth of a map of 16 scans,
-            and attention over the others would cost twenty times as much.
+            and attention over all of them would cost twenty times as much.
     """
 
     num_scans: int = 32
@@ -66,7 +66,7 @@ class TrainingConfig:
 
     Attributes:
         model: configuration of the model.
-        curriculum: stages, one after the other.
+        curriculum: stages, in their order.
         sampling: choice of the scans of a sample.
         augment: augmentation of each scan. Each step draws a new motion for each scan.
         num_variants: number of times that a scan is thinned, occluded and jittered; steps choose among these variants.
@@ -158,7 +158,7 @@ def without(config: TrainingConfig, part: TrainingPart) -> TrainingConfig:
         part: "curriculum" trains with the largest groups from the first step on.
 
     Returns:
-        A new configuration of as many steps.
+        A new configuration with the same number of steps.
 
     Raises:
         ValueError: an unknown part.

@@ -93,7 +93,7 @@ class SampleMaker:
         layout = layouts[step % len(layouts)]
         groups = draw_groups(table, self._anchor(step, number), layout, sampling, rng)
         rows = np.concatenate([group.rows for group in groups if group is not None])
-        # Always as many scans as the layout has: another number would be compiled again.
+        # The number of scans is always that of the layout: another number would be compiled again.
         num_spare = sum(map(sum, layout)) - len(rows)
         padded = np.concatenate([rows, np.full(num_spare, rows[0])])
         scans, placed = self._store.read(padded, self._config, rng)

@@ -36,8 +36,8 @@ def encode(
         scale: factor by which the points are enlarged first, for rooms (`scene_scale`). All scans that are compared
             or merged must share it; positions, and poses for `merge_clouds`, are then in metres times this factor.
         num_elements: number of surface elements, from that of the descriptors to that of the points of the first stage
-            of `model.config.pyramid`; those beyond the descriptors have no features, and make `register` of two clouds
-            more exact. None for the descriptors alone, which are surface elements too.
+            of `model.config.pyramid`. Elements beyond the descriptors have no features, and make `register` of two
+            clouds more exact. None for the descriptors alone, which are surface elements too.
 
     Returns:
         `model.config.num_descriptors` descriptors and the further elements, metres, same frame, in the order of

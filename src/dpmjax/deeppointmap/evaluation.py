@@ -46,7 +46,7 @@ UPRIGHT = AugmentConfig(
 
 
 class PairKind(NamedTuple):
-    """What the pairs of an evaluation are.
+    """Distances and sizes of the pairs of an evaluation.
 
     Attributes:
         min_distance_m: least distance between the two scans, or between the first scans of the two maps.
@@ -63,7 +63,7 @@ class Pairs(NamedTuple):
     """Pairs of one kind.
 
     Attributes:
-        kind: what they are.
+        kind: distances and sizes of the pairs.
         sources: (p, s) scans of the first map of each pair; the first scan is its frame.
         targets: (p, s) scans of the second map.
     """
@@ -148,7 +148,7 @@ def draw_evaluation_pairs(
         drive: scans with true poses.
         num_pairs: number of pairs of each kind; fewer where the drive has fewer.
         config: preprocessing and pyramid.
-        kinds: what the pairs are.
+        kinds: kinds of pairs.
         max_scans: a longer drive is thinned to this number of scans, evenly.
         seed: seed of the draws.
 

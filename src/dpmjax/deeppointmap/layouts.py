@@ -1,7 +1,7 @@
 """The sizes of the maps in a sample: a few fixed layouts for each stage, so that no step computes on empty rows.
 
 Attention over padded maps costs 5 times as much as over the scans that are there with groups of up to 4 scans, and 13
-times with 16. So the sizes of the groups are not drawn for each step: the layouts of a stage together hold them in the
+times with 16. So the sizes of the groups are not drawn for each step. The layouts of a stage together hold them in the
 proportions of the published draw, and the steps take the layouts in turn. Each layout compiles one step.
 """
 
@@ -28,9 +28,9 @@ GOLDEN = 0.6180339887498949
 def stage_layouts(max_group: int, config: SamplingConfig) -> tuple[Layout, ...]:
     """Makes the layouts of a stage.
 
-    The published draw of a group: two scans with `pair_probability`, else 2 to `max_group`, each number equally
-    likely. Half of the groups are split into one scan against all others, the rest anywhere. The two maps of a group
-    may change places, as the losses are symmetric; the smaller one is the first.
+    The published draw of a group: two scans with `pair_probability`, else 2 to `max_group`, each number equally likely.
+    One half of the groups is split into one scan against all others; the second half is split anywhere. The two maps of
+    a group may change places, as the losses are symmetric; the smaller one is the first.
 
     Args:
         max_group: scans in both maps of a group together, at most.

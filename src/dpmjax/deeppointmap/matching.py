@@ -42,11 +42,13 @@ class MatchConfig:
 
     Attributes:
         temperature: temperature of both softmaxes.
-        pair_ratio: number of pairs per direction, as a share of the mean size of the two clouds; ...
-        max_num_pairs: ... at most this many: more tell no more about one motion, and the consensus takes their cube.
+        pair_ratio: number of pairs per direction, as a share of the mean size of the two clouds.
+        max_num_pairs: largest number of pairs per direction; more pairs do not make a motion more exact, and the cost
+            of the consensus grows with their cube.
         max_offset_m: pairs with longer offsets are dropped.
-        min_inlier_score: pairs with higher scores are the first inliers ...
-        min_num_first: ... or this many of the best pairs, where those are fewer.
+        min_inlier_score: pairs with higher scores are the first inliers.
+        min_num_first: least number of first inliers; where fewer pairs have such scores, this number of the best pairs
+            is taken.
         num_rounds: number of times that the inliers are chosen again.
         inlier_sigmas: an inlier's error is at most the mean plus this many standard deviations of the inliers before.
         min_num_inliers: a choice of fewer inliers is rejected.
@@ -307,8 +309,8 @@ def merge_clouds(clouds: DescriptorCloud, T_map_cloud: Float[AnyArray, "s 4 4"])
             may be anything.
 
     Returns:
-        One cloud of capacity s * n, the s * m points with features in front, with the directions of the rays of all
-        clouds, and with their normals if they have some; positions are 0 where the mask is False.
+        One cloud of capacity s * n, the s * m points with features in front. It has the directions of the rays of all
+        clouds, and their normals if they have some. Positions are 0 where the mask is False.
 
     Raises:
         ValueError: if the shapes do not match.
@@ -365,7 +367,7 @@ def thinned_mask(
     cloud is nearer than the spacing of the first cloud: the median distance between its nearest descriptors.
 
     Args:
-        positions: of the clouds of the union, one after the other, in one frame, metres.
+        positions: of the clouds of the union, cloud by cloud, in one frame, metres.
         mask: False for descriptors that are not there.
         num_a_cloud: number of descriptors of each cloud.
 

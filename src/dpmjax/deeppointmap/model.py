@@ -195,8 +195,8 @@ def correlate(model: Model, a: DescriptorCloud, b: DescriptorCloud) -> tuple[Des
         b: the same.
 
     Returns:
-        Both clouds with correlated features; positions and masks stay as they are (zero where masked). Surface
-        elements are left out.
+        Both clouds with correlated features; positions and masks do not change (zero where masked). Surface elements
+        are left out.
     """
     a, b = a.described, b.described
     for name, cloud in (("a", a), ("b", b)):

@@ -32,7 +32,8 @@ class ObjectiveConfig:
         coarse_weight: weight of the coarse pairing loss.
         offset_weight: weight of the offset loss.
         temperature: temperature of both pairing losses.
-        positive_radius_m: the nearest descriptor within this radius is the positive; the others within it are neutral.
+        positive_radius_m: the nearest descriptor within this radius is the positive; further descriptors within it are
+            neutral.
         offset_radius_m: offsets are learned for all pairs within this radius.
         max_close: largest number of such pairs for each descriptor, the nearest first. Two scans need 4, maps of many
             scans need more.
@@ -54,10 +55,10 @@ class ObjectiveConfig:
 
 @flax.struct.dataclass
 class ClosePairs:
-    """The descriptors of the other cloud that lie close to each descriptor of one cloud, nearest first.
+    """Descriptors of a second cloud that lie close to each descriptor of a first one, nearest first.
 
     Attributes:
-        indices: row in the other cloud; 0 where `mask` is False.
+        indices: row in the second cloud; 0 where `mask` is False.
         mask: False where there are fewer.
         offsets: from the descriptor to its neighbour, metres, in the frame of the descriptor; 0 where `mask` is False.
     """

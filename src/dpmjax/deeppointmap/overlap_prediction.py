@@ -49,7 +49,7 @@ MAX_DISTANCE_M, MAX_DISAGREEMENT_M = 100.0, 5.0
 
 
 class OverlapEvidence(NamedTuple):
-    """Numbers that tell overlap; similarities are cosines, shares are in [0, 1].
+    """Features from which overlap is predicted; similarities are cosines, shares are in [0, 1].
 
     Attributes:
         scan_similarity: of the mean encoder features of both clouds.

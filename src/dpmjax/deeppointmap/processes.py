@@ -18,7 +18,7 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 TreeT = TypeVar("TreeT")
 BATCH_AXIS = "batch"
 AUTO = "auto"
-# A process without a heartbeat for this long counts as dead, and the others end.
+# A process without a heartbeat for this long counts as dead, and all processes end.
 _HEARTBEAT_TIMEOUT_S = 300
 
 
@@ -70,7 +70,7 @@ def place(tree: TreeT, mesh: Mesh, *axes: str) -> TreeT:
 
     Args:
         tree: without an axis, the same in every process. With `BATCH_AXIS`, the samples of this process, stacked along
-            the first axis; as many as this process has devices in the mesh, or a multiple.
+            the first axis. Their number is that of the devices of this process in the mesh, or a multiple.
         mesh: from `device_mesh`.
         *axes: `BATCH_AXIS` to spread the first axis over the devices; none to copy the tree to every device.
 

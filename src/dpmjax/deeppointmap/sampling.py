@@ -91,7 +91,7 @@ def draw_groups(
 
     Args:
         table: the scans.
-        first_anchor: anchor of one of the groups; those of the others are random.
+        first_anchor: anchor of one of the groups; all further anchors are random.
         layout: sizes of the groups.
         config: distances.
         rng: source of the draws.
@@ -127,8 +127,8 @@ def _group_at(
     chosen = rng.choice(others, min(sum(shape) - 1, len(others)), replace=False)
     members = rng.permutation(np.concatenate([[anchor], chosen]))
     num_source = min(shape[0], len(members) - 1)
-    # The scan nearest to the other map stands first, as the nearest keyframe does in SLAM. It is the frame of its map,
-    # and thinning keeps all its descriptors.
+    # The scan nearest to the opposite map stands first, as the nearest keyframe does in SLAM. It is the frame of its
+    # map, and thinning keeps all its descriptors.
     target = _nearest_first(table, members[num_source:], int(members[0]))
     return Group(_nearest_first(table, members[:num_source], int(target[0])), target)
 
@@ -172,7 +172,7 @@ class GroupBatch:
 
 @flax.struct.dataclass
 class SampleScans:
-    """The scans of a sample as they are stored, and the motion that each gets in the step.
+    """The stored scans of a sample, and the motion that each gets in the step.
 
     Attributes:
         pyramids: stored pyramids; spare rows repeat the first.
@@ -222,7 +222,7 @@ def arrange_groups(groups: Sequence[Group | None], layout: Layout, placed: Place
         One batch for each shape in the layout, in its order.
 
     Raises:
-        ValueError: if there are not as many poses as scans in the groups.
+        ValueError: if the number of poses is not that of the scans in the groups.
     """
     T_world_scan = placed.T_world_scan
     ends = np.cumsum([0 if group is None else len(group.rows) for group in groups])

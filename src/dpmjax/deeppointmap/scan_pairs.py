@@ -23,7 +23,7 @@ class ScanPair(NamedTuple):
 
     Attributes:
         source: points, metres, in the frame of the turned lidar.
-        target: points of the other scan.
+        target: points of the second scan.
         T_target_source: the true motion.
     """
 

@@ -78,7 +78,7 @@ def prepare_scan(model: Model, points: RawScan, *, scale: float = 1.0) -> Prepar
 
 
 def prepare_scans(model: Model, scans: Sequence[RawScan], *, scale: float = 1.0) -> list[PreparedScan]:
-    """Prepares scans one after the other; threads measure their surfaces while JAX encodes.
+    """Prepares scans in their order; threads measure their surfaces while JAX encodes.
 
     A `ValueError` says if the points of a scan are no real numbers (n, 3).
 
@@ -111,16 +111,16 @@ def register(
 ) -> Registration:
     """Registers two scans or maps without a first guess (DeepPointMap section 3.2).
 
-    Where both are scans, the best distinct motions of the descriptors are verified by the scans themselves: points
-    must meet surfaces and leave free space free. Where none of the first is clearly right, motions under which the
-    scans look alike from above are tried too; in corridors, motions along the axis and half-turns. The motion under
-    which the scans agree best is taken. Descriptor clouds
-    have no points: the best motion of the descriptors is taken, and refined by their surface elements.
+    For two scans, the scans themselves verify the best distinct motions of their descriptors: points must meet surfaces
+    and must not lie in free space. If none of these motions is clearly right, motions under which the scans look alike
+    from above are tried too. In corridors, motions along the axis and half-turns are added. The motion under which the
+    scans agree best is taken. Descriptor clouds have no points: the best motion of the descriptors is taken, and
+    refined by their surface elements.
 
     Args:
         model: encoder and decoder.
         source: a raw scan (n, 3) in metres, a scan from `prepare_scan`, or a descriptor cloud.
-        target: the same; one may be a scan and the other a map.
+        target: the same; a scan can be registered with a map.
         config: choice of pairs and inliers; None takes that of the model.
         refine: whether to end with a fine point-to-plane alignment: of two scans, or else of the surface elements of
             both clouds, if they have some. Without it, the motion of two scans is that of the short alignment that
@@ -130,11 +130,12 @@ def register(
             2 or 4 from the extent of both scans. Prepared scans know theirs. The result is in metres.
 
     Returns:
-        `T_target_source`, `confidence`, `rmse` and the pairs. The confidence is the probability that the motion is
-        right within 2 m and 5 degrees if the model is calibrated (`model.config.calibration`), else the mean score of
-        the pairs, which is no probability. A motion that only the views from above suggested has no inliers, and
-        without calibration the confidence 0. Failure is data: without any pair and without a view the motion is the
-        identity and the confidence 0; with fewer than three distinct pairs `rmse` is infinite.
+        `T_target_source`, `confidence`, `rmse` and the pairs. The confidence of a calibrated model
+        (`model.config.calibration`) is the probability that the motion is right within 2 m and 5 degrees. Without
+        calibration it is the mean score of the pairs, which is no probability. A motion that only the views from above
+        suggested has no inliers, and without calibration the confidence 0. Failure is data: without any pair and
+        without a view the motion is the identity and the confidence 0; with fewer than three distinct pairs `rmse` is
+        infinite.
 
     Raises:
         ValueError: if the points are no real numbers (n, 3), if features have another width than the model, if both
@@ -212,9 +213,10 @@ def overlap(model: Model, source: ScanOrCloud, target: ScanOrCloud) -> Float[Arr
     """Predicts the probability that two scans or maps overlap: that their origins are less than 20 m apart.
 
     A calibrated model (`model.config.overlap`, from `python -m experiments.dpm_calibrate`) rests it on the match of the
-    descriptors. It is fitted on simulated towns and buildings, where half of the pairs overlapped, a quarter was 20 to
-    40 m apart, and the rest farther or of other places: where overlap is rarer, the probability is too high. A model
-    without it answers with the decoder's head (DeepPointMap section 3.2), which is right for published weights only.
+    descriptors. It is fitted on simulated towns and buildings. Half of the pairs overlapped, a quarter was 20 to 40 m
+    apart, and a quarter was farther apart or of different places. Where overlap is rarer, the probability is too high.
+    A model without it answers with the decoder's head (DeepPointMap section 3.2), which is right for published weights
+    only.
 
     A `ValueError` says if the points are no real numbers (n, 3), or if features have another width than the model.
 
@@ -315,7 +317,8 @@ def _verified(
 
 
 def _refined(source: DescriptorCloud, target: DescriptorCloud, hypotheses: Registration, scale: float) -> _Motions:
-    # The elements alone cannot choose among hypotheses: in a corridor, or turned by half, others meet as many planes.
+    # The elements alone cannot choose among hypotheses: in a corridor, or after a half-turn, wrong ones meet the same
+    # number of planes.
     T_target_source = np.array(hypotheses.T_target_source[0], np.float64)
     if hypotheses.num_inliers[0] > 0 and np.isfinite(T_target_source).all():
         aligned = align_elements_on_host(source.elements, target.elements, T_target_source)

@@ -70,9 +70,9 @@ def train(
         The model, without calibration, and the progress.
 
     Raises:
-        ValueError: if there is no drive, or if `start` is a model of another network; or if a drive has no poses, no
-            scan that can be read, or no two scans at a distance of `config.sampling`; or if `cache` is given with
-            scans that are prepared already.
+        ValueError: if there is no drive, or `start` is a model of another network. Also if a drive has no poses, no
+            readable scan, or no two scans at a distance of `config.sampling`, and if `cache` is given with prepared
+            scans.
         TrainingLostError: if the loss is not finite.
     """
     if cache is not None and isinstance(drives, ScanStore):

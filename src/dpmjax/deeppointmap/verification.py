@@ -1,7 +1,7 @@
 """Verification of motion hypotheses by the scans themselves: surfaces that meet, and free space that stays free.
 
-A short point-to-plane alignment first brings a hypothesis to where the surfaces say that it should be. A right one then
-puts most points onto planes of the other scan, and hardly any into its free space.
+A short point-to-plane alignment first improves a hypothesis. A right one then puts most points of each scan onto planes
+of the opposite scan, and hardly any into its free space.
 """
 
 from __future__ import annotations
@@ -42,16 +42,17 @@ class EvidenceWeights:
     """Logistic model of P(right within 2 m and 5 degrees) of one motion, by shares of the points of both scans.
 
     Fitted by `python -m experiments.dpm_evidence` on simulated scenes, dense and sparse, out of doors and inside.
-    Walls are all surfaces that are not level.
+    Points of each scan are compared with the opposite scan, and are visible where that scan has measurements. Walls are
+    all surfaces that are not level.
 
     Attributes:
-        bias: the constant.
-        walls_met: points of walls that meet a plane where the other scan sees.
-        walls_visible: points of walls where the other scan sees.
-        walls_contradicted: points of walls in the free space of the other scan.
-        level_met: points of level surfaces that meet a plane where the other scan sees.
-        level_visible: points of level surfaces where the other scan sees.
-        level_contradicted: points of level surfaces in the free space of the other scan.
+        bias: constant term.
+        walls_met: weight of the share of points of walls that are visible and meet a plane.
+        walls_visible: weight of the share of points of walls that are visible.
+        walls_contradicted: weight of the share of points of walls that are visible and lie in free space.
+        level_met: weight of the share of points of level surfaces that are visible and meet a plane.
+        level_visible: weight of the share of points of level surfaces that are visible.
+        level_contradicted: weight of the share of points of level surfaces that are visible and lie in free space.
     """
 
     bias: float = -6.6
@@ -68,16 +69,16 @@ class SlidingConfig:
     """Search along a weak axis.
 
     Attributes:
-        max_weak_share: an axis is weak if its share of the information of the walls is smaller; 0.25 or more in streets
-            and rooms, 0.07 to 0.21 in corridors. 0 switches the search off.
+        max_weak_share: an axis is weak if its share of the information of the walls is smaller. The share is 0.25 or
+            more in streets and rooms, 0.07 to 0.21 in corridors. 0 switches the search off.
         step_m: distance of the motions that are tried.
         num_fine: number of them that are aligned finely.
         num_samples: number of elements of each scan that face the axis and are compared.
         max_count: number of elements that count at most at one position along the axis, so that an end wall is one
             observation; the two ends of a corridor may look alike.
-        contradicted: an element that faces the axis and lies in free space counts against a motion as so many that
-            meet count for it.
-        visible: the same of an element that the other scan sees.
+        contradicted: penalty of an element that faces the axis and lies in free space; an element that meets a plane
+            adds 1.
+        visible: the same for a visible element.
     """
 
     max_weak_share: float = 0.22
@@ -107,10 +108,10 @@ class VerificationConfig:
         refinement: alignment of the chosen one, for `register(..., refine=True)`; it starts where `fine` ended.
         num_fine: number of hypotheses that are aligned finely.
         num_samples: number of points of each scan that are compared.
-        plane_radius_m: a point meets a plane if a point of it is within this distance, ...
-        plane_distance_m: ... the plane itself is within this, ...
-        min_cosine: ... and the cosine between both normals is larger.
-        evidence: what the points of both scans say about a motion.
+        plane_radius_m: largest distance of a point from the nearest point of a plane that it meets.
+        plane_distance_m: largest distance of a point from a plane that it meets.
+        min_cosine: least cosine between the normals of a point and of a plane that it meets.
+        evidence: weights of the shares of points, which give the log odds of a motion.
         clear_score: no further hypothesis is tried after one with higher log odds.
         sliding: further motions where the walls hold one direction only, and their comparison.
     """
@@ -137,7 +138,7 @@ class VerificationConfig:
 
 
 class MeasuredScan(NamedTuple):
-    """What verification compares: the surface of a scan and its free space.
+    """Surface and free space of a scan, which verification compares.
 
     Attributes:
         surface: points, normals and a tree, in the frame of the lidar.
@@ -174,7 +175,7 @@ def verify_motion(
         config: tolerances.
 
     Returns:
-        Shares of points that are visible, that meet planes and that lie in free space, and what they say together.
+        Shares of points that are visible, that meet planes and that lie in free space, and the log odds of the motion.
     """
     return verify_motions(source, target, np.asarray(T_target_source)[None], config)[0]
 
@@ -191,7 +192,7 @@ def verify_motions(
         config: tolerances.
 
     Returns:
-        What `verify_motion` returns for each motion.
+        One result of `verify_motion` for each motion.
     """
     sides = _both_sides(source, target, T_target_source, config)
     is_thin = len(target.surface.points) < SPARSE_SHARE * len(source.surface.points)
@@ -207,13 +208,13 @@ def verify_motions(
 
 
 class ComparedScan(NamedTuple):
-    """Samples of a scan under several motions, in the other scan.
+    """Samples of a scan under several motions, compared with a second scan.
 
     Attributes:
-        meets: (s, n) whether a sample meets a plane of the other scan.
-        is_visible: (s, n) whether the other scan sees there.
-        is_contradicted: (s, n) whether it lies in the free space of the other scan.
-        is_level: (n,) whether it is of a level surface.
+        meets: (s, n) True for a sample that meets a plane of the second scan.
+        is_visible: (s, n) True for a sample where the second scan has measurements.
+        is_contradicted: (s, n) True for a sample in the free space of the second scan.
+        is_level: (n,) True for a sample of a level surface.
     """
 
     meets: Bool[np.ndarray, "s n"]
@@ -225,11 +226,11 @@ class ComparedScan(NamedTuple):
 def compare_scans(
     scan: MeasuredScan, other: MeasuredScan, T_other_scan: Float[np.ndarray, "s 4 4"], config: VerificationConfig
 ) -> ComparedScan:
-    """Compares the samples of one scan with the other scan.
+    """Compares the samples of one scan with a second scan.
 
     Args:
         scan: the scan whose samples are compared.
-        other: the other.
+        other: the second scan.
         T_other_scan: motions.
         config: number of samples and tolerances.
 
@@ -250,10 +251,10 @@ def compare_scans(
 def evidence_shares(
     source: MeasuredScan, target: MeasuredScan, T_target_source: Float[np.ndarray, "s 4 4"], config: VerificationConfig
 ) -> Float[np.ndarray, "s 6"]:
-    """Computes what `EvidenceWeights` weighs.
+    """Computes the shares that `EvidenceWeights` weighs.
 
-    Only what the other scan sees counts. So a motion that puts two scans onto each other gains nothing by it: level
-    ground meets level ground anywhere, but walls do not.
+    Only visible points count. So a motion that merely puts two scans onto each other gains nothing: level ground meets
+    level ground anywhere, but walls do not.
 
     Args:
         source: a scan.

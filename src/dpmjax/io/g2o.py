@@ -45,8 +45,9 @@ def read_g2o(path: str | Path, *, nearest_psd: bool = False) -> PoseGraph:
         The graph; nodes in the order of the file, those after FIX fixed.
 
     Raises:
-        InputError: no such file, an unknown line, a wrong number of values, graphs in the plane and in space in one
-            file, a repeated or missing node, or invalid poses or information matrices; line and edge are named.
+        InputError: no such file, an unknown line, a wrong number of values, or graphs in the plane and in space in one
+            file. Also a repeated or missing node, and invalid poses or information matrices. The message names line and
+            edge.
     """
     lines, fixed = _read_lines(path)
     vertices = [line for line in lines if TAGS[line.tag].num_nodes == 1]

@@ -24,9 +24,9 @@ _MULRAN_OUSTER_RPY_DEG = (0.0001, 0.0003, 179.6654)
 def read_kitti_odometry(folder: Path) -> Drive3D:
     """Lists a sequence of KITTI odometry.
 
-    Poses are searched in poses_lidar.txt (in the lidar's frame), in poses.txt beside velodyne/ (SemanticKITTI) and in
-    poses/NN.txt two folders up (both in the left camera's frame), and in files of other usual names (in the lidar's
-    frame). Rows of TUM are matched by time, others by the numbers of the scans.
+    Poses in the lidar's frame are searched in poses_lidar.txt. Poses in the left camera's frame are searched in
+    poses.txt beside velodyne/ (SemanticKITTI) and in poses/NN.txt two folders up. Last come files of other usual names,
+    in the lidar's frame. Rows of TUM are matched by time, others by the numbers of the scans.
 
     Args:
         folder: the folder that holds velodyne/.

@@ -30,8 +30,9 @@ _ENDINGS |= {"carmen": (".log", ".clf", ".log.gz", ".clf.gz")}
 _PLAUSIBLE_RANGE = {"m": (0.05, 500.0), "px": (2.0, 20000.0)}
 # Few planar lidars measure farther; a sequence with hardly any shorter beam may be in millimetres.
 _USUAL_M, _LEAST_USUAL_SHARE = 100.0, 0.05
-# Beams within this share of the largest range have it. They are the code for no echo where there are so many, this
-# share of all, in so many scans, and this share of the scans has other beams.
+# Beams within `_SAME_RANGE` of the largest range, as a share of it, have this range. They are the code for no echo if
+# their number, their share of all beams and the number of scans with them reach the limits. The last limit is the least
+# share of scans that also have other beams.
 _SAME_RANGE, _LEAST_MAXIMA, _LEAST_SHARE, _LEAST_SCANS, _LEAST_OTHERS = 1e-5, 20, 0.005, 3, 0.5
 _LARGEST_SPAN = 1.05 * 2.0 * np.pi  # Angles of one scan that span more are no radians.
 _LEAST_BEAMS = 17  # Lines are fitted to up to 17 neighbouring beams.
@@ -182,12 +183,12 @@ def read_arrays(path: str | Path, *, unit: Unit | None = None) -> ScanSequence:
 
     A `.npy` holds points (n, b, 2) in the sensor frame; the third coordinate of (n, b, 3) is ignored. A `.npz` holds
     `points` like that, or `ranges` (n, b) with `angles` (b,) or (n, b) in radians counter-clockwise from straight
-    ahead; and optionally `mask` (n, b), `poses` (the reference) and `odometry` as (n, 3) x, y, heading or (n, 3, 3)
-    `T_world_scan`, `times` (n,) in seconds, and `unit`, "px" or "m".
+    ahead. Optional arrays are `mask` (n, b), `times` (n,) in seconds, and `unit`, "px" or "m". Also optional are
+    `poses` (the reference) and `odometry`, as (n, 3) x, y, heading or (n, 3, 3) `T_world_scan`.
 
-    Angles that span more than a turn are taken as degrees. A beam is invalid where `mask` is False, where both
-    coordinates are NaN or one is infinite, or where its range is NaN, infinite or not positive (as scanner drivers
-    write a beam without echo). A beam with one NaN coordinate and a finite one is an error.
+    Angles that span more than a turn are taken as degrees. A beam is invalid where `mask` is False, or where both
+    coordinates are NaN or one is infinite. It is also invalid where its range is NaN, infinite or not positive, as
+    scanner drivers write a beam without echo. A beam with one NaN coordinate and a finite one is an error.
 
     Args:
         path: the file.

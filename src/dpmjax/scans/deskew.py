@@ -22,8 +22,8 @@ def deskew(
 
     Args:
         points: metres, each in the frame of the lidar at its own moment.
-        offsets: time of each point since the scan's pose, as a share of the time between two scans: a scan whose pose
-            is that of the middle of the turn has offsets from -0.5 to 0.5, if a turn ends where the next begins.
+        offsets: time of each point since the scan's pose, as a share of the time between two scans. A pose of the
+            middle of the turn gives offsets from -0.5 to 0.5, if a turn ends where the next begins.
         T_last_scan: motion of the lidar from one scan to the next.
 
     Returns:

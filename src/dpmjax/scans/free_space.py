@@ -1,4 +1,4 @@
-"""Free space between a lidar and what it measured: a point of another scan cannot lie there."""
+"""Free space between a lidar and the surfaces that it measured: a point of another scan cannot lie there."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from dpmjax.checks import require_positive_fields
 
 @dataclass(frozen=True)
 class RangeImageConfig:
-    """Resolution of a range image, and what lies clearly in front of it.
+    """Resolution of a range image, and margins of a contradiction.
 
     Attributes:
         pixel_deg: side of a pixel in azimuth and elevation.
-        margin_m: a point contradicts a measurement if it is nearer by more than this ...
-        margin_share: ... and by more than this share of its range.
+        margin_m: a point contradicts a measurement if it is nearer by more than this distance.
+        margin_share: the point must also be nearer by more than this share of its range.
     """
 
     pixel_deg: float = 2.0
@@ -43,7 +43,7 @@ class RangeImage(NamedTuple):
 
 
 class View(NamedTuple):
-    """How points of another scan lie in a range image.
+    """Visibility of the points of another scan in a range image.
 
     Attributes:
         is_visible: the lidar measured something in this direction, and the point is not far behind it.
@@ -77,7 +77,7 @@ def range_image(points: Float[np.ndarray, "n 3"], config: RangeImageConfig = Ran
 def view_points(
     image: RangeImage, points: Float[np.ndarray, "n 3"], config: RangeImageConfig = RangeImageConfig()
 ) -> View:
-    """Compares points with what the lidar of an image has measured in their directions.
+    """Compares points with the ranges that the lidar of an image has measured in their directions.
 
     Args:
         image: from `range_image` of the same configuration.
@@ -85,7 +85,7 @@ def view_points(
         config: resolution and margins.
 
     Returns:
-        What is visible, and what contradicts.
+        Masks of the points that are visible, and of those that contradict the image.
     """
     pixels, ranges = _project(points, config)
     nearest, farthest = image.nearest_m.ravel()[pixels], image.farthest_m.ravel()[pixels]

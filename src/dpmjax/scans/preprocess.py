@@ -72,8 +72,8 @@ def preprocess_scan(
     """Applies the range, voxel and outlier filters, in this order (DeepPointMap, supplement).
 
     Points that are not finite are dropped. The kept points stand in front, in their order, except that the point
-    farthest from the sensor is exchanged with the first: farthest-point sampling then starts at the rim, whatever the
-    order of the scan. A `ValueError` names an argument of a wrong shape.
+    farthest from the sensor is exchanged with the first. Farthest-point sampling then starts at the rim for any order
+    of the scan. A `ValueError` names an argument of a wrong shape.
 
     Args:
         points: (n, 3), metres, in the frame of the lidar.

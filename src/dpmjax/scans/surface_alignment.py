@@ -25,7 +25,7 @@ class AlignmentLevel:
     """One radius of the pairs.
 
     Attributes:
-        radius_m: a point is paired with the nearest point of the other surface within this distance.
+        radius_m: a point is paired with the nearest point of the opposite surface within this distance.
         num_points: number of points that are paired.
         num_iterations: largest number of steps.
         kernel_m: width of the kernel; None for that of the configuration.
@@ -50,8 +50,8 @@ class AlignmentConfig:
     Attributes:
         levels: coarse to fine.
         min_cosine: surfaces are paired if the cosine between their normals is larger; it weighs the pair.
-        kernel_share: width of the Geman-McClure kernel, as a share of the radius ...
-        min_kernel_m: ... and at least this.
+        kernel_share: width of the Geman-McClure kernel, as a share of the radius.
+        min_kernel_m: least width of the kernel.
         converged_m: a level ends after a shorter step.
         converged_rad: the same for the rotation.
     """
@@ -117,7 +117,8 @@ class NearestPlanes(NamedTuple):
     """Samples of the source under several motions, and the planes of the target nearest to them.
 
     Attributes:
-        is_paired: (s, n) whether a point of the target is within the radius; the rest means nothing elsewhere.
+        is_paired: (s, n) True if a point of the target is within the radius; all further fields are undefined where it
+            is False.
         points: (s, n, 3) samples in the frame of the target.
         residuals: (s, n) signed distances to the planes, metres.
         normals: (s, n, 3) normals of the planes.
@@ -198,7 +199,7 @@ def align_surfaces_from(
         config: levels and kernel.
 
     Returns:
-        What `align_surfaces` returns for each guess.
+        One result of `align_surfaces` for each guess.
     """
     T = np.array(T_target_source, np.float64)
     rmse, num_pairs = np.full(len(T), np.inf), np.zeros(len(T), int)

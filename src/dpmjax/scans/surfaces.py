@@ -33,9 +33,9 @@ class SurfaceConfig:
         max_range_m: farther points are too sparse and are dropped.
         voxel_size_m: the first point of each voxel is kept.
         num_neighbours: number of neighbours of a normal, the point itself among them.
-        neighbour_radius_m: neighbours farther away do not count, ...
-        sparse_radius_share: ... unless the scan is so sparse that this share of the median distance of the last
-            neighbour is more.
+        neighbour_radius_m: neighbours farther away do not count.
+        sparse_radius_share: the radius is at least this share of the median distance of the last neighbour, for sparse
+            scans.
     """
 
     min_range_m: float = 1.0
@@ -60,8 +60,8 @@ class Surface(NamedTuple):
         normals: (n, 3) unit normals, either side; any where `flatness` is 0.
         flatness: (n,) in [0, 1], how much the neighbourhood is a plane: (l2 - l1) / l3 of the eigenvalues of its
             covariance, smallest first; 0 where there are too few neighbours.
-        samples: rows of flat points in random order, those of the three main directions of normals in turn, so that
-            the first few tell as much about each direction (normal-space sampling, Rusinkiewicz and Levoy 2001).
+        samples: rows of flat points in random order, those of the three main directions of normals in turn. So the
+            first few constrain each direction equally (normal-space sampling, Rusinkiewicz and Levoy 2001).
         tree: a tree of the points.
     """
 

@@ -41,10 +41,10 @@ class ViewCorrelationConfig:
         full_extent_m: horizontal range of a tenth of the points of a scan that needs whole cells.
         num_cells: cells along a side; points within 0.36 sides and shifts up to 0.27 sides do not wrap around.
         num_turns: turns of a circle.
-        num_directions: images by the direction of the normals; one more holds what is no surface.
+        num_directions: images by the direction of the normals; one more image holds points without a surface.
         num_motions: distinct motions that are returned; 0 switches the search off.
-        distinct_cells: two motions differ by more than this, ...
-        distinct_turns: ... or by more than so many steps of the turn.
+        distinct_cells: two motions are distinct if they differ by more cells than this.
+        distinct_turns: two motions are also distinct if they differ by more steps of the turn than this.
     """
 
     cell_m: float = 1.0

@@ -1,8 +1,8 @@
 """The ideal planar lidar: exact meeting points of beams with a world of unit pixel squares, and scans of a walk.
 
-Frame: pixel `is_obstacle[row, col]` fills the square [col, col + 1) x [row, row + 1); x points right along the columns,
-y points up along the rows (row 0 is the lowest), so that the world is right-handed and a plot with the origin below
-shows it as it is. Angles are counter-clockwise from x.
+Frame: pixel `is_obstacle[row, col]` fills the square [col, col + 1) x [row, row + 1). The x axis points right along the
+columns, y points up along the rows (row 0 is the lowest). So the world is right-handed, and a plot with the origin
+below shows it without a flip. Angles are counter-clockwise from x.
 """
 
 from __future__ import annotations

@@ -33,7 +33,7 @@ _ROUTES = ("loop", "there_and_back", "wander")
 
 @dataclass(frozen=True)
 class SceneMixture:
-    """What scenes are drawn from.
+    """Distribution from which scenes are drawn.
 
     Attributes:
         kinds: kinds of place, outdoors and indoors, with their weights.
@@ -98,7 +98,7 @@ class Scene:
 
     Attributes:
         seed: of everything random in it.
-        place: what the place is like.
+        place: configuration of the town or the building.
         motion: how the lidar is moved, `DriveConfig` in a town, `WalkConfig` in a building.
         sensor: the lidar.
         scale: factor of points and poses.
@@ -159,7 +159,7 @@ def draw_scene(seed: int, mixture: SceneMixture = SceneMixture()) -> Scene:
 
     Args:
         seed: of all choices, not negative.
-        mixture: what is drawn from.
+        mixture: distribution of scenes.
 
     Returns:
         The scene.
@@ -239,7 +239,7 @@ def simulate_scenes(seeds: Sequence[int], mixture: SceneMixture = SceneMixture()
 
     Args:
         seeds: one for each scene.
-        mixture: what is drawn from.
+        mixture: distribution of scenes.
 
     Returns:
         One sequence a seed.
@@ -262,7 +262,7 @@ def simulate_drive(
         length_m: length of the way outdoors; indoors a quarter of it.
         kind: kind of place; None draws one.
         sensor: the lidar; None draws one.
-        mixture: what is drawn from; its `length_m` does not count.
+        mixture: distribution of scenes; its `length_m` does not count.
 
     Returns:
         The sequence, with exact poses and times; a scan is simulated when it is read.

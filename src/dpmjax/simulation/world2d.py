@@ -1,10 +1,10 @@
 """Binary worlds of 1024 x 1024 pixels in the manner of DeepMapping Figure 4, each made by its seed.
 
-The index selects one of three kinds in turn. 0 is an office (rooms cut out of rooms), 1 a yard (free-standing blocks,
-open to the border of the image), 2 a clinic (a corridor between two rows of rooms). All are furnished with round,
-square and three-cornered obstacles, so that no two places look alike. Two more kinds have names only: a grove (trees,
-bushes and rocks within the edge of a forest, without a straight wall) and a crowd (an office with walking people). The
-frame is that of `raycast`: row 0 is the lowest.
+The index selects one of three kinds in turn. 0 is an office (rooms cut out of rooms). 1 is a yard (free-standing
+blocks, open to the border of the image). 2 is a clinic (a corridor between two rows of rooms). All are furnished with
+round, square and three-cornered obstacles, so that no two places look alike. Two more kinds have names only: a grove
+(trees, bushes and rocks within the edge of a forest, without a straight wall) and a crowd (an office with walking
+people). The frame is that of `raycast`: row 0 is the lowest.
 """
 
 from __future__ import annotations

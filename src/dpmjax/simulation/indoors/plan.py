@@ -85,10 +85,10 @@ def make_plan(rng: np.random.Generator, kind: str) -> Plan:
 
     Args:
         rng: source of all choices.
-        kind: "office": rooms on both sides of a corridor; "hall": one to three halls in a row, with side rooms;
-            "flat": small rooms on both sides of a short corridor; "corridor": one long corridor or tunnel with up to
-            three side rooms; "tunnel": a longer tunnel; "garage": one low and wide room; "stairs": flights of stairs
-            and landings in a row.
+        kind: kind of building. An "office" has rooms on both sides of a corridor, a "flat" small rooms on both sides of
+            a short one. A "hall" is a row of one to three halls with side rooms, a "garage" one low and wide room. A
+            "corridor" is one long corridor or tunnel with up to three side rooms, a "tunnel" a longer tunnel. "stairs"
+            are flights of stairs and landings in a row.
 
     Returns:
         The plan.

@@ -2,7 +2,7 @@
 
 A scan of 100,000 rays against 30,000 boxes would need 3e9 tests. The nearest bodies are picked once a scan, and each
 sector of some degrees has a list of them, nearest first. A band of rays goes through its list until all its rays have
-met something nearer than what is left.
+met something nearer than the remaining bodies.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from dpmjax.simulation.town.intersect import Cross, cross_box, cross_cylinder, c
 from dpmjax.simulation.town.primitives import GROUND, NOTHING, Bodies
 
 _KINDS: tuple[Cross, ...] = (cross_box, cross_cylinder, cross_spheroid)
-# Bodies that a band of rays is tested against before it asks whether it is done.
+# A band of rays is tested against this number of bodies between two checks of the loop condition.
 _AT_ONCE = 2
 _ON_NOTHING, _ON_GROUND = -2, -1
 
@@ -66,7 +66,7 @@ class _Band(NamedTuple):
 
 
 class _Found(NamedTuple):
-    """What rays have met so far: the range, the body's row (of all kinds together) and the optical depth left."""
+    """First hits so far: the range, the body's row (of all kinds together) and the optical depth left."""
 
     ranges: Float[Array, "c b"]
     rows: Int[Array, "c b"]
@@ -76,10 +76,10 @@ class _Found(NamedTuple):
 def cast_turn(
     near: NearWorld, T_world_lidar: Float[Array, "4 4"], rays: Rays, *, max_range: float, config: CastConfig
 ) -> Hits:
-    """Follows all rays of a turn to what they meet first, without noise and loss.
+    """Follows all rays of a turn to their first hits, without noise and loss.
 
     Args:
-        near: what lies near the sensor.
+        near: bodies and ground near the sensor.
         T_world_lidar: pose of the sensor.
         rays: by sector.
         max_range: m.
@@ -113,7 +113,7 @@ def cast_turn(
 
 
 def _cast_band(near: NearWorld, bodies: Bodies, height: Float[Array, ""], band: _Band, max_range: float) -> Hits:
-    """What the rays of a band meet first; `height` is the sensor's, `bodies` those of all kinds."""
+    """Finds the first hits of the rays of a band; `height` is the sensor's, `bodies` those of all kinds."""
     down = cross_ground(near.ground, band.offset.at[2].add(height), band.directions, max_range)
     is_down = down <= max_range
     rows = jnp.where(is_down, _ON_GROUND, _ON_NOTHING)
@@ -129,7 +129,7 @@ def _cast_band(near: NearWorld, bodies: Bodies, height: Float[Array, ""], band: 
 def _meet_bodies(
     found: _Found, kind: NearBodies, lists: SectorLists, band: _Band, cross: Cross, first_row: int
 ) -> _Found:
-    """Tests the rays against the bodies of one kind, nearest first, until none can be nearer than what was met."""
+    """Tests the rays against the bodies of one kind, nearest first, until none can be nearer than the hits so far."""
     reach = jnp.linalg.norm(band.offset)
 
     def is_open(carry: tuple[Array, _Found]) -> Array:

@@ -1,6 +1,6 @@
-"""Picks what a scan can meet: the nearest bodies of each kind, the ground around, a list of bodies for each sector.
+"""Picks the bodies that a scan can meet: the nearest of each kind, the ground around, a list of bodies for each sector.
 
-What is picked has the same shapes in every world, so that the ray caster compiles once for each sensor.
+The selection has the same shapes in every world, so that the ray caster compiles once for each sensor.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ _CORNERS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1
 
 @dataclass(frozen=True)
 class CastConfig:
-    """How much of the world a scan looks at.
+    """Capacities of the part of the world that a scan can meet.
 
     Attributes:
         num_boxes: nearest boxes that take part.
@@ -64,7 +64,7 @@ class NearBodies(NamedTuple):
 
 
 class NearWorld(NamedTuple):
-    """What lies near the sensor.
+    """Bodies and ground near the sensor.
 
     Attributes:
         boxes: nearest boxes, those of the traffic among them.
@@ -84,7 +84,7 @@ class SectorLists(NamedTuple):
 
     Attributes:
         rows: rows of the bodies; those from `counts` on have no meaning.
-        counts: how many bodies a sector has.
+        counts: number of bodies of a sector.
     """
 
     rows: Int[Array, "*s c"]
@@ -101,11 +101,11 @@ def near_world(
         town: the world.
         start: position of the sensor, m.
         time: s, for the traffic.
-        max_range: what lies beyond this is left out, m.
+        max_range: bodies beyond this range are left out, m.
         config: capacities.
 
     Returns:
-        What lies near, in shapes that depend on the capacities alone.
+        Bodies and ground near the sensor, in shapes that depend on the capacities alone.
     """
     boxes = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), town.boxes, traffic_boxes(town.traffic, start, time))
     kinds = (boxes, config.num_boxes), (town.cylinders, config.num_cylinders), (town.spheroids, config.num_spheroids)

@@ -25,13 +25,13 @@ _DRIVE_STREAM = 8151
 
 @dataclass(frozen=True)
 class DriveConfig:
-    """How the car drives.
+    """Settings of the drive.
 
     Attributes:
         speed_m_s: on straight streets; in corners it is a third of that at least.
         rate_hz: scans per second.
         length_m: way that is driven; None for once round (a closed route) or to the end.
-        is_reversed: the other way round, in the other lane.
+        is_reversed: drives the route from its end to its start, in the opposite lane.
         sensor_height_m: above the ground.
         sway_m: standard deviation of the way the car wanders in its lane.
         max_turn_deg_s: the car slows down in corners until it turns no faster; cars turn at 20 to 40 degrees a second.
@@ -78,8 +78,8 @@ def simulate_lidar_sequence(
 
     Args:
         seed: of the town, the drive and the noise: the same sequence every time.
-        config: what the town is like.
-        driving: how the car drives; None takes the default with the sensor's own height.
+        config: settings of the town.
+        driving: settings of the drive; None takes the default with the sensor's own height.
         sensor: the lidar.
         trajectory: (n, 4, 4) `T_world_lidar` of a real drive to lay the street along, see `make_town`.
 

@@ -45,9 +45,9 @@ def furnish(rng: np.random.Generator, streets: Streets, plots: Plots, kind: Kind
 
     Args:
         rng: source of all choices.
-        streets: where the streets are.
-        plots: the ground that is free; taken from as it is built upon.
-        kind: what the place is like.
+        streets: lines and widths of the streets.
+        plots: free ground; each new object takes its part of it.
+        kind: densities and sizes of the kind of place.
 
     Returns:
         The rows of primitives.
@@ -98,7 +98,7 @@ def _verge(into: Collection, rng: np.random.Generator, side: _Side) -> None:
 
 
 def _roadside(into: Collection, rng: np.random.Generator, side: _Side) -> None:
-    """What stands beside a road without pavement: delineators, signs, poles of a line."""
+    """Adds the objects beside a road without pavement: delineators, signs, poles of a line."""
     lines = [(float(rng.uniform(25, 50)), 0.06, 1.0, 0.7)]
     if rng.random() < 0.5:
         lines.append((float(rng.uniform(30, 50)), 0.12, 7.5, 2.5))
@@ -114,7 +114,7 @@ def _roadside(into: Collection, rng: np.random.Generator, side: _Side) -> None:
 
 
 def _houses(into: Collection, rng: np.random.Generator, side: _Side) -> None:
-    """The first row: houses with their gardens, fronts in line but for some decimetres, unless the gardens differ."""
+    """Adds the first row: houses with gardens, fronts in line within some decimetres unless the gardens differ."""
     quarter, way = side.quarter, float(rng.uniform(0, 6))
     line = rng.uniform(*quarter.setback)
     while way < side.length:
@@ -212,7 +212,7 @@ def _put_cabinet(into: Collection, rng: np.random.Generator, place: Place) -> No
 
 
 def _second_row(into: Collection, rng: np.random.Generator, side: _Side) -> None:
-    """What is seen through the gaps: houses and trees behind the first row."""
+    """Adds the second row: houses and trees that are visible through the gaps of the first."""
     way = float(rng.uniform(0, 15))
     while way < side.length:
         width, depth = rng.uniform(8, 20), rng.uniform(7, 12)

@@ -1,4 +1,4 @@
-"""Where rays meet boxes, their windows, cylinders, spheroids and the ground.
+"""Intersections of rays with boxes, their windows, cylinders, spheroids and the ground.
 
 Bodies are relative to the rays' common start. Solid and soft bodies share one rule: the way that is gone inside. A ray
 that starts inside a body enters it at a negative distance, which the caller treats as a miss: the sensor's own car is
@@ -219,7 +219,7 @@ def cross_ground(
 
 
 def _false_position(bracket: tuple[Array, Array, Array, Array], margin: float) -> Array:
-    """Where a straight line between the ends of the bracket is zero, kept off the ends by a part of its length."""
+    """Returns the zero of the line between the ends of the bracket, kept off the ends by a part of its length."""
     near, far, above, below = bracket
     return near + (far - near) * jnp.clip(above / jnp.maximum(above - below, 1e-9), margin, 1.0 - margin)
 

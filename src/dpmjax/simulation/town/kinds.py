@@ -10,7 +10,7 @@ Span = tuple[float, float]
 
 @dataclass(frozen=True)
 class Quarter:
-    """What a street looks like. Distances in metres.
+    """Houses, gardens and trees along a street. Distances in metres.
 
     Attributes:
         setback: from the kerb to the house fronts.
@@ -43,10 +43,10 @@ class Quarter:
 
 @dataclass(frozen=True)
 class Kind:
-    """What a place is like.
+    """Streets, land and traffic of a kind of place.
 
     Attributes:
-        quarters: what its streets look like.
+        quarters: kinds of its streets.
         shares: of the quarters.
         half_width: of the streets, from the middle to the kerb, m.
         steepness: typical slope of the land, rise over run.

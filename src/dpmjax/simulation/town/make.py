@@ -28,7 +28,7 @@ _TOWN_STREAM = 8150
 
 @dataclass(frozen=True)
 class TownConfig:
-    """What a town is like.
+    """Settings of a town.
 
     Attributes:
         kind: of the place: suburb, canyon (tall houses), country, car_park, campus, wood, field, or jam (queues of
@@ -64,7 +64,7 @@ class Town:
         name: with its seed, for titles.
         streets: the streets and the route, on the host.
         terrain: the ground, on the host.
-        primitives: what a beam meets, on the device.
+        primitives: bodies and ground that a beam meets, on the device.
     """
 
     name: str
@@ -78,7 +78,7 @@ def make_town(seed: int, config: TownConfig = TownConfig(), *, trajectory: Array
 
     Args:
         seed: of all choices, not negative.
-        config: what the town is like; with a trajectory, its route and slopes do not count.
+        config: settings of the town; with a trajectory, its route and slopes do not count.
         trajectory: (n, 4, 4) `T_world_lidar` of a real drive, z up (of KITTI: in the lidar's frame, not the camera's).
             One street is laid along it, and the ground goes 1.73 m below it, at one height for all passes of a place.
 

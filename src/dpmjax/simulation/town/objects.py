@@ -46,7 +46,7 @@ class Place:
     heading: float
 
     def move(self, along: float, left: float) -> Place:
-        """The place so many metres ahead and to the left."""
+        """Returns the place at these distances ahead and to the left, m."""
         cos, sin = np.cos(self.heading), np.sin(self.heading)
         return Place(self.x + cos * along - sin * left, self.y + sin * along + cos * left, self.ground, self.heading)
 

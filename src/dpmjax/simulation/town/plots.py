@@ -24,7 +24,7 @@ class Plots:
         self._is_taken = np.zeros(terrain.heights.shape, bool)
 
     def claim(self, place: Place, size: Size, kerb_distance: float) -> bool:
-        """Takes a rectangle if all of it is free.
+        """Takes a rectangle if it is free.
 
         Args:
             place: its middle.
@@ -32,7 +32,7 @@ class Plots:
             kerb_distance: no part may be nearer than this to a kerb, m; negative allows to stand on the street.
 
         Returns:
-            Whether it was free.
+            True if it was free.
         """
         cells = self._cells(place, size)
         if (cells < 0).any() or (cells >= np.array(self._is_taken.shape)[::-1]).any():
@@ -44,7 +44,7 @@ class Plots:
         return True
 
     def are_free(self, positions: FloatArray, kerb_distance: float) -> BoolArray:
-        """Which places are free.
+        """Finds the free places.
 
         Args:
             positions: (n, 2) x and y, m, on the terrain.

@@ -1,4 +1,4 @@
-"""What a town is made of, as the ray caster sees it: boxes, poles, spheroids, a height field, and traffic on lanes.
+"""Primitives of a town for the ray caster: boxes, poles, spheroids, a height field, and traffic on lanes.
 
 Lists have a capacity (a power of two) and a mask, so that towns of similar size share one compiled kernel. All
 coordinates are in the world frame: metres, z up.
@@ -21,7 +21,8 @@ CELL_M = 0.5
 """Distance of the nodes of the ground."""
 # Road users nearer to the sensor than this are left out: the sensor's own car is there.
 _CLEARANCE_M = 4.0
-# Half lengths of cars; what is shorter walks, what is longer is a lorry: one box above the street.
+# Least and largest half length of cars. Shorter road users are people, longer ones are lorries: one box above the
+# street.
 _CAR_LENGTH_M = (0.5, 2.9)
 
 
@@ -130,7 +131,7 @@ class TownPrimitives(NamedTuple):
 
 
 def capacity_for(count: int, *, least: int = 64) -> int:
-    """The power of two that holds so many entries.
+    """Returns the power of two that holds this number of entries.
 
     Args:
         count: number of entries.

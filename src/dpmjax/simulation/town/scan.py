@@ -131,12 +131,12 @@ def scan_town(
         time: s, moves the traffic.
         key: of noise, lost returns and foliage.
         sensor: the lidar.
-        motion: (6,) twist of the sensor during one turn (m, radians; see `geometry.se3.exp`), in its own frame: points
-            stay in the frame of the moment of their beam, as a raw scan's do. None for a sensor that stands still.
+        motion: (6,) twist of the sensor during one turn (m, radians; see `geometry.se3.exp`), in its own frame. Points
+            stay in the frame of the moment of their beam, as in a raw scan. None for a sensor that stands still.
 
     Returns:
-        (b, 3) points in the sensor frame, m, with b = beams times azimuths: beam by beam from the highest down, each
-        clockwise from straight behind; masked where nothing came back (points there are zero).
+        (b, 3) points in the sensor frame, m, with b = beams times azimuths. Their order is beam by beam from the
+        highest down, each clockwise from straight behind. They are masked, and zero, where no return came back.
 
     Raises:
         ValueError: the pose is not (4, 4), or the motion not (6,).

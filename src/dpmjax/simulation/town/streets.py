@@ -26,7 +26,7 @@ class Streets:
     Attributes:
         paths: (k, 2) points of each street at steps of half a metre, from side street to side street.
         half_widths: from the middle to the kerb, m, of each street.
-        lanes: (k, 2) points of the long ways that traffic takes, in one direction; it also takes them in the other.
+        lanes: (k, 2) points of the long ways of the traffic, in one direction; traffic drives in both directions.
         route: (k, 2) points of the drive's middle line at steps of half a metre.
         is_closed: the route ends where it began.
     """
@@ -45,8 +45,8 @@ def make_streets(
 
     Args:
         rng: source of all choices.
-        kind: "loop": once round some blocks; "there_and_back": down a street, round a block and back on the other side
-            of the street, round a block there; "wander": at random, and home by the shortest way.
+        kind: route. "loop" goes once round some blocks. "there_and_back" goes down a street, round a block, back on the
+            opposite side of the street, and round a block there. "wander" goes at random, and home by the shortest way.
         length: wanted length of the route, m; met within a block or two.
         block: side of a block, m.
         half_width: narrowest and widest street, from the middle to the kerb, m.
@@ -157,7 +157,7 @@ def _wander(rng: np.random.Generator, side: int, num_blocks: int) -> list[tuple[
 
 
 def _neighbours(route: list[tuple[int, int]], side: int) -> list[tuple[int, int]]:
-    """Where the route can go on without turning on the spot."""
+    """Returns the corners to which the route can continue without a turn on the spot."""
     i, j = route[-1]
     steps = [(i + 1, j), (i - 1, j), (i, j + 1), (i, j - 1)]
     return [s for s in steps if s != route[-2] and 0 <= s[0] < side and 0 <= s[1] < side]
@@ -168,7 +168,7 @@ def lane_of(streets: Streets, *, is_reversed: bool) -> FloatArray:
 
     Args:
         streets: with the route.
-        is_reversed: drive the route the other way round, on the other side of the street.
+        is_reversed: True for the lane of the route in reverse, on the opposite side of the street.
 
     Returns:
         (k, 2) points at steps of about half a metre.
