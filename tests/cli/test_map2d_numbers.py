@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from dpmjax.cli.map2d_numbers import corrected_numbers, planar_errors, report
+from dpmjax.cli.map2d_numbers import corrected_numbers, planar_errors, report, spans_of
 from dpmjax.geometry import se2
 from dpmjax.simulation import simulate_sequence
 
@@ -50,3 +50,10 @@ def test_the_last_lines_name_the_uncertain_scans_and_the_fault() -> None:
     assert "uncertain where 4 scans are" in text
     assert text.endswith("3-5, 9")
     assert "the scans are mirrored\n" in text
+
+
+@pytest.mark.parametrize(
+    ("rows", "spans"), [([], []), ([4], ["4"]), ([3, 4, 5, 9], ["3-5", "9"]), ([0, 2, 3], ["0", "2-3"])]
+)
+def test_numbers_of_scans_are_spans(rows: list[int], spans: list[str]) -> None:
+    assert spans_of(rows) == spans

@@ -137,7 +137,7 @@ def spans_of(rows: Sequence[int]) -> list[str]:
     """Returns increasing numbers as spans, such as 3-5 and 9."""
     breaks = np.flatnonzero(np.diff(rows) > 1) + 1
     parts = np.split(np.asarray(rows), breaks)
-    return [f"{part[0]}-{part[-1]}" if len(part) > 1 else f"{part[0]}" for part in parts]
+    return [f"{part[0]}-{part[-1]}" if len(part) > 1 else f"{part[0]}" for part in parts if len(part)]
 
 
 def report(unit: str, numbers: Mapping[str, Any]) -> str:
