@@ -11,13 +11,22 @@ from dpmjax.geometry import rigid
 from dpmjax.scans.surfaces import surface_of_elements
 from dpmjax.slam import KeyframeMap, OdometryConfig
 from dpmjax.slam.keyframes import Keyframe, MapEdge, add_keyframe
-from dpmjax.slam.local_map import PlacedElements, joined_surface, local_map_of, nearest_keyframe, placed_scan, with_scan
+from dpmjax.slam.local_map import (
+    RECENT_SHARE,
+    PlacedElements,
+    joined_surface,
+    local_map_of,
+    nearest_keyframe,
+    placed_scan,
+    with_scan,
+)
 from dpmjax.types import SurfaceElements
 from tests.slam.truth import compact_of, laps, number_of, pose
 
 CONFIG = OdometryConfig(num_keyframes=5, num_recent=3)
 TRUTH = laps(1, side_m=20.0, step_m=2.0)
-SPACING_M = 0.8
+EXTENT_M = 10.0
+SPACING_M = RECENT_SHARE * EXTENT_M
 
 
 def chain(T_world_keyframe: np.ndarray, missing_edge: int | None = None) -> KeyframeMap:
@@ -79,26 +88,26 @@ def test_a_local_map_moves_with_the_frame_of_the_map() -> None:
 def test_a_scan_that_adds_nothing_does_not_join() -> None:
     recent = (PlacedElements(np.eye(4), elements_at(5.0)),)
     for T in (pose(0, 0, 0), pose(0.99 * SPACING_M, 0, 0), pose(0, 0, 0.16)):
-        assert with_scan(recent, PlacedElements(T, elements_at(5.0)), SPACING_M, CONFIG) is recent
+        assert with_scan(recent, PlacedElements(T, elements_at(5.0)), EXTENT_M, CONFIG) is recent
     for T in (pose(1.01 * SPACING_M, 0, 0), pose(0, 0, 0.18)):
         placed = PlacedElements(T, elements_at(5.0))
-        joined = with_scan(recent, placed, SPACING_M, CONFIG)
+        joined = with_scan(recent, placed, EXTENT_M, CONFIG)
         assert joined == (*recent, placed)
         # The distance is that from the last scan that has joined.
-        assert with_scan(joined, placed, SPACING_M, CONFIG) is joined
-        assert len(with_scan(joined, recent[0], SPACING_M, CONFIG)) == 3
-    assert with_scan((), recent[0], SPACING_M, CONFIG) == recent
+        assert with_scan(joined, placed, EXTENT_M, CONFIG) is joined
+        assert len(with_scan(joined, recent[0], EXTENT_M, CONFIG)) == 3
+    assert with_scan((), recent[0], EXTENT_M, CONFIG) == recent
 
 
 def test_the_oldest_of_too_many_scans_leaves() -> None:
     recent: tuple[PlacedElements, ...] = ()
     for step in range(1, 6):
-        recent = with_scan(recent, PlacedElements(pose(step, 0, 0), elements_at(5.0 + step)), SPACING_M, CONFIG)
+        recent = with_scan(recent, PlacedElements(pose(step, 0, 0), elements_at(5.0 + step)), EXTENT_M, CONFIG)
     assert [placed.T_map_scan[0, 3] for placed in recent] == [3, 4, 5]
     surface = local_map_of(chain(TRUTH[:3]), recent, CONFIG).surface
     np.testing.assert_allclose(sorted(surface.points[-3:, 0]), [8 + 3, 9 + 4, 10 + 5], atol=1e-5)
     assert len(surface.points) == 3 + 3
-    assert with_scan((), recent[0], SPACING_M, replace(CONFIG, num_recent=0)) == ()
+    assert with_scan((), recent[0], EXTENT_M, replace(CONFIG, num_recent=0)) == ()
 
 
 def test_a_placed_scan_has_the_flat_elements() -> None:

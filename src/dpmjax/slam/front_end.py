@@ -15,7 +15,6 @@ from dpmjax.deeppointmap.compact_scans import CompactScan
 from dpmjax.geometry import rigid
 from dpmjax.scans.deskew import deskew
 from dpmjax.slam.alignment import Alignment, ThinnedScan, best_of
-from dpmjax.slam.config import OdometryConfig
 from dpmjax.slam.keyframes import (
     EdgeKind,
     Keyframe,
@@ -41,9 +40,6 @@ from dpmjax.slam.local_map import (
 from dpmjax.slam.methods import SlamMethods
 from dpmjax.slam.reports import ScanReport, ScanStatus
 from dpmjax.types import AnyArray
-
-RECENT_SHARE = 0.08
-"""Smallest distance between the last scans of the local map, as a share of the extent."""
 
 NEAR_M = 2.0
 """Poses farther apart are of other places."""
@@ -161,7 +157,8 @@ def step(
         return _make_keyframe(methods, state, slam_map, thinned, located)
     after = _advanced(methods, state, located)
     if located.status != "predicted":
-        recent = with_scan(state.recent, *_placed(methods, thinned, located.T_keyframe_scan))
+        placed = placed_scan(thinned.measured.surface, located.T_keyframe_scan)
+        recent = with_scan(state.recent, placed, thinned.extent_m, methods.config.odometry)
         if recent is not state.recent:
             surface = joined_surface((*local_map.keyframes, *recent))
             after = after._replace(recent=recent, local_map=local_map._replace(surface=surface))
@@ -190,12 +187,6 @@ def _pass_over(state: FrontEndState, slam_map: KeyframeMap) -> tuple[FrontEndSta
     located = Located(state.T_keyframe_last @ state.T_before_last, "empty", "too few points", 0.0, guess)
     after = state._replace(num_scans=state.num_scans + 1, T_keyframe_last=located.T_keyframe_scan)
     return after, slam_map, _report(state, slam_map, located, is_keyframe=False)
-
-
-def _placed(methods: SlamMethods, scan: ThinnedScan, T_map_scan: Pose) -> tuple[PlacedElements, float, OdometryConfig]:
-    """Returns a scan for the local map, its smallest distance from the last one, and the settings."""
-    config = methods.config.odometry
-    return placed_scan(scan.measured.surface, T_map_scan), RECENT_SHARE * scan.extent_m, config
 
 
 class _Attempt(NamedTuple):
@@ -308,9 +299,10 @@ def _make_keyframe(
     moved = (
         [] if is_guess else [entry._replace(T_map_scan=rigid.inverse(T) @ entry.T_map_scan) for entry in state.recent]
     )
+    placed = placed_scan(scan.measured.surface, np.eye(4))
     after = _advanced(methods, state, located)._replace(
         is_begun=True,
-        recent=with_scan(tuple(moved), *_placed(methods, scan, np.eye(4))),
+        recent=with_scan(tuple(moved), placed, scan.extent_m, methods.config.odometry),
         local_map=None,
         T_keyframe_last=np.eye(4),
     )

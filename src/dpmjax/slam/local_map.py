@@ -20,6 +20,9 @@ from dpmjax.slam.config import OdometryConfig
 from dpmjax.slam.keyframes import KeyframeMap, Pose, nearest_in_graph, turn_rad
 from dpmjax.types import SurfaceElements
 
+RECENT_SHARE = 0.08
+"""Smallest distance between the last scans, as a share of the extent."""
+
 RECENT_RAD = 0.17
 """Turn from which on a scan joins the local map at a smaller distance."""
 
@@ -88,14 +91,14 @@ def placed_scan(surface: Surface, T_map_scan: Pose) -> PlacedElements:
 
 
 def with_scan(
-    recent: tuple[PlacedElements, ...], placed: PlacedElements, spacing_m: float, config: OdometryConfig
+    recent: tuple[PlacedElements, ...], placed: PlacedElements, extent_m: float, config: OdometryConfig
 ) -> tuple[PlacedElements, ...]:
     """Adds a scan that is far enough from the last one, and drops the oldest scan beyond the number that is kept.
 
     Args:
         recent: the last scans, oldest first.
         placed: the scan.
-        spacing_m: smallest distance from the last scan, unless the scan is turned.
+        extent_m: of the scan; a share of it is the smallest distance from the last scan, unless the scan is turned.
         config: number of scans, and turn.
 
     Returns:
@@ -103,7 +106,7 @@ def with_scan(
     """
     if recent:
         T_last_scan = rigid.inverse(recent[-1].T_map_scan) @ placed.T_map_scan
-        if np.linalg.norm(T_last_scan[:3, 3]) < spacing_m and turn_rad(T_last_scan) < RECENT_RAD:
+        if np.linalg.norm(T_last_scan[:3, 3]) < RECENT_SHARE * extent_m and turn_rad(T_last_scan) < RECENT_RAD:
             return recent
     return (*recent, placed)[-config.num_recent :] if config.num_recent else recent
 
