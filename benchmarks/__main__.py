@@ -12,18 +12,27 @@ from __future__ import annotations
 
 import importlib
 import json
-import pkgutil
-import subprocess
 import sys
-import tempfile
+import traceback
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
 import tyro
 
-import benchmarks
-from benchmarks.rows import COLUMNS, Row, format_table
+from benchmarks.rows import COLUMNS, Row, format_table, in_new_process
+from dpmjax.cli import environment, peak_rss_gb
+
+BENCHMARKS = {
+    "core": ("core", "run"),
+    "deepmapping": ("deepmapping", "run"),
+    "deepmapping_zero": ("deepmapping", "run_from_zero"),
+    "deeppointmap": ("deeppointmap", "run"),
+    "pose_graph": ("pose_graph", "run"),
+    "slam": ("slam", "run"),
+    "toy": ("deepmapping", "run_toy"),
+}
+"""Module and function of each benchmark."""
 
 
 @dataclass(frozen=True)
@@ -40,62 +49,45 @@ class Config:
 
 def main(config: Config) -> int:
     """Runs the chosen benchmarks; returns 0, 1 after a failure, 2 for an unknown name."""
-    modules = discover()
-    unknown = sorted(set(config.only) - set(modules))
-    if unknown:
-        print(f"benchmarks: error: no benchmark {', '.join(unknown)}; there are {', '.join(modules)}", file=sys.stderr)
-        return 2
+    unknown = sorted(set(config.only) - set(BENCHMARKS))
+    reason = f"no benchmark {', '.join(unknown)}; there are {', '.join(BENCHMARKS)}" if unknown else None
     if config.output is not None and not config.output.absolute().parent.is_dir():
-        print(f"benchmarks: error: there is no folder {config.output.absolute().parent}", file=sys.stderr)
+        reason = f"there is no folder {config.output.absolute().parent}"
+    if reason is not None:
+        print(f"benchmarks: error: {reason}", file=sys.stderr)
         return 2
     named_rows: list[tuple[str, Row]] = []
-    environment: dict[str, Any] = {}
+    machine: dict[str, Any] = {}
     failed: list[str] = []
-    for name in config.only or modules:
+    for name in config.only or BENCHMARKS:
         print(f"running {name} ...", file=sys.stderr, flush=True)
-        report = run_in_child(modules[name], config.quick)
-        if report is None:
+        try:
+            rows, machine = in_new_process(run_benchmark, name, config.quick)
+        except Exception:
+            traceback.print_exc()
             failed.append(name)
             continue
-        environment = report["environment"]
-        named_rows += [(name, Row(*row)) for row in report["rows"]]
+        named_rows += [(name, row) for row in rows]
     if named_rows:
-        print(describe(environment))
-        print(format_table(named_rows))
+        print(describe(machine), format_table(named_rows), sep="\n")
     if config.output is not None:
         records = [dict(zip(COLUMNS, (name, *row), strict=True)) for name, row in named_rows]
-        report = {"environment": environment, "quick": config.quick, "failed": failed, "rows": records}
+        report = {"environment": machine, "quick": config.quick, "failed": failed, "rows": records}
         config.output.write_text(json.dumps(report, indent=2) + "\n", encoding="utf-8")
     if failed:
         print(f"benchmarks: failed: {', '.join(failed)}", file=sys.stderr)
     return 1 if failed else 0
 
 
-def discover() -> dict[str, str]:
-    """Module of each benchmark by its name: the modules of this package that have a `NAME`."""
-    found = {}
-    for module in pkgutil.iter_modules(benchmarks.__path__):
-        if module.name.startswith("_") or module.name == "child":
-            continue
-        path = f"benchmarks.{module.name}"
-        name = getattr(importlib.import_module(path), "NAME", None)
-        if name is not None:
-            found[name] = path
-    return found
-
-
-def run_in_child(module: str, quick: bool) -> dict[str, Any] | None:
-    """Runs one benchmark in a fresh process; None where it failed, with a message on stderr."""
-    with tempfile.TemporaryDirectory() as folder:
-        output = Path(folder) / "rows.json"
-        command = [sys.executable, "-m", "benchmarks.child", module, str(output), "quick" if quick else "full"]
-        if subprocess.run(command, cwd=Path(__file__).parents[1]).returncode != 0:
-            return None
-        return json.loads(output.read_text(encoding="utf-8"))
+def run_benchmark(name: str, quick: bool) -> tuple[list[Row], dict[str, Any]]:
+    """Returns the rows of a benchmark, with the peak memory of this process, and the machine."""
+    module, function = BENCHMARKS[name]
+    rows = getattr(importlib.import_module(f"benchmarks.{module}"), function)(quick)
+    return [*rows, Row("whole process", "peak memory", peak_rss_gb(), "GB")], environment()
 
 
 def describe(environment: dict[str, Any]) -> str:
-    """Machine and versions in two lines."""
+    """Returns machine and versions in two lines."""
     versions = ", ".join(f"{name} {version}" for name, version in environment["versions"].items())
     return f"{environment['cpu']}, {environment['num_cores']} cores; device {environment['device']}\n{versions}"
 

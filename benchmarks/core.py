@@ -13,7 +13,6 @@ from scipy.special import logsumexp
 import dpmjax
 from benchmarks.rows import Row, measure
 
-NAME = "core"
 TEMPERATURE = 0.1
 
 

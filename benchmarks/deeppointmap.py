@@ -7,19 +7,16 @@ has one.
 
 from __future__ import annotations
 
-import json
 import os
-import subprocess
-import sys
 import tempfile
 from pathlib import Path
 from typing import NamedTuple
 
 import jax
 
-from benchmarks.rows import Row
+from benchmarks.deeppointmap_stages import stage_rows
+from benchmarks.rows import Row, in_new_process
 
-NAME = "deeppointmap"
 FULL = (
     "products",
     *(f"encode {preset}" for preset in ("tiny", "small", "paper")),
@@ -82,11 +79,7 @@ def run(quick: bool) -> list[Row]:
 
 def run_stage(stage: str, folder: Path, quick: bool, *, platform: str | None = None) -> list[Row]:
     """Returns rows of one stage, run in a fresh process on a platform, or on the device that JAX chooses."""
-    output = folder / "rows.json"
-    command = [sys.executable, "-m", "benchmarks.deeppointmap_stages", stage, str(folder), str(output)]
-    environment = os.environ if platform is None else {**os.environ, "JAX_PLATFORMS": platform}
-    subprocess.run([*command, "quick" if quick else "full"], check=True, cwd=Path(__file__).parents[1], env=environment)
-    return [Row(*row) for row in json.loads(output.read_text(encoding="utf-8"))]
+    return in_new_process(stage_rows, stage, folder, quick, **({} if platform is None else {"JAX_PLATFORMS": platform}))
 
 
 def with_figures(rows: list[Row]) -> list[Row]:

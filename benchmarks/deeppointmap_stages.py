@@ -1,13 +1,11 @@
 """The stages of the DeepPointMap benchmark, each run in a process of its own so that its peak memory is its own.
 
-`benchmarks.deeppointmap` starts them: `python -m benchmarks.deeppointmap_stages STAGE FOLDER OUTPUT EFFORT`.
+`benchmarks.deeppointmap` starts them.
 """
 
 from __future__ import annotations
 
-import json
 import os
-import sys
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
@@ -194,12 +192,6 @@ STAGES: dict[str, Callable[[Path, bool], list[Row]]] = {
 }
 
 
-def main(stage: str, folder: str, output: str, effort: str) -> None:
-    """Runs one stage and writes its rows, with its peak memory, to `output` as JSON."""
-    rows = STAGES[stage](Path(folder), effort == "quick")
-    rows.append(Row(f"process of {stage}", "peak memory", peak_rss_gb(), "GB"))
-    Path(output).write_text(json.dumps(rows), encoding="utf-8")
-
-
-if __name__ == "__main__":
-    main(*sys.argv[1:])
+def stage_rows(stage: str, folder: Path, quick: bool) -> list[Row]:
+    """Returns the rows of one stage, with the peak memory of this process."""
+    return [*STAGES[stage](folder, quick), Row(f"process of {stage}", "peak memory", peak_rss_gb(), "GB")]

@@ -15,7 +15,6 @@ import dpmjax
 from benchmarks.rows import Row, Timing, measure
 from dpmjax.cli import why_not_importable
 
-NAME = "pose_graph"
 DATA = Path(os.environ.get("DPMJAX_DATA", "../shared/data")) / "g2o"
 GRAPHS = ("intel", "M3500", "parking-garage", "sphere2500")
 

@@ -1,14 +1,18 @@
-"""The rows that a benchmark returns, how they are printed, and the times among them.
+"""The rows that a benchmark returns, how they are printed, the times among them, and processes of their own.
 
 The first call of a function is timed apart from later ones, and timing includes the wait for results.
 """
 
 from __future__ import annotations
 
+import os
 import statistics
 import time
-from collections.abc import Callable, Iterable, Sequence
-from typing import NamedTuple
+from collections.abc import Callable, Iterable
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
+from typing import Any, NamedTuple
+from unittest.mock import patch
 
 import jax
 
@@ -35,16 +39,26 @@ def format_table(named_rows: Iterable[tuple[str, Row]]) -> str:
     """Lays rows out under `COLUMNS`, numbers aligned to the right."""
     cells = [COLUMNS, *((name, row.case, row.metric, f"{row.value:.4g}", row.unit) for name, row in named_rows)]
     widths = [max(len(line[column]) for line in cells) for column in range(len(COLUMNS))]
-    lines = [_format_line(line, widths) for line in cells]
-    return "\n".join([lines[0], "-" * len(lines[0].rstrip()), *lines[1:]])
-
-
-def _format_line(cells: Sequence[str], widths: Sequence[int]) -> str:
-    name, case, metric, value, unit = (
-        cell.rjust(width) if column == COLUMNS.index("value") else cell.ljust(width)
-        for column, (cell, width) in enumerate(zip(cells, widths, strict=True))
+    form = "  ".join(
+        f"{{:{'>' if name == 'value' else '<'}{width}}}" for name, width in zip(COLUMNS, widths, strict=True)
     )
-    return f"{name}  {case}  {metric}  {value}  {unit}".rstrip()
+    head, *lines = (form.format(*line).rstrip() for line in cells)
+    return "\n".join([head, "-" * len(head), *lines])
+
+
+def in_new_process(function: Callable[..., Any], *arguments: object, **environment: str) -> Any:
+    """Returns what a function of a module returns in a fresh process, whose peak memory is its own.
+
+    Args:
+        function: the function.
+        *arguments: its arguments.
+        **environment: variables of the environment of that process.
+
+    Returns:
+        Its result.
+    """
+    with patch.dict(os.environ, environment), ProcessPoolExecutor(1, get_context("spawn")) as pool:
+        return pool.submit(function, *arguments).result()
 
 
 class Timing(NamedTuple):

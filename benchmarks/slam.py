@@ -30,7 +30,6 @@ from dpmjax.simulation import route_poses
 from dpmjax.slam import SlamConfig, SlamMethods, SlamResult, SlamState, finish_slam, init_slam, local_map_of, step_slam
 from tests.slam.truth import MistakenMatcher, TruthGeometry, scans_of
 
-NAME = "slam"
 ROUTE_STREAM = 77
 LENGTH_M, BLOCK_M, STEP_M = 4000.0, 100.0, 1.0
 EARLY, LATE, WINDOW = 500, 5000, 200

@@ -1,28 +1,16 @@
-"""Tables of methods by sets of scans: a file of its own for each row, so that a killed run goes on."""
+"""Tables of methods by sets of scans: one row for each method and set."""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache, partial
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
-from tqdm import tqdm
 
-from dpmjax.cli import (
-    RunFolder,
-    RunOptions,
-    StopFlag,
-    check_least,
-    check_names,
-    do_row,
-    open_run_folder,
-    planar_errors,
-    recording,
-    why_not_importable,
-)
+from dpmjax import cli
 from experiments._deepmapping_methods import METHODS, SUCCESS_PX, Task, assess, choose
 
 NOT_RUN = {
@@ -35,7 +23,7 @@ _AS_GOOD_PX = 0.1
 
 
 @dataclass(frozen=True, kw_only=True)
-class TableOptions(RunOptions):
+class TableOptions(cli.RunOptions):
     """Options of a comparison of methods."""
 
     methods: tuple[str, ...] = tuple(METHODS)
@@ -45,18 +33,11 @@ class TableOptions(RunOptions):
 
     def __post_init__(self) -> None:
         """Checks names and ranges."""
-        check_names("--methods", self.methods, METHODS)
-        check_least(self, steps=2)
+        cli.check_names("--methods", self.methods, METHODS)
+        cli.check_least(self, steps=2)
 
 
-def unusable_methods(names: Sequence[str]) -> dict[str, str]:
-    """Returns the methods whose package cannot be imported, and why."""
-    packages = {name: package for name in names if (package := METHODS[name].package) is not None}
-    reasons = {name: why_not_importable(package) for name, package in packages.items()}
-    return {name: reason for name, reason in reasons.items() if reason is not None}
-
-
-def run_method(name: str, task: Task) -> dict[str, Any]:
+def run_method(name: str, task: Task) -> cli.Row:
     """Returns one row: errors, time and assessment of the kept candidate, and the numbers of every candidate."""
     method = METHODS[name]
     begun, begun_cpu = time.perf_counter(), time.process_time()
@@ -67,7 +48,7 @@ def run_method(name: str, task: Task) -> dict[str, Any]:
     seconds, cpu_seconds = time.perf_counter() - begun, time.process_time() - begun_cpu
     kept, measured = chosen or choose(task, candidates)
     return {
-        **planar_errors(task.sequence, candidates[kept]),
+        **cli.planar_errors(task.sequence, candidates[kept]),
         "success": measured[kept]["ate_px"] < SUCCESS_PX,
         "seconds": seconds,
         "cpu_s": cpu_seconds,
@@ -93,13 +74,13 @@ def best_kept(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     return {"num_choices": len(regrets), "num_best_kept": sum(regret <= _AS_GOOD_PX for regret in regrets)}
 
 
-def run_table(
+def run_methods(
     config: TableOptions,
     experiment: str,
-    cells: Sequence[dict[str, Any]],
-    prepare: Callable[[dict[str, Any]], tuple[Task, dict[str, Any]]],
-    write: Callable[[RunFolder, list[dict[str, Any]], dict[str, str]], str],
-) -> list[dict[str, Any]]:
+    cells: Sequence[cli.Row],
+    prepare: Callable[[cli.Row], tuple[Task, cli.Row]],
+    report: Callable[[list[cli.Row], dict[str, str]], cli.Report],
+) -> list[cli.Row]:
     """Runs every method on every cell; what an earlier run has done is read from its files.
 
     Args:
@@ -107,7 +88,7 @@ def run_table(
         experiment: name of the experiment.
         cells: what identifies each set of scans.
         prepare: makes the task of a cell, and what its rows carry besides the results.
-        write: writes the rows so far, and why some methods were not run, after each cell; returns a summary to print.
+        report: summarises the rows, and names the methods that were not run, with the reasons.
 
     Returns:
         All rows.
@@ -115,30 +96,21 @@ def run_table(
     Raises:
         ValueError: the package of a chosen method cannot be imported.
     """
-    unusable = unusable_methods(config.methods)
+    packages = {name: package for name in config.methods if (package := METHODS[name].package) is not None}
+    reasons = {name: cli.why_not_importable(package) for name, package in packages.items()}
+    unusable = {name: reason for name, reason in reasons.items() if reason is not None}
     if unusable and set(config.methods) != set(METHODS):
         name, reason = next(iter(unusable.items()))
         raise ValueError(f"--methods {name}: {reason}")
     not_run = NOT_RUN | unusable
-    folder = open_run_folder(config, experiment)
+    # The scans are made once for all methods, and not at all where all rows exist.
+    prepared = lru_cache(maxsize=1)(lambda *cell: prepare(dict(cell)))
 
-    def work(method: str, prepared: Callable[[], tuple[Task, dict[str, Any]]]) -> dict[str, Any]:
-        task, extra = prepared()
+    def work(_: cli.TableRun, method: str, **cell: Any) -> cli.Row:
+        task, extra = prepared(*cell.items())
         return run_method(method, task) | extra
 
-    rows: list[dict[str, Any]] = []
-    summary = ""
-    with recording(folder), StopFlag() as stop:
-        for cell in tqdm(cells, unit=" sets"):
-            # The scans are made once for all methods, and not at all where all rows exist.
-            prepared = cache(partial(prepare, cell))
-            for method in config.methods:
-                if stop.is_requested:
-                    return rows
-                if method not in not_run:
-                    case = {"method": method, **cell}
-                    rows.append(do_row(folder.path, case, partial(work, method, prepared), seed=config.seed))
-            summary = write(folder, rows, not_run)
-    print(summary, *(f"{name}: not run ({reason})" for name, reason in not_run.items()), sep="\n")
-    print(f"results in {folder.path}")
+    cases = [{"method": method, **cell} for cell in cells for method in config.methods if method not in not_run]
+    rows = cli.run_table(config, experiment, cases, work, lambda rows: report(rows, not_run))
+    print(*(f"{name}: not run ({reason})" for name, reason in not_run.items()), sep="\n")
     return rows

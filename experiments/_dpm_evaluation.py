@@ -4,16 +4,13 @@ from __future__ import annotations
 
 import itertools
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from tqdm import tqdm
 
-from dpmjax import registration_recall
-from dpmjax.cli import BAND_NAMES, error_columns
+from dpmjax import cli, registration_recall
 from dpmjax.deeppointmap import (
-    ScanPair,
     VerificationConfig,
     choose_motion,
     draw_scan_pairs,
@@ -50,59 +47,41 @@ def search_alone(source: np.ndarray, target: np.ndarray, config: VerificationCon
 
 
 def evaluate_matcher(
-    matcher: Matcher, drive: LidarSequence, band: str, num_pairs: int, seed: int, bar: tqdm
-) -> dict[str, Any]:
+    matcher: Matcher, drive: LidarSequence, band: str, num_pairs: int, *, seed: int, on_pair: Callable[[], object]
+) -> cli.Row:
     """Returns errors and seconds of another matcher on the same pairs."""
     motions, seconds, true = [], [], []
-    for pair in _pairs(drive, band, num_pairs, seed, bar):
+    for pair in read_scan_pairs(drive, draw_scan_pairs(drive, band, num_pairs, seed=seed), seed=seed):
         started = time.perf_counter()
         motions.append(matcher(pair.source, pair.target))
         seconds.append(time.perf_counter() - started)
         true.append(pair.T_target_source)
+        on_pair()
     errors = registration_recall(np.reshape(motions, (-1, 4, 4)), np.reshape(true, (-1, 4, 4)))
-    row = error_columns(errors, "_refined")
-    return {
-        **row,
-        "is_right": row.pop("is_right_refined"),
-        **({"pair_s": float(np.median(seconds))} if seconds else {}),
-    }
+    row = cli.error_columns(errors, "_refined")
+    row["is_right"] = row.pop("is_right_refined")
+    return row | ({"pair_s": float(np.median(seconds))} if seconds else {})
 
 
-def table(rows: Sequence[dict[str, Any]]) -> str:
+def table(rows: Sequence[cli.Row]) -> str:
     """Returns the rows as a Markdown table: one line a sequence and distance."""
-    lines = [
-        f"| sequence | distance | pairs | recall: {NETWORK} | {VERIFIED} | the same, refined | {SEARCH}, refined "
-        f"| {KISS} | median error: network alone | refined | s / pair | {KISS}, s | overlap AUC |",
-        "|---|---|---|---|---|---|---|---|---|---|---|---|---|",
-    ]
+    columns = (
+        "sequence", "distance", "pairs", f"recall: {NETWORK}", VERIFIED, "the same, refined", f"{SEARCH}, refined",
+        KISS, "median error: network alone", "refined", "s / pair", f"{KISS}, s", "overlap AUC",
+    )  # fmt: skip
     by_case = {(row["method"], row["sequence"], row["band"]): row for row in rows}
+    lines = []
     for (method, sequence, band), row in by_case.items():
-        if method != "DeepPointMap" or band not in BAND_NAMES or not row["num_pairs"]:
+        if method != "DeepPointMap" or band not in cli.BAND_NAMES or not row["num_pairs"]:
             continue
         kiss, search = (by_case.get((other, sequence, band), {}) for other in ("KISS-Matcher", "search"))
         auc = by_case.get(("overlap", sequence, "all"), {}).get("auc") if band == "near" else None
-        errors = " | ".join(_length(row[f"median_error_{stage}_m"]) for stage in ("descriptors", "refined"))
-        recalls = " | ".join(f"{row[f'recall_{stage}']:.2f}" for stage in ("descriptors", "verified", "refined"))
-        others = " | ".join(_number(other.get("recall_refined")) for other in (search, kiss))
-        lines.append(
-            f"| {sequence} | {BAND_NAMES[band]} | {row['num_pairs']} | {recalls} | {others} | {errors} "
-            f"| {_number(row['pair_s'])} | {_number(kiss.get('pair_s'))} | {_number(auc, 3)} |"
-        )
-    return "\n".join(lines)
-
-
-def _pairs(drive: LidarSequence, band: str, num_pairs: int, seed: int, bar: tqdm) -> Iterator[ScanPair]:
-    for pair in read_scan_pairs(drive, draw_scan_pairs(drive, band, num_pairs, seed=seed), seed=seed):
-        yield pair
-        bar.update(1)
-
-
-def _number(value: float | None, decimals: int = 2) -> str:
-    return "-" if value is None else f"{value:.{decimals}f}"
-
-
-def _length(metres: float | None) -> str:
-    return "-" if metres is None or np.isnan(metres) else f"{metres:.3f} m"
+        recalls = (row[f"recall_{stage}"] for stage in ("descriptors", "verified", "refined"))
+        others = (other.get("recall_refined") for other in (search, kiss))
+        errors = (cli.length_text(row[f"median_error_{stage}_m"]) for stage in ("descriptors", "refined"))
+        seconds = (row["pair_s"], kiss.get("pair_s"), cli.cell_text(auc, 3))
+        lines.append([sequence, cli.BAND_NAMES[band], row["num_pairs"], *recalls, *others, *errors, *seconds])
+    return cli.markdown(columns, lines)
 
 
 NETWORK, VERIFIED = "network alone", "network, search and verification"
@@ -134,7 +113,7 @@ def pooled_rows(rows: Sequence[Mapping[str, Any]], drives: Sequence[str]) -> lis
     if len(unseen) < len(drives):
         sets[f"all drives but {', '.join(sorted(set(drives) - set(unseen)))}"] = unseen
     pooled: list[dict[str, Any]] = []
-    for (title, names), band in itertools.product(sets.items(), BAND_NAMES):
+    for (title, names), band in itertools.product(sets.items(), cli.BAND_NAMES):
         answers = {method: _answers(rows, method, names, band) for method in _ANSWERS}
         known = {method: of_all for method, of_all in answers.items() if of_all is not None and len(of_all)}
         for method, is_right in known.items():
@@ -160,22 +139,19 @@ def pooled_table(pooled: Sequence[Mapping[str, Any]]) -> str:
     """Returns the pooled rows as Markdown; without any, an empty string."""
     if not pooled:
         return ""
-    lines = [
-        "| pooled over | distance | pairs | method | right | recall (95 % interval) | p against the other methods |",
-        "|---|---|---|---|---|---|---|",
-    ]
+    lines = []
     for row in pooled:
         p_values = "; ".join(f"{name} {_p_value(p)}" for name, p in row["p_values"].items())
-        lines.append(
-            f"| {row['drives']} | {BAND_NAMES[row['band']]} | {row['num_pairs']} | {row['method']} "
-            f"| {row['num_right']} | {row['recall']:.3f} ({row['recall_low']:.3f} to {row['recall_high']:.3f}) "
-            f"| {p_values or '-'} |"
-        )
+        recall = f"{row['recall']:.3f} ({row['recall_low']:.3f} to {row['recall_high']:.3f})"
+        numbers = (row["num_pairs"], row["method"], row["num_right"], recall)
+        lines.append([row["drives"], cli.BAND_NAMES[row["band"]], *numbers, p_values or "-"])
+    columns = ("pooled over", "distance", "pairs", "method", "right", "recall (95 % interval)")
+    text = cli.markdown((*columns, "p against the other methods"), lines)
     notes = "Intervals: Wilson. p: McNemar's exact test, two-sided, on the same pairs."
     notes += " All motions but those of the network alone and of KISS-Matcher are refined."
     if watched := sorted({name for row in pooled for name in row["sequences"]} & set(MONITORED)):
         notes += f" The recall on {', '.join(watched)} was watched during the training: it is no unseen drive."
-    return "\n".join([*lines, "", notes])
+    return f"{text}\n\n{notes}"
 
 
 def _p_value(p: float) -> str:

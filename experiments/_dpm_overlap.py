@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from tqdm import tqdm
 
 from dpmjax.deeppointmap import (
     NO_OVERLAP_M,
@@ -29,7 +28,7 @@ NUM_SCANS, NUM_OTHER_SCANS = 36, 12
 TOWN_STREAM = 4134
 
 
-def measure_town(model: Model, drives: Sequence[LidarSequence], num_pairs: int, seed: int, bar: tqdm) -> dict[str, Any]:
+def measure_town(model: Model, drives: Sequence[LidarSequence], num_pairs: int, seed: int) -> dict[str, Any]:
     """Returns evidence and distance of the pairs of a town.
 
     Half of the pairs are less than 20 m apart, a quarter 20 to 40 m, an eighth farther; an eighth has one scan of
@@ -40,7 +39,6 @@ def measure_town(model: Model, drives: Sequence[LidarSequence], num_pairs: int, 
         drives: drives through the town, and through a second one.
         num_pairs: number of pairs, about.
         seed: seed of the run.
-        bar: gets the pairs.
     """
     rng = np.random.default_rng([TOWN_STREAM, seed])
     rows = [_spread(len(drive), num) for drive, num in zip(drives, (NUM_SCANS, NUM_OTHER_SCANS), strict=True)]
@@ -51,18 +49,14 @@ def measure_town(model: Model, drives: Sequence[LidarSequence], num_pairs: int, 
         (distances >= OVERLAP_M) & (distances < NO_OVERLAP_M),
         distances >= NO_OVERLAP_M,
     )
-    sources, targets, metres = [], [], []
+    drawn: list[tuple[Any, Any, float]] = []
     for kind, share in zip(kinds, (2, 4, 8), strict=True):
         for a, b in draw_rows(np.argwhere(kind), num_pairs // share, rng):
-            sources.append(own[a])
-            targets.append(own[b])
-            metres.append(float(distances[a, b]))
+            drawn.append((own[a], own[b], float(distances[a, b])))
     for a, b in draw_rows(np.argwhere(np.ones((len(own), len(other)))), num_pairs // 8, rng):
-        sources.append(own[a])
-        targets.append(other[b])
-        metres.append(float("inf"))
-    evidence = np.asarray(evidence_pairs(model, sources, targets))
-    bar.update(len(sources))
+        drawn.append((own[a], other[b], float("inf")))
+    sources, targets, metres = zip(*drawn, strict=True)
+    evidence = np.asarray(evidence_pairs(model, list(sources), list(targets)))
     return {"evidence": evidence.tolist(), "is_overlap": [distance < OVERLAP_M for distance in metres]}
 
 
@@ -76,7 +70,7 @@ def fit(rows: Sequence[dict[str, Any]]) -> tuple[LogisticModel, dict[str, Any], 
         "num_overlap_pairs": len(towns),
         "auc_overlap": area_under_curve(found, is_overlap),
         "brier_overlap": brier_score(found, is_overlap),
-        "brier_of_a_constant_overlap": float(np.mean((is_overlap.mean() - is_overlap) ** 2)),
+        "brier_of_a_constant_overlap": float(is_overlap.var()),
     }
     fitted = fit_logistic(OVERLAP_FEATURES, features, is_overlap)
     return fitted, numbers, {"probability": found, "is_overlap": is_overlap}

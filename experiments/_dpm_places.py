@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from dpmjax import encode, register
+from dpmjax.cli import RowStopped
 from dpmjax.deeppointmap import Model, draw_rows_apart, read_scan_pairs, register_in_stages, scan_distances
 from dpmjax.io import LidarSequence
 from dpmjax.metrics import registration_recall
@@ -43,7 +44,7 @@ def measure_pairs(
     num_pairs: int,
     *,
     seed: int,
-    on_pair: Callable[[], object],
+    is_stopped: Callable[[], bool],
 ) -> dict[str, Any]:
     """Registers random pairs as scans, and as clouds of surface elements.
 
@@ -53,7 +54,7 @@ def measure_pairs(
         bands_m: smallest and largest distance of the pairs.
         num_pairs: number of pairs of each distance, fewer where the drive has fewer.
         seed: of the draws.
-        on_pair: called after each pair.
+        is_stopped: whether to leave the row out, by `RowStopped`.
 
     Returns:
         Lists with an entry for each pair: the evidence of each kind, whether both registrations are right, and the
@@ -76,5 +77,6 @@ def measure_pairs(
             found["is_right_of_clouds"].append(bool(is_right[0]))
             found["is_right"].append(bool(is_right[1]))
             found["distance_m"].append(float(np.linalg.norm(pair.T_target_source[:3, 3])))
-            on_pair()
+            if is_stopped():
+                raise RowStopped
     return found

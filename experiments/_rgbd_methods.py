@@ -5,40 +5,27 @@ from __future__ import annotations
 import itertools
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Float
 from numpy.typing import NDArray
 
-from dpmjax.deepmapping import Pinhole, as_depth_scans
+from dpmjax import deepmapping as dm
 from dpmjax.geometry import image_normals
 from dpmjax.io import DepthSequence
-from dpmjax.metrics import absolute_trajectory_error
-
-if TYPE_CHECKING:
-    from dpmjax.deepmapping import DeepMappingConfig
-    from dpmjax.io import DepthSequence
-
+from dpmjax.metrics import absolute_trajectory_error, point_distance
 
 METHODS = (
-    "zero",
-    "placed",
-    "placed-no-prior",
-    "deepmapping",
-    "deepmapping-cold",
-    "direct",
-    "icp",
-    "deepmapping-icp",
+    "zero", "placed", "placed-no-prior", "deepmapping", "deepmapping-cold", "direct", "icp", "deepmapping-icp",
     "multiway",
-)
+)  # fmt: skip
 _ICP_POINTS = 800
 
 
 def run_method(
     name: str,
     sequence: DepthSequence,
-    settings: DeepMappingConfig,
+    settings: dm.DeepMappingConfig,
     found: Mapping[str, NDArray[np.float64]],
     *,
     seed: int,
@@ -61,25 +48,22 @@ def run_method(
     """
     import jax
 
-    from dpmjax import deepmapping as dm
     from experiments.baselines.multiway import multiway_images
 
     scans, key = dm.as_depth_scans(sequence.points, sequence.mask), jax.random.key(seed)
     if name == "zero":
         return np.tile(np.eye(4), (len(sequence), 1, 1))
-    if name == "placed":
-        return dm.initialize_depth(scans, dm.depth_search(settings.motion), key=key)
-    if name == "placed-no-prior":
-        search = replace(dm.depth_search(settings.motion), translation_weight=0.0)
+    if name.startswith("placed"):
+        search = dm.depth_search(settings.motion)
+        search = replace(search, translation_weight=0.0) if name == "placed-no-prior" else search
         return dm.initialize_depth(scans, search, key=key)
     if name == "multiway":
         return multiway_images(sequence.points, sequence.mask)
     if name == "icp":
         return chain_icp(sequence, seed=seed)
     if name in ("deepmapping", "deepmapping-icp"):
-        first = "placed" if name == "deepmapping" else "icp"
-        start = found.get(first)
-        if start is None and first == "icp":
+        start = found.get("placed" if name == "deepmapping" else "icp")
+        if start is None and name == "deepmapping-icp":
             start = chain_icp(sequence, seed=seed)
         return dm.register_depth(scans, settings, key=key, start=start).T_world_camera
     used = dm.as_direct(settings) if name == "direct" else settings
@@ -111,16 +95,13 @@ def spread_of(sequence: DepthSequence) -> float:
 
 def errors_of(T: NDArray[np.float64], sequence: DepthSequence) -> dict[str, float]:
     """ATE (mm), mean point distance (mm) and the largest error of a turn between neighbours (degrees)."""
-    from dpmjax.metrics import absolute_trajectory_error, point_distance
-
     reference = sequence.T_world_camera
     assert reference is not None
     ate = absolute_trajectory_error(T[:, :3, 3], reference[:, :3, 3])
     count = len(sequence)
     points = sequence.points.reshape(count, -1, 3)
     distance = point_distance(points, sequence.mask.reshape(count, -1), T, reference)
-    relative = np.swapaxes(T[:-1, :3, :3], 1, 2) @ T[1:, :3, :3]
-    true = np.swapaxes(reference[:-1, :3, :3], 1, 2) @ reference[1:, :3, :3]
+    relative, true = (np.swapaxes(R[:-1, :3, :3], 1, 2) @ R[1:, :3, :3] for R in (T, reference))
     cosine = (np.einsum("nij,nij->n", relative, true) - 1.0) / 2.0
     turn = np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))
     return {"ate_mm": 1e3 * ate, "point_distance_mm": 1e3 * distance, "largest_turn_error_deg": float(turn.max())}
@@ -150,7 +131,7 @@ def surface_spread(sequence: DepthSequence, depth_noise_m: float) -> float:
     assert T is not None
     count = len(sequence)
     information = _information_of_moves(count)
-    pinhole = as_depth_scans(sequence.points, sequence.mask).pinhole
+    pinhole = dm.as_depth_scans(sequence.points, sequence.mask).pinhole
     surfaces = image_normals(sequence.points, sequence.mask)
     for one in range(count):
         for other in range(count):
@@ -180,7 +161,7 @@ def _information_of_moves(count: int) -> Float[np.ndarray, "m m"]:
 def _add_pair(
     information: NDArray[np.float64],
     sequence: DepthSequence,
-    pinhole: Pinhole,
+    pinhole: dm.Pinhole,
     surfaces: tuple[NDArray[np.float64], NDArray[np.bool_]],
     pair: tuple[int, int],
     depth_noise_m: float,

@@ -1,27 +1,24 @@
-"""`dpm_evaluate --slam`: which drives, the loop over drives and methods, the table and the pictures."""
+"""`dpm_evaluate --slam`: which drives, the rows of drives and methods, the tables and the pictures."""
 
 from __future__ import annotations
 
-import itertools
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from dpmjax import io, load_model, viz
-from dpmjax.cli import DriveSelection, RunFolder, do_row, keep_scans, open_drive, why_not_importable
+from dpmjax import cli, io, load_model, viz
 from dpmjax.io import LidarSequence
 from dpmjax.metrics import align_rigid, path_lengths
 from dpmjax.simulation import HDL64E, OS1_64, DriveConfig, LidarSensor, Scene, TownConfig, simulate_scene
 from dpmjax.slam import SlamMethods, make_methods
 from experiments import _slam_evaluation as evaluation
-from experiments._slam_evaluation import NETWORK, ODOMETRY, OURS, PRECISIONS, Drive, StoppedError
-from experiments._slam_localization import evaluate_localization
+from experiments._slam_evaluation import NETWORK, ODOMETRY, OURS, PRECISIONS, Drive
 from experiments._slam_peers import PEERS, why_missing
-from experiments._slam_refine import MULTIWAY, REFINED, evaluate_refinement
+from experiments._slam_uses import MULTIWAY, REFINED, evaluate_localization, evaluate_refinement
 
 TOWN = "town"
 # Kind of place, kind of route, lidar: taken in turn. Each route drives some streets in both directions.
@@ -53,26 +50,7 @@ SIZES = {
     "map_bytes_float32": "ours, float32",
     "map_bytes_int8": "ours, int8",
 }
-
-
-Task = tuple[Drive, str, Callable[[], dict[str, Any]]]
-
-
-@dataclass(frozen=True, kw_only=True)
-class DriveChoice:
-    """Drives that are compared.
-
-    Attributes:
-        paths: folders of scans, files of poses along which towns are simulated, or `TOWN` for towns of the seeds.
-        selection: scans of each folder and of each town.
-        town_seeds: seeds of the towns.
-        town_lengths_m: length of each town's route.
-    """
-
-    paths: Sequence[str]
-    selection: DriveSelection
-    town_seeds: Sequence[int] = ()
-    town_lengths_m: Sequence[float] = ()
+LOCALIZATION = "localization, "
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -92,19 +70,32 @@ class Comparison:
     num_localized: int
 
 
-def open_drives(choice: DriveChoice) -> list[LidarSequence]:
-    """Opens the drives; bad input that can be known before the run is a `ValueError`."""
+def open_drives(
+    paths: Sequence[str], options: cli.DriveOptions, towns: Mapping[int, float] | None = None
+) -> list[LidarSequence]:
+    """Opens the drives that are compared.
+
+    Args:
+        paths: folders of scans, files of poses along which towns are simulated, or `TOWN` for towns of the seeds.
+        options: which scans of each folder and of each town.
+        towns: length of the route of each town, metres, by its seed.
+
+    Returns:
+        The drives.
+
+    Raises:
+        ValueError: a path cannot be read, or two drives have the same name.
+    """
     drives: list[LidarSequence] = []
-    part = choice.selection
-    for entry in choice.paths:
+    for entry in paths:
         if entry == TOWN and not Path(entry).exists():
-            towns = zip(choice.town_seeds, choice.town_lengths_m, strict=True)
-            simulated = [keep_scans(town_drive(seed, number, length)) for number, (seed, length) in enumerate(towns)]
-            rows = slice(None, None, part.jump)
-            drives += [drive.take(rows).take(slice(part.num_scans)) for drive in simulated]
+            routes = enumerate((towns or {}).items())
+            simulated = [cli.keep_scans(town_drive(seed, number, length_m)) for number, (seed, length_m) in routes]
+            rows = slice(None, None, options.jump)
+            drives += [drive.take(rows).take(slice(options.n_scans)) for drive in simulated]
         else:
             names: Sequence[str | None] = io.list_lidar_sequences(entry) or [None]
-            drives += [open_drive(replace(part, data=Path(entry), sequence=name)) for name in names]
+            drives += [cli.open_drive(Path(entry), options, name) for name in names]
     titles = [drive.name for drive in drives]
     if len(set(titles)) < len(titles):
         raise ValueError(f"two drives have the same name ({', '.join(sorted(titles))}); evaluate them one by one")
@@ -122,108 +113,102 @@ def missing_peers(comparison: Comparison) -> dict[str, str]:
     """Returns the peers that cannot run, and why."""
     reasons = {name: why_missing(name) for name in PEERS}
     if comparison.is_refined:
-        reasons[MULTIWAY] = why_not_importable("open3d")
+        reasons[MULTIWAY] = cli.why_not_importable("open3d")
     return {name: reason for name, reason in reasons.items() if reason is not None}
 
 
 def compare(
-    comparison: Comparison, folder: RunFolder, sequences: Sequence[LidarSequence], is_stopped: Callable[[], bool]
-) -> Iterator[tuple[Drive, dict[str, Any]]]:
-    """Makes the rows that are missing; ends early where a signal came."""
+    config: cli.RunOptions, experiment: str, comparison: Comparison, sequences: Sequence[LidarSequence]
+) -> list[cli.Row]:
+    """Makes the rows of drives and methods that are missing, and writes tables, numbers and pictures."""
     methods = make_methods(load_model(comparison.weights), weights=comparison.weights)
-    missing = missing_peers(comparison)
-    drives = [evaluation.open_folder(folder, sequence, is_stopped) for sequence in sequences]
-    ours: dict[str, dict[str, Any]] = {}
+    missing, by_name = missing_peers(comparison), {sequence.name: sequence for sequence in sequences}
+
+    def work(run: cli.TableRun, sequence: str, method: str) -> cli.Row:
+        drive = evaluation.open_folder(run.folder, by_name[sequence], run.is_stopped)
+        if method != ODOMETRY:
+            return evaluate(comparison, drive, methods, method)
+        case, ours = {"sequence": sequence, "method": OURS}, partial(evaluation.evaluate_ours, drive, methods)
+        return evaluation.odometry_row(drive, cli.do_row(run.folder.path, case, ours, seed=comparison.seed))
+
+    def report(rows: list[cli.Row]) -> cli.Report:
+        notes = (f"{name} was not run: {why}." for name, why in missing.items())
+        numbers = {"weights": comparison.weights, "peers_left_out": missing}
+        draw_rows = partial(draw, sequences=sequences, rows=rows)
+        return cli.Report(numbers, "\n\n".join([tables(rows), *notes]), draw_rows)
+
     # Trajectories of all drives come first: an early end leaves a whole table.
-    more = (_refinements(comparison, drives, methods), _localizations(comparison, drives, methods))
-    for drive, method, work in itertools.chain(_runs(drives, methods, ours), *more):
-        if method in missing:
-            continue
-        case = {"sequence": drive.sequence.name, "method": method}
-        try:
-            row = do_row(folder.path, case, work, seed=comparison.seed)
-        except StoppedError:
-            return
-        if method == OURS:
-            ours[drive.sequence.name] = row
-        yield drive, row
+    stages = ((*PEERS, OURS, NETWORK, ODOMETRY), (REFINED, MULTIWAY) if comparison.is_refined else ())
+    cases = [
+        {"sequence": name, "method": method}
+        for stage in stages
+        for name in by_name
+        for method in stage
+        if method not in missing
+    ]
+    cases += [
+        {"sequence": sequence.name, "method": f"{LOCALIZATION}{precision}"}
+        for sequence in sequences
+        for precision in PRECISIONS
+        if comparison.num_localized and sequence.T_world_lidar is not None
+    ]
+    return cli.run_table(config, experiment, cases, work, report)
 
 
-def _runs(drives: Sequence[Drive], methods: SlamMethods, ours: dict[str, dict[str, Any]]) -> Iterator[Task]:
-    for drive in drives:
-        for name in PEERS:
-            yield drive, name, partial(evaluation.evaluate_peer, drive, name)
-        yield drive, OURS, partial(evaluation.evaluate_ours, drive, methods)
-        yield drive, NETWORK, partial(evaluation.evaluate_network, drive, methods)
-        yield drive, ODOMETRY, lambda drive=drive: evaluation.odometry_row(drive, ours[drive.sequence.name])
+def evaluate(comparison: Comparison, drive: Drive, methods: SlamMethods, method: str) -> cli.Row:
+    """Returns the row of a drive and a method."""
+    if method in PEERS:
+        return evaluation.evaluate_peer(drive, method)
+    if method in (REFINED, MULTIWAY):
+        return evaluate_refinement(drive, methods, method, comparison.seed)
+    if method.startswith(LOCALIZATION):
+        precision = next(name for name in PRECISIONS if method.endswith(name))
+        return evaluate_localization(drive, methods, precision, comparison.num_localized, comparison.seed)
+    return (evaluation.evaluate_ours if method == OURS else evaluation.evaluate_network)(drive, methods)
 
 
-def _refinements(comparison: Comparison, drives: Sequence[Drive], methods: SlamMethods) -> Iterator[Task]:
-    for drive in drives if comparison.is_refined else ():
-        for name in (REFINED, MULTIWAY):
-            yield drive, name, partial(evaluate_refinement, drive, methods, name, comparison.seed)
-
-
-def _localizations(comparison: Comparison, drives: Sequence[Drive], methods: SlamMethods) -> Iterator[Task]:
-    for drive in drives:
-        if comparison.num_localized and drive.reference is not None:
-            for precision in PRECISIONS:
-                work = partial(evaluate_localization, drive, methods, precision)
-                yield drive, f"localization, {precision}", partial(work, comparison.num_localized, comparison.seed)
-
-
-def tables(rows: Sequence[dict[str, Any]]) -> str:
+def tables(rows: Sequence[cli.Row]) -> str:
     """Returns the tables as Markdown: trajectories and loops, sizes of maps, localisation."""
     tracks = [row for row in rows if "path_m" in row]
     places = [row for row in rows if "num_inside" in row]
-    text = "\n".join(
-        [
-            "| drive | scans, way | method | ATE, m | t_rel, % | loops (wrong) "
-            "| recall of loops: all; same way; opposite | s / scan: all; first, last tenth |",
-            "|---|---|---|---|---|---|---|---|",
-            *map(_track_line, tracks),
-            "",
-            f"| drive | way | {' | '.join(f'{name}, MB' for name in SIZES.values())} |",
-            "|---" * (2 + len(SIZES)) + "|",
-            *map(partial(_size_line, tracks), dict.fromkeys(row["sequence"] for row in tracks)),
-        ]
-    )
-    if not places:
-        return text
-    lines = [
-        "| drive | map of the first half | scans in it: right, not found, wrong | other scans: refused, right, wrong "
-        "| median error, m | s / scan |",
-        "|---|---|---|---|---|---|",
+    columns = ("drive", "scans, way", "method", "ATE, m", "t_rel, %", "loops (wrong)")
+    columns += ("recall of loops: all; same way; opposite", "s / scan: all; first, last tenth")
+    sizes = ("drive", "way", *(f"{name}, MB" for name in SIZES.values()))
+    parts = [
+        cli.markdown(columns, map(_track_cells, tracks)),
+        cli.markdown(sizes, [_size_cells(tracks, name) for name in dict.fromkeys(row["sequence"] for row in tracks)]),
     ]
-    return "\n".join([text, "", *lines, *map(_place_line, places)])
+    if places:
+        columns = ("drive", "map of the first half", "scans in it: right, not found, wrong")
+        columns += ("other scans: refused, right, wrong", "median error, m", "s / scan")
+        parts.append(cli.markdown(columns, map(_place_cells, places)))
+    return "\n\n".join(parts)
 
 
-def _track_line(row: dict[str, Any]) -> str:
+def _track_cells(row: cli.Row) -> list[object]:
     loops = f"{row['num_loops']}" + (f" ({row['num_wrong_loops']})" if "num_wrong_loops" in row else "")
     shares = [row.get(f"loop_recall{suffix}") for suffix in ("", "_same_way", "_opposite")]
-    recall = "; ".join(number(share) for share in shares) if row.get("num_revisits") else "no scan comes back"
+    recall = "; ".join(map(cli.cell_text, shares)) if row.get("num_revisits") else "no scan comes back"
     if "num_known_pairs" in row:
         loops += f", {row['num_known_pairs_found']} of {row['num_known_pairs']} known pairs"
     if row["method"] not in (OURS, NETWORK, "KISS-SLAM"):
         loops = recall = ""
     tenths = row.get("scan_s_tenths")
-    growth = f"; {number(tenths[0], 3)}, {number(tenths[-1], 3)}" if tenths else ""
-    return (
-        f"| {row['sequence']} | {row['num_scans']}, {row['path_m']:.0f} m | {row['method']} "
-        f"| {number(row.get('ate_m'), 3)} | {number(row.get('t_rel_percent'))} | {loops} | {recall} "
-        f"| {number(row['scan_s'], 3)}{growth} |"
-    )
+    seconds = [row["scan_s"], *([tenths[0], tenths[-1]] if tenths else [])]
+    first, *others = (cli.cell_text(value, 3) for value in seconds)
+    case = [row["sequence"], f"{row['num_scans']}, {row['path_m']:.0f} m", row["method"]]
+    errors = [cli.cell_text(row.get("ate_m"), 3), row.get("t_rel_percent")]
+    return [*case, *errors, loops, recall, first + (f"; {', '.join(others)}" if others else "")]
 
 
-def _size_line(rows: Sequence[dict[str, Any]], sequence: str) -> str:
+def _size_cells(rows: Sequence[cli.Row], sequence: str) -> list[object]:
     of_drive = {row["method"]: row for row in rows if row["sequence"] == sequence}
     merged = {name: row[name] for row in of_drive.values() for name in SIZES if row.get(name)}
-    sizes = [merged[name][-1] / 1e6 if name in merged else None for name in SIZES]
-    cells = " | ".join(number(size) for size in sizes)
-    return f"| {sequence} | {next(iter(of_drive.values()))['path_m']:.0f} m | {cells} |"
+    sizes = (merged[name][-1] / 1e6 if name in merged else None for name in SIZES)
+    return [sequence, f"{next(iter(of_drive.values()))['path_m']:.0f} m", *sizes]
 
 
-def _place_line(row: dict[str, Any]) -> str:
+def _place_cells(row: cli.Row) -> list[object]:
     inside, outside = ([row[f"num_{name}{kind}"] for kind in ("right", "wrong")] for name in ("", "outside_"))
     counts = [
         f"{asked}: {', '.join(map(str, order))}"
@@ -232,24 +217,18 @@ def _place_line(row: dict[str, Any]) -> str:
             (row["num_outside"], (row["num_outside"] - sum(outside), *outside)),
         )
     ]
-    return (
-        f"| {row['sequence']} | {row['method'].partition(', ')[2]}, {row['map_bytes'] / 1e6:.2f} MB "
-        f"| {' | '.join(counts)} | {number(row['median_error_m'], 3)} | {number(row['scan_s'])} |"
-    )
+    size = f"{row['method'].removeprefix(LOCALIZATION)}, {row['map_bytes'] / 1e6:.2f} MB"
+    return [row["sequence"], size, *counts, cli.cell_text(row["median_error_m"], 3), row["scan_s"]]
 
 
-def number(value: float | None, decimals: int = 2) -> str:
-    """Returns a number for a table; a dash for none."""
-    return "-" if value is None or not np.isfinite(value) else f"{value:.{decimals}f}"
-
-
-def draw(folder: RunFolder, drives: Sequence[Drive], rows: Sequence[dict[str, Any]]) -> None:
+def draw(folder: cli.RunFolder, *, sequences: Sequence[LidarSequence], rows: Sequence[dict[str, Any]]) -> None:
     """Draws trajectories.png, a panel a drive with all methods, and map_sizes.png, bytes against metres (figure 4)."""
     tracks, sizes = {}, {}
-    for drive in drives:
-        of_drive = {row["method"]: row for row in rows if row["sequence"] == drive.sequence.name and "path_m" in row}
-        tracks[drive.sequence.name] = _panel(drive, of_drive)
-        sizes[drive.sequence.name] = _growth(drive, of_drive)
+    for sequence in sequences:
+        of_drive = {row["method"]: row for row in rows if row["sequence"] == sequence.name and "path_m" in row}
+        if of_drive:
+            drive = evaluation.open_folder(folder, sequence, lambda: False)
+            tracks[sequence.name], sizes[sequence.name] = _panel(drive, of_drive), _growth(drive, of_drive)
     if tracks:
         viz.save_figure(viz.trajectories_figure(tracks, COLORS), folder / "trajectories.png")
     sizes = {name: curves for name, curves in sizes.items() if curves}

@@ -19,13 +19,21 @@ import numpy as np
 from tqdm import tqdm
 
 from dpmjax import save_map
-from dpmjax.cli import RunFolder, SlamRun, map_drive, trajectory_errors, write_loops, write_scans, write_trajectory
+from dpmjax.cli import (
+    RowStopped,
+    RunFolder,
+    SlamRun,
+    map_drive,
+    trajectory_errors,
+    write_loops,
+    write_scans,
+    write_trajectory,
+)  # fmt: skip
 from dpmjax.geometry import rigid
 from dpmjax.io import LidarSequence
 from dpmjax.metrics import find_revisits, loop_recall, path_lengths, registration_recall
 from dpmjax.saved_maps import Precision
 from dpmjax.slam import KeyframeMap, SlamMethods, SlamResult
-from experiments._slam_elements import with_network
 from experiments._slam_peers import PEERS, POINT_BYTES, FoundLoop, Peer, is_indoors, peer_version
 
 # Both align with the map of surface elements; the first guess is the motion of before, or the decoder's for every scan.
@@ -37,10 +45,6 @@ NUM_SIZES = 8
 # Stages of a run that no other program's time has.
 _FILE_STAGES = ("read", "write", "viewer")
 _ODOMETRY_STAGES = ("thinning", "odometry")
-
-
-class StoppedError(Exception):
-    """A signal has stopped a row."""
 
 
 class Scale(NamedTuple):
@@ -109,11 +113,17 @@ def evaluate_network(drive: Drive, methods: SlamMethods) -> dict[str, Any]:
     return map_row(drive, drive.folder.part("methods", "network"), NETWORK, with_network(methods))[1]
 
 
+def with_network(methods: SlamMethods) -> SlamMethods:
+    """Returns methods whose decoder is the source of every first guess."""
+    odometry = replace(methods.config.odometry, proposer="network")
+    return methods._replace(config=replace(methods.config, odometry=odometry))
+
+
 def map_row(drive: Drive, folder: RunFolder, method: str, methods: SlamMethods) -> tuple[SlamResult, dict[str, Any]]:
     """Maps a drive, or goes on from the state in the folder, and measures trajectory, loops and seconds."""
     run, result = map_drive(folder, drive.sequence, methods, drive.is_stopped)
     if len(run.reports) < len(drive.sequence):
-        raise StoppedError
+        raise RowStopped
     ends = result.keyframes
     found = [
         FoundLoop((ends[loop.source],) * 2, (ends[loop.target],) * 2, loop.T_target_source)
@@ -156,7 +166,7 @@ def evaluate_peer(drive: Drive, name: str) -> dict[str, Any]:
     at = set(size_marks(num_scans))
     for number in tqdm(range(num_scans), desc=f"{drive.sequence.name}, {name}", unit=" scans", dynamic_ncols=True):
         if drive.is_stopped():
-            raise StoppedError
+            raise RowStopped
         points = drive.sequence.read_points(number).astype(np.float64)
         clock = time.perf_counter()
         if len(points):

@@ -15,21 +15,21 @@ has the box plots.
 from __future__ import annotations
 
 import time
+from collections import defaultdict
 from dataclasses import dataclass, replace
-from functools import partial
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar
+from typing import Annotated, Any, ClassVar
 
 import numpy as np
 from tyro.conf import arg
 
-from dpmjax.cli import RunFolder, RunOptions, StopFlag, do_rows, open_run_folder, recording, run_command, write_metrics
+from dpmjax import cli, nets, simulation, viz
+from dpmjax import deepmapping as dm
 from experiments._rgbd_methods import errors_of
-
-if TYPE_CHECKING:
-    from dpmjax.deepmapping import DeepMappingConfig
 
 EXPERIMENT = "deepmapping_ablations"
 _SUCCESS_MM = 450.0
+# Images of a trajectory, and pixels of each in a step.
+_NUM_VIEWS, _NUM_PIXELS = 8, 200
 VARIANTS: dict[str, tuple[str, ...]] = {
     "lnet": ("CNN", "PointNet"),
     "mnet": ("MLP", "ResMLP", "grid"),
@@ -41,7 +41,7 @@ VARIANTS: dict[str, tuple[str, ...]] = {
 
 
 @dataclass(frozen=True, kw_only=True)
-class Config(RunOptions):
+class Config(cli.RunOptions):
     """Options of the ablations."""
 
     may_change: ClassVar[frozenset[str]] = frozenset({"limit", "only"})
@@ -52,128 +52,92 @@ class Config(RunOptions):
     """Steps of each fit."""
     only: tuple[str, ...] = tuple(VARIANTS)
     """Which ablations."""
-    views: Annotated[int, arg(metavar="N")] = 8
-    """Images a trajectory."""
-    points: Annotated[int, arg(metavar="N")] = 200
-    """Pixels of each image in a step."""
 
     def __post_init__(self) -> None:
         """Checks ranges."""
-        for name, least in (("limit", 1), ("steps", 1), ("views", 2), ("points", 1)):
-            if getattr(self, name) < least:
-                raise ValueError(f"--{name}: expected at least {least}, got {getattr(self, name)}")
-        unknown = [name for name in self.only if name not in VARIANTS]
-        if unknown or not self.only:
-            raise ValueError(f"--only: expected some of {', '.join(VARIANTS)}, got {', '.join(unknown) or 'none'}")
+        cli.check_least(self, limit=1, steps=1)
+        cli.check_names("--only", self.only, VARIANTS)
 
 
-def main(config: Config) -> dict[str, Any]:
+def main(config: Config) -> list[cli.Row]:
     """Runs the missing cases, variant by variant, then writes the table and the box plots."""
-    folder = open_run_folder(config, EXPERIMENT)
     cases = [
         {"ablation": ablation, "variant": variant, "trajectory": trajectory}
         for ablation in config.only
         for variant in VARIANTS[ablation]
         for trajectory in range(config.limit)
     ]
-    with recording(folder), StopFlag() as stop:
-        work = partial(run_one, config=config)
-        rows = do_rows(folder.path, cases, work, seed=config.seed, is_stopped=lambda: stop.is_requested)
-        if rows:
-            table = summarise(rows)
-            metrics = {"variants": table, "is_interrupted": stop.is_requested}
-            write_metrics(folder, metrics, seed=config.seed, rows=rows)
-            draw(folder, rows)
-            for row in table:
-                print(
-                    f"{row['ablation']:8} {row['variant']:9} median ATE {row['median_ate_mm']:7.1f} mm, success "
-                    f"{100 * row['success']:5.1f} % of {row['num_runs']}, {row['median_run_s']:.1f} s"
-                )
-            print(f"results in {folder.path}")
-            return {"variants": table}
-    return {}
+
+    def work(_: cli.TableRun, ablation: str, variant: str, trajectory: int) -> cli.Row:
+        return run_one(settings_of(ablation, variant, config.steps), trajectory, config.seed)
+
+    return cli.run_table(config, EXPERIMENT, cases, work, report)
 
 
-def settings_of(ablation: str, variant: str, config: Config) -> DeepMappingConfig:
-    """The basis with one thing changed."""
-    from dpmjax.deepmapping import JOINT_DEPTH, depth_preset
-    from dpmjax.nets import OccupancyConfig
-
+def settings_of(ablation: str, variant: str, num_steps: int) -> dm.DeepMappingConfig:
+    """Returns the basis with one thing changed."""
     phase = replace(
-        JOINT_DEPTH,
-        num_steps=config.steps,
+        dm.JOINT_DEPTH,
+        num_steps=num_steps,
         occupancy_weight=0.5,
         final_learning_rate=0.1,
-        beams_per_step=config.points,
+        beams_per_step=_NUM_PIXELS,
         num_free=4,
         is_sampled_as_published=False,
     )
-    fast, number = depth_preset("fast"), int(variant) if variant.isdigit() else 0
+    fast, number = dm.depth_preset("fast"), int(variant) if variant.isdigit() else 0
     localization = replace(fast.localization, kind="point") if variant == "PointNet" else fast.localization
     maps = {
-        "ResMLP": OccupancyConfig(kind="resmlp", features=(64, 64, 64, 128, 128)),
+        "ResMLP": nets.OccupancyConfig(kind="resmlp", features=(64, 64, 64, 128, 128)),
         "grid": fast.occupancy,
-        "depth": OccupancyConfig(features=(64,) * number),
-        "width": OccupancyConfig(features=(number,) * 4),
+        "depth": nets.OccupancyConfig(features=(64,) * number),
+        "width": nets.OccupancyConfig(features=(number,) * 4),
     }
     changes: dict[str, dict[str, Any]] = {
         "without": {"occupancy_weight": 1.0},
         "free": {"num_free": number},
     }
     changed = ablation if number else variant
-    phase, occupancy = (
-        replace(phase, **changes.get(changed, {})),
-        maps.get(changed, OccupancyConfig(features=(64,) * 6)),
-    )
-    per_call = min(50, config.steps)
-    networks = {"localization": localization, "occupancy": occupancy}
-    return replace(fast, cold_phases=(phase,), warm_phases=(phase,), steps_per_call=per_call, **networks)
+    phase = replace(phase, **changes.get(changed, {}))
+    occupancy = maps.get(changed, nets.OccupancyConfig(features=(64,) * 6))
+    networks = {"localization": localization, "occupancy": occupancy, "steps_per_call": min(50, num_steps)}
+    return replace(fast, cold_phases=(phase,), warm_phases=(phase,), **networks)
 
 
-def run_one(ablation: str, variant: str, trajectory: int, *, config: Config) -> dict[str, Any]:
-    """Errors of one fit; the first of a variant compiles, and its `run_s` contains that."""
+def run_one(settings: dm.DeepMappingConfig, trajectory: int, run_seed: int) -> cli.Row:
+    """Returns the errors of one fit; the first of a variant compiles, and its `run_s` contains that."""
     import jax
 
-    from dpmjax import deepmapping as dm
-    from dpmjax import simulation
-
-    seed = 1000 * config.seed + trajectory
-    sequence = simulation.simulate_depth_sequence(seed % 15, config.views, seed=seed)
+    seed = 1000 * run_seed + trajectory
+    sequence = simulation.simulate_depth_sequence(seed % 15, _NUM_VIEWS, seed=seed)
     begun = time.perf_counter()
     scans = dm.as_depth_scans(sequence.points, sequence.mask)
-    fitted = dm.fit_depth(scans, settings_of(ablation, variant, config), key=jax.random.key(config.seed))
+    fitted = dm.fit_depth(scans, settings, key=jax.random.key(run_seed))
     return {**errors_of(fitted.T_world_camera, sequence), "run_s": time.perf_counter() - begun}
 
 
-def summarise(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """A row a variant."""
-    groups: dict[tuple[str, str], list[dict[str, Any]]] = {
-        (ablation, variant): [row for row in rows if (row["ablation"], row["variant"]) == (ablation, variant)]
-        for ablation, variants in VARIANTS.items()
-        for variant in variants
-    }
+def report(rows: list[cli.Row]) -> cli.Report:
+    """Returns a line for each variant, and ablations.png."""
+    groups: dict[tuple[str, str], list[cli.Row]] = defaultdict(list)
+    panels: dict[str, dict[str, list[float]]] = defaultdict(lambda: defaultdict(list))
+    for row in rows:
+        groups[row["ablation"], row["variant"]].append(row)
+        panels[f"{row['ablation']}: ATE, mm"][row["variant"]].append(row["ate_mm"])
     table = []
     for (ablation, variant), some in groups.items():
-        if some:
-            ate = np.array([row["ate_mm"] for row in some])
-            numbers = {"median_ate_mm": np.median(ate), "success": (ate < _SUCCESS_MM).mean()}
-            numbers["median_run_s"] = np.median([row["run_s"] for row in some])
-            case = {"ablation": ablation, "variant": variant, "num_runs": len(some)}
-            quartiles = np.quantile(ate, [0.25, 0.75]).tolist()
-            table.append({**case, **{key: float(n) for key, n in numbers.items()}, "quartiles_ate_mm": quartiles})
-    return table
+        ate = np.array([row["ate_mm"] for row in some])
+        numbers = {"median_ate_mm": float(np.median(ate)), "success": float((ate < _SUCCESS_MM).mean())}
+        numbers["median_run_s"] = float(np.median([row["run_s"] for row in some]))
+        case = {"ablation": ablation, "variant": variant, "num_runs": len(some)}
+        table.append({**case, **numbers, "quartiles_ate_mm": np.quantile(ate, [0.25, 0.75]).tolist()})
 
+    def draw(folder: cli.RunFolder) -> None:
+        viz.save_figure(viz.error_boxes_figure(panels, threshold=_SUCCESS_MM), folder / "ablations.png")
 
-def draw(folder: RunFolder, rows: list[dict[str, Any]]) -> None:
-    """ablations.png."""
-    from dpmjax import viz
-
-    groups: dict[str, dict[str, list[float]]] = {}
-    for row in rows:
-        groups.setdefault(row["ablation"], {}).setdefault(row["variant"], []).append(row["ate_mm"])
-    panels = {f"{ablation}: ATE, mm": variants for ablation, variants in groups.items()}
-    viz.save_figure(viz.error_boxes_figure(panels, threshold=_SUCCESS_MM), folder / "ablations.png")
+    columns = ("ablation", "variant", "num_runs", "median_ate_mm", "success", "median_run_s")
+    text = cli.markdown(columns, [[row[name] for name in columns] for row in table])
+    return cli.Report({"variants": table}, text, draw)
 
 
 if __name__ == "__main__":
-    raise SystemExit(run_command(main, Config, name=EXPERIMENT, description=__doc__))
+    raise SystemExit(cli.run_command(main, Config, name=EXPERIMENT, description=__doc__))

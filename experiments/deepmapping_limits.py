@@ -23,8 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 from tyro.conf import arg
 
-from dpmjax import simulation, viz
-from dpmjax.cli import RunFolder, check_least, check_names, run_command, write_metrics
+from dpmjax import cli, simulation, viz
 from experiments import _deepmapping_methods as shared
 from experiments import _deepmapping_tables as tables
 from experiments._deepmapping_methods import Task
@@ -61,9 +60,9 @@ class Config(tables.TableOptions):
     def __post_init__(self) -> None:
         """Checks names and ranges."""
         super().__post_init__()
-        check_names("--orders", self.orders, ORDERS)
-        check_names("--worlds", self.worlds, WORLDS)
-        check_least(self, limit=1, strides=1, noises_px=0)
+        cli.check_names("--orders", self.orders, ORDERS)
+        cli.check_names("--worlds", self.worlds, WORLDS)
+        cli.check_least(self, limit=1, strides=1, noises_px=0)
         if max(self.strides) > NUM_SCANS // 4:
             raise ValueError(f"--strides: expected at most {NUM_SCANS // 4}, got {max(self.strides)}")
 
@@ -78,7 +77,7 @@ def main(config: Config) -> list[dict[str, Any]]:
         "order": config.orders,
     }
     cells = [dict(zip(axes, cell, strict=True)) for cell in itertools.product(*axes.values())]
-    return tables.run_table(config, EXPERIMENT, cells, partial(_prepare, config), partial(_write, config))
+    return tables.run_methods(config, EXPERIMENT, cells, partial(_prepare, config), partial(report, config))
 
 
 def _prepare(config: Config, cell: dict[str, Any]) -> tuple[Task, dict[str, Any]]:
@@ -120,14 +119,9 @@ def summary(rows: Sequence[dict[str, Any]]) -> list[str]:
 
 
 def table(rows: Sequence[dict[str, Any]]) -> str:
-    """Returns the median ATE of every method and candidate in every cell, as Markdown; the kept candidate comes
-    last.
-    """
+    """Returns the median ATE of every method and candidate in every cell, as Markdown."""
     columns = dict.fromkeys(_column(row, name) for row in rows for name in row["candidates"])
-    lines = [
-        f"| world | order | every | noise, px | {' | '.join(columns)} | best kept |",
-        f"|{'---|' * (len(columns) + 5)}",
-    ]
+    lines = []
     for cell, mine in _grouped(rows, "world", "order", "stride", "noise_px").items():
         ates: dict[str, list[float]] = defaultdict(list)
         for row in mine:
@@ -135,9 +129,8 @@ def table(rows: Sequence[dict[str, Any]]) -> str:
                 ates[_column(row, name)].append(numbers["ate_px"])
         medians = (f"{np.median(ates[column]):.3g}" if column in ates else "" for column in columns)
         kept = tables.best_kept(mine)
-        shares = f"{kept['num_best_kept']} of {kept['num_choices']}"
-        lines.append(f"| {' | '.join([*(f'{value}' for value in cell), *medians, shares])} |")
-    return "\n".join(lines)
+        lines.append([*map(str, cell), *medians, f"{kept['num_best_kept']} of {kept['num_choices']}"])
+    return cli.markdown(("world", "order", "every", "noise, px", *columns, "best kept"), lines)
 
 
 def _column(row: dict[str, Any], candidate: str) -> str:
@@ -153,22 +146,23 @@ def _grouped(rows: Sequence[dict[str, Any]], *keys: str) -> dict[tuple[Any, ...]
     return groups
 
 
-def _write(config: Config, folder: RunFolder, rows: list[dict[str, Any]], not_run: dict[str, str]) -> str:
-    """Writes metrics.json, table.md and a picture for each world and order; returns the summary."""
+def report(config: Config, rows: list[dict[str, Any]], not_run: dict[str, str]) -> cli.Report:
+    """Returns the successes, the table and a picture for each world and order."""
     lines = summary(rows)
-    metrics = {"success_threshold_px": shared.SUCCESS_PX, "summary": lines, "not_run": not_run}
-    numbers = tables.success_of_trusted(rows) | tables.best_kept(rows)
-    write_metrics(folder, metrics | numbers, seed=config.seed, rows=rows)
-    (folder / "table.md").write_text(table(rows) + "\n", encoding="utf-8")
-    for (world, order), mine in _grouped(rows, "world", "order").items():
-        figure = viz.success_grids_figure(
-            success_grids(mine, config),
-            {"scans used": [f"1/{stride}" for stride in sorted(config.strides)]},
-            {"range noise, px": [f"{noise:g}" for noise in config.noises_px]},
-        )
-        viz.save_figure(figure, folder / f"{world}_{order}.png")
-    return "\n".join(lines)
+
+    def draw(folder: cli.RunFolder) -> None:
+        print(*lines, sep="\n")
+        for (world, order), mine in _grouped(rows, "world", "order").items():
+            figure = viz.success_grids_figure(
+                success_grids(mine, config),
+                {"scans used": [f"1/{stride}" for stride in sorted(config.strides)]},
+                {"range noise, px": [f"{noise:g}" for noise in config.noises_px]},
+            )
+            viz.save_figure(figure, folder / f"{world}_{order}.png")
+
+    numbers = {"success_threshold_px": shared.SUCCESS_PX, "summary": lines, "not_run": not_run}
+    return cli.Report(numbers | tables.success_of_trusted(rows) | tables.best_kept(rows), table(rows), draw)
 
 
 if __name__ == "__main__":
-    raise SystemExit(run_command(main, Config, name=EXPERIMENT, description=__doc__))
+    raise SystemExit(cli.run_command(main, Config, name=EXPERIMENT, description=__doc__))

@@ -14,17 +14,17 @@ import itertools
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from tyro.conf import Positional, arg
 
-from dpmjax.cli import environment, read_map2d_run, run_command, write_json
+from dpmjax import ScanSet, cli, metrics, simulation, viz
+from dpmjax import deepmapping as dm
+from dpmjax.io import ScanSequence
 
-if TYPE_CHECKING:
-    from dpmjax.deepmapping import Fitted
-    from dpmjax.io import ScanSequence
+Floats = NDArray[np.float64]
 
 EXPERIMENT = "deepmapping_relocalize"
 # A fit counts as a success below this error (section 4.1); so does a re-localisation.
@@ -47,33 +47,27 @@ class Config:
 
     def __post_init__(self) -> None:
         """Checks ranges."""
-        for name in ("stride_px", "steps"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"--{name.replace('_', '-')}: expected at least 1, got {getattr(self, name)}")
+        cli.check_least(self, stride_px=1, steps=1)
 
 
 def main(config: Config) -> dict[str, Any]:
-    """Loads the run, re-localises scans everywhere with both L-Nets, draws, writes."""
+    """Loads the run, trains L-Net on its poses, re-localises scans everywhere, draws, writes."""
     import jax
 
-    from dpmjax import ScanSet
-    from dpmjax.deepmapping import LocalizationTrainingConfig, relocalize, train_localization
-    from dpmjax.simulation import make_world, scan_world
-
-    run = read_map2d_run(config.run)
+    run = cli.read_map2d_run(config.run)
     if run.world is None:
         raise ValueError(f"{config.run} is a run on {run.sequence.name}, whose world is needed; use a built-in one")
     sequence, fitted = run.sequence, run.fitted
-    grid = make_world(run.world).is_obstacle
+    grid = simulation.make_world(run.world).is_obstacle
     truth = free_poses(grid, config)
-    points, mask = scan_world(grid, truth, num_beams=sequence.points.shape[1])
+    points, mask = simulation.scan_world(grid, truth, num_beams=sequence.points.shape[1])
     begun = time.perf_counter()
-    training = LocalizationTrainingConfig(num_steps=config.steps)
+    training = dm.LocalizationTrainingConfig(num_steps=config.steps)
     scans = ScanSet(sequence.points, sequence.mask)
-    trained = train_localization(fitted, scans, training, key=jax.random.key(config.seed))
+    trained = dm.train_localization(fitted, scans, training, key=jax.random.key(config.seed))
     jax.block_until_ready(trained.params)
     training_s, begun = time.perf_counter() - begun, time.perf_counter()
-    found = relocalize(trained, ScanSet(points, mask))
+    found = dm.relocalize(trained, ScanSet(points, mask))
     errors, turns = errors_at(found.pose, truth, fitted, sequence)
     queries = Queries(errors, turns, found.is_known, is_mapped(truth, fitted, sequence), found.nats)
     report = {
@@ -84,13 +78,12 @@ def main(config: Config) -> dict[str, Any]:
         "training_s": training_s,
         "relocalization_s": time.perf_counter() - begun,
         "seed": config.seed,
-        **environment(),
+        **cli.environment(),
     }
-    write_json(config.run / "relocalization.json", report)
+    cli.write_json(config.run / "relocalization.json", report)
     np.savez(config.run / "relocalization.npz", truth=truth, **queries._asdict())
     draw(config, sequence, grid.shape, truth, queries)
-    tell(report)
-    print(f"results in {config.run}")
+    print(lines_of(report), f"results in {config.run}", sep="\n")
     return report
 
 
@@ -105,22 +98,17 @@ class Queries(NamedTuple):
         nats: cost of a beam by the map.
     """
 
-    errors: NDArray[np.float64]
-    turns: NDArray[np.float64]
+    errors: Floats
+    turns: Floats
     is_known: NDArray[np.bool_]
     is_mapped: NDArray[np.bool_]
-    nats: NDArray[np.float64]
+    nats: Floats
 
 
-def draw(
-    config: Config, sequence: ScanSequence, shape: tuple[int, ...], truth: NDArray[np.float64], queries: Queries
-) -> None:
-    """relocalization.png: maps of the errors, of all scans and of those that are known."""
-    from dpmjax import viz
-
+def draw(config: Config, sequence: ScanSequence, shape: tuple[int, ...], truth: Floats, queries: Queries) -> None:
+    """Draws relocalization.png: maps of the errors, of all scans and of those that are known."""
     panels = []
-    everywhere = np.ones(len(truth), bool)
-    for name, rows in (("all scans", everywhere), ("scans that are known", queries.is_known)):
+    for name, rows in (("all scans", np.ones(len(truth), bool)), ("scans that are known", queries.is_known)):
         image = np.full(shape, np.nan)[:: config.stride_px, :: config.stride_px]
         image[tuple((truth[rows, 1::-1] // config.stride_px).astype(int).T)] = queries.errors[rows]
         share = float((queries.errors[rows] < _RIGHT_PX).mean()) if rows.any() else 0.0
@@ -132,7 +120,7 @@ def draw(
     viz.save_figure(figure, config.run / "relocalization.png")
 
 
-def free_poses(grid: NDArray[np.bool_], config: Config) -> NDArray[np.float64]:
+def free_poses(grid: NDArray[np.bool_], config: Config) -> Floats:
     """Returns (m, 3) poses of random headings at the centres of the free squares."""
     half = config.stride_px // 2
     rows, columns = np.nonzero(~grid[half :: config.stride_px, half :: config.stride_px])
@@ -141,13 +129,10 @@ def free_poses(grid: NDArray[np.bool_], config: Config) -> NDArray[np.float64]:
     return np.column_stack([places, headings])
 
 
-def is_mapped(truth: NDArray[np.float64], fitted: Fitted, sequence: ScanSequence) -> NDArray[np.bool_]:
+def is_mapped(truth: Floats, fitted: dm.Fitted, sequence: ScanSequence) -> NDArray[np.bool_]:
     """Returns True for places of true poses that some beam of the fit's scans has passed."""
-    from dpmjax.deepmapping import draw_map
-    from dpmjax.metrics import align_rigid
-
-    picture = draw_map(fitted, sequence.points, sequence.mask)
-    T_fit_world = align_rigid(sequence.reference_poses[:, :2], fitted.poses[:, :2])
+    picture = dm.draw_map(fitted, sequence.points, sequence.mask)
+    T_fit_world = metrics.align_rigid(sequence.reference_poses[:, :2], fitted.poses[:, :2])
     places = truth[:, :2] @ T_fit_world[:2, :2].T + T_fit_world[:2, 2]
     x_min, x_max, y_min, y_max = picture.extent
     height, width = picture.explored.shape
@@ -157,20 +142,17 @@ def is_mapped(truth: NDArray[np.float64], fitted: Fitted, sequence: ScanSequence
     return is_inside & picture.explored[row, column]
 
 
-def errors_at(
-    poses: NDArray[np.float64], truth: NDArray[np.float64], fitted: Fitted, sequence: ScanSequence
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def errors_at(poses: Floats, truth: Floats, fitted: dm.Fitted, sequence: ScanSequence) -> tuple[Floats, Floats]:
     """Distance (px) and angle (degrees) to the truth, in the frame that lays the run's trajectory onto the truth."""
     from dpmjax.geometry import se2
-    from dpmjax.metrics import align_rigid
 
-    T = align_rigid(fitted.poses[:, :2], sequence.reference_poses[:, :2])
+    T = metrics.align_rigid(fitted.poses[:, :2], sequence.reference_poses[:, :2])
     moved = poses[:, :2] @ T[:2, :2].T + T[:2, 2]
     turn = se2.wrap_angle(poses[:, 2] + np.arctan2(T[1, 0], T[0, 0]) - truth[:, 2])
     return np.linalg.norm(moved - truth[:, :2], axis=1), np.degrees(np.abs(turn))
 
 
-def summarise(queries: Queries, truth: NDArray[np.float64], sequence: ScanSequence) -> dict[str, Any]:
+def summarise(queries: Queries, truth: Floats, sequence: ScanSequence) -> dict[str, Any]:
     """Numbers of all mapped free space, of the known scans, and by the distance from the trajectory."""
     from scipy.spatial import KDTree
 
@@ -199,17 +181,18 @@ def _numbers(queries: Queries, rows: NDArray[np.bool_]) -> dict[str, Any]:
     }
 
 
-def tell(report: dict[str, Any]) -> None:
-    """Prints the numbers of each group of scans."""
-    for name, row in report["groups"].items():
-        print(
-            f"{name}: {row['num_poses']} scans, median {row['median_px']:.1f} px, {row['median_deg']:.1f} degrees, "
-            f"{row['share_below_20_px']:.0%} below {_RIGHT_PX:.0f} px, {row['share_known']:.0%} called known"
-        )
+def lines_of(report: dict[str, Any]) -> str:
+    """Returns the numbers of each group of scans for the console."""
+    lines = [
+        f"{name}: {row['num_poses']} scans, median {row['median_px']:.1f} px, {row['median_deg']:.1f} degrees, "
+        f"{row['share_below_20_px']:.0%} below {_RIGHT_PX:.0f} px, {row['share_known']:.0%} called known"
+        for name, row in report["groups"].items()
+    ]
     precision = report["precision_of_known"]
     answer = "none is called known" if precision is None else f"{precision:.1%} of those called known are right"
-    print(f"{answer}; {report['share_of_mapped_known']:.0%} of the mapped ones are called known")
+    known = f"{answer}; {report['share_of_mapped_known']:.0%} of the mapped ones are called known"
+    return "\n".join([*lines, known])
 
 
 if __name__ == "__main__":
-    raise SystemExit(run_command(main, Config, name=EXPERIMENT, description=__doc__))
+    raise SystemExit(cli.run_command(main, Config, name=EXPERIMENT, description=__doc__))

@@ -3,11 +3,10 @@
     python -m experiments.deepmapping_suite --limit 6        the first six trajectories
     python -m experiments.deepmapping_suite --resume         go on where the last run stopped
 
-Three built-in worlds, 50 trajectories of 128 poses and 25 of 256, made by seed. Every trajectory of every method is a
-file of its own, so that a killed run goes on. With --range-noise-px the rows also carry the least error that one scan
-allows where the world is known (the Cramer-Rao bound). A method that compares several candidates, as a search and
-DeepMapping from it, has a row for each of them below its own. Results: table.md, metrics.json (with all rows),
-boxes.png.
+Three built-in worlds, 50 trajectories of 128 poses and 25 of 256, made by seed. With --range-noise-px the rows also
+carry the least error that one scan allows where the world is known (the Cramer-Rao bound). A method that compares
+several candidates, as a search and DeepMapping from it, has a row for each of them below its own. Results: table.md,
+metrics.json (with all rows), boxes.png.
 """
 
 from __future__ import annotations
@@ -20,8 +19,7 @@ from typing import Annotated, Any, ClassVar
 import numpy as np
 from tyro.conf import arg
 
-from dpmjax import metrics, simulation, viz
-from dpmjax.cli import RunFolder, check_least, run_command, write_metrics
+from dpmjax import cli, metrics, simulation, viz
 from experiments import _deepmapping_methods as shared
 from experiments import _deepmapping_tables as tables
 from experiments._deepmapping_methods import Task
@@ -44,7 +42,7 @@ class Config(tables.TableOptions):
     def __post_init__(self) -> None:
         """Checks names and ranges."""
         super().__post_init__()
-        check_least(self, limit=1, range_noise_px=0)
+        cli.check_least(self, limit=1, range_noise_px=0)
 
 
 def list_trajectories() -> list[dict[str, int]]:
@@ -56,9 +54,10 @@ def list_trajectories() -> list[dict[str, int]]:
 
 
 def main(config: Config) -> list[dict[str, Any]]:
-    """Runs the missing cases, and writes the table after every trajectory."""
-    cells = list_trajectories()[: config.limit]
-    return tables.run_table(config, EXPERIMENT, cells, partial(_prepare, config), partial(_write, config.seed))
+    """Runs the missing cases, and writes the table."""
+    return tables.run_methods(
+        config, EXPERIMENT, list_trajectories()[: config.limit], partial(_prepare, config), report
+    )
 
 
 def _prepare(config: Config, cell: dict[str, Any]) -> tuple[Task, dict[str, Any]]:
@@ -110,48 +109,44 @@ def by_method(rows: Sequence[dict[str, Any]]) -> dict[str, list[dict[str, Any]]]
 
 def table(rows: Sequence[dict[str, Any]]) -> str:
     """Returns the table as Markdown: a row for each method, and below it one for each of several candidates."""
-    lines = [
-        "| method | trajectories | median ATE, px | median point distance, px | success (ATE < 20 px) | median s "
-        "| trusted | of these right |",
-        "|---|---|---|---|---|---|---|---|",
-    ]
+    columns = ("method", "trajectories", "median ATE, px", "median point distance, px", "success (ATE < 20 px)")
 
-    def line(title: str, s: dict[str, Any], last: str) -> str:
-        return (
-            f"| {title} | {s['num_trajectories']} | {s['median_ate_px']:.3g} "
-            f"| {s['median_point_distance_px']:.3g} | {s['success']:.1%} | {last} |"
-        )
+    def cells(title: str, s: dict[str, Any], *last: object) -> list[object]:
+        medians = (f"{s[name]:.3g}" for name in ("median_ate_px", "median_point_distance_px"))
+        return [title, s["num_trajectories"], *medians, f"{s['success']:.1%}", *last]
 
+    lines = []
     for method, mine in by_method(rows).items():
         s = summarise(mine)
         right = "-" if s["success_of_trusted"] is None else f"{s['success_of_trusted']:.1%}"
-        lines.append(line(shared.METHODS[method].title, s, f"{s['median_s']:.1f} | {s['num_trusted']} | {right}"))
+        lines.append(cells(shared.METHODS[method].title, s, f"{s['median_s']:.1f}", s["num_trusted"], right))
         if len(s["candidates"]) > 1:
             lines += [
-                line(f"- of it: {name}", c, f"kept {c['num_kept']} times | |") for name, c in s["candidates"].items()
+                cells(f"- of it: {name}", c, f"kept {c['num_kept']} times", "", "")
+                for name, c in s["candidates"].items()
             ]
-    return "\n".join(lines)
+    return cli.markdown((*columns, "median s", "trusted", "of these right"), lines)
 
 
-def _write(seed: int, folder: RunFolder, rows: list[dict[str, Any]], not_run: dict[str, str]) -> str:
-    """Writes table.md, metrics.json and boxes.png; returns the table."""
+def report(rows: list[dict[str, Any]], not_run: dict[str, str]) -> cli.Report:
+    """Returns the numbers of the methods, the table and boxes.png."""
     groups = by_method(rows)
     methods = {method: {"title": shared.METHODS[method].title, **summarise(mine)} for method, mine in groups.items()}
-    numbers = {"success_threshold_px": shared.SUCCESS_PX, "methods": methods, "not_run": not_run}
-    note = write_metrics(folder, numbers, seed=seed, rows=rows)
-    text = table(rows)
-    bounds = [row["bound_px"] for row in rows if "bound_px" in row]
+    text, bounds = table(rows), [row["bound_px"] for row in rows if "bound_px" in row]
     if bounds:
         least = f"{np.median(bounds):.3g} px"
         text += f"\n\nNo unbiased estimate has a median ATE below {least}, not even where the world is known."
-    (folder / "table.md").write_text(text + (f"\n\n{note}.\n" if note else "\n"), encoding="utf-8")
     panels = {
         label: {method: [row[key] for row in mine] for method, mine in groups.items()}
         for label, key in (("ATE, px", "ate_px"), ("point distance, px", "point_distance_px"))
     }
-    viz.save_figure(viz.error_boxes_figure(panels, threshold=shared.SUCCESS_PX), folder / "boxes.png")
-    return text
+
+    def draw(folder: cli.RunFolder) -> None:
+        viz.save_figure(viz.error_boxes_figure(panels, threshold=shared.SUCCESS_PX), folder / "boxes.png")
+
+    numbers = {"success_threshold_px": shared.SUCCESS_PX, "methods": methods, "not_run": not_run}
+    return cli.Report(numbers, text, draw)
 
 
 if __name__ == "__main__":
-    raise SystemExit(run_command(main, Config, name=EXPERIMENT, description=__doc__))
+    raise SystemExit(cli.run_command(main, Config, name=EXPERIMENT, description=__doc__))

@@ -17,15 +17,18 @@ out of the fits. `python -m experiments.dpm_confidence` checks the confidence on
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import numpy as np
-from tqdm import tqdm
 from tyro.conf import Positional, arg
 
-from dpmjax.cli import RunOptions, check_least, do_row, open_run_folder, recording, run_command, write_metrics
+from dpmjax import cli, load_model, metrics, save_model, simulation, viz
+from dpmjax import deeppointmap as dpm
+from dpmjax.io import LidarSequence
+from dpmjax.weights import read_card
+from experiments import _dpm_overlap as overlap
+from experiments._dpm_places import KINDS, ambiguous_case, ambiguous_drive, measure_pairs
 
 EXPERIMENT = "dpm_calibrate"
 MODEL = "model.safetensors"
@@ -35,10 +38,11 @@ TOWN_BANDS_M = ((2.0, 10.0), (10.0, 20.0), (60.0, np.inf))
 AMBIGUOUS_BANDS_M = ((1.0, 10.0), (10.0, 20.0))
 # Far from the seeds of the towns of training, also of its held-out one.
 FIRST_TOWN, FIRST_AMBIGUOUS, FIRST_OVERLAP_TOWN = 3_000_000, 3_100_000, 3_500_000
+TOWN_LENGTH_M = 400.0
 
 
 @dataclass(frozen=True, kw_only=True)
-class Config(RunOptions):
+class Config(cli.RunOptions):
     """Options of the run."""
 
     model: Positional[str]
@@ -47,8 +51,6 @@ class Config(RunOptions):
     """Number of towns. The kinds of place, of which there are nine, take turns, so that each counts the same."""
     pairs: Annotated[int, arg(metavar="N")] = 30
     """Pairs of each town that are 2 to 10 m apart, as many 10 to 20 m apart, and as many without overlap."""
-    town_length_m: Annotated[float, arg(metavar="M")] = 400.0
-    """Length of the drive through each town."""
     ambiguous: Annotated[int, arg(metavar="N")] = 30
     """Number of ambiguous places, each with as many pairs 1 to 10 m and 10 to 20 m apart."""
     overlap_towns: Annotated[int, arg(metavar="N")] = 24
@@ -58,101 +60,86 @@ class Config(RunOptions):
 
     def __post_init__(self) -> None:
         """Checks ranges."""
-        check_least(self, towns=2, pairs=5, ambiguous=2, overlap_towns=0, overlap_pairs=16, town_length_m=150, seed=0)
+        cli.check_least(self, towns=2, pairs=5, ambiguous=2, overlap_towns=0, overlap_pairs=16, seed=0)
         if self.overlap_towns == 1:
             raise ValueError("--overlap-towns: expected 0, or 2 or more: each is left out once, got 1")
 
 
-def main(config: Config) -> dict[str, Any]:
+def main(config: Config) -> list[cli.Row]:
     """Registers and compares the pairs, fits, and writes the model."""
-    from dpmjax import load_model, save_model, viz
-    from dpmjax.weights import read_card
-    from experiments import _dpm_overlap
-
     model = load_model(config.model)
-    folder = open_run_folder(config, EXPERIMENT)
-    rows, overlap_rows = [], []
-    num_pairs = config.pairs * (config.towns * len(TOWN_BANDS_M) + config.ambiguous * len(AMBIGUOUS_BANDS_M))
-    total = num_pairs + config.overlap_towns * config.overlap_pairs
-    with recording(folder), tqdm(total=total, unit=" pairs") as bar:
-        for case in _cases(config):
-            work = partial(_registrations, config, model, **case, bar=bar)
-            rows.append(do_row(folder.path, case, work, seed=config.seed))
-            bar.update(sum(len(row["is_right"]) for row in rows) - bar.n)
-        num_done = sum(len(row["is_right"]) for row in rows)
-        for town in range(FIRST_OVERLAP_TOWN, FIRST_OVERLAP_TOWN + config.overlap_towns):
-            work = partial(_overlap_town, config, model, town, bar)
-            overlap_rows.append(do_row(folder.path, {"overlap_town": town}, work, seed=config.seed))
-            bar.update(num_done + sum(len(row["is_overlap"]) for row in overlap_rows) - bar.n)
-        calibration, numbers, held_out = fit(rows)
-        calibrated = model.replace(config=replace(model.config, calibration=calibration))
-        note = (
-            f"Confidence calibrated on {config.towns} towns and {config.ambiguous} ambiguous places, "
-            f"{numbers['num_pairs']} pairs"
-        )
-        title = "places left out of the fit"
-        if overlap_rows:
-            overlap, overlap_numbers, overlap_held_out = _dpm_overlap.fit(overlap_rows)
-            numbers |= overlap_numbers
-            calibrated = calibrated.replace(config=replace(calibrated.config, overlap=overlap))
-            note += f"; overlap fitted on {config.overlap_towns} towns, {numbers['num_overlap_pairs']} pairs"
-            values = overlap_held_out["probability"], overlap_held_out["is_overlap"]
-            figure = viz.reliability_figure(*values, title=f"overlap, {title}", labels=OVERLAP_LABELS)
-            viz.save_figure(figure, folder / "reliability_overlap.png")
-        card = read_card(Path(config.model)) if config.model.endswith(".safetensors") else config.model
-        save_model(calibrated, folder / MODEL, card=f"{card} {note}.".strip())
-        write_metrics(folder, {"model": config.model, **numbers}, seed=config.seed)
-        for kind, name in (("of_scans", "reliability.png"), ("of_clouds", "reliability_clouds.png")):
-            found = held_out[kind]
-            figure = viz.reliability_figure(found["confidence"], found["is_right"], title=title)
-            viz.save_figure(figure, folder / name)
-    print(", ".join(f"{name} {value:.3f}" for name, value in numbers.items() if isinstance(value, float)))
-    print(f"results in {folder.path}")
-    return numbers
+
+    def work(run: cli.TableRun, **case: int | str) -> cli.Row:
+        if "overlap_town" in case:
+            # The other town is that of the next row.
+            seeds = (case["overlap_town"], case["overlap_town"] + 1)
+            drives = [simulation.simulate_drive(seed, length_m=TOWN_LENGTH_M) for seed in seeds]
+            return overlap.measure_town(model, drives, config.overlap_pairs, config.seed)
+        drive, bands_m = open_place(**case)
+        return measure_pairs(model, drive, bands_m, config.pairs, seed=config.seed, is_stopped=run.is_stopped)
+
+    cases = list_cases(config)
+    return cli.run_table(config, EXPERIMENT, cases, work, lambda rows: report(config, model, rows, len(cases)))
 
 
-def _cases(config: Config) -> list[dict[str, Any]]:
-    from dpmjax.simulation import SceneMixture
-    from experiments._dpm_places import ambiguous_case
-
-    kinds = [kind for kind, _ in SceneMixture().kinds]
+def list_cases(config: Config) -> list[cli.Row]:
+    """Returns the places of the confidence, then the towns of the overlap."""
+    kinds = [kind for kind, _ in simulation.SceneMixture().kinds]
     towns = [{"town": FIRST_TOWN + number, "kind": kinds[number % len(kinds)]} for number in range(config.towns)]
-    return towns + [ambiguous_case(number, FIRST_AMBIGUOUS) for number in range(config.ambiguous)]
+    places = [ambiguous_case(number, FIRST_AMBIGUOUS) for number in range(config.ambiguous)]
+    return towns + places + [{"overlap_town": FIRST_OVERLAP_TOWN + number} for number in range(config.overlap_towns)]
 
 
-def _registrations(config: Config, model: Any, *, kind: str, bar: tqdm, **case: int) -> dict[str, Any]:
-    from dpmjax.simulation import simulate_drive
-    from experiments._dpm_places import ambiguous_drive, measure_pairs
-
-    if "town" in case:
-        drive, bands_m = simulate_drive(case["town"], length_m=config.town_length_m, kind=kind), TOWN_BANDS_M
-    else:
-        drive = ambiguous_drive(case["place"], kind, case["beams"], config.town_length_m)
-        bands_m = AMBIGUOUS_BANDS_M
-    return measure_pairs(model, drive, bands_m, config.pairs, seed=config.seed, on_pair=lambda: bar.update(1))
+def open_place(
+    *, kind: str, town: int | None = None, place: int = 0, beams: int = 0
+) -> tuple[LidarSequence, tuple[tuple[float, float], ...]]:
+    """Simulates a town or an ambiguous place; returns its drive, and the distances of its pairs, metres."""
+    if town is not None:
+        return simulation.simulate_drive(town, length_m=TOWN_LENGTH_M, kind=kind), TOWN_BANDS_M
+    return ambiguous_drive(place, kind, beams, TOWN_LENGTH_M), AMBIGUOUS_BANDS_M
 
 
-def _overlap_town(config: Config, model: Any, town: int, bar: tqdm) -> dict[str, Any]:
-    from dpmjax.simulation import simulate_drive
-    from experiments._dpm_overlap import measure_town
+def report(config: Config, model: dpm.Model, rows: list[cli.Row], num_cases: int) -> cli.Report:
+    """Fits the regressions; the model and the reliability of places left out are written with the pictures."""
+    if len(rows) < num_cases:
+        return cli.Report({"model": config.model}, f"{len(rows)} of {num_cases} places", rows=())
+    overlap_rows = [row for row in rows if "overlap_town" in row]
+    calibration, numbers, held_out = fit([row for row in rows if "overlap_town" not in row])
+    calibrated = replace(model.config, calibration=calibration)
+    note = f"Confidence calibrated on {config.towns} towns and {config.ambiguous} ambiguous places, "
+    note += f"{numbers['num_pairs']} pairs"
+    title = "places left out of the fit"
+    figures = {
+        name: viz.reliability_figure(held_out[kind]["confidence"], held_out[kind]["is_right"], title=title)
+        for kind, name in (("of_scans", "reliability.png"), ("of_clouds", "reliability_clouds.png"))
+    }
+    if overlap_rows:
+        fitted, overlap_numbers, found = overlap.fit(overlap_rows)
+        numbers |= overlap_numbers
+        calibrated = replace(calibrated, overlap=fitted)
+        note += f"; overlap fitted on {config.overlap_towns} towns, {numbers['num_overlap_pairs']} pairs"
+        figures["reliability_overlap.png"] = viz.reliability_figure(
+            found["probability"], found["is_overlap"], title=f"overlap, {title}", labels=OVERLAP_LABELS
+        )
 
-    # The other town is that of the next row.
-    drives = [simulate_drive(seed, length_m=config.town_length_m) for seed in (town, town + 1)]
-    return measure_town(model, drives, config.overlap_pairs, config.seed, bar)
+    def write(folder: cli.RunFolder) -> None:
+        card = read_card(Path(config.model)) if config.model.endswith(".safetensors") else config.model
+        save_model(model.replace(config=calibrated), folder / MODEL, card=f"{card} {note}.".strip())
+        for name, figure in figures.items():
+            viz.save_figure(figure, folder / name)
+
+    text = ", ".join(f"{name} {value:.3f}" for name, value in numbers.items() if isinstance(value, float))
+    return cli.Report({"model": config.model, **numbers}, text, write, rows=())
 
 
-def fit(rows: list[dict[str, Any]]) -> tuple[Any, dict[str, Any], dict[str, dict[str, np.ndarray]]]:
+def fit(rows: list[cli.Row]) -> tuple[dpm.Calibration, cli.Row, dict[str, dict[str, np.ndarray]]]:
     """Returns the calibration of all places, its numbers, and the confidence of each place when it is left out.
 
     Each model is fitted on the pairs that it rates: scans on those whose walls hold all directions.
     """
-    from dpmjax.deeppointmap import CLOUD_FEATURES, SCAN_FEATURES, WEAK_FEATURES, Calibration, fit_logistic
-    from experiments._dpm_overlap import held_out_probability
-    from experiments._dpm_places import KINDS
-
-    numbers: dict[str, Any] = {"num_pairs": sum(len(row["is_right"]) for row in rows)}
+    numbers: cli.Row = {"num_pairs": sum(len(row["is_right"]) for row in rows)}
     models, held_out = {}, {}
-    for kind, names in zip(KINDS, (CLOUD_FEATURES, SCAN_FEATURES, WEAK_FEATURES), strict=True):
+    for kind, names in zip(KINDS, (dpm.CLOUD_FEATURES, dpm.SCAN_FEATURES, dpm.WEAK_FEATURES), strict=True):
         pairs = [
             (place, row[kind][number], row["is_right_of_clouds" if kind == "of_clouds" else "is_right"][number])
             for place, row in enumerate(rows)
@@ -162,17 +149,17 @@ def fit(rows: list[dict[str, Any]]) -> tuple[Any, dict[str, Any], dict[str, dict
         if kind == "of_weak_scans" and len({is_right for _, _, is_right in pairs}) < 2:
             continue
         place, features, is_right = (np.array(column) for column in zip(*pairs, strict=True))
-        models[kind] = fit_logistic(names, features, is_right)
-        confidence = held_out_probability(names, features, is_right, place)
+        models[kind] = dpm.fit_logistic(names, features, is_right)
+        confidence = overlap.held_out_probability(names, features, is_right, place)
         held_out[kind] = {"confidence": confidence, "is_right": is_right}
         numbers |= {
             f"num_pairs_{kind}": len(pairs),
             f"share_right_{kind}": float(is_right.mean()),
-            f"brier_{kind}": float(np.mean((confidence - is_right) ** 2)),
-            f"brier_of_a_constant_{kind}": float(np.mean((is_right.mean() - is_right) ** 2)),
+            f"brier_{kind}": metrics.brier_score(confidence, is_right),
+            f"brier_of_a_constant_{kind}": float(is_right.var()),
         }
-    return Calibration(**models), numbers, held_out
+    return dpm.Calibration(**models), numbers, held_out
 
 
 if __name__ == "__main__":
-    raise SystemExit(run_command(main, Config, name=EXPERIMENT, description=__doc__))
+    raise SystemExit(cli.run_command(main, Config, name=EXPERIMENT, description=__doc__))

@@ -13,31 +13,16 @@ residual along x, y and z of the lidar. Results go to results/dpm_clouds/<time>/
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated
 
 import numpy as np
 from tyro.conf import Positional, arg
 
-from dpmjax.cli import (
-    BAND_NAMES,
-    RunFolder,
-    RunOptions,
-    StopFlag,
-    check_least,
-    do_rows,
-    open_run_folder,
-    recording,
-    run_command,
-    write_metrics,
-)
-
-if TYPE_CHECKING:
-    from dpmjax import DescriptorCloud
-    from dpmjax.deeppointmap import Model
-    from dpmjax.io import LidarSequence
+from dpmjax import cli, io, load_model, registration_recall, simulation
+from dpmjax import deeppointmap as dpm
 
 EXPERIMENT = "dpm_clouds"
 # Apart from the seeds of training, selection, calibration and held-out towns.
@@ -45,7 +30,7 @@ FIRST_SCENE = 7_000_000
 
 
 @dataclass(frozen=True, kw_only=True)
-class Config(RunOptions):
+class Config(cli.RunOptions):
     """Options of the run."""
 
     paths: Annotated[Positional[tuple[str, ...]], arg(metavar="scenes|PATH ...")] = ("scenes",)
@@ -61,85 +46,74 @@ class Config(RunOptions):
 
     def __post_init__(self) -> None:
         """Checks ranges."""
-        check_least(self, pairs=1, num_scenes=1, seed=0, elements=1)
+        cli.check_least(self, pairs=1, num_scenes=1, seed=0, elements=1)
         if not self.paths or not self.elements:
             raise ValueError("give at least one folder of scans, or scenes, and one number of elements")
 
 
-def main(config: Config) -> list[dict[str, Any]]:
+def main(config: Config) -> list[cli.Row]:
     """Makes the rows that are missing, and writes the table and the numbers."""
-    from dpmjax import load_model
-
     model = load_model(config.weights)
     low, high = model.config.num_descriptors, model.config.pyramid.stages[0].num_points
     if not low <= min(config.elements) <= max(config.elements) <= high:
         raise ValueError(f"--elements: expected from {low} to {high}, got {config.elements}")
     drives = {drive.name: drive for drive in open_drives(config.paths, config.num_scenes)}
-    folder = open_run_folder(config, EXPERIMENT)
+    stages = {"decoder": None, **{f"elements_{num}": num for num in config.elements}}
 
-    def work(sequence: str, band: str) -> dict[str, Any]:
-        return evaluate(model, drives[sequence], band, config)
+    def work(_: cli.TableRun, sequence: str, band: str) -> cli.Row:
+        drawn = dpm.draw_scan_pairs(drives[sequence], band, config.pairs, seed=config.seed)
+        return evaluate(model, dpm.read_scan_pairs(drives[sequence], drawn, seed=config.seed), stages)
 
-    with recording(folder), StopFlag() as stop:
-        cases = [{"sequence": name, "band": band} for name in drives for band in BAND_NAMES]
-        rows = do_rows(folder.path, cases, work, seed=config.seed, is_stopped=lambda: stop.is_requested)
-        print(write_results(folder, config, rows))
-    print(f"results in {folder.path}")
-    return rows
+    cases = [{"sequence": name, "band": band} for name in drives for band in cli.BAND_NAMES]
+    numbers = {"weights": config.weights}
+    return cli.run_table(config, EXPERIMENT, cases, work, lambda rows: cli.Report(numbers, table(rows, list(stages))))
 
 
-def open_drives(paths: Sequence[str], num_scenes: int = 0) -> list[LidarSequence]:
+def open_drives(paths: Sequence[str], num_scenes: int = 0) -> list[io.LidarSequence]:
     """Opens the drives, and simulates scenes where a path is scenes; a `ValueError` names one without poses."""
-    from dpmjax.io import list_lidar_sequences, open_lidar_sequence
-    from dpmjax.simulation import draw_scene, simulate_scene
-
-    drives: list[LidarSequence] = []
+    drives: list[io.LidarSequence] = []
     for path in paths:
         if path == "scenes" and not Path(path).exists():
             seeds = range(FIRST_SCENE, FIRST_SCENE + num_scenes)
-            drives += [simulate_scene(draw_scene(seed)) for seed in seeds]
+            drives += [simulation.simulate_scene(simulation.draw_scene(seed)) for seed in seeds]
             continue
-        drives += [open_lidar_sequence(path, sequence=name) for name in list_lidar_sequences(path) or [None]]
+        drives += [io.open_lidar_sequence(path, sequence=name) for name in io.list_lidar_sequences(path) or [None]]
     for drive in drives:
         if drive.T_world_lidar is None:
             raise ValueError(f"{drive.name}: expected a pose for each scan, got none")
     return drives
 
 
-def evaluate(model: Model, drive: LidarSequence, band: str, config: Config) -> dict[str, Any]:
+def evaluate(model: dpm.Model, pairs: Iterable[dpm.ScanPair], stages: dict[str, int | None]) -> cli.Row:
     """Returns errors in metres and seconds by stage, and the quality of the offsets, on the pairs of a band."""
-    from dpmjax import encode, register, registration_recall
-    from dpmjax.deeppointmap import draw_scan_pairs, offset_quality, read_scan_pairs
-
-    stages = {"decoder": None, **{f"elements_{num}": num for num in config.elements}}
     motions: dict[str, list[np.ndarray]] = {stage: [] for stage in stages}
     seconds: dict[str, list[float]] = {stage: [] for stage in stages}
-    pairs = []
-    drawn = draw_scan_pairs(drive, band, config.pairs, seed=config.seed)
-    for pair in read_scan_pairs(drive, drawn, seed=config.seed):
-        clouds = [encode(model, points, num_elements=max(config.elements)) for points in (pair.source, pair.target)]
-        pairs.append((*clouds, pair.T_target_source.astype(np.float32)))
+    encoded = []
+    most = max(num for num in stages.values() if num is not None)
+    for pair in pairs:
+        clouds = [dpm.encode(model, points, num_elements=most) for points in (pair.source, pair.target)]
+        encoded.append((*clouds, pair.T_target_source.astype(np.float32)))
         for stage, num in stages.items():
             few = [first_elements(cloud, num) for cloud in clouds]
             start = time.process_time()
-            match = register(model, few[0], few[1], refine=num is not None)
+            match = dpm.register(model, few[0], few[1], refine=num is not None)
             motions[stage].append(np.asarray(match.T_target_source, np.float64))
             seconds[stage].append(time.process_time() - start)
-    row: dict[str, Any] = {"num_pairs": len(pairs)}
-    if not pairs:
+    row: cli.Row = {"num_pairs": len(encoded)}
+    if not encoded:
         return row
-    true = np.stack([np.asarray(T, np.float64) for *_, T in pairs])
+    true = np.stack([np.asarray(T, np.float64) for *_, T in encoded])
     for stage in stages:
         found = registration_recall(np.stack(motions[stage]), true)
         errors = np.asarray(found.translation_errors_m)[np.asarray(found.is_right)]
         row[f"recall_{stage}"] = float(found.recall)
         row[f"median_error_{stage}_m"] = float(np.median(errors)) if len(errors) else None
         row[f"{stage}_cpu_s"] = float(np.median(seconds[stage]))
-    offsets = offset_quality(model, pairs)
+    offsets = dpm.offset_quality(model, encoded)
     return {**row, "offset_r2": offsets.r2.tolist(), "offset_rmse_m": offsets.rmse_m.tolist()}
 
 
-def first_elements(cloud: DescriptorCloud, num: int | None) -> DescriptorCloud:
+def first_elements(cloud: dpm.DescriptorCloud, num: int | None) -> dpm.DescriptorCloud:
     """Returns the cloud with its first elements; None leaves the descriptors without elements."""
     if num is None:
         return cloud.described
@@ -153,40 +127,20 @@ def first_elements(cloud: DescriptorCloud, num: int | None) -> DescriptorCloud:
     )
 
 
-def write_results(folder: RunFolder, config: Config, rows: Sequence[dict[str, Any]]) -> str:
-    """Writes table.md and metrics.json; returns the table."""
-    note = write_metrics(folder, {"weights": config.weights}, seed=config.seed, rows=rows)
-    text = table(rows, config.elements)
-    (folder / "table.md").write_text(text + (f"\n\n{note}.\n" if note else "\n"), encoding="utf-8")
-    return text
-
-
-def table(rows: Sequence[dict[str, Any]], elements: Sequence[int]) -> str:
+def table(rows: Sequence[cli.Row], stages: Sequence[str]) -> str:
     """Returns the table as Markdown: recall and median error of the right ones, metres."""
-    columns = ["decoder", *(f"elements_{num}" for num in elements)]
-    names = ["decoder", *(f"{num} elements" for num in elements)]
-    lines = [
-        f"| sequence | distance | pairs | {' | '.join(names)} | R2 of offsets x, y, z (rmse) |",
-        "|---" * (len(names) + 4) + "|",
-    ]
+    names = [" ".join(reversed(stage.split("_"))) for stage in stages]
+    lines = []
     for row in rows:
         if row["num_pairs"] == 0:
             continue
-        cells = []
-        for column in columns:
-            error = row[f"median_error_{column}_m"]
-            cells.append(f"{row[f'recall_{column}']:.2f}, {'' if error is None else f'{error:.3f} m'}")
+        cells = (f"{row[f'recall_{stage}']:.2f}, {cli.length_text(row[f'median_error_{stage}_m'])}" for stage in stages)
         # JSON has no NaN: what could not be measured is null in the file of a row.
-        numbers = (
-            [np.nan if value is None else value for value in row[name]] for name in ("offset_r2", "offset_rmse_m")
-        )
-        parts = zip(*numbers, strict=True)
-        r2 = ", ".join(f"{share:.2f} ({rmse_m:.2f} m)" for share, rmse_m in parts)
-        lines.append(
-            f"| {row['sequence']} | {BAND_NAMES[row['band']]} | {row['num_pairs']} | {' | '.join(cells)} | {r2} |"
-        )
-    return "\n".join(lines)
+        parts = zip(row["offset_r2"], row["offset_rmse_m"], strict=True)
+        r2 = ", ".join(f"{cli.cell_text(share)} ({cli.cell_text(rmse_m)} m)" for share, rmse_m in parts)
+        lines.append([row["sequence"], cli.BAND_NAMES[row["band"]], row["num_pairs"], *cells, r2])
+    return cli.markdown(("sequence", "distance", "pairs", *names, "R2 of offsets x, y, z (rmse)"), lines)
 
 
 if __name__ == "__main__":
-    raise SystemExit(run_command(main, Config, name=EXPERIMENT, description=__doc__))
+    raise SystemExit(cli.run_command(main, Config, name=EXPERIMENT, description=__doc__))

@@ -18,178 +18,143 @@ from typing import Annotated, Any
 import numpy as np
 from tyro.conf import arg
 
-from dpmjax.cli import (
-    RunOptions,
-    StopFlag,
-    check_least,
-    do_rows,
-    open_run_folder,
-    recording,
-    run_command,
-    write_metrics,
-)
+from dpmjax import cli, load_model, registration_recall, scans, simulation
+from dpmjax import deeppointmap as dpm
 from dpmjax.geometry import rigid
 
 EXPERIMENT = "dpm_evidence"
 # Far from the seeds of all other commands.
 FIRST_SCENE = 6_500_000
 WHOLE, THINNED = "whole", "thinned"
-SCENES = (
-    *((kind, sensor, WHOLE) for kind, sensor in (("suburb", "HDL64E"), ("campus", "OS1_64"), ("canyon", "HDL64E"))),
-    *((kind, sensor, WHOLE) for kind, sensor in (("country", "HDL32E"), ("wood", "OS1_64"), ("car_park", "HDL32E"))),
-    *((kind, sensor, WHOLE) for kind, sensor in (("office", "HDL64E"), ("hall", "OS1_64"), ("flat", "OS1_64"))),
-    *((kind, sensor, WHOLE) for kind, sensor in (("office", "OS1_64"), ("hall", "HDL32E"))),
-    *((kind, sensor, THINNED) for kind, sensor in (("suburb", "HDL64E"), ("suburb", "HDL32E"), ("campus", "HDL32E"))),
-    *((kind, sensor, THINNED) for kind, sensor in (("canyon", "HDL64E"), ("country", "HDL32E"), ("hall", "OS1_64"))),
+SCENES = tuple(
+    (*scene.split(), points)
+    for points, scenes in (
+        (WHOLE, "suburb HDL64E, campus OS1_64, canyon HDL64E, country HDL32E, wood OS1_64, car_park HDL32E"),
+        (WHOLE, "office HDL64E, hall OS1_64, flat OS1_64, office OS1_64, hall HDL32E"),
+        (THINNED, "suburb HDL64E, suburb HDL32E, campus HDL32E, canyon HDL64E, country HDL32E, hall OS1_64"),
+    )
+    for scene in scenes.split(", ")
 )
 INDOORS = ("office", "hall", "flat")
 BANDS = {"near": (2.0, 10.0), "far": (10.0, 20.0)}
 BANDS_INDOORS = {"near": (1.0, 5.0), "far": (5.0, 12.0)}
 NUM_POINTS, MAX_RANGE_M = 1400, 30.0
 TILT_DEG = 1.0
+LENGTH_M = 200.0
 
 
 @dataclass(frozen=True, kw_only=True)
-class Config(RunOptions):
+class Config(cli.RunOptions):
     """Options of the run."""
 
     weights: Annotated[str, arg(metavar="NAME|FILE")] = "dpm_small"
-    """The network whose hypotheses are judged."""
+    """The network that proposes the hypotheses."""
     pairs: Annotated[int, arg(metavar="N")] = 20
     """Pairs of each distance of each scene."""
     scenes: Annotated[int, arg(metavar="N")] = len(SCENES)
     """Number of scenes."""
-    length_m: Annotated[float, arg(metavar="M")] = 200.0
-    """Length of the way through each scene."""
 
     def __post_init__(self) -> None:
         """Checks ranges."""
-        check_least(self, pairs=1, scenes=2, length_m=100, seed=0)
+        cli.check_least(self, pairs=1, scenes=2, seed=0)
         if self.scenes > len(SCENES):
             raise ValueError(f"--scenes: expected at most {len(SCENES)}, got {self.scenes}")
 
 
-def main(config: Config) -> dict[str, Any]:
+def main(config: Config) -> list[cli.Row]:
     """Registers the pairs, fits, and writes weights and table."""
-    from dpmjax import load_model
-
-    model = load_model(config.weights)
-    folder = open_run_folder(config, EXPERIMENT)
     cases = [
         {"scene": number, "kind": kind, "sensor": sensor, "points": points}
         for number, (kind, sensor, points) in enumerate(SCENES[: config.scenes])
     ]
-    with recording(folder), StopFlag() as stop:
-        work = partial(measure_scene, config, model)
-        rows = do_rows(folder.path, cases, work, seed=config.seed, is_stopped=lambda: stop.is_requested)
-        numbers: dict[str, Any] = {"is_interrupted": stop.is_requested, "weights_of": config.weights}
-        if not stop.is_requested:
-            weights, table = fit(rows)
-            numbers |= {"evidence": asdict(weights), "table": table}
-            (folder / "table.md").write_text(as_table(table), encoding="utf-8")
-            print(as_table(table))
-            print(weights)
-        write_metrics(folder, numbers, seed=config.seed)
-    print(f"results in {folder.path}")
-    return numbers
+
+    def report(rows: list[cli.Row]) -> cli.Report:
+        if len(rows) < len(cases):
+            return cli.Report({"weights_of": config.weights}, f"{len(rows)} of {len(cases)} scenes", rows=())
+        weights, table = fit(rows)
+        columns = [name.replace("_", " ") for name in table[0]]
+        numbers = {"weights_of": config.weights, "evidence": asdict(weights), "table": table}
+        text = f"{cli.markdown(columns, [list(row.values()) for row in table])}\n\n{weights}"
+        return cli.Report(numbers, text, rows=())
+
+    return cli.run_table(config, EXPERIMENT, cases, partial(measure_scene, config, load_model(config.weights)), report)
 
 
-def measure_scene(
-    config: Config, model: Any, *, scene: int, kind: str, sensor: str, points: str
-) -> dict[str, list[dict[str, Any]]]:
+def measure_scene(config: Config, model: dpm.Model, run: cli.TableRun, **case: Any) -> cli.Row:
     """Returns the pairs of a scene: the evidence of each hypothesis, and whether it is right."""
-    from dpmjax import simulation
-    from dpmjax.deeppointmap import draw_rows_apart, match_clouds, prepare_scan, scan_distances
-
+    scene, kind, sensor, points = (case[name] for name in ("scene", "kind", "sensor", "points"))
     lidar = getattr(simulation, sensor)
-    drive = simulation.simulate_drive(FIRST_SCENE + scene, length_m=config.length_m, kind=kind, sensor=lidar)
-    distances = scan_distances(drive)
+    drive = simulation.simulate_drive(FIRST_SCENE + scene, length_m=LENGTH_M, kind=kind, sensor=lidar)
+    distances = dpm.scan_distances(drive)
     bands = BANDS_INDOORS if kind in INDOORS else BANDS
     drawn = [
         (band, rows)
         for number, (band, limits_m) in enumerate(bands.items())
-        for rows in draw_rows_apart(distances, *limits_m, config.pairs, np.random.default_rng([config.seed, number]))
+        for rows in dpm.draw_rows_apart(
+            distances, *limits_m, config.pairs, np.random.default_rng([config.seed, number])
+        )
     ]
     pairs = []
     for band, rows in drawn:
-        scans, poses = [], []
+        if run.is_stopped():
+            raise cli.RowStopped
+        clouds, poses = [], []
         for row in rows:
             rng = np.random.default_rng([config.seed, row])
             T_lidar_turned = _turn(rng)
             scan = drive.read_scan(int(row)) @ T_lidar_turned[:3, :3]
-            scans.append(_thinned(scan, rng) if points == THINNED else scan)
+            clouds.append(_thinned(scan, rng) if points == THINNED else scan)
             poses.append(drive.T_world_lidar[row] @ T_lidar_turned)
-        prepared = [prepare_scan(model, scan.astype(np.float32)) for scan in scans]
-        found = match_clouds(model, *(scan.descriptors for scan in prepared), config=model.config.matching)
+        prepared = [dpm.prepare_scan(model, scan.astype(np.float32)) for scan in clouds]
+        found = dpm.match_clouds(model, *(scan.descriptors for scan in prepared), config=model.config.matching)
         measured = [scan.measured for scan in prepared]
-        pairs.append({"band": band, **judged(model, measured, found, rigid.inverse(poses[1]) @ poses[0])})
+        pairs.append({"band": band, **hypotheses(model, measured, found, rigid.inverse(poses[1]) @ poses[0])})
     return {"pairs": pairs}
 
 
-def judged(model: Any, measured: list[Any], hypotheses: Any, T_true: np.ndarray) -> dict[str, Any]:
+def hypotheses(model: dpm.Model, measured: list[Any], found: Any, T_true: np.ndarray) -> cli.Row:
     """Returns the evidence of all hypotheses of a pair, aligned as `register` aligns them."""
-    from dpmjax.deeppointmap import distinct_motions, evidence_shares
-    from dpmjax.metrics import registration_recall
-    from dpmjax.scans import align_surfaces_from, correlate_views
-
     config, surfaces = model.config.verification, [scan.surface for scan in measured]
-    T = np.concatenate([distinct_motions(hypotheses), correlate_views(*surfaces, config.views)])
+    T = np.concatenate([dpm.distinct_motions(found), scans.correlate_views(*surfaces, config.views)])
     for alignment in (config.coarse, config.fine):
-        T = np.stack([found.T_target_source for found in align_surfaces_from(*surfaces, T, alignment)])
+        T = np.stack([one.T_target_source for one in scans.align_surfaces_from(*surfaces, T, alignment)])
     return {
-        "shares": evidence_shares(*measured, T, config).tolist(),
+        "shares": dpm.evidence_shares(*measured, T, config).tolist(),
         "is_right": registration_recall(T, np.broadcast_to(T_true, T.shape)).is_right.tolist(),
     }
 
 
-def fit(rows: list[dict[str, Any]]) -> tuple[Any, list[dict[str, Any]]]:
+def fit(rows: list[cli.Row]) -> tuple[dpm.EvidenceWeights, list[cli.Row]]:
     """Returns the weights by all scenes, and a table of the choices by weights without the scene."""
-    from dpmjax.deeppointmap import EvidenceWeights, fit_weights
-
-    _, *present = astuple(EvidenceWeights())
-    names = tuple(field.name for field in fields(EvidenceWeights))
-    scene = np.concatenate([np.full(_num_hypotheses(row), row["scene"]) for row in rows])
+    _, *present = astuple(dpm.EvidenceWeights())
+    names = tuple(field.name for field in fields(dpm.EvidenceWeights))
+    scene = np.concatenate([np.full(len(pair["is_right"]), row["scene"]) for row in rows for pair in row["pairs"]])
     shares = np.concatenate([pair["shares"] for row in rows for pair in row["pairs"]])
     is_right = np.concatenate([pair["is_right"] for row in rows for pair in row["pairs"]])
     table = []
     for row in rows:
         others = scene != row["scene"]
-        weights, _ = fit_weights(shares[others], is_right[others])
+        weights, _ = dpm.fit_weights(shares[others], is_right[others])
         for band in dict.fromkeys(pair["band"] for pair in row["pairs"]):
             pairs = [pair for pair in row["pairs"] if pair["band"] == band]
-            right = [np.asarray(pair["is_right"]) for pair in pairs]
-            by_score = [
-                is_right[np.argmax(pair["shares"] @ np.array(present))]
-                for is_right, pair in zip(right, pairs, strict=True)
-            ]
-            by_fit = [
-                is_right[np.argmax(pair["shares"] @ weights)] for is_right, pair in zip(right, pairs, strict=True)
-            ]
+            case = {name: row[name] for name in ("kind", "sensor", "points")}
             table.append(
                 {
-                    **{name: row[name] for name in ("kind", "sensor", "points")},
+                    **case,
                     "band": band,
                     "num_pairs": len(pairs),
-                    "by_the_present_weights": float(np.mean(by_score)),
-                    "by_a_fit_on_the_others": float(np.mean(by_fit)),
-                    "any_right": float(np.mean([one.any() for one in right])),
+                    "by_the_present_weights": share_right(pairs, np.array(present)),
+                    "by_a_fit_on_the_others": share_right(pairs, weights),
+                    "any_right": float(np.mean([np.any(pair["is_right"]) for pair in pairs])),
                 }
             )
-    weights, bias = fit_weights(shares, is_right)
-    return EvidenceWeights(**dict(zip(names, (round(bias, 2), *np.round(weights, 2).tolist()), strict=True))), table
+    weights, bias = dpm.fit_weights(shares, is_right)
+    return dpm.EvidenceWeights(**dict(zip(names, (round(bias, 2), *np.round(weights, 2).tolist()), strict=True))), table
 
 
-def as_table(table: list[dict[str, Any]]) -> str:
-    """Returns the table in Markdown."""
-    lines = ["| " + " | ".join(name.replace("_", " ") for name in table[0]) + " |", "|" + "---|" * len(table[0])]
-    for row in table:
-        cells = [f"{value:.2f}" if isinstance(value, float) else str(value) for value in row.values()]
-        lines.append("| " + " | ".join(cells) + " |")
-    return "\n".join(lines) + "\n"
-
-
-def _num_hypotheses(row: dict[str, Any]) -> int:
-    return sum(len(pair["is_right"]) for pair in row["pairs"])
+def share_right(pairs: list[cli.Row], weights: np.ndarray) -> float:
+    """Returns the share of pairs whose hypothesis of the highest score is right."""
+    return float(np.mean([pair["is_right"][int(np.argmax(pair["shares"] @ weights))] for pair in pairs]))
 
 
 def _thinned(scan: np.ndarray, rng: np.random.Generator) -> np.ndarray:
@@ -208,4 +173,4 @@ def _turn(rng: np.random.Generator) -> np.ndarray:
 
 
 if __name__ == "__main__":
-    raise SystemExit(run_command(main, Config, name=EXPERIMENT, description=__doc__))
+    raise SystemExit(cli.run_command(main, Config, name=EXPERIMENT, description=__doc__))

@@ -15,35 +15,23 @@ from __future__ import annotations
 import operator
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from tyro.conf import Positional, arg
 
-from dpmjax.cli import (
-    RunFolder,
-    RunOptions,
-    StopFlag,
-    check_least,
-    do_rows,
-    open_run_folder,
-    recording,
-    run_command,
-    write_metrics,
-)
-
-if TYPE_CHECKING:
-    from dpmjax import DescriptorCloud
-    from dpmjax.deeppointmap import Model
-    from dpmjax.io import LidarSequence
+from dpmjax import cli, load_model, registration_recall, scans, slam
+from dpmjax import deeppointmap as dpm
+from dpmjax.io import LidarSequence
+from experiments.dpm_clouds import open_drives
 
 EXPERIMENT = "dpm_keyframes"
 
 
 @dataclass(frozen=True, kw_only=True)
-class Config(RunOptions):
+class Config(cli.RunOptions):
     """Options of the run."""
 
     paths: Annotated[Positional[tuple[str, ...]], arg(metavar="PATH ...")]
@@ -55,41 +43,32 @@ class Config(RunOptions):
 
     def __post_init__(self) -> None:
         """Checks ranges."""
-        check_least(self, seed=0, keyframes=1)
+        cli.check_least(self, seed=0, keyframes=1)
         if not self.paths or not self.keyframes:
             raise ValueError("give at least one folder of scans and one number of keyframes")
 
 
-def main(config: Config) -> list[dict[str, Any]]:
+def main(config: Config) -> list[cli.Row]:
     """Makes the rows that are missing, and writes the table and the numbers."""
-    from dpmjax import load_model
-    from experiments.dpm_clouds import open_drives
-
     model = load_model(config.weights)
     drives = {drive.name: drive for drive in open_drives(config.paths)}
-    folder = open_run_folder(config, EXPERIMENT)
 
-    def work(sequence: str) -> dict[str, Any]:
+    def work(_: cli.TableRun, sequence: str) -> cli.Row:
         return evaluate(model, drives[sequence], config.keyframes)
 
-    with recording(folder), StopFlag() as stop:
-        cases = [{"sequence": name} for name in drives]
-        rows = do_rows(folder.path, cases, work, seed=config.seed, is_stopped=lambda: stop.is_requested)
-        print(write_results(folder, config, rows))
-    print(f"results in {folder.path}")
-    return rows
+    def report(rows: list[cli.Row]) -> cli.Report:
+        return cli.Report({"weights": config.weights}, table(rows, config.keyframes))
+
+    return cli.run_table(config, EXPERIMENT, [{"sequence": name} for name in drives], work, report)
 
 
-def evaluate(model: Model, drive: LidarSequence, nums_keyframes: Sequence[int]) -> dict[str, Any]:
+def evaluate(model: dpm.Model, drive: LidarSequence, nums_keyframes: Sequence[int]) -> cli.Row:
     """Returns the errors of all scans after the first for each number of keyframes."""
-    from dpmjax import registration_recall
-    from dpmjax.deeppointmap import encode_scans, match_clouds
-
     poses = np.asarray(drive.T_world_lidar, np.float64)
-    scans = [drive.read_scan(number) for number in range(len(drive))]
-    clouds = jax.device_get(encode_scans(model, scans).described)
-    is_keyframe = choose_keyframes(poses[:, :3, 3], [keyframe_spacing_m(points, model) for points in scans])
-    row: dict[str, Any] = {"num_scans": len(drive) - 1, "num_keyframes": int(is_keyframe.sum())}
+    points = [drive.read_scan(number) for number in range(len(drive))]
+    clouds = jax.device_get(dpm.encode_scans(model, points).described)
+    is_keyframe = choose_keyframes(poses[:, :3, 3], [keyframe_spacing_m(scan, model) for scan in points])
+    row: cli.Row = {"num_scans": len(drive) - 1, "num_keyframes": int(is_keyframe.sum())}
     for num in nums_keyframes:
         found, true = [], []
         for number in range(1, len(drive)):
@@ -98,7 +77,7 @@ def evaluate(model: Model, drive: LidarSequence, nums_keyframes: Sequence[int]) 
             near = rows[np.argsort(distances, kind="stable")][:num]
             source = jax.tree.map(operator.itemgetter(number), clouds)
             target = merged(clouds, near, poses, num)
-            hypotheses = match_clouds(model, source, target, config=model.config.matching)
+            hypotheses = dpm.match_clouds(model, source, target, config=model.config.matching)
             found.append(np.asarray(hypotheses.T_target_source[0], np.float64))
             true.append(np.linalg.inv(poses[near[0]]) @ poses[number])
         recall = registration_recall(np.stack(found), np.stack(true))
@@ -112,12 +91,9 @@ def evaluate(model: Model, drive: LidarSequence, nums_keyframes: Sequence[int]) 
     return row
 
 
-def keyframe_spacing_m(points: np.ndarray, model: Model) -> float:
+def keyframe_spacing_m(points: np.ndarray, model: dpm.Model) -> float:
     """Returns the spacing of keyframes at a scan: a share of the median range of its points, as SLAM has it."""
-    from dpmjax.scans import preprocess_scan_on_host
-    from dpmjax.slam import FrontEndConfig
-
-    config, thinned = FrontEndConfig(), preprocess_scan_on_host(points, None, model.config.preprocess)
+    config, thinned = slam.FrontEndConfig(), scans.preprocess_scan_on_host(points, None, model.config.preprocess)
     ranges = np.linalg.norm(np.asarray(thinned.points)[np.asarray(thinned.mask)], axis=1)
     extent_m = float(np.median(ranges)) if len(ranges) else 0.0
     return float(np.clip(config.keyframe_share * extent_m, config.min_keyframe_m, config.max_keyframe_m))
@@ -132,43 +108,32 @@ def choose_keyframes(positions: np.ndarray, spacings_m: Sequence[float]) -> np.n
     return is_keyframe
 
 
-def merged(clouds: DescriptorCloud, rows: np.ndarray, poses: np.ndarray, capacity: int) -> DescriptorCloud:
+def merged(clouds: dpm.DescriptorCloud, rows: np.ndarray, poses: np.ndarray, capacity: int) -> dpm.DescriptorCloud:
     """Returns the thinned union of some keyframes in the frame of the first; the size is a power of two."""
-    from dpmjax.deeppointmap import merge_clouds, thin_merged
-
     padded = np.concatenate([rows, np.full(capacity - len(rows), rows[0])])
     some = jax.tree.map(lambda leaf: leaf[padded], clouds)
     some = some.replace(mask=some.mask & (np.arange(capacity) < len(rows))[:, None])
     T_map_scan = np.linalg.inv(poses[rows[0]]) @ poses[padded]
-    union = thin_merged(merge_clouds(some, jnp.asarray(T_map_scan, jnp.float32)), some.mask.shape[1])
+    union = dpm.thin_merged(dpm.merge_clouds(some, jnp.asarray(T_map_scan, jnp.float32)), some.mask.shape[1])
     # Valid rows stand in front: attention over masked ones costs several times as much.
     num_rows = 1 << max(int(union.mask.sum()) - 1, 0).bit_length()
     order = np.argsort(~np.asarray(union.mask), kind="stable")[:num_rows]
-    compact: DescriptorCloud = jax.tree.map(lambda leaf: leaf[order], union)
+    compact: dpm.DescriptorCloud = jax.tree.map(lambda leaf: leaf[order], union)
     return compact
 
 
-def write_results(folder: RunFolder, config: Config, rows: Sequence[dict[str, Any]]) -> str:
-    """Writes table.md and metrics.json; returns the table."""
-    note = write_metrics(folder, {"weights": config.weights}, seed=config.seed, rows=rows)
-    text = table(rows, config.keyframes)
-    (folder / "table.md").write_text(text + (f"\n\n{note}.\n" if note else "\n"), encoding="utf-8")
-    return text
-
-
-def table(rows: Sequence[dict[str, Any]], nums_keyframes: Sequence[int]) -> str:
+def table(rows: Sequence[cli.Row], nums_keyframes: Sequence[int]) -> str:
     """Returns the table as Markdown: scans that are wrong, median and 95th percentile of the error, metres."""
     names = [f"{num} merged" if num > 1 else "nearest" for num in nums_keyframes]
-    lines = [f"| sequence | scans | {' | '.join(names)} |", "|---" * (len(names) + 2) + "|"]
+    lines = []
     for row in rows:
-        cells = []
-        for num in nums_keyframes:
-            of_num = row[f"keyframes_{num}"]
-            errors = f"{of_num['median_error_m']:.2f}, {of_num['error_95_m']:.2f} m"
-            cells.append(f"{of_num['num_wrong']} ({of_num['num_over_2_m']} > 2 m), {errors}")
-        lines.append(f"| {row['sequence']} | {row['num_scans']} | {' | '.join(cells)} |")
-    return "\n".join(lines)
+        cells = (
+            f"{one['num_wrong']} ({one['num_over_2_m']} > 2 m), {one['median_error_m']:.2f}, {one['error_95_m']:.2f} m"
+            for one in (row[f"keyframes_{num}"] for num in nums_keyframes)
+        )
+        lines.append([row["sequence"], row["num_scans"], *cells])
+    return cli.markdown(("sequence", "scans", *names), lines)
 
 
 if __name__ == "__main__":
-    raise SystemExit(run_command(main, Config, name=EXPERIMENT, description=__doc__))
+    raise SystemExit(cli.run_command(main, Config, name=EXPERIMENT, description=__doc__))

@@ -9,29 +9,30 @@ results/dpm_slam_ablations/<time>/: table.md, metrics.json (ATE, loops, their re
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import partial
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
+import numpy as np
 from tyro.conf import Positional, arg
 
-from dpmjax.cli import (
-    DriveSelection,
-    RunOptions,
-    StopFlag,
-    check_least,
-    do_row,
-    open_run_folder,
-    recording,
-    run_command,
-    write_metrics,
+from dpmjax import Model, cli, load_model, save_map
+from dpmjax.scans import surface_at
+from dpmjax.slam import (
+    Alignment,
+    Geometry,
+    LocalMap,
+    Match,
+    Matcher,
+    SlamConfig,
+    SlamMethods,
+    Submap,
+    ThinnedScan,
+    make_methods,
 )
-
-if TYPE_CHECKING:
-    from dpmjax import Model
-    from dpmjax.slam import SlamMethods
-    from experiments._slam_evaluation import Drive
+from experiments._slam_comparison import open_drives
+from experiments._slam_evaluation import PRECISIONS, Drive, file_name, map_path, map_row, open_folder, with_network
 
 EXPERIMENT = "dpm_slam_ablations"
 NUM_ELEMENTS = (64, 128, 256, 512, 1024)
@@ -46,53 +47,30 @@ SETTINGS = (
 
 
 @dataclass(frozen=True, kw_only=True)
-class Config(RunOptions):
+class Config(cli.DriveOptions):
     """Options of the run."""
 
     paths: Annotated[Positional[tuple[str, ...]], arg(metavar="PATH ...")]
     """Folders of scans with poses, or files of poses."""
     weights: Annotated[str, arg(metavar="NAME|FILE")] = "dpm_small"
     """Name of a shipped model, or a .safetensors file."""
-    n_scans: Annotated[int | None, arg(aliases=["-n"], metavar="N")] = None
-    """Number of scans of each drive."""
-    jump: Annotated[int, arg(aliases=["-j"], metavar="N")] = 1
-    """Use every Nth scan."""
-
-    def __post_init__(self) -> None:
-        """Checks ranges."""
-        check_least(self, n_scans=1, jump=1, seed=0)
 
 
-def main(config: Config) -> list[dict[str, Any]]:
+def main(config: Config) -> list[cli.Row]:
     """Makes the rows that are missing, and writes table and numbers."""
-    from dpmjax import load_model
-    from experiments import _slam_comparison as comparison
-    from experiments._slam_evaluation import StoppedError, open_folder
-
     model = load_model(config.weights)
-    selection = DriveSelection(num_scans=config.n_scans, jump=config.jump, seed=config.seed)
-    sequences = comparison.open_drives(comparison.DriveChoice(paths=config.paths, selection=selection))
-    folder = open_run_folder(config, EXPERIMENT)
-    rows: list[dict[str, Any]] = []
-    with recording(folder), StopFlag() as stop:
-        drives = [open_folder(folder, sequence, lambda: stop.is_requested) for sequence in sequences]
-        for drive, setting in ((drive, setting) for drive in drives for setting in SETTINGS):
-            case = {"sequence": drive.sequence.name, "setting": setting}
-            try:
-                rows.append(do_row(folder.path, case, partial(evaluate, drive, model, setting), seed=config.seed))
-            except StoppedError:
-                break
-            write_metrics(folder, {"weights": config.weights}, seed=config.seed, rows=rows)
-        (folder / "table.md").write_text(table(rows) + "\n", encoding="utf-8")
-        print(f"{table(rows)}\nresults in {folder.path}")
-    return rows
+    sequences = {sequence.name: sequence for sequence in open_drives(config.paths, config)}
+
+    def work(run: cli.TableRun, sequence: str, setting: str) -> cli.Row:
+        return evaluate(open_folder(run.folder, sequences[sequence], run.is_stopped), model, setting)
+
+    cases = [{"sequence": name, "setting": setting} for name in sequences for setting in SETTINGS]
+    numbers = {"weights": config.weights}
+    return cli.run_table(config, EXPERIMENT, cases, work, lambda rows: cli.Report(numbers, table(rows)))
 
 
-def evaluate(drive: Drive, model: Model, setting: str) -> dict[str, Any]:
+def evaluate(drive: Drive, model: Model, setting: str) -> cli.Row:
     """Maps a drive with a setting, and measures trajectory, loops and map."""
-    from dpmjax import save_map
-    from experiments._slam_evaluation import PRECISIONS, file_name, map_path, map_row
-
     part = drive.folder.part("methods", file_name(setting))
     result, row = map_row(drive, part, setting, ablated(model, setting))
     sizes = {name: save_map(map_path(part.path, name), result.map, name).stat().st_size for name in PRECISIONS}
@@ -101,9 +79,6 @@ def evaluate(drive: Drive, model: Model, setting: str) -> dict[str, Any]:
 
 def ablated(model: Model, setting: str) -> SlamMethods:
     """Returns the methods of a setting."""
-    from dpmjax.slam import make_methods
-    from experiments._slam_elements import with_fewer_elements, with_network, without_elements
-
     if setting.endswith(NO_OFFSETS):
         decoder = replace(model.config.decoder, predicts_offsets=False)
         model = replace(model, config=replace(model.config, decoder=decoder))
@@ -118,25 +93,117 @@ def ablated(model: Model, setting: str) -> SlamMethods:
     return methods if setting == WHOLE else with_fewer_elements(model, int(setting.split()[0]))
 
 
-def table(rows: Sequence[dict[str, Any]]) -> str:
+def table(rows: Sequence[cli.Row]) -> str:
     """Returns the table as Markdown."""
+    columns = ("drive", "setting", "ATE, m", "t_rel, %", "loops (wrong)", "recall of loops", "keyframes")
     lines = [
-        "| drive | setting | ATE, m | t_rel, % | loops (wrong) | recall of loops | keyframes | map int8, float32, MB |",
-        "|---|---|---|---|---|---|---|---|",
+        [
+            row["sequence"],
+            row["setting"],
+            cli.cell_text(row.get("ate_m"), 3),
+            row.get("t_rel_percent"),
+            f"{row['num_loops']} ({row.get('num_wrong_loops', '-')})",
+            row.get("loop_recall"),
+            row["num_keyframes"],
+            ", ".join(f"{row[f'map_bytes_{precision}'] / 1e6:.2f}" for precision in ("int8", "float32")),
+        ]
+        for row in rows
     ]
-    return "\n".join([*lines, *map(_line, rows)])
+    return cli.markdown((*columns, "map int8, float32, MB"), lines)
 
 
-def _line(row: dict[str, Any]) -> str:
-    from experiments._slam_comparison import number
+def with_fewer_elements(model: Model, num_elements: int) -> SlamMethods:
+    """Returns methods whose scans and keyframes have at most `num_elements` surface elements.
 
-    sizes = ", ".join(f"{row[f'map_bytes_{precision}'] / 1e6:.2f}" for precision in ("int8", "float32"))
-    return (
-        f"| {row['sequence']} | {row['setting']} | {number(row.get('ate_m'), 3)} | {number(row.get('t_rel_percent'))} "
-        f"| {row['num_loops']} ({row.get('num_wrong_loops', '-')}) | {number(row.get('loop_recall'))} "
-        f"| {row['num_keyframes']} | {sizes} |"
-    )
+    Fewer elements of the same surface are farther apart, by the root of the ratio: radii of odometry grow with it.
+    """
+    factor = max(math.sqrt(model.config.pyramid.stages[0].num_points / num_elements), 1.0)
+    whole = make_methods(model, _with_wider_radii(SlamConfig(), factor))
+    matcher = _FewerOfKeyframes(whole.matcher, num_elements)
+    return whole._replace(matcher=matcher, geometry=_FewerOfScans(whole.geometry, num_elements))
+
+
+def _with_wider_radii(config: SlamConfig, factor: float) -> SlamConfig:
+    def wider(alignment: Any) -> Any:
+        levels = (replace(level, radius_m=factor * level.radius_m) for level in alignment.levels)
+        return replace(alignment, levels=tuple(levels))
+
+    odometry = config.odometry
+    radius_m = factor * odometry.plane_radius_m
+    odometry = replace(odometry, narrow=wider(odometry.narrow), wide=wider(odometry.wide), plane_radius_m=radius_m)
+    return replace(config, odometry=odometry)
+
+
+def without_elements(methods: SlamMethods) -> SlamMethods:
+    """Returns methods without surface elements: each pose and each loop stays as the decoder proposes it."""
+    loops = methods.config.loops
+    information = np.diag(np.repeat([loops.sigma_m**-2.0, loops.sigma_rad**-2.0], 3))
+    geometry = _Unmoved(methods.geometry, information)
+    return with_network(methods._replace(matcher=_DecoderAlone(methods.matcher), geometry=geometry))
+
+
+class _Wrapped:
+    """A matcher or a geometry of which some functions are replaced."""
+
+    def __init__(self, wrapped: Any) -> None:
+        self._wrapped = wrapped
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._wrapped, name)
+
+
+class _FewerOfKeyframes(_Wrapped):
+    """A matcher whose keyframes keep the first elements, in the order of farthest points, and their features."""
+
+    def __init__(self, matcher: Matcher, num_elements: int) -> None:
+        super().__init__(matcher)
+        self._num = num_elements
+
+    def encode(self, scan: ThinnedScan) -> Any:
+        whole = self._wrapped.encode(scan)
+        unit_m, *arrays = whole.elements
+        elements = type(whole.elements)(unit_m, *(array[: self._num] for array in arrays))
+        described = {name: getattr(whole, name)[: self._num] for name in ("features", "feature_steps", "directions")}
+        return whole._replace(elements=elements, **described)
+
+
+class _FewerOfScans(_Wrapped):
+    """A geometry whose scans have their first elements only."""
+
+    def __init__(self, geometry: Geometry, num_elements: int) -> None:
+        super().__init__(geometry)
+        self._num = num_elements
+
+    def thin(self, points: np.ndarray) -> ThinnedScan | None:
+        whole = self._wrapped.thin(points)
+        if whole is None:
+            return None
+        points = whole.measured.surface.points
+        few = surface_at(points, np.arange(min(self._num, len(points))))
+        return whole._replace(measured=whole.measured._replace(surface=few))
+
+
+class _Unmoved(_Wrapped):
+    """A geometry that returns the first of the given poses and accepts it."""
+
+    def __init__(self, geometry: Geometry, information: np.ndarray) -> None:
+        super().__init__(geometry)
+        self._information = information
+
+    def align(self, local_map: LocalMap, scan: ThinnedScan, T_map_scan: np.ndarray) -> Alignment:
+        return Alignment(T_map_scan, 1.0, 0.0, 1.0, self._information)
+
+    def search(self, local_map: LocalMap, scan: ThinnedScan, T_map_scan: np.ndarray) -> Alignment:
+        return self.align(local_map, scan, T_map_scan[0])
+
+
+class _DecoderAlone(_Wrapped):
+    """A matcher that registers the central scans of submaps by their descriptors, and verifies nothing."""
+
+    def register(self, pairs: Sequence[tuple[Submap, Submap]]) -> list[Match]:
+        proposals = [self._wrapped.propose(source.scans[0], target.scans[0], 1) for source, target in pairs]
+        return [Match(proposal.T_target_source[0], proposal.probability, np.nan) for proposal in proposals]
 
 
 if __name__ == "__main__":
-    raise SystemExit(run_command(main, Config, name=EXPERIMENT, description=__doc__))
+    raise SystemExit(cli.run_command(main, Config, name=EXPERIMENT, description=__doc__))

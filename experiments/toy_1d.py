@@ -14,27 +14,14 @@ from __future__ import annotations
 import itertools
 import time
 from dataclasses import dataclass, replace
-from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, get_args
+from typing import Annotated, Any, get_args
 
 import numpy as np
 from numpy.typing import NDArray
-from tyro.conf import FlagCreatePairsOff, arg
+from tyro.conf import arg
 
-from dpmjax.cli import (
-    RunFolder,
-    open_run_folder,
-    peak_rss_gb,
-    recording,
-    require_importable,
-    run_command,
-    select_device,
-    why_not_importable,
-    write_metrics,
-)
-
-if TYPE_CHECKING:
-    from dpmjax.deepmapping import Fit, ToyConfig
+from dpmjax import cli, nets, viz
+from dpmjax import deepmapping as dm
 
 EXPERIMENT = "toy_1d"
 FORMS = ("network", "direct")
@@ -43,101 +30,84 @@ SOLVERS = ("gradient-descent", "lbfgs", "bfgs")
 _SAME_PLACE = 0.05
 # The pictures show -VIEW to VIEW.
 VIEW = 6.0
+# The paper's is 2e-4.
+LEARNING_RATES = (1e-4, 2e-4, 5e-4, 1e-3)
 
 
-@dataclass(frozen=True)
-class Config:
+@dataclass(frozen=True, kw_only=True)
+class Config(cli.OutputOptions):
     """Options of the example."""
 
-    output: Annotated[Path | None, arg(aliases=["-o"], metavar="OUT")] = None
-    """Folder for the results, instead of results/toy_1d/<time>."""
     seeds: Annotated[int, arg(metavar="N")] = 1000
     """Starts, all in one vmap."""
     steps: Annotated[int, arg(metavar="N")] = 1000
     """Steps of descent; the paper's number."""
-    learning_rates: tuple[float, ...] = (1e-4, 2e-4, 5e-4, 1e-3)
-    """Learning rates; the paper's 2e-4 is always among them."""
     seed: int = 0
     """Seed of everything random."""
-    device: Annotated[str | None, arg(metavar="cpu|gpu")] = None
-    """Where to compute; without it, JAX chooses."""
-    force: FlagCreatePairsOff[bool] = False
-    """Replace an earlier run in OUT."""
 
     def __post_init__(self) -> None:
         """Checks ranges."""
-        for name in ("seeds", "steps"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"--{name}: expected at least 1, got {getattr(self, name)}")
-        if self.device not in (None, "cpu", "gpu"):
-            raise ValueError(f"--device: expected cpu or gpu, got {self.device}")
-        if any(not rate > 0.0 for rate in self.learning_rates):
-            raise ValueError(f"--learning-rates: expected numbers above 0, got {self.learning_rates}")
+        cli.check_least(self, seeds=1, steps=1)
 
 
 def main(config: Config) -> dict[str, Any]:
     """Runs all seeds, then all variants, draws, measures, writes."""
-    from dpmjax.deepmapping import ToyConfig, global_minimum
-    from dpmjax.nets import Initialization
-
-    require_importable("jaxopt", "the solvers of the direct form")
-    select_device(config.device)  # type: ignore[arg-type]
-    folder = open_run_folder(config, EXPERIMENT)
-    with recording(folder):
-        paper = ToyConfig(num_steps=config.steps)
+    cli.require_importable("jaxopt", "the solvers of the direct form")
+    folder = cli.open_run_folder(config, EXPERIMENT)
+    with cli.recording(folder):
+        paper = dm.ToyConfig(num_steps=config.steps)
         ends, figure = run_paper(paper, config)
-        shares = {name: share_at_minimum(x) for name, x in ends.items()}
         variants = []
-        for initialization in get_args(Initialization):
-            for rate in sorted({paper.learning_rate, *config.learning_rates}):
-                net = replace(paper.net, initialization=initialization)
-                runs = descend_both(replace(paper, net=net, learning_rate=rate), config)
-                row = {form: share_at_minimum(run.poses) for form, run in zip(FORMS, runs, strict=True)}
-                variants.append({"initialization": initialization, "learning_rate": rate, **row})
-        x_best, loss_best = global_minimum()
+        for initialization, rate in itertools.product(get_args(nets.Initialization), LEARNING_RATES):
+            net = replace(paper.net, initialization=initialization)
+            runs = descend_both(replace(paper, net=net, learning_rate=rate), config)
+            shares = {form: share_at_minimum(run.poses) for form, run in zip(FORMS, runs, strict=True)}
+            variants.append({"initialization": initialization, "learning_rate": rate, **shares})
+        x_best, loss_best = dm.global_minimum()
         metrics = {
             "x_global": x_best,
             "loss_global": loss_best,
             "seeds": config.seeds,
             "steps": config.steps,
-            "share_at_global_minimum": shares,
+            "share_at_global_minimum": {name: share_at_minimum(x) for name, x in ends.items()},
             "variants": variants,
             "seconds": measure_seconds(paper, config),
-            "peak_rss_gb": peak_rss_gb(),
+            "peak_rss_gb": cli.peak_rss_gb(),
         }
-        write_metrics(folder, metrics, seed=config.seed)
-        draw(folder, ends, shares, figure)
-        tell(folder, metrics)
+        cli.write_metrics(folder, metrics, seed=config.seed)
+        x = np.linspace(-VIEW, VIEW, 2401)
+        loss = np.asarray(dm.toy_loss(x))
+        viz.save_figure(viz.toy_figure((x, loss), **figure), folder / "toy.png")
+        ends_figure = viz.endings_figure(x, loss, ends, metrics["share_at_global_minimum"])
+        viz.save_figure(ends_figure, folder / "endings.png")
+        print(report(metrics), f"results in {folder.path}", sep="\n")
     return metrics
 
 
-def descend(toy: ToyConfig, config: Config) -> Fit:
+def descend(toy: dm.ToyConfig, config: Config) -> dm.Fit:
     """All seeds as starts of one fit."""
     import jax
 
-    from dpmjax.deepmapping import fit, toy_problem
-
-    return fit(toy_problem(toy), None, key=jax.random.key(config.seed), num_starts=config.seeds)
+    return dm.fit(dm.toy_problem(toy), None, key=jax.random.key(config.seed), num_starts=config.seeds)
 
 
-def descend_both(toy: ToyConfig, config: Config) -> tuple[Fit, Fit]:
+def descend_both(toy: dm.ToyConfig, config: Config) -> tuple[dm.Fit, dm.Fit]:
     """All seeds in the network form, and in the direct form from the same starts."""
     return descend(replace(toy, form="network"), config), descend(replace(toy, form="direct"), config)
 
 
-def path(run: Fit) -> NDArray[np.floating]:
+def path(run: dm.Fit) -> NDArray[np.floating]:
     """(seeds, steps + 1) x of every seed from the start to the end."""
     assert run.report is not None
     x = np.atleast_2d(np.asarray(run.report.terms))
     return np.concatenate([x, np.reshape(run.poses, (-1, 1))], axis=1)
 
 
-def run_paper(toy: ToyConfig, config: Config) -> tuple[dict[str, NDArray[np.floating]], dict[str, Any]]:
+def run_paper(toy: dm.ToyConfig, config: Config) -> tuple[dict[str, NDArray[np.floating]], dict[str, Any]]:
     """Ends of all methods with the paper's settings, and what figure 14 shows of one seed."""
     import jax
     import jax.numpy as jnp
 
-    from dpmjax.deepmapping import network_value, toy_loss
     from experiments.baselines.direct import minimize_toy
 
     runs = descend_both(toy, config)
@@ -150,12 +120,12 @@ def run_paper(toy: ToyConfig, config: Config) -> tuple[dict[str, NDArray[np.floa
     chosen = choose_seed(network, direct)
     z = jnp.linspace(-VIEW, VIEW, 1201)
     params = runs[0].state.params if config.seeds == 1 else jax.tree.map(lambda x: x[chosen], runs[0].state.params)
-    converted = toy_loss(jax.vmap(lambda one: network_value(toy, params.replace(z=one)))(z))
+    converted = dm.toy_loss(jax.vmap(lambda one: dm.network_value(toy, params.replace(z=one)))(z))
     x_direct, visited = float(direct[chosen, -1]), network[chosen]
     return ends, {
         "converted": (np.asarray(z), np.asarray(converted)),
-        "visited": (visited, np.asarray(toy_loss(visited))),
-        "direct_end": (x_direct, float(toy_loss(x_direct))),
+        "visited": (visited, np.asarray(dm.toy_loss(visited))),
+        "direct_end": (x_direct, float(dm.toy_loss(x_direct))),
         "network_end_z": float(params.z),
     }
 
@@ -176,9 +146,7 @@ def choose_seed(network_x: NDArray[np.floating], direct_x: NDArray[np.floating])
 
 def is_at_minimum(x: NDArray[np.floating]) -> NDArray[np.bool_]:
     """Returns True for ends at the global minimum."""
-    from dpmjax.deepmapping import global_minimum
-
-    return np.abs(np.asarray(x, np.float64) - global_minimum()[0]) < _SAME_PLACE
+    return np.abs(np.asarray(x, np.float64) - dm.global_minimum()[0]) < _SAME_PLACE
 
 
 def share_at_minimum(x: NDArray[np.floating]) -> float:
@@ -186,20 +154,20 @@ def share_at_minimum(x: NDArray[np.floating]) -> float:
     return float(is_at_minimum(x).mean())
 
 
-def measure_seconds(toy: ToyConfig, config: Config) -> dict[str, Any]:
+def measure_seconds(toy: dm.ToyConfig, config: Config) -> dict[str, Any]:
     """Seconds of the network form: all seeds in one vmap, one seed, and one seed in a plain PyTorch loop."""
     seconds: dict[str, Any] = {}
     for name, seeds in (("all_seeds", config.seeds), ("one_seed", 1)):
         run = descend(toy, replace(config, seeds=seeds))
         seconds |= {f"{name}_compile_s": run.compile_s, f"{name}_run_s": run.run_s}
-    if (reason := why_not_importable("torch")) is not None:
+    if (reason := cli.why_not_importable("torch")) is not None:
         print(f"the loop in PyTorch is not timed: {reason}")
     else:
         seconds["torch_one_seed_run_s"] = torch_seconds(toy, config.seed)
     return seconds
 
 
-def torch_seconds(toy: ToyConfig, seed: int) -> float:
+def torch_seconds(toy: dm.ToyConfig, seed: int) -> float:
     """The same descent of one seed as a plain loop in PyTorch."""
     import torch
 
@@ -221,31 +189,19 @@ def torch_seconds(toy: ToyConfig, seed: int) -> float:
     return time.perf_counter() - begun
 
 
-def draw(
-    folder: RunFolder, ends: dict[str, NDArray[np.float32]], shares: dict[str, float], figure: dict[str, Any]
-) -> None:
-    """toy.png and endings.png."""
-    from dpmjax import viz
-    from dpmjax.deepmapping import toy_loss
-
-    x = np.linspace(-VIEW, VIEW, 2401)
-    loss = np.asarray(toy_loss(x))
-    viz.save_figure(viz.toy_figure((x, loss), **figure), folder / "toy.png")
-    viz.save_figure(viz.endings_figure(x, loss, ends, shares), folder / "endings.png")
-
-
-def tell(folder: RunFolder, metrics: dict[str, Any]) -> None:
-    """The shares as a table."""
-    for name, share in metrics["share_at_global_minimum"].items():
-        print(f"{name:36} {100 * share:5.1f} % at x = {metrics['x_global']:.3f}, L = {metrics['loss_global']:.3f}")
-    for row in metrics["variants"]:
-        print(
-            f"{row['initialization']:12} rate {row['learning_rate']:g}: "
-            f"network {100 * row['network']:5.1f} %, direct {100 * row['direct']:5.1f} %"
-        )
-    print(", ".join(f"{name} {value:.3g}" for name, value in metrics["seconds"].items()))
-    print(f"results in {folder.path}")
+def report(metrics: dict[str, Any]) -> str:
+    """Returns the shares as lines."""
+    minimum = f"x = {metrics['x_global']:.3f}, L = {metrics['loss_global']:.3f}"
+    lines = [
+        f"{name:36} {100 * share:5.1f} % at {minimum}" for name, share in metrics["share_at_global_minimum"].items()
+    ]
+    lines += [
+        f"{row['initialization']:12} rate {row['learning_rate']:g}: "
+        f"network {100 * row['network']:5.1f} %, direct {100 * row['direct']:5.1f} %"
+        for row in metrics["variants"]
+    ]
+    return "\n".join([*lines, ", ".join(f"{name} {value:.3g}" for name, value in metrics["seconds"].items())])
 
 
 if __name__ == "__main__":
-    raise SystemExit(run_command(main, Config, name=EXPERIMENT, description=__doc__))
+    raise SystemExit(cli.run_command(main, Config, name=EXPERIMENT, description=__doc__))

@@ -12,7 +12,7 @@ from unittest.mock import Mock
 
 import pytest
 
-from dpmjax.cli import register
+from dpmjax.cli import program
 from dpmjax.cli.command import EXIT_BAD_INPUT
 
 REPOSITORY = Path(__file__).parents[2]
@@ -153,7 +153,7 @@ def test_a_device_that_is_not_there_is_one_line_with_exit_code_2(tmp_path, monke
     monkeypatch.setattr("jax.config.update", lambda *_: None)
     monkeypatch.setattr("jax.devices", Mock(side_effect=error))
     arguments = ["a.npy", "b.npy", "--device", "gpu", "-o", str(tmp_path / "out")]
-    assert register.run(arguments) == EXIT_BAD_INPUT
+    assert program.main(["register", *arguments]) == EXIT_BAD_INPUT
     assert capsys.readouterr().err.splitlines() == [
         "dpmjax: error: --device gpu: JAX finds no such device here; leave the option out or install its plugin"
     ]

@@ -11,13 +11,19 @@ import numpy as np
 import pytest
 
 import dpmjax
-from dpmjax.cli import drive_sources, evaluation_rows
+from dpmjax import deeppointmap, simulation
+from dpmjax.cli import drives
 from dpmjax.cli.command import EXIT_BAD_INPUT, EXIT_OK
-from dpmjax.cli.evaluate import run, table
+from dpmjax.cli.evaluate import table
+from dpmjax.cli.program import main
 from dpmjax.cli.result_files import load_json
 from dpmjax.deeppointmap import SamplingConfig, scan_evaluation
 from tests.data_sets import write_kitti_sequence
 from tests.deeppointmap import toy
+
+
+def run(arguments: list[str]) -> int:
+    return main(["evaluate", *arguments])
 
 
 @pytest.fixture
@@ -28,7 +34,7 @@ def weights(tmp_path):
 
 
 def test_a_town_is_evaluated_and_nothing_is_registered_twice(weights, tmp_path, monkeypatch, capsys) -> None:
-    monkeypatch.setattr(drive_sources, "simulate_drive", lambda seed, **_: toy.drive(seed))
+    monkeypatch.setattr(simulation, "simulate_drive", lambda seed, **_: toy.drive(seed))
     out = tmp_path / "out"
     assert run(["--weights", str(weights), "--pairs", "2", "-o", str(out)]) == EXIT_OK
     printed = capsys.readouterr().out
@@ -45,14 +51,14 @@ def test_a_town_is_evaluated_and_nothing_is_registered_twice(weights, tmp_path, 
     assert 0 <= metrics["rows"][3]["auc"] <= 1
     for name in ("table.md", "reliability.png", "config.json", "log.txt"):
         assert (out / name).exists()
-    monkeypatch.setattr(evaluation_rows, "evaluate_scan_pairs", None)
+    monkeypatch.setattr(deeppointmap, "evaluate_scan_pairs", None)
     assert run(["--resume", "-o", str(out)]) == EXIT_OK
     assert load_json(out / "metrics.json")["rows"] == metrics["rows"]
 
 
 @pytest.mark.parametrize("num_registered", [1, 4])
 def test_ctrl_c_within_a_band_keeps_the_rows_before_it(weights, tmp_path, monkeypatch, num_registered: int) -> None:
-    monkeypatch.setattr(drive_sources, "simulate_drive", lambda seed, **_: toy.drive(seed))
+    monkeypatch.setattr(simulation, "simulate_drive", lambda seed, **_: toy.drive(seed))
     out, register, count = tmp_path / "out", scan_evaluation.register_in_stages, itertools.count(1)
 
     def interrupting(*arguments):
@@ -86,10 +92,10 @@ def test_a_folder_of_scans_with_poses_is_evaluated(weights, tmp_path, capsys) ->
 
 def test_a_drive_is_checked_with_the_distances_that_are_asked_for(tmp_path) -> None:
     write_kitti_sequence(tmp_path / "kitti", "00", toy.drive(num_scans=6))
-    assert len(drive_sources.find_sources([str(tmp_path / "kitti")], [])) == 1
+    assert len(drives.find_sources([str(tmp_path / "kitti")], [])) == 1
     far = SamplingConfig(min_distance_m=500.0, max_distance_m=900.0)
     with pytest.raises(ValueError, match=r"no two of them 500\.0 to 900\.0 m apart"):
-        drive_sources.find_sources([str(tmp_path / "kitti")], [], far)
+        drives.find_sources([str(tmp_path / "kitti")], [], far)
 
 
 def test_a_table_of_no_right_registration_has_no_median() -> None:

@@ -9,6 +9,7 @@ import pytest
 import dpmjax
 from dpmjax.cli import localize
 from dpmjax.cli.command import EXIT_BAD_INPUT, EXIT_FAILED, EXIT_OK
+from dpmjax.cli.program import main
 from dpmjax.cli.result_files import load_json, read_history
 from dpmjax.cli.slam_numbers import localization_errors
 from dpmjax.geometry import rigid
@@ -33,7 +34,7 @@ def case(tmp_path_factory):
 
 
 def run(*arguments) -> int:
-    return localize.run(list(map(str, arguments)))
+    return main(["localize", *map(str, arguments)])
 
 
 def scans_of(case):
@@ -140,7 +141,8 @@ def test_errors_are_those_of_the_keyframes_frames(case) -> None:
     np.testing.assert_array_equal(errors.is_found, [True, True, True, False])
     np.testing.assert_allclose(errors.translation_m[:3], [0, 3, 0.5], atol=1e-6)
     # The table of a run that goes on holds the same results.
-    rows = [localize.as_row(number, drive, slam_map, one, 0.1) for number, one in enumerate(found)]
+    inputs = localize.Case(slam_map, drive, None, True)
+    rows = [localize.as_row(number, inputs, one, 0.1) for number, one in enumerate(found)]
     again = localization_errors(
         list(map(localize.as_localization, rows)), slam_map, reference, drive.T_world_lidar[[1, 1, 1, 1]]
     )

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 import dpmjax
-from dpmjax.cli import merge
 from dpmjax.cli.command import EXIT_BAD_INPUT, EXIT_OK
+from dpmjax.cli.program import main
 from dpmjax.cli.result_files import load_json
 from dpmjax.slam import JoinedMaps, MergedMaps
 from dpmjax.slam.keyframes import MapEdge
@@ -34,7 +34,7 @@ def case(tmp_path_factory):
 
 
 def run(*arguments) -> int:
-    return merge.run(list(map(str, arguments)))
+    return main(["merge", *map(str, arguments)])
 
 
 def joined_by_a_loop(model, *maps, on_keyframe=None) -> MergedMaps:

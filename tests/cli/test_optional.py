@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from dpmjax.cli import info, slam
+from dpmjax.cli import program, slam
 from dpmjax.cli.command import EXIT_BAD_INPUT, EXIT_OK, run_command
 from dpmjax.cli.machine import EXTRAS, require_importable, why_not_importable
 from experiments import deepmapping_rgbd, deepmapping_suite, toy_1d
@@ -69,7 +69,7 @@ def test_info_names_what_is_broken_and_what_is_missing(
         (packages / f"{name}.py").touch()
     (packages / "open3d.py").write_text(FAILURES["a missing library"])
     monkeypatch.setitem(sys.modules, "gtsam", None)
-    assert info.run([]) == EXIT_OK
+    assert program.main(["info"]) == EXIT_OK
     lines = [line.removeprefix("extra").strip() for line in capsys.readouterr().out.splitlines()]
     assert f"baselines: open3d is installed, but its import fails: {LIBUSB}" in lines
     assert "gtsam: gtsam is not installed (pip install 'dpmjax[gtsam]')" in lines

@@ -8,7 +8,8 @@ import pytest
 
 import dpmjax
 from dpmjax.cli.command import EXIT_BAD_INPUT, EXIT_OK
-from dpmjax.cli.register import report, run
+from dpmjax.cli.program import main
+from dpmjax.cli.register import report
 from dpmjax.cli.result_files import load_json
 from dpmjax.io import read_lidar_file, write_pcd
 from tests.data_sets import read_ply
@@ -27,7 +28,7 @@ def files(tmp_path_factory):
 
 
 def command(files, *arguments) -> int:
-    return run([*map(str, arguments), "--weights", str(files / "model.safetensors")])
+    return main(["register", *map(str, arguments), "--weights", str(files / "model.safetensors")])
 
 
 def test_files_hold_the_motion_that_the_library_finds(files, tmp_path, capsys) -> None:

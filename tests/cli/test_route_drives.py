@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 from scipy.spatial import KDTree
 
-from dpmjax.cli.drive_sources import find_sources
-from dpmjax.cli.drives import DriveSelection, open_drive
+from dpmjax.cli.drives import DriveOptions, find_sources, open_drive
 from dpmjax.cli.route_drives import STEP_M, keep_scans, route_drive
 from dpmjax.geometry import rigid
 from dpmjax.io import InputError, LidarSequence, write_kitti, write_tum
@@ -46,7 +45,7 @@ def without_rays(monkeypatch, tmp_path) -> Path:
 
 def test_the_drive_follows_the_trajectory_and_its_heights(without_rays) -> None:
     truth = hill()
-    drive = open_drive(DriveSelection(data=write_tum(without_rays / "hill.tum", truth)))
+    drive = open_drive(write_tum(without_rays / "hill.tum", truth), DriveOptions())
     assert drive.name == "hill"
     assert "simulated along these poses" in drive.notes[0].text
     positions = drive.T_world_lidar[:, :3, 3]
@@ -83,7 +82,7 @@ def test_drives_to_train_and_to_evaluate_on_may_be_trajectories(without_rays) ->
 
 def test_another_seed_makes_another_town(without_rays) -> None:
     path = write_tum(without_rays / "hill.txt", hill())
-    first, again, other = (open_drive(DriveSelection(data=path, seed=seed)) for seed in (0, 0, 1))
+    first, again, other = (open_drive(path, DriveOptions(seed=seed)) for seed in (0, 0, 1))
     np.testing.assert_array_equal(first.T_world_lidar, again.T_world_lidar)
     assert np.abs(first.T_world_lidar[:5] - other.T_world_lidar[:5]).max() > 1e-3
 
@@ -123,14 +122,14 @@ def test_a_file_that_is_no_drive_is_refused(without_rays, text: str, message: st
     path = without_rays / "poses.txt"
     path.write_text(text)
     with pytest.raises(InputError, match=message):
-        open_drive(DriveSelection(data=path))
+        open_drive(path, DriveOptions())
     assert not (without_rays / "results").exists()
 
 
 @pytest.mark.slow
 def test_nothing_stands_on_the_route(tmp_path, monkeypatch) -> None:
     monkeypatch.chdir(tmp_path)
-    drive = open_drive(DriveSelection(data=write_tum(tmp_path / "hill.txt", hill())))
+    drive = open_drive(write_tum(tmp_path / "hill.txt", hill()), DriveOptions())
     for index in range(0, len(drive), 12):
         points = drive.read_scan(index)
         assert len(points) > 30_000

@@ -11,8 +11,10 @@ from typing import ClassVar
 import numpy as np
 import pytest
 
-from dpmjax.cli import result_files, run_folder
-from dpmjax.cli.result_files import HistoryFile, commits_note, do_row, read_history, row_path, write_json
+from dpmjax.cli import rows as row_files
+from dpmjax.cli import run_folder
+from dpmjax.cli.result_files import HistoryFile, commits_note, read_history, write_json
+from dpmjax.cli.rows import do_row, row_path
 from dpmjax.cli.run_folder import (
     RunFailedError,
     RunOptions,
@@ -132,7 +134,7 @@ def test_metrics_are_valid_json_with_seed_and_versions():
 
 
 def run_rows(folder, commit, monkeypatch, methods):
-    monkeypatch.setattr(result_files, "git_hash", lambda: commit)
+    monkeypatch.setattr(row_files, "git_hash", lambda: commit)
     return [do_row(folder.path, {"method": method}, lambda: {"ate_px": 1.5}, seed=3) for method in methods]
 
 

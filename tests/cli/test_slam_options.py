@@ -11,7 +11,7 @@ import pytest
 import dpmjax
 from dpmjax.cli import slam
 from dpmjax.cli.command import EXIT_BAD_INPUT, EXIT_OK
-from dpmjax.cli.drives import DriveSelection, ScanReader, open_drive, with_raised_beams
+from dpmjax.cli.drives import DriveOptions, ScanReader, open_drive, with_raised_beams
 from dpmjax.cli.machine import why_not_importable
 from dpmjax.cli.result_files import load_json
 from dpmjax.io import write_tum
@@ -113,7 +113,7 @@ def test_kittis_beams_are_raised(tmp_path) -> None:
 
 def test_a_selection_is_every_nth_scan_of_its_reference(tmp_path) -> None:
     drive = write_drive(tmp_path / "drive")
-    part = open_drive(DriveSelection(data=drive, jump=3, num_scans=4))
+    part = open_drive(drive, DriveOptions(jump=3, n_scans=4))
     assert [Path(source).stem for source in part.sources] == ["000", "003", "006", "009"]
     whole = dpmjax.io.open_lidar_sequence(drive)
     np.testing.assert_array_equal(part.T_world_lidar, whole.T_world_lidar[:12:3])

@@ -17,7 +17,8 @@ from dpmjax.cli.command import run_command
 from dpmjax.cli.result_files import read_history
 from dpmjax.cli.run_folder import CHECKPOINTS, HISTORY, RunFolder
 from dpmjax.cli.train import NAME, Config, main, training_settings
-from dpmjax.cli.train_run import KINDS, EvaluationSets, Records, run_training
+from dpmjax.cli.train_data import KINDS, EvaluationSets
+from dpmjax.cli.train_run import Records, run_training
 from dpmjax.deeppointmap import (
     CurriculumStage,
     SampleMaker,
@@ -135,7 +136,6 @@ def test_help_needs_no_jax_and_shows_examples() -> None:
     [
         ({"steps": 1}, "--steps"),
         ({"num_towns": 0}, "--num-towns"),
-        ({"town_length_m": 5.0}, "--town-length-m"),
         ({"weights": "dpm_small", "frame": "local"}, "--frame"),
     ],
 )

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 import sys
 
 import numpy as np
@@ -11,9 +10,9 @@ import pytest
 
 from dpmjax.cli.command import run_command
 from dpmjax.simulation import simulate_sequence
-from experiments import deepmapping_ablations, deepmapping_relocalize, deepmapping_rgbd, deepmapping_size, toy_1d
+from experiments import deepmapping_ablations, deepmapping_relocalize, deepmapping_rgbd, toy_1d
 
-MODULES = (deepmapping_ablations, deepmapping_relocalize, deepmapping_rgbd, deepmapping_size, toy_1d)
+MODULES = (deepmapping_ablations, deepmapping_relocalize, deepmapping_rgbd, toy_1d)
 
 
 def run(module, *options) -> int:
@@ -32,9 +31,7 @@ def test_help_shows_examples(module, capsys) -> None:
     [
         (toy_1d, ["--seeds", 0], "--seeds"),
         (toy_1d, ["--device", "tpu"], "--device"),
-        (deepmapping_size, ["--sizes", 1], "--sizes"),
         (deepmapping_ablations, ["--only", "colour"], "--only"),
-        (deepmapping_ablations, ["--views", 1], "--views"),
         (deepmapping_rgbd, ["--methods", "guess"], "--methods"),
         (deepmapping_rgbd, ["--limit", 0], "--limit"),
     ],
@@ -62,7 +59,7 @@ def test_bad_input_is_one_line_and_exit_code_2(module, options, message, capsys)
 
 @pytest.mark.slow
 def test_toy_writes_its_pictures_and_shares(tmp_path, capsys) -> None:
-    options = ["--seeds", 4, "--steps", 3, "--learning-rates", 2e-4, "-o", tmp_path / "out"]
+    options = ["--seeds", 4, "--steps", 3, "-o", tmp_path / "out"]
     assert run(toy_1d, *options) == 0
     metrics = json.loads((tmp_path / "out" / "metrics.json").read_text())
     assert metrics["x_global"] == pytest.approx(-1.417, abs=1e-3)
@@ -112,10 +109,9 @@ def test_not_moving_is_never_right_on_hard_walks(tmp_path) -> None:
 
 
 def test_ablations_change_one_thing_each() -> None:
-    config = deepmapping_ablations.Config()
-    basis = deepmapping_ablations.settings_of("lnet", "CNN", config)
+    basis = deepmapping_ablations.settings_of("lnet", "CNN", 600)
     for ablation, variants in deepmapping_ablations.VARIANTS.items():
-        settings = [deepmapping_ablations.settings_of(ablation, variant, config) for variant in variants]
+        settings = [deepmapping_ablations.settings_of(ablation, variant, 600) for variant in variants]
         assert len(set(settings)) == len(variants)
         for one in settings:
             changed = (
@@ -124,18 +120,6 @@ def test_ablations_change_one_thing_each() -> None:
                 + (one.cold_phases != basis.cold_phases)
             )
             assert changed <= (2 if ablation == "mnet" else 1)
-
-
-def test_exponents_are_those_of_full_steps() -> None:
-    def row(size):
-        part = {"step_s": 0.5, "epoch_s": 1e-3 * size}
-        return {"num_scans": size, "network": part, "free": part, "peak_rss_gb": 0.1 * math.sqrt(size)}
-
-    found = deepmapping_size.exponents([row(size) for size in (64, 256, 1024, 4096)])
-    assert found["step, L-Net (s)"] == pytest.approx(0.0, abs=1e-9)
-    assert found["epoch, free poses (s)"] == pytest.approx(1.0)
-    assert found["peak memory (GB)"] == pytest.approx(0.5)
-    assert deepmapping_size.exponents([row(64)])["peak memory (GB)"] is None
 
 
 def test_relocalization_tells_known_from_right_and_mapped() -> None:

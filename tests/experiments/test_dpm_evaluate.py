@@ -5,11 +5,9 @@ from __future__ import annotations
 import jax
 import numpy as np
 import pytest
-from tqdm import tqdm
 
 import dpmjax
-from dpmjax import simulation
-from dpmjax.cli import drive_sources, evaluation_rows
+from dpmjax import deeppointmap, simulation
 from dpmjax.cli.command import EXIT_BAD_INPUT, EXIT_OK, run_command
 from dpmjax.cli.result_files import load_json
 from dpmjax.deeppointmap import (
@@ -39,8 +37,8 @@ def run(module, arguments) -> int:
 
 
 def test_evaluation_measures_every_sequence_and_resumes(weights, tmp_path, monkeypatch, capsys) -> None:
-    monkeypatch.setattr(drive_sources, "simulate_drive", lambda seed, **_: toy.drive(seed))
-    monkeypatch.setattr(dpm_evaluate, "why_not_importable", lambda _: "it is not installed")
+    monkeypatch.setattr(simulation, "simulate_drive", lambda seed, **_: toy.drive(seed))
+    monkeypatch.setattr("dpmjax.cli.why_not_importable", lambda _: "it is not installed")
     arguments = ["town", "--weights", weights, "--pairs", 2, "--num-towns", 1, "-o", tmp_path / "out"]
     assert run(dpm_evaluate, arguments) == EXIT_OK
     printed = capsys.readouterr().out
@@ -55,7 +53,7 @@ def test_evaluation_measures_every_sequence_and_resumes(weights, tmp_path, monke
     for name in ("table.md", "reliability.png", "failures.png"):
         assert (tmp_path / "out" / name).stat().st_size > 0
     # All rows are there: nothing is registered again.
-    monkeypatch.setattr(evaluation_rows, "evaluate_scan_pairs", None)
+    monkeypatch.setattr(deeppointmap, "evaluate_scan_pairs", None)
     assert run(dpm_evaluate, ["--resume", "-o", tmp_path / "out"]) == EXIT_OK
     assert load_json(tmp_path / "out" / "metrics.json")["rows"] == metrics["rows"]
 
@@ -157,8 +155,7 @@ def test_a_calibration_is_rated_by_what_it_is_sure_of() -> None:
 
 
 def test_half_of_the_overlap_pairs_of_a_town_overlap(weights) -> None:
-    with tqdm(disable=True) as bar:
-        drives = [toy.drive(1), toy.drive(2)]
-        row = _dpm_overlap.measure_town(dpmjax.load_model(weights), drives, 32, 0, bar)
+    drives = [toy.drive(1), toy.drive(2)]
+    row = _dpm_overlap.measure_town(dpmjax.load_model(weights), drives, 32, 0)
     assert sum(row["is_overlap"]) == 16
     assert np.shape(row["evidence"]) == (32, len(OVERLAP_FEATURES))

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 import dpmjax
+from dpmjax.cli import RowStopped
 from dpmjax.cli.command import EXIT_BAD_INPUT, EXIT_OK, run_command
 from dpmjax.cli.result_files import load_json
 from dpmjax.cli.route_drives import STEP_M as STEP_OF_KEPT_SCANS_M
@@ -19,9 +20,9 @@ from dpmjax.geometry import rigid
 from dpmjax.io import LidarSequence
 from dpmjax.saved_maps import load_state
 from dpmjax.slam import RefinedKeyframes
-from experiments import _slam_comparison, _slam_evaluation, _slam_peers, _slam_refine, dpm_evaluate
-from experiments._slam_evaluation import NETWORK, ODOMETRY, OURS, Drive, FoundLoop, StoppedError
-from experiments._slam_refine import MULTIWAY, REFINED
+from experiments import _slam_comparison, _slam_evaluation, _slam_peers, _slam_uses, dpm_evaluate
+from experiments._slam_evaluation import NETWORK, ODOMETRY, OURS, Drive, FoundLoop
+from experiments._slam_uses import MULTIWAY, REFINED
 from tests.deeppointmap import toy
 from tests.slam.truth import laps, pose
 
@@ -140,7 +141,7 @@ def test_refinements_are_rows_that_a_resumed_run_may_add(with_toys, tmp_path, mo
         T[:, 1, 3] += 3.0 * np.arange(len(T))
         return RefinedKeyframes(replace(slam_map, T_world_keyframe=T), 1, 1)
 
-    monkeypatch.setattr(_slam_refine, "refine_keyframes", moved)
+    monkeypatch.setattr(_slam_uses, "refine_keyframes", moved)
     monkeypatch.setitem(sys.modules, "open3d", None)
     assert run("--slam", "--resume", "--refine", "-o", out) == EXIT_OK
     assert f"{MULTIWAY} was not run: open3d is not installed" in capsys.readouterr().out
@@ -172,7 +173,7 @@ def test_a_stopped_row_is_not_written(tmp_path, monkeypatch) -> None:
     monkeypatch.setattr(_slam_evaluation, "PEERS", {PEER: ("json", SteadyPeer)})
     calls = iter([False, False, True])
     drive = drive_of(toy.drive(num_scans=6), tmp_path, lambda: next(calls))
-    with pytest.raises(StoppedError):
+    with pytest.raises(RowStopped):
         _slam_evaluation.evaluate_peer(drive, PEER)
     assert not list(tmp_path.iterdir())
 

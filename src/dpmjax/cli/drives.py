@@ -1,56 +1,64 @@
-"""Input of the commands: drives of 3-D scans, read ahead in a thread, and saved maps."""
+"""Input of the commands: drives of 3-D scans, from files or simulated, read ahead in a thread; and saved maps."""
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Generator, Iterable
+from collections.abc import Generator, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
+from tyro.conf import FlagCreatePairsOff, arg
+
+from dpmjax import deeppointmap, io, saved_maps, scans, simulation, slam
+from dpmjax.cli.command import check_least
+from dpmjax.cli.run_folder import RunOptions
+from dpmjax.sequences import LidarSequence, Note
 
 if TYPE_CHECKING:
-    from dpmjax.sequences import LidarSequence, Note
-    from dpmjax.slam import KeyframeMap, SlamMethods
     from dpmjax.slam.front_end import AnyScan
 
-
-LOGGER = logging.getLogger(__name__)
+LOGGER = logging.getLogger("dpmjax.drives")
+TOWN = "town"
 TOWN_ROUTE_M, TOWN_DRIVE_M, TOWN_RATE_HZ, TOWN_AZIMUTHS = 400.0, 480.0, 3.0, 900
 
 
 @dataclass(frozen=True, kw_only=True)
-class DriveSelection:
-    """Scans of one drive.
+class DriveOptions(RunOptions):
+    """Options of every command that reads the scans of whole drives."""
 
-    Attributes:
-        data: folder of scans, a bag of ROS, or a file of poses along which a town is simulated; None for any town.
-        sequence: name of the drive, where the folder holds several.
-        num_scans: number of scans; None for all.
-        jump: every `jump`-th scan is taken.
-        is_kitti_corrected: the beams are raised by 0.205 degrees, as KITTI's HDL-64E needs.
-        columns: numbers a point has in `.bin` files; None infers it from the values.
-        topic: which clouds of a bag of ROS; None takes the only ones.
-        seed: seed of the simulated town.
-    """
+    topic: Annotated[str | None, arg(aliases=["-t"], metavar="NAME")] = None
+    """Which clouds of a bag of ROS, where it holds several topics of them."""
+    columns: Annotated[int | None, arg(metavar="N")] = None
+    """Numbers a point has in .bin files (4: KITTI, 5: nuScenes); without it, the values decide."""
+    kitti_angle_correction: FlagCreatePairsOff[bool] = False
+    """Raise the beams by 0.205 degrees, as KITTI's HDL-64E needs."""
+    n_scans: Annotated[int | None, arg(aliases=["-n"], metavar="N")] = None
+    """Use the first N scans, after --jump."""
+    jump: Annotated[int, arg(aliases=["-j"], metavar="N")] = 1
+    """Use every Nth scan."""
 
-    data: Path | None = None
-    sequence: str | None = None
-    num_scans: int | None = None
-    jump: int = 1
-    is_kitti_corrected: bool = False
-    columns: int | None = None
-    topic: str | None = None
-    seed: int = 0
+    def __post_init__(self) -> None:
+        """Checks ranges."""
+        check_least(self, n_scans=1, jump=1, seed=0, columns=3)
+
+    def check_data(self, data: object, sequence: str | None) -> None:
+        """Raises a ValueError where options belong to files and no folder is given."""
+        if sequence is not None and not data:
+            raise ValueError("--sequence chooses a drive of DATA: give its folder too")
+        if self.kitti_angle_correction and not data:
+            raise ValueError("--kitti-angle-correction is for the scans of KITTI's car: give their folder, DATA")
 
 
-def open_drive(selection: DriveSelection) -> LidarSequence:
+def open_drive(data: Path | None, options: DriveOptions, sequence: str | None = None) -> LidarSequence:
     """Opens a drive, checks the lengths of its files and reads its first scan.
 
     Args:
-        selection: the scans.
+        data: folder of scans, a bag of ROS, or a file of poses along which a town is simulated; None for any town.
+        options: which scans of the drive; the seed is that of a simulated town.
+        sequence: name of the drive, where the folder holds several.
 
     Returns:
         The drive.
@@ -58,21 +66,18 @@ def open_drive(selection: DriveSelection) -> LidarSequence:
     Raises:
         InputError: no such folder, drive or poses, a file that is missing or cut off, or a first scan that is bad.
     """
-    from dpmjax import io
     from dpmjax.cli.route_drives import is_route, route_drive
 
-    if selection.data is None:
-        drive = demo_drive(selection.seed)
-    elif is_route(selection.data):
-        drive = route_drive(selection.data, selection.seed)
+    if data is None:
+        drive = demo_drive(options.seed)
+    elif is_route(data):
+        drive = route_drive(data, options.seed)
     else:
-        drive = io.open_lidar_sequence(
-            selection.data, sequence=selection.sequence, bin_columns=selection.columns, topic=selection.topic
-        )
-    if selection.is_kitti_corrected:
+        drive = io.open_lidar_sequence(data, sequence=sequence, bin_columns=options.columns, topic=options.topic)
+    if options.kitti_angle_correction:
         drive = with_raised_beams(drive)
-    part = drive.take(np.arange(len(drive))[:: selection.jump][: selection.num_scans])
-    io.require_whole_files(part, bin_columns=selection.columns)
+    part = drive.take(np.arange(len(drive))[:: options.jump][: options.n_scans])
+    io.require_whole_files(part, bin_columns=options.columns)
     note = io.unit_note(part.read_points(0), part.sources[0])
     return part if note is None else replace(part, notes=(*part.notes, note))
 
@@ -97,22 +102,88 @@ def report_notes(notes: Iterable[Note]) -> dict[str, list[str]]:
 
 def with_raised_beams(drive: LidarSequence) -> LidarSequence:
     """Returns the drive with the beams of KITTI's lidar raised to their true elevation."""
-    from dpmjax.scans import raise_beams
     from dpmjax.scans.elevation import KITTI_ELEVATION_DEG
 
     def read_scan(index: int) -> np.ndarray:
-        return raise_beams(drive.read_scan(index), KITTI_ELEVATION_DEG)
+        return scans.raise_beams(drive.read_scan(index), KITTI_ELEVATION_DEG)
 
     return replace(drive, read_scan=read_scan)
 
 
 def demo_drive(seed: int) -> LidarSequence:
     """Simulates a drive once round a town and on over known streets, with an HDL-64 of half the columns."""
-    from dpmjax.simulation import HDL64E, DriveConfig, Scene, TownConfig, simulate_scene
+    town = simulation.TownConfig("suburb", "loop", TOWN_ROUTE_M, 90.0)
+    driving = simulation.DriveConfig(rate_hz=TOWN_RATE_HZ, length_m=TOWN_DRIVE_M)
+    sensor = simulation.HDL64E.with_azimuths(TOWN_AZIMUTHS)
+    return simulation.simulate_scene(simulation.Scene(seed, town, driving, sensor))
 
-    town = TownConfig("suburb", "loop", TOWN_ROUTE_M, 90.0)
-    driving = DriveConfig(rate_hz=TOWN_RATE_HZ, length_m=TOWN_DRIVE_M)
-    return simulate_scene(Scene(seed, town, driving, HDL64E.with_azimuths(TOWN_AZIMUTHS)))
+
+@dataclass(frozen=True)
+class Source:
+    """Origin of a drive to train on or to evaluate with; a worker process opens it.
+
+    Attributes:
+        path: folder of scans, or a file of poses along which a town is simulated; None for any town.
+        name: name of the sequence in the folder; None where it holds one.
+        town_seed: seed of the town.
+        town_length_m: length of the drive through the town.
+        town_kind: kind of place; None draws one.
+        town_mixture: distribution from which the town is drawn; None for that of `simulate_drive`.
+    """
+
+    path: Path | None = None
+    name: str | None = None
+    town_seed: int = 0
+    town_length_m: float = 600.0
+    town_kind: str | None = None
+    town_mixture: simulation.SceneMixture | None = None
+
+    def open(self) -> LidarSequence:
+        """Opens or simulates the drive; of one with reference poses, the scans that have one."""
+        from dpmjax.cli.route_drives import is_route, route_drive
+
+        if self.path is None:
+            mixture = self.town_mixture or simulation.SceneMixture()
+            length_m, kind = self.town_length_m, self.town_kind
+            return simulation.simulate_drive(self.town_seed, length_m=length_m, kind=kind, mixture=mixture)
+        if is_route(self.path):
+            return route_drive(self.path, self.town_seed)
+        drive = io.open_lidar_sequence(self.path, sequence=self.name)
+        return drive if drive.T_world_lidar is None else drive.take(np.flatnonzero(drive.has_reference))
+
+
+def find_sources(
+    data: Sequence[str], towns: Sequence[Source], sampling: deeppointmap.SamplingConfig | None = None
+) -> list[Source]:
+    """Returns the drives of the entries of a command line, checked; those of the towns where an entry is `town`.
+
+    Args:
+        data: folders or files of poses, or `town` for the towns.
+        towns: such as the seeds of the run give.
+        sampling: distances at which a drive must have pairs of scans; None takes the published ones.
+
+    Returns:
+        The drives, in order.
+
+    Raises:
+        ValueError: if a path cannot be read or holds no useful drive.
+    """
+    sources: list[Source] = []
+    sampling = sampling or deeppointmap.SamplingConfig()
+    for entry in data:
+        if entry == TOWN and not Path(entry).exists():
+            sources += towns
+            continue
+        names: Sequence[str | None] = io.list_lidar_sequences(entry) or [None]
+        found = {source: source.open() for source in (Source(Path(entry), name) for name in names)}
+        checked = ((source, deeppointmap.why_useless(drive, sampling)) for source, drive in found.items())
+        reasons = {source: reason for source, reason in checked if reason is not None}
+        if len(reasons) == len(found):
+            raise ValueError("; ".join(f"{entry}: {reason}" for reason in dict.fromkeys(reasons.values())))
+        for source, reason in reasons.items():
+            LOGGER.warning("%s is left out: %s", found[source].name, reason)
+        sources += [source for source in found if source not in reasons]
+    return sources
 
 
 TURN_S = 0.1
@@ -128,22 +199,21 @@ class ScanReader:
     """
 
     def __init__(self, sequence: LidarSequence, *, is_deskewed: bool = False, jump: int = 1) -> None:
-        self._sequence, self._is_deskewed, self._jump = sequence, is_deskewed, jump
+        self.sequence, self._is_deskewed, self._jump = sequence, is_deskewed, jump
 
     def __call__(self, index: int) -> AnyScan:
         """Reads a scan."""
-        from dpmjax.scans import offsets_by_azimuth
-        from dpmjax.slam import TimedScan
-
-        points = self._sequence.read_points(index)
+        points = self.sequence.read_points(index)
         if not self._is_deskewed or not len(points):
             return points
         offsets = self._offsets_by_times(index)
-        return TimedScan(points, offsets_by_azimuth(points, self._turn_share(index)) if offsets is None else offsets)
+        if offsets is None:
+            offsets = scans.offsets_by_azimuth(points, self._turn_share(index))
+        return slam.TimedScan(points, offsets)
 
     def iterate(self, start: int) -> Generator[AnyScan, None, None]:
         """Reads scan after scan, the next one while the caller works on this one."""
-        numbers = range(start, len(self._sequence))
+        numbers = range(start, len(self.sequence))
         with ThreadPoolExecutor(1) as pool:
             waiting = pool.submit(self, start) if numbers else None
             for index in numbers:
@@ -153,13 +223,11 @@ class ScanReader:
 
     def _offsets_by_times(self, index: int) -> np.ndarray | None:
         """Returns the offsets by the times in the file; None where it has none that can be used."""
-        from dpmjax.scans import offsets_by_times
-
-        times = None if self._sequence.read_times is None else self._sequence.read_times(index)
+        times = None if self.sequence.read_times is None else self.sequence.read_times(index)
         if times is None:
             return None
         interval_s = self._interval_s(index)
-        offsets = offsets_by_times(times, interval_s)
+        offsets = scans.offsets_by_times(times, interval_s)
         return offsets if offsets is None or interval_s is not None else offsets / self._jump
 
     def _turn_share(self, index: int) -> float:
@@ -169,14 +237,14 @@ class ScanReader:
 
     def _interval_s(self, index: int) -> float | None:
         """Returns the time between the two scans before, whose motion predicts this one; None where it is unknown."""
-        times = self._sequence.times
+        times = self.sequence.times
         if times is None or index < 2:
             return None
         interval_s = float(times[index - 1] - times[index - 2])
         return interval_s if interval_s > 0 else None
 
 
-def open_map(path: Path, methods: SlamMethods) -> KeyframeMap:
+def open_map(path: Path, methods: slam.SlamMethods) -> slam.KeyframeMap:
     """Reads a saved map.
 
     Args:
@@ -189,16 +257,14 @@ def open_map(path: Path, methods: SlamMethods) -> KeyframeMap:
     Raises:
         ValueError: no such file, no map, or a map of other weights.
     """
-    from dpmjax.saved_maps import load_map
-
-    slam_map, origin = load_map(path), methods.origin
+    slam_map, origin = saved_maps.load_map(path), methods.origin
     if slam_map.origin is not None and slam_map.origin.fingerprint != origin.fingerprint:
         found = f"made with weights {slam_map.origin}, these are {origin}"
         raise ValueError(f"{path}: {found}; name the weights that made it with --weights")
     return slam_map
 
 
-def keyframe_points(slam_map: KeyframeMap, row: int) -> np.ndarray:
+def keyframe_points(slam_map: slam.KeyframeMap, row: int) -> np.ndarray:
     """Returns the surface elements of a keyframe.
 
     Args:

@@ -16,31 +16,34 @@ where the drive has some) with pairs more than 40 m apart.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated
 
 import numpy as np
-from tqdm import tqdm
 from tyro.conf import Positional, arg
 
-from dpmjax.cli.command import StopFlag, check_least, run_command
-from dpmjax.cli.result_files import do_row
-from dpmjax.cli.run_folder import RunFolder, RunOptions, open_run_folder, recording, write_metrics
-from dpmjax.io.files import write_atomically
-
-if TYPE_CHECKING:
-    from dpmjax.sequences import LidarSequence
+from dpmjax import deeppointmap, metrics, simulation, viz, weights
+from dpmjax.cli.command import check_least
+from dpmjax.cli.drives import Source, find_sources
+from dpmjax.cli.rows import Report, Row, RowStopped, TableRun, cell_text, markdown, run_table
+from dpmjax.cli.run_folder import RunFolder, RunOptions
+from dpmjax.sequences import LidarSequence
 
 NAME = "evaluate"
 # Overlap is cheap: more pairs, of each kind.
 OVERLAP_FACTOR = 2
-HEADER = (
-    "drive | distance | pairs | recall, network alone | recall, verified | recall, refined (95 % interval) "
-    "| median error, network alone | median error, refined | s / pair | overlap AUC"
-)
+FIRST_TOWN = 5_000_000
+"""Seed of the first town; no training, selection or calibration uses these towns."""
+
+NUM_SHOWN, TOWN_LENGTH_M = 4, 400.0
+STAGES = ("descriptors", "verified", "refined")
+BAND_NAMES = {"near": "2-10 m", "middle": "10-20 m"}
+COLUMNS = (
+    "drive", "distance", "pairs", "recall, network alone", "recall, verified", "recall, refined (95 % interval)",
+    "median error, network alone", "median error, refined", "s / pair", "overlap AUC",
+)  # fmt: skip
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -55,120 +58,219 @@ class Config(RunOptions):
     """Pairs for each distance."""
     num_towns: Annotated[int, arg(metavar="N")] = 1
     """Number of towns, where town is among the data; a suburb first, then other kinds of place."""
-    town_length_m: Annotated[float, arg(metavar="M")] = 400.0
-    """Length of the route through each town."""
 
     def __post_init__(self) -> None:
-        """Checks ranges.
-
-        Raises:
-            ValueError: if an option is out of range.
-        """
-        check_least(self, pairs=1, num_towns=1, seed=0, town_length_m=100)
+        """Checks ranges."""
+        check_least(self, pairs=1, num_towns=1, seed=0)
         if not self.data:
             raise ValueError("give at least one folder of scans, or town")
 
 
-class BandStopped(Exception):
-    """A signal came while the pairs of a band were registered."""
-
-
-def main(config: Config) -> list[dict[str, Any]]:
+def main(config: Config) -> list[Row]:
     """Makes the rows that are missing, and writes table, numbers and pictures."""
-    from dpmjax.cli.evaluation_rows import (
-        BAND_NAMES,
-        evaluation_towns,
-        open_evaluation_drives,
-        overlap_row,
-        registration_row,
-    )
-    from dpmjax.simulation import SceneMixture
-    from dpmjax.weights import load_model
+    model = weights.load_model(config.weights)
+    kinds = [kind for kind, _ in simulation.SceneMixture().kinds]
+    drives = open_evaluation_drives(config.data, evaluation_towns(config.num_towns, TOWN_LENGTH_M, kinds))
+    by_name = {drive.name: drive for drive in drives}
 
-    model = load_model(config.weights)
-    kinds = [kind for kind, _ in SceneMixture().kinds]
-    drives = open_evaluation_drives(config.data, evaluation_towns(config.num_towns, config.town_length_m, kinds))
-    folder = open_run_folder(config, NAME)
-    rows: list[dict[str, Any]] = []
-    with recording(folder), StopFlag() as stop, tqdm(unit=" pairs", dynamic_ncols=True) as bar:
+    def work(run: TableRun, sequence: str, band: str) -> Row:
+        return evaluation_row(model, by_name[sequence], band, config.pairs, run, seed=config.seed)
 
-        def add(drive: LidarSequence, band: str, work: Callable[[], dict[str, Any]]) -> None:
-            if not stop.is_requested:
-                bar.set_description(f"{drive.name}, {BAND_NAMES.get(band, band)}")
-                with suppress(BandStopped):
-                    rows.append(do_row(folder.path, {"sequence": drive.name, "band": band}, work, seed=config.seed))
+    def report(rows: list[Row]) -> Report:
+        numbers, text = calibration_numbers(rows), table(rows)
+        if numbers:
+            note = "" if numbers["is_calibrated"] else "; these weights are not calibrated"
+            text += f"\n\nBrier score of the confidence, all pairs: {numbers['brier']:.3f} (0 is best{note})."
+        draw = partial(draw_evaluation, drives=drives, rows=rows, weights=config.weights, seed=config.seed)
+        return Report({"weights": config.weights, **numbers}, text, draw)
 
-        def advance(num_pairs: int) -> None:
-            bar.update(num_pairs)
-            if stop.is_requested:
-                raise BandStopped
-
-        for drive in drives:
-            for band in ("near", "middle", "far"):
-                work = partial(registration_row, model, drive, band, config.pairs)
-                add(drive, band, partial(work, seed=config.seed, on_pair=partial(advance, 1)))
-            of_overlap = partial(overlap_row, model, drive, OVERLAP_FACTOR * config.pairs)
-            add(drive, "overlap", partial(of_overlap, seed=config.seed, on_scan=partial(advance, 0)))
-        text = write_results(folder, config, drives, rows, is_interrupted=stop.is_requested)
-    print(text, f"results in {folder.path}", sep="\n")
-    return rows
+    cases = [{"sequence": name, "band": band} for name in by_name for band in ("near", "middle", "far", "overlap")]
+    return run_table(config, NAME, cases, work, report)
 
 
-def write_results(
-    folder: RunFolder,
-    config: Config,
-    drives: Sequence[LidarSequence],
-    rows: Sequence[dict[str, Any]],
+def evaluation_row(
+    model: deeppointmap.Model, drive: LidarSequence, band: str, num_pairs: int, run: TableRun, *, seed: int
+) -> Row:
+    """Returns the registrations of a band of distances, or the overlap of more pairs, until a signal comes."""
+
+    def advance() -> None:
+        if run.is_stopped():
+            raise RowStopped
+
+    if band == "overlap":
+        return overlap_row(model, drive, OVERLAP_FACTOR * num_pairs, seed=seed, on_scan=advance)
+    return registration_row(model, drive, band, num_pairs, seed=seed, on_pair=advance)
+
+
+def evaluation_towns(num_towns: int, length_m: float, kinds: Sequence[str | None] = (None,)) -> list[Source]:
+    """Returns towns that no training has seen; the kinds of place take turns, None draws one."""
+    return [
+        Source(town_seed=FIRST_TOWN + number, town_length_m=length_m, town_kind=kinds[number % len(kinds)])
+        for number in range(num_towns)
+    ]
+
+
+def open_evaluation_drives(data: Sequence[str], towns: Sequence[Source]) -> list[LidarSequence]:
+    """Opens the drives of a command line.
+
+    Args:
+        data: folders, or `town` for the towns.
+        towns: towns from `evaluation_towns`.
+
+    Returns:
+        The drives, each with poses, near pairs and a name of its own.
+
+    Raises:
+        ValueError: a path cannot be read, or a drive has no poses or no pairs, or two drives have the same name.
+    """
+    drives = [source.open() for source in find_sources(data, towns)]
+    for drive in drives:
+        if not len(deeppointmap.draw_scan_pairs(drive, "near", 1)):
+            raise ValueError(f"{drive.name}: no two scans are 2 to 10 m apart; are the poses in metres?")
+    names = [drive.name for drive in drives]
+    if len(set(names)) < len(names):
+        raise ValueError(f"two drives have the same name ({', '.join(sorted(names))}); evaluate them one by one")
+    return drives
+
+
+def registration_row(
+    model: deeppointmap.Model,
+    drive: LidarSequence,
+    band: str,
+    num_pairs: int,
     *,
-    is_interrupted: bool,
-) -> str:
-    """Writes table.md, metrics.json and the pictures; returns the text to print."""
-    from dpmjax.cli.evaluation_rows import calibration_numbers, draw_evaluation
+    seed: int,
+    on_pair: Callable[[], object],
+) -> Row:
+    """Returns errors by stage, confidence and seconds of the registrations of a band of distances."""
+    pairs = deeppointmap.read_scan_pairs(
+        drive, deeppointmap.draw_scan_pairs(drive, band, num_pairs, seed=seed), seed=seed
+    )
+    found = deeppointmap.evaluate_scan_pairs(model, pairs, on_pair=on_pair)
+    row: Row = {
+        "is_calibrated": model.config.calibration is not None,
+        "num_asked": num_pairs,
+        "confidence": found.confidence.tolist(),
+    }
+    for stage in STAGES:
+        row |= error_columns(getattr(found, stage), f"_{stage}")
+    is_right = row.pop("is_right_refined")
+    return {
+        **row,
+        "is_right": is_right.tolist(),
+        "motions": found.T_target_source.reshape(-1, 16).tolist(),
+        **_seconds(found),
+    }
 
-    numbers = calibration_numbers(rows)
-    metrics = {"weights": config.weights, **numbers, "is_interrupted": is_interrupted}
-    note = write_metrics(folder, metrics, seed=config.seed, rows=rows)
-    text = table(rows)
-    if numbers:
-        note_of_score = "" if numbers["is_calibrated"] else "; these weights are not calibrated"
-        text += f"\n\nBrier score of the confidence, all pairs: {numbers['brier']:.3f} (0 is best{note_of_score})."
-    write_atomically(folder / "table.md", text + (f"\n\n{note}.\n" if note else "\n"))
-    title = f"{Path(config.weights).stem}, all pairs"
-    draw_evaluation(folder, drives, rows, title=title, seed=config.seed)
-    return text
+
+def overlap_row(
+    model: deeppointmap.Model, drive: LidarSequence, num_pairs: int, *, seed: int, on_scan: Callable[[], object]
+) -> Row:
+    """Returns AUC and Brier score of the overlap probability; AUC None where the drive lacks pairs."""
+    found = deeppointmap.evaluate_overlap(model, drive, num_pairs, seed=seed, on_scan=on_scan)
+    row: Row = {"auc": None, "has_revisits": found.has_revisits, "num_pairs": len(found.is_overlap)}
+    if not len(found.is_overlap):
+        return row
+    return {
+        **row,
+        "auc": found.area_under_curve,
+        "brier": found.brier_score,
+        "probability": found.probability.tolist(),
+        "is_overlap": found.is_overlap.tolist(),
+    }
 
 
-def table(rows: Sequence[dict[str, Any]]) -> str:
+def error_columns(errors: metrics.RegistrationRecall, suffix: str) -> Row:
+    """Returns the recall, all errors, and the median errors of right registrations."""
+    is_right = errors.is_right
+    of_right = np.column_stack([errors.translation_errors_m, errors.rotation_errors_deg])[is_right]
+    metres, degrees = np.median(of_right, axis=0) if len(of_right) else (np.nan, np.nan)
+    return {
+        "num_pairs": len(is_right),
+        f"recall{suffix}": errors.recall if len(is_right) else None,
+        f"median_error{suffix}_m": float(metres),
+        f"median_error{suffix}_deg": float(degrees),
+        f"translation_errors{suffix}_m": errors.translation_errors_m,
+        f"rotation_errors{suffix}_deg": errors.rotation_errors_deg,
+        f"is_right{suffix}": is_right,
+    }
+
+
+def calibration_numbers(rows: Sequence[Row]) -> Row:
+    """Returns the Brier score of the confidence, over all pairs and those of each band, and `is_calibrated`."""
+    known = [row for row in rows if "confidence" in row and row["num_pairs"]]
+
+    def brier(some: Sequence[Row]) -> float:
+        confidence, is_right = (np.concatenate([row[name] for row in some]) for name in ("confidence", "is_right"))
+        return metrics.brier_score(confidence, is_right.astype(bool))
+
+    bands = dict.fromkeys(row["band"] for row in known)
+    numbers = {f"brier_{band}": brier([row for row in known if row["band"] == band]) for band in bands}
+    is_calibrated = all(row["is_calibrated"] for row in known)
+    return {"brier": brier(known), **numbers, "is_calibrated": is_calibrated} if known else {}
+
+
+def draw_evaluation(
+    folder: RunFolder, *, drives: Sequence[LidarSequence], rows: Sequence[Row], weights: str, seed: int
+) -> None:
+    """Draws reliability.png, and failures.png where a registration of an overlapping pair is wrong."""
+    known = [row for row in rows if "confidence" in row]
+    confidence, is_right = (np.concatenate([[], *(row[name] for row in known)]) for name in ("confidence", "is_right"))
+    title = f"{Path(weights).stem}, all pairs"
+    viz.save_figure(viz.reliability_figure(confidence, is_right, title=title), folder / "reliability.png")
+    if worst := worst_failures(drives, known, NUM_SHOWN, seed):
+        viz.save_figure(viz.registered_pairs_figure(worst), folder / "failures.png")
+
+
+def worst_failures(
+    drives: Sequence[LidarSequence], rows: Sequence[Row], num_shown: int, seed: int
+) -> list[viz.RegisteredPair]:
+    """Returns the wrong registrations of overlapping pairs that have the highest confidence."""
+    names = {drive.name: drive for drive in drives}
+    wrong = [
+        (row["confidence"][number], row, number)
+        for row in rows
+        if row["band"] != "far"
+        for number in np.flatnonzero(~np.asarray(row["is_right"], bool))
+    ]
+    shown = []
+    for confidence, row, number in sorted(wrong, key=lambda failure: -failure[0])[:num_shown]:
+        drive = names[row["sequence"]]
+        drawn = deeppointmap.draw_scan_pairs(drive, row["band"], row["num_asked"], seed=seed)
+        *_, pair = deeppointmap.read_scan_pairs(drive, drawn[: number + 1], seed=seed)
+        a, b = drawn[number]
+        title = f"{drive.name}: scan {a} onto {b}, confidence {confidence:.2f}"
+        T = np.asarray(row["motions"][number]).reshape(4, 4)
+        motions = {"found": T, "true": pair.T_target_source}
+        shown.append(viz.RegisteredPair(title, pair.source, pair.target, motions))
+    return shown
+
+
+def table(rows: Sequence[Row]) -> str:
     """Returns the table as Markdown: a row for each drive and distance."""
-    from dpmjax.cli.evaluation_rows import BAND_NAMES
-    from dpmjax.metrics import wilson_interval
-
     by_case = {(row["sequence"], row["band"]): row for row in rows}
-    lines = [f"| {HEADER} |", "|" + "---|" * (HEADER.count("|") + 1)]
+    lines = []
     for (sequence, band), row in by_case.items():
         if band not in BAND_NAMES or not row["num_pairs"]:
             continue
-        auc = by_case.get((sequence, "overlap"), {}).get("auc")
-        refined = wilson_interval(int(np.sum(row["is_right"])), row["num_pairs"])
-        cells = [
-            sequence,
-            BAND_NAMES[band],
-            str(row["num_pairs"]),
-            *(f"{row[f'recall_{stage}']:.2f}" for stage in ("descriptors", "verified")),
-            f"{refined.share:.2f} ({refined.low:.2f} to {refined.high:.2f})",
-            *(_length(row[f"median_error_{stage}_m"]) for stage in ("descriptors", "refined")),
-            f"{row['pair_s']:.2f}",
-            "-" if auc is None or band != "near" else f"{auc:.3f}",
-        ]
-        lines.append(f"| {' | '.join(cells)} |")
-    return "\n".join(lines)
+        auc = by_case.get((sequence, "overlap"), {}).get("auc") if band == "near" else None
+        refined = metrics.wilson_interval(int(np.sum(row["is_right"])), row["num_pairs"])
+        interval = f"{refined.share:.2f} ({refined.low:.2f} to {refined.high:.2f})"
+        recalls = (row[f"recall_{stage}"] for stage in ("descriptors", "verified"))
+        errors = (length_text(row[f"median_error_{stage}_m"]) for stage in ("descriptors", "refined"))
+        case = (sequence, BAND_NAMES[band], row["num_pairs"])
+        lines.append([*case, *recalls, interval, *errors, row["pair_s"], cell_text(auc, 3)])
+    return markdown(COLUMNS, lines)
 
 
-def _length(metres: float | None) -> str:
-    # Without a right registration the median is NaN, which JSON has no word for.
+def length_text(metres: float | None) -> str:
+    """Returns a median error for a table; a dash where no registration was right."""
+    # NaN becomes null in the file of a row.
     return "-" if metres is None or np.isnan(metres) else f"{metres:.3f} m"
 
 
-def run(args: Sequence[str] | None = None) -> int:
-    """Runs the subcommand; returns the exit code."""
-    return run_command(main, Config, name=NAME, description=__doc__, args=args)
+def _seconds(found: deeppointmap.ScanEvaluation) -> Row:
+    if not len(found.confidence):
+        return {}
+    stages = {f"{stage}_s": float(np.median(of_stage)) for stage, of_stage in found.seconds._asdict().items()}
+    return {**stages, "pair_s": float(np.median(found.seconds.total))}

@@ -12,20 +12,17 @@ along a spanning tree. Results go to results/graph/<time>/ (latest links to the 
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import numpy as np
 from tyro.conf import FlagCreatePairsOff, Positional, arg
 
-from dpmjax.cli.command import check_least, run_command
-from dpmjax.cli.run_folder import OutputOptions, RunFolder, open_run_folder, recording, write_metrics
+from dpmjax import io, pose_graph, viz
+from dpmjax.cli.command import check_least
+from dpmjax.cli.run_folder import OutputOptions, open_run_folder, recording, write_metrics
 from dpmjax.sequences import InputError
-
-if TYPE_CHECKING:
-    from dpmjax.pose_graph import OptimizedPoseGraph, PoseGraph
 
 NAME = "graph"
 # Edges below this weight count as rejected.
@@ -54,19 +51,26 @@ class Config(OutputOptions):
 
 def main(config: Config) -> dict[str, Any]:
     """Reads, optimises, writes; returns the content of `metrics.json`."""
-    from dpmjax.io.g2o import read_g2o
-    from dpmjax.pose_graph import PoseGraphConfig, optimize_pose_graph
+    from dpmjax.io.g2o import read_g2o, write_g2o
 
     started = time.perf_counter()
     graph = read_g2o(config.graph, nearest_psd=config.nearest_psd)
-    settings = PoseGraphConfig(outlier_chi2=config.outlier_chi2, max_iterations=config.iterations)
+    settings = pose_graph.PoseGraphConfig(outlier_chi2=config.outlier_chi2, max_iterations=config.iterations)
     folder = open_run_folder(config, NAME)
     with recording(folder):
-        found = optimize_pose_graph(graph, settings)
-        metrics = {"graph": config.graph.name, **numbers_of(found), "wall_s": time.perf_counter() - started}
-        write_results(folder, found.graph)
+        found = pose_graph.optimize_pose_graph(graph, settings)
+        wall_s = time.perf_counter() - started
+        metrics = {"graph": config.graph.name, **graph_numbers(found), "wall_s": wall_s}
+        poses, stamps = found.graph.poses, found.graph.ids.astype(np.float64)
+        write_g2o(folder / "graph.g2o", found.graph)
+        io.write_tum(folder / "trajectory_tum.txt", poses, times=stamps, frame="T_world_node")
         write_metrics(folder, metrics)
-        draw(folder, config.graph.stem, graph, found)
+        title = f"{config.graph.stem}: {len(graph.poses)} nodes, {len(graph.edges.source)} edges"
+        tracks = [
+            viz.Track(f"start, chi2 {found.chi2_initial:.4g}", positions(graph.poses)),
+            viz.Track(f"optimised, chi2 {found.chi2:.4g}", positions(poses)),
+        ]
+        viz.save_figure(viz.trajectory_figure(title, tracks, None, np.zeros((0, 2, 3))), folder / "trajectory.png")
         print(report(metrics), f"results in {folder.path}", sep="\n")
         if not found.is_converged:
             advice = "give more --iterations, or a kernel by --outlier-chi2"
@@ -74,7 +78,7 @@ def main(config: Config) -> dict[str, Any]:
     return metrics
 
 
-def numbers_of(found: OptimizedPoseGraph) -> dict[str, Any]:
+def graph_numbers(found: pose_graph.OptimizedPoseGraph) -> dict[str, Any]:
     """Returns the numbers of an optimisation."""
     return {
         "status": "done" if found.is_converged else "failed",
@@ -88,28 +92,9 @@ def numbers_of(found: OptimizedPoseGraph) -> dict[str, Any]:
     }
 
 
-def write_results(folder: RunFolder, graph: PoseGraph) -> None:
-    """Writes graph.g2o and trajectory_tum.txt."""
-    from dpmjax.io import write_tum
-    from dpmjax.io.g2o import write_g2o
-
-    write_g2o(folder / "graph.g2o", graph)
-    write_tum(folder / "trajectory_tum.txt", graph.poses, times=graph.ids.astype(np.float64), frame="T_world_node")
-
-
-def draw(folder: RunFolder, name: str, graph: PoseGraph, found: OptimizedPoseGraph) -> None:
-    """Draws trajectory.png: the poses before and after."""
-    from dpmjax import viz
-
-    def positions(poses: np.ndarray) -> np.ndarray:
-        return np.column_stack([poses[:, :2], 0 * poses[:, 0]]) if poses.ndim == 2 else poses[:, :3, 3]
-
-    tracks = [
-        viz.Track(f"start, chi2 {found.chi2_initial:.4g}", positions(graph.poses)),
-        viz.Track(f"optimised, chi2 {found.chi2:.4g}", positions(found.graph.poses)),
-    ]
-    title = f"{name}: {len(graph.poses)} nodes, {len(graph.edges.source)} edges"
-    viz.save_figure(viz.trajectory_figure(title, tracks, None, np.zeros((0, 2, 3))), folder / "trajectory.png")
+def positions(poses: np.ndarray) -> np.ndarray:
+    """Returns (n, 3) positions of poses in the plane or in space."""
+    return np.column_stack([poses[:, :2], 0 * poses[:, 0]]) if poses.ndim == 2 else poses[:, :3, 3]
 
 
 def report(metrics: dict[str, Any]) -> str:
@@ -119,8 +104,3 @@ def report(metrics: dict[str, Any]) -> str:
         f"{metrics['num_nodes']} nodes, {metrics['num_edges']} edges{let_go}\n"
         f"chi2 {metrics['chi2_initial']:.6g} -> {metrics['chi2']:.6g} in {metrics['iterations']} iterations"
     )
-
-
-def run(args: Sequence[str] | None = None) -> int:
-    """Runs the subcommand; returns the exit code."""
-    return run_command(main, Config, name=NAME, description=__doc__, args=args)

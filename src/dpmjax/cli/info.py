@@ -7,10 +7,8 @@ A bug report begins with what this prints.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
-from dpmjax.cli.command import run_command
 from dpmjax.cli.machine import EXTRAS, device_name, environment, why_not_importable
 
 NAME = "info"
@@ -47,8 +45,3 @@ def unusable_packages() -> dict[str, list[str]]:
         if (reason := why_not_importable(package)) is not None:
             reasons.append(reason)
     return found
-
-
-def run(args: Sequence[str] | None = None) -> int:
-    """Runs the subcommand; returns the exit code."""
-    return run_command(main, Config, name=NAME, description=__doc__, args=args)

@@ -13,26 +13,20 @@ trajectory_tum.txt (the scans that were found), map.png, metrics.json. Where the
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 from tqdm import tqdm
-from tyro.conf import FlagCreatePairsOff, Positional, arg
+from tyro.conf import Positional, arg
 
-from dpmjax.cli.command import StopFlag, check_least, run_command
-from dpmjax.cli.drives import DriveSelection, open_drive, report_notes
+from dpmjax import io, slam, viz, weights
+from dpmjax.cli.command import StopFlag
+from dpmjax.cli.drives import DriveOptions, keyframe_points, open_drive, open_map, report_notes
 from dpmjax.cli.result_files import HistoryFile, read_history
-from dpmjax.cli.run_folder import RunFolder, RunOptions, open_run_folder, recording, write_metrics
-from dpmjax.cli.slam_numbers import localization_errors
-from dpmjax.sequences import InputError
-
-if TYPE_CHECKING:
-    from dpmjax.sequences import LidarSequence
-    from dpmjax.slam import KeyframeMap, Localization
-    from dpmjax.slam.localization import LocalizationStatus
+from dpmjax.cli.run_folder import RunFolder, open_run_folder, recording, write_metrics
+from dpmjax.sequences import InputError, LidarSequence
 
 NAME = "localize"
 TABLE = "localizations.csv"
@@ -44,7 +38,7 @@ NUM_MAP_POINTS = 200_000
 
 
 @dataclass(frozen=True, kw_only=True)
-class Config(RunOptions):
+class Config(DriveOptions):
     """Options of the run."""
 
     map: Annotated[Positional[Path], arg(metavar="MAP", help_behavior_hint="required")] = Path()
@@ -55,77 +49,14 @@ class Config(RunOptions):
     """Which drive of a folder that holds several."""
     weights: Annotated[str, arg(metavar="NAME|FILE")] = "dpm_small"
     """The weights that made the map: a shipped name or a .safetensors file."""
-    kitti_angle_correction: FlagCreatePairsOff[bool] = False
-    """Raise the beams by 0.205 degrees, as KITTI's HDL-64E needs."""
-    n_scans: Annotated[int | None, arg(aliases=["-n"], metavar="N")] = None
-    """Use the first N scans."""
-    jump: Annotated[int, arg(aliases=["-j"], metavar="J")] = 1
-    """Use every J-th scan."""
-    topic: Annotated[str | None, arg(aliases=["-t"], metavar="NAME")] = None
-    """Which clouds of a bag of ROS, where it holds several topics of them."""
-    columns: Annotated[int | None, arg(metavar="N")] = None
-    """Numbers a point has in .bin files; without it, the values decide."""
     map_poses: Annotated[Path | None, arg(metavar="FILE")] = None
     """Reference poses of all scans of the drive that made the map, in the world of the scans' reference."""
 
     def __post_init__(self) -> None:
         """Checks ranges."""
-        check_least(self, n_scans=1, jump=1, seed=0, columns=3)
+        super().__post_init__()
         if not self.resume and Path() in (self.map, self.scans):
             raise ValueError("give a map and a folder of scans")
-
-    @property
-    def selection(self) -> DriveSelection:
-        """The scans that are looked for."""
-        return DriveSelection(
-            data=self.scans,
-            sequence=self.sequence,
-            num_scans=self.n_scans,
-            jump=self.jump,
-            is_kitti_corrected=self.kitti_angle_correction,
-            columns=self.columns,
-            topic=self.topic,
-        )
-
-
-def main(config: Config) -> list[dict[str, str]]:
-    """Looks for the scans that are missing, and writes table, trajectory, numbers and picture."""
-    from dpmjax.cli.drives import open_map
-    from dpmjax.slam import localize_each, make_methods
-    from dpmjax.weights import load_model
-
-    model = load_model(config.weights)
-    slam_map = open_map(config.map, make_methods(model, weights=config.weights))
-    drive = open_drive(config.selection)
-    is_calibrated = model.config.calibration is not None
-    case = Case(slam_map, drive, reference_of(config, slam_map, drive), is_calibrated)
-    folder = open_run_folder(config, NAME)
-    path = folder / TABLE
-    earlier = read_history(path) if folder.is_resumed and path.exists() else []
-    rows: list[dict[str, str]] = list(earlier)
-    results = localize_each(model, slam_map, (drive.read_points(i) for i in range(len(rows), len(drive))))
-    with (
-        recording(folder),
-        StopFlag() as stop,
-        HistoryFile(path, COLUMNS, keep_until=len(drive) if earlier else None) as table,
-        tqdm(total=len(drive), initial=len(rows), unit=" scans", dynamic_ncols=True) as bar,
-    ):
-        notes = report_notes(drive.notes)
-        clock = time.perf_counter()
-        while len(rows) < len(drive) and not stop.is_requested:
-            result = next(results)
-            row = as_row(len(rows), drive, slam_map, result, time.perf_counter() - clock)
-            clock = time.perf_counter()
-            table.append(**row)
-            rows.append(row)
-            bar.update(1)
-            bar.set_postfix(found=sum(row["status"] == "found" for row in rows))
-        print(write_results(folder, config, case, rows, notes))
-        if rows and all(row["status"] == "empty" for row in rows) and not stop.is_requested:
-            found = f"{len(rows)} of {len(rows)} scans without enough points, none could be looked for"
-            raise InputError(drive.name, found, "check that the scans are 3-D and in metres")
-    print(f"results in {folder.path}")
-    return rows
 
 
 class Case(NamedTuple):
@@ -138,63 +69,89 @@ class Case(NamedTuple):
         is_calibrated: whether the probabilities are such; they are scores of the matches where it is false.
     """
 
-    slam_map: KeyframeMap
+    slam_map: slam.KeyframeMap
     drive: LidarSequence
     T_reference_keyframe: np.ndarray | None
     is_calibrated: bool
 
 
-def reference_of(config: Config, slam_map: KeyframeMap, drive: LidarSequence) -> np.ndarray | None:
-    """Returns the reference poses of the keyframes; a `ValueError` says where they cannot be used."""
-    from dpmjax.io import read_poses
+def main(config: Config) -> list[dict[str, str]]:
+    """Looks for the scans that are missing, and writes table, trajectory, numbers and picture."""
+    model = weights.load_model(config.weights)
+    slam_map = open_map(config.map, slam.make_methods(model, weights=config.weights))
+    drive = open_drive(config.scans, config, config.sequence)
+    case = Case(slam_map, drive, reference_of(config, slam_map, drive), model.config.calibration is not None)
+    folder = open_run_folder(config, NAME)
+    path = folder / TABLE
+    rows = read_history(path) if folder.is_resumed and path.exists() else []
+    results = slam.localize_each(model, slam_map, (drive.read_points(i) for i in range(len(rows), len(drive))))
+    with (
+        recording(folder),
+        StopFlag() as stop,
+        HistoryFile(path, COLUMNS, keep_until=len(drive) if rows else None) as table,
+        tqdm(total=len(drive), initial=len(rows), unit=" scans", dynamic_ncols=True) as bar,
+    ):
+        notes = report_notes(drive.notes)
+        clock = time.perf_counter()
+        while len(rows) < len(drive) and not stop.is_requested:
+            row = as_row(len(rows), case, next(results), time.perf_counter() - clock)
+            clock = time.perf_counter()
+            table.append(**row)
+            rows.append(row)
+            bar.update(1)
+            bar.set_postfix(found=sum(row["status"] == "found" for row in rows))
+        print(write_results(folder, config, case, rows, notes))
+        if _are_all_empty(rows) and not stop.is_requested:
+            found = f"{len(rows)} of {len(rows)} scans without enough points, none could be looked for"
+            raise InputError(drive.name, found, "check that the scans are 3-D and in metres")
+    print(f"results in {folder.path}")
+    return rows
 
+
+def reference_of(config: Config, slam_map: slam.KeyframeMap, drive: LidarSequence) -> np.ndarray | None:
+    """Returns the reference poses of the keyframes; a `ValueError` says where they cannot be used."""
     if config.map_poses is None:
         return None
     if drive.T_world_lidar is None:
         raise ValueError(f"--map-poses: {config.scans} has no reference poses to compare with")
-    poses, numbers = read_poses(config.map_poses), [keyframe.scan for keyframe in slam_map.keyframes]
+    poses, numbers = io.read_poses(config.map_poses), [keyframe.scan for keyframe in slam_map.keyframes]
     if max(numbers) >= len(poses):
         raise ValueError(f"{config.map_poses}: {len(poses)} poses, the map has a keyframe of scan {max(numbers)}")
     return poses[numbers]
 
 
-def as_row(
-    number: int, drive: LidarSequence, slam_map: KeyframeMap, result: Localization, seconds: float
-) -> dict[str, str]:
+def as_row(number: int, case: Case, result: slam.Localization, seconds: float) -> dict[str, str]:
     """Returns the row of a scan as text."""
-    row = {"scan": str(number), "source": drive.sources[number], "status": result.status, "reason": result.reason}
+    row = dict.fromkeys(COLUMNS, "") | {"scan": str(number), "source": case.drive.sources[number]}
+    row |= {"status": result.status, "reason": result.reason}
     row |= {"probability": f"{result.probability:.4f}", "seconds": f"{seconds:.3f}"}
     if result.T_world_scan is None or result.keyframe is None:
-        return row | dict.fromkeys((*POSE, "keyframe", "keyframe_scan"), "")
-    row |= {"keyframe": str(result.keyframe), "keyframe_scan": str(slam_map.keyframes[result.keyframe].scan)}
+        return row
+    row |= {"keyframe": str(result.keyframe), "keyframe_scan": str(case.slam_map.keyframes[result.keyframe].scan)}
     return row | dict(zip(POSE, (f"{value:.9f}" for value in result.T_world_scan[:3].ravel()), strict=True))
 
 
-def as_localization(row: dict[str, str]) -> Localization:
+def as_localization(row: dict[str, str]) -> slam.Localization:
     """Returns the result of a row of the table."""
-    from dpmjax.slam import Localization
-
     if row["status"] != "found":
-        status: LocalizationStatus = "empty" if row["status"] == "empty" else "not in this map"
-        return Localization(status, None, 0.0, None, row["reason"])
+        return slam.Localization("empty" if row["status"] == "empty" else "not in this map", None, 0.0, None, "")
     T = np.eye(4)
     T[:3] = np.reshape([float(row[name]) for name in POSE], (3, 4))
-    return Localization("found", T, float(row["probability"]), int(row["keyframe"]), row["reason"])
+    return slam.Localization("found", T, float(row["probability"]), int(row["keyframe"]), row["reason"])
 
 
 def write_results(
     folder: RunFolder, config: Config, case: Case, rows: list[dict[str, str]], notes: dict[str, list[str]]
 ) -> str:
     """Writes trajectory, metrics and picture; returns a summary."""
-    from dpmjax import io, viz
-
     results = [as_localization(row) for row in rows]
     numbers = [number for number, result in enumerate(results) if result.is_in_map]
     T = np.array([results[number].T_world_scan for number in numbers]).reshape(-1, 4, 4)
     times = case.drive.times
     stamps = numbers if times is None else times[numbers]
     io.write_tum(folder / "trajectory_tum.txt", T, times=np.asarray(stamps, float), frame="T_map_scan")
-    metrics: dict[str, Any] = {
+    errors, is_wrong = error_numbers(case, results)
+    metrics = {
         "num_scans": len(rows),
         "num_found": len(numbers),
         "num_empty": sum(result.status == "empty" for result in results),
@@ -202,42 +159,51 @@ def write_results(
         "is_calibrated": case.is_calibrated,
         "map_bytes": config.map.stat().st_size,
         **notes,
-        "status": "failed" if rows and all(result.status == "empty" for result in results) else "done",
+        "status": "failed" if _are_all_empty(rows) else "done",
         "scan_s": float(np.median([float(row["seconds"]) for row in rows])) if rows else None,
+        **errors,
     }
-    text, is_wrong, reference = f"{len(numbers)} of {len(rows)} scans found", None, case.T_reference_keyframe
-    if reference is not None and case.drive.T_world_lidar is not None and rows:
-        T_reference_scan, has_reference = case.drive.T_world_lidar[: len(rows)], case.drive.has_reference[: len(rows)]
-        errors = localization_errors(results, case.slam_map, reference, T_reference_scan)
-        is_wrong = (~errors.is_right & has_reference)[errors.is_found]
-        apart = np.linalg.norm(T_reference_scan[:, None, :3, 3] - reference[None, :, :3, 3], axis=2)
-        num_inside, num_right = int((apart.min(axis=1) <= REACH_M).sum()), int(errors.is_right.sum())
-        metrics |= {"num_inside": num_inside, "num_right": num_right, "num_wrong": int(is_wrong.sum())}
-        if num_right:
-            metrics["median_error_m"] = float(np.median(errors.translation_m[errors.is_right]))
-            metrics["median_error_deg"] = float(np.median(errors.rotation_deg[errors.is_right]))
-        text += f"; {num_inside} are within {REACH_M:g} m of a keyframe; {num_right} right, {is_wrong.sum()} wrong"
-    if not case.is_calibrated:
-        text += "; the probabilities are scores (these weights are not calibrated)"
     write_metrics(folder, metrics, seed=config.seed)
-    title = f"{case.drive.name} in {config.map.name}: {text.partition(';')[0]}"
+    found = f"{len(numbers)} of {len(rows)} scans found"
+    title = f"{case.drive.name} in {config.map.name}: {found}"
     figure = viz.localization_figure(
         map_points(case.slam_map), case.slam_map.T_world_keyframe, T, is_wrong=is_wrong, title=title
     )
     viz.save_figure(figure, folder / "map.png")
-    return text
+    if errors:
+        found += f"; {errors['num_inside']} are within {REACH_M:g} m of a keyframe; "
+        found += f"{errors['num_right']} right, {errors['num_wrong']} wrong"
+    return found + ("" if case.is_calibrated else "; the probabilities are scores (these weights are not calibrated)")
 
 
-def map_points(slam_map: KeyframeMap) -> np.ndarray:
+def error_numbers(case: Case, results: list[slam.Localization]) -> tuple[dict[str, Any], np.ndarray | None]:
+    """Returns the numbers of right and wrong scans, and which of those that were found are wrong.
+
+    Without a reference there are no numbers, and None.
+    """
+    from dpmjax.cli.slam_numbers import localization_errors
+
+    reference, drive = case.T_reference_keyframe, case.drive.take(slice(0, len(results)))
+    if reference is None or drive.T_world_lidar is None or not results:
+        return {}, None
+    errors = localization_errors(results, case.slam_map, reference, drive.T_world_lidar)
+    is_wrong = (~errors.is_right & drive.has_reference)[errors.is_found]
+    apart = np.linalg.norm(drive.T_world_lidar[:, None, :3, 3] - reference[None, :, :3, 3], axis=2)
+    num_inside, num_right = int((apart.min(axis=1) <= REACH_M).sum()), int(errors.is_right.sum())
+    numbers: dict[str, Any] = {"num_inside": num_inside, "num_right": num_right, "num_wrong": int(is_wrong.sum())}
+    if num_right:
+        numbers["median_error_m"] = float(np.median(errors.translation_m[errors.is_right]))
+        numbers["median_error_deg"] = float(np.median(errors.rotation_deg[errors.is_right]))
+    return numbers, is_wrong
+
+
+def map_points(slam_map: slam.KeyframeMap) -> np.ndarray:
     """Returns surface points of the map, thinned at random."""
-    from dpmjax.cli.drives import keyframe_points
-
     points = np.concatenate(
         [keyframe_points(slam_map, row) @ T[:3, :3].T + T[:3, 3] for row, T in enumerate(slam_map.T_world_keyframe)]
     )
     return points[np.random.default_rng(0).permutation(len(points))[:NUM_MAP_POINTS]]
 
 
-def run(args: Sequence[str] | None = None) -> int:
-    """Runs the subcommand; returns the exit code."""
-    return run_command(main, Config, name=NAME, description=__doc__, args=args)
+def _are_all_empty(rows: list[dict[str, str]]) -> bool:
+    return bool(rows) and all(row["status"] == "empty" for row in rows)

@@ -15,27 +15,23 @@ map_2.npz and so on.
 
 from __future__ import annotations
 
+import collections
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import numpy as np
 from tyro.conf import Positional, arg
 
-from dpmjax.cli.command import run_command
+from dpmjax import saved_maps, slam, viz, weights
+from dpmjax.cli.command import progress_bar
+from dpmjax.cli.drives import keyframe_points, open_map
+from dpmjax.cli.result_files import write_table
 from dpmjax.cli.run_folder import OutputOptions, RunFolder, open_run_folder, recording, write_metrics
-from dpmjax.cli.slam_numbers import counted
-
-if TYPE_CHECKING:
-    from dpmjax.slam import KeyframeMap, MergedMaps
-    from dpmjax.viz import AgentPanel, AgentTrack
 
 NAME = "merge"
-LOOP_COLUMNS = (
-    "map", "scan", "other_map", "other_scan", "found_by", "status", "overlap", "probability", "rmse_m"
-)  # fmt: skip
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,45 +46,41 @@ class Config(OutputOptions):
 
 def main(config: Config) -> dict[str, Any]:
     """Reads the maps, merges them, writes; returns the content of `metrics.json`."""
-    from dpmjax.cli.command import progress_bar
-    from dpmjax.cli.drives import open_map
-    from dpmjax.slam import make_methods, merge_maps
-    from dpmjax.weights import load_model
-
     started = time.perf_counter()
     if len(config.maps) < 2:
         raise ValueError(f"give two or more maps, files of dpmjax.save_map; got {len(config.maps)}")
-    methods = make_methods(load_model(config.weights), weights=config.weights)
+    methods = slam.make_methods(weights.load_model(config.weights), weights=config.weights)
     maps = [open_map(path, methods) for path in config.maps]
     folder = open_run_folder(config, NAME)
     with recording(folder):
         with progress_bar("loops between maps", " keyframes") as on_keyframe:
-            merged = merge_maps(methods, *maps, on_keyframe=on_keyframe)
+            merged = slam.merge_maps(methods, *maps, on_keyframe=on_keyframe)
         write_results(folder, maps, merged)
         metrics = {"weights": config.weights, **merge_numbers(config.maps, maps, merged)}
-        metrics["wall_s"] = time.perf_counter() - started
-        write_metrics(folder, metrics)
-        draw(folder, config.maps, merged)
-        print(report(metrics), f"results in {folder.path}", sep="\n")
+        write_metrics(folder, metrics | {"wall_s": time.perf_counter() - started})
+        parts = len(merged.maps)
+        title = f"{len(maps)} maps" + (f", {parts} after merging" if parts > 1 else " in one")
+        panels = [panel_of(config.maps, merged, part) for part in range(parts)]
+        viz.save_figure(viz.agents_figure(title, panels), folder / "map.png")
+        print(summary(metrics), f"results in {folder.path}", sep="\n")
     return metrics
 
 
-def write_results(folder: RunFolder, maps: Sequence[KeyframeMap], merged: MergedMaps) -> None:
+def write_results(folder: RunFolder, maps: Sequence[slam.KeyframeMap], merged: slam.MergedMaps) -> None:
     """Writes the maps, the graph and the table of loops."""
-    from dpmjax.cli.slam_files import loop_cells, write_table
+    from dpmjax.cli.slam_files import LOOP_CELLS, loop_cells
     from dpmjax.io.g2o import write_g2o
-    from dpmjax.saved_maps import save_map
-    from dpmjax.slam import as_pose_graph
 
     for part, slam_map in enumerate(merged.maps, start=1):
-        save_map(folder / map_name(part, len(merged.maps)), slam_map)
-    write_g2o(folder / "graph.g2o", as_pose_graph(merged.joined.slam_map))
+        saved_maps.save_map(folder / map_name(part, len(merged.maps)), slam_map)
+    write_g2o(folder / "graph.g2o", slam.as_pose_graph(merged.joined.slam_map))
     ends = [(number, keyframe.scan) for number, each in enumerate(maps, start=1) for keyframe in each.keyframes]
-    rows = []
-    for loop in merged.loops:
-        (number, scan), (other, other_scan) = ends[loop.source], ends[loop.target]
-        rows.append({"map": number, "scan": scan, "other_map": other, "other_scan": other_scan, **loop_cells(loop)})
-    write_table(folder / "loops.csv", LOOP_COLUMNS, rows)
+    names = ("map", "scan", "other_map", "other_scan")
+    rows = (
+        dict(zip(names, (*ends[loop.source], *ends[loop.target]), strict=True)) | loop_cells(loop)
+        for loop in merged.loops
+    )
+    write_table(folder / "loops.csv", (*names, *LOOP_CELLS), rows)
 
 
 def map_name(part: int, num_parts: int) -> str:
@@ -101,11 +93,11 @@ def short_name(path: Path) -> str:
     return str(Path(*path.parts[-2:]))
 
 
-def merge_numbers(paths: Sequence[Path], maps: Sequence[KeyframeMap], merged: MergedMaps) -> dict[str, Any]:
+def merge_numbers(paths: Sequence[Path], maps: Sequence[slam.KeyframeMap], merged: slam.MergedMaps) -> dict[str, Any]:
     """Returns the content of `metrics.json`: which maps have met, and the numbers of loops and keyframes."""
     accepted = [loop for loop in merged.loops if loop.status == "accepted"]
-    map_of_row = merged.joined.map_of_keyframe + 1
-    pairs = [sorted((int(map_of_row[loop.source]), int(map_of_row[loop.target]))) for loop in accepted]
+    map_of_row = (merged.joined.map_of_keyframe + 1).tolist()
+    met = collections.Counter(tuple(sorted((map_of_row[loop.source], map_of_row[loop.target]))) for loop in accepted)
     parts = [
         {
             "file": map_name(part, len(merged.maps)),
@@ -125,69 +117,46 @@ def merge_numbers(paths: Sequence[Path], maps: Sequence[KeyframeMap], merged: Me
             {"map": number, "file": short_name(path), "num_keyframes": len(each)}
             for number, (path, each) in enumerate(zip(paths, maps, strict=True), start=1)
         ],
-        "loops_between": [
-            {"maps": list(pair), "num_loops": pairs.count(list(pair))} for pair in sorted(set(map(tuple, pairs)))
-        ],
+        "loops_between": [{"maps": list(pair), "num_loops": num} for pair, num in sorted(met.items())],
     }
 
 
-def draw(folder: RunFolder, paths: Sequence[Path], merged: MergedMaps) -> None:
-    """Draws map.png, a panel for each part."""
-    from dpmjax import viz
-
-    title = (
-        f"{len(paths)} maps, {len(merged.maps)} after merging" if len(merged.maps) > 1 else f"{len(paths)} maps in one"
-    )
-    panels = [panel_of(paths, merged, part) for part in range(len(merged.maps))]
-    viz.save_figure(viz.agents_figure(title, panels), folder / "map.png")
-
-
-def panel_of(paths: Sequence[Path], merged: MergedMaps, part: int) -> AgentPanel:
+def panel_of(paths: Sequence[Path], merged: slam.MergedMaps, part: int) -> viz.AgentPanel:
     """Returns the panel of a part: its maps with their surfaces and keyframes, and the loops between them."""
-    from dpmjax import viz
+    from dpmjax.cli.slam_files import accepted_ends
 
     members = [number for number, component in enumerate(merged.component) if component == part]
-    joined = merged.joined
-    ends = [
-        (loop.source, loop.target)
-        for loop in merged.loops
-        if loop.status == "accepted" and joined.map_of_keyframe[loop.source] in members
-    ]
-    loops = joined.slam_map.T_world_keyframe[np.reshape(ends, (-1, 2)).astype(np.int64), :3, 3]
+    ends = accepted_ends(merged.loops)
+    ends = ends[np.isin(merged.joined.map_of_keyframe[ends[:, 0]], members)]
     is_joined = len(members) > 1
     text = f"in the frame of {short_name(paths[members[0]])}" if is_joined else "no common place with another map"
-    return viz.AgentPanel(text, [track_of(paths[number], merged, number) for number in members], loops)
+    tracks = [track_of(paths[number], merged, number) for number in members]
+    return viz.AgentPanel(text, tracks, merged.joined.slam_map.T_world_keyframe[ends, :3, 3])
 
 
-def track_of(path: Path, merged: MergedMaps, number: int) -> AgentTrack:
+def track_of(path: Path, merged: slam.MergedMaps, number: int) -> viz.AgentTrack:
     """Returns the keyframes of a map and the points of their surfaces, in its colour."""
-    from dpmjax import viz
-    from dpmjax.cli.drives import keyframe_points
     from dpmjax.cli.slam_files import gather_map
+    from dpmjax.cli.slam_numbers import counted
 
     slam_map = merged.joined.slam_map
     rows = np.flatnonzero(merged.joined.map_of_keyframe == number)
-    cloud = gather_map((keyframe_points(slam_map, row), slam_map.T_world_keyframe[row]) for row in rows.tolist())
+    T_world_keyframe = slam_map.T_world_keyframe[rows]
+    cloud = gather_map(T_world_keyframe, lambda row: keyframe_points(slam_map, rows[row]))
     label = f"{short_name(path)}, {counted(len(rows), 'keyframe')}"
-    positions = slam_map.T_world_keyframe[rows, :3, 3]
     color = viz.COLORS[number % len(viz.COLORS)]
-    return viz.AgentTrack(label, color, positions, None, cloud.points, cloud.heights_m)
+    return viz.AgentTrack(label, color, T_world_keyframe[:, :3, 3], None, cloud.points, cloud.heights_m)
 
 
-def report(metrics: dict[str, Any]) -> str:
+def summary(metrics: dict[str, Any]) -> str:
     """Returns the last lines on the console."""
+    from dpmjax.cli.slam_numbers import counted
+
     names = {entry["map"]: entry["file"] for entry in metrics["maps"]}
     lines = []
     for part in metrics["parts"]:
         members = ", ".join(names[number] for number in part["maps"])
         text = "one map now" if len(part["maps"]) > 1 else "no common place with another map"
         lines.append(f"{members}: {text}, {counted(part['num_keyframes'], 'keyframe')}, {part['file']}")
-    loops = (
-        f"{counted(metrics['num_loops'], 'loop')} between maps, of {counted(metrics['num_candidates'], 'candidate')}"
-    )
-    return "\n".join([*lines, loops])
-
-
-def run(args: Sequence[str] | None = None) -> int:
-    """Runs the subcommand; returns the exit code."""
-    return run_command(main, Config, name=NAME, description=__doc__, args=args)
+    loops, candidates = counted(metrics["num_loops"], "loop"), counted(metrics["num_candidates"], "candidate")
+    return "\n".join([*lines, f"{loops} between maps, of {candidates}"])

@@ -42,7 +42,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """
     given = list(sys.argv[1:] if arguments is None else arguments)
     if given and given[0] in COMMANDS:
-        return int(importlib.import_module(f"dpmjax.cli.{given[0]}").run(given[1:]))
+        module = importlib.import_module(f"dpmjax.cli.{given[0]}")
+        run = importlib.import_module("dpmjax.cli.command").run_command
+        return int(run(module.main, module.Config, name=given[0], description=module.__doc__, args=given[1:]))
     if given and given[0] == "--version":
         print(f"dpmjax {importlib.metadata.version('dpmjax')}")
         return EXIT_OK

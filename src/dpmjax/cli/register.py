@@ -12,21 +12,17 @@ metrics.json, aligned.ply (A in the frame of B, and B, in two colours) and regis
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import numpy as np
 from tyro.conf import Positional, arg
 
-from dpmjax.cli.command import check_least, run_command
+from dpmjax import deeppointmap, io, viz, weights
+from dpmjax.cli.command import check_least
 from dpmjax.cli.drives import report_notes
 from dpmjax.cli.run_folder import OutputOptions, RunFolder, open_run_folder, recording, write_metrics
-from dpmjax.io.files import write_atomically
-
-if TYPE_CHECKING:
-    from dpmjax.types import Registration
 
 NAME = "register"
 # Below this probability the motion is called uncertain; a score without calibration has no such limit.
@@ -56,35 +52,37 @@ class Config(OutputOptions):
 
 def main(config: Config) -> dict[str, Any]:
     """Reads both scans, registers them, writes; returns the content of `metrics.json`."""
-    from dpmjax import io
-    from dpmjax.deeppointmap import register
-    from dpmjax.weights import load_model
-
     started = time.perf_counter()
-    source, target = (io.read_lidar_file(path, bin_columns=config.columns) for path in (config.source, config.target))
-    scans = {config.source: source, config.target: target}
-    notes = [note for path, points in scans.items() for note in io.scan_notes(path, points, bin_columns=config.columns)]
-    model = load_model(config.weights)
+    paths = (config.source, config.target)
+    source, target = (io.read_lidar_file(path, bin_columns=config.columns) for path in paths)
+    scans = zip(paths, (source, target), strict=True)
+    notes = [note for path, points in scans for note in io.scan_notes(path, points, bin_columns=config.columns)]
+    model = weights.load_model(config.weights)
     folder = open_run_folder(config, NAME)
     with recording(folder):
-        told = report_notes(notes)
+        noted = report_notes(notes)
         clock = time.perf_counter()
-        found = register(model, source, target, refine=config.refine)
+        found = deeppointmap.register(model, source, target, refine=config.refine)
         T = np.asarray(found.T_target_source, np.float64)
         metrics = {
             "source": config.source.name,
             "target": config.target.name,
             "weights": config.weights,
-            **told,
+            **noted,
             **motion_numbers(T),
-            **match_numbers(found),
+            "confidence": float(found.confidence),
+            "num_inliers": int(found.num_inliers),
+            **match_shares(found.verification),
             "is_calibrated": model.config.calibration is not None,
             "register_s": time.perf_counter() - clock,
         }
         write_results(folder, T, source, target)
         metrics["wall_s"] = time.perf_counter() - started
         write_metrics(folder, metrics)
-        draw(folder, config, T, metrics["confidence"], source, target)
+        title = f"{config.source.name} (blue), {config.target.name} (orange)"
+        motions = {"as measured": np.eye(4), f"registered, confidence {metrics['confidence']:.2f}": T}
+        figure = viz.registered_pairs_figure([viz.RegisteredPair(title, source, target, motions)])
+        viz.save_figure(figure, folder / "registration.png")
         print(report(T, metrics), f"results in {folder.path}", sep="\n")
     return metrics
 
@@ -101,40 +99,19 @@ def motion_numbers(T_target_source: np.ndarray) -> dict[str, Any]:
     }
 
 
-def match_numbers(found: Registration) -> dict[str, Any]:
-    """Returns the confidence and the numbers that it rests on."""
-    numbers: dict[str, Any] = {"confidence": float(found.confidence), "num_inliers": int(found.num_inliers)}
-    if found.verification is not None:
-        shares = found.verification
-        numbers |= {
-            "visible_share": float(shares.visible_share),
-            "matched_share": float(shares.matched_share),
-            "contradicted_share": float(shares.contradicted_share),
-        }
-    return numbers
+def match_shares(verification: Any) -> dict[str, float]:
+    """Returns the shares of points that the confidence rests on; none where nothing was verified."""
+    names = () if verification is None else ("visible_share", "matched_share", "contradicted_share")
+    return {name: float(getattr(verification, name)) for name in names}
 
 
 def write_results(folder: RunFolder, T_target_source: np.ndarray, source: np.ndarray, target: np.ndarray) -> None:
     """Writes T_target_source.txt and aligned.ply."""
-    from dpmjax import io
-
     rows = (" ".join(f"{value:.9f}" for value in row) for row in T_target_source)
-    write_atomically(folder / "T_target_source.txt", "\n".join(rows) + "\n")
+    io.write_atomically(folder / "T_target_source.txt", "\n".join(rows) + "\n")
     moved = source @ T_target_source[:3, :3].T + T_target_source[:3, 3]
     colors = np.repeat(np.array([SOURCE_COLOR, TARGET_COLOR], np.uint8), [len(source), len(target)], axis=0)
     io.write_ply(folder / "aligned.ply", np.concatenate([moved, target]).astype(np.float32), colors=colors)
-
-
-def draw(
-    folder: RunFolder, config: Config, T: np.ndarray, confidence: float, source: np.ndarray, target: np.ndarray
-) -> None:
-    """Draws registration.png."""
-    from dpmjax import viz
-
-    title = f"{config.source.name} (blue), {config.target.name} (orange)"
-    motions = {"as measured": np.eye(4), f"registered, confidence {confidence:.2f}": T}
-    pair = viz.RegisteredPair(title, source, target, motions)
-    viz.save_figure(viz.registered_pairs_figure([pair]), folder / "registration.png")
 
 
 def report(T_target_source: np.ndarray, metrics: dict[str, Any]) -> str:
@@ -150,8 +127,3 @@ def report(T_target_source: np.ndarray, metrics: dict[str, Any]) -> str:
         f"{metrics['translation_m']:.3f} m, {metrics['rotation_deg']:.2f} degrees\n"
         f"{confidence}"
     )
-
-
-def run(args: Sequence[str] | None = None) -> int:
-    """Runs the subcommand; returns the exit code."""
-    return run_command(main, Config, name=NAME, description=__doc__, args=args)

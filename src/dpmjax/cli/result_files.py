@@ -1,22 +1,18 @@
-"""Result files: JSON that appears whole or not at all, rows that name their commit, a table that grows by the row."""
+"""Result files: JSON and CSV that appear whole or not at all, notes on commits, a table that grows by the row."""
 
 from __future__ import annotations
 
 import csv
 import dataclasses
-import hashlib
+import io
 import json
 import math
 import os
 from collections import defaultdict
-from collections.abc import Callable, Mapping, Sequence
-from functools import partial
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from tqdm import tqdm
-
-from dpmjax.cli.machine import git_hash, versions
 from dpmjax.io.files import write_atomically
 
 UNKNOWN = "unknown"
@@ -63,65 +59,6 @@ def as_json(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-def do_row(folder: Path, case: dict[str, Any], work: Callable[[], dict[str, Any]], *, seed: int) -> dict[str, Any]:
-    """Makes one row of results, or reads it where an earlier, perhaps killed, run has made it.
-
-    Each row is a file of its own below `rows/`, written whole, and carries the commit, the versions and the seed that
-    made it.
-
-    Args:
-        folder: folder of the run.
-        case: identifies the row and becomes part of it.
-        work: makes the remaining entries of the row.
-        seed: seed of the run.
-
-    Returns:
-        The row. The commit of a row that carries none is "unknown".
-    """
-    path = row_path(folder, case)
-    if path.exists():
-        return {"git_hash": UNKNOWN, **load_json(path)}
-    row = {**case, **work(), "git_hash": git_hash() or UNKNOWN, "seed": seed}
-    row["versions"] = ", ".join(f"{name} {version}" for name, version in versions().items())
-    write_json(path, row)
-    return row
-
-
-def do_rows(
-    folder: Path,
-    cases: Sequence[dict[str, Any]],
-    work: Callable[..., dict[str, Any]],
-    *,
-    seed: int,
-    is_stopped: Callable[[], bool],
-) -> list[dict[str, Any]]:
-    """Makes one row a case by `do_row`, under a progress bar.
-
-    Args:
-        folder: folder of the run.
-        cases: what identifies the rows.
-        work: makes the remaining entries of a row; it is called with the entries of the case as keywords.
-        seed: seed of the run.
-        is_stopped: whether to end before the next row.
-
-    Returns:
-        The rows so far.
-    """
-    rows: list[dict[str, Any]] = []
-    for case in tqdm(cases, unit=" rows"):
-        if is_stopped():
-            break
-        rows.append(do_row(folder, case, partial(work, **case), seed=seed))
-    return rows
-
-
-def row_path(folder: Path, case: Mapping[str, Any]) -> Path:
-    """Returns the file of a row, under a readable name that no other case has."""
-    text = "_".join(f"{key}-{value}" for key, value in case.items())
-    digest = hashlib.sha256(text.encode()).hexdigest()[:6]
-    return folder / "rows" / f"{text.replace('.', 'p').replace('/', '-')[:120]}_{digest}.json"
-
-
 def commits_note(rows: Sequence[Mapping[str, Any]], commit: str | None) -> str | None:
     """Names the rows that another commit has made than the one that writes the file.
 
@@ -148,6 +85,15 @@ def commits_note(rows: Sequence[Mapping[str, Any]], commit: str | None) -> str |
     ]
     count, own = sum(map(len, methods.values())), short(commit or UNKNOWN)
     return f"{count} of {len(rows)} rows were made by another commit than this file ({own}): {'; '.join(parts)}"
+
+
+def write_table(path: Path, columns: Sequence[str], rows: Iterable[Mapping[str, Any]]) -> None:
+    """Writes a CSV file; it appears whole or not at all."""
+    text = io.StringIO()
+    writer = csv.DictWriter(text, columns, lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    write_atomically(path, text.getvalue())
 
 
 class HistoryFile:

@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, NamedTuple
@@ -26,23 +26,22 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, NamedTuple
 import numpy as np
 from tyro.conf import FlagCreatePairsOff, Positional, arg
 
-from dpmjax.cli.command import StopFlag, check_least, run_command
-from dpmjax.cli.drives import DriveSelection, open_drive, report_notes
+from dpmjax import slam, weights
+from dpmjax.cli.command import StopFlag, progress_bar
+from dpmjax.cli.drives import DriveOptions, ScanReader, keyframe_points, open_drive, open_map, report_notes
 from dpmjax.cli.machine import peak_rss_gb, require_importable
-from dpmjax.cli.run_folder import RunFolder, RunOptions, open_run_folder, recording, write_metrics
-from dpmjax.sequences import InputError
+from dpmjax.cli.run_folder import RunFolder, open_run_folder, recording, write_metrics
+from dpmjax.sequences import InputError, LidarSequence
 
 if TYPE_CHECKING:
-    from dpmjax.cli.slam_numbers import SlamRun
-    from dpmjax.sequences import LidarSequence
-    from dpmjax.slam import KeyframeMap, SlamMethods, SlamResult, SlamState
+    from dpmjax.cli.slam_run import SlamRun
 
 NAME = "slam"
 LOGGER = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, kw_only=True)
-class Config(RunOptions):
+class Config(DriveOptions):
     """Options of the run."""
 
     may_change: ClassVar[frozenset[str]] = frozenset({"n_scans", "refine"})
@@ -51,10 +50,6 @@ class Config(RunOptions):
     """Folder of scans, a bag of ROS, or a file of poses: a town is simulated along it. Without it: any town."""
     sequence: Annotated[str | None, arg(aliases=["-s"], metavar="NAME")] = None
     """Which drive, where DATA holds several."""
-    topic: Annotated[str | None, arg(aliases=["-t"], metavar="NAME")] = None
-    """Which clouds of a bag, where it holds several topics of them."""
-    columns: Annotated[int | None, arg(metavar="N")] = None
-    """Numbers a point has in .bin files (4: KITTI, 5: nuScenes); without it, the values decide."""
     weights: Annotated[str, arg(metavar="NAME|FILE")] = "dpm_small"
     """Name of a shipped model, or a .safetensors file."""
     map: Annotated[Path | None, arg(metavar="IN")] = None
@@ -69,51 +64,27 @@ class Config(RunOptions):
     """Refine the keyframes by DeepMapping afterwards; takes a minute for each window of 32."""
     deskew: FlagCreatePairsOff[bool] = False
     """Undo the motion of the lidar during its turn, by the times of the points (of .pcd .ply .npz) or their azimuth."""
-    kitti_angle_correction: FlagCreatePairsOff[bool] = False
-    """Raise the beams by 0.205 degrees, as KITTI's HDL-64E needs."""
-    n_scans: Annotated[int | None, arg(aliases=["-n"], metavar="N")] = None
-    """Number of scans; a resumed run may take more."""
-    jump: Annotated[int, arg(aliases=["-j"], metavar="N")] = 1
-    """Use every Nth scan."""
     visualize: Annotated[FlagCreatePairsOff[bool], arg(aliases=["-v"])] = False
     """Show the run in the live viewer (extra viewer); without a screen, OUT gets a recording, slam.rrd."""
 
     def __post_init__(self) -> None:
         """Checks ranges."""
-        check_least(self, n_scans=1, jump=1, seed=0, columns=3)
-        if self.sequence is not None and self.data is None:
-            raise ValueError("--sequence chooses a drive of DATA: give its folder too")
-        if self.kitti_angle_correction and self.data is None:
-            raise ValueError("--kitti-angle-correction is for the scans of KITTI's car: give their folder, DATA")
-
-    @property
-    def selection(self) -> DriveSelection:
-        """The scans of the run."""
-        return DriveSelection(
-            data=self.data,
-            sequence=self.sequence,
-            num_scans=self.n_scans,
-            jump=self.jump,
-            is_kitti_corrected=self.kitti_angle_correction,
-            columns=self.columns,
-            topic=self.topic,
-            seed=self.seed,
-        )
+        super().__post_init__()
+        self.check_data(self.data, self.sequence)
 
 
 def main(config: Config) -> dict[str, Any]:
     """Reads, maps, writes; returns the content of `metrics.json`."""
-    from dpmjax.cli.drives import ScanReader
     from dpmjax.cli.slam_numbers import counted, status_of, summary, why_failed
-    from dpmjax.cli.slam_run import Hooks, find_beginning, live_viewer, run_scans
-    from dpmjax.slam import finish_slam
+    from dpmjax.cli.slam_run import find_beginning, live_viewer, run_scans
 
     if config.visualize:
         require_importable("rerun", "-v")
     started = time.perf_counter()
     methods = slam_methods(config)
-    start = starting_state(config, methods)
-    sequence = open_drive(config.selection)
+    # A map of other weights is refused here, before the scans are opened.
+    start = slam.init_slam(None if config.map is None else open_map(config.map, methods))
+    sequence = open_drive(config.data, config, config.sequence)
     reader = ScanReader(sequence, is_deskewed=config.deskew, jump=config.jump)
     folder = open_run_folder(config, NAME)
     beginning = find_beginning(folder, methods, start)
@@ -122,20 +93,19 @@ def main(config: Config) -> dict[str, Any]:
         tell(f"{sequence.name}: {counted(len(sequence), 'scan')}{done}")
         notes = report_notes(sequence.notes)
         with live_viewer(folder, sequence.name, is_on=config.visualize) as on_scan:
-            hooks = Hooks(lambda: stop.is_requested, on_scan)
-            run = run_scans(folder, sequence, reader, methods, beginning, hooks)
-        result = finish_slam(run.state, run.reports, methods.config)
+            run = run_scans(folder, reader, methods, beginning, lambda: stop.is_requested, on_scan)
+        result = slam.finish_slam(run.state, run.reports, methods.config)
         drive = Drive(sequence, start.front_end.num_scans, len(start.slam_map))
         metrics = write_results(folder, config, drive, run, result)
         if config.refine and run.failure is None and not stop.is_requested:
             metrics |= refine(folder, config, drive, result, lambda: stop.is_requested)
         metrics |= {"is_interrupted": stop.is_requested or run.failure is not None, "peak_rss_gb": peak_rss_gb()}
-        failed = why_failed(metrics["scan_statuses"])
         metrics |= {**notes, "status": status_of(metrics), "wall_s": time.perf_counter() - started}
         write_metrics(folder, metrics, seed=config.seed)
         tell(f"{summary(metrics)}\nresults in {folder.path}")
         if run.failure is not None:
             raise run.failure
+        failed = why_failed(metrics["scan_statuses"])
         if failed is not None and not stop.is_requested:
             raise InputError(sequence.name, failed, "check that the scans are 3-D, in metres, and follow each other")
     return metrics
@@ -154,95 +124,73 @@ class Drive(NamedTuple):
     first_scan: int
     num_keyframes_before: int
 
-    def read_keyframe(self, slam_map: KeyframeMap, row: int) -> np.ndarray:
+    def read_keyframe(self, slam_map: slam.KeyframeMap, row: int) -> np.ndarray:
         """Reads the points of a keyframe; those of the extended map are the points of its surface."""
-        from dpmjax.cli.drives import keyframe_points
-
         if row < self.num_keyframes_before:
             return keyframe_points(slam_map, row)
         return self.sequence.read_points(slam_map.keyframes[row].scan - self.first_scan)
 
 
-def slam_methods(config: Config) -> SlamMethods:
+def slam_methods(config: Config) -> slam.SlamMethods:
     """Returns the methods of the model."""
-    from dpmjax.slam import make_methods, slam_preset
-    from dpmjax.weights import load_model
-
-    settings = slam_preset(config.preset)
+    settings = slam.slam_preset(config.preset)
     if config.odometry is not None:
         settings = replace(settings, odometry=replace(settings.odometry, proposer=config.odometry))
     if config.no_loop:
         settings = replace(settings, loops=replace(settings.loops, is_on=False))
-    return make_methods(load_model(config.weights), settings, weights=config.weights)
+    return slam.make_methods(weights.load_model(config.weights), settings, weights=config.weights)
 
 
-def starting_state(config: Config, methods: SlamMethods) -> SlamState:
-    """Returns the state before the first scan; a `ValueError` for a map of other weights."""
-    from dpmjax.cli.drives import open_map
-    from dpmjax.slam import init_slam
-
-    return init_slam(None if config.map is None else open_map(config.map, methods))
-
-
-def write_results(folder: RunFolder, config: Config, drive: Drive, run: SlamRun, result: SlamResult) -> dict[str, Any]:
+def write_results(
+    folder: RunFolder, config: Config, drive: Drive, run: SlamRun, result: slam.SlamResult
+) -> dict[str, Any]:
     """Writes all files but metrics.json, and returns its numbers; pictures come last."""
     from dpmjax.cli import slam_files as files
     from dpmjax.cli.slam_numbers import run_numbers
 
-    sequence, slam_map = drive.sequence, result.map
-    times = None if sequence.times is None else sequence.times[: len(result.reports)]
+    sequence, slam_map = drive.sequence.take(slice(0, len(result.reports))), result.map
     metrics = {"weights": config.weights, **run_numbers(run, result, sequence)}
     if not result.reports:
         return metrics
-    files.write_trajectory(folder.path, result.T_world_scan, times)
-    files.write_trajectory(folder.path, result.T_odometry_scan, times, "odometry")
+    files.write_trajectory(folder.path, result.T_world_scan, sequence.times)
+    files.write_trajectory(folder.path, result.T_odometry_scan, sequence.times, "odometry")
     files.write_graph(folder.path, result)
     files.write_loops(folder / "loops.csv", result.loops, result.keyframes)
     files.write_scans(folder / "scans.csv", result.reports, result.keyframes, sequence.sources)
     if len(slam_map):
         metrics |= files.write_map_file(folder / "map.npz", slam_map)
     write_metrics(folder, metrics, seed=config.seed)  # numbers first: a picture that fails must not cost them
-    views = files.keyframe_views(slam_map, lambda row: drive.read_keyframe(slam_map, row))
-    cloud = files.gather_map(views)
+    cloud = files.gather_map(slam_map.T_world_keyframe, lambda row: drive.read_keyframe(slam_map, row))
     files.write_map(folder / "map.ply", cloud)
     files.draw_pictures(folder.path, sequence, result, cloud, drive.num_keyframes_before)
     return metrics | {"map_points": len(cloud.points), "map_voxel_m": cloud.voxel_m}
 
 
 def refine(
-    folder: RunFolder, config: Config, drive: Drive, result: SlamResult, is_stopped: Callable[[], bool]
+    folder: RunFolder, config: Config, drive: Drive, result: slam.SlamResult, is_stopped: Callable[[], bool]
 ) -> dict[str, Any]:
     """Refines the trajectory by DeepMapping, writes it as refined_*.txt, and returns its numbers."""
     import jax
 
-    from dpmjax.cli.command import progress_bar
     from dpmjax.cli.slam_files import write_trajectory
     from dpmjax.cli.slam_numbers import trajectory_errors
-    from dpmjax.slam import place_scans, refine_keyframes
 
-    sequence = drive.sequence
+    sequence = drive.sequence.take(slice(0, len(result.reports)))
     with progress_bar("refine", " windows of keyframes") as on_window:
-        refined = refine_keyframes(
+        refined = slam.refine_keyframes(
             result.map,
             lambda row: drive.read_keyframe(result.map, row),
             key=jax.random.key(config.seed),
             on_window=on_window,
             stop=is_stopped,
         )
-    T = place_scans(refined.slam_map.T_world_keyframe, result.reports)
-    times = None if sequence.times is None else sequence.times[: len(T)]
-    write_trajectory(folder.path, T, times, "refined")
-    reference = None if sequence.T_world_lidar is None else sequence.T_world_lidar[: len(T)]
+    T = slam.place_scans(refined.slam_map.T_world_keyframe, result.reports)
+    write_trajectory(folder.path, T, sequence.times, "refined")
     numbers = {"refine_windows": refined.num_windows, "refine_windows_improved": refined.num_improved}
-    return {**numbers, **trajectory_errors(T, reference, "_refined")}
+    return {**numbers, **trajectory_errors(T, sequence.T_world_lidar, "_refined")}
 
 
 def tell(text: str) -> None:
     """Prints, and writes to the log."""
     print(text, flush=True)
     LOGGER.info("%s", text)
-
-
-def run(args: Sequence[str] | None = None) -> int:
-    """Runs the subcommand; returns the exit code."""
-    return run_command(main, Config, name=NAME, description=__doc__, args=args)

@@ -2,23 +2,26 @@
 
 from __future__ import annotations
 
-import csv
-import io
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from tqdm import tqdm
 
-from dpmjax.io.files import write_atomically
-
-if TYPE_CHECKING:
-    from dpmjax.sequences import LidarSequence
-    from dpmjax.slam import KeyframeMap, Loop, ScanReport, SlamResult
+from dpmjax import io, metrics, saved_maps, slam, viz
+from dpmjax.cli.result_files import write_table
+from dpmjax.cli.slam_numbers import counted, distances_to_reference
+from dpmjax.geometry import rigid
+from dpmjax.io.g2o import write_g2o
+from dpmjax.sequences import LidarSequence
 
 MAP_VOXEL_M, MAX_MAP_POINTS = 0.2, 3_000_000
 MAP_RANGES_M = (2.0, 60.0)
+LOOP_CELLS = ("found_by", "status", "overlap", "probability", "rmse_m")
+SCAN_COLUMNS = (
+    "scan", "status", "is_keyframe", "keyframe_scan", "score", "probability", "num_accepted", "reason", "source"
+)  # fmt: skip
 
 
 class Cloud(NamedTuple):
@@ -39,40 +42,31 @@ def write_trajectory(
     folder: Path, T_world_scan: np.ndarray, times: np.ndarray | None, name: str = "trajectory"
 ) -> None:
     """Writes a trajectory as TUM, KITTI and npy."""
-    from dpmjax import io as dpm_io
-
-    dpm_io.write_poses_npy(folder / f"{name}.npy", T_world_scan)
-    dpm_io.write_tum(folder / f"{name}_tum.txt", T_world_scan, times=times, frame="T_world_lidar")
-    dpm_io.write_kitti(folder / f"{name}_kitti.txt", T_world_scan)
+    io.write_poses_npy(folder / f"{name}.npy", T_world_scan)
+    io.write_tum(folder / f"{name}_tum.txt", T_world_scan, times=times, frame="T_world_lidar")
+    io.write_kitti(folder / f"{name}_kitti.txt", T_world_scan)
 
 
-def write_graph(folder: Path, result: SlamResult) -> None:
+def write_graph(folder: Path, result: slam.SlamResult) -> None:
     """Writes graph.g2o and keyframes.txt (number and pose of each keyframe)."""
-    from dpmjax import io as dpm_io
-    from dpmjax.io.g2o import write_g2o
-
     if result.graph is not None:
         write_g2o(folder / "graph.g2o", result.graph)
     poses = result.map.T_world_keyframe
-    dpm_io.write_tum(
+    io.write_tum(
         folder / "keyframes.txt", poses, times=result.keyframes, frame="T_map_keyframe; stamps are numbers of scans"
     )
 
 
-def write_loops(path: Path, loops: Sequence[Loop], keyframes: Sequence[int] | np.ndarray) -> None:
+def write_loops(path: Path, loops: Sequence[slam.Loop], keyframes: Sequence[int] | np.ndarray) -> None:
     """Writes every candidate of a loop, and what became of it."""
-    rows = [
-        {
-            "scan": int(keyframes[loop.source]),
-            "other_scan": int(keyframes[loop.target]),
-            **loop_cells(loop),
-        }
+    ends = (
+        {"scan": int(keyframes[loop.source]), "other_scan": int(keyframes[loop.target]), **loop_cells(loop)}
         for loop in loops
-    ]
-    write_table(path, ("scan", "other_scan", "found_by", "status", "overlap", "probability", "rmse_m"), rows)
+    )
+    write_table(path, ("scan", "other_scan", *LOOP_CELLS), ends)
 
 
-def loop_cells(loop: Loop) -> dict[str, str]:
+def loop_cells(loop: slam.Loop) -> dict[str, str]:
     """Returns the cells of a loop candidate in a table: how it was found, its outcome and the numbers that decided."""
     numbers = {"overlap": loop.overlap, "probability": loop.probability, "rmse_m": loop.rmse}
     cells = {name: _number(number) for name, number in numbers.items()}
@@ -80,7 +74,7 @@ def loop_cells(loop: Loop) -> dict[str, str]:
 
 
 def write_scans(
-    path: Path, reports: Sequence[ScanReport], keyframes: Sequence[int] | np.ndarray, sources: Sequence[str]
+    path: Path, reports: Sequence[slam.ScanReport], keyframes: Sequence[int] | np.ndarray, sources: Sequence[str]
 ) -> None:
     """Writes how each scan was placed."""
     rows = [
@@ -97,38 +91,25 @@ def write_scans(
         }
         for report, source in zip(reports, sources, strict=False)
     ]
-    names = (
-        "scan",
-        "status",
-        "is_keyframe",
-        "keyframe_scan",
-        "score",
-        "probability",
-        "num_accepted",
-        "reason",
-        "source",
-    )
-    write_table(path, names, rows)
+    write_table(path, SCAN_COLUMNS, rows)
 
 
-def write_table(path: Path, columns: Sequence[str], rows: Iterable[dict[str, Any]]) -> None:
-    """Writes a CSV file; it appears whole or not at all."""
-    text = io.StringIO()
-    writer = csv.DictWriter(text, columns, lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(rows)
-    write_atomically(path, text.getvalue())
+def accepted_ends(loops: Sequence[slam.Loop]) -> np.ndarray:
+    """Returns (m, 2) rows of the keyframes that accepted loops join."""
+    ends = [(loop.source, loop.target) for loop in loops if loop.status == "accepted"]
+    return np.array(ends, np.int64).reshape(-1, 2)
 
 
 def _number(value: float | None) -> str:
     return "" if value is None else f"{value:.6g}"
 
 
-def gather_map(views: Iterable[tuple[np.ndarray, np.ndarray]]) -> Cloud:
+def gather_map(T_world_scan: np.ndarray, read_scan: Callable[[int], np.ndarray]) -> Cloud:
     """Puts scans into the world, one point a voxel; voxels grow where the map gets too large.
 
     Args:
-        views: pairs of the points of a scan and its pose.
+        T_world_scan: (n, 4, 4) poses.
+        read_scan: reads the points of a scan, in its own frame.
 
     Returns:
         The points of all scans, thinned.
@@ -141,8 +122,8 @@ def gather_map(views: Iterable[tuple[np.ndarray, np.ndarray]]) -> Cloud:
         whole = np.concatenate(parts)
         return whole[first_of_each_voxel(whole[:, :3], voxel_m)]
 
-    for scan, T in views:
-        points = scan.astype(np.float64)
+    for row, T in enumerate(tqdm(T_world_scan, desc="map", unit=" keyframes", dynamic_ncols=True)):
+        points = read_scan(row).astype(np.float64)
         ranges = np.linalg.norm(points, axis=1)
         points = points[(ranges > MAP_RANGES_M[0]) & (ranges < MAP_RANGES_M[1])]
         turned = points[first_of_each_voxel(points, voxel_m)] @ T[:3, :3].T
@@ -158,55 +139,33 @@ def gather_map(views: Iterable[tuple[np.ndarray, np.ndarray]]) -> Cloud:
     return Cloud(whole[:, :3], whole[:, 3], voxel_m)
 
 
-def keyframe_views(
-    slam_map: KeyframeMap, read_keyframe: Callable[[int], np.ndarray]
-) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Reads keyframes again, with progress; yields points and pose."""
-    for row in tqdm(range(len(slam_map)), desc="map", unit=" keyframes", dynamic_ncols=True):
-        yield read_keyframe(row), slam_map.T_world_keyframe[row]
-
-
-def write_map_file(path: Path, slam_map: KeyframeMap) -> dict[str, int]:
+def write_map_file(path: Path, slam_map: slam.KeyframeMap) -> dict[str, int]:
     """Writes the map that later runs extend and scans are localised in; returns its size at each precision."""
-    from dpmjax.saved_maps import map_bytes, save_map
-
-    save_map(path, slam_map)
-    sizes = {"int8": len(map_bytes(slam_map, "int8"))}
-    return {"map_bytes": path.stat().st_size, **{f"map_bytes_{name}": size for name, size in sizes.items()}}
+    saved_maps.save_map(path, slam_map)
+    return {"map_bytes": path.stat().st_size, "map_bytes_int8": len(saved_maps.map_bytes(slam_map, "int8"))}
 
 
 def write_map(path: Path, cloud: Cloud) -> None:
     """Writes the thinned map, coloured by height."""
-    from dpmjax import io as dpm_io
-    from dpmjax import viz
-
-    dpm_io.write_ply(path, cloud.points, colors=viz.height_colors(cloud.heights_m))
+    io.write_ply(path, cloud.points, colors=viz.height_colors(cloud.heights_m))
 
 
 def draw_pictures(
-    folder: Path, sequence: LidarSequence, result: SlamResult, cloud: Cloud, num_keyframes_before: int = 0
+    folder: Path, sequence: LidarSequence, result: slam.SlamResult, cloud: Cloud, num_keyframes_before: int = 0
 ) -> None:
     """Draws trajectory.png and map.png."""
-    from dpmjax import viz
-    from dpmjax.cli.slam_numbers import counted
-    from dpmjax.geometry import rigid
-    from dpmjax.metrics import align_rigid
-
     T, slam_map, num_old = result.T_world_scan, result.map, num_keyframes_before
     # Odometry alone begins where the drive begins, also in a map that was there before.
     odometry = T[0] @ rigid.inverse(result.T_odometry_scan[0]) @ result.T_odometry_scan
-    reference = None if sequence.T_world_lidar is None else sequence.T_world_lidar[: len(T)]
-    accepted = [loop for loop in result.loops if loop.status == "accepted"]
-    ends = np.array([(loop.source, loop.target) for loop in accepted], np.int64).reshape(-1, 2)
+    reference, ends = sequence.T_world_lidar, accepted_ends(result.loops)
     tracks = [_track("odometry alone", odometry, reference)] if len(ends) else []
     if num_old:
         tracks = [viz.Track("the map before", slam_map.T_world_keyframe[:num_old, :3, 3]), *tracks]
     tracks.append(_track("SLAM", T, reference))
-    shown = None
-    if reference is not None and sequence.has_reference[: len(T)].any():
-        has_reference = sequence.has_reference[: len(T)]
-        positions = reference[has_reference, :3, 3]
-        T_map_reference = align_rigid(positions, T[has_reference, :3, 3])
+    shown, known = None, sequence.has_reference
+    if reference is not None and known.any():
+        positions = reference[known, :3, 3]
+        T_map_reference = metrics.align_rigid(positions, T[known, :3, 3])
         shown = positions @ T_map_reference[:3, :3].T + T_map_reference[:3, 3]
     title = f"{sequence.name}: {counted(len(T), 'scan')}"
     figure = viz.trajectory_figure(title, tracks, shown, slam_map.T_world_keyframe[ends, :3, 3])
@@ -215,10 +174,7 @@ def draw_pictures(
     viz.save_figure(viz.height_map_figure(title, cloud.points, cloud.heights_m, T[:, :3, 3]), folder / "map.png")
 
 
-def _track(name: str, T_world_scan: np.ndarray, reference: np.ndarray | None) -> Any:
-    from dpmjax import viz
-    from dpmjax.cli.slam_numbers import distances_to_reference
-
+def _track(name: str, T_world_scan: np.ndarray, reference: np.ndarray | None) -> viz.Track:
     errors = distances_to_reference(T_world_scan, reference)
     label = name if errors is None else f"{name}, ATE {np.sqrt(np.nanmean(errors**2)):.2f} m"
     return viz.Track(label, T_world_scan[:, :3, 3], errors)

@@ -1,4 +1,4 @@
-"""Numbers of SLAM and of localization for metrics.json: errors, counts, seconds; and the record of a run."""
+"""Numbers of SLAM and of localization for metrics.json: errors, counts, seconds."""
 
 from __future__ import annotations
 
@@ -9,37 +9,11 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from dpmjax import metrics, slam
+from dpmjax.sequences import LidarSequence
+
 if TYPE_CHECKING:
-    from dpmjax.sequences import LidarSequence
-    from dpmjax.slam import KeyframeMap, Localization, ScanReport, SlamResult, SlamState
-
-
-class SlamRun(NamedTuple):
-    """A run until its end or its stop.
-
-    Attributes:
-        state: after the last scan.
-        reports: reports of all scans.
-        stages_s: seconds of each stage in this process, without compilation.
-        compile_s: seconds of compilation.
-        run_s: seconds of all scans of this process, without compilation.
-        scan_s: seconds of each scan of this process, without compilation, reading and writing.
-        failure: what ended the run early; None where nothing did.
-    """
-
-    state: SlamState
-    reports: tuple[ScanReport, ...]
-    stages_s: dict[str, float]
-    compile_s: float
-    run_s: float
-    scan_s: tuple[float, ...]
-    failure: Exception | None
-
-    @property
-    def num_done(self) -> int:
-        """Number of scans of this process."""
-        return len(self.scan_s)
-
+    from dpmjax.cli.slam_run import SlamRun
 
 MAX_ERROR_M, MAX_ERROR_DEG = 2.0, 5.0
 """Errors up to which a localisation is right."""
@@ -62,8 +36,8 @@ class LocalizationErrors(NamedTuple):
 
 
 def localization_errors(
-    found: Sequence[Localization],
-    slam_map: KeyframeMap,
+    found: Sequence[slam.Localization],
+    slam_map: slam.KeyframeMap,
     T_reference_keyframe: np.ndarray,
     T_reference_scan: np.ndarray,
 ) -> LocalizationErrors:
@@ -79,7 +53,6 @@ def localization_errors(
         The errors.
     """
     from dpmjax.geometry import rigid
-    from dpmjax.metrics import registration_recall
 
     is_found = np.array([one.is_in_map for one in found], bool)
     is_right, errors = np.zeros(len(found), bool), np.full((2, len(found)), np.nan)
@@ -88,7 +61,7 @@ def localization_errors(
         T_world_scan = np.array([one.T_world_scan for one in found if one.is_in_map])
         T = rigid.inverse(slam_map.T_world_keyframe[keyframes]) @ T_world_scan
         true = rigid.inverse(T_reference_keyframe[keyframes]) @ T_reference_scan[is_found]
-        recall = registration_recall(T, true, max_translation_m=MAX_ERROR_M, max_rotation_deg=MAX_ERROR_DEG)
+        recall = metrics.registration_recall(T, true, max_translation_m=MAX_ERROR_M, max_rotation_deg=MAX_ERROR_DEG)
         is_right[is_found] = recall.is_right
         errors[:, is_found] = recall.translation_errors_m, recall.rotation_errors_deg
     return LocalizationErrors(is_found, is_right, *errors)
@@ -105,17 +78,16 @@ UNSURE = {
 
 def trajectory_errors(T_world_scan: np.ndarray, reference: np.ndarray | None, suffix: str = "") -> dict[str, Any]:
     """Returns ATE, RPE and KITTI's errors of a trajectory, at scans with a reference pose; none without two of them."""
-    from dpmjax.metrics import absolute_trajectory_error, relative_pose_error, segment_error
-
     if reference is None:
         return {}
     has_reference = np.isfinite(reference.reshape(-1, 16)).all(axis=1)
     T_world_scan, reference = T_world_scan[has_reference], reference[has_reference]
     if len(T_world_scan) < 2:
         return {}
-    relative, segments = relative_pose_error(T_world_scan, reference), segment_error(T_world_scan, reference)
+    relative = metrics.relative_pose_error(T_world_scan, reference)
+    segments = metrics.segment_error(T_world_scan, reference)
     return {
-        f"ate{suffix}_m": absolute_trajectory_error(T_world_scan[:, :3, 3], reference[:, :3, 3]),
+        f"ate{suffix}_m": metrics.absolute_trajectory_error(T_world_scan[:, :3, 3], reference[:, :3, 3]),
         f"rpe{suffix}_m": relative.translation_rmse,
         f"rpe{suffix}_deg": math.degrees(relative.rotation_rmse),
         f"t_rel{suffix}_percent": segments.translation_percent,
@@ -125,27 +97,24 @@ def trajectory_errors(T_world_scan: np.ndarray, reference: np.ndarray | None, su
 
 def distances_to_reference(T_world_scan: np.ndarray, reference: np.ndarray | None) -> np.ndarray | None:
     """Returns the distance of each scan to the reference after the best rigid alignment; NaN for scans without one."""
-    from dpmjax.metrics import align_rigid
-
     if reference is None:
         return None
     has_reference = np.isfinite(reference.reshape(-1, 16)).all(axis=1)
     if not has_reference.any():
         return None
-    T = align_rigid(T_world_scan[has_reference, :3, 3], reference[has_reference, :3, 3])
+    T = metrics.align_rigid(T_world_scan[has_reference, :3, 3], reference[has_reference, :3, 3])
     moved = T_world_scan[:, :3, 3] @ T[:3, :3].T + T[:3, 3]
     return np.asarray(np.linalg.norm(moved - reference[:, :3, 3], axis=1))
 
 
-def run_numbers(run: SlamRun, result: SlamResult, sequence: LidarSequence) -> dict[str, Any]:
-    """Returns what `metrics.json` says of a run."""
-    T, num = result.T_world_scan, len(result.reports)
-    reference = None if sequence.T_world_lidar is None else sequence.T_world_lidar[:num]
+def run_numbers(run: SlamRun, result: slam.SlamResult, sequence: LidarSequence) -> dict[str, Any]:
+    """Returns the numbers of a run for `metrics.json`; the sequence has the scans that were placed."""
+    T, reference = result.T_world_scan, sequence.T_world_lidar
     statuses = collections.Counter(report.status for report in result.reports)
     loops = collections.Counter(loop.status for loop in result.loops)
     return {
         "sequence": sequence.name,
-        "num_scans": num,
+        "num_scans": len(T),
         "path_m": float(np.linalg.norm(np.diff(T[:, :3, 3], axis=0), axis=1).sum()),
         "num_keyframes": len(result.keyframes),
         "num_parts": count_parts(result.map),
@@ -180,17 +149,17 @@ def why_failed(statuses: Mapping[str, int]) -> str | None:
     return None
 
 
-def status_of(metrics: Mapping[str, Any]) -> str:
+def status_of(numbers: Mapping[str, Any]) -> str:
     """Returns how a run ended.
 
     Args:
-        metrics: the numbers of the run.
+        numbers: of the run.
 
     Returns:
         done; uncertain: less than half of the scans were aligned; failed: none; interrupted: before its end.
     """
-    statuses = metrics["scan_statuses"]
-    if metrics["is_interrupted"]:
+    statuses = numbers["scan_statuses"]
+    if numbers["is_interrupted"]:
         return "interrupted"
     if why_failed(statuses) is not None:
         return "failed"
@@ -198,7 +167,7 @@ def status_of(metrics: Mapping[str, Any]) -> str:
     return "done" if 2 * num_sure >= sum(statuses.values()) else "uncertain"
 
 
-def count_parts(slam_map: KeyframeMap) -> int:
+def count_parts(slam_map: slam.KeyframeMap) -> int:
     """Returns the number of parts of a map that measured motions join."""
     from dpmjax.slam.keyframes import connected_parts
 
@@ -206,33 +175,33 @@ def count_parts(slam_map: KeyframeMap) -> int:
     return len(set(connected_parts(len(slam_map), measured).tolist()))
 
 
-def summary(metrics: dict[str, Any]) -> str:
+def summary(numbers: Mapping[str, Any]) -> str:
     """Returns the last lines on the console."""
     counts = (("scan", "num_scans"), ("keyframe", "num_keyframes"), ("loop closure", "num_loops"))
-    scans, *others = (counted(metrics[name], noun) for noun, name in counts)
-    lines = [", ".join([scans, f"{metrics['path_m']:.1f} m driven", *others])]
+    scans, *others = (counted(numbers[name], noun) for noun, name in counts)
+    lines = [", ".join([scans, f"{numbers['path_m']:.1f} m driven", *others])]
     lines += [
-        f"{counted(metrics['scan_statuses'][status], 'scan')} {text}"
+        f"{counted(numbers['scan_statuses'][status], 'scan')} {text}"
         for status, text in UNSURE.items()
-        if status in metrics["scan_statuses"]
+        if status in numbers["scan_statuses"]
     ]
     if len(lines) > 1:
         lines[-1] += " (scans.csv has the reason for each)"
-    if metrics["num_parts"] > 1:
-        lines.append(f"the map has {metrics['num_parts']} parts that no loop joins; their relative pose is a guess")
-    if "ate_m" in metrics:
+    if numbers["num_parts"] > 1:
+        lines.append(f"the map has {numbers['num_parts']} parts that no loop joins; their relative pose is a guess")
+    if "ate_m" in numbers:
         lines.append("errors against the reference poses (ATE of the whole drive, RPE from scan to scan):")
     for suffix, name in (("_odometry", "odometry alone"), ("", "SLAM"), ("_refined", "refined")):
-        if f"ate{suffix}_m" in metrics:
-            line = f"  {name:14}  ATE {metrics[f'ate{suffix}_m']:.3f} m, RPE {metrics[f'rpe{suffix}_m']:.3f} m"
-            t_rel, r_rel = metrics.get(f"t_rel{suffix}_percent"), metrics.get(f"r_rel{suffix}_deg_per_100m")
+        if f"ate{suffix}_m" in numbers:
+            line = f"  {name:14}  ATE {numbers[f'ate{suffix}_m']:.3f} m, RPE {numbers[f'rpe{suffix}_m']:.3f} m"
+            t_rel, r_rel = numbers.get(f"t_rel{suffix}_percent"), numbers.get(f"r_rel{suffix}_deg_per_100m")
             is_long = t_rel is not None and math.isfinite(t_rel)
             lines.append(line + (f", {t_rel:.2f} %, {r_rel:.2f} degrees/100 m" if is_long else ""))
-    speed = metrics["scans_per_s"]
+    speed = numbers["scans_per_s"]
     if speed is not None:
-        slowest = sorted(metrics["stages_ms_per_scan"].items(), key=lambda entry: -entry[1])[:4]
+        slowest = sorted(numbers["stages_ms_per_scan"].items(), key=lambda entry: -entry[1])[:4]
         stages = ", ".join(f"{name} {ms:.0f}" for name, ms in slowest)
-        lines.append(f"{speed:.1f} scans/s (ms a scan: {stages}); compilation took {metrics['compile_s']:.0f} s more")
+        lines.append(f"{speed:.1f} scans/s (ms a scan: {stages}); compilation took {numbers['compile_s']:.0f} s more")
     return "\n".join(lines)
 
 

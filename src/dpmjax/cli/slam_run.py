@@ -4,28 +4,25 @@ from __future__ import annotations
 
 import collections
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
-import numpy as np
 from tqdm import tqdm
 
+from dpmjax import slam, viz
 from dpmjax.cli.drives import ScanReader
 from dpmjax.cli.run_folder import RunFolder
-from dpmjax.cli.slam_files import write_scans, write_trajectory
-from dpmjax.cli.slam_numbers import SlamRun
-from dpmjax.saved_maps import load_state, save_state
+from dpmjax.cli.slam_files import accepted_ends, write_scans, write_trajectory
+from dpmjax.saved_maps import RunState, load_state, save_state
 from dpmjax.sequences import LidarSequence
-from dpmjax.slam import SlamMethods, SlamResult, SlamState, finish_slam, init_slam, place_scans, step_slam
 
 if TYPE_CHECKING:
-    from dpmjax.slam import ScanReport, SlamState
     from dpmjax.slam.front_end import AnyScan
 
-    OnScan = Callable[[AnyScan, SlamState, ScanReport], None]
+    OnScan = Callable[[AnyScan, slam.SlamState, slam.ScanReport], None]
 
 
 STATE = "run_state.npz"
@@ -35,37 +32,38 @@ SAVE_EVERY_S = 10.0
 FLUSH_EVERY_S = 30.0
 _STAGES = {
     "thin": "thinning",
-    "align": "odometry",
-    "search": "odometry",
+    **dict.fromkeys(("align", "search"), "odometry"),
     "encode": "encoder",
     "propose": "decoder",
-    "register": "loops",
-    "overlaps": "loops",
+    **dict.fromkeys(("register", "overlaps"), "loops"),
 }
 
 
-class Beginning(NamedTuple):
-    """State from which a run goes on.
+class SlamRun(NamedTuple):
+    """A run until its end or its stop.
 
     Attributes:
-        state: after the scans that are done.
-        reports: reports of the scans of the drive that are done.
+        state: after the last scan.
+        reports: reports of all scans.
+        stages_s: seconds of each stage in this process, without compilation.
+        compile_s: seconds of compilation.
+        run_s: seconds of all scans of this process, without compilation.
+        scan_s: seconds of each scan of this process, without compilation, reading and writing.
+        failure: what ended the run early; None where nothing did.
     """
 
-    state: SlamState
-    reports: tuple[ScanReport, ...] = ()
+    state: slam.SlamState
+    reports: tuple[slam.ScanReport, ...]
+    stages_s: dict[str, float]
+    compile_s: float
+    run_s: float
+    scan_s: tuple[float, ...]
+    failure: Exception | None
 
-
-class Hooks(NamedTuple):
-    """Callbacks of a run.
-
-    Attributes:
-        is_stopped: whether to end before the next scan.
-        on_scan: called with each scan, the state after it and its report; None for no call.
-    """
-
-    is_stopped: Callable[[], bool]
-    on_scan: Callable[[AnyScan, SlamState, ScanReport], None] | None = None
+    @property
+    def num_done(self) -> int:
+        """Number of scans of this process."""
+        return len(self.scan_s)
 
 
 class Stopwatch:
@@ -109,21 +107,21 @@ class Timed:
         return partial(self._watch.timed, _STAGES[name], found) if name in _STAGES else found
 
 
-def find_beginning(folder: RunFolder, methods: SlamMethods, start: SlamState) -> Beginning:
+def find_beginning(folder: RunFolder, methods: slam.SlamMethods, start: slam.SlamState) -> RunState:
     """Reads how far a run has come that is resumed; a `ValueError` for one of other weights."""
     path = folder / STATE
     if not folder.is_resumed or not path.is_file():
-        return Beginning(start)
-    state, reports = load_state(path)
-    made_by, given = state.slam_map.origin, methods.origin
+        return RunState(start, ())
+    found = load_state(path)
+    made_by, given = found.state.slam_map.origin, methods.origin
     if made_by is not None and made_by.fingerprint != given.fingerprint:
         raise ValueError(f"{path}: made with weights {made_by}, these are {given}; give those, or start again")
-    return Beginning(state, reports)
+    return found
 
 
 def map_drive(
-    folder: RunFolder, sequence: LidarSequence, methods: SlamMethods, is_stopped: Callable[[], bool]
-) -> tuple[SlamRun, SlamResult]:
+    folder: RunFolder, sequence: LidarSequence, methods: slam.SlamMethods, is_stopped: Callable[[], bool]
+) -> tuple[SlamRun, slam.SlamResult]:
     """Maps a drive from its beginning, or goes on from the state in its folder.
 
     Args:
@@ -138,49 +136,60 @@ def map_drive(
     Raises:
         InputError: a scan on the way that cannot be read.
     """
-    reader = ScanReader(sequence)
-    beginning = find_beginning(folder, methods, init_slam())
-    run = run_scans(folder, sequence, reader, methods, beginning, Hooks(is_stopped))
+    beginning = find_beginning(folder, methods, slam.init_slam())
+    run = run_scans(folder, ScanReader(sequence), methods, beginning, is_stopped)
     if run.failure is not None:
         raise run.failure
-    return run, finish_slam(run.state, run.reports, methods.config)
+    return run, slam.finish_slam(run.state, run.reports, methods.config)
 
 
 def run_scans(
     folder: RunFolder,
-    sequence: LidarSequence,
     reader: ScanReader,
-    methods: SlamMethods,
-    beginning: Beginning,
-    hooks: Hooks,
+    methods: slam.SlamMethods,
+    beginning: RunState,
+    is_stopped: Callable[[], bool],
+    on_scan: OnScan | None = None,
 ) -> SlamRun:
-    """Places the remaining scans; the result holds what ended it early, and the state of the last keyframe is saved."""
-    watch = Stopwatch()
+    """Places the remaining scans; the result holds what ended it early, and the state of the last keyframe is saved.
+
+    Args:
+        folder: folder for the state and interim results.
+        reader: reads the scans.
+        methods: matcher, geometry and settings.
+        beginning: state and reports of the scans that are done.
+        is_stopped: whether to end before the next scan.
+        on_scan: called with each scan, the state after it and its report.
+
+    Returns:
+        The run.
+    """
+    watch, sequence = Stopwatch(), reader.sequence
     timed = methods._replace(matcher=Timed(methods.matcher, watch), geometry=Timed(methods.geometry, watch))
     state, reports = beginning.state, list(beginning.reports)
     first, failure, started = len(reports), None, watch.now_s()
     flushed = saved = time.perf_counter()
     scan_s: list[float] = []
-    resumable: Beginning | None = None
+    resumable: RunState | None = None
     bar = tqdm(total=len(sequence), initial=first, desc=sequence.name, unit=" scans", dynamic_ncols=True)
     scans = reader.iterate(first)
     try:
         for _ in range(first, len(sequence)):
-            if hooks.is_stopped():
+            if is_stopped():
                 break
             scan = watch.timed("read", next, scans)
             before = watch.now_s()
-            state, report = step_slam(timed, state, scan)
+            state, report = slam.step_slam(timed, state, scan)
             scan_s.append(watch.now_s() - before)
             reports.append(report)
             if report.is_keyframe:
-                resumable = Beginning(state, tuple(reports))
+                resumable = RunState(state, tuple(reports))
             if resumable is not None and time.perf_counter() - saved > SAVE_EVERY_S:
                 watch.timed("write", save_state, folder / STATE, *resumable)
                 resumable, saved = None, time.perf_counter()
-            if hooks.on_scan is not None:
-                watch.timed("viewer", hooks.on_scan, scan, state, report)
-            bar.set_postfix_str(_progress(state, reports, watch), refresh=False)
+            if on_scan is not None:
+                watch.timed("viewer", on_scan, scan, state, report)
+            bar.set_postfix_str(_progress(state, report, watch), refresh=False)
             bar.update(1)
             if time.perf_counter() - flushed > FLUSH_EVERY_S:
                 watch.timed("write", write_interim, folder, sequence, state, reports)
@@ -197,20 +206,19 @@ def run_scans(
     return SlamRun(state, tuple(reports), dict(watch.stages_s), watch.compile_s, run_s, tuple(scan_s), failure)
 
 
-def write_interim(folder: RunFolder, sequence: LidarSequence, state: SlamState, reports: list[ScanReport]) -> None:
+def write_interim(
+    folder: RunFolder, sequence: LidarSequence, state: slam.SlamState, reports: Sequence[slam.ScanReport]
+) -> None:
     """Writes the present trajectory and scans.csv."""
-    slam_map = state.slam_map
-    times = None if sequence.times is None else sequence.times[: len(reports)]
-    write_trajectory(folder.path, place_scans(slam_map.T_world_keyframe, reports), times)
-    keyframes = [keyframe.scan for keyframe in slam_map.keyframes]
-    write_scans(folder / "scans.csv", reports, keyframes, sequence.sources)
+    slam_map, done = state.slam_map, sequence.take(slice(0, len(reports)))
+    write_trajectory(folder.path, slam.place_scans(slam_map.T_world_keyframe, reports), done.times)
+    write_scans(folder / "scans.csv", reports, [keyframe.scan for keyframe in slam_map.keyframes], done.sources)
 
 
-def _progress(state: SlamState, reports: list[ScanReport], watch: Stopwatch) -> str:
-    accepted = sum(loop.status == "accepted" for loop in state.loops.loops)
-    parts = [f"kf {len(state.slam_map)}", f"loops {accepted}", f"score {reports[-1].score:.2f}"]
-    if reports[-1].status not in ("first", "tracked"):
-        parts.append(reports[-1].status)
+def _progress(state: slam.SlamState, report: slam.ScanReport, watch: Stopwatch) -> str:
+    parts = [f"kf {len(state.slam_map)}", f"loops {len(accepted_ends(state.loops.loops))}", f"score {report.score:.2f}"]
+    if report.status not in ("first", "tracked"):
+        parts.append(report.status)
     return ", ".join([*parts, f"compiled {watch.compile_s:.0f} s"])
 
 
@@ -220,21 +228,19 @@ def live_viewer(folder: RunFolder, name: str, *, is_on: bool) -> Iterator[OnScan
     if not is_on:
         yield None
         return
-    from dpmjax import viz
     from dpmjax.slam.front_end import corrected_points
 
     viewer = viz.LiveViewer(name, folder / "slam.rrd")
 
-    def show(scan: AnyScan, state: SlamState, report: ScanReport) -> None:
-        slam_map = state.slam_map
-        if not len(slam_map):
+    def show(scan: AnyScan, state: slam.SlamState, report: slam.ScanReport) -> None:
+        T_world_keyframe = state.slam_map.T_world_keyframe
+        if not len(T_world_keyframe):
             return
-        points, T = corrected_points(scan, report.T_turn), slam_map.T_world_keyframe[report.keyframe]
-        viewer.show_scan(report.scan, points, T @ report.T_keyframe_scan)
+        points = corrected_points(scan, report.T_turn)
+        viewer.show_scan(report.scan, points, T_world_keyframe[report.keyframe] @ report.T_keyframe_scan)
         if report.is_keyframe:
-            ends = [(loop.source, loop.target) for loop in state.loops.loops if loop.status == "accepted"]
-            positions = slam_map.T_world_keyframe[np.array(ends, np.int64).reshape(-1, 2), :3, 3]
-            viewer.show_map(slam_map.T_world_keyframe, points, positions)
+            positions = T_world_keyframe[accepted_ends(state.loops.loops), :3, 3]
+            viewer.show_map(T_world_keyframe, points, positions)
 
     try:
         yield show

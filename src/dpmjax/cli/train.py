@@ -19,27 +19,46 @@ apart. The model is the one of the step with the best mean recall on other towns
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
+import numpy as np
 from tyro.conf import FlagCreatePairsOff, arg
 
-from dpmjax.cli.command import StopFlag, check_least, run_command
+from dpmjax import deeppointmap, simulation, viz, weights
+from dpmjax.cli.command import StopFlag, check_least
+from dpmjax.cli.drives import Source, find_sources
 from dpmjax.cli.machine import peak_rss_gb, select_device
-from dpmjax.cli.run_folder import RunFolder, RunOptions, open_run_folder, recording, write_metrics
+from dpmjax.cli.result_files import read_history
+from dpmjax.cli.run_folder import HISTORY, METRICS, RunFolder, RunOptions, open_run_folder, recording, write_metrics
 
 if TYPE_CHECKING:
     from dpmjax.cli.train_run import Records
-    from dpmjax.deeppointmap import Model, TrainingConfig
 
 NAME = "train"
+MODEL = "model.safetensors"
+TOWN_LENGTH_M = 600.0
+# More bad scans than this are counted only.
+MAX_LISTED = 10
+SHOWN_CURVES = ("loss", "pairing", "offset", "top1_accuracy", "recall", "recall_far", "real_recall")
 
 
 @dataclass(frozen=True, kw_only=True)
-class Config(RunOptions):
+class ProcessOptions(RunOptions):
+    """Options of a run of several processes."""
+
+    coordinator: Annotated[str | None, arg(metavar="HOST:PORT|auto")] = None
+    """Train in several processes as one, at this address of process 0; auto: as Slurm, Open MPI or a TPU pod says."""
+    num_processes: Annotated[int | None, arg(metavar="N")] = None
+    """How many processes there are."""
+    process_id: Annotated[int | None, arg(metavar="I")] = None
+    """Which of them this one is, from 0; process 0 alone writes and prints."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Config(ProcessOptions):
     """Options of the run."""
 
     may_change: ClassVar[frozenset[str]] = frozenset({"hours", "finish", "cache", "validate"})
@@ -62,16 +81,12 @@ class Config(RunOptions):
     that register pairs already; without it, the preset decides."""
     num_towns: Annotated[int, arg(metavar="N")] = 4
     """How many towns to train on, where town is among the data."""
-    town_length_m: Annotated[float, arg(metavar="M")] = 600.0
-    """Length of the drive through each town."""
     hours: Annotated[float | None, arg(metavar="H")] = None
     """Train for about H hours: the learning rate falls in the last part of them. Without it, the steps decide."""
     finish: FlagCreatePairsOff[bool] = False
     """Let the learning rate fall from here on, and end: with --resume, a run that was planned longer ends well."""
     cache: Annotated[Path, arg(metavar="DIR")] = Path("results/train/cache")
     """Folder where prepared scans are kept between runs; 0.8 MB for each scan of `small`."""
-    selection_pairs: Annotated[int, arg(metavar="N")] = 320
-    """Pairs of scans and of maps, of towns of their own, by which the best model is chosen."""
     held_out_pairs: Annotated[int, arg(metavar="N")] = 60
     """Pairs of each kind of the held-out town that recall is reported on."""
     validate: Annotated[tuple[Path, ...], arg(metavar="PATH")] = ()
@@ -80,22 +95,11 @@ class Config(RunOptions):
     """Measure recall every N steps, and at the end."""
     bfloat16: FlagCreatePairsOff[bool] = False
     """Multiply matrices of the networks in bfloat16; geometry stays in float32."""
-    coordinator: Annotated[str | None, arg(metavar="HOST:PORT|auto")] = None
-    """Train in several processes as one, at this address of process 0; auto: as Slurm, Open MPI or a TPU pod says."""
-    num_processes: Annotated[int | None, arg(metavar="N")] = None
-    """How many processes there are."""
-    process_id: Annotated[int | None, arg(metavar="I")] = None
-    """Which of them this one is, from 0; process 0 alone writes and prints."""
 
     def __post_init__(self) -> None:
-        """Checks ranges.
-
-        Raises:
-            ValueError: if an option is out of range.
-        """
-        check_least(self, steps=3, num_towns=1, selection_pairs=1, held_out_pairs=1, recall_every=1, seed=0)
-        check_least(self, groups=2)
-        check_least(self, town_length_m=100, num_processes=1, process_id=0)
+        """Checks ranges."""
+        check_least(self, steps=3, num_towns=1, held_out_pairs=1, recall_every=1, seed=0, groups=2)
+        check_least(self, num_processes=1, process_id=0)
         if self.hours is not None and not 0 < self.hours < float("inf"):
             raise ValueError(f"--hours: expected more than 0, got {self.hours}")
         if not self.data:
@@ -112,27 +116,25 @@ def main(config: Config) -> None:
     join_processes(config.coordinator, config.num_processes, config.process_id)
     if config.coordinator is not None:  # not before the processes have found each other
         select_device(config.device)
-    from dpmjax.cli.drive_sources import Source, find_sources
-    from dpmjax.cli.train_data import prepare_sources
-    from dpmjax.cli.train_results import draw, measure, print_summary, write_model
-    from dpmjax.cli.train_run import run_training
-    from dpmjax.deeppointmap import ScanStore, TrainingHooks
-    from dpmjax.simulation import TRAINING_MIXTURE
-    from dpmjax.weights import load_model
+    from dpmjax.cli.train_data import draw_sets, prepare_sources
+    from dpmjax.cli.train_run import Records, run_training
 
     with together():
-        weights = None if config.weights is None else load_model(config.weights)
-        settings = training_settings(config, weights)
-        seeds = range(config.seed, config.seed + config.num_towns)
-        town = Source(town_length_m=config.town_length_m, town_mixture=TRAINING_MIXTURE)
-        towns = [replace(town, town_seed=seed) for seed in seeds]
+        first = None if config.weights is None else weights.load_model(config.weights)
+        settings = training_settings(config, first)
+        town = Source(town_length_m=TOWN_LENGTH_M, town_mixture=simulation.TRAINING_MIXTURE)
+        towns = [replace(town, town_seed=config.seed + number) for number in range(config.num_towns)]
         sources = find_sources(config.data, towns, settings.sampling)
         folder = open_run_folder(config, NAME) if is_first() else None
     with recording(folder) if folder is not None else nullcontext(), StopFlag() as stop:
         with together():
-            store = ScanStore(prepare_sources(sources, settings, config.cache, seed=config.seed))
-            records = None if folder is None else _open_records(folder, config, settings, store, weights)
-        hooks = TrainingHooks(evaluate_every=config.recall_every, stop=lambda: stop.received or 0)
+            store = deeppointmap.ScanStore(prepare_sources(sources, settings, config.cache, seed=config.seed))
+            records = None
+            if folder is not None:
+                print(f"{len(store.table)} scans; {config.preset}: {settings.num_steps} steps at most")
+                sets = draw_sets(settings, config.held_out_pairs, config.validate, length_m=TOWN_LENGTH_M)
+                records = Records(folder, settings, sets, seed=config.seed, weights=first)
+        hooks = deeppointmap.TrainingHooks(evaluate_every=config.recall_every, stop=lambda: stop.received or 0)
         plateau_s = plateau_seconds(config, settings)
         trained = run_training(records, store, settings, hooks, seed=config.seed, plateau_s=plateau_s)
         if trained.stopped_by:
@@ -152,53 +154,111 @@ def main(config: Config) -> None:
         # Numbers first: a picture that fails must not cost them.
         write_metrics(folder, metrics)
         write_model(folder, trained.model, metrics, origin=f"{config.preset}, trained on {', '.join(config.data)}")
-        draw(folder, evaluation, records.sets.held_out)
+        draw_loss(folder)
+        draw_matches(folder, evaluation, records.sets.held_out)
         print_summary(folder, metrics)
 
 
-def _open_records(
-    folder: RunFolder, config: Config, settings: TrainingConfig, store: Any, weights: Model | None
-) -> Records:
-    from dpmjax.cli.train_run import Records, draw_sets
-
-    print(f"{len(store.table)} scans; {config.preset}: {settings.num_steps} steps at most")
-    sets = draw_sets(
-        settings,
-        selection_pairs=config.selection_pairs,
-        held_out_pairs=config.held_out_pairs,
-        validate=config.validate,
-        length_m=config.town_length_m,
-    )
-    return Records(folder, settings, sets, seed=config.seed, weights=weights)
-
-
-def plateau_seconds(config: Config, settings: TrainingConfig) -> float | None:
+def plateau_seconds(config: Config, settings: deeppointmap.TrainingConfig) -> float | None:
     """Returns the seconds of steps after which the learning rate falls; None where the steps decide."""
     if config.finish:
         return 0.0
     return None if config.hours is None else 3600 * config.hours * (1 - settings.decay_ratio)
 
 
-def training_settings(config: Config, weights: Model | None = None) -> TrainingConfig:
-    """Returns the preset, with the options applied; the network is that of the weights, if there are any."""
-    from dpmjax.deeppointmap import CurriculumStage, training_preset, without
-
-    settings = training_preset(config.preset)
-    if weights is not None:
-        settings = replace(settings, model=replace(weights.config, calibration=None, overlap=None))
+def training_settings(config: Config, first: deeppointmap.Model | None = None) -> deeppointmap.TrainingConfig:
+    """Returns the preset, with the options applied; the network is that of the first weights, if there are any."""
+    settings = deeppointmap.training_preset(config.preset)
+    if first is not None:
+        settings = replace(settings, model=replace(first.config, calibration=None, overlap=None))
     if config.frame is not None:
         encoder = replace(settings.model.encoder, frame=config.frame)
         settings = replace(settings, model=replace(settings.model, encoder=encoder))
     if config.groups:
         num_steps = max(1, settings.num_steps // len(config.groups))
-        settings = replace(settings, curriculum=tuple(CurriculumStage(group, num_steps) for group in config.groups))
+        stages = tuple(deeppointmap.CurriculumStage(group, num_steps) for group in config.groups)
+        settings = replace(settings, curriculum=stages)
     for part in config.without:
-        settings = without(settings, part)
+        settings = deeppointmap.without(settings, part)
     if config.bfloat16:
         settings = replace(settings, model=settings.model.with_compute_dtype("bfloat16"))
     return settings if config.steps is None else settings.with_steps(config.steps)
 
 
-def run(args: Sequence[str] | None = None) -> int:
-    """Runs the subcommand; returns the exit code."""
-    return run_command(main, Config, name=NAME, description=__doc__, args=args)
+def measure(trained: deeppointmap.Trained, records: Records) -> tuple[deeppointmap.Evaluation, dict[str, Any]]:
+    """Returns recall and errors of the trained and of the untrained network, and times."""
+    from dpmjax.cli.train_data import KIND_NAMES
+
+    pairs = records.sets.held_out
+    models = {"": trained.model, "_untrained": records.untrained}
+    evaluations = {suffix: deeppointmap.evaluate_registration(model, pairs) for suffix, model in models.items()}
+    metrics: dict[str, Any] = {
+        "num_held_out_pairs": len(pairs.pairs[0].sources),
+        "steps": int(trained.progress.state.step),
+        "best_step": int(trained.progress.best_step) or None,
+        "selection_score": float(trained.progress.best_score),
+        "train_s": records.run_s,
+        "compile_s": trained.speed.compile_s,
+        "scans_per_s": trained.speed.scans_per_s,
+    }
+    for suffix, evaluation in evaluations.items():
+        near = evaluation.recalls[0]
+        of_kinds = zip(KIND_NAMES, evaluation.recalls, strict=True)
+        metrics |= {f"{name}{suffix}": recall.recall for name, recall in of_kinds}
+        metrics |= {
+            f"translation_error_median{suffix}_m": float(np.median(near.translation_errors_m)),
+            f"rotation_error_median{suffix}_deg": float(np.median(near.rotation_errors_deg)),
+        }
+    return evaluations[""], metrics
+
+
+def write_model(folder: RunFolder, model: deeppointmap.Model, metrics: dict[str, Any], *, origin: str) -> None:
+    """Writes model.safetensors with a description of its training, which begins with the preset and the data."""
+    best = "" if metrics["best_step"] is None else f" (best recall after {metrics['best_step']})"
+    card = (
+        f"{origin} ({metrics['num_scans']} scans), "
+        f"{metrics['steps']} steps{best}, seed {metrics['seed']}. Held-out town, {metrics['num_held_out_pairs']} pairs "
+        f"2-10 m apart, any yaw: recall (2 m, 5 deg) {metrics['recall']:.3f}, "
+        f"untrained {metrics['recall_untrained']:.3f}."
+    )
+    unfinished = folder / f".tmp_{MODEL}"
+    weights.save_model(model, unfinished, card=card)
+    unfinished.replace(folder / MODEL)
+
+
+def draw_loss(folder: RunFolder) -> None:
+    """Draws loss.png: losses and recalls over the steps."""
+    rows = read_history(folder / HISTORY)
+    if rows:
+        names = {name: name.replace("_", " ") for name in SHOWN_CURVES}
+        curves = {label: np.array([float(row[name] or "nan") for row in rows]) for name, label in names.items()}
+        curves = {label: curve for label, curve in curves.items() if np.isfinite(curve).any()}
+        steps = [int(row["step"]) for row in rows]
+        viz.save_figure(viz.curves_figure(steps, curves), folder / "loss.png")
+
+
+def draw_matches(folder: RunFolder, evaluation: deeppointmap.Evaluation, pairs: deeppointmap.EvaluationPairs) -> None:
+    """Draws matches.png: the held-out pair of scans of median error."""
+    errors, of_kind = evaluation.recalls[0].translation_errors_m, pairs.pairs[0]
+    number = int(np.argsort(errors)[len(errors) // 2])
+    a, b = int(of_kind.sources[number, 0]), int(of_kind.targets[number, 0])
+    matches, T_true = evaluation.matches[0], pairs.true_motions(of_kind)[number]
+    is_inlier = matches.is_inlier[number]
+    p = np.asarray(evaluation.clouds.positions[a])[matches.source_indices[number][is_inlier]]
+    q = np.asarray(evaluation.clouds.positions[b])[matches.target_indices[number][is_inlier]]
+    distances = np.linalg.norm(p @ T_true[:3, :3].T + T_true[:3, 3] - q, axis=1)
+    title = f"held-out pair of median error, {errors[number]:.2f} m; green: matches less than 3 m apart"
+    scans = viz.MatchedScans(pairs.scan_points(a), pairs.scan_points(b), p, q, distances < 3.0)
+    viz.save_figure(viz.matches_figure(scans, matches.T_target_source[number], title=title), folder / "matches.png")
+
+
+def print_summary(folder: RunFolder, metrics: dict[str, Any]) -> None:
+    """Prints the recall, the scans that were left out, and the folder."""
+    at = "" if metrics["best_step"] is None else f" (best, after step {metrics['best_step']})"
+    print(f"recall on the held-out town {metrics['recall_untrained']:.2f} -> {metrics['recall']:.2f}{at}")
+    bad = metrics["bad_scans"]
+    if bad:
+        print(f"{len(bad)} scans left out, all of them in {folder / METRICS}:")
+        for source, reason in list(bad.items())[:MAX_LISTED]:
+            print(f"  {source}: {reason}")
+    print(f"results in {folder.path}")

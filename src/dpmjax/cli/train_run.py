@@ -4,11 +4,8 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Sequence
 from dataclasses import replace
-from functools import partial
-from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from tqdm import tqdm
@@ -16,12 +13,10 @@ from tqdm import tqdm
 from dpmjax.checkpoints import Checkpoints
 from dpmjax.cli.result_files import HistoryFile, read_history
 from dpmjax.cli.run_folder import BEST, CHECKPOINTS, HISTORY, RunFolder
-from dpmjax.cli.train_data import HELD_OUT_SEED, SELECTION_SEED
+from dpmjax.cli.train_data import KIND_NAMES, EvaluationSets
 from dpmjax.deeppointmap import (
     CurriculumStage,
-    EvaluationPairs,
     Model,
-    PairKind,
     ScanStore,
     StepRecord,
     Trained,
@@ -30,57 +25,16 @@ from dpmjax.deeppointmap import (
     TrainingProgress,
     TrainingState,
     begin_training,
-    draw_evaluation_pairs,
     evaluate_registration,
     train,
 )
-from dpmjax.io import open_lidar_sequence
-from dpmjax.simulation import HDL32E, HDL64E, OS1_64, simulate_drive
 
 # Seconds between checkpoints; Ctrl-C and the end write one too.
 SAVE_EVERY_S = 300.0
-VALIDATION_PAIRS = 60
-SELECTION_SCENES = (("suburb", HDL64E), ("canyon", OS1_64), ("country", HDL32E), ("campus", OS1_64))
 SHOWN = ("loss", "pairing", "offset", "top1_accuracy", "score")
 MEASURES = (*SHOWN, "coarse", "gradient_norm", "learning_rate")
-KINDS = (PairKind(2.0, 10.0), PairKind(10.0, 20.0), PairKind(2.0, 10.0, 4), PairKind(10.0, 20.0, 4))
-"""Pairs that models are selected and reported by: scans and maps of four scans, near and far."""
-
-KIND_NAMES = ("recall", "recall_far", "recall_maps", "recall_maps_far")
 RECALLS = (*KIND_NAMES, "real_recall", "real_recall_far")
 COLUMNS = ("step", "stage", "run_s", *MEASURES, *RECALLS)
-
-
-class EvaluationSets(NamedTuple):
-    """Pairs of a run.
-
-    Attributes:
-        selection: pairs of towns of their own, by which the best model is chosen.
-        real: pairs of each folder of real scans that are measured beside; they choose nothing.
-        held_out: pairs of another town, measured once at the end.
-    """
-
-    selection: tuple[EvaluationPairs, ...]
-    real: tuple[EvaluationPairs, ...]
-    held_out: EvaluationPairs
-
-
-def draw_sets(
-    settings: TrainingConfig, *, selection_pairs: int, held_out_pairs: int, validate: Sequence[Path], length_m: float
-) -> EvaluationSets:
-    """Returns the pairs of a run."""
-    draw = partial(draw_evaluation_pairs, config=settings.model)
-    num = max(1, selection_pairs // (len(KINDS) * len(SELECTION_SCENES)))
-    towns = [
-        simulate_drive(SELECTION_SEED + number, length_m=min(length_m, 250.0), kind=kind, sensor=sensor)
-        for number, (kind, sensor) in enumerate(SELECTION_SCENES)
-    ]
-    held_out = simulate_drive(HELD_OUT_SEED, length_m=length_m, kind="suburb", sensor=HDL64E)
-    work = [partial(draw, town, num, kinds=KINDS, max_scans=64) for town in towns]
-    work += [partial(draw, open_lidar_sequence(path), VALIDATION_PAIRS, kinds=KINDS[:2]) for path in validate]
-    work += [partial(draw, held_out, held_out_pairs, kinds=KINDS)]
-    sets = [one() for one in tqdm(work, desc="prepare evaluation", unit=" drives", dynamic_ncols=True)]
-    return EvaluationSets(tuple(sets[: len(towns)]), tuple(sets[len(towns) : -1]), sets[-1])
 
 
 class Records:

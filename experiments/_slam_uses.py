@@ -1,25 +1,24 @@
-"""Localisation of `dpm_evaluate --slam`: random scans of a drive in the map that SLAM made of its first half."""
+"""Uses of the finished SLAM run of `dpm_evaluate --slam`: localisation in its map, and refinements of its keyframes."""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Iterator
-from typing import Any
 
+import jax
 import numpy as np
 from tqdm import tqdm
 
-from dpmjax import load_map, save_map
-from dpmjax.cli import localization_errors
+from dpmjax import cli, load_map, save_map
 from dpmjax.io import LidarSequence
 from dpmjax.saved_maps import Precision
-from dpmjax.slam import SlamMethods, localize_each
-from experiments._slam_evaluation import Drive, StoppedError, first_keyframes, map_path
+from dpmjax.slam import SlamMethods, localize_each, place_scans, refine_keyframes
+from experiments._slam_evaluation import Drive, common_numbers, first_keyframes, map_path
+
+REFINED, MULTIWAY = "ours, refined by DeepMapping", "ours, refined by multiway registration"
 
 
-def evaluate_localization(
-    drive: Drive, methods: SlamMethods, precision: Precision, num: int, seed: int
-) -> dict[str, Any]:
+def evaluate_localization(drive: Drive, methods: SlamMethods, precision: Precision, num: int, seed: int) -> cli.Row:
     """Looks for random scans of the drive in the map of its first half, saved and loaded at a precision.
 
     The map is that of the SLAM run. No scan is one of its keyframes. A scan is in the map where a keyframe of the whole
@@ -42,7 +41,7 @@ def evaluate_localization(
         found.append(one)
         seconds.append(time.perf_counter() - clock)
         clock = time.perf_counter()
-    errors = localization_errors(found, slam_map, known, drive.reference[chosen])
+    errors = cli.localization_errors(found, slam_map, known, drive.reference[chosen])
     keyframes = drive.reference[sorted(taken), :3, 3]
     apart = np.linalg.norm(drive.reference[chosen][:, None, :3, 3] - keyframes[None], axis=2).min(axis=1)
     is_inside, is_found, is_right = apart <= drive.scale.reach_m, errors.is_found, errors.is_right
@@ -64,5 +63,34 @@ def evaluate_localization(
 def _points_of(part: LidarSequence, drive: Drive, precision: str) -> Iterator[np.ndarray]:
     for number in tqdm(range(len(part)), desc=f"{part.name}, {precision}", unit=" scans", dynamic_ncols=True):
         if drive.is_stopped():
-            raise StoppedError
+            raise cli.RowStopped
         yield part.read_points(number)
+
+
+def evaluate_refinement(drive: Drive, methods: SlamMethods, method: str, seed: int) -> cli.Row:
+    """Refines the keyframes of our run, which goes on from its state, and measures the poses of all scans."""
+    run, result = cli.map_drive(drive.folder, drive.sequence, methods, drive.is_stopped)
+    if len(run.reports) < len(drive.sequence):
+        raise cli.RowStopped
+    T, numbers = result.map.T_world_keyframe, {}
+
+    def read_keyframe(row: int) -> np.ndarray:
+        return drive.sequence.read_points(result.map.keyframes[row].scan)
+
+    clock = time.perf_counter()
+    if method == REFINED:
+        with cli.progress_bar("refine", " windows of keyframes") as on_window:
+            refined = refine_keyframes(
+                result.map, read_keyframe, key=jax.random.key(seed), on_window=on_window, stop=drive.is_stopped
+            )
+        T = refined.slam_map.T_world_keyframe
+        numbers = {"refine_windows": refined.num_windows, "refine_windows_improved": refined.num_improved}
+    elif len(T) > 1:
+        from experiments.baselines.multiway import multiway_clouds
+
+        T = multiway_clouds([read_keyframe(row) for row in range(len(T))], T)
+    seconds = time.perf_counter() - clock
+    if drive.is_stopped():
+        raise cli.RowStopped
+    row = common_numbers(drive, method, place_scans(T, run.reports), [])
+    return {**row, **numbers, "num_keyframes": len(T), "scan_s": seconds / len(drive.sequence)}

@@ -1,0 +1,169 @@
+"""Tables of results: one resumable row a case, a file each; then table.md, metrics.json and the pictures of all."""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from tqdm import tqdm
+
+from dpmjax.cli.command import StopFlag
+from dpmjax.cli.machine import git_hash, versions
+from dpmjax.cli.result_files import UNKNOWN, load_json, write_json
+from dpmjax.cli.run_folder import RunFolder, RunOptions, open_run_folder, recording, write_metrics
+from dpmjax.io.files import write_atomically
+
+Row = dict[str, Any]
+
+
+class RowStopped(Exception):
+    """A signal has stopped the work on a row, which is left out."""
+
+
+class TableRun(NamedTuple):
+    """An open table.
+
+    Attributes:
+        folder: folder of the run.
+        is_stopped: whether a signal asks the work on a row to end by `RowStopped`.
+    """
+
+    folder: RunFolder
+    is_stopped: Callable[[], bool]
+
+
+class Report(NamedTuple):
+    """Summary of the rows.
+
+    Attributes:
+        numbers: entries of metrics.json beside the rows.
+        text: content of table.md, also printed.
+        draw: draws the pictures; None for no pictures.
+        rows: rows of metrics.json; None for the rows of the cases.
+    """
+
+    numbers: Row
+    text: str
+    draw: Callable[[RunFolder], None] | None = None
+    rows: Sequence[Row] | None = None
+
+
+def run_table(
+    config: RunOptions,
+    name: str,
+    cases: Iterable[Row],
+    work: Callable[..., Row],
+    report: Callable[[list[Row]], Report],
+) -> list[Row]:
+    """Makes the rows that the run folder lacks, and writes table.md, metrics.json and the pictures.
+
+    Args:
+        config: options of the run.
+        name: name of the command.
+        cases: entries that identify each row.
+        work: makes the other entries of a row from the open table and the entries of its case, as keywords.
+        report: summarises all rows.
+
+    Returns:
+        The rows; after a signal, those until then.
+    """
+    folder = open_run_folder(config, name)
+    with recording(folder), StopFlag() as stop:
+        table = TableRun(folder, lambda: stop.is_requested)
+        rows = do_rows(folder.path, list(cases), partial(work, table), seed=config.seed, is_stopped=table.is_stopped)
+        summary = report(rows) if rows else Report({}, "no row is finished")
+        write_report(folder, config, summary, rows, is_interrupted=stop.is_requested)
+    print(f"results in {folder.path}")
+    return rows
+
+
+def write_report(
+    folder: RunFolder, config: RunOptions, report: Report, rows: Sequence[Row], *, is_interrupted: bool
+) -> None:
+    """Writes metrics.json, table.md and the pictures, and prints the table; numbers come before pictures."""
+    metrics = {**report.numbers, "is_interrupted": is_interrupted}
+    note = write_metrics(folder, metrics, seed=config.seed, rows=rows if report.rows is None else report.rows)
+    write_atomically(folder / "table.md", report.text + (f"\n\n{note}.\n" if note else "\n"))
+    print(report.text)
+    if report.draw is not None:
+        report.draw(folder)
+
+
+def markdown(columns: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
+    """Returns a table as Markdown; floats have two decimals, None and floats that are not finite a dash."""
+    lines = [columns, *([cell_text(cell) for cell in row] for row in rows)]
+    head, *body = (f"| {' | '.join(line)} |" for line in lines)
+    return "\n".join([head, "|" + "---|" * len(columns), *body])
+
+
+def cell_text(value: object, decimals: int = 2) -> str:
+    """Returns a cell: a float with its decimals, a dash for None and no finite number, other values as they print."""
+    if isinstance(value, float):
+        return f"{value:.{decimals}f}" if math.isfinite(value) else "-"
+    return "-" if value is None else str(value)
+
+
+def do_row(folder: Path, case: Row, work: Callable[[], Row], *, seed: int) -> Row:
+    """Makes one row of results, or reads it where an earlier, perhaps killed, run has made it.
+
+    Each row is a file of its own below `rows/`, written whole, and carries the commit, the versions and the seed that
+    made it.
+
+    Args:
+        folder: folder of the run.
+        case: identifies the row and becomes part of it.
+        work: makes the remaining entries of the row.
+        seed: seed of the run.
+
+    Returns:
+        The row. The commit of a row that carries none is "unknown".
+    """
+    path = row_path(folder, case)
+    if path.exists():
+        return {"git_hash": UNKNOWN, **load_json(path)}
+    row = {**case, **work(), "git_hash": git_hash() or UNKNOWN, "seed": seed}
+    row["versions"] = ", ".join(f"{name} {version}" for name, version in versions().items())
+    write_json(path, row)
+    return row
+
+
+def do_rows(
+    folder: Path,
+    cases: Sequence[Row],
+    work: Callable[..., Row],
+    *,
+    seed: int,
+    is_stopped: Callable[[], bool],
+) -> list[Row]:
+    """Makes one row a case by `do_row`, under a progress bar.
+
+    Args:
+        folder: folder of the run.
+        cases: what identifies the rows.
+        work: makes the remaining entries of a row; it is called with the entries of the case as keywords.
+        seed: seed of the run.
+        is_stopped: whether to end before the next row.
+
+    Returns:
+        The rows so far, without one that ended by `RowStopped`.
+    """
+    rows: list[Row] = []
+    for case in tqdm(cases, unit=" rows"):
+        if is_stopped():
+            break
+        try:
+            rows.append(do_row(folder, case, partial(work, **case), seed=seed))
+        except RowStopped:
+            break
+    return rows
+
+
+def row_path(folder: Path, case: Mapping[str, Any]) -> Path:
+    """Returns the file of a row, under a readable name that no other case has."""
+    text = "_".join(f"{key}-{value}" for key, value in case.items())
+    digest = hashlib.sha256(text.encode()).hexdigest()[:6]
+    return folder / "rows" / f"{text.replace('.', 'p').replace('/', '-')[:120]}_{digest}.json"
