@@ -29,6 +29,8 @@ Floats = NDArray[np.float64]
 EXPERIMENT = "deepmapping_relocalize"
 # A fit counts as a success below this error (section 4.1); so does a re-localisation.
 _RIGHT_PX = 20.0
+# Training steps of L-Net on the poses of the run.
+_NUM_STEPS = 5000
 _BINS_PX = (0.0, 10.0, 20.0, 50.0, 100.0, 1500.0)
 
 
@@ -40,14 +42,12 @@ class Config:
     """Folder of a run of `dpmjax map2d` on a built-in world."""
     stride_px: Annotated[int, arg(metavar="PX")] = 6
     """A scan is taken at the centre of every free square of this side."""
-    steps: Annotated[int, arg(metavar="N")] = 5000
-    """Training steps of L-Net on the poses of the run."""
     seed: int = 0
     """Seed of the training."""
 
     def __post_init__(self) -> None:
         """Checks ranges."""
-        cli.check_least(self, stride_px=1, steps=1)
+        cli.check_least(self, stride_px=1)
 
 
 def main(config: Config) -> dict[str, Any]:
@@ -62,7 +62,7 @@ def main(config: Config) -> dict[str, Any]:
     truth = free_poses(grid, config)
     points, mask = simulation.scan_world(grid, truth, num_beams=sequence.points.shape[1])
     begun = time.perf_counter()
-    training = dm.LocalizationTrainingConfig(num_steps=config.steps)
+    training = dm.LocalizationTrainingConfig(num_steps=_NUM_STEPS)
     scans = ScanSet(sequence.points, sequence.mask)
     trained = dm.train_localization(fitted, scans, training, key=jax.random.key(config.seed))
     jax.block_until_ready(trained.params)

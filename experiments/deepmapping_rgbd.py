@@ -42,13 +42,15 @@ _RIGHT_SHARE, _RIGHT_DEG, _RIGHT_MM = 0.1, 2.0, 100.0
 # Settings were chosen on apartments below 15; each hard walk has an apartment of its own.
 _NUM_APARTMENTS, _FIRST_HELD_OUT = 15, 1000
 _HARD_VIEWS, _FOLDER_VIEWS = 16, 8
+# Trajectories that are drawn from above.
+_NUM_PICTURES = 4
 
 
 @dataclass(frozen=True, kw_only=True)
 class Config(cli.RunOptions):
     """Options of the comparison."""
 
-    may_change: ClassVar[frozenset[str]] = frozenset({"limit", "pictures"})
+    may_change: ClassVar[frozenset[str]] = frozenset({"limit"})
 
     data: Annotated[Positional[Path | None], arg(metavar="[DATA]")] = None
     """A scene of the Active Vision Dataset, or a folder of NAME.depth.png; without it, simulated apartments."""
@@ -62,8 +64,6 @@ class Config(cli.RunOptions):
     """fast: seconds a trajectory; paper: its networks and sampling, for a GPU."""
     window_step: Annotated[int, arg(metavar="N")] = _FOLDER_VIEWS // 2
     """Windows of 8 images of a folder begin so many images apart."""
-    pictures: Annotated[int, arg(metavar="N")] = 4
-    """Trajectories to draw from above."""
 
     def __post_init__(self) -> None:
         """Checks ranges."""
@@ -143,7 +143,7 @@ def run_one(trajectory: int, folder: cli.RunFolder, config: Config, settings: dm
         begun = time.perf_counter()
         found[name] = run_method(name, sequence, settings, found, seed=config.seed)
         row[name] = {**errors_of(found[name], sequence), "run_s": time.perf_counter() - begun}
-    if trajectory < config.pictures:
+    if trajectory < _NUM_PICTURES:
         panels = [(f"{name}, ATE {row[name]['ate_mm']:.0f} mm", T) for name, T in found.items() if name != "zero"]
         panels.append(("reference", sequence.T_world_camera))
         figure = viz.from_above_figure(panels, sequence.points, sequence.mask)

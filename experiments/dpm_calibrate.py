@@ -39,6 +39,8 @@ AMBIGUOUS_BANDS_M = ((1.0, 10.0), (10.0, 20.0))
 # Far from the seeds of the towns of training, also of its held-out one.
 FIRST_TOWN, FIRST_AMBIGUOUS, FIRST_OVERLAP_TOWN = 3_000_000, 3_100_000, 3_500_000
 TOWN_LENGTH_M = 400.0
+# Pairs of each band of a place, and of each town of the overlap.
+NUM_PAIRS, NUM_OVERLAP_PAIRS = 30, 96
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -49,18 +51,14 @@ class Config(cli.RunOptions):
     """The model: a .safetensors file, or the name of a shipped one."""
     towns: Annotated[int, arg(metavar="N")] = 9
     """Number of towns. The kinds of place, of which there are nine, take turns, so that each counts the same."""
-    pairs: Annotated[int, arg(metavar="N")] = 30
-    """Pairs of each town that are 2 to 10 m apart, as many 10 to 20 m apart, and as many without overlap."""
     ambiguous: Annotated[int, arg(metavar="N")] = 30
     """Number of ambiguous places, each with as many pairs 1 to 10 m and 10 to 20 m apart."""
     overlap_towns: Annotated[int, arg(metavar="N")] = 24
     """Number of towns for overlap; 0 keeps the overlap probability of the model."""
-    overlap_pairs: Annotated[int, arg(metavar="N")] = 96
-    """Pairs of each of them."""
 
     def __post_init__(self) -> None:
         """Checks ranges."""
-        cli.check_least(self, towns=2, pairs=5, ambiguous=2, overlap_towns=0, overlap_pairs=16, seed=0)
+        cli.check_least(self, towns=2, ambiguous=2, overlap_towns=0, seed=0)
         if self.overlap_towns == 1:
             raise ValueError("--overlap-towns: expected 0, or 2 or more: each is left out once, got 1")
 
@@ -74,9 +72,9 @@ def main(config: Config) -> list[cli.Row]:
             # The other town is that of the next row.
             seeds = (case["overlap_town"], case["overlap_town"] + 1)
             drives = [simulation.simulate_drive(seed, length_m=TOWN_LENGTH_M) for seed in seeds]
-            return overlap.measure_town(model, drives, config.overlap_pairs, config.seed)
+            return overlap.measure_town(model, drives, NUM_OVERLAP_PAIRS, config.seed)
         drive, bands_m = open_place(**case)
-        return measure_pairs(model, drive, bands_m, config.pairs, seed=config.seed, is_stopped=run.is_stopped)
+        return measure_pairs(model, drive, bands_m, NUM_PAIRS, seed=config.seed, is_stopped=run.is_stopped)
 
     cases = list_cases(config)
     return cli.run_table(config, EXPERIMENT, cases, work, lambda rows: report(config, model, rows, len(cases)))

@@ -1,7 +1,7 @@
 """Registers pairs of scans from their descriptor clouds alone, and refines the motion by their surface elements.
 
     python -m experiments.dpm_clouds path/to/drive another/drive
-    python -m experiments.dpm_clouds scenes --num-scenes 9              simulated scenes that no training has seen
+    python -m experiments.dpm_clouds scenes                             simulated scenes that no training has seen
 
 Random pairs 2 to 10 m and 10 to 20 m apart, turned by any yaw, are encoded; the scans themselves are not used again. A
 registration within 2 m and 5 degrees is right. A row of the table has the share of right ones and their median error,
@@ -26,7 +26,9 @@ from dpmjax import deeppointmap as dpm
 
 EXPERIMENT = "dpm_clouds"
 # Apart from the seeds of training, selection, calibration and held-out towns.
-FIRST_SCENE = 7_000_000
+FIRST_SCENE, NUM_SCENES = 7_000_000, 9
+# Numbers of surface elements a scan, one column each.
+ELEMENTS = (256, 512, 768, 1024)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -39,26 +41,23 @@ class Config(cli.RunOptions):
     """Name of a shipped model, or a .safetensors file."""
     pairs: Annotated[int, arg(metavar="N")] = 20
     """Pairs for each distance."""
-    num_scenes: Annotated[int, arg(metavar="N")] = 9
-    """Number of scenes, where scenes is among the paths."""
-    elements: Annotated[tuple[int, ...], arg(metavar="N")] = (256, 512, 768, 1024)
-    """Numbers of surface elements a scan, one column each."""
 
     def __post_init__(self) -> None:
         """Checks ranges."""
-        cli.check_least(self, pairs=1, num_scenes=1, seed=0, elements=1)
-        if not self.paths or not self.elements:
-            raise ValueError("give at least one folder of scans, or scenes, and one number of elements")
+        cli.check_least(self, pairs=1, seed=0)
+        if not self.paths:
+            raise ValueError("give at least one folder of scans, or scenes")
 
 
 def main(config: Config) -> list[cli.Row]:
     """Makes the rows that are missing, and writes the table and the numbers."""
     model = load_model(config.weights)
     low, high = model.config.num_descriptors, model.config.pyramid.stages[0].num_points
-    if not low <= min(config.elements) <= max(config.elements) <= high:
-        raise ValueError(f"--elements: expected from {low} to {high}, got {config.elements}")
-    drives = {drive.name: drive for drive in open_drives(config.paths, config.num_scenes)}
-    stages = {"decoder": None, **{f"elements_{num}": num for num in config.elements}}
+    elements = [num for num in ELEMENTS if low <= num <= high]
+    if not elements:
+        raise ValueError(f"{config.weights}: scans have from {low} to {high} elements, none of {ELEMENTS}")
+    drives = {drive.name: drive for drive in open_drives(config.paths)}
+    stages = {"decoder": None, **{f"elements_{num}": num for num in elements}}
 
     def work(_: cli.TableRun, sequence: str, band: str) -> cli.Row:
         drawn = dpm.draw_scan_pairs(drives[sequence], band, config.pairs, seed=config.seed)
@@ -69,12 +68,12 @@ def main(config: Config) -> list[cli.Row]:
     return cli.run_table(config, EXPERIMENT, cases, work, lambda rows: cli.Report(numbers, table(rows, list(stages))))
 
 
-def open_drives(paths: Sequence[str], num_scenes: int = 0) -> list[io.LidarSequence]:
+def open_drives(paths: Sequence[str]) -> list[io.LidarSequence]:
     """Opens the drives, and simulates scenes where a path is scenes; a `ValueError` names one without poses."""
     drives: list[io.LidarSequence] = []
     for path in paths:
         if path == "scenes" and not Path(path).exists():
-            seeds = range(FIRST_SCENE, FIRST_SCENE + num_scenes)
+            seeds = range(FIRST_SCENE, FIRST_SCENE + NUM_SCENES)
             drives += [simulation.simulate_scene(simulation.draw_scene(seed)) for seed in seeds]
             continue
         drives += [io.open_lidar_sequence(path, sequence=name) for name in io.list_lidar_sequences(path) or [None]]

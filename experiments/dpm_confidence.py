@@ -31,6 +31,8 @@ FIRST_PLACE = 3_200_000
 BANDS_M = ((1.0, 5.0), (5.0, 10.0), (10.0, 20.0), (60.0, np.inf))
 SURE = 0.9
 NEAR_M = 5.0
+# Length of the way through each place out of doors; inside a quarter of it. Pairs of each place and distance.
+LENGTH_M, NUM_PAIRS = 400.0, 8
 RATED = {"scans": "is_right", "clouds": "is_right_of_clouds"}
 COLUMNS = (
     "match of", "calibration of", "place", "pairs", "right", "sure", "sure and wrong", "1-5 m, right and sure",
@@ -48,14 +50,10 @@ class Config(cli.RunOptions):
     """Calibrated models of one network: names of shipped ones, or .safetensors files."""
     places: Annotated[int, arg(metavar="N")] = 15
     """Number of places: five kinds take turns, then three lidars."""
-    pairs: Annotated[int, arg(metavar="N")] = 8
-    """Pairs of each place and distance."""
-    length_m: Annotated[float, arg(metavar="M")] = 400.0
-    """Length of the way through each place out of doors; inside a quarter of it."""
 
     def __post_init__(self) -> None:
         """Checks ranges."""
-        cli.check_least(self, places=1, pairs=1, length_m=150, seed=0)
+        cli.check_least(self, places=1, seed=0)
         if not self.models:
             raise ValueError("give at least one model")
 
@@ -72,8 +70,8 @@ def main(config: Config) -> list[cli.Row]:
             raise ValueError(f"{name}: expected the network of {config.models[0]} with another calibration")
 
     def work(run: cli.TableRun, place: int, kind: str, beams: int) -> cli.Row:
-        drive = ambiguous_drive(place, kind, beams, config.length_m)
-        return measure_pairs(first, drive, BANDS_M, config.pairs, seed=config.seed, is_stopped=run.is_stopped)
+        drive = ambiguous_drive(place, kind, beams, LENGTH_M)
+        return measure_pairs(first, drive, BANDS_M, NUM_PAIRS, seed=config.seed, is_stopped=run.is_stopped)
 
     def report(rows: list[cli.Row]) -> cli.Report:
         numbers = [

@@ -6,9 +6,9 @@ By Adam the direct form is `fit_deepmapping` with the settings of `as_direct`.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -82,9 +82,8 @@ _SPREAD = (0.15, 0.5)
 _PAIRS_AT_ONCE = 32
 
 
-@dataclass(frozen=True)
-class SwarmConfig:
-    """Settings of the swarms.
+class Swarms(NamedTuple):
+    """Sizes of the swarms.
 
     Attributes:
         num_particles: relative poses that are tried at a time.
@@ -98,12 +97,11 @@ class SwarmConfig:
     num_rounds: int = 3
     num_beams: int = 86
 
-    def __post_init__(self) -> None:
-        if min(self.num_particles, self.num_iterations, self.num_rounds, self.num_beams) < 1:
-            raise ValueError(f"all counts must be at least 1, got {self}")
+
+SWARMS = Swarms()
 
 
-def swarm_chain(scans: ScanSet, config: SwarmConfig | None = None, *, key: jax.Array) -> NDArray[np.float64]:
+def swarm_chain(scans: ScanSet, sizes: Swarms = SWARMS, *, key: jax.Array) -> NDArray[np.float64]:
     """Poses of planar scans, each onto the one before by a swarm that minimises their Chamfer distance (eq. 5).
 
     A swarm over all poses at once does not converge; over one relative pose of three numbers it does. Without evosax it
@@ -111,29 +109,28 @@ def swarm_chain(scans: ScanSet, config: SwarmConfig | None = None, *, key: jax.A
 
     Args:
         scans: n scans in order of time.
-        config: settings.
+        sizes: of the swarms.
         key: key of the swarms.
 
     Returns:
         (n, 3) T_world_scan, x, y, heading; the first one zero.
     """
-    config = config or SwarmConfig()
     points, mask = jnp.asarray(scans.points), jnp.asarray(scans.mask)
-    stride = max(1, -(-mask.shape[1] // config.num_beams))
+    stride = max(1, -(-mask.shape[1] // sizes.num_beams))
     unit = typical_range(scans.points, scans.mask)
     widths = jnp.array([_SPREAD[0] * unit, _SPREAD[0] * unit, _SPREAD[1]])
-    steps = _swarm_pairs(points[:, ::stride], mask[:, ::stride], widths, key, config=config)
+    steps = _swarm_pairs(points[:, ::stride], mask[:, ::stride], widths, key, sizes=sizes)
     return se2.chain(np.asarray(steps, np.float64))
 
 
-@partial(jax.jit, static_argnames="config")
+@partial(jax.jit, static_argnames="sizes")
 def _swarm_pairs(
     points: Float[Array, "n b 2"],
     mask: Bool[Array, "n b"],
     widths: Float[Array, " 3"],
     key: jax.Array,
     *,
-    config: SwarmConfig,
+    sizes: Swarms,
 ) -> Float[Array, "m 3"]:
     """T_before_scan of every scan but the first."""
 
@@ -143,8 +140,8 @@ def _swarm_pairs(
         def misfit(pose: Float[Array, " 3"]) -> Array:
             return chamfer_distance(se2.transform_points(pose, after), before, after_mask, before_mask)
 
-        swarm = partial(_swarm, lambda x: jax.vmap(misfit)(x * widths), config=config)
-        found, values = jax.lax.map(swarm, jax.random.split(pair_key, config.num_rounds))
+        swarm = partial(_swarm, lambda x: jax.vmap(misfit)(x * widths), sizes=sizes)
+        found, values = jax.lax.map(swarm, jax.random.split(pair_key, sizes.num_rounds))
         return found[values.argmin()] * widths
 
     keys = jax.random.split(key, len(mask) - 1)
@@ -152,13 +149,13 @@ def _swarm_pairs(
     return jax.lax.map(best_of_rounds, pairs, batch_size=_PAIRS_AT_ONCE)
 
 
-def _swarm(misfit: Any, key: jax.Array, *, config: SwarmConfig) -> tuple[Float[Array, " 3"], Float[Array, ""]]:
+def _swarm(misfit: Any, key: jax.Array, *, sizes: Swarms) -> tuple[Float[Array, " 3"], Float[Array, ""]]:
     """The best particle of one swarm in the box from -1 to 1, and its misfit."""
     from evosax.algorithms import PSO
 
     start_key, init_key, key = jax.random.split(key, 3)
-    algorithm = PSO(population_size=config.num_particles, solution=jnp.zeros(3))
-    particles = jax.random.uniform(start_key, (config.num_particles, 3), minval=-1.0, maxval=1.0)
+    algorithm = PSO(population_size=sizes.num_particles, solution=jnp.zeros(3))
+    particles = jax.random.uniform(start_key, (sizes.num_particles, 3), minval=-1.0, maxval=1.0)
     state = algorithm.init(init_key, particles, misfit(particles), algorithm.default_params)
 
     def iterate(state: Any, key: jax.Array) -> tuple[Any, None]:
@@ -167,5 +164,5 @@ def _swarm(misfit: Any, key: jax.Array, *, config: SwarmConfig) -> tuple[Float[A
         state, _ = algorithm.tell(tell_key, particles, misfit(particles), state, algorithm.default_params)
         return state, None
 
-    state, _ = jax.lax.scan(iterate, state, jax.random.split(key, config.num_iterations))
+    state, _ = jax.lax.scan(iterate, state, jax.random.split(key, sizes.num_iterations))
     return state.best_solution, state.best_fitness

@@ -12,11 +12,11 @@ from dpmjax.io import ScanSequence
 from dpmjax.metrics import absolute_trajectory_error
 from dpmjax.simulation import simulate_depth_sequence, simulate_sequence
 from dpmjax.types import ScanSet
-from experiments.baselines.direct import SwarmConfig, swarm_chain
+from experiments.baselines.direct import Swarms, swarm_chain
 from experiments.baselines.multiway import multiway, multiway_clouds, multiway_images
 from tests.optional import import_or_skip
 
-QUICK = SwarmConfig(num_particles=24, num_iterations=30, num_rounds=1, num_beams=64)
+QUICK = Swarms(num_particles=24, num_iterations=30, num_rounds=1, num_beams=64)
 
 
 @pytest.fixture(scope="module")
@@ -92,8 +92,3 @@ def test_multiway_polishes_clouds_in_the_frame_of_the_first() -> None:
     np.testing.assert_allclose(found[0], T_true[0], atol=1e-9)
     before, after = (np.linalg.norm(T[:, :3, 3] - T_true[:, :3, 3], axis=1).max() for T in (start, found))
     assert after < before / 4
-
-
-def test_a_swarm_has_particles() -> None:
-    with pytest.raises(ValueError, match="at least 1"):
-        SwarmConfig(num_particles=0)

@@ -78,7 +78,7 @@ def test_the_chosen_seed_is_one_that_tells_the_story() -> None:
 
 def test_rgbd_resumes_trajectory_by_trajectory(tmp_path) -> None:
     out = tmp_path / "out"
-    assert run(deepmapping_rgbd, "--limit", 1, "--methods", "zero", "-o", out, "--pictures", 0) == 0
+    assert run(deepmapping_rgbd, "--limit", 1, "--methods", "zero", "-o", out) == 0
     first = json.loads((out / "metrics.json").read_text())["rows"]
     assert run(deepmapping_rgbd, "--resume", "-o", out, "--limit", 2) == 0
     metrics = json.loads((out / "metrics.json").read_text())
@@ -99,7 +99,7 @@ def test_multiway_without_open3d_is_refused_before_the_run(tmp_path, monkeypatch
 
 def test_not_moving_is_never_right_on_hard_walks(tmp_path) -> None:
     out = tmp_path / "out"
-    assert run(deepmapping_rgbd, "--walks", "hard", "--limit", 2, "--methods", "zero", "-o", out, "--pictures", 0) == 0
+    assert run(deepmapping_rgbd, "--walks", "hard", "--limit", 2, "--methods", "zero", "-o", out) == 0
     metrics = json.loads((out / "metrics.json").read_text())
     assert [row["views"] for row in metrics["rows"]] == [16, 16]
     for row in metrics["rows"]:

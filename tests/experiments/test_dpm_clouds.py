@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-import pytest
 
 from dpmjax.types import DescriptorCloud
-from experiments.dpm_clouds import Config, first_elements, main, table
+from experiments.dpm_clouds import first_elements, table
 
 
 def test_a_row_tells_recall_and_error_of_each_number_of_elements() -> None:
@@ -29,9 +28,3 @@ def test_first_elements_keep_the_descriptors() -> None:
     assert first_elements(cloud, 6).elements.positions.shape == (6, 3)
     assert first_elements(cloud, 6).features.shape == (4, 2)
     assert first_elements(cloud, None).normals is None
-
-
-@pytest.mark.parametrize("elements", [(), (0,), (100,), (2000,)])
-def test_a_number_of_elements_that_the_model_has_not_is_refused(elements: tuple[int, ...]) -> None:
-    with pytest.raises(ValueError, match="elements"):
-        main(Config(elements=elements))

@@ -112,7 +112,9 @@ def test_calibration_is_stored_in_a_copy_of_the_model(weights, tmp_path, monkeyp
 
     monkeypatch.setattr(_dpm_places, "register_in_stages", staged)
     monkeypatch.setattr(_dpm_places, "register", lambda model, *clouds, refine: Found())
-    sizes = ["--towns", 3, "--pairs", 20, "--ambiguous", 2, "--overlap-towns", 2, "--overlap-pairs", 16]
+    monkeypatch.setattr(dpm_calibrate, "NUM_PAIRS", 20)
+    monkeypatch.setattr(dpm_calibrate, "NUM_OVERLAP_PAIRS", 16)
+    sizes = ["--towns", 3, "--ambiguous", 2, "--overlap-towns", 2]
     assert run(dpm_calibrate, [weights, *sizes, "-o", tmp_path / "out"]) == EXIT_OK
     assert len(set(kinds[:3])) == 3  # of towns for confidence; those for overlap are of any kind
     assert set(kinds[3:]) == {None}

@@ -34,7 +34,7 @@ from dpmjax.cli.run_folder import RunFolder, open_run_folder, recording, write_m
 from dpmjax.sequences import InputError, LidarSequence
 
 if TYPE_CHECKING:
-    from dpmjax.cli.slam_run import SlamRun
+    from dpmjax.cli.slam_numbers import SlamRun
 
 NAME = "slam"
 LOGGER = logging.getLogger(__name__)

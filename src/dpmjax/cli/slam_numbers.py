@@ -1,22 +1,46 @@
-"""Numbers of SLAM and of localization for metrics.json: errors, counts, seconds."""
+"""Numbers of SLAM and of localization for metrics.json: errors, counts, seconds; and the record of a run."""
 
 from __future__ import annotations
 
 import collections
 import math
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from dpmjax import metrics, slam
 from dpmjax.sequences import LidarSequence
 
-if TYPE_CHECKING:
-    from dpmjax.cli.slam_run import SlamRun
-
 MAX_ERROR_M, MAX_ERROR_DEG = 2.0, 5.0
 """Errors up to which a localisation is right."""
+
+
+class SlamRun(NamedTuple):
+    """A run until its end or its stop.
+
+    Attributes:
+        state: after the last scan.
+        reports: reports of all scans.
+        stages_s: seconds of each stage in this process, without compilation.
+        compile_s: seconds of compilation.
+        run_s: seconds of all scans of this process, without compilation.
+        scan_s: seconds of each scan of this process, without compilation, reading and writing.
+        failure: what ended the run early; None where nothing did.
+    """
+
+    state: slam.SlamState
+    reports: tuple[slam.ScanReport, ...]
+    stages_s: dict[str, float]
+    compile_s: float
+    run_s: float
+    scan_s: tuple[float, ...]
+    failure: Exception | None
+
+    @property
+    def num_done(self) -> int:
+        """Number of scans of this process."""
+        return len(self.scan_s)
 
 
 class LocalizationErrors(NamedTuple):

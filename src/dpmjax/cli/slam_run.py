@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import jax
 from tqdm import tqdm
@@ -16,6 +16,7 @@ from dpmjax import slam, viz
 from dpmjax.cli.drives import ScanReader
 from dpmjax.cli.run_folder import RunFolder
 from dpmjax.cli.slam_files import accepted_ends, write_scans, write_trajectory
+from dpmjax.cli.slam_numbers import SlamRun
 from dpmjax.saved_maps import RunState, load_state, save_state
 from dpmjax.sequences import LidarSequence
 
@@ -37,33 +38,6 @@ _STAGES = {
     "propose": "decoder",
     **dict.fromkeys(("register", "overlaps"), "loops"),
 }
-
-
-class SlamRun(NamedTuple):
-    """A run until its end or its stop.
-
-    Attributes:
-        state: after the last scan.
-        reports: reports of all scans.
-        stages_s: seconds of each stage in this process, without compilation.
-        compile_s: seconds of compilation.
-        run_s: seconds of all scans of this process, without compilation.
-        scan_s: seconds of each scan of this process, without compilation, reading and writing.
-        failure: what ended the run early; None where nothing did.
-    """
-
-    state: slam.SlamState
-    reports: tuple[slam.ScanReport, ...]
-    stages_s: dict[str, float]
-    compile_s: float
-    run_s: float
-    scan_s: tuple[float, ...]
-    failure: Exception | None
-
-    @property
-    def num_done(self) -> int:
-        """Number of scans of this process."""
-        return len(self.scan_s)
 
 
 class Stopwatch:
