@@ -79,7 +79,7 @@ def run_methods(
     experiment: str,
     cells: Sequence[cli.Row],
     prepare: Callable[[cli.Row], tuple[Task, cli.Row]],
-    report: Callable[[list[cli.Row], dict[str, str]], cli.Report],
+    report: Callable[[list[cli.Row], dict[str, str]], cli.Summary],
 ) -> list[cli.Row]:
     """Runs every method on every cell; what an earlier run has done is read from its files.
 

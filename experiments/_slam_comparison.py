@@ -131,11 +131,11 @@ def compare(
         case, ours = {"sequence": sequence, "method": OURS}, partial(evaluation.evaluate_ours, drive, methods)
         return evaluation.odometry_row(drive, cli.do_row(run.folder.path, case, ours, seed=comparison.seed))
 
-    def report(rows: list[cli.Row]) -> cli.Report:
+    def report(rows: list[cli.Row]) -> cli.Summary:
         notes = (f"{name} was not run: {why}." for name, why in missing.items())
         numbers = {"weights": comparison.weights, "peers_left_out": missing}
         draw_rows = partial(draw, sequences=sequences, rows=rows)
-        return cli.Report(numbers, "\n\n".join([tables(rows), *notes]), draw_rows)
+        return cli.Summary(numbers, "\n\n".join([tables(rows), *notes]), draw_rows)
 
     # Trajectories of all drives come first: an early end leaves a whole table.
     stages = ((*PEERS, OURS, NETWORK, ODOMETRY), (REFINED, MULTIWAY) if comparison.is_refined else ())

@@ -116,7 +116,7 @@ def run_one(settings: dm.DeepMappingConfig, trajectory: int, run_seed: int) -> c
     return {**errors_of(fitted.T_world_camera, sequence), "run_s": time.perf_counter() - begun}
 
 
-def report(rows: list[cli.Row]) -> cli.Report:
+def report(rows: list[cli.Row]) -> cli.Summary:
     """Returns a line for each variant, and ablations.png."""
     groups: dict[tuple[str, str], list[cli.Row]] = defaultdict(list)
     panels: dict[str, dict[str, list[float]]] = defaultdict(lambda: defaultdict(list))
@@ -136,7 +136,7 @@ def report(rows: list[cli.Row]) -> cli.Report:
 
     columns = ("ablation", "variant", "num_runs", "median_ate_mm", "success", "median_run_s")
     text = cli.markdown(columns, [[row[name] for name in columns] for row in table])
-    return cli.Report({"variants": table}, text, draw)
+    return cli.Summary({"variants": table}, text, draw)
 
 
 if __name__ == "__main__":

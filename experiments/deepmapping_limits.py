@@ -146,7 +146,7 @@ def _grouped(rows: Sequence[dict[str, Any]], *keys: str) -> dict[tuple[Any, ...]
     return groups
 
 
-def report(config: Config, rows: list[dict[str, Any]], not_run: dict[str, str]) -> cli.Report:
+def report(config: Config, rows: list[dict[str, Any]], not_run: dict[str, str]) -> cli.Summary:
     """Returns the successes, the table and a picture for each world and order."""
     lines = summary(rows)
 
@@ -161,7 +161,7 @@ def report(config: Config, rows: list[dict[str, Any]], not_run: dict[str, str]) 
             viz.save_figure(figure, folder / f"{world}_{order}.png")
 
     numbers = {"success_threshold_px": shared.SUCCESS_PX, "summary": lines, "not_run": not_run}
-    return cli.Report(numbers | tables.success_of_trusted(rows) | tables.best_kept(rows), table(rows), draw)
+    return cli.Summary(numbers | tables.success_of_trusted(rows) | tables.best_kept(rows), table(rows), draw)
 
 
 if __name__ == "__main__":

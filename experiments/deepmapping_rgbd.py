@@ -171,7 +171,7 @@ def summarise(rows: Sequence[cli.Row], methods: Sequence[str]) -> dict[str, Any]
     return {"num_trajectories": len(rows), **held, "methods": table}
 
 
-def report(rows: list[cli.Row], methods: Sequence[str]) -> cli.Report:
+def report(rows: list[cli.Row], methods: Sequence[str]) -> cli.Summary:
     """Returns the shares and medians of each method, and errors.png."""
     numbers = summarise(rows, methods)
     right = f"below {_RIGHT_SHARE:.0%} of the spread, turns {_RIGHT_DEG:g} degrees, points {_RIGHT_MM:g} mm"
@@ -188,7 +188,7 @@ def report(rows: list[cli.Row], methods: Sequence[str]) -> cli.Report:
     def draw(folder: cli.RunFolder) -> None:
         viz.save_figure(viz.error_boxes_figure(panels, threshold=_SUCCESS_MM), folder / "errors.png")
 
-    return cli.Report(numbers, f"{text}\n\n{cli.markdown(('method', *columns), lines)}", draw)
+    return cli.Summary(numbers, f"{text}\n\n{cli.markdown(('method', *columns), lines)}", draw)
 
 
 if __name__ == "__main__":

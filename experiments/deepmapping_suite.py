@@ -128,7 +128,7 @@ def table(rows: Sequence[dict[str, Any]]) -> str:
     return cli.markdown((*columns, "median s", "trusted", "of these right"), lines)
 
 
-def report(rows: list[dict[str, Any]], not_run: dict[str, str]) -> cli.Report:
+def report(rows: list[dict[str, Any]], not_run: dict[str, str]) -> cli.Summary:
     """Returns the numbers of the methods, the table and boxes.png."""
     groups = by_method(rows)
     methods = {method: {"title": shared.METHODS[method].title, **summarise(mine)} for method, mine in groups.items()}
@@ -145,7 +145,7 @@ def report(rows: list[dict[str, Any]], not_run: dict[str, str]) -> cli.Report:
         viz.save_figure(viz.error_boxes_figure(panels, threshold=shared.SUCCESS_PX), folder / "boxes.png")
 
     numbers = {"success_threshold_px": shared.SUCCESS_PX, "methods": methods, "not_run": not_run}
-    return cli.Report(numbers, text, draw)
+    return cli.Summary(numbers, text, draw)
 
 
 if __name__ == "__main__":

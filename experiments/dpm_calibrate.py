@@ -97,10 +97,10 @@ def open_place(
     return ambiguous_drive(place, kind, beams, TOWN_LENGTH_M), AMBIGUOUS_BANDS_M
 
 
-def report(config: Config, model: dpm.Model, rows: list[cli.Row], num_cases: int) -> cli.Report:
+def report(config: Config, model: dpm.Model, rows: list[cli.Row], num_cases: int) -> cli.Summary:
     """Fits the regressions; the model and the reliability of places left out are written with the pictures."""
     if len(rows) < num_cases:
-        return cli.Report({"model": config.model}, f"{len(rows)} of {num_cases} places", rows=())
+        return cli.Summary({"model": config.model}, f"{len(rows)} of {num_cases} places", rows=())
     overlap_rows = [row for row in rows if "overlap_town" in row]
     calibration, numbers, held_out = fit([row for row in rows if "overlap_town" not in row])
     calibrated = replace(model.config, calibration=calibration)
@@ -127,7 +127,7 @@ def report(config: Config, model: dpm.Model, rows: list[cli.Row], num_cases: int
             viz.save_figure(figure, folder / name)
 
     text = ", ".join(f"{name} {value:.3f}" for name, value in numbers.items() if isinstance(value, float))
-    return cli.Report({"model": config.model, **numbers}, text, write, rows=())
+    return cli.Summary({"model": config.model, **numbers}, text, write, rows=())
 
 
 def fit(rows: list[cli.Row]) -> tuple[dpm.Calibration, cli.Row, dict[str, dict[str, np.ndarray]]]:

@@ -65,7 +65,7 @@ def main(config: Config) -> list[cli.Row]:
 
     cases = [{"sequence": name, "band": band} for name in drives for band in cli.BAND_NAMES]
     numbers = {"weights": config.weights}
-    return cli.run_table(config, EXPERIMENT, cases, work, lambda rows: cli.Report(numbers, table(rows, list(stages))))
+    return cli.run_table(config, EXPERIMENT, cases, work, lambda rows: cli.Summary(numbers, table(rows, list(stages))))
 
 
 def open_drives(paths: Sequence[str]) -> list[io.LidarSequence]:

@@ -73,14 +73,14 @@ def main(config: Config) -> list[cli.Row]:
         drive = ambiguous_drive(place, kind, beams, LENGTH_M)
         return measure_pairs(first, drive, BANDS_M, NUM_PAIRS, seed=config.seed, is_stopped=run.is_stopped)
 
-    def report(rows: list[cli.Row]) -> cli.Report:
+    def report(rows: list[cli.Row]) -> cli.Summary:
         numbers = [
             {"model": name, "rated": rated, "kind": kind, **rate(some, calibration, rated)}
             for rated in RATED
             for name, calibration in calibrations.items()
             for kind, some in _by_kind(rows).items()
         ]
-        return cli.Report({"models": list(config.models)}, table(numbers), rows=numbers)
+        return cli.Summary({"models": list(config.models)}, table(numbers), rows=numbers)
 
     cases = [ambiguous_case(number, FIRST_PLACE) for number in range(config.places)]
     return cli.run_table(config, EXPERIMENT, cases, work, report)

@@ -130,7 +130,7 @@ def evaluate_pairs(config: Config) -> list[cli.Row]:
     return cli.run_table(config, EXPERIMENT, cases, work, lambda rows: report(config, drives, rows, no_kiss))
 
 
-def report(config: Config, drives: Sequence[LidarSequence], rows: list[cli.Row], no_kiss: str | None) -> cli.Report:
+def report(config: Config, drives: Sequence[LidarSequence], rows: list[cli.Row], no_kiss: str | None) -> cli.Summary:
     """Returns the numbers, the tables and the pictures of the pairs."""
     from experiments._dpm_evaluation import pooled_rows, pooled_table, table
 
@@ -140,7 +140,7 @@ def report(config: Config, drives: Sequence[LidarSequence], rows: list[cli.Row],
     notes = [] if no_kiss is None else [f"KISS-Matcher was not run: {no_kiss}."]
     text = "\n\n".join(filter(None, [table(rows), pooled_table(pooled), *notes]))
     draw = partial(cli.draw_evaluation, drives=drives, rows=rows, weights=config.weights, seed=config.seed)
-    return cli.Report({**numbers, "pooled": pooled}, text, draw)
+    return cli.Summary({**numbers, "pooled": pooled}, text, draw)
 
 
 if __name__ == "__main__":

@@ -68,14 +68,14 @@ def main(config: Config) -> list[cli.Row]:
         for number, (kind, sensor, points) in enumerate(SCENES[: config.scenes])
     ]
 
-    def report(rows: list[cli.Row]) -> cli.Report:
+    def report(rows: list[cli.Row]) -> cli.Summary:
         if len(rows) < len(cases):
-            return cli.Report({"weights_of": config.weights}, f"{len(rows)} of {len(cases)} scenes", rows=())
+            return cli.Summary({"weights_of": config.weights}, f"{len(rows)} of {len(cases)} scenes", rows=())
         weights, table = fit(rows)
         columns = [name.replace("_", " ") for name in table[0]]
         numbers = {"weights_of": config.weights, "evidence": asdict(weights), "table": table}
         text = f"{cli.markdown(columns, [list(row.values()) for row in table])}\n\n{weights}"
-        return cli.Report(numbers, text, rows=())
+        return cli.Summary(numbers, text, rows=())
 
     return cli.run_table(config, EXPERIMENT, cases, partial(measure_scene, config, load_model(config.weights)), report)
 

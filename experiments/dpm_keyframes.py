@@ -56,8 +56,8 @@ def main(config: Config) -> list[cli.Row]:
     def work(_: cli.TableRun, sequence: str) -> cli.Row:
         return evaluate(model, drives[sequence], config.keyframes)
 
-    def report(rows: list[cli.Row]) -> cli.Report:
-        return cli.Report({"weights": config.weights}, table(rows, config.keyframes))
+    def report(rows: list[cli.Row]) -> cli.Summary:
+        return cli.Summary({"weights": config.weights}, table(rows, config.keyframes))
 
     return cli.run_table(config, EXPERIMENT, [{"sequence": name} for name in drives], work, report)
 

@@ -82,7 +82,7 @@ def main(config: Config) -> Any:
 
     numbers = {"weights": config.weights}
     cases = [{"sequence": name} for name in by_name]
-    return cli.run_table(config, EXPERIMENT, cases, work, lambda rows: cli.Report(numbers, table(rows)))
+    return cli.run_table(config, EXPERIMENT, cases, work, lambda rows: cli.Summary(numbers, table(rows)))
 
 
 def map_agents(

@@ -66,7 +66,7 @@ def main(config: Config) -> list[cli.Row]:
 
     cases = [{"sequence": name, "setting": setting} for name in sequences for setting in SETTINGS]
     numbers = {"weights": config.weights}
-    return cli.run_table(config, EXPERIMENT, cases, work, lambda rows: cli.Report(numbers, table(rows)))
+    return cli.run_table(config, EXPERIMENT, cases, work, lambda rows: cli.Summary(numbers, table(rows)))
 
 
 def evaluate(drive: Drive, model: Model, setting: str) -> cli.Row:

@@ -9,7 +9,7 @@ import pytest
 
 from dpmjax.cli.command import EXIT_BAD_INPUT, EXIT_FAILED, EXIT_OK
 from dpmjax.cli.result_files import load_json
-from dpmjax.cli.slam_numbers import status_of, why_failed
+from dpmjax.cli.slam_numbers import run_status, why_failed
 from dpmjax.io import write_pcd, write_tum
 from tests.cli.test_slam import run
 from tests.cli.test_slam_fuzz import leave_networks_out
@@ -70,8 +70,8 @@ def test_a_run_without_a_single_step_has_failed(statuses: dict[str, int], found:
         ({"empty": 3}, True, "interrupted"),
     ],
 )
-def test_status_of_a_run(statuses: dict[str, int], is_interrupted: bool, status: str) -> None:
-    assert status_of({"scan_statuses": statuses, "is_interrupted": is_interrupted}) == status
+def test_run_status_a_run(statuses: dict[str, int], is_interrupted: bool, status: str) -> None:
+    assert run_status({"scan_statuses": statuses, "is_interrupted": is_interrupted}) == status
 
 
 def test_notes_are_in_the_log_and_the_numbers_and_errors_are_those_of_matched_scans(

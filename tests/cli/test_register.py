@@ -9,7 +9,7 @@ import pytest
 import dpmjax
 from dpmjax.cli.command import EXIT_BAD_INPUT, EXIT_OK
 from dpmjax.cli.program import main
-from dpmjax.cli.register import report
+from dpmjax.cli.register import motion_text
 from dpmjax.cli.result_files import load_json
 from dpmjax.io import read_lidar_file, write_pcd
 from tests.data_sets import read_ply
@@ -57,7 +57,7 @@ def test_files_hold_the_motion_that_the_library_finds(files, tmp_path, capsys) -
 @pytest.mark.parametrize(("confidence", "is_sure"), [(0.5, False), (0.95, True)])
 def test_a_calibrated_confidence_is_a_probability_with_a_limit(confidence: float, is_sure: bool) -> None:
     metrics = {"source": "a", "target": "b", "translation_m": 1.0, "rotation_deg": 2.0, "confidence": confidence}
-    *_, last = report(np.eye(4), {**metrics, "is_calibrated": True}).splitlines()
+    *_, last = motion_text(np.eye(4), {**metrics, "is_calibrated": True}).splitlines()
     assert last.startswith(f"probability that it is right within 2 m and 5 degrees: {confidence:.2f}")
     assert ("NOT SURE" not in last) == is_sure
 

@@ -38,9 +38,9 @@ from .result_files import read_history as read_history
 from .result_files import write_json as write_json
 from .result_files import write_table as write_table
 from .route_drives import keep_scans as keep_scans
-from .rows import Report as Report
 from .rows import Row as Row
 from .rows import RowStopped as RowStopped
+from .rows import Summary as Summary
 from .rows import TableRun as TableRun
 from .rows import cell_text as cell_text
 from .rows import do_row as do_row

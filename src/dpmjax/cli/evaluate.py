@@ -27,7 +27,7 @@ from tyro.conf import Positional, arg
 from dpmjax import deeppointmap, metrics, simulation, viz, weights
 from dpmjax.cli.command import check_least
 from dpmjax.cli.drives import Source, find_sources
-from dpmjax.cli.rows import Report, Row, RowStopped, TableRun, cell_text, markdown, run_table
+from dpmjax.cli.rows import Row, RowStopped, Summary, TableRun, cell_text, markdown, run_table
 from dpmjax.cli.run_folder import RunFolder, RunOptions
 from dpmjax.sequences import LidarSequence
 
@@ -76,13 +76,13 @@ def main(config: Config) -> list[Row]:
     def work(run: TableRun, sequence: str, band: str) -> Row:
         return evaluation_row(model, by_name[sequence], band, config.pairs, run, seed=config.seed)
 
-    def report(rows: list[Row]) -> Report:
+    def report(rows: list[Row]) -> Summary:
         numbers, text = calibration_numbers(rows), table(rows)
         if numbers:
             note = "" if numbers["is_calibrated"] else "; these weights are not calibrated"
             text += f"\n\nBrier score of the confidence, all pairs: {numbers['brier']:.3f} (0 is best{note})."
         draw = partial(draw_evaluation, drives=drives, rows=rows, weights=config.weights, seed=config.seed)
-        return Report({"weights": config.weights, **numbers}, text, draw)
+        return Summary({"weights": config.weights, **numbers}, text, draw)
 
     cases = [{"sequence": name, "band": band} for name in by_name for band in ("near", "middle", "far", "overlap")]
     return run_table(config, NAME, cases, work, report)

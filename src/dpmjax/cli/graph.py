@@ -71,7 +71,10 @@ def main(config: Config) -> dict[str, Any]:
             viz.Track(f"optimised, chi2 {found.chi2:.4g}", positions(poses)),
         ]
         viz.save_figure(viz.trajectory_figure(title, tracks, None, np.zeros((0, 2, 3))), folder / "trajectory.png")
-        print(report(metrics), f"results in {folder.path}", sep="\n")
+        let_go = f", {metrics['num_edges_let_go']} of them let go" if metrics["num_edges_let_go"] else ""
+        print(f"{metrics['num_nodes']} nodes, {metrics['num_edges']} edges{let_go}")
+        print(f"chi2 {found.chi2_initial:.6g} -> {found.chi2:.6g} in {found.iterations} iterations")
+        print(f"results in {folder.path}")
         if not found.is_converged:
             advice = "give more --iterations, or a kernel by --outlier-chi2"
             raise InputError(config.graph, f"no minimum after {found.iterations} iterations", advice)
@@ -95,12 +98,3 @@ def graph_numbers(found: pose_graph.OptimizedPoseGraph) -> dict[str, Any]:
 def positions(poses: np.ndarray) -> np.ndarray:
     """Returns (n, 3) positions of poses in the plane or in space."""
     return np.column_stack([poses[:, :2], 0 * poses[:, 0]]) if poses.ndim == 2 else poses[:, :3, 3]
-
-
-def report(metrics: dict[str, Any]) -> str:
-    """Returns the last lines on the console."""
-    let_go = f", {metrics['num_edges_let_go']} of them let go" if metrics["num_edges_let_go"] else ""
-    return (
-        f"{metrics['num_nodes']} nodes, {metrics['num_edges']} edges{let_go}\n"
-        f"chi2 {metrics['chi2_initial']:.6g} -> {metrics['chi2']:.6g} in {metrics['iterations']} iterations"
-    )

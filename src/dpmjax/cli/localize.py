@@ -100,7 +100,7 @@ def main(config: Config) -> list[dict[str, str]]:
             rows.append(row)
             bar.update(1)
             bar.set_postfix(found=sum(row["status"] == "found" for row in rows))
-        print(write_results(folder, config, case, rows, notes))
+        print(write_found(folder, config, case, rows, notes))
         if _are_all_empty(rows) and not stop.is_requested:
             found = f"{len(rows)} of {len(rows)} scans without enough points, none could be looked for"
             raise InputError(drive.name, found, "check that the scans are 3-D and in metres")
@@ -140,7 +140,7 @@ def as_localization(row: dict[str, str]) -> slam.Localization:
     return slam.Localization("found", T, float(row["probability"]), int(row["keyframe"]), row["reason"])
 
 
-def write_results(
+def write_found(
     folder: RunFolder, config: Config, case: Case, rows: list[dict[str, str]], notes: dict[str, list[str]]
 ) -> str:
     """Writes trajectory, metrics and picture; returns a summary."""

@@ -55,18 +55,18 @@ def main(config: Config) -> dict[str, Any]:
     with recording(folder):
         with progress_bar("loops between maps", " keyframes") as on_keyframe:
             merged = slam.merge_maps(methods, *maps, on_keyframe=on_keyframe)
-        write_results(folder, maps, merged)
+        write_maps(folder, maps, merged)
         metrics = {"weights": config.weights, **merge_numbers(config.maps, maps, merged)}
         write_metrics(folder, metrics | {"wall_s": time.perf_counter() - started})
         parts = len(merged.maps)
         title = f"{len(maps)} maps" + (f", {parts} after merging" if parts > 1 else " in one")
         panels = [panel_of(config.maps, merged, part) for part in range(parts)]
         viz.save_figure(viz.agents_figure(title, panels), folder / "map.png")
-        print(summary(metrics), f"results in {folder.path}", sep="\n")
+        print(merge_text(metrics), f"results in {folder.path}", sep="\n")
     return metrics
 
 
-def write_results(folder: RunFolder, maps: Sequence[slam.KeyframeMap], merged: slam.MergedMaps) -> None:
+def write_maps(folder: RunFolder, maps: Sequence[slam.KeyframeMap], merged: slam.MergedMaps) -> None:
     """Writes the maps, the graph and the table of loops."""
     from dpmjax.cli.slam_files import LOOP_CELLS, loop_cells
     from dpmjax.io.g2o import write_g2o
@@ -142,13 +142,13 @@ def track_of(path: Path, merged: slam.MergedMaps, number: int) -> viz.AgentTrack
     slam_map = merged.joined.slam_map
     rows = np.flatnonzero(merged.joined.map_of_keyframe == number)
     T_world_keyframe = slam_map.T_world_keyframe[rows]
-    cloud = gather_map(T_world_keyframe, lambda row: keyframe_points(slam_map, rows[row]))
+    cloud = gather_map(T_world_keyframe, lambda row: keyframe_points(slam_map, int(rows[row])))
     label = f"{short_name(path)}, {counted(len(rows), 'keyframe')}"
     color = viz.COLORS[number % len(viz.COLORS)]
     return viz.AgentTrack(label, color, T_world_keyframe[:, :3, 3], None, cloud.points, cloud.heights_m)
 
 
-def summary(metrics: dict[str, Any]) -> str:
+def merge_text(metrics: dict[str, Any]) -> str:
     """Returns the last lines on the console."""
     from dpmjax.cli.slam_numbers import counted
 

@@ -76,14 +76,14 @@ def main(config: Config) -> dict[str, Any]:
             "is_calibrated": model.config.calibration is not None,
             "register_s": time.perf_counter() - clock,
         }
-        write_results(folder, T, source, target)
+        write_motion(folder, T, source, target)
         metrics["wall_s"] = time.perf_counter() - started
         write_metrics(folder, metrics)
         title = f"{config.source.name} (blue), {config.target.name} (orange)"
         motions = {"as measured": np.eye(4), f"registered, confidence {metrics['confidence']:.2f}": T}
         figure = viz.registered_pairs_figure([viz.RegisteredPair(title, source, target, motions)])
         viz.save_figure(figure, folder / "registration.png")
-        print(report(T, metrics), f"results in {folder.path}", sep="\n")
+        print(motion_text(T, metrics), f"results in {folder.path}", sep="\n")
     return metrics
 
 
@@ -105,7 +105,7 @@ def match_shares(verification: Any) -> dict[str, float]:
     return {name: float(getattr(verification, name)) for name in names}
 
 
-def write_results(folder: RunFolder, T_target_source: np.ndarray, source: np.ndarray, target: np.ndarray) -> None:
+def write_motion(folder: RunFolder, T_target_source: np.ndarray, source: np.ndarray, target: np.ndarray) -> None:
     """Writes T_target_source.txt and aligned.ply."""
     rows = (" ".join(f"{value:.9f}" for value in row) for row in T_target_source)
     io.write_atomically(folder / "T_target_source.txt", "\n".join(rows) + "\n")
@@ -114,7 +114,7 @@ def write_results(folder: RunFolder, T_target_source: np.ndarray, source: np.nda
     io.write_ply(folder / "aligned.ply", np.concatenate([moved, target]).astype(np.float32), colors=colors)
 
 
-def report(T_target_source: np.ndarray, metrics: dict[str, Any]) -> str:
+def motion_text(T_target_source: np.ndarray, metrics: dict[str, Any]) -> str:
     """Returns the last lines on the console."""
     rows = "\n".join("  " + " ".join(f"{value:12.6f}" for value in row) for row in T_target_source)
     if metrics["is_calibrated"]:

@@ -36,7 +36,7 @@ class TableRun(NamedTuple):
     is_stopped: Callable[[], bool]
 
 
-class Report(NamedTuple):
+class Summary(NamedTuple):
     """Summary of the rows.
 
     Attributes:
@@ -57,7 +57,7 @@ def run_table(
     name: str,
     cases: Iterable[Row],
     work: Callable[..., Row],
-    report: Callable[[list[Row]], Report],
+    report: Callable[[list[Row]], Summary],
 ) -> list[Row]:
     """Makes the rows that the run folder lacks, and writes table.md, metrics.json and the pictures.
 
@@ -75,14 +75,14 @@ def run_table(
     with recording(folder), StopFlag() as stop:
         table = TableRun(folder, lambda: stop.is_requested)
         rows = do_rows(folder.path, list(cases), partial(work, table), seed=config.seed, is_stopped=table.is_stopped)
-        summary = report(rows) if rows else Report({}, "no row is finished")
+        summary = report(rows) if rows else Summary({}, "no row is finished")
         write_report(folder, config, summary, rows, is_interrupted=stop.is_requested)
     print(f"results in {folder.path}")
     return rows
 
 
 def write_report(
-    folder: RunFolder, config: RunOptions, report: Report, rows: Sequence[Row], *, is_interrupted: bool
+    folder: RunFolder, config: RunOptions, report: Summary, rows: Sequence[Row], *, is_interrupted: bool
 ) -> None:
     """Writes metrics.json, table.md and the pictures, and prints the table; numbers come before pictures."""
     metrics = {**report.numbers, "is_interrupted": is_interrupted}

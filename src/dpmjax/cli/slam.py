@@ -75,7 +75,7 @@ class Config(DriveOptions):
 
 def main(config: Config) -> dict[str, Any]:
     """Reads, maps, writes; returns the content of `metrics.json`."""
-    from dpmjax.cli.slam_numbers import counted, status_of, summary, why_failed
+    from dpmjax.cli.slam_numbers import counted, run_status, summary, why_failed
     from dpmjax.cli.slam_run import find_beginning, live_viewer, run_scans
 
     if config.visualize:
@@ -95,12 +95,12 @@ def main(config: Config) -> dict[str, Any]:
         with live_viewer(folder, sequence.name, is_on=config.visualize) as on_scan:
             run = run_scans(folder, reader, methods, beginning, lambda: stop.is_requested, on_scan)
         result = slam.finish_slam(run.state, run.reports, methods.config)
-        drive = Drive(sequence, start.front_end.num_scans, len(start.slam_map))
+        drive = MappedDrive(sequence, start.front_end.num_scans, len(start.slam_map))
         metrics = write_results(folder, config, drive, run, result)
         if config.refine and run.failure is None and not stop.is_requested:
-            metrics |= refine(folder, config, drive, result, lambda: stop.is_requested)
+            metrics |= refine_trajectory(folder, config, drive, result, lambda: stop.is_requested)
         metrics |= {"is_interrupted": stop.is_requested or run.failure is not None, "peak_rss_gb": peak_rss_gb()}
-        metrics |= {**notes, "status": status_of(metrics), "wall_s": time.perf_counter() - started}
+        metrics |= {**notes, "status": run_status(metrics), "wall_s": time.perf_counter() - started}
         write_metrics(folder, metrics, seed=config.seed)
         tell(f"{summary(metrics)}\nresults in {folder.path}")
         if run.failure is not None:
@@ -111,7 +111,7 @@ def main(config: Config) -> dict[str, Any]:
     return metrics
 
 
-class Drive(NamedTuple):
+class MappedDrive(NamedTuple):
     """The scans of a run, and where it begins in a map.
 
     Attributes:
@@ -142,7 +142,7 @@ def slam_methods(config: Config) -> slam.SlamMethods:
 
 
 def write_results(
-    folder: RunFolder, config: Config, drive: Drive, run: SlamRun, result: slam.SlamResult
+    folder: RunFolder, config: Config, drive: MappedDrive, run: SlamRun, result: slam.SlamResult
 ) -> dict[str, Any]:
     """Writes all files but metrics.json, and returns its numbers; pictures come last."""
     from dpmjax.cli import slam_files as files
@@ -166,8 +166,8 @@ def write_results(
     return metrics | {"map_points": len(cloud.points), "map_voxel_m": cloud.voxel_m}
 
 
-def refine(
-    folder: RunFolder, config: Config, drive: Drive, result: slam.SlamResult, is_stopped: Callable[[], bool]
+def refine_trajectory(
+    folder: RunFolder, config: Config, drive: MappedDrive, result: slam.SlamResult, is_stopped: Callable[[], bool]
 ) -> dict[str, Any]:
     """Refines the trajectory by DeepMapping, writes it as refined_*.txt, and returns its numbers."""
     import jax

@@ -173,7 +173,7 @@ def why_failed(statuses: Mapping[str, int]) -> str | None:
     return None
 
 
-def status_of(numbers: Mapping[str, Any]) -> str:
+def run_status(numbers: Mapping[str, Any]) -> str:
     """Returns how a run ended.
 
     Args:

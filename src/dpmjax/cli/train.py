@@ -154,7 +154,7 @@ def main(config: Config) -> None:
         # Numbers first: a picture that fails must not cost them.
         write_metrics(folder, metrics)
         write_model(folder, trained.model, metrics, origin=f"{config.preset}, trained on {', '.join(config.data)}")
-        draw_loss(folder)
+        draw_curves(folder)
         draw_matches(folder, evaluation, records.sets.held_out)
         print_summary(folder, metrics)
 
@@ -226,7 +226,7 @@ def write_model(folder: RunFolder, model: deeppointmap.Model, metrics: dict[str,
     unfinished.replace(folder / MODEL)
 
 
-def draw_loss(folder: RunFolder) -> None:
+def draw_curves(folder: RunFolder) -> None:
     """Draws loss.png: losses and recalls over the steps."""
     rows = read_history(folder / HISTORY)
     if rows:
