@@ -9,20 +9,17 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
+import jax
 import numpy as np
 from numpy.typing import NDArray
 
-from dpmjax import deepmapping, registration
+from dpmjax import ScanSet, registration
+from dpmjax import deepmapping as dm
 from dpmjax.cli import planar_errors
-from dpmjax.registration import DEEPMAPPING, START_NAMES
-
-if TYPE_CHECKING:
-    from dpmjax import ScanSet
-    from dpmjax.deepmapping import DeepMappingConfig
-    from dpmjax.io import ScanSequence
-    from dpmjax.registration import PlanarScans
+from dpmjax.io import ScanSequence
+from dpmjax.registration import DEEPMAPPING, START_NAMES, PlanarScans
 
 Floats = NDArray[np.float64]
 Candidates = dict[str, Floats]
@@ -54,8 +51,6 @@ class Task:
     @property
     def scans(self) -> ScanSet:
         """Returns the scans without their names and reference."""
-        from dpmjax import ScanSet
-
         return ScanSet(self.sequence.points, self.sequence.mask)
 
 
@@ -83,11 +78,6 @@ def refined(task: Task, poses: Floats) -> Floats:
     return registration.refine(task.planar, poses).poses
 
 
-def refined_icp(task: Task) -> Candidates:
-    """Returns incremental ICP, refined."""
-    return {f"{START_NAMES['icp-plane']}, refined": refined(task, incremental(task))}
-
-
 def choose(task: Task, candidates: Mapping[str, Floats]) -> tuple[str, dict[str, dict[str, float]]]:
     """Returns the name of the best candidate, chosen by the scans alone, and the errors and scores of all."""
     kept, scores = registration.choose_trajectory(task.planar, candidates)
@@ -101,46 +91,41 @@ def assess(task: Task, poses: Floats) -> dict[str, Any]:
     return registration.assess_trajectory(task.planar, poses)._asdict()
 
 
-def _fit(task: Task, start: Floats | None, config: DeepMappingConfig | None = None) -> Floats:
+def _fit(task: Task, start: Floats | None, config: dm.DeepMappingConfig | None = None) -> Floats:
     """Returns poses by DeepMapping from a start, or from zero poses."""
-    import jax
-
-    settings = config or deepmapping.preset("fast")
-    settings = settings if task.steps is None else deepmapping.with_steps(settings, task.steps)
+    settings = config or dm.preset("fast")
+    settings = settings if task.steps is None else dm.with_steps(settings, task.steps)
     key = jax.random.key(task.seed)
     return registration.fit_in_order(task.scans, settings, key=key, start=start, is_ordered=task.is_ordered).poses
 
 
+def _refined_icp(task: Task) -> Candidates:
+    return {f"{START_NAMES['icp-plane']}, refined": refined(task, incremental(task))}
+
+
 def _direct_lbfgs(task: Task) -> Floats:
     """Returns poses by DeepMapping's loss without L-Net, from zero by L-BFGS."""
-    import jax
-
     from experiments.baselines.direct import optimize_directly
 
-    key = jax.random.key(task.seed)
     num_iterations = _LBFGS_ITERATIONS if task.steps is None else max(1, task.steps // 4)
-    return optimize_directly(task.scans, deepmapping.preset("fast"), num_iterations=num_iterations, key=key)
+    key = jax.random.key(task.seed)
+    return optimize_directly(task.scans, dm.preset("fast"), num_iterations=num_iterations, key=key)
 
 
 def _lnet_from_icp(task: Task) -> Candidates:
     """Returns incremental ICP, and DeepMapping from it by the phases of a cold start, L-Net's among them."""
-    start, config = incremental(task), deepmapping.preset("fast")
-    return {START_NAMES["icp-plane"]: start, DEEPMAPPING: _fit(task, start, _with_cold_phases(config))}
-
-
-def _with_cold_phases(config: DeepMappingConfig) -> DeepMappingConfig:
-    return replace(config, warm_phases=config.cold_phases)
-
-
-def _without_windows(config: DeepMappingConfig) -> DeepMappingConfig:
-    """Returns the settings with one registration of the whole set from the first phase on."""
-    return replace(config, cold_phases=tuple(replace(phase, scans_per_window=None) for phase in config.cold_phases))
+    start, config = incremental(task), dm.preset("fast")
+    fitted = _fit(task, start, replace(config, warm_phases=config.cold_phases))
+    return {START_NAMES["icp-plane"]: start, DEEPMAPPING: fitted}
 
 
 def _direct(task: Task, *, has_windows: bool) -> Floats:
-    """Returns poses by DeepMapping's loss without L-Net, from zero by Adam."""
-    config = deepmapping.as_direct(deepmapping.preset("fast"))
-    return _fit(task, None, config if has_windows else _without_windows(config))
+    """Returns poses by DeepMapping's loss without L-Net, from zero by Adam; windows, or the whole set in each phase."""
+    config = dm.as_direct(dm.preset("fast"))
+    if not has_windows:
+        phases = tuple(replace(phase, scans_per_window=None) for phase in config.cold_phases)
+        config = replace(config, cold_phases=phases)
+    return _fit(task, None, config)
 
 
 def _multiway(task: Task) -> Floats:
@@ -150,8 +135,6 @@ def _multiway(task: Task) -> Floats:
 
 
 def _swarm(task: Task) -> Floats:
-    import jax
-
     from experiments.baselines.direct import swarm_chain
 
     return swarm_chain(task.scans, key=jax.random.key(task.seed))
@@ -210,7 +193,7 @@ class Method(NamedTuple):
 METHODS: dict[str, Method] = {
     "icp-point": Method(START_NAMES["icp-point"], partial(incremental, metric="point")),
     "icp-plane": Method(START_NAMES["icp-plane"], incremental),
-    "icp-refined": Method("incremental ICP, refined", refined_icp),
+    "icp-refined": Method("incremental ICP, refined", _refined_icp),
     "multiway": Method("multiway registration of Open3D", _multiway, "open3d"),
     "particle-swarm": Method("particle swarms, each scan onto the one before", _swarm, "evosax"),
     "lnet-zero": Method("L-Net and M-Net from zero", lambda task: {DEEPMAPPING: _fit(task, None)}),

@@ -151,7 +151,6 @@ def report(config: Config, rows: list[dict[str, Any]], not_run: dict[str, str]) 
     lines = summary(rows)
 
     def draw(folder: cli.RunFolder) -> None:
-        print(*lines, sep="\n")
         for (world, order), mine in _grouped(rows, "world", "order").items():
             figure = viz.success_grids_figure(
                 success_grids(mine, config),
@@ -161,7 +160,8 @@ def report(config: Config, rows: list[dict[str, Any]], not_run: dict[str, str]) 
             viz.save_figure(figure, folder / f"{world}_{order}.png")
 
     numbers = {"success_threshold_px": shared.SUCCESS_PX, "summary": lines, "not_run": not_run}
-    return cli.Summary(numbers | tables.success_of_trusted(rows) | tables.best_kept(rows), table(rows), draw)
+    numbers |= tables.success_of_trusted(rows) | tables.best_kept(rows)
+    return cli.Summary(numbers, "\n\n".join(["\n".join(lines), table(rows)]), draw)
 
 
 if __name__ == "__main__":

@@ -72,7 +72,7 @@ def test_method_registers_a_tiny_walk(name, task) -> None:
     assert row["success"] == (row["ate_px"] < 20.0)
     assert (DEEPMAPPING in row["candidates"]) == (name == "all" or "deepmapping" in name or "lnet" in name)
     for numbers in row["candidates"].values():
-        assert {"ate_px", "point_distance_px", "code_length", "misfit"} == set(numbers)
+        assert {"ate_px", "worst_scan_px", "point_distance_px", "code_length", "misfit", "surprise"} == set(numbers)
 
 
 @pytest.mark.slow

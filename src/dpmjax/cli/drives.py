@@ -1,4 +1,4 @@
-"""Input of the commands: drives of 3-D scans, from files or simulated, read ahead in a thread; and saved maps."""
+"""Input of the commands: drives of 3-D scans, from files or simulated, read ahead in a thread."""
 
 from __future__ import annotations
 
@@ -7,18 +7,15 @@ from collections.abc import Generator, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import numpy as np
 from tyro.conf import FlagCreatePairsOff, arg
 
-from dpmjax import deeppointmap, io, saved_maps, scans, simulation, slam
+from dpmjax import deeppointmap, io, scans, simulation, slam
 from dpmjax.cli.command import check_least
 from dpmjax.cli.run_folder import RunOptions
 from dpmjax.sequences import LidarSequence, Note
-
-if TYPE_CHECKING:
-    from dpmjax.slam.front_end import AnyScan
 
 LOGGER = logging.getLogger("dpmjax.drives")
 TOWN = "town"
@@ -201,7 +198,7 @@ class ScanReader:
     def __init__(self, sequence: LidarSequence, *, is_deskewed: bool = False, jump: int = 1) -> None:
         self.sequence, self._is_deskewed, self._jump = sequence, is_deskewed, jump
 
-    def __call__(self, index: int) -> AnyScan:
+    def __call__(self, index: int) -> slam.TimedScan | np.ndarray:
         """Reads a scan."""
         points = self.sequence.read_points(index)
         if not self._is_deskewed or not len(points):
@@ -211,7 +208,7 @@ class ScanReader:
             offsets = scans.offsets_by_azimuth(points, self._turn_share(index))
         return slam.TimedScan(points, offsets)
 
-    def iterate(self, start: int) -> Generator[AnyScan, None, None]:
+    def iterate(self, start: int) -> Generator[slam.TimedScan | np.ndarray, None, None]:
         """Reads scan after scan, the next one while the caller works on this one."""
         numbers = range(start, len(self.sequence))
         with ThreadPoolExecutor(1) as pool:
@@ -242,39 +239,3 @@ class ScanReader:
             return None
         interval_s = float(times[index - 1] - times[index - 2])
         return interval_s if interval_s > 0 else None
-
-
-def open_map(path: Path, methods: slam.SlamMethods) -> slam.KeyframeMap:
-    """Reads a saved map.
-
-    Args:
-        path: a file of `save_map`.
-        methods: methods of the weights that must have made it.
-
-    Returns:
-        The map.
-
-    Raises:
-        ValueError: no such file, no map, or a map of other weights.
-    """
-    slam_map, origin = saved_maps.load_map(path), methods.origin
-    if slam_map.origin is not None and slam_map.origin.fingerprint != origin.fingerprint:
-        found = f"made with weights {slam_map.origin}, these are {origin}"
-        raise ValueError(f"{path}: {found}; name the weights that made it with --weights")
-    return slam_map
-
-
-def keyframe_points(slam_map: slam.KeyframeMap, row: int) -> np.ndarray:
-    """Returns the surface elements of a keyframe.
-
-    Args:
-        slam_map: the map.
-        row: row of the keyframe.
-
-    Returns:
-        (n, 3) metres, in the frame of the keyframe's lidar.
-    """
-    from dpmjax.scans.compact import expand_elements
-
-    elements = expand_elements(slam_map.keyframes[row].compact.elements)
-    return np.asarray(elements.positions)[np.asarray(elements.mask)]

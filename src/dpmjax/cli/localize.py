@@ -23,9 +23,11 @@ from tyro.conf import Positional, arg
 
 from dpmjax import io, slam, viz, weights
 from dpmjax.cli.command import StopFlag
-from dpmjax.cli.drives import DriveOptions, keyframe_points, open_drive, open_map, report_notes
+from dpmjax.cli.drives import DriveOptions, open_drive, report_notes
 from dpmjax.cli.result_files import HistoryFile, read_history
 from dpmjax.cli.run_folder import RunFolder, open_run_folder, recording, write_metrics
+from dpmjax.cli.slam_files import keyframe_points, open_map
+from dpmjax.cli.slam_numbers import localization_errors
 from dpmjax.sequences import InputError, LidarSequence
 
 NAME = "localize"
@@ -181,8 +183,6 @@ def error_numbers(case: Case, results: list[slam.Localization]) -> tuple[dict[st
 
     Without a reference there are no numbers, and None.
     """
-    from dpmjax.cli.slam_numbers import localization_errors
-
     reference, drive = case.T_reference_keyframe, case.drive.take(slice(0, len(results)))
     if reference is None or drive.T_world_lidar is None or not results:
         return {}, None

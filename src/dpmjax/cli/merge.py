@@ -27,9 +27,10 @@ from tyro.conf import Positional, arg
 
 from dpmjax import saved_maps, slam, viz, weights
 from dpmjax.cli.command import progress_bar
-from dpmjax.cli.drives import keyframe_points, open_map
 from dpmjax.cli.result_files import write_table
 from dpmjax.cli.run_folder import OutputOptions, RunFolder, open_run_folder, recording, write_metrics
+from dpmjax.cli.slam_files import LOOP_CELLS, accepted_ends, gather_map, keyframe_points, loop_cells, open_map
+from dpmjax.cli.slam_numbers import counted
 
 NAME = "merge"
 
@@ -68,7 +69,6 @@ def main(config: Config) -> dict[str, Any]:
 
 def write_maps(folder: RunFolder, maps: Sequence[slam.KeyframeMap], merged: slam.MergedMaps) -> None:
     """Writes the maps, the graph and the table of loops."""
-    from dpmjax.cli.slam_files import LOOP_CELLS, loop_cells
     from dpmjax.io.g2o import write_g2o
 
     for part, slam_map in enumerate(merged.maps, start=1):
@@ -123,8 +123,6 @@ def merge_numbers(paths: Sequence[Path], maps: Sequence[slam.KeyframeMap], merge
 
 def panel_of(paths: Sequence[Path], merged: slam.MergedMaps, part: int) -> viz.AgentPanel:
     """Returns the panel of a part: its maps with their surfaces and keyframes, and the loops between them."""
-    from dpmjax.cli.slam_files import accepted_ends
-
     members = [number for number, component in enumerate(merged.component) if component == part]
     ends = accepted_ends(merged.loops)
     ends = ends[np.isin(merged.joined.map_of_keyframe[ends[:, 0]], members)]
@@ -136,9 +134,6 @@ def panel_of(paths: Sequence[Path], merged: slam.MergedMaps, part: int) -> viz.A
 
 def track_of(path: Path, merged: slam.MergedMaps, number: int) -> viz.AgentTrack:
     """Returns the keyframes of a map and the points of their surfaces, in its colour."""
-    from dpmjax.cli.slam_files import gather_map
-    from dpmjax.cli.slam_numbers import counted
-
     slam_map = merged.joined.slam_map
     rows = np.flatnonzero(merged.joined.map_of_keyframe == number)
     T_world_keyframe = slam_map.T_world_keyframe[rows]
@@ -150,8 +145,6 @@ def track_of(path: Path, merged: slam.MergedMaps, number: int) -> viz.AgentTrack
 
 def merge_text(metrics: dict[str, Any]) -> str:
     """Returns the last lines on the console."""
-    from dpmjax.cli.slam_numbers import counted
-
     names = {entry["map"]: entry["file"] for entry in metrics["maps"]}
     lines = []
     for part in metrics["parts"]:

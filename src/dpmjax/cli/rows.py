@@ -42,13 +42,13 @@ class Summary(NamedTuple):
     Attributes:
         numbers: entries of metrics.json beside the rows.
         text: content of table.md, also printed.
-        draw: draws the pictures; None for no pictures.
+        write_more: writes pictures and further files into the folder; None for none.
         rows: rows of metrics.json; None for the rows of the cases.
     """
 
     numbers: Row
     text: str
-    draw: Callable[[RunFolder], None] | None = None
+    write_more: Callable[[RunFolder], None] | None = None
     rows: Sequence[Row] | None = None
 
 
@@ -76,21 +76,21 @@ def run_table(
         table = TableRun(folder, lambda: stop.is_requested)
         rows = do_rows(folder.path, list(cases), partial(work, table), seed=config.seed, is_stopped=table.is_stopped)
         summary = report(rows) if rows else Summary({}, "no row is finished")
-        write_report(folder, config, summary, rows, is_interrupted=stop.is_requested)
+        write_summary(folder, config, summary, rows, is_interrupted=stop.is_requested)
     print(f"results in {folder.path}")
     return rows
 
 
-def write_report(
-    folder: RunFolder, config: RunOptions, report: Summary, rows: Sequence[Row], *, is_interrupted: bool
+def write_summary(
+    folder: RunFolder, config: RunOptions, summary: Summary, rows: Sequence[Row], *, is_interrupted: bool
 ) -> None:
     """Writes metrics.json, table.md and the pictures, and prints the table; numbers come before pictures."""
-    metrics = {**report.numbers, "is_interrupted": is_interrupted}
-    note = write_metrics(folder, metrics, seed=config.seed, rows=rows if report.rows is None else report.rows)
-    write_atomically(folder / "table.md", report.text + (f"\n\n{note}.\n" if note else "\n"))
-    print(report.text)
-    if report.draw is not None:
-        report.draw(folder)
+    metrics = {**summary.numbers, "is_interrupted": is_interrupted}
+    note = write_metrics(folder, metrics, seed=config.seed, rows=rows if summary.rows is None else summary.rows)
+    write_atomically(folder / "table.md", summary.text + (f"\n\n{note}.\n" if note else "\n"))
+    print(summary.text)
+    if summary.write_more is not None:
+        summary.write_more(folder)
 
 
 def markdown(columns: Sequence[str], rows: Iterable[Sequence[object]]) -> str:

@@ -21,20 +21,19 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, NamedTuple
+from typing import Annotated, Any, ClassVar, Literal, NamedTuple
 
 import numpy as np
 from tyro.conf import FlagCreatePairsOff, Positional, arg
 
 from dpmjax import slam, weights
+from dpmjax.cli import slam_files as files
+from dpmjax.cli import slam_numbers as numbers
 from dpmjax.cli.command import StopFlag, progress_bar
-from dpmjax.cli.drives import DriveOptions, ScanReader, keyframe_points, open_drive, open_map, report_notes
+from dpmjax.cli.drives import DriveOptions, ScanReader, open_drive, report_notes
 from dpmjax.cli.machine import peak_rss_gb, require_importable
 from dpmjax.cli.run_folder import RunFolder, open_run_folder, recording, write_metrics
 from dpmjax.sequences import InputError, LidarSequence
-
-if TYPE_CHECKING:
-    from dpmjax.cli.slam_numbers import SlamRun
 
 NAME = "slam"
 LOGGER = logging.getLogger(__name__)
@@ -75,7 +74,6 @@ class Config(DriveOptions):
 
 def main(config: Config) -> dict[str, Any]:
     """Reads, maps, writes; returns the content of `metrics.json`."""
-    from dpmjax.cli.slam_numbers import counted, run_status, summary, why_failed
     from dpmjax.cli.slam_run import find_beginning, live_viewer, run_scans
 
     if config.visualize:
@@ -83,14 +81,14 @@ def main(config: Config) -> dict[str, Any]:
     started = time.perf_counter()
     methods = slam_methods(config)
     # A map of other weights is refused here, before the scans are opened.
-    start = slam.init_slam(None if config.map is None else open_map(config.map, methods))
+    start = slam.init_slam(None if config.map is None else files.open_map(config.map, methods))
     sequence = open_drive(config.data, config, config.sequence)
     reader = ScanReader(sequence, is_deskewed=config.deskew, jump=config.jump)
     folder = open_run_folder(config, NAME)
     beginning = find_beginning(folder, methods, start)
     with recording(folder), StopFlag() as stop:
         done = f", {len(beginning.reports)} done before" if beginning.reports else ""
-        tell(f"{sequence.name}: {counted(len(sequence), 'scan')}{done}")
+        tell(f"{sequence.name}: {numbers.counted(len(sequence), 'scan')}{done}")
         notes = report_notes(sequence.notes)
         with live_viewer(folder, sequence.name, is_on=config.visualize) as on_scan:
             run = run_scans(folder, reader, methods, beginning, lambda: stop.is_requested, on_scan)
@@ -100,12 +98,12 @@ def main(config: Config) -> dict[str, Any]:
         if config.refine and run.failure is None and not stop.is_requested:
             metrics |= refine_trajectory(folder, config, drive, result, lambda: stop.is_requested)
         metrics |= {"is_interrupted": stop.is_requested or run.failure is not None, "peak_rss_gb": peak_rss_gb()}
-        metrics |= {**notes, "status": run_status(metrics), "wall_s": time.perf_counter() - started}
+        metrics |= {**notes, "status": numbers.run_status(metrics), "wall_s": time.perf_counter() - started}
         write_metrics(folder, metrics, seed=config.seed)
-        tell(f"{summary(metrics)}\nresults in {folder.path}")
+        tell(f"{numbers.summary(metrics)}\nresults in {folder.path}")
         if run.failure is not None:
             raise run.failure
-        failed = why_failed(metrics["scan_statuses"])
+        failed = numbers.why_failed(metrics["scan_statuses"])
         if failed is not None and not stop.is_requested:
             raise InputError(sequence.name, failed, "check that the scans are 3-D, in metres, and follow each other")
     return metrics
@@ -127,7 +125,7 @@ class MappedDrive(NamedTuple):
     def read_keyframe(self, slam_map: slam.KeyframeMap, row: int) -> np.ndarray:
         """Reads the points of a keyframe; those of the extended map are the points of its surface."""
         if row < self.num_keyframes_before:
-            return keyframe_points(slam_map, row)
+            return files.keyframe_points(slam_map, row)
         return self.sequence.read_points(slam_map.keyframes[row].scan - self.first_scan)
 
 
@@ -142,14 +140,11 @@ def slam_methods(config: Config) -> slam.SlamMethods:
 
 
 def write_results(
-    folder: RunFolder, config: Config, drive: MappedDrive, run: SlamRun, result: slam.SlamResult
+    folder: RunFolder, config: Config, drive: MappedDrive, run: numbers.SlamRun, result: slam.SlamResult
 ) -> dict[str, Any]:
     """Writes all files but metrics.json, and returns its numbers; pictures come last."""
-    from dpmjax.cli import slam_files as files
-    from dpmjax.cli.slam_numbers import run_numbers
-
     sequence, slam_map = drive.sequence.take(slice(0, len(result.reports))), result.map
-    metrics = {"weights": config.weights, **run_numbers(run, result, sequence)}
+    metrics = {"weights": config.weights, **numbers.run_numbers(run, result, sequence)}
     if not result.reports:
         return metrics
     files.write_trajectory(folder.path, result.T_world_scan, sequence.times)
@@ -172,9 +167,6 @@ def refine_trajectory(
     """Refines the trajectory by DeepMapping, writes it as refined_*.txt, and returns its numbers."""
     import jax
 
-    from dpmjax.cli.slam_files import write_trajectory
-    from dpmjax.cli.slam_numbers import trajectory_errors
-
     sequence = drive.sequence.take(slice(0, len(result.reports)))
     with progress_bar("refine", " windows of keyframes") as on_window:
         refined = slam.refine_keyframes(
@@ -185,9 +177,9 @@ def refine_trajectory(
             stop=is_stopped,
         )
     T = slam.place_scans(refined.slam_map.T_world_keyframe, result.reports)
-    write_trajectory(folder.path, T, sequence.times, "refined")
-    numbers = {"refine_windows": refined.num_windows, "refine_windows_improved": refined.num_improved}
-    return {**numbers, **trajectory_errors(T, sequence.T_world_lidar, "_refined")}
+    files.write_trajectory(folder.path, T, sequence.times, "refined")
+    windows = {"refine_windows": refined.num_windows, "refine_windows_improved": refined.num_improved}
+    return {**windows, **numbers.trajectory_errors(T, sequence.T_world_lidar, "_refined")}
 
 
 def tell(text: str) -> None:

@@ -1,4 +1,4 @@
-"""The files of a SLAM run: trajectories, graph, tables of scans and loops, the thinned map, the pictures."""
+"""The files of a SLAM run: trajectories, graph, tables, maps, the pictures; and saved maps that are read again."""
 
 from __future__ import annotations
 
@@ -9,11 +9,9 @@ from typing import NamedTuple
 import numpy as np
 from tqdm import tqdm
 
-from dpmjax import io, metrics, saved_maps, slam, viz
+from dpmjax import geometry, io, metrics, saved_maps, slam, viz
 from dpmjax.cli.result_files import write_table
 from dpmjax.cli.slam_numbers import counted, distances_to_reference
-from dpmjax.geometry import rigid
-from dpmjax.io.g2o import write_g2o
 from dpmjax.sequences import LidarSequence
 
 MAP_VOXEL_M, MAX_MAP_POINTS = 0.2, 3_000_000
@@ -49,6 +47,8 @@ def write_trajectory(
 
 def write_graph(folder: Path, result: slam.SlamResult) -> None:
     """Writes graph.g2o and keyframes.txt (number and pose of each keyframe)."""
+    from dpmjax.io.g2o import write_g2o
+
     if result.graph is not None:
         write_g2o(folder / "graph.g2o", result.graph)
     poses = result.map.T_world_keyframe
@@ -156,7 +156,7 @@ def draw_pictures(
     """Draws trajectory.png and map.png."""
     T, slam_map, num_old = result.T_world_scan, result.map, num_keyframes_before
     # Odometry alone begins where the drive begins, also in a map that was there before.
-    odometry = T[0] @ rigid.inverse(result.T_odometry_scan[0]) @ result.T_odometry_scan
+    odometry = T[0] @ geometry.rigid.inverse(result.T_odometry_scan[0]) @ result.T_odometry_scan
     reference, ends = sequence.T_world_lidar, accepted_ends(result.loops)
     tracks = [_track("odometry alone", odometry, reference)] if len(ends) else []
     if num_old:
@@ -178,3 +178,39 @@ def _track(name: str, T_world_scan: np.ndarray, reference: np.ndarray | None) ->
     errors = distances_to_reference(T_world_scan, reference)
     label = name if errors is None else f"{name}, ATE {np.sqrt(np.nanmean(errors**2)):.2f} m"
     return viz.Track(label, T_world_scan[:, :3, 3], errors)
+
+
+def open_map(path: Path, methods: slam.SlamMethods) -> slam.KeyframeMap:
+    """Reads a saved map.
+
+    Args:
+        path: a file of `save_map`.
+        methods: methods of the weights that must have made it.
+
+    Returns:
+        The map.
+
+    Raises:
+        ValueError: no such file, no map, or a map of other weights.
+    """
+    slam_map, origin = saved_maps.load_map(path), methods.origin
+    if slam_map.origin is not None and slam_map.origin.fingerprint != origin.fingerprint:
+        found = f"made with weights {slam_map.origin}, these are {origin}"
+        raise ValueError(f"{path}: {found}; name the weights that made it with --weights")
+    return slam_map
+
+
+def keyframe_points(slam_map: slam.KeyframeMap, row: int) -> np.ndarray:
+    """Returns the surface elements of a keyframe.
+
+    Args:
+        slam_map: the map.
+        row: row of the keyframe.
+
+    Returns:
+        (n, 3) metres, in the frame of the keyframe's lidar.
+    """
+    from dpmjax.scans.compact import expand_elements
+
+    elements = expand_elements(slam_map.keyframes[row].compact.elements)
+    return np.asarray(elements.positions)[np.asarray(elements.mask)]

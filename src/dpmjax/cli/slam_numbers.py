@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from dpmjax import metrics, slam
+from dpmjax import geometry, metrics, slam
 from dpmjax.sequences import LidarSequence
 
 MAX_ERROR_M, MAX_ERROR_DEG = 2.0, 5.0
@@ -76,15 +76,13 @@ def localization_errors(
     Returns:
         The errors.
     """
-    from dpmjax.geometry import rigid
-
     is_found = np.array([one.is_in_map for one in found], bool)
     is_right, errors = np.zeros(len(found), bool), np.full((2, len(found)), np.nan)
     if is_found.any():
         keyframes = np.array([one.keyframe for one in found if one.is_in_map], np.int64)
         T_world_scan = np.array([one.T_world_scan for one in found if one.is_in_map])
-        T = rigid.inverse(slam_map.T_world_keyframe[keyframes]) @ T_world_scan
-        true = rigid.inverse(T_reference_keyframe[keyframes]) @ T_reference_scan[is_found]
+        T = geometry.rigid.inverse(slam_map.T_world_keyframe[keyframes]) @ T_world_scan
+        true = geometry.rigid.inverse(T_reference_keyframe[keyframes]) @ T_reference_scan[is_found]
         recall = metrics.registration_recall(T, true, max_translation_m=MAX_ERROR_M, max_rotation_deg=MAX_ERROR_DEG)
         is_right[is_found] = recall.is_right
         errors[:, is_found] = recall.translation_errors_m, recall.rotation_errors_deg

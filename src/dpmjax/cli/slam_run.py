@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import jax
 from tqdm import tqdm
@@ -19,12 +19,6 @@ from dpmjax.cli.slam_files import accepted_ends, write_scans, write_trajectory
 from dpmjax.cli.slam_numbers import SlamRun
 from dpmjax.saved_maps import RunState, load_state, save_state
 from dpmjax.sequences import LidarSequence
-
-if TYPE_CHECKING:
-    from dpmjax.slam.front_end import AnyScan
-
-    OnScan = Callable[[AnyScan, slam.SlamState, slam.ScanReport], None]
-
 
 STATE = "run_state.npz"
 # Seconds between writings of the state: a killed run repeats the scans since the last one.
@@ -123,7 +117,7 @@ def run_scans(
     methods: slam.SlamMethods,
     beginning: RunState,
     is_stopped: Callable[[], bool],
-    on_scan: OnScan | None = None,
+    on_scan: Callable[[Any, slam.SlamState, slam.ScanReport], None] | None = None,
 ) -> SlamRun:
     """Places the remaining scans; the result holds what ended it early, and the state of the last keyframe is saved.
 
@@ -197,7 +191,7 @@ def _progress(state: slam.SlamState, report: slam.ScanReport, watch: Stopwatch) 
 
 
 @contextmanager
-def live_viewer(folder: RunFolder, name: str, *, is_on: bool) -> Iterator[OnScan | None]:
+def live_viewer(folder: RunFolder, name: str, *, is_on: bool) -> Iterator[Callable[..., None] | None]:
     """Opens the viewer; yields what shows a scan, or None where the viewer is off."""
     if not is_on:
         yield None
@@ -206,7 +200,7 @@ def live_viewer(folder: RunFolder, name: str, *, is_on: bool) -> Iterator[OnScan
 
     viewer = viz.LiveViewer(name, folder / "slam.rrd")
 
-    def show(scan: AnyScan, state: slam.SlamState, report: slam.ScanReport) -> None:
+    def show(scan: Any, state: slam.SlamState, report: slam.ScanReport) -> None:
         T_world_keyframe = state.slam_map.T_world_keyframe
         if not len(T_world_keyframe):
             return
