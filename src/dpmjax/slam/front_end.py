@@ -14,7 +14,6 @@ from jaxtyping import Float
 from dpmjax.deeppointmap.compact_scans import CompactScan
 from dpmjax.geometry import rigid
 from dpmjax.scans.deskew import deskew
-from dpmjax.slam.alignment import Alignment, ThinnedScan, best_of
 from dpmjax.slam.keyframes import (
     EdgeKind,
     Keyframe,
@@ -37,7 +36,7 @@ from dpmjax.slam.local_map import (
     placed_scan,
     with_scan,
 )
-from dpmjax.slam.methods import SlamMethods
+from dpmjax.slam.methods import Alignment, SlamMethods, ThinnedScan, best_of
 from dpmjax.slam.reports import ScanReport, ScanStatus
 from dpmjax.types import AnyArray
 
@@ -126,7 +125,7 @@ class TimedScan(NamedTuple):
 AnyScan = Float[AnyArray, "_n 3"] | TimedScan
 
 
-def step(
+def place_scan(
     methods: SlamMethods, state: FrontEndState, slam_map: KeyframeMap, scan: AnyScan
 ) -> tuple[FrontEndState, KeyframeMap, ScanReport]:
     """Places a scan.

@@ -27,8 +27,7 @@ from dpmjax.slam.keyframes import (
     with_origin,
 )
 from dpmjax.slam.loop_consistency import scans_agree
-from dpmjax.slam.matcher import Match
-from dpmjax.slam.methods import SlamMethods
+from dpmjax.slam.methods import Match, SlamMethods
 from dpmjax.slam.retrieval import most_similar
 from dpmjax.slam.system import make_methods
 from dpmjax.types import AnyArray
@@ -74,7 +73,7 @@ class LocalizationConfig:
         require_positive_fields(self, "same_place_m", "same_place_rad")
 
 
-class Evidence(NamedTuple):
+class KeyframeMatch(NamedTuple):
     """One registration of the scan.
 
     Attributes:
@@ -107,7 +106,7 @@ class Localization(NamedTuple):
     probability: float
     keyframe: int | None
     reason: str
-    evidence: tuple[Evidence, ...] = ()
+    evidence: tuple[KeyframeMatch, ...] = ()
 
     @property
     def is_in_map(self) -> bool:
@@ -117,7 +116,7 @@ class Localization(NamedTuple):
 
 class _Place(NamedTuple):
     # Registrations that agree, the most probable first.
-    members: tuple[Evidence, ...]
+    members: tuple[KeyframeMatch, ...]
 
     @property
     def total(self) -> float:
@@ -187,7 +186,7 @@ def _localized(
         return Localization("empty", None, 0.0, None, "too few points")
     compact, extent_m = methods.matcher.encode(thinned), thinned.extent_m
     rows = _candidates(slam_map, compact, methods, config)
-    tried: list[Evidence] = []
+    tried: list[KeyframeMatch] = []
     for start in range(0, len(rows), config.num_at_once):
         done = {one.keyframe for one in tried}
         left = [row for row in rows[start : start + config.num_at_once] if row not in done]
@@ -216,20 +215,20 @@ def _candidates(
 
 def _registered(
     slam_map: KeyframeMap, rows: list[int], compact: CompactScan, methods: SlamMethods, config: LocalizationConfig
-) -> list[Evidence]:
+) -> list[KeyframeMatch]:
     source, radius_m = Submap((compact,), np.eye(4)[None]), methods.config.front_end.submap_radius_m
     targets = [submap_around(slam_map, row, config.num_submap, radius_m) for row in rows]
     matches = methods.matcher.register([(source, target) for target in targets]) if rows else []
     loops = methods.config.loops
     return [
-        Evidence(
+        KeyframeMatch(
             row, orthonormal(slam_map.T_world_keyframe[row] @ match.T_target_source), match, scans_agree(match, loops)
         )
         for row, match in zip(rows, matches, strict=True)
     ]
 
 
-def _places(tried: list[Evidence], config: LocalizationConfig) -> list[_Place]:
+def _places(tried: list[KeyframeMatch], config: LocalizationConfig) -> list[_Place]:
     """Groups registrations around the most probable ones whose scans agree."""
     # Fewer points meet planes of a keyframe farther off: that it puts the scan at the same place is enough.
     left = sorted(tried, key=lambda one: -one.match.probability)
@@ -242,7 +241,7 @@ def _places(tried: list[Evidence], config: LocalizationConfig) -> list[_Place]:
     return places
 
 
-def _agree(one: Evidence, other: Evidence, config: LocalizationConfig) -> bool:
+def _agree(one: KeyframeMatch, other: KeyframeMatch, config: LocalizationConfig) -> bool:
     return are_near(one.T_world_scan, other.T_world_scan, config.same_place_m, config.same_place_rad)
 
 
@@ -251,7 +250,7 @@ def _is_supported(place: _Place, config: LocalizationConfig, min_support: int) -
 
 
 def _neighbours(
-    slam_map: KeyframeMap, best: Evidence, tried: list[Evidence], extent_m: float, config: LocalizationConfig
+    slam_map: KeyframeMap, best: KeyframeMatch, tried: list[KeyframeMatch], extent_m: float, config: LocalizationConfig
 ) -> list[int]:
     """Returns keyframes near the place that were not tried yet, nearest first."""
     apart_m = distances_to(slam_map, best.T_world_scan[:3, 3])
@@ -260,7 +259,9 @@ def _neighbours(
     return [row for row in near if row not in done][: config.num_neighbours]
 
 
-def _decided(slam_map: KeyframeMap, tried: list[Evidence], extent_m: float, config: LocalizationConfig) -> Localization:
+def _decided(
+    slam_map: KeyframeMap, tried: list[KeyframeMatch], extent_m: float, config: LocalizationConfig
+) -> Localization:
     places = sorted(_places(tried, config), key=lambda place: -place.total)
     evidence = tuple(tried)
     if not places:

@@ -55,7 +55,7 @@ class _Path(NamedTuple):
         return is_before & (self.since_m(row) > MIN_PATH_SHARE * self.extents_m[row])
 
 
-def find_candidates(slam_map: KeyframeMap, row: int, config: LoopClosureConfig) -> list[LoopCandidate]:
+def find_loop_candidates(slam_map: KeyframeMap, row: int, config: LoopClosureConfig) -> list[LoopCandidate]:
     """Finds older keyframes that may show the place of a keyframe.
 
     By distance: within a radius that grows with the path since, for odometry drifts. By retrieval: over the whole map,

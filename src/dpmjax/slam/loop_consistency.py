@@ -13,7 +13,7 @@ import numpy as np
 from dpmjax.geometry import rigid
 from dpmjax.slam.config import LoopClosureConfig
 from dpmjax.slam.keyframes import KeyframeMap, are_near
-from dpmjax.slam.matcher import Match
+from dpmjax.slam.methods import Match
 from dpmjax.slam.reports import Loop, LoopStatus
 
 PENDING_PATH_M = 40.0
@@ -32,7 +32,7 @@ MAX_WITNESSES = 6
 """So many accepted loops are asked whether they agree with a new one."""
 
 
-def status_of(slam_map: KeyframeMap, loop: Loop, match: Match, config: LoopClosureConfig) -> LoopStatus:
+def loop_status(slam_map: KeyframeMap, loop: Loop, match: Match, config: LoopClosureConfig) -> LoopStatus:
     """Decides about a registration by itself.
 
     Args:

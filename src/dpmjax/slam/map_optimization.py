@@ -19,8 +19,7 @@ from dpmjax.slam.keyframes import (
     with_edges,
     with_poses,
 )
-from dpmjax.slam.loop_state import LoopState
-from dpmjax.slam.reports import Loop
+from dpmjax.slam.reports import Loop, LoopState
 
 TAKEN_BACK_WEIGHT = 0.25
 """Smallest weight of a loop edge that stays after the optimisation."""

@@ -1,10 +1,9 @@
-"""The interface of a matcher (encoding, proposals, registration, overlap), and the one of DeepPointMap's networks."""
+"""The matcher of DeepPointMap's networks: encoding, proposals, registration, overlap."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import NamedTuple, Protocol
 
 import jax
 import jax.numpy as jnp
@@ -22,114 +21,14 @@ from dpmjax.scans.compact import expand_elements
 from dpmjax.scans.plane_information import plane_information
 from dpmjax.scans.surface_alignment import AlignmentLevel, align_surfaces, pair_with_planes
 from dpmjax.scans.surfaces import Surface
-from dpmjax.slam.alignment import ThinnedScan
-from dpmjax.slam.keyframes import Pose, Submap
+from dpmjax.slam.keyframes import Submap
 from dpmjax.slam.local_map import PlacedElements, joined_surface
+from dpmjax.slam.methods import Match, Proposal, ThinnedScan
 from dpmjax.slam.retrieval import pooled_vector
-from dpmjax.types import DescriptorCloud, Registration, Verification
+from dpmjax.types import DescriptorCloud, Registration
 
 ELEMENT_RADIUS_M = 2.0
 """Radius of `VerificationConfig.plane_radius_m` for surface elements, which are metres apart."""
-
-
-class Match(NamedTuple):
-    """A registration without a first guess.
-
-    Attributes:
-        T_target_source: float64.
-        probability: that it is right within 2 m and 5 degrees, if the matcher is calibrated; else a score in [0, 1].
-        rmse: of the pairs that it rests on, metres.
-        verification: how well the scans agree under it; None where the matcher has no scans.
-        information: (6, 6) inverse covariance by the planes of the scans, in the tangent of the source, translation
-            first; None where it is not known.
-    """
-
-    T_target_source: Pose
-    probability: float
-    rmse: float
-    verification: Verification | None = None
-    information: Float[np.ndarray, "6 6"] | None = None
-
-
-class Proposal(NamedTuple):
-    """Motions of a scan that descriptors alone propose.
-
-    Attributes:
-        T_target_source: (h, 4, 4) float64, the most likely first.
-        probability: P(correct) of the first.
-    """
-
-    T_target_source: Float[np.ndarray, "h 4 4"]
-    probability: float
-
-
-class Matcher(Protocol):
-    """Recognises places and registers scans and maps without a first guess.
-
-    Attributes:
-        fingerprint: keyframes are compared only with those of a matcher of the same fingerprint.
-    """
-
-    @property
-    def fingerprint(self) -> str: ...  # noqa: D102
-
-    def encode(self, scan: ThinnedScan) -> CompactScan:
-        """Prepares a scan for any number of registrations.
-
-        Args:
-            scan: the scan.
-
-        Returns:
-            Descriptors, surface elements and free space.
-        """
-        ...
-
-    def vector(self, scan: CompactScan) -> Float[np.ndarray, " c"]:
-        """Returns one vector for retrieval, of a length that is the same for all scans.
-
-        Args:
-            scan: from `encode`.
-
-        Returns:
-            The vector.
-        """
-        ...
-
-    def propose(self, source: CompactScan, target: CompactScan, num_motions: int) -> Proposal:
-        """Registers a scan by descriptors alone.
-
-        Args:
-            source: a scan.
-            target: the other.
-            num_motions: largest number of motions.
-
-        Returns:
-            Distinct motions; at least one.
-        """
-        ...
-
-    def register(self, pairs: Sequence[tuple[Submap, Submap]]) -> list[Match]:
-        """Registers pairs of source and target, and verifies them by their surfaces.
-
-        Args:
-            pairs: submaps; a single scan is a submap of one.
-
-        Returns:
-            One match a pair, between the frames of the two submaps.
-        """
-        ...
-
-    def overlaps(self, source: CompactScan, targets: Sequence[CompactScan]) -> Float[np.ndarray, " n"]:
-        """Estimates the probability that scans see the same place, for many scans at once.
-
-        Args:
-            source: a scan.
-            targets: the scans that it is compared with; at least one.
-
-        Returns:
-            The probabilities.
-        """
-        ...
 
 
 class NetworkMatcher:

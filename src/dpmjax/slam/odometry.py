@@ -16,10 +16,10 @@ from dpmjax.scans.plane_information import plane_information, with_least_covaria
 from dpmjax.scans.preprocess import first_of_each_voxel
 from dpmjax.scans.surface_alignment import AlignmentLevel, align_surfaces_from, nearest_planes, pair_with_planes
 from dpmjax.scans.surfaces import Surface, SurfaceConfig, surface_at
-from dpmjax.slam.alignment import Alignment, ThinnedScan, best_of
 from dpmjax.slam.config import OdometryConfig
 from dpmjax.slam.keyframes import Pose, orthonormal
 from dpmjax.slam.local_map import LocalMap
+from dpmjax.slam.methods import Alignment, ThinnedScan, best_of
 
 NUM_SAMPLES = 1000
 """Number of surface elements that the score of a pose compares."""
