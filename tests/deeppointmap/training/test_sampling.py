@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from dpmjax.deeppointmap import CurriculumStage, SamplingConfig, TrainingConfig, training_preset
-from dpmjax.deeppointmap.layouts import stage_layouts
-from dpmjax.deeppointmap.sampling import Group, PlacedScans, ScanTable, arrange_groups, draw_groups
+from dpmjax.deeppointmap.training.layouts import stage_layouts
+from dpmjax.deeppointmap.training.sampling import Group, PlacedScans, ScanTable, arrange_groups, draw_groups
 
 
 def table(num: int = 60, step_m: float = 2.0) -> ScanTable:

@@ -11,7 +11,7 @@ import functools
 
 import numpy as np
 
-from dpmjax.deeppointmap.curriculum import SamplingConfig
+from dpmjax.deeppointmap.training.curriculum import SamplingConfig
 
 GroupShape = tuple[int, int]
 """Number of scans in the first and in the second map of a group."""

@@ -23,7 +23,6 @@ import optax
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
-from dpmjax.deeppointmap.curriculum import TrainingConfig
 from dpmjax.deeppointmap.matching import merge_clouds
 from dpmjax.deeppointmap.model import (
     Model,
@@ -34,7 +33,8 @@ from dpmjax.deeppointmap.model import (
     predict_offsets,
     similarity_features,
 )
-from dpmjax.deeppointmap.objective import (
+from dpmjax.deeppointmap.training.curriculum import TrainingConfig
+from dpmjax.deeppointmap.training.objective import (
     ClosePairs,
     ObjectiveConfig,
     ObjectiveTerms,
@@ -42,7 +42,7 @@ from dpmjax.deeppointmap.objective import (
     close_pairs,
     matching_loss,
 )
-from dpmjax.deeppointmap.sampling import (
+from dpmjax.deeppointmap.training.sampling import (
     GroupBatch,
     MapOfScans,
     RegistrationSample,

@@ -24,12 +24,12 @@ from dpmjax.deeppointmap import (
     without,
 )
 from dpmjax.deeppointmap.model import predict_offsets
-from dpmjax.deeppointmap.sampling import RegistrationSample
-from dpmjax.deeppointmap.training import TrainingState, _learning_rate, batch_loss
+from dpmjax.deeppointmap.training.sampling import RegistrationSample
+from dpmjax.deeppointmap.training.step import TrainingState, _learning_rate, batch_loss
 from tests.deeppointmap import toy
 from tests.tolerances import ACCUMULATED
 
-REPOSITORY = Path(__file__).parents[2]
+REPOSITORY = Path(__file__).parents[3]
 
 
 @pytest.fixture(scope="module")
@@ -177,8 +177,8 @@ def test_the_learning_rate_falls_at_the_end_or_when_it_is_asked_to(start) -> Non
 EIGHT_DEVICES = """
 import jax, numpy as np
 from dpmjax.deeppointmap import SampleMaker, init_training
-from dpmjax.deeppointmap.processes import BATCH_AXIS, device_mesh, place
-from dpmjax.deeppointmap.training import batch_loss
+from dpmjax.deeppointmap.training.processes import BATCH_AXIS, device_mesh, place
+from dpmjax.deeppointmap.training.step import batch_loss
 from tests.deeppointmap import toy
 assert jax.device_count() == 8
 maker = SampleMaker(toy.store(), toy.TRAINING, seed=0, num_samples=8)

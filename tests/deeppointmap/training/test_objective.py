@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from dpmjax.deeppointmap.objective import ObjectiveConfig, TrainingSide, close_pairs, matching_loss
+from dpmjax.deeppointmap.training.objective import ObjectiveConfig, TrainingSide, close_pairs, matching_loss
 from dpmjax.geometry import rigid, se3
 from tests.deeppointmap import toy
 from tests.tolerances import ACCUMULATED

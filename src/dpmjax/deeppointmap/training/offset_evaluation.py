@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from dpmjax.deeppointmap.model import Model, correlate, predict_offsets
-from dpmjax.deeppointmap.objective import ObjectiveConfig, close_pairs
+from dpmjax.deeppointmap.training.objective import ObjectiveConfig, close_pairs
 from dpmjax.geometry.bearing import directions_of
 from dpmjax.types import AnyArray, DescriptorCloud
 

@@ -8,7 +8,7 @@ from typing import Literal, get_args
 
 from dpmjax.checks import require_count, require_fields, require_one_of, require_positive_fields
 from dpmjax.deeppointmap.model_config import ModelConfig, Preset, model_preset
-from dpmjax.deeppointmap.objective import ObjectiveConfig
+from dpmjax.deeppointmap.training.objective import ObjectiveConfig
 from dpmjax.scans.augment import AugmentConfig
 
 
