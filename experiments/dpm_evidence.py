@@ -128,13 +128,13 @@ def measure_scene(
 
 def judged(model: Any, measured: list[Any], hypotheses: Any, T_true: np.ndarray) -> dict[str, Any]:
     """Returns the evidence of all hypotheses of a pair, aligned as `register` aligns them."""
-    from dpmjax.deeppointmap import distinct_motions, evidence_shares
+    from dpmjax.deeppointmap import COARSE, FINE, distinct_motions, evidence_shares
     from dpmjax.metrics import registration_recall
     from dpmjax.scans import align_surfaces_from, correlate_views
 
     config, surfaces = model.config.verification, [scan.surface for scan in measured]
     T = np.concatenate([distinct_motions(hypotheses), correlate_views(*surfaces, config.views)])
-    for alignment in (config.coarse, config.fine):
+    for alignment in (COARSE, FINE):
         T = np.stack([found.T_target_source for found in align_surfaces_from(*surfaces, T, alignment)])
     return {
         "shares": evidence_shares(*measured, T, config).tolist(),

@@ -213,7 +213,7 @@ def test_a_guess_gives_way_to_loops() -> None:
 @pytest.mark.parametrize("num_keyframes", [1, 4])
 def test_a_submap_is_in_the_frame_of_its_centre(num_keyframes) -> None:
     truth = laps(1, side_m=40.0, step_m=2.0)
-    submap = submap_around(map_of(truth), 10, num_keyframes, 20.0)
+    submap = submap_around(map_of(truth), 10, num_keyframes)
     numbers = [number_of(scan) for scan in submap.scans]
     assert numbers[0] == 10
     assert len(numbers) == num_keyframes

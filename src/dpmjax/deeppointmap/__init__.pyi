@@ -27,6 +27,8 @@ from .model import encode_pyramid as encode_pyramid
 from .model import init_model as init_model
 from .model_config import ModelConfig as ModelConfig
 from .model_config import model_preset as model_preset
+from .motion_choice import COARSE as COARSE
+from .motion_choice import FINE as FINE
 from .motion_choice import VerifiedMotion as VerifiedMotion
 from .motion_choice import choose_motion as choose_motion
 from .motion_choice import refine_motion as refine_motion

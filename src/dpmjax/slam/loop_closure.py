@@ -162,7 +162,7 @@ def _register_candidates(
     overlapping.sort(key=lambda number: -(loops[number].overlap or 0.0))
 
     def submap(center: int) -> Submap:
-        return submap_around(slam_map, center, front.num_submap, front.submap_radius_m)
+        return submap_around(slam_map, center, front.num_submap)
 
     for number in overlapping[: config.num_registered]:
         (match,) = methods.matcher.register([(submap(row), submap(loops[number].target))])

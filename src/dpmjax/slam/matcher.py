@@ -16,7 +16,9 @@ from dpmjax.deeppointmap.confidence import gather_evidence, with_confidence
 from dpmjax.deeppointmap.encoding import pyramid_of_cloud
 from dpmjax.deeppointmap.matching import merge_clouds, thin_merged
 from dpmjax.deeppointmap.model import Model, encode_pyramid, model_fingerprint
+from dpmjax.deeppointmap.motion_choice import REFINEMENT
 from dpmjax.deeppointmap.scan_registration import PreparedScan, distinct_motions, match_clouds, register_each
+from dpmjax.deeppointmap.verification import PLANE_DISTANCE_M
 from dpmjax.scans.compact import expand_elements
 from dpmjax.scans.plane_information import plane_information
 from dpmjax.scans.surface_alignment import AlignmentLevel, align_surfaces, pair_with_planes
@@ -114,12 +116,10 @@ class NetworkMatcher:
     def _match(self, source: Submap, target: Submap, found: Registration) -> Match:
         config = self._model.config.verification
         scan, union = _surface(source._replace(scans=source.scans[:1])), _surface(target)
-        aligned = align_surfaces(scan, union, np.asarray(found.T_target_source, np.float64), config.refinement)
+        aligned = align_surfaces(scan, union, np.asarray(found.T_target_source, np.float64), REFINEMENT)
         T = aligned.T_target_source
         level = AlignmentLevel(config.plane_radius_m, config.num_samples, 1)
-        information = plane_information(
-            pair_with_planes(scan, union, T, level), T, max_residual_m=config.plane_distance_m
-        )
+        information = plane_information(pair_with_planes(scan, union, T, level), T, max_residual_m=PLANE_DISTANCE_M)
         return Match(T, float(found.confidence), float(found.rmse), found.verification, information)
 
 

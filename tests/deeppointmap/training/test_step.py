@@ -25,7 +25,7 @@ from dpmjax.deeppointmap import (
 )
 from dpmjax.deeppointmap.model import predict_offsets
 from dpmjax.deeppointmap.training.sampling import RegistrationSample
-from dpmjax.deeppointmap.training.step import TrainingState, _learning_rate, batch_loss
+from dpmjax.deeppointmap.training.step import WEIGHT_DECAY, TrainingState, _learning_rate, batch_loss
 from tests.deeppointmap import toy
 from tests.tolerances import ACCUMULATED
 
@@ -79,7 +79,7 @@ def test_without_the_offset_head_it_does_not_learn_and_a_pair_is_registered_by_p
     config = without(toy.TRAINING, "offset-head")
     after, report = make_step(config)(start, maker(0))
     head = (state.params["decoder"]["offset_head"] for state in (start, after))
-    kept = 1 - float(report.learning_rate) * config.weight_decay  # AdamW's decay, no gradient
+    kept = 1 - float(report.learning_rate) * WEIGHT_DECAY  # AdamW's decay, no gradient
     for before, now in zip(*map(jax.tree.leaves, head), strict=True):
         np.testing.assert_allclose(now, kept * before, atol=1e-7)
     model = Model(start.params, config.model)

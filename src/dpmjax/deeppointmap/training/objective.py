@@ -28,7 +28,6 @@ class ObjectiveConfig:
     """Weights and distances (DeepPointMap section 3.3).
 
     Attributes:
-        pairing_weight: weight of the pairing loss.
         coarse_weight: weight of the coarse pairing loss.
         offset_weight: weight of the offset loss.
         temperature: temperature of both pairing losses.
@@ -39,7 +38,6 @@ class ObjectiveConfig:
             scans need more.
     """
 
-    pairing_weight: float = 1.0
     coarse_weight: float = 0.1
     offset_weight: float = 1.0
     temperature: float = 0.1
@@ -49,7 +47,7 @@ class ObjectiveConfig:
 
     def __post_init__(self) -> None:
         require_positive_fields(self, "temperature", "positive_radius_m", "offset_radius_m")
-        require_fields(self, "pairing_weight", "coarse_weight", "offset_weight", low=0)
+        require_fields(self, "coarse_weight", "offset_weight", low=0)
         require_fields(self, "max_close", low=1)
 
 
@@ -150,11 +148,7 @@ def matching_loss(
     backward = _direction(b, a, squared.T, config)
     mean = jax.tree.map(lambda one, other: (one + other) / 2, forward, backward)
     terms = mean._replace(num_positives=forward.num_positives + backward.num_positives)
-    total = (
-        config.pairing_weight * terms.pairing
-        + config.coarse_weight * terms.coarse
-        + config.offset_weight * terms.offset
-    )
+    total = terms.pairing + config.coarse_weight * terms.coarse + config.offset_weight * terms.offset
     return total, terms
 
 

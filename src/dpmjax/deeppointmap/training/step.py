@@ -52,6 +52,12 @@ from dpmjax.geometry.bearing import directions_of
 from dpmjax.nets.neighbourhood import WINNERS
 from dpmjax.types import AnyArray, DescriptorCloud
 
+GROUP_SCANS_AT_ONCE = 16
+"""Groups of about this many scans are decoded at the same time."""
+
+WEIGHT_DECAY = 1e-4
+"""Weight decay of AdamW."""
+
 
 @flax.struct.dataclass
 class TrainingState:
@@ -190,9 +196,7 @@ def batch_loss(
             return _map_pair_loss(model, *maps, group.T_target_source, config.objective)
 
         return [
-            _in_parts(
-                of_group, group, config.group_scans_at_once // (group.source.rows.shape[1] + group.target.rows.shape[1])
-            )
+            _in_parts(of_group, group, GROUP_SCANS_AT_ONCE // (group.source.rows.shape[1] + group.target.rows.shape[1]))
             for group in sample.groups
         ]
 
@@ -279,5 +283,5 @@ def _optimizer(config: TrainingConfig) -> optax.GradientTransformation:
         optax.clip_by_global_norm(config.max_gradient_norm),
         # The mean of gradients is stored in 16 bits: a sixth of a checkpoint less, and training does not need more.
         optax.scale_by_adam(mu_dtype=jnp.bfloat16),
-        optax.add_decayed_weights(config.weight_decay),
+        optax.add_decayed_weights(WEIGHT_DECAY),
     )
