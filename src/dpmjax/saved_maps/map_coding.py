@@ -23,7 +23,7 @@ STEP_SHARE = 0.7
 """Step of the coefficients, as a share of the standard deviation of a channel."""
 
 NUM_ELEMENTS = 256
-"""Number of surface elements of a keyframe, if it has no more descriptors. Localisation needs keyframes more than elements."""
+"""Number of surface elements of a keyframe, if it has no more descriptors: localisation needs keyframes more."""
 
 POSITION_STEP_M = 0.02
 PLANARITY_STEP = 17
