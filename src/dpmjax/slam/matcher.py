@@ -81,11 +81,13 @@ class NetworkMatcher:
         Returns:
             Distinct motions, best first.
         """
-        config = self._model.config
-        hypotheses = match_clouds(self._model, source.cloud, target.cloud, config=config.matching)
+        matching = self._model.config.matching
+        if matching.consensus is not None:
+            matching = replace(matching, consensus=replace(matching.consensus, num_motions=num_motions))
+        hypotheses = match_clouds(self._model, source.cloud, target.cloud, config=matching)
         best = jax.tree.map(lambda leaf: jnp.asarray(leaf[0]), hypotheses)
-        confident = with_confidence(best, gather_evidence(hypotheses, 0, None), config.calibration)
-        return Proposal(distinct_motions(hypotheses)[:num_motions], float(confident.confidence))
+        confident = with_confidence(best, gather_evidence(hypotheses, 0, None), self._model.config.calibration)
+        return Proposal(distinct_motions(hypotheses), float(confident.confidence))
 
     def register(self, pairs: Sequence[tuple[Submap, Submap]]) -> list[Match]:
         """Registers merged descriptors, verifies by the central scans, aligns with the whole target; see `Matcher`.
