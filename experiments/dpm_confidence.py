@@ -114,7 +114,7 @@ def _by_kind(rows: Sequence[dict[str, Any]]) -> dict[str, list[dict[str, Any]]]:
 
 def rate(rows: Sequence[dict[str, Any]], calibration: Calibration, rated: str) -> dict[str, Any]:
     """Returns the numbers of registrations that a calibration is sure of, and its expected calibration error."""
-    from dpmjax.deeppointmap import Evidence, calibrated_probability
+    from dpmjax.deeppointmap import MatchEvidence, calibrated_probability
     from dpmjax.metrics import brier_score, expected_calibration_error
 
     confidence, is_right, distance_m = [], [], []
@@ -122,7 +122,7 @@ def rate(rows: Sequence[dict[str, Any]], calibration: Calibration, rated: str) -
         for number, of_clouds in enumerate(row["of_clouds"]):
             of_scans = (row[name][number] if rated == "scans" else None for name in ("of_scans", "of_weak_scans"))
             arrays = (None if values is None else np.asarray(values) for values in (of_clouds, *of_scans))
-            confidence.append(calibrated_probability(calibration, Evidence(*arrays)))
+            confidence.append(calibrated_probability(calibration, MatchEvidence(*arrays)))
         is_right += row[RATED[rated]]
         distance_m += row["distance_m"]
     probability, right, distance = np.array(confidence), np.array(is_right), np.array(distance_m)

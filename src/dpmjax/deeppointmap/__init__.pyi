@@ -7,8 +7,8 @@ from .confidence import OVERLAP_FEATURES as OVERLAP_FEATURES
 from .confidence import SCAN_FEATURES as SCAN_FEATURES
 from .confidence import WEAK_FEATURES as WEAK_FEATURES
 from .confidence import Calibration as Calibration
-from .confidence import Evidence as Evidence
 from .confidence import LogisticModel as LogisticModel
+from .confidence import MatchEvidence as MatchEvidence
 from .confidence import calibrated_probability as calibrated_probability
 from .confidence import fit_logistic as fit_logistic
 from .confidence import fit_weights as fit_weights

@@ -365,7 +365,7 @@ def thin_merged(merged: DescriptorCloud, num_a_cloud: int) -> DescriptorCloud:
 def thinned_mask(
     positions: Float[np.ndarray, "n 3"], mask: Bool[np.ndarray, " n"], num_a_cloud: int
 ) -> Bool[np.ndarray, " n"]:
-    """Finds the descriptors of a union whose place no earlier cloud describes.
+    """Removes descriptors of a union near those of earlier clouds.
 
     The softmax over a target would be split between copies of one place. A descriptor is removed if one of an earlier
     cloud is nearer than the spacing of the first cloud: the median distance between its nearest descriptors.

@@ -126,7 +126,7 @@ def add_keyframe(
 
 
 def with_origin(slam_map: KeyframeMap, origin: MapOrigin) -> KeyframeMap:
-    """Notes what makes a map; one that another matcher has made is refused.
+    """Records the matcher and the settings of a map.
 
     Args:
         slam_map: the map.
@@ -285,7 +285,7 @@ def turn_rad(T_a_b: Pose) -> float:
 
 
 def are_near(T_a: Pose, T_b: Pose, most_m: float, most_rad: float) -> bool:
-    """Returns True if two poses of one thing differ by at most a distance and a turn.
+    """Returns True if two poses differ by at most a distance and a rotation angle.
 
     Args:
         T_a: a pose.

@@ -65,7 +65,7 @@ def close_loops(methods: SlamMethods, slam_map: KeyframeMap, state: LoopState) -
 
 
 def search_again(methods: SlamMethods, slam_map: KeyframeMap, state: LoopState) -> LoopState:
-    """Registers keyframes that lie near earlier ones since the optimisation, and were not compared with them before.
+    """Registers keyframes with earlier ones that are near only since the optimisation.
 
     Args:
         methods: matcher and settings.

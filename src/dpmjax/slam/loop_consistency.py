@@ -42,7 +42,7 @@ MAX_WITNESSES = 6
 
 
 def loop_status(slam_map: KeyframeMap, loop: Loop, match: Match, config: LoopClosureConfig) -> LoopStatus:
-    """Decides about a registration by itself.
+    """Tests a registration of a loop against its probability, the agreement of the scans, and odometry.
 
     Args:
         slam_map: the map.

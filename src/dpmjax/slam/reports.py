@@ -103,7 +103,7 @@ class LoopState(NamedTuple):
 
 
 def loops_of_map(slam_map: KeyframeMap) -> LoopState:
-    """Lists the loops that an earlier run has accepted, so that they can still be taken back.
+    """Lists the loops that an earlier run has accepted; the optimisation may remove them later.
 
     Args:
         slam_map: of the earlier run.

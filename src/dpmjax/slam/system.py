@@ -175,7 +175,7 @@ def finish_slam(state: SlamState, reports: Iterable[ScanReport], config: SlamCon
 def place_scans(
     T_world_keyframe: Float[np.ndarray, "k 4 4"], reports: Sequence[ScanReport]
 ) -> Float[np.ndarray, "n 4 4"]:
-    """Puts every scan where its keyframe says.
+    """Computes the world pose of each scan from the pose of its keyframe.
 
     Args:
         T_world_keyframe: poses of the keyframes; none where all scans were empty.

@@ -1,6 +1,6 @@
 """The training objective of DeepPointMap: similar descriptors at the same place, and correct offsets.
 
-`close_pairs` finds, from true poses, the descriptors that lie close to each other. The offset head predicts their
+`training_pairs` finds, from true poses, the descriptors that lie close to each other. The offset head predicts their
 offsets. `matching_loss` combines the three losses. All functions take arrays, not networks.
 """
 
@@ -52,7 +52,7 @@ class ObjectiveConfig:
 
 
 @flax.struct.dataclass
-class ClosePairs:
+class TrainingPairs:
     """Descriptors of a second cloud that lie close to each descriptor of a first one, nearest first.
 
     Attributes:
@@ -75,7 +75,7 @@ class TrainingSide:
         mask: True for descriptors that are there; others may hold anything.
         matched_features: correlated descriptors after the similarity head.
         coarse_features: uncorrelated descriptors after the coarse head.
-        close: from `close_pairs`.
+        close: from `training_pairs`.
         offsets: predicted offsets of the close pairs, metres, in the frame of the cloud.
     """
 
@@ -83,7 +83,7 @@ class TrainingSide:
     mask: Bool[AnyArray, "*b m"]
     matched_features: Float[AnyArray, "*b m c"]
     coarse_features: Float[AnyArray, "*b m e"]
-    close: ClosePairs
+    close: TrainingPairs
     offsets: Float[AnyArray, "*b m k 3"]
 
 
@@ -105,9 +105,9 @@ class ObjectiveTerms(NamedTuple):
     num_positives: Int[Array, ""]
 
 
-def close_pairs(
+def training_pairs(
     a: DescriptorCloud, b: DescriptorCloud, T_b_a: Float[AnyArray, "4 4"], *, config: ObjectiveConfig
-) -> tuple[ClosePairs, ClosePairs]:
+) -> tuple[TrainingPairs, TrainingPairs]:
     """Finds the pairs closer than `offset_radius_m`, and their true offsets.
 
     Args:
@@ -182,10 +182,10 @@ def _top1_accuracy(source: TrainingSide, target: TrainingSide, positives: Int[Ar
 
 def _close_of(
     cloud: DescriptorCloud, other: DescriptorCloud, T_cloud_other: Float[Array, "4 4"], config: ObjectiveConfig
-) -> ClosePairs:
+) -> TrainingPairs:
     positions = jnp.where(cloud.mask[:, None], cloud.positions, 0)
     others = rigid.transform_points(T_cloud_other, other.positions)
     near = radius_search(positions, others, config.offset_radius_m, config.max_close, other.mask)
     is_close = near.mask & cloud.mask[:, None]
     offsets = jnp.where(is_close[..., None], others[near.indices] - positions[:, None], 0)
-    return ClosePairs(jnp.where(is_close, near.indices, 0), is_close, offsets)
+    return TrainingPairs(jnp.where(is_close, near.indices, 0), is_close, offsets)

@@ -35,12 +35,12 @@ from dpmjax.deeppointmap.model import (
 )
 from dpmjax.deeppointmap.training.curriculum import TrainingConfig
 from dpmjax.deeppointmap.training.objective import (
-    ClosePairs,
     ObjectiveConfig,
     ObjectiveTerms,
+    TrainingPairs,
     TrainingSide,
-    close_pairs,
     matching_loss,
+    training_pairs,
 )
 from dpmjax.deeppointmap.training.sampling import (
     GroupBatch,
@@ -217,7 +217,7 @@ def _map_pair_loss(
 ) -> tuple[Float[Array, ""], ObjectiveTerms]:
     # Applies the networks to two maps, and computes the losses (DeepPointMap eq. 4 to 7).
     correlated_a, correlated_b = correlate(model, a, b)
-    close_a, close_b = close_pairs(a, b, T_b_a, config=config)
+    close_a, close_b = training_pairs(a, b, T_b_a, config=config)
     sides = (_side(model, a, correlated_a, correlated_b, close_a), _side(model, b, correlated_b, correlated_a, close_b))
     return matching_loss(*sides, T_b_a, config=config)
 
@@ -243,7 +243,7 @@ def _in_parts(function: Callable[[Any], Any], trees: Any, at_once: int) -> Any:
 
 
 def _side(
-    model: Model, cloud: DescriptorCloud, correlated: DescriptorCloud, other: DescriptorCloud, close: ClosePairs
+    model: Model, cloud: DescriptorCloud, correlated: DescriptorCloud, other: DescriptorCloud, close: TrainingPairs
 ) -> TrainingSide:
     directions = directions_of(cloud)[:, None]
     own = correlated.features[:, None]
