@@ -247,7 +247,7 @@ def refine_motion(
 def weak_direction_of(
     source: MeasuredScan, target: MeasuredScan, T_target_source: Float[np.ndarray, "4 4"], config: VerificationConfig
 ) -> WeakDirection:
-    """Finds the horizontal direction in which a motion is least certain, by all elements of the source that meet planes.
+    """Finds the horizontal direction in which a motion is least certain, by all source elements that meet planes.
 
     Args:
         source: a scan.
