@@ -81,8 +81,6 @@ SCANS_3D = Group("3-D scans", (
     }),
     Section("MatchConfig", "dpmjax.deeppointmap", "`register(model, a, b, config=config)`", {
         "pair_ratio": ("share", "more pairs find motions of smaller overlap, slower"),
-        "max_num_pairs": ("pairs", "bound of the pairs; the time of the consensus grows with its cube"),
-        "max_offset_m": ("m", "descriptor pairs with longer predicted offsets are dropped"),
         "consensus": ("", "None: the published rounds of inliers, for published weights"),
     }),
 ))  # fmt: skip
@@ -92,34 +90,23 @@ SLAM = Group("SLAM", (
         "proposer": ("", "\"network\": the decoder proposes the motion of every scan, slower"),
         "num_keyframes": ("keyframes", "more: a larger local map, less drift, slower"),
         "num_recent": ("scans", "more: a denser local map, slower"),
-        "min_num_points": ("elements", "lower for very sparse lidars; below it a scan counts as empty"),
-        "plane_distance_m": ("m", "higher for noisy lidars"),
-        "turns_deg": ("deg", "wider if the robot turns fast between scans"),
-        "tilts_deg": ("deg", "wider if the vehicle pitches and rolls"),
     }),
     Section("FrontEndConfig", "dpmjax.slam", "`SlamConfig(front_end=...)`", {
-        "min_score_share": ("share of the usual", "higher if the robot may be carried: poses are rejected sooner"),
         "keyframe_share": ("share of the median range", "higher: fewer keyframes, smaller maps, fewer loops"),
         "max_keyframe_m": ("m", "longest way between two keyframes"),
-        "keyframe_rad": ("rad", "largest turn between two keyframes"),
         "num_lost": ("scans", "after this number of rejected scans a new part of the map begins"),
     }),
     Section("LoopClosureConfig", "dpmjax.slam", "`SlamConfig(loops=...)`", {
         "is_on": ("", "False: odometry alone (`--no-loop`)"),
-        "max_radius_m": ("m", "larger if odometry drifts far before a place is seen again"),
         "num_similar": ("keyframes", "more candidates by appearance: more loops, slower"),
         "min_overlap": ("probability", "lower for places that are seen from far apart; slower"),
         "min_probability": ("probability", "higher if wrong loops occur"),
         "min_support": ("registrations", "1: a loop needs no second one; risky in places that look alike"),
-        "drift_m": ("m per root of a metre", "higher for worse odometry"),
-        "edge_outlier_chi2": ("chi2", "lower: contradicted loops lose their weight sooner"),
     }),
     Section("LocalizationConfig", "dpmjax.slam", "`localize(model, slam_map, scan, config)`", {
         "num_similar": ("keyframes", "more for large maps"),
         "num_registered": ("keyframes", "more: more scans are found, slower"),
-        "same_place_m": ("m", "smaller in rooms"),
         "min_support": ("registrations", "1 for maps with few keyframes; riskier"),
-        "min_best": ("probability", "lower: more scans are found, and some may be wrong"),
     }),
     Section("PoseGraphConfig", "dpmjax.pose_graph", "`optimize_pose_graph(graph, config)`", {
         "outlier_chi2": ("chi2", "10 if edges may be wrong; None: plain least squares"),
@@ -136,7 +123,6 @@ TRAINING = Group("Training", (
         "learning_rate": ("", "lower (1e-4) to tune trained weights on few scans"),
         "final_learning_rate": ("", "at the end of the decay"),
         "decay_ratio": ("share of the steps", "part of the training in which the learning rate falls"),
-        "weight_decay": ("", "of AdamW"),
         "max_gradient_norm": ("", "lower if the loss jumps"),
         "scans_at_once": ("scans", "more on a GPU, fewer if memory is short"),
     }),
@@ -144,7 +130,6 @@ TRAINING = Group("Training", (
         "num_scans": ("scans", "scans of one step; memory and time grow with it"),
         "min_distance_m": ("m", "nearer scans are too similar to learn from"),
         "max_distance_m": ("m", "larger: harder pairs"),
-        "pair_probability": ("probability", "share of groups that are one pair of scans"),
     }),
 ))  # fmt: skip
 

@@ -98,7 +98,7 @@ def rate(rows: Sequence[cli.Row], calibration: dpm.Calibration, rated: str) -> c
         for number, of_clouds in enumerate(row["of_clouds"]):
             of_scans = (row[name][number] if rated == "scans" else None for name in ("of_scans", "of_weak_scans"))
             arrays = (None if values is None else np.asarray(values) for values in (of_clouds, *of_scans))
-            confidence.append(dpm.calibrated_probability(calibration, dpm.Evidence(*arrays)))
+            confidence.append(dpm.calibrated_probability(calibration, dpm.MatchEvidence(*arrays)))
         is_right += row[RATED[rated]]
         distance_m += row["distance_m"]
     probability, right, distance = np.array(confidence), np.array(is_right), np.array(distance_m)

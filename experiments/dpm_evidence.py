@@ -116,7 +116,7 @@ def hypotheses(model: dpm.Model, measured: list[Any], found: Any, T_true: np.nda
     """Returns the evidence of all hypotheses of a pair, aligned as `register` aligns them."""
     config, surfaces = model.config.verification, [scan.surface for scan in measured]
     T = np.concatenate([dpm.distinct_motions(found), scans.correlate_views(*surfaces, config.views)])
-    for alignment in (config.coarse, config.fine):
+    for alignment in (dpm.COARSE, dpm.FINE):
         T = np.stack([one.T_target_source for one in scans.align_surfaces_from(*surfaces, T, alignment)])
     return {
         "shares": dpm.evidence_shares(*measured, T, config).tolist(),

@@ -27,7 +27,6 @@ from .deepmapping.relocalization import relocalize as relocalize
 from .deeppointmap.batches import encode_scans as encode_scans
 from .deeppointmap.batches import overlap_pairs as overlap_pairs
 from .deeppointmap.batches import register_pairs as register_pairs
-from .deeppointmap.curriculum import training_preset as training_preset
 from .deeppointmap.encoding import encode as encode
 from .deeppointmap.model import Model as Model
 from .deeppointmap.model import correlate as correlate
@@ -37,8 +36,9 @@ from .deeppointmap.model_config import ModelConfig as ModelConfig
 from .deeppointmap.model_config import model_preset as model_preset
 from .deeppointmap.scan_registration import overlap as overlap
 from .deeppointmap.scan_registration import register as register
-from .deeppointmap.training_loop import train as train
-from .deeppointmap.training_records import TrainingHooks as TrainingHooks
+from .deeppointmap.training.curriculum import training_preset as training_preset
+from .deeppointmap.training.loop import train as train
+from .deeppointmap.training.records import TrainingHooks as TrainingHooks
 from .geometry.alignment import weighted_svd as weighted_svd
 from .geometry.neighbours import k_nearest as k_nearest
 from .geometry.neighbours import radius_search as radius_search

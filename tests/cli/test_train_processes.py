@@ -33,7 +33,7 @@ TRAINING = replace(toy.TRAINING, curriculum=(CurriculumStage(2, 4),))
 # The second process gets a signal before its third step of four.
 PROCESS = """
 import os, signal, sys
-from dpmjax.deeppointmap.processes import is_first, join_processes, merged
+from dpmjax.deeppointmap.training.processes import is_first, join_processes, merged
 coordinator, number, folder = sys.argv[1], int(sys.argv[2]), sys.argv[3]
 join_processes(coordinator, 2, number)
 

@@ -11,7 +11,7 @@ import pytest
 import dpmjax
 from dpmjax.deeppointmap.confidence import logistic_probability, weak_features
 from dpmjax.deeppointmap.motion_choice import VerifiedMotion, choose_motion, refine_motion, weak_direction_of
-from dpmjax.deeppointmap.verification import MeasuredScan, SlidingConfig, VerificationConfig, measure_scan
+from dpmjax.deeppointmap.verification import MeasuredScan, VerificationConfig, measure_scan
 from dpmjax.scans.weak_directions import facing_surface, facing_weights, sliding_motions, wall_axis, weak_share
 from tests.scans.surface_scenes import corridor, motion, seen_from
 
@@ -101,7 +101,7 @@ def test_walls_of_all_directions_leave_the_choice_as_it_was() -> None:
     scans = [measure_scan(seen_from(points, T), CONFIG) for T in POSES]
     hypotheses = np.stack([along_the_corridor(9.0), along_the_corridor(0.5)])
     found = choose_motion(*scans, hypotheses, CONFIG)
-    without = choose_motion(*scans, hypotheses, replace(CONFIG, sliding=SlidingConfig(max_weak_share=0)))
+    without = choose_motion(*scans, hypotheses, replace(CONFIG, max_weak_share=0))
     assert found.verification == without.verification
     assert found.verification.num_slid == 0
     np.testing.assert_array_equal(found.T_target_source, without.T_target_source)

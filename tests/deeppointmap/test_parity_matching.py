@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from dpmjax.deeppointmap.matching import MatchConfig, match_descriptors
-from dpmjax.deeppointmap.objective import ObjectiveConfig, TrainingSide, close_pairs, matching_loss
+from dpmjax.deeppointmap.training.objective import ObjectiveConfig, TrainingSide, close_pairs, matching_loss
 from tests.deeppointmap import toy
 from tests.optional import import_or_skip
 

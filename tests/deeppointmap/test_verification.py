@@ -7,7 +7,7 @@ import pytest
 
 from dpmjax.deeppointmap.motion_choice import VerifiedMotion, choose_motion, refine_motion
 from dpmjax.deeppointmap.verification import (
-    SlidingConfig,
+    EVIDENCE,
     VerificationConfig,
     evidence_shares,
     measure_scan,
@@ -59,7 +59,7 @@ def test_motions_are_verified_together_as_alone(scans) -> None:
     for found, T in zip(together, motions, strict=True):
         np.testing.assert_allclose(found, verify_motion(*scans, T, CONFIG), atol=1e-12)
     shares = evidence_shares(*scans, motions, CONFIG)
-    bias, *weights = astuple(CONFIG.evidence)
+    bias, *weights = astuple(EVIDENCE)
     np.testing.assert_allclose([found.score for found in together], shares @ weights + bias)
     assert ((shares >= 0) & (shares <= 1)).all()
 
@@ -109,7 +109,7 @@ def test_the_scans_find_the_motion_that_no_hypothesis_names(scans) -> None:
     found = choose_motion(*scans, (T_TRUE @ motion(90, (9, 0, 0)))[None], CONFIG)
     assert found.row is None
     assert translation_error(found.T_target_source) < 0.1
-    without = replace(CONFIG, views=replace(CONFIG.views, num_motions=0), sliding=SlidingConfig(max_weak_share=0))
+    without = replace(CONFIG, views=replace(CONFIG.views, num_motions=0), max_weak_share=0)
     found = choose_motion(*scans, (T_TRUE @ motion(90, (9, 0, 0)))[None], without)
     assert found.row == 0
     assert found.verification.num_tried == 1
@@ -117,7 +117,7 @@ def test_the_scans_find_the_motion_that_no_hypothesis_names(scans) -> None:
 
 def test_near_equal_hypotheses_do_not_compete(scans) -> None:
     hypotheses = np.stack([T_TRUE @ motion(angle, (0, 0, 0)) for angle in (0, 1, -1, 2)])
-    found = choose_motion(*scans, hypotheses, replace(CONFIG, sliding=SlidingConfig(max_weak_share=0)))
+    found = choose_motion(*scans, hypotheses, replace(CONFIG, max_weak_share=0))
     assert found.verification.gap == found.verification.score
 
 

@@ -16,8 +16,8 @@ from dpmjax.deeppointmap import (
     SCAN_FEATURES,
     WEAK_FEATURES,
     Calibration,
-    Evidence,
     LogisticModel,
+    MatchEvidence,
 )
 from dpmjax.deeppointmap.scan_evaluation import StagedRegistration, StageSeconds
 from experiments import _dpm_overlap, _dpm_places, dpm_calibrate, dpm_confidence, dpm_evaluate
@@ -91,7 +91,7 @@ def test_calibration_is_stored_in_a_copy_of_the_model(weights, tmp_path, monkeyp
         is_right = rng.uniform() < 0.5
         T = pair.T_target_source if is_right else np.eye(4)
         of_clouds = rng.normal(size=4) + is_right
-        evidence = Evidence(
+        evidence = MatchEvidence(
             of_clouds,
             np.concatenate([of_clouds, rng.normal(size=len(SCAN_FEATURES) - 4) + 2 * is_right]),
             rng.normal(size=len(WEAK_FEATURES)) + 2 * is_right if rng.uniform() < 0.5 else None,

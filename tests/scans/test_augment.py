@@ -10,6 +10,7 @@ import pytest
 from dpmjax.geometry import rigid
 from dpmjax.scans import AugmentConfig, BoxConfig, SectorConfig, augment_scan
 from dpmjax.scans.augment import (
+    JITTER_CLIP_SIGMAS,
     is_behind_box,
     is_behind_boxes,
     is_behind_sectors,
@@ -103,9 +104,9 @@ def test_drop_ratio_is_uniform() -> None:
 
 def test_jitter_is_clipped() -> None:
     scan = cloud(300, 300)
-    many = augment_all(replace(NOTHING, jitter_sigma_m=0.1, jitter_clip_sigmas=1.0), scan)
+    many = augment_all(replace(NOTHING, jitter_sigma_m=0.1), scan)
     nearest = np.linalg.norm(many.cloud.points[0][:, None] - np.asarray(scan.points), axis=-1).min(axis=1)
-    assert 0 < nearest.max() <= 0.1 * np.sqrt(3) + 1e-5
+    assert 0 < nearest.max() <= 0.1 * JITTER_CLIP_SIGMAS * np.sqrt(3) + 1e-5
 
 
 def test_sectors_hide_a_wedge_from_some_range_on() -> None:

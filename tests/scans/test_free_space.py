@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from dpmjax.scans.free_space import RangeImageConfig, range_image, view_points
+from dpmjax.scans.free_space import range_image, view_points
 
 
 def sphere(radius: float, num: int = 20000) -> np.ndarray:
@@ -21,10 +21,9 @@ def test_points_before_on_and_behind_a_sphere(radius: float, is_visible: bool, i
 
 
 def test_margin_grows_with_the_range() -> None:
-    config = RangeImageConfig(margin_m=1.0, margin_share=0.1)
-    image = range_image(sphere(30.0), config)
-    assert not view_points(image, sphere(27.5, 100), config).is_contradicted.any()
-    assert view_points(image, sphere(26.5, 100), config).is_contradicted.all()
+    image = range_image(sphere(30.0))
+    assert not view_points(image, sphere(27.5, 100)).is_contradicted.any()
+    assert view_points(image, sphere(26.5, 100)).is_contradicted.all()
 
 
 def test_nothing_is_known_where_nothing_was_measured() -> None:
@@ -42,8 +41,3 @@ def test_the_image_has_no_seam_behind_the_lidar() -> None:
     """Azimuths just above -pi and just below pi are neighbours."""
     wall = np.array([[-20.0, 0.05, 0.0]])
     assert view_points(range_image(wall), np.array([[-5.0, -0.05, 0.0]])).is_contradicted.all()
-
-
-def test_settings_out_of_range_are_named() -> None:
-    with pytest.raises(ValueError, match="pixel_deg"):
-        RangeImageConfig(pixel_deg=0.0)

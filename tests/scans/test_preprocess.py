@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from dpmjax.scans import PreprocessConfig, preprocess_scan, preprocess_scan_on_host
-from dpmjax.scans.preprocess import TABLE_BITS, first_of_each_voxel
+from dpmjax.scans.preprocess import OUTLIER_SIGMAS, TABLE_BITS, first_of_each_voxel
 from dpmjax.types import PointCloud
 
 CONFIG = PreprocessConfig(max_range_m=30.0, num_outlier_neighbours=5, capacity=512)
@@ -37,7 +37,7 @@ def preprocessed_in_numpy(points: np.ndarray, config: PreprocessConfig) -> np.nd
     kept = np.array(kept)
     distances = np.sort(np.linalg.norm(kept[:, None].astype(np.float64) - kept, axis=-1), axis=1)
     spread = distances[:, 1 : config.num_outlier_neighbours + 1].mean(axis=1)
-    kept = kept[spread <= spread.mean() + config.outlier_sigmas * spread.std()]
+    kept = kept[spread <= spread.mean() + OUTLIER_SIGMAS * spread.std()]
     farthest = int(np.argmax(np.linalg.norm(kept, axis=1)))
     kept[[0, farthest]] = kept[[farthest, 0]]
     return kept
@@ -182,7 +182,6 @@ def test_wrong_arguments_are_named(as_user) -> None:
         ("capacity", 0),
         ("capacity", 1 << 16),
         ("num_outlier_neighbours", -1),
-        ("outlier_sigmas", 0.0),
     ):
         with pytest.raises(ValueError, match=f"^{name}: expected"):
             PreprocessConfig(**{name: value})

@@ -11,12 +11,11 @@ from dpmjax.scans.plane_information import plane_information, with_least_covaria
 from dpmjax.scans.surface_alignment import PlanePairs
 from dpmjax.slam import KeyframeMap, LoopClosureConfig, SlamConfig, SlamMethods
 from dpmjax.slam.keyframes import Keyframe, MapEdge, add_keyframe, diagonal_information, submap_around
-from dpmjax.slam.loop_candidates import MIN_PATH_SHARE, find_candidates, nearest_pairs
+from dpmjax.slam.loop_candidates import MIN_PATH_SHARE, find_loop_candidates, nearest_pairs
 from dpmjax.slam.loop_closure import MAX_AGAIN, search_again
 from dpmjax.slam.loop_consistency import are_consistent
-from dpmjax.slam.loop_state import LoopState
 from dpmjax.slam.map_optimization import optimize_map
-from dpmjax.slam.reports import Loop
+from dpmjax.slam.reports import Loop, LoopState
 from dpmjax.slam.retrieval import most_similar, pooled_vector
 from dpmjax.types import DescriptorCloud
 from tests.slam.truth import TruthGeometry, TruthMatcher, compact_of, laps, noise, number_of, pose
@@ -81,11 +80,13 @@ def test_candidates_are_old_and_near() -> None:
     truth = laps(2, side_m=40.0, step_m=2.0)
     slam_map = map_of(truth)
     row = len(truth) - 1
-    near = [candidate.row for candidate in find_candidates(slam_map, row, CONFIG) if candidate.found_by == "distance"]
+    near = [
+        candidate.row for candidate in find_loop_candidates(slam_map, row, CONFIG) if candidate.found_by == "distance"
+    ]
     assert row - len(truth) // 2 in near
     for candidate in near:
         assert slam_map.keyframes[row].path_m - slam_map.keyframes[candidate].path_m > 40.0
-    assert not find_candidates(slam_map, 3, CONFIG)
+    assert not find_loop_candidates(slam_map, 3, CONFIG)
 
 
 def test_nearest_pairs_are_those_of_a_search_by_hand() -> None:
@@ -212,7 +213,7 @@ def test_a_guess_gives_way_to_loops() -> None:
 @pytest.mark.parametrize("num_keyframes", [1, 4])
 def test_a_submap_is_in_the_frame_of_its_centre(num_keyframes) -> None:
     truth = laps(1, side_m=40.0, step_m=2.0)
-    submap = submap_around(map_of(truth), 10, num_keyframes, 20.0)
+    submap = submap_around(map_of(truth), 10, num_keyframes)
     numbers = [number_of(scan) for scan in submap.scans]
     assert numbers[0] == 10
     assert len(numbers) == num_keyframes

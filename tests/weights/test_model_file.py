@@ -68,6 +68,8 @@ def test_wrong_configurations_are_named() -> None:
         config_from_json({"colour": 1}, ModelConfig)
     with pytest.raises(ValueError, match="ModelConfig.encoder.stem_channels: expected int, got 'x'"):
         config_from_json({"encoder": {"stem_channels": "x"}}, ModelConfig)
+    # A file of another version is read without it.
+    assert config_from_json({"colour": 1, "scale_m": 2.0}, ModelConfig, file="old.safetensors").scale_m == 2.0
 
 
 def test_full_size_checkpoint_is_loaded_by_its_tensors(torch: Any, tmp_path: Path) -> None:

@@ -110,7 +110,7 @@ class Config(ProcessOptions):
 
 def main(config: Config) -> None:
     """Trains, evaluates, and writes the files; one of several processes writes."""
-    from dpmjax.deeppointmap.processes import is_first, join_processes, merged, together
+    from dpmjax.deeppointmap.training.processes import is_first, join_processes, merged, together
 
     started = time.perf_counter()
     join_processes(config.coordinator, config.num_processes, config.process_id)

@@ -83,7 +83,7 @@ class Calibration:
     of_weak_scans: LogisticModel | None = None
 
 
-class Evidence(NamedTuple):
+class MatchEvidence(NamedTuple):
     """Features from which the confidence is computed.
 
     Attributes:
@@ -97,7 +97,7 @@ class Evidence(NamedTuple):
     of_weak_scans: Float[np.ndarray, " w"] | None = None
 
 
-def gather_evidence(hypotheses: Registration, row: int | None, verification: Verification | None) -> Evidence:
+def gather_evidence(hypotheses: Registration, row: int | None, verification: Verification | None) -> MatchEvidence:
     """Gathers the features of one hypothesis.
 
     Args:
@@ -116,10 +116,10 @@ def gather_evidence(hypotheses: Registration, row: int | None, verification: Ver
         rmse_m = min(float(hypotheses.rmse[row]), MAX_RMSE_M)
         of_clouds = np.array([support[row], float(hypotheses.mean_score[row]), rmse_m, support[row] - second])
     if verification is None:
-        return Evidence(of_clouds, None)
+        return MatchEvidence(of_clouds, None)
     of_scans = verification[: verification._fields.index("num_tried")]
     of_weak_scans = weak_features(verification) if verification.num_slid > 0 else None
-    return Evidence(of_clouds, np.concatenate([of_clouds, of_scans]), of_weak_scans)
+    return MatchEvidence(of_clouds, np.concatenate([of_clouds, of_scans]), of_weak_scans)
 
 
 def weak_features(verification: Verification) -> Float[np.ndarray, "2"]:
@@ -134,7 +134,7 @@ def weak_features(verification: Verification) -> Float[np.ndarray, "2"]:
     return np.array([min(verification.score, MAX_SCORE), np.sqrt(max(verification.facing_gap, 0.0))])
 
 
-def calibrated_probability(calibration: Calibration, evidence: Evidence) -> float:
+def calibrated_probability(calibration: Calibration, evidence: MatchEvidence) -> float:
     """Computes the probability that a registration is right, by the model that fits its features.
 
     Args:
@@ -216,7 +216,7 @@ def fit_weights(
     return weights, float(found[-1] - weights @ mean)
 
 
-def with_confidence(match: Registration, evidence: Evidence, calibration: Calibration | None) -> Registration:
+def with_confidence(match: Registration, evidence: MatchEvidence, calibration: Calibration | None) -> Registration:
     """Sets the confidence of a registration to the calibrated probability.
 
     Args:

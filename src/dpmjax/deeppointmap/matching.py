@@ -25,6 +25,25 @@ from dpmjax.geometry.consensus import ConsensusConfig, find_consensus, motion_su
 from dpmjax.geometry.rigid import safe_sqrt
 from dpmjax.types import AnyArray, DescriptorCloud, Registration
 
+MAX_OFFSET_M = 2.0
+"""Pairs with longer offsets are dropped."""
+
+NUM_CONFIDENT = 30
+"""The confidence is the mean score of this many first inliers."""
+
+INLIER_SIGMAS = 3.0
+"""An inlier's error is at most the mean plus this many standard deviations of the inliers before."""
+
+MIN_NUM_FIRST = 64
+"""Least number of first inliers; where fewer pairs have such scores, this number of the best pairs is taken."""
+
+MIN_INLIER_SCORE = 0.5
+"""Pairs with higher scores are the first inliers."""
+
+MAX_NUM_PAIRS = 512
+"""Largest number of pairs per direction. More pairs do not make a motion more exact, and the cost of the consensus is
+cubic."""
+
 PredictOffsets = Callable[[Int[Array, " k"], Int[Array, " k"]], tuple[Float[Array, "k 3"], Float[Array, "k 3"]]]
 """Maps rows of the source and of the target to the offsets of eq. 1 (source frame) and eq. 2 (target frame), metres."""
 
@@ -43,36 +62,21 @@ class MatchConfig:
     Attributes:
         temperature: temperature of both softmaxes.
         pair_ratio: number of pairs per direction, as a share of the mean size of the two clouds.
-        max_num_pairs: largest number of pairs per direction; more pairs do not make a motion more exact, and the cost
-            of the consensus grows with their cube.
-        max_offset_m: pairs with longer offsets are dropped.
-        min_inlier_score: pairs with higher scores are the first inliers.
-        min_num_first: least number of first inliers; where fewer pairs have such scores, this number of the best pairs
-            is taken.
         num_rounds: number of times that the inliers are chosen again.
-        inlier_sigmas: an inlier's error is at most the mean plus this many standard deviations of the inliers before.
         min_num_inliers: a choice of fewer inliers is rejected.
-        num_confident: the confidence is the mean score of this many first inliers.
         consensus: if given, the first inliers are the pairs that support one common motion. This tolerates many wrong
             pairs, as from networks with little training or in repetitive places.
     """
 
     temperature: float = 0.1
     pair_ratio: float = 0.5
-    max_num_pairs: int = 512
-    max_offset_m: float = 2.0
-    min_inlier_score: float = 0.5
-    min_num_first: int = 64
     num_rounds: int = 3
-    inlier_sigmas: float = 3.0
     min_num_inliers: int = 30
-    num_confident: int = 30
     consensus: ConsensusConfig | None = None
 
     def __post_init__(self) -> None:
-        require_positive_fields(self, "temperature", "pair_ratio", "max_offset_m", "inlier_sigmas")
-        require_fields(self, "min_num_first", "num_rounds", "min_num_inliers", "num_confident", low=1)
-        require_fields(self, "max_num_pairs", low=1)
+        require_positive_fields(self, "temperature", "pair_ratio")
+        require_fields(self, "num_rounds", "min_num_inliers", low=1)
         require_fields(self, "pair_ratio", low=0, high=4)
 
 
@@ -189,7 +193,7 @@ def best_pairs(
     num_source, num_target = similarity.shape
     # floor(floor(ratio * (m + n)) / 2): the count of the published configuration.
     wanted = int(config.pair_ratio * (num_source + num_target)) // 2
-    capacity = min(wanted, config.max_num_pairs, num_source * num_target)
+    capacity = min(wanted, MAX_NUM_PAIRS, num_source * num_target)
     is_pair = source_mask[:, None] & target_mask[None, :]
     scores = dual_softmax(similarity, is_pair, config.temperature)
     scores, flat = lax.top_k(jnp.where(is_pair, scores, -1).ravel(), capacity)
@@ -212,7 +216,7 @@ def _align(
     # Weighted SVD with rounds of inliers over both directions of the pairs (DeepPointMap eq. 3).
     offsets = jnp.concatenate(both_offsets)
     scores = jnp.tile(pairs.scores, 2)
-    is_used = jnp.tile(pairs.mask, 2) & (jnp.sum(offsets**2, axis=1) <= config.max_offset_m**2)
+    is_used = jnp.tile(pairs.mask, 2) & (jnp.sum(offsets**2, axis=1) <= MAX_OFFSET_M**2)
     offsets = jnp.where(is_used[:, None], offsets, 0)
     # Metres keep the type of the points, whatever type the heads compute in.
     offsets = offsets.astype(source_points.dtype)
@@ -229,7 +233,7 @@ def _align(
         num_inliers = jnp.sum(is_inlier)
         squared = jnp.sum(jnp.where(is_inlier, errors**2, 0)) / jnp.maximum(num_inliers, 1)
         is_determined = jnp.minimum(*(_num_distinct(some, is_inlier) for some in rows)) >= MIN_NUM_POINTS
-        is_scored = is_inlier & (jnp.cumsum(is_inlier) <= config.num_confident)
+        is_scored = is_inlier & (jnp.cumsum(is_inlier) <= NUM_CONFIDENT)
         mean_score = jnp.sum(jnp.where(is_scored, scores, 0)) / jnp.maximum(jnp.sum(is_scored), 1)
         half = slice(num_pairs)
         support = motion_support(
@@ -269,7 +273,7 @@ def _first_inliers(pairs: _PointPairs, config: MatchConfig) -> Bool[Array, "h p"
     source, target, scores, is_used = lax.stop_gradient(pairs)
     if config.consensus is None:
         ranks = jnp.argsort(jnp.argsort(jnp.where(is_used, -scores, jnp.inf)))
-        return (is_used & ((scores > config.min_inlier_score) | (ranks < config.min_num_first)))[None]
+        return (is_used & ((scores > MIN_INLIER_SCORE) | (ranks < MIN_NUM_FIRST)))[None]
     # The consensus is found in the first direction alone, at a quarter of the work, and then applied to both.
     half = len(source) // 2
     consensus = find_consensus(source[:half], target[:half], is_used[:half], config=config.consensus)
@@ -286,7 +290,7 @@ def _choose_inliers(pairs: _PointPairs, first: Bool[Array, " p"], config: MatchC
     def choose(_: Int[Array, ""], is_inlier: Bool[Array, " p"]) -> Bool[Array, " p"]:
         _, errors = _solve(pairs, is_inlier)
         spread = jnp.std(errors, where=is_inlier)
-        limit = (jnp.mean(errors, where=is_inlier) + config.inlier_sigmas * spread) * ERROR_SLACK
+        limit = (jnp.mean(errors, where=is_inlier) + INLIER_SIGMAS * spread) * ERROR_SLACK
         chosen = pairs.is_used & (errors <= limit)  # none without an inlier, where the limit is NaN
         return jnp.where(jnp.sum(chosen) >= config.min_num_inliers, chosen, is_inlier)
 
@@ -361,7 +365,7 @@ def thin_merged(merged: DescriptorCloud, num_a_cloud: int) -> DescriptorCloud:
 def thinned_mask(
     positions: Float[np.ndarray, "n 3"], mask: Bool[np.ndarray, " n"], num_a_cloud: int
 ) -> Bool[np.ndarray, " n"]:
-    """Finds the descriptors of a union whose place no earlier cloud describes.
+    """Removes descriptors of a union near those of earlier clouds.
 
     The softmax over a target would be split between copies of one place. A descriptor is removed if one of an earlier
     cloud is nearer than the spacing of the first cloud: the median distance between its nearest descriptors.

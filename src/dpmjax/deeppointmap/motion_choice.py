@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from dpmjax.deeppointmap.verification import (
+    PLANE_DISTANCE_M,
     MeasuredScan,
     VerificationConfig,
     compare_scans,
@@ -39,6 +40,39 @@ from dpmjax.scans.weak_directions import (
     weak_share,
 )
 from dpmjax.types import Verification
+
+COARSE = AlignmentConfig(levels=(AlignmentLevel(3.0, 600, 5),))
+"""Alignment of each hypothesis."""
+
+FINE = AlignmentConfig(levels=(AlignmentLevel(1.0, 1500, 5),))
+"""Alignment of the best `NUM_FINE` hypotheses."""
+
+REFINEMENT = AlignmentConfig(levels=(AlignmentLevel(1.0, 4000, 8), AlignmentLevel(0.4, 8000, 10)))
+"""Alignment of the chosen hypothesis by `refine_motion`; it starts where `FINE` ended."""
+
+NUM_FINE = 3
+
+CLEAR_SCORE = 1.0
+"""No further hypothesis is tried after one with higher log odds."""
+
+SLIDING_STEP_M = 0.7
+"""Distance of the motions that are tried along a weak axis."""
+
+NUM_SLID_FINE = 32
+"""Number of these motions that are aligned finely."""
+
+NUM_FACING = 4000
+"""Number of elements of each scan that face the axis and are compared."""
+
+MAX_FACING = 10.0
+"""Largest number of elements that count at one position along the axis, so that an end wall is one observation; the two
+ends of a corridor may look alike."""
+
+FACING_CONTRADICTED = 3.0
+"""Penalty of an element that faces the axis and lies in free space; an element that meets a plane adds 1."""
+
+FACING_VISIBLE = 0.2
+"""Penalty of a visible element that faces the axis."""
 
 HYPOTHESES_AT_ONCE = 4
 
@@ -84,17 +118,17 @@ def choose_motion(
     hypotheses, scans = np.asarray(T_target_source, float), (source, target)
     tried: list[VerifiedMotion] = []
     for some in _candidates(source, target, hypotheses, config):
-        tried += _aligned(scans, some, config.coarse, config)
+        tried += _aligned(scans, some, COARSE, config)
         tried.sort(key=lambda motion: -motion.verification.score)
-        if tried[0].verification.score > config.clear_score:
+        if tried[0].verification.score > CLEAR_SCORE:
             break
-    finalists, remaining = _aligned(scans, tried[: config.num_fine], config.fine, config), tried[config.num_fine :]
+    finalists, remaining = _aligned(scans, tried[:NUM_FINE], FINE, config), tried[NUM_FINE:]
     axes = wall_axis(source.surface), wall_axis(target.surface)
     num_slid = 0
-    if is_weak := weak_share(*axes) < config.sliding.max_weak_share:
-        starts = sliding_motions(*axes, config.sliding.step_m)
+    if is_weak := weak_share(*axes) < config.max_weak_share:
+        starts = sliding_motions(*axes, SLIDING_STEP_M)
         num_slid = len(starts)
-        finalists += _aligned(scans, _best_along(scans, axes, starts, config), config.fine, config)
+        finalists += _aligned(scans, _best_along(scans, axes, starts, config), FINE, config)
     motions = [*finalists, *remaining]
     T = np.stack([motion.T_target_source for motion in motions])
     scores = np.array([motion.verification.score for motion in motions])
@@ -134,9 +168,9 @@ def _best_along(
     config: VerificationConfig,
 ) -> list[_Candidate]:
     """Returns the motions that the elements that face the axis support most, coarsely aligned."""
-    slid = _moved(scans, starts, config.coarse)
+    slid = _moved(scans, starts, COARSE)
     order = np.argsort(-_facing_elements(scans, axes, slid, config), kind="stable")
-    return [_Candidate(None, T) for T in slid[order[: config.sliding.num_fine]]]
+    return [_Candidate(None, T) for T in slid[order[:NUM_SLID_FINE]]]
 
 
 def _facing_elements(
@@ -146,7 +180,7 @@ def _facing_elements(
     config: VerificationConfig,
 ) -> Float[np.ndarray, " s"]:
     """Counts elements that face the weak axis and meet; those in free space and unmet visible ones count against it."""
-    sliding, settings = config.sliding, replace(config, num_samples=config.sliding.num_samples)
+    settings = replace(config, num_samples=NUM_FACING)
     first, second = (
         scan._replace(surface=facing_surface(scan.surface, axis.axis)) for scan, axis in zip(scans, axes, strict=True)
     )
@@ -155,8 +189,8 @@ def _facing_elements(
         compare_scans(second, scans[0], rigid.inverse(T_target_source), settings),
     )
     counts = [
-        (side.meets - sliding.contradicted * side.is_contradicted - sliding.visible * side.is_visible)
-        @ facing_weights(scan.surface, axis.axis, sliding.max_count)[: sliding.num_samples]
+        (side.meets - FACING_CONTRADICTED * side.is_contradicted - FACING_VISIBLE * side.is_visible)
+        @ facing_weights(scan.surface, axis.axis, MAX_FACING)[:NUM_FACING]
         for side, scan, axis in zip(sides, (first, second), axes, strict=True)
     ]
     return np.mean(counts, axis=0)
@@ -204,7 +238,7 @@ def refine_motion(
         The refined motion and its verification.
     """
     start = motion.T_target_source
-    T = align_surfaces(source.surface, target.surface, start, config.refinement).T_target_source
+    T = align_surfaces(source.surface, target.surface, start, REFINEMENT).T_target_source
     found = verify_motion(source, target, T, config)
     kept = {name: getattr(motion.verification, name) for name in OF_THE_SEARCH}
     return VerifiedMotion(motion.row, T, found._replace(**kept))
@@ -213,7 +247,7 @@ def refine_motion(
 def weak_direction_of(
     source: MeasuredScan, target: MeasuredScan, T_target_source: Float[np.ndarray, "4 4"], config: VerificationConfig
 ) -> WeakDirection:
-    """Finds the horizontal direction in which a motion is known least, by all elements of the source that meet planes.
+    """Finds the horizontal direction in which a motion is least certain, by all source elements that meet planes.
 
     Args:
         source: a scan.
@@ -228,7 +262,7 @@ def weak_direction_of(
     level = AlignmentLevel(config.plane_radius_m, max(1, len(source.surface.samples)), 1)
     pairs = pair_with_planes(source.surface, target.surface, T_target_source, level)
     up = T_level_lidar(target.surface)[2, :3]
-    return weakest_direction(pairs, T_target_source, up, max_residual_m=config.plane_distance_m)
+    return weakest_direction(pairs, T_target_source, up, max_residual_m=PLANE_DISTANCE_M)
 
 
 def _is_apart(T: Float[np.ndarray, "s 4 4"], T_other: Float[np.ndarray, "4 4"]) -> Bool[np.ndarray, " s"]:

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from dpmjax.deeppointmap.matching import MatchConfig, best_pairs, dual_softmax
+from dpmjax.deeppointmap.matching import MAX_OFFSET_M, MatchConfig, best_pairs, dual_softmax
 from dpmjax.deeppointmap.model import (
     Model,
     correlate,
@@ -158,7 +158,7 @@ def _best_motion(
     features_a, features_b = a.features[rows], b.features[columns]
     offsets = predict_offsets(model, features_a, features_b, directions_of(a)[rows])
     returning = predict_offsets(model, features_b, features_a, directions_of(b)[columns])
-    is_used = pairs.mask & (jnp.sum(offsets**2, axis=1) <= MATCHING.max_offset_m**2)
+    is_used = pairs.mask & (jnp.sum(offsets**2, axis=1) <= MAX_OFFSET_M**2)
     points = a.positions[rows]
     found = find_consensus(points + offsets, b.positions[columns], is_used, config=CONSENSUS)
     T, is_inlier = found.T_target_source[0], found.is_inlier[0]

@@ -15,7 +15,7 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from dpmjax.deeppointmap.confidence import Evidence, calibrated_probability, gather_evidence
+from dpmjax.deeppointmap.confidence import MatchEvidence, calibrated_probability, gather_evidence
 from dpmjax.deeppointmap.encoding import encode
 from dpmjax.deeppointmap.model import Model
 from dpmjax.deeppointmap.motion_choice import choose_motion, refine_motion
@@ -65,7 +65,7 @@ class StagedRegistration(NamedTuple):
     descriptors: Float[np.ndarray, "4 4"]
     verified: Float[np.ndarray, "4 4"]
     refined: Float[np.ndarray, "4 4"]
-    evidence: Evidence
+    evidence: MatchEvidence
     seconds: StageSeconds
 
 
@@ -156,7 +156,7 @@ def evaluate_scan_pairs(
     )
 
 
-def _confidence(model: Model, evidence: Evidence) -> float:
+def _confidence(model: Model, evidence: MatchEvidence) -> float:
     calibration = model.config.calibration
     if calibration is None or evidence.of_scans is None:
         return float(evidence.of_clouds[1])

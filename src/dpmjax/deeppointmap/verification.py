@@ -15,9 +15,8 @@ from jaxtyping import Bool, Float
 
 from dpmjax.checks import require_fields
 from dpmjax.geometry import rigid
-from dpmjax.scans.free_space import RangeImage, RangeImageConfig, range_image, view_points
+from dpmjax.scans.free_space import RangeImage, range_image, view_points
 from dpmjax.scans.surface_alignment import (
-    AlignmentConfig,
     AlignmentLevel,
     nearest_planes,
 )
@@ -32,9 +31,11 @@ are near those of the source, so its own points are compared with the planes of 
 LEVEL_COSINE = 0.8
 """Surfaces whose normals are nearer to the vertical are level."""
 
-COARSE = AlignmentConfig(levels=(AlignmentLevel(3.0, 600, 5),))
-FINE = AlignmentConfig(levels=(AlignmentLevel(1.0, 1500, 5),))
-REFINEMENT = AlignmentConfig(levels=(AlignmentLevel(1.0, 4000, 8), AlignmentLevel(0.4, 8000, 10)))
+PLANE_DISTANCE_M = 0.15
+"""Largest distance of a point from a plane that it meets."""
+
+MIN_COSINE = 0.7
+"""Least cosine between the normals of a point and of a plane that it meets."""
 
 
 @dataclass(frozen=True)
@@ -64,77 +65,32 @@ class EvidenceWeights:
     level_contradicted: float = 5.0
 
 
-@dataclass(frozen=True)
-class SlidingConfig:
-    """Search along a weak axis.
-
-    Attributes:
-        max_weak_share: an axis is weak if its share of the information of the walls is smaller. The share is 0.25 or
-            more in streets and rooms, 0.07 to 0.21 in corridors. 0 switches the search off.
-        step_m: distance of the motions that are tried.
-        num_fine: number of them that are aligned finely.
-        num_samples: number of elements of each scan that face the axis and are compared.
-        max_count: number of elements that count at most at one position along the axis, so that an end wall is one
-            observation; the two ends of a corridor may look alike.
-        contradicted: penalty of an element that faces the axis and lies in free space; an element that meets a plane
-            adds 1.
-        visible: the same for a visible element.
-    """
-
-    max_weak_share: float = 0.22
-    step_m: float = 0.7
-    num_fine: int = 32
-    num_samples: int = 4000
-    max_count: float = 10.0
-    contradicted: float = 3.0
-    visible: float = 0.2
-
-    def __post_init__(self) -> None:
-        require_fields(self, "max_weak_share", "contradicted", "visible", low=0)
-        require_fields(self, "step_m", "max_count", low=1e-9)
-        require_fields(self, "num_fine", "num_samples", low=1)
+EVIDENCE = EvidenceWeights()
 
 
 @dataclass(frozen=True)
 class VerificationConfig:
-    """Settings of the verification and of the final alignment.
+    """Settings of the verification.
 
     Attributes:
         surface: points and normals of a scan.
-        image: free space of a scan.
         views: search of further motions by the scans alone, where the first hypotheses are not clearly right.
-        coarse: alignment of each hypothesis.
-        fine: alignment of the best `num_fine` of them.
-        refinement: alignment of the chosen one, for `register(..., refine=True)`; it starts where `fine` ended.
-        num_fine: number of hypotheses that are aligned finely.
         num_samples: number of points of each scan that are compared.
         plane_radius_m: largest distance of a point from the nearest point of a plane that it meets.
-        plane_distance_m: largest distance of a point from a plane that it meets.
-        min_cosine: least cosine between the normals of a point and of a plane that it meets.
-        evidence: weights of the shares of points, which give the log odds of a motion.
-        clear_score: no further hypothesis is tried after one with higher log odds.
-        sliding: further motions where the walls hold one direction only, and their comparison.
+        max_weak_share: motions along an axis are tried if its share of the information of the walls is smaller. The
+            share is 0.25 or more in streets and rooms, 0.07 to 0.21 in corridors. 0 switches the search off.
     """
 
     surface: SurfaceConfig = field(default_factory=SurfaceConfig)
-    image: RangeImageConfig = field(default_factory=RangeImageConfig)
     views: ViewCorrelationConfig = field(default_factory=ViewCorrelationConfig)
-    coarse: AlignmentConfig = COARSE
-    fine: AlignmentConfig = FINE
-    refinement: AlignmentConfig = REFINEMENT
-    num_fine: int = 3
     num_samples: int = 1000
     plane_radius_m: float = 1.0
-    plane_distance_m: float = 0.15
-    min_cosine: float = 0.7
-    evidence: EvidenceWeights = field(default_factory=EvidenceWeights)
-    clear_score: float = 1.0
-    sliding: SlidingConfig = field(default_factory=SlidingConfig)
+    max_weak_share: float = 0.22
 
     def __post_init__(self) -> None:
-        require_fields(self, "num_fine", "num_samples", low=1)
-        require_fields(self, "plane_radius_m", "plane_distance_m", low=1e-9)
-        require_fields(self, "min_cosine", low=0)
+        require_fields(self, "num_samples", low=1)
+        require_fields(self, "plane_radius_m", low=1e-9)
+        require_fields(self, "max_weak_share", low=0)
 
 
 class MeasuredScan(NamedTuple):
@@ -160,7 +116,7 @@ def measure_scan(points: Float[np.ndarray, "n 3"], config: VerificationConfig) -
         Surface and free space.
     """
     surface = scan_surface(points, config.surface)
-    return MeasuredScan(surface, range_image(surface.points, config.image))
+    return MeasuredScan(surface, range_image(surface.points))
 
 
 def verify_motion(
@@ -197,7 +153,7 @@ def verify_motions(
     sides = _both_sides(source, target, T_target_source, config)
     is_thin = len(target.surface.points) < SPARSE_SHARE * len(source.surface.points)
     matched = _share(sides[1 if is_thin else 0].meets)
-    bias, *weights = astuple(config.evidence)
+    bias, *weights = astuple(EVIDENCE)
     num_visible = sum(side.is_visible.sum(axis=1) for side in sides)
     num_contradicted = sum(side.is_contradicted.sum(axis=1) for side in sides)
     visible = num_visible / max(sum(side.is_visible.shape[1] for side in sides), 1)
@@ -239,9 +195,9 @@ def compare_scans(
     """
     level = AlignmentLevel(config.plane_radius_m, config.num_samples, 1)
     planes = nearest_planes(scan.surface, other.surface, T_other_scan, level)
-    meets = planes.is_paired & (np.abs(planes.residuals) < config.plane_distance_m)
-    meets &= planes.cosines > config.min_cosine
-    view = view_points(other.image, planes.points.reshape(-1, 3), config.image)
+    meets = planes.is_paired & (np.abs(planes.residuals) < PLANE_DISTANCE_M)
+    meets &= planes.cosines > MIN_COSINE
+    view = view_points(other.image, planes.points.reshape(-1, 3))
     is_level = np.abs(scan.surface.normals[scan.surface.samples[: config.num_samples], 2]) > LEVEL_COSINE
     return ComparedScan(
         meets, view.is_visible.reshape(meets.shape), view.is_contradicted.reshape(meets.shape), is_level

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from dpmjax.deeppointmap.compact_scans import CompactScan, round_features
 from dpmjax.saved_maps.map_coding import (
+    NUM_ELEMENTS,
     ElementCodes,
     FeatureCodes,
     Precision,
@@ -174,7 +175,9 @@ def pack_scans(scans: Sequence[CompactScan], precision: Precision) -> Arrays:
         The arrays by name.
     """
     num_elements = max(len(scan.elements.mask) for scan in scans)
-    elements = [_padded(scan.elements, num_elements) for scan in scans]
+    if precision == "int8":
+        num_elements = min(num_elements, max(NUM_ELEMENTS, scans[0].features.shape[0]))
+    elements = [_of_length(scan.elements, num_elements) for scan in scans]
     arrays = {"directions": np.stack([scan.directions for scan in scans])}
     arrays |= _pack_images([scan.image for scan in scans])
     if precision == "int8":
@@ -227,11 +230,12 @@ def unpack_scans(reader: ArrayReader, precision: Precision) -> list[CompactScan]
     return [CompactScan(one, *codes_of, angles, image) for one, codes_of, angles, image in parts_of_scans]
 
 
-def _padded(elements: CompactElements, num_elements: int) -> CompactElements:
-    """Fills up with elements that are not there: keyframes of a map that was thinned have fewer."""
-    missing = num_elements - len(elements.mask)
-    padded = (np.pad(array, [(0, missing), *[(0, 0)] * (array.ndim - 1)]) for array in elements[1:])
-    return CompactElements(elements.unit_m, *padded) if missing else elements
+def _of_length(elements: CompactElements, num_elements: int) -> CompactElements:
+    """Keeps the first elements, and fills up with elements that are not there."""
+    kept = [array[:num_elements] for array in elements[1:]]
+    missing = num_elements - len(kept[-1])
+    padded = (np.pad(array, [(0, missing), *[(0, 0)] * (array.ndim - 1)]) for array in kept)
+    return CompactElements(elements.unit_m, *padded)
 
 
 def _prefixed(name: str, codes: FeatureCodes | ElementCodes) -> Arrays:

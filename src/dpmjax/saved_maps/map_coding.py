@@ -16,9 +16,14 @@ from dpmjax.scans.compact import MAX_COMPONENT, CompactElements
 
 Precision = Literal["float32", "int8"]
 
-MAX_RANK = 48
-STEP_SHARE = 0.5
+MAX_RANK = 16
+"""Largest number of principal components."""
+
+STEP_SHARE = 0.7
 """Step of the coefficients, as a share of the standard deviation of a channel."""
+
+NUM_ELEMENTS = 256
+"""Number of surface elements of a keyframe, if it has no more descriptors: localisation needs keyframes more."""
 
 POSITION_STEP_M = 0.02
 PLANARITY_STEP = 17

@@ -24,7 +24,9 @@ from dpmjax.slam.map_thinning import thin_map
 from dpmjax.weights.config_json import config_from_json
 
 FORMAT, VERSION = "dpmjax map", 3
-SPACING_SHARE = 0.8
+SPACING_SHARE = 0.2
+"""Below the distance of consecutive keyframes: only those of other laps are left out."""
+
 ADVICE = "save it again with dpmjax.save_map"
 
 
@@ -37,10 +39,10 @@ def save_map(
         path: must end in `.npz`; an existing file is replaced.
         slam_map: map of a run, `result.map`, with at least one keyframe.
         precision: "float32" is exact: a run that goes on from the file equals an unbroken one. "int8" is the smallest,
-            for localisation: it rounds features and elements to codes, and omits keyframes that others cover
-            (`slam.thin_map`).
+            for localisation: it rounds features and elements to codes, keeps 256 elements a keyframe, and omits
+            keyframes that those of other laps cover (`slam.thin_map`).
         spacing_share: keyframes nearer to others than this share of their extent are left out; 0 keeps all. None takes
-            0.8 for "int8" and 0 for "float32".
+            0.2 for "int8" and 0 for "float32".
 
     Returns:
         The path.
@@ -151,7 +153,7 @@ def map_of_arrays(path: str | Path, arrays: Arrays) -> KeyframeMap:
     require(version == VERSION, path, f"format version {version}, this dpmjax reads {VERSION}", advice)
     require(precision in get_args(Precision), path, f"precision {precision}", ADVICE)
     with refusing(path, "{error}", ADVICE, (ValueError, TypeError)):
-        origin = MapOrigin(fingerprint, config_from_json(header["config"], SlamConfig), weights)
+        origin = MapOrigin(fingerprint, config_from_json(header["config"], SlamConfig, file=path), weights)
     for name, array in arrays.items():
         is_good = array.dtype.kind in "iub" or (array.dtype.kind == "f" and bool(np.isfinite(array).all()))
         require(is_good, path, f"{name} holds values that are not finite numbers", ADVICE)

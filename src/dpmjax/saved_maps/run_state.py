@@ -17,8 +17,7 @@ from dpmjax.saved_maps.map_file import map_arrays, map_of_arrays
 from dpmjax.sequences import InputError, require
 from dpmjax.slam.front_end import FrontEndState
 from dpmjax.slam.local_map import PlacedElements
-from dpmjax.slam.loop_state import LoopState
-from dpmjax.slam.reports import Loop, ScanReport
+from dpmjax.slam.reports import Loop, LoopState, ScanReport
 from dpmjax.slam.system import SlamState
 from dpmjax.types import SurfaceElements
 

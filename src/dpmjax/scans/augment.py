@@ -21,6 +21,21 @@ from dpmjax.geometry.rigid import namespace_of
 from dpmjax.scans.preprocess import farthest_first
 from dpmjax.types import AnyArray, PointCloud
 
+BOX_CENTRE_Z_M = (-1.5, 0.5)
+"""Height of the centre of the box, in the frame of the lidar."""
+
+BOX_HEIGHT_M = (1.0, 3.5)
+"""Height of the box."""
+
+BOX_WIDTH_M = (0.5, 2.5)
+"""Shorter side on the ground."""
+
+BOX_LENGTH_M = (2.0, 10.0)
+"""Longer side on the ground."""
+
+JITTER_CLIP_SIGMAS = 3.0
+"""The noise is clipped at this many standard deviations."""
+
 Interval = tuple[float, float]
 TURN = (-math.pi, math.pi)
 
@@ -52,24 +67,15 @@ class BoxConfig:
 
     Attributes:
         max_count: largest number of boxes; each number from 1 to it is equally likely.
-        length_m: longer side on the ground.
-        width_m: shorter side on the ground.
-        height_m: height of the box.
         gap_m: free space between the sensor and the circle around the box.
-        centre_z_m: height of the centre of the box, in the frame of the lidar.
     """
 
     max_count: int = 3
-    length_m: Interval = (2.0, 10.0)
-    width_m: Interval = (0.5, 2.5)
-    height_m: Interval = (1.0, 3.5)
     gap_m: Interval = (1.0, 10.0)
-    centre_z_m: Interval = (-1.5, 0.5)
 
     def __post_init__(self) -> None:
         require_fields(self, "max_count", low=1)
-        _require_intervals(self, "length_m", "width_m", "height_m", "gap_m")
-        _require_intervals(self, "centre_z_m", low=-math.inf)
+        _require_intervals(self, "gap_m")
 
 
 def _require_intervals(config: SectorConfig | BoxConfig | AugmentConfig, *names: str, low: float = 0.0) -> None:
@@ -97,7 +103,6 @@ class AugmentConfig:
         tilt_power: the uniform number that gives a tilt is raised to this power: above 1, most scans stand upright.
         translation_sigma_m: standard deviation of the translation in x and y; half of it in z.
         jitter_sigma_m: standard deviation of the noise of each coordinate.
-        jitter_clip_sigmas: the noise is clipped at this many standard deviations.
     """
 
     max_drop_ratio: float = 0.5
@@ -112,7 +117,6 @@ class AugmentConfig:
     tilt_power: float = 1.0
     translation_sigma_m: float = 3.0
     jitter_sigma_m: float = 0.005
-    jitter_clip_sigmas: float = 3.0
 
     def __post_init__(self) -> None:
         require_fields(self, "max_drop_ratio", "sector_probability", "box_probability", low=0, high=1)
@@ -123,7 +127,7 @@ class AugmentConfig:
             both = f"{self.sector_probability} and {self.box_probability}"
             raise ValueError(f"sector_probability, box_probability: expected a sum of at most 1, got {both}")
         require_fields(self, "max_yaw_rad", "max_tilt_rad", "translation_sigma_m", low=0)
-        require_fields(self, "jitter_sigma_m", "jitter_clip_sigmas", low=0)
+        require_fields(self, "jitter_sigma_m", low=0)
 
 
 class AugmentedScan(NamedTuple):
@@ -159,7 +163,7 @@ def augment_scan(cloud: PointCloud, config: AugmentConfig, *, key: PRNGKeyArray)
     is_lost = _is_dropped(cloud.mask, config, drop_key) | _is_occluded(points, config, occlusion_key)
     mask = cloud.mask & ~is_lost
     T_augmented_lidar = random_motion(config, key=motion_key).astype(points.dtype)
-    noise, limit = jax.random.normal(jitter_key, points.shape, points.dtype), config.jitter_clip_sigmas
+    noise, limit = jax.random.normal(jitter_key, points.shape, points.dtype), JITTER_CLIP_SIGMAS
     points = rigid.transform_points(T_augmented_lidar, points) + config.jitter_sigma_m * jnp.clip(noise, -limit, limit)
     return AugmentedScan(farthest_first(PointCloud(jnp.where(mask[:, None], points, 0), mask)), T_augmented_lidar)
 
@@ -248,7 +252,7 @@ def is_behind_boxes(points: Float[AnyArray, "n 3"], config: BoxConfig, *, key: P
     """Returns True for points that a random box hides; metres, in the frame of the sensor, z up."""
     draws = jax.random.uniform(key, (8, config.max_count))
     count = _count(draws[0, 0], config.max_count)
-    bounds = (config.length_m, config.width_m, config.height_m, config.centre_z_m, TURN, TURN, config.gap_m)
+    bounds = (BOX_LENGTH_M, BOX_WIDTH_M, BOX_HEIGHT_M, BOX_CENTRE_Z_M, TURN, TURN, config.gap_m)
     length, width, height, z, azimuth, heading, gap = _between(bounds, draws[1:])
     # The gap keeps the sensor outside of the box: inside, everything would be hidden.
     distance = gap + jnp.hypot(length, width) / 2

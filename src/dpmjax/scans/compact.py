@@ -92,7 +92,7 @@ def expand_elements(compact: CompactElements) -> SurfaceElements:
 
 
 def compact_image(image: RangeImage) -> CompactImage:
-    """Rounds a range image to codes, so that nothing is contradicted that was not before.
+    """Rounds near ranges down and far ranges up, so that the free space of a range image never grows.
 
     Args:
         image: of a scan.

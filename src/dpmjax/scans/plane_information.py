@@ -91,7 +91,7 @@ def weakest_direction(
 def with_least_covariance(
     information: Float[np.ndarray, "6 6"], sigma_m: float, sigma_rad: float
 ) -> Float[np.ndarray, "6 6"]:
-    """Adds a covariance that no number of points undercuts.
+    """Adds a constant diagonal covariance, which bounds the covariance of a pose from below.
 
     Args:
         information: inverse covariance.

@@ -21,6 +21,10 @@ from dpmjax.geometry.neighbours import HostTree, k_nearest
 from dpmjax.geometry.sampling import voxel_sample
 from dpmjax.types import AnyArray, PointCloud
 
+OUTLIER_SIGMAS = 3.0
+"""A point is an outlier if its mean distance to its neighbours exceeds the mean over all points by more than this
+number of standard deviations."""
+
 MAX_CAPACITY = 1 << 15
 MAX_VOXELS = 1 << 20
 OUTLIER_SLACK = 1 + 1e-5
@@ -43,8 +47,6 @@ class PreprocessConfig:
         max_range_m: farther points are too sparse and are dropped.
         voxel_size_m: the first point of each voxel is kept.
         num_outlier_neighbours: number of neighbours in the outlier test; 0 switches the test off.
-        outlier_sigmas: a point is an outlier if its mean distance to its neighbours exceeds the mean over all points
-            by more than this many standard deviations.
         capacity: capacity of the resulting cloud. Where more points are left, evenly spaced ones are kept before the
             outlier test.
     """
@@ -53,13 +55,12 @@ class PreprocessConfig:
     max_range_m: float = 60.0
     voxel_size_m: float = 0.3
     num_outlier_neighbours: int = 10
-    outlier_sigmas: float = 3.0
     capacity: int = 16384
 
     def __post_init__(self) -> None:
         if not 0 <= self.min_range_m < self.max_range_m:
             raise ValueError(f"min_range_m: expected from 0 to below {self.max_range_m}, got {self.min_range_m}")
-        require_positive_fields(self, "voxel_size_m", "outlier_sigmas")
+        require_positive_fields(self, "voxel_size_m")
         require_fields(self, "capacity", low=1, high=MAX_CAPACITY)
         require_fields(self, "num_outlier_neighbours", low=0)
         if self.max_range_m / self.voxel_size_m >= MAX_VOXELS:
@@ -136,7 +137,7 @@ def _is_inlier(points: Float[Array, "n 3"], mask: Bool[Array, " n"], config: Pre
     others = near.mask[:, 1:]
     distances = jnp.sqrt(jnp.where(others, near.squared_distances[:, 1:], 0))
     spread = jnp.sum(distances, axis=1) / jnp.maximum(jnp.sum(others, axis=1), 1)
-    limit = jnp.mean(spread, where=mask) + config.outlier_sigmas * jnp.std(spread, where=mask)
+    limit = jnp.mean(spread, where=mask) + OUTLIER_SIGMAS * jnp.std(spread, where=mask)
     return mask & (spread <= limit * OUTLIER_SLACK)
 
 
@@ -251,4 +252,4 @@ def _is_inlier_on_host(
     distances = HostTree(points, num_threads=num_threads).nearest(points, num_nearest)[1]
     spread = np.empty(len(points))
     spread[order] = distances[:, 1:].mean(axis=1)
-    return spread <= (spread.mean() + config.outlier_sigmas * spread.std()) * OUTLIER_SLACK
+    return spread <= (spread.mean() + OUTLIER_SIGMAS * spread.std()) * OUTLIER_SLACK

@@ -16,6 +16,18 @@ from dpmjax.checks import require_count, require_fields, require_positive
 from dpmjax.geometry.planes import PlaneStep, geman_mcclure, motion_about, step_to_planes
 from dpmjax.scans.surfaces import Surface
 
+CONVERGED_RAD = 1e-4
+"""The same for the rotation."""
+
+CONVERGED_M = 2e-3
+"""A level ends after a shorter step."""
+
+MIN_KERNEL_M = 0.05
+"""Least width of the kernel."""
+
+KERNEL_SHARE = 1 / 6
+"""Width of the Geman-McClure kernel, as a share of the radius."""
+
 MIN_PAIRS = 20
 """Fewer pairs tell nothing about a motion."""
 
@@ -50,10 +62,6 @@ class AlignmentConfig:
     Attributes:
         levels: coarse to fine.
         min_cosine: surfaces are paired if the cosine between their normals is larger; it weighs the pair.
-        kernel_share: width of the Geman-McClure kernel, as a share of the radius.
-        min_kernel_m: least width of the kernel.
-        converged_m: a level ends after a shorter step.
-        converged_rad: the same for the rotation.
     """
 
     levels: tuple[AlignmentLevel, ...] = (
@@ -62,16 +70,11 @@ class AlignmentConfig:
         AlignmentLevel(0.4, 8000, 10),
     )
     min_cosine: float = 0.3
-    kernel_share: float = 1 / 6
-    min_kernel_m: float = 0.05
-    converged_m: float = 2e-3
-    converged_rad: float = 1e-4
 
     def __post_init__(self) -> None:
         if not self.levels:
             raise ValueError("levels: expected one or more, got none")
         require_fields(self, "min_cosine", low=0, high=1)
-        require_fields(self, "kernel_share", "min_kernel_m", "converged_m", "converged_rad", low=1e-9)
 
     def kernel_width_m(self, level: AlignmentLevel) -> float:
         """Returns the width of the kernel at a level.
@@ -82,7 +85,7 @@ class AlignmentConfig:
         Returns:
             Metres.
         """
-        return max(self.min_kernel_m, self.kernel_share * level.radius_m) if level.kernel_m is None else level.kernel_m
+        return max(MIN_KERNEL_M, KERNEL_SHARE * level.radius_m) if level.kernel_m is None else level.kernel_m
 
     def is_converged(self, step: PlaneStep) -> Any:
         """Compares steps with the least ones that go on.
@@ -96,7 +99,7 @@ class AlignmentConfig:
         length_squared, angle_squared = (
             (part**2).sum(axis=-1) for part in (step.tangent[..., :3], step.tangent[..., 3:])
         )
-        return (length_squared < self.converged_m**2) & (angle_squared < self.converged_rad**2)
+        return (length_squared < CONVERGED_M**2) & (angle_squared < CONVERGED_RAD**2)
 
 
 class SurfaceAlignment(NamedTuple):

@@ -19,6 +19,18 @@ from dpmjax.checks import require_fields
 from dpmjax.geometry import rigid
 from dpmjax.scans.surfaces import MIN_FLATNESS, Surface
 
+DISTINCT_TURNS = 1.5
+"""Two motions are also distinct if they differ by more steps of the turn than this."""
+
+DISTINCT_CELLS = 2.0
+"""Two motions are distinct if they differ by more cells than this."""
+
+NUM_DIRECTIONS = 4
+"""Images by the direction of the normals; one more image holds points without a surface."""
+
+FULL_EXTENT_M = 25.0
+"""Horizontal range of a tenth of the points of a scan that needs whole cells."""
+
 STEEP_COSINE = 0.5
 """Normals with a smaller vertical component belong to upright surfaces."""
 
@@ -38,27 +50,19 @@ class ViewCorrelationConfig:
 
     Attributes:
         cell_m: side of a cell; down to half of it where scans reach less than `full_extent_m`, as in rooms.
-        full_extent_m: horizontal range of a tenth of the points of a scan that needs whole cells.
         num_cells: cells along a side; points within 0.36 sides and shifts up to 0.27 sides do not wrap around.
         num_turns: turns of a circle.
-        num_directions: images by the direction of the normals; one more image holds points without a surface.
         num_motions: distinct motions that are returned; 0 switches the search off.
-        distinct_cells: two motions are distinct if they differ by more cells than this.
-        distinct_turns: two motions are also distinct if they differ by more steps of the turn than this.
     """
 
     cell_m: float = 1.0
-    full_extent_m: float = 25.0
     num_cells: int = 96
     num_turns: int = 60
-    num_directions: int = 4
     num_motions: int = 24
-    distinct_cells: float = 2.0
-    distinct_turns: float = 1.5
 
     def __post_init__(self) -> None:
-        require_fields(self, "num_cells", "num_turns", "num_directions", low=1)
-        require_fields(self, "cell_m", "full_extent_m", "distinct_cells", "distinct_turns", low=1e-9)
+        require_fields(self, "num_cells", "num_turns", low=1)
+        require_fields(self, "cell_m", low=1e-9)
         require_fields(self, "num_motions", low=0)
 
     @property
@@ -108,7 +112,7 @@ def correlate_views(
 
 def _extent_share(source: Surface, target: Surface, config: ViewCorrelationConfig) -> float:
     extents = [np.percentile(np.hypot(*surface.points[:, :2].T), EXTENT_PERCENT) for surface in (source, target)]
-    return float(np.clip(max(extents) / config.full_extent_m, MIN_EXTENT_SHARE, 1))
+    return float(np.clip(max(extents) / FULL_EXTENT_M, MIN_EXTENT_SHARE, 1))
 
 
 def T_level_lidar(surface: Surface) -> Float[np.ndarray, "4 4"]:
@@ -149,7 +153,7 @@ def _images(
     is_used = (np.hypot(x, y) < config.max_range_m) & (~is_flat | (np.abs(normals[:, 2]) < STEEP_COSINE))
     x, y, is_flat = x[is_used], y[is_used], is_flat[is_used]
     angles = np.arctan2(normals[is_used, 1], normals[is_used, 0])
-    size, num = config.num_cells, config.num_directions
+    size, num = config.num_cells, NUM_DIRECTIONS
     shape = (len(turns), num + 1, size, size)
     cosine, sine = np.cos(turns)[:, None], np.sin(turns)[:, None]
     turned = cosine * x - sine * y, sine * x + cosine * y
@@ -181,8 +185,8 @@ def _best_peaks(
         k = int(np.argmax(remaining))
         found.append((float(turns[turn[k]]), float(x[k]), float(y[k])))
         steps = np.abs(turn - turn[k])
-        is_same = np.minimum(steps, len(turns) - steps) <= config.distinct_turns
-        remaining &= ~(is_same & (np.hypot(x - x[k], y - y[k]) <= config.distinct_cells * config.cell_m))
+        is_same = np.minimum(steps, len(turns) - steps) <= DISTINCT_TURNS
+        remaining &= ~(is_same & (np.hypot(x - x[k], y - y[k]) <= DISTINCT_CELLS * config.cell_m))
     return found
 
 

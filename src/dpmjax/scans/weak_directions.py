@@ -96,7 +96,7 @@ def weak_share(source: WallAxis, target: WallAxis) -> float:
 
 
 def sliding_motions(source: WallAxis, target: WallAxis, step_m: float) -> Float[np.ndarray, "s 4 4"]:
-    """Makes the motions that bring the walls along both axes onto each other, both ways round, at steps along the axis.
+    """Makes motions that align the walls of both scans across the axis, for both headings, at regular shifts along it.
 
     Args:
         source: axis of a scan.

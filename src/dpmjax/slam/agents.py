@@ -23,7 +23,7 @@ BYTES_A_POINT = 12
 """Three float32 numbers."""
 
 
-class Traffic(NamedTuple):
+class SentBytes(NamedTuple):
     """Bytes that an agent sends, and those of its points.
 
     Attributes:
@@ -55,7 +55,7 @@ class AgentsResult(NamedTuple):
     component: tuple[int, ...]
     joined: JoinedMaps
     agents: tuple[SlamResult, ...]
-    traffic: tuple[Traffic, ...]
+    traffic: tuple[SentBytes, ...]
 
 
 class MergedMaps(NamedTuple):
@@ -163,12 +163,12 @@ def merge_maps(
     return MergedMaps(tuple(merged), joined)
 
 
-def _traffic(agent: SlamResult) -> Traffic:
+def _traffic(agent: SlamResult) -> SentBytes:
     slam_map = agent.state.slam_map
     scans = [keyframe.compact for keyframe in slam_map.keyframes]
     vectors_and_poses = slam_map.vectors.nbytes + slam_map.T_world_keyframe.nbytes
     scan_bytes = [BYTES_A_POINT * report.num_points for report in agent.reports]
-    return Traffic(
+    return SentBytes(
         keyframe_bytes=sum(map(_num_bytes, scans)) + vectors_and_poses,
         descriptor_bytes=sum(_num_bytes((scan.features, scan.feature_steps, scan.directions)) for scan in scans),
         keyframe_scan_bytes=sum(scan_bytes[keyframe.scan] for keyframe in slam_map.keyframes),

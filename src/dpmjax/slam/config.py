@@ -25,38 +25,25 @@ class OdometryConfig:
         proposer: source of the first guess. With "prediction" it is the last motion; if that fails, further motions and
             those of the decoder are tried. With "network" the decoder registers each scan to the nearest keyframe
             (DeepPointMap section 4).
-        min_num_points: a scan with fewer flat surface elements counts as empty.
         num_keyframes: number of the nearest keyframes in the local map.
         num_recent: number of scans since the last keyframe in the local map.
         narrow: alignment from a first guess that is nearly right.
         wide: alignment from other starts.
         plane_radius_m: largest distance between an element and the element of the map whose plane it meets.
-        plane_distance_m: largest distance to that plane.
-        good_share: share of the usual score from which on no other start is tried.
-        num_hypotheses: number of motions that the decoder proposes.
-        turns_deg: turns about the vertical among the further starts.
-        tilts_deg: turns about the x and y axes among the further starts.
     """
 
     proposer: Proposer = "prediction"
-    min_num_points: int = 100
     num_keyframes: int = 12
     num_recent: int = 8
     narrow: AlignmentConfig = NARROW
     wide: AlignmentConfig = WIDE
     plane_radius_m: float = 1.5
-    plane_distance_m: float = 0.15
-    good_share: float = 0.85
-    num_hypotheses: int = 3
-    turns_deg: tuple[float, ...] = (-10.0, 10.0, -20.0, 20.0, -35.0, 35.0, -50.0, 50.0)
-    tilts_deg: tuple[float, ...] = (-8.0, 8.0)
 
     def __post_init__(self) -> None:
         require_one_of("proposer", self.proposer, get_args(Proposer))
-        require_positive_fields(self, "plane_radius_m", "plane_distance_m")
-        require_fields(self, "min_num_points", "num_keyframes", "num_hypotheses", low=1)
+        require_positive_fields(self, "plane_radius_m")
+        require_fields(self, "num_keyframes", low=1)
         require_fields(self, "num_recent", low=0)
-        require_fields(self, "good_share", low=0, high=1)
 
 
 @dataclass(frozen=True)
@@ -64,33 +51,25 @@ class FrontEndConfig:
     """Acceptance of the pose of a scan, and choice of keyframes.
 
     Attributes:
-        min_score_share: smallest accepted share of the usual score.
-        min_score: smallest accepted score.
         min_probability: smallest P(correct) of the decoder's motion that accepts a pose of a lower share.
         num_submap: largest number of keyframes that are merged for a registration.
-        submap_radius_m: largest distance of these keyframes (DeepPointMap's published configuration).
         num_lost: number of scans without an accepted pose after which a new segment begins, which loops may join.
         keyframe_share: distance of keyframes, as a share of the extent.
-        keyframe_rad: turn between keyframes at a smaller distance.
         max_keyframe_m: upper bound of the distance of keyframes (DeepPointMap: 3 to 10 m).
         min_keyframe_m: lower bound of the distance of keyframes.
     """
 
-    min_score_share: float = 0.4
-    min_score: float = 0.2
     min_probability: float = 0.5
     num_submap: int = 4
-    submap_radius_m: float = 20.0
     num_lost: int = 6
     keyframe_share: float = 0.3
-    keyframe_rad: float = 0.6
     max_keyframe_m: float = 5.0
     min_keyframe_m: float = 0.5
 
     def __post_init__(self) -> None:
-        require_fields(self, "min_score_share", "min_probability", low=0, high=1)
+        require_fields(self, "min_probability", low=0, high=1)
         require_fields(self, "num_submap", "num_lost", low=1)
-        require_positive_fields(self, "submap_radius_m", "keyframe_share", "keyframe_rad")
+        require_positive_fields(self, "keyframe_share")
         require_fields(self, "min_keyframe_m", low=1e-3, high=self.max_keyframe_m)
 
 
@@ -100,7 +79,6 @@ class LoopClosureConfig:
 
     Attributes:
         is_on: False leaves the map as odometry makes it.
-        max_radius_m: upper bound of the radius (DeepPointMap: 100 m).
         num_near: largest number of candidates by distance.
         num_similar: largest number of candidates by retrieval.
         min_cosine: smallest similarity of a candidate by retrieval.
@@ -108,17 +86,12 @@ class LoopClosureConfig:
         num_asked: number of candidates whose overlap is predicted at a time, of both kinds in turn.
         num_registered: largest number of candidates that are registered.
         min_probability: smallest P(correct) of an accepted registration.
-        min_matched_share: smallest share of points that meet planes, where the scans verify a registration.
-        max_contradicted_share: largest share of points in free space.
         min_support: number of consistent registrations, itself among them, that make a loop an edge.
         sigma_m: standard deviation of a registration by descriptors.
         sigma_rad: standard deviation of its rotation.
-        drift_m: standard deviation of odometry over one metre; it grows with the root of the path.
-        edge_outlier_chi2: cost from which on the optimisation reduces the weight of a loop edge.
     """
 
     is_on: bool = True
-    max_radius_m: float = 100.0
     num_near: int = 6
     num_similar: int = 6
     min_cosine: float = 0.8
@@ -126,21 +99,15 @@ class LoopClosureConfig:
     num_asked: int = 4
     num_registered: int = 2
     min_probability: float = 0.5
-    min_matched_share: float = 0.35
-    max_contradicted_share: float = 0.1
     min_support: int = 2
     sigma_m: float = 0.2
     sigma_rad: float = 0.02
-    drift_m: float = 0.05
-    edge_outlier_chi2: float = 25.0
 
     def __post_init__(self) -> None:
         require_fields(self, "min_overlap", "min_probability", low=0, high=1)
-        require_fields(self, "min_matched_share", "max_contradicted_share", low=0, high=1)
         require_fields(self, "min_support", "num_registered", "num_asked", low=1)
         require_fields(self, "num_near", "num_similar", low=0)
-        require_positive_fields(self, "max_radius_m")
-        require_positive_fields(self, "sigma_m", "sigma_rad", "drift_m", "edge_outlier_chi2")
+        require_positive_fields(self, "sigma_m", "sigma_rad")
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,6 @@ from jaxtyping import Float
 from dpmjax.deeppointmap.compact_scans import CompactScan
 from dpmjax.geometry import rigid
 from dpmjax.scans.deskew import deskew
-from dpmjax.slam.alignment import Alignment, ThinnedScan, best_of
 from dpmjax.slam.keyframes import (
     EdgeKind,
     Keyframe,
@@ -37,9 +36,24 @@ from dpmjax.slam.local_map import (
     placed_scan,
     with_scan,
 )
-from dpmjax.slam.methods import SlamMethods
+from dpmjax.slam.methods import Alignment, SlamMethods, ThinnedScan, best_of
 from dpmjax.slam.reports import ScanReport, ScanStatus
 from dpmjax.types import AnyArray
+
+KEYFRAME_RAD = 0.6
+"""Turn between keyframes at a smaller distance."""
+
+MIN_SCORE = 0.2
+"""Smallest accepted score."""
+
+MIN_SCORE_SHARE = 0.4
+"""Smallest accepted share of the usual score."""
+
+NUM_HYPOTHESES = 3
+"""Number of motions that the decoder proposes."""
+
+GOOD_SHARE = 0.85
+"""Share of the usual score from which on no other start is tried."""
 
 NEAR_M = 2.0
 """Poses farther apart are of other places."""
@@ -126,7 +140,7 @@ class TimedScan(NamedTuple):
 AnyScan = Float[AnyArray, "_n 3"] | TimedScan
 
 
-def step(
+def place_scan(
     methods: SlamMethods, state: FrontEndState, slam_map: KeyframeMap, scan: AnyScan
 ) -> tuple[FrontEndState, KeyframeMap, ScanReport]:
     """Places a scan.
@@ -202,7 +216,7 @@ def _locate(methods: SlamMethods, state: FrontEndState, local_map: LocalMap, sca
     config, predicted = methods.config.front_end, state.T_keyframe_last @ state.T_before_last
     usual = float(np.median(state.scores)) if state.scores else 1.0
     # Nothing is usual yet where a part of the map begins: sparse scans never score high.
-    wanted = max(config.min_score, config.min_score_share * usual if state.scores else 0.0)
+    wanted = max(MIN_SCORE, MIN_SCORE_SHARE * usual if state.scores else 0.0)
     tried = _attempt(methods, state, local_map, scan, usual)
     # Nothing supports the prediction before any motion is known.
     best = _better(tried, MIN_MARGIN if state.scores else 0.0)
@@ -214,7 +228,7 @@ def _locate(methods: SlamMethods, state: FrontEndState, local_map: LocalMap, sca
     is_far = not are_near(predicted, best.T_map_scan, NEAR_M, np.inf)
     if is_far and state.scores and (tried.probability or 0.0) < config.min_probability:
         # A motion that neither the motion of before nor the decoder supports needs the usual score.
-        wanted = methods.config.odometry.good_share * usual
+        wanted = GOOD_SHARE * usual
     if best.score >= wanted or _is_confirmed(methods, tried, best):
         status: ScanStatus = "network" if is_matched else "tracked"
         return Located(best.T_map_scan, status, numbers, best.score, best.information, *network)
@@ -236,16 +250,16 @@ def _attempt(
     tracked = None
     if config.proposer == "prediction" and has_motion:
         tracked = geometry.align(local_map, scan, predicted)
-        if tracked.score >= config.good_share * usual:
+        if tracked.score >= GOOD_SHARE * usual:
             return _Attempt(tracked)
     compact = methods.matcher.encode(scan)
     row = nearest_keyframe(local_map, predicted[:3, 3])
-    proposal = methods.matcher.propose(compact, local_map.compact[row], config.num_hypotheses)
+    proposal = methods.matcher.propose(compact, local_map.compact[row], NUM_HYPOTHESES)
     starts = orthonormal(local_map.keyframes[row].T_map_scan @ proposal.T_target_source)
     matched = geometry.search(local_map, scan, starts)
-    if tracked is None and (config.proposer == "prediction" or matched.score < config.good_share * usual):
+    if tracked is None and (config.proposer == "prediction" or matched.score < GOOD_SHARE * usual):
         tracked = geometry.align(local_map, scan, predicted)
-    if tracked is not None and matched.score < config.good_share * usual:
+    if tracked is not None and matched.score < GOOD_SHARE * usual:
         others = state.T_keyframe_last @ geometry.other_motions(state.T_before_last, scan.extent_m)
         tracked = best_of([tracked, geometry.search(local_map, scan, orthonormal(others))])
     return _Attempt(tracked, matched, starts[0], proposal.probability, compact)
@@ -267,7 +281,7 @@ def _is_confirmed(methods: SlamMethods, tried: _Attempt, best: Alignment) -> boo
         return False
     ends = (tried.tracked.T_map_scan, tried.T_map_scan)
     are_equal = all(are_near(T, best.T_map_scan, NEAR_M, NEAR_RAD) for T in ends)
-    return are_equal and best.score >= config.min_score
+    return are_equal and best.score >= MIN_SCORE
 
 
 def _is_keyframe(methods: SlamMethods, located: Located, scan: ThinnedScan) -> bool:
@@ -276,7 +290,7 @@ def _is_keyframe(methods: SlamMethods, located: Located, scan: ThinnedScan) -> b
     config, T = methods.config.front_end, located.T_keyframe_scan
     spacing_m = config.keyframe_share * scan.extent_m
     spacing_m = float(np.clip(spacing_m, config.min_keyframe_m, config.max_keyframe_m))
-    return bool(np.linalg.norm(T[:3, 3]) > spacing_m) or turn_rad(T) > config.keyframe_rad
+    return bool(np.linalg.norm(T[:3, 3]) > spacing_m) or turn_rad(T) > KEYFRAME_RAD
 
 
 def _make_keyframe(

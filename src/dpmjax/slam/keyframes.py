@@ -17,6 +17,9 @@ from dpmjax.geometry import rigid
 from dpmjax.pose_graph.graph import Edges, PoseGraph
 from dpmjax.slam.config import MapOrigin
 
+SUBMAP_RADIUS_M = 20.0
+"""Largest distance of the keyframes of a submap (DeepPointMap's published configuration)."""
+
 Pose = Float[np.ndarray, "4 4"]
 EdgeKind = Literal["odometry", "loop", "guess"]
 
@@ -123,7 +126,7 @@ def add_keyframe(
 
 
 def with_origin(slam_map: KeyframeMap, origin: MapOrigin) -> KeyframeMap:
-    """Notes what makes a map; one that another matcher has made is refused.
+    """Records the matcher and the settings of a map.
 
     Args:
         slam_map: the map.
@@ -232,19 +235,18 @@ def nearest_in_graph(slam_map: KeyframeMap, row: int, num_keyframes: int, radius
     return rows[np.lexsort((apart[rows], rows != row))][:num_keyframes]
 
 
-def submap_around(slam_map: KeyframeMap, row: int, num_keyframes: int, radius_m: float) -> Submap:
+def submap_around(slam_map: KeyframeMap, row: int, num_keyframes: int) -> Submap:
     """Gathers a keyframe and its neighbours in the graph, nearest first.
 
     Args:
         slam_map: the map.
         row: of the central keyframe.
         num_keyframes: largest number of keyframes, the central one among them.
-        radius_m: neighbours farther away are left out.
 
     Returns:
         The submap, in the frame of the central keyframe.
     """
-    rows = nearest_in_graph(slam_map, row, num_keyframes, radius_m)
+    rows = nearest_in_graph(slam_map, row, num_keyframes, SUBMAP_RADIUS_M)
     T_submap_world = rigid.inverse(slam_map.T_world_keyframe[row])
     return Submap(tuple(slam_map.keyframes[i].compact for i in rows), T_submap_world @ slam_map.T_world_keyframe[rows])
 
@@ -283,7 +285,7 @@ def turn_rad(T_a_b: Pose) -> float:
 
 
 def are_near(T_a: Pose, T_b: Pose, most_m: float, most_rad: float) -> bool:
-    """Returns True if two poses of one thing differ by at most a distance and a turn.
+    """Returns True if two poses differ by at most a distance and a rotation angle.
 
     Args:
         T_a: a pose.

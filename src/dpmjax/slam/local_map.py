@@ -112,14 +112,14 @@ def with_scan(
 
 
 def nearest_keyframe(local_map: LocalMap, position_map: Float[np.ndarray, " 3"]) -> int:
-    """Returns the place of the keyframe that is nearest to a position.
+    """Returns the index of the keyframe that is nearest to a position.
 
     Args:
         local_map: the local map.
         position_map: metres.
 
     Returns:
-        Place in `keyframes`.
+        Index in `keyframes`.
     """
     positions = np.array([placed.T_map_scan[:3, 3] for placed in local_map.keyframes])
     return int(np.argmin(np.linalg.norm(positions - position_map, axis=1)))

@@ -13,7 +13,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from dpmjax.checks import require_fields, require_positive_fields
+from dpmjax.checks import require_fields
 from dpmjax.deeppointmap.compact_scans import CompactScan
 from dpmjax.deeppointmap.model import Model
 from dpmjax.slam.keyframes import (
@@ -27,11 +27,22 @@ from dpmjax.slam.keyframes import (
     with_origin,
 )
 from dpmjax.slam.loop_consistency import scans_agree
-from dpmjax.slam.matcher import Match
-from dpmjax.slam.methods import SlamMethods
+from dpmjax.slam.methods import Match, SlamMethods
 from dpmjax.slam.retrieval import most_similar
 from dpmjax.slam.system import make_methods
 from dpmjax.types import AnyArray
+
+MAX_RIVAL_SHARE = 0.5
+"""Largest sum of probabilities of a second place, as a share of that of the best one."""
+
+SAME_PLACE_RAD = 0.06
+"""Largest turn between registrations that agree."""
+
+SAME_PLACE_M = 1.5
+"""Largest distance between registrations that agree."""
+
+NUM_AT_ONCE = 2
+"""Number of registrations at a time; the next ones follow only where the place is not clear."""
 
 LocalizationStatus = Literal["found", "not in this map", "empty"]
 
@@ -43,38 +54,30 @@ class LocalizationConfig:
     Attributes:
         num_similar: number of keyframes by retrieval whose overlap is estimated.
         num_registered: largest number of them that are registered, in order of their overlap.
-        num_at_once: number of registrations at a time; the next ones follow only where the place is not clear.
         num_neighbours: number of further keyframes near the best place that are registered.
         num_submap: number of keyframes whose descriptors are merged for a registration.
-        same_place_m: largest distance between registrations that agree.
-        same_place_rad: largest turn between registrations that agree.
         min_probability: a registration supports a place from this P(correct) on, if the scans agree.
         min_support: number of registrations that must end at the same place; the scans of at least one must agree. One
             registration suffices where no other keyframe is near.
-        min_best: smallest P(correct) of the best of them. Streets look alike: several may agree on a wrong place.
-        max_rival_share: another place may have this share of the sum of the best one.
+        min_best: smallest P(correct) of the best registration of a place. Streets look alike: several may agree on a
+            wrong place.
     """
 
     num_similar: int = 16
     num_registered: int = 8
-    num_at_once: int = 2
     num_neighbours: int = 2
     num_submap: int = 1
-    same_place_m: float = 1.5
-    same_place_rad: float = 0.06
     min_probability: float = 0.2
     min_support: int = 2
     min_best: float = 0.9
-    max_rival_share: float = 0.5
 
     def __post_init__(self) -> None:
-        require_fields(self, "num_similar", "num_registered", "num_at_once", "num_submap", "min_support", low=1)
+        require_fields(self, "num_similar", "num_registered", "num_submap", "min_support", low=1)
         require_fields(self, "num_neighbours", low=0)
-        require_fields(self, "min_probability", "min_best", "max_rival_share", low=0, high=1)
-        require_positive_fields(self, "same_place_m", "same_place_rad")
+        require_fields(self, "min_probability", "min_best", low=0, high=1)
 
 
-class Evidence(NamedTuple):
+class KeyframeMatch(NamedTuple):
     """One registration of the scan.
 
     Attributes:
@@ -107,7 +110,7 @@ class Localization(NamedTuple):
     probability: float
     keyframe: int | None
     reason: str
-    evidence: tuple[Evidence, ...] = ()
+    evidence: tuple[KeyframeMatch, ...] = ()
 
     @property
     def is_in_map(self) -> bool:
@@ -117,7 +120,7 @@ class Localization(NamedTuple):
 
 class _Place(NamedTuple):
     # Registrations that agree, the most probable first.
-    members: tuple[Evidence, ...]
+    members: tuple[KeyframeMatch, ...]
 
     @property
     def total(self) -> float:
@@ -187,10 +190,10 @@ def _localized(
         return Localization("empty", None, 0.0, None, "too few points")
     compact, extent_m = methods.matcher.encode(thinned), thinned.extent_m
     rows = _candidates(slam_map, compact, methods, config)
-    tried: list[Evidence] = []
-    for start in range(0, len(rows), config.num_at_once):
+    tried: list[KeyframeMatch] = []
+    for start in range(0, len(rows), NUM_AT_ONCE):
         done = {one.keyframe for one in tried}
-        left = [row for row in rows[start : start + config.num_at_once] if row not in done]
+        left = [row for row in rows[start : start + NUM_AT_ONCE] if row not in done]
         tried += _registered(slam_map, left, compact, methods, config)
         place = max(_places(tried, config), key=lambda place: place.total, default=None)
         if place is not None and not _is_supported(place, config, config.min_support):
@@ -216,34 +219,33 @@ def _candidates(
 
 def _registered(
     slam_map: KeyframeMap, rows: list[int], compact: CompactScan, methods: SlamMethods, config: LocalizationConfig
-) -> list[Evidence]:
-    source, radius_m = Submap((compact,), np.eye(4)[None]), methods.config.front_end.submap_radius_m
-    targets = [submap_around(slam_map, row, config.num_submap, radius_m) for row in rows]
+) -> list[KeyframeMatch]:
+    source = Submap((compact,), np.eye(4)[None])
+    targets = [submap_around(slam_map, row, config.num_submap) for row in rows]
     matches = methods.matcher.register([(source, target) for target in targets]) if rows else []
-    loops = methods.config.loops
     return [
-        Evidence(
-            row, orthonormal(slam_map.T_world_keyframe[row] @ match.T_target_source), match, scans_agree(match, loops)
+        KeyframeMatch(
+            row, orthonormal(slam_map.T_world_keyframe[row] @ match.T_target_source), match, scans_agree(match)
         )
         for row, match in zip(rows, matches, strict=True)
     ]
 
 
-def _places(tried: list[Evidence], config: LocalizationConfig) -> list[_Place]:
+def _places(tried: list[KeyframeMatch], config: LocalizationConfig) -> list[_Place]:
     """Groups registrations around the most probable ones whose scans agree."""
     # Fewer points meet planes of a keyframe farther off: that it puts the scan at the same place is enough.
     left = sorted(tried, key=lambda one: -one.match.probability)
     left = [one for one in left if one.match.probability >= config.min_probability]
     places = []
     while first := next((one for one in left if one.do_scans_agree), None):
-        others = [one for one in left if one is not first and _agree(first, one, config)]
+        others = [one for one in left if one is not first and _agree(first, one)]
         places.append(_Place((first, *others)))
         left = [one for one in left if not any(one is member for member in places[-1].members)]
     return places
 
 
-def _agree(one: Evidence, other: Evidence, config: LocalizationConfig) -> bool:
-    return are_near(one.T_world_scan, other.T_world_scan, config.same_place_m, config.same_place_rad)
+def _agree(one: KeyframeMatch, other: KeyframeMatch) -> bool:
+    return are_near(one.T_world_scan, other.T_world_scan, SAME_PLACE_M, SAME_PLACE_RAD)
 
 
 def _is_supported(place: _Place, config: LocalizationConfig, min_support: int) -> bool:
@@ -251,7 +253,7 @@ def _is_supported(place: _Place, config: LocalizationConfig, min_support: int) -
 
 
 def _neighbours(
-    slam_map: KeyframeMap, best: Evidence, tried: list[Evidence], extent_m: float, config: LocalizationConfig
+    slam_map: KeyframeMap, best: KeyframeMatch, tried: list[KeyframeMatch], extent_m: float, config: LocalizationConfig
 ) -> list[int]:
     """Returns keyframes near the place that were not tried yet, nearest first."""
     apart_m = distances_to(slam_map, best.T_world_scan[:3, 3])
@@ -260,7 +262,9 @@ def _neighbours(
     return [row for row in near if row not in done][: config.num_neighbours]
 
 
-def _decided(slam_map: KeyframeMap, tried: list[Evidence], extent_m: float, config: LocalizationConfig) -> Localization:
+def _decided(
+    slam_map: KeyframeMap, tried: list[KeyframeMatch], extent_m: float, config: LocalizationConfig
+) -> Localization:
     places = sorted(_places(tried, config), key=lambda place: -place.total)
     evidence = tuple(tried)
     if not places:
@@ -272,7 +276,7 @@ def _decided(slam_map: KeyframeMap, tried: list[Evidence], extent_m: float, conf
     numbers += f", next place {rival:.2f}"
     is_alone = int((distances_to(slam_map, first.T_world_scan[:3, 3]) <= extent_m).sum()) <= 1
     is_supported = _is_supported(best, config, 1 if is_alone else config.min_support)
-    if not is_supported or rival > config.max_rival_share * best.total:
+    if not is_supported or rival > MAX_RIVAL_SHARE * best.total:
         return Localization("not in this map", None, 0.0, None, numbers, evidence)
     probability = first.match.probability
     return Localization("found", first.T_world_scan, probability, first.keyframe, numbers, evidence)

@@ -12,6 +12,9 @@ from dpmjax.slam.config import LoopClosureConfig
 from dpmjax.slam.keyframes import KeyframeMap, distances_to
 from dpmjax.slam.retrieval import most_similar
 
+MAX_RADIUS_M = 100.0
+"""Upper bound of the radius (DeepPointMap: 100 m)."""
+
 MIN_PATH_SHARE = 4.0
 """Smallest distance of a candidate along the path, in extents."""
 
@@ -55,7 +58,7 @@ class _Path(NamedTuple):
         return is_before & (self.since_m(row) > MIN_PATH_SHARE * self.extents_m[row])
 
 
-def find_candidates(slam_map: KeyframeMap, row: int, config: LoopClosureConfig) -> list[LoopCandidate]:
+def find_loop_candidates(slam_map: KeyframeMap, row: int, config: LoopClosureConfig) -> list[LoopCandidate]:
     """Finds older keyframes that may show the place of a keyframe.
 
     By distance: within a radius that grows with the path since, for odometry drifts. By retrieval: over the whole map,
@@ -73,7 +76,7 @@ def find_candidates(slam_map: KeyframeMap, row: int, config: LoopClosureConfig) 
     is_old, since_m = path.is_old(row), path.since_m(row)
     apart_m = distances_to(slam_map, slam_map.T_world_keyframe[row, :3, 3])
     radius_m = RADIUS_SHARE * keyframe.extent_m + DRIFT_SHARE * since_m
-    is_near = is_old & (apart_m <= np.minimum(radius_m, config.max_radius_m))
+    is_near = is_old & (apart_m <= np.minimum(radius_m, MAX_RADIUS_M))
     near = np.argsort(np.where(is_near, apart_m, np.inf), kind="stable")[: int(is_near.sum())]
     near = _spread(near, slam_map, keyframe.extent_m / 2, config.num_near)
     similar = _similar(slam_map, row, is_old, config)

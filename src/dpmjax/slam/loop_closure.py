@@ -11,13 +11,11 @@ from jaxtyping import Float
 from dpmjax.scans.plane_information import with_least_covariance
 from dpmjax.slam.config import LoopClosureConfig
 from dpmjax.slam.keyframes import KeyframeMap, Submap, diagonal_information, submap_around
-from dpmjax.slam.loop_candidates import LoopCandidate, find_candidates, nearest_pairs
-from dpmjax.slam.loop_consistency import accept_consistent, status_of
-from dpmjax.slam.loop_state import LoopState
+from dpmjax.slam.loop_candidates import LoopCandidate, find_loop_candidates, nearest_pairs
+from dpmjax.slam.loop_consistency import accept_consistent, loop_status
 from dpmjax.slam.map_optimization import optimize_map
-from dpmjax.slam.matcher import Match
-from dpmjax.slam.methods import SlamMethods
-from dpmjax.slam.reports import Loop, LoopStatus
+from dpmjax.slam.methods import Match, SlamMethods
+from dpmjax.slam.reports import Loop, LoopState, LoopStatus
 
 SURE_OVERLAP = 0.9
 """Overlap probability from which on no further candidate is looked at."""
@@ -56,7 +54,7 @@ def close_loops(methods: SlamMethods, slam_map: KeyframeMap, state: LoopState) -
     row = len(slam_map) - 1
     if not config.is_on or row < 1 or is_resting(slam_map, state.loops, row):
         return slam_map, state
-    loops = examine_candidates(methods, slam_map, state.loops, row, find_candidates(slam_map, row, config))
+    loops = examine_candidates(methods, slam_map, state.loops, row, find_loop_candidates(slam_map, row, config))
     is_stale = state.is_stale or num_accepted(loops) > num_accepted(state.loops)
     state = LoopState(loops, state.num_optimized, is_stale)
     wait = max(EVERY_KEYFRAMES, int(EVERY_SHARE * len(slam_map)))
@@ -67,7 +65,7 @@ def close_loops(methods: SlamMethods, slam_map: KeyframeMap, state: LoopState) -
 
 
 def search_again(methods: SlamMethods, slam_map: KeyframeMap, state: LoopState) -> LoopState:
-    """Registers keyframes that lie near earlier ones since the optimisation, and were not compared with them before.
+    """Registers keyframes with earlier ones that are near only since the optimisation.
 
     Args:
         methods: matcher and settings.
@@ -164,12 +162,12 @@ def _register_candidates(
     overlapping.sort(key=lambda number: -(loops[number].overlap or 0.0))
 
     def submap(center: int) -> Submap:
-        return submap_around(slam_map, center, front.num_submap, front.submap_radius_m)
+        return submap_around(slam_map, center, front.num_submap)
 
     for number in overlapping[: config.num_registered]:
         (match,) = methods.matcher.register([(submap(row), submap(loops[number].target))])
         loops[number] = loops[number]._replace(
-            status=status_of(slam_map, loops[number], match, config),
+            status=loop_status(slam_map, loops[number], match, config),
             probability=match.probability,
             rmse=match.rmse,
             T_target_source=match.T_target_source,

@@ -13,8 +13,17 @@ import numpy as np
 from dpmjax.geometry import rigid
 from dpmjax.slam.config import LoopClosureConfig
 from dpmjax.slam.keyframes import KeyframeMap, are_near
-from dpmjax.slam.matcher import Match
+from dpmjax.slam.methods import Match
 from dpmjax.slam.reports import Loop, LoopStatus
+
+MAX_CONTRADICTED_SHARE = 0.1
+"""Largest share of points in free space."""
+
+MIN_MATCHED_SHARE = 0.35
+"""Smallest share of points that meet planes, where the scans verify a registration."""
+
+DRIFT_M = 0.05
+"""Standard deviation of odometry over one metre; it grows with the root of the path."""
 
 PENDING_PATH_M = 40.0
 """Largest distance along the path between the ends of registrations that support each other."""
@@ -32,8 +41,8 @@ MAX_WITNESSES = 6
 """So many accepted loops are asked whether they agree with a new one."""
 
 
-def status_of(slam_map: KeyframeMap, loop: Loop, match: Match, config: LoopClosureConfig) -> LoopStatus:
-    """Decides about a registration by itself.
+def loop_status(slam_map: KeyframeMap, loop: Loop, match: Match, config: LoopClosureConfig) -> LoopStatus:
+    """Tests a registration of a loop against its probability, the agreement of the scans, and odometry.
 
     Args:
         slam_map: the map.
@@ -46,7 +55,7 @@ def status_of(slam_map: KeyframeMap, loop: Loop, match: Match, config: LoopClosu
     """
     if match.probability < config.min_probability:
         return "improbable"
-    if not scans_agree(match, config):
+    if not scans_agree(match):
         return "scans disagree"
     source, target = slam_map.keyframes[loop.source], slam_map.keyframes[loop.target]
     if source.segment == target.segment:
@@ -61,32 +70,19 @@ def status_of(slam_map: KeyframeMap, loop: Loop, match: Match, config: LoopClosu
     return "waits for support"
 
 
-def scans_agree(match: Match, config: LoopClosureConfig) -> bool:
+def scans_agree(match: Match) -> bool:
     """Returns True if enough points of the scans meet planes under a registration, and few lie in free space.
 
     Args:
         match: the registration.
-        config: both limits.
 
     Returns:
         True also where the matcher has no scans.
     """
     shares = match.verification
-    return shares is None or shares_suffice(shares.matched_share, shares.contradicted_share, config)
-
-
-def shares_suffice(matched_share: float, contradicted_share: float, config: LoopClosureConfig) -> bool:
-    """Returns True if enough points meet planes, and few lie in free space.
-
-    Args:
-        matched_share: of the points that are compared.
-        contradicted_share: of those that are visible.
-        config: both limits.
-
-    Returns:
-        True at the limits, too.
-    """
-    return matched_share >= config.min_matched_share and contradicted_share <= config.max_contradicted_share
+    return shares is None or (
+        shares.matched_share >= MIN_MATCHED_SHARE and shares.contradicted_share <= MAX_CONTRADICTED_SHARE
+    )
 
 
 def accept_consistent(
@@ -169,6 +165,6 @@ def _is_near_along(slam_map: KeyframeMap, row: int, other: int) -> bool:
 def _drift(path_m: float, config: LoopClosureConfig) -> tuple[float, float]:
     """Returns standard deviations of a cycle of two registrations and a path of odometry: metres, radians."""
     return (
-        float(np.sqrt(2 * config.sigma_m**2 + config.drift_m**2 * path_m)),
+        float(np.sqrt(2 * config.sigma_m**2 + DRIFT_M**2 * path_m)),
         float(np.sqrt(2 * config.sigma_rad**2 + DRIFT_RAD**2 * path_m)),
     )

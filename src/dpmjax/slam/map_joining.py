@@ -18,10 +18,9 @@ from dpmjax.geometry import rigid
 from dpmjax.slam.keyframes import KeyframeMap, MapEdge, connected_parts, with_origin, with_poses
 from dpmjax.slam.loop_candidates import find_meetings
 from dpmjax.slam.loop_closure import examine_candidates, is_resting, num_accepted
-from dpmjax.slam.loop_state import LoopState, loops_of_map
 from dpmjax.slam.map_optimization import optimize_map
 from dpmjax.slam.methods import SlamMethods
-from dpmjax.slam.reports import Loop
+from dpmjax.slam.reports import Loop, LoopState, loops_of_map
 
 OnKeyframe = Callable[[int, int], None]
 """Called with the number of keyframes that were compared, and with that of all to be compared."""

@@ -19,8 +19,10 @@ from dpmjax.slam.keyframes import (
     with_edges,
     with_poses,
 )
-from dpmjax.slam.loop_state import LoopState
-from dpmjax.slam.reports import Loop
+from dpmjax.slam.reports import Loop, LoopState
+
+OUTLIER_CHI2 = 25.0
+"""Cost from which on the optimisation reduces the weight of a loop edge."""
 
 TAKEN_BACK_WEIGHT = 0.25
 """Smallest weight of a loop edge that stays after the optimisation."""
@@ -55,7 +57,7 @@ def optimize_map(slam_map: KeyframeMap, state: LoopState, config: LoopClosureCon
     graph = as_pose_graph(with_edges(slam_map, [*edges, *measured, *held]))
     trust = np.full(len(graph.edges.source), CERTAIN)
     trust[: len(edges)] = 1.0
-    settings = PoseGraphConfig(outlier_chi2=config.edge_outlier_chi2, is_chordal_start=False)
+    settings = PoseGraphConfig(outlier_chi2=OUTLIER_CHI2, is_chordal_start=False)
     solved = optimize_pose_graph(graph, settings, trust=trust)
     loops = list(state.loops)
     kept = []

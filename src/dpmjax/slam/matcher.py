@@ -1,10 +1,9 @@
-"""The interface of a matcher (encoding, proposals, registration, overlap), and the one of DeepPointMap's networks."""
+"""The matcher of DeepPointMap's networks: encoding, proposals, registration, overlap."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import NamedTuple, Protocol
 
 import jax
 import jax.numpy as jnp
@@ -17,119 +16,21 @@ from dpmjax.deeppointmap.confidence import gather_evidence, with_confidence
 from dpmjax.deeppointmap.encoding import pyramid_of_cloud
 from dpmjax.deeppointmap.matching import merge_clouds, thin_merged
 from dpmjax.deeppointmap.model import Model, encode_pyramid, model_fingerprint
+from dpmjax.deeppointmap.motion_choice import REFINEMENT
 from dpmjax.deeppointmap.scan_registration import PreparedScan, distinct_motions, match_clouds, register_each
+from dpmjax.deeppointmap.verification import PLANE_DISTANCE_M
 from dpmjax.scans.compact import expand_elements
 from dpmjax.scans.plane_information import plane_information
 from dpmjax.scans.surface_alignment import AlignmentLevel, align_surfaces, pair_with_planes
 from dpmjax.scans.surfaces import Surface
-from dpmjax.slam.alignment import ThinnedScan
-from dpmjax.slam.keyframes import Pose, Submap
+from dpmjax.slam.keyframes import Submap
 from dpmjax.slam.local_map import PlacedElements, joined_surface
+from dpmjax.slam.methods import Match, Proposal, ThinnedScan
 from dpmjax.slam.retrieval import pooled_vector
-from dpmjax.types import DescriptorCloud, Registration, Verification
+from dpmjax.types import DescriptorCloud, Registration
 
 ELEMENT_RADIUS_M = 2.0
 """Radius of `VerificationConfig.plane_radius_m` for surface elements, which are metres apart."""
-
-
-class Match(NamedTuple):
-    """A registration without a first guess.
-
-    Attributes:
-        T_target_source: float64.
-        probability: that it is right within 2 m and 5 degrees, if the matcher is calibrated; else a score in [0, 1].
-        rmse: of the pairs that it rests on, metres.
-        verification: how well the scans agree under it; None where the matcher has no scans.
-        information: (6, 6) inverse covariance by the planes of the scans, in the tangent of the source, translation
-            first; None where it is not known.
-    """
-
-    T_target_source: Pose
-    probability: float
-    rmse: float
-    verification: Verification | None = None
-    information: Float[np.ndarray, "6 6"] | None = None
-
-
-class Proposal(NamedTuple):
-    """Motions of a scan that descriptors alone propose.
-
-    Attributes:
-        T_target_source: (h, 4, 4) float64, the most likely first.
-        probability: P(correct) of the first.
-    """
-
-    T_target_source: Float[np.ndarray, "h 4 4"]
-    probability: float
-
-
-class Matcher(Protocol):
-    """Recognises places and registers scans and maps without a first guess.
-
-    Attributes:
-        fingerprint: keyframes are compared only with those of a matcher of the same fingerprint.
-    """
-
-    @property
-    def fingerprint(self) -> str: ...  # noqa: D102
-
-    def encode(self, scan: ThinnedScan) -> CompactScan:
-        """Prepares a scan for any number of registrations.
-
-        Args:
-            scan: the scan.
-
-        Returns:
-            Descriptors, surface elements and free space.
-        """
-        ...
-
-    def vector(self, scan: CompactScan) -> Float[np.ndarray, " c"]:
-        """Returns one vector for retrieval, of a length that is the same for all scans.
-
-        Args:
-            scan: from `encode`.
-
-        Returns:
-            The vector.
-        """
-        ...
-
-    def propose(self, source: CompactScan, target: CompactScan, num_motions: int) -> Proposal:
-        """Registers a scan by descriptors alone.
-
-        Args:
-            source: a scan.
-            target: the other.
-            num_motions: largest number of motions.
-
-        Returns:
-            Distinct motions; at least one.
-        """
-        ...
-
-    def register(self, pairs: Sequence[tuple[Submap, Submap]]) -> list[Match]:
-        """Registers pairs of source and target, and verifies them by their surfaces.
-
-        Args:
-            pairs: submaps; a single scan is a submap of one.
-
-        Returns:
-            One match a pair, between the frames of the two submaps.
-        """
-        ...
-
-    def overlaps(self, source: CompactScan, targets: Sequence[CompactScan]) -> Float[np.ndarray, " n"]:
-        """Estimates the probability that scans see the same place, for many scans at once.
-
-        Args:
-            source: a scan.
-            targets: the scans that it is compared with; at least one.
-
-        Returns:
-            The probabilities.
-        """
-        ...
 
 
 class NetworkMatcher:
@@ -180,11 +81,13 @@ class NetworkMatcher:
         Returns:
             Distinct motions, best first.
         """
-        config = self._model.config
-        hypotheses = match_clouds(self._model, source.cloud, target.cloud, config=config.matching)
+        matching = self._model.config.matching
+        if matching.consensus is not None:
+            matching = replace(matching, consensus=replace(matching.consensus, num_motions=num_motions))
+        hypotheses = match_clouds(self._model, source.cloud, target.cloud, config=matching)
         best = jax.tree.map(lambda leaf: jnp.asarray(leaf[0]), hypotheses)
-        confident = with_confidence(best, gather_evidence(hypotheses, 0, None), config.calibration)
-        return Proposal(distinct_motions(hypotheses)[:num_motions], float(confident.confidence))
+        confident = with_confidence(best, gather_evidence(hypotheses, 0, None), self._model.config.calibration)
+        return Proposal(distinct_motions(hypotheses), float(confident.confidence))
 
     def register(self, pairs: Sequence[tuple[Submap, Submap]]) -> list[Match]:
         """Registers merged descriptors, verifies by the central scans, aligns with the whole target; see `Matcher`.
@@ -215,12 +118,10 @@ class NetworkMatcher:
     def _match(self, source: Submap, target: Submap, found: Registration) -> Match:
         config = self._model.config.verification
         scan, union = _surface(source._replace(scans=source.scans[:1])), _surface(target)
-        aligned = align_surfaces(scan, union, np.asarray(found.T_target_source, np.float64), config.refinement)
+        aligned = align_surfaces(scan, union, np.asarray(found.T_target_source, np.float64), REFINEMENT)
         T = aligned.T_target_source
         level = AlignmentLevel(config.plane_radius_m, config.num_samples, 1)
-        information = plane_information(
-            pair_with_planes(scan, union, T, level), T, max_residual_m=config.plane_distance_m
-        )
+        information = plane_information(pair_with_planes(scan, union, T, level), T, max_residual_m=PLANE_DISTANCE_M)
         return Match(T, float(found.confidence), float(found.rmse), found.verification, information)
 
 

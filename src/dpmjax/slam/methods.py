@@ -1,12 +1,219 @@
-"""The parts of SLAM: matcher, geometry and settings."""
+"""The parts of SLAM that are arguments: a matcher, the geometry of odometry, and settings.
+
+`SurfaceGeometry` (`odometry`) aligns scans with the local map; `NetworkMatcher` (`matcher`) recognises places.
+"""
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from collections.abc import Sequence
+from typing import NamedTuple, Protocol
 
-from dpmjax.slam.alignment import Geometry
+import numpy as np
+from jaxtyping import Float
+
+from dpmjax.deeppointmap.compact_scans import CompactScan
+from dpmjax.deeppointmap.verification import MeasuredScan
 from dpmjax.slam.config import MapOrigin, SlamConfig
-from dpmjax.slam.matcher import Matcher
+from dpmjax.slam.keyframes import Pose, Submap
+from dpmjax.slam.local_map import LocalMap
+from dpmjax.types import PointCloud, Verification
+
+
+class ThinnedScan(NamedTuple):
+    """A scan after its one thinning.
+
+    Attributes:
+        cloud: thinned points, metres, in the frame of the lidar; input of the encoder.
+        measured: their surface and free space.
+        extent_m: median range of the thinned points.
+    """
+
+    cloud: PointCloud
+    measured: MeasuredScan
+    extent_m: float
+
+
+class Alignment(NamedTuple):
+    """A scan in the frame of the local map.
+
+    Attributes:
+        T_map_scan: float64.
+        matched_share: share of the elements of the scan that meet planes of the map.
+        contradicted_share: share of the visible elements of the map that lie in the free space of the scan.
+        score: `matched_share` less the weighted `contradicted_share`.
+        information: (6, 6) inverse covariance in the tangent of the scan, translation first: weak along a corridor.
+    """
+
+    T_map_scan: Pose
+    matched_share: float
+    contradicted_share: float
+    score: float
+    information: Float[np.ndarray, "6 6"]
+
+
+class Geometry(Protocol):
+    """Thins scans and aligns them with the local map."""
+
+    def thin(self, points: Float[np.ndarray, "n 3"]) -> ThinnedScan | None:
+        """Prepares a scan.
+
+        Args:
+            points: finite, metres, in the frame of the lidar.
+
+        Returns:
+            The thinned scan; None for a scan without enough flat points.
+        """
+        ...
+
+    def align(self, local_map: LocalMap, scan: ThinnedScan, T_map_scan: Pose) -> Alignment:
+        """Aligns a scan from a first guess that is nearly right.
+
+        Args:
+            local_map: the local map.
+            scan: the scan.
+            T_map_scan: first guess.
+
+        Returns:
+            The pose.
+        """
+        ...
+
+    def search(self, local_map: LocalMap, scan: ThinnedScan, T_map_scan: Float[np.ndarray, "s 4 4"]) -> Alignment:
+        """Aligns a scan from several first guesses, coarse to fine.
+
+        Args:
+            local_map: the local map.
+            scan: the scan.
+            T_map_scan: first guesses; at least one.
+
+        Returns:
+            The pose of the highest score.
+        """
+        ...
+
+    def other_motions(self, T_last_scan: Pose, extent_m: float) -> Float[np.ndarray, "s 4 4"]:
+        """Returns motions that a vehicle may make instead of the predicted one.
+
+        Args:
+            T_last_scan: the predicted motion.
+            extent_m: median range of the scan.
+
+        Returns:
+            The motions.
+        """
+        ...
+
+
+def best_of(alignments: Sequence[Alignment]) -> Alignment:
+    """Returns the alignment of the highest score.
+
+    Args:
+        alignments: at least one.
+
+    Returns:
+        The first of the best.
+    """
+    return max(alignments, key=lambda found: found.score)
+
+
+class Match(NamedTuple):
+    """A registration without a first guess.
+
+    Attributes:
+        T_target_source: float64.
+        probability: that it is right within 2 m and 5 degrees, if the matcher is calibrated; else a score in [0, 1].
+        rmse: of the pairs that it rests on, metres.
+        verification: how well the scans agree under it; None where the matcher has no scans.
+        information: (6, 6) inverse covariance by the planes of the scans, in the tangent of the source, translation
+            first; None where it is not known.
+    """
+
+    T_target_source: Pose
+    probability: float
+    rmse: float
+    verification: Verification | None = None
+    information: Float[np.ndarray, "6 6"] | None = None
+
+
+class Proposal(NamedTuple):
+    """Motions of a scan that descriptors alone propose.
+
+    Attributes:
+        T_target_source: (h, 4, 4) float64, the most likely first.
+        probability: P(correct) of the first.
+    """
+
+    T_target_source: Float[np.ndarray, "h 4 4"]
+    probability: float
+
+
+class Matcher(Protocol):
+    """Recognises places and registers scans and maps without a first guess.
+
+    Attributes:
+        fingerprint: keyframes are compared only with those of a matcher of the same fingerprint.
+    """
+
+    @property
+    def fingerprint(self) -> str: ...  # noqa: D102
+
+    def encode(self, scan: ThinnedScan) -> CompactScan:
+        """Prepares a scan for any number of registrations.
+
+        Args:
+            scan: the scan.
+
+        Returns:
+            Descriptors, surface elements and free space.
+        """
+        ...
+
+    def vector(self, scan: CompactScan) -> Float[np.ndarray, " c"]:
+        """Returns one vector for retrieval, of a length that is the same for all scans.
+
+        Args:
+            scan: from `encode`.
+
+        Returns:
+            The vector.
+        """
+        ...
+
+    def propose(self, source: CompactScan, target: CompactScan, num_motions: int) -> Proposal:
+        """Registers a scan by descriptors alone.
+
+        Args:
+            source: a scan.
+            target: the other.
+            num_motions: largest number of motions.
+
+        Returns:
+            Distinct motions; at least one.
+        """
+        ...
+
+    def register(self, pairs: Sequence[tuple[Submap, Submap]]) -> list[Match]:
+        """Registers pairs of source and target, and verifies them by their surfaces.
+
+        Args:
+            pairs: submaps; a single scan is a submap of one.
+
+        Returns:
+            One match a pair, between the frames of the two submaps.
+        """
+        ...
+
+    def overlaps(self, source: CompactScan, targets: Sequence[CompactScan]) -> Float[np.ndarray, " n"]:
+        """Estimates the probability that scans see the same place, for many scans at once.
+
+        Args:
+            source: a scan.
+            targets: the scans that it is compared with; at least one.
+
+        Returns:
+            The probabilities.
+        """
+        ...
 
 
 class SlamMethods(NamedTuple):

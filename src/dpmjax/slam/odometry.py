@@ -16,10 +16,22 @@ from dpmjax.scans.plane_information import plane_information, with_least_covaria
 from dpmjax.scans.preprocess import first_of_each_voxel
 from dpmjax.scans.surface_alignment import AlignmentLevel, align_surfaces_from, nearest_planes, pair_with_planes
 from dpmjax.scans.surfaces import Surface, SurfaceConfig, surface_at
-from dpmjax.slam.alignment import Alignment, ThinnedScan, best_of
 from dpmjax.slam.config import OdometryConfig
 from dpmjax.slam.keyframes import Pose, orthonormal
 from dpmjax.slam.local_map import LocalMap
+from dpmjax.slam.methods import Alignment, ThinnedScan, best_of
+
+PLANE_DISTANCE_M = 0.15
+"""Largest distance between an element and the plane of the map that it meets."""
+
+TILTS_DEG = (-8.0, 8.0)
+"""Turns about the x and y axes among the further starts."""
+
+TURNS_DEG = (-10.0, 10.0, -20.0, 20.0, -35.0, 35.0, -50.0, 50.0)
+"""Turns about the vertical among the further starts."""
+
+MIN_NUM_POINTS = 100
+"""A scan with fewer flat surface elements counts as empty."""
 
 NUM_SAMPLES = 1000
 """Number of surface elements that the score of a pose compares."""
@@ -79,12 +91,12 @@ class SurfaceGeometry:
         Returns:
             The thinned scan; None if it is empty.
         """
-        if len(points) < self.config.min_num_points:
+        if len(points) < MIN_NUM_POINTS:
             return None
         cloud = thin_scan(points, self._model_config)
         thinned = np.asarray(cloud.points)[np.asarray(cloud.mask)].astype(np.float64)
         surface = surface_at(thinned, _spread_rows(thinned), NEIGHBOURHOODS)
-        if np.count_nonzero(surface.flatness) < self.config.min_num_points:
+        if np.count_nonzero(surface.flatness) < MIN_NUM_POINTS:
             return None
         extent_m = float(np.median(np.linalg.norm(thinned, axis=1)))
         return ThinnedScan(cloud, MeasuredScan(surface, range_image(thinned)), extent_m)
@@ -134,12 +146,12 @@ class SurfaceGeometry:
         R, step = T_last_scan[:3, :3], T_last_scan[:3, 3]
         motions = [(R, factor * step) for factor in STEP_FACTORS]
         motions += [(R, np.array([share * extent_m, 0.0, 0.0])) for share in AHEAD_SHARES]
-        for turn_deg in self.config.turns_deg:
+        for turn_deg in TURNS_DEG:
             turned = R @ Rotation.from_euler("z", turn_deg, degrees=True).as_matrix()
             motions += [(turned, np.zeros(3)), (turned, step)]
         # A vehicle that rocks does not turn on: its tilt comes back.
         motions.append((np.eye(3), step))
-        for axis, tilt_deg in itertools.product("xy", self.config.tilts_deg):
+        for axis, tilt_deg in itertools.product("xy", TILTS_DEG):
             tilt = Rotation.from_euler(axis, tilt_deg, degrees=True).as_matrix()
             motions += [(R @ tilt, step), (tilt, step)]
         found = np.tile(np.eye(4), (len(motions), 1, 1))
@@ -158,7 +170,7 @@ class SurfaceGeometry:
         score = matched - CONTRADICTION_WEIGHT * contradicted
         level = AlignmentLevel(config.plane_radius_m, NUM_SAMPLES, 1)
         pairs = pair_with_planes(surface, local_map.surface, T, level)
-        information = plane_information(pairs, T, max_residual_m=config.plane_distance_m)
+        information = plane_information(pairs, T, max_residual_m=PLANE_DISTANCE_M)
         information = with_least_covariance(information, FLOOR_M, FLOOR_RAD)
         return Alignment(T, matched, contradicted, score, information)
 
@@ -170,7 +182,7 @@ class SurfaceGeometry:
         config = self.config
         level = AlignmentLevel(config.plane_radius_m, num_samples, 1)
         planes = nearest_planes(surface, local_map.surface, T_map_scan[None], level)
-        meets = planes.is_paired & (np.abs(planes.residuals) < config.plane_distance_m)
+        meets = planes.is_paired & (np.abs(planes.residuals) < PLANE_DISTANCE_M)
         meets &= planes.cosines > MIN_COSINE
         direction = np.argmax(np.abs(surface.normals[surface.samples[:num_samples]]), axis=1)
         counts = np.bincount(direction, minlength=3)

@@ -1,4 +1,4 @@
-"""Reports of SLAM: a record for each scan and for each loop candidate, with the reason of its decision."""
+"""Reports of SLAM: a record for each scan and for each loop candidate, with the reason of its decision; all loops."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from dpmjax.slam.keyframes import Pose
+from dpmjax.slam.keyframes import KeyframeMap, Pose
 
 ScanStatus = Literal["first", "tracked", "network", "predicted", "empty", "restarted"]
 """How the pose of a scan was found.
@@ -86,3 +86,35 @@ class Loop(NamedTuple):
     rmse: float | None = None
     T_target_source: Pose | None = None
     information: Float[np.ndarray, "6 6"] | None = None
+
+
+class LoopState(NamedTuple):
+    """All candidates so far.
+
+    Attributes:
+        loops: every candidate, in the order in which they were found.
+        num_optimized: number of keyframes at the last optimisation.
+        is_stale: whether edges were added since that do not only lengthen the chain of odometry.
+    """
+
+    loops: tuple[Loop, ...] = ()
+    num_optimized: int = 0
+    is_stale: bool = False
+
+
+def loops_of_map(slam_map: KeyframeMap) -> LoopState:
+    """Lists the loops that an earlier run has accepted; the optimisation may remove them later.
+
+    Args:
+        slam_map: of the earlier run.
+
+    Returns:
+        The loops.
+    """
+    edges = [edge for edge in slam_map.edges if edge.kind == "loop"]
+    known = Loop(0, 0, "map", "accepted", 1.0)
+    loops = [
+        known._replace(source=e.source, target=e.target, T_target_source=e.T_target_source, information=e.information)
+        for e in edges
+    ]
+    return LoopState(tuple(loops), len(slam_map), False)

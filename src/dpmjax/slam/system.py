@@ -16,12 +16,11 @@ from dpmjax.slam.config import SlamConfig
 from dpmjax.slam.front_end import AnyScan, FrontEndState, TimedScan
 from dpmjax.slam.keyframes import KeyframeMap, as_pose_graph
 from dpmjax.slam.loop_closure import close_loops, num_accepted
-from dpmjax.slam.loop_state import LoopState, loops_of_map
 from dpmjax.slam.map_optimization import optimize_map
 from dpmjax.slam.matcher import NetworkMatcher
 from dpmjax.slam.methods import SlamMethods
 from dpmjax.slam.odometry import SurfaceGeometry
-from dpmjax.slam.reports import Loop, ScanReport
+from dpmjax.slam.reports import Loop, LoopState, ScanReport, loops_of_map
 
 
 class SlamState(NamedTuple):
@@ -135,7 +134,7 @@ def step_slam(methods: SlamMethods, state: SlamState, scan: AnyScan) -> tuple[Sl
     shape = np.shape(scan.points if isinstance(scan, TimedScan) else scan)
     if len(shape) != 2 or shape[1] != 3:
         raise ValueError(f"scan: expected shape (n, 3), got {shape}")
-    front, slam_map, report = front_end.step(methods, state.front_end, state.slam_map, scan)
+    front, slam_map, report = front_end.place_scan(methods, state.front_end, state.slam_map, scan)
     report, loops = report._replace(num_points=shape[0]), state.loops
     if report.is_keyframe:
         num_before = num_accepted(loops.loops)
@@ -176,7 +175,7 @@ def finish_slam(state: SlamState, reports: Iterable[ScanReport], config: SlamCon
 def place_scans(
     T_world_keyframe: Float[np.ndarray, "k 4 4"], reports: Sequence[ScanReport]
 ) -> Float[np.ndarray, "n 4 4"]:
-    """Puts every scan where its keyframe says.
+    """Computes the world pose of each scan from the pose of its keyframe.
 
     Args:
         T_world_keyframe: poses of the keyframes; none where all scans were empty.

@@ -104,7 +104,7 @@ def read_card(path_or_name: str | Path) -> str:
 def _load_safetensors(path: Path) -> Model:
     header, arrays = _read(path)
     try:
-        config = config_from_json(json.loads(header["config"]), ModelConfig)
+        config = config_from_json(json.loads(header["config"]), ModelConfig, file=path)
     except (KeyError, TypeError, ValueError) as error:
         raise ValueError(f"{path}: its configuration cannot be read ({error})") from error
     return model_from_arrays(arrays, config, str(path))

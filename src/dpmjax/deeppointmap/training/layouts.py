@@ -11,7 +11,10 @@ import functools
 
 import numpy as np
 
-from dpmjax.deeppointmap.curriculum import SamplingConfig
+from dpmjax.deeppointmap.training.curriculum import SamplingConfig
+
+PAIR_PROBABILITY = 0.34
+"""Probability that a group is one pair of scans, in every stage."""
 
 GroupShape = tuple[int, int]
 """Number of scans in the first and in the second map of a group."""
@@ -40,8 +43,8 @@ def stage_layouts(max_group: int, config: SamplingConfig) -> tuple[Layout, ...]:
         From 1 to `NUM_LAYOUTS` different layouts of at most `config.num_scans` scans each.
     """
     sizes = np.arange(2, max_group + 1)
-    shares = np.full(len(sizes), (1 - config.pair_probability) / len(sizes))
-    shares[0] += config.pair_probability
+    shares = np.full(len(sizes), (1 - PAIR_PROBABILITY) / len(sizes))
+    shares[0] += PAIR_PROBABILITY
     num_groups = max(1, round(NUM_LAYOUTS * config.num_scans / float(sizes @ shares)))
     drawn = np.searchsorted(np.cumsum(shares) / shares.sum(), (np.arange(num_groups) + 0.5) / num_groups)
     layouts: list[list[GroupShape]] = [[] for _ in range(NUM_LAYOUTS)]

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from dpmjax.deeppointmap.objective import ObjectiveConfig, TrainingSide, close_pairs, matching_loss
+from dpmjax.deeppointmap.training.objective import ObjectiveConfig, TrainingSide, matching_loss, training_pairs
 from dpmjax.geometry import rigid, se3
 from tests.deeppointmap import toy
 from tests.tolerances import ACCUMULATED
@@ -28,7 +28,7 @@ def sides(seed: int, mask_a=None, mask_b=None, poison: bool = False) -> tuple[Tr
     rng = np.random.default_rng(100 + seed)
     places = positions(seed)
     masks = [np.ones(len(p), bool) if m is None else m for p, m in zip(places, (mask_a, mask_b), strict=True)]
-    close = close_pairs(*map(toy.cloud, places, masks), T_B_A, config=CONFIG)
+    close = training_pairs(*map(toy.cloud, places, masks), T_B_A, config=CONFIG)
     result = []
     for place, mask, pairs in zip(places, masks, close, strict=True):
         matched, coarse = rng.normal(size=(2, len(place), 16)).astype(np.float32)
@@ -89,7 +89,7 @@ def test_terms_are_those_of_numpy(seed: int) -> None:
 @pytest.mark.parametrize("seed", [1])
 def test_close_pairs_are_all_pairs_within_the_radius(seed: int) -> None:
     a, b = positions(seed)
-    of_a, of_b = jax.device_get(close_pairs(toy.cloud(a), toy.cloud(b), T_B_A, config=replace(CONFIG, max_close=50)))
+    of_a, of_b = jax.device_get(training_pairs(toy.cloud(a), toy.cloud(b), T_B_A, config=replace(CONFIG, max_close=50)))
     in_a = np.asarray(rigid.transform_points(np.linalg.inv(T_B_A), b))
     is_close = np.linalg.norm(a[:, None] - in_a, axis=-1) <= 2
     np.testing.assert_array_equal(of_a.mask.sum(axis=1), is_close.sum(axis=1))
@@ -137,7 +137,7 @@ def test_clouds_far_apart_cost_nothing() -> None:
     a, b = positions(4)
     T_far = T_B_A.copy()
     T_far[:3, 3] += 1000
-    close = close_pairs(toy.cloud(a), toy.cloud(b), T_far, config=CONFIG)
+    close = training_pairs(toy.cloud(a), toy.cloud(b), T_far, config=CONFIG)
     assert not any(np.any(pairs.mask) for pairs in close)
     near = sides(4)
     far = [side.replace(close=pairs) for side, pairs in zip(near, close, strict=True)]

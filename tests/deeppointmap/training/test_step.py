@@ -24,12 +24,12 @@ from dpmjax.deeppointmap import (
     without,
 )
 from dpmjax.deeppointmap.model import predict_offsets
-from dpmjax.deeppointmap.sampling import RegistrationSample
-from dpmjax.deeppointmap.training import TrainingState, _learning_rate, batch_loss
+from dpmjax.deeppointmap.training.sampling import RegistrationSample
+from dpmjax.deeppointmap.training.step import WEIGHT_DECAY, TrainingState, _learning_rate, batch_loss
 from tests.deeppointmap import toy
 from tests.tolerances import ACCUMULATED
 
-REPOSITORY = Path(__file__).parents[2]
+REPOSITORY = Path(__file__).parents[3]
 
 
 @pytest.fixture(scope="module")
@@ -79,7 +79,7 @@ def test_without_the_offset_head_it_does_not_learn_and_a_pair_is_registered_by_p
     config = without(toy.TRAINING, "offset-head")
     after, report = make_step(config)(start, maker(0))
     head = (state.params["decoder"]["offset_head"] for state in (start, after))
-    kept = 1 - float(report.learning_rate) * config.weight_decay  # AdamW's decay, no gradient
+    kept = 1 - float(report.learning_rate) * WEIGHT_DECAY  # AdamW's decay, no gradient
     for before, now in zip(*map(jax.tree.leaves, head), strict=True):
         np.testing.assert_allclose(now, kept * before, atol=1e-7)
     model = Model(start.params, config.model)
@@ -177,8 +177,8 @@ def test_the_learning_rate_falls_at_the_end_or_when_it_is_asked_to(start) -> Non
 EIGHT_DEVICES = """
 import jax, numpy as np
 from dpmjax.deeppointmap import SampleMaker, init_training
-from dpmjax.deeppointmap.processes import BATCH_AXIS, device_mesh, place
-from dpmjax.deeppointmap.training import batch_loss
+from dpmjax.deeppointmap.training.processes import BATCH_AXIS, device_mesh, place
+from dpmjax.deeppointmap.training.step import batch_loss
 from tests.deeppointmap import toy
 assert jax.device_count() == 8
 maker = SampleMaker(toy.store(), toy.TRAINING, seed=0, num_samples=8)

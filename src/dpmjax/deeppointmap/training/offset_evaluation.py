@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from dpmjax.deeppointmap.model import Model, correlate, predict_offsets
-from dpmjax.deeppointmap.objective import ObjectiveConfig, close_pairs
+from dpmjax.deeppointmap.training.objective import ObjectiveConfig, training_pairs
 from dpmjax.geometry.bearing import directions_of
 from dpmjax.types import AnyArray, DescriptorCloud
 
@@ -67,7 +67,7 @@ def _offsets(
 ) -> tuple[Float[np.ndarray, "p 3"], Float[np.ndarray, "p 3"]]:
     """Returns predicted and true offsets of the close pairs, in the frame of the source."""
     source, target = correlate(model, source, target)
-    close, _ = close_pairs(source, target, T, config=config)
+    close, _ = training_pairs(source, target, T, config=config)
     directions = directions_of(source)[:, None]
     predicted = predict_offsets(model, source.features[:, None], target.features, directions, close.indices)
     mask = np.asarray(close.mask)

@@ -8,7 +8,7 @@ from typing import Literal, get_args
 
 from dpmjax.checks import require_count, require_fields, require_one_of, require_positive_fields
 from dpmjax.deeppointmap.model_config import ModelConfig, Preset, model_preset
-from dpmjax.deeppointmap.objective import ObjectiveConfig
+from dpmjax.deeppointmap.training.objective import ObjectiveConfig
 from dpmjax.scans.augment import AugmentConfig
 
 
@@ -38,7 +38,6 @@ class SamplingConfig:
         num_scans: capacity of one sample, all groups together.
         min_distance_m: scans nearer to the anchor are too similar to it.
         max_distance_m: scans farther from the anchor do not belong to its group.
-        pair_probability: probability that a group is one pair of scans, in every stage.
         max_side: largest number of scans of one map. Half of the groups up to this size are split into one scan
             against all others.
         max_descriptors: largest number of descriptors of one map (ours): thinning leaves a fifth of a map of 16 scans,
@@ -48,14 +47,12 @@ class SamplingConfig:
     num_scans: int = 32
     min_distance_m: float = 0.25
     max_distance_m: float = 20.0
-    pair_probability: float = 0.34
     max_side: int = 16
     max_descriptors: int = 1024
 
     def __post_init__(self) -> None:
         require_fields(self, "max_side", "max_descriptors", low=1)
         require_fields(self, "num_scans", low=2)
-        require_fields(self, "pair_probability", low=0, high=1)
         if not 0 <= self.min_distance_m < self.max_distance_m:
             raise ValueError(f"min_distance_m: expected 0 to below {self.max_distance_m}, got {self.min_distance_m}")
 
@@ -74,12 +71,10 @@ class TrainingConfig:
         learning_rate: learning rate after the warm-up and before the decay.
         final_learning_rate: learning rate at the end of the decay.
         decay_ratio: share of the steps in which the learning rate falls, at the end.
-        weight_decay: weight decay of AdamW.
         warmup_steps: number of steps in which the learning rate rises from 0.
         max_gradient_norm: longer gradients are scaled down to this norm.
         scans_at_once: about this many scans of a sample are encoded at the same time. More scans need more memory and
             keep a large device busy; the results change by rounding only.
-        group_scans_at_once: groups of about this many scans are decoded at the same time.
     """
 
     model: ModelConfig = field(default_factory=ModelConfig)
@@ -93,16 +88,14 @@ class TrainingConfig:
     learning_rate: float = 1e-3
     final_learning_rate: float = 1e-5
     decay_ratio: float = 0.2
-    weight_decay: float = 1e-4
     warmup_steps: int = 0
     max_gradient_norm: float = 35.0
     scans_at_once: int = 8
-    group_scans_at_once: int = 16
 
     def __post_init__(self) -> None:
         require_positive_fields(self, "learning_rate", "final_learning_rate", "max_gradient_norm")
-        require_fields(self, "weight_decay", "warmup_steps", low=0)
-        require_fields(self, "scans_at_once", "group_scans_at_once", "num_variants", low=1)
+        require_fields(self, "warmup_steps", low=0)
+        require_fields(self, "scans_at_once", "num_variants", low=1)
         require_fields(self, "decay_ratio", low=0, high=1)
         require_count("len(curriculum)", len(self.curriculum))
         largest = max(stage.max_group for stage in self.curriculum)

@@ -91,13 +91,13 @@ def is_first() -> bool:
 
 
 def largest(number: int) -> int:
-    """Finds the largest of the numbers of all processes.
+    """Computes the maximum over all processes.
 
     Args:
-        number: number of this process.
+        number: value of this process.
 
     Returns:
-        The largest.
+        The maximum.
     """
     return number if _is_alone() else int(np.max(multihost_utils.process_allgather(np.int32(number))))
 
@@ -136,7 +136,7 @@ def merged(table: dict[str, Any]) -> dict[str, Any]:
 
 @contextmanager
 def together() -> Iterator[None]:
-    """Lets a block succeed in all processes or fail in all. Where it failed, its own error is raised.
+    """Runs a block that succeeds in all processes or fails in all; a process where it failed raises its own error.
 
     Yields:
         Nothing.

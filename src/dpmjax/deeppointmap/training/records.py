@@ -12,10 +12,10 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from dpmjax.checks import require_count
-from dpmjax.deeppointmap.curriculum import CurriculumStage, TrainingConfig
 from dpmjax.deeppointmap.model import Model
 from dpmjax.deeppointmap.model_config import ModelConfig
-from dpmjax.deeppointmap.training import TrainingReport, TrainingState, init_training
+from dpmjax.deeppointmap.training.curriculum import CurriculumStage, TrainingConfig
+from dpmjax.deeppointmap.training.step import TrainingReport, TrainingState, init_training
 from dpmjax.types import AnyArray
 
 

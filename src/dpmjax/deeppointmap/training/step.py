@@ -23,7 +23,6 @@ import optax
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
-from dpmjax.deeppointmap.curriculum import TrainingConfig
 from dpmjax.deeppointmap.matching import merge_clouds
 from dpmjax.deeppointmap.model import (
     Model,
@@ -34,15 +33,16 @@ from dpmjax.deeppointmap.model import (
     predict_offsets,
     similarity_features,
 )
-from dpmjax.deeppointmap.objective import (
-    ClosePairs,
+from dpmjax.deeppointmap.training.curriculum import TrainingConfig
+from dpmjax.deeppointmap.training.objective import (
     ObjectiveConfig,
     ObjectiveTerms,
+    TrainingPairs,
     TrainingSide,
-    close_pairs,
     matching_loss,
+    training_pairs,
 )
-from dpmjax.deeppointmap.sampling import (
+from dpmjax.deeppointmap.training.sampling import (
     GroupBatch,
     MapOfScans,
     RegistrationSample,
@@ -51,6 +51,12 @@ from dpmjax.deeppointmap.sampling import (
 from dpmjax.geometry.bearing import directions_of
 from dpmjax.nets.neighbourhood import WINNERS
 from dpmjax.types import AnyArray, DescriptorCloud
+
+GROUP_SCANS_AT_ONCE = 16
+"""Groups of about this many scans are decoded at the same time."""
+
+WEIGHT_DECAY = 1e-4
+"""Weight decay of AdamW."""
 
 
 @flax.struct.dataclass
@@ -190,9 +196,7 @@ def batch_loss(
             return _map_pair_loss(model, *maps, group.T_target_source, config.objective)
 
         return [
-            _in_parts(
-                of_group, group, config.group_scans_at_once // (group.source.rows.shape[1] + group.target.rows.shape[1])
-            )
+            _in_parts(of_group, group, GROUP_SCANS_AT_ONCE // (group.source.rows.shape[1] + group.target.rows.shape[1]))
             for group in sample.groups
         ]
 
@@ -213,7 +217,7 @@ def _map_pair_loss(
 ) -> tuple[Float[Array, ""], ObjectiveTerms]:
     # Applies the networks to two maps, and computes the losses (DeepPointMap eq. 4 to 7).
     correlated_a, correlated_b = correlate(model, a, b)
-    close_a, close_b = close_pairs(a, b, T_b_a, config=config)
+    close_a, close_b = training_pairs(a, b, T_b_a, config=config)
     sides = (_side(model, a, correlated_a, correlated_b, close_a), _side(model, b, correlated_b, correlated_a, close_b))
     return matching_loss(*sides, T_b_a, config=config)
 
@@ -239,7 +243,7 @@ def _in_parts(function: Callable[[Any], Any], trees: Any, at_once: int) -> Any:
 
 
 def _side(
-    model: Model, cloud: DescriptorCloud, correlated: DescriptorCloud, other: DescriptorCloud, close: ClosePairs
+    model: Model, cloud: DescriptorCloud, correlated: DescriptorCloud, other: DescriptorCloud, close: TrainingPairs
 ) -> TrainingSide:
     directions = directions_of(cloud)[:, None]
     own = correlated.features[:, None]
@@ -279,5 +283,5 @@ def _optimizer(config: TrainingConfig) -> optax.GradientTransformation:
         optax.clip_by_global_norm(config.max_gradient_norm),
         # The mean of gradients is stored in 16 bits: a sixth of a checkpoint less, and training does not need more.
         optax.scale_by_adam(mu_dtype=jnp.bfloat16),
-        optax.add_decayed_weights(config.weight_decay),
+        optax.add_decayed_weights(WEIGHT_DECAY),
     )

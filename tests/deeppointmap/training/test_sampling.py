@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from dpmjax.deeppointmap import CurriculumStage, SamplingConfig, TrainingConfig, training_preset
-from dpmjax.deeppointmap.layouts import stage_layouts
-from dpmjax.deeppointmap.sampling import Group, PlacedScans, ScanTable, arrange_groups, draw_groups
+from dpmjax.deeppointmap.training.layouts import PAIR_PROBABILITY, stage_layouts
+from dpmjax.deeppointmap.training.sampling import Group, PlacedScans, ScanTable, arrange_groups, draw_groups
 
 
 def table(num: int = 60, step_m: float = 2.0) -> ScanTable:
@@ -34,7 +34,7 @@ def test_layouts_hold_the_sizes_of_the_published_draw_and_leave_no_room(max_grou
     assert all(1 <= a <= b <= config.max_side and a + b <= max_group for a, b in shapes)
     sizes = np.array([sum(shape) for shape in shapes])
     # Of the mean size of the published draw, within what fits into so few samples.
-    mean = 2 * config.pair_probability + (1 - config.pair_probability) * (2 + max_group) / 2
+    mean = 2 * PAIR_PROBABILITY + (1 - PAIR_PROBABILITY) * (2 + max_group) / 2
     assert 0.7 < sizes.mean() / mean < 1.4
     assert max_group == 2 or sizes.max() > max_group / 2
 

@@ -8,8 +8,8 @@ from pathlib import Path
 
 from scipy.spatial import cKDTree
 
-from dpmjax.deeppointmap.curriculum import SamplingConfig, TrainingConfig
-from dpmjax.deeppointmap.scan_store import ScanStore, prepare_drive
+from dpmjax.deeppointmap.training.curriculum import SamplingConfig, TrainingConfig
+from dpmjax.deeppointmap.training.scan_store import ScanStore, prepare_drive
 from dpmjax.sequences import LidarSequence
 
 LOGGER = logging.getLogger("dpmjax.training")

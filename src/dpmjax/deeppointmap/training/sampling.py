@@ -16,9 +16,9 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from dpmjax.deeppointmap.curriculum import SamplingConfig
-from dpmjax.deeppointmap.layouts import GroupShape, Layout
 from dpmjax.deeppointmap.matching import thinned_mask
+from dpmjax.deeppointmap.training.curriculum import SamplingConfig
+from dpmjax.deeppointmap.training.layouts import GroupShape, Layout
 from dpmjax.geometry import rigid
 from dpmjax.geometry.pyramid_storage import StoredPyramid
 from dpmjax.types import AnyArray

@@ -16,14 +16,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from dpmjax.deeppointmap.curriculum import TrainingConfig
 from dpmjax.deeppointmap.matching import merge_clouds, thinned_mask
 from dpmjax.deeppointmap.model import Model, encode_stored
 from dpmjax.deeppointmap.model_config import ModelConfig
-from dpmjax.deeppointmap.sampling import SampleScans
 from dpmjax.deeppointmap.scan_pairs import draw_rows_apart, scan_distances, true_poses
 from dpmjax.deeppointmap.scan_registration import trace_match
-from dpmjax.deeppointmap.scan_store import ScanStore, prepare_drive
+from dpmjax.deeppointmap.training.curriculum import TrainingConfig
+from dpmjax.deeppointmap.training.sampling import SampleScans
+from dpmjax.deeppointmap.training.scan_store import ScanStore, prepare_drive
 from dpmjax.geometry import rigid
 from dpmjax.metrics.poses import RegistrationRecall, registration_recall
 from dpmjax.scans.augment import AugmentConfig

@@ -1,6 +1,6 @@
 """The training objective of DeepPointMap: similar descriptors at the same place, and correct offsets.
 
-`close_pairs` finds, from true poses, the descriptors that lie close to each other. The offset head predicts their
+`training_pairs` finds, from true poses, the descriptors that lie close to each other. The offset head predicts their
 offsets. `matching_loss` combines the three losses. All functions take arrays, not networks.
 """
 
@@ -28,7 +28,6 @@ class ObjectiveConfig:
     """Weights and distances (DeepPointMap section 3.3).
 
     Attributes:
-        pairing_weight: weight of the pairing loss.
         coarse_weight: weight of the coarse pairing loss.
         offset_weight: weight of the offset loss.
         temperature: temperature of both pairing losses.
@@ -39,7 +38,6 @@ class ObjectiveConfig:
             scans need more.
     """
 
-    pairing_weight: float = 1.0
     coarse_weight: float = 0.1
     offset_weight: float = 1.0
     temperature: float = 0.1
@@ -49,12 +47,12 @@ class ObjectiveConfig:
 
     def __post_init__(self) -> None:
         require_positive_fields(self, "temperature", "positive_radius_m", "offset_radius_m")
-        require_fields(self, "pairing_weight", "coarse_weight", "offset_weight", low=0)
+        require_fields(self, "coarse_weight", "offset_weight", low=0)
         require_fields(self, "max_close", low=1)
 
 
 @flax.struct.dataclass
-class ClosePairs:
+class TrainingPairs:
     """Descriptors of a second cloud that lie close to each descriptor of a first one, nearest first.
 
     Attributes:
@@ -77,7 +75,7 @@ class TrainingSide:
         mask: True for descriptors that are there; others may hold anything.
         matched_features: correlated descriptors after the similarity head.
         coarse_features: uncorrelated descriptors after the coarse head.
-        close: from `close_pairs`.
+        close: from `training_pairs`.
         offsets: predicted offsets of the close pairs, metres, in the frame of the cloud.
     """
 
@@ -85,7 +83,7 @@ class TrainingSide:
     mask: Bool[AnyArray, "*b m"]
     matched_features: Float[AnyArray, "*b m c"]
     coarse_features: Float[AnyArray, "*b m e"]
-    close: ClosePairs
+    close: TrainingPairs
     offsets: Float[AnyArray, "*b m k 3"]
 
 
@@ -107,9 +105,9 @@ class ObjectiveTerms(NamedTuple):
     num_positives: Int[Array, ""]
 
 
-def close_pairs(
+def training_pairs(
     a: DescriptorCloud, b: DescriptorCloud, T_b_a: Float[AnyArray, "4 4"], *, config: ObjectiveConfig
-) -> tuple[ClosePairs, ClosePairs]:
+) -> tuple[TrainingPairs, TrainingPairs]:
     """Finds the pairs closer than `offset_radius_m`, and their true offsets.
 
     Args:
@@ -150,11 +148,7 @@ def matching_loss(
     backward = _direction(b, a, squared.T, config)
     mean = jax.tree.map(lambda one, other: (one + other) / 2, forward, backward)
     terms = mean._replace(num_positives=forward.num_positives + backward.num_positives)
-    total = (
-        config.pairing_weight * terms.pairing
-        + config.coarse_weight * terms.coarse
-        + config.offset_weight * terms.offset
-    )
+    total = terms.pairing + config.coarse_weight * terms.coarse + config.offset_weight * terms.offset
     return total, terms
 
 
@@ -188,10 +182,10 @@ def _top1_accuracy(source: TrainingSide, target: TrainingSide, positives: Int[Ar
 
 def _close_of(
     cloud: DescriptorCloud, other: DescriptorCloud, T_cloud_other: Float[Array, "4 4"], config: ObjectiveConfig
-) -> ClosePairs:
+) -> TrainingPairs:
     positions = jnp.where(cloud.mask[:, None], cloud.positions, 0)
     others = rigid.transform_points(T_cloud_other, other.positions)
     near = radius_search(positions, others, config.offset_radius_m, config.max_close, other.mask)
     is_close = near.mask & cloud.mask[:, None]
     offsets = jnp.where(is_close[..., None], others[near.indices] - positions[:, None], 0)
-    return ClosePairs(jnp.where(is_close, near.indices, 0), is_close, offsets)
+    return TrainingPairs(jnp.where(is_close, near.indices, 0), is_close, offsets)

@@ -19,14 +19,20 @@ from typing import Any
 import jax
 import numpy as np
 
-from dpmjax.deeppointmap.curriculum import CurriculumStage, TrainingConfig
-from dpmjax.deeppointmap.data_pipeline import SampleMaker
 from dpmjax.deeppointmap.model import Model
-from dpmjax.deeppointmap.processes import BATCH_AXIS, device_mesh, from_first, is_first, largest, place, together
-from dpmjax.deeppointmap.scan_store import ScanStore
-from dpmjax.deeppointmap.training import finish, make_step
-from dpmjax.deeppointmap.training_drives import prepare_drives
-from dpmjax.deeppointmap.training_records import (
+from dpmjax.deeppointmap.training.curriculum import CurriculumStage, TrainingConfig
+from dpmjax.deeppointmap.training.data_pipeline import SampleMaker
+from dpmjax.deeppointmap.training.drives import prepare_drives
+from dpmjax.deeppointmap.training.processes import (
+    BATCH_AXIS,
+    device_mesh,
+    from_first,
+    is_first,
+    largest,
+    place,
+    together,
+)
+from dpmjax.deeppointmap.training.records import (
     Speed,
     StepRecord,
     Trained,
@@ -37,6 +43,8 @@ from dpmjax.deeppointmap.training_records import (
     begin_training,
     uncalibrated,
 )
+from dpmjax.deeppointmap.training.scan_store import ScanStore
+from dpmjax.deeppointmap.training.step import finish, make_step
 from dpmjax.sequences import LidarSequence
 
 NO_HOOKS = TrainingHooks()

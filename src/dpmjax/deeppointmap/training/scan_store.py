@@ -24,9 +24,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from dpmjax.deeppointmap.curriculum import TrainingConfig
 from dpmjax.deeppointmap.encoding import pyramid_of_cloud
-from dpmjax.deeppointmap.sampling import PlacedScans, SampleScans, ScanTable
+from dpmjax.deeppointmap.training.curriculum import TrainingConfig
+from dpmjax.deeppointmap.training.sampling import PlacedScans, SampleScans, ScanTable
 from dpmjax.geometry.pyramid_storage import pack_pyramid, record_type, sampled_positions, stored_pyramids
 from dpmjax.scans.augment import AugmentConfig, augment_scan, random_motions_on_host
 from dpmjax.scans.preprocess import preprocess_scan_on_host
