@@ -21,7 +21,7 @@ from typing import Annotated
 import numpy as np
 from tyro.conf import Positional, arg
 
-from dpmjax import cli, io, load_model, registration_recall, simulation
+from dpmjax import DescriptorCloud, cli, io, load_model, registration_recall, simulation
 from dpmjax import deeppointmap as dpm
 
 EXPERIMENT = "dpm_clouds"
@@ -112,7 +112,7 @@ def evaluate(model: dpm.Model, pairs: Iterable[dpm.ScanPair], stages: dict[str, 
     return {**row, "offset_r2": offsets.r2.tolist(), "offset_rmse_m": offsets.rmse_m.tolist()}
 
 
-def first_elements(cloud: dpm.DescriptorCloud, num: int | None) -> dpm.DescriptorCloud:
+def first_elements(cloud: DescriptorCloud, num: int | None) -> DescriptorCloud:
     """Returns the cloud with its first elements; None leaves the descriptors without elements."""
     if num is None:
         return cloud.described

@@ -22,7 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 from tyro.conf import Positional, arg
 
-from dpmjax import cli, load_model, registration_recall, scans, slam
+from dpmjax import DescriptorCloud, cli, load_model, registration_recall, scans, slam
 from dpmjax import deeppointmap as dpm
 from dpmjax.io import LidarSequence
 from experiments.dpm_clouds import open_drives
@@ -108,7 +108,7 @@ def choose_keyframes(positions: np.ndarray, spacings_m: Sequence[float]) -> np.n
     return is_keyframe
 
 
-def merged(clouds: dpm.DescriptorCloud, rows: np.ndarray, poses: np.ndarray, capacity: int) -> dpm.DescriptorCloud:
+def merged(clouds: DescriptorCloud, rows: np.ndarray, poses: np.ndarray, capacity: int) -> DescriptorCloud:
     """Returns the thinned union of some keyframes in the frame of the first; the size is a power of two."""
     padded = np.concatenate([rows, np.full(capacity - len(rows), rows[0])])
     some = jax.tree.map(lambda leaf: leaf[padded], clouds)
@@ -118,7 +118,7 @@ def merged(clouds: dpm.DescriptorCloud, rows: np.ndarray, poses: np.ndarray, cap
     # Valid rows stand in front: attention over masked ones costs several times as much.
     num_rows = 1 << max(int(union.mask.sum()) - 1, 0).bit_length()
     order = np.argsort(~np.asarray(union.mask), kind="stable")[:num_rows]
-    compact: dpm.DescriptorCloud = jax.tree.map(lambda leaf: leaf[order], union)
+    compact: DescriptorCloud = jax.tree.map(lambda leaf: leaf[order], union)
     return compact
 
 
