@@ -136,6 +136,7 @@ def test_help_needs_no_jax_and_shows_examples() -> None:
     [
         ({"steps": 1}, "--steps"),
         ({"num_towns": 0}, "--num-towns"),
+        ({"town_length_m": 5.0}, "--town-length-m"),
         ({"weights": "dpm_small", "frame": "local"}, "--frame"),
     ],
 )

@@ -29,7 +29,7 @@ class TableRun(NamedTuple):
 
     Attributes:
         folder: folder of the run.
-        is_stopped: whether a signal asks the work on a row to end by `RowStopped`.
+        is_stopped: True after a signal: the work on a row then ends by `RowStopped`.
     """
 
     folder: RunFolder
@@ -65,7 +65,7 @@ def run_table(
         config: options of the run.
         name: name of the command.
         cases: entries that identify each row.
-        work: makes the other entries of a row from the open table and the entries of its case, as keywords.
+        work: makes the remaining entries of a row, from the open table and the entries of its case as keywords.
         report: summarises all rows.
 
     Returns:

@@ -39,7 +39,6 @@ if TYPE_CHECKING:
 
 NAME = "train"
 MODEL = "model.safetensors"
-TOWN_LENGTH_M = 600.0
 # More bad scans than this are counted only.
 MAX_LISTED = 10
 SHOWN_CURVES = ("loss", "pairing", "offset", "top1_accuracy", "recall", "recall_far", "real_recall")
@@ -81,6 +80,8 @@ class Config(ProcessOptions):
     that register pairs already; without it, the preset decides."""
     num_towns: Annotated[int, arg(metavar="N")] = 4
     """How many towns to train on, where town is among the data."""
+    town_length_m: Annotated[float, arg(metavar="M")] = 600.0
+    """Length of the drive through each town."""
     hours: Annotated[float | None, arg(metavar="H")] = None
     """Train for about H hours: the learning rate falls in the last part of them. Without it, the steps decide."""
     finish: FlagCreatePairsOff[bool] = False
@@ -99,7 +100,7 @@ class Config(ProcessOptions):
     def __post_init__(self) -> None:
         """Checks ranges."""
         check_least(self, steps=3, num_towns=1, held_out_pairs=1, recall_every=1, seed=0, groups=2)
-        check_least(self, num_processes=1, process_id=0)
+        check_least(self, town_length_m=100, num_processes=1, process_id=0)
         if self.hours is not None and not 0 < self.hours < float("inf"):
             raise ValueError(f"--hours: expected more than 0, got {self.hours}")
         if not self.data:
@@ -122,7 +123,7 @@ def main(config: Config) -> None:
     with together():
         first = None if config.weights is None else weights.load_model(config.weights)
         settings = training_settings(config, first)
-        town = Source(town_length_m=TOWN_LENGTH_M, town_mixture=simulation.TRAINING_MIXTURE)
+        town = Source(town_length_m=config.town_length_m, town_mixture=simulation.TRAINING_MIXTURE)
         towns = [replace(town, town_seed=config.seed + number) for number in range(config.num_towns)]
         sources = find_sources(config.data, towns, settings.sampling)
         folder = open_run_folder(config, NAME) if is_first() else None
@@ -132,7 +133,7 @@ def main(config: Config) -> None:
             records = None
             if folder is not None:
                 print(f"{len(store.table)} scans; {config.preset}: {settings.num_steps} steps at most")
-                sets = draw_sets(settings, config.held_out_pairs, config.validate, length_m=TOWN_LENGTH_M)
+                sets = draw_sets(settings, config.held_out_pairs, config.validate, length_m=config.town_length_m)
                 records = Records(folder, settings, sets, seed=config.seed, weights=first)
         hooks = deeppointmap.TrainingHooks(evaluate_every=config.recall_every, stop=lambda: stop.received or 0)
         plateau_s = plateau_seconds(config, settings)

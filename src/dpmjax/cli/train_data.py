@@ -53,11 +53,11 @@ class EvaluationSets(NamedTuple):
 def draw_sets(
     settings: TrainingConfig, held_out_pairs: int, validate: Sequence[Path], *, length_m: float
 ) -> EvaluationSets:
-    """Returns the pairs of a run; `validate` names folders of real scans, `length_m` is that of the held-out town."""
+    """Returns the pairs of a run; `validate` names folders of real scans, `length_m` is that of towns."""
     draw = partial(draw_evaluation_pairs, config=settings.model)
     num = max(1, SELECTION_PAIRS // (len(KINDS) * len(SELECTION_SCENES)))
     towns = [
-        simulate_drive(SELECTION_SEED + number, length_m=SELECTION_LENGTH_M, kind=kind, sensor=sensor)
+        simulate_drive(SELECTION_SEED + number, length_m=min(length_m, SELECTION_LENGTH_M), kind=kind, sensor=sensor)
         for number, (kind, sensor) in enumerate(SELECTION_SCENES)
     ]
     held_out = simulate_drive(HELD_OUT_SEED, length_m=length_m, kind="suburb", sensor=HDL64E)
