@@ -11,8 +11,8 @@ import pytest
 from dpmjax.geometry import rigid
 from dpmjax.metrics import absolute_trajectory_error
 from dpmjax.slam import SlamConfig, SlamMethods, SlamResult, init_slam, run_slam, slam_preset, step_slam
+from dpmjax.slam.interfaces import Match
 from dpmjax.slam.keyframes import diagonal_information
-from dpmjax.slam.methods import Match
 from tests.slam.truth import EMPTY, MistakenMatcher, TruthGeometry, TruthMatcher, laps, number_of, pose, scans_of
 
 CONFIG = SlamConfig()

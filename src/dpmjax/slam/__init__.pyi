@@ -10,6 +10,13 @@ from .config import OdometryConfig as OdometryConfig
 from .config import SlamConfig as SlamConfig
 from .config import slam_preset as slam_preset
 from .front_end import TimedScan as TimedScan
+from .interfaces import Alignment as Alignment
+from .interfaces import Geometry as Geometry
+from .interfaces import Match as Match
+from .interfaces import Matcher as Matcher
+from .interfaces import Proposal as Proposal
+from .interfaces import SlamMethods as SlamMethods
+from .interfaces import ThinnedScan as ThinnedScan
 from .keyframes import KeyframeMap as KeyframeMap
 from .keyframes import Submap as Submap
 from .keyframes import as_pose_graph as as_pose_graph
@@ -23,13 +30,6 @@ from .map_joining import JoinedMaps as JoinedMaps
 from .map_joining import take_component as take_component
 from .map_thinning import thin_map as thin_map
 from .matcher import NetworkMatcher as NetworkMatcher
-from .methods import Alignment as Alignment
-from .methods import Geometry as Geometry
-from .methods import Match as Match
-from .methods import Matcher as Matcher
-from .methods import Proposal as Proposal
-from .methods import SlamMethods as SlamMethods
-from .methods import ThinnedScan as ThinnedScan
 from .odometry import SurfaceGeometry as SurfaceGeometry
 from .refinement import RefinedKeyframes as RefinedKeyframes
 from .refinement import refine_keyframes as refine_keyframes

@@ -13,9 +13,9 @@ from dpmjax.deeppointmap.model import Model
 from dpmjax.geometry import rigid
 from dpmjax.slam.config import SlamConfig
 from dpmjax.slam.front_end import AnyScan
+from dpmjax.slam.interfaces import SlamMethods
 from dpmjax.slam.keyframes import KeyframeMap
 from dpmjax.slam.map_joining import JoinedMaps, OnKeyframe, join_maps, take_component
-from dpmjax.slam.methods import SlamMethods
 from dpmjax.slam.reports import Loop
 from dpmjax.slam.system import SlamResult, as_methods, place_scans, run_slam
 

@@ -14,6 +14,7 @@ from jaxtyping import Float
 from dpmjax.deeppointmap.compact_scans import CompactScan
 from dpmjax.geometry import rigid
 from dpmjax.scans.deskew import deskew
+from dpmjax.slam.interfaces import Alignment, SlamMethods, ThinnedScan, best_of
 from dpmjax.slam.keyframes import (
     EdgeKind,
     Keyframe,
@@ -36,7 +37,6 @@ from dpmjax.slam.local_map import (
     placed_scan,
     with_scan,
 )
-from dpmjax.slam.methods import Alignment, SlamMethods, ThinnedScan, best_of
 from dpmjax.slam.reports import ScanReport, ScanStatus
 from dpmjax.types import AnyArray
 

@@ -16,6 +16,7 @@ from jaxtyping import Float
 from dpmjax.checks import require_fields
 from dpmjax.deeppointmap.compact_scans import CompactScan
 from dpmjax.deeppointmap.model import Model
+from dpmjax.slam.interfaces import Match, SlamMethods
 from dpmjax.slam.keyframes import (
     KeyframeMap,
     Pose,
@@ -27,7 +28,6 @@ from dpmjax.slam.keyframes import (
     with_origin,
 )
 from dpmjax.slam.loop_consistency import scans_agree
-from dpmjax.slam.methods import Match, SlamMethods
 from dpmjax.slam.retrieval import most_similar
 from dpmjax.slam.system import make_methods
 from dpmjax.types import AnyArray

@@ -10,11 +10,11 @@ from jaxtyping import Float
 
 from dpmjax.scans.plane_information import with_least_covariance
 from dpmjax.slam.config import LoopClosureConfig
+from dpmjax.slam.interfaces import Match, SlamMethods
 from dpmjax.slam.keyframes import KeyframeMap, Submap, diagonal_information, submap_around
 from dpmjax.slam.loop_candidates import LoopCandidate, find_loop_candidates, nearest_pairs
 from dpmjax.slam.loop_consistency import accept_consistent, loop_status
 from dpmjax.slam.map_optimization import optimize_map
-from dpmjax.slam.methods import Match, SlamMethods
 from dpmjax.slam.reports import Loop, LoopState, LoopStatus
 
 SURE_OVERLAP = 0.9

@@ -12,8 +12,8 @@ import numpy as np
 
 from dpmjax.geometry import rigid
 from dpmjax.slam.config import LoopClosureConfig
+from dpmjax.slam.interfaces import Match
 from dpmjax.slam.keyframes import KeyframeMap, are_near
-from dpmjax.slam.methods import Match
 from dpmjax.slam.reports import Loop, LoopStatus
 
 MAX_CONTRADICTED_SHARE = 0.1

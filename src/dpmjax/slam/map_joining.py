@@ -15,11 +15,11 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from dpmjax.geometry import rigid
+from dpmjax.slam.interfaces import SlamMethods
 from dpmjax.slam.keyframes import KeyframeMap, MapEdge, connected_parts, with_origin, with_poses
 from dpmjax.slam.loop_candidates import find_meetings
 from dpmjax.slam.loop_closure import examine_candidates, is_resting, num_accepted
 from dpmjax.slam.map_optimization import optimize_map
-from dpmjax.slam.methods import SlamMethods
 from dpmjax.slam.reports import Loop, LoopState, loops_of_map
 
 OnKeyframe = Callable[[int, int], None]

@@ -23,9 +23,9 @@ from dpmjax.scans.compact import expand_elements
 from dpmjax.scans.plane_information import plane_information
 from dpmjax.scans.surface_alignment import AlignmentLevel, align_surfaces, pair_with_planes
 from dpmjax.scans.surfaces import Surface
+from dpmjax.slam.interfaces import Match, Proposal, ThinnedScan
 from dpmjax.slam.keyframes import Submap
 from dpmjax.slam.local_map import PlacedElements, joined_surface
-from dpmjax.slam.methods import Match, Proposal, ThinnedScan
 from dpmjax.slam.retrieval import pooled_vector
 from dpmjax.types import DescriptorCloud, Registration
 

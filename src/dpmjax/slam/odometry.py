@@ -17,9 +17,9 @@ from dpmjax.scans.preprocess import first_of_each_voxel
 from dpmjax.scans.surface_alignment import AlignmentLevel, align_surfaces_from, nearest_planes, pair_with_planes
 from dpmjax.scans.surfaces import Surface, SurfaceConfig, surface_at
 from dpmjax.slam.config import OdometryConfig
+from dpmjax.slam.interfaces import Alignment, ThinnedScan, best_of
 from dpmjax.slam.keyframes import Pose, orthonormal
 from dpmjax.slam.local_map import LocalMap
-from dpmjax.slam.methods import Alignment, ThinnedScan, best_of
 
 PLANE_DISTANCE_M = 0.15
 """Largest distance between an element and the plane of the map that it meets."""

@@ -14,11 +14,11 @@ from dpmjax.pose_graph.graph import PoseGraph
 from dpmjax.slam import front_end
 from dpmjax.slam.config import SlamConfig
 from dpmjax.slam.front_end import AnyScan, FrontEndState, TimedScan
+from dpmjax.slam.interfaces import SlamMethods
 from dpmjax.slam.keyframes import KeyframeMap, as_pose_graph
 from dpmjax.slam.loop_closure import close_loops, num_accepted
 from dpmjax.slam.map_optimization import optimize_map
 from dpmjax.slam.matcher import NetworkMatcher
-from dpmjax.slam.methods import SlamMethods
 from dpmjax.slam.odometry import SurfaceGeometry
 from dpmjax.slam.reports import Loop, LoopState, ScanReport, loops_of_map
 
