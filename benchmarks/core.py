@@ -41,7 +41,7 @@ def run(quick: bool) -> list[Row]:
 
 
 def cases(quick: bool) -> list[Case]:
-    """Problems of the sizes that registration and training meet."""
+    """Returns problems of the sizes that registration and training meet."""
     rng = np.random.default_rng(0)
     num_pairs, num_points, num_descriptors = (256, 1024, 256) if quick else (4096, 16384, 1024)
     source = rng.normal(size=(num_pairs, 3)).astype(np.float32)
@@ -64,34 +64,34 @@ def cases(quick: bool) -> list[Case]:
 
 
 def difference(case: Case) -> float:
-    """Largest entry of the difference to the peer on the same numbers in float64."""
+    """Returns the largest entry of the difference to the peer on the same numbers in float64."""
     exact = (array.astype(np.float64) if array.dtype == np.float32 else array for array in case.arguments)
     return float(np.max(np.abs(np.asarray(case.ours(*case.arguments)) - np.asarray(case.peer(*exact)))))
 
 
 def rotation_about_z(angle: float) -> NDArray[np.float64]:
-    """A (3, 3) rotation by `angle` radians."""
+    """Returns a (3, 3) rotation by `angle` radians."""
     cos, sin = np.cos(angle), np.sin(angle)
     return np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
 
 
 def near_distances(queries: NDArray[np.float32], points: NDArray[np.float32]) -> object:
-    """Squared distances to the eight nearest points."""
+    """Returns squared distances to the eight nearest points."""
     return dpmjax.k_nearest(queries, points, 8).squared_distances
 
 
 def tree_distances(queries: NDArray[np.floating], points: NDArray[np.floating]) -> object:
-    """The same with a tree, built anew for each call as a moving scan needs it."""
+    """Returns the same with a tree, built anew for each call as a moving scan needs it."""
     return KDTree(points).query(queries, 8)[0] ** 2
 
 
 def info_nce(queries: NDArray[np.float32], keys: NDArray[np.float32], positives: NDArray[np.int32]) -> object:
-    """The loss at the temperature of both forms."""
+    """Returns the loss at the temperature of both forms."""
     return dpmjax.info_nce(queries, keys, positives, temperature=TEMPERATURE)
 
 
 def weighted_svd(source: NDArray[np.floating], target: NDArray[np.floating], weights: NDArray[np.floating]) -> object:
-    """T_target_source by NumPy's SVD."""
+    """Returns T_target_source by NumPy's SVD."""
     shares = (weights / weights.sum())[:, None]
     source_centre, target_centre = (shares * source).sum(axis=0), (shares * target).sum(axis=0)
     U, _, Vt = np.linalg.svd((shares * (target - target_centre)).T @ (source - source_centre))
@@ -102,12 +102,12 @@ def weighted_svd(source: NDArray[np.floating], target: NDArray[np.floating], wei
 
 
 def chamfer_distance(a: NDArray[np.floating], b: NDArray[np.floating]) -> object:
-    """Mean distance from a to b plus from b to a, with a tree for each."""
+    """Returns the mean distance from a to b plus from b to a, with a tree for each."""
     return np.mean(KDTree(b).query(a)[0]) + np.mean(KDTree(a).query(b)[0])
 
 
 def numpy_info_nce(queries: NDArray[np.floating], keys: NDArray[np.floating], positives: NDArray[np.int32]) -> object:
-    """InfoNCE of cosine similarities."""
+    """Returns InfoNCE of cosine similarities."""
     queries = queries / np.linalg.norm(queries, axis=1, keepdims=True)
     keys = keys / np.linalg.norm(keys, axis=1, keepdims=True)
     logits = queries @ keys.T / TEMPERATURE

@@ -36,7 +36,7 @@ _SUCCESS_PX, _PAPER = 20.0, {"success": 0.842, "median ate": 5.7, "median wall":
 
 
 def run(quick: bool) -> list[Row]:
-    """ICP and refinement with and without noise, the fit from a poor start and from zero, the paper's step."""
+    """Measures ICP and refinement with and without noise, the fit from a poor start and from zero, the paper's step."""
     rows: list[Row] = []
     sequences = [simulate_sequence(0, 64 if quick else 256, seed=0)]
     if DATA.is_dir():
@@ -52,7 +52,7 @@ def run(quick: bool) -> list[Row]:
 
 
 def _poor_start(sequence: ScanSequence) -> NDArray[np.float64]:
-    """The start that comes with the authors' trajectory; elsewhere a drift of its size."""
+    """Returns the start that comes with the authors' trajectory; elsewhere a drift of its size."""
     file = DATA / "start_16px.txt"
     if file.exists() and sequence.name.startswith("v1_pose0"):
         return np.loadtxt(file)[: len(sequence)]
@@ -63,7 +63,7 @@ def _poor_start(sequence: ScanSequence) -> NDArray[np.float64]:
 
 
 def _with_noise(sequence: ScanSequence, noise_px: float) -> ScanSequence:
-    """Gaussian noise along the beams."""
+    """Adds Gaussian noise along the beams."""
     ranges = np.linalg.norm(sequence.points, axis=-1, keepdims=True)
     noise = noise_px * np.random.default_rng(1).standard_normal(ranges.shape)
     points = sequence.points * (1.0 + noise / np.maximum(ranges, 1e-6))
@@ -80,7 +80,7 @@ def _ate(sequence: ScanSequence, poses: NDArray[np.float64]) -> float:
 
 
 def _classical(sequence: ScanSequence, case: str, quick: bool) -> list[Row]:
-    """Incremental point-to-line ICP, then its refinement; the second call of each is timed."""
+    """Measures incremental point-to-line ICP, then its refinement; the second call of each is timed."""
     lines = _lines(sequence)
     poses, rows = _timed(f"{case}: icp-plane", sequence, lambda: incremental_icp(_lines(sequence)).poses)
     rows += _timed(f"{case}: icp-plane, refined", sequence, lambda: refine(lines, poses).poses)[1]
@@ -93,7 +93,7 @@ def _classical(sequence: ScanSequence, case: str, quick: bool) -> list[Row]:
 def _timed(
     case: str, sequence: ScanSequence, function: Callable[[], NDArray[np.float64]]
 ) -> tuple[NDArray[np.float64], list[Row]]:
-    """The poses of the function, and its rows."""
+    """Returns the poses of the function, and its rows."""
     timing, poses = measure(function, repeats=1), function()
     times = (("compile", timing.compile_s), ("run", timing.median_s))
     return poses, [
@@ -103,7 +103,7 @@ def _timed(
 
 
 def _fit(sequence: ScanSequence, start: NDArray[np.float64] | None, case: str, quick: bool) -> list[Row]:
-    """Neural losses alone, ATE at the marks and at the end; then the refinement of the result."""
+    """Measures neural losses alone: ATE at the marks and at the end; then the refinement of the result."""
     config = dm.with_steps(dm.preset("fast"), 100) if quick else dm.preset("fast")
     data, length = planar_data(ScanSet(sequence.points, sequence.mask), start)
     unit = np.array([length, length, 1.0])
@@ -128,7 +128,7 @@ def _fit(sequence: ScanSequence, start: NDArray[np.float64] | None, case: str, q
 
 
 def _paper_step(sequence: ScanSequence) -> list[Row]:
-    """One step of the paper's architecture, losses and sampling: a batch of 128 scans, as published."""
+    """Measures one step of the paper's architecture, losses and sampling: a batch of 128 scans, as published."""
     data, _ = planar_data(ScanSet(sequence.points, sequence.mask))
     problem, run_s = planar_problem(dm.preset("paper"), data), [0.0]
     done = fit(

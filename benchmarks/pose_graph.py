@@ -36,7 +36,7 @@ def run(quick: bool) -> list[Row]:
 
 
 def compare(path: Path, repeats: int, *, has_peer: bool) -> list[Row]:
-    """The rows of one graph."""
+    """Returns the rows of one graph."""
     graph = dpmjax.read_g2o(path)
     case = f"{path.stem} {len(graph.poses)} poses, {len(graph.edges.source)} edges"
     ours = measure(lambda: dpmjax.optimize_pose_graph(graph).chi2, repeats=repeats)
@@ -55,7 +55,7 @@ def compare(path: Path, repeats: int, *, has_peer: bool) -> list[Row]:
 
 
 def gtsam_timing(path: Path, is_spatial: bool, repeats: int) -> tuple[Timing, float]:
-    """Time and final cost of GTSAM, its settings as they come."""
+    """Returns time and final cost of GTSAM, its settings as they come."""
     import gtsam
 
     factors, start = gtsam.readG2o(str(path), is_spatial)

@@ -76,7 +76,7 @@ class Timing(NamedTuple):
     min_s: float
 
     def rows(self, case: str) -> list[Row]:
-        """The timing as rows of the table."""
+        """Returns the timing as rows of the table."""
         return [
             Row(case, "compile", self.compile_s, "s"),
             Row(case, "median", 1e3 * self.median_s, "ms"),

@@ -104,7 +104,7 @@ def judged(result: SlamResult, truth: np.ndarray) -> Proof:
 
 
 def proof_rows(case: str, proof: Proof) -> list[Row]:
-    """The rows of one drive."""
+    """Returns the rows of one drive."""
     return [
         Row(case, "ATE", proof.ate_m, "m"),
         Row(case, "ATE of odometry", proof.ate_odometry_m, "m"),
@@ -115,7 +115,7 @@ def proof_rows(case: str, proof: Proof) -> list[Row]:
 
 
 def summary_rows(case: str, proofs: Sequence[Proof]) -> list[Row]:
-    """The rows of all drives together."""
+    """Returns the rows of all drives together."""
     ates = np.array([proof.ate_m for proof in proofs])
     return [
         Row(case, "median ATE", float(np.median(ates)), "m"),
@@ -142,7 +142,7 @@ class Cost(NamedTuple):
 
 
 def growth_rows() -> list[Row]:
-    """The rows of a drive of 5,100 scans."""
+    """Returns the rows of a drive of 5,100 scans."""
     truth = route(0, 1.5 * LATE * STEP_M)[: LATE + WINDOW // 2]
     _, (early, late) = costs(truth, (EARLY, LATE)), costs(truth, (EARLY, LATE))
     rows = []

@@ -30,7 +30,7 @@ def run_method(
     *,
     seed: int,
 ) -> NDArray[np.float64]:
-    """(n, 4, 4) T_world_camera by one method.
+    """Returns (n, 4, 4) T_world_camera by one method.
 
     Args:
         name: one of `METHODS`. "zero": all cameras at one place. "placed": the search for first poses;
@@ -71,7 +71,7 @@ def run_method(
 
 
 def chain_icp(sequence: DepthSequence, *, seed: int) -> NDArray[np.float64]:
-    """Point-to-plane ICP of each image onto the one before, from where it stands."""
+    """Returns poses by point-to-plane ICP of each image onto the one before, from the same pose."""
     from dpmjax.registration import icp
 
     rng = np.random.default_rng(seed)
@@ -87,14 +87,14 @@ def chain_icp(sequence: DepthSequence, *, seed: int) -> NDArray[np.float64]:
 
 
 def spread_of(sequence: DepthSequence) -> float:
-    """Root mean square distance of the cameras from their mean, mm: the ATE of not moving at all."""
+    """Returns the root mean square distance of the cameras from their mean, mm: the ATE of not moving at all."""
     assert sequence.T_world_camera is not None
     positions = sequence.T_world_camera[:, :3, 3]
     return 1e3 * float(np.sqrt(np.mean(np.sum((positions - positions.mean(axis=0)) ** 2, axis=1))))
 
 
 def errors_of(T: NDArray[np.float64], sequence: DepthSequence) -> dict[str, float]:
-    """ATE (mm), mean point distance (mm) and the largest error of a turn between neighbours (degrees)."""
+    """Returns ATE (mm), mean point distance (mm) and the largest error of a turn between neighbours (degrees)."""
     reference = sequence.T_world_camera
     assert reference is not None
     ate = absolute_trajectory_error(T[:, :3, 3], reference[:, :3, 3])
@@ -115,7 +115,7 @@ _NUM_DRAWS = 200
 
 
 def surface_spread(sequence: DepthSequence, depth_noise_m: float) -> float:
-    """Median ATE of the trajectories that the surfaces cannot tell from the true one.
+    """Returns the median ATE of the trajectories that the surfaces cannot tell from the true one.
 
     They are drawn from the normal distribution whose information matrix is that of point-to-plane distances between all
     pairs of images.
@@ -150,7 +150,7 @@ def surface_spread(sequence: DepthSequence, depth_noise_m: float) -> float:
 
 
 def _information_of_moves(count: int) -> Float[np.ndarray, "m m"]:
-    """Information matrix of x, z and angle of all cameras if nothing is seen."""
+    """Returns the information matrix of x, z and angle of all cameras if nothing is seen."""
     step = np.zeros((2 * (count - 1), 3 * count))
     for row in range(len(step)):
         camera, axis = divmod(row, 2)

@@ -237,7 +237,7 @@ def draw(folder: cli.RunFolder, *, sequences: Sequence[LidarSequence], rows: Seq
 
 
 def _panel(drive: Drive, rows: dict[str, dict[str, Any]]) -> viz.TrackPanel:
-    """All trajectories in the frame of the reference; without one, in that of the first scan."""
+    """Returns all trajectories in the frame of the reference; without one, in that of the first scan."""
     reference = None if drive.reference is None else drive.reference[:, :3, 3]
     shown = {}
     for method in [name for name in COLORS if name in rows]:
@@ -250,7 +250,7 @@ def _panel(drive: Drive, rows: dict[str, dict[str, Any]]) -> viz.TrackPanel:
 
 
 def _growth(drive: Drive, rows: dict[str, dict[str, Any]]) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-    """Metres driven, and bytes, of each form of a map."""
+    """Returns metres driven, and bytes, of each form of a map."""
     curves = {}
     for row in rows.values():
         poses = drive.trajectory(row["method"]) if drive.reference is None else drive.reference

@@ -143,7 +143,7 @@ def is_mapped(truth: Floats, fitted: dm.Fitted, sequence: ScanSequence) -> NDArr
 
 
 def errors_at(poses: Floats, truth: Floats, fitted: dm.Fitted, sequence: ScanSequence) -> tuple[Floats, Floats]:
-    """Distance (px) and angle (degrees) to the truth, in the frame that lays the run's trajectory onto the truth."""
+    """Returns distance (px) and angle (degrees) to the truth, after the run's trajectory is aligned with it."""
     from dpmjax.geometry import se2
 
     T = metrics.align_rigid(fitted.poses[:, :2], sequence.reference_poses[:, :2])
@@ -153,7 +153,7 @@ def errors_at(poses: Floats, truth: Floats, fitted: dm.Fitted, sequence: ScanSeq
 
 
 def summarise(queries: Queries, truth: Floats, sequence: ScanSequence) -> dict[str, Any]:
-    """Numbers of all mapped free space, of the known scans, and by the distance from the trajectory."""
+    """Returns the numbers of all mapped free space, of the known scans, and by the distance from the trajectory."""
     from scipy.spatial import KDTree
 
     distance, _ = KDTree(sequence.reference_poses[:, :2]).query(truth[:, :2])

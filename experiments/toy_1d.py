@@ -85,26 +85,26 @@ def main(config: Config) -> dict[str, Any]:
 
 
 def descend(toy: dm.ToyConfig, config: Config) -> dm.Fit:
-    """All seeds as starts of one fit."""
+    """Fits all seeds as starts of one fit."""
     import jax
 
     return dm.fit(dm.toy_problem(toy), None, key=jax.random.key(config.seed), num_starts=config.seeds)
 
 
 def descend_both(toy: dm.ToyConfig, config: Config) -> tuple[dm.Fit, dm.Fit]:
-    """All seeds in the network form, and in the direct form from the same starts."""
+    """Fits all seeds in the network form, and in the direct form from the same starts."""
     return descend(replace(toy, form="network"), config), descend(replace(toy, form="direct"), config)
 
 
 def path(run: dm.Fit) -> NDArray[np.floating]:
-    """(seeds, steps + 1) x of every seed from the start to the end."""
+    """Returns (seeds, steps + 1) x of every seed from the start to the end."""
     assert run.report is not None
     x = np.atleast_2d(np.asarray(run.report.terms))
     return np.concatenate([x, np.reshape(run.poses, (-1, 1))], axis=1)
 
 
 def run_paper(toy: dm.ToyConfig, config: Config) -> tuple[dict[str, NDArray[np.floating]], dict[str, Any]]:
-    """Ends of all methods with the paper's settings, and what figure 14 shows of one seed."""
+    """Returns the ends of all methods with the paper's settings, and the data of figure 14 of one seed."""
     import jax
     import jax.numpy as jnp
 
@@ -131,7 +131,7 @@ def run_paper(toy: dm.ToyConfig, config: Config) -> tuple[dict[str, NDArray[np.f
 
 
 def choose_seed(network_x: NDArray[np.floating], direct_x: NDArray[np.floating]) -> int:
-    """The first seed that the network form brings to the minimum and the direct form does not, as in figure 14.
+    """Returns the first seed that the network form brings to the minimum and the direct form does not, as in figure 14.
 
     Args:
         network_x: (seeds, steps) x of the network form.
@@ -150,12 +150,12 @@ def is_at_minimum(x: NDArray[np.floating]) -> NDArray[np.bool_]:
 
 
 def share_at_minimum(x: NDArray[np.floating]) -> float:
-    """Share of the seeds that end at the global minimum."""
+    """Returns the share of the seeds that end at the global minimum."""
     return float(is_at_minimum(x).mean())
 
 
 def measure_seconds(toy: dm.ToyConfig, config: Config) -> dict[str, Any]:
-    """Seconds of the network form: all seeds in one vmap, one seed, and one seed in a plain PyTorch loop."""
+    """Returns seconds of the network form: all seeds in one vmap, one seed, one seed in a PyTorch loop."""
     seconds: dict[str, Any] = {}
     for name, seeds in (("all_seeds", config.seeds), ("one_seed", 1)):
         run = descend(toy, replace(config, seeds=seeds))
@@ -168,7 +168,7 @@ def measure_seconds(toy: dm.ToyConfig, config: Config) -> dict[str, Any]:
 
 
 def torch_seconds(toy: dm.ToyConfig, seed: int) -> float:
-    """The same descent of one seed as a plain loop in PyTorch."""
+    """Returns the seconds of the same descent of one seed as a plain loop in PyTorch."""
     import torch
 
     torch.manual_seed(seed)

@@ -25,7 +25,7 @@ from dpmjax.losses import chamfer_distance
 def optimize_directly(
     scans: ScanSet, config: DeepMappingConfig, *, num_iterations: int, key: jax.Array
 ) -> NDArray[np.float64]:
-    """Poses and map from zero by L-BFGS on the loss at the end of the last warm phase, its random samples held.
+    """Returns poses from zero by L-BFGS on the loss at the end of the last warm phase, its random samples held.
 
     Args:
         scans: n planar scans.
@@ -55,7 +55,7 @@ def optimize_directly(
 def minimize_toy(
     x0: Float[Array, ""], method: Literal["gradient-descent", "lbfgs", "bfgs"], *, max_iterations: int = 1000
 ) -> Float[Array, ""]:
-    """The direct form of the toy by a solver of jaxopt with its own line search.
+    """Solves the direct form of the toy by a solver of jaxopt with its own line search.
 
     Args:
         x0: where to start.
@@ -102,7 +102,7 @@ SWARMS = Swarms()
 
 
 def swarm_chain(scans: ScanSet, sizes: Swarms = SWARMS, *, key: jax.Array) -> NDArray[np.float64]:
-    """Poses of planar scans, each onto the one before by a swarm that minimises their Chamfer distance (eq. 5).
+    """Returns poses of planar scans, each onto the one before by a swarm on their Chamfer distance (eq. 5).
 
     A swarm over all poses at once does not converge; over one relative pose of three numbers it does. Without evosax it
     ends in a ModuleNotFoundError.
@@ -132,7 +132,7 @@ def _swarm_pairs(
     *,
     sizes: Swarms,
 ) -> Float[Array, "m 3"]:
-    """T_before_scan of every scan but the first."""
+    """Returns T_before_scan of every scan but the first."""
 
     def best_of_rounds(pair: tuple[jax.Array, ...]) -> Array:
         before, before_mask, after, after_mask, pair_key = pair
@@ -150,7 +150,7 @@ def _swarm_pairs(
 
 
 def _swarm(misfit: Any, key: jax.Array, *, sizes: Swarms) -> tuple[Float[Array, " 3"], Float[Array, ""]]:
-    """The best particle of one swarm in the box from -1 to 1, and its misfit."""
+    """Returns the best particle of one swarm in the box from -1 to 1, and its misfit."""
     from evosax.algorithms import PSO
 
     start_key, init_key, key = jax.random.split(key, 3)

@@ -32,7 +32,7 @@ _VOXEL_SHARE = 0.01
 
 
 def multiway(scans: ScanSet) -> Floats:
-    """Poses of planar scans by Open3D's multiway registration; a ModuleNotFoundError without Open3D.
+    """Returns poses of planar scans by Open3D's multiway registration; a ModuleNotFoundError without Open3D.
 
     Args:
         scans: n scans in order of time.
@@ -52,7 +52,7 @@ def multiway(scans: ScanSet) -> Floats:
 def multiway_images(
     points: Float[np.ndarray, "n h w 3"], mask: Bool[np.ndarray, "n h w"]
 ) -> Float[NDArray[np.float64], "n 4 4"]:
-    """Poses of depth images by Open3D's multiway registration; a ModuleNotFoundError without Open3D.
+    """Returns poses of depth images by Open3D's multiway registration; a ModuleNotFoundError without Open3D.
 
     Args:
         points: points of n images in order of time, each in the frame of its camera.

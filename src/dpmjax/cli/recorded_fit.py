@@ -104,7 +104,7 @@ class FitRecorder:
 
 
 def _earlier_seconds(folder: RunFolder, step: int) -> float:
-    """Run time of the steps that an earlier run has done."""
+    """Returns the run time of the steps that an earlier run has done."""
     if not folder.is_resumed or not (folder / HISTORY).exists():
         return 0.0
     return max((float(row["run_s"]) for row in read_history(folder / HISTORY) if int(row["step"]) <= step), default=0.0)

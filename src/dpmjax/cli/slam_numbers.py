@@ -39,7 +39,7 @@ class SlamRun(NamedTuple):
 
     @property
     def num_done(self) -> int:
-        """Number of scans of this process."""
+        """Returns the number of scans of this process."""
         return len(self.scan_s)
 
 
