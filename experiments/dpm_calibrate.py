@@ -27,8 +27,8 @@ from dpmjax import cli, load_model, metrics, save_model, simulation, viz
 from dpmjax import deeppointmap as dpm
 from dpmjax.io import LidarSequence
 from dpmjax.weights import read_card
-from experiments import _dpm_overlap as overlap
-from experiments._dpm_places import KINDS, ambiguous_case, ambiguous_drive, measure_pairs
+from experiments import _dpm_calibration_pairs as pairs_of
+from experiments._dpm_calibration_pairs import KINDS, ambiguous_case, ambiguous_drive, measure_pairs
 
 EXPERIMENT = "dpm_calibrate"
 MODEL = "model.safetensors"
@@ -72,9 +72,9 @@ def main(config: Config) -> list[cli.Row]:
             # The other town is that of the next row.
             seeds = (case["overlap_town"], case["overlap_town"] + 1)
             drives = [simulation.simulate_drive(seed, length_m=TOWN_LENGTH_M) for seed in seeds]
-            return overlap.measure_town(model, drives, NUM_OVERLAP_PAIRS, config.seed)
+            return pairs_of.measure_town(model, drives, NUM_OVERLAP_PAIRS, config.seed)
         drive, bands_m = open_place(**case)
-        return measure_pairs(model, drive, bands_m, NUM_PAIRS, seed=config.seed, is_stopped=run.is_stopped)
+        return measure_pairs(model, drive, bands_m, NUM_PAIRS, seed=config.seed, on_pair=run.check_stop)
 
     cases = list_cases(config)
     return cli.run_table(config, EXPERIMENT, cases, work, lambda rows: report(config, model, rows, len(cases)))
@@ -112,7 +112,7 @@ def report(config: Config, model: dpm.Model, rows: list[cli.Row], num_cases: int
         for kind, name in (("of_scans", "reliability.png"), ("of_clouds", "reliability_clouds.png"))
     }
     if overlap_rows:
-        fitted, overlap_numbers, found = overlap.fit(overlap_rows)
+        fitted, overlap_numbers, found = pairs_of.fit_overlap(overlap_rows)
         numbers |= overlap_numbers
         calibrated = replace(calibrated, overlap=fitted)
         note += f"; overlap fitted on {config.overlap_towns} towns, {numbers['num_overlap_pairs']} pairs"
@@ -148,7 +148,7 @@ def fit(rows: list[cli.Row]) -> tuple[dpm.Calibration, cli.Row, dict[str, dict[s
             continue
         place, features, is_right = (np.array(column) for column in zip(*pairs, strict=True))
         models[kind] = dpm.fit_logistic(names, features, is_right)
-        confidence = overlap.held_out_probability(names, features, is_right, place)
+        confidence = pairs_of.held_out_probability(names, features, is_right, place)
         held_out[kind] = {"confidence": confidence, "is_right": is_right}
         numbers |= {
             f"num_pairs_{kind}": len(pairs),

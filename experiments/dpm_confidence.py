@@ -23,7 +23,7 @@ from tyro.conf import Positional, arg
 
 from dpmjax import cli, load_model, metrics
 from dpmjax import deeppointmap as dpm
-from experiments._dpm_places import ambiguous_case, ambiguous_drive, measure_pairs
+from experiments._dpm_calibration_pairs import ambiguous_case, ambiguous_drive, measure_pairs
 
 EXPERIMENT = "dpm_confidence"
 # Apart from the seeds of the calibration.
@@ -71,7 +71,7 @@ def main(config: Config) -> list[cli.Row]:
 
     def work(run: cli.TableRun, place: int, kind: str, beams: int) -> cli.Row:
         drive = ambiguous_drive(place, kind, beams, LENGTH_M)
-        return measure_pairs(first, drive, BANDS_M, NUM_PAIRS, seed=config.seed, is_stopped=run.is_stopped)
+        return measure_pairs(first, drive, BANDS_M, NUM_PAIRS, seed=config.seed, on_pair=run.check_stop)
 
     def report(rows: list[cli.Row]) -> cli.Summary:
         numbers = [

@@ -109,17 +109,13 @@ def evaluate_pairs(config: Config) -> list[cli.Row]:
     methods = ("DeepPointMap", "search", *(("KISS-Matcher",) if no_kiss is None else ()))
 
     def work(run: cli.TableRun, method: str, sequence: str, band: str) -> cli.Row:
-        def advance() -> None:
-            if run.is_stopped():
-                raise cli.RowStopped
-
         drive = by_name[sequence]
         if method == "overlap":
             num_pairs = OVERLAP_FACTOR * config.pairs
-            return cli.overlap_row(model, drive, num_pairs, seed=config.seed, on_scan=advance)
+            return cli.overlap_row(model, drive, num_pairs, seed=config.seed, on_scan=run.check_stop)
         if method == "DeepPointMap":
-            return cli.registration_row(model, drive, band, config.pairs, seed=config.seed, on_pair=advance)
-        return evaluate_matcher(matchers[method], drive, band, config.pairs, seed=config.seed, on_pair=advance)
+            return cli.registration_row(model, drive, band, config.pairs, seed=config.seed, on_pair=run.check_stop)
+        return evaluate_matcher(matchers[method], drive, band, config.pairs, seed=config.seed, on_pair=run.check_stop)
 
     bands = [(method, band) for band in ("near", "middle") for method in methods]
     cases = [

@@ -96,8 +96,7 @@ def measure_scene(config: Config, model: dpm.Model, run: cli.TableRun, **case: A
     ]
     pairs = []
     for band, rows in drawn:
-        if run.is_stopped():
-            raise cli.RowStopped
+        run.check_stop()
         clouds, poses = [], []
         for row in rows:
             rng = np.random.default_rng([config.seed, row])

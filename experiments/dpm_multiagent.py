@@ -76,8 +76,7 @@ def main(config: Config) -> Any:
     def work(run: cli.TableRun, sequence: str) -> cli.Row:
         part = run.folder.part("drives", sequence)
         numbers = map_agents(part, config, methods, by_name[sequence], run.is_stopped)
-        if run.is_stopped():
-            raise cli.RowStopped
+        run.check_stop()
         return numbers
 
     numbers = {"weights": config.weights}

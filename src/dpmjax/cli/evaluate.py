@@ -27,7 +27,7 @@ from tyro.conf import Positional, arg
 from dpmjax import deeppointmap, metrics, simulation, viz, weights
 from dpmjax.cli.command import check_least
 from dpmjax.cli.drives import Source, find_sources
-from dpmjax.cli.rows import Row, RowStopped, Summary, TableRun, cell_text, markdown, run_table
+from dpmjax.cli.rows import Row, Summary, TableRun, cell_text, markdown, run_table
 from dpmjax.cli.run_folder import RunFolder, RunOptions
 from dpmjax.sequences import LidarSequence
 
@@ -74,7 +74,11 @@ def main(config: Config) -> list[Row]:
     by_name = {drive.name: drive for drive in drives}
 
     def work(run: TableRun, sequence: str, band: str) -> Row:
-        return evaluation_row(model, by_name[sequence], band, config.pairs, run, seed=config.seed)
+        drive = by_name[sequence]
+        if band == "overlap":
+            num_pairs = OVERLAP_FACTOR * config.pairs
+            return overlap_row(model, drive, num_pairs, seed=config.seed, on_scan=run.check_stop)
+        return registration_row(model, drive, band, config.pairs, seed=config.seed, on_pair=run.check_stop)
 
     def report(rows: list[Row]) -> Summary:
         numbers, text = calibration_numbers(rows), table(rows)
@@ -86,20 +90,6 @@ def main(config: Config) -> list[Row]:
 
     cases = [{"sequence": name, "band": band} for name in by_name for band in ("near", "middle", "far", "overlap")]
     return run_table(config, NAME, cases, work, report)
-
-
-def evaluation_row(
-    model: deeppointmap.Model, drive: LidarSequence, band: str, num_pairs: int, run: TableRun, *, seed: int
-) -> Row:
-    """Returns the registrations of a band of distances, or the overlap of more pairs, until a signal comes."""
-
-    def advance() -> None:
-        if run.is_stopped():
-            raise RowStopped
-
-    if band == "overlap":
-        return overlap_row(model, drive, OVERLAP_FACTOR * num_pairs, seed=seed, on_scan=advance)
-    return registration_row(model, drive, band, num_pairs, seed=seed, on_pair=advance)
 
 
 def evaluation_towns(num_towns: int, length_m: float, kinds: Sequence[str | None] = (None,)) -> list[Source]:

@@ -35,6 +35,11 @@ class TableRun(NamedTuple):
     folder: RunFolder
     is_stopped: Callable[[], bool]
 
+    def check_stop(self) -> None:
+        """Raises `RowStopped` after a signal; a callback of the work on a row."""
+        if self.is_stopped():
+            raise RowStopped
+
 
 class Summary(NamedTuple):
     """Summary of the rows.
