@@ -10,7 +10,6 @@ does their load.
 
 from __future__ import annotations
 
-import importlib
 import json
 import sys
 import traceback
@@ -20,8 +19,7 @@ from typing import Annotated, Any
 
 import tyro
 
-from benchmarks.rows import COLUMNS, Row, format_table, in_new_process
-from dpmjax.cli import environment, peak_rss_gb
+from benchmarks.rows import COLUMNS, Row, format_table, in_new_process, run_benchmark
 
 BENCHMARKS = {
     "core": ("core", "run"),
@@ -62,7 +60,7 @@ def main(config: Config) -> int:
     for name in config.only or BENCHMARKS:
         print(f"running {name} ...", file=sys.stderr, flush=True)
         try:
-            rows, machine = in_new_process(run_benchmark, name, config.quick)
+            rows, machine = in_new_process(run_benchmark, *BENCHMARKS[name], config.quick)
         except Exception:
             traceback.print_exc()
             failed.append(name)
@@ -77,13 +75,6 @@ def main(config: Config) -> int:
     if failed:
         print(f"benchmarks: failed: {', '.join(failed)}", file=sys.stderr)
     return 1 if failed else 0
-
-
-def run_benchmark(name: str, quick: bool) -> tuple[list[Row], dict[str, Any]]:
-    """Returns the rows of a benchmark, with the peak memory of this process, and the machine."""
-    module, function = BENCHMARKS[name]
-    rows = getattr(importlib.import_module(f"benchmarks.{module}"), function)(quick)
-    return [*rows, Row("whole process", "peak memory", peak_rss_gb(), "GB")], environment()
 
 
 def describe(environment: dict[str, Any]) -> str:

@@ -5,6 +5,7 @@ The first call of a function is timed apart from later ones, and timing includes
 
 from __future__ import annotations
 
+import importlib
 import os
 import statistics
 import time
@@ -15,6 +16,8 @@ from typing import Any, NamedTuple
 from unittest.mock import patch
 
 import jax
+
+from dpmjax.cli import environment, peak_rss_gb
 
 COLUMNS = ("name", "case", "metric", "value", "unit")
 
@@ -59,6 +62,12 @@ def in_new_process(function: Callable[..., Any], *arguments: object, **environme
     """
     with patch.dict(os.environ, environment), ProcessPoolExecutor(1, get_context("spawn")) as pool:
         return pool.submit(function, *arguments).result()
+
+
+def run_benchmark(module: str, function: str, quick: bool) -> tuple[list[Row], dict[str, Any]]:
+    """Returns the rows of a benchmark, with the peak memory of this process, and the machine."""
+    rows = getattr(importlib.import_module(f"benchmarks.{module}"), function)(quick)
+    return [*rows, Row("whole process", "peak memory", peak_rss_gb(), "GB")], environment()
 
 
 class Timing(NamedTuple):
