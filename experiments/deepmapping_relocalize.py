@@ -57,7 +57,7 @@ def main(config: Config) -> dict[str, Any]:
     import jax
 
     from dpmjax import ScanSet
-    from dpmjax.deepmapping import LocalizationTrainingConfig, relocalize, train_localization
+    from dpmjax.deepmapping import relocalize, train_localization
     from dpmjax.simulation import make_world, scan_world
 
     run = read_map2d_run(config.run)
@@ -68,9 +68,8 @@ def main(config: Config) -> dict[str, Any]:
     truth = free_poses(grid, config)
     points, mask = scan_world(grid, truth, num_beams=sequence.points.shape[1])
     begun = time.perf_counter()
-    training = LocalizationTrainingConfig(num_steps=config.steps)
     scans = ScanSet(sequence.points, sequence.mask)
-    trained = train_localization(fitted, scans, training, key=jax.random.key(config.seed))
+    trained = train_localization(fitted, scans, num_steps=config.steps, key=jax.random.key(config.seed))
     jax.block_until_ready(trained.params)
     training_s, begun = time.perf_counter() - begun, time.perf_counter()
     found = relocalize(trained, ScanSet(points, mask))

@@ -12,7 +12,8 @@ import pytest
 from dpmjax import deepmapping as dm
 from dpmjax.deepmapping.batches import draw_rows
 from dpmjax.deepmapping.engine import fit, init
-from dpmjax.deepmapping.planar import as_scan_set, planar_problem
+from dpmjax.deepmapping.mapping import mapping_problem
+from dpmjax.deepmapping.planar import as_scan_set
 from dpmjax.deepmapping.problem import MappingData
 from dpmjax.geometry import se2
 from dpmjax.metrics import absolute_trajectory_error
@@ -94,7 +95,7 @@ def test_steps_of_the_paper_preset_lower_its_loss(tiny_data) -> None:
     scans = tiny_data.scans
     few = MappingData(ScanSet(scans.points[:6, ::2], scans.mask[:6, ::2]))
     losses: list[float] = []
-    problem = planar_problem(small, few)
+    problem = mapping_problem(small, few)
     before = init(problem, few, key=KEY).params
     after = fit(problem, few, key=KEY, on_report=lambda p: losses.append(p.report.loss)).state.params
     assert losses[2] < losses[1] < losses[0]

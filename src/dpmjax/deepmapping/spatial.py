@@ -17,7 +17,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from dpmjax.deepmapping.config import DeepMappingConfig, PhaseConfig
 from dpmjax.deepmapping.problem import MapFrame, MappingData, Params, choose_frame
-from dpmjax.geometry import rigid, se3
+from dpmjax.geometry import rigid
+from dpmjax.geometry.se3 import motion_matrices
 from dpmjax.nets.localization import LocalizationNet
 from dpmjax.nets.occupancy import init_map_net
 
@@ -34,24 +35,7 @@ class SpatialScans(Protocol):
         """False where nothing was measured."""
 
 
-def motion_matrices(values: Float[Array, "n k"]) -> Float[Array, "n 4 4"]:
-    """Motions as matrices.
-
-    Args:
-        values: k = 3 are x, z and the angle about y (section 4.2), k = 6 is a twist (v, w).
-
-    Returns:
-        (n, 4, 4) rigid motions.
-    """
-    if values.shape[-1] == 6:
-        return se3.exp(values)
-    x, z, cos, sin = values[:, 0], values[:, 1], jnp.cos(values[:, 2]), jnp.sin(values[:, 2])
-    zero, one = jnp.zeros_like(x), jnp.ones_like(x)
-    rows = ((cos, zero, sin, x), (zero, one, zero, zero), (-sin, zero, cos, z), (zero, zero, zero, one))
-    return jnp.stack([jnp.stack(row, axis=-1) for row in rows], axis=-2)
-
-
-def start_poses(poses: ArrayLike, num_scans: int, unit: float) -> Float[Array, "n 4 4"]:
+def scaled_start(poses: ArrayLike, num_scans: int, unit: float) -> Float[Array, "n 4 4"]:
     """Checked poses to start from.
 
     Args:
@@ -72,7 +56,7 @@ def start_poses(poses: ArrayLike, num_scans: int, unit: float) -> Float[Array, "
     return jnp.asarray(T, jnp.float32)
 
 
-def fitted_poses(poses: ArrayLike, unit: float) -> NDArray[np.float64]:
+def unscaled_poses(poses: ArrayLike, unit: float) -> NDArray[np.float64]:
     """Poses in the unit of the points.
 
     Args:

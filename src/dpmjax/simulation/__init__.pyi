@@ -8,7 +8,6 @@ from .indoors.building import BuildingConfig as BuildingConfig
 from .indoors.building import make_building as make_building
 from .indoors.walking import WalkConfig as WalkConfig
 from .indoors.walking import walk as walk
-from .raycast2d import cast_rays as cast_rays
 from .raycast2d import cast_scans as cast_scans
 from .raycast2d import scan_world as scan_world
 from .raycast2d import simulate_sequence as simulate_sequence

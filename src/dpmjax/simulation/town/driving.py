@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
+from dpmjax.checks import require_positive_fields
 from dpmjax.sequences import FloatArray, LidarSequence
 from dpmjax.simulation.town.make import Town, TownConfig, make_town
 from dpmjax.simulation.town.primitives import TownPrimitives
@@ -19,6 +20,7 @@ from dpmjax.simulation.town.streets import arc_lengths, at_way, lane_of, make_st
 _WHEELBASE_M = 2.7
 _TRACK_M = 1.6
 _SHAKE_DEG = 0.25  # Standard deviation of fast roll and pitch.
+_SWAY_M = 0.15  # Standard deviation of the distance to the middle of the lane.
 _TURN_S = 0.1
 _DRIVE_STREAM = 8151
 
@@ -33,7 +35,6 @@ class DriveConfig:
         length_m: way that is driven; None for once round (a closed route) or to the end.
         is_reversed: drives the route from its end to its start, in the opposite lane.
         sensor_height_m: above the ground.
-        sway_m: standard deviation of the way the car wanders in its lane.
         max_turn_deg_s: the car slows down in corners until it turns no faster; cars turn at 20 to 40 degrees a second.
 
     Raises:
@@ -45,13 +46,11 @@ class DriveConfig:
     length_m: float | None = None
     is_reversed: bool = False
     sensor_height_m: float = 1.73
-    sway_m: float = 0.15
     max_turn_deg_s: float = np.inf
 
     def __post_init__(self) -> None:
-        lengths = () if self.length_m is None else (self.length_m,)
-        if not all(value > 0 for value in (self.speed_m_s, self.rate_hz, self.max_turn_deg_s, *lengths)):
-            raise ValueError("speed_m_s, rate_hz, length_m and max_turn_deg_s must be positive")
+        lengths = () if self.length_m is None else ("length_m",)
+        require_positive_fields(self, "speed_m_s", "rate_hz", "max_turn_deg_s", *lengths)
 
 
 class Drive(NamedTuple):
@@ -187,7 +186,7 @@ def drive(town: Town, config: DriveConfig = DriveConfig(), *, seed: int = 0) -> 
     way = way % whole if is_closed else way
     along = _directions(lane, way)
     left = np.column_stack([-along[:, 1], along[:, 0]])
-    places = at_way(lane, way) + (config.sway_m * _slow_noise(rng, way))[:, None] * left
+    places = at_way(lane, way) + (_SWAY_M * _slow_noise(rng, way))[:, None] * left
     return Drive(_poses(town, places, along, left, config, rng), times)
 
 

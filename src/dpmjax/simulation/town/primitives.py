@@ -6,7 +6,6 @@ coordinates are in the world frame: metres, z up.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import jax
@@ -64,28 +63,6 @@ class Ground(NamedTuple):
     heights: Float[Array, "h w"]
     origin: Float[Array, " 2"]
     cell: Float[Array, ""]
-
-
-@dataclass(frozen=True)
-class Terrain:
-    """Ground heights and distances from the streets on one grid.
-
-    Attributes:
-        origin: (2,) x and y of entry [0, 0], m.
-        heights: (h, w) z, m; the column follows x.
-        street_distance: (h, w) from the nearest kerb, m; negative on a street.
-    """
-
-    origin: FloatArray
-    heights: FloatArray = field(repr=False)
-    street_distance: FloatArray = field(repr=False)
-
-    def height_at(self, positions: FloatArray) -> FloatArray:
-        """Ground heights (m,) at (m, 2) places, bilinear."""
-        from scipy.ndimage import map_coordinates
-
-        at = (np.atleast_2d(positions)[:, :2] - self.origin) / CELL_M
-        return map_coordinates(self.heights, at[:, ::-1].T, order=1, mode="nearest")
 
 
 class Traffic(NamedTuple):
