@@ -142,10 +142,10 @@ def free_poses(grid: NDArray[np.bool_], config: Config) -> NDArray[np.float64]:
 
 def is_mapped(truth: NDArray[np.float64], fitted: Fitted, sequence: ScanSequence) -> NDArray[np.bool_]:
     """Returns True for places of true poses that some beam of the fit's scans has passed."""
-    from dpmjax.deepmapping import draw_map
+    from dpmjax.deepmapping import map_picture
     from dpmjax.metrics import align_rigid
 
-    picture = draw_map(fitted, sequence.points, sequence.mask)
+    picture = map_picture(fitted, sequence.points, sequence.mask)
     T_fit_world = align_rigid(sequence.reference_poses[:, :2], fitted.poses[:, :2])
     places = truth[:, :2] @ T_fit_world[:2, :2].T + T_fit_world[:2, 2]
     x_min, x_max, y_min, y_max = picture.extent

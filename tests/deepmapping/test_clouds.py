@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 
 from dpmjax import deepmapping as dm
-from dpmjax.deepmapping.batches import draw_rows
+from dpmjax.deepmapping.batches import scans_of_step
 from dpmjax.deepmapping.cloud_scans import find_partners
+from dpmjax.deepmapping.clouds import PlaneCloud, clouds_of, misfit_of_pairs, plane_misfit, trajectory_misfit
 from dpmjax.deepmapping.engine import init
 from dpmjax.deepmapping.mapping import mapping_data, mapping_problem
-from dpmjax.deepmapping.plane_distance import PlaneCloud, clouds_of, misfit_of_pairs, plane_misfit, trajectory_misfit
 from dpmjax.geometry import se3
 from dpmjax.metrics import absolute_trajectory_error
 from dpmjax.nets.localization import LocalizationNetConfig
@@ -171,7 +171,7 @@ def test_long_sets_are_fitted_in_blocks_that_see_every_scan(scans) -> None:
     phase = replace(dm.preset("fast", "clouds").warm_phases[0], scans_per_step=64)
     seen = set()
     for step in range(60):
-        rows, block = map(np.asarray, draw_rows(phase, 100, jnp.int32(step), key=jax.random.fold_in(KEY, step)))
+        rows, block = map(np.asarray, scans_of_step(phase, 100, jnp.int32(step), key=jax.random.fold_in(KEY, step)))
         assert len(rows) == 64
         assert all((np.diff(rows[block == number]) == 1).all() for number in (0, 1))
         seen |= set(rows.tolist())

@@ -12,7 +12,7 @@ import pytest
 
 import dpmjax
 from dpmjax import deepmapping as dm
-from dpmjax.deepmapping.batches import draw_rows, join_windows, window_rows
+from dpmjax.deepmapping.batches import join_windows, scans_of_step, window_rows
 from dpmjax.deepmapping.engine import init
 from dpmjax.deepmapping.mapping import mapping_data, mapping_problem
 from dpmjax.geometry import se2
@@ -40,7 +40,7 @@ def test_windows_hold_every_motion_between_neighbours(num_scans: int, length: in
     pairs = {pair for row in rows.tolist() for pair in pairwise(row)}
     assert pairs == {(k, k + 1) for k in range(num_scans - 1)}
     phase = replace(dm.preset("fast").cold_phases[0], scans_per_window=length)
-    drawn, block = draw_rows(phase, num_scans, jnp.int32(0), key=KEY)
+    drawn, block = scans_of_step(phase, num_scans, jnp.int32(0), key=KEY)
     np.testing.assert_array_equal(np.asarray(drawn).reshape(rows.shape), rows)
     np.testing.assert_array_equal(np.asarray(block).reshape(rows.shape), np.arange(len(rows))[:, None] + 0 * rows)
 

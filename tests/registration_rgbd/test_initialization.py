@@ -25,7 +25,13 @@ from dpmjax.registration_rgbd import (
 from dpmjax.registration_rgbd.adjustment import SampledImages, adjust_poses
 from dpmjax.registration_rgbd.depth_images import PixelSample
 from dpmjax.registration_rgbd.initialization import _best_that_differ, _explained, _window
-from dpmjax.registration_rgbd.motion_search import SearchCamera, Views, propose_motions, surface_directions
+from dpmjax.registration_rgbd.motion_search import (
+    MAX_TRANSLATION,
+    SearchCamera,
+    Views,
+    propose_motions,
+    surface_directions,
+)
 from tests.tolerances import ROUNDING
 
 KEY = jax.random.key(0)
@@ -157,5 +163,5 @@ def test_what_a_wall_leaves_open_is_proposed_side_by_side() -> None:
     np.testing.assert_allclose(T[:, :3, 3] @ ACROSS, 0.0, atol=0.005)
     np.testing.assert_allclose(T[:, 0, 2], 0.0, atol=0.005)
     places = np.sort(T[:, :3, 3] @ ALONG)
-    assert np.diff(places).min() > 0.1 * config.max_translation
-    assert np.ptp(places) > config.max_translation
+    assert np.diff(places).min() > 0.1 * MAX_TRANSLATION
+    assert np.ptp(places) > MAX_TRANSLATION

@@ -17,8 +17,8 @@ from dpmjax.simulation.town.primitives import (
     SOLID,
     Bodies,
     Ground,
+    RoadUsers,
     TownPrimitives,
-    Traffic,
     pack_bodies,
 )
 from dpmjax.simulation.town.scan import make_rays
@@ -148,7 +148,7 @@ def small_town(land, rng):
     thickness = rng.uniform(0.05, 0.4, len(place))
     poles = np.column_stack([place + np.array([3, -2, 0]), thickness, thickness, sizes[:, 2] + 1, zero])
     tufts = np.column_stack([place + np.array([-2, 3, 1]), sizes[:, [0, 0, 1]] * 0.5, zero])
-    traffic = Traffic(
+    traffic = RoadUsers(
         lane_points=jnp.zeros((2, 64, 3)),
         lane_lengths=jnp.ones(2),
         lanes=jnp.zeros(4, jnp.int32),

@@ -21,7 +21,7 @@ from .engine import step as step
 from .engine import steps_per_call as steps_per_call
 from .localization_training import train_localization as train_localization
 from .map_raster import MapPicture as MapPicture
-from .map_raster import draw_map as draw_map
+from .map_raster import map_picture as map_picture
 from .mapping import Fitted as Fitted
 from .mapping import Registered as Registered
 from .mapping import fit_deepmapping as fit_deepmapping

@@ -5,8 +5,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
@@ -60,10 +58,5 @@ def _loss(
     return mapping_loss(config, phase, params, world, pair_term, key=free_key)
 
 
-def _scaled(scans: DepthScans, start: Float[Array, "n 4 4"] | None, unit: float) -> DepthScans:
-    del start
-    return replace(scans, points=scans.points / unit)
-
-
-DEPTH = Sensor(_scaled, scaled_start, unscaled_poses, init_spatial, _loss, spatial_poses, next_spatial_phase)
+DEPTH = Sensor(scaled_start, unscaled_poses, init_spatial, _loss, spatial_poses, next_spatial_phase)
 """DeepMapping of depth images; poses are (n, 4, 4) T_world_camera."""

@@ -146,7 +146,7 @@ class MapPicture(NamedTuple):
     extent: tuple[float, float, float, float]
 
 
-def draw_map(
+def map_picture(
     fitted: Fitted, points: NDArray[np.floating], mask: NDArray[np.bool_], *, num_cells: int = 500
 ) -> MapPicture:
     """Evaluates M-Net wherever a beam has been.

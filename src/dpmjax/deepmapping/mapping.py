@@ -6,6 +6,7 @@ The type of the scans chooses the sensor: a ScanSet is planar, DepthScans are de
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Literal, NamedTuple
 
 import jax
@@ -13,13 +14,12 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from dpmjax.deepmapping.cloud_scans import CloudScans, as_cloud_scans
-from dpmjax.deepmapping.clouds import CLOUDS
+from dpmjax.deepmapping.cloud_scans import CloudScans, as_cloud_scans, find_partners
+from dpmjax.deepmapping.clouds import CLOUDS, trajectory_misfit
 from dpmjax.deepmapping.config import DeepMappingConfig
 from dpmjax.deepmapping.depth import DEPTH
 from dpmjax.deepmapping.engine import Fit, Report, fit
 from dpmjax.deepmapping.planar import PLANAR, as_scan_set
-from dpmjax.deepmapping.plane_distance import trajectory_misfit
 from dpmjax.deepmapping.presets import preset
 from dpmjax.deepmapping.problem import MappingData, Params, Problem, Sensor, make_optimizer, phases_of
 from dpmjax.geometry import se2
@@ -100,7 +100,11 @@ def mapping_data(scans: Scans | ArrayLike, start: ArrayLike | None = None) -> tu
     checked = scans if isinstance(scans, DepthScans | CloudScans) else as_scan_set(scans)
     unit, sensor = typical_range(checked.points, checked.mask), _SENSORS[type(checked)]
     T_start = None if start is None else sensor.scaled_start(start, len(checked.points), unit)
-    return MappingData(sensor.scaled(checked, T_start, unit), T_start), unit
+    scaled = replace(checked, points=checked.points / unit)
+    if isinstance(scaled, CloudScans):
+        partners = scaled.partners if T_start is None else find_partners(np.asarray(T_start), 1.0)
+        scaled = replace(scaled, spacing=scaled.spacing / unit, partners=partners)
+    return MappingData(scaled, T_start), unit
 
 
 def mapping_problem(config: DeepMappingConfig, data: MappingData) -> Problem:
@@ -170,7 +174,8 @@ def register_depth(
     They are compared by `projective_consistency`, without ground truth.
 
     Args:
-        images: (n, h, w, 3) points in the camera frames (x right, y down, z forward), any unit; or DepthScans.
+        images: (n, h, w, 3) points in the camera frames (x right, y down, z forward), or DepthScans; metres, or any
+            unit where a start is given.
         config: settings of the fit; None: `preset("fast", "depth")`. Its `motion` holds for the search, too.
         key: key of the search and of the fit.
         start: (n, 4, 4) T_world_camera to start from; None: `initialize_depth` searches first poses.

@@ -13,7 +13,14 @@ from jaxtyping import Array, Bool, Float, Int
 from numpy.typing import ArrayLike, NDArray
 
 from dpmjax.checks import as_beams
-from dpmjax.deepmapping.batches import draw_offsets, draw_rows, in_windows, join_windows, scans_in_block, window_rows
+from dpmjax.deepmapping.batches import (
+    draw_offsets,
+    in_windows,
+    join_windows,
+    scans_in_block,
+    scans_of_step,
+    window_rows,
+)
 from dpmjax.deepmapping.config import DeepMappingConfig, PhaseConfig
 from dpmjax.deepmapping.objective import Terms, WorldBatch, chamfer_term
 from dpmjax.deepmapping.problem import MapFrame, MappingData, Params, Sensor, choose_frame, mapping_loss, phases_of
@@ -150,7 +157,7 @@ def _loss(
     batch_key, loss_key = jax.random.split(key)
     beam_key, row_key = jax.random.split(batch_key)
     beams = choose_beams(scans.mask.shape[1], phase, jax.random.randint(beam_key, (), 0, scans.mask.shape[1]))
-    rows, block = draw_rows(phase, scans.mask.shape[0], step, key=row_key)
+    rows, block = scans_of_step(phase, scans.mask.shape[0], step, key=row_key)
     some = ScanSet(scans.points[:, beams], scans.mask[:, beams])
     if phase.poses == "network":
         poses = _localize(config, phase, params, some, rows)
@@ -163,11 +170,6 @@ def _loss(
     return mapping_loss(config, phase, params, world, chamfer_term(world, offsets, phase.comparison), key=free_key)
 
 
-def _scaled(scans: ScanSet, start: Float[Array, "n 3"] | None, unit: float) -> ScanSet:
-    del start
-    return replace(scans, points=scans.points / unit)
-
-
 def _scaled_start(start: ArrayLike, num_scans: int, unit: float) -> Float[Array, "n 3"]:
     return jnp.asarray(se2.as_poses("start", start, num_scans) / [unit, unit, 1.0], jnp.float32)
 
@@ -176,5 +178,5 @@ def _unscaled(poses: Float[Array, "n 3"], unit: float) -> NDArray[np.float64]:
     return np.asarray(poses, np.float64) * [unit, unit, 1.0]
 
 
-PLANAR = Sensor(_scaled, _scaled_start, _unscaled, _init, _loss, _poses, _next_phase)
+PLANAR = Sensor(_scaled_start, _unscaled, _init, _loss, _poses, _next_phase)
 """DeepMapping of planar scans; poses are (n, 3) x, y, heading."""

@@ -74,7 +74,6 @@ class Sensor(NamedTuple):
     """The parts of DeepMapping that depend on the sensor: its scans, its poses, and how pairs of scans are compared.
 
     Attributes:
-        scaled: (scans, start, unit) -> the scans in typical ranges; `start` is in typical ranges or None.
         scaled_start: (start, number of scans, unit) -> checked poses in typical ranges.
         unscaled: (poses, unit) -> float64 poses in the unit of the points.
         init: as in Problem.
@@ -83,7 +82,6 @@ class Sensor(NamedTuple):
         next_phase: as in Problem.
     """
 
-    scaled: Callable[..., Any]
     scaled_start: Callable[..., Array]
     unscaled: Callable[..., NDArray[np.float64]]
     init: Callable[..., Params]

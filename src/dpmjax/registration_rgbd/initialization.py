@@ -19,6 +19,7 @@ from dpmjax.geometry.se3 import Motion
 from dpmjax.registration_rgbd.adjustment import SampledImages, adjust_poses
 from dpmjax.registration_rgbd.depth_images import DepthScans, PixelSample
 from dpmjax.registration_rgbd.motion_search import (
+    MAX_TRANSLATION,
     MAX_TURN_DEG,
     DepthSearchConfig,
     SearchCamera,
@@ -55,12 +56,12 @@ def initialize_depth(
     """Searches first poses of all images, the first at the origin.
 
     Args:
-        scans: scans in order of time; neighbours overlap.
+        scans: images in order of time, metres; neighbours overlap.
         config: settings of the search; None: `depth_search("planar")`.
         key: key of the search.
 
     Returns:
-        (n, 4, 4) T_world_camera, unit of the points.
+        (n, 4, 4) T_world_camera, metres.
     """
     config = config or depth_search("planar")
     sample_key, search_key = jax.random.split(key)
@@ -136,7 +137,7 @@ def _best_that_differ(T: NDArray[np.float64], images: SampledImages, config: Dep
     scores = np.concatenate([_explained(jnp.asarray(t[:, rows], jnp.float32), window, tolerance) for t in T])
     T = T.reshape(-1, *T.shape[2:])
     scores = scores - _mean_cost(T, config)
-    far, turn = _APART[0] * config.max_translation, _APART[1] * np.deg2rad(MAX_TURN_DEG)
+    far, turn = _APART[0] * MAX_TRANSLATION, _APART[1] * np.deg2rad(MAX_TURN_DEG)
     is_left, kept = scores >= scores.max() - _MARGIN, list[NDArray[np.float64]]()
     while is_left.any() and len(kept) < config.num_trajectories:
         best = T[np.argmax(np.where(is_left, scores, -np.inf))]

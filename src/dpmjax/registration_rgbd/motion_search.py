@@ -24,6 +24,8 @@ from dpmjax.registration_rgbd.adjustment import gap_equations, improve_motions, 
 from dpmjax.registration_rgbd.depth_images import DepthScans, Pinhole, PixelSample
 from dpmjax.registration_rgbd.projective_consistency import Agreement, both_ways, surface_gap
 
+# Largest translation between neighbouring images along each axis, metres.
+MAX_TRANSLATION = 0.7
 # Largest turn between neighbouring images about the vertical axis of the camera, and largest tilt (turn about a
 # horizontal axis; full motion only), degrees.
 MAX_TURN_DEG, _MAX_TILT_DEG = 75.0, 30.0
@@ -49,11 +51,10 @@ _NUM_TOLERANCES, _NUM_ITERATIONS = 4, 2
 
 @dataclass(frozen=True)
 class DepthSearchConfig:
-    """Settings of the search. Lengths are in the unit of the points, metres by default.
+    """Settings of the search.
 
     Attributes:
         motion: degrees of freedom of the camera.
-        max_translation: the largest translation between neighbouring images along each axis.
         num_trajectories: the largest number of trajectories that go on from image to image.
         num_candidates: number of motions of the first round, spread evenly.
         num_varied: number of new motions around each kept one in a round.
@@ -66,7 +67,6 @@ class DepthSearchConfig:
     """
 
     motion: Motion = "planar"
-    max_translation: float = 0.7
     num_trajectories: int = 16
     num_candidates: int = 1024
     num_varied: int = 20
@@ -203,7 +203,7 @@ def motion_cost(length: Any, turn: Any, config: DepthSearchConfig) -> Any:
         The cost of each.
     """
     turn_share = turn / np.deg2rad(MAX_TURN_DEG)
-    return config.translation_weight * length / config.max_translation + config.turn_weight * turn_share
+    return config.translation_weight * length / MAX_TRANSLATION + config.turn_weight * turn_share
 
 
 def _take(tree: Any, rows: Any) -> Any:
@@ -234,7 +234,7 @@ def _score_motion(
     agreement = Agreement(*(references.weights * values for values in agreements))
     length = jnp.linalg.norm(T_last_scan[:3, 3])
     score = agreement.consistency() - motion_cost(length, _turn_of(T_last_scan), config)
-    return jnp.where(length > _LONGEST * config.max_translation, -jnp.inf, score)
+    return jnp.where(length > _LONGEST * MAX_TRANSLATION, -jnp.inf, score)
 
 
 def _distinct(
@@ -242,10 +242,9 @@ def _distinct(
     scores: Float[Array, " m"],
     count: int,
     shares: tuple[float, float],
-    config: DepthSearchConfig,
 ) -> Float[Array, "k 4 4"]:
     """The best motions that differ by these shares of the largest translation or turn from all better ones."""
-    far, turn = shares[0] * config.max_translation, shares[1] * np.deg2rad(MAX_TURN_DEG)
+    far, turn = shares[0] * MAX_TRANSLATION, shares[1] * np.deg2rad(MAX_TURN_DEG)
 
     def pick(left: Float[Array, " m"], _: None) -> tuple[Float[Array, " m"], Array]:
         best = T[jnp.argmax(left)]
@@ -256,11 +255,9 @@ def _distinct(
     return jax.lax.scan(pick, scores, length=count)[1]
 
 
-def _slid(
-    T: Float[Array, "k 4 4"], directions: Float[Array, "a 3"], config: DepthSearchConfig
-) -> Float[Array, "m 4 4"]:
+def _slid(T: Float[Array, "k 4 4"], directions: Float[Array, "a 3"]) -> Float[Array, "m 4 4"]:
     """The motions, each moved to and fro along each axis of the image."""
-    lengths = _SLIDE * config.max_translation * jnp.linspace(-1.0, 1.0, _NUM_SLIDES)
+    lengths = _SLIDE * MAX_TRANSLATION * jnp.linspace(-1.0, 1.0, _NUM_SLIDES)
     moves = (lengths[:, None, None] * directions).reshape(-1, 3)
     T_scan_slid = jnp.tile(jnp.eye(4), (len(moves), 1, 1)).at[:, :3, 3].set(moves)
     slid = rigid.compose(T[:, None], T_scan_slid).reshape(-1, 4, 4)
@@ -314,7 +311,7 @@ def _search(
     config: DepthSearchConfig,
 ) -> Float[Array, "k 4 4"]:
     """The best T_last_scan of the image that differ."""
-    turn, tilt, far = np.deg2rad(MAX_TURN_DEG), np.deg2rad(_MAX_TILT_DEG), config.max_translation
+    turn, tilt, far = np.deg2rad(MAX_TURN_DEG), np.deg2rad(_MAX_TILT_DEG), MAX_TRANSLATION
     widths = jnp.array([far, far, turn] if config.motion == "planar" else [far, far, far, tilt, turn, tilt])
     first_key, round_key = jax.random.split(key)
     values = widths * jax.random.uniform(first_key, (config.num_candidates, len(widths)), minval=-1.0, maxval=1.0)
@@ -335,13 +332,13 @@ def _search(
         moves = motion_matrices((spread * noise.at[0].set(0.0)).reshape(-1, len(widths)))
         T = rigid.compose(best, moves.reshape(config.num_varied, len(best), 4, 4)).reshape(-1, 4, 4)
     scores = scores_of(T, nearest, tolerances[_NUM_ROUNDS - 1])
-    T = _slid(_distinct(T, scores, _NUM_SLID, _DIFFERENT, config), view.directions, config)
+    T = _slid(_distinct(T, scores, _NUM_SLID, _DIFFERENT), view.directions)
     adjusted_at = tolerances[_NUM_ROUNDS:]
-    T = _distinct(T, scores_of(T, references, adjusted_at[0]), _NUM_ADJUSTED, _SLID_APART, config)
+    T = _distinct(T, scores_of(T, references, adjusted_at[0]), _NUM_ADJUSTED, _SLID_APART)
     for tolerance in adjusted_at:
 
         def adjust(one: Float[Array, "4 4"], tolerance: Float[Array, ""] = tolerance) -> Float[Array, "4 4"]:
             return _adjusted(one, references, view, camera, tolerance, config)
 
         T = jax.lax.map(adjust, T, batch_size=16)
-    return _distinct(T, scores_of(T, references, adjusted_at[-1]), _NUM_DISTINCT, _SLID_APART, config)
+    return _distinct(T, scores_of(T, references, adjusted_at[-1]), _NUM_DISTINCT, _SLID_APART)

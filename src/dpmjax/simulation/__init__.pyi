@@ -18,8 +18,8 @@ from .scenes import draw_scene as draw_scene
 from .scenes import simulate_drive as simulate_drive
 from .scenes import simulate_scene as simulate_scene
 from .scenes import simulate_scenes as simulate_scenes
-from .town.driving import Drive as Drive
 from .town.driving import DriveConfig as DriveConfig
+from .town.driving import TimedPoses as TimedPoses
 from .town.driving import drive as drive
 from .town.driving import route_poses as route_poses
 from .town.driving import simulate_lidar_sequence as simulate_lidar_sequence

@@ -14,7 +14,7 @@ from dpmjax.sequences import FloatArray
 from dpmjax.simulation.indoors.plan import Door, Plan, Room, make_plan, make_route
 from dpmjax.simulation.town import primitives
 from dpmjax.simulation.town.objects import Collection, Place, put_box, put_car, put_person, put_pole
-from dpmjax.simulation.town.primitives import CELL_M, Ground, TownPrimitives, Traffic
+from dpmjax.simulation.town.primitives import CELL_M, Ground, RoadUsers, TownPrimitives
 from dpmjax.simulation.town.vegetation import plant_bushes
 
 _Put = Callable[[Collection, np.random.Generator, Place], None]
@@ -103,11 +103,11 @@ def _floor(plan: Plan) -> Ground:
     return Ground(jnp.asarray(heights, jnp.float32), jnp.asarray(low, jnp.float32), jnp.float32(CELL_M))
 
 
-def _nobody() -> Traffic:
+def _nobody() -> RoadUsers:
     empty = np.zeros((0, 3))
     rows, flags = primitives.padded(empty, 64), primitives.mask_of(0, 64)
     zero = rows[:, 0]
-    return Traffic(jnp.zeros((2, 64, 3)), jnp.ones(2), zero.astype(jnp.int32), zero, zero, zero, rows, flags)
+    return RoadUsers(jnp.zeros((2, 64, 3)), jnp.ones(2), zero.astype(jnp.int32), zero, zero, zero, rows, flags)
 
 
 def _place(x: float, y: float, heading: float = 0.0) -> Place:

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from dpmjax.checks import require_positive_fields
 from dpmjax.sequences import FloatArray
 from dpmjax.simulation.indoors.building import Building
-from dpmjax.simulation.town.driving import Drive
+from dpmjax.simulation.town.driving import TimedPoses
 from dpmjax.simulation.town.streets import arc_lengths, at_way, smooth, tangents
 
 _WALK_STREAM = 8161
@@ -46,7 +46,7 @@ class WalkConfig:
         require_positive_fields(self, "rate_hz", "height_m")
 
 
-def walk(building: Building, config: WalkConfig = WalkConfig(), *, seed: int = 0) -> Drive:
+def walk(building: Building, config: WalkConfig = WalkConfig(), *, seed: int = 0) -> TimedPoses:
     """Walks along the building's route.
 
     Args:
@@ -71,7 +71,7 @@ def walk(building: Building, config: WalkConfig = WalkConfig(), *, seed: int = 0
     poses[:, :2, 3] = at_way(route, way)
     steps = np.sin(2 * np.pi * _STEPS_PER_S * times) + _SINK * _slow(rng, times)
     poses[:, 2, 3] = building.plan.floor_at(poses[:, 0, 3]) + config.height_m + bob_m * steps
-    return Drive(poses, times)
+    return TimedPoses(poses, times)
 
 
 def _slow(rng: np.random.Generator, times: FloatArray) -> FloatArray:

@@ -53,7 +53,7 @@ class DriveConfig:
         require_positive_fields(self, "speed_m_s", "rate_hz", "max_turn_deg_s", *lengths)
 
 
-class Drive(NamedTuple):
+class TimedPoses(NamedTuple):
     """Poses and times of a drive.
 
     Attributes:
@@ -122,7 +122,7 @@ def route_poses(
 def scan_along(
     name: str,
     primitives: TownPrimitives,
-    way: Drive,
+    way: TimedPoses,
     *,
     seed: int,
     sensor: LidarSensor,
@@ -153,7 +153,7 @@ def scan_along(
     return LidarSequence(name, sources, read_scan, way.T_world_lidar, way.times)
 
 
-def _motions(way: Drive) -> FloatArray:
+def _motions(way: TimedPoses) -> FloatArray:
     """(n, 6) twists of the sensor during a turn, on its way to the next pose; the last is that before."""
     poses = way.T_world_lidar
     if len(poses) < 2:
@@ -166,7 +166,7 @@ def _motions(way: Drive) -> FloatArray:
     return np.vstack([twists, twists[-1:]])
 
 
-def drive(town: Town, config: DriveConfig = DriveConfig(), *, seed: int = 0) -> Drive:
+def drive(town: Town, config: DriveConfig = DriveConfig(), *, seed: int = 0) -> TimedPoses:
     """Drives along the town's route.
 
     Args:
@@ -187,7 +187,7 @@ def drive(town: Town, config: DriveConfig = DriveConfig(), *, seed: int = 0) -> 
     along = _directions(lane, way)
     left = np.column_stack([-along[:, 1], along[:, 0]])
     places = at_way(lane, way) + (_SWAY_M * _slow_noise(rng, way))[:, None] * left
-    return Drive(_poses(town, places, along, left, config, rng), times)
+    return TimedPoses(_poses(town, places, along, left, config, rng), times)
 
 
 def _timetable(lane: FloatArray, length: float, config: DriveConfig, is_closed: bool) -> tuple[FloatArray, FloatArray]:

@@ -14,7 +14,7 @@ from dpmjax.simulation.town import primitives
 from dpmjax.simulation.town.furnish import furnish
 from dpmjax.simulation.town.heights import with_equal_passes
 from dpmjax.simulation.town.kinds import KINDS, Kind
-from dpmjax.simulation.town.primitives import CELL_M, LANE_STEP_M, TownPrimitives, Traffic, padded
+from dpmjax.simulation.town.primitives import CELL_M, LANE_STEP_M, RoadUsers, TownPrimitives, padded
 from dpmjax.simulation.town.streets import LANE_M, Streets, arc_lengths, make_streets, resample, streets_along
 from dpmjax.simulation.town.terrain import Plots, Terrain, make_terrain
 
@@ -106,7 +106,7 @@ def _positions(trajectory: ArrayLike) -> FloatArray:
     return poses[:, :3, 3]
 
 
-def _make_traffic(rng: np.random.Generator, streets: Streets, terrain: Terrain, kind: Kind) -> Traffic:
+def _make_traffic(rng: np.random.Generator, streets: Streets, terrain: Terrain, kind: Kind) -> RoadUsers:
     lanes = [resample(lane, LANE_STEP_M) for line in streets.lanes for lane in (line, line[::-1])]
     lengths = np.array([arc_lengths(lane)[-1] for lane in lanes])
     half_width = float(np.mean(streets.half_widths))
@@ -121,7 +121,7 @@ def _make_traffic(rng: np.random.Generator, streets: Streets, terrain: Terrain, 
     lane_points, lane_lengths = padded(np.stack(points), capacity), jnp.maximum(padded(lengths, capacity), 1.0)
     own_lanes, (starts, speeds, sides) = rows[:, 0].astype(jnp.int32), rows[:, 1:4].T
     mask = primitives.mask_of(len(table), len(rows))
-    return Traffic(lane_points, lane_lengths, own_lanes, starts, speeds, sides, rows[:, 4:7], mask)
+    return RoadUsers(lane_points, lane_lengths, own_lanes, starts, speeds, sides, rows[:, 4:7], mask)
 
 
 def _users(

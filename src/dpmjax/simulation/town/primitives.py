@@ -65,7 +65,7 @@ class Ground(NamedTuple):
     cell: Float[Array, ""]
 
 
-class Traffic(NamedTuple):
+class RoadUsers(NamedTuple):
     """Cars that drive and people that walk, each at its own speed along a lane.
 
     Attributes:
@@ -104,7 +104,7 @@ class TownPrimitives(NamedTuple):
     cylinders: Bodies
     spheroids: Bodies
     ground: Ground
-    traffic: Traffic
+    traffic: RoadUsers
 
 
 def capacity_for(count: int, *, least: int = 64) -> int:
@@ -174,7 +174,7 @@ def turn_back(vectors: Float[Array, "... 3"], heading: Float[Array, "... 2"]) ->
     return jnp.stack([along, across, jnp.broadcast_to(z, along.shape)], axis=-1)
 
 
-def traffic_boxes(traffic: Traffic, sensor: Float[Array, " 3"], time: Float[Array, ""]) -> Bodies:
+def traffic_boxes(traffic: RoadUsers, sensor: Float[Array, " 3"], time: Float[Array, ""]) -> Bodies:
     """The road users at a time.
 
     Args:
@@ -216,7 +216,7 @@ def _car_levels(half_height: Float[Array, "..."]) -> tuple[Float[Array, "..."], 
     return 0.6 * room, 0.4 * room
 
 
-def _on_lane(traffic: Traffic, way: Float[Array, " n"]) -> Float[Array, "n 3"]:
+def _on_lane(traffic: RoadUsers, way: Float[Array, " n"]) -> Float[Array, "n 3"]:
     """Points of the lanes, linear between their samples."""
     at = jnp.clip(way / LANE_STEP_M, 0.0, traffic.lane_points.shape[1] - 1.001)
     low = jnp.floor(at).astype(jnp.int32)
