@@ -157,7 +157,7 @@ def test_bad_input_is_named(as_user, scans, options, message) -> None:
 
 
 def test_unknown_presets_and_too_few_steps_are_refused() -> None:
-    with pytest.raises(ValueError, match="preset: expected 'fast' or 'paper'"):
+    with pytest.raises(ValueError, match="preset: expected one of fast, paper"):
         dm.preset("quick")
     with pytest.raises(ValueError, match="steps: expected at least one"):
         dm.with_steps(dm.preset("fast"), 1)
