@@ -29,8 +29,8 @@ import jaxtyping
 import pytest
 
 # Before the first import of the package, so that the functions of its rooms are wrapped. The records of `types` and
-# of most of `deepmapping` and `registration_rgbd` are not: `vmap` and optimisers make more of them than their annotations
-# say. An integer is a float, as for mypy.
+# of most of `deepmapping` and `registration_rgbd` are not: `vmap` and optimisers make more of them than their
+# annotations say. An integer is a float, as for mypy.
 PACKAGE = Path(__file__).parents[1] / "src" / "dpmjax"
 ROOMS = {path.stem for path in PACKAGE.iterdir()} - {"__init__", "types", "deepmapping", "registration_rgbd"}
 CHECKED_FILES = (
