@@ -131,9 +131,9 @@ def error_maps_figure(
             panel.error, cmap=colormap, vmin=0.0, vmax=worst, origin="lower", extent=limits, interpolation="nearest"
         )
         axes.plot(*np.asarray(trajectory_world).T, ".", color=TRAJECTORY, ms=1.8)
-        frame_map(axes, limits, unit if panel is maps[0] else None)
         axes.set_title(f"{panel.title}\n", fontsize=11, color=INK, loc="left", fontweight="bold")
         annotate_corner(axes, panel.subtitle, (0, 6))
+        frame_map(axes, limits, unit if panel is maps[0] else None)
     # The bar and its label need about 0.9 inches at the right, whatever the number of maps.
     right = 1.0 - 0.9 / figure.get_figwidth()
     figure.tight_layout(rect=(0.0, 0.0, right, 1.0))
