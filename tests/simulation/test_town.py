@@ -22,7 +22,7 @@ from dpmjax.simulation import (
     simulate_lidar_sequence,
 )
 from dpmjax.simulation.town import driving
-from dpmjax.simulation.town.heights import with_equal_passes
+from dpmjax.simulation.town.terrain import with_equal_passes
 from tests.data_sets import write_kitti_sequence
 
 SENSOR = LidarSensor("test", HDL64E.elevations_deg[::4], 360, max_range_m=80.0)

@@ -12,11 +12,10 @@ from dpmjax.checks import require_fields, require_one_of, require_positive_field
 from dpmjax.sequences import FloatArray
 from dpmjax.simulation.town import primitives
 from dpmjax.simulation.town.furnish import furnish
-from dpmjax.simulation.town.heights import with_equal_passes
 from dpmjax.simulation.town.kinds import KINDS, Kind
 from dpmjax.simulation.town.primitives import CELL_M, LANE_STEP_M, RoadUsers, TownPrimitives, padded
 from dpmjax.simulation.town.streets import LANE_M, Streets, arc_lengths, make_streets, resample, streets_along
-from dpmjax.simulation.town.terrain import Plots, Terrain, make_terrain
+from dpmjax.simulation.town.terrain import Plots, Terrain, make_terrain, with_equal_passes
 
 _SENSOR_HEIGHT_M = 1.73
 _WALKERS_PER_KM = 15.0  # For each kilometre of lane.

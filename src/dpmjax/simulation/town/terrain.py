@@ -1,22 +1,31 @@
-"""The ground of a town: heights and distances from the streets, and the part of it that is taken."""
+"""The ground of a town: heights, equal ones where a trajectory comes back; distances from streets; what is taken."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
 
 import numpy as np
+import scipy.sparse as sp
 from numpy.typing import NDArray
+from scipy.ndimage import distance_transform_edt, gaussian_filter, map_coordinates
+from scipy.sparse.linalg import spsolve
+from scipy.spatial import KDTree
 
 from dpmjax.sequences import BoolArray, FloatArray
 from dpmjax.simulation.town.kinds import KINDS, Kind
 from dpmjax.simulation.town.objects import Place, Size
 from dpmjax.simulation.town.primitives import CELL_M
-from dpmjax.simulation.town.streets import Streets
+from dpmjax.simulation.town.streets import Streets, arc_lengths, resample
 
 PAVEMENT_M = 2.2
 _MARGIN_M = 70.0
 _TILE = 256
 _KERB_M = 0.12
+# Passes of a place lie this near to each other, with this much way between them.
+_NEAR_M, _LEAST_WAY_M, _NUM_NEAR = 6.0, 30.0, 64
+_STEEPEST = 0.2
+# Against the weight 1 of each step: places of two passes lie up to half a metre apart along the way.
+_TIE_WEIGHT = 0.01
 
 
 @dataclass(frozen=True)
@@ -35,8 +44,6 @@ class Terrain:
 
     def height_at(self, positions: FloatArray) -> FloatArray:
         """Ground heights (m,) at (m, 2) places, bilinear."""
-        from scipy.ndimage import map_coordinates
-
         at = (np.atleast_2d(positions)[:, :2] - self.origin) / CELL_M
         return map_coordinates(self.heights, at[:, ::-1].T, order=1, mode="nearest")
 
@@ -71,8 +78,6 @@ def make_terrain(
 
 def _street_distance(streets: Streets, origin: FloatArray, shape: tuple[int, int]) -> FloatArray:
     """Distance from the nearest kerb; streets of different width count by their own."""
-    from scipy.ndimage import distance_transform_edt
-
     widths = np.round(np.array(streets.half_widths), 1)
     nearest = np.full(shape, np.inf)
     for width in np.unique(np.round(widths * 2) / 2):
@@ -96,9 +101,6 @@ def _rolling(rng: np.random.Generator, x: FloatArray, y: FloatArray, steepness: 
 
 def _through(support: FloatArray, origin: FloatArray, shape: tuple[int, int]) -> FloatArray:
     """Land through given points: inverse distances on a coarse grid, smoothed, then brought to the fine one."""
-    from scipy.ndimage import gaussian_filter, map_coordinates
-    from scipy.spatial import KDTree
-
     coarse = 8
     rows, columns = (count // coarse + 2 for count in shape)
     step = CELL_M * coarse
@@ -121,8 +123,6 @@ def _cross_section(distance: FloatArray) -> FloatArray:
 
 def _roughness(rng: np.random.Generator, distance: FloatArray) -> FloatArray:
     """A centimetre on streets, several and gentle mounds beside them."""
-    from scipy.ndimage import gaussian_filter
-
     fine = rng.normal(size=distance.shape)
     mounds = gaussian_filter(rng.normal(size=distance.shape), 8.0) * 28.0
     is_garden = np.clip((distance - PAVEMENT_M) / 2.0, 0, 1)
@@ -183,3 +183,43 @@ class Plots:
         cos, sin = np.cos(place.heading), np.sin(place.heading)
         x, y = place.x + cos * u - sin * v, place.y + sin * u + cos * v
         return np.round((np.column_stack([x, y]) - self.terrain.origin) / CELL_M).astype(np.int64)
+
+
+def with_equal_passes(positions: FloatArray) -> FloatArray:
+    """Returns the trajectory with heights that are equal where it passes a place again; slopes change least.
+
+    A sparse least-squares problem keeps the steps of height, and sets those between two passes to zero. Slopes are
+    limited to 20 %, because the height of a receiver that stands still may drift by metres.
+
+    Args:
+        positions: (n, 3) m, in order, at least 1 m long.
+
+    Returns:
+        (m, 3) positions on the same way at steps of a metre.
+    """
+    positions = resample(positions, 1.0)
+    count = len(positions)
+    pairs = _passes(positions[:, :2], arc_lengths(positions))
+    steps = np.column_stack([np.arange(count - 1), np.arange(1, count)])
+    ends = np.vstack([steps, pairs])
+    weights = np.repeat([1.0, _TIE_WEIGHT], [len(steps), len(pairs)])
+    climbs = np.clip(np.diff(positions[:, 2]), -_STEEPEST, _STEEPEST)
+    wanted = np.concatenate([climbs, np.zeros(len(pairs))])
+    rows = np.repeat(np.arange(len(ends)), 2)
+    difference = sp.csr_array((np.tile([-1.0, 1.0], len(ends)), (rows, ends.ravel())), (len(ends), count))
+    # The first height stays, so that the system has one solution.
+    inner = difference[:, 1:]
+    normal = (inner.T @ sp.diags_array(weights) @ inner).tocsc()
+    change = spsolve(normal, inner.T @ (weights * (wanted - difference @ positions[:, 2])))
+    heights = positions[:, 2] + np.concatenate([[0.0], np.atleast_1d(change)])
+    return np.column_stack([positions[:, :2], heights])
+
+
+def _passes(places: FloatArray, way: FloatArray) -> np.ndarray:
+    """(m, 2) rows of each place and of the nearest one of another pass."""
+    distances, rows = KDTree(places).query(places, min(_NUM_NEAR, len(places)), distance_upper_bound=_NEAR_M)
+    is_found, rows = np.isfinite(distances), np.asarray(rows)
+    is_other = is_found & (np.abs(way[np.where(is_found, rows, 0)] - way[:, None]) > _LEAST_WAY_M)
+    has_other = is_other.any(axis=1)
+    first = is_other.argmax(axis=1)
+    return np.column_stack([np.flatnonzero(has_other), rows[has_other, first[has_other]]])
