@@ -11,10 +11,10 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import NDArray
 
-from dpmjax.deepmapping import Pinhole, as_depth_scans
 from dpmjax.geometry import image_normals
 from dpmjax.io import DepthSequence
 from dpmjax.metrics import absolute_trajectory_error
+from dpmjax.registration_rgbd import Pinhole, as_depth_scans
 
 if TYPE_CHECKING:
     from dpmjax.deepmapping import DeepMappingConfig
@@ -62,16 +62,17 @@ def run_method(
     import jax
 
     from dpmjax import deepmapping as dm
+    from dpmjax.registration_rgbd import depth_search, initialize_depth
     from experiments.baselines.multiway import multiway_images
 
-    scans, key = dm.as_depth_scans(sequence.points, sequence.mask), jax.random.key(seed)
+    scans, key = as_depth_scans(sequence.points, sequence.mask), jax.random.key(seed)
     if name == "zero":
         return np.tile(np.eye(4), (len(sequence), 1, 1))
     if name == "placed":
-        return dm.initialize_depth(scans, dm.depth_search(settings.motion), key=key)
+        return initialize_depth(scans, depth_search(settings.motion), key=key)
     if name == "placed-no-prior":
-        search = replace(dm.depth_search(settings.motion), translation_weight=0.0)
-        return dm.initialize_depth(scans, search, key=key)
+        search = replace(depth_search(settings.motion), translation_weight=0.0)
+        return initialize_depth(scans, search, key=key)
     if name == "multiway":
         return multiway_images(sequence.points, sequence.mask)
     if name == "icp":
@@ -81,9 +82,9 @@ def run_method(
         start = found.get(first)
         if start is None and first == "icp":
             start = chain_icp(sequence, seed=seed)
-        return dm.register_depth(scans, settings, key=key, start=start).T_world_camera
+        return dm.register_depth(scans, settings, key=key, start=start).T_world_scan
     used = dm.as_direct(settings) if name == "direct" else settings
-    return dm.fit_depth(scans, used, key=key).T_world_camera
+    return dm.fit_deepmapping(scans, used, key=key).T_world_scan
 
 
 def chain_icp(sequence: DepthSequence, *, seed: int) -> NDArray[np.float64]:

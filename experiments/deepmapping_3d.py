@@ -43,7 +43,7 @@ from dpmjax.cli import (
 from experiments._cloud_input import DriveWindow, FirstPoses, read_drive, starting_poses
 
 if TYPE_CHECKING:
-    from dpmjax.deepmapping import CloudFitted, CloudScans, DeepMappingConfig
+    from dpmjax.deepmapping import CloudScans, DeepMappingConfig, Registered
     from dpmjax.io import LidarSequence
 
 Floats = NDArray[np.float64]
@@ -129,7 +129,7 @@ def main(config: Config) -> dict[str, Any]:
             **errors(sequence, start, fitted),
             "misfit": fitted.misfit,
             "start_misfit": fitted.start_misfit,
-            "unit_m": fitted.unit,
+            "unit_m": fitted.fitted.unit,
             "fit_s": recorder.run_s,
             "compile_s": recorder.compile_s,
             "peak_rss_gb": peak_rss_gb(),
@@ -158,7 +158,7 @@ def fit_settings(config: Config) -> DeepMappingConfig:
     """Returns the preset, with the given number of steps."""
     from dpmjax import deepmapping
 
-    settings = deepmapping.cloud_preset(config.preset)
+    settings = deepmapping.preset(config.preset, "clouds")
     return settings if config.steps is None else deepmapping.with_steps(settings, config.steps)
 
 
@@ -180,7 +180,7 @@ def ate_of(sequence: LidarSequence) -> Callable[[Floats], float]:
     return lambda positions: absolute_trajectory_error(positions, reference[:, :3, 3])
 
 
-def errors(sequence: LidarSequence, start: Floats | None, fitted: CloudFitted) -> dict[str, float]:
+def errors(sequence: LidarSequence, start: Floats | None, fitted: Registered) -> dict[str, float]:
     """Errors of the start and of the kept poses; empty without a reference."""
     from dpmjax.metrics import relative_pose_error
 
@@ -198,7 +198,7 @@ def errors(sequence: LidarSequence, start: Floats | None, fitted: CloudFitted) -
     return numbers
 
 
-def write_results(folder: RunFolder, sequence: LidarSequence, scans: CloudScans, fitted: CloudFitted) -> None:
+def write_results(folder: RunFolder, sequence: LidarSequence, scans: CloudScans, fitted: Registered) -> None:
     """Writes the trajectories and map.ply."""
     from dpmjax import io
 
@@ -216,7 +216,7 @@ def world_points(scans: CloudScans, T: Floats) -> Floats:
 
 
 def draw_map(
-    folder: RunFolder, sequence: LidarSequence, scans: CloudScans, start: Floats | None, fitted: CloudFitted
+    folder: RunFolder, sequence: LidarSequence, scans: CloudScans, start: Floats | None, fitted: Registered
 ) -> None:
     """Draws map.png: walls from above, at the start, after the fit, at the reference."""
     from dpmjax import viz

@@ -96,7 +96,7 @@ def main(config: Config) -> dict[str, Any]:
 
 def settings_of(ablation: str, variant: str, config: Config) -> DeepMappingConfig:
     """The basis with one thing changed."""
-    from dpmjax.deepmapping import JOINT_DEPTH, depth_preset
+    from dpmjax.deepmapping import JOINT_DEPTH, preset
     from dpmjax.nets import OccupancyConfig
 
     phase = replace(
@@ -108,7 +108,7 @@ def settings_of(ablation: str, variant: str, config: Config) -> DeepMappingConfi
         num_free=4,
         is_sampled_as_published=False,
     )
-    fast, number = depth_preset("fast"), int(variant) if variant.isdigit() else 0
+    fast, number = preset("fast", "depth"), int(variant) if variant.isdigit() else 0
     localization = replace(fast.localization, kind="point") if variant == "PointNet" else fast.localization
     maps = {
         "ResMLP": OccupancyConfig(kind="resmlp", features=(64, 64, 64, 128, 128)),
@@ -134,15 +134,15 @@ def run_one(ablation: str, variant: str, trajectory: int, *, config: Config) -> 
     """Errors of one fit; the first of a variant compiles, and its `run_s` contains that."""
     import jax
 
-    from dpmjax import deepmapping as dm
-    from dpmjax import simulation
+    from dpmjax import fit_deepmapping, simulation
+    from dpmjax.registration_rgbd import as_depth_scans
 
     seed = 1000 * config.seed + trajectory
     sequence = simulation.simulate_depth_sequence(seed % 15, config.views, seed=seed)
     begun = time.perf_counter()
-    scans = dm.as_depth_scans(sequence.points, sequence.mask)
-    fitted = dm.fit_depth(scans, settings_of(ablation, variant, config), key=jax.random.key(config.seed))
-    return {**errors_of(fitted.T_world_camera, sequence), "run_s": time.perf_counter() - begun}
+    scans = as_depth_scans(sequence.points, sequence.mask)
+    fitted = fit_deepmapping(scans, settings_of(ablation, variant, config), key=jax.random.key(config.seed))
+    return {**errors_of(fitted.T_world_scan, sequence), "run_s": time.perf_counter() - begun}
 
 
 def summarise(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:

@@ -57,7 +57,7 @@ def main(config: Config) -> dict[str, Any]:
     import jax
 
     from dpmjax import ScanSet
-    from dpmjax.deepmapping import LocalizationTrainingConfig, relocalize, train_localization
+    from dpmjax.deepmapping import relocalize, train_localization
     from dpmjax.simulation import make_world, scan_world
 
     run = read_map2d_run(config.run)
@@ -68,9 +68,8 @@ def main(config: Config) -> dict[str, Any]:
     truth = free_poses(grid, config)
     points, mask = scan_world(grid, truth, num_beams=sequence.points.shape[1])
     begun = time.perf_counter()
-    training = LocalizationTrainingConfig(num_steps=config.steps)
     scans = ScanSet(sequence.points, sequence.mask)
-    trained = train_localization(fitted, scans, training, key=jax.random.key(config.seed))
+    trained = train_localization(fitted, scans, num_steps=config.steps, key=jax.random.key(config.seed))
     jax.block_until_ready(trained.params)
     training_s, begun = time.perf_counter() - begun, time.perf_counter()
     found = relocalize(trained, ScanSet(points, mask))
@@ -143,10 +142,10 @@ def free_poses(grid: NDArray[np.bool_], config: Config) -> NDArray[np.float64]:
 
 def is_mapped(truth: NDArray[np.float64], fitted: Fitted, sequence: ScanSequence) -> NDArray[np.bool_]:
     """Returns True for places of true poses that some beam of the fit's scans has passed."""
-    from dpmjax.deepmapping import draw_map
+    from dpmjax.deepmapping import map_picture
     from dpmjax.metrics import align_rigid
 
-    picture = draw_map(fitted, sequence.points, sequence.mask)
+    picture = map_picture(fitted, sequence.points, sequence.mask)
     T_fit_world = align_rigid(sequence.reference_poses[:, :2], fitted.poses[:, :2])
     places = truth[:, :2] @ T_fit_world[:2, :2].T + T_fit_world[:2, 2]
     x_min, x_max, y_min, y_max = picture.extent

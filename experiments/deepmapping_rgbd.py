@@ -179,10 +179,10 @@ def _hard_walk(config: Config, index: int, walk: DepthWalkConfig) -> DepthSequen
 
 def fit_settings(config: Config, sequence: DepthSequence) -> DeepMappingConfig:
     """The preset, with the motion of the data."""
-    from dpmjax.deepmapping import depth_preset
+    from dpmjax.deepmapping import preset
 
     is_planar = sequence.is_planar if config.motion == "auto" else config.motion == "planar"
-    return depth_preset(config.preset, motion="planar" if is_planar else "full")
+    return preset(config.preset, "depth", motion="planar" if is_planar else "full")
 
 
 def run_one(trajectory: int, *, folder: RunFolder, config: Config, settings: DeepMappingConfig) -> dict[str, Any]:

@@ -107,7 +107,7 @@ def measure(num_scans: int, seed: int, output: str) -> None:
     import jax
 
     from dpmjax import ScanSet
-    from dpmjax.deepmapping import fit, planar_data, planar_problem, preset, steps_per_call
+    from dpmjax.deepmapping import fit, mapping_data, mapping_problem, preset, steps_per_call
     from dpmjax.simulation import simulate_sequence
 
     sequence = simulate_sequence(0, num_scans, seed=seed, with_odometry=True)
@@ -116,8 +116,8 @@ def measure(num_scans: int, seed: int, output: str) -> None:
     assert sequence.odometry_poses is not None
     phases: dict[str, Any] = {}
     for name, odometry in (("network", None), ("free", sequence.odometry_poses)):
-        data, _ = planar_data(scans, odometry)
-        problem = planar_problem(preset("fast"), data)
+        data, _ = mapping_data(scans, odometry)
+        problem = mapping_problem(preset("fast"), data)
         run_s = [0.0]
         done = fit(
             problem,
