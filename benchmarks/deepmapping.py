@@ -20,7 +20,7 @@ from benchmarks.rows import Row, measure
 from dpmjax import ScanSet, fit_deepmapping
 from dpmjax import deepmapping as dm
 from dpmjax.cli import why_not_importable
-from dpmjax.deepmapping import Progress, ToyConfig, fit, planar_data, planar_problem, toy_problem
+from dpmjax.deepmapping import Progress, ToyConfig, fit, mapping_data, mapping_problem, toy_problem
 from dpmjax.io import ScanSequence, read_sequence
 from dpmjax.metrics import absolute_trajectory_error
 from dpmjax.registration import PlanarScans, incremental_icp, planar_scans, refine
@@ -105,7 +105,7 @@ def _timed(
 def _fit(sequence: ScanSequence, start: NDArray[np.float64] | None, case: str, quick: bool) -> list[Row]:
     """Measures neural losses alone: ATE at the marks and at the end; then the refinement of the result."""
     config = dm.with_steps(dm.preset("fast"), 100) if quick else dm.preset("fast")
-    data, length = planar_data(ScanSet(sequence.points, sequence.mask), start)
+    data, length = mapping_data(ScanSet(sequence.points, sequence.mask), start)
     unit = np.array([length, length, 1.0])
     marks = list(_MARKS_S)
     rows = [Row(case, "ate at start", _ate(sequence, np.zeros((len(sequence), 3)) if start is None else start), "px")]
@@ -115,7 +115,7 @@ def _fit(sequence: ScanSequence, start: NDArray[np.float64] | None, case: str, q
             ate = _ate(sequence, np.asarray(progress.report.poses, np.float64) * unit)
             rows.append(Row(case, f"ate after {marks.pop(0):.0f} s", ate, "px"))
 
-    done = fit(planar_problem(config, data), data, key=jax.random.key(0), on_report=at_mark)
+    done = fit(mapping_problem(config, data), data, key=jax.random.key(0), on_report=at_mark)
     poses = np.asarray(done.poses, np.float64) * unit
     rows += [
         Row(case, "ate at the end", _ate(sequence, poses), "px"),
@@ -129,8 +129,8 @@ def _fit(sequence: ScanSequence, start: NDArray[np.float64] | None, case: str, q
 
 def _paper_step(sequence: ScanSequence) -> list[Row]:
     """Measures one step of the paper's architecture, losses and sampling: a batch of 128 scans, as published."""
-    data, _ = planar_data(ScanSet(sequence.points, sequence.mask))
-    problem, run_s = planar_problem(dm.preset("paper"), data), [0.0]
+    data, _ = mapping_data(ScanSet(sequence.points, sequence.mask))
+    problem, run_s = mapping_problem(dm.preset("paper"), data), [0.0]
     done = fit(
         problem, data, key=jax.random.key(0), stop=lambda: len(run_s) > 2,
         on_report=lambda progress: run_s.append(progress.run_s),

@@ -11,6 +11,7 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 
 from dpmjax import deepmapping as dm
+from dpmjax import registration_rgbd as rgbd
 from dpmjax.geometry import image_normals
 from dpmjax.io import DepthSequence
 from dpmjax.metrics import absolute_trajectory_error, point_distance
@@ -50,13 +51,13 @@ def run_method(
 
     from experiments.baselines.multiway import multiway_images
 
-    scans, key = dm.as_depth_scans(sequence.points, sequence.mask), jax.random.key(seed)
+    scans, key = rgbd.as_depth_scans(sequence.points, sequence.mask), jax.random.key(seed)
     if name == "zero":
         return np.tile(np.eye(4), (len(sequence), 1, 1))
     if name.startswith("placed"):
-        search = dm.depth_search(settings.motion)
+        search = rgbd.depth_search(settings.motion)
         search = replace(search, translation_weight=0.0) if name == "placed-no-prior" else search
-        return dm.initialize_depth(scans, search, key=key)
+        return rgbd.initialize_depth(scans, search, key=key)
     if name == "multiway":
         return multiway_images(sequence.points, sequence.mask)
     if name == "icp":
@@ -65,9 +66,9 @@ def run_method(
         start = found.get("placed" if name == "deepmapping" else "icp")
         if start is None and name == "deepmapping-icp":
             start = chain_icp(sequence, seed=seed)
-        return dm.register_depth(scans, settings, key=key, start=start).T_world_camera
+        return dm.register_depth(scans, settings, key=key, start=start).T_world_scan
     used = dm.as_direct(settings) if name == "direct" else settings
-    return dm.fit_depth(scans, used, key=key).T_world_camera
+    return dm.fit_deepmapping(scans, used, key=key).T_world_scan
 
 
 def chain_icp(sequence: DepthSequence, *, seed: int) -> NDArray[np.float64]:
@@ -131,7 +132,7 @@ def surface_spread(sequence: DepthSequence, depth_noise_m: float) -> float:
     assert T is not None
     count = len(sequence)
     information = _information_of_moves(count)
-    pinhole = dm.as_depth_scans(sequence.points, sequence.mask).pinhole
+    pinhole = rgbd.as_depth_scans(sequence.points, sequence.mask).pinhole
     surfaces = image_normals(sequence.points, sequence.mask)
     for one in range(count):
         for other in range(count):
@@ -161,7 +162,7 @@ def _information_of_moves(count: int) -> Float[np.ndarray, "m m"]:
 def _add_pair(
     information: NDArray[np.float64],
     sequence: DepthSequence,
-    pinhole: dm.Pinhole,
+    pinhole: rgbd.Pinhole,
     surfaces: tuple[NDArray[np.float64], NDArray[np.bool_]],
     pair: tuple[int, int],
     depth_noise_m: float,

@@ -24,6 +24,7 @@ from tyro.conf import arg
 
 from dpmjax import cli, nets, simulation, viz
 from dpmjax import deepmapping as dm
+from dpmjax.registration_rgbd import as_depth_scans
 from experiments._rgbd_methods import errors_of
 
 EXPERIMENT = "deepmapping_ablations"
@@ -85,7 +86,7 @@ def settings_of(ablation: str, variant: str, num_steps: int) -> dm.DeepMappingCo
         num_free=4,
         is_sampled_as_published=False,
     )
-    fast, number = dm.depth_preset("fast"), int(variant) if variant.isdigit() else 0
+    fast, number = dm.preset("fast", "depth"), int(variant) if variant.isdigit() else 0
     localization = replace(fast.localization, kind="point") if variant == "PointNet" else fast.localization
     maps = {
         "ResMLP": nets.OccupancyConfig(kind="resmlp", features=(64, 64, 64, 128, 128)),
@@ -111,9 +112,9 @@ def run_one(settings: dm.DeepMappingConfig, trajectory: int, run_seed: int) -> c
     seed = 1000 * run_seed + trajectory
     sequence = simulation.simulate_depth_sequence(seed % 15, _NUM_VIEWS, seed=seed)
     begun = time.perf_counter()
-    scans = dm.as_depth_scans(sequence.points, sequence.mask)
-    fitted = dm.fit_depth(scans, settings, key=jax.random.key(run_seed))
-    return {**errors_of(fitted.T_world_camera, sequence), "run_s": time.perf_counter() - begun}
+    scans = as_depth_scans(sequence.points, sequence.mask)
+    fitted = dm.fit_deepmapping(scans, settings, key=jax.random.key(run_seed))
+    return {**errors_of(fitted.T_world_scan, sequence), "run_s": time.perf_counter() - begun}
 
 
 def report(rows: list[cli.Row]) -> cli.Summary:

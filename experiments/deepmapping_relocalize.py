@@ -62,9 +62,8 @@ def main(config: Config) -> dict[str, Any]:
     truth = free_poses(grid, config)
     points, mask = simulation.scan_world(grid, truth, num_beams=sequence.points.shape[1])
     begun = time.perf_counter()
-    training = dm.LocalizationTrainingConfig(num_steps=_NUM_STEPS)
     scans = ScanSet(sequence.points, sequence.mask)
-    trained = dm.train_localization(fitted, scans, training, key=jax.random.key(config.seed))
+    trained = dm.train_localization(fitted, scans, num_steps=_NUM_STEPS, key=jax.random.key(config.seed))
     jax.block_until_ready(trained.params)
     training_s, begun = time.perf_counter() - begun, time.perf_counter()
     found = dm.relocalize(trained, ScanSet(points, mask))
@@ -131,7 +130,7 @@ def free_poses(grid: NDArray[np.bool_], config: Config) -> Floats:
 
 def is_mapped(truth: Floats, fitted: dm.Fitted, sequence: ScanSequence) -> NDArray[np.bool_]:
     """Returns True for places of true poses that some beam of the fit's scans has passed."""
-    picture = dm.draw_map(fitted, sequence.points, sequence.mask)
+    picture = dm.map_picture(fitted, sequence.points, sequence.mask)
     T_fit_world = metrics.align_rigid(sequence.reference_poses[:, :2], fitted.poses[:, :2])
     places = truth[:, :2] @ T_fit_world[:2, :2].T + T_fit_world[:2, 2]
     x_min, x_max, y_min, y_max = picture.extent

@@ -75,7 +75,7 @@ def main(config: Config) -> list[cli.Row]:
     """Runs the missing cases, then writes the table and the pictures."""
     if "multiway" in config.methods:
         cli.require_importable("open3d", "--methods multiway")
-    settings = dm.depth_preset(config.preset, motion="planar" if read_trajectory(config, 0).is_planar else "full")
+    settings = dm.preset(config.preset, "depth", motion="planar" if read_trajectory(config, 0).is_planar else "full")
 
     def work(run: cli.TableRun, trajectory: int) -> cli.Row:
         return run_one(trajectory, run.folder, config, settings)

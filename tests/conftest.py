@@ -29,14 +29,16 @@ import jaxtyping
 import pytest
 
 # Before the first import of the package, so that the functions of its rooms are wrapped. The records of `types` and
-# of most of `deepmapping` are not: `vmap` and optimisers make more of them than their annotations say. An integer is
-# a float, as for mypy.
+# of most of `deepmapping` and `registration_rgbd` are not: `vmap` and optimisers make more of them than their
+# annotations say. An integer is a float, as for mypy.
 PACKAGE = Path(__file__).parents[1] / "src" / "dpmjax"
-ROOMS = {path.stem for path in PACKAGE.iterdir()} - {"__init__", "types", "deepmapping"}
-OF_DEPTH = ("depth_initialization", "depth_motion_search", "depth_adjustment")
-CHECKED_OF_DEEPMAPPING = ("objective", "map_raster", *OF_DEPTH)
+ROOMS = {path.stem for path in PACKAGE.iterdir()} - {"__init__", "types", "deepmapping", "registration_rgbd"}
+CHECKED_FILES = (
+    *("deepmapping.objective", "deepmapping.map_raster"),
+    *(f"registration_rgbd.{name}" for name in ("initialization", "motion_search", "adjustment")),
+)
 jaxtyping.install_import_hook(
-    [f"dpmjax.{room}" for room in (*sorted(ROOMS), *(f"deepmapping.{name}" for name in CHECKED_OF_DEEPMAPPING))],
+    [f"dpmjax.{name}" for name in (*sorted(ROOMS), *CHECKED_FILES)],
     "beartype.beartype(conf=beartype.BeartypeConf(is_pep484_tower=True))",
 )
 

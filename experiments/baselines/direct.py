@@ -17,7 +17,7 @@ from jaxtyping import Array, Bool, Float
 from numpy.typing import NDArray
 
 from dpmjax import ScanSet
-from dpmjax.deepmapping import DeepMappingConfig, init, planar_data, planar_problem, toy_loss
+from dpmjax.deepmapping import DeepMappingConfig, init, mapping_data, mapping_problem, toy_loss
 from dpmjax.geometry import se2, typical_range
 from dpmjax.losses import chamfer_distance
 
@@ -38,9 +38,9 @@ def optimize_directly(
     """
     import jaxopt
 
-    data, unit = planar_data(scans, np.zeros((len(scans.points), 3)))
+    data, unit = mapping_data(scans, np.zeros((len(scans.points), 3)))
     phase = replace(config.warm_phases[-1], scans_per_step=len(scans.points))
-    problem = planar_problem(replace(config, warm_phases=(phase,)), data)
+    problem = mapping_problem(replace(config, warm_phases=(phase,)), data)
     start = init(problem, data, key=key).params
 
     def loss(moving: tuple[Array, Any]) -> Float[Array, ""]:

@@ -4,7 +4,7 @@ Flow of the data, and the package of each step:
 
 1. `io` reads scans from disk, `simulation` makes worlds: NumPy arrays on the host.
 2. `scans` and `types` turn each scan into a cloud of fixed capacity with a mask.
-3. `registration` aligns planar scans the classical way, and `pose_graph` solves pose graphs.
+3. `registration` aligns planar scans the classical way, `registration_rgbd` depth images. `pose_graph` solves graphs.
 4. `deepmapping` registers a whole set by training two small networks (`nets`) under two losses (`losses`).
 5. `deeppointmap` turns each 3-D scan into a few hundred descriptors and registers descriptor clouds.
 6. `metrics` compares trajectories with a reference, `viz` draws them.

@@ -11,6 +11,7 @@ from . import metrics as metrics
 from . import nets as nets
 from . import pose_graph as pose_graph
 from . import registration as registration
+from . import registration_rgbd as registration_rgbd
 from . import saved_maps as saved_maps
 from . import scans as scans
 from . import sequences as sequences
@@ -20,9 +21,9 @@ from . import types as types
 from . import viz as viz
 from . import weights as weights
 from .compile_cache import enable_compile_cache as enable_compile_cache
-from .deepmapping.clouds import register_clouds as register_clouds
-from .deepmapping.depth import register_depth as register_depth
-from .deepmapping.planar import fit_deepmapping as fit_deepmapping
+from .deepmapping.mapping import fit_deepmapping as fit_deepmapping
+from .deepmapping.mapping import register_clouds as register_clouds
+from .deepmapping.mapping import register_depth as register_depth
 from .deepmapping.relocalization import relocalize as relocalize
 from .deeppointmap.batches import encode_scans as encode_scans
 from .deeppointmap.batches import overlap_pairs as overlap_pairs

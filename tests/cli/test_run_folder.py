@@ -85,6 +85,11 @@ def test_force_never_touches_a_folder_that_is_no_run(tmp_path):
     assert (tmp_path / "thesis.txt").read_text() == "years"
 
 
+def test_a_run_that_was_killed_before_it_had_a_configuration_may_start_again(tmp_path):
+    (tmp_path / ".config.json.x1").write_text("{")
+    assert open_run(output=tmp_path).path == tmp_path
+
+
 def test_resume_takes_the_latest_run_and_refuses_other_options():
     with pytest.raises(ValueError, match="nothing to resume"):
         open_run(resume=True)

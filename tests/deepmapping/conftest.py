@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from dpmjax.deepmapping.planar import planar_data
+from dpmjax.deepmapping.mapping import mapping_data
 from dpmjax.deepmapping.problem import MappingData
 from dpmjax.io import ScanSequence
 from dpmjax.simulation import simulate_sequence
@@ -22,7 +22,7 @@ def tiny_walk() -> ScanSequence:
 @pytest.fixture(scope="session")
 def tiny_data(tiny_walk: ScanSequence) -> MappingData:
     """In typical ranges, without a start."""
-    return planar_data(ScanSet(tiny_walk.points, tiny_walk.mask))[0]
+    return mapping_data(ScanSet(tiny_walk.points, tiny_walk.mask))[0]
 
 
 @pytest.fixture(scope="session")

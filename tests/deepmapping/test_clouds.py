@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 
 from dpmjax import deepmapping as dm
-from dpmjax.deepmapping.batches import draw_rows
+from dpmjax.deepmapping.batches import scans_of_step
 from dpmjax.deepmapping.cloud_scans import find_partners
-from dpmjax.deepmapping.clouds import cloud_data, cloud_problem
+from dpmjax.deepmapping.clouds import PlaneCloud, clouds_of, misfit_of_pairs, plane_misfit, trajectory_misfit
 from dpmjax.deepmapping.engine import init
-from dpmjax.deepmapping.plane_distance import PlaneCloud, clouds_of, misfit_of_pairs, plane_misfit, trajectory_misfit
+from dpmjax.deepmapping.mapping import mapping_data, mapping_problem
 from dpmjax.geometry import se3
 from dpmjax.metrics import absolute_trajectory_error
 from dpmjax.nets.localization import LocalizationNetConfig
@@ -58,7 +58,7 @@ def start(truth) -> np.ndarray:
 
 def small(num_steps: int = 4) -> dm.DeepMappingConfig:
     """The fast preset in small."""
-    config = dm.cloud_preset("fast")
+    config = dm.preset("fast", "clouds")
     cold = [replace(phase, num_steps=2, beams_per_step=32) for phase in config.cold_phases]
     warm = replace(config.warm_phases[0], num_steps=num_steps, num_offsets=2)
     return replace(
@@ -164,14 +164,14 @@ def test_a_cold_start_goes_through_all_phases(scans) -> None:
     square = np.einsum("nji,njk->nik", fitted.T_world_scan[:, :3, :3], fitted.T_world_scan[:, :3, :3])
     np.testing.assert_allclose(square, np.tile(np.eye(3), (NUM_SCANS, 1, 1)), atol=1e-5)
     assert fitted.start_misfit is None
-    assert np.isfinite(fitted.report.loss)
+    assert np.isfinite(fitted.fitted.report.loss)
 
 
 def test_long_sets_are_fitted_in_blocks_that_see_every_scan(scans) -> None:
-    phase = replace(dm.cloud_preset("fast").warm_phases[0], scans_per_step=64)
+    phase = replace(dm.preset("fast", "clouds").warm_phases[0], scans_per_step=64)
     seen = set()
     for step in range(60):
-        rows, block = map(np.asarray, draw_rows(phase, 100, jnp.int32(step), key=jax.random.fold_in(KEY, step)))
+        rows, block = map(np.asarray, scans_of_step(phase, 100, jnp.int32(step), key=jax.random.fold_in(KEY, step)))
         assert len(rows) == 64
         assert all((np.diff(rows[block == number]) == 1).all() for number in (0, 1))
         seen |= set(rows.tolist())
@@ -184,8 +184,8 @@ def test_a_step_of_blocks_moves_the_scans_that_it_draws(scans) -> None:
     many = replace(many, spacing=scans.spacing)
     phase = replace(small().warm_phases[0], scans_per_step=32, beams_per_step=16)
     config = replace(small(), warm_phases=(phase,))
-    data, _ = cloud_data(many, np.tile(np.eye(4), (40, 1, 1)))
-    problem = cloud_problem(config, data)
+    data, _ = mapping_data(many, np.tile(np.eye(4), (40, 1, 1)))
+    problem = mapping_problem(config, data)
     params = init(problem, data, key=KEY).params
 
     def loss(params: object) -> jnp.ndarray:

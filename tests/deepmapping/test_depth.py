@@ -11,21 +11,20 @@ import pytest
 
 from dpmjax import deepmapping as dm
 from dpmjax import io, simulation
-from dpmjax.deepmapping.depth import depth_problem
 from dpmjax.deepmapping.engine import init
+from dpmjax.deepmapping.mapping import mapping_problem
 from dpmjax.deepmapping.problem import MappingData
-from dpmjax.deepmapping.projective_consistency import (
-    Agreement,
-    PixelSample,
-    explained_share,
-    fit_pinhole,
-    image_agreement,
-    image_surface,
-)
-from dpmjax.deepmapping.spatial import motion_matrices
+from dpmjax.geometry.se3 import motion_matrices
 from dpmjax.metrics import absolute_trajectory_error
 from dpmjax.nets.localization import LocalizationNetConfig
 from dpmjax.nets.occupancy import OccupancyConfig
+from dpmjax.registration_rgbd.depth_images import DepthScans, PixelSample, as_depth_scans, fit_pinhole, image_surface
+from dpmjax.registration_rgbd.projective_consistency import (
+    Agreement,
+    explained_share,
+    image_agreement,
+    projective_consistency,
+)
 from tests.tolerances import ROUNDING
 
 KEY = jax.random.key(0)
@@ -38,13 +37,13 @@ def walk() -> io.DepthSequence:
 
 
 @pytest.fixture(scope="module")
-def scans(walk) -> dm.DepthScans:
-    return dm.as_depth_scans(walk.points, walk.mask)
+def scans(walk) -> DepthScans:
+    return as_depth_scans(walk.points, walk.mask)
 
 
 def small(motion: str) -> dm.DeepMappingConfig:
     """The fast preset in small."""
-    config = dm.depth_preset("fast", motion=motion)
+    config = dm.preset("fast", "depth", motion=motion)
     phases = [replace(phase, num_steps=4, beams_per_step=64) for phase in config.cold_phases]
     return replace(
         config,
@@ -66,9 +65,9 @@ def test_planar_motions_turn_about_the_vertical_axis() -> None:
 
 @pytest.mark.slow
 def test_a_fit_goes_through_all_phases_and_returns_rigid_motions(scans) -> None:
-    fitted = dm.fit_depth(scans, small("planar"), key=KEY)
-    assert_rigid(fitted.T_world_camera)
-    np.testing.assert_array_equal(fitted.T_world_camera[:, 1, 3], 0.0)
+    fitted = dm.fit_deepmapping(scans, small("planar"), key=KEY)
+    assert_rigid(fitted.T_world_scan)
+    np.testing.assert_array_equal(fitted.T_world_scan[:, 1, 3], 0.0)
     assert np.isfinite(fitted.report.loss)
 
 
@@ -77,21 +76,21 @@ def test_a_fit_improves_the_trajectory_of_a_perturbed_start(walk, scans) -> None
     rng = np.random.default_rng(0)
     shake = np.asarray(motion_matrices(jnp.asarray(rng.normal(size=(4, 3)) * [0.06, 0.06, 0.03], jnp.float32)))
     start = walk.T_world_camera @ shake
-    refine = replace(dm.depth_preset("fast").warm_phases[0], num_steps=60)
+    refine = replace(dm.preset("fast", "depth").warm_phases[0], num_steps=60)
     config = replace(small("planar"), warm_phases=(refine,), steps_per_call=30)
-    fitted = dm.fit_depth(scans, config, key=KEY, start=start)
+    fitted = dm.fit_deepmapping(scans, config, key=KEY, start=start)
 
     def ate(T: np.ndarray) -> float:
         return absolute_trajectory_error(T[:, :3, 3], walk.T_world_camera[:, :3, 3])
 
-    assert ate(fitted.T_world_camera) < 0.5 * ate(start)
+    assert ate(fitted.T_world_scan) < 0.5 * ate(start)
 
 
 @pytest.mark.slow
 def test_full_motion_leaves_the_plane(scans) -> None:
-    fitted = dm.fit_depth(scans, small("full"), key=KEY, start=np.tile(np.eye(4), (4, 1, 1)))
-    assert_rigid(fitted.T_world_camera)
-    assert (fitted.T_world_camera[:, 1, 3] != 0.0).all()
+    fitted = dm.fit_deepmapping(scans, small("full"), key=KEY, start=np.tile(np.eye(4), (4, 1, 1)))
+    assert_rigid(fitted.T_world_scan)
+    assert (fitted.T_world_scan[:, 1, 3] != 0.0).all()
 
 
 def assert_rigid(T: np.ndarray) -> None:
@@ -102,9 +101,9 @@ def assert_rigid(T: np.ndarray) -> None:
 
 def test_sets_of_one_shape_share_their_compilation(scans, assert_compiles_nothing) -> None:
     start, other = np.tile(np.eye(4), (4, 1, 1)), replace(scans, points=0.9 * scans.points)
-    dm.fit_depth(scans, small("full"), key=KEY, start=start)
+    dm.fit_deepmapping(scans, small("full"), key=KEY, start=start)
     with assert_compiles_nothing():
-        dm.fit_depth(other, small("full"), key=KEY, start=start)
+        dm.fit_deepmapping(other, small("full"), key=KEY, start=start)
 
 
 def test_masked_pixels_never_matter(walk) -> None:
@@ -113,7 +112,7 @@ def test_masked_pixels_never_matter(walk) -> None:
     results = []
     for filling in (0.0, 1e6, np.nan):
         points = np.where(mask[..., None], walk.points, filling)
-        results.append(dm.as_depth_scans(points, mask))
+        results.append(as_depth_scans(points, mask))
     jax.tree.map(np.testing.assert_array_equal, results[0], results[1])
     jax.tree.map(np.testing.assert_array_equal, results[0], results[2])
 
@@ -121,7 +120,7 @@ def test_masked_pixels_never_matter(walk) -> None:
 def test_direct_form_starts_where_the_network_does(scans) -> None:
     config = small("planar")
     data = MappingData(scans)
-    direct, network = (init(depth_problem(c, data), data, key=KEY).params for c in (dm.as_direct(config), config))
+    direct, network = (init(mapping_problem(c, data), data, key=KEY).params for c in (dm.as_direct(config), config))
     assert float(jnp.abs(direct.poses).max()) > 0.0
     assert float(jnp.abs(network.poses).max()) == 0.0
     assert all(phase.poses == "free" for phase in dm.as_direct(config).cold_phases)
@@ -152,7 +151,7 @@ def test_the_surface_between_pixels_of_a_plane_is_the_plane(scans) -> None:
 
 def test_an_image_matches_itself_and_contradicts_itself_from_elsewhere(walk) -> None:
     points, mask = jnp.asarray(walk.points[0].reshape(-1, 3)), jnp.asarray(walk.mask[0].reshape(-1))
-    surface = dm.as_depth_scans(walk.points, walk.mask).surfaces[0]
+    surface = as_depth_scans(walk.points, walk.mask).surfaces[0]
     pinhole, tolerance = fit_pinhole(walk.points, walk.mask), jnp.float32(0.05)
 
     def consistency(T_other_camera: jax.Array, mask: jax.Array) -> float:
@@ -167,7 +166,7 @@ def test_an_image_matches_itself_and_contradicts_itself_from_elsewhere(walk) -> 
 
 @pytest.mark.parametrize("count", [2, 3, 4])
 def test_every_pair_of_images_counts_once(walk, count: int) -> None:
-    scans = dm.as_depth_scans(walk.points[:count], walk.mask[:count])
+    scans = as_depth_scans(walk.points[:count], walk.mask[:count])
     T = walk.T_world_camera[:count] @ np.asarray(motion_matrices(0.05 * jnp.arange(3.0 * count).reshape(count, 3)))
     T_i_j = np.linalg.inv(T)[:, None] @ T
     sample = [PixelSample(scans.points[i].reshape(-1, 3), scans.mask[i].reshape(-1)) for i in range(count)]
@@ -178,7 +177,7 @@ def test_every_pair_of_images_counts_once(walk, count: int) -> None:
         if i != j
     ]
     pooled = Agreement(*(jnp.stack(values) for values in zip(*pairs, strict=True))).consistency()
-    np.testing.assert_allclose(dm.projective_consistency(scans, T), pooled, rtol=1e-3, atol=1e-4)
+    np.testing.assert_allclose(projective_consistency(scans, T), pooled, rtol=1e-3, atol=1e-4)
 
 
 @pytest.mark.parametrize(
@@ -192,22 +191,22 @@ def test_every_pair_of_images_counts_once(walk, count: int) -> None:
 )
 def test_bad_input_is_named(points, options, message) -> None:
     with pytest.raises(ValueError, match=message):
-        dm.fit_depth(points, small("planar"), key=KEY, **options)
+        dm.fit_deepmapping(as_depth_scans(points), small("planar"), key=KEY, **options)
     with pytest.raises(ValueError, match="preset"):
-        dm.depth_preset("quick")
+        dm.preset("quick", "depth")
 
 
 def test_the_truth_is_more_consistent_than_a_walk_with_one_wrong_turn(walk, scans) -> None:
     turned = walk.T_world_camera.copy()
     turned[2] = turned[2] @ np.asarray(motion_matrices(jnp.array([[0.0, 0.0, 0.3]])))[0]
-    truth, wrong = (float(dm.projective_consistency(scans, T)) for T in (walk.T_world_camera, turned))
+    truth, wrong = (float(projective_consistency(scans, T)) for T in (walk.T_world_camera, turned))
     assert truth > wrong + 0.02
     assert truth <= 1.0
 
 
 def test_a_point_is_explained_once(walk) -> None:
     def share(rows: list[int], T: np.ndarray) -> float:
-        scans = dm.as_depth_scans(walk.points[rows], walk.mask[rows])
+        scans = as_depth_scans(walk.points[rows], walk.mask[rows])
         return float(explained_share(jnp.asarray(T, jnp.float32), scans.pixels, scans, 3.0, jnp.float32(0.02)))
 
     same = np.tile(np.eye(4), (4, 1, 1))
@@ -231,7 +230,7 @@ def test_near_points_have_the_leeway_of_farther_ones() -> None:
     moved[1, 2, 3] = -0.05
 
     def share(depth: float, unit: float) -> float:
-        scans = dm.as_depth_scans(np.stack([depth * rays] * 2))
+        scans = as_depth_scans(np.stack([depth * rays] * 2))
         return float(explained_share(jnp.asarray(moved, jnp.float32), scans.pixels, scans, unit, jnp.float32(0.02)))
 
     assert share(0.3, unit=0.3) < -5.0
@@ -242,7 +241,7 @@ def test_near_points_have_the_leeway_of_farther_ones() -> None:
 def test_consistency_has_finite_slopes_where_nothing_overlaps(scans) -> None:
     def slope(turn: float) -> jax.Array:
         def loss(values: jax.Array) -> jax.Array:
-            return dm.projective_consistency(scans, motion_matrices(values), 0.05)
+            return projective_consistency(scans, motion_matrices(values), 0.05)
 
         motions = jnp.zeros((4, 3)).at[:, 2].set(turn * jnp.arange(4))
         return jax.grad(loss)(motions)

@@ -12,9 +12,10 @@ import pytest
 from dpmjax import deepmapping as dm
 from dpmjax import io, simulation
 from dpmjax.geometry import typical_range
+from dpmjax.registration_rgbd import DepthScans, as_depth_scans, initialize_depth, projective_consistency
 
 KEY = jax.random.key(3)
-CONFIG = replace(dm.depth_preset("fast"), steps_per_call=1)
+CONFIG = replace(dm.preset("fast", "depth"), steps_per_call=1)
 
 
 @pytest.fixture(scope="module")
@@ -23,11 +24,11 @@ def walk() -> io.DepthSequence:
 
 
 @pytest.fixture(scope="module")
-def scans(walk) -> dm.DepthScans:
-    return dm.as_depth_scans(walk.points, walk.mask)
+def scans(walk) -> DepthScans:
+    return as_depth_scans(walk.points, walk.mask)
 
 
-def returning(T: np.ndarray, scans: dm.DepthScans) -> Callable[..., dm.Fit]:
+def returning(T: np.ndarray, scans: DepthScans) -> Callable[..., dm.Fit]:
     """An engine that trains nothing and returns poses."""
     poses = np.array(T)
     poses[:, :3, 3] /= typical_range(scans.points, scans.mask)
@@ -44,9 +45,9 @@ def test_of_start_and_fit_the_more_consistent_one_is_kept(walk, scans) -> None:
     for start, fitted, kept in ((right, apart, "start"), (apart, right, "fit")):
         found = dm.register_depth(scans, CONFIG, key=KEY, start=start, engine=returning(fitted, scans))
         assert found.kept == kept
-        np.testing.assert_allclose(found.T_world_camera, right, atol=1e-6)
-        assert (found.consistency > found.start_consistency) == (kept == "fit")
-        assert found.consistency == pytest.approx(float(dm.projective_consistency(scans, fitted)), abs=1e-4)
+        np.testing.assert_allclose(found.T_world_scan, right, atol=1e-6)
+        assert (found.misfit < found.start_misfit) == (kept == "fit")
+        assert found.misfit == pytest.approx(1.0 - float(projective_consistency(scans, fitted)), abs=1e-4)
 
 
 def test_a_fit_that_is_not_finite_is_not_kept(walk, scans) -> None:
@@ -58,7 +59,7 @@ def test_a_fit_that_is_not_finite_is_not_kept(walk, scans) -> None:
 @pytest.mark.slow
 def test_without_a_start_the_search_is_the_start(walk, scans) -> None:
     found = dm.register_depth(scans, CONFIG, key=KEY, engine=returning(walk.T_world_camera, scans))
-    np.testing.assert_array_equal(found.start, dm.initialize_depth(scans, key=KEY))
+    np.testing.assert_array_equal(found.start, initialize_depth(scans, key=KEY))
 
 
 def test_bad_input_is_named(scans) -> None:

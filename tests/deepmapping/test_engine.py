@@ -22,7 +22,7 @@ from dpmjax.deepmapping import (
     fit,
     init,
     is_finished,
-    planar_problem,
+    mapping_problem,
     resume,
     solve,
     step,
@@ -31,6 +31,7 @@ from dpmjax.deepmapping import (
 from dpmjax.deepmapping.batches import draw_offsets
 from dpmjax.nets.localization import LocalizationNetConfig
 from dpmjax.nets.occupancy import OccupancyConfig
+from dpmjax.types import ScanSet
 from tests.tolerances import ACCUMULATED, DOUBLE
 
 KEY, OTHER_KEY = jax.random.key(3), jax.random.key(4)
@@ -187,9 +188,12 @@ def test_no_start_is_refused() -> None:
         fit(valley(), jnp.zeros(()), key=KEY, num_starts=0)
 
 
+NO_SCANS = ScanSet(jnp.zeros((2, 4, 2)), jnp.zeros((2, 4), bool))
+
+
 @pytest.mark.parametrize(("num_steps", "expected"), [(60, 60), (20, 20), (61, 63), (25, 25)])
 def test_calls_of_a_step_share_the_steps_of_the_phase(num_steps: int, expected: int) -> None:
-    problem = planar_problem(dm.with_steps(dm.preset("fast"), num_steps), MappingData(None, np.zeros(3)))
+    problem = mapping_problem(dm.with_steps(dm.preset("fast"), num_steps), MappingData(NO_SCANS, np.zeros(3)))
     length = steps_per_call(problem, problem.phases[0])
     assert length * -(-num_steps // length) == expected
 
@@ -206,7 +210,7 @@ BRIEF = replace(
     ),
     steps_per_call=2,
 )
-COLD = planar_problem(BRIEF, MappingData(None))
+COLD = mapping_problem(BRIEF, MappingData(NO_SCANS))
 
 
 @pytest.mark.slow
@@ -215,7 +219,7 @@ def test_other_data_of_the_same_shape_compile_nothing_in_any_phase(tiny_data, as
     # Another random key and other scans; the problem is made anew from equal settings.
     other = MappingData(replace(tiny_data.scans, points=0.9 * tiny_data.scans.points))
     with assert_compiles_nothing():
-        second = fit(planar_problem(replace(BRIEF), other), other, key=OTHER_KEY)
+        second = fit(mapping_problem(replace(BRIEF), other), other, key=OTHER_KEY)
     assert int(first.state.phase) == int(second.state.phase) == len(COLD.phases) - 1
     assert not np.array_equal(first.poses, second.poses)
 

@@ -10,9 +10,10 @@ import numpy as np
 import pytest
 
 from dpmjax import deepmapping as dm
-from dpmjax.deepmapping.batches import draw_rows
+from dpmjax.deepmapping.batches import scans_of_step
 from dpmjax.deepmapping.engine import fit, init
-from dpmjax.deepmapping.planar import as_scan_set, planar_problem
+from dpmjax.deepmapping.mapping import mapping_problem
+from dpmjax.deepmapping.planar import as_scan_set
 from dpmjax.deepmapping.problem import MappingData
 from dpmjax.geometry import se2
 from dpmjax.metrics import absolute_trajectory_error
@@ -55,7 +56,7 @@ def test_a_cold_start_finds_the_walk_roughly(tiny_walk) -> None:
 
 
 def test_picture_is_dark_at_walls_and_light_in_free_space(tiny_walk, warm) -> None:
-    picture = dm.draw_map(warm, tiny_walk.points, tiny_walk.mask, num_cells=200)
+    picture = dm.map_picture(warm, tiny_walk.points, tiny_walk.mask, num_cells=200)
     world = se2.transform_points(warm.poses, tiny_walk.points)
     sensors = np.broadcast_to(warm.poses[:, None, :2], world.shape)
     x_min, x_max, y_min, y_max = picture.extent
@@ -94,7 +95,7 @@ def test_steps_of_the_paper_preset_lower_its_loss(tiny_data) -> None:
     scans = tiny_data.scans
     few = MappingData(ScanSet(scans.points[:6, ::2], scans.mask[:6, ::2]))
     losses: list[float] = []
-    problem = planar_problem(small, few)
+    problem = mapping_problem(small, few)
     before = init(problem, few, key=KEY).params
     after = fit(problem, few, key=KEY, on_report=lambda p: losses.append(p.report.loss)).state.params
     assert losses[2] < losses[1] < losses[0]
@@ -106,13 +107,13 @@ def test_steps_of_the_paper_preset_lower_its_loss(tiny_data) -> None:
 
 def test_every_scan_is_in_some_batch_of_the_published_order() -> None:
     phase = replace(dm.preset("paper").cold_phases[0], scans_per_step=4)
-    rows = [np.asarray(draw_rows(phase, 11, jnp.int32(k), key=KEY)[0]) for k in range(3)]
+    rows = [np.asarray(scans_of_step(phase, 11, jnp.int32(k), key=KEY)[0]) for k in range(3)]
     assert set(np.concatenate(rows).tolist()) == set(range(11))
     assert all((np.diff(r) == 1).all() for r in rows)
 
 
 def test_large_sets_are_drawn_in_blocks_of_neighbours() -> None:
-    rows, block = map(np.asarray, draw_rows(dm.preset("fast").warm_phases[0], 1000, jnp.int32(0), key=KEY))
+    rows, block = map(np.asarray, scans_of_step(dm.preset("fast").warm_phases[0], 1000, jnp.int32(0), key=KEY))
     assert len(rows) == 256
     for number in range(8):
         assert (np.diff(rows[block == number]) == 1).all()
@@ -156,7 +157,7 @@ def test_bad_input_is_named(as_user, scans, options, message) -> None:
 
 
 def test_unknown_presets_and_too_few_steps_are_refused() -> None:
-    with pytest.raises(ValueError, match="preset: expected 'fast' or 'paper'"):
+    with pytest.raises(ValueError, match="preset: expected one of fast, paper"):
         dm.preset("quick")
     with pytest.raises(ValueError, match="steps: expected at least one"):
         dm.with_steps(dm.preset("fast"), 1)

@@ -12,10 +12,11 @@ from scipy.ndimage import maximum_filter
 
 import dpmjax
 from dpmjax import deepmapping as dm
+from dpmjax.deepmapping import localization_training
 from dpmjax.deepmapping.engine import init
 from dpmjax.deepmapping.localization_training import shift_scan, turn_scan
 from dpmjax.deepmapping.map_raster import make_raster, render_scans
-from dpmjax.deepmapping.planar import planar_data, planar_problem
+from dpmjax.deepmapping.mapping import mapping_data, mapping_problem
 from dpmjax.deepmapping.problem import MapFrame
 from dpmjax.deepmapping.relocalization import largest_nearby, propose_poses
 from dpmjax.geometry import se2
@@ -40,8 +41,8 @@ def fitted(tiny_walk) -> dm.Fitted:
         localization=LocalizationNetConfig(features=(16, 32), strides=(1, 2), is_circular=True, hidden=(32,)),
         cold_phases=(replace(dm.preset("fast").cold_phases[0], scans_per_window=None),),
     )
-    data, unit = planar_data(ScanSet(tiny_walk.points, tiny_walk.mask))
-    params = init(planar_problem(config, data), data, key=KEY).params
+    data, unit = mapping_data(ScanSet(tiny_walk.points, tiny_walk.mask))
+    params = init(mapping_problem(config, data), data, key=KEY).params
     return dm.Fitted(tiny_walk.reference_poses, with_true_map(params, tiny_walk, unit), None, unit, config, 1)
 
 
@@ -68,8 +69,10 @@ def unmapped(fitted) -> dm.Fitted:
 @pytest.fixture(scope="module")
 def trained(fitted, tiny_walk) -> dm.Fitted:
     scans = ScanSet(tiny_walk.points, tiny_walk.mask)
-    settings = dm.LocalizationTrainingConfig(num_steps=400, scans_per_step=32, num_rendered=400)
-    return dm.train_localization(fitted, scans, settings, key=KEY)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(localization_training, "_SCANS_PER_STEP", 32)
+        patch.setattr(localization_training, "_NUM_RENDERED", 400)
+        return dm.train_localization(fitted, scans, num_steps=400, key=KEY)
 
 
 @pytest.fixture(scope="module")
@@ -205,7 +208,7 @@ def test_bad_input_is_named(fitted, tiny_walk) -> None:
         dpmjax.relocalize(warm, tiny_walk.points)
     with pytest.raises(ValueError, match="the 20 scans of the fit"):
         dm.train_localization(fitted, tiny_walk.points[:5], key=KEY)
-    with pytest.raises(ValueError, match="num_rendered"):
-        dm.LocalizationTrainingConfig(num_rendered=-1)
+    with pytest.raises(ValueError, match="num_steps"):
+        dm.train_localization(fitted, tiny_walk.points, num_steps=0, key=KEY)
     with pytest.raises(ValueError, match="max_nats"):
         dpmjax.relocalize(fitted, tiny_walk.points, max_nats=0.0)

@@ -12,9 +12,9 @@ import pytest
 
 import dpmjax
 from dpmjax import deepmapping as dm
-from dpmjax.deepmapping.batches import draw_rows, join_windows, window_rows
+from dpmjax.deepmapping.batches import join_windows, scans_of_step, window_rows
 from dpmjax.deepmapping.engine import init
-from dpmjax.deepmapping.planar import planar_data, planar_problem
+from dpmjax.deepmapping.mapping import mapping_data, mapping_problem
 from dpmjax.geometry import se2
 from dpmjax.nets.localization import LocalizationNet, LocalizationNetConfig
 from dpmjax.nets.occupancy import OccupancyConfig
@@ -40,7 +40,7 @@ def test_windows_hold_every_motion_between_neighbours(num_scans: int, length: in
     pairs = {pair for row in rows.tolist() for pair in pairwise(row)}
     assert pairs == {(k, k + 1) for k in range(num_scans - 1)}
     phase = replace(dm.preset("fast").cold_phases[0], scans_per_window=length)
-    drawn, block = draw_rows(phase, num_scans, jnp.int32(0), key=KEY)
+    drawn, block = scans_of_step(phase, num_scans, jnp.int32(0), key=KEY)
     np.testing.assert_array_equal(np.asarray(drawn).reshape(rows.shape), rows)
     np.testing.assert_array_equal(np.asarray(block).reshape(rows.shape), np.arange(len(rows))[:, None] + 0 * rows)
 
@@ -71,7 +71,7 @@ def test_windows_with_different_scans_do_not_learn_from_each_other(tiny_data) ->
     phase = replace(SMALL.cold_phases[0], num_steps=2, scans_per_window=8)
     config = replace(SMALL, cold_phases=(phase,))
     other = replace(tiny_data.scans, points=tiny_data.scans.points.at[15:].multiply(0.5))
-    problem = planar_problem(config, tiny_data)
+    problem = mapping_problem(config, tiny_data)
 
     def gradient(scans: ScanSet):
         data = tiny_data._replace(scans=scans)
@@ -89,8 +89,8 @@ def test_windows_with_different_scans_do_not_learn_from_each_other(tiny_data) ->
 def test_poses_of_windows_start_in_the_world_of_the_given_start(tiny_walk, poses) -> None:
     phase = replace(SMALL.cold_phases[0], poses=poses, scans_per_window=8)
     config = replace(SMALL, warm_phases=(phase,), localization=replace(SMALL.localization, output_scale=0.0))
-    data, unit = planar_data(ScanSet(tiny_walk.points, tiny_walk.mask), tiny_walk.reference_poses)
-    problem = planar_problem(config, data)
+    data, unit = mapping_data(ScanSet(tiny_walk.points, tiny_walk.mask), tiny_walk.reference_poses)
+    problem = mapping_problem(config, data)
     found = np.asarray(problem.poses(config, phase, init(problem, data, key=KEY).params, data)) * [unit, unit, 1.0]
     np.testing.assert_allclose(se2.to_matrix(found), se2.to_matrix(tiny_walk.reference_poses), atol=2e-2)
 
@@ -104,8 +104,8 @@ def test_phases_with_networks_of_other_windows_are_refused() -> None:
 
 
 def test_networks_of_windows_do_not_relocalize(tiny_walk) -> None:
-    data, unit = planar_data(ScanSet(tiny_walk.points, tiny_walk.mask))
-    params = init(planar_problem(SMALL, data), data, key=KEY).params
+    data, unit = mapping_data(ScanSet(tiny_walk.points, tiny_walk.mask))
+    params = init(mapping_problem(SMALL, data), data, key=KEY).params
     fitted = dm.Fitted(tiny_walk.reference_poses, params, None, unit, SMALL, 0)
     with pytest.raises(ValueError, match="train_localization"):
         dpmjax.relocalize(fitted, tiny_walk.points)

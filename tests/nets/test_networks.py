@@ -32,7 +32,6 @@ def test_paper_networks_have_the_published_sizes() -> None:
     assert layer_sizes(localization) == sorted([*convolutions, (1024, 512), (512, 256), (256, 3)])
     occupancy = jax.eval_shape(lambda key: init_map_net(config.occupancy, key=key), KEY)
     assert layer_sizes(occupancy) == sorted([(2, 64), (64, 512), (512, 512), (512, 256), (256, 128), (128, 1)])
-    assert config.localization.dilation == 3
     assert not config.localization.is_circular
 
 
@@ -89,14 +88,14 @@ def test_circular_convolution_does_not_see_where_the_turn_begins() -> None:
 
 
 def test_image_convolution_is_that_of_the_textbook() -> None:
-    config = LocalizationNetConfig(features=(4,), strides=(2,), dilation=2, hidden=())
+    config = LocalizationNetConfig(features=(4,), strides=(2,), hidden=())
     net, points, mask = LocalizationNet(config), jax.random.normal(KEY, (6, 8, 3)), jnp.ones((6, 8), bool)
     params = jax.jit(net.init)(KEY, points, mask)["params"]
     weight = np.asarray(params["DilatedConvolution_0"]["Dense_0"]["kernel"], np.float64).reshape(3, 3, 3, 4)
-    padded = np.pad(np.asarray(points, np.float64), ((2, 2), (2, 2), (0, 0)))
+    padded = np.pad(np.asarray(points, np.float64), ((3, 3), (3, 3), (0, 0)))
     features = np.array(
         [
-            sum(padded[r + 2 * i, c + 2 * j] @ weight[i, j] for i in range(3) for j in range(3))
+            sum(padded[r + 3 * i, c + 3 * j] @ weight[i, j] for i in range(3) for j in range(3))
             for r in range(0, 6, 2)
             for c in range(0, 8, 2)
         ]

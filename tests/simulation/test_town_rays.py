@@ -7,7 +7,7 @@ import pytest
 
 from dpmjax.simulation import LidarSensor
 from dpmjax.simulation.town.cast import cast_turn
-from dpmjax.simulation.town.culling import CastConfig, near_world
+from dpmjax.simulation.town.culling import near_world
 from dpmjax.simulation.town.intersect import cross_box, cross_cylinder, cross_ground, cross_spheroid, ground_height
 from dpmjax.simulation.town.primitives import (
     GROUND,
@@ -17,15 +17,14 @@ from dpmjax.simulation.town.primitives import (
     SOLID,
     Bodies,
     Ground,
+    RoadUsers,
     TownPrimitives,
-    Traffic,
     pack_bodies,
 )
 from dpmjax.simulation.town.scan import make_rays
 from tests.tolerances import ACCUMULATED
 
 SENSOR = LidarSensor("test", tuple(np.linspace(20.0, -30.0, 9)), 72, max_range_m=60.0)
-CONFIG = CastConfig(num_boxes=64, num_cylinders=64, num_spheroids=64, boxes_per_sector=64, cylinders_per_sector=64)
 
 
 def directions(rng, count):
@@ -149,7 +148,7 @@ def small_town(land, rng):
     thickness = rng.uniform(0.05, 0.4, len(place))
     poles = np.column_stack([place + np.array([3, -2, 0]), thickness, thickness, sizes[:, 2] + 1, zero])
     tufts = np.column_stack([place + np.array([-2, 3, 1]), sizes[:, [0, 0, 1]] * 0.5, zero])
-    traffic = Traffic(
+    traffic = RoadUsers(
         lane_points=jnp.zeros((2, 64, 3)),
         lane_lengths=jnp.ones(2),
         lanes=jnp.zeros(4, jnp.int32),
@@ -182,12 +181,12 @@ def tilted_pose():
 def turn(land):
     """A small town and what a turn of the sensor meets there."""
     town, *tables = small_town(land, np.random.default_rng(11))
-    rays = make_rays(SENSOR, CONFIG, jnp.float32(0.01), jnp.zeros(6))
+    rays = make_rays(SENSOR, jnp.float32(0.01), jnp.zeros(6))
 
     @jax.jit
     def look(town, pose):
-        near = near_world(town, pose[:3, 3], jnp.float32(0.0), max_range=SENSOR.max_range_m, config=CONFIG)
-        return cast_turn(near, pose, rays, max_range=SENSOR.max_range_m, config=CONFIG)
+        near = near_world(town, pose[:3, 3], jnp.float32(0.0), max_range=SENSOR.max_range_m)
+        return cast_turn(near, pose, rays, max_range=SENSOR.max_range_m)
 
     return look, town, tables, np.asarray(rays.directions, np.float64)
 

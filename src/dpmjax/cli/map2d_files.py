@@ -66,7 +66,7 @@ def draw_map(
 
 def draw_occupancy(folder: RunFolder, registered: ScanSequence, result: RegisteredScans, limits: viz.Limits) -> None:
     """Draws occupancy.png: the occupancy that M-Net predicts, in the frame and within the limits of map.png."""
-    picture = deepmapping.draw_map(result.fitted, registered.points, registered.mask)
+    picture = deepmapping.map_picture(result.fitted, registered.points, registered.mask)
     kept, reference = result.candidates[result.kept].poses, registered.reference_poses
     anchor, trajectory = kept if reference is None else reference, result.fitted.poses[:, :2]
     T_view_fit = trajectory_metrics.align_rigid(trajectory, anchor[:, :2])

@@ -46,7 +46,7 @@ def read_map2d_run(path: Path) -> Map2dRun:
     import jax
 
     from dpmjax.checkpoints import Checkpoints
-    from dpmjax.deepmapping import Fitted, init, planar_data, planar_problem
+    from dpmjax.deepmapping import Fitted, init, mapping_data, mapping_problem
 
     config, trajectory = load_config(find_run(NAME, path), Config), path / "trajectory.npy"
     if not trajectory.is_file():
@@ -59,8 +59,8 @@ def read_map2d_run(path: Path) -> Map2dRun:
     if sequence.unit == "m":
         raise ValueError(f"{path} is a run on {sequence.name}, in metres, whose fit may have a part of the scans")
     settings = fit_settings(config, sequence)
-    data, unit = planar_data(as_scan_set(sequence), None if config.init == "zero" else np.load(trajectory))
-    problem = planar_problem(settings, data)
+    data, unit = mapping_data(as_scan_set(sequence), None if config.init == "zero" else np.load(trajectory))
+    problem = mapping_problem(settings, data)
     like = init(problem, data, key=jax.random.key(0))
     state = Checkpoints((path / CHECKPOINTS).resolve()).restore_latest(like, fallback=None)
     if state is None:

@@ -291,7 +291,8 @@ def _check_replaceable(path: Path, force: bool) -> None:
         raise ValueError(_cannot_write(path, f"{existing} is a file"))
     if not os.access(existing, os.W_OK):
         raise ValueError(_cannot_write(path, "permission denied"))
-    if existing != path or not any(path.iterdir()):
+    # A run that was killed while it wrote its configuration leaves the temporary file of that.
+    if existing != path or all(entry.name.startswith(f".{CONFIG}.") for entry in path.iterdir()):
         return
     if not (path / CONFIG).is_file():
         raise ValueError(f"{path} is not empty and holds no earlier run: name another folder with -o")

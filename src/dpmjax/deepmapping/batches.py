@@ -38,7 +38,7 @@ def scans_in_block(phase: PhaseConfig, num_scans: int) -> int:
     return phase.scans_per_step if phase.is_sampled_as_published else _BLOCK
 
 
-def draw_rows(
+def scans_of_step(
     phase: PhaseConfig, num_scans: int, step: Int[Array, ""], *, key: jax.Array
 ) -> tuple[Int[Array, " m"], Int[Array, " m"]]:
     """Scans of a step: all windows, or all scans where they are few enough, else blocks of neighbours in time.

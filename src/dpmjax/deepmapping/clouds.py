@@ -1,146 +1,158 @@
-"""DeepMapping of 3-D lidar clouds: the problem, and `register_clouds` around the engine (section 3, in SE(3)).
+"""Lidar clouds as a sensor of DeepMapping in SE(3): clouds are compared by planes or by the Chamfer distance.
 
-`spatial` has the poses, `cloud_scans` the scans, `plane_distance` how they are compared.
+The rings of two lidar scans do not meet the same points. The nearest point of another scan lies on a ring, beside the
+surface between rings. The Chamfer distance pulls ring onto ring; a plane through the nearest point does not.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import replace
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
-from jaxtyping import Array, Float, Int
-from numpy.typing import ArrayLike, NDArray
+from jaxtyping import Array, Bool, Float, Int
 
-from dpmjax.deepmapping.batches import draw_offsets, draw_rows, scans_in_block
-from dpmjax.deepmapping.cloud_scans import CloudScans, as_cloud_scans, find_partners
+from dpmjax.deepmapping.batches import draw_offsets, scans_in_block, scans_of_step
+from dpmjax.deepmapping.cloud_scans import CloudScans
 from dpmjax.deepmapping.config import DeepMappingConfig, PhaseConfig, PlaneComparison
-from dpmjax.deepmapping.engine import Fit, Report, fit
 from dpmjax.deepmapping.objective import Terms, WorldBatch, chamfer_term, interpolate_log
-from dpmjax.deepmapping.plane_distance import PlaneCloud, clouds_of, misfit_of_pairs, take_rows, trajectory_misfit
-from dpmjax.deepmapping.presets import cloud_preset
-from dpmjax.deepmapping.problem import MappingData, MappingFunctions, Params, Problem, mapping_loss, mapping_problem
+from dpmjax.deepmapping.problem import MappingData, Params, Sensor, mapping_loss
 from dpmjax.deepmapping.spatial import (
-    fitted_poses,
     init_spatial,
     next_spatial_phase,
     poses_of_scans,
+    scaled_start,
     spatial_poses,
-    start_poses,
+    unscaled_poses,
 )
 from dpmjax.geometry import rigid
-from dpmjax.geometry.sampling import typical_range
+from dpmjax.geometry.neighbours import k_nearest
 
-# Kernel width, in typical ranges, of the misfit by which the start and the fit are compared.
-_MISFIT_KERNEL_WIDTH = 0.004
-
-
-class CloudFitted(NamedTuple):
-    """Result of `register_clouds`.
-
-    Attributes:
-        T_world_scan: (n, 4, 4) float64, unit of the points: of the fit, or the start where that fits better.
-        params: parameters of L-Net and M-Net.
-        report: report of the last call of the step.
-        unit: the length that the parameters count in, unit of the points.
-        kept: source of the poses, the fit or the start.
-        misfit: share of planes that do not meet the planes of other scans, 0 to 1, at the poses of the fit.
-        start_misfit: the same at the start; None after a cold start.
-    """
-
-    T_world_scan: NDArray[np.float64]
-    params: Params
-    report: Report | None
-    unit: float
-    kept: Literal["fit", "start"]
-    misfit: float
-    start_misfit: float | None
+# Reach of the search for a plane, in widths of the kernel and in spacings of the points; the larger of both.
+_REACH_WIDTHS, _REACH_SPACINGS = 5.0, 2.0
+# Planes whose normals have a smaller cosine do not match; the two sides of a wall do not either.
+_MIN_COSINE = 0.3
+# Trajectories are compared by pairs of scans at these distances in time, and by this number of points of each scan.
+_JUDGED_OFFSETS, _JUDGED_POINTS = (1, 2, 4, 8), 512
 
 
-def cloud_data(scans: CloudScans | Sequence[ArrayLike], start: ArrayLike | None = None) -> tuple[MappingData, float]:
-    """Scans and poses with the typical range of the scans as the unit of length, as the problem takes them.
+class PlaneCloud(NamedTuple):
+    """Points of one scan with their planes, or of several with a leading axis; as in CloudScans."""
 
-    Args:
-        scans: (m_i, 3) points in the lidar frames; or CloudScans.
-        start: (n, 4, 4) T_world_scan to start from; None: cold start.
-
-    Returns:
-        The data, and the typical range in the unit of the scans.
-
-    Raises:
-        ValueError: as `as_cloud_scans`, or `start` has a wrong shape or is not finite.
-    """
-    scans = scans if isinstance(scans, CloudScans) else as_cloud_scans(scans)
-    unit = typical_range(scans.points, scans.mask)
-    T_start = None if start is None else start_poses(start, len(scans.points), unit)
-    scaled = replace(scans, points=scans.points / unit, spacing=scans.spacing / unit)
-    if T_start is not None:
-        scaled = replace(scaled, partners=find_partners(np.asarray(T_start), 1.0))
-    return MappingData(scaled, T_start), unit
+    points: Float[Array, "... c 3"]
+    mask: Bool[Array, "... c"]
+    normals: Float[Array, "... c 3"]
+    flatness: Float[Array, "... c"]
 
 
-def cloud_problem(config: DeepMappingConfig, data: MappingData) -> Problem:
-    """DeepMapping of lidar clouds; poses are (n, 4, 4) T_world_scan.
+def clouds_of(scans: CloudScans) -> PlaneCloud:
+    """The points of all scans with their planes."""
+    return PlaneCloud(scans.points, scans.mask, scans.normals, scans.flatness)
+
+
+def take_rows(cloud: PlaneCloud, rows: Int[Array, " m"]) -> PlaneCloud:
+    """Some of the scans."""
+    return PlaneCloud(*(leaf[rows] for leaf in cloud))
+
+
+def plane_misfit(
+    T_target_source: Float[Array, "4 4"],
+    source: PlaneCloud,
+    target: PlaneCloud,
+    width: Float[Array, ""] | float,
+    spacing: Float[Array, ""] | float,
+) -> Float[Array, ""]:
+    """Share of the source's planes that do not meet a plane of the target, softly: 0 all do, 1 none.
+
+    A point at the distance r from the plane through the nearest point of the target has the misfit r^2 / (r^2 +
+    width^2) (Geman and McClure 1985). The misfit is 1 without such a plane. Flat neighbourhoods count more.
 
     Args:
-        config: settings of the fit.
-        data: data of `cloud_data`.
+        T_target_source: maps the source's points into the frame of the target.
+        source: some points of a scan.
+        target: scan with the planes.
+        width: width of the kernel, unit of the points.
+        spacing: typical distance of a point of the target to its neighbours.
 
     Returns:
-        The problem.
-
-    Raises:
-        ValueError: the motion is not "full".
+        The misfit; 1 where the source has no plane. Which plane is nearest has no derivative.
     """
-    if config.motion != "full":
-        raise ValueError(f"motion: expected 'full' of clouds, got {config.motion!r}")
-    return mapping_problem(config, data, MappingFunctions(init_spatial, _loss, spatial_poses, next_spatial_phase))
+    moved = rigid.transform_points(T_target_source, source.points)
+    reach = jnp.maximum(_REACH_WIDTHS * width, _REACH_SPACINGS * spacing)
+    near = k_nearest(jax.lax.stop_gradient(moved), target.points, 1, target.mask)
+    nearest = near.indices[:, 0]
+    is_paired = source.mask & near.mask[:, 0] & (near.squared_distances[:, 0] <= reach**2)
+    normals = target.normals[nearest]
+    gap = jnp.where(is_paired, jnp.sum((moved - target.points[nearest]) * normals, axis=-1), 0.0)
+    turned = jnp.einsum("ij,pj->pi", T_target_source[:3, :3], source.normals, precision=jax.lax.Precision.HIGHEST)
+    cosines = jnp.sum(turned * normals, axis=-1)
+    agreement = target.flatness[nearest] * jnp.maximum(cosines - _MIN_COSINE, 0.0) / (1.0 - _MIN_COSINE)
+    agreement = jax.lax.stop_gradient(jnp.where(is_paired, agreement, 0.0))
+    weights = jnp.where(source.mask, source.flatness, 0.0)
+    total = weights.sum()
+    matched = jnp.sum(weights * agreement * width**2 / (width**2 + gap**2))
+    return 1.0 - matched / jnp.where(total > 0.0, total, 1.0)
 
 
-def register_clouds(
-    scans: CloudScans | Sequence[ArrayLike],
-    config: DeepMappingConfig | None = None,
-    *,
-    key: jax.Array,
-    start: ArrayLike | None = None,
-    engine: Callable[..., Fit] = fit,
-) -> CloudFitted:
-    """Registers 3-D lidar scans by optimising L-Net and M-Net on them alone (DeepMapping eq. 6, in SE(3)).
-
-    The fit replaces a given start only if its planes meet better than those of the start; no ground truth is used.
+def misfit_of_pairs(
+    T_world_scan: Float[Array, "m 4 4"],
+    samples: PlaneCloud,
+    scans: PlaneCloud,
+    pairs: Int[Array, "p 2"],
+    is_pair: Bool[Array, " p"],
+    sizes: tuple[Float[Array, ""] | float, Float[Array, ""] | float],
+) -> Float[Array, ""]:
+    """Mean misfit of pairs of scans, in both directions.
 
     Args:
-        scans: (m_i, 3) points in the lidar frames, any unit, in the order of time; or CloudScans.
-        config: settings; None: `cloud_preset("fast")`.
-        key: key of the whole run.
-        start: (n, 4, 4) T_world_scan to start from; None: cold start.
-        engine: what trains, called as `engine(problem, data, key=key)`;
-            `functools.partial(fit, on_report=..., stop=...)` reports each call of the step and can be stopped.
+        T_world_scan: poses.
+        samples: some points of each scan.
+        scans: the scans.
+        pairs: rows of the scans.
+        is_pair: False for pairs that do not count.
+        sizes: width and spacing, as of `plane_misfit`.
 
     Returns:
-        CloudFitted, in the world of `start`, or an arbitrary one after a cold start.
-
-    Raises:
-        ValueError: as `cloud_data`.
+        The mean; 0 without a pair.
     """
-    config = config or cloud_preset("fast")
-    data, unit = cloud_data(scans, start)
-    return _as_fitted(engine(cloud_problem(config, data), data, key=key), data, unit)
+    both = jnp.concatenate([pairs, pairs[:, ::-1]])
+    source, target = both[:, 0], both[:, 1]
+    T = rigid.compose(rigid.inverse(T_world_scan[target]), T_world_scan[source])
+    sources, targets = take_rows(samples, source), take_rows(scans, target)
+    misfits = jax.vmap(plane_misfit, in_axes=(0, 0, 0, None, None))(T, sources, targets, *sizes)
+    counts = jnp.tile(is_pair, 2)
+    return jnp.sum(jnp.where(counts, misfits, 0.0)) / jnp.maximum(counts.sum(), 1)
 
 
-def _as_fitted(done: Fit, data: MappingData, unit: float) -> CloudFitted:
-    """Returns the fit or its start, the one that fits better by the scans, in the unit of the points."""
-    misfit, start_misfit = float(trajectory_misfit(data.scans, done.poses, _MISFIT_KERNEL_WIDTH)), None
-    T, kept = fitted_poses(done.poses, unit), "fit"
-    if data.start is not None:
-        start_misfit = float(trajectory_misfit(data.scans, data.start, _MISFIT_KERNEL_WIDTH))
-        # A fit that is not finite is not better.
-        if not misfit < start_misfit:
-            T, kept = fitted_poses(data.start, unit), "start"
-    return CloudFitted(T, done.state.params, done.report, unit, kept, misfit, start_misfit)  # type: ignore[arg-type]
+@jax.jit
+def trajectory_misfit(
+    scans: CloudScans, T_world_scan: Float[Array, "n 4 4"], width: Float[Array, ""] | float
+) -> Float[Array, ""]:
+    """Mean misfit of each scan with those 1, 2, 4 and 8 later, and with its partners: compares trajectories.
+
+    Args:
+        scans: the scans.
+        T_world_scan: their poses, unit of the points.
+        width: width of the kernel, unit of the points.
+
+    Returns:
+        0 (all planes meet) to 1 (none does); no reference is needed.
+    """
+    count = scans.mask.shape[0]
+    first = jnp.arange(count)
+    later = first + jnp.array([offset for offset in _JUDGED_OFFSETS if offset < count])[:, None]
+    others = jnp.concatenate([jnp.where(later < count, later, -1), scans.partners.T])
+    clouds = clouds_of(scans)
+    samples = jax.tree.map(lambda leaf: leaf[:, :_JUDGED_POINTS], clouds)
+
+    def judge(other: Int[Array, " n"]) -> tuple[Float[Array, ""], Int[Array, ""]]:
+        is_pair = other >= 0
+        pairs = jnp.stack([first, jnp.maximum(other, 0)], axis=-1)
+        mean = misfit_of_pairs(T_world_scan, samples, clouds, pairs, is_pair, (width, scans.spacing))
+        return mean * is_pair.sum(), is_pair.sum()
+
+    totals, counts = jax.lax.map(judge, others)
+    return totals.sum() / jnp.maximum(counts.sum(), 1)
 
 
 def _draw_points(scans: PlaneCloud, count: int, *, key: jax.Array) -> PlaneCloud:
@@ -171,7 +183,7 @@ def _loss(
     row_key, point_key, partner_key, free_key, offset_key = jax.random.split(key, 5)
     scans, progress = data.scans, step / phase.num_steps
     count = scans.mask.shape[0]
-    rows, block = draw_rows(phase, count, step, key=row_key)
+    rows, block = scans_of_step(phase, count, step, key=row_key)
     offsets = draw_offsets(phase, scans_in_block(phase, count) - 1, key=offset_key)
     comparison = phase.comparison
     num_revisits = comparison.num_revisits if isinstance(comparison, PlaneComparison) else 0
@@ -194,3 +206,7 @@ def _loss(
         width = interpolate_log(comparison.width, progress)
         pair_term = misfit_of_pairs(T, samples, clouds, pairs, is_pair, (width, scans.spacing))
     return mapping_loss(config, phase, params, world, pair_term, key=free_key)
+
+
+CLOUDS = Sensor(scaled_start, unscaled_poses, init_spatial, _loss, spatial_poses, next_spatial_phase)
+"""DeepMapping of lidar clouds; poses are (n, 4, 4) T_world_scan."""

@@ -5,11 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from typing import Literal
 
+from dpmjax.geometry.se3 import Motion
 from dpmjax.nets.localization import LocalizationNetConfig
 from dpmjax.nets.occupancy import OccupancyConfig
-
-Motion = Literal["planar", "full"]
-"""Motion of a sensor: x, z and the angle about y, as in the paper; or a twist in SE(3)."""
 
 
 @dataclass(frozen=True)

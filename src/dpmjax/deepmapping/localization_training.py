@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -16,7 +16,8 @@ from numpy.typing import ArrayLike
 from dpmjax.checks import require_count
 from dpmjax.deepmapping.config import DeepMappingConfig
 from dpmjax.deepmapping.map_raster import make_raster, render_scans
-from dpmjax.deepmapping.planar import Fitted, as_scan_set, choose_beams, localize_scans
+from dpmjax.deepmapping.mapping import Fitted
+from dpmjax.deepmapping.planar import as_scan_set, choose_beams, localize_scans
 from dpmjax.geometry import se2
 from dpmjax.types import ScanSet
 
@@ -27,30 +28,11 @@ _MAX_TURN_DEG = 20.0
 # Scans are re-projected to points around their own (`shift_scan`), up to this distance in typical ranges, so that L-Net
 # learns the surroundings of the trajectory.
 _MAX_SHIFT = 0.2
+# Scans of a step, drawn with replacement. Scans that are rendered from the map at random free places: they make up half
+# of each step, so that L-Net learns places that the trajectory has seen but not passed.
+_SCANS_PER_STEP, _NUM_RENDERED = 64, 4096
 # Largest share of the beams that is hidden from L-Net; the share differs from scan to scan.
 _LARGEST_DROP = 0.2
-
-
-@dataclass(frozen=True)
-class LocalizationTrainingConfig:
-    """Settings of the training of L-Net on the poses of a fit.
-
-    Attributes:
-        num_steps: number of steps of Adam.
-        scans_per_step: number of scans of a step, drawn with replacement.
-        num_rendered: number of scans that are rendered from the map at random free places. They make up half of each
-            step: L-Net learns places that the trajectory has seen but not passed.
-    """
-
-    num_steps: int = 5000
-    scans_per_step: int = 64
-    num_rendered: int = 4096
-
-    def __post_init__(self) -> None:
-        require_count("num_steps", self.num_steps)
-        require_count("scans_per_step", self.scans_per_step)
-        if self.num_rendered < 0:
-            raise ValueError(f"num_rendered: expected zero or more, got {self.num_rendered}")
 
 
 def has_windows(fitted: Fitted) -> bool:
@@ -66,9 +48,7 @@ def has_windows(fitted: Fitted) -> bool:
     return biases.ndim > 1
 
 
-def train_localization(
-    fitted: Fitted, scans: ScanSet | ArrayLike, config: LocalizationTrainingConfig | None = None, *, key: jax.Array
-) -> Fitted:
+def train_localization(fitted: Fitted, scans: ScanSet | ArrayLike, *, num_steps: int = 5000, key: jax.Array) -> Fitted:
     """Trains L-Net on the poses that the fit has found, so that `relocalize` answers in the same world.
 
     The labels are the fit's own: no ground truth enters. Scans are turned, shifted and partly hidden, and others are
@@ -77,16 +57,16 @@ def train_localization(
     Args:
         fitted: any fit, also from given poses.
         scans: (n, b, 2) the scans of the fit.
-        config: settings.
+        num_steps: number of steps of Adam.
         key: key of the batches.
 
     Returns:
         The fit with another L-Net and with zero start poses; poses and map are the same.
 
     Raises:
-        ValueError: the number of scans is not that of the fit.
+        ValueError: the number of scans is not that of the fit, or there is no step.
     """
-    config = config or LocalizationTrainingConfig()
+    require_count("num_steps", num_steps)
     scans = as_scan_set(scans)
     if len(scans.points) != len(fitted.poses):
         raise ValueError(f"scans: expected the {len(fitted.poses)} scans of the fit, got {len(scans.points)}")
@@ -94,35 +74,35 @@ def train_localization(
     measured = replace(scans, points=scans.points / fitted.unit)
     render_key, train_key = jax.random.split(key)
     raster = make_raster(fitted.params, fitted.config)
-    rendered = render_scans(raster, measured, config.num_rendered, key=render_key)
+    rendered = render_scans(raster, measured, _NUM_RENDERED, key=render_key)
     begin = fitted.params.localization
     if has_windows(fitted):
         begin = jax.tree.map(lambda weights: weights[0], begin)
     sources = ((measured, poses), rendered) if len(rendered[1]) else ((measured, poses),)
-    share = replace(config, scans_per_step=max(1, config.scans_per_step // len(sources)))
-    net = _train(begin, sources, train_key, fit_config=fitted.config, config=share)
+    net = _train(begin, sources, train_key, config=fitted.config, num_steps=num_steps)
     params = replace(fitted.params, localization=net, start=jnp.zeros_like(fitted.params.start))
     return fitted._replace(params=params)
 
 
-@partial(jax.jit, static_argnames=("fit_config", "config"))
+@partial(jax.jit, static_argnames=("config", "num_steps"))
 def _train(
     params: Any,
     sources: tuple[tuple[ScanSet, Float[Array, "n 3"]], ...],
     key: jax.Array,
     *,
-    fit_config: DeepMappingConfig,
-    config: LocalizationTrainingConfig,
+    config: DeepMappingConfig,
+    num_steps: int,
 ) -> Any:
-    optimizer = optax.adam(optax.cosine_decay_schedule(_LEARNING_RATE, config.num_steps, 0.01))
+    optimizer = optax.adam(optax.cosine_decay_schedule(_LEARNING_RATE, num_steps, 0.01))
+    count = _SCANS_PER_STEP // len(sources)
 
     def loss_of(params: Any, step_key: jax.Array) -> Array:
         parts = [
-            _draw_training_batch(*source, fit_config, config, key=jax.random.fold_in(step_key, index))
+            _draw_training_batch(*source, config, count, key=jax.random.fold_in(step_key, index))
             for index, source in enumerate(sources)
         ]
         batch, labels = jax.tree.map(lambda *x: jnp.concatenate(x), *parts)
-        error = localize_scans(params, batch.points, batch.mask, fit_config) - labels
+        error = localize_scans(params, batch.points, batch.mask, config) - labels
         return jnp.mean(jnp.sum(jnp.abs(error[:, :2]), -1) + jnp.abs(se2.wrap_angle(error[:, 2])))
 
     def one_step(carry: tuple[Any, Any], step: Array) -> tuple[tuple[Any, Any], None]:
@@ -131,22 +111,22 @@ def _train(
         updates, state = optimizer.update(gradient, state, params)
         return (optax.apply_updates(params, updates), state), None
 
-    return jax.lax.scan(one_step, (params, optimizer.init(params)), jnp.arange(config.num_steps))[0][0]
+    return jax.lax.scan(one_step, (params, optimizer.init(params)), jnp.arange(num_steps))[0][0]
 
 
 def _draw_training_batch(
     scans: ScanSet,
     poses: Float[Array, "n 3"],
-    fit_config: DeepMappingConfig,
-    config: LocalizationTrainingConfig,
+    config: DeepMappingConfig,
+    count: int,
     *,
     key: jax.Array,
 ) -> tuple[ScanSet, Float[Array, "m 3"]]:
     """Scans turned, shifted and partly hidden, and their poses."""
     row_key, first_key, turn_key, share_key, drop_key, shift_key = jax.random.split(key, 6)
     num_scans, num_beams = scans.mask.shape
-    rows = jax.random.randint(row_key, (config.scans_per_step,), 0, num_scans)
-    beams = choose_beams(num_beams, fit_config.cold_phases[0], jax.random.randint(first_key, (), 0, num_beams))
+    rows = jax.random.randint(row_key, (count,), 0, num_scans)
+    beams = choose_beams(num_beams, config.cold_phases[0], jax.random.randint(first_key, (), 0, num_beams))
     points, mask = scans.points[rows][:, beams], scans.mask[rows][:, beams]
     limit = np.deg2rad(_MAX_TURN_DEG)
     turn = jax.random.uniform(turn_key, rows.shape, minval=-limit, maxval=limit) - poses[rows, 2]

@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool, Float, Int
 from numpy.typing import NDArray
 
 from dpmjax.deepmapping.config import DeepMappingConfig
-from dpmjax.deepmapping.planar import Fitted
+from dpmjax.deepmapping.mapping import Fitted
 from dpmjax.deepmapping.problem import MapFrame, Params, bind_map
 from dpmjax.geometry import se2
 from dpmjax.types import ScanSet
@@ -146,7 +146,7 @@ class MapPicture(NamedTuple):
     extent: tuple[float, float, float, float]
 
 
-def draw_map(
+def map_picture(
     fitted: Fitted, points: NDArray[np.floating], mask: NDArray[np.bool_], *, num_cells: int = 500
 ) -> MapPicture:
     """Evaluates M-Net wherever a beam has been.

@@ -1,11 +1,10 @@
-"""DeepMapping of planar scans: the problem, and `fit_deepmapping` around the engine."""
+"""Planar scans as a sensor of DeepMapping: poses x, y, heading, by one L-Net or by one for each window of the walk."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -14,51 +13,21 @@ from jaxtyping import Array, Bool, Float, Int
 from numpy.typing import ArrayLike, NDArray
 
 from dpmjax.checks import as_beams
-from dpmjax.deepmapping.batches import draw_offsets, draw_rows, in_windows, join_windows, scans_in_block, window_rows
-from dpmjax.deepmapping.config import DeepMappingConfig, PhaseConfig
-from dpmjax.deepmapping.engine import Fit, Report, fit
-from dpmjax.deepmapping.objective import Terms, WorldBatch, chamfer_term
-from dpmjax.deepmapping.problem import (
-    MapFrame,
-    MappingData,
-    MappingFunctions,
-    Params,
-    Problem,
-    choose_frame,
-    mapping_loss,
-    mapping_problem,
-    phases_of,
+from dpmjax.deepmapping.batches import (
+    draw_offsets,
+    in_windows,
+    join_windows,
+    scans_in_block,
+    scans_of_step,
+    window_rows,
 )
+from dpmjax.deepmapping.config import DeepMappingConfig, PhaseConfig
+from dpmjax.deepmapping.objective import Terms, WorldBatch, chamfer_term
+from dpmjax.deepmapping.problem import MapFrame, MappingData, Params, Sensor, choose_frame, mapping_loss, phases_of
 from dpmjax.geometry import se2
-from dpmjax.geometry.sampling import typical_range
 from dpmjax.nets.localization import LocalizationNet
 from dpmjax.nets.occupancy import init_map_net
 from dpmjax.types import ScanSet
-
-
-class Fitted(NamedTuple):
-    """Result of `fit_deepmapping`.
-
-    Attributes:
-        poses: (n, 3) x, y, heading, float64.
-        params: parameters of L-Net and M-Net.
-        report: report of the last call of the step.
-        unit: the length that the parameters count in, unit of the points.
-        config: settings of the fit.
-        num_steps: steps done in all, those of a resumed run too; with 0, the networks are untrained.
-    """
-
-    poses: NDArray[np.float64]
-    params: Params
-    report: Report | None
-    unit: float
-    config: DeepMappingConfig
-    num_steps: int
-
-    @property
-    def T_world_scan(self) -> NDArray[np.float64]:
-        """(n, 3, 3) the poses as matrices."""
-        return se2.to_matrix(self.poses)
 
 
 def as_scan_set(scans: ScanSet | ArrayLike, *, min_scans: int = 2) -> ScanSet:
@@ -82,77 +51,6 @@ def as_scan_set(scans: ScanSet | ArrayLike, *, min_scans: int = 2) -> ScanSet:
     if len(empty):
         raise ValueError(f"scans: scan {empty[0]} has no valid beam; leave it out ({len(empty)} such scans)")
     return beams
-
-
-def planar_data(scans: ScanSet | ArrayLike, start: ArrayLike | None = None) -> tuple[MappingData, float]:
-    """Checked scans and poses with the typical range of the scans as the unit of length, as the problem takes them.
-
-    Args:
-        scans: as `as_scan_set`.
-        start: (n, 3) x, y, heading or (n, 3, 3) matrices to start from; None: cold start.
-
-    Returns:
-        The data, and the typical range in the unit of the scans.
-
-    Raises:
-        ValueError: the scans or the poses have a wrong shape or are not finite, or a scan has no valid beam.
-    """
-    checked = as_scan_set(scans)
-    unit, count = typical_range(checked.points, checked.mask), len(checked.points)
-    scaled = replace(checked, points=checked.points / unit)
-    if start is None:
-        return MappingData(scaled), unit
-    poses = se2.as_poses("start", start, count)
-    return MappingData(scaled, jnp.asarray(poses / [unit, unit, 1.0], jnp.float32)), unit
-
-
-def planar_problem(config: DeepMappingConfig, data: MappingData) -> Problem:
-    """DeepMapping of planar scans; poses are (n, 3) x, y, heading.
-
-    Args:
-        config: settings of the fit.
-        data: data of `planar_data`.
-
-    Returns:
-        The problem.
-    """
-    return mapping_problem(config, data, MappingFunctions(_init, _loss, _poses, _next_phase))
-
-
-def fit_deepmapping(
-    scans: ScanSet | ArrayLike,
-    config: DeepMappingConfig | None = None,
-    *,
-    key: jax.Array,
-    start: ArrayLike | None = None,
-    engine: Callable[..., Fit] = fit,
-) -> Fitted:
-    """Registers planar scans by optimising L-Net and M-Net on them alone (DeepMapping eq. 6).
-
-    Args:
-        scans: (n, b, 2) in the sensor frames, any unit; all-zero or non-finite beams are left out. Or a ScanSet.
-        config: settings; None: `preset("fast")`.
-        key: key of the whole run.
-        start: (n, 3) x, y, heading or (n, 3, 3) matrices to start from; None: cold start from zero.
-        engine: what trains, called as `engine(problem, data, key=key)`;
-            `functools.partial(fit, on_report=..., stop=...)` reports each call of the step and can be stopped.
-
-    Returns:
-        Fitted, poses in the unit of the points. The world is that of `start`, or arbitrary after a cold start.
-
-    Raises:
-        ValueError: the scans or the poses have a wrong shape or are not finite, a scan has no valid beam, or there is
-            no start.
-    """
-    config = config or DeepMappingConfig()
-    data, unit = planar_data(scans, start)
-    return _as_fitted(engine(planar_problem(config, data), data, key=key), unit, config)
-
-
-def _as_fitted(done: Fit, unit: float, config: DeepMappingConfig) -> Fitted:
-    """Returns the result of a fit in the unit of the points."""
-    poses = np.asarray(done.poses, np.float64) * [unit, unit, 1.0]
-    return Fitted(poses, done.state.params, done.report, unit, config, int(done.state.step))
 
 
 def localize_scans(
@@ -259,7 +157,7 @@ def _loss(
     batch_key, loss_key = jax.random.split(key)
     beam_key, row_key = jax.random.split(batch_key)
     beams = choose_beams(scans.mask.shape[1], phase, jax.random.randint(beam_key, (), 0, scans.mask.shape[1]))
-    rows, block = draw_rows(phase, scans.mask.shape[0], step, key=row_key)
+    rows, block = scans_of_step(phase, scans.mask.shape[0], step, key=row_key)
     some = ScanSet(scans.points[:, beams], scans.mask[:, beams])
     if phase.poses == "network":
         poses = _localize(config, phase, params, some, rows)
@@ -270,3 +168,15 @@ def _loss(
     free_key, offset_key = jax.random.split(loss_key)
     offsets = draw_offsets(phase, scans_in_block(phase, scans.mask.shape[0]) - 1, key=offset_key)
     return mapping_loss(config, phase, params, world, chamfer_term(world, offsets, phase.comparison), key=free_key)
+
+
+def _scaled_start(start: ArrayLike, num_scans: int, unit: float) -> Float[Array, "n 3"]:
+    return jnp.asarray(se2.as_poses("start", start, num_scans) / [unit, unit, 1.0], jnp.float32)
+
+
+def _unscaled(poses: Float[Array, "n 3"], unit: float) -> NDArray[np.float64]:
+    return np.asarray(poses, np.float64) * [unit, unit, 1.0]
+
+
+PLANAR = Sensor(_scaled_start, _unscaled, _init, _loss, _poses, _next_phase)
+"""DeepMapping of planar scans; poses are (n, 3) x, y, heading."""

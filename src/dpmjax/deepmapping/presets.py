@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Literal
 
+from dpmjax.checks import require_one_of
 from dpmjax.deepmapping.config import (
     LOCALIZE,
     REFINE,
@@ -99,95 +100,67 @@ JOINT_CLOUDS = replace(JOINT, num_steps=3000, scans_per_step=64, beams_per_step=
 """The paper's losses and sampling, in 3-D."""
 
 
-def preset(name: Literal["fast", "paper"], *, is_organised: bool = True) -> DeepMappingConfig:
-    """Returns the settings of a preset for planar scans.
-
-    Args:
-        name: "fast" (a minute on two cores) or "paper" (its architecture, losses and sampling).
-        is_organised: the beams are in order; else L-Net is a PointNet.
-
-    Returns:
-        The settings.
-
-    Raises:
-        ValueError: the name is unknown.
-    """
-    _check_preset(name)
-    config = DeepMappingConfig()
-    if name == "paper":
-        config = _as_published(config, JOINT, LocalizationNetConfig())
-    if not is_organised:
-        config = replace(config, localization=replace(config.localization, kind="point"))
-    return config
-
-
-def depth_preset(name: Literal["fast", "paper"], *, motion: Motion = "planar") -> DeepMappingConfig:
-    """Returns the settings of a preset for depth images.
-
-    Args:
-        name: "fast" (seconds to a minute on two cores) or "paper" (its networks and sampling).
-        motion: degrees of freedom of the camera.
-
-    Returns:
-        The settings.
-
-    Raises:
-        ValueError: the name is unknown.
-    """
-    _check_preset(name)
-    config = DeepMappingConfig(
+_FAST: dict[str, DeepMappingConfig] = {
+    "planar": DeepMappingConfig(),
+    "depth": DeepMappingConfig(
         cold_phases=(LOCALIZE_DEPTH, UNROLL_DEPTH, REFINE_DEPTH),
         warm_phases=(REFINE_DEPTH,),
         localization=LocalizationNetConfig(features=(32, 64, 128), strides=(2, 2, 1), hidden=(128, 64)),
         occupancy=_SPATIAL_GRID,
         steps_per_call=50,
         map_margin=1.2,
-        motion=motion,
-    )
-    if name == "paper":
-        return _as_published(
-            config, JOINT_DEPTH, LocalizationNetConfig(features=(64, 128, 256, 1024), strides=(1,) * 4)
-        )
-    if motion == "planar":
-        return config
-    # Real depth images in SE(3) do not agree to half a percent of the depth, and their first poses are rougher.
-    refine = replace(REFINE_DEPTH, comparison=ProjectiveComparison(tolerance=(0.1, 0.02)))
-    return replace(config, cold_phases=(*config.cold_phases[:-1], refine), warm_phases=(refine,))
-
-
-def cloud_preset(name: Literal["fast", "paper"]) -> DeepMappingConfig:
-    """Returns the settings of a preset for lidar clouds.
-
-    Args:
-        name: "fast" (a minute on two cores for some dozens of scans) or "paper" (its networks, losses and sampling).
-
-    Returns:
-        The settings.
-
-    Raises:
-        ValueError: the name is unknown.
-    """
-    _check_preset(name)
-    config = DeepMappingConfig(
+    ),
+    "clouds": DeepMappingConfig(
         cold_phases=(LOCALIZE_CLOUDS, UNROLL_CLOUDS, REFINE_CLOUDS),
         warm_phases=(REFINE_CLOUDS,),
         localization=LocalizationNetConfig(kind="point", features=(32, 64, 128), hidden=(128, 64)),
         occupancy=_SPATIAL_GRID,
         map_margin=1.05,
         motion="full",
-    )
-    return config if name == "fast" else _as_published(config, JOINT_CLOUDS, LocalizationNetConfig(kind="point"))
+    ),
+}
+_PAPER = {
+    "planar": (JOINT, LocalizationNetConfig()),
+    "depth": (JOINT_DEPTH, LocalizationNetConfig(features=(64, 128, 256, 1024), strides=(1,) * 4)),
+    "clouds": (JOINT_CLOUDS, LocalizationNetConfig(kind="point")),
+}
+"""The only phase, and L-Net, of each sensor in the paper."""
 
 
-def _as_published(
-    config: DeepMappingConfig, phase: PhaseConfig, localization: LocalizationNetConfig
+def preset(
+    name: Literal["fast", "paper"],
+    sensor: Literal["planar", "depth", "clouds"] = "planar",
+    *,
+    motion: Motion = "planar",
+    is_organised: bool = True,
 ) -> DeepMappingConfig:
-    """Returns settings with one phase and the paper's networks."""
-    config = replace(config, localization=localization, occupancy=OccupancyConfig(), steps_per_call=1)
-    return replace(config, cold_phases=(phase,), warm_phases=(phase,))
+    """Returns the settings of a preset.
 
+    Args:
+        name: "fast" (seconds to a minute on two cores) or "paper" (its networks, losses and sampling).
+        sensor: "planar" scans, "depth" images or lidar "clouds".
+        motion: degrees of freedom of a depth camera.
+        is_organised: False for planar scans whose beams have no order; L-Net is a PointNet then.
 
-def _check_preset(name: str) -> None:
-    """Raises a ValueError where the name of a preset is unknown."""
-    if name not in ("fast", "paper"):
-        raise ValueError(f"preset: expected 'fast' or 'paper', got {name!r}")
+    Returns:
+        The settings.
+
+    Raises:
+        ValueError: the name or the sensor is unknown.
+    """
+    require_one_of("preset", name, ("fast", "paper"))
+    require_one_of("sensor", sensor, _FAST)
+    config = _FAST[sensor]
+    if sensor == "depth":
+        config = replace(config, motion=motion)
+    if name == "paper":
+        phase, net = _PAPER[sensor]
+        config = replace(config, cold_phases=(phase,), warm_phases=(phase,), steps_per_call=1)
+        config = replace(config, localization=net, occupancy=OccupancyConfig())
+    elif sensor == "depth" and motion == "full":
+        # Real depth images in SE(3) do not agree to half a percent of the depth, and their first poses are rougher.
+        refine = replace(REFINE_DEPTH, comparison=ProjectiveComparison(tolerance=(0.1, 0.02)))
+        config = replace(config, cold_phases=(*config.cold_phases[:-1], refine), warm_phases=(refine,))
+    if not is_organised:
+        config = replace(config, localization=replace(config.localization, kind="point"))
+    return config

@@ -11,8 +11,10 @@ from typing import Any, NamedTuple
 import flax.struct
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optax
 from jaxtyping import Array, Float
+from numpy.typing import NDArray
 
 from dpmjax.deepmapping.config import DeepMappingConfig, PhaseConfig
 from dpmjax.deepmapping.objective import MapLogits, Terms, WorldBatch, free_factors, interpolate_log, occupancy_term
@@ -60,7 +62,7 @@ class MappingData(NamedTuple):
     """Data of DeepMapping, in typical ranges.
 
     Attributes:
-        scans: a ScanSet or DepthScans.
+        scans: ScanSet, DepthScans or CloudScans.
         start: poses to start from, as the problem has them; None: cold start.
     """
 
@@ -68,9 +70,20 @@ class MappingData(NamedTuple):
     start: Float[Array, "n ..."] | None = None
 
 
-class MappingFunctions(NamedTuple):
-    """Functions of a Problem that depend on the sensor."""
+class Sensor(NamedTuple):
+    """The parts of DeepMapping that depend on the sensor: its scans, its poses, and how pairs of scans are compared.
 
+    Attributes:
+        scaled_start: (start, number of scans, unit) -> checked poses in typical ranges.
+        unscaled: (poses, unit) -> float64 poses in the unit of the points.
+        init: as in Problem.
+        loss: as in Problem; it ends with `mapping_loss`.
+        poses: as in Problem.
+        next_phase: as in Problem.
+    """
+
+    scaled_start: Callable[..., Array]
+    unscaled: Callable[..., NDArray[np.float64]]
     init: Callable[..., Params]
     loss: Callable[..., tuple[Float[Array, ""], Terms]]
     poses: Callable[..., Array]
@@ -102,23 +115,6 @@ class Params:
     occupancy: Any
     start: Float[Array, "n ..."]
     frame: MapFrame
-
-
-def mapping_problem(config: DeepMappingConfig, data: MappingData, functions: MappingFunctions) -> Problem:
-    """DeepMapping as a problem of the engine, its phases by whether there is a start.
-
-    Args:
-        config: settings of the fit.
-        data: data with the start.
-        functions: functions of planar scans or of depth images.
-
-    Returns:
-        The problem.
-    """
-    return Problem(
-        config, phases_of(config, data), optimizer=make_optimizer, **functions._asdict(),
-        steps_per_call=config.steps_per_call,
-    )  # fmt: skip
 
 
 def phases_of(config: DeepMappingConfig, data: MappingData) -> tuple[PhaseConfig, ...]:

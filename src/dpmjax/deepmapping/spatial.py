@@ -1,5 +1,4 @@
-"""Common parts of the problems in space, of depth images and lidar clouds: poses T_start @ motion, their start, their
-map frame.
+"""Poses in space, of depth images and lidar clouds: T_start @ motion, their start, their map frame.
 
 The given start does not change; L-Net's output, or the free parameter, is a motion after it.
 """
@@ -7,51 +6,28 @@ The given start does not change; L-Net's output, or the free parameter, is a mot
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any, Protocol
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float, Int
 from numpy.typing import ArrayLike, NDArray
 
+from dpmjax.deepmapping.cloud_scans import CloudScans
 from dpmjax.deepmapping.config import DeepMappingConfig, PhaseConfig
 from dpmjax.deepmapping.problem import MapFrame, MappingData, Params, choose_frame
-from dpmjax.geometry import rigid, se3
+from dpmjax.geometry import rigid
+from dpmjax.geometry.se3 import motion_matrices
 from dpmjax.nets.localization import LocalizationNet
 from dpmjax.nets.occupancy import init_map_net
+from dpmjax.registration_rgbd.depth_images import DepthScans
+
+SpatialScans = DepthScans | CloudScans
+_ALL = slice(None)
 
 
-class SpatialScans(Protocol):
-    """DepthScans or CloudScans: points (n, ..., 3) in the sensor frames, and where there is one."""
-
-    @property
-    def points(self) -> Float[Array, "n *size 3"]:
-        """In typical ranges."""
-
-    @property
-    def mask(self) -> Bool[Array, "n *size"]:
-        """False where nothing was measured."""
-
-
-def motion_matrices(values: Float[Array, "n k"]) -> Float[Array, "n 4 4"]:
-    """Motions as matrices.
-
-    Args:
-        values: k = 3 are x, z and the angle about y (section 4.2), k = 6 is a twist (v, w).
-
-    Returns:
-        (n, 4, 4) rigid motions.
-    """
-    if values.shape[-1] == 6:
-        return se3.exp(values)
-    x, z, cos, sin = values[:, 0], values[:, 1], jnp.cos(values[:, 2]), jnp.sin(values[:, 2])
-    zero, one = jnp.zeros_like(x), jnp.ones_like(x)
-    rows = ((cos, zero, sin, x), (zero, one, zero, zero), (-sin, zero, cos, z), (zero, zero, zero, one))
-    return jnp.stack([jnp.stack(row, axis=-1) for row in rows], axis=-2)
-
-
-def start_poses(poses: ArrayLike, num_scans: int, unit: float) -> Float[Array, "n 4 4"]:
+def scaled_start(poses: ArrayLike, num_scans: int, unit: float) -> Float[Array, "n 4 4"]:
     """Checked poses to start from.
 
     Args:
@@ -72,7 +48,7 @@ def start_poses(poses: ArrayLike, num_scans: int, unit: float) -> Float[Array, "
     return jnp.asarray(T, jnp.float32)
 
 
-def fitted_poses(poses: ArrayLike, unit: float) -> NDArray[np.float64]:
+def unscaled_poses(poses: ArrayLike, unit: float) -> NDArray[np.float64]:
     """Poses in the unit of the points.
 
     Args:
@@ -92,16 +68,20 @@ def _net(config: DeepMappingConfig) -> LocalizationNet:
 
 
 def _motions(
-    config: DeepMappingConfig, phase: PhaseConfig, params: Params, scans: SpatialScans, rows: Int[Array, " m"] | None
+    config: DeepMappingConfig, phase: PhaseConfig, params: Params, scans: SpatialScans, rows: Int[Array, " m"] | slice
 ) -> Float[Array, "m k"]:
     if phase.poses == "free":
-        return params.poses if rows is None else params.poses[rows]
-    points, mask = (scans.points, scans.mask) if rows is None else (scans.points[rows], scans.mask[rows])
-    return jax.vmap(_net(config).apply, in_axes=(None, 0, 0))(params.localization, points, mask)  # type: ignore[return-value]
+        return params.poses[rows]
+    localize = jax.vmap(_net(config).apply, in_axes=(None, 0, 0))
+    return localize(params.localization, scans.points[rows], scans.mask[rows])  # type: ignore[return-value]
 
 
 def poses_of_scans(
-    config: DeepMappingConfig, phase: PhaseConfig, params: Params, scans: SpatialScans, rows: Int[Array, " m"] | None
+    config: DeepMappingConfig,
+    phase: PhaseConfig,
+    params: Params,
+    scans: SpatialScans,
+    rows: Int[Array, " m"] | slice = _ALL,
 ) -> Float[Array, "m 4 4"]:
     """Poses of some scans.
 
@@ -110,21 +90,19 @@ def poses_of_scans(
         phase: phase of the fit; L-Net gives the motions, or they are free.
         params: parameters of the fit.
         scans: all scans.
-        rows: indices of the scans; None: all.
+        rows: indices of the scans.
 
     Returns:
         T_start @ motion of each, in typical ranges.
     """
-    motions = motion_matrices(_motions(config, phase, params, scans, rows))
-    start = params.start if rows is None else params.start[rows]
-    return rigid.compose(start, motions)
+    return rigid.compose(params.start[rows], motion_matrices(_motions(config, phase, params, scans, rows)))
 
 
 def spatial_poses(
     config: DeepMappingConfig, phase: PhaseConfig, params: Params, data: MappingData
 ) -> Float[Array, "n 4 4"]:
     """Poses of all scans, as a Problem has them."""
-    return poses_of_scans(config, phase, params, data.scans, None)
+    return poses_of_scans(config, phase, params, data.scans)
 
 
 def _choose_frame(config: DeepMappingConfig, scans: SpatialScans, T: Float[Array, "n 4 4"]) -> MapFrame:
@@ -151,7 +129,7 @@ def init_spatial(config: DeepMappingConfig, key: jax.Array, data: MappingData) -
     first = config.cold_phases[0]
     if first.poses == "free" and start is None:
         # The paper's direct baseline starts where L-Net's first forward pass puts the sensors.
-        params = replace(params, poses=_motions(config, replace(first, poses="network"), params, scans, None))
+        params = replace(params, poses=_motions(config, replace(first, poses="network"), params, scans, _ALL))
     return params
 
 

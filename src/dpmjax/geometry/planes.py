@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
 
+from dpmjax.geometry import rigid
 from dpmjax.types import AnyArray
 
 
@@ -41,7 +42,7 @@ def fit_planes(xyz: Columns, is_near: Bool[AnyArray, "n k"]) -> PlaneFits:
     Returns:
         Normals and flatness.
     """
-    xp, tiny = _array_module(xyz[0]), np.finfo(xyz[0].dtype).tiny
+    xp, tiny = rigid.namespace_of(xyz[0]), np.finfo(xyz[0].dtype).tiny
     counts = is_near.sum(axis=1)
     centred = []
     for column in xyz:
@@ -60,10 +61,6 @@ def fit_planes(xyz: Columns, is_near: Bool[AnyArray, "n k"]) -> PlaneFits:
     return PlaneFits(_kernels(a, b, c, d, e, f, 2 * xp.cos(angle + 2 * np.pi / 3)), flatness)
 
 
-def _array_module(array: AnyArray) -> Any:
-    return jnp if isinstance(array, jax.Array) else np
-
-
 def _dots(first: Float[AnyArray, "n k"], second: Float[AnyArray, "n k"]) -> Any:
     # JAX would make a contraction of it, at lower precision on some devices.
     return jnp.sum(first * second, axis=1) if isinstance(first, jax.Array) else np.einsum("nk,nk->n", first, second)
@@ -75,7 +72,7 @@ def _kernels(*matrix_and_value: Float[AnyArray, " n"]) -> Any:
     The rows of the matrix less the eigenvalue span a plane; the longest cross product of two of them is taken.
     """
     xx, xy, xz, yy, yz, zz, value = matrix_and_value
-    xp = _array_module(xx)
+    xp = rigid.namespace_of(xx)
     a, d, f = xx - value, yy - value, zz - value
     products = xp.stack(
         [
@@ -135,19 +132,19 @@ def step_to_planes(
     Returns:
         The step; 0 where no pair counts.
     """
-    xp = jnp if isinstance(points, jax.Array) else np
+    xp = rigid.namespace_of(points)
     counted = (weights > 0).astype(points.dtype)
     count = xp.maximum(counted.sum(axis=-1), 1)[..., None]
-    centre = _matmul(counted[..., None, :], points)[..., 0, :] / count
+    centre = rigid.matmul(counted[..., None, :], points)[..., 0, :] / count
     levers = points - centre[..., None, :]
     (lx, ly, lz), (nx, ny, nz) = (xp.moveaxis(vectors, -1, 0) for vectors in (levers, normals))
     jacobian = xp.stack([nx, ny, nz, ly * nz - lz * ny, lz * nx - lx * nz, lx * ny - ly * nx], axis=-2)
     weighted = weights[..., None, :] * jacobian
-    system = _matmul(weighted, xp.swapaxes(jacobian, -1, -2))
+    system = rigid.matmul(weighted, xp.swapaxes(jacobian, -1, -2))
     diagonal = xp.diagonal(system, axis1=-2, axis2=-1)
     floor = max(1e-9, float(np.finfo(points.dtype).eps)) * diagonal.sum(axis=-1, keepdims=True)
     damping = 1e-6 * diagonal + floor + np.finfo(points.dtype).tiny
-    gradient = _matmul(weighted, residuals[..., None])
+    gradient = rigid.matmul(weighted, residuals[..., None])
     tangent = -xp.linalg.solve(system + damping[..., None] * np.eye(6, dtype=points.dtype), gradient)[..., 0]
     return PlaneStep(tangent, centre)
 
@@ -162,7 +159,7 @@ def motion_about(step: PlaneStep) -> Any:
         (..., 4, 4) homogeneous matrices of the kind of the step; the derivative is right at the zero step too.
     """
     tangent, centre = step
-    xp = jnp if isinstance(tangent, jax.Array) else np
+    xp = rigid.namespace_of(tangent)
     x, y, z = xp.moveaxis(tangent[..., 3:], -1, 0)
     squared = (tangent[..., 3:] ** 2).sum(axis=-1)
     is_turned = squared > 0
@@ -171,12 +168,8 @@ def motion_about(step: PlaneStep) -> Any:
     rows = ([zero, -z, y], [z, zero, -x], [-y, x, zero])
     cross = xp.stack([xp.stack(row, axis=-1) for row in rows], axis=-2)
     # Rodrigues; sinc(t) is sin(pi t) / (pi t), and half the square of sinc(t / 2) is (1 - cos) / angle^2.
-    turn = xp.sinc(angle / np.pi) * cross + xp.sinc(angle / (2 * np.pi)) ** 2 / 2 * _matmul(cross, cross)
-    translation = tangent[..., :3] - _matmul(turn, centre[..., None])[..., 0]
+    turn = xp.sinc(angle / np.pi) * cross + xp.sinc(angle / (2 * np.pi)) ** 2 / 2 * rigid.matmul(cross, cross)
+    translation = tangent[..., :3] - rigid.matmul(turn, centre[..., None])[..., 0]
     top = xp.concatenate([turn + np.eye(3, dtype=tangent.dtype), translation[..., None]], axis=-1)
     last = xp.broadcast_to(np.array([0, 0, 0, 1], tangent.dtype), (*tangent.shape[:-1], 1, 4))
     return xp.concatenate([top, last], axis=-2)
-
-
-def _matmul(first: Any, second: Any) -> Any:
-    return jnp.matmul(first, second, precision="highest") if isinstance(first, jax.Array) else first @ second

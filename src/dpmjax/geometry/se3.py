@@ -5,12 +5,17 @@ Tangents are (translation, rotation), in that order. Lengths keep their unit, an
 
 from __future__ import annotations
 
+from typing import Literal
+
 import jax
 import jax.numpy as jnp
 import jaxlie
 from jaxtyping import Array, Float
 
 from dpmjax.types import AnyArray
+
+Motion = Literal["planar", "full"]
+"""Degrees of freedom of a camera: x, z and the angle about y (DeepMapping section 4.2); or a twist in SE(3)."""
 
 
 @jax.jit
@@ -65,3 +70,20 @@ def adjoint(T_a_b: Float[AnyArray, "... 4 4"]) -> Float[Array, "... 6 6"]:
     """
     with jax.default_matmul_precision("highest"):
         return jaxlie.SE3.from_matrix(jnp.asarray(T_a_b)).adjoint()
+
+
+def motion_matrices(values: Float[Array, "n k"]) -> Float[Array, "n 4 4"]:
+    """Makes the motions of a camera.
+
+    Args:
+        values: (n, 3) x, z and the angle about y of a level camera, or (n, 6) twists.
+
+    Returns:
+        (n, 4, 4) rigid motions.
+    """
+    if values.shape[-1] == 6:
+        return exp(values)
+    x, z, cos, sin = values[:, 0], values[:, 1], jnp.cos(values[:, 2]), jnp.sin(values[:, 2])
+    zero, one = jnp.zeros_like(x), jnp.ones_like(x)
+    rows = ((cos, zero, sin, x), (zero, one, zero, zero), (-sin, zero, cos, z), (zero, zero, zero, one))
+    return jnp.stack([jnp.stack(row, axis=-1) for row in rows], axis=-2)

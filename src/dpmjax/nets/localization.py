@@ -19,13 +19,12 @@ HE_LIKE = nn.initializers.variance_scaling(2.0, "fan_avg", "uniform")
 
 @dataclass(frozen=True)
 class LocalizationNetConfig:
-    """Shape of L-Net. The defaults are the paper's (section 4.1) with the dilation of the published program.
+    """Shape of L-Net. The defaults are the paper's (section 4.1).
 
     Attributes:
         kind: "conv" for beams or pixels in order, "point" (PointNet, supplement A) for any set of points.
         features: channels of the layers before the maximum over the beams.
         strides: strides of the same layers; "point" ignores them.
-        dilation: distance of the three taps of a convolution along each axis, in beams or pixels.
         is_circular: the last beam is the neighbour of the first (a full turn); else zeros follow.
         hidden: channels of the layers after the maximum.
         output_scale: factor on the initial weights of the last layer; a small one lets all poses begin near zero.
@@ -34,7 +33,6 @@ class LocalizationNetConfig:
     kind: Literal["conv", "point"] = "conv"
     features: tuple[int, ...] = (64, 128, 1024)
     strides: tuple[int, ...] = (1, 1, 1)
-    dilation: int = 3
     is_circular: bool = False
     hidden: tuple[int, ...] = (512, 256)
     output_scale: float = 1.0
@@ -42,6 +40,10 @@ class LocalizationNetConfig:
     def __post_init__(self) -> None:
         if self.kind == "conv" and len(self.strides) != len(self.features):
             raise ValueError(f"strides: expected one for each of {len(self.features)} layers, got {self.strides}")
+
+
+# Distance of the three taps of a convolution along each axis, in beams or pixels: that of the published program.
+_DILATION = 3
 
 
 class DilatedConvolution(nn.Module):
@@ -52,7 +54,6 @@ class DilatedConvolution(nn.Module):
 
     features: int
     stride: int
-    dilation: int
     is_circular: bool
 
     @nn.compact
@@ -66,10 +67,11 @@ class DilatedConvolution(nn.Module):
             Channels of every `stride`-th beam or pixel.
         """
         *size, _ = x.shape
-        gap = self.dilation
-        padded = jnp.pad(x, [(gap, gap)] * len(size) + [(0, 0)], mode="wrap" if self.is_circular else "constant")
+        padded = jnp.pad(
+            x, [(_DILATION, _DILATION)] * len(size) + [(0, 0)], mode="wrap" if self.is_circular else "constant"
+        )
         taps = [
-            padded[tuple(slice(k * gap, k * gap + n, self.stride) for k, n in zip(tap, size, strict=True))]
+            padded[tuple(slice(k * _DILATION, k * _DILATION + n, self.stride) for k, n in zip(tap, size, strict=True))]
             for tap in itertools.product(range(3), repeat=len(size))
         ]
         return nn.Dense(self.features, kernel_init=HE_LIKE)(jnp.concatenate(taps, axis=-1))
@@ -97,7 +99,7 @@ class LocalizationNet(nn.Module):
         for layer, features in enumerate(config.features):
             if config.kind == "conv":
                 stride = config.strides[layer]
-                x = DilatedConvolution(features, stride, config.dilation, config.is_circular)(x)
+                x = DilatedConvolution(features, stride, config.is_circular)(x)
                 mask = mask[(slice(None, None, stride),) * mask.ndim]
             else:
                 x = nn.Dense(features, kernel_init=HE_LIKE)(x)

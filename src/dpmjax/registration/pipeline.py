@@ -18,7 +18,8 @@ from numpy.typing import ArrayLike
 from dpmjax.checks import require_one_of, require_positive
 from dpmjax.deepmapping.config import DeepMappingConfig
 from dpmjax.deepmapping.engine import Fit, Progress, fit
-from dpmjax.deepmapping.planar import Fitted, as_scan_set, fit_deepmapping
+from dpmjax.deepmapping.mapping import Fitted, fit_deepmapping
+from dpmjax.deepmapping.planar import as_scan_set
 from dpmjax.geometry import se2
 from dpmjax.registration.assessment import Assessment, assess_trajectory
 from dpmjax.registration.global_registration import nearest_tour, register_globally

@@ -8,7 +8,6 @@ from .indoors.building import BuildingConfig as BuildingConfig
 from .indoors.building import make_building as make_building
 from .indoors.walking import WalkConfig as WalkConfig
 from .indoors.walking import walk as walk
-from .raycast2d import cast_rays as cast_rays
 from .raycast2d import cast_scans as cast_scans
 from .raycast2d import scan_world as scan_world
 from .raycast2d import simulate_sequence as simulate_sequence
@@ -19,8 +18,8 @@ from .scenes import draw_scene as draw_scene
 from .scenes import simulate_drive as simulate_drive
 from .scenes import simulate_scene as simulate_scene
 from .scenes import simulate_scenes as simulate_scenes
-from .town.driving import Drive as Drive
 from .town.driving import DriveConfig as DriveConfig
+from .town.driving import TimedPoses as TimedPoses
 from .town.driving import drive as drive
 from .town.driving import route_poses as route_poses
 from .town.driving import simulate_lidar_sequence as simulate_lidar_sequence

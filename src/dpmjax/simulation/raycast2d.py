@@ -8,7 +8,6 @@ below shows it without a flip. Angles are counter-clockwise from x.
 from __future__ import annotations
 
 import zlib
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -16,23 +15,6 @@ from numpy.typing import ArrayLike, NDArray
 from dpmjax.sequences import BoolArray, FloatArray, ScanSequence, World
 from dpmjax.simulation.trajectory2d import simulate_odometry, simulate_people, simulate_trajectory, stop_at_people
 from dpmjax.simulation.world2d import make_world
-
-
-class RayHits(NamedTuple):
-    """Hits of beams.
-
-    Attributes:
-        points: (m, 2) float64 x, y in the world, px; one coordinate lies exactly on a pixel edge.
-        ranges: (m,) float64 distance from the origin of the beam, px.
-        axis: (m,) int64, the axis of the hit edge's normal: 0 for a vertical edge (normal along x), 1 for a horizontal
-            one.
-        is_border: (m,) bool, True where the beam met nothing but the border of the image.
-    """
-
-    points: FloatArray
-    ranges: FloatArray
-    axis: NDArray[np.int64]
-    is_border: BoolArray
 
 
 def beam_angles(num_beams: int) -> FloatArray:
@@ -65,10 +47,10 @@ def cast_scans(is_obstacle: BoolArray, poses: ArrayLike, *, num_beams: int = 256
     """
     at = np.asarray(poses, np.float64).reshape(-1, 3)
     angles = (at[:, 2:] + beam_angles(num_beams)).ravel()
-    return cast_rays(is_obstacle, np.repeat(at[:, :2], num_beams, axis=0), angles).ranges.reshape(-1, num_beams)
+    return cast_rays(is_obstacle, np.repeat(at[:, :2], num_beams, axis=0), angles).reshape(-1, num_beams)
 
 
-def cast_rays(is_obstacle: BoolArray, origins: ArrayLike, angles: ArrayLike) -> RayHits:
+def cast_rays(is_obstacle: BoolArray, origins: ArrayLike, angles: ArrayLike) -> FloatArray:
     """Follows beams through the pixel grid to the first obstacle edge, or to the border of the image.
 
     Grid traversal of Amanatides and Woo (1987); a beam crosses a whole square of free pixels at once. The result is
@@ -81,7 +63,7 @@ def cast_rays(is_obstacle: BoolArray, origins: ArrayLike, angles: ArrayLike) -> 
         angles: (m,) directions in the world, radians.
 
     Returns:
-        The meeting points; no beams give empty arrays.
+        (m,) ranges, px.
 
     Raises:
         ValueError: an origin is not finite, outside of the image or inside an obstacle.
@@ -95,22 +77,13 @@ def cast_rays(is_obstacle: BoolArray, origins: ArrayLike, angles: ArrayLike) -> 
     direction = np.stack([np.cos(theta), np.sin(theta)], axis=1)
 
     cell = np.floor(start).astype(np.int64)
-    length, axis = np.zeros(len(start)), np.zeros(len(start), np.int64)
+    length = np.zeros(len(start))
     active = np.arange(len(start))
     while len(active):
         reach = distance[cell[active, 1] + 1, cell[active, 0] + 1].astype(np.int64)
-        cell[active], length[active], axis[active] = _leap(
-            start[active], direction[active], cell[active], reach, length[active]
-        )
+        cell[active], length[active] = _leap(start[active], direction[active], cell[active], reach, length[active])
         active = active[distance[cell[active, 1] + 1, cell[active, 0] + 1] > 0]
-
-    points = start + length[:, None] * direction
-    rows = np.arange(len(start))
-    # The edge itself is an integer: take it from the cell, not from rounded products.
-    points[rows, axis] = cell[rows, axis] + (direction[rows, axis] < 0)
-    height, width = is_obstacle.shape
-    is_border = np.any((cell < 0) | (cell >= [width, height]), axis=1)
-    return RayHits(points, length, axis, is_border)
+    return length
 
 
 def scan_world(
@@ -219,7 +192,7 @@ def _free_distance(is_obstacle: BoolArray) -> NDArray[np.int32]:
 
 def _leap(
     start: FloatArray, direction: FloatArray, cell: NDArray[np.int64], reach: NDArray[np.int64], reached: FloatArray
-) -> tuple[NDArray[np.int64], FloatArray, NDArray[np.int64]]:
+) -> tuple[NDArray[np.int64], FloatArray]:
     """Moves each beam into the first pixel outside of the free square of half-width `reach` round its pixel.
 
     With reach 1 this is one step of the plain grid traversal.
@@ -232,7 +205,7 @@ def _leap(
         reached: (m,) lengths at which the beams are.
 
     Returns:
-        The new cells (m, 2), the lengths (m,) at which they are entered, and the axes (m,) of the crossed edges.
+        The new cells (m, 2), and the lengths (m,) at which they are entered.
     """
     ahead = np.where(direction > 0, reach[:, None], -reach[:, None])
     edge = cell + ahead + (direction < 0)
@@ -248,4 +221,4 @@ def _leap(
     side = np.floor(start[rows, other] + length * direction[rows, other]).astype(np.int64)
     near, far = cell[rows, other], cell[rows, other] + ahead[rows, other] - np.sign(ahead[rows, other])
     entered[rows, other] = np.clip(side, np.minimum(near, far), np.maximum(near, far))
-    return entered, length, axis
+    return entered, length

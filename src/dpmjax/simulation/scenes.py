@@ -8,6 +8,7 @@ from typing import TypeVar, cast
 
 import numpy as np
 
+from dpmjax.checks import require_one_of, require_positive_fields
 from dpmjax.sequences import LidarSequence
 from dpmjax.simulation.indoors.building import KINDS as INDOOR_KINDS
 from dpmjax.simulation.indoors.building import Building, BuildingConfig, make_building
@@ -15,16 +16,7 @@ from dpmjax.simulation.indoors.walking import WalkConfig, walk
 from dpmjax.simulation.town.driving import DriveConfig, drive, scan_along
 from dpmjax.simulation.town.kinds import KINDS as OUTDOOR_KINDS
 from dpmjax.simulation.town.make import Town, TownConfig, make_town
-from dpmjax.simulation.town.scan import (
-    HDL32E,
-    HDL64E,
-    OS1_64,
-    OS1_128,
-    PANDAR64,
-    SOLID_STATE,
-    VLP16,
-    LidarSensor,
-)
+from dpmjax.simulation.town.scan import HDL32E, HDL64E, OS1_64, OS1_128, PANDAR64, SOLID_STATE, VLP16, LidarSensor
 
 _SCENE_STREAM = 8170
 _Entry = TypeVar("_Entry")
@@ -40,9 +32,8 @@ class SceneMixture:
         sensors: lidars, with their weights.
         length_m: length of the way outdoors; indoors a quarter of it.
         spacing_m: mean way between scans outdoors; indoors a quarter of it.
-        scale: lowest and highest factor that a scene outdoors and its poses are scaled by, drawn uniformly in its
-            logarithm.
-        indoor_scale: the same indoors, where networks made for tens of metres see more of a scene that is enlarged.
+        indoor_scale: lowest and highest factor that a scene indoors and its poses are scaled by, drawn uniformly in its
+            logarithm: networks made for tens of metres see more of a scene that is enlarged.
         moving_rate: share of the drives whose lidar moves during its turn.
         other_lidar_rate: share of the drives in which every other scan is of a second lidar.
 
@@ -51,27 +42,14 @@ class SceneMixture:
     """
 
     kinds: tuple[tuple[str, float], ...] = (
-        ("suburb", 0.3),
-        ("canyon", 0.14),
-        ("country", 0.12),
-        ("car_park", 0.08),
-        ("campus", 0.12),
-        ("wood", 0.08),
-        ("office", 0.05),
-        ("hall", 0.08),
-        ("flat", 0.03),
-    )
+        ("suburb", 0.3), ("canyon", 0.14), ("country", 0.12), ("car_park", 0.08), ("campus", 0.12), ("wood", 0.08),
+        ("office", 0.05), ("hall", 0.08), ("flat", 0.03),
+    )  # fmt: skip
     sensors: tuple[tuple[LidarSensor, float], ...] = (
-        (HDL64E, 0.4),
-        (OS1_64, 0.16),
-        (OS1_128, 0.08),
-        (PANDAR64, 0.1),
-        (HDL32E, 0.16),
-        (VLP16, 0.1),
-    )
+        (HDL64E, 0.4), (OS1_64, 0.16), (OS1_128, 0.08), (PANDAR64, 0.1), (HDL32E, 0.16), (VLP16, 0.1),
+    )  # fmt: skip
     length_m: float = 600.0
     spacing_m: float = 2.0
-    scale: tuple[float, float] = (1.0, 1.0)
     indoor_scale: tuple[float, float] = (1.0, 4.0)
     moving_rate: float = 0.4
     other_lidar_rate: float = 0.0
@@ -81,15 +59,12 @@ class SceneMixture:
             weights = [weight for _, weight in entries]
             if not weights or min(weights) < 0 or sum(weights) <= 0:
                 raise ValueError(f"{name} must have weights from 0 up, not all 0, got {weights}")
-        unknown = {kind for kind, _ in self.kinds} - {*OUTDOOR_KINDS, *INDOOR_KINDS}
-        if unknown:
-            known = ", ".join((*OUTDOOR_KINDS, *INDOOR_KINDS))
-            raise ValueError(f"kinds must be of {known}, got {sorted(unknown)[0]!r}")
-        if min(self.length_m, self.spacing_m) <= 0:
-            raise ValueError("length_m and spacing_m must be positive")
-        for name, (low, high) in (("scale", self.scale), ("indoor_scale", self.indoor_scale)):
-            if not 0 < low <= high:
-                raise ValueError(f"{name} must be positive and ascending, got {low}, {high}")
+        for kind, _ in self.kinds:
+            require_one_of("kinds", kind, (*OUTDOOR_KINDS, *INDOOR_KINDS))
+        require_positive_fields(self, "length_m", "spacing_m")
+        low, high = self.indoor_scale
+        if not 0 < low <= high:
+            raise ValueError(f"indoor_scale must be positive and ascending, got {low}, {high}")
 
 
 @dataclass(frozen=True)
@@ -124,33 +99,16 @@ class Scene:
 
 TRAINING_MIXTURE = SceneMixture(
     kinds=(
-        ("suburb", 0.19),
-        ("canyon", 0.09),
-        ("country", 0.08),
-        ("car_park", 0.07),
-        ("campus", 0.09),
-        ("wood", 0.06),
-        ("field", 0.05),
-        ("jam", 0.04),
-        ("office", 0.08),
-        ("hall", 0.06),
-        ("flat", 0.04),
-        ("corridor", 0.05),
-        ("tunnel", 0.03),
-        ("garage", 0.04),
-        ("stairs", 0.03),
+        ("suburb", 0.19), ("canyon", 0.09), ("country", 0.08), ("car_park", 0.07), ("campus", 0.09), ("wood", 0.06),
+        ("field", 0.05), ("jam", 0.04), ("office", 0.08), ("hall", 0.06), ("flat", 0.04), ("corridor", 0.05),
+        ("tunnel", 0.03), ("garage", 0.04), ("stairs", 0.03),
     ),
     sensors=(
-        (HDL64E, 0.22),
-        (OS1_64, 0.14),
-        (OS1_128, 0.1),
-        (PANDAR64, 0.1),
-        (HDL32E, 0.18),
-        (VLP16, 0.2),
+        (HDL64E, 0.22), (OS1_64, 0.14), (OS1_128, 0.1), (PANDAR64, 0.1), (HDL32E, 0.18), (VLP16, 0.2),
         (SOLID_STATE, 0.06),
     ),
     other_lidar_rate=0.7,
-)
+)  # fmt: skip
 """What networks are trained on: a third indoors, and drives in which two lidars take turns."""
 
 
@@ -171,15 +129,14 @@ def draw_scene(seed: int, mixture: SceneMixture = SceneMixture()) -> Scene:
         raise ValueError(f"seed must not be negative, got {seed}")
     rng = np.random.default_rng([_SCENE_STREAM, seed])
     kind, sensor = _choice(rng, mixture.kinds), _choice(rng, mixture.sensors)
-    scales = mixture.indoor_scale if kind in INDOOR_KINDS else mixture.scale
-    scale = float(np.exp(rng.uniform(*np.log(scales))))
+    # Drawn outdoors, too, where it is 1: the choices after it stay those of the seed.
+    scale = float(np.exp(rng.uniform(*np.log(mixture.indoor_scale if kind in INDOOR_KINDS else (1.0, 1.0)))))
     is_moving = bool(rng.random() < mixture.moving_rate)
     if kind in INDOOR_KINDS:
         is_robot = rng.random() < 0.3
         height, tilt = (rng.uniform(0.3, 0.9), 1.0) if is_robot else (rng.uniform(0.9, 1.7), rng.uniform(3, 10))
         rate = 4.0 / mixture.spacing_m
-        look, bob = (3.0, 0.0) if is_robot else (25.0, 0.03)
-        walking = WalkConfig(1.0, rate, float(height), float(tilt), look, bob)
+        walking = WalkConfig(rate, float(height), float(tilt), is_robot=bool(is_robot))
         place = BuildingConfig(kind, 0.25 * mixture.length_m)
         return Scene(seed, place, walking, sensor, scale, is_moving, _other_sensor(rng, mixture, sensor))
     town = TownConfig(kind, str(rng.choice(_ROUTES)), mixture.length_m, float(rng.uniform(75, 130)))

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import jax
 from jaxtyping import Float
 
-from dpmjax.deepmapping.clouds import register_clouds
+from dpmjax.deepmapping.mapping import register_clouds
 from dpmjax.geometry import rigid
 from dpmjax.pose_graph.optimize import PoseGraphConfig, optimize_pose_graph
 from dpmjax.slam.keyframes import KeyframeMap, Pose, as_pose_graph, with_edges, with_poses

@@ -121,9 +121,7 @@ def toy_figure(
     axes.plot(*direct_end, "o", color=DIRECT, ms=9, mec="white", label="direct descent ends", zorder=5)
     axes.plot(network_end_z, network_end[1], "P", color=ACCENT, ms=10, mec="white", label="z* of the network", zorder=6)
     axes.plot(*network_end, "o", color=ACCENT, ms=9, mec="white", label="x* = f(z*)", zorder=6)
-    axes.set_xlabel("x, or z for the dashed line", color=INK, fontsize=9)
-    axes.set_ylabel("L", color=INK, fontsize=9)
-    style_axes(axes)
+    style_axes(axes, "x, or z for the dashed line", "L")
     axes.legend(fontsize=8, frameon=False, loc="upper left", ncols=2)
     axes.set_xlim(float(x.min()), float(x.max()))
     axes.set_ylim(top=1.5 * float(loss.max()))
@@ -154,16 +152,14 @@ def endings_figure(
     figure = new_figure(8.0, 1.8 + 0.95 * len(ends))
     top, *rows = figure.subplots(1 + len(ends), 1, sharex=True, height_ratios=(1.8, *([1.0] * len(ends))))
     top.plot(shown, np.asarray(loss), color=INK, lw=1.2)
-    top.set_ylabel("L(x)", fontsize=9, color=INK)
-    style_axes(top)
+    style_axes(top, y_label="L(x)")
     edges = np.linspace(shown.min(), shown.max(), 241)
     for axes, (name, values) in zip(rows, ends.items(), strict=True):
         finite = values[np.isfinite(values)]
         axes.hist(np.clip(finite, edges[0], edges[-1]), edges, color=ACCENT if "network" in name else DIRECT)
         axes.set_yscale("symlog", linthresh=1.0)
         annotate_corner(axes, f"{name}: {100 * shares[name]:.1f} % at the global minimum", (3, 2), color=INK)
-        style_axes(axes)
-    rows[-1].set_xlabel("x at the end of a seed", fontsize=9, color=INK)
+        style_axes(axes, "x at the end of a seed" if axes is rows[-1] else "")
     figure.tight_layout()
     return figure
 

@@ -175,10 +175,9 @@ def size_figure(curves: Mapping[str, ArrayLike], *, memory_limit_gb: float) -> F
     left.set_yscale("log")
     for axes in (left, right):
         axes.set_xscale("log", base=2)
-        axes.set_xlabel("scans", fontsize=9, color=INK)
         axes.set_xticks(sizes, [f"{int(size)}" for size in sizes])
         axes.legend(fontsize=8, frameon=False)
-        style_axes(axes)
+        style_axes(axes, "scans")
     figure.tight_layout()
     return figure
 
@@ -209,9 +208,7 @@ def curves_figure(steps: ArrayLike, curves: Mapping[str, ArrayLike]) -> Figure:
         axes.plot(x[is_known], curve[is_known], color=LOSS_COLOR, lw=1, **style)
         if many:
             axes.plot(x[is_known], _smoothed(curve[is_known]), color=LOSS_COLOR, lw=1.6)
-        axes.set_ylabel(name, color=INK, fontsize=9)
-        style_axes(axes)
-    rows[-1].set_xlabel("step", color=INK, fontsize=9)
+        style_axes(axes, "step" if axes is rows[-1] else "", name)
     figure.tight_layout()
     return figure
 

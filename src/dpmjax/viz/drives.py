@@ -13,9 +13,13 @@ from dpmjax.viz.figures import (
     INK,
     MUTED,
     Limits,
-    add_scale_bar,
+    add_axes,
+    draw_loops,
     frame_map,
     new_figure,
+    pixels_of,
+    plane_limits,
+    size_in,
     style_axes,
 )
 
@@ -29,7 +33,6 @@ HEIGHTS_M = (-2.5, 5.5)
 """Heights above the lidar that the colours of maps span."""
 
 _ROOF_M = 1.0
-_LONGER_SIDE_IN, _SHORTER_SIDE_IN = 6.4, 2.6
 
 
 class Track(NamedTuple):
@@ -78,10 +81,10 @@ def trajectory_figure(
         axes.plot(*reference[:, :2].T, color="#b9c0c8", lw=4.2, solid_capstyle="round", label="reference", zorder=2)
     for track in tracks:
         axes.plot(*track.positions[:, :2].T, label=track.label, zorder=4, **_style(track, tracks))
-    _draw_loops(axes, loops)
+    if len(loops):
+        draw_loops(axes, loops, f"{len(loops)} loops", LOOP)
     axes.plot(*tracks[-1].positions[:1, :2].T, "o", ms=6, color=INK, mec="white", zorder=7, label="start")
-    frame_map(axes, limits)
-    add_scale_bar(axes, limits, "m")
+    frame_map(axes, limits, "m")
     axes.set_title(title, fontsize=11, color=INK, loc="left", fontweight="bold")
     axes.legend(
         loc="upper left", bbox_to_anchor=(-0.01, -0.01), ncols=3, frameon=False, fontsize=8, labelcolor=MUTED,
@@ -127,8 +130,7 @@ def height_map_figure(
         interpolation="nearest",
     )
     axes.plot(*path[:, :2].T, color=ACCENT, lw=1.0, zorder=4)
-    frame_map(axes, limits)
-    add_scale_bar(axes, limits, "m")
+    frame_map(axes, limits, "m")
     axes.set_title(title, fontsize=11, color=INK, loc="left", fontweight="bold")
     bar_in = min(height_in, 3.0)
     bar = add_axes(figure, (width_in + 0.27, 0.12 + (height_in - bar_in) / 2, 0.13, bar_in))
@@ -149,12 +151,6 @@ def height_colors(heights_m: Float[np.ndarray, " n"]) -> UInt8[np.ndarray, "n 3"
     """
     share = (np.asarray(heights_m, np.float64) - HEIGHTS_M[0]) / (HEIGHTS_M[1] - HEIGHTS_M[0])
     return np.asarray(_colormap()(np.clip(share, 0, 1), bytes=True))[:, :3]
-
-
-def add_axes(figure: Figure, place_in: tuple[float, float, float, float]) -> Axes:
-    """Adds axes at left, bottom, with width and height in inches."""
-    (left, bottom, width, height), (whole, high) = place_in, figure.get_size_inches()
-    return figure.add_axes((left / whole, bottom / high, width / whole, height / high))
 
 
 def _colormap() -> Colormap:
@@ -181,55 +177,13 @@ def _raster(
     points: Float[np.ndarray, "n 3"], heights_m: Float[np.ndarray, " n"], limits: Limits, columns: int, rows: int
 ) -> UInt8[np.ndarray, "r c 3"]:
     """The picture: the highest point of each pixel; pixels without points are white."""
-    place = (points[:, :2] - [limits.x_min, limits.y_min]) / [limits.width / columns, limits.height / rows]
-    column, row = np.floor(place).astype(np.int64).T
-    is_inside = (column >= 0) & (column < columns) & (row >= 0) & (row < rows)
+    pixel, is_inside = pixels_of(points, limits, columns, rows)
     highest = np.full(rows * columns, -np.inf)
-    np.maximum.at(highest, row[is_inside] * columns + column[is_inside], heights_m[is_inside])
+    np.maximum.at(highest, pixel, heights_m[is_inside])
     picture = np.full((rows * columns, 3), 255, np.uint8)
     is_seen = np.isfinite(highest)
     picture[is_seen] = height_colors(highest[is_seen])
     return picture.reshape(rows, columns, 3)
-
-
-def plane_limits(positions: Float[np.ndarray, "n 2"], margin_share: float) -> Limits:
-    """Returns a rectangle round positions; that of a straight road has a useful height too.
-
-    Args:
-        positions: positions, at least one.
-        margin_share: margin as a share of the longer side, added on all sides.
-
-    Returns:
-        The limits.
-    """
-    low, high = positions.min(axis=0), positions.max(axis=0)
-    margin = max(margin_share * float((high - low).max()), 1.0)
-    narrow = np.maximum((high - low).max() * 0.35 - (high - low), 0) / 2
-    (x_min, y_min), (x_max, y_max) = low - narrow - margin, high + narrow + margin
-    return Limits(float(x_min), float(x_max), float(y_min), float(y_max))
-
-
-def size_in(limits: Limits) -> tuple[float, float]:
-    """Returns width and height of the panel of a map.
-
-    Args:
-        limits: limits of the map.
-
-    Returns:
-        Inches.
-    """
-    scale = _LONGER_SIDE_IN / max(limits.width, limits.height)
-    return max(limits.width * scale, _SHORTER_SIDE_IN), max(limits.height * scale, _SHORTER_SIDE_IN)
-
-
-def _draw_loops(axes: Axes, loops: Float[np.ndarray, "m 2 3"]) -> None:
-    from matplotlib.collections import LineCollection
-
-    if len(loops):
-        lines = LineCollection(list(loops[:, :, :2]), colors=LOOP, linewidths=1.0, alpha=0.9, zorder=5)
-        lines.set_label(f"{len(loops)} loops")
-        axes.add_collection(lines)
-        axes.plot(*loops[:, 0, :2].T, ".", ms=3.2, color=LOOP, zorder=6)
 
 
 def _draw_errors(axes: Axes, tracks: Sequence[Track]) -> None:
@@ -237,10 +191,9 @@ def _draw_errors(axes: Axes, tracks: Sequence[Track]) -> None:
         if track.errors_m is not None:
             way = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(track.positions, axis=0), axis=1))])
             axes.plot(way, track.errors_m, **_style(track, tracks))
-    style_axes(axes)
+    style_axes(axes, "distance driven, m")
     axes.set_ylim(bottom=0)
     axes.set_xlim(left=0)
-    axes.set_xlabel("distance driven, m", fontsize=8, color=MUTED)
     axes.set_title("distance to the aligned reference, m", fontsize=8.5, color=MUTED, loc="left")
 
 

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
+from jaxtyping import Bool, Float, Int64
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -16,6 +17,7 @@ INK = "#1b1f24"
 MUTED = "#6a737d"
 FRAME = "#d6dadf"
 ACCENT = "#d1495b"
+_LONGER_SIDE_IN, _SHORTER_SIDE_IN = 6.4, 2.6
 
 
 class Limits(NamedTuple):
@@ -55,8 +57,10 @@ def save_figure(figure: Figure, path: str | os.PathLike[str], dpi: int = 160) ->
         unfinished.unlink(missing_ok=True)
 
 
-def style_axes(axes: Axes) -> None:
-    """Gives the axes of a curve a light grid, small ticks and a thin frame."""
+def style_axes(axes: Axes, x_label: str = "", y_label: str = "") -> None:
+    """Gives the axes of a curve their labels, a light grid, small ticks and a thin frame."""
+    axes.set_xlabel(x_label, fontsize=9, color=INK)
+    axes.set_ylabel(y_label, fontsize=9, color=INK)
     axes.grid(color=FRAME, lw=0.6)
     axes.set_axisbelow(True)
     axes.tick_params(colors=MUTED, labelsize=8)
@@ -70,8 +74,8 @@ def annotate_corner(axes: Axes, text: str, offset: tuple[float, float], **style:
     axes.annotate(text, (0, 1), xytext=offset, xycoords="axes fraction", textcoords="offset points", **style)
 
 
-def frame_map(axes: Axes, limits: Limits) -> None:
-    """Gives a map panel equal axes, its limits, and a thin frame instead of ticks."""
+def frame_map(axes: Axes, limits: Limits, unit: str | None = None) -> None:
+    """Gives a map panel equal axes, its limits, a thin frame instead of ticks, and a scale bar if there is a unit."""
     axes.set_aspect("equal", adjustable="box")
     axes.set_xlim(limits.x_min, limits.x_max)
     axes.set_ylim(limits.y_min, limits.y_max)
@@ -80,9 +84,11 @@ def frame_map(axes: Axes, limits: Limits) -> None:
     for spine in axes.spines.values():
         spine.set_color(FRAME)
         spine.set_linewidth(0.8)
+    if unit is not None:
+        _add_scale_bar(axes, limits, unit)
 
 
-def add_scale_bar(axes: Axes, limits: Limits, unit: str) -> None:
+def _add_scale_bar(axes: Axes, limits: Limits, unit: str) -> None:
     """Draws a bar of a round length, about a fifth of the width, in the lower left corner."""
     length = round_length(limits.width / 5.0)
     x = limits.x_min + 0.04 * limits.width
@@ -124,3 +130,57 @@ def format_length(length: float, unit: str) -> str:
         return f"< 0.001 {unit}"
     decimals = min(3, max(0, 2 - int(np.floor(np.log10(abs(length))))))
     return f"{length:.{decimals}f} {unit}"
+
+
+def add_axes(figure: Figure, place_in: tuple[float, float, float, float]) -> Axes:
+    """Adds axes at left, bottom, with width and height in inches."""
+    (left, bottom, width, height), (whole, high) = place_in, figure.get_size_inches()
+    return figure.add_axes((left / whole, bottom / high, width / whole, height / high))
+
+
+def plane_limits(positions: Float[np.ndarray, "n 2"], margin_share: float) -> Limits:
+    """Returns a rectangle round positions; that of a straight road has a useful height too.
+
+    Args:
+        positions: positions, at least one.
+        margin_share: margin as a share of the longer side, added on all sides.
+
+    Returns:
+        The limits.
+    """
+    low, high = positions.min(axis=0), positions.max(axis=0)
+    margin = max(margin_share * float((high - low).max()), 1.0)
+    narrow = np.maximum((high - low).max() * 0.35 - (high - low), 0) / 2
+    (x_min, y_min), (x_max, y_max) = low - narrow - margin, high + narrow + margin
+    return Limits(float(x_min), float(x_max), float(y_min), float(y_max))
+
+
+def size_in(limits: Limits) -> tuple[float, float]:
+    """Returns width and height of the panel of a map.
+
+    Args:
+        limits: limits of the map.
+
+    Returns:
+        Inches.
+    """
+    scale = _LONGER_SIDE_IN / max(limits.width, limits.height)
+    return max(limits.width * scale, _SHORTER_SIDE_IN), max(limits.height * scale, _SHORTER_SIDE_IN)
+
+
+def draw_loops(axes: Axes, loops: Float[np.ndarray, "m 2 3"], label: str, color: str) -> None:
+    """Draws loops, at least one, as lines between the positions of their ends."""
+    from matplotlib.collections import LineCollection
+
+    axes.add_collection(LineCollection(list(loops[:, :, :2]), colors=color, linewidths=1.0, zorder=5, label=label))
+    axes.plot(*loops.reshape(-1, 3)[:, :2].T, ".", ms=3.2, color=color, zorder=6)
+
+
+def pixels_of(
+    points: Float[np.ndarray, "n d"], limits: Limits, columns: int, rows: int
+) -> tuple[Int64[np.ndarray, " m"], Bool[np.ndarray, " n"]]:
+    """Returns the pixels of a flat raster over the limits, row by row, of the points inside; and which are inside."""
+    place = (points[:, :2] - [limits.x_min, limits.y_min]) / [limits.width / columns, limits.height / rows]
+    column, row = np.floor(place).astype(np.int64).T
+    is_inside = (column >= 0) & (column < columns) & (row >= 0) & (row < rows)
+    return row[is_inside] * columns + column[is_inside], is_inside

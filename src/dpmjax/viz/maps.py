@@ -14,7 +14,7 @@ from dpmjax.viz.figures import (
     INK,
     MUTED,
     Limits,
-    add_scale_bar,
+    add_axes,
     annotate_corner,
     draw_trajectory,
     format_length,
@@ -116,17 +116,12 @@ def registered_scans_figure(panels: Sequence[Panel], unit: str) -> Figure:
     height_in = PANEL_WIDTH_IN * limits.height / limits.width
     width_in = len(panels) * PANEL_WIDTH_IN + (len(panels) + 1) * GAP_IN
     figure = new_figure(width_in, height_in + HEADER_IN + FOOTER_IN)
-    total_in = height_in + HEADER_IN + FOOTER_IN
     colormap = time_colormap()
     for column, panel in enumerate(aligned):
         left_in = GAP_IN + column * (PANEL_WIDTH_IN + GAP_IN)
-        axes = figure.add_axes(
-            (left_in / width_in, FOOTER_IN / total_in, PANEL_WIDTH_IN / width_in, height_in / total_in)
-        )
-        _draw_panel(axes, panel, limits, unit, colormap)
-        if column == 0:
-            add_scale_bar(axes, limits, unit)
-    _add_time_bar(figure, len(anchor.poses), width_in, total_in, colormap)
+        _draw_panel(add_axes(figure, (left_in, FOOTER_IN, PANEL_WIDTH_IN, height_in)), panel, unit, colormap)
+        frame_map(figure.axes[-1], limits, None if column else unit)
+    _add_time_bar(figure, len(anchor.poses), colormap)
     return figure
 
 
@@ -184,14 +179,13 @@ def _extent(panel: Panel) -> tuple[NDArray[np.floating], NDArray[np.floating]]:
     return low, high
 
 
-def _draw_panel(axes: Axes, panel: Panel, limits: Limits, unit: str, colormap: Colormap) -> None:
+def _draw_panel(axes: Axes, panel: Panel, unit: str, colormap: Colormap) -> None:
     points, scans = panel.visible_points()
     order = np.random.default_rng(0).permutation(len(points))[:MAX_POINTS_PER_PANEL]
     size = np.clip(50_000.0 / max(1, len(order)), 0.45, 4.0)
     colors = colormap(scans[order] / max(1, len(panel.poses) - 1))
     axes.scatter(points[order, 0], points[order, 1], size, colors, linewidths=0, rasterized=True, zorder=2)
     draw_trajectory(axes, panel.trajectory_world, "black")
-    frame_map(axes, limits)
     known = {"ATE": panel.ate, "point distance": panel.point_distance}
     numbers = [f"{name} {format_length(value, unit)}" for name, value in known.items() if value is not None]
     # A long title is drawn smaller, so that it does not run into the next panel.
@@ -200,10 +194,11 @@ def _draw_panel(axes: Axes, panel: Panel, limits: Limits, unit: str, colormap: C
     annotate_corner(axes, "   ".join(numbers), (1, 7), fontsize=9.5)
 
 
-def _add_time_bar(figure: Figure, num_scans: int, width_in: float, total_in: float, colormap: Colormap) -> None:
+def _add_time_bar(figure: Figure, num_scans: int, colormap: Colormap) -> None:
     """A thin bar under the panels that says which colour is which scan."""
+    width_in = figure.get_figwidth()
     length_in = min(3.0, 0.5 * width_in)
-    axes = figure.add_axes((0.5 - length_in / 2.0 / width_in, 0.24 / total_in, length_in / width_in, 0.09 / total_in))
+    axes = add_axes(figure, (0.5 * (width_in - length_in), 0.24, length_in, 0.09))
     axes.imshow(np.linspace(0.0, 1.0, 256)[None, :], aspect="auto", cmap=colormap)
     axes.set_axis_off()
     style: Any = {"xycoords": "axes fraction", "textcoords": "offset points", "va": "center", "fontsize": 8.5}

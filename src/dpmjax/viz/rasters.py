@@ -12,11 +12,12 @@ from dpmjax.viz.figures import (
     ACCENT,
     INK,
     Limits,
-    add_scale_bar,
+    add_axes,
     annotate_corner,
     draw_trajectory,
     frame_map,
     new_figure,
+    plane_limits,
 )
 from dpmjax.viz.maps import time_colormap
 
@@ -67,11 +68,8 @@ def occupancy_figure(
 
     scale_in = LONGER_SIDE_IN / max(limits.width, limits.height)
     width_in, height_in = limits.width * scale_in, limits.height * scale_in
-    total_width_in, total_height_in = width_in + 2.0 * GAP_IN, height_in + 2.0 * GAP_IN
-    figure = new_figure(total_width_in, total_height_in)
-    axes = figure.add_axes(
-        (GAP_IN / total_width_in, GAP_IN / total_height_in, width_in / total_width_in, height_in / total_height_in)
-    )
+    figure = new_figure(width_in + 2.0 * GAP_IN, height_in + 2.0 * GAP_IN)
+    axes = add_axes(figure, (GAP_IN, GAP_IN, width_in, height_in))
     brightness = np.where(explored, 1.0 - np.clip(probability, 0.0, 1.0), UNEXPLORED_GREY)
     axes.set_facecolor(str(UNEXPLORED_GREY))
     image = axes.imshow(brightness, cmap="gray", vmin=0.0, vmax=1.0, origin="lower", extent=extent)
@@ -79,8 +77,7 @@ def occupancy_figure(
     image.set_transform(Affine2D(T) + axes.transData)
     if trajectory_world is not None:
         draw_trajectory(axes, np.asarray(trajectory_world, np.float64) @ T[:2, :2].T + T[:2, 2], ACCENT)
-    frame_map(axes, limits)
-    add_scale_bar(axes, limits, unit)
+    frame_map(axes, limits, unit)
     return figure
 
 
@@ -134,10 +131,9 @@ def error_maps_figure(
             panel.error, cmap=colormap, vmin=0.0, vmax=worst, origin="lower", extent=limits, interpolation="nearest"
         )
         axes.plot(*np.asarray(trajectory_world).T, ".", color=TRAJECTORY, ms=1.8)
-        frame_map(axes, limits)
         axes.set_title(f"{panel.title}\n", fontsize=11, color=INK, loc="left", fontweight="bold")
         annotate_corner(axes, panel.subtitle, (0, 6))
-    add_scale_bar(axes_row[0], limits, unit)
+        frame_map(axes, limits, unit if panel is maps[0] else None)
     # The bar and its label need about 0.9 inches at the right, whatever the number of maps.
     right = 1.0 - 0.9 / figure.get_figwidth()
     figure.tight_layout(rect=(0.0, 0.0, right, 1.0))
@@ -174,10 +170,7 @@ def from_above_figure(
         clouds.append(np.einsum("nij,nhwj->nhwi", T[:, :3, :3], cloud) + T[:, None, None, :3, 3])
         sensors.append(T[:, :3, 3])
     low, high = np.quantile(clouds[-1][valid][:, [0, 2]], [0.002, 0.998], axis=0)
-    centres = sensors[-1][:, [0, 2]]
-    low, high = np.minimum(low, centres.min(0)), np.maximum(high, centres.max(0))
-    margin = 0.12 * float((high - low).max())
-    limits = Limits(low[0] - margin, high[0] + margin, low[1] - margin, high[1] + margin)
+    limits = plane_limits(np.vstack([sensors[-1][:, [0, 2]], [low, high]]), 0.12)
     figure = new_figure(4.4 * len(panels), 4.4 * limits.height / limits.width + 0.5)
     colors = time_colormap()(np.linspace(0.0, 1.0, len(cloud)))
     axes_row = figure.subplots(1, len(panels), squeeze=False)[0]
@@ -186,8 +179,7 @@ def from_above_figure(
             shown = world[image][valid[image] & (world[image][..., 1] > below_m)]
             axes.plot(shown[:, 0], shown[:, 2], ".", ms=1.2, mew=0, color=color)
         axes.plot(centres[:, 0], centres[:, 2], "-o", color=INK, ms=3, lw=1)
-        frame_map(axes, limits)
+        frame_map(axes, limits, "m" if axes is axes_row[0] else None)
         axes.set_title(title, fontsize=10, color=INK, loc="left")
-    add_scale_bar(axes_row[0], limits, "m")
     figure.tight_layout()
     return figure

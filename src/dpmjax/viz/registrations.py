@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from dpmjax.viz.figures import ACCENT, FRAME, INK, MUTED, Limits, add_scale_bar, frame_map, new_figure, style_axes
+from dpmjax.viz.figures import ACCENT, INK, MUTED, frame_map, new_figure, plane_limits, size_in, style_axes
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -58,7 +58,7 @@ def reliability_figure(
     bins = np.minimum((confidence * NUM_BINS).astype(int), NUM_BINS - 1)
     figure = new_figure(4.6, 4.6)
     axes = figure.subplots()
-    style_axes(axes)
+    style_axes(axes, *labels)
     axes.plot([0, 1], [0, 1], color=MUTED, lw=1, ls="--")
     used = [number for number in range(NUM_BINS) if np.any(bins == number)]
     x = [confidence[bins == number].mean() for number in used]
@@ -69,8 +69,6 @@ def reliability_figure(
         axes.annotate(str(count), (left, up), xytext=(5, -10), textcoords="offset points", fontsize=7, color=MUTED)
     brier = float(np.mean((confidence - right) ** 2)) if len(right) else float("nan")
     axes.set_title(f"{title}\n{len(right)} pairs, Brier score {brier:.3f}", fontsize=10, color=INK)
-    axes.set_xlabel(labels[0], color=INK)
-    axes.set_ylabel(labels[1], color=INK)
     figure.tight_layout()
     return figure
 
@@ -93,23 +91,15 @@ def registered_pairs_figure(pairs: Sequence[RegisteredPair]) -> Figure:
                 axes.plot(points[:, 0], points[:, 1], ".", color=color, ms=1.2, alpha=0.5, mew=0)
             axes.plot([0, T[0, 3]], [0, T[1, 3]], "o-", color=ACCENT, ms=4, lw=1)
             both = np.concatenate([pair.target, moved])[:, :2]
-            low, high = np.quantile(both, (0.5 - SHOWN_SHARE / 2, 0.5 + SHOWN_SHARE / 2), axis=0)
-            half = 0.55 * max(float((high - low).max()), 1.0)
-            (x, y) = (low + high) / 2
-            axes.set_xlim(x - half, x + half)
-            axes.set_ylim(y - half, y + half)
+            corners = np.quantile(both, (0.5 - SHOWN_SHARE / 2, 0.5 + SHOWN_SHARE / 2), axis=0)
+            frame_map(axes, plane_limits(corners, 0.05))
             axes.set_title(f"{pair.title}\n{label}", fontsize=9, color=INK)
-            axes.set_aspect("equal")
-            axes.set_xticks([])
-            axes.set_yticks([])
-            for spine in axes.spines.values():
-                spine.set_color(FRAME)
     figure.tight_layout()
     return figure
 
 
 RIGHT = "#2a9d5c"
-LONGER_SIDE_IN, HEAD_SHARE = 7.0, 0.02
+HEAD_SHARE = 0.02
 
 
 def localization_figure(
@@ -135,9 +125,11 @@ def localization_figure(
     points, path = np.asarray(points_map, float).reshape(-1, 3), np.asarray(T_map_keyframe, float)[:, :3, 3]
     T = np.asarray(T_map_scan, float).reshape(-1, 4, 4)
     wrong = np.zeros(len(T), bool) if is_wrong is None else np.asarray(is_wrong, bool)
-    limits = _limits(np.concatenate([points[:, :2], path[:, :2], T[:, :2, 3]]))
-    scale_in = LONGER_SIDE_IN / max(limits.width, limits.height)
-    figure = new_figure(limits.width * scale_in + 0.3, limits.height * scale_in + 0.8)
+    # A few far points must not make the map small.
+    shown = np.concatenate([points[:, :2], path[:, :2], T[:, :2, 3]])
+    limits = plane_limits(np.percentile(shown, [0.5, 99.5], axis=0), 0.06)
+    width_in, height_in = size_in(limits)
+    figure = new_figure(width_in + 0.3, height_in + 0.8)
     axes = figure.subplots()
     axes.scatter(points[:, 0], points[:, 1], s=0.4, color=MUTED, alpha=0.35, linewidths=0, rasterized=True)
     axes.plot(path[:, 0], path[:, 1], ".", color=INK, ms=3, label=f"{len(path)} keyframes", zorder=4)
@@ -147,15 +139,8 @@ def localization_figure(
             (x, y), (dx, dy) = T[mask, :2, 3].T, T[mask, :2, 0].T
             axes.quiver(x, y, dx, dy, color=color, scale=1 / head, scale_units="xy", width=0.004, zorder=6)
             axes.plot(x, y, "o", color=color, ms=3.5, label=f"{mask.sum()} {label}", zorder=5)
-    frame_map(axes, limits)
-    add_scale_bar(axes, limits, "m")
+    frame_map(axes, limits, "m")
     axes.legend(loc="upper right", fontsize=8, framealpha=0.85)
     axes.set_title(title, fontsize=10, color=INK)
     figure.tight_layout()
     return figure
-
-
-def _limits(points: np.ndarray) -> Limits:
-    low, high = np.percentile(points, [0.5, 99.5], axis=0)
-    margin = 0.06 * max(*(high - low), 1.0)
-    return Limits(low[0] - margin, high[0] + margin, low[1] - margin, high[1] + margin)

@@ -10,8 +10,19 @@ import numpy as np
 from jaxtyping import Float, UInt8
 from numpy.typing import NDArray
 
-from dpmjax.viz.drives import add_axes, plane_limits, size_in
-from dpmjax.viz.figures import INK, MUTED, Limits, add_scale_bar, frame_map, new_figure, style_axes
+from dpmjax.viz.figures import (
+    INK,
+    MUTED,
+    Limits,
+    add_axes,
+    draw_loops,
+    frame_map,
+    new_figure,
+    pixels_of,
+    plane_limits,
+    size_in,
+    style_axes,
+)
 
 if TYPE_CHECKING:
     from matplotlib.artist import Artist
@@ -61,8 +72,7 @@ def trajectories_figure(panels: Mapping[str, TrackPanel], colors: Mapping[str, s
             axes.plot(*panel.reference[:, :2].T, color="#b9c0c8", lw=3.6, solid_capstyle="round", label="reference")
         for method in [method for method in colors if method in panel.tracks]:
             axes.plot(*panel.tracks[method][:, :2].T, color=colors[method], lw=1.0, label=method)
-        frame_map(axes, plane_limits(_shown(panel), _MARGIN))
-        add_scale_bar(axes, plane_limits(_shown(panel), _MARGIN), "m")
+        frame_map(axes, plane_limits(_shown(panel), _MARGIN), "m")
         axes.set_title(name, fontsize=8.5, color=INK)
     shown = [zip(*axes.get_legend_handles_labels(), strict=True) for axes in grid]
     entries = {label: handle for handles in shown for handle, label in handles}
@@ -127,9 +137,7 @@ def growth_figure(
         axes.set_yscale("log")
         axes.set_xlim(left=0)
         axes.set_title(drive, fontsize=8.5, color=INK)
-        axes.set_xlabel("distance driven, m", fontsize=8, color=MUTED)
-        style_axes(axes)
-    grid[0].set_ylabel("map, MB", fontsize=8, color=MUTED)
+        style_axes(axes, "distance driven, m", "map, MB" if axes is grid[0] else "")
     _add_legend(figure, entries)
     return figure
 
@@ -203,8 +211,6 @@ def agents_figure(title: str, panels: Sequence[AgentPanel]) -> Figure:
 
 
 def _draw_panel(axes: Axes, panel: AgentPanel, limits: Limits, size: tuple[float, float]) -> None:
-    from matplotlib.collections import LineCollection
-
     axes.imshow(
         _raster(panel, limits, int(DOTS_PER_IN * size[0]), int(DOTS_PER_IN * size[1])),
         origin="lower",
@@ -220,12 +226,9 @@ def _draw_panel(axes: Axes, panel: AgentPanel, limits: Limits, size: tuple[float
         axes.plot(*agent.positions[:, :2].T, color=agent.color, lw=2.6, label=agent.label, zorder=4)
         axes.plot(*agent.positions[:1, :2].T, "o", ms=5.5, color=agent.color, mec="white", zorder=8)
     if len(panel.loops):
-        lines = LineCollection(list(panel.loops[:, :, :2]), colors=INK, linewidths=0.9, zorder=7)
-        lines.set_label(f"{len(panel.loops)} loop{'s' * (len(panel.loops) != 1)} between them")
-        axes.add_collection(lines)
-        axes.plot(*panel.loops.reshape(-1, 3)[:, :2].T, ".", ms=3.5, color=INK, zorder=7)
-    frame_map(axes, limits)
-    add_scale_bar(axes, limits, "m")
+        label = f"{len(panel.loops)} loop{'s' * (len(panel.loops) != 1)} between them"
+        draw_loops(axes, panel.loops, label, INK)
+    frame_map(axes, limits, "m")
     axes.set_title(panel.title, fontsize=9, color=MUTED, loc="left")
     columns = max(int(size[0] / 1.6), 1)
     axes.legend(
@@ -249,10 +252,7 @@ def _raster(panel: AgentPanel, limits: Limits, columns: int, rows: int) -> UInt8
     color, total = np.zeros((rows * columns, 3)), np.zeros(rows * columns)
     for agent in panel.agents:
         points = agent.points[agent.heights_m > MIN_HEIGHT_M, :2]
-        place = (points - [limits.x_min, limits.y_min]) / [limits.width / columns, limits.height / rows]
-        column, row = np.floor(place).astype(np.int64).T
-        is_inside = (column >= 0) & (column < columns) & (row >= 0) & (row < rows)
-        count = np.bincount(row[is_inside] * columns + column[is_inside], minlength=rows * columns)
+        count = np.bincount(pixels_of(points, limits, columns, rows)[0], minlength=rows * columns)
         color += count[:, None] * np.array(to_rgb(agent.color))
         total += count
     is_seen = total > 0

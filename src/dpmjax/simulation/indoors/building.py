@@ -9,11 +9,12 @@ from dataclasses import dataclass, field
 import jax.numpy as jnp
 import numpy as np
 
+from dpmjax.checks import require_one_of, require_positive_fields
 from dpmjax.sequences import FloatArray
 from dpmjax.simulation.indoors.plan import Door, Plan, Room, make_plan, make_route
 from dpmjax.simulation.town import primitives
 from dpmjax.simulation.town.objects import Collection, Place, put_box, put_car, put_person, put_pole
-from dpmjax.simulation.town.primitives import CELL_M, Ground, TownPrimitives, Traffic, pack_bodies
+from dpmjax.simulation.town.primitives import CELL_M, Ground, RoadUsers, TownPrimitives
 from dpmjax.simulation.town.vegetation import plant_bushes
 
 _Put = Callable[[Collection, np.random.Generator, Place], None]
@@ -41,10 +42,8 @@ class BuildingConfig:
     route_length_m: float = 100.0
 
     def __post_init__(self) -> None:
-        if self.kind not in KINDS:
-            raise ValueError(f"kind must be one of {', '.join(KINDS)}, got {self.kind!r}")
-        if not self.route_length_m > 0:
-            raise ValueError(f"route_length_m must be positive, got {self.route_length_m}")
+        require_one_of("kind", self.kind, KINDS)
+        require_positive_fields(self, "route_length_m")
 
 
 @dataclass(frozen=True)
@@ -94,10 +93,7 @@ def make_building(seed: int, config: BuildingConfig = BuildingConfig()) -> Build
             _steps(into, rng, room, plan)
         else:
             _furniture(into, rng, room, route, is_hall=config.kind == "hall")
-    tables = (np.array(rows, np.float64) for rows in (into.boxes, into.cylinders, into.spheroids))
-    kinds = (primitives.SOLID, primitives.POLE, primitives.SOFT)
-    boxes, cylinders, spheroids = map(pack_bodies, tables, kinds)
-    whole = TownPrimitives(boxes, cylinders, spheroids, _floor(plan), _nobody())
+    whole = TownPrimitives(*into.packed(), _floor(plan), _nobody())
     return Building(f"{config.kind}-{seed}", plan, route, whole)
 
 
@@ -107,11 +103,11 @@ def _floor(plan: Plan) -> Ground:
     return Ground(jnp.asarray(heights, jnp.float32), jnp.asarray(low, jnp.float32), jnp.float32(CELL_M))
 
 
-def _nobody() -> Traffic:
+def _nobody() -> RoadUsers:
     empty = np.zeros((0, 3))
     rows, flags = primitives.padded(empty, 64), primitives.mask_of(0, 64)
     zero = rows[:, 0]
-    return Traffic(jnp.zeros((2, 64, 3)), jnp.ones(2), zero.astype(jnp.int32), zero, zero, zero, rows, flags)
+    return RoadUsers(jnp.zeros((2, 64, 3)), jnp.ones(2), zero.astype(jnp.int32), zero, zero, zero, rows, flags)
 
 
 def _place(x: float, y: float, heading: float = 0.0) -> Place:

@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from dpmjax.simulation.town.culling import CastConfig, NearBodies, NearWorld, SectorLists, sector_lists
+from dpmjax.simulation.town.culling import NUM_IN_SECTOR, NearBodies, NearWorld, SectorLists, sector_lists
 from dpmjax.simulation.town.intersect import Cross, cross_box, cross_cylinder, cross_ground, cross_spheroid, recess
 from dpmjax.simulation.town.primitives import GROUND, NOTHING, Bodies
 
@@ -73,9 +73,7 @@ class _Found(NamedTuple):
     depths: Float[Array, "c b"]
 
 
-def cast_turn(
-    near: NearWorld, T_world_lidar: Float[Array, "4 4"], rays: Rays, *, max_range: float, config: CastConfig
-) -> Hits:
+def cast_turn(near: NearWorld, T_world_lidar: Float[Array, "4 4"], rays: Rays, *, max_range: float) -> Hits:
     """Follows all rays of a turn to their first hits, without noise and loss.
 
     Args:
@@ -83,7 +81,6 @@ def cast_turn(
         T_world_lidar: pose of the sensor.
         rays: by sector.
         max_range: m.
-        config: capacities.
 
     Returns:
         The hits, by sector.
@@ -93,11 +90,10 @@ def cast_turn(
     offsets = jnp.einsum("ij,sj->si", turn, rays.T_lidar_sector[:, :3, 3], precision=highest)
     directions = jnp.einsum("sij,sgcbj->sgcbi", turns, rays.directions, precision=highest)
     kinds = (near.boxes, near.cylinders, near.spheroids)
-    capacities = (config.boxes_per_sector, config.cylinders_per_sector, config.spheroids_per_sector)
     way = jnp.linalg.norm(offsets, axis=-1).max()
     lists = tuple(
         sector_lists(kind, T_world_lidar, rays.azimuths, capacity, way)
-        for kind, capacity in zip(kinds, capacities, strict=True)
+        for kind, capacity in zip(kinds, NUM_IN_SECTOR, strict=True)
     )
     repeated = jax.tree.map(lambda x: jnp.repeat(x, directions.shape[1], axis=0), (offsets, lists))
     directions, depths = (x.reshape(-1, *x.shape[2:]) for x in (directions, rays.depths))

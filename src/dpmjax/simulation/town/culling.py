@@ -5,7 +5,6 @@ The selection has the same shapes in every world, so that the ray caster compile
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import partial
 from typing import NamedTuple
 
@@ -17,38 +16,12 @@ from jaxtyping import Array, Float, Int
 from dpmjax.geometry import rigid, se2
 from dpmjax.simulation.town.primitives import CELL_M, Bodies, Ground, TownPrimitives, traffic_boxes, turn_back
 
+# Nearest boxes, cylinders and spheroids that take part in a scan, and those of each that one sector of the turn holds.
+_NUM_NEAR = (1024, 512, 2048)
+NUM_IN_SECTOR = (96, 48, 160)
+# Side of the square of ground around the sensor; its border goes on outside.
+_GROUND_M = 168
 _CORNERS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], np.float32)
-
-
-@dataclass(frozen=True)
-class CastConfig:
-    """Capacities of the part of the world that a scan can meet.
-
-    Attributes:
-        num_boxes: nearest boxes that take part.
-        num_cylinders: nearest cylinders.
-        num_spheroids: nearest spheroids.
-        boxes_per_sector: boxes that one sector of the turn holds.
-        cylinders_per_sector: cylinders of a sector.
-        spheroids_per_sector: spheroids of a sector.
-        ground_m: side of the square of ground around the sensor; its border goes on outside.
-        max_sectors: largest number of sectors of a turn.
-        max_bands: largest number of bands of elevation of a sector.
-    """
-
-    num_boxes: int = 1024
-    num_cylinders: int = 512
-    num_spheroids: int = 2048
-    boxes_per_sector: int = 96
-    cylinders_per_sector: int = 48
-    spheroids_per_sector: int = 160
-    ground_m: int = 168
-    max_sectors: int = 72
-    max_bands: int = 2
-
-    def __post_init__(self) -> None:
-        if min(vars(self).values()) < 1:
-            raise ValueError(f"all capacities must be at least 1, got {self}")
 
 
 class NearBodies(NamedTuple):
@@ -91,9 +64,9 @@ class SectorLists(NamedTuple):
     counts: Int[Array, "*s"]
 
 
-@partial(jax.jit, static_argnames=("max_range", "config"))
+@partial(jax.jit, static_argnames="max_range")
 def near_world(
-    town: TownPrimitives, start: Float[Array, " 3"], time: Float[Array, ""], *, max_range: float, config: CastConfig
+    town: TownPrimitives, start: Float[Array, " 3"], time: Float[Array, ""], *, max_range: float
 ) -> NearWorld:
     """Picks what a scan can meet.
 
@@ -102,19 +75,20 @@ def near_world(
         start: position of the sensor, m.
         time: s, for the traffic.
         max_range: bodies beyond this range are left out, m.
-        config: capacities.
 
     Returns:
-        Bodies and ground near the sensor, in shapes that depend on the capacities alone.
+        Bodies and ground near the sensor, in the same shapes for every town.
     """
     boxes = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), town.boxes, traffic_boxes(town.traffic, start, time))
-    kinds = (boxes, config.num_boxes), (town.cylinders, config.num_cylinders), (town.spheroids, config.num_spheroids)
-    near = [nearest_bodies(x._replace(centres=x.centres - start), number, max_range) for x, number in kinds]
-    return NearWorld(near[0], near[1], near[2], _near_ground(town.ground, start, config.ground_m))
+    kinds = zip((boxes, town.cylinders, town.spheroids), _NUM_NEAR, strict=True)
+    boxes, cylinders, spheroids = (
+        nearest_bodies(x._replace(centres=x.centres - start), number, max_range) for x, number in kinds
+    )
+    return NearWorld(boxes, cylinders, spheroids, _near_ground(town.ground, start))
 
 
-def _near_ground(ground: Ground, start: Float[Array, " 3"], side_m: int) -> Ground:
-    count = round(side_m / CELL_M) + 1
+def _near_ground(ground: Ground, start: Float[Array, " 3"]) -> Ground:
+    count = round(_GROUND_M / CELL_M) + 1
     heights = jnp.pad(ground.heights, [(0, max(count - size, 0)) for size in ground.heights.shape], mode="edge")
     corner = jnp.round((start[:2] - ground.origin) / ground.cell - 0.5 * count).astype(jnp.int32)
     corner = jnp.clip(corner, 0, jnp.array([heights.shape[1] - count, heights.shape[0] - count]))

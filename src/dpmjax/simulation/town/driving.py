@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
+from dpmjax.checks import require_positive_fields
 from dpmjax.sequences import FloatArray, LidarSequence
 from dpmjax.simulation.town.make import Town, TownConfig, make_town
 from dpmjax.simulation.town.primitives import TownPrimitives
@@ -19,6 +20,7 @@ from dpmjax.simulation.town.streets import arc_lengths, at_way, lane_of, make_st
 _WHEELBASE_M = 2.7
 _TRACK_M = 1.6
 _SHAKE_DEG = 0.25  # Standard deviation of fast roll and pitch.
+_SWAY_M = 0.15  # Standard deviation of the distance to the middle of the lane.
 _TURN_S = 0.1
 _DRIVE_STREAM = 8151
 
@@ -33,7 +35,6 @@ class DriveConfig:
         length_m: way that is driven; None for once round (a closed route) or to the end.
         is_reversed: drives the route from its end to its start, in the opposite lane.
         sensor_height_m: above the ground.
-        sway_m: standard deviation of the way the car wanders in its lane.
         max_turn_deg_s: the car slows down in corners until it turns no faster; cars turn at 20 to 40 degrees a second.
 
     Raises:
@@ -45,16 +46,14 @@ class DriveConfig:
     length_m: float | None = None
     is_reversed: bool = False
     sensor_height_m: float = 1.73
-    sway_m: float = 0.15
     max_turn_deg_s: float = np.inf
 
     def __post_init__(self) -> None:
-        lengths = () if self.length_m is None else (self.length_m,)
-        if not all(value > 0 for value in (self.speed_m_s, self.rate_hz, self.max_turn_deg_s, *lengths)):
-            raise ValueError("speed_m_s, rate_hz, length_m and max_turn_deg_s must be positive")
+        lengths = () if self.length_m is None else ("length_m",)
+        require_positive_fields(self, "speed_m_s", "rate_hz", "max_turn_deg_s", *lengths)
 
 
-class Drive(NamedTuple):
+class TimedPoses(NamedTuple):
     """Poses and times of a drive.
 
     Attributes:
@@ -123,7 +122,7 @@ def route_poses(
 def scan_along(
     name: str,
     primitives: TownPrimitives,
-    way: Drive,
+    way: TimedPoses,
     *,
     seed: int,
     sensor: LidarSensor,
@@ -154,7 +153,7 @@ def scan_along(
     return LidarSequence(name, sources, read_scan, way.T_world_lidar, way.times)
 
 
-def _motions(way: Drive) -> FloatArray:
+def _motions(way: TimedPoses) -> FloatArray:
     """(n, 6) twists of the sensor during a turn, on its way to the next pose; the last is that before."""
     poses = way.T_world_lidar
     if len(poses) < 2:
@@ -167,7 +166,7 @@ def _motions(way: Drive) -> FloatArray:
     return np.vstack([twists, twists[-1:]])
 
 
-def drive(town: Town, config: DriveConfig = DriveConfig(), *, seed: int = 0) -> Drive:
+def drive(town: Town, config: DriveConfig = DriveConfig(), *, seed: int = 0) -> TimedPoses:
     """Drives along the town's route.
 
     Args:
@@ -187,8 +186,8 @@ def drive(town: Town, config: DriveConfig = DriveConfig(), *, seed: int = 0) -> 
     way = way % whole if is_closed else way
     along = _directions(lane, way)
     left = np.column_stack([-along[:, 1], along[:, 0]])
-    places = at_way(lane, way) + (config.sway_m * _slow_noise(rng, way))[:, None] * left
-    return Drive(_poses(town, places, along, left, config, rng), times)
+    places = at_way(lane, way) + (_SWAY_M * _slow_noise(rng, way))[:, None] * left
+    return TimedPoses(_poses(town, places, along, left, config, rng), times)
 
 
 def _timetable(lane: FloatArray, length: float, config: DriveConfig, is_closed: bool) -> tuple[FloatArray, FloatArray]:

@@ -10,11 +10,10 @@ from dpmjax.sequences import FloatArray
 from dpmjax.simulation.town import objects
 from dpmjax.simulation.town.kinds import Kind, Quarter
 from dpmjax.simulation.town.objects import Collection, Place, Size
-from dpmjax.simulation.town.plots import Plots
 from dpmjax.simulation.town.streets import Streets, arc_lengths, at_way, tangents
+from dpmjax.simulation.town.terrain import PAVEMENT_M, Plots
 from dpmjax.simulation.town.vegetation import plant_bushes, plant_land, plant_trees
 
-_PAVEMENT_M = 2.2
 _FREE_M = 4.2  # Least distance of parked cars from the middle of a street.
 _BORDERS = ("hedge", "wall", "fence")
 
@@ -127,19 +126,19 @@ def _houses(into: Collection, rng: np.random.Generator, side: _Side) -> None:
         middle = way + 0.5 * width
         place = side.place(middle, setback + 0.5 * depth)
         is_built = rng.random() < quarter.house_rate
-        has_house = is_built and side.plots.claim(place, (width - 0.6, depth), _PAVEMENT_M + 0.6)
+        has_house = is_built and side.plots.claim(place, (width - 0.6, depth), PAVEMENT_M + 0.6)
         if has_house:
             height = float(rng.uniform(*quarter.eaves))
             objects.put_house(into, rng, place, (width, depth), height, is_plain=setback < 3.6)
             if gap > 4 and rng.random() < 0.5:
                 garage = side.place(way + width + 0.5 * gap, setback + 4.0)
-                if side.plots.claim(garage, (3.0, 5.5), _PAVEMENT_M + 0.6):
+                if side.plots.claim(garage, (3.0, 5.5), PAVEMENT_M + 0.6):
                     objects.put_box(into, garage, (3.0, 5.5), (-1.0, 2.6), window_depth=0.1)
         elif rng.random() < quarter.car_park_rate:
             _car_park(into, rng, side, (middle, width + gap))
-        if setback > _PAVEMENT_M + 1.4 and rng.random() < quarter.border_rate:
-            border = side.place(middle + 0.5 * gap, _PAVEMENT_M + 0.4)
-            if side.plots.claim(border, (width + gap - 1.0, 0.4), _PAVEMENT_M - 0.4):
+        if setback > PAVEMENT_M + 1.4 and rng.random() < quarter.border_rate:
+            border = side.place(middle + 0.5 * gap, PAVEMENT_M + 0.4)
+            if side.plots.claim(border, (width + gap - 1.0, 0.4), PAVEMENT_M - 0.4):
                 objects.put_border(into, rng, border, width + gap - 0.4, str(rng.choice(_BORDERS)))
         _garden(into, rng, side, (way, width + gap), setback if has_house else setback + depth)
         way += width + gap
@@ -148,15 +147,15 @@ def _houses(into: Collection, rng: np.random.Generator, side: _Side) -> None:
 def _garden(into: Collection, rng: np.random.Generator, side: _Side, plot: Size, front: float) -> None:
     """Trees and bushes between the pavement and the house."""
     (way, width), quarter = plot, side.quarter
-    if front < _PAVEMENT_M + 2.0:
+    if front < PAVEMENT_M + 2.0:
         return
 
     def places(mean: float, size: float) -> list[Place]:
         drawn = [
-            side.place(way + rng.uniform(0, width), rng.uniform(_PAVEMENT_M + 1.0, front - 0.8))
+            side.place(way + rng.uniform(0, width), rng.uniform(PAVEMENT_M + 1.0, front - 0.8))
             for _ in range(rng.poisson(mean))
         ]
-        return [place for place in drawn if side.plots.claim(place, (size, size), _PAVEMENT_M + 0.4)]
+        return [place for place in drawn if side.plots.claim(place, (size, size), PAVEMENT_M + 0.4)]
 
     for place in places(quarter.garden_trees, 0.8):
         _put_tree(into, rng, place, side, 0.8)
@@ -167,8 +166,8 @@ def _garden(into: Collection, rng: np.random.Generator, side: _Side, plot: Size,
 def _car_park(into: Collection, rng: np.random.Generator, side: _Side, plot: Size) -> None:
     middle, width = plot
     size = (max(width - 2.0, 14.0), float(rng.uniform(16, 34)))
-    place = side.place(middle, _PAVEMENT_M + 1.0 + 0.5 * size[1])
-    if side.plots.claim(place, size, _PAVEMENT_M):
+    place = side.place(middle, PAVEMENT_M + 1.0 + 0.5 * size[1])
+    if side.plots.claim(place, size, PAVEMENT_M):
         objects.put_car_park(into, rng, place, size)
 
 

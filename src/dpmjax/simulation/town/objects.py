@@ -10,6 +10,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from dpmjax.simulation.town.primitives import POLE, SOFT, SOLID, Bodies, pack_bodies
+
 _SUNK_M = 1.0  # Houses and walls reach below the ground, which may slope.
 Size = tuple[float, float]
 
@@ -27,6 +29,12 @@ class Collection:
     boxes: list[tuple[float, ...]] = field(default_factory=list)
     cylinders: list[tuple[float, ...]] = field(default_factory=list)
     spheroids: list[tuple[float, ...]] = field(default_factory=list)
+
+    def packed(self) -> tuple[Bodies, Bodies, Bodies]:
+        """Returns boxes, cylinders and spheroids on the device."""
+        kinds = ((self.boxes, SOLID), (self.cylinders, POLE), (self.spheroids, SOFT))
+        boxes, cylinders, spheroids = (pack_bodies(np.array(rows, np.float64), surface) for rows, surface in kinds)
+        return boxes, cylinders, spheroids
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,6 @@ coordinates are in the world frame: metres, z up.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import jax
@@ -66,29 +65,7 @@ class Ground(NamedTuple):
     cell: Float[Array, ""]
 
 
-@dataclass(frozen=True)
-class Terrain:
-    """Ground heights and distances from the streets on one grid.
-
-    Attributes:
-        origin: (2,) x and y of entry [0, 0], m.
-        heights: (h, w) z, m; the column follows x.
-        street_distance: (h, w) from the nearest kerb, m; negative on a street.
-    """
-
-    origin: FloatArray
-    heights: FloatArray = field(repr=False)
-    street_distance: FloatArray = field(repr=False)
-
-    def height_at(self, positions: FloatArray) -> FloatArray:
-        """Ground heights (m,) at (m, 2) places, bilinear."""
-        from scipy.ndimage import map_coordinates
-
-        at = (np.atleast_2d(positions)[:, :2] - self.origin) / CELL_M
-        return map_coordinates(self.heights, at[:, ::-1].T, order=1, mode="nearest")
-
-
-class Traffic(NamedTuple):
+class RoadUsers(NamedTuple):
     """Cars that drive and people that walk, each at its own speed along a lane.
 
     Attributes:
@@ -127,7 +104,7 @@ class TownPrimitives(NamedTuple):
     cylinders: Bodies
     spheroids: Bodies
     ground: Ground
-    traffic: Traffic
+    traffic: RoadUsers
 
 
 def capacity_for(count: int, *, least: int = 64) -> int:
@@ -197,7 +174,7 @@ def turn_back(vectors: Float[Array, "... 3"], heading: Float[Array, "... 2"]) ->
     return jnp.stack([along, across, jnp.broadcast_to(z, along.shape)], axis=-1)
 
 
-def traffic_boxes(traffic: Traffic, sensor: Float[Array, " 3"], time: Float[Array, ""]) -> Bodies:
+def traffic_boxes(traffic: RoadUsers, sensor: Float[Array, " 3"], time: Float[Array, ""]) -> Bodies:
     """The road users at a time.
 
     Args:
@@ -239,7 +216,7 @@ def _car_levels(half_height: Float[Array, "..."]) -> tuple[Float[Array, "..."], 
     return 0.6 * room, 0.4 * room
 
 
-def _on_lane(traffic: Traffic, way: Float[Array, " n"]) -> Float[Array, "n 3"]:
+def _on_lane(traffic: RoadUsers, way: Float[Array, " n"]) -> Float[Array, "n 3"]:
     """Points of the lanes, linear between their samples."""
     at = jnp.clip(way / LANE_STEP_M, 0.0, traffic.lane_points.shape[1] - 1.001)
     low = jnp.floor(at).astype(jnp.int32)

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from dpmjax.checks import require_shape
 from dpmjax.geometry import se3
 from dpmjax.simulation.town.cast import Hits, Rays, cast_turn
-from dpmjax.simulation.town.culling import CastConfig, NearWorld, near_world
+from dpmjax.simulation.town.culling import NearWorld, near_world
 from dpmjax.simulation.town.primitives import NOTHING, TownPrimitives
 from dpmjax.types import AnyArray, PointCloud
 
@@ -28,6 +28,8 @@ _REFLECTIVITY = np.array([0.0, 0.17, 0.35, 0.4, 0.35, 0.3], np.float32)
 _ROUGHNESS_M = np.array([0.0, 0.0, 0.025, 0.0, 0.01, 0.02], np.float32)
 _BIAS_STREAM = 8152
 _GLASS_RETURNS = 0.35
+# Largest number of sectors of a turn, and of bands of elevation of a sector.
+_MAX_SECTORS, _MAX_BANDS = 72, 2
 # How sharply returns end at that range, in natural logarithms of range.
 _FADE = 0.18
 # Steps in range that the length of a pulse can mix, m.
@@ -145,22 +147,19 @@ def scan_town(
     twist = jnp.zeros(6) if motion is None else jnp.asarray(motion, jnp.float32)
     require_shape("T_world_lidar", pose, (4, 4))
     require_shape("motion", twist, (6,))
-    config = CastConfig()
-    near = near_world(town, pose[:3, 3], time, max_range=sensor.max_range_m, config=config)
-    return _scan_near(near, pose, twist, key=key, sensor=sensor, config=config)
+    near = near_world(town, pose[:3, 3], time, max_range=sensor.max_range_m)
+    return _scan_near(near, pose, twist, key=key, sensor=sensor)
 
 
-@partial(jax.jit, static_argnames=("sensor", "config"))
-def _scan_near(
-    near: NearWorld, pose: Array, twist: Array, *, key: PRNGKeyArray, sensor: LidarSensor, config: CastConfig
-) -> PointCloud:
+@partial(jax.jit, static_argnames="sensor")
+def _scan_near(near: NearWorld, pose: Array, twist: Array, *, key: PRNGKeyArray, sensor: LidarSensor) -> PointCloud:
     key_phase, key_rays = jax.random.split(key)
     phase = jax.random.uniform(key_phase, (), minval=0.0, maxval=2 * np.pi / sensor.num_azimuths)
     # One draw for all: each draw of its own would take a second to compile.
     depth, noise, loss, mix, part = jax.random.uniform(key_rays, (5, sensor.num_rays), minval=1e-6, maxval=1.0)
-    rays = make_rays(sensor, config, phase, twist)
+    rays = make_rays(sensor, phase, twist)
     rays = rays._replace(depths=-jnp.log(depth).reshape(rays.depths.shape))
-    hits = cast_turn(near, pose, rays, max_range=sensor.max_range_m, config=config)
+    hits = cast_turn(near, pose, rays, max_range=sensor.max_range_m)
     probability = _by_beam(_return_probability(hits, sensor), sensor)
     directions = _by_beam(rays.directions, sensor)
     ranges = _mix_edges(_by_beam(hits.ranges, sensor), sensor, mix, part)
@@ -192,19 +191,18 @@ def _mix_edges(ranges: Float[Array, " b"], sensor: LidarSensor, choice: Array, p
     return jnp.where(is_mixed, ranges + part * gap.reshape(-1), ranges)
 
 
-def make_rays(sensor: LidarSensor, config: CastConfig, phase: Float[Array, ""], motion: Float[Array, " 6"]) -> Rays:
+def make_rays(sensor: LidarSensor, phase: Float[Array, ""], motion: Float[Array, " 6"]) -> Rays:
     """The rays of a turn, by sectors of whole columns; foliage is met at its surface.
 
     Args:
         sensor: the lidar.
-        config: capacities.
         phase: by how much the turn is turned to the left, radians.
         motion: twist of the sensor during the turn, in its own frame.
 
     Returns:
         The rays, in the sensor frame.
     """
-    (num_sectors, num_bands), num_beams = _ray_shape(sensor, config), len(sensor.elevations_deg)
+    (num_sectors, num_bands), num_beams = _ray_shape(sensor), len(sensor.elevations_deg)
     step = 2 * np.pi / sensor.num_azimuths
     # Clockwise from straight behind.
     columns = (np.pi - step * (np.arange(sensor.num_azimuths) + 0.5)).astype(np.float32)
@@ -222,11 +220,11 @@ def make_rays(sensor: LidarSensor, config: CastConfig, phase: Float[Array, ""], 
     return Rays(rays, phase + jnp.asarray(columns.mean(axis=1)), jnp.zeros(rays.shape[:-1]), T_lidar_sector)
 
 
-def _ray_shape(sensor: LidarSensor, config: CastConfig) -> tuple[int, int]:
+def _ray_shape(sensor: LidarSensor) -> tuple[int, int]:
     """Number of sectors, the largest of whole columns, and of bands, the largest of whole beams."""
     num_beams = len(sensor.elevations_deg)
-    sectors = max(count for count in range(1, config.max_sectors + 1) if sensor.num_azimuths % count == 0)
-    return sectors, max(count for count in range(1, config.max_bands + 1) if num_beams % count == 0)
+    sectors = max(count for count in range(1, _MAX_SECTORS + 1) if sensor.num_azimuths % count == 0)
+    return sectors, max(count for count in range(1, _MAX_BANDS + 1) if num_beams % count == 0)
 
 
 def _return_probability(hits: Hits, sensor: LidarSensor) -> Float[Array, "s g c b"]:

@@ -7,8 +7,8 @@ import numpy as np
 from dpmjax.sequences import BoolArray, FloatArray
 from dpmjax.simulation.town.kinds import Kind, Span
 from dpmjax.simulation.town.objects import Collection
-from dpmjax.simulation.town.plots import Plots
 from dpmjax.simulation.town.primitives import CELL_M
+from dpmjax.simulation.town.terrain import Plots
 
 _FARTHEST_M = 65.0  # From the nearest kerb: what grows farther away is not seen.
 _PATCH_M = 14.0

@@ -14,10 +14,14 @@ from jaxtyping import Array, Float
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from dpmjax.deepmapping.config import Motion
-from dpmjax.deepmapping.depth_adjustment import SampledImages, adjust_poses
-from dpmjax.deepmapping.depth_motion_search import (
-    DepthInitializationConfig,
+from dpmjax.geometry.sampling import typical_range
+from dpmjax.geometry.se3 import Motion
+from dpmjax.registration_rgbd.adjustment import SampledImages, adjust_poses
+from dpmjax.registration_rgbd.depth_images import DepthScans, PixelSample
+from dpmjax.registration_rgbd.motion_search import (
+    MAX_TRANSLATION,
+    MAX_TURN_DEG,
+    DepthSearchConfig,
     SearchCamera,
     Views,
     depth_search,
@@ -25,12 +29,7 @@ from dpmjax.deepmapping.depth_motion_search import (
     propose_motions,
     surface_directions,
 )
-from dpmjax.deepmapping.projective_consistency import (
-    DepthScans,
-    PixelSample,
-    explained_share,
-)
-from dpmjax.geometry.sampling import typical_range
+from dpmjax.registration_rgbd.projective_consistency import explained_share
 
 # Trajectories differ by such a share of the largest translation, root mean square, or of the largest turn.
 _APART = (0.085, 0.075)
@@ -52,17 +51,17 @@ _NUM_LAST, _NUM_TOLERANCES = 4, 3
 
 
 def initialize_depth(
-    scans: DepthScans, config: DepthInitializationConfig | None = None, *, key: jax.Array
+    scans: DepthScans, config: DepthSearchConfig | None = None, *, key: jax.Array
 ) -> NDArray[np.float64]:
     """Searches first poses of all images, the first at the origin.
 
     Args:
-        scans: scans in order of time; neighbours overlap.
+        scans: images in order of time, metres; neighbours overlap.
         config: settings of the search; None: `depth_search("planar")`.
         key: key of the search.
 
     Returns:
-        (n, 4, 4) T_world_camera, unit of the points.
+        (n, 4, 4) T_world_camera, metres.
     """
     config = config or depth_search("planar")
     sample_key, search_key = jax.random.split(key)
@@ -113,7 +112,7 @@ def _window(num_placed: int, images: SampledImages, num_window: int) -> tuple[ND
     return np.minimum(rows, num_placed - 1), SampledImages(seen, some, unit)
 
 
-def _mean_cost(T: NDArray[np.float64], config: DepthInitializationConfig) -> NDArray[np.float64]:
+def _mean_cost(T: NDArray[np.float64], config: DepthSearchConfig) -> NDArray[np.float64]:
     """Cost of the motions of each trajectory."""
     motions = np.linalg.inv(T[:, :-1]) @ T[:, 1:]
     costs = motion_cost(np.linalg.norm(motions[..., :3, 3], axis=-1), _turns(motions), config)
@@ -131,16 +130,14 @@ def _explained(T: Float[Array, "m n 4 4"], images: SampledImages, tolerance: Flo
     return jax.lax.map(lambda one: explained_share(one, images.sample, images.scans, images.unit, tolerance), T)
 
 
-def _best_that_differ(
-    T: NDArray[np.float64], images: SampledImages, config: DepthInitializationConfig
-) -> NDArray[np.float64]:
+def _best_that_differ(T: NDArray[np.float64], images: SampledImages, config: DepthSearchConfig) -> NDArray[np.float64]:
     """The best of (t, k, m, 4, 4) trajectories that differ from all better ones, best first."""
     rows, window = _window(T.shape[2], images, _NUM_WINDOW)
     tolerance = jnp.asarray(config.tolerance[1])
     scores = np.concatenate([_explained(jnp.asarray(t[:, rows], jnp.float32), window, tolerance) for t in T])
     T = T.reshape(-1, *T.shape[2:])
     scores = scores - _mean_cost(T, config)
-    far, turn = _APART[0] * config.max_translation, _APART[1] * np.deg2rad(config.max_turn_deg)
+    far, turn = _APART[0] * MAX_TRANSLATION, _APART[1] * np.deg2rad(MAX_TURN_DEG)
     is_left, kept = scores >= scores.max() - _MARGIN, list[NDArray[np.float64]]()
     while is_left.any() and len(kept) < config.num_trajectories:
         best = T[np.argmax(np.where(is_left, scores, -np.inf))]

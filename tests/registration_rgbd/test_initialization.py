@@ -9,16 +9,29 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from dpmjax import deepmapping as dm
 from dpmjax import io, simulation
-from dpmjax.deepmapping import depth_initialization
-from dpmjax.deepmapping.depth_adjustment import SampledImages, adjust_poses
-from dpmjax.deepmapping.depth_initialization import _best_that_differ, _explained, _window
-from dpmjax.deepmapping.depth_motion_search import SearchCamera, Views, propose_motions, surface_directions
-from dpmjax.deepmapping.projective_consistency import PixelSample
-from dpmjax.deepmapping.spatial import motion_matrices
 from dpmjax.geometry.sampling import typical_range
+from dpmjax.geometry.se3 import motion_matrices
 from dpmjax.metrics import absolute_trajectory_error
+from dpmjax.registration_rgbd import (
+    DepthScans,
+    DepthSearchConfig,
+    as_depth_scans,
+    depth_search,
+    initialization,
+    initialize_depth,
+    projective_consistency,
+)
+from dpmjax.registration_rgbd.adjustment import SampledImages, adjust_poses
+from dpmjax.registration_rgbd.depth_images import PixelSample
+from dpmjax.registration_rgbd.initialization import _best_that_differ, _explained, _window
+from dpmjax.registration_rgbd.motion_search import (
+    MAX_TRANSLATION,
+    SearchCamera,
+    Views,
+    propose_motions,
+    surface_directions,
+)
 from tests.tolerances import ROUNDING
 
 KEY = jax.random.key(0)
@@ -33,8 +46,8 @@ def walk() -> io.DepthSequence:
 
 
 @pytest.fixture(scope="module")
-def scans(walk) -> dm.DepthScans:
-    return dm.as_depth_scans(walk.points, walk.mask)
+def scans(walk) -> DepthScans:
+    return as_depth_scans(walk.points, walk.mask)
 
 
 def take(sample: PixelSample, count: int) -> PixelSample:
@@ -79,7 +92,7 @@ def test_adjusted_poses_are_never_less_consistent(walk, scans) -> None:
             motion="planar",
         )
         before, after = (
-            float(dm.projective_consistency(scans, T, 0.02)) for T in (start, start @ np.asarray(motions, np.float64))
+            float(projective_consistency(scans, T, 0.02)) for T in (start, start @ np.asarray(motions, np.float64))
         )
         assert after >= before - 1e-4
 
@@ -88,7 +101,7 @@ def test_images_without_a_pose_count_nothing(walk, scans) -> None:
     T = walk.T_world_camera[:3]
     rows, window = _window(3, SampledImages(scans, scans.pixels, 1.0), 24)
     share = _explained(jnp.asarray(T[rows], jnp.float32)[None], window, jnp.asarray(0.02))
-    alone = SampledImages(dm.DepthScans(scans.points[:3], scans.mask[:3], scans.pinhole), take(scans.pixels, 3), 1.0)
+    alone = SampledImages(DepthScans(scans.points[:3], scans.mask[:3], scans.pinhole), take(scans.pixels, 3), 1.0)
     np.testing.assert_allclose(
         share, _explained(jnp.asarray(T, jnp.float32)[None], alone, jnp.asarray(0.02)), **ROUNDING
     )
@@ -102,31 +115,31 @@ def test_of_alike_trajectories_the_best_goes_on(walk, scans, monkeypatch) -> Non
     turned[3] = turned[3] @ np.asarray(motion_matrices(jnp.array([[0.0, 0.0, 0.3]])))[0]
     near[1:, 0, 3] += 0.02
     candidates = np.stack([near, far, turned, truth])[None]
-    images, config = SampledImages(scans, scans.pixels, 1.0), dm.depth_search("planar")
-    monkeypatch.setattr(depth_initialization, "_MARGIN", 100.0)
+    images, config = SampledImages(scans, scans.pixels, 1.0), depth_search("planar")
+    monkeypatch.setattr(initialization, "_MARGIN", 100.0)
     kept = _best_that_differ(candidates, images, config)
     np.testing.assert_array_equal(kept[0], truth)
     assert {T.tobytes() for T in kept} == {T.tobytes() for T in (far, turned, truth)}
     assert len(_best_that_differ(candidates, images, replace(config, num_trajectories=2))) == 2
-    monkeypatch.setattr(depth_initialization, "_MARGIN", 1e-6)
+    monkeypatch.setattr(initialization, "_MARGIN", 1e-6)
     assert len(_best_that_differ(candidates, images, config)) == 1
 
 
 @pytest.mark.slow
 def test_images_are_registered_without_a_first_guess(walk, scans) -> None:
-    config = dm.DepthInitializationConfig(num_candidates=512, num_kept=16)
-    T = dm.initialize_depth(scans, config, key=KEY)
+    config = DepthSearchConfig(num_candidates=512)
+    T = initialize_depth(scans, config, key=KEY)
     relative = np.linalg.inv(walk.T_world_camera[0]) @ walk.T_world_camera
     assert absolute_trajectory_error(T[:, :3, 3], relative[:, :3, 3]) < 0.02
     assert np.abs(T[:, 0, 2] - relative[:, 0, 2]).max() < 0.02
     np.testing.assert_array_equal(T[0], np.eye(4))
 
 
-def two_views_of_a_wall() -> dm.DepthScans:
+def two_views_of_a_wall() -> DepthScans:
     """The same image twice, of a bare wall with the normal `ACROSS`, two metres away."""
     rays = np.stack([*np.meshgrid(np.linspace(-0.7, 0.7, 12), np.linspace(-0.4, 0.4, 8)), np.ones((8, 12))], axis=-1)
     wall = rays * (-2.0 / (rays @ ACROSS))[..., None]
-    return dm.as_depth_scans(np.stack([wall, wall]))
+    return as_depth_scans(np.stack([wall, wall]))
 
 
 def test_an_image_of_one_wall_is_slid_along_it_first() -> None:
@@ -144,11 +157,11 @@ def test_an_image_of_one_wall_is_slid_along_it_first() -> None:
 def test_what_a_wall_leaves_open_is_proposed_side_by_side() -> None:
     scans = two_views_of_a_wall()
     views = Views(scans.pixels, scans.surfaces, jnp.asarray(surface_directions(scans, "planar")))
-    config = dm.DepthInitializationConfig(num_candidates=256, num_kept=8, num_varied=8, num_distinct=8)
+    config = DepthSearchConfig(num_candidates=256, num_varied=8)
     T = propose_motions(np.eye(4)[None], views, SearchCamera(scans.pinhole, 2.0), config, key=KEY)
-    assert T.shape == (8, 4, 4)
+    assert T.shape == (16, 4, 4)
     np.testing.assert_allclose(T[:, :3, 3] @ ACROSS, 0.0, atol=0.005)
     np.testing.assert_allclose(T[:, 0, 2], 0.0, atol=0.005)
     places = np.sort(T[:, :3, 3] @ ALONG)
-    assert np.diff(places).min() > 0.1 * config.max_translation
-    assert np.ptp(places) > config.max_translation
+    assert np.diff(places).min() > 0.1 * MAX_TRANSLATION
+    assert np.ptp(places) > MAX_TRANSLATION

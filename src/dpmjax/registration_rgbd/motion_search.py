@@ -17,20 +17,21 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 from numpy.typing import NDArray
 
-from dpmjax.deepmapping.config import Motion
-from dpmjax.deepmapping.depth_adjustment import gap_equations, improve_motions, motion_scales
-from dpmjax.deepmapping.projective_consistency import (
-    Agreement,
-    DepthScans,
-    Pinhole,
-    PixelSample,
-    both_ways,
-    surface_gap,
-)
-from dpmjax.deepmapping.spatial import motion_matrices
 from dpmjax.geometry import rigid
 from dpmjax.geometry.normals import image_normals
+from dpmjax.geometry.se3 import Motion, motion_matrices
+from dpmjax.registration_rgbd.adjustment import gap_equations, improve_motions, motion_scales
+from dpmjax.registration_rgbd.depth_images import DepthScans, Pinhole, PixelSample
+from dpmjax.registration_rgbd.projective_consistency import Agreement, both_ways, surface_gap
 
+# Largest translation between neighbouring images along each axis, metres.
+MAX_TRANSLATION = 0.7
+# Largest turn between neighbouring images about the vertical axis of the camera, and largest tilt (turn about a
+# horizontal axis; full motion only), degrees.
+MAX_TURN_DEG, _MAX_TILT_DEG = 75.0, 30.0
+# Best motions that go on to the next round, before the slides. Adjusted motions that differ, by which a trajectory is
+# continued: where an image leaves open how far the camera moved along a wall, they lie side by side along it.
+_NUM_KEPT, _NUM_DISTINCT = 32, 16
 # Rounds of motions, each varied half as widely as the one before.
 _NUM_ROUNDS = 4
 # Best motions of the last round that differ and are slid; places of each along each direction of the surfaces; best
@@ -49,20 +50,14 @@ _NUM_TOLERANCES, _NUM_ITERATIONS = 4, 2
 
 
 @dataclass(frozen=True)
-class DepthInitializationConfig:
-    """Settings of the search. Lengths are in the unit of the points, metres by default.
+class DepthSearchConfig:
+    """Settings of the search.
 
     Attributes:
         motion: degrees of freedom of the camera.
-        max_translation: the largest translation between neighbouring images along each axis.
-        max_turn_deg: the largest turn between neighbouring images about the vertical axis of the camera, degrees.
-        max_tilt_deg: the largest tilt (turn about a horizontal axis), degrees; full motion only.
         num_trajectories: the largest number of trajectories that go on from image to image.
         num_candidates: number of motions of the first round, spread evenly.
-        num_kept: number of the best motions that go on to the next round, before the slides.
         num_varied: number of new motions around each kept one in a round.
-        num_distinct: number of the best adjusted motions that differ, by which a trajectory is continued. Where an
-            image leaves open how far the camera moved along a wall, they lie side by side along it.
         tolerance: share of the depth by which matching points may differ, in the first and in the last round; the last
             one also while trajectories grow.
         final_tolerance: the same, in the last adjustment and where the best trajectory is chosen.
@@ -72,26 +67,20 @@ class DepthInitializationConfig:
     """
 
     motion: Motion = "planar"
-    max_translation: float = 0.7
-    max_turn_deg: float = 75.0
-    max_tilt_deg: float = 30.0
     num_trajectories: int = 16
     num_candidates: int = 1024
-    num_kept: int = 32
     num_varied: int = 20
-    num_distinct: int = 16
     tolerance: tuple[float, float] = (0.12, 0.02)
     final_tolerance: float = 0.006
     translation_weight: float = 0.05
     turn_weight: float = 0.0
 
     def __post_init__(self) -> None:
-        counts = (self.num_trajectories, self.num_candidates, self.num_kept, self.num_varied, self.num_distinct)
-        if min(counts) < 1:
+        if min(self.num_trajectories, self.num_candidates, self.num_varied) < 1:
             raise ValueError(f"all counts must be at least 1, got {self}")
 
 
-def depth_search(motion: Motion) -> DepthInitializationConfig:
+def depth_search(motion: Motion) -> DepthSearchConfig:
     """Returns the settings of the search for first poses.
 
     Args:
@@ -102,8 +91,8 @@ def depth_search(motion: Motion) -> DepthInitializationConfig:
         The settings.
     """
     if motion == "planar":
-        return DepthInitializationConfig()
-    return DepthInitializationConfig(
+        return DepthSearchConfig()
+    return DepthSearchConfig(
         motion="full",
         num_trajectories=8,
         num_candidates=16384,
@@ -172,7 +161,7 @@ def propose_motions(
     T_world_camera: NDArray[np.float64],
     views: Views,
     camera: SearchCamera,
-    config: DepthInitializationConfig,
+    config: DepthSearchConfig,
     *,
     key: jax.Array,
 ) -> NDArray[np.float64]:
@@ -202,7 +191,7 @@ def propose_motions(
     return np.asarray(found, np.float64)
 
 
-def motion_cost(length: Any, turn: Any, config: DepthInitializationConfig) -> Any:
+def motion_cost(length: Any, turn: Any, config: DepthSearchConfig) -> Any:
     """Returns the costs of motions, in consistency: the shortest motion is taken where images leave it open.
 
     Args:
@@ -213,8 +202,8 @@ def motion_cost(length: Any, turn: Any, config: DepthInitializationConfig) -> An
     Returns:
         The cost of each.
     """
-    turn_share = turn / np.deg2rad(config.max_turn_deg)
-    return config.translation_weight * length / config.max_translation + config.turn_weight * turn_share
+    turn_share = turn / np.deg2rad(MAX_TURN_DEG)
+    return config.translation_weight * length / MAX_TRANSLATION + config.turn_weight * turn_share
 
 
 def _take(tree: Any, rows: Any) -> Any:
@@ -232,7 +221,7 @@ def _score_motion(
     view: Views,
     pinhole: Pinhole,
     tolerance: Array,
-    config: DepthInitializationConfig,
+    config: DepthSearchConfig,
 ) -> Float[Array, ""]:
     """Consistency of an image with its references at a motion, less the cost of the motion."""
 
@@ -245,7 +234,7 @@ def _score_motion(
     agreement = Agreement(*(references.weights * values for values in agreements))
     length = jnp.linalg.norm(T_last_scan[:3, 3])
     score = agreement.consistency() - motion_cost(length, _turn_of(T_last_scan), config)
-    return jnp.where(length > _LONGEST * config.max_translation, -jnp.inf, score)
+    return jnp.where(length > _LONGEST * MAX_TRANSLATION, -jnp.inf, score)
 
 
 def _distinct(
@@ -253,10 +242,9 @@ def _distinct(
     scores: Float[Array, " m"],
     count: int,
     shares: tuple[float, float],
-    config: DepthInitializationConfig,
 ) -> Float[Array, "k 4 4"]:
     """The best motions that differ by these shares of the largest translation or turn from all better ones."""
-    far, turn = shares[0] * config.max_translation, shares[1] * np.deg2rad(config.max_turn_deg)
+    far, turn = shares[0] * MAX_TRANSLATION, shares[1] * np.deg2rad(MAX_TURN_DEG)
 
     def pick(left: Float[Array, " m"], _: None) -> tuple[Float[Array, " m"], Array]:
         best = T[jnp.argmax(left)]
@@ -267,11 +255,9 @@ def _distinct(
     return jax.lax.scan(pick, scores, length=count)[1]
 
 
-def _slid(
-    T: Float[Array, "k 4 4"], directions: Float[Array, "a 3"], config: DepthInitializationConfig
-) -> Float[Array, "m 4 4"]:
+def _slid(T: Float[Array, "k 4 4"], directions: Float[Array, "a 3"]) -> Float[Array, "m 4 4"]:
     """The motions, each moved to and fro along each axis of the image."""
-    lengths = _SLIDE * config.max_translation * jnp.linspace(-1.0, 1.0, _NUM_SLIDES)
+    lengths = _SLIDE * MAX_TRANSLATION * jnp.linspace(-1.0, 1.0, _NUM_SLIDES)
     moves = (lengths[:, None, None] * directions).reshape(-1, 3)
     T_scan_slid = jnp.tile(jnp.eye(4), (len(moves), 1, 1)).at[:, :3, 3].set(moves)
     slid = rigid.compose(T[:, None], T_scan_slid).reshape(-1, 4, 4)
@@ -284,7 +270,7 @@ def _adjusted(
     view: Views,
     camera: SearchCamera,
     tolerance: Float[Array, ""],
-    config: DepthInitializationConfig,
+    config: DepthSearchConfig,
 ) -> Float[Array, "4 4"]:
     """A motion so that points of the image lie on the surfaces of its references, and theirs on its own."""
     pinhole = camera.pinhole
@@ -322,10 +308,10 @@ def _search(
     camera: SearchCamera,
     key: jax.Array,
     *,
-    config: DepthInitializationConfig,
+    config: DepthSearchConfig,
 ) -> Float[Array, "k 4 4"]:
     """The best T_last_scan of the image that differ."""
-    turn, tilt, far = np.deg2rad(config.max_turn_deg), np.deg2rad(config.max_tilt_deg), config.max_translation
+    turn, tilt, far = np.deg2rad(MAX_TURN_DEG), np.deg2rad(_MAX_TILT_DEG), MAX_TRANSLATION
     widths = jnp.array([far, far, turn] if config.motion == "planar" else [far, far, far, tilt, turn, tilt])
     first_key, round_key = jax.random.split(key)
     values = widths * jax.random.uniform(first_key, (config.num_candidates, len(widths)), minval=-1.0, maxval=1.0)
@@ -339,20 +325,20 @@ def _search(
         )
 
     for step in range(_NUM_ROUNDS - 1):
-        best = T[jax.lax.top_k(scores_of(T, nearest, tolerances[step]), config.num_kept)[1]]
+        best = T[jax.lax.top_k(scores_of(T, nearest, tolerances[step]), _NUM_KEPT)[1]]
         noise = jax.random.normal(jax.random.fold_in(round_key, step), (config.num_varied, len(best), len(widths)))
         # The kept motions themselves are candidates of the next round.
         spread = _FIRST_SPREAD * 0.5**step * widths
         moves = motion_matrices((spread * noise.at[0].set(0.0)).reshape(-1, len(widths)))
         T = rigid.compose(best, moves.reshape(config.num_varied, len(best), 4, 4)).reshape(-1, 4, 4)
     scores = scores_of(T, nearest, tolerances[_NUM_ROUNDS - 1])
-    T = _slid(_distinct(T, scores, _NUM_SLID, _DIFFERENT, config), view.directions, config)
+    T = _slid(_distinct(T, scores, _NUM_SLID, _DIFFERENT), view.directions)
     adjusted_at = tolerances[_NUM_ROUNDS:]
-    T = _distinct(T, scores_of(T, references, adjusted_at[0]), _NUM_ADJUSTED, _SLID_APART, config)
+    T = _distinct(T, scores_of(T, references, adjusted_at[0]), _NUM_ADJUSTED, _SLID_APART)
     for tolerance in adjusted_at:
 
         def adjust(one: Float[Array, "4 4"], tolerance: Float[Array, ""] = tolerance) -> Float[Array, "4 4"]:
             return _adjusted(one, references, view, camera, tolerance, config)
 
         T = jax.lax.map(adjust, T, batch_size=16)
-    return _distinct(T, scores_of(T, references, adjusted_at[-1]), config.num_distinct, _SLID_APART, config)
+    return _distinct(T, scores_of(T, references, adjusted_at[-1]), _NUM_DISTINCT, _SLID_APART)

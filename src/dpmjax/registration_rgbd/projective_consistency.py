@@ -8,17 +8,13 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import flax.struct
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Bool, Float, Int
-from numpy.typing import NDArray
 
 from dpmjax.geometry import rigid
+from dpmjax.registration_rgbd.depth_images import DepthScans, Pinhole, PixelSample
 
-# Four pixels whose inverse depths differ by less than this share lie on one surface; else an edge runs between them.
-_EDGE = 0.15
 # Cost of a contradiction in matches: along a bare wall a wrong pose matches nearly everywhere, and overlaps more. At a
 # coarse tolerance many contradictions only say that the pose is not exact yet, and cost less.
 _CONTRADICTION, _LEAST_CONTRADICTION, _FULL_TOLERANCE = 18.0, 3.0, 0.02
@@ -29,92 +25,6 @@ _CONTRADICTED_POINT, _CLEAR, _NEAR = 20.0, 0.04, 0.25
 # Matches count as a share of the visible points, not of all points, or else every image would be pulled onto the
 # others. This share of all points is added to the visible ones, so that a little overlap that matches is worth little.
 _UNSEEN = 0.1
-
-
-class Pinhole(NamedTuple):
-    """A camera: column = fx x/z + cx, row = fy y/z + cy, in pixels."""
-
-    fx: Array
-    fy: Array
-    cx: Array
-    cy: Array
-
-
-class PixelSample(NamedTuple):
-    """Some points of each image, in its camera frame.
-
-    Attributes:
-        points: (n, p, 3), or (p, 3) of one image.
-        mask: False for points that are not there.
-    """
-
-    points: Float[Array, "... p 3"]
-    mask: Bool[Array, "... p"]
-
-
-@flax.struct.dataclass
-class DepthScans:
-    """Organised depth images as clouds in their camera frames (x right, y down, z forward).
-
-    Attributes:
-        points: metres, or typical ranges inside of the fit.
-        mask: True where something was measured.
-        pinhole: camera of all images.
-    """
-
-    points: Float[Array, "n h w 3"]
-    mask: Bool[Array, "n h w"]
-    pinhole: Pinhole
-
-    @property
-    def surfaces(self) -> Float[Array, "n 4 r c"]:
-        """The surface between the pixels of each image; see `image_surface`."""
-        return jax.vmap(image_surface)(jnp.where(self.mask, self.points[..., 2], 0.0))
-
-    @property
-    def pixels(self) -> PixelSample:
-        """All pixels of each image."""
-        count = self.mask.shape[0]
-        return PixelSample(self.points.reshape(count, -1, 3), self.mask.reshape(count, -1))
-
-
-def image_surface(depth: Float[Array, "h w"]) -> Float[Array, "4 r c"]:
-    """The surface between the pixels of a depth image: one over the depth, bilinear between each four pixels.
-
-    One over the depth is linear on a plane.
-
-    Args:
-        depth: depth along z, 0 where nothing was measured.
-
-    Returns:
-        Value at the upper left pixel of each four, slopes along columns and rows, and the twist. All are 0 where the
-        four pixels do not lie on one surface. r = h - 1, c = w - 1.
-    """
-    inverse = jnp.where(depth > 0.0, 1.0 / jnp.where(depth > 0.0, depth, 1.0), 0.0)
-    corners = jnp.stack([inverse[:-1, :-1], inverse[:-1, 1:], inverse[1:, :-1], inverse[1:, 1:]])
-    low, high = corners.min(axis=0), corners.max(axis=0)
-    a, b, c, d = corners
-    return jnp.where((low > 0.0) & (high - low < _EDGE * high), jnp.stack([a, b - a, c - a, a - b - c + d]), 0.0)
-
-
-def fit_pinhole(points: NDArray[np.floating], mask: NDArray[np.bool_]) -> Pinhole:
-    """The camera of organised clouds, by least squares.
-
-    Args:
-        points: (n, h, w, 3) in the camera frames.
-        mask: (n, h, w) True where something was measured, with z above 0.
-
-    Returns:
-        Pinhole.
-    """
-    _, row, column = np.nonzero(mask)
-    valid = np.asarray(points, np.float64)[mask]
-
-    def line(ratio: NDArray[np.float64], pixel: NDArray[np.intp]) -> NDArray[np.float64]:
-        return np.linalg.lstsq(np.stack([ratio, np.ones_like(ratio)], axis=-1), pixel, rcond=None)[0]
-
-    (fx, cx), (fy, cy) = line(valid[:, 0] / valid[:, 2], column), line(valid[:, 1] / valid[:, 2], row)
-    return Pinhole(*(jnp.asarray(value, jnp.float32) for value in (fx, fy, cx, cy)))
 
 
 class Agreement(NamedTuple):

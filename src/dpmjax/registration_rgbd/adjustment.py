@@ -14,15 +14,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from dpmjax.deepmapping.config import Motion
-from dpmjax.deepmapping.projective_consistency import (
-    DepthScans,
-    PixelSample,
-    consistency_of_pairs,
-    surface_gap,
-)
-from dpmjax.deepmapping.spatial import motion_matrices
 from dpmjax.geometry import rigid
+from dpmjax.geometry.se3 import Motion, motion_matrices
+from dpmjax.registration_rgbd.depth_images import DepthScans, PixelSample
+from dpmjax.registration_rgbd.projective_consistency import consistency_of_pairs, surface_gap
 
 # Share of the mean information that is added to all, at first; divided after a better step, multiplied after a worse.
 _DAMPING, _LEAST_DAMPING, _BETTER, _WORSE = 1e-3, 1e-5, 4.0, 8.0

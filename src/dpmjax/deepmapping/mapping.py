@@ -1,0 +1,246 @@
+"""DeepMapping of scans of any sensor: the problem, `fit_deepmapping` around the engine, and the choice of fit or start.
+
+The type of the scans chooses the sensor: a ScanSet is planar, DepthScans are depth images, CloudScans lidar clouds.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import Literal, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from dpmjax.deepmapping.cloud_scans import CloudScans, as_cloud_scans, find_partners
+from dpmjax.deepmapping.clouds import CLOUDS, trajectory_misfit
+from dpmjax.deepmapping.config import DeepMappingConfig
+from dpmjax.deepmapping.depth import DEPTH
+from dpmjax.deepmapping.engine import Fit, Report, fit
+from dpmjax.deepmapping.planar import PLANAR, as_scan_set
+from dpmjax.deepmapping.presets import preset
+from dpmjax.deepmapping.problem import MappingData, Params, Problem, Sensor, make_optimizer, phases_of
+from dpmjax.geometry import se2
+from dpmjax.geometry.sampling import typical_range
+from dpmjax.registration_rgbd.depth_images import DepthScans, as_depth_scans
+from dpmjax.registration_rgbd.initialization import initialize_depth
+from dpmjax.registration_rgbd.motion_search import depth_search
+from dpmjax.registration_rgbd.projective_consistency import projective_consistency
+from dpmjax.types import ScanSet
+
+_SENSORS: dict[type, Sensor] = {ScanSet: PLANAR, DepthScans: DEPTH, CloudScans: CLOUDS}
+# Kernel width, in typical ranges, of the misfit by which a start and the fit of clouds are compared.
+_MISFIT_KERNEL_WIDTH = 0.004
+
+Scans = ScanSet | DepthScans | CloudScans
+
+
+class Fitted(NamedTuple):
+    """Result of `fit_deepmapping`.
+
+    Attributes:
+        poses: float64, unit of the points: (n, 3) x, y, heading of planar scans, else (n, 4, 4) T_world_scan.
+        params: parameters of L-Net and M-Net.
+        report: report of the last call of the step.
+        unit: the length that the parameters count in, unit of the points.
+        config: settings of the fit.
+        num_steps: steps done in all, those of a resumed run too; with 0, the networks are untrained.
+    """
+
+    poses: NDArray[np.float64]
+    params: Params
+    report: Report | None
+    unit: float
+    config: DeepMappingConfig
+    num_steps: int
+
+    @property
+    def T_world_scan(self) -> NDArray[np.float64]:
+        """(n, 3, 3) or (n, 4, 4) the poses as matrices; the frame of a depth image is that of its camera."""
+        return self.poses if self.poses.ndim == 3 else se2.to_matrix(self.poses)
+
+
+class Registered(NamedTuple):
+    """Result of `register_depth` and of `register_clouds`.
+
+    Attributes:
+        T_world_scan: (n, 4, 4) float64, unit of the points: of the fit, or the start where that fits better.
+        kept: source of the poses, the fit or the start.
+        misfit: disagreement of the scans at the poses of the fit, 0 or more. Of depth images 1 less their
+            `projective_consistency`; of clouds the share of planes that do not meet planes of other scans.
+        start_misfit: the same at the start; None after a cold start.
+        start: (n, 4, 4) poses that the fit started from; None after a cold start.
+        fitted: DeepMapping of the scans.
+    """
+
+    T_world_scan: NDArray[np.float64]
+    kept: Literal["fit", "start"]
+    misfit: float
+    start_misfit: float | None
+    start: NDArray[np.float64] | None
+    fitted: Fitted
+
+
+def mapping_data(scans: Scans | ArrayLike, start: ArrayLike | None = None) -> tuple[MappingData, float]:
+    """Checks scans and poses, and takes the typical range of the scans as the unit of length.
+
+    Args:
+        scans: DepthScans, CloudScans, or planar scans as `as_scan_set` takes them.
+        start: poses to start from: (n, 3) x, y, heading or (n, 3, 3) matrices of planar scans, else (n, 4, 4)
+            T_world_scan; None: cold start.
+
+    Returns:
+        The data as the problem takes them, and the typical range in the unit of the scans.
+
+    Raises:
+        ValueError: the scans or the poses have a wrong shape or are not finite, or a scan has no valid beam.
+    """
+    checked = scans if isinstance(scans, DepthScans | CloudScans) else as_scan_set(scans)
+    unit, sensor = typical_range(checked.points, checked.mask), _SENSORS[type(checked)]
+    T_start = None if start is None else sensor.scaled_start(start, len(checked.points), unit)
+    scaled = replace(checked, points=checked.points / unit)
+    if isinstance(scaled, CloudScans):
+        partners = scaled.partners if T_start is None else find_partners(np.asarray(T_start), 1.0)
+        scaled = replace(scaled, spacing=scaled.spacing / unit, partners=partners)
+    return MappingData(scaled, T_start), unit
+
+
+def mapping_problem(config: DeepMappingConfig, data: MappingData) -> Problem:
+    """States DeepMapping of scans as a problem of the engine.
+
+    Args:
+        config: settings of the fit.
+        data: data of `mapping_data`.
+
+    Returns:
+        The problem; its poses are those of `Fitted`, in typical ranges.
+
+    Raises:
+        ValueError: clouds move in the plane by these settings.
+    """
+    if isinstance(data.scans, CloudScans) and config.motion != "full":
+        raise ValueError(f"motion: expected 'full' of clouds, got {config.motion!r}")
+    sensor = _SENSORS[type(data.scans)]
+    return Problem(
+        config, phases_of(config, data), sensor.init, make_optimizer, sensor.loss, sensor.poses, sensor.next_phase,
+        config.steps_per_call,
+    )  # fmt: skip
+
+
+def fit_deepmapping(
+    scans: Scans | ArrayLike,
+    config: DeepMappingConfig | None = None,
+    *,
+    key: jax.Array,
+    start: ArrayLike | None = None,
+    engine: Callable[..., Fit] = fit,
+) -> Fitted:
+    """Registers scans by optimising L-Net and M-Net on them alone (DeepMapping eq. 6).
+
+    Args:
+        scans: planar scans (n, b, 2) in the sensor frames, any unit; all-zero or non-finite beams are left out. Or a
+            ScanSet, DepthScans (section 4.2) or CloudScans.
+        config: settings; None: the fast preset of planar scans; `preset` has those of other sensors.
+        key: key of the whole run.
+        start: poses to start from, as `mapping_data` takes them; None: cold start from zero.
+        engine: what trains, called as `engine(problem, data, key=key)`;
+            `functools.partial(fit, on_report=..., stop=...)` reports each call of the step and can be stopped.
+
+    Returns:
+        Fitted, poses in the unit of the points. The world is that of `start`, or arbitrary after a cold start.
+
+    Raises:
+        ValueError: as `mapping_data`.
+    """
+    config = config or DeepMappingConfig()
+    data, unit = mapping_data(scans, start)
+    done = engine(mapping_problem(config, data), data, key=key)
+    poses = _SENSORS[type(data.scans)].unscaled(done.poses, unit)
+    return Fitted(poses, done.state.params, done.report, unit, config, int(done.state.step))
+
+
+def register_depth(
+    images: DepthScans | ArrayLike,
+    config: DeepMappingConfig | None = None,
+    *,
+    key: jax.Array,
+    start: ArrayLike | None = None,
+    engine: Callable[..., Fit] = fit,
+) -> Registered:
+    """Registers depth images: a search for first poses, DeepMapping from them (section 4.2), and of both the better.
+
+    They are compared by `projective_consistency`, without ground truth.
+
+    Args:
+        images: (n, h, w, 3) points in the camera frames (x right, y down, z forward), or DepthScans; metres, or any
+            unit where a start is given.
+        config: settings of the fit; None: `preset("fast", "depth")`. Its `motion` holds for the search, too.
+        key: key of the search and of the fit.
+        start: (n, 4, 4) T_world_camera to start from; None: `initialize_depth` searches first poses.
+        engine: engine of the fit, as in `fit_deepmapping`.
+
+    Returns:
+        Registered, in the world of the start.
+
+    Raises:
+        ValueError: as `as_depth_scans`, or `start` has a wrong shape or is not finite.
+    """
+    config = config or preset("fast", "depth")
+    scans = images if isinstance(images, DepthScans) else as_depth_scans(images)
+    if start is None:
+        start = initialize_depth(scans, depth_search(config.motion), key=key)
+    # Search and fit share the key: a fit from given poses gives the same as one from the same poses, found here. The
+    # published numbers rest on it.
+    fitted = fit_deepmapping(scans, config, key=key, start=start, engine=engine)
+    return _keep_better(fitted, start, lambda T: 1.0 - float(projective_consistency(scans, T)))
+
+
+def register_clouds(
+    scans: CloudScans | Sequence[ArrayLike],
+    config: DeepMappingConfig | None = None,
+    *,
+    key: jax.Array,
+    start: ArrayLike | None = None,
+    engine: Callable[..., Fit] = fit,
+) -> Registered:
+    """Registers 3-D lidar scans by optimising L-Net and M-Net on them alone (DeepMapping eq. 6, in SE(3)).
+
+    The fit replaces a given start only if its planes meet better than those of the start; no ground truth is used.
+
+    Args:
+        scans: (m_i, 3) points in the lidar frames, any unit, in the order of time; or CloudScans.
+        config: settings; None: `preset("fast", "clouds")`.
+        key: key of the whole run.
+        start: (n, 4, 4) T_world_scan to start from; None: cold start.
+        engine: engine of the fit, as in `fit_deepmapping`.
+
+    Returns:
+        Registered, in the world of `start`, or an arbitrary one after a cold start.
+
+    Raises:
+        ValueError: as `as_cloud_scans`, or `start` has a wrong shape or is not finite.
+    """
+    scans = scans if isinstance(scans, CloudScans) else as_cloud_scans(scans)
+    fitted = fit_deepmapping(scans, config or preset("fast", "clouds"), key=key, start=start, engine=engine)
+    (scaled, _), unit = mapping_data(scans, start)
+
+    def misfit_of(T: ArrayLike) -> float:
+        poses = jnp.asarray(CLOUDS.unscaled(T, 1.0 / unit), jnp.float32)
+        return float(trajectory_misfit(scaled, poses, _MISFIT_KERNEL_WIDTH))
+
+    return _keep_better(fitted, start, misfit_of)
+
+
+def _keep_better(fitted: Fitted, start: ArrayLike | None, misfit_of: Callable[..., float]) -> Registered:
+    """Returns the poses of the fit or of its start, those of the smaller misfit."""
+    T, misfit = fitted.T_world_scan, misfit_of(fitted.T_world_scan)
+    if start is None:
+        return Registered(T, "fit", misfit, None, None, fitted)
+    T_start = np.asarray(start, np.float64)
+    start_misfit = misfit_of(T_start)
+    # A fit that is not finite is not better.
+    if misfit < start_misfit:
+        return Registered(T, "fit", misfit, start_misfit, T_start, fitted)
+    return Registered(T_start, "start", misfit, start_misfit, T_start, fitted)

@@ -1,0 +1,134 @@
+"""Organised depth images: points in the camera frames with their camera, and the surface between the pixels."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+from numpy.typing import ArrayLike, NDArray
+
+# Four pixels whose inverse depths differ by less than this share lie on one surface; else an edge runs between them.
+_EDGE = 0.15
+
+
+class Pinhole(NamedTuple):
+    """A camera: column = fx x/z + cx, row = fy y/z + cy, in pixels."""
+
+    fx: Array
+    fy: Array
+    cx: Array
+    cy: Array
+
+
+class PixelSample(NamedTuple):
+    """Some points of each image, in its camera frame.
+
+    Attributes:
+        points: (n, p, 3), or (p, 3) of one image.
+        mask: False for points that are not there.
+    """
+
+    points: Float[Array, "... p 3"]
+    mask: Bool[Array, "... p"]
+
+
+@flax.struct.dataclass
+class DepthScans:
+    """Organised depth images as clouds in their camera frames (x right, y down, z forward).
+
+    Attributes:
+        points: metres, or typical ranges inside of the fit.
+        mask: True where something was measured.
+        pinhole: camera of all images.
+    """
+
+    points: Float[Array, "n h w 3"]
+    mask: Bool[Array, "n h w"]
+    pinhole: Pinhole
+
+    @property
+    def surfaces(self) -> Float[Array, "n 4 r c"]:
+        """The surface between the pixels of each image; see `image_surface`."""
+        return jax.vmap(image_surface)(jnp.where(self.mask, self.points[..., 2], 0.0))
+
+    @property
+    def pixels(self) -> PixelSample:
+        """All pixels of each image."""
+        count = self.mask.shape[0]
+        return PixelSample(self.points.reshape(count, -1, 3), self.mask.reshape(count, -1))
+
+
+def as_depth_scans(points: ArrayLike, mask: ArrayLike | None = None) -> DepthScans:
+    """Checked depth images.
+
+    Args:
+        points: (n, h, w, 3) in the camera frames (x right, y down, z forward), any unit.
+        mask: (n, h, w) True where something was measured; None: pixels that are not finite or all zero measured
+            nothing.
+
+    Returns:
+        The images with their camera.
+
+    Raises:
+        ValueError: the shapes are not (n, h, w, 3) and (n, h, w) with n >= 2, an image has no valid pixel, or a valid
+            point is not finite or not in front of the camera (z above 0).
+    """
+    cloud = np.asarray(points, np.float32)
+    if cloud.ndim != 4 or cloud.shape[-1] != 3 or len(cloud) < 2:
+        raise ValueError(f"points: expected shape (n, h, w, 3) with n >= 2, got {cloud.shape}")
+    is_finite = np.isfinite(cloud).all(-1)
+    valid = is_finite & (np.abs(cloud).sum(-1) > 0) if mask is None else np.asarray(mask)
+    if valid.shape != cloud.shape[:3] or valid.dtype != bool:
+        raise ValueError(f"mask: expected bool of shape {cloud.shape[:3]}, got {valid.dtype} of {valid.shape}")
+    if (valid & ~is_finite).any():
+        raise ValueError("points: expected finite coordinates where the mask is True")
+    if (cloud[valid][:, 2] <= 0.0).any():
+        raise ValueError("points: expected z above 0, in front of the camera, where the mask is True")
+    empty = np.flatnonzero(~valid.any((1, 2)))
+    if len(empty):
+        raise ValueError(f"mask: image {empty[0]} has no valid pixel; leave it out ({len(empty)} such images)")
+    pinhole = fit_pinhole(cloud, valid)
+    return DepthScans(jnp.asarray(np.where(valid[..., None], cloud, 0.0)), jnp.asarray(valid), pinhole)
+
+
+def image_surface(depth: Float[Array, "h w"]) -> Float[Array, "4 r c"]:
+    """The surface between the pixels of a depth image: one over the depth, bilinear between each four pixels.
+
+    One over the depth is linear on a plane.
+
+    Args:
+        depth: depth along z, 0 where nothing was measured.
+
+    Returns:
+        Value at the upper left pixel of each four, slopes along columns and rows, and the twist. All are 0 where the
+        four pixels do not lie on one surface. r = h - 1, c = w - 1.
+    """
+    inverse = jnp.where(depth > 0.0, 1.0 / jnp.where(depth > 0.0, depth, 1.0), 0.0)
+    corners = jnp.stack([inverse[:-1, :-1], inverse[:-1, 1:], inverse[1:, :-1], inverse[1:, 1:]])
+    low, high = corners.min(axis=0), corners.max(axis=0)
+    a, b, c, d = corners
+    return jnp.where((low > 0.0) & (high - low < _EDGE * high), jnp.stack([a, b - a, c - a, a - b - c + d]), 0.0)
+
+
+def fit_pinhole(points: NDArray[np.floating], mask: NDArray[np.bool_]) -> Pinhole:
+    """The camera of organised clouds, by least squares.
+
+    Args:
+        points: (n, h, w, 3) in the camera frames.
+        mask: (n, h, w) True where something was measured, with z above 0.
+
+    Returns:
+        Pinhole.
+    """
+    _, row, column = np.nonzero(mask)
+    valid = np.asarray(points, np.float64)[mask]
+
+    def line(ratio: NDArray[np.float64], pixel: NDArray[np.intp]) -> NDArray[np.float64]:
+        return np.linalg.lstsq(np.stack([ratio, np.ones_like(ratio)], axis=-1), pixel, rcond=None)[0]
+
+    (fx, cx), (fy, cy) = line(valid[:, 0] / valid[:, 2], column), line(valid[:, 1] / valid[:, 2], row)
+    return Pinhole(*(jnp.asarray(value, jnp.float32) for value in (fx, fy, cx, cy)))
