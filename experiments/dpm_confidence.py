@@ -31,8 +31,8 @@ FIRST_PLACE = 3_200_000
 BANDS_M = ((1.0, 5.0), (5.0, 10.0), (10.0, 20.0), (60.0, np.inf))
 SURE = 0.9
 NEAR_M = 5.0
-# Length of the way through each place out of doors; inside a quarter of it. Pairs of each place and distance.
-LENGTH_M, NUM_PAIRS = 400.0, 8
+# Length of the way through each place out of doors; inside a quarter of it.
+LENGTH_M = 400.0
 RATED = {"scans": "is_right", "clouds": "is_right_of_clouds"}
 COLUMNS = (
     "match of", "calibration of", "place", "pairs", "right", "sure", "sure and wrong", "1-5 m, right and sure",
@@ -50,10 +50,12 @@ class Config(cli.RunOptions):
     """Calibrated models of one network: names of shipped ones, or .safetensors files."""
     places: Annotated[int, arg(metavar="N")] = 15
     """Number of places: five kinds take turns, then three lidars."""
+    pairs: Annotated[int, arg(metavar="N")] = 8
+    """Pairs of each place and distance."""
 
     def __post_init__(self) -> None:
         """Checks ranges."""
-        cli.check_least(self, places=1, seed=0)
+        cli.check_least(self, places=1, pairs=1, seed=0)
         if not self.models:
             raise ValueError("give at least one model")
 
@@ -71,7 +73,7 @@ def main(config: Config) -> list[cli.Row]:
 
     def work(run: cli.TableRun, place: int, kind: str, beams: int) -> cli.Row:
         drive = ambiguous_drive(place, kind, beams, LENGTH_M)
-        return measure_pairs(first, drive, BANDS_M, NUM_PAIRS, seed=config.seed, on_pair=run.check_stop)
+        return measure_pairs(first, drive, BANDS_M, config.pairs, seed=config.seed, on_pair=run.check_stop)
 
     def report(rows: list[cli.Row]) -> cli.Summary:
         numbers = [
