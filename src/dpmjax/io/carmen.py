@@ -4,13 +4,15 @@ A scan has two poses. A log as recorded has both at the places of its ODOM lines
 odometry, and there is no reference. In a log that a SLAM program has corrected, the first pose is the reference and the
 second the raw odometry; where both are equal, the raw odometry is lost.
 
-Some published logs have lines with the time stamp and odometry of another moment. There the time stamps are out of
-order, and the odometry jumps by metres and back. Those entries are interpolated.
+Some published logs have lines with the scan, time stamp and odometry of another moment, while their corrected poses are
+in order. There the time stamps are out of order, and the odometry jumps by metres and back. These scans are put where
+they belong by their time.
 """
 
 from __future__ import annotations
 
 import bisect
+import dataclasses
 import gzip
 import logging
 import zlib
@@ -161,6 +163,8 @@ _LONGEST_RANGE_M = 1e6
 _SAME_PLACE_M = 0.5
 # Equal poses, metres and radians.
 _SAME_POSE = 1e-4
+# A line is moved where its time stamp puts it if that shortens the detour of its odometry to this share.
+_SHORTER_WAY = 0.5
 _CODE_BAND_M = 0.1  # Codes for "no echo" scatter by a few centimetres (81.87 to 81.91 m on a SICK LMS).
 
 
@@ -175,7 +179,8 @@ def read_carmen_log(path: str | Path, *, max_range: float | None = None) -> Scan
 
     Returns:
         The scans in metres; scans with fewer beams than the longest are padded with masked beams. Poses are those of
-        the laser; the corrected ones are the reference. No times where the log's stand still.
+        the laser; the corrected ones are the reference. No times where the log's stand still. Lines of another moment
+        are in the order of time; the reference of such a scan follows from the one before by the odometry.
 
     Raises:
         InputError: the file cannot be read, has no FLASER and no ROBOTLASER1 line, or one lacks values or holds words
@@ -194,10 +199,9 @@ def read_carmen_log(path: str | Path, *, max_range: float | None = None) -> Scan
         row[:count] = ranges[:, None] * np.column_stack([np.cos(line.angles), np.sin(line.angles)])
     points[~mask] = 0  # no -0.0
     reference, odometry = _reference_and_odometry(log)
-    stamps = np.array([line.time for line in lines])
-    times, repaired = _repair(stamps, np.zeros((len(lines), 3)) if odometry is None else odometry, path)
-    raw = None if odometry is None else repaired
-    return ScanSequence(Path(path).name.split(".")[0], points, mask, "m", True, reference, raw, times)
+    times = np.array([line.time for line in lines])
+    sequence = ScanSequence(Path(path).name.split(".")[0], points, mask, "m", True, reference, odometry, times)
+    return _in_order(sequence, path)
 
 
 def _reference_and_odometry(log: CarmenLines) -> tuple[FloatArray | None, FloatArray | None]:
@@ -227,25 +231,66 @@ def _no_echo_limit(lines: list[ScanLine]) -> float:
     return largest - _CODE_BAND_M if largest >= _SHORTEST_SCALE_M else np.inf
 
 
-def _repair(times: FloatArray, odometry: FloatArray, path: str | Path) -> tuple[FloatArray | None, FloatArray]:
-    """Interpolates time and odometry where the time stamp is out of order; no times where they stand still."""
+def _in_order(sequence: ScanSequence, path: str | Path) -> ScanSequence:
+    """Puts scans of another moment where their time belongs; drops times that stand still or have no order."""
+    times, odometry, rows = sequence.times, sequence.odometry_poses, np.arange(len(sequence))
+    assert times is not None
     if np.ptp(times) == 0:
-        return None, odometry
-    trusted = _longest_increasing(times)
-    num_wrong = len(times) - len(trusted)
-    if 2 * num_wrong > len(times):
-        _log.warning("%s: time stamps are in no order; odometry is taken as it stands, times are dropped", path)
-        return None, odometry
-    if num_wrong:
-        message = "%s: %d of %d lines carry time and odometry of another moment; both are interpolated"
-        _log.warning(message, path, num_wrong, len(times))
-    index = np.arange(len(times))
-    pose = odometry[trusted].copy()
+        return dataclasses.replace(sequence, times=None)
+    ordered = _longest_increasing(times)
+    late = np.setdiff1d(rows, ordered)
+    if 2 * len(late) > len(times):
+        _log.warning("%s: time stamps are in no order; lines stay in their order, times are dropped", path)
+        return dataclasses.replace(sequence, times=None)
+    moved = np.zeros(len(times), bool)
+    if odometry is not None:
+        by_row, by_time = (_detours(odometry, late, ordered, keys) for keys in (rows.astype(np.float64), times))
+        moved[late] = by_time < _SHORTER_WAY * by_row
+    if len(late):
+        message = "%s: %d of %d lines are of another moment; %d are moved to their time, the others are interpolated"
+        _log.warning(message, path, len(late), len(times), moved.sum())
+    known = np.union1d(ordered, np.flatnonzero(moved))
+    stamps = np.interp(rows, ordered, times[ordered])
+    stamps[known] = times[known]
+    order = np.argsort(stamps, kind="stable")
+    if odometry is not None:
+        odometry = _interpolated(odometry, ordered, known)
+    repaired = dataclasses.replace(sequence, times=stamps, odometry_poses=odometry)
+    return _carry_reference(repaired.take(order), moved[order])
+
+
+def _interpolated(odometry: FloatArray, ordered: NDArray[np.int64], known: NDArray[np.int64]) -> FloatArray:
+    """Returns odometry that is interpolated between the ordered lines wherever it is not known."""
+    pose = odometry[ordered].copy()
     pose[:, 2] = np.unwrap(pose[:, 2])
-    repaired = np.column_stack([np.interp(index, trusted, column) for column in pose.T])
-    repaired[:, 2] = np.pi - (np.pi - repaired[:, 2]) % (2 * np.pi)
-    repaired[trusted] = odometry[trusted]
-    return np.interp(index, trusted, times[trusted]), repaired
+    between = np.column_stack([np.interp(np.arange(len(odometry)), ordered, column) for column in pose.T])
+    between[:, 2] = np.pi - (np.pi - between[:, 2]) % (2 * np.pi)
+    between[known] = odometry[known]
+    return between
+
+
+def _detours(odometry: FloatArray, late: NDArray[np.int64], ordered: NDArray[np.int64], keys: FloatArray) -> FloatArray:
+    """Returns how much longer the way of the ordered lines becomes with each late one, where these keys put it."""
+    after = np.searchsorted(keys[ordered], keys[late])
+    before, after = ordered[np.maximum(after - 1, 0)], ordered[np.minimum(after, len(ordered) - 1)]
+
+    def way(start: NDArray[np.int64], end: NDArray[np.int64]) -> FloatArray:
+        step = se2.relative(odometry[start], odometry[end])
+        return np.hypot(step[:, 0], step[:, 1]) + np.abs(se2.wrap_angle(step[:, 2]))
+
+    return way(before, late) + way(late, after) - way(before, after)
+
+
+def _carry_reference(sequence: ScanSequence, moved: NDArray[np.bool_]) -> ScanSequence:
+    """Moves the reference on by the odometry to the scans that were moved: theirs is that of the line, not the scan."""
+    reference, odometry = sequence.reference_poses, sequence.odometry_poses
+    if reference is None or odometry is None or not moved.any():
+        return sequence
+    rows = np.arange(len(moved))
+    before = np.maximum.accumulate(np.where(moved, -1, rows))
+    before = np.where(before < 0, np.flatnonzero(~moved)[0], before)
+    carried = se2.compose(reference[before], se2.relative(odometry[before], odometry))
+    return dataclasses.replace(sequence, reference_poses=np.where(moved[:, None], carried, reference))
 
 
 def _longest_increasing(values: FloatArray) -> NDArray[np.int64]:
