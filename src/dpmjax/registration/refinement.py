@@ -13,10 +13,7 @@ from numpy.typing import ArrayLike
 
 from dpmjax.checks import as_beams
 from dpmjax.geometry import se2
-from dpmjax.registration.held_steps import (
-    matched_steps,
-    settle_steps,
-)
+from dpmjax.registration.held_steps import matched_steps, settle_steps
 from dpmjax.registration.incremental import incremental_icp
 from dpmjax.registration.joint_alignment import AlignmentConfig, align_all, restore_open
 from dpmjax.registration.line_adjustment import adjust_to_lines
@@ -27,6 +24,7 @@ from dpmjax.registration.quality import choose_trajectory
 from dpmjax.registration.range_profiles import make_profiles
 from dpmjax.registration.step_prior import StepPrior
 from dpmjax.registration.step_scores import fitting_scans, interpolate
+from dpmjax.registration.torn_steps import restore_torn
 from dpmjax.types import ScanSet
 
 # The start is sound, and no loops are searched, if the fitness of all its steps is above this, and so is the weakest
@@ -95,6 +93,7 @@ def refine(
     scans = scans if isinstance(scans, PlanarScans) else planar_scans(as_beams("scans", scans))
     start = se2.as_poses("poses", poses, len(scans))
     candidates, num_loops = {"start": start}, {"start": 0}
+    fitting_steps = np.asarray(se2.relative(start[:-1], start[1:]))
     prior = (prior or StepPrior.of_poses(start, scans.typical_range)) if scans.is_ordered else None
     if prior is not None and config.loops is not None and not _is_sound(scans, start):
         # The steps again, with those of the start as guess, and with the prior where the scans leave a direction open.
@@ -108,7 +107,12 @@ def refine(
         matched = matched_steps(settled, slides, scans.typical_range)
         candidates["loops"], _, weights = close_loops(scans, se2.chain(settled.poses), config.loops, steps=matched)
         num_loops["loops"] = int((weights > 0.25).sum())
+        fitting_steps = settled.poses
     aligned = {name: align_all(scans, candidate, config, prior) for name, candidate in candidates.items()}
+    for name, found in list(aligned.items()) if prior is not None else []:
+        if (restored := restore_torn(make_profiles(scans), fitting_steps, found, config)) is not None:
+            mended = f"{name}, mended"
+            aligned[mended], num_loops[mended] = align_all(scans, restored, config, prior), num_loops[name]
     kept = "start" if len(aligned) == 1 else choose_trajectory(scans, aligned, prior=prior)[0]
     best = aligned[kept]
     if scans.noise > _MIN_NOISE * scans.typical_range:

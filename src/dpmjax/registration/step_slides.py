@@ -20,6 +20,8 @@ from dpmjax.registration.step_scores import pair_scores
 
 # Shifts to either side, and their spacing, typical ranges.
 _REACH, _SPACING = 0.36, 0.012
+# Places between two shifts, where the scores are interpolated; a prior may be sharper than the spacing.
+_FINER = 8
 # Difference of scores that divides the probability of a place by e.
 _SCORE_SCALE = 0.02
 # A step is torn where another place farther than this (typical ranges) is more probable by this number of nats.
@@ -33,7 +35,8 @@ class Slides(NamedTuple):
 
     Attributes:
         directions: (k, 2) unit vectors in the frame of the target.
-        shifts: (k,) shift to the most probable place of a torn or open step, in the unit of the points; 0 for others.
+        shifts: (k,) shift to the mean of the places of an open step, and to the most probable place of a torn one, in
+            the unit of the points; 0 for others.
         deviations: (k,) standard deviation of the shift about that place, in the unit of the points.
         is_torn: (k,) True where another place is clearly better than the given one.
         is_open: (k,) True where the scores alone leave places far apart.
@@ -88,19 +91,31 @@ def slide_steps(
     places[..., :2] += shifts[:, None] * directions[:, None]
     source, target = (np.repeat(rows, len(shifts)) for rows in (source, target))
     scores = pair_scores(profiles, source, target, places.reshape(-1, 3)).reshape(len(steps), -1)
+    shifts, scores, count = _interpolated(shifts), _interpolated(scores), _FINER * count
     nats = scores / _SCORE_SCALE
-    is_open = _deviations(nats, shifts, nats.argmax(axis=1)) > _OPEN_DEVIATION * unit
+    is_open = _spread(nats, shifts)[1] > _OPEN_DEVIATION * unit
     if prior is not None:
+        places = np.repeat(np.asarray(steps, np.float64)[:, None], len(shifts), axis=1)
+        places[..., :2] += shifts[:, None] * directions[:, None]
         nats -= prior.costs(places)
     row, best = np.arange(len(steps)), nats.argmax(axis=1)
     is_torn = (nats[row, best] - nats[:, count] > _LEAST_GAIN) & (np.abs(shifts[best]) > _LEAST_SHIFT * unit)
-    deviations = _deviations(nats, shifts, best)
-    best = np.where(is_torn | is_open, best, count)
-    return Slides(directions, shifts[best], deviations, is_torn, is_open, scores[row, best])
+    means, deviations = _spread(nats, shifts)
+    shift = np.where(is_open, means, np.where(is_torn, shifts[best], 0.0))
+    nearest = np.abs(shifts - shift[:, None]).argmin(axis=1)
+    return Slides(directions, shift, deviations, is_torn, is_open, scores[row, nearest])
 
 
-def _deviations(nats: Floats, shifts: Floats, best: Indices) -> Floats:
-    """Returns the standard deviations (k,) of shifts (s,) about the best one, by log probabilities (k, s)."""
+def _interpolated(values: Floats) -> Floats:
+    """Returns values (..., s) with those between each two of them."""
+    parts = np.arange(_FINER) / _FINER
+    between = values[..., :-1, None] + parts * np.diff(values)[..., None]
+    return np.concatenate([between.reshape(*values.shape[:-1], -1), values[..., -1:]], axis=-1)
+
+
+def _spread(nats: Floats, shifts: Floats) -> tuple[Floats, Floats]:
+    """Returns the means (k,) and the standard deviations of shifts (s,) about the most probable ones."""
     probability = np.exp(nats - nats.max(axis=1, keepdims=True))
     probability /= probability.sum(axis=1, keepdims=True)
-    return np.sqrt((probability * (shifts - shifts[best][:, None]) ** 2).sum(axis=1))
+    means, best = probability @ shifts, shifts[nats.argmax(axis=1)]
+    return means, np.sqrt((probability * (shifts - best[:, None]) ** 2).sum(axis=1))
