@@ -1,7 +1,7 @@
 """Steps that a refinement has torn: two scans that fitted each other before it, and do not after it.
 
-A loop that pulls at a long step, or a wrong pair in space, moves single scans away from their neighbours, farther than an
-alignment can mend. The graph is solved again with the steps of before at these places.
+A loop that pulls at a long step, or a wrong pair in space, moves single scans away from their neighbours by more than
+an alignment can mend. The graph is solved again with the steps of before at these places.
 """
 
 from __future__ import annotations
