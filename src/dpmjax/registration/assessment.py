@@ -136,27 +136,37 @@ def _slide_all(profiles: RangeProfiles, poses: Floats, prior: StepPrior) -> Slid
 def _deviations(profiles: RangeProfiles, num_scans: int, pairs: _Pairs, steps: Slides | None) -> Floats:
     """Returns the standard deviation of each scan's place against the largest part without open connections (n,).
 
-    A pair that has no other place along its weak direction is closed. The variances of open steps add up along the best
-    way from a scan to that part; without a way the deviation is infinite. The steps (n - 1) are those of a prior.
+    A pair that has no other place along its weak direction is closed. An open one counts by the spread of its places.
+    These variances and those of the steps (n - 1), which are known of a prior, are the resistances of a network, whose
+    resistance to that part is the variance of a scan. A scan without a way to it has an infinite deviation.
     """
+    slides = slide_steps(profiles, pairs.source, pairs.target, pairs.relative)
+    is_used = ~slides.is_torn & (pairs.scores > _MIN_CONNECTION)
     if steps is not None:
         # A step between neighbours in time counts with its prior.
-        pairs = pairs.take(pairs.source != pairs.target + 1)
-    slides = slide_steps(profiles, pairs.source, pairs.target, pairs.relative)
-    is_closed = ~slides.is_torn & ~slides.is_open & (pairs.scores > _MIN_CONNECTION)
-    source, target, variances = pairs.source[is_closed], pairs.target[is_closed], np.zeros(is_closed.sum())
+        is_used &= pairs.source != pairs.target + 1
+    source, target, information = pairs.source[is_used], pairs.target[is_used], slides.information()[is_used]
     if steps is not None:
         rows = np.flatnonzero(~steps.is_torn)
         source, target = np.concatenate([source, rows + 1]), np.concatenate([target, rows])
-        variances = np.concatenate([variances, np.where(steps.is_open, steps.deviations**2, 0.0)[rows]])
-    # In a sparse graph a zero is no edge.
-    ways = scipy.sparse.csr_array((np.maximum(variances, 1e-12), (source, target)), (num_scans, num_scans))
-    closed = scipy.sparse.csr_array((variances == 0.0, (source, target)), (num_scans, num_scans))
+        information = np.concatenate([information, steps.information()[rows]])
+    is_closed = np.isinf(information)
+    size = (num_scans, num_scans)
+    closed = scipy.sparse.csr_array((is_closed.astype(np.float64), (source, target)), size)
     closed.eliminate_zeros()
     label = scipy.sparse.csgraph.connected_components(closed, directed=False)[1]
-    largest = np.flatnonzero(label == np.bincount(label).argmax())
-    found = scipy.sparse.csgraph.dijkstra(ways, directed=False, indices=largest, min_only=True)
-    return np.sqrt(np.asarray(found, np.float64))
+    # A closed part moves as one.
+    network = np.zeros((label.max() + 1, label.max() + 1))
+    np.add.at(network, (label[source[~is_closed]], label[target[~is_closed]]), -information[~is_closed])
+    network += network.T
+    ground = np.bincount(label).argmax()
+    part = scipy.sparse.csgraph.connected_components(scipy.sparse.csr_array(network), directed=False)[1]
+    variances, rows = np.full(len(network), np.inf), np.flatnonzero(part == part[ground])
+    variances[ground], rows = 0.0, rows[rows != ground]
+    np.fill_diagonal(network, 0.0)
+    np.fill_diagonal(network, -network.sum(axis=1))
+    variances[rows] = np.diag(np.linalg.inv(network[np.ix_(rows, rows)]))
+    return np.sqrt(np.maximum(variances[label], 0.0))
 
 
 def _weakest_connection(tree: scipy.sparse.csr_array) -> tuple[int, float]:

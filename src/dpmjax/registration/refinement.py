@@ -21,15 +21,17 @@ from dpmjax.registration.loop_closure import LoopConfig, close_loops
 from dpmjax.registration.pair_alignment import FINE, match_pairs
 from dpmjax.registration.planar_scans import Floats, PlanarScans, planar_scans
 from dpmjax.registration.quality import choose_trajectory
-from dpmjax.registration.range_profiles import make_profiles
+from dpmjax.registration.range_profiles import RangeProfiles, make_profiles
 from dpmjax.registration.step_prior import StepPrior
-from dpmjax.registration.step_scores import fitting_scans, interpolate
+from dpmjax.registration.step_scores import fitting_scans, interpolate, pair_scores
 from dpmjax.registration.torn_steps import restore_torn
 from dpmjax.types import ScanSet
 
 # The start is sound, and no loops are searched, if the fitness of all its steps is above this, and so is the weakest
 # eigenvalue of each, as a share of the beams.
 _MIN_FITNESS, _MIN_EIGENVALUE = 0.35, 0.005
+# Times that the alignment is repeated where it tears steps.
+_NUM_REPAIRS = 3
 # Scans are adjusted to common lines above this range noise, in typical ranges.
 _MIN_NOISE = 1.5e-4
 
@@ -107,18 +109,37 @@ def refine(
         matched = matched_steps(settled, slides, scans.typical_range)
         candidates["loops"], _, weights = close_loops(scans, se2.chain(settled.poses), config.loops, steps=matched)
         num_loops["loops"] = int((weights > 0.25).sum())
-        fitting_steps = settled.poses
-    aligned = {name: align_all(scans, candidate, config, prior) for name, candidate in candidates.items()}
-    for name, found in list(aligned.items()) if prior is not None else []:
-        if (restored := restore_torn(make_profiles(scans), fitting_steps, found, config)) is not None:
-            mended = f"{name}, mended"
-            aligned[mended], num_loops[mended] = align_all(scans, restored, config, prior), num_loops[name]
+        fitting_steps = _better_steps(make_profiles(scans), fitting_steps, settled.poses)
+    aligned = {name: _align(scans, candidate, fitting_steps, config, prior) for name, candidate in candidates.items()}
     kept = "start" if len(aligned) == 1 else choose_trajectory(scans, aligned, prior=prior)[0]
     best = aligned[kept]
     if scans.noise > _MIN_NOISE * scans.typical_range:
         adjusted = adjust_to_lines(scans, best)
         best = adjusted if prior is None else restore_open(make_profiles(scans), best, adjusted, config, prior)
     return Refined(best, num_loops[kept])
+
+
+def _align(
+    scans: PlanarScans, poses: Floats, steps: Floats, config: RefinementConfig, prior: StepPrior | None
+) -> Floats:
+    """Aligns all scans, and once more from where steps that it has torn are put back, as long as the map gains."""
+    best, profiles = align_all(scans, poses, config, prior), make_profiles(scans)
+    for _ in range(0 if prior is None else _NUM_REPAIRS):
+        restored = restore_torn(profiles, steps, best, config)
+        if restored is None:
+            break
+        again = align_all(scans, restored, config, prior)
+        if choose_trajectory(scans, {"before": best, "after": again}, prior=prior)[0] == "before":
+            break
+        best = again
+    return best
+
+
+def _better_steps(profiles: RangeProfiles, steps: Floats, others: Floats) -> Floats:
+    """Returns of each step (n - 1, 3) the one of two that fits better."""
+    later = np.arange(1, len(steps) + 1)
+    scores = [pair_scores(profiles, later, later - 1, found) for found in (steps, others)]
+    return np.where((scores[1] > scores[0])[:, None], others, steps)
 
 
 def _is_sound(scans: PlanarScans, poses: Floats) -> bool:
