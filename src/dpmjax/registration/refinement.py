@@ -20,7 +20,7 @@ from dpmjax.registration.line_adjustment import adjust_to_lines
 from dpmjax.registration.loop_closure import LoopConfig, close_loops
 from dpmjax.registration.pair_alignment import FINE, match_pairs
 from dpmjax.registration.planar_scans import Floats, PlanarScans, planar_scans
-from dpmjax.registration.quality import choose_trajectory
+from dpmjax.registration.quality import choose_trajectory, map_code_length
 from dpmjax.registration.range_profiles import RangeProfiles, make_profiles
 from dpmjax.registration.step_prior import StepPrior
 from dpmjax.registration.step_scores import fitting_scans, interpolate, pair_scores
@@ -122,14 +122,14 @@ def refine(
 def _align(
     scans: PlanarScans, poses: Floats, steps: Floats, config: RefinementConfig, prior: StepPrior | None
 ) -> Floats:
-    """Aligns all scans, and once more from where steps that it has torn are put back, as long as the map gains."""
+    """Aligns all scans, and again from where torn steps are put back, as long as the map gets no worse."""
     best, profiles = align_all(scans, poses, config, prior), make_profiles(scans)
     for _ in range(0 if prior is None else _NUM_REPAIRS):
         restored = restore_torn(profiles, steps, best, config)
         if restored is None:
             break
         again = align_all(scans, restored, config, prior)
-        if choose_trajectory(scans, {"before": best, "after": again}, prior=prior)[0] == "before":
+        if map_code_length(scans, again) > map_code_length(scans, best):
             break
         best = again
     return best
