@@ -31,7 +31,7 @@ from dpmjax.types import ScanSet
 # eigenvalue of each, as a share of the beams.
 _MIN_FITNESS, _MIN_EIGENVALUE = 0.35, 0.005
 # Times that the alignment is repeated where it tears steps.
-_NUM_REPAIRS = 3
+_NUM_REPAIRS = 2
 # Scans are adjusted to common lines above this range noise, in typical ranges.
 _MIN_NOISE = 1.5e-4
 
@@ -116,6 +116,9 @@ def refine(
     if scans.noise > _MIN_NOISE * scans.typical_range:
         adjusted = adjust_to_lines(scans, best)
         best = adjusted if prior is None else restore_open(make_profiles(scans), best, adjusted, config, prior)
+        restored = None if prior is None else restore_torn(make_profiles(scans), fitting_steps, best, config, prior)
+        if restored is not None and map_code_length(scans, restored) <= map_code_length(scans, best):
+            best = restored
     return Refined(best, num_loops[kept])
 
 
@@ -123,9 +126,11 @@ def _align(
     scans: PlanarScans, poses: Floats, steps: Floats, config: RefinementConfig, prior: StepPrior | None
 ) -> Floats:
     """Aligns all scans, and again from where torn steps are put back, as long as the map gets no worse."""
-    best, profiles = align_all(scans, poses, config, prior), make_profiles(scans)
-    for _ in range(0 if prior is None else _NUM_REPAIRS):
-        restored = restore_torn(profiles, steps, best, config)
+    best = align_all(scans, poses, config, prior)
+    if prior is None:
+        return best
+    for _ in range(_NUM_REPAIRS):
+        restored = restore_torn(make_profiles(scans), steps, best, config, prior)
         if restored is None:
             break
         again = align_all(scans, restored, config, prior)

@@ -13,7 +13,9 @@ from dpmjax.pose_graph.graph import Edges, join_edges
 from dpmjax.registration.joint_alignment import AlignmentConfig, choose_pairs, solve_step
 from dpmjax.registration.planar_scans import Floats
 from dpmjax.registration.range_profiles import RangeProfiles
+from dpmjax.registration.step_prior import StepPrior
 from dpmjax.registration.step_scores import WEAK_SCORE, pair_scores
+from dpmjax.registration.step_slides import slide_steps
 
 # A step is torn whose score has fallen by this much, from a score that was not weak.
 _LOST_SCORE = 0.25
@@ -21,7 +23,9 @@ _LOST_SCORE = 0.25
 _NUM_ROUNDS, _LEAST_WEIGHT = 5, 0.01
 
 
-def restore_torn(profiles: RangeProfiles, steps: Floats, poses: Floats, config: AlignmentConfig) -> Floats | None:
+def restore_torn(
+    profiles: RangeProfiles, steps: Floats, poses: Floats, config: AlignmentConfig, prior: StepPrior
+) -> Floats | None:
     """Puts torn steps back and spreads the difference over the pairs that hold the map.
 
     Args:
@@ -29,20 +33,23 @@ def restore_torn(profiles: RangeProfiles, steps: Floats, poses: Floats, config: 
         steps: (n - 1, 3) T_scan_next before the refinement.
         poses: (n, 3) T_world_scan after it.
         config: of the pairs in space.
+        prior: of the steps; one that fits better elsewhere along its walls is torn, too.
 
     Returns:
         (n, 3) T_world_scan, to be aligned again; None where no step is torn.
     """
-    later = np.arange(1, len(poses))
-    before = pair_scores(profiles, later, later - 1, steps)
-    after = pair_scores(profiles, later, later - 1, np.asarray(se2.relative(poses[:-1], poses[1:])))
-    is_torn = (before > WEAK_SCORE) & (after < before - _LOST_SCORE)
-    if not is_torn.any():
+    later, kept = np.arange(1, len(poses)), np.asarray(se2.relative(poses[:-1], poses[1:]))
+    before, after = (pair_scores(profiles, later, later - 1, found) for found in (steps, kept))
+    is_lost = (before > WEAK_SCORE) & (after < before - _LOST_SCORE)
+    slides = slide_steps(profiles, later, later - 1, kept, prior)
+    is_slid = slides.is_torn & (slides.scores > WEAK_SCORE) & ~is_lost
+    if not (is_lost | is_slid).any():
         return None
-    edges = _holding_pairs(profiles, poses, config)
-    kept = np.asarray(se2.relative(poses[:-1], poses[1:]))
-    chain = Edges(later, later - 1, np.where(is_torn[:, None], steps, kept), np.where(is_torn, before, after))
-    edges = join_edges(edges, chain._replace(information=np.maximum(chain.information, _LEAST_WEIGHT)))
+    chain = Edges(later, later - 1, kept, np.maximum(after, _LEAST_WEIGHT))
+    for rows, found, weights in ((is_lost, steps, before), (is_slid, slides.moved(kept), slides.scores)):
+        measured = np.where(rows[:, None], found, chain.measurements)
+        chain = chain._replace(measurements=measured, information=np.where(rows, weights, chain.information))
+    edges = join_edges(_holding_pairs(profiles, poses, config), chain)
     scale = np.diag([1.0, 1.0, profiles.scans.typical_range**2])
     edges = edges._replace(information=edges.information[:, None, None] * scale)
     for _ in range(_NUM_ROUNDS):
