@@ -104,7 +104,8 @@ def refine(
         if len(rows) < len(scans):
             some = scans.take(rows).replace(is_ordered=True)
             fitting = refine(some, start[rows], config, prior=prior.through(rows))
-            return fitting._replace(poses=interpolate(len(scans), rows, fitting.poses))
+            whole = interpolate(len(scans), rows, fitting.poses)
+            return fitting._replace(poses=_put_back(scans, fitting_steps, whole, config, prior))
         settled, slides = settle_steps(scans, steps, prior)
         matched = matched_steps(settled, slides, scans.typical_range)
         candidates["loops"], _, weights = close_loops(scans, se2.chain(settled.poses), config.loops, steps=matched)
@@ -116,9 +117,7 @@ def refine(
     if scans.noise > _MIN_NOISE * scans.typical_range:
         adjusted = adjust_to_lines(scans, best)
         best = adjusted if prior is None else restore_open(make_profiles(scans), best, adjusted, config, prior)
-        restored = None if prior is None else restore_torn(make_profiles(scans), fitting_steps, best, config, prior)
-        if restored is not None and map_code_length(scans, restored) <= map_code_length(scans, best):
-            best = restored
+        best = best if prior is None else _put_back(scans, fitting_steps, best, config, prior)
     return Refined(best, num_loops[kept])
 
 
@@ -138,6 +137,13 @@ def _align(
             break
         best = again
     return best
+
+
+def _put_back(scans: PlanarScans, steps: Floats, poses: Floats, config: RefinementConfig, prior: StepPrior) -> Floats:
+    """Returns poses with their torn steps put back, unless that makes the map worse."""
+    restored = restore_torn(make_profiles(scans), steps, poses, config, prior)
+    is_better = restored is not None and map_code_length(scans, restored) <= map_code_length(scans, poses)
+    return restored if restored is not None and is_better else poses
 
 
 def _better_steps(profiles: RangeProfiles, steps: Floats, others: Floats) -> Floats:
