@@ -3,22 +3,23 @@
     python -m experiments.field_inputs DATA -o out                    DATA holds the folders field_2d and field_3d
     python -m experiments.field_inputs DATA --only CSAIL.g2o w100.graph
 
-Each run keeps its folder below OUT; a run that is finished already is not done again.
+A row that is finished already is not done again.
 """
 
 from __future__ import annotations
 
-import json
 import subprocess
 import sys
+import tempfile
 import time
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
 from tyro.conf import Positional, arg
 
-from dpmjax.cli import METRICS, RunFolder, load_json, run_command, write_metrics
+from dpmjax.cli import METRICS, RunFolder, do_rows, load_json, run_command, write_metrics
 from dpmjax.io.files import write_atomically
 
 EXPERIMENT = "field_inputs"
@@ -29,7 +30,7 @@ class Case(NamedTuple):
 
     Attributes:
         data: file or folder below DATA.
-        command: words of the command, DATA/ in front of its files left out.
+        command: words of the command; each {} is that path.
         before: result when the input was tried first.
         right: right result.
         keys: numbers of metrics.json that are the result; none: the last line on the console.
@@ -92,7 +93,7 @@ class Config:
     data: Annotated[Positional[Path], arg(metavar="DATA")]
     """Folder with field_2d and field_3d."""
     output: Annotated[Path, arg(aliases=["-o"], metavar="OUT")] = Path("results/field_inputs")
-    """Folder for the runs, metrics.json and field_inputs.md."""
+    """Folder for metrics.json, field_inputs.md, and a file for each row."""
     only: tuple[str, ...] = ()
     """Names of inputs to run; without them, all."""
 
@@ -101,38 +102,34 @@ def main(config: Config) -> list[dict[str, Any]]:
     """Runs the missing rows and writes the table."""
     if not config.data.is_dir():
         raise ValueError(f"{config.data}: no such folder; give the one that holds field_2d and field_3d")
-    rows = []
-    for number, case in enumerate(CASES):
-        if not config.only or Path(case.data).name in config.only:
-            row = _run(case, config, config.output / f"{number:02d}_{Path(case.data).name}")
-            rows.append(
-                {"input": case.data, "command": case.command, "before": case.before, "right": case.right, **row}
-            )
-            write_metrics(RunFolder(config.output, is_resumed=True), {}, rows=rows)
+    chosen = [case for case in CASES if not config.only or Path(case.data).name in config.only]
+    cases = [{"data": case.data, "command": case.command} for case in chosen]
+    (config.output / "rows").mkdir(parents=True, exist_ok=True)
+    work = partial(_run, config=config)
+    found = do_rows(config.output, cases, work, seed=0, is_stopped=lambda: False)
+    rows = [row | {"before": case.before, "right": case.right} for case, row in zip(chosen, found, strict=True)]
+    write_metrics(RunFolder(config.output, is_resumed=True), {}, rows=rows)
     table = markdown(rows)
     write_atomically(config.output / "field_inputs.md", table + "\n")
     print(table)
     return rows
 
 
-def _run(case: Case, config: Config, folder: Path) -> dict[str, Any]:
-    """Returns the exit code, the result and the seconds of a run, or of an earlier one."""
-    done = folder.with_suffix(".json")
-    if not done.exists():
-        command = [word.format(*(2 * [str(config.data / case.data)])) for word in case.command.split()]
-        started = time.perf_counter()
-        ended = subprocess.run(
-            [sys.executable, "-m", "dpmjax", *command, "-o", str(folder), "--force"], capture_output=True, text=True
-        )
-        metrics = load_json(folder / METRICS) if (folder / METRICS).exists() else {}
-        last = (ended.stderr if ended.returncode else ended.stdout).strip().splitlines()[-1:]
-        found = {key: _value(metrics, key) for key in case.keys} if metrics and case.keys else {}
-        row = {"exit_code": ended.returncode, "wall_s": time.perf_counter() - started, **found}
-        row["last_line"] = "".join(last).replace(str(config.data) + "/", "")
-        row["git_hash"] = metrics.get("git_hash")
-        done.parent.mkdir(parents=True, exist_ok=True)
-        write_atomically(done, json.dumps(row, indent=1))
-    return dict(load_json(done))
+def _run(data: str, command: str, *, config: Config) -> dict[str, Any]:
+    """Returns the exit code, the seconds, the last line and the numbers of a run."""
+    (case,) = (case for case in CASES if (case.data, case.command) == (data, command))
+    words, started = command.format(*(2 * [str(config.data / data)])).split(), time.perf_counter()
+    with tempfile.TemporaryDirectory() as folder:
+        ended = subprocess.run([sys.executable, "-m", "dpmjax", *words, "-o", folder], capture_output=True, text=True)
+        path = Path(folder) / METRICS
+        metrics = load_json(path) if path.exists() else {}
+    last = (ended.stderr if ended.returncode else ended.stdout).strip().splitlines()[-1:]
+    return {
+        "exit_code": ended.returncode,
+        "wall_s": time.perf_counter() - started,
+        "last_line": "".join(last).replace(str(config.data) + "/", ""),
+        "numbers": {key: value for key in case.keys if (value := _value(metrics, key)) is not None},
+    }
 
 
 def _value(metrics: dict[str, Any], key: str) -> Any:
@@ -146,12 +143,11 @@ def _value(metrics: dict[str, Any], key: str) -> Any:
 def markdown(rows: list[dict[str, Any]]) -> str:
     """Returns the table as Markdown: of a refused input the message, of others the numbers."""
     lines = ["| input | command | before | now | right | s |", "|---|---|---|---|---|---|"]
-    known = {"input", "command", "before", "right", "exit_code", "wall_s", "last_line", "git_hash"}
     for row in rows:
-        numbers = {name.split(".")[-1]: value for name, value in row.items() if name not in known and value is not None}
-        shown = ", ".join(f"{name} {_text(value)}" for name, value in numbers.items()) or row["last_line"]
-        now = f"exit code {row['exit_code']}: {row['last_line']}" if row["exit_code"] else shown
-        cells = row["input"], row["command"].format("", ""), row["before"], now, row["right"], f"{row['wall_s']:.0f}"
+        numbers = ", ".join(f"{name.split('.')[-1]} {_text(value)}" for name, value in row["numbers"].items())
+        now = f"exit code {row['exit_code']}: {row['last_line']}" if row["exit_code"] else numbers or row["last_line"]
+        command = row["command"].replace("{}/", "").replace("{}", "").strip()
+        cells = row["data"], command, row["before"], now, row["right"], f"{row['wall_s']:.0f}"
         lines.append(f"| {' | '.join(cell.replace('|', '/') for cell in cells)} |")
     return "\n".join(lines)
 
