@@ -3,28 +3,21 @@
 A scan has two poses. A log as recorded has both at the places of its ODOM lines: they are the raw
 odometry, and there is no reference. In a log that a SLAM program has corrected, the first pose is the reference and the
 second the raw odometry; where both are equal, the raw odometry is lost.
-
-Some published logs have lines with the scan, time stamp and odometry of another moment, while their corrected poses are
-in order. There the time stamps are out of order, and the odometry jumps by metres and back. These scans are put where
-they belong by their time.
 """
 
 from __future__ import annotations
 
-import bisect
-import dataclasses
 import gzip
-import logging
 import zlib
 from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from dpmjax.geometry import se2
 from dpmjax.io.files import read_bytes, refusing
+from dpmjax.io.log_order import in_order_of_time
 from dpmjax.sequences import FloatArray, ScanSequence, require
 
 _LARGEST_NUMBER = 1e18
@@ -156,15 +149,12 @@ def _check_numbers(ranges: FloatArray, others: Sequence[float], source: str) -> 
     require(is_good, source, "NaN, infinite or huge values", "remove the line")
 
 
-_log = logging.getLogger(__name__)
 _SHORTEST_SCALE_M = 7.9  # No laser of these logs has a shorter scale: a log that ends before has no code for "no echo".
 _LONGEST_RANGE_M = 1e6
 # Poses of a log as recorded are those of its ODOM lines, within the way from one such line to the next.
 _SAME_PLACE_M = 0.5
 # Equal poses, metres and radians.
 _SAME_POSE = 1e-4
-# A line is moved where its time stamp puts it if that shortens the detour of its odometry to this share.
-_SHORTER_WAY = 0.5
 _CODE_BAND_M = 0.1  # Codes for "no echo" scatter by a few centimetres (81.87 to 81.91 m on a SICK LMS).
 
 
@@ -201,7 +191,7 @@ def read_carmen_log(path: str | Path, *, max_range: float | None = None) -> Scan
     reference, odometry = _reference_and_odometry(log)
     times = np.array([line.time for line in lines])
     sequence = ScanSequence(Path(path).name.split(".")[0], points, mask, "m", True, reference, odometry, times)
-    return _in_order(sequence, path)
+    return in_order_of_time(sequence, path)
 
 
 def _reference_and_odometry(log: CarmenLines) -> tuple[FloatArray | None, FloatArray | None]:
@@ -229,81 +219,3 @@ def _is_at_wheels(log: CarmenLines, poses: FloatArray) -> bool:
 def _no_echo_limit(lines: list[ScanLine]) -> float:
     largest = max(float(line.ranges.max()) for line in lines)
     return largest - _CODE_BAND_M if largest >= _SHORTEST_SCALE_M else np.inf
-
-
-def _in_order(sequence: ScanSequence, path: str | Path) -> ScanSequence:
-    """Puts scans of another moment where their time belongs; drops times that stand still or have no order."""
-    times, odometry, rows = sequence.times, sequence.odometry_poses, np.arange(len(sequence))
-    assert times is not None
-    if np.ptp(times) == 0:
-        return dataclasses.replace(sequence, times=None)
-    ordered = _longest_increasing(times)
-    late = np.setdiff1d(rows, ordered)
-    if 2 * len(late) > len(times):
-        _log.warning("%s: time stamps are in no order; lines stay in their order, times are dropped", path)
-        return dataclasses.replace(sequence, times=None)
-    moved = np.zeros(len(times), bool)
-    if odometry is not None:
-        by_row, by_time = (_detours(odometry, late, ordered, keys) for keys in (rows.astype(np.float64), times))
-        moved[late] = by_time < _SHORTER_WAY * by_row
-    if len(late):
-        message = "%s: %d of %d lines are of another moment; %d are moved to their time, the others are interpolated"
-        _log.warning(message, path, len(late), len(times), moved.sum())
-    known = np.union1d(ordered, np.flatnonzero(moved))
-    stamps = np.interp(rows, ordered, times[ordered])
-    stamps[known] = times[known]
-    order = np.argsort(stamps, kind="stable")
-    if odometry is not None:
-        odometry = _interpolated(odometry, ordered, known)
-    repaired = dataclasses.replace(sequence, times=stamps, odometry_poses=odometry)
-    return _carry_reference(repaired.take(order), moved[order])
-
-
-def _interpolated(odometry: FloatArray, ordered: NDArray[np.int64], known: NDArray[np.int64]) -> FloatArray:
-    """Returns odometry that is interpolated between the ordered lines wherever it is not known."""
-    pose = odometry[ordered].copy()
-    pose[:, 2] = np.unwrap(pose[:, 2])
-    between = np.column_stack([np.interp(np.arange(len(odometry)), ordered, column) for column in pose.T])
-    between[:, 2] = np.pi - (np.pi - between[:, 2]) % (2 * np.pi)
-    between[known] = odometry[known]
-    return between
-
-
-def _detours(odometry: FloatArray, late: NDArray[np.int64], ordered: NDArray[np.int64], keys: FloatArray) -> FloatArray:
-    """Returns how much longer the way of the ordered lines becomes with each late one, where these keys put it."""
-    after = np.searchsorted(keys[ordered], keys[late])
-    before, after = ordered[np.maximum(after - 1, 0)], ordered[np.minimum(after, len(ordered) - 1)]
-
-    def way(start: NDArray[np.int64], end: NDArray[np.int64]) -> FloatArray:
-        step = se2.relative(odometry[start], odometry[end])
-        return np.hypot(step[:, 0], step[:, 1]) + np.abs(se2.wrap_angle(step[:, 2]))
-
-    return way(before, late) + way(late, after) - way(before, after)
-
-
-def _carry_reference(sequence: ScanSequence, moved: NDArray[np.bool_]) -> ScanSequence:
-    """Moves the reference on by the odometry to the scans that were moved: theirs is that of the line, not the scan."""
-    reference, odometry = sequence.reference_poses, sequence.odometry_poses
-    if reference is None or odometry is None or not moved.any():
-        return sequence
-    rows = np.arange(len(moved))
-    before = np.maximum.accumulate(np.where(moved, -1, rows))
-    before = np.where(before < 0, np.flatnonzero(~moved)[0], before)
-    carried = se2.compose(reference[before], se2.relative(odometry[before], odometry))
-    return dataclasses.replace(sequence, reference_poses=np.where(moved[:, None], carried, reference))
-
-
-def _longest_increasing(values: FloatArray) -> NDArray[np.int64]:
-    """Indices of the longest subsequence that strictly increases (patience sorting)."""
-    tails: list[float] = []
-    ends: list[int] = []
-    before = np.full(len(values), -1)
-    for index, value in enumerate(values.tolist()):
-        pile = bisect.bisect_left(tails, value)
-        tails[pile : pile + 1] = [value]
-        ends[pile : pile + 1] = [index]
-        before[index] = ends[pile - 1] if pile else -1
-    chain = [ends[-1]]
-    while before[chain[-1]] >= 0:
-        chain.append(int(before[chain[-1]]))
-    return np.array(chain[::-1])

@@ -137,8 +137,8 @@ def _deviations(profiles: RangeProfiles, num_scans: int, pairs: _Pairs, steps: S
     """Returns the standard deviation of each scan's place against the largest part without open connections (n,).
 
     A pair that has no other place along its weak direction is closed. An open one counts by the spread of its places.
-    These variances and those of the steps (n - 1), which are known of a prior, are the resistances of a network, whose
-    resistance to that part is the variance of a scan. A scan without a way to it has an infinite deviation.
+    These variances are the resistances of a network, with those of the steps (n - 1) that have a prior. The resistance
+    from a scan to that part is the variance of the scan; without a way it is infinite.
     """
     slides = slide_steps(profiles, pairs.source, pairs.target, pairs.relative)
     is_used = ~slides.is_torn & (pairs.scores > _MIN_CONNECTION)

@@ -60,7 +60,7 @@ def restore_torn(
 
 
 def _holding_pairs(profiles: RangeProfiles, poses: Floats, config: AlignmentConfig) -> Edges:
-    """Returns the pairs that fit, but for steps; the weights are their scores (e,)."""
+    """Returns the pairs that fit, without steps; the weights are their scores (e,)."""
     source, target = choose_pairs(profiles.scans, poses, config)
     is_pair = source != target + 1
     source, target = source[is_pair], target[is_pair]
