@@ -77,10 +77,16 @@ CASES = (
     Case("field_3d/corridor_pair", "register {}/28.npy {}/16.npy", "0 m, .96", "7.54 m", _PAIR),
     Case("field_3d/corridor_pair", "register {}/18.npy {}/10.npy", "opposite direction, .995", "4.52 m", _PAIR),
     Case("field_3d/street_first_step", "slam {}", "y -0.66 m", "7.48 m driven", ("path_m", "status")),
-    Case("field_3d/nuscenes_5_columns", "slam {}", "read as 4 columns", "5 columns; one scan is refused"),
+    Case("field_3d/nuscenes_5_columns", "slam {}", "read as 4 columns", "5 columns, said", ("input_notes",)),
     Case("field_3d/tum_reference_of_another_rate", "slam {}", "ATE 1.112 m", "0.01 m", ("ate_m", "status")),
     Case("field_3d/pcd_padding_count_0/000950.pcd", "register {} {}", "refused", "0 m", _PAIR),
-    Case("field_3d/pcd_binary_compressed/samp24-utm.pcd", "register {} {}", "refused", "read, UTM named", _PAIR),
+    Case(
+        "field_3d/pcd_binary_compressed/samp24-utm.pcd",
+        "register {} {}",
+        "refused",
+        "read, UTM said",
+        (*_PAIR, "input_notes"),
+    ),
     Case("field_3d/livox_ascii_pcd_char_fields/10.pcd", "register {} {}", "refused", "0 m", _PAIR),
     Case("field_3d/os0_8_beams_slow", "slam {}", "turned by 3.7 degrees", "at most 1 degree", ("path_m", "status")),
 )
@@ -146,13 +152,15 @@ def markdown(rows: list[dict[str, Any]]) -> str:
     for row in rows:
         numbers = ", ".join(f"{name.split('.')[-1]} {_text(value)}" for name, value in row["numbers"].items())
         now = f"exit code {row['exit_code']}: {row['last_line']}" if row["exit_code"] else numbers or row["last_line"]
-        command = row["command"].replace("{}/", "").replace("{}", "").strip()
+        command = " ".join(row["command"].replace("{}/", "").replace("{}", "").split())
         cells = row["data"], command, row["before"], now, row["right"], f"{row['wall_s']:.0f}"
         lines.append(f"| {' | '.join(cell.replace('|', '/') for cell in cells)} |")
     return "\n".join(lines)
 
 
 def _text(value: Any) -> str:
+    if isinstance(value, list):
+        return "; ".join(value)
     return f"{value:.3g}" if isinstance(value, float) else str(value)
 
 
