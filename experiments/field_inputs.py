@@ -36,7 +36,7 @@ class Case(NamedTuple):
         command: words of the command; each {} is that path.
         before: result when the input was tried first.
         right: right result.
-        keys: numbers of metrics.json that are the result; none: the last line on the console.
+        keys: numbers of metrics.json that are the result; none: the input is refused, and the message is.
     """
 
     data: str
@@ -125,7 +125,7 @@ def main(config: Config) -> list[dict[str, Any]]:
 
 
 def _run(data: str, command: str, *, config: Config) -> dict[str, Any]:
-    """Returns the exit code, the seconds, the last line and the numbers of a run."""
+    """Returns the exit code, the seconds, the message and the numbers of a run."""
     (case,) = (case for case in CASES if (case.data, case.command) == (data, command))
     words, started = command.format(*(2 * [str(config.data / data)])).split(), time.perf_counter()
     with tempfile.TemporaryDirectory() as folder:
@@ -136,11 +136,11 @@ def _run(data: str, command: str, *, config: Config) -> dict[str, Any]:
             metrics["turned_deg"] = _turned_deg(np.load(path.with_name("trajectory.npy")))
     # Rows tell nothing about the machine.
     metrics = json.loads(json.dumps(metrics).replace(f"{config.data}/", ""))
-    last = (ended.stderr if ended.returncode else ended.stdout).strip().splitlines()[-1:]
+    last = ended.stderr.strip().splitlines()[-1:] if ended.returncode else []
     return {
         "exit_code": ended.returncode,
         "wall_s": time.perf_counter() - started,
-        "last_line": "".join(last).replace(str(config.data) + "/", ""),
+        "message": "".join(last).replace(str(config.data) + "/", ""),
         "numbers": {key: value for key in case.keys if (value := _value(metrics, key)) is not None},
     }
 
@@ -164,7 +164,7 @@ def markdown(rows: list[dict[str, Any]]) -> str:
     lines = ["| input | command | before | now | right | s |", "|---|---|---|---|---|---|"]
     for row in rows:
         numbers = ", ".join(f"{name.split('.')[-1]} {_text(value)}" for name, value in row["numbers"].items())
-        now = f"exit code {row['exit_code']}: {row['last_line']}" if row["exit_code"] else numbers or row["last_line"]
+        now = f"exit code {row['exit_code']}: {row['message']}" if row["exit_code"] else numbers
         command = " ".join(row["command"].replace("{}/", "").replace("{}", "").split())
         cells = row["data"], command, row["before"], now, row["right"], f"{row['wall_s']:.0f}"
         lines.append(f"| {' | '.join(cell.replace('|', '/') for cell in cells)} |")

@@ -13,7 +13,7 @@ def test_a_row_has_the_message_of_a_refused_input(tmp_path) -> None:
     config = Config(tmp_path, tmp_path / "out", ("landmark_xy.g2o",))
     (row,) = main(config)
     assert row["exit_code"] == 2
-    assert "line 2" in row["last_line"]
+    assert "line 2" in row["message"]
     assert "line 2" in (tmp_path / "out" / "field_inputs.md").read_text()
     # What is done is not done again.
     (tmp_path / "field_2d" / "landmark_xy.g2o").unlink()
