@@ -12,9 +12,10 @@ from numpy.typing import NDArray
 
 from dpmjax import deepmapping as dm
 from dpmjax import registration_rgbd as rgbd
+from dpmjax.cli import depth_errors
 from dpmjax.geometry import image_normals
 from dpmjax.io import DepthSequence
-from dpmjax.metrics import absolute_trajectory_error, point_distance
+from dpmjax.metrics import absolute_trajectory_error
 
 METHODS = (
     "zero", "placed", "placed-no-prior", "deepmapping", "deepmapping-cold", "direct", "icp", "deepmapping-icp",
@@ -96,16 +97,12 @@ def spread_of(sequence: DepthSequence) -> float:
 
 def errors_of(T: NDArray[np.float64], sequence: DepthSequence) -> dict[str, float]:
     """Returns ATE (mm), mean point distance (mm) and the largest error of a turn between neighbours (degrees)."""
-    reference = sequence.T_world_camera
-    assert reference is not None
-    ate = absolute_trajectory_error(T[:, :3, 3], reference[:, :3, 3])
-    count = len(sequence)
-    points = sequence.points.reshape(count, -1, 3)
-    distance = point_distance(points, sequence.mask.reshape(count, -1), T, reference)
-    relative, true = (np.swapaxes(R[:-1, :3, :3], 1, 2) @ R[1:, :3, :3] for R in (T, reference))
-    cosine = (np.einsum("nij,nij->n", relative, true) - 1.0) / 2.0
-    turn = np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))
-    return {"ate_mm": 1e3 * ate, "point_distance_mm": 1e3 * distance, "largest_turn_error_deg": float(turn.max())}
+    errors = depth_errors(sequence, T)
+    return {
+        "ate_mm": 1e3 * errors["ate_m"],
+        "point_distance_mm": 1e3 * errors["point_distance_m"],
+        "largest_turn_error_deg": errors["largest_turn_error_deg"],
+    }
 
 
 # Standard deviations: of the length of a move without any measurement, and of a pixel at depth 0.

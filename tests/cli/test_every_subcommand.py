@@ -21,6 +21,7 @@ REPOSITORY = Path(__file__).parents[2]
 SIMULATED = {
     "register": ("a.npy", "b.npy", "-o", "registered"),
     "map2d": ("-n", "24", "--steps", "20", "-o", "mapped"),
+    "depth": ("-n", "3", "-o", "images"),
     "slam": ("-n", "12", "-o", "first"),
     "localize": ("first/map.npz", "scans", "-o", "found"),
     "merge": ("first/map.npz", "first/map.npz", "-o", "merged"),
@@ -34,6 +35,7 @@ the tests of `dpmjax train` run it."""
 MISSING = {
     "register": ("none.pcd", "b.npy"),
     "map2d": ("none.log",),
+    "depth": ("none",),
     "slam": ("none",),
     "localize": ("none.npz", "scans"),
     "merge": ("none.npz", "first/map.npz"),

@@ -125,6 +125,18 @@ def test_entries_of_another_moment_are_interpolated(tmp_path, caplog):
     np.testing.assert_array_equal(log.reference_poses[:, 0], range(6))
 
 
+def test_scans_of_another_moment_are_put_there_and_their_reference_is_carried_by_the_odometry(tmp_path):
+    lines = [flaser([1 + i], (i, 0, 0), (2 * i, 0, 0.5), 10.0 * i) for i in range(20)]
+    # The scan, time and odometry of t = 145, at the corrected pose of the line that it replaces.
+    lines[3] = flaser([15.5], (3, 0, 0), (29, 0, 0.5), 145.0)
+    log = read_carmen_log(write(tmp_path, *lines))
+    np.testing.assert_array_equal(log.times, [0, 10, 20, *range(40, 150, 10), 145, *range(150, 200, 10)])
+    np.testing.assert_allclose(log.points[14, 0, 1], -15.5)
+    np.testing.assert_allclose(log.odometry_poses[14], [29, 0, 0.5])
+    step = [np.cos(0.5), -np.sin(0.5)]
+    np.testing.assert_allclose(log.reference_poses[14], [14 + step[0], step[1], 0], atol=1e-12)
+
+
 @pytest.mark.parametrize(
     ("line", "found"),
     [

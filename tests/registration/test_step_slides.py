@@ -7,10 +7,12 @@ import pytest
 
 from dpmjax.geometry import se2
 from dpmjax.registration import PlanarScans, assess_trajectory, planar_scans, refine
+from dpmjax.registration.joint_alignment import AlignmentConfig
 from dpmjax.registration.odometry import calibrate_odometry
 from dpmjax.registration.range_profiles import make_profiles
 from dpmjax.registration.step_prior import StepPrior
 from dpmjax.registration.step_slides import slide_steps
+from dpmjax.registration.torn_steps import restore_torn
 from dpmjax.simulation import scan_world, simulate_odometry
 
 # A scan reaches the end rooms from none of the scans 8 to 15.
@@ -122,3 +124,15 @@ def test_trust_depends_on_what_holds_the_corridor(scans, truth, odometry) -> Non
     torn = assess_trajectory(scans, torn_in_the_corridor(truth, 18.0), prior=prior)
     assert not torn.is_trusted
     assert {10, 11} <= set(torn.uncertain_scans)
+
+
+def test_a_scan_that_was_torn_out_is_put_back(scans, truth) -> None:
+    profiles, config = make_profiles(scans), AlignmentConfig()
+    prior = StepPrior.of_poses(truth, scans.typical_range)
+    assert restore_torn(profiles, steps_of(truth), truth, config, prior) is None
+    torn = truth.copy()
+    torn[3] += [25.0, -20.0, 0.3]
+    found = restore_torn(profiles, steps_of(truth), torn, config, prior)
+    assert found is not None
+    off = se2.relative(found[[0]], found) - se2.relative(truth[[0]], truth)
+    assert np.hypot(off[:, 0], off[:, 1]).max() < 2.0

@@ -148,6 +148,7 @@ def test_pose_folders_are_read_in_natural_order(pose_folder):
         (lambda path: (path / "frame-2.depth.png").write_bytes(b"no picture"), "not a readable PNG"),
         (lambda path: (path / "frame-2.depth.png").unlink(), "at least two"),
         (lambda path: (path / "frame-2.pose.txt").write_text("1 2 3"), "a matrix of"),
+        (lambda path: (path / "camera-intrinsics.txt").write_text("6 0 3.5\n0 -6.5 2.5\n0 0 1"), "y axis of its poses"),
     ],
 )
 def test_damaged_pose_folders_are_told_in_one_line(pose_folder, spoil, message):

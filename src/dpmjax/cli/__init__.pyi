@@ -4,6 +4,7 @@ from .command import check_least as check_least
 from .command import check_names as check_names
 from .command import progress_bar as progress_bar
 from .command import run_command as run_command
+from .depth import depth_errors as depth_errors
 from .drives import DriveOptions as DriveOptions
 from .drives import open_drive as open_drive
 from .evaluate import BAND_NAMES as BAND_NAMES

@@ -10,6 +10,7 @@ from collections.abc import Sequence
 COMMANDS = {
     "register": "two 3-D scans: their relative pose, its confidence, a picture",
     "map2d": "planar scans without poses: poses and a map",
+    "depth": "depth images without poses: poses and a map",
     "slam": "a drive of 3-D scans: a pose for every scan, loops, a map",
     "localize": "scans in a saved map: where each was taken",
     "merge": "saved maps of several drives: one map",

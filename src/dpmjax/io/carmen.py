@@ -3,26 +3,21 @@
 A scan has two poses. A log as recorded has both at the places of its ODOM lines: they are the raw
 odometry, and there is no reference. In a log that a SLAM program has corrected, the first pose is the reference and the
 second the raw odometry; where both are equal, the raw odometry is lost.
-
-Some published logs have lines with the time stamp and odometry of another moment. There the time stamps are out of
-order, and the odometry jumps by metres and back. Those entries are interpolated.
 """
 
 from __future__ import annotations
 
-import bisect
 import gzip
-import logging
 import zlib
 from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from dpmjax.geometry import se2
 from dpmjax.io.files import read_bytes, refusing
+from dpmjax.io.log_order import in_order_of_time
 from dpmjax.sequences import FloatArray, ScanSequence, require
 
 _LARGEST_NUMBER = 1e18
@@ -154,7 +149,6 @@ def _check_numbers(ranges: FloatArray, others: Sequence[float], source: str) -> 
     require(is_good, source, "NaN, infinite or huge values", "remove the line")
 
 
-_log = logging.getLogger(__name__)
 _SHORTEST_SCALE_M = 7.9  # No laser of these logs has a shorter scale: a log that ends before has no code for "no echo".
 _LONGEST_RANGE_M = 1e6
 # Poses of a log as recorded are those of its ODOM lines, within the way from one such line to the next.
@@ -175,7 +169,8 @@ def read_carmen_log(path: str | Path, *, max_range: float | None = None) -> Scan
 
     Returns:
         The scans in metres; scans with fewer beams than the longest are padded with masked beams. Poses are those of
-        the laser; the corrected ones are the reference. No times where the log's stand still.
+        the laser; the corrected ones are the reference. No times where the log's stand still. Lines of another moment
+        are in the order of time; the reference of such a scan follows from the one before by the odometry.
 
     Raises:
         InputError: the file cannot be read, has no FLASER and no ROBOTLASER1 line, or one lacks values or holds words
@@ -194,10 +189,9 @@ def read_carmen_log(path: str | Path, *, max_range: float | None = None) -> Scan
         row[:count] = ranges[:, None] * np.column_stack([np.cos(line.angles), np.sin(line.angles)])
     points[~mask] = 0  # no -0.0
     reference, odometry = _reference_and_odometry(log)
-    stamps = np.array([line.time for line in lines])
-    times, repaired = _repair(stamps, np.zeros((len(lines), 3)) if odometry is None else odometry, path)
-    raw = None if odometry is None else repaired
-    return ScanSequence(Path(path).name.split(".")[0], points, mask, "m", True, reference, raw, times)
+    times = np.array([line.time for line in lines])
+    sequence = ScanSequence(Path(path).name.split(".")[0], points, mask, "m", True, reference, odometry, times)
+    return in_order_of_time(sequence, path)
 
 
 def _reference_and_odometry(log: CarmenLines) -> tuple[FloatArray | None, FloatArray | None]:
@@ -225,40 +219,3 @@ def _is_at_wheels(log: CarmenLines, poses: FloatArray) -> bool:
 def _no_echo_limit(lines: list[ScanLine]) -> float:
     largest = max(float(line.ranges.max()) for line in lines)
     return largest - _CODE_BAND_M if largest >= _SHORTEST_SCALE_M else np.inf
-
-
-def _repair(times: FloatArray, odometry: FloatArray, path: str | Path) -> tuple[FloatArray | None, FloatArray]:
-    """Interpolates time and odometry where the time stamp is out of order; no times where they stand still."""
-    if np.ptp(times) == 0:
-        return None, odometry
-    trusted = _longest_increasing(times)
-    num_wrong = len(times) - len(trusted)
-    if 2 * num_wrong > len(times):
-        _log.warning("%s: time stamps are in no order; odometry is taken as it stands, times are dropped", path)
-        return None, odometry
-    if num_wrong:
-        message = "%s: %d of %d lines carry time and odometry of another moment; both are interpolated"
-        _log.warning(message, path, num_wrong, len(times))
-    index = np.arange(len(times))
-    pose = odometry[trusted].copy()
-    pose[:, 2] = np.unwrap(pose[:, 2])
-    repaired = np.column_stack([np.interp(index, trusted, column) for column in pose.T])
-    repaired[:, 2] = np.pi - (np.pi - repaired[:, 2]) % (2 * np.pi)
-    repaired[trusted] = odometry[trusted]
-    return np.interp(index, trusted, times[trusted]), repaired
-
-
-def _longest_increasing(values: FloatArray) -> NDArray[np.int64]:
-    """Indices of the longest subsequence that strictly increases (patience sorting)."""
-    tails: list[float] = []
-    ends: list[int] = []
-    before = np.full(len(values), -1)
-    for index, value in enumerate(values.tolist()):
-        pile = bisect.bisect_left(tails, value)
-        tails[pile : pile + 1] = [value]
-        ends[pile : pile + 1] = [index]
-        before[index] = ends[pile - 1] if pile else -1
-    chain = [ends[-1]]
-    while before[chain[-1]] >= 0:
-        chain.append(int(before[chain[-1]]))
-    return np.array(chain[::-1])

@@ -166,8 +166,13 @@ def _read_matrix(path: Path, shape: tuple[int, int]) -> FloatArray:
 
 def _make_camera(path: Path, width: int, height: int, intrinsics: Iterable[float]) -> Camera:
     """The camera of fx, fy, cx, cy."""
+    values = [float(value) for value in intrinsics]
+    if min(values[:2]) < 0.0:
+        axis = "x" if values[0] < 0.0 else "y"
+        found = f"a negative focal length, {min(values[:2]):g}: the {axis} axis of its poses points the other way"
+        raise InputError(path, found, f"give it without the sign, and turn the {axis} axis of the cameras in all poses")
     with refusing(path, "not a camera ({error})", "give focal lengths above 0", (ValueError,)):
-        return Camera(width, height, *(float(value) for value in intrinsics))
+        return Camera(width, height, *values)
 
 
 def _walk(known: list[str], links: dict[str, Any], num_views: int, rng: np.random.Generator) -> list[str]:

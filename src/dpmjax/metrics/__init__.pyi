@@ -6,6 +6,7 @@ from .loops import path_lengths as path_lengths
 from .poses import RegistrationRecall as RegistrationRecall
 from .poses import RelativePoseError as RelativePoseError
 from .poses import absolute_trajectory_error as absolute_trajectory_error
+from .poses import align_poses as align_poses
 from .poses import align_rigid as align_rigid
 from .poses import point_distance as point_distance
 from .poses import registration_recall as registration_recall

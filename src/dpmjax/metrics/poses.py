@@ -74,6 +74,33 @@ def align_rigid(
     return best_motion(*checked_positions(estimated, reference, mask))
 
 
+def align_poses(
+    T_estimated: Float[AnyArray, "n 4 4"], T_reference: Float[AnyArray, "n 4 4"], *, lever: float
+) -> Float[AnyArray, "4 4"]:
+    """Computes the rigid motion, without scale, that brings estimated poses closest to the reference ones.
+
+    The positions and the ends of levers along the axes of each pose are aligned. So positions on one line leave no
+    rotation open.
+
+    Args:
+        T_estimated: `T_world_scan` of each scan.
+        T_reference: the same, in the reference's world.
+        lever: length of the levers, in the unit of the poses: the longer, the more the rotations count.
+
+    Returns:
+        `T_reference_estimated`.
+
+    Raises:
+        ValueError: the shapes differ, or a number is not finite.
+    """
+    xp = namespace_of(T_estimated, T_reference)
+    poses = [checked_poses("T_estimated", T_estimated, xp), checked_poses("T_reference", T_reference, xp)]
+    require_same_shape("T_reference", poses[1], poses[0])
+    arms = lever * xp.concatenate([-xp.eye(3), xp.eye(3)])
+    ends = [_transform(T, xp.broadcast_to(arms, (len(T), 6, 3))).reshape(-1, 3) for T in poses]
+    return align_rigid(*ends)
+
+
 def absolute_trajectory_error(
     estimated: Float[AnyArray, "n d"], reference: Float[AnyArray, "n d"], mask: Bool[AnyArray, " n"] | None = None
 ) -> float | Float[jax.Array, ""]:

@@ -22,7 +22,7 @@ from dpmjax.registration.quality import MAX_NOISE, near_pairs
 from dpmjax.registration.range_profiles import RangeProfiles, compare_pairs, make_profiles
 from dpmjax.registration.step_prior import StepPrior
 from dpmjax.registration.step_scores import pair_scores
-from dpmjax.registration.step_slides import slide_steps
+from dpmjax.registration.step_slides import Slides, slide_steps
 
 # Limits of `assess_trajectory`, calibrated on right and wrong maps of simulated worlds and of thinned logs
 # (docs/notebook/deepmapping_notes.md).
@@ -116,51 +116,57 @@ def assess_trajectory(
     is_clear = excess <= limit and scans.noise <= MAX_NOISE * scans.typical_range
     is_whole = num_connected >= _LEAST_REGISTERED * len(poses) and weakest >= _MIN_CONNECTION
     is_alone = best <= _LEAST_SCORE
-    deviations = _deviations(profiles, poses, pairs, prior)
-    deviations[_torn_scans(profiles, poses, ~is_alone, prior)] = np.inf
+    steps = None if prior is None else _slide_all(profiles, poses, prior)
+    deviations = _deviations(profiles, len(poses), pairs, steps)
+    if steps is not None:
+        later = np.arange(1, len(poses))
+        is_torn = steps.is_torn & (steps.scores > _MIN_CONNECTION) & ~is_alone[later] & ~is_alone[later - 1]
+        deviations[np.concatenate([later[is_torn], later[is_torn] - 1])] = np.inf
     may_slide = (deviations > _MAX_DEVIATION * scans.typical_range) & ~is_alone
     is_trusted = is_clear and is_whole and not may_slide.any() and fault is None
     uncertain = tuple(np.flatnonzero(is_alone | may_slide).tolist())
     return Assessment(weakest, float(excess), bool(is_trusted), uncertain, fault)
 
 
-def _deviations(profiles: RangeProfiles, poses: Floats, pairs: _Pairs, prior: StepPrior | None) -> Floats:
+def _slide_all(profiles: RangeProfiles, poses: Floats, prior: StepPrior) -> Slides:
+    later = np.arange(1, len(poses))
+    return slide_steps(profiles, later, later - 1, np.asarray(se2.relative(poses[:-1], poses[1:])), prior)
+
+
+def _deviations(profiles: RangeProfiles, num_scans: int, pairs: _Pairs, steps: Slides | None) -> Floats:
     """Returns the standard deviation of each scan's place against the largest part without open connections (n,).
 
-    A pair that has no other place along its weak direction is closed. The variances of open steps add up along the best
-    way from a scan to that part; without a way the deviation is infinite.
+    A pair that has no other place along its weak direction is closed. An open one counts by the spread of its places.
+    These variances are the resistances of a network, with those of the steps (n - 1) that have a prior. The resistance
+    from a scan to that part is the variance of the scan; without a way it is infinite.
     """
-    num_scans, later = len(poses), np.arange(1, len(poses))
-    if prior is not None:
-        # A step between neighbours in time counts with its prior.
-        pairs = pairs.take(pairs.source != pairs.target + 1)
     slides = slide_steps(profiles, pairs.source, pairs.target, pairs.relative)
-    is_closed = ~slides.is_torn & ~slides.is_open & (pairs.scores > _MIN_CONNECTION)
-    source, target, variances = pairs.source[is_closed], pairs.target[is_closed], np.zeros(is_closed.sum())
-    if prior is not None:
-        steps = slide_steps(profiles, later, later - 1, np.asarray(se2.relative(poses[:-1], poses[1:])), prior)
-        rows = later[~steps.is_torn]
-        source, target = np.concatenate([source, rows]), np.concatenate([target, rows - 1])
-        of_steps = np.where(steps.is_open, steps.deviations**2, 0.0)[~steps.is_torn]
-        variances = np.concatenate([variances, of_steps])
-    # In a sparse graph a zero is no edge.
-    ways = scipy.sparse.csr_array((np.maximum(variances, 1e-12), (source, target)), (num_scans, num_scans))
-    closed = scipy.sparse.csr_array((variances == 0.0, (source, target)), (num_scans, num_scans))
+    is_used = ~slides.is_torn & (pairs.scores > _MIN_CONNECTION)
+    if steps is not None:
+        # A step between neighbours in time counts with its prior.
+        is_used &= pairs.source != pairs.target + 1
+    source, target, information = pairs.source[is_used], pairs.target[is_used], slides.information()[is_used]
+    if steps is not None:
+        rows = np.flatnonzero(~steps.is_torn)
+        source, target = np.concatenate([source, rows + 1]), np.concatenate([target, rows])
+        information = np.concatenate([information, steps.information()[rows]])
+    is_closed = np.isinf(information)
+    size = (num_scans, num_scans)
+    closed = scipy.sparse.csr_array((is_closed.astype(np.float64), (source, target)), size)
     closed.eliminate_zeros()
     label = scipy.sparse.csgraph.connected_components(closed, directed=False)[1]
-    largest = np.flatnonzero(label == np.bincount(label).argmax())
-    found = scipy.sparse.csgraph.dijkstra(ways, directed=False, indices=largest, min_only=True)
-    return np.sqrt(np.asarray(found, np.float64))
-
-
-def _torn_scans(profiles: RangeProfiles, poses: Floats, is_used: NDArray[np.bool_], prior: StepPrior | None) -> Indices:
-    """Returns the rows of both scans of each step that belongs elsewhere by the scans and the prior together."""
-    if prior is None:
-        return np.zeros(0, np.int64)
-    later = np.arange(1, len(poses))
-    steps = slide_steps(profiles, later, later - 1, np.asarray(se2.relative(poses[:-1], poses[1:])), prior)
-    is_torn = steps.is_torn & (steps.scores > _MIN_CONNECTION) & is_used[later] & is_used[later - 1]
-    return np.concatenate([later[is_torn], later[is_torn] - 1])
+    # A closed part moves as one.
+    network = np.zeros((label.max() + 1, label.max() + 1))
+    np.add.at(network, (label[source[~is_closed]], label[target[~is_closed]]), -information[~is_closed])
+    network += network.T
+    ground = np.bincount(label).argmax()
+    part = scipy.sparse.csgraph.connected_components(scipy.sparse.csr_array(network), directed=False)[1]
+    variances, rows = np.full(len(network), np.inf), np.flatnonzero(part == part[ground])
+    variances[ground], rows = 0.0, rows[rows != ground]
+    np.fill_diagonal(network, 0.0)
+    np.fill_diagonal(network, -network.sum(axis=1))
+    variances[rows] = np.diag(np.linalg.inv(network[np.ix_(rows, rows)]))
+    return np.sqrt(np.maximum(variances[label], 0.0))
 
 
 def _weakest_connection(tree: scipy.sparse.csr_array) -> tuple[int, float]:

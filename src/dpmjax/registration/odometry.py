@@ -163,7 +163,7 @@ def _calibrate(clear: ClearSteps, expected: Floats, unit: float) -> StepPrior:
     length, turn = np.hypot(steps[:, 0], steps[:, 1]), np.abs(steps[:, 2])
     # A wheel that slips errs by a share of the way; a turn moves a sensor that is mounted off the axis.
     size = np.hypot(length, _LEAST_MOVE * unit)
-    share = max(_LENGTH_FLOOR, _spread(off[:, :2].max(axis=1) / size[clear.rows]))
+    share = max(_LENGTH_FLOOR, _spread((off[:, :2] / size[clear.rows][:, None]).ravel()))
     turn_share = max(_TURN_FLOOR, _spread(off[is_turn, 2] / turn[clear.rows][is_turn]))
     turn_noise = max(floors[1], _spread(off[~is_turn, 2]))
     moved, turned = np.hypot(floors[0], share * size), np.hypot(turn_noise, turn_share * turn)

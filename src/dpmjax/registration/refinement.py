@@ -13,25 +13,25 @@ from numpy.typing import ArrayLike
 
 from dpmjax.checks import as_beams
 from dpmjax.geometry import se2
-from dpmjax.registration.held_steps import (
-    matched_steps,
-    settle_steps,
-)
+from dpmjax.registration.held_steps import matched_steps, settle_steps
 from dpmjax.registration.incremental import incremental_icp
 from dpmjax.registration.joint_alignment import AlignmentConfig, align_all, restore_open
 from dpmjax.registration.line_adjustment import adjust_to_lines
 from dpmjax.registration.loop_closure import LoopConfig, close_loops
 from dpmjax.registration.pair_alignment import FINE, match_pairs
 from dpmjax.registration.planar_scans import Floats, PlanarScans, planar_scans
-from dpmjax.registration.quality import choose_trajectory
-from dpmjax.registration.range_profiles import make_profiles
+from dpmjax.registration.quality import choose_trajectory, map_code_length
+from dpmjax.registration.range_profiles import RangeProfiles, make_profiles
 from dpmjax.registration.step_prior import StepPrior
-from dpmjax.registration.step_scores import fitting_scans, interpolate
+from dpmjax.registration.step_scores import fitting_scans, interpolate, pair_scores
+from dpmjax.registration.torn_steps import restore_torn
 from dpmjax.types import ScanSet
 
 # The start is sound, and no loops are searched, if the fitness of all its steps is above this, and so is the weakest
 # eigenvalue of each, as a share of the beams.
 _MIN_FITNESS, _MIN_EIGENVALUE = 0.35, 0.005
+# Times that the alignment is repeated where it tears steps.
+_NUM_REPAIRS = 2
 # Scans are adjusted to common lines above this range noise, in typical ranges.
 _MIN_NOISE = 1.5e-4
 
@@ -95,6 +95,7 @@ def refine(
     scans = scans if isinstance(scans, PlanarScans) else planar_scans(as_beams("scans", scans))
     start = se2.as_poses("poses", poses, len(scans))
     candidates, num_loops = {"start": start}, {"start": 0}
+    fitting_steps = np.asarray(se2.relative(start[:-1], start[1:]))
     prior = (prior or StepPrior.of_poses(start, scans.typical_range)) if scans.is_ordered else None
     if prior is not None and config.loops is not None and not _is_sound(scans, start):
         # The steps again, with those of the start as guess, and with the prior where the scans leave a direction open.
@@ -103,18 +104,53 @@ def refine(
         if len(rows) < len(scans):
             some = scans.take(rows).replace(is_ordered=True)
             fitting = refine(some, start[rows], config, prior=prior.through(rows))
-            return fitting._replace(poses=interpolate(len(scans), rows, fitting.poses))
+            whole = interpolate(len(scans), rows, fitting.poses)
+            return fitting._replace(poses=_put_back(scans, fitting_steps, whole, config, prior))
         settled, slides = settle_steps(scans, steps, prior)
         matched = matched_steps(settled, slides, scans.typical_range)
         candidates["loops"], _, weights = close_loops(scans, se2.chain(settled.poses), config.loops, steps=matched)
         num_loops["loops"] = int((weights > 0.25).sum())
-    aligned = {name: align_all(scans, candidate, config, prior) for name, candidate in candidates.items()}
+        fitting_steps = _better_steps(make_profiles(scans), fitting_steps, settled.poses)
+    aligned = {name: _align(scans, candidate, fitting_steps, config, prior) for name, candidate in candidates.items()}
     kept = "start" if len(aligned) == 1 else choose_trajectory(scans, aligned, prior=prior)[0]
     best = aligned[kept]
     if scans.noise > _MIN_NOISE * scans.typical_range:
         adjusted = adjust_to_lines(scans, best)
         best = adjusted if prior is None else restore_open(make_profiles(scans), best, adjusted, config, prior)
+        best = best if prior is None else _put_back(scans, fitting_steps, best, config, prior)
     return Refined(best, num_loops[kept])
+
+
+def _align(
+    scans: PlanarScans, poses: Floats, steps: Floats, config: RefinementConfig, prior: StepPrior | None
+) -> Floats:
+    """Aligns all scans, and again from where torn steps are put back, as long as the map gets no worse."""
+    best = align_all(scans, poses, config, prior)
+    if prior is None:
+        return best
+    for _ in range(_NUM_REPAIRS):
+        restored = restore_torn(make_profiles(scans), steps, best, config, prior)
+        if restored is None:
+            break
+        again = align_all(scans, restored, config, prior)
+        if map_code_length(scans, again) > map_code_length(scans, best):
+            break
+        best = again
+    return best
+
+
+def _put_back(scans: PlanarScans, steps: Floats, poses: Floats, config: RefinementConfig, prior: StepPrior) -> Floats:
+    """Returns poses with their torn steps put back, unless that makes the map worse."""
+    restored = restore_torn(make_profiles(scans), steps, poses, config, prior)
+    is_better = restored is not None and map_code_length(scans, restored) <= map_code_length(scans, poses)
+    return restored if restored is not None and is_better else poses
+
+
+def _better_steps(profiles: RangeProfiles, steps: Floats, others: Floats) -> Floats:
+    """Returns of each step (n - 1, 3) the one of two that fits better."""
+    later = np.arange(1, len(steps) + 1)
+    scores = [pair_scores(profiles, later, later - 1, found) for found in (steps, others)]
+    return np.where((scores[1] > scores[0])[:, None], others, steps)
 
 
 def _is_sound(scans: PlanarScans, poses: Floats) -> bool:

@@ -1,0 +1,194 @@
+"""Registers depth images of one camera into one map, without poses (DeepMapping, section 4.2).
+
+    dpmjax depth                         a walk through a simulated apartment
+    dpmjax depth images                  a folder of NAME.depth.png with an intrinsics file, as 7-Scenes has it
+    dpmjax depth images -n 12 -o out     its first 12 images
+    dpmjax depth images --jump 10        every tenth image
+    dpmjax depth --resume                continue the latest run
+
+Depth is 16 bit, millimetres, 0 or 65535 for nothing. Where each image has a NAME.pose.txt, the result is measured by
+these poses. Results go to results/depth/<time>/ (latest links to the newest): metrics.json, trajectories as TUM, KITTI
+and npy (T_world_camera, metres), map.ply, and pictures: map.png (from above) and loss.png. A search gives the first
+poses and DeepMapping improves them; of both the one whose images agree better is kept, chosen without ground truth.
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from tyro.conf import Positional, arg
+
+from dpmjax.cli.command import StopFlag, check_least
+from dpmjax.cli.machine import peak_rss_gb
+from dpmjax.cli.recorded_fit import FitRecorder, draw_loss
+from dpmjax.cli.run_folder import RunFolder, RunOptions, open_run_folder, recording, write_metrics
+
+if TYPE_CHECKING:
+    from dpmjax.deepmapping import Registered
+    from dpmjax.sequences import DepthSequence
+
+Floats = NDArray[np.float64]
+
+NAME = "depth"
+_NUM_SIMULATED = 8
+# Typical ranges by which a rotation counts in the alignment of poses: it decides what positions on a line leave open.
+_LEVER = 0.1
+
+
+@dataclass(frozen=True, kw_only=True)
+class Config(RunOptions):
+    """Options of the run."""
+
+    data: Annotated[Positional[Path | None], arg(metavar="[DATA]")] = None
+    """Folder of NAME.depth.png, one *intrinsics*.txt, and a NAME.pose.txt for each image or for none. Without it: a
+    simulated apartment."""
+    preset: Literal["fast", "paper"] = "fast"
+    """fast: minutes on two cores; paper: networks and sampling of the paper."""
+    motion: Literal["auto", "planar", "full"] = "auto"
+    """planar: the camera stays level and at one height; full: any motion; auto: full but for simulated images."""
+    start: Annotated[int, arg(metavar="N")] = 0
+    """First image to use."""
+    n_scans: Annotated[int | None, arg(aliases=["-n"], metavar="N")] = None
+    """Use N images; without it, all."""
+    jump: Annotated[int, arg(aliases=["-j"], metavar="N")] = 1
+    """Use every Nth image."""
+
+    def __post_init__(self) -> None:
+        """Checks ranges."""
+        check_least(self, n_scans=2, jump=1, start=0)
+
+
+def main(config: Config) -> dict[str, Any]:
+    """Reads, registers, measures, writes; returns the content of `metrics.json`."""
+    import jax
+
+    from dpmjax import deepmapping, registration_rgbd
+
+    started = time.perf_counter()
+    sequence = read_images(config)
+    images = registration_rgbd.as_depth_scans(sequence.points, sequence.mask)
+    folder = open_run_folder(config, NAME)
+    with recording(folder), StopFlag() as stop:
+        print(f"{sequence.name}: {len(sequence)} images", "search of first poses ...", sep="\n", flush=True)
+        recorder = FitRecorder(folder, "m", stop=lambda _run_s: stop.is_requested)
+        is_planar = sequence.is_planar if config.motion == "auto" else config.motion == "planar"
+        settings = deepmapping.preset(config.preset, "depth", motion="planar" if is_planar else "full")
+        key = jax.random.key(config.seed)
+        found = deepmapping.register_depth(images, settings, key=key, engine=recorder)
+        metrics = {
+            **numbers_of(sequence, found),
+            "fit_s": recorder.run_s,
+            "compile_s": recorder.compile_s,
+            "steps": recorder.steps,
+            "peak_rss_gb": peak_rss_gb(),
+            "is_interrupted": stop.is_requested,
+        }
+        write_results(folder, sequence, found.T_world_scan)
+        draw(folder, sequence, found)
+        metrics["wall_s"] = time.perf_counter() - started
+        write_metrics(folder, metrics, seed=config.seed)
+        print(report(metrics), f"results in {folder.path}", sep="\n")
+    return metrics
+
+
+def read_images(config: Config) -> DepthSequence:
+    """Returns the images of DATA or of a simulated walk, sub-range and stride applied."""
+    from dpmjax import io, simulation
+
+    stop = None if config.n_scans is None else config.start + config.n_scans * config.jump
+    if config.data is None:
+        sequence = simulation.simulate_depth_sequence(0, stop or _NUM_SIMULATED, seed=config.seed)
+    else:
+        sequence = io.read_pose_folder(config.data)
+    chosen = sequence.take(slice(config.start, stop, config.jump))
+    if len(chosen) < 2:
+        raise ValueError(f"{sequence.name}: {len(chosen)} of {len(sequence)} images are chosen; choose two or more")
+    return chosen
+
+
+def numbers_of(sequence: DepthSequence, found: Registered) -> dict[str, Any]:
+    """Returns the numbers of a registration under the names of `metrics.json`."""
+    assert found.start is not None and found.start_misfit is not None
+    before, after = (depth_errors(sequence, T) for T in (found.start, found.T_world_scan))
+    kept = {"fit": "DeepMapping", "start": "search of first poses"}[found.kept]
+    return {
+        "num_images": len(sequence),
+        "kept": kept,
+        "consistency": 1 - (found.misfit if found.kept == "fit" else found.start_misfit),
+        "consistency_initial": 1 - found.start_misfit,
+        **after,
+        **{"_initial_".join(name.rsplit("_", 1)): value for name, value in before.items()},
+    }
+
+
+def depth_errors(sequence: DepthSequence, T_world_camera: Floats) -> dict[str, float]:
+    """Returns ATE, mean distance of map points, and the largest error of a turn between neighbours.
+
+    Args:
+        sequence: the images; their reference may be missing.
+        T_world_camera: (n, 4, 4) poses, metres.
+
+    Returns:
+        The numbers by name; nothing where there is no reference.
+    """
+    from scipy.spatial.transform import Rotation
+
+    from dpmjax import metrics
+    from dpmjax.geometry import typical_range
+
+    reference = sequence.T_world_camera
+    if reference is None:
+        return {}
+    count = len(sequence)
+    points, mask = sequence.points.reshape(count, -1, 3), sequence.mask.reshape(count, -1)
+    lever = _LEVER * typical_range(points, mask)
+    T_reference_world = np.asarray(metrics.align_poses(T_world_camera, reference, lever=lever))
+    aligned = T_reference_world @ T_world_camera
+    off = np.einsum("nij,nbj->nbi", aligned[:, :3, :3] - reference[:, :3, :3], points)
+    off += aligned[:, None, :3, 3] - reference[:, None, :3, 3]
+    turns = [Rotation.from_matrix(T[:, :3, :3]) for T in (T_world_camera, reference)]
+    steps = [turn[:-1].inv() * turn[1:] for turn in turns]
+    return {
+        "ate_m": float(metrics.absolute_trajectory_error(T_world_camera[:, :3, 3], reference[:, :3, 3])),
+        "point_distance_m": float(np.linalg.norm(off, axis=-1)[mask].mean()),
+        "largest_turn_error_deg": float(np.degrees((steps[1].inv() * steps[0]).magnitude().max())),
+    }
+
+
+def write_results(folder: RunFolder, sequence: DepthSequence, T_world_camera: Floats) -> None:
+    """Writes trajectory.npy, trajectory_tum.txt, trajectory_kitti.txt and map.ply."""
+    from dpmjax import io
+
+    io.write_poses_npy(folder / "trajectory.npy", T_world_camera)
+    io.write_tum(folder / "trajectory_tum.txt", T_world_camera)
+    io.write_kitti(folder / "trajectory_kitti.txt", T_world_camera)
+    points = np.einsum("nij,nhwj->nhwi", T_world_camera[:, :3, :3], sequence.points)
+    points += T_world_camera[:, None, None, :3, 3]
+    io.write_ply(folder / "map.ply", points[sequence.mask].astype(np.float32))
+
+
+def draw(folder: RunFolder, sequence: DepthSequence, found: Registered) -> None:
+    """Draws map.png: the search, DeepMapping, the reference; and loss.png."""
+    from dpmjax import viz
+
+    assert found.start is not None
+    panels = [("search of first poses", found.start), ("DeepMapping", found.fitted.T_world_scan)]
+    if sequence.T_world_camera is not None:
+        panels.append(("reference", sequence.T_world_camera))
+    figure = viz.from_above_figure(panels, sequence.points, sequence.mask)
+    viz.save_figure(figure, folder / "map.png", dpi=110)
+    draw_loss(folder, "m")
+
+
+def report(numbers: dict[str, Any]) -> str:
+    """Returns the last lines on the console."""
+    lines = [f"kept: {numbers['kept']}; the images agree to {numbers['consistency']:.0%}"]
+    if "ate_m" in numbers:
+        ate, points, turn = (numbers[name] for name in ("ate_m", "point_distance_m", "largest_turn_error_deg"))
+        lines.append(f"ATE {ate:.3f} m, map points {points:.3f} m, largest error of a turn {turn:.2f} degrees")
+    return "\n".join(lines)
