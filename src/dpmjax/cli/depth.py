@@ -113,7 +113,8 @@ def read_images(config: Config) -> DepthSequence:
 
 def numbers_of(sequence: DepthSequence, found: Registered) -> dict[str, Any]:
     """Returns the numbers of a registration under the names of `metrics.json`."""
-    assert found.start is not None and found.start_misfit is not None
+    assert found.start is not None
+    assert found.start_misfit is not None
     before, after = (depth_errors(sequence, T) for T in (found.start, found.T_world_scan))
     kept = {"fit": "DeepMapping", "start": "search of first poses"}[found.kept]
     return {
