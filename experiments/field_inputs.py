@@ -3,7 +3,8 @@
     python -m experiments.field_inputs DATA -o out                    DATA holds the folders field_2d and field_3d
     python -m experiments.field_inputs DATA --only CSAIL.g2o w100.graph
 
-A row that is finished already is not done again.
+Results go to results/field_inputs/<time>/: table.md, metrics.json, and a file for each row; --resume makes the missing
+rows.
 """
 
 from __future__ import annotations
@@ -22,8 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 from tyro.conf import Positional, arg
 
-from dpmjax.cli import METRICS, RunFolder, do_rows, load_json, run_command, write_metrics
-from dpmjax.io.files import write_atomically
+from dpmjax.cli import METRICS, RunOptions, Summary, TableRun, load_json, markdown, run_command, run_table
 
 EXPERIMENT = "field_inputs"
 
@@ -95,37 +95,39 @@ CASES = (
 )
 
 
-@dataclass(frozen=True)
-class Config:
+@dataclass(frozen=True, kw_only=True)
+class Config(RunOptions):
     """Options of the table."""
 
     data: Annotated[Positional[Path], arg(metavar="DATA")]
     """Folder with field_2d and field_3d."""
-    output: Annotated[Path, arg(aliases=["-o"], metavar="OUT")] = Path("results/field_inputs")
-    """Folder for metrics.json, field_inputs.md, and a file for each row."""
     only: tuple[str, ...] = ()
     """Names of inputs to run; without them, all."""
+
+    def __post_init__(self) -> None:
+        """Checks the folder."""
+        if not self.data.is_dir():
+            raise ValueError(f"{self.data}: no such folder; give the one that holds field_2d and field_3d")
 
 
 def main(config: Config) -> list[dict[str, Any]]:
     """Runs the missing rows and writes the table."""
-    if not config.data.is_dir():
-        raise ValueError(f"{config.data}: no such folder; give the one that holds field_2d and field_3d")
-    chosen = [case for case in CASES if not config.only or Path(case.data).name in config.only]
-    cases = [{"data": case.data, "command": case.command} for case in chosen]
-    (config.output / "rows").mkdir(parents=True, exist_ok=True)
-    work = partial(_run, config=config)
-    found = do_rows(config.output, cases, work, seed=0, is_stopped=lambda: False)
-    rows = [row | {"before": case.before, "right": case.right} for case, row in zip(chosen, found, strict=True)]
-    write_metrics(RunFolder(config.output, is_resumed=True), {}, rows=rows)
-    table = markdown(rows)
-    write_atomically(config.output / "field_inputs.md", table + "\n")
-    print(table)
-    return rows
+    cases = [case for case in CASES if not config.only or Path(case.data).name in config.only]
+    named = [{"data": case.data, "command": case.command} for case in cases]
+    return run_table(config, EXPERIMENT, named, partial(_run, config=config), report)
 
 
-def _run(data: str, command: str, *, config: Config) -> dict[str, Any]:
+def report(rows: list[dict[str, Any]]) -> Summary:
+    """Adds the results of before and the right ones."""
+    known = {(case.data, case.command): case for case in CASES}
+    cases = (known[row["data"], row["command"]] for row in rows)
+    compared = [row | {"before": case.before, "right": case.right} for row, case in zip(rows, cases, strict=True)]
+    return Summary({}, table_of(compared), rows=compared)
+
+
+def _run(table: TableRun, data: str, command: str, *, config: Config) -> dict[str, Any]:
     """Returns the exit code, the seconds, the message and the numbers of a run."""
+    table.check_stop()
     (case,) = (case for case in CASES if (case.data, case.command) == (data, command))
     words, started = command.format(*(2 * [str(config.data / data)])).split(), time.perf_counter()
     with tempfile.TemporaryDirectory() as folder:
@@ -159,16 +161,16 @@ def _value(metrics: dict[str, Any], key: str) -> Any:
     return found
 
 
-def markdown(rows: list[dict[str, Any]]) -> str:
+def table_of(rows: list[dict[str, Any]]) -> str:
     """Returns the table as Markdown: of a refused input the message, of others the numbers."""
-    lines = ["| input | command | before | now | right | s |", "|---|---|---|---|---|---|"]
+    lines = []
     for row in rows:
         numbers = ", ".join(f"{name.split('.')[-1]} {_text(value)}" for name, value in row["numbers"].items())
         now = f"exit code {row['exit_code']}: {row['message']}" if row["exit_code"] else numbers
         command = " ".join(row["command"].replace("{}/", "").replace("{}", "").split())
         cells = row["data"], command, row["before"], now, row["right"], f"{row['wall_s']:.0f}"
-        lines.append(f"| {' | '.join(cell.replace('|', '/') for cell in cells)} |")
-    return "\n".join(lines)
+        lines.append([cell.replace("|", "/") for cell in cells])
+    return markdown(("input", "command", "before", "now", "right", "s"), lines)
 
 
 def _text(value: Any) -> str:

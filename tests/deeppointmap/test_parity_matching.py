@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from dpmjax.deeppointmap.matching import MatchConfig, match_descriptors
-from dpmjax.deeppointmap.training.objective import ObjectiveConfig, TrainingSide, close_pairs, matching_loss
+from dpmjax.deeppointmap.training.objective import ObjectiveConfig, TrainingSide, matching_loss, training_pairs
 from tests.deeppointmap import toy
 from tests.optional import import_or_skip
 
@@ -88,7 +88,7 @@ def test_losses_are_the_published_ones(case, decoder) -> None:
     masks = [~case[f"descriptor_padding_{side}"] for side in "ab"]
     correlated = [case[f"correlated_features_{side}"] for side in "ab"]
     T_b_a = case["T_b_a"].astype(np.float32)
-    close = close_pairs(*map(toy.cloud, positions, masks), T_b_a, config=config)
+    close = training_pairs(*map(toy.cloud, positions, masks), T_b_a, config=config)
     sides = []
     for here, there in ((0, 1), (1, 0)):
         partners = correlated[there][np.asarray(close[here].indices)]

@@ -55,7 +55,7 @@ def test_swarms_find_a_short_walk(walk) -> None:
 def test_swarms_never_see_masked_beams(walk) -> None:
     mask = walk.mask & (np.random.default_rng(0).uniform(size=walk.mask.shape) < 0.9)
     one, other = (
-        swarm_chain(scans_of(replace(walk, mask=mask), hidden), replace(QUICK, num_iterations=3), key=jax.random.key(1))
+        swarm_chain(scans_of(replace(walk, mask=mask), hidden), QUICK._replace(num_iterations=3), key=jax.random.key(1))
         for hidden in (0.0, 1e4)
     )
     np.testing.assert_array_equal(one, other)

@@ -97,6 +97,9 @@ def test_a_scan_that_adds_nothing_does_not_join() -> None:
         assert with_scan(joined, placed, EXTENT_M, CONFIG) is joined
         assert len(with_scan(joined, recent[0], EXTENT_M, CONFIG)) == 3
     assert with_scan((), recent[0], EXTENT_M, CONFIG) == recent
+    # People move around a lidar that stands still.
+    here = PlacedElements(np.eye(4), elements_at(6.0))
+    assert with_scan(recent, here, EXTENT_M, CONFIG, is_changed=True) == (*recent, here)
 
 
 def test_the_oldest_of_too_many_scans_leaves() -> None:

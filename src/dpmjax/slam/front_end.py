@@ -172,7 +172,9 @@ def place_scan(
     after = _advanced(methods, state, located)
     if located.status != "predicted":
         placed = placed_scan(thinned.measured.surface, located.T_keyframe_scan)
-        recent = with_scan(state.recent, placed, thinned.extent_m, methods.config.odometry)
+        # Around a lidar that stands still, people move: the map of before fits less and less.
+        is_changed = bool(state.scores) and located.score < GOOD_SHARE * _usual_score(state)
+        recent = with_scan(state.recent, placed, thinned.extent_m, methods.config.odometry, is_changed=is_changed)
         if recent is not state.recent:
             surface = joined_surface((*local_map.keyframes, *recent))
             after = after._replace(recent=recent, local_map=local_map._replace(surface=surface))
@@ -214,7 +216,7 @@ class _Attempt(NamedTuple):
 
 def _locate(methods: SlamMethods, state: FrontEndState, local_map: LocalMap, scan: ThinnedScan) -> Located:
     config, predicted = methods.config.front_end, state.T_keyframe_last @ state.T_before_last
-    usual = float(np.median(state.scores)) if state.scores else 1.0
+    usual = _usual_score(state)
     # Nothing is usual yet where a part of the map begins: sparse scans never score high.
     wanted = max(MIN_SCORE, MIN_SCORE_SHARE * usual if state.scores else 0.0)
     tried = _attempt(methods, state, local_map, scan, usual)
@@ -237,6 +239,10 @@ def _locate(methods: SlamMethods, state: FrontEndState, local_map: LocalMap, sca
     # The best alignment is the better guess, unless a robot hardly moves like that.
     is_likely = are_near(predicted, best.T_map_scan, 3 * GUESS_M, 3 * GUESS_RAD)
     return Located(best.T_map_scan if is_likely else predicted, status, numbers, best.score, guess, *network)
+
+
+def _usual_score(state: FrontEndState) -> float:
+    return float(np.median(state.scores)) if state.scores else 1.0
 
 
 def _attempt(

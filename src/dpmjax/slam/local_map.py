@@ -91,7 +91,12 @@ def placed_scan(surface: Surface, T_map_scan: Pose) -> PlacedElements:
 
 
 def with_scan(
-    recent: tuple[PlacedElements, ...], placed: PlacedElements, extent_m: float, config: OdometryConfig
+    recent: tuple[PlacedElements, ...],
+    placed: PlacedElements,
+    extent_m: float,
+    config: OdometryConfig,
+    *,
+    is_changed: bool = False,
 ) -> tuple[PlacedElements, ...]:
     """Adds a scan that is far enough from the last one, and drops the oldest scan beyond the number that is kept.
 
@@ -99,12 +104,13 @@ def with_scan(
         recent: the last scans, oldest first.
         placed: the scan.
         extent_m: of the scan; a share of it is the smallest distance from the last scan, unless the scan is turned.
-        config: number of scans, and turn.
+        config: number of scans.
+        is_changed: True for a scan that agrees less with the local map than usual; it joins at any distance.
 
     Returns:
         The last scans after; the same tuple where the scan does not join.
     """
-    if recent:
+    if recent and not is_changed:
         T_last_scan = rigid.inverse(recent[-1].T_map_scan) @ placed.T_map_scan
         if np.linalg.norm(T_last_scan[:3, 3]) < RECENT_SHARE * extent_m and turn_rad(T_last_scan) < RECENT_RAD:
             return recent
