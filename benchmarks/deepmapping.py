@@ -23,7 +23,7 @@ from dpmjax.cli import why_not_importable
 from dpmjax.deepmapping import Progress, ToyConfig, fit, mapping_data, mapping_problem, toy_problem
 from dpmjax.io import ScanSequence, read_sequence
 from dpmjax.metrics import absolute_trajectory_error
-from dpmjax.registration import PlanarScans, incremental_icp, planar_scans, refine
+from dpmjax.registration2d import PlanarScans, incremental_icp, planar_scans, refine
 from dpmjax.simulation import simulate_sequence
 from experiments.toy_1d import FORMS, share_at_minimum, torch_seconds
 

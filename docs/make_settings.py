@@ -40,7 +40,7 @@ class Group(NamedTuple):
 
 
 SCANS_2D = Group("2-D scans", (
-    Section("RegistrationConfig", "dpmjax.registration", "`register_scans(scans, config, key=key)`", {
+    Section("RegistrationConfig", "dpmjax.registration2d", "`register_scans(scans, config, key=key)`", {
         "is_ordered": ("", "False for scans without an order in time; the start is then the global search"),
         "refine": ("", "False: no candidate is refined"),
         "min_distance": ("unit of the scans", "0.5 m for whole recordings: nearer scans follow the odometry"),
@@ -62,7 +62,7 @@ SCANS_2D = Group("2-D scans", (
         "max_offset": ("scans", "higher if places are seen again soon; lower if neighbouring scans hardly overlap"),
         "scans_per_window": ("scans", "shorter windows if scans are far apart; None: one L-Net for the whole set"),
     }),
-    Section("RefinementConfig", "dpmjax.registration", "`refine(scans, poses, config)`", {
+    Section("RefinementConfig", "dpmjax.registration2d", "`refine(scans, poses, config)`", {
         "temporal": ("scans", "offsets of the neighbours in time"),
         "num_spatial": ("scans", "more neighbours in space: stiffer maps, slower"),
         "radius": ("typical ranges", "how far apart neighbours in space may be"),

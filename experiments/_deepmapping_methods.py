@@ -15,11 +15,11 @@ import jax
 import numpy as np
 from numpy.typing import NDArray
 
-from dpmjax import ScanSet, registration
+from dpmjax import ScanSet, registration2d
 from dpmjax import deepmapping as dm
 from dpmjax.cli import planar_errors
 from dpmjax.io import ScanSequence
-from dpmjax.registration import DEEPMAPPING, START_NAMES, PlanarScans
+from dpmjax.registration2d import DEEPMAPPING, START_NAMES, PlanarScans
 
 Floats = NDArray[np.float64]
 Candidates = dict[str, Floats]
@@ -59,28 +59,28 @@ def make_task(sequence: ScanSequence, *, is_ordered: bool = True, steps: int | N
     if not is_ordered:
         order = np.random.default_rng([seed, 77]).permutation(len(sequence))
         sequence = replace(sequence.take(order), odometry_poses=None)
-    planar = registration.planar_scans(sequence.points, sequence.mask, is_ordered=is_ordered)
+    planar = registration2d.planar_scans(sequence.points, sequence.mask, is_ordered=is_ordered)
     return Task(sequence, planar, is_ordered, steps, seed)
 
 
 def incremental(task: Task, metric: Literal["point", "plane"] = "plane") -> Floats:
     """Returns poses by incremental ICP."""
-    return registration.incremental_icp(task.planar, metric).poses
+    return registration2d.incremental_icp(task.planar, metric).poses
 
 
 def search(task: Task) -> Floats:
     """Returns poses by global registration, from nothing but the scans: no odometry, no first guess, no refinement."""
-    return registration.register_globally(task.planar).poses
+    return registration2d.register_globally(task.planar).poses
 
 
 def refined(task: Task, poses: Floats) -> Floats:
     """Returns the poses after the alignment of all scans together."""
-    return registration.refine(task.planar, poses).poses
+    return registration2d.refine(task.planar, poses).poses
 
 
 def choose(task: Task, candidates: Mapping[str, Floats]) -> tuple[str, dict[str, dict[str, float]]]:
     """Returns the name of the best candidate, chosen by the scans alone, and the errors and scores of all."""
-    kept, scores = registration.choose_trajectory(task.planar, candidates)
+    kept, scores = registration2d.choose_trajectory(task.planar, candidates)
     return kept, {
         name: planar_errors(task.sequence, candidates[name]) | score._asdict() for name, score in scores.items()
     }
@@ -88,7 +88,7 @@ def choose(task: Task, candidates: Mapping[str, Floats]) -> tuple[str, dict[str,
 
 def assess(task: Task, poses: Floats) -> dict[str, Any]:
     """Returns the assessment of poses, from the scans alone, under the names of the result files."""
-    return registration.assess_trajectory(task.planar, poses)._asdict()
+    return registration2d.assess_trajectory(task.planar, poses)._asdict()
 
 
 def _fit(task: Task, start: Floats | None, config: dm.DeepMappingConfig | None = None) -> Floats:
@@ -96,7 +96,7 @@ def _fit(task: Task, start: Floats | None, config: dm.DeepMappingConfig | None =
     settings = config or dm.preset("fast")
     settings = settings if task.steps is None else dm.with_steps(settings, task.steps)
     key = jax.random.key(task.seed)
-    return registration.fit_in_order(task.scans, settings, key=key, start=start, is_ordered=task.is_ordered).poses
+    return registration2d.fit_in_order(task.scans, settings, key=key, start=start, is_ordered=task.is_ordered).poses
 
 
 def _refined_icp(task: Task) -> Candidates:

@@ -74,7 +74,7 @@ def run_method(
 
 def chain_icp(sequence: DepthSequence, *, seed: int) -> NDArray[np.float64]:
     """Returns poses by point-to-plane ICP of each image onto the one before, from the same pose."""
-    from dpmjax.registration import icp
+    from dpmjax.registration2d import icp
 
     rng = np.random.default_rng(seed)
     # One size for all clouds, so that ICP compiles once.

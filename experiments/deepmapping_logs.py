@@ -21,7 +21,7 @@ from typing import Annotated, Any
 from tyro.conf import Positional, arg
 
 from dpmjax.cli import EXIT_BAD_INPUT, METRICS, RunFolder, load_json, run_command, spans_of, write_metrics
-from dpmjax.registration import DEEPMAPPING
+from dpmjax.registration2d import DEEPMAPPING
 from experiments._corridor_logs import write_corridor_log
 
 EXPERIMENT = "deepmapping_logs"

@@ -23,7 +23,7 @@ ALLOWED: dict[str, set[str]] = {
     "nets": {"geometry"},
     "losses": {"geometry"},
     "pose_graph": {"geometry"},
-    "registration": {"geometry", "losses", "pose_graph"},
+    "registration2d": {"geometry", "losses", "pose_graph"},
     "registration_rgbd": {"geometry"},
     "deepmapping": {"geometry", "nets", "losses", "scans", "registration_rgbd"},
     "deeppointmap": {"geometry", "nets", "losses", "scans", "metrics"},
@@ -36,7 +36,7 @@ ALLOWED: dict[str, set[str]] = {
     "weights": {"geometry", "nets", "deeppointmap"},
 }
 # This file joins classical registration with DeepMapping; the rest of its room knows no network.
-ALLOWED_IN_FILE: dict[str, set[str]] = {"registration/pipeline.py": {"deepmapping"}}
+ALLOWED_IN_FILE: dict[str, set[str]] = {"registration2d/pipeline.py": {"deepmapping"}}
 # The command imports every room, and no room imports it.
 ALLOWED |= {"cli": set(ALLOWED) - EVERYBODY_MAY, "__main__": {"cli"}}
 ONLY_IN: dict[str, set[str]] = {"matplotlib": {"viz", "io"}, "jaxlie": {"geometry"}, "torch": {"weights"}}

@@ -10,7 +10,7 @@ from . import losses as losses
 from . import metrics as metrics
 from . import nets as nets
 from . import pose_graph as pose_graph
-from . import registration as registration
+from . import registration2d as registration2d
 from . import registration_rgbd as registration_rgbd
 from . import saved_maps as saved_maps
 from . import scans as scans
@@ -61,10 +61,10 @@ from .pose_graph.graph import Edges as Edges
 from .pose_graph.graph import PoseGraph as PoseGraph
 from .pose_graph.optimize import PoseGraphConfig as PoseGraphConfig
 from .pose_graph.optimize import optimize_pose_graph as optimize_pose_graph
-from .registration.icp import icp as icp
-from .registration.pipeline import RegistrationConfig as RegistrationConfig
-from .registration.pipeline import register_scans as register_scans
-from .registration.refinement import refine as refine
+from .registration2d.icp import icp as icp
+from .registration2d.pipeline import RegistrationConfig as RegistrationConfig
+from .registration2d.pipeline import register_scans as register_scans
+from .registration2d.refinement import refine as refine
 from .saved_maps.map_file import load_map as load_map
 from .saved_maps.map_file import save_map as save_map
 from .slam.agents import AgentsResult as AgentsResult

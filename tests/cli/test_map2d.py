@@ -17,7 +17,7 @@ from evo.tools import file_interface
 from dpmjax.cli.command import Interrupted, run_command
 from dpmjax.cli.map2d import NAME, Config, main
 from dpmjax.io import ScanSequence, write_pcd
-from dpmjax.registration import register_scans
+from dpmjax.registration2d import register_scans
 from dpmjax.simulation import simulate_sequence
 from tests.data_sets import write_deepmapping_folder
 
@@ -123,7 +123,7 @@ def test_a_run_interrupted_before_the_fit_keeps_its_start(scans_npz, tmp_path, m
         os.kill(os.getpid(), signal.SIGINT)
         return register_scans(*options, **hooks)  # type: ignore[arg-type]
 
-    monkeypatch.setattr("dpmjax.registration.register_scans", interrupted)
+    monkeypatch.setattr("dpmjax.registration2d.register_scans", interrupted)
     with pytest.raises(Interrupted):
         main(Config(data=scans_npz, init="zero", output=tmp_path / "out"))
     found = metrics_of(tmp_path / "out")

@@ -6,7 +6,7 @@ import pytest
 from dpmjax.geometry import se2
 from dpmjax.pose_graph.graph import Edges, PoseGraph, join_edges
 from dpmjax.pose_graph.optimize import ROBUST, optimize_pose_graph
-from dpmjax.registration.joint_alignment import solve_step
+from dpmjax.registration2d.joint_alignment import solve_step
 from tests.tolerances import DOUBLE
 
 

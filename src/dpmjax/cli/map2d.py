@@ -30,7 +30,7 @@ import numpy as np
 from numpy.typing import NDArray
 from tyro.conf import Positional, arg
 
-from dpmjax import deepmapping, io, registration, simulation
+from dpmjax import deepmapping, io, registration2d, simulation
 from dpmjax.cli.command import StopFlag, check_least, run_command
 from dpmjax.cli.drives import report_notes
 from dpmjax.cli.machine import peak_rss_gb
@@ -53,7 +53,7 @@ from dpmjax.cli.run_folder import (
 
 if TYPE_CHECKING:
     from dpmjax.deepmapping import DeepMappingConfig, Fit
-    from dpmjax.registration import RegisteredScans, RegistrationConfig
+    from dpmjax.registration2d import RegisteredScans, RegistrationConfig
     from dpmjax.sequences import ScanSequence
 
 Floats = NDArray[np.float64]
@@ -169,13 +169,13 @@ def register(
         fitted = sequence.take(rows)
         return partial(recorder, measure=ate_of(fitted, typical_range(fitted.points, fitted.mask)))
 
-    return registration.register_scans(
+    return registration2d.register_scans(
         as_scan_set(sequence),
         registration_settings(config, sequence),
         key=jax.random.key(config.seed),
         start=start,
         odometry=sequence.odometry_poses if config.ordered else None,
-        hooks=registration.RegistrationHooks(show, lambda: stop.is_requested, engine),
+        hooks=registration2d.RegistrationHooks(show, lambda: stop.is_requested, engine),
     )
 
 
@@ -190,7 +190,7 @@ def numbers_of(
     start, kept = (result.candidates[name].poses for name in (result.start, result.kept))
 
     def title(name: str) -> str:
-        return name.replace(registration.GIVEN_POSES, f"poses of {Path(config.init).name}")
+        return name.replace(registration2d.GIVEN_POSES, f"poses of {Path(config.init).name}")
 
     return {
         "num_scans": len(sequence),
@@ -257,7 +257,7 @@ def starting_poses(config: Config, sequence: ScanSequence) -> Any:
             f"{sequence.name}: has no odometry of its own (its odometry column repeats the corrected pose, or is "
             "missing); use --init icp-plane"
         )
-    words = ("auto", *registration.START_NAMES)
+    words = ("auto", *registration2d.START_NAMES)
     if init in words:
         return init
     if not Path(init).exists():
@@ -267,7 +267,7 @@ def starting_poses(config: Config, sequence: ScanSequence) -> Any:
 
 def registration_settings(config: Config, sequence: ScanSequence) -> RegistrationConfig:
     """Returns the settings of the registration; scans in metres are chosen by their motion."""
-    return registration.RegistrationConfig(
+    return registration2d.RegistrationConfig(
         is_ordered=config.ordered,
         refine=config.refine,
         fit=fit_settings(config, sequence),

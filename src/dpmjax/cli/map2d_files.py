@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dpmjax import deepmapping, io, registration, viz
+from dpmjax import deepmapping, io, registration2d, viz
 from dpmjax import metrics as trajectory_metrics
 from dpmjax.cli.run_folder import RunFolder
 
 if TYPE_CHECKING:
-    from dpmjax.registration import RegisteredScans
+    from dpmjax.registration2d import RegisteredScans
     from dpmjax.sequences import ScanSequence
     from dpmjax.types import ScanSet
 
@@ -48,7 +48,7 @@ def draw_map(
     scans, unit = as_scan_set(registered), registered.unit
     panels = []
     titles = dict(zip(result.candidates, metrics["candidates"], strict=True))
-    for name in dict.fromkeys((result.start, registration.DEEPMAPPING, result.kept)):
+    for name in dict.fromkeys((result.start, registration2d.DEEPMAPPING, result.kept)):
         if name not in result.candidates:
             continue
         title, numbers = titles[name], metrics["candidates"][titles[name]]

@@ -1,7 +1,7 @@
 """Point-to-plane alignment of whole lidar scans on the host, coarse to fine, from a first guess of some metres.
 
-`registration.icp` is the textbook method for any two clouds on any device. This one searches trees, shrinks the radius
-of its pairs, samples all directions of normals alike, and pairs only surfaces whose normals agree.
+`registration2d.icp` is the textbook method for any two clouds on any device. This one searches trees, shrinks the
+radius of its pairs, samples all directions of normals alike, and pairs only surfaces whose normals agree.
 """
 
 from __future__ import annotations

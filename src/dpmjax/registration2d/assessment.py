@@ -1,0 +1,186 @@
+"""Trust in a registration without the truth.
+
+A map is wrong where a weak connection holds it together, where beams pass through what others have hit, and where a
+step may slide along a corridor. Trust therefore rests on three quantities. The first is the score of the weakest
+connection of the best tree of pairs. The second is the share of contradicting beams of the pairs outside the tree,
+beyond that of the pairs in it. The third is the standard deviation of each scan's place against the largest part of the
+map that has no open connection.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import scipy.sparse
+import scipy.sparse.csgraph
+from numpy.typing import NDArray
+
+from dpmjax.geometry import se2
+from dpmjax.registration2d.planar_scans import Floats, Indices, PlanarScans
+from dpmjax.registration2d.quality import MAX_NOISE, near_pairs
+from dpmjax.registration2d.range_profiles import RangeProfiles, compare_pairs, make_profiles
+from dpmjax.registration2d.step_prior import StepPrior
+from dpmjax.registration2d.step_scores import pair_scores
+from dpmjax.registration2d.step_slides import Slides, slide_steps
+
+# Limits of `assess_trajectory`, calibrated on right and wrong maps of simulated worlds and of thinned logs
+# (docs/notebook/deepmapping_notes.md).
+# Score of its best pair above which a scan belongs to the map.
+_LEAST_SCORE = 0.1
+# Least share of the scans that the connected map must hold.
+_LEAST_REGISTERED = 0.9
+# Least score of the weakest connection between two parts of a trusted map.
+_MIN_CONNECTION = 0.1
+# Least number of scans of a part, and least share of the connected scans; the larger of the two decides.
+_PART_SCANS, _PART_SHARE = 3, 0.02
+# In maps of no more connected scans than this, a single scan is a part.
+_FEW_SCANS = 60
+# The largest contradiction (`Assessment`) of a trusted map is the floor plus the factor times the contradicted share of
+# the connections that hold the map, because sensor and people contradict there too; it is never above the maximum.
+_CONTRADICTION_FLOOR = 0.02
+_CONTRADICTION_FACTOR = 1.6
+_MAX_CONTRADICTION = 0.055
+# Largest standard deviation of a scan's place against the map, typical ranges.
+_MAX_DEVIATION = 0.02
+
+
+class Assessment(NamedTuple):
+    """Trust in a registration, computed without the truth.
+
+    Attributes:
+        weakest_connection: score, at most 1, of the weakest connection that holds two parts of the map together.
+        contradiction: share of contradicting beams in the pairs outside the tree of best pairs, less that of the pairs
+            in it. A beam contradicts where it ends in the free space of another scan.
+        is_trusted: both values are within the limits of right maps, no scan may slide, the scans are not mirrored, and
+            the range noise is below its limit.
+        uncertain_scans: rows of the scans for which trust does not hold: they fit no other scan, or they may slide
+            along a corridor together.
+        fault: sentence on axes or units that contradict the odometry; None: none found.
+    """
+
+    weakest_connection: float
+    contradiction: float
+    is_trusted: bool
+    uncertain_scans: tuple[int, ...] = ()
+    fault: str | None = None
+
+
+class _Pairs(NamedTuple):
+    """Pairs of near scans (p): rows, T_target_source, and their scores."""
+
+    source: Indices
+    target: Indices
+    relative: Floats
+    scores: Floats
+
+    def take(self, is_taken: NDArray[np.bool_]) -> _Pairs:
+        return _Pairs(self.source[is_taken], self.target[is_taken], self.relative[is_taken], self.scores[is_taken])
+
+
+def assess_trajectory(
+    scans: PlanarScans, poses: Floats, *, prior: StepPrior | None = None, fault: str | None = None
+) -> Assessment:
+    """Tells whether the registration of scans can be trusted.
+
+    The best pairs of scans make a tree that holds the map together. It must have no weak connection between two parts.
+    Pairs outside the tree must contradict hardly more than the pairs in it. Scans that fit no other scan are left out,
+    if they are few. No scan may be free to slide against the map.
+
+    Args:
+        scans: n scans, two at least.
+        poses: (n, 3) x, y, heading.
+        prior: of the steps of ordered scans; None: the scans alone.
+        fault: of the odometry or the scans against it; no map is trusted with one.
+
+    Returns:
+        Assessment.
+    """
+    profiles, (source, target) = make_profiles(scans), near_pairs(poses, scans.typical_range)
+    relative = np.asarray(se2.relative(poses[target], poses[source]))
+    pairs = _Pairs(source, target, relative, pair_scores(profiles, source, target, relative))
+    views = compare_pairs(profiles, source, target, relative)
+    best = np.full(len(poses), -np.inf)
+    np.maximum.at(best, np.concatenate([source, target]), np.tile(pairs.scores, 2))
+    is_used = (best[source] > _LEAST_SCORE) & (best[target] > _LEAST_SCORE)
+    pairs = pairs.take(is_used)
+    contradicted, visible = (np.asarray(x)[is_used] for x in (views.contradicted, views.visible))
+    size = (len(poses), len(poses))
+    costs = scipy.sparse.csr_array((2.0 - pairs.scores, (pairs.source, pairs.target)), size)
+    tree = scipy.sparse.csr_array(scipy.sparse.csgraph.minimum_spanning_tree(costs))
+    holding = tree.tocoo()
+    holds = np.isin(pairs.source * len(poses) + pairs.target, holding.row.astype(np.int64) * len(poses) + holding.col)
+    shares = [contradicted[rows].sum() / max(visible[rows].sum(), 1.0) for rows in (holds, ~holds)]
+    excess, num_connected, weakest = shares[1] - shares[0], *_weakest_connection(tree)
+    limit = min(_CONTRADICTION_FLOOR + _CONTRADICTION_FACTOR * shares[0], _MAX_CONTRADICTION)
+    is_clear = excess <= limit and scans.noise <= MAX_NOISE * scans.typical_range
+    is_whole = num_connected >= _LEAST_REGISTERED * len(poses) and weakest >= _MIN_CONNECTION
+    is_alone = best <= _LEAST_SCORE
+    steps = None if prior is None else _slide_all(profiles, poses, prior)
+    deviations = _deviations(profiles, len(poses), pairs, steps)
+    if steps is not None:
+        later = np.arange(1, len(poses))
+        is_torn = steps.is_torn & (steps.scores > _MIN_CONNECTION) & ~is_alone[later] & ~is_alone[later - 1]
+        deviations[np.concatenate([later[is_torn], later[is_torn] - 1])] = np.inf
+    may_slide = (deviations > _MAX_DEVIATION * scans.typical_range) & ~is_alone
+    is_trusted = is_clear and is_whole and not may_slide.any() and fault is None
+    uncertain = tuple(np.flatnonzero(is_alone | may_slide).tolist())
+    return Assessment(weakest, float(excess), bool(is_trusted), uncertain, fault)
+
+
+def _slide_all(profiles: RangeProfiles, poses: Floats, prior: StepPrior) -> Slides:
+    later = np.arange(1, len(poses))
+    return slide_steps(profiles, later, later - 1, np.asarray(se2.relative(poses[:-1], poses[1:])), prior)
+
+
+def _deviations(profiles: RangeProfiles, num_scans: int, pairs: _Pairs, steps: Slides | None) -> Floats:
+    """Returns the standard deviation of each scan's place against the largest part without open connections (n,).
+
+    A pair that has no other place along its weak direction is closed. An open one counts by the spread of its places.
+    These variances are the resistances of a network, with those of the steps (n - 1) that have a prior. The resistance
+    from a scan to that part is the variance of the scan; without a way it is infinite.
+    """
+    slides = slide_steps(profiles, pairs.source, pairs.target, pairs.relative)
+    is_used = ~slides.is_torn & (pairs.scores > _MIN_CONNECTION)
+    if steps is not None:
+        # A step between neighbours in time counts with its prior.
+        is_used &= pairs.source != pairs.target + 1
+    source, target, information = pairs.source[is_used], pairs.target[is_used], slides.information()[is_used]
+    if steps is not None:
+        rows = np.flatnonzero(~steps.is_torn)
+        source, target = np.concatenate([source, rows + 1]), np.concatenate([target, rows])
+        information = np.concatenate([information, steps.information()[rows]])
+    is_closed = np.isinf(information)
+    size = (num_scans, num_scans)
+    closed = scipy.sparse.csr_array((is_closed.astype(np.float64), (source, target)), size)
+    closed.eliminate_zeros()
+    label = scipy.sparse.csgraph.connected_components(closed, directed=False)[1]
+    # A closed part moves as one.
+    network = np.zeros((label.max() + 1, label.max() + 1))
+    np.add.at(network, (label[source[~is_closed]], label[target[~is_closed]]), -information[~is_closed])
+    network += network.T
+    ground = np.bincount(label).argmax()
+    part = scipy.sparse.csgraph.connected_components(scipy.sparse.csr_array(network), directed=False)[1]
+    variances, rows = np.full(len(network), np.inf), np.flatnonzero(part == part[ground])
+    variances[ground], rows = 0.0, rows[rows != ground]
+    np.fill_diagonal(network, 0.0)
+    np.fill_diagonal(network, -network.sum(axis=1))
+    variances[rows] = np.diag(np.linalg.inv(network[np.ix_(rows, rows)]))
+    return np.sqrt(np.maximum(variances[label], 0.0))
+
+
+def _weakest_connection(tree: scipy.sparse.csr_array) -> tuple[int, float]:
+    """Scans of the largest connected tree, and the lowest score between two of its parts that are no single scans."""
+    label = scipy.sparse.csgraph.connected_components(tree, directed=False)[1]
+    root = int(np.flatnonzero(label == np.bincount(label).argmax())[0])
+    order, parent = scipy.sparse.csgraph.breadth_first_order(tree, root, directed=False)
+    size = np.ones(tree.shape[0], np.int64)
+    for scan in order[:0:-1]:
+        size[parent[scan]] += size[scan]
+    count, below = len(order), order[1:]
+    if not len(below):
+        return count, 0.0
+    cost = np.asarray((tree + tree.T)[below, parent[below]]).reshape(-1)
+    smaller = np.minimum(size[below], count - size[below])
+    is_part = smaller >= (1 if count <= _FEW_SCANS else max(_PART_SCANS, _PART_SHARE * count))
+    return count, float(2.0 - cost[is_part].max()) if is_part.any() else 1.0

@@ -1,0 +1,288 @@
+"""Global registration: poses of all scans without a first guess, and if need be without an order.
+
+Scans in the order of time are registered as a sequence (`sequence_search.py`). Without an order, or where steps are
+weak or noisy, a few dozen keyframes are searched against each other exhaustively and assembled into one map. The
+keyframes are spread evenly in time; without an order they are the scans most similar to all scans. The remaining scans
+are then searched against some of the keyframes and placed in the map.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+import scipy.sparse
+import scipy.sparse.csgraph
+import scipy.spatial
+from jaxtyping import Float
+from numpy.typing import NDArray
+
+from dpmjax.geometry import se2
+from dpmjax.pose_graph.graph import PoseGraph, join_edges
+from dpmjax.pose_graph.optimize import ROBUST, optimize_pose_graph
+from dpmjax.registration2d.incremental import incremental_icp
+from dpmjax.registration2d.map_assembly import PoseScorer, assemble, settle
+from dpmjax.registration2d.pair_search import (
+    Candidates,
+    CorrelativeConfig,
+    Hypotheses,
+    agreeing_edges,
+    chance_level,
+    join_candidates,
+    noisy_share,
+    search_pairs,
+)
+from dpmjax.registration2d.planar_scans import Floats, Indices, PlanarScans
+from dpmjax.registration2d.range_profiles import RangeProfiles, compare_pairs, make_profiles
+from dpmjax.registration2d.step_scores import weak_steps
+from dpmjax.registration2d.wall_directions import WallDirections
+
+# Numbers of search partners of a scan that is no keyframe: keyframes with the most similar views, and, without an
+# order, scans with the most similar views. With an order the keyframes before and after it replace the latter.
+_NUM_ANCHORS, _NUM_NEAREST_VIEWS = 2, 3
+# Numbers of likely headings around which these pairs, and pairs of keyframes, are searched.
+_NUM_LIKELY_TURNS, _NUM_KEYFRAME_TURNS = 3, 6
+# A sequence is registered like a set where more than this share of its steps is weak, or where the range noise is more
+# than this in typical ranges: a chain of steps drifts then.
+_MAX_WEAK, _MAX_NOISE = 0.25, 0.0225
+# Without an order, keyframes are chosen among this number of evenly spread scans.
+_MAX_ELIGIBLE = 1024
+# A scan whose best neighbour matches less than this share of the usual beams is unregistered; scans are of one cluster
+# if they match more than this share.
+_MIN_SUPPORT, _MIN_LINK = 0.6, 0.3
+
+
+@dataclass(frozen=True)
+class GlobalConfig:
+    """Settings of the global registration. Lengths are in typical ranges of the scans.
+
+    Attributes:
+        max_keyframes: largest number of keyframes, which are searched all against all.
+        max_unregistered: largest number of unregistered scans that are searched against all keyframes. Those still
+            unregistered are then searched against an equal number of further scans. A cluster of up to half of
+            `max_unregistered` scans, which matches no scan outside it, is unregistered too.
+        search: of pairs.
+    """
+
+    max_keyframes: int = 32
+    max_unregistered: int = 12
+    search: CorrelativeConfig = field(default_factory=CorrelativeConfig)
+
+
+class GlobalRegistration(NamedTuple):
+    """Result of `register_globally`.
+
+    Attributes:
+        poses: (n, 3) T_world_scan, the first one zero.
+        keyframes: rows of the scans that were searched all against all; none where a sequence needs no such search.
+    """
+
+    poses: Floats
+    keyframes: Indices
+
+
+class _Task(NamedTuple):
+    """The scans to be registered, the same for all stages."""
+
+    profiles: RangeProfiles
+    walls: WallDirections
+    keyframes: Indices
+    is_ordered: bool
+    config: GlobalConfig
+
+    @property
+    def others(self) -> Indices:
+        """Rows of the scans that are no keyframes."""
+        return np.setdiff1d(np.arange(len(self.profiles)), self.keyframes)
+
+    def search(self, source: Indices, target: Indices, turns: NDArray[np.bool_] | None = None) -> Candidates:
+        """Candidates of pairs."""
+        return search_pairs(self.profiles, source, target, self.config.search, turns=turns)
+
+    def likely_turns(self, source: Indices, target: Indices, num_peaks: int) -> NDArray[np.bool_]:
+        """Headings of T_target_source that the walls of both scans suggest."""
+        return self.walls.likely_turns(source, target, self.config.search.num_turns, num_peaks)
+
+
+def register_globally(scans: PlanarScans, config: GlobalConfig | None = None) -> GlobalRegistration:
+    """Poses of all scans from no guess.
+
+    Args:
+        scans: n scans. If they are ordered, neighbours in the array are neighbours in time. Otherwise no order is used,
+            and up to 1,024 shuffled scans give the same map.
+        config: settings.
+
+    Returns:
+        GlobalRegistration.
+    """
+    config, profiles, everyone = config or GlobalConfig(), make_profiles(scans), np.arange(len(scans))
+    if scans.is_ordered and scans.noise <= _MAX_NOISE * scans.typical_range:
+        poses = incremental_icp(scans).poses
+        # Few scans are searched all against all as soon as one step is weak.
+        allowed = _MAX_WEAK if len(scans) > config.max_keyframes else 0.0
+        if weak_steps(profiles, poses, everyone).sum() <= allowed * len(scans):
+            return GlobalRegistration(poses, everyone[:0])
+    walls = WallDirections(scans)
+    if scans.is_ordered:
+        keyframes = spread_evenly(len(scans), config.max_keyframes)
+    else:
+        eligible = spread_evenly(len(scans), _MAX_ELIGIBLE)
+        keyframes = eligible[most_typical(walls.best_similarity(everyone, eligible), config.max_keyframes)]
+    task = _Task(profiles, walls, keyframes, scans.is_ordered, config)
+    first, second = np.tril_indices(len(keyframes), k=-1)
+    pairs = keyframes[first], keyframes[second]
+    found = task.search(*pairs, task.likely_turns(*pairs, _NUM_KEYFRAME_TURNS))
+    inside = found._replace(source=first, target=second)
+    poses = np.zeros((len(scans), 3))
+    poses[keyframes] = assemble(profiles.take(keyframes), inside, is_ordered=scans.is_ordered)
+    if len(keyframes) < len(scans):
+        key_edges = agreeing_edges(poses, found, profiles)
+        poses, more = place_others(task, poses, found, task.search(*_similar_pairs(task)))
+        edges = join_edges(key_edges, agreeing_edges(poses, more, profiles))
+        poses = optimize_pose_graph(PoseGraph.create(poses, edges), ROBUST).graph.poses
+    return GlobalRegistration(se2.relative(poses[0], poses), keyframes)
+
+
+def spread_evenly(num_scans: int, count: int) -> Indices:
+    """At most `count` scans, the first and the last among them."""
+    return np.unique(np.round(np.linspace(0, num_scans - 1, min(num_scans, count))).astype(np.int64))
+
+
+def most_typical(similarity: Float[np.ndarray, "n m"], count: int) -> Indices:
+    """Columns of the scans that together are most similar to all of the n scans, of those with m columns."""
+    count = min(similarity.shape[1], count)
+    chosen: list[int] = []
+    # Similarity of each scan to the most similar chosen one; each choice adds as much to that as it can.
+    covered = np.full(len(similarity), -1.0, similarity.dtype)
+    for _ in range(count):
+        gain = np.maximum(similarity - covered[:, None], 0.0).sum(axis=0)
+        gain[chosen] = -1.0
+        chosen.append(int(gain.argmax()))
+        covered = np.maximum(covered, similarity[:, chosen[-1]])
+    return np.sort(np.array(chosen, np.int64))
+
+
+def place_in_map(poses: Floats, placed: Indices, hypotheses: Hypotheses, scorer: PoseScorer) -> Floats:
+    """Poses of the scans that are not yet placed: of their hypotheses the one with the best score against placed scans.
+
+    Then all scans may change their poses as in `assemble`.
+
+    Args:
+        poses: (n, 3); right for those of `placed`.
+        placed: rows.
+        hypotheses: of pairs; each scan that is not placed needs one with a placed scan.
+        scorer: of the map.
+
+    Returns:
+        (n, 3) poses. Scans without any hypothesis stay where `poses` has them.
+    """
+    is_placed = np.zeros(len(poses), bool)
+    is_placed[placed] = True
+    fresh = hypotheses.take(np.flatnonzero(is_placed[hypotheses.anchor] & ~is_placed[hypotheses.scan]))
+    candidates = fresh.world_poses(poses)
+    # Hypotheses of one scan compete with each other alone: no need to subtract what chance would give.
+    score = scorer._replace(chance=0.0, is_ordered=False).score(fresh.scan, candidates, placed, poses)
+    order = np.argsort(score, kind="stable")
+    poses = poses.copy()
+    # The best one of each scan is written last.
+    poses[fresh.scan[order]] = candidates[order]
+    return settle(poses, hypotheses, scorer)
+
+
+def _similar_pairs(task: _Task) -> tuple[Indices, Indices, NDArray[np.bool_]]:
+    """Pairs of each other scan with similar keyframes and with near scans; and the turns to try for each."""
+    others, keyframes = task.others, task.keyframes
+    if task.is_ordered:
+        after = np.clip(np.searchsorted(keyframes, others), 1, len(keyframes) - 1)
+        near = np.stack([keyframes[after - 1], keyframes[after]], axis=1)
+    else:  # Those with the most similar views of all are likely to be near.
+        near = task.walls.most_similar(others, np.arange(len(task.profiles)), _NUM_NEAREST_VIEWS)
+    pairs = np.concatenate([task.walls.most_similar(others, keyframes, _NUM_ANCHORS), near], axis=1)
+    # Each pair once, with one scan that is turned for all its partners.
+    ends = np.stack([pairs.reshape(-1), np.repeat(others, pairs.shape[1])], axis=-1)
+    _, first = np.unique(np.sort(ends, axis=1), axis=0, return_index=True)
+    source, target = ends[np.sort(first)].T
+    return source, target, task.likely_turns(source, target, _NUM_LIKELY_TURNS)
+
+
+def place_others(task: _Task, poses: Floats, found: Candidates, more: Candidates) -> tuple[Floats, Candidates]:
+    """Places all scans, from the poses of the keyframes.
+
+    Args:
+        task: the scans.
+        poses: (n, 3); right for the keyframes.
+        found: candidates of the keyframes.
+        more: candidates of the scans that are no keyframes.
+
+    Returns:
+        (n, 3) poses, and `more` with the candidates of scans that had to be searched again.
+    """
+
+    def place(poses: Floats, more: Candidates) -> Floats:
+        candidates = join_candidates(found, more)
+        share = noisy_share(task.profiles, candidates)
+        scorer = PoseScorer(task.profiles, chance_level(found), share, task.is_ordered)
+        return place_in_map(poses, task.keyframes, Hypotheses.of(candidates), scorer)
+
+    poses = place(poses, more)
+    # A scan that sees no keyframe has its neighbours among the remaining scans; so has a keyframe that sees no second
+    # one.
+    for partners in (task.keyframes, task.others):
+        lost = find_unregistered(task.profiles, poses, task.config)
+        if not len(lost):
+            break
+        # Similarity has misled these, so all turns are tried, with the partners of the most similar views.
+        similar = task.walls.most_similar(lost, partners, len(task.keyframes))
+        source, target = similar.reshape(-1), np.repeat(lost, similar.shape[1])
+        more = join_candidates(more, task.search(source, target))
+        poses = place(poses, more)
+    return poses, more
+
+
+def find_unregistered(profiles: RangeProfiles, poses: Floats, config: GlobalConfig) -> Indices:
+    """Unregistered scans, the worst first: they match far fewer beams than usual with any scan outside their cluster.
+
+    A small cluster of scans that match each other and no other scan is unregistered too: its scans must not support
+    each other.
+
+    Args:
+        profiles: n scans.
+        poses: (n, 3) T_world_scan.
+        config: settings.
+
+    Returns:
+        Rows of the unregistered scans.
+    """
+    num_scans = len(poses)
+    num_near = min(7, num_scans)
+    near = scipy.spatial.cKDTree(poses[:, :2]).query(poses[:, :2], k=num_near)[1]
+    scan, other = np.repeat(np.arange(num_scans), num_near), near.reshape(-1).astype(np.int64)
+    views = compare_pairs(profiles, scan, other, se2.relative(poses[other], poses[scan]))
+    matched = np.where(scan == other, 0.0, views.matched)
+    usual = float(np.median(matched.reshape(near.shape).max(axis=1)))
+    links = (matched > _MIN_LINK * usual).astype(np.float64)
+    is_linked = scipy.sparse.csr_array((links, (scan, other)), shape=(num_scans, num_scans))
+    is_linked.eliminate_zeros()
+    cluster = scipy.sparse.csgraph.connected_components(is_linked, directed=False)[1]
+    is_small = np.bincount(cluster)[cluster] <= config.max_unregistered // 2
+    matched = np.where(is_small[scan] & (cluster[scan] == cluster[other]), 0.0, matched)
+    support = matched.reshape(near.shape).max(axis=1)
+    worst = np.argsort(support)[: config.max_unregistered]
+    return worst[support[worst] < _MIN_SUPPORT * usual].astype(np.int64)
+
+
+def nearest_tour(poses: Floats) -> Indices:
+    """Orders scans so that neighbours are near each other: from each pose to the nearest one not yet visited.
+
+    Args:
+        poses: (n, 3) x, y, heading.
+
+    Returns:
+        (n,) rows, the first one 0.
+    """
+    tour, apart = [0], np.linalg.norm(poses[:, None, :2] - poses[:, :2], axis=-1)
+    for _ in poses[1:]:
+        apart[:, tour[-1]] = np.inf
+        tour.append(int(apart[tour[-1]].argmin()))
+    return np.array(tour, np.int64)

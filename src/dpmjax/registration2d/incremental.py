@@ -1,0 +1,135 @@
+"""Incremental ICP: every scan against the one before, then the steps chained. The usual warm start of DeepMapping."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from dpmjax.geometry import se2
+from dpmjax.registration2d.pair_alignment import COARSE, FINE, Metric, PairMatches, PosePrior, match_pairs
+from dpmjax.registration2d.planar_scans import Floats, PlanarScans
+from dpmjax.registration2d.sequence_search import search_sequence
+from dpmjax.registration2d.step_prior import StepPrior, usual_motion
+
+# Share of the typical range that a coarse match is off by; and that of a direction that the scans leave open.
+_COARSE_RESIDUAL = 0.015
+_OPEN_RESIDUAL = 0.0075
+
+
+# Distance of the turns that are tried, degrees: the basin of one alignment is about as wide. The largest turn between
+# two scans that is searched when the small ones do not fit.
+_TURN_STEP, _MAX_TURN = 15.0, 90.0
+# A pair with a better fitness is not searched further; one with a lower fitness even then is searched at longer steps.
+_GOOD_FITNESS, _POOR_FITNESS = 0.75, 0.4
+# A step is open if its weakest eigenvalue is below this share of the beams.
+_MIN_EIGENVALUE = 0.01
+
+
+class IncrementalResult(NamedTuple):
+    """Result of `incremental_icp`.
+
+    Attributes:
+        poses: (n, 3) T_world_scan, the first one zero.
+        steps: the n - 1 matched steps T_scan_next, each by itself.
+    """
+
+    poses: Floats
+    steps: PairMatches
+
+
+def incremental_icp(
+    scans: PlanarScans, metric: Metric = "plane", *, odometry: Floats | None = None, prior: StepPrior | None = None
+) -> IncrementalResult:
+    """Registers each scan to the one before and chains the steps.
+
+    Without odometry, steps that are not clear are searched, and the poses are those of the best sequence of hypotheses
+    (`sequence_search.py`). Scans that fit no scan around them (a swapped line of the log) are interpolated.
+
+    Args:
+        scans: n scans in time order.
+        metric: distance to lines ("plane") or to points ("point").
+        odometry: (n, 3) raw poses. Their steps serve as guesses; without them the steps are searched.
+        prior: of the steps; None: that of the odometry, if there is any, at the usual deviations.
+
+    Returns:
+        IncrementalResult.
+    """
+    unit = scans.typical_range
+    source, target = scans.take(slice(1, None)), scans.take(slice(len(scans) - 1))
+    if len(scans) == 1:
+        return IncrementalResult(np.zeros((1, 3)), match_pairs(source, target, np.zeros((0, 1, 3)), FINE))
+    if odometry is None:
+        rough = _search_steps(source, target, metric)
+        prior = usual_motion(rough, unit)
+    else:
+        prior = prior or StepPrior.of_poses(odometry, unit)
+        guesses = np.asarray(se2.relative(odometry[:-1], odometry[1:]))
+        rough = _match_odometry(source, target, guesses, prior.as_pose_prior(_COARSE_RESIDUAL * unit), metric)
+    # Where the scans fix a step, the prior is weighed against their noise alone; an open step leans on the prior.
+    num_beams = np.maximum(np.asarray(source.is_on_line.sum(1)), 1)
+    is_open = rough.weakest_eigenvalue() < _MIN_EIGENVALUE * num_beams / COARSE.source_stride
+    belief = prior.as_pose_prior(np.where(is_open, _OPEN_RESIDUAL * unit, 3.0 * scans.noise)[:, None])
+    predicted = np.concatenate([prior.steps[:, :2], rough.poses[:, 2:]], axis=1)
+    guesses = np.stack([rough.poses, np.where(is_open[:, None], predicted, rough.poses)], axis=1)
+    steps = match_pairs(source, target, guesses, FINE, belief, metric=metric)
+    poses = se2.chain(steps.poses) if odometry is not None else search_sequence(scans, steps).poses
+    return IncrementalResult(poses, steps)
+
+
+def scan_odometry(scans: PlanarScans) -> Floats:
+    """Chains coarse alignments of each scan with the one before, from no motion: about how far the robot has gone.
+
+    It tells which scans of a dense recording lie apart, where a robot has no odometry; steps that are long or open in
+    some direction are wrong.
+
+    Args:
+        scans: n scans in time order.
+
+    Returns:
+        (n, 3) T_world_scan, the first one zero.
+    """
+    return se2.chain(match_near(scans.take(slice(1, None)), scans.take(slice(len(scans) - 1)), "plane").poses)
+
+
+def match_near(source: PlanarScans, target: PlanarScans, metric: Metric) -> PairMatches:
+    """Returns coarse matches from no motion and small turns."""
+    fan = np.radians(_TURN_STEP) * np.outer([0.0, -0.5, 0.5], [0.0, 0.0, 1.0])
+    return match_pairs(source, target, np.broadcast_to(fan, (len(source), 3, 3)), COARSE, metric=metric)
+
+
+def _match_odometry(
+    source: PlanarScans, target: PlanarScans, guess: Floats, prior: PosePrior, metric: Metric
+) -> PairMatches:
+    """Returns coarse matches around the steps of the odometry."""
+    fan = np.radians(_TURN_STEP) * np.outer([0.0, -0.5, 0.5, -1.5, 1.5], [0.0, 0.0, 1.0])
+    return match_pairs(source, target, guess[:, None] + fan, COARSE, prior, metric=metric)
+
+
+def _search_steps(source: PlanarScans, target: PlanarScans, metric: Metric) -> PairMatches:
+    """Returns coarse matches from small motions, then from larger ones where the fitness is poor."""
+    unit, rough = source.typical_range, match_near(source, target, metric)
+    prior = usual_motion(rough, unit).as_pose_prior(_COARSE_RESIDUAL * unit)
+    # Around the predicted translations, then far from zero.
+    near, far = _fan(unit, (0.0, 0.15), 4), _fan(unit, (0.3, 0.525), 8, turn_share=0.5)
+    centre = np.asarray(prior.mean) * [1.0, 1.0, 0.0]
+    for limit, fan, middle in ((_GOOD_FITNESS, near, centre), (_POOR_FITNESS, far, 0.0 * centre)):
+        rows = np.flatnonzero(rough.fitness < limit)
+        if not len(rows):
+            continue
+        belief = PosePrior(prior.mean[rows], prior.information[rows])
+        guesses = middle[rows][:, None] + fan
+        wide = match_pairs(source.take(rows), target.take(rows), guesses, COARSE, belief, metric=metric)
+        better = wide.fitness > rough.fitness[rows]
+        for kept, found in zip(rough, wide, strict=True):
+            kept[rows[better]] = found[better]
+    return rough
+
+
+def _fan(typical_range: float, radii: tuple[float, ...], num_ways: int, *, turn_share: float = 1.0) -> Floats:
+    """Guesses (h, 3) of a step: every turn at every shift by `radii` (typical ranges) in `num_ways` directions."""
+    last = turn_share * _MAX_TURN
+    turns = np.radians(np.arange(-last, last + 1e-6, _TURN_STEP))
+    ways = 2 * np.pi * np.arange(num_ways) / num_ways
+    shifts = [(r * np.cos(w), r * np.sin(w)) for r in radii for w in (ways if r else ways[:1])]
+    return np.array([(typical_range * x, typical_range * y, turn) for turn in turns for x, y in shifts])

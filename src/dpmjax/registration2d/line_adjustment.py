@@ -1,0 +1,232 @@
+"""Line adjustment: all poses against lines that all scans make together, as in a bundle adjustment.
+
+The line of one scan is as noisy as its beams. Here every beam is compared with a straight line through the beams of all
+scans nearby. Their weights come from the range noise: a grazing beam measures its wall well, because its noise runs
+along the wall. The lines are eliminated: their weights make each residual a function of poses alone.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import scipy.spatial
+from jaxtyping import Array, Bool, Float, Int
+
+from dpmjax.geometry import se2
+from dpmjax.geometry.neighbours import k_nearest
+from dpmjax.pose_graph.normal_equations import solve_blocks
+from dpmjax.registration2d.planar_scans import Floats, Indices, PlanarScans
+
+_einsum = partial(jnp.einsum, precision="highest")
+
+
+# The nearest beam of a neighbour, and this number of beams to either side of it, may be part of the line.
+_NUM_BESIDE = 2
+# In standard deviations of the range noise: half the length of line that a beam is compared with; beams farther than
+# this off a line are not part of it; walls stray so far from a straight line, so grazing beams are trusted no further.
+_WINDOW, _GATE, _ROUGHNESS = 6.0, 4.0, 0.2
+# Residuals of this many of their standard deviations lose most of their weight.
+_OUTLIER = 3.0
+# A wall is bent if its points stray by more than this, as a mean square in standard deviations.
+_MAX_CHI2 = 1.15
+# Points are a line if their variance along it is this many times the variance across it.
+_MIN_SLENDERNESS = 2.0
+# Gauss-Newton steps of each round.
+_NUM_ITERATIONS = 2
+
+
+@dataclass(frozen=True)
+class LineAdjustmentConfig:
+    """Settings of the line adjustment.
+
+    Attributes:
+        num_neighbours: number of neighbouring scans that share lines with a scan, spread evenly by nearness within
+            `radius`.
+        radius: within which scans share lines, in typical ranges of the scans.
+        num_rounds: times that the beams of a line are chosen.
+    """
+
+    num_neighbours: int = 48
+    radius: float = 1.2
+    num_rounds: int = 2
+
+
+class _Beams(NamedTuple):
+    """Beams of the neighbours that may lie on the line of each beam of a scan, in its frame: (b, s, k)."""
+
+    offsets: Float[Array, "b s k 2"]
+    slant: Float[Array, "b s k 2"]
+    levers: Float[Array, "b s k 2"]
+    mask: Bool[Array, "b s k"]
+
+
+class _Lines(NamedTuple):
+    """The line of each beam (b).
+
+    Attributes:
+        normals: turned as those of the beams.
+        shares: weights of the beams around, whose mean is the point of the line where the beam meets it.
+        variance: of the line there.
+        is_line: straight, and seen by enough beams.
+    """
+
+    normals: Float[Array, "b 2"]
+    shares: Float[Array, "b s k"]
+    variance: Float[Array, " b"]
+    is_line: Bool[Array, " b"]
+
+
+def _levers(points: Float[Array, "... 2"]) -> Float[Array, "... 2"]:
+    """Returns the derivatives of points with respect to the heading of their scan."""
+    return jnp.stack([-points[..., 1], points[..., 0]], -1)
+
+
+def _gather_beams(own: PlanarScans, others: PlanarScans, nearest: Int[Array, "b s"], poses: Array) -> _Beams:
+    """For each beam those of the scans around, beside the nearest one, that see the same side of a surface nearby."""
+    noise = own.noises
+    rotation = se2.rotation(poses[:, 2])
+    turn = partial(_einsum, "sij,skj->ski", rotation)
+    points = se2.transform_points(poses, others.points)
+    index = nearest[..., None] + jnp.arange(-_NUM_BESIDE, _NUM_BESIDE + 1)
+    is_inside = (index >= 0) & (index < points.shape[1])
+    index = jnp.clip(index, 0, points.shape[1] - 1)
+    scan = jnp.arange(points.shape[0])[:, None]
+    reach = jnp.maximum(jnp.linalg.norm(others.points, axis=-1, keepdims=True), 1e-12)
+    offsets = points[scan, index] - own.points[:, None, None]
+    squared = (offsets**2).sum(-1)
+    faces_same_way = _einsum("bi,bski->bsk", own.normals, turn(others.normals)[scan, index]) > 0.8
+    # Not the beam itself, which would agree with itself.
+    is_near = (squared < (_WINDOW * noise) ** 2) & (squared > (1e-3 * noise) ** 2)
+    slant, levers = (turn(x)[scan, index] for x in (others.points / reach, _levers(others.points)))
+    mask = others.is_on_line[scan, index] & is_inside & is_near & faces_same_way
+    return _Beams(offsets, slant, levers, mask)
+
+
+def _fit_lines(beams: _Beams, normals: Float[Array, "b 2"], noise: Float[Array, ""]) -> _Lines:
+    """Weighted straight lines, each from the beams around one beam; `normals` are where to start."""
+    floor = (_ROUGHNESS * noise) ** 2
+    taper = jnp.maximum(1.0 - (beams.offsets**2).sum(-1) / (_WINDOW * noise) ** 2, 0.0) ** 2
+    for _ in range(2):
+        across = _einsum("bi,bski->bsk", normals, beams.offsets)
+        slant = _einsum("bi,bski->bsk", normals, beams.slant)
+        counts = beams.mask & (jnp.abs(across) < _GATE * noise)
+        certainty = 1.0 / (noise**2 * slant**2 + floor)
+        weight = jnp.where(counts, taper * certainty, 0.0)
+        total = jnp.maximum(weight.sum((1, 2)), 1e-12)
+        mean = _einsum("bsk,bski->bi", weight, beams.offsets) / total[:, None]
+        centred = beams.offsets - mean[:, None, None]
+        spread = _einsum("bsk,bski,bskj->bij", weight, centred, centred) / total[:, None, None]
+        difference = 0.5 * (spread[:, 0, 0] - spread[:, 1, 1])
+        radius = jnp.hypot(difference, spread[:, 0, 1])
+        angle = 0.5 * jnp.arctan2(spread[:, 0, 1], difference)
+        fitted = jnp.stack([-jnp.sin(angle), jnp.cos(angle)], -1)
+        fitted = jnp.where((fitted * normals).sum(-1, keepdims=True) < 0, -fitted, fitted)
+        half_sum = 0.5 * (spread[:, 0, 0] + spread[:, 1, 1])
+        is_slender = half_sum + radius > _MIN_SLENDERNESS * (half_sum - radius)
+        normals = jnp.where(is_slender[:, None], fitted, normals)
+    stray = (weight * _einsum("bi,bski->bsk", normals, centred) ** 2).sum((1, 2))
+    chi2 = stray / jnp.maximum(jnp.where(counts, taper, 0.0).sum((1, 2)), 1e-12)
+    along = _einsum("bi,bski->bsk", _levers(normals), centred)
+    here = -(_levers(normals) * mean).sum(-1)
+    length = jnp.maximum((weight * along**2).sum((1, 2)), 1e-12)
+    shares = weight * (1.0 / total[:, None, None] + along * (here / length)[:, None, None])
+    is_line = is_slender & (chi2 < _MAX_CHI2) & (counts.sum((1, 2)) > 5)
+    return _Lines(normals, shares, 1.0 / total + here**2 / length, is_line)
+
+
+def _linearise(
+    own: PlanarScans, others: PlanarScans, nearest: Int[Array, "b s"], poses: Float[Array, "s 3"]
+) -> tuple[Float[Array, "s s 3 3"], Float[Array, "s 3"]]:
+    """J^T W J and J^T W r of one scan over all; the first of `others` is the scan itself, at pose zero."""
+    noise = own.noises
+    beams = _gather_beams(own, others, nearest, poses)
+    lines = _fit_lines(beams, own.normals, noise)
+    normals = lines.normals
+    residual = -_einsum("bsk,bski,bi->b", lines.shares, beams.offsets, normals)
+    squared_slant = (normals * own.points).sum(-1) ** 2 / jnp.maximum((own.points**2).sum(-1), 1e-12)
+    variance = noise**2 * (squared_slant + _ROUGHNESS**2) + lines.variance
+    robust = 1.0 / (1.0 + residual**2 / (_OUTLIER**2 * variance)) ** 2
+    weight = jnp.where(own.is_on_line & lines.is_line, robust / variance, 0.0)
+    rotation = se2.rotation(poses[:, 2])
+    shift = lines.shares.sum(2)[..., None] * _einsum("bi,sij->bsj", normals, rotation)
+    turn = _einsum("bsk,bski,bi->bs", lines.shares, beams.levers, normals)
+    own_part = jnp.concatenate([normals, (normals * _levers(own.points)).sum(-1, keepdims=True)], -1)
+    jacobian = (-jnp.concatenate([shift, turn[..., None]], -1)).at[:, 0].add(own_part)
+    information = _einsum("b,bsi,btj->stij", weight, jacobian, jacobian)
+    return information, _einsum("b,b,bsi->si", weight, residual, jacobian)
+
+
+@jax.jit
+def _find_nearest(scans: PlanarScans, around: Int[Array, "n s"], poses: Float[Array, "n s 3"]) -> Int[Array, "n b s"]:
+    """The beam of each scan around that ends nearest to each beam."""
+
+    def find(one: tuple[Array, Array]) -> Array:
+        rows, relative = one
+        points = se2.transform_points(relative, scans.points[rows])
+        own = scans.points[rows[0]]
+        search = jax.vmap(lambda some, mask: k_nearest(own, some, 1, mask=mask).indices[:, 0], out_axes=1)
+        return search(points, scans.is_on_line[rows])
+
+    return jax.lax.map(find, (around, poses))
+
+
+@jax.jit
+def _linearise_all(
+    scans: PlanarScans, around: Int[Array, "n s"], nearest: Int[Array, "n b s"], poses: Float[Array, "n s 3"]
+) -> tuple[Float[Array, "n s s 3 3"], Float[Array, "n s 3"]]:
+    def linearise(one: tuple[Array, Array, Array]) -> tuple[Array, Array]:
+        rows, nearest, relative = one
+        return _linearise(scans.take(rows[0]), scans.take(rows), nearest, relative)
+
+    return jax.lax.map(linearise, (around, nearest, poses))
+
+
+def _choose_around(poses: Floats, num_neighbours: int, radius: float) -> Indices:
+    """Rows of each scan, itself first, and of others: evenly by nearness out of those within the radius."""
+    num_scans = len(poses)
+    count = min(num_neighbours, num_scans - 1)
+    tree = scipy.spatial.cKDTree(poses[:, :2])
+    around = np.empty((num_scans, count + 1), np.int64)
+    for scan, pose in enumerate(poses):
+        num_within = tree.query_ball_point(pose[:2], radius, return_length=True)
+        near = np.atleast_1d(tree.query(pose[:2], k=min(num_scans, max(num_within, count + 1)))[1])
+        # Of scans at one place any may come first.
+        near = near[near != scan]
+        around[scan] = [scan, *near[np.linspace(0, len(near) - 1, count).astype(np.int64)]]
+    return around
+
+
+def adjust_to_lines(scans: PlanarScans, poses: Floats, config: LineAdjustmentConfig | None = None) -> Floats:
+    """Gauss-Newton of all poses against lines that all scans make together.
+
+    Args:
+        scans: n scans with a range noise above zero.
+        poses: (n, 3) start, T_world_scan, within a few deviations of the noise.
+        config: settings.
+
+    Returns:
+        (n, 3) poses; the first is that of the start. Without noise the start itself: nothing tells what to weigh by.
+    """
+    config = config or LineAdjustmentConfig()
+    poses = np.asarray(poses, np.float64)
+    if len(poses) < 2 or scans.noise <= 0:
+        return poses
+    radius, scans = config.radius * scans.typical_range, scans.replace(is_ordered=False)
+    for _ in range(config.num_rounds):
+        around = _choose_around(poses, config.num_neighbours, radius)
+        nearest = _find_nearest(scans, around, _relative_to_own(poses, around))
+        for _ in range(_NUM_ITERATIONS):
+            system = _linearise_all(scans, around, nearest, _relative_to_own(poses, around))
+            blocks, gradient = (np.asarray(x, np.float64) for x in system)
+            poses = se2.compose(poses, solve_blocks(around, blocks, gradient, len(poses)))
+    return poses
+
+
+def _relative_to_own(poses: Floats, around: Indices) -> Float[np.ndarray, "n s 3"]:
+    """Poses of the scans around each scan in its frame."""
+    return se2.relative(poses[around[:, 0]][:, None], poses[around]).astype(np.float32)

@@ -1,0 +1,206 @@
+"""Loop closure: pairs of scans far apart in time are matched without trust in the drifted poses, then optimised.
+
+A single pair of half-circle scans in a corridor fits in many wrong ways. Three checks make a loop reliable: the target
+is a small submap of several scans, neighbouring loops agree with it, and the robust graph rejects loops that still
+contradict it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import scipy.spatial
+from jaxtyping import Array, Bool, Float, Int
+
+from dpmjax.geometry import se2
+from dpmjax.pose_graph.graph import Edges, PoseGraph, join_edges
+from dpmjax.pose_graph.optimize import ROBUST, optimize_pose_graph
+from dpmjax.registration2d.held_steps import BEAM_DEVIATION, pose_steps
+from dpmjax.registration2d.pair_alignment import PairMatches, PosePrior, Schedule, match_pairs
+from dpmjax.registration2d.planar_scans import Floats, Indices, PlanarScans, batches
+from dpmjax.registration2d.range_profiles import contradicted_share, make_profiles
+from dpmjax.registration2d.step_scores import weak_steps
+
+_SEARCH = Schedule(gate=(0.18, 0.045), kernel=(0.09, 0.0225), num_iterations=7, source_stride=5, target_stride=3)
+_REFINE = Schedule(gate=(0.075, 0.0225), kernel=(0.0225, 0.0045), num_iterations=10, target_stride=2)
+# Number of candidates that are matched at a time, all batches of one shape.
+_BATCH = 512
+# Two views that overlap well are nearer than twice this, in typical ranges, whatever the drift.
+_NEARBY = 0.15
+# Number of scans before and after the target that its submap holds.
+_SUBMAP_WIDTH = 2
+# Least robust share of matched beams, and largest share of beams that contradict their partner scan.
+_MIN_FITNESS, _MAX_CONTRADICTED = 0.4, 0.08
+# Share of the beams that the weakest eigenvalue of a pair must reach.
+_MIN_EIGENVALUE = 0.03
+# Least number of agreeing loops; the number of scans within which they lie; and the limits of agreement: translation in
+# typical ranges, radians.
+_MIN_SUPPORT, _NEIGHBOURHOOD, _AGREEMENT = 2, 6, (0.045, 0.08)
+# Number of loops that must contradict a step before the trajectory is torn there.
+_STEP_TRUST = 30.0
+
+
+@dataclass(frozen=True)
+class LoopConfig:
+    """Settings of the loop search. Lengths are in typical ranges of the scans.
+
+    Attributes:
+        num_rounds: searches, each from the poses that the one before has corrected.
+        drift: error of a pose as a share of the way since; it sets where loops are looked for.
+        max_radius: largest distance of a candidate.
+        min_way: way between the two scans of a loop.
+        max_candidates: largest number of pairs in a round.
+    """
+
+    num_rounds: int = 3
+    drift: float = 0.05
+    max_radius: float = 2.25
+    min_way: float = 2.25
+    max_candidates: int = 2000
+
+
+class LoopResult(NamedTuple):
+    """Result of `close_loops`.
+
+    Attributes:
+        poses: (n, 3) corrected T_world_scan.
+        loops: edges of the last round.
+        weights: their final weights, 0 (rejected) to 1.
+    """
+
+    poses: Floats
+    loops: Edges
+    weights: Floats
+
+
+def close_loops(
+    scans: PlanarScans, poses: Floats, config: LoopConfig | None = None, *, steps: Edges | None = None
+) -> LoopResult:
+    """Corrects a drifted trajectory by the loops found in it.
+
+    Args:
+        scans: n scans in time order.
+        poses: (n, 3) start, T_world_scan: locally right, globally drifted.
+        config: settings.
+        steps: edges between neighbours in time; None: those of `poses`.
+
+    Returns:
+        LoopResult; the poses are those of the start where there is no loop.
+    """
+    config = config or LoopConfig()
+    steps = steps or pose_steps(poses, scans.typical_range)
+    # A step that its own scans do not support may be torn like a loop.
+    is_weak = weak_steps(make_profiles(scans), poses, np.arange(len(poses)))
+    step_trust = np.where(is_weak, 1.0, _STEP_TRUST)
+    for _ in range(config.num_rounds):
+        loops, weights = _find_loops(scans, poses, config), np.zeros(0)
+        if not len(loops.source):
+            break
+        trust = np.append(step_trust, np.ones(len(loops.source)))
+        solved = optimize_pose_graph(PoseGraph.create(poses, join_edges(steps, loops)), ROBUST, trust=trust)
+        poses, weights = solved.graph.poses, solved.weights[len(steps.source) :]
+    return LoopResult(poses, loops, weights)
+
+
+def _find_loops(scans: PlanarScans, poses: Floats, config: LoopConfig) -> Edges:
+    """Loops between scans of one trajectory, each supported by its neighbours; perhaps none."""
+    unit = scans.typical_range
+    source, target = find_candidates(poses, config, unit)
+    matches = PairMatches(np.zeros((len(source), 3)), np.zeros(len(source)), np.zeros((len(source), 3, 3)))
+    for part, rows in batches(len(source), _BATCH):
+        for kept, found in zip(matches, _match(scans, poses, source[rows], target[rows], config), strict=True):
+            kept[part] = found[: part.stop - part.start]
+    contradicted = contradicted_share(make_profiles(scans), source, target, matches.poses)
+    num_beams = np.maximum(np.asarray(scans.is_on_line.sum(1))[source], 1)
+    is_held = matches.weakest_eigenvalue() / num_beams > _MIN_EIGENVALUE
+    fits = (matches.fitness > _MIN_FITNESS) & (contradicted < _MAX_CONTRADICTED) & is_held
+    information = matches.information[fits] / (BEAM_DEVIATION * unit) ** 2
+    edges = Edges(source[fits], target[fits], matches.poses[fits], information)
+    is_supported = count_support(edges, poses, unit) >= _MIN_SUPPORT
+    return jax.tree.map(lambda x: x[is_supported], edges)
+
+
+def find_candidates(poses: Floats, config: LoopConfig, typical_range: float) -> tuple[Indices, Indices]:
+    """Pairs of scans that may see the same place: later one (source) and earlier one (target)."""
+    way, nearby = _way_along(poses), 2.0 * _NEARBY * typical_range
+    radius = min(config.max_radius * typical_range, nearby + config.drift * way[-1])
+    first, second = scipy.spatial.cKDTree(poses[:, :2]).query_pairs(radius, output_type="ndarray").T
+    apart = way[second] - way[first]
+    distance = np.hypot(*(poses[second, :2] - poses[first, :2]).T)
+    keep = (apart > config.min_way * typical_range) & (distance < nearby + config.drift * apart) & (second - first > 5)
+    source, target = second[keep], first[keep]
+    if len(source) > config.max_candidates:
+        # Nearer pairs overlap more often; random factors on their distances keep some far pairs among the candidates.
+        rng = np.random.default_rng(0)
+        order = np.argsort(distance[keep] * rng.uniform(0.1, 1.0, len(source)))[: config.max_candidates]
+        source, target = source[np.sort(order)], target[np.sort(order)]
+    return source.astype(np.int64), target.astype(np.int64)
+
+
+def _way_along(poses: Floats) -> Floats:
+    """(n,) length of the trajectory up to each pose."""
+    return np.append(0.0, np.cumsum(np.hypot(*np.diff(poses[:, :2], axis=0).T)))
+
+
+def _match(scans: PlanarScans, poses: Floats, source: Indices, target: Indices, config: LoopConfig) -> PairMatches:
+    """Matches scans to submaps around their targets, one batch of candidates."""
+    unit, way = scans.typical_range, _way_along(poses)
+    submaps, ones = _build_submaps(scans, poses, target), scans.take(source)
+    predicted = se2.relative(poses[target], poses[source])
+    # The prior has the standard deviation of the drift: it fixes the position along a corridor, where scans cannot.
+    sigma = 0.045 * unit + 0.5 * config.drift * (way[source] - way[target])
+    belief = np.stack([sigma, sigma, np.full_like(sigma, np.inf)], axis=-1) ** -2.0
+    prior = PosePrior(predicted, (0.015 * unit) ** 2 * belief)
+    rough = match_pairs(ones, submaps, _guesses(predicted, unit), _SEARCH, prior)
+    prior = PosePrior(predicted, (3.0 * scans.noise) ** 2 * belief)
+    return match_pairs(ones, submaps, rough.poses[:, None], _REFINE, prior)
+
+
+def _guesses(predicted: Floats, typical_range: float) -> Floats:
+    """Guesses of each pair (p, h, 3): scans that overlap are near each other; only the heading is trusted a little."""
+    shifts = 1.5 * _NEARBY * typical_range * np.array([(0, 0), (1, 0), (-1, 0), (0, 1), (0, -1)])
+    fan = np.array([(x, y, turn) for turn in np.radians([0.0, -12.0, 12.0]) for x, y in shifts])
+    guesses = fan + predicted[:, None] * [0.0, 0.0, 1.0]
+    return np.concatenate([guesses, predicted[:, None]], axis=1)
+
+
+def _build_submaps(scans: PlanarScans, poses: Floats, centres: Indices) -> PlanarScans:
+    """A submap around each centre scan, in its frame: some scans before and after it, the nearest first."""
+    rows = centres[:, None] + np.array(sorted(range(-_SUBMAP_WIDTH, _SUBMAP_WIDTH + 1), key=abs))
+    is_there = (rows >= 0) & (rows < len(poses))
+    rows = np.clip(rows, 0, len(poses) - 1)
+    relative = se2.relative(poses[centres][:, None], poses[rows]).astype(np.float32)
+    return _merge_scans(scans.replace(is_ordered=False), rows, is_there, relative)
+
+
+@jax.jit
+def _merge_scans(
+    scans: PlanarScans, rows: Int[Array, "p w"], is_there: Bool[Array, "p w"], poses: Float[Array, "p w 3"]
+) -> PlanarScans:
+    """Submaps of w scans each; poses are T_submap_scan."""
+    some, there = scans.take(rows), is_there[..., None]
+    points, centroids = (se2.transform_points(poses, x) for x in (some.points, some.centroids))
+    normals = se2.transform_points(poses * jnp.array([0.0, 0.0, 1.0]), some.normals)
+    arrays = points, some.mask & there, normals, centroids, some.is_on_line & there
+    points, mask, normals, centroids, is_on_line = (x.reshape(len(rows), -1, *x.shape[3:]) for x in arrays)
+    noises, lengths = some.noises[:, 0], some.typical_ranges[:, 0]
+    return PlanarScans(points, mask, normals, centroids, is_on_line, noises, lengths, is_ordered=False)
+
+
+def count_support(edges: Edges, poses: Floats, typical_range: float) -> Indices:
+    """Number of neighbouring loops that agree with each loop, through the steps of the trajectory between them."""
+    near = np.abs(edges.source[:, None] - edges.source) <= _NEIGHBOURHOOD
+    near &= np.abs(edges.target[:, None] - edges.target) <= _NEIGHBOURHOOD
+    near &= (edges.source[:, None] != edges.source) | (edges.target[:, None] != edges.target)
+    one, other = np.nonzero(near)
+    step_target = se2.relative(poses[edges.target[one]], poses[edges.target[other]])
+    step_source = se2.relative(poses[edges.source[other]], poses[edges.source[one]])
+    through = se2.compose(se2.compose(step_target, edges.measurements[other]), step_source)
+    error = se2.relative(edges.measurements[one], through)
+    agrees = np.hypot(error[:, 0], error[:, 1]) < _AGREEMENT[0] * typical_range
+    agrees &= np.abs(error[:, 2]) < _AGREEMENT[1]
+    return np.bincount(one[agrees], minlength=len(edges.source))

@@ -1,0 +1,281 @@
+"""One map from scored relative poses of pairs, grown scan by scan; every new pose is scored against all placed scans.
+
+A wrong pair scores well for its two scans; it rarely does against all others. So the best pair starts a map, and every
+free scan has the pose hypotheses of its pairs. The hypothesis with the best score against all placed scans is taken
+next. Once all scans are placed, each may move to a better hypothesis, and a robust graph over all pairs that agree
+averages their small errors.
+
+A single wrong connection between similar places can spoil a map. The scans behind it form a block that is consistent in
+itself and misplaced as a whole, and no scan alone gains by moving. So the map is cut at its weakest connections, and
+the smaller block moves to the best of the poses that any pair across the cut supports.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import scipy.sparse
+import scipy.sparse.csgraph
+from numpy.typing import NDArray
+
+from dpmjax.geometry import se2
+from dpmjax.pose_graph.graph import PoseGraph
+from dpmjax.pose_graph.optimize import ROBUST, optimize_pose_graph
+from dpmjax.registration2d.pair_search import (
+    AGREEMENT,
+    Candidates,
+    Hypotheses,
+    agreeing_edges,
+    chance_level,
+    noisy_share,
+)
+from dpmjax.registration2d.planar_scans import Floats, Indices
+from dpmjax.registration2d.range_profiles import RangeProfiles, compare_pairs
+
+# Matched beams that make up for a contradicting one.
+_CONTRADICTION_WEIGHT = 4.0
+# How much more the matched beams of neighbours in time count, where there is an order.
+_NEXT_WEIGHT = 4.0
+# Largest distance of scans that score each other, in typical ranges, and largest number of nearest scans that do.
+_RADIUS, _NUM_SCORERS = 1.2, 32
+# Poses times placed scans that are compared at a time: 8 MB a table.
+_BLOCK = 1 << 20
+# Number of maps, each grown from a different pair; the best one is kept.
+_NUM_SEEDS = 6
+# Rounds in which scans may change their pose.
+_NUM_REVISIONS = 3
+# Weakest connections at which a block is cut off, and poses that are tried for a block.
+_NUM_CUTS, _NUM_BLOCK_POSES = 6, 48
+
+
+class PoseScorer(NamedTuple):
+    """Scores poses of scans against those of placed ones.
+
+    Attributes:
+        profiles: n scans.
+        chance: beams that two scans of different places match by chance; they do not count.
+        noisy_share: share of visible beams that seem to contradict where all is right; they do not count.
+        is_ordered: neighbours in the array are neighbours in time.
+    """
+
+    profiles: RangeProfiles
+    chance: float
+    noisy_share: float
+    is_ordered: bool
+
+    @property
+    def radius(self) -> float:
+        """Distance within which scans score each other, unit of the points."""
+        return _RADIUS * self.profiles.scans.typical_range
+
+    def score(self, scan: Indices, candidates: Floats, placed: Indices, poses: Floats) -> Floats:
+        """(m,) score of each `scan` at its candidate pose (m, 3) against all of `placed`, which are at `poses`."""
+        total, height = np.zeros(len(scan)), max(1, _BLOCK // max(len(placed), 1))
+        for start in range(0, len(scan), height):
+            part = slice(start, start + height)
+            total[part] = add_up(self.pairwise_scores(scan[part], candidates[part], placed, poses))
+        return total
+
+    def pairwise_scores(self, scan: Indices, candidates: Floats, placed: Indices, poses: Floats) -> Floats:
+        """(m, k) score of each `scan` against each of `placed`; 0 for those too far apart."""
+        apart = candidates[:, None, :2] - poses[placed][None, :, :2]
+        apart = np.hypot(apart[..., 0], apart[..., 1])
+        apart[scan[:, None] == placed[None]] = np.inf
+        limit = np.full(len(scan), self.radius)
+        if len(placed) > _NUM_SCORERS:
+            limit = np.minimum(limit, np.partition(apart, _NUM_SCORERS, axis=1)[:, _NUM_SCORERS])
+        row, column = np.nonzero(apart < limit[:, None])
+        other, scores = placed[column], np.zeros(apart.shape)
+        scores[row, column] = self.score_pairs(scan[row], other, se2.relative(poses[other], candidates[row]))
+        return scores
+
+    def score_pairs(self, source: Indices, target: Indices, poses: Floats) -> Floats:
+        """(p,) matched less weighted contradicting beams of pairs at `poses`, T_target_source, above chance."""
+        views = compare_pairs(self.profiles, source, target, poses, stride=4)
+        # Matches by chance do not count; else rooms would be stacked on rooms.
+        is_next = self.is_ordered & (np.abs(source - target) == 1)
+        matched = np.maximum(views.matched - np.where(is_next, 0.5, 1.0) * self.chance, 0.0)
+        matched *= np.where(is_next, _NEXT_WEIGHT, 1.0)
+        contradicted = np.maximum(views.contradicted - self.noisy_share * views.visible, 0.0)
+        return np.asarray(matched - _CONTRADICTION_WEIGHT * contradicted, np.float64)
+
+    def score_map(self, poses: Floats) -> Floats:
+        """(n, n) pairwise scores of a map, below the diagonal; 0 for scans too far apart."""
+        source, target = np.tril_indices(len(poses), k=-1)
+        relative = se2.relative(poses[target], poses[source])
+        near = np.hypot(relative[:, 0], relative[:, 1]) < self.radius
+        values = np.zeros((len(poses), len(poses)))
+        values[source[near], target[near]] = self.score_pairs(source[near], target[near], relative[near])
+        return values
+
+
+def add_up(scores: Floats) -> Floats:
+    """Total of pairwise scores: negative ones in full, and the k-th best positive one by 1 / k.
+
+    A pose needs a few scans that match it well. Were all counted alike, rooms that look alike would be stacked: the
+    more scans overlap, the more beams match.
+
+    Args:
+        scores: (..., k).
+
+    Returns:
+        (...) totals.
+    """
+    ordered = -np.sort(-scores, axis=-1)
+    return np.where(ordered > 0.0, ordered / np.arange(1, scores.shape[-1] + 1), ordered).sum(axis=-1)
+
+
+def is_firmly_more(score: Floats | np.float64, reference: Floats | np.float64) -> NDArray[np.bool_]:
+    """Returns True where a score is more than 2 % above a reference: below that it is the same pose by another pair."""
+    return np.asarray(score > reference + 0.02 * np.abs(reference))
+
+
+def assemble(profiles: RangeProfiles, candidates: Candidates, *, is_ordered: bool = False) -> Floats:
+    """Poses of all scans from candidates of their pairs, without a first guess.
+
+    Args:
+        profiles: n scans.
+        candidates: of pairs that connect all scans.
+        is_ordered: neighbours in the array are neighbours in time, so likely to overlap.
+
+    Returns:
+        (n, 3) T_world_scan; the first pose is zero.
+    """
+    scorer = PoseScorer(profiles, chance_level(candidates), noisy_share(profiles, candidates), is_ordered)
+    hypotheses, everyone = Hypotheses.of(candidates), np.arange(len(profiles))
+    maps = [settle(_grow(hypotheses, scorer, seed), hypotheses, scorer) for seed in _choose_seeds(hypotheses)]
+    scores = [scorer.score(everyone, poses, everyone, poses).sum() for poses in maps]
+    poses = maps[int(np.argmax(scores))] if maps else np.zeros((len(profiles), 3))
+    poses, num_moved = move_blocks(poses, hypotheses, scorer)
+    poses = settle(poses, hypotheses, scorer) if num_moved else poses
+    edges = agreeing_edges(poses, candidates, profiles)
+    poses = optimize_pose_graph(PoseGraph.create(poses, edges), ROBUST).graph.poses
+    return np.asarray(se2.relative(poses[0], poses))
+
+
+def _choose_seeds(hypotheses: Hypotheses) -> list[int]:
+    """The best pairs, no scan in two of them."""
+    chosen: list[int] = []
+    used: set[int] = set()
+    for row in np.argsort(-hypotheses.scores, kind="stable"):
+        pair = {int(hypotheses.scan[row]), int(hypotheses.anchor[row])}
+        if len(chosen) < _NUM_SEEDS and not pair & used:
+            chosen.append(int(row))
+            used |= pair
+    return chosen
+
+
+def _grow(hypotheses: Hypotheses, scorer: PoseScorer, seed: int) -> Floats:
+    """Poses of all scans, grown from the anchor of one hypothesis."""
+    scan, anchor, num_scans = hypotheses.scan, hypotheses.anchor, len(scorer.profiles)
+    poses, is_placed = np.zeros((num_scans, 3)), np.zeros(num_scans, bool)
+    # Of each open hypothesis: the pose of its scan in the world, and its score against each placed scan.
+    worlds, scores = np.zeros((len(scan), 3)), np.zeros((len(scan), num_scans))
+    newest, pose = int(anchor[seed]), np.zeros(3)
+    while True:
+        poses[newest], is_placed[newest] = pose, True
+        if is_placed.all():
+            return poses
+        is_open, is_fresh = is_placed[anchor] & ~is_placed[scan], anchor == newest
+        worlds[is_fresh] = hypotheses.take(np.flatnonzero(is_fresh)).world_poses(poses)
+        for chosen, placed in ((~is_fresh, np.array([newest])), (is_fresh, np.flatnonzero(is_placed))):
+            rows = np.flatnonzero(is_open & chosen)
+            scores[rows[:, None], placed] = scorer.pairwise_scores(scan[rows], worlds[rows], placed, poses)
+        rows = np.flatnonzero(is_open)
+        if len(rows):
+            best = rows[add_up(scores[rows]).argmax()] if is_placed.sum() > 1 else seed
+            newest, pose = int(scan[best]), worlds[best]
+        else:
+            newest, pose = int(np.flatnonzero(~is_placed)[0]), np.zeros(3)
+
+
+def settle(poses: Floats, hypotheses: Hypotheses, scorer: PoseScorer) -> Floats:
+    """Rounds in which scans move, until none does."""
+    for _ in range(_NUM_REVISIONS):
+        poses, num_moved = _revise(poses, hypotheses, scorer)
+        if not num_moved:
+            break
+    return poses
+
+
+def _revise(poses: Floats, hypotheses: Hypotheses, scorer: PoseScorer) -> tuple[Floats, int]:
+    """Moves each scan, the worst supported first, to its hypothesis with the best score; and counts the moves."""
+    poses, everyone, num_moved = poses.copy(), np.arange(len(poses)), 0
+    support = scorer.score(everyone, poses, everyone, poses)
+    score = scorer.score(hypotheses.scan, hypotheses.world_poses(poses), everyone, poses)
+    # A scan without a better hypothesis now is not compared again.
+    is_better = np.isin(everyone, hypotheses.scan[is_firmly_more(score, support[hypotheses.scan])])
+    for scan in (scan for scan in np.argsort(support) if is_better[scan]):
+        own = hypotheses.take(np.flatnonzero(hypotheses.scan == scan))
+        candidates = np.concatenate([poses[scan][None], own.world_poses(poses)])
+        score = scorer.score(np.full(len(candidates), scan), candidates, everyone, poses)
+        best = int(score.argmax())
+        if is_firmly_more(score[best], score[0]):
+            off = se2.relative(poses[scan], candidates[best])
+            far = AGREEMENT[0] * scorer.profiles.scans.typical_range
+            num_moved += bool(np.hypot(off[0], off[1]) > far)
+            poses[scan] = candidates[best]
+    return poses, num_moved
+
+
+def move_blocks(poses: Floats, hypotheses: Hypotheses, scorer: PoseScorer) -> tuple[Floats, int]:
+    """Cuts the map at its weakest connections in turn, and moves blocks that have a better score at a new pose.
+
+    Args:
+        poses: (n, 3) a map of all scans.
+        hypotheses: of all pairs.
+        scorer: of the map.
+
+    Returns:
+        (n, 3) poses, and how many blocks have moved.
+    """
+    num_moved = 0
+    for cut in range(_NUM_CUTS):
+        values = scorer.score_map(poses)
+        blocks = weakest_cuts(values, _NUM_CUTS)
+        if cut >= len(blocks):
+            break
+        motion = _better_motion(poses, blocks[cut], hypotheses, scorer, values)
+        if motion is not None:
+            poses = poses.copy()
+            poses[blocks[cut]] = se2.compose(motion, poses[blocks[cut]])
+            num_moved += 1
+    return poses, num_moved
+
+
+def weakest_cuts(values: Floats, count: int) -> list[NDArray[np.bool_]]:
+    """The smaller sides (n,) of the cuts at the weakest connections of the best tree of pairs, the weakest first."""
+    cost = np.tril(values.max() + 1.0 - np.maximum(values, 0.0), k=-1)
+    tree = scipy.sparse.csgraph.minimum_spanning_tree(scipy.sparse.csr_matrix(cost)).tocoo()
+    blocks = []
+    for edge in np.argsort(-tree.data)[:count]:
+        keep = np.arange(len(tree.data)) != edge
+        rest = scipy.sparse.coo_matrix((tree.data[keep], (tree.row[keep], tree.col[keep])), shape=tree.shape)
+        _, label = scipy.sparse.csgraph.connected_components(rest, directed=False)
+        side = label == label[tree.row[edge]]
+        blocks.append(side if 2 * side.sum() <= len(values) else ~side)
+    return blocks
+
+
+def _better_motion(
+    poses: Floats, block: NDArray[np.bool_], hypotheses: Hypotheses, scorer: PoseScorer, values: Floats
+) -> Floats | None:
+    """The motion (3,) of the block in the world with the best score, of those by pairs across the cut; None: none."""
+    across = np.flatnonzero(block[hypotheses.scan] & ~block[hypotheses.anchor])
+    across = across[np.argsort(-hypotheses.scores[across], kind="stable")[:_NUM_BLOCK_POSES]]
+    best = hypotheses.take(across)
+    motions = se2.compose(best.world_poses(poses), se2.inverse(poses[best.scan]))
+    motions = np.concatenate([np.zeros((1, 3)), motions])
+    inside, outside = np.flatnonzero(block), np.flatnonzero(~block)
+    moved = se2.compose(motions[:, None], poses[inside][None])
+    apart = moved[:, :, None, :2] - poses[outside][None, None, :, :2]
+    which, i, j = np.nonzero(np.hypot(apart[..., 0], apart[..., 1]) < scorer.radius)
+    value = scorer.score_pairs(inside[i], outside[j], se2.relative(poses[outside[j]], moved[which, i]))
+    # Pairs on one side of the cut are the same for all motions.
+    scores = np.repeat(np.where(block[:, None] == block, values, 0.0)[None], len(motions), axis=0)
+    scores[which, inside[i], outside[j]] = value
+    # Each pair counts for both scans.
+    total = add_up(scores + np.swapaxes(scores, 1, 2)).sum(axis=-1)
+    highest = int(total.argmax())
+    return motions[highest] if is_firmly_more(total[highest], total[0]) else None

@@ -1,0 +1,367 @@
+"""Registration of planar scans by one call: a start, DeepMapping from it, refinement, and the choice among the results.
+
+`register_scans` joins the functions of this room with DeepMapping; no other file of the room imports `deepmapping`. A
+candidate is a trajectory under the name of the method that produced it: "DeepMapping" is the result of L-Net or M-Net.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import partial
+from typing import Literal, NamedTuple, get_args
+
+import jax
+import numpy as np
+from numpy.typing import ArrayLike
+
+from dpmjax.checks import require_one_of, require_positive
+from dpmjax.deepmapping.config import DeepMappingConfig
+from dpmjax.deepmapping.engine import Fit, Progress, fit
+from dpmjax.deepmapping.mapping import Fitted, fit_deepmapping
+from dpmjax.deepmapping.planar import as_scan_set
+from dpmjax.geometry import se2
+from dpmjax.registration2d.assessment import Assessment, assess_trajectory
+from dpmjax.registration2d.global_registration import nearest_tour, register_globally
+from dpmjax.registration2d.incremental import incremental_icp, scan_odometry
+from dpmjax.registration2d.odometry import Odometry, calibrate_odometry
+from dpmjax.registration2d.planar_scans import Floats, Indices, PlanarScans, planar_scans
+from dpmjax.registration2d.quality import Score, choose_trajectory
+from dpmjax.registration2d.recordings import Recording, choose_scans, take_scans
+from dpmjax.registration2d.refinement import refine
+from dpmjax.types import ScanSet
+
+StartName = Literal["auto", "odometry", "icp-plane", "icp-point", "global", "zero"]
+"""Where the poses start; "auto": see `register_scans`."""
+
+DEEPMAPPING = "DeepMapping"
+GIVEN_POSES = "given poses"
+START_NAMES: dict[str, str] = {
+    "icp-plane": "incremental ICP, point to line",
+    "icp-point": "incremental ICP, point to point",
+    "global": "global registration",
+    "odometry": "odometry",
+    "zero": "zero poses",
+}
+"""The name of the candidate that each start makes."""
+
+STARTS_FROM_SCANS = ("icp-plane", "icp-point", "global")
+"""Starts that use the scans alone."""
+
+Engine = Callable[..., Fit]
+"""What trains, as `fit_deepmapping(engine=...)` takes it."""
+EngineOf = Callable[[Indices], Engine]
+"""Makes the engine of the scans of these rows, in this order."""
+
+# Up to this many scans without odometry are all registered.
+_MAX_WHOLE = 256
+# A fit whose map takes this many times the nats of the refined start is not refined.
+_LEAST_PROMISING = 1.15
+
+
+@dataclass(frozen=True)
+class RegistrationConfig:
+    """Settings of `register_scans`.
+
+    Attributes:
+        is_ordered: the scans lie in the order of time.
+        refine: the start and the fit are refined, too, and the better map counts.
+        fit: settings of DeepMapping; presets are `dpmjax.deepmapping.preset`.
+        min_distance: scans of a recording are registered where they lie at least this far apart, in the unit of the
+            scans, or are turned by `min_turn`. The remaining scans follow the motion between these. None: all are
+            registered.
+        min_turn: scans of a recording that are turned at least this far against each other are registered, radians.
+
+    Raises:
+        ValueError: a limit is not positive.
+    """
+
+    is_ordered: bool = True
+    refine: bool = True
+    fit: DeepMappingConfig = field(default_factory=DeepMappingConfig)
+    min_distance: float | None = None
+    min_turn: float = 0.35
+
+    def __post_init__(self) -> None:
+        require_positive("min_distance", 1.0 if self.min_distance is None else self.min_distance)
+        require_positive("min_turn", self.min_turn)
+
+
+class RegistrationHooks(NamedTuple):
+    """Functions that `register_scans` calls.
+
+    Attributes:
+        on_progress: called with the name of a stage and the share of it that is done: 0 where the stage begins, and
+            after each call of the step of the fit.
+        stop: called before each stage that may be left out and before each call of the step of the fit. Where it
+            returns True, the fit ends, and the best of the candidates so far is kept.
+        engine: called with the rows of the scans that are fitted, in the order of the fit; returns what trains them,
+            as `fit_deepmapping(engine=...)`, which reports and stops by itself. None: `deepmapping.fit`.
+    """
+
+    on_progress: Callable[[str, float], None] = lambda _stage, _share: None
+    stop: Callable[[], bool] = lambda: False
+    engine: EngineOf | None = None
+
+
+class Candidate(NamedTuple):
+    """A trajectory that was compared.
+
+    Attributes:
+        poses: (k, 3) T_world_scan of the registered scans.
+        score: of its map, by the scans alone.
+    """
+
+    poses: Floats
+    score: Score
+
+
+class RegisteredScans(NamedTuple):
+    """Result of `register_scans`.
+
+    Attributes:
+        poses: (n, 3) T_world_scan of all scans, x, y, heading, in the unit of the scans.
+        kept: name of the candidate that the poses come from.
+        start: name of the candidate that the fit started from.
+        candidates: all candidates by name; DeepMapping is one if it has done a step.
+        assessment: of the kept candidate: `is_trusted` tells whether its map can be trusted, `uncertain_scans` (rows of
+            all scans) for which of the registered scans it cannot, and `fault` what contradicts the odometry.
+        fitted: DeepMapping of the registered scans; untrained where the fit was stopped before its first step.
+        recording: all scans, and the rows of those that were registered.
+    """
+
+    poses: Floats
+    kept: str
+    start: str
+    candidates: dict[str, Candidate]
+    assessment: Assessment
+    fitted: Fitted
+    recording: Recording
+
+    @property
+    def T_world_scan(self) -> Floats:
+        """(n, 3, 3) the poses as matrices."""
+        return se2.to_matrix(self.poses)
+
+
+def register_scans(
+    scans: ScanSet | ArrayLike,
+    config: RegistrationConfig | None = None,
+    *,
+    key: jax.Array,
+    start: StartName | ArrayLike = "auto",
+    odometry: ArrayLike | None = None,
+    hooks: RegistrationHooks | None = None,
+) -> RegisteredScans:
+    """Registers planar scans: a start, DeepMapping from it, both refined, and of these the best map.
+
+    The map is chosen and assessed by the scans alone. Where the start was "auto", it was the odometry, and the map
+    cannot be trusted, the scans are registered without odometry, too.
+
+    Args:
+        scans: (n, b, 2) beam end points in the sensor frames, any unit; all-zero or non-finite beams are left out. Or a
+            ScanSet.
+        config: settings.
+        key: of the fit.
+        start: initial poses, (n, 3) x, y, heading or (n, 3, 3) matrices, or a name. The name "odometry" is the given
+            odometry, "zero" sets all poses to zero, and "icp-plane" and "icp-point" are incremental ICP. The name
+            "global" is an exhaustive search of scan pairs, which needs no order. The name "auto" is the odometry where
+            there is one, else incremental point-to-line ICP; it is "global" for scans without an order.
+        odometry: (n, 3) or (n, 3, 3) raw odometry of ordered scans.
+        hooks: functions that are called: progress, a request to stop, the engine of the fit.
+
+    Returns:
+        RegisteredScans.
+
+    Raises:
+        ValueError: the scans, the start or the odometry have a wrong shape or are not finite, or a scan has no valid
+            beam. Also if there is no odometry to start from, or if the start needs an order that the scans do not have.
+    """
+    config, hooks = config or RegistrationConfig(), hooks or RegistrationHooks()
+    all_scans = as_scan_set(scans)
+    odometry_poses = None if odometry is None else se2.as_poses("odometry", odometry, len(all_scans.points))
+    first_poses = _checked_start(start, odometry_poses, len(all_scans.points), config)
+    recording = _choose_scans(all_scans, odometry_poses, first_poses, config, hooks)
+    lines = planar_scans(take_scans(all_scans, recording.chosen), is_ordered=config.is_ordered)
+    evidence = _find_evidence(lines, first_poses, odometry_poses, recording, hooks)
+    start_name, poses = _start_poses(lines, first_poses, evidence, recording, hooks)
+    warm_start = None if start_name == START_NAMES["zero"] else poses
+    fitted = _fit(recording, warm_start, config, key=key, hooks=hooks)
+    found = {start_name: poses}
+    if fitted.num_steps > 0:
+        found[DEEPMAPPING] = fitted.poses
+    if config.refine and not hooks.stop():
+        found |= _refined_candidates(lines, found, evidence, hooks)
+    hooks.on_progress("choice and assessment", 0.0)
+    kept, scores, assessment = _choose(lines, found, evidence)
+    has_other = isinstance(start, str) and start == "auto" and config.refine and odometry_poses is not None
+    has_other = has_other and not (evidence is not None and evidence.is_mirrored)
+    if has_other and not assessment.is_trusted and not hooks.stop():
+        hooks.on_progress("the map from odometry cannot be trusted: registration without it", 0.0)
+        name = START_NAMES["icp-plane"]
+        found[f"{name}, refined"] = refine(lines, incremental_icp(lines).poses).poses
+        kept, scores, assessment = _choose(lines, found, evidence)
+    if recording.motion is not None:
+        hooks.on_progress("poses between the registered scans", 0.0)
+    candidates = {name: Candidate(found[name], score) for name, score in scores.items()}
+    uncertain = tuple(recording.chosen[list(assessment.uncertain_scans)].tolist())
+    assessment = assessment._replace(uncertain_scans=uncertain)
+    return RegisteredScans(recording.aligned(found[kept]), kept, start_name, candidates, assessment, fitted, recording)
+
+
+def _choose(
+    scans: PlanarScans, candidates: dict[str, Floats], evidence: Odometry | None
+) -> tuple[str, dict[str, Score], Assessment]:
+    """Returns the name of the best candidate, the scores of all, and the assessment of the best."""
+    if evidence is None:
+        kept, scores = choose_trajectory(scans, candidates)
+        return kept, scores, assess_trajectory(scans, candidates[kept])
+    kept, scores = choose_trajectory(scans, candidates, prior=evidence.prior)
+    # Units are corrected; of a mirrored log nothing tells which side is right.
+    fault = evidence.fault if evidence.is_mirrored else None
+    assessment = assess_trajectory(scans, candidates[kept], prior=evidence.prior, fault=fault)
+    return kept, scores, assessment._replace(fault=evidence.fault)
+
+
+def _find_evidence(
+    scans: PlanarScans,
+    start: str | Floats,
+    odometry: Floats | None,
+    recording: Recording,
+    hooks: RegistrationHooks,
+) -> Odometry | None:
+    """Calibrates the odometry, or the given poses without any; None where the start uses the scans alone."""
+    given = odometry if isinstance(start, str) else (start if odometry is None else odometry)
+    if given is None or (isinstance(start, str) and start != "odometry") or len(scans) < 2 or not scans.is_ordered:
+        return None
+    hooks.on_progress("calibration of the odometry", 0.0)
+    return calibrate_odometry(scans, given[recording.chosen])
+
+
+def _checked_start(
+    start: StartName | ArrayLike, odometry: Floats | None, count: int, config: RegistrationConfig
+) -> str | Floats:
+    """Returns the start with "auto" resolved, or the given poses."""
+    if not config.is_ordered and odometry is not None:
+        raise ValueError("odometry: expected None, because the scans are not ordered")
+    if not isinstance(start, str):
+        return se2.as_poses("start", start, count)
+    require_one_of("start", start, get_args(StartName))
+    if start == "auto":
+        by_order = "icp-plane" if odometry is None else "odometry"
+        return by_order if config.is_ordered else "global"
+    if start == "odometry" and odometry is None:
+        raise ValueError("start: expected a start without odometry, because there is none, got 'odometry'")
+    if start != "global" and not config.is_ordered:
+        raise ValueError(f"start: expected 'global' or poses, because the scans are not ordered, got {start!r}")
+    return start
+
+
+def _choose_scans(
+    scans: ScanSet, odometry: Floats | None, start: str | Floats, config: RegistrationConfig, hooks: RegistrationHooks
+) -> Recording:
+    """Chooses the scans that are registered by the odometry, or by the scans where the start uses them alone."""
+    motion = None if isinstance(start, str) and start in STARTS_FROM_SCANS else odometry
+    if not config.is_ordered:
+        return Recording(scans, np.arange(len(scans.points)), None, np.arange(len(scans.points)))
+    if config.min_distance is None:
+        return choose_scans(scans, None, 1.0, 1.0)
+    if motion is None and len(scans.points) > _MAX_WHOLE:
+        hooks.on_progress("odometry from the scans", 0.0)
+        motion = scan_odometry(planar_scans(scans))
+    return choose_scans(scans, motion, config.min_distance, config.min_turn)
+
+
+def _start_poses(
+    scans: PlanarScans, start: str | Floats, evidence: Odometry | None, recording: Recording, hooks: RegistrationHooks
+) -> tuple[str, Floats]:
+    """Returns the name of the start and the poses of the registered scans."""
+    if not isinstance(start, str):
+        return GIVEN_POSES, start[recording.chosen]
+    name = START_NAMES[start]
+    hooks.on_progress(f"start: {name}", 0.0)
+    match start:
+        case "zero":
+            return name, np.zeros((len(scans), 3))
+        case "global":
+            return name, register_globally(scans).poses
+        case "icp-plane" | "icp-point":
+            return name, incremental_icp(scans, "plane" if start == "icp-plane" else "point").poses
+    assert evidence is not None
+    return name, evidence.poses
+
+
+def fit_in_order(
+    scans: ScanSet,
+    config: DeepMappingConfig,
+    *,
+    key: jax.Array,
+    start: Floats | None,
+    is_ordered: bool,
+    engine_of: EngineOf | None = None,
+) -> Fitted:
+    """Fits scans in an order in which neighbours are near each other: that of time, or a tour of the start.
+
+    Args:
+        scans: the scans.
+        config: settings of the fit.
+        key: of the fit.
+        start: (n, 3) x, y, heading to start from; None: cold start, in the given order.
+        is_ordered: the scans lie in the order of time.
+        engine_of: called with the order, rows of the scans; returns what trains them, as in `fit_deepmapping`. None:
+            `deepmapping.fit`.
+
+    Returns:
+        The fit, its poses in the order of the scans.
+
+    Raises:
+        ValueError: as `fit_deepmapping`.
+    """
+    order = np.arange(len(scans.points)) if is_ordered or start is None else nearest_tour(start)
+    first_poses = None if start is None else start[order]
+    engine = fit if engine_of is None else engine_of(order)
+    fitted = fit_deepmapping(take_scans(scans, order), config, key=key, start=first_poses, engine=engine)
+    return fitted._replace(poses=fitted.poses[np.argsort(order)])
+
+
+def _fit(
+    recording: Recording, start: Floats | None, config: RegistrationConfig, *, key: jax.Array, hooks: RegistrationHooks
+) -> Fitted:
+    """Fits the registered scans by the engine of the hooks, or by one that reports to them."""
+    hooks.on_progress(DEEPMAPPING, 0.0)
+
+    def report(progress: Progress) -> None:
+        hooks.on_progress(DEEPMAPPING, progress.share)
+
+    def engine_of(order: Indices) -> Engine:
+        if hooks.engine is not None:
+            return hooks.engine(recording.chosen[order])
+        return partial(fit, on_report=report, stop=hooks.stop)
+
+    scans = take_scans(recording.scans, recording.chosen)
+    return fit_in_order(scans, config.fit, key=key, start=start, is_ordered=config.is_ordered, engine_of=engine_of)
+
+
+def _refined_candidates(
+    scans: PlanarScans, candidates: dict[str, Floats], evidence: Odometry | None, hooks: RegistrationHooks
+) -> dict[str, Floats]:
+    """Returns the start and the fit, each refined; a fit that is a worse map than the refined start is left out.
+
+    Near a good start the fit gives the sharper map. The start keeps the motion that a robot's odometry has measured.
+    """
+    (start, start_poses), *fits = candidates.items()
+    prior = None if evidence is None else evidence.prior
+    found: dict[str, Floats] = {}
+
+    def add_refined(name: str, poses: Floats) -> None:
+        hooks.on_progress(f"{name}, refined", 0.0)
+        found[f"{name}, refined"] = refine(scans, poses, prior=prior).poses
+
+    if start != START_NAMES["zero"]:
+        add_refined(start, start_poses)
+    for name, poses in fits:
+        scores = choose_trajectory(scans, {name: poses, **found}, prior=prior)[1]
+        nats = [score.code_length for score in scores.values()]
+        if nats[0] <= _LEAST_PROMISING * nats[-1]:
+            add_refined(name, poses)
+    return found

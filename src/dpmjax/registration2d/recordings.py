@@ -1,0 +1,237 @@
+"""Whole recordings: choice of the scans that are registered, and poses of all scans.
+
+A robot's log has thousands of scans, most of them a hand's breadth from the one before. Only those are registered that
+lie some way or turn apart. Each remaining scan follows the odometry between the registered scans before and after it,
+and is then aligned with the nearer of the two.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+from numpy.typing import NDArray
+
+from dpmjax.checks import require_positive
+from dpmjax.geometry import se2
+from dpmjax.registration2d.pair_alignment import FINE, PosePrior, match_pairs
+from dpmjax.registration2d.planar_scans import Floats, Indices, PlanarScans, planar_scans
+from dpmjax.registration2d.range_profiles import contradicted_share, make_profiles
+from dpmjax.types import ScanSet
+
+# Standard deviation of odometry from one chosen scan to the next: translation in typical ranges, radians.
+_ODOMETRY_SIGMA = (0.005, 0.01)
+# The same of a scan that does not fit: a robot that turns fast has read its wheels at another moment than its scans.
+# Such a scan is turned by these angles first, radians.
+_LOOSE_SIGMA, _TURNS = (0.01, 0.1), (-0.15, -0.1, -0.05, 0.0, 0.05, 0.1, 0.15)
+# A scan keeps to odometry where a lower share of its beams fits, or where more of them contradict the chosen scan.
+_MIN_FITNESS, _MAX_CONTRADICTED = 0.5, 0.05
+# A robot stands still that moves by less than this share of the way between registered scans.
+_STANDING = 0.02
+# Scans that are aligned at a time.
+_BLOCK = 1024
+
+
+class Recording(NamedTuple):
+    """All scans of a recording, and those that are registered.
+
+    Attributes:
+        scans: all n scans.
+        chosen: rows of the k registered scans, in order.
+        motion: (n, 3) poses whose steps are the motion between registered scans; None where all are registered but
+            repeated ones.
+        originals: (n,) row of the scan that each scan repeats beam by beam; its own row where it repeats none.
+    """
+
+    scans: ScanSet
+    chosen: Indices
+    motion: Floats | None
+    originals: Indices
+
+    def between(self, poses: Floats) -> Floats:
+        """Returns poses of all scans, by those of the registered ones and the motion between them."""
+        rows = np.unique(self.originals)
+        if self.motion is not None:
+            poses = fill_between(np.searchsorted(rows, self.chosen), poses, self.motion[rows])
+        return poses[np.searchsorted(rows, self.originals)]
+
+    def aligned(self, poses: Floats) -> Floats:
+        """Returns the same, each scan aligned with the nearest registered one."""
+        poses = self.between(poses)
+        if self.motion is None:
+            return poses
+        rows = np.unique(self.originals)
+        scans = planar_scans(take_scans(self.scans, rows))
+        aligned = align_between(scans, np.searchsorted(rows, self.chosen), poses[rows])
+        return aligned[np.searchsorted(rows, self.originals)]
+
+
+def take_scans(scans: ScanSet, rows: Indices) -> ScanSet:
+    """Returns the scans of these rows."""
+    # On the host: each number of rows would be a program of its own.
+    return ScanSet(jnp.asarray(np.asarray(scans.points)[rows]), jnp.asarray(np.asarray(scans.mask)[rows]))
+
+
+def find_originals(scans: ScanSet) -> Indices:
+    """Finds scans that repeat the one before beam by beam: recorded twice, or by a robot that waits in a simulation.
+
+    Args:
+        scans: n scans in the order of time.
+
+    Returns:
+        (n,) row of the first scan of each such run.
+    """
+    points, mask = np.asarray(scans.points), np.asarray(scans.mask)
+    repeats = np.append(False, (points[1:] == points[:-1]).all((1, 2)) & (mask[1:] == mask[:-1]).all(1))
+    return np.maximum.accumulate(np.where(repeats, 0, np.arange(len(points))))
+
+
+def choose_scans(scans: ScanSet, motion: Floats | None, min_distance: float, min_turn: float) -> Recording:
+    """Chooses the scans of a recording that are registered: those that lie apart, or all that move where most do.
+
+    Args:
+        scans: n scans in the order of time.
+        motion: (n, 3) odometry of any kind; None: all scans are registered.
+        min_distance: as `choose_by_motion`.
+        min_turn: as `choose_by_motion`.
+
+    Returns:
+        Recording; a scan that repeats the one before is not registered, and has its pose.
+    """
+    originals = find_originals(scans)
+    rows = np.unique(originals)
+    if motion is None:
+        return Recording(scans, rows, None, originals)
+    chosen = choose_by_motion(motion[rows], min_distance, min_turn)
+    if 2 * len(chosen) >= len(rows):
+        # A robot that stands still measures noise alone.
+        chosen = choose_by_motion(motion[rows], _STANDING * min_distance, _STANDING * min_turn)
+    return Recording(scans, rows[chosen], None if len(chosen) == len(rows) else motion, originals)
+
+
+def choose_by_motion(odometry: Float[np.ndarray, "n 3"], min_distance: float, min_turn: float) -> Indices:
+    """Chooses scans that lie apart; a robot that stands still adds none.
+
+    Args:
+        odometry: poses x, y, heading of all scans, in the order of time.
+        min_distance: a scan at this distance or more from the last chosen one is chosen.
+        min_turn: a scan turned by this or more against the last chosen one is chosen, too; radians.
+
+    Returns:
+        Rows of the chosen scans in order; the first and the last scan are among them.
+
+    Raises:
+        ValueError: if there is no scan, or if a limit is not positive.
+    """
+    require_positive("min_distance", min_distance)
+    require_positive("min_turn", min_turn)
+    if len(odometry) == 0:
+        raise ValueError("odometry: expected at least one pose, got none")
+    chosen = [0]
+    for row in range(1, len(odometry)):
+        x, y, heading = odometry[row] - odometry[chosen[-1]]
+        if np.hypot(x, y) >= min_distance or abs(se2.wrap_angle(heading)) >= min_turn:
+            chosen.append(row)
+    if chosen[-1] != len(odometry) - 1:
+        chosen.append(len(odometry) - 1)
+    return np.array(chosen, np.int64)
+
+
+def fill_between(chosen: Indices, poses: Float[np.ndarray, "k 3"], odometry: Float[np.ndarray, "n 3"]) -> Floats:
+    """Returns poses of all scans: those of the chosen ones, and odometry in between, corrected at both ends.
+
+    The error of odometry at the next chosen scan is spread over the scans before it, in proportion to the way and the
+    turns until there.
+
+    Args:
+        chosen: rows of k scans in order, the first and the last scan among them.
+        poses: T_world_scan of these, x, y, heading.
+        odometry: of all n scans.
+
+    Returns:
+        (n, 3) T_world_scan; the given ones at `chosen`, to rounding.
+
+    Raises:
+        ValueError: if the rows do not begin at the first scan, end at the last one, and increase.
+    """
+    if chosen[0] != 0 or chosen[-1] != len(odometry) - 1 or (np.diff(chosen) < 1).any():
+        raise ValueError(f"chosen: expected increasing rows from 0 to {len(odometry) - 1}")
+    before = np.clip(np.searchsorted(chosen, np.arange(len(odometry)), side="right") - 1, 0, max(len(chosen) - 2, 0))
+    after = np.minimum(before + 1, len(chosen) - 1)
+    start, end = chosen[before], chosen[after]
+    # All in the frame of the chosen scan before: where odometry puts the next one, and how far off that is.
+    T_before_after = se2.relative(odometry[start], odometry[end])
+    error = se2.relative(T_before_after, se2.relative(poses[before], poses[after]))
+    part = _exp(_share_of_way(odometry, start, end)[:, None] * np.asarray(se2.log(error), np.float64))
+    correction = se2.compose(se2.compose(T_before_after, part), se2.inverse(T_before_after))
+    T_before_scan = se2.compose(correction, se2.relative(odometry[start], odometry))
+    filled = np.asarray(se2.compose(poses[before], T_before_scan), np.float64)
+    filled[chosen] = poses
+    return filled
+
+
+def align_between(scans: PlanarScans, chosen: Indices, poses: Float[np.ndarray, "n 3"]) -> Floats:
+    """Aligns each scan with one of the chosen scans before and after it, point to line: the nearer one if it fits.
+
+    Args:
+        scans: n scans in the order of time.
+        chosen: rows of k scans in order, the first and the last scan among them.
+        poses: T_world_scan of all scans, right at `chosen`, as `fill_between` makes them.
+
+    Returns:
+        (n, 3) T_world_scan; those at `chosen`, and of scans that fit badly, as they were.
+    """
+    aligned = poses.copy()
+    others = np.setdiff1d(np.arange(len(poses)), chosen)
+    after = np.searchsorted(chosen, others)
+    ends = np.stack([chosen[after - 1], chosen[after]])
+    apart = np.abs(se2.relative(poses[ends], poses[others]))
+    order = (apart @ [1.0, 1.0, scans.typical_range]).argsort(axis=0)
+    nearest, farther = np.take_along_axis(ends, order, axis=0)
+    is_left = np.ones(len(others), bool)
+    for target, turns, sigma in (
+        (nearest, (0.0,), _ODOMETRY_SIGMA),
+        (nearest, _TURNS, _LOOSE_SIGMA),
+        (farther, _TURNS, _LOOSE_SIGMA),
+    ):
+        rows = np.flatnonzero(is_left)
+        for start in range(0, len(rows), _BLOCK):
+            some = rows[start : start + _BLOCK]
+            found, fits = _align_with(scans, poses, (others[some], target[some]), turns, sigma)
+            aligned[others[some[fits]]] = found[fits]
+            is_left[some[fits]] = False
+    return aligned
+
+
+def _align_with(
+    scans: PlanarScans,
+    poses: Floats,
+    pairs: tuple[Indices, Indices],
+    turns: tuple[float, ...],
+    sigma: tuple[float, float],
+) -> tuple[Floats, NDArray[np.bool_]]:
+    """Returns poses of the sources aligned with their targets, from some turns of the expected poses, and their fit."""
+    source, target = pairs
+    expected = np.asarray(se2.relative(poses[target], poses[source]))
+    spread = np.array(sigma)[[0, 0, 1]] * [scans.typical_range, scans.typical_range, 1.0]
+    prior = PosePrior(expected, np.broadcast_to((3.0 * scans.noise / spread) ** 2, expected.shape))
+    guesses = expected[:, None] + np.outer(turns, [0.0, 0.0, 1.0])
+    found = match_pairs(scans.take(source), scans.take(target), guesses, FINE, prior)
+    profiles, rows = make_profiles(scans.take(np.concatenate([source, target]))), np.arange(len(source))
+    contradicted = contradicted_share(profiles, rows, len(source) + rows, found.poses)
+    fits = (found.fitness > _MIN_FITNESS) & (contradicted < _MAX_CONTRADICTED)
+    return np.asarray(se2.compose(poses[target], found.poses)), fits
+
+
+def _share_of_way(odometry: Floats, start: Indices, end: Indices) -> Floats:
+    """Returns how much of the way from `start` to `end` each scan has behind it; turns count as a metre a radian."""
+    steps = se2.relative(odometry[:-1], odometry[1:])
+    lengths = np.hypot(steps[:, 0], steps[:, 1]) + np.abs(se2.wrap_angle(steps[:, 2])) + 1e-9
+    way = np.append(0.0, np.cumsum(lengths))
+    return np.asarray((way - way[start]) / np.maximum(way[end] - way[start], 1e-9), np.float64)
+
+
+def _exp(tangent: Floats) -> Floats:
+    return np.asarray(se2.from_matrix(np.asarray(se2.exp(tangent), np.float64)), np.float64)

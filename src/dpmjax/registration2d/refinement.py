@@ -1,0 +1,161 @@
+"""Refinement of a trajectory: loops where it leaves doubt, then the joint alignment of all scans.
+
+Under range noise the scans are then adjusted to lines that they make together (line_adjustment.py).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from dpmjax.checks import as_beams
+from dpmjax.geometry import se2
+from dpmjax.registration2d.held_steps import matched_steps, settle_steps
+from dpmjax.registration2d.incremental import incremental_icp
+from dpmjax.registration2d.joint_alignment import AlignmentConfig, align_all, restore_open
+from dpmjax.registration2d.line_adjustment import adjust_to_lines
+from dpmjax.registration2d.loop_closure import LoopConfig, close_loops
+from dpmjax.registration2d.pair_alignment import FINE, match_pairs
+from dpmjax.registration2d.planar_scans import Floats, PlanarScans, planar_scans
+from dpmjax.registration2d.quality import choose_trajectory, map_code_length
+from dpmjax.registration2d.range_profiles import RangeProfiles, make_profiles
+from dpmjax.registration2d.step_prior import StepPrior
+from dpmjax.registration2d.step_scores import fitting_scans, interpolate, pair_scores
+from dpmjax.registration2d.torn_steps import restore_torn
+from dpmjax.types import ScanSet
+
+# The start is sound, and no loops are searched, if the fitness of all its steps is above this, and so is the weakest
+# eigenvalue of each, as a share of the beams.
+_MIN_FITNESS, _MIN_EIGENVALUE = 0.35, 0.005
+# Times that the alignment is repeated where it tears steps.
+_NUM_REPAIRS = 2
+# Scans are adjusted to common lines above this range noise, in typical ranges.
+_MIN_NOISE = 1.5e-4
+
+
+@dataclass(frozen=True)
+class RefinementConfig(AlignmentConfig):
+    """Settings of the refinement: those of the alignment, and of the loop search.
+
+    Attributes:
+        loops: settings of the loop search, which only ordered scans get; None: never.
+    """
+
+    loops: LoopConfig | None = field(default_factory=LoopConfig)
+
+
+class Refined(NamedTuple):
+    """Result of `refine`.
+
+    Attributes:
+        poses: (n, 3) x, y, heading.
+        num_loops: loops that were found and kept; 0 where none was needed.
+    """
+
+    poses: Floats
+    num_loops: int
+
+    @property
+    def T_world_scan(self) -> Floats:
+        """(n, 3, 3) the poses as matrices."""
+        return se2.to_matrix(self.poses)
+
+
+def refine(
+    scans: PlanarScans | ScanSet | ArrayLike,
+    poses: ArrayLike,
+    config: RefinementConfig | None = None,
+    *,
+    prior: StepPrior | None = None,
+) -> Refined:
+    """Closes loops where the start leaves doubt, then aligns all scans together, and to common lines if there is noise.
+
+    Loops are searched from a chain of the start's steps, which forgets what else the start knows; so the start is
+    aligned without loops too, and the better map counts. Of scans that are not ordered only neighbours in space count,
+    the steps of the start mean nothing, and no loops are searched.
+
+    Args:
+        scans: (n, b, 2) beam end points in the sensor frames, any unit, in the order of time; all-zero or non-finite
+            beams are left out. Or a ScanSet. Or PlanarScans: scans without an order are
+            `planar_scans(scans, is_ordered=False)`.
+        poses: start, (n, 3) x, y, heading or (n, 3, 3) matrices, in the unit of the scans.
+        config: settings.
+        prior: of the steps of ordered scans; None: that of the start, at the usual deviations.
+
+    Returns:
+        Refined; the first pose is that of the start, unless loops are kept.
+
+    Raises:
+        ValueError: the scans or the poses have a wrong shape or are not finite.
+    """
+    config = config or RefinementConfig()
+    scans = scans if isinstance(scans, PlanarScans) else planar_scans(as_beams("scans", scans))
+    start = se2.as_poses("poses", poses, len(scans))
+    candidates, num_loops = {"start": start}, {"start": 0}
+    fitting_steps = np.asarray(se2.relative(start[:-1], start[1:]))
+    prior = (prior or StepPrior.of_poses(start, scans.typical_range)) if scans.is_ordered else None
+    if prior is not None and config.loops is not None and not _is_sound(scans, start):
+        # The steps again, with those of the start as guess, and with the prior where the scans leave a direction open.
+        chained, steps = incremental_icp(scans, odometry=start, prior=prior)
+        rows = np.flatnonzero(fitting_scans(scans, chained))
+        if len(rows) < len(scans):
+            some = scans.take(rows).replace(is_ordered=True)
+            fitting = refine(some, start[rows], config, prior=prior.through(rows))
+            whole = interpolate(len(scans), rows, fitting.poses)
+            return fitting._replace(poses=_put_back(scans, fitting_steps, whole, config, prior))
+        settled, slides = settle_steps(scans, steps, prior)
+        matched = matched_steps(settled, slides, scans.typical_range)
+        candidates["loops"], _, weights = close_loops(scans, se2.chain(settled.poses), config.loops, steps=matched)
+        num_loops["loops"] = int((weights > 0.25).sum())
+        fitting_steps = _better_steps(make_profiles(scans), fitting_steps, settled.poses)
+    aligned = {name: _align(scans, candidate, fitting_steps, config, prior) for name, candidate in candidates.items()}
+    kept = "start" if len(aligned) == 1 else choose_trajectory(scans, aligned, prior=prior)[0]
+    best = aligned[kept]
+    if scans.noise > _MIN_NOISE * scans.typical_range:
+        adjusted = adjust_to_lines(scans, best)
+        best = adjusted if prior is None else restore_open(make_profiles(scans), best, adjusted, config, prior)
+        best = best if prior is None else _put_back(scans, fitting_steps, best, config, prior)
+    return Refined(best, num_loops[kept])
+
+
+def _align(
+    scans: PlanarScans, poses: Floats, steps: Floats, config: RefinementConfig, prior: StepPrior | None
+) -> Floats:
+    """Aligns all scans, and again from where torn steps are put back, as long as the map gets no worse."""
+    best = align_all(scans, poses, config, prior)
+    if prior is None:
+        return best
+    for _ in range(_NUM_REPAIRS):
+        restored = restore_torn(make_profiles(scans), steps, best, config, prior)
+        if restored is None:
+            break
+        again = align_all(scans, restored, config, prior)
+        if map_code_length(scans, again) > map_code_length(scans, best):
+            break
+        best = again
+    return best
+
+
+def _put_back(scans: PlanarScans, steps: Floats, poses: Floats, config: RefinementConfig, prior: StepPrior) -> Floats:
+    """Returns poses with their torn steps put back, unless that makes the map worse."""
+    restored = restore_torn(make_profiles(scans), steps, poses, config, prior)
+    is_better = restored is not None and map_code_length(scans, restored) <= map_code_length(scans, poses)
+    return restored if restored is not None and is_better else poses
+
+
+def _better_steps(profiles: RangeProfiles, steps: Floats, others: Floats) -> Floats:
+    """Returns of each step (n - 1, 3) the one of two that fits better."""
+    later = np.arange(1, len(steps) + 1)
+    scores = [pair_scores(profiles, later, later - 1, found) for found in (steps, others)]
+    return np.where((scores[1] > scores[0])[:, None], others, steps)
+
+
+def _is_sound(scans: PlanarScans, poses: Floats) -> bool:
+    """Returns True if all steps fit and are fixed in every direction, so that a chain of them has little drift."""
+    guesses = se2.relative(poses[:-1], poses[1:])[:, None]
+    steps = match_pairs(scans.take(slice(1, None)), scans.take(slice(len(poses) - 1)), guesses, FINE)
+    share = steps.weakest_eigenvalue() / np.maximum(np.asarray(scans.is_on_line.sum(1))[1:], 1)
+    return bool((steps.fitness > _MIN_FITNESS).all() and (share > _MIN_EIGENVALUE).all())

@@ -1,0 +1,192 @@
+"""Joins the parts of a sequence that weak steps connect: from submap to submap, and by loops that agree.
+
+A step is weak where the scans on both sides share few beams, and all scans behind it may be metres off. So the two
+submaps on either side are searched against each other. Then submaps of different parts are searched against each other.
+A single such pair may be wrong, but wrong pairs disagree about the weak step and right ones agree (consensus, as in
+pairwise consistent sets of loops).
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from dpmjax.geometry import se2
+from dpmjax.registration2d.pair_search import CorrelativeConfig, search_pairs
+from dpmjax.registration2d.planar_scans import Floats, Indices
+from dpmjax.registration2d.range_profiles import RangeProfiles, make_profiles
+from dpmjax.registration2d.step_scores import MotionPrior, pair_scores, weak_steps
+from dpmjax.registration2d.submaps import along_way, submap_scans
+from dpmjax.registration2d.wall_directions import WallDirections
+
+# The submaps on either side of a weak step reach so far along the way, typical ranges: what both see may be the end of
+# a corridor. The largest turn of such a step, its longest shift, cells of the images and candidates of each.
+_SIDE_LENGTH, _MAX_TURN, _MAX_SHIFT, _NUM_CELLS, _NUM_CANDIDATES = 2.0, 2.2, 1.6, 256, 24
+# Weight of the motion prior beside the agreement of two submaps, and beside the votes of loops.
+_PRIOR_WEIGHT, _LOOP_PRIOR_WEIGHT = 0.1, 0.3
+# Submaps lie a typical range apart, or farther if they were more than this.
+_MAX_SUBMAPS = 80
+# Pairs of submaps are searched within a distance that adds up: a constant, a share of the way between them, and a
+# length for each weak step between them. Least way between the two where they lie on either side of one weak step.
+# Lengths are in typical ranges. Number of likely turns that are searched.
+_NEAR, _DRIFT, _WEAK_STEP, _LEAST_WAY, _NUM_TURNS = 1.0, 0.1, 1.0, 1.5, 6
+# Pairs with a lower score do not vote; votes within these (typical ranges, radians) are one.
+_LEAST_VOTE, _AGREEMENT = 0.3, (0.15, 0.12)
+# How often the own score of a weak step counts, and how many more votes another pose must have.
+_OWN_WEIGHT, _LEAST_GAIN = 4.0, 0.4
+# Smaller corrections are left to the loop closure: typical ranges, radians.
+_LEAST_MOVE = (0.25, 0.25)
+_NUM_ROUNDS = 2
+
+
+class _Sequence(NamedTuple):
+    """A sequence of scans, of which `rows` are registered at `poses` (n, 3)."""
+
+    profiles: RangeProfiles
+    poses: Floats
+    rows: Indices
+    prior: MotionPrior
+
+
+class _Submaps(NamedTuple):
+    """Submaps along a sequence: the row of the centre, the part that it belongs to, the way until there."""
+
+    profiles: RangeProfiles
+    centres: Indices
+    parts: Indices
+    ways: Floats
+
+
+class _Votes(NamedTuple):
+    """Pairs of submaps (v,): later one, earlier one, T_earlier_later (v, 3), score."""
+
+    later: Indices
+    earlier: Indices
+    poses: Floats
+    scores: Floats
+
+
+def join_parts(
+    profiles: RangeProfiles, poses: Floats, rows: Indices, prior: MotionPrior, config: CorrelativeConfig
+) -> Floats:
+    """Moves the scans behind each weak step to the pose that most scans support.
+
+    Args:
+        profiles: n scans in time order.
+        poses: (n, 3) T_world_scan.
+        rows: (k,) the registered scans.
+        prior: of their motion.
+        config: of the search of pairs of submaps.
+
+    Returns:
+        (n, 3) poses; those that were given where no step is weak.
+    """
+    sequence = _Sequence(profiles, poses.copy(), rows, prior)
+    steps = np.flatnonzero(weak_steps(profiles, poses, rows))
+    if not len(steps):
+        return poses
+    _search_across(sequence, steps, config)
+    part = np.append(0, np.cumsum(np.isin(np.arange(len(rows) - 1), steps)))
+    submaps = _make_submaps(sequence, part)
+    votes = _find_votes(sequence, submaps, config)
+    for _ in range(_NUM_ROUNDS):
+        for step in steps:
+            _follow_votes(sequence, submaps, votes, int(step))
+    return sequence.poses
+
+
+def _search_across(sequence: _Sequence, steps: Indices, config: CorrelativeConfig) -> None:
+    """Moves the scans behind each weak step by a search of the submap behind it against the one before it."""
+    poses, rows, unit = sequence.poses, sequence.rows, sequence.profiles.scans.typical_range
+    ends = np.concatenate([[-1], steps, [len(rows) - 1]])
+    sides = []
+    for number, step in enumerate(steps):
+        head, tail = rows[ends[number] + 1 : step + 1], rows[step + 1 : ends[number + 2] + 1]
+        sides += [along_way(poses, side, _SIDE_LENGTH * unit) for side in (head[::-1], tail)]
+    centres = np.array([side[0] for side in sides])
+    profiles, target = (
+        make_profiles(submap_scans(sequence.profiles.scans, poses, centres, sides)),
+        2 * np.arange(len(steps)),
+    )
+    config = replace(config, num_cells=_NUM_CELLS, max_shift=_MAX_SHIFT, num_candidates=_NUM_CANDIDATES)
+    turns = np.abs(se2.wrap_angle(2 * np.pi * np.arange(config.num_turns) / config.num_turns)) < _MAX_TURN
+    found = search_pairs(profiles, target + 1, target, config, turns=np.broadcast_to(turns, (len(target), len(turns))))
+    for number, step in enumerate(steps):
+        before, after = rows[step], rows[step + 1]
+        gap, here = int(after - before), se2.relative(poses[before], poses[after])
+        candidates = found.poses[number][np.isfinite(found.scores[number])]
+        ways = np.concatenate([[here, sequence.prior.expected(gap)], candidates])
+        pairs = np.full(len(ways), 2 * number + 1), np.full(len(ways), 2 * number)
+        score = pair_scores(profiles, *pairs, ways)
+        score -= _PRIOR_WEIGHT * sequence.prior.surprise(ways, np.full(len(ways), gap))
+        _move_behind(sequence, int(step), ways[score.argmax()])
+
+
+def _move_behind(sequence: _Sequence, step: int, way: Floats) -> None:
+    """Moves all scans behind a step so that it becomes `way`."""
+    poses, rows = sequence.poses, sequence.rows
+    motion = se2.compose(se2.compose(poses[rows[step]], way), se2.inverse(poses[rows[step + 1]]))
+    poses[rows[step + 1] :] = se2.compose(motion, poses[rows[step + 1] :])
+
+
+def _make_submaps(sequence: _Sequence, part: Indices) -> _Submaps:
+    """Submaps about a typical range apart, none across a weak step."""
+    poses, rows, unit = sequence.poses, sequence.rows, sequence.profiles.scans.typical_range
+    way = np.append(0.0, np.cumsum(np.hypot(*np.diff(poses[rows, :2], axis=0).T)))
+    spacing = max(unit, way[-1] / _MAX_SUBMAPS)
+    middles, members = [], []
+    for number in range(part[-1] + 1):
+        own = np.flatnonzero(part == number)
+        count = max(1, int(np.ceil((way[own[-1]] - way[own[0]]) / spacing)))
+        for place in way[own[0]] + (np.arange(count) + 0.5) / count * (way[own[-1]] - way[own[0]]):
+            middles.append(own[np.abs(way[own] - place).argmin()])
+            members.append(rows[own[np.abs(way[own] - way[middles[-1]]) < unit]])
+    middle = np.array(middles)
+    profiles = make_profiles(submap_scans(sequence.profiles.scans, poses, rows[middle], members))
+    return _Submaps(profiles, rows[middle], part[middle], way[middle])
+
+
+def _find_votes(sequence: _Sequence, submaps: _Submaps, config: CorrelativeConfig) -> _Votes:
+    """Relative poses of submaps of different parts that may overlap."""
+    unit, poses = sequence.profiles.scans.typical_range, sequence.poses[submaps.centres]
+    later, earlier = np.tril_indices(len(poses), k=-1)
+    way, crossed = submaps.ways[later] - submaps.ways[earlier], submaps.parts[later] - submaps.parts[earlier]
+    reach = _NEAR * unit + _DRIFT * way + _WEAK_STEP * unit * crossed
+    keep = np.hypot(*(poses[later, :2] - poses[earlier, :2]).T) < reach
+    keep &= (crossed > 0) & ((way > _LEAST_WAY * unit) | (crossed > 1))
+    later, earlier = later[keep], earlier[keep]
+    if not len(later):
+        return _Votes(later, earlier, np.zeros((0, 3)), np.zeros(0))
+    turns = WallDirections(submaps.profiles.scans).likely_turns(later, earlier, config.num_turns, _NUM_TURNS)
+    found = search_pairs(submaps.profiles, later, earlier, replace(config, num_candidates=4), turns=turns)
+    row, column = np.nonzero(np.isfinite(found.scores))
+    later, earlier, ways = later[row], earlier[row], found.poses[row, column]
+    scores = pair_scores(submaps.profiles, later, earlier, ways)
+    is_vote = scores > _LEAST_VOTE
+    return _Votes(later[is_vote], earlier[is_vote], ways[is_vote], scores[is_vote])
+
+
+def _follow_votes(sequence: _Sequence, submaps: _Submaps, votes: _Votes, step: int) -> None:
+    """Moves the scans behind a weak step to the pose that most loops across it agree on."""
+    poses, unit, prior = sequence.poses, sequence.profiles.scans.typical_range, sequence.prior
+    before, after = sequence.rows[step], sequence.rows[step + 1]
+    here, gap = se2.relative(poses[before], poses[after]), int(after - before)
+    across = (submaps.centres[votes.later] >= after) & (submaps.centres[votes.earlier] <= before)
+    later, earlier = submaps.centres[votes.later[across]], submaps.centres[votes.earlier[across]]
+    motion = se2.compose(se2.compose(poses[earlier], votes.poses[across]), se2.inverse(poses[later]))
+    ways = se2.relative(poses[before], se2.compose(motion, poses[after]))
+    is_near = np.hypot(ways[:, 0], ways[:, 1]) < _WEAK_STEP * unit
+    ways = np.concatenate([here[None], ways[is_near]])
+    weight = np.append(0.0, votes.scores[across][is_near])
+    off = se2.relative(ways[:, None], ways[None])
+    distance = np.hypot(off[..., 0], off[..., 1]) / (_AGREEMENT[0] * unit)
+    total = np.exp(-0.5 * (distance**2 + (off[..., 2] / _AGREEMENT[1]) ** 2)) @ weight
+    total -= _LOOP_PRIOR_WEIGHT * prior.surprise(ways, np.full(len(ways), gap))
+    own = pair_scores(sequence.profiles, np.array([after]), np.array([before]), here[None])
+    total[0] += _OWN_WEIGHT * max(0.0, float(own[0]))
+    best = int(total.argmax())
+    is_far = np.hypot(off[0, best, 0], off[0, best, 1]) > _LEAST_MOVE[0] * unit or abs(off[0, best, 2]) > _LEAST_MOVE[1]
+    if is_far and total[best] > total[0] + _LEAST_GAIN:
+        _move_behind(sequence, step, ways[best])

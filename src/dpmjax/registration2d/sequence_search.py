@@ -1,0 +1,320 @@
+"""Poses of a sequence of scans by a beam search: each scan against the last placed ones, several hypotheses a step.
+
+A step between two scans that share few beams has several poses that fit. They are found by an exhaustive search of the
+pair (`pair_search.py`). Their score is matched less contradicting beams against all of the last placed scans; the
+fitness of an ICP has no contradicting beams. The best few sequences of poses are kept from scan to scan. A scan that
+fits none of the last ones (a swapped line of the log, a lens that was covered) stays unregistered, and the sequence
+goes on behind it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dpmjax.geometry import se2
+from dpmjax.registration2d.pair_alignment import FINE, PairMatches, match_pairs
+from dpmjax.registration2d.pair_search import CorrelativeConfig, search_pairs
+from dpmjax.registration2d.planar_scans import Floats, Indices, PlanarScans
+from dpmjax.registration2d.range_profiles import RangeProfiles, contradicted_share, make_profiles
+from dpmjax.registration2d.sequence_joining import join_parts
+from dpmjax.registration2d.step_scores import (
+    LEAST_VISIBLE,
+    WEAK_SCORE,
+    MotionPrior,
+    distinct_rows,
+    find_evidence,
+    interpolate,
+    pair_scores,
+    weak_steps,
+)
+
+# Turns of a step that are searched, radians for each scan that it spans.
+_MAX_TURN = 1.7
+# A step is clear where its score, fitness and the weakest eigenvalue (share of the beams) are above these, and the
+# share of visible beams that contradict is below the last one.
+_CLEAR_SCORE, _CLEAR_FITNESS, _CLEAR_EIGENVALUE, _CLEAR_CONTRADICTION = 0.45, 0.5, 0.02, 0.05
+# Weak steps are also searched from the scans before and behind them, up to the first number of scans apart; steps with
+# a score below the second number, up to the third number apart.
+_WEAK_SPAN, _BAD_SCORE, _BAD_SPAN = 3, 0.12, 5
+# Where neither step of a scan has a better score, the scans before and behind it are searched against each other.
+_SURE_SCORE = 0.5
+# Largest number of scans between two weak steps that are left out.
+_NUM_ALONE = 2
+# Hypotheses of a scan that are nearer to each other, in typical ranges and radians, are one.
+_SAME = (0.02, 0.02)
+# Two sequences are one if this number of their last scans agrees within these tolerances, typical ranges and radians.
+_NUM_SAME, _SAME_SHAPE = 4, (0.05, 0.05)
+# Score of a scan that is left out; and of one that is placed by the motion before it, after too many were left out.
+_LEFT_OUT, _GUESSED = 0.05, -1.0
+# Weight of the motion prior.
+_PRIOR_WEIGHT = 0.1
+
+
+@dataclass(frozen=True)
+class SequenceConfig:
+    """Settings of the sequence search.
+
+    Attributes:
+        num_sequences: sequences of poses that are kept from scan to scan.
+        num_compared: number of the last placed scans that a scan is compared with.
+        search: of pairs whose step is not clear.
+    """
+
+    num_sequences: int = 6
+    num_compared: int = 8
+    search: CorrelativeConfig = field(
+        default_factory=lambda: CorrelativeConfig(max_shift=0.9, block=8, num_peaks=6, num_candidates=8, num_levels=3)
+    )
+
+
+class SequenceResult(NamedTuple):
+    """Result of `search_sequence`.
+
+    Attributes:
+        poses: (n, 3) T_world_scan, the first one zero; of unregistered scans an interpolation.
+        is_registered: (n,) False for scans that fit none of the scans around them.
+    """
+
+    poses: Floats
+    is_registered: NDArray[np.bool_]
+
+
+class _Hypotheses(NamedTuple):
+    """Relative poses of pairs: (h,) rows, (h, 3) T_target_source, (h,) scores of the pair alone."""
+
+    source: Indices
+    target: Indices
+    poses: Floats
+    scores: Floats
+
+
+def search_sequence(scans: PlanarScans, steps: PairMatches, config: SequenceConfig | None = None) -> SequenceResult:
+    """Finds the poses of scans in time order.
+
+    Args:
+        scans: n scans.
+        steps: the n - 1 steps T_scan_next that an ICP has found.
+        config: settings.
+
+    Returns:
+        SequenceResult.
+    """
+    config, rows = config or SequenceConfig(), distinct_rows(scans)
+    some, profiles = scans.take(rows), make_profiles(scans.take(rows))
+    # The scans between two of these rows are the first of the two.
+    matched = PairMatches(*(x[rows[1:] - 1] for x in steps))
+    hypotheses = _find_hypotheses(some, profiles, matched, config)
+    is_clear = (hypotheses.source == hypotheses.target + 1) & (hypotheses.scores > _CLEAR_SCORE)
+    prior = MotionPrior.of(hypotheses.poses[is_clear], scans.typical_range)
+    found = _Beam(profiles, hypotheses, prior, config).run()
+    kept = np.flatnonzero(found.is_registered)
+    kept = kept[~_is_alone(weak_steps(profiles, found.poses, kept))]
+    poses = join_parts(profiles, found.poses, kept, prior, config.search)
+    is_registered = np.zeros(len(scans), bool)
+    is_registered[rows[kept]] = True
+    return SequenceResult(interpolate(len(scans), rows[kept], poses[kept]), is_registered)
+
+
+def _is_alone(is_weak: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """(k,) scans between two weak steps, one or two of them."""
+    part = np.append(0, np.cumsum(is_weak))
+    return np.asarray(np.bincount(part)[part] <= min(_NUM_ALONE, len(part) // 4))
+
+
+def _find_hypotheses(
+    scans: PlanarScans, profiles: RangeProfiles, steps: PairMatches, config: SequenceConfig
+) -> _Hypotheses:
+    """The steps, and the candidates of a search where they are not clear."""
+    num_scans = len(scans)
+    later = np.arange(1, num_scans)
+    scores = pair_scores(profiles, later, later - 1, steps.poses)
+    best = scores.copy()
+    num_beams = np.maximum(np.asarray(scans.is_on_line.sum(1))[1:], 1)
+    is_clear = (best > _CLEAR_SCORE) & (steps.fitness > _CLEAR_FITNESS)
+    is_clear &= contradicted_share(profiles, later, later - 1, steps.poses) < _CLEAR_CONTRADICTION
+    is_clear &= steps.weakest_eigenvalue() > _CLEAR_EIGENVALUE * num_beams
+    found = [_Hypotheses(later, later - 1, steps.poses, scores)]
+    open_steps, searched = later[~is_clear], set[tuple[int, int]]()
+    for span, limit in ((1, np.inf), (_WEAK_SPAN, WEAK_SCORE), (_BAD_SPAN, _BAD_SCORE)):
+        open_steps = open_steps[best[open_steps - 1] < limit]
+        pairs = {(a, a - k) for i in open_steps.tolist() for k in range(1, span + 1) for a in range(i, i + k)}
+        if span == 1:
+            # A scan that no clear step reaches may be one to leave out.
+            pairs |= {
+                (i + 1, i - 1) for i in later[:-1][(scores[:-1] < _SURE_SCORE) & (scores[1:] < _SURE_SCORE)].tolist()
+            }
+        new = np.array(sorted(p for p in pairs - searched if p[1] >= 0 and p[0] < num_scans), np.int64).reshape(-1, 2)
+        searched |= pairs
+        if not len(new):
+            break
+        found.append(_search(scans, profiles, new, config))
+        # A step is as good as the best hypothesis across it.
+        for source, target, score in zip(found[-1].source, found[-1].target, found[-1].scores, strict=True):
+            across = slice(target, source)
+            best[across] = np.maximum(best[across], score)
+    source, target = (np.concatenate([getattr(x, name) for x in found]) for name in ("source", "target"))
+    poses, scores = (np.concatenate([getattr(x, name) for x in found]) for name in ("poses", "scores"))
+    order = np.lexsort((-scores, source))
+    return _Hypotheses(source[order], target[order], poses[order], scores[order])
+
+
+def _search(
+    scans: PlanarScans, profiles: RangeProfiles, pairs: NDArray[np.int64], config: SequenceConfig
+) -> _Hypotheses:
+    """Candidates of pairs (p, 2), each aligned by ICP where that is no worse."""
+    source, target = pairs.T.copy()
+    turn = se2.wrap_angle(2 * np.pi * np.arange(config.search.num_turns) / config.search.num_turns)
+    turns = np.abs(turn) < _MAX_TURN * (source - target)[:, None] ** 0.5
+    found = search_pairs(profiles, source, target, config.search, turns=turns)
+    row, column = np.nonzero(np.isfinite(found.scores))
+    source, target, poses = source[row], target[row], found.poses[row, column]
+    aligned = match_pairs(scans.take(source), scans.take(target), poses[:, None], FINE).poses
+    before, after = (pair_scores(profiles, source, target, x) for x in (poses, aligned))
+    is_better = after > before - 0.02
+    poses = np.where(is_better[:, None], aligned, poses)
+    return _Hypotheses(source, target, poses, np.where(is_better, after, before))
+
+
+class _Sequences(NamedTuple):
+    """The best sequences of poses up to some scan, s of them, the best first.
+
+    Attributes:
+        poses: (s, w, 3) T_world_scan of the last w scans.
+        is_placed: (s, w) which of these are registered.
+        scores: (s,) totals.
+    """
+
+    poses: Floats
+    is_placed: NDArray[np.bool_]
+    scores: Floats
+
+
+def _with_second_start(now: _Sequences) -> _Sequences:
+    """The sequences of two scans, and one that begins at the second scan."""
+    poses, is_placed = np.zeros_like(now.poses[:1]), np.zeros_like(now.is_placed[:1])
+    is_placed[:, -1] = True
+    scores = np.append(now.scores, _LEFT_OUT)
+    return _Sequences(np.concatenate([now.poses, poses]), np.concatenate([now.is_placed, is_placed]), scores)
+
+
+class _Ways(NamedTuple):
+    """Ways to go on with a scan, m of them: (m,) sequence, (m, 3) pose, (m,) score, (m,) whether it is registered."""
+
+    parent: Indices
+    poses: Floats
+    scores: Floats
+    is_placed: NDArray[np.bool_]
+
+
+class _Beam:
+    """The beam search over the hypotheses of a sequence."""
+
+    def __init__(
+        self, profiles: RangeProfiles, hypotheses: _Hypotheses, prior: MotionPrior, config: SequenceConfig
+    ) -> None:
+        self.profiles, self.hypotheses, self.prior, self.config = profiles, hypotheses, prior, config
+        self.unit, self.width = profiles.scans.typical_range, config.num_compared + _BAD_SPAN
+        self.starts = np.searchsorted(hypotheses.source, np.arange(len(profiles) + 1))
+
+    def run(self) -> SequenceResult:
+        """Goes through all scans, then back along the best sequence."""
+        num_scans = len(self.profiles)
+        poses, is_placed = np.zeros((1, self.width, 3)), np.zeros((1, self.width), bool)
+        is_placed[:, -1] = True
+        now = _Sequences(poses, is_placed, np.zeros(1))
+        history: list[tuple[Indices, Floats, NDArray[np.bool_]]] = []
+        for scan in range(1, num_scans):
+            now, parents = self.advance(now, scan)
+            if scan == 1:
+                # The first scan may be the one that fits nothing.
+                now, parents = _with_second_start(now), np.append(parents, 0)
+            history.append((parents, now.poses[:, -1], now.is_placed[:, -1]))
+        world, is_registered, which = np.zeros((num_scans, 3)), np.ones(num_scans, bool), 0
+        for scan in range(num_scans - 1, 0, -1):
+            parents, last, placed = history[scan - 1]
+            world[scan], is_registered[scan] = last[which], placed[which]
+            is_registered[0] = scan > 1 or which < len(parents) - 1
+            which = int(parents[which])
+        return SequenceResult(world, is_registered)
+
+    def advance(self, now: _Sequences, scan: int) -> tuple[_Sequences, Indices]:
+        """The best sequences with one more scan, and the sequence that each of them goes on."""
+        ways = self.extend(now, scan)
+        parent, pose, score, placed = ways
+        total = now.scores[parent] + score
+        order = np.argsort(-total, kind="stable")
+        chosen: list[int] = []
+        for row in order.tolist():
+            if len(chosen) == self.config.num_sequences:
+                break
+            if not any(self.is_same(now, ways, row, other) for other in chosen):
+                chosen.append(row)
+        rows = np.array(chosen)
+        parents = parent[rows]
+        poses = np.concatenate([now.poses[parents, 1:], pose[rows, None]], axis=1)
+        is_placed = np.concatenate([now.is_placed[parents, 1:], placed[rows, None]], axis=1)
+        return _Sequences(poses, is_placed, total[rows] - total[rows[0]]), parents
+
+    def extend(self, now: _Sequences, scan: int) -> _Ways:
+        """All ways to go on with a scan: its hypotheses, and to leave it out."""
+        own = slice(self.starts[scan], self.starts[scan + 1])
+        back = scan - self.hypotheses.target[own]
+        parent, which = np.nonzero(now.is_placed[:, self.width - back])
+        pose = np.asarray(se2.compose(now.poses[parent, self.width - back[which]], self.hypotheses.poses[own][which]))
+        keep = self.distinct(parent, pose)
+        parent, pose = parent[keep], pose[keep]
+        score = self.score(now, scan, parent, pose)
+        everyone = np.arange(len(now.scores))
+        last = now.poses[:, -1]
+        lost = ~now.is_placed[:, -_BAD_SPAN:].any(axis=1)
+        return _Ways(
+            np.concatenate([parent, everyone]),
+            np.concatenate([pose, last]),
+            np.concatenate([score, np.where(lost, _GUESSED, _LEFT_OUT)]),
+            np.concatenate([np.ones(len(parent), bool), lost]),
+        )
+
+    def distinct(self, parent: Indices, pose: Floats) -> Indices:
+        """Rows of the hypotheses that equal none before them in the same sequence."""
+        off = pose[:, None] - pose
+        near = np.hypot(off[..., 0], off[..., 1]) < _SAME[0] * self.unit
+        near &= (np.abs(se2.wrap_angle(off[..., 2])) < _SAME[1]) & (parent[:, None] == parent)
+        kept: list[int] = []
+        for row in range(len(parent)):
+            if not near[row, kept].any():
+                kept.append(row)
+        return np.array(kept, np.int64)
+
+    def score(self, now: _Sequences, scan: int, parent: Indices, pose: Floats) -> Floats:
+        """(m,) agreement of a scan with the last placed ones, and the motion prior."""
+        rank = np.cumsum(now.is_placed[:, ::-1], axis=1)[:, ::-1]
+        is_used = (now.is_placed & (rank <= self.config.num_compared))[parent]
+        placed = now.poses[parent]
+        relative = np.asarray(se2.relative(placed, np.broadcast_to(pose[:, None], placed.shape)))
+        row, column = np.nonzero(is_used)
+        pairs = np.full(len(row), scan), scan - self.width + column
+        evidence, visible = find_evidence(self.profiles, *pairs, relative[row, column])
+        # The newest scan counts most: a pose is not better for having moved less and so overlapping with older scans.
+        weight = 1.0 / rank[parent][row, column]
+        total, seen = (np.bincount(row, weight * x, len(parent)) for x in (evidence, visible))
+        agreement = total / (seen + LEAST_VISIBLE)
+        newest = is_used.shape[1] - 1 - is_used[:, ::-1].argmax(axis=1)
+        step, gap = relative[np.arange(len(parent)), newest], self.width - newest
+        return np.asarray(agreement - _PRIOR_WEIGHT * self.prior.surprise(step, gap), np.float64)
+
+    def is_same(self, now: _Sequences, ways: _Ways, row: int, other: int) -> bool:
+        """Returns True if two continuations agree about the last scans, so that no later scan can separate them."""
+        rows = np.array([row, other])
+        parent = ways.parent[rows]
+        placed = np.concatenate([now.is_placed[parent, 1 - _NUM_SAME :], ways.is_placed[rows, None]], axis=1)
+        if (placed[0] != placed[1]).any() or not placed[0].any():
+            return bool((placed[0] == placed[1]).all())
+        poses = np.concatenate([now.poses[parent, 1 - _NUM_SAME :], ways.poses[rows, None]], axis=1)[:, placed[0]]
+        inside = se2.relative(poses[:, -1:], poses)
+        off = inside[0] - inside[1]
+        is_near = np.hypot(off[:, 0], off[:, 1]) < _SAME_SHAPE[0] * self.unit
+        return bool((is_near & (np.abs(se2.wrap_angle(off[:, 2])) < _SAME_SHAPE[1])).all())

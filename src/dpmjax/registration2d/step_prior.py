@@ -1,0 +1,90 @@
+"""Expected steps of a sequence before its beams are compared: of odometry, of given poses, or of the usual motion."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from dpmjax.geometry import se2
+from dpmjax.registration2d.pair_alignment import PairMatches, PosePrior
+from dpmjax.registration2d.planar_scans import Floats, Indices
+
+# Standard deviations of a step of poses that nothing is known about: typical ranges, radians.
+_USUAL_DEVIATION = (0.0225, 0.15)
+# Clear steps predict the translation of another one if their turns differ by less, in radians; with fewer of them,
+# all clear ones do, or none. Least deviation of such a prediction, typical ranges.
+_SIMILAR_TURN, _LEAST_CLEAR, _LEAST_DEVIATION = 0.15, 5, 0.015
+# Degrees of freedom of the cost of a step: wheels slip, and logs have gaps.
+_FREEDOM = 3.0
+
+
+def step_cost(chi2: Any) -> Any:
+    """Returns the nats of a step that is off by this squared number of standard deviations: those of Student's t."""
+    return 0.5 * (_FREEDOM + 3.0) * np.log1p(chi2 / _FREEDOM)
+
+
+class StepPrior(NamedTuple):
+    """Expected steps from each scan to the next, with their standard deviations.
+
+    Attributes:
+        steps: (k, 3) T_scan_next.
+        deviations: (k, 3) of x and y in the unit of the points, and of the heading in radians; infinite: unknown.
+    """
+
+    steps: Floats
+    deviations: Floats
+
+    @classmethod
+    def of_poses(cls, poses: Floats, typical_range: float) -> StepPrior:
+        """Makes a prior of poses (n, 3) of unknown accuracy."""
+        steps = np.asarray(se2.relative(poses[:-1], poses[1:]), np.float64)
+        deviation = np.array(_USUAL_DEVIATION)[[0, 0, 1]] * [typical_range, typical_range, 1.0]
+        return cls(steps, np.broadcast_to(deviation, steps.shape))
+
+    def costs(self, steps: Float[np.ndarray, "k *m 3"]) -> Floats:
+        """(k, *m) heavy-tailed costs of steps in nats; 0 where they are as expected."""
+        shape = (len(self.steps),) + (1,) * (steps.ndim - 2) + (3,)
+        off = steps - self.steps.reshape(shape)
+        off[..., 2] = se2.wrap_angle(off[..., 2])
+        chi2 = ((off / self.deviations.reshape(shape)) ** 2).sum(-1)
+        return np.asarray(step_cost(chi2), np.float64)
+
+    def as_pose_prior(self, residual: float | Floats) -> PosePrior:
+        """Returns the prior of alignments whose beams have this standard deviation, in the unit of the points."""
+        return PosePrior(self.steps, (residual / self.deviations) ** 2)
+
+    def through(self, rows: Indices) -> StepPrior:
+        """Returns the prior of the steps between these rows (m,) of the n scans, in order."""
+        poses = se2.chain(self.steps)
+        variances = np.concatenate([np.zeros((1, 3)), np.cumsum(self.deviations**2, axis=0)])
+        steps = se2.relative(poses[rows[:-1]], poses[rows[1:]])
+        return StepPrior(np.asarray(steps, np.float64), np.sqrt(np.diff(variances[rows], axis=0)))
+
+
+def usual_motion(matches: PairMatches, typical_range: float) -> StepPrior:
+    """Predicts each step by the median translation of the clear ones with a similar turn.
+
+    In a corridor two scans fit at every shift along it; a robot that has made straight steps of one metre elsewhere
+    has made another one there.
+
+    Args:
+        matches: of the steps; those with much information and a good fitness are clear.
+        typical_range: of the scans.
+
+    Returns:
+        StepPrior of the translations; without five clear steps all deviations are infinite.
+    """
+    eigenvalue = matches.weakest_eigenvalue()
+    is_clear = (eigenvalue >= np.median(eigenvalue)) & (matches.fitness >= np.median(matches.fitness))
+    clear, turns = matches.poses[is_clear], matches.poses[:, 2]
+    steps, deviations = np.zeros((len(turns), 3)), np.full((len(turns), 3), np.inf)
+    for row, turn in enumerate(turns):
+        alike = clear[np.abs(se2.wrap_angle(clear[:, 2] - turn)) < _SIMILAR_TURN]
+        alike = alike if len(alike) >= _LEAST_CLEAR else clear
+        if len(alike) >= _LEAST_CLEAR:
+            steps[row, :2] = np.median(alike[:, :2], axis=0)
+            spread = 1.4826 * np.median(np.abs(alike[:, :2] - steps[row, :2]), axis=0)
+            deviations[row, :2] = spread + _LEAST_DEVIATION * typical_range
+    return StepPrior(steps, deviations)

@@ -1,0 +1,225 @@
+"""Global registration: the exhaustive search of pairs, and maps grown from pairs."""
+
+from __future__ import annotations
+
+import importlib
+from dataclasses import replace
+from unittest.mock import Mock
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from dpmjax.geometry import se2
+from dpmjax.io import ScanSequence
+from dpmjax.metrics import absolute_trajectory_error
+from dpmjax.registration2d import GlobalConfig, PlanarScans, nearest_tour, planar_scans, refine, register_globally
+from dpmjax.registration2d.global_registration import _Task, find_unregistered, place_others
+from dpmjax.registration2d.map_assembly import PoseScorer, add_up, assemble, move_blocks, weakest_cuts
+from dpmjax.registration2d.pair_search import (
+    Candidates,
+    CorrelativeConfig,
+    Hypotheses,
+    _spectra,
+    agreeing_edges,
+    search_pairs,
+)
+from dpmjax.registration2d.range_profiles import RangeProfiles, compare_pairs, make_profiles
+from dpmjax.registration2d.wall_directions import WallDirections
+from dpmjax.simulation import simulate_sequence
+
+# Coarse, so that a test takes a second: what is law does not depend on it.
+COARSE = CorrelativeConfig(num_cells=64, cell=0.075, num_turns=72, block=8, num_levels=5, num_candidates=3)
+CONFIG = GlobalConfig(search=COARSE)
+
+
+def scans_of(sequence: ScanSequence, *, is_ordered: bool = True) -> PlanarScans:
+    return planar_scans(sequence.points, sequence.mask, is_ordered=is_ordered)
+
+
+def ate(poses: np.ndarray, sequence: ScanSequence) -> float:
+    return absolute_trajectory_error(poses[:, :2], sequence.reference_poses[:, :2])
+
+
+@pytest.fixture(scope="module")
+def sequence() -> ScanSequence:
+    """Seven scans of the office, 60 px apart."""
+    return simulate_sequence(0, 49, seed=1).take(slice(0, None, 8))
+
+
+@pytest.fixture(scope="module")
+def truth(sequence) -> np.ndarray:
+    return sequence.reference_poses
+
+
+@pytest.fixture(scope="module")
+def profiles(sequence) -> RangeProfiles:
+    return make_profiles(scans_of(sequence))
+
+
+@pytest.fixture(scope="module")
+def found(profiles) -> Candidates:
+    """All pairs, searched."""
+    return search_pairs(profiles, *np.tril_indices(len(profiles), k=-1), COARSE)
+
+
+@pytest.fixture(scope="module")
+def scorer(profiles) -> PoseScorer:
+    return PoseScorer(profiles, 100.0, 0.02, False)
+
+
+def test_support_counts_by_rank_and_contradictions_in_full() -> None:
+    # 3 + 2 / 2 - 1; nothing; all that contradicts.
+    scores = np.array([[2.0, -1.0, 0.0, 3.0], [0.0, 0.0, 0.0, 0.0], [-1.0, -2.0, 0.0, -4.0]])
+    np.testing.assert_allclose(add_up(scores), [3.0, 0.0, -7.0], atol=1e-12)
+
+
+def test_search_finds_the_relative_pose_from_any_yaw(sequence, truth) -> None:
+    # Scan 0, and scan 1 turned by each yaw: all are searched at once.
+    yaws = np.array([0.0, 1.3, 3.1, -2.0])
+    turned = [se2.transform_points(np.array([0.0, 0.0, -yaw]), sequence.points[1]) for yaw in yaws]
+    some = make_profiles(planar_scans(np.stack([sequence.points[0], *turned]), sequence.mask[[0, 1, 1, 1, 1]]))
+    found = search_pairs(some, np.arange(1, 5), np.zeros(4, int), COARSE)
+    expected = se2.relative(truth[0], truth[1] + yaws[:, None] * [0.0, 0.0, 1.0])
+    error = se2.relative(expected, found.poses[:, 0])
+    assert (np.hypot(error[:, 0], error[:, 1]) < 3.0).all()
+    assert (np.abs(error[:, 2]) < 0.03).all()
+    assert (found.scores[:, 0] > found.scores[:, 1] + 20).all()
+
+
+def test_candidates_of_a_pair_are_different_poses(profiles, found) -> None:
+    poses = np.where(np.isfinite(found.scores)[..., None], found.poses, np.nan)
+    for first, second in ((0, 1), (0, 2), (1, 2)):
+        off = poses[:, first] - poses[:, second]
+        is_near = np.hypot(off[:, 0], off[:, 1]) < COARSE.apart[0] * profiles.scans.typical_range
+        assert not (is_near & (np.abs(se2.wrap_angle(off[:, 2])) < COARSE.apart[1])).any()
+
+
+def test_only_the_given_turns_are_searched(profiles) -> None:
+    turns = np.zeros((1, COARSE.num_turns), bool)
+    turns[0, 18] = True
+    found = search_pairs(profiles, np.array([1]), np.array([0]), COARSE, turns=turns)
+    headings = found.poses[0, np.isfinite(found.scores[0]), 2]
+    # Refinement moves a heading by less than a turn.
+    np.testing.assert_allclose(headings, np.pi / 2, atol=2 * 2 * np.pi / COARSE.num_turns)
+
+
+def test_a_program_has_one_fourier_transform(profiles, monkeypatch: pytest.MonkeyPatch) -> None:
+    # Two at once may wait for each other's threads for ever (CPU, JAX 0.11).
+    transform = Mock(wraps=jnp.fft.rfft2)
+    monkeypatch.setattr(jnp.fft, "rfft2", transform)
+    _spectra.__wrapped__(profiles, jnp.zeros(()), jnp.ones(()), COARSE)
+    assert transform.call_count == 1
+
+
+def test_assembly_rejects_a_wrong_pair(sequence, profiles, found) -> None:
+    wrong = int(np.flatnonzero((found.source == 6) & (found.target == 0))[0])
+    poses, scores = found.poses.copy(), found.scores.copy()
+    poses[wrong, 0] = [5.0, -20.0, 2.0]
+    scores[wrong, 0] = 0.9 * scores.max()
+    candidates = found._replace(poses=poses, scores=scores)
+    assembled = assemble(profiles, candidates)
+    assert ate(assembled, sequence) < 4.0
+    edges = agreeing_edges(assembled, candidates, profiles)
+    assert not ((edges.source == 6) & (edges.target == 0)).any()
+
+
+def test_a_block_at_a_wrong_pose_moves_back_as_a_whole(sequence, truth, found, scorer) -> None:
+    torn = truth.copy()
+    torn[4:] = se2.compose(np.array([300.0, 150.0, 0.4]), torn[4:])
+    mended, num_moved = move_blocks(torn, Hypotheses.of(found), scorer)
+    assert num_moved == 1
+    assert ate(torn, sequence) > 50.0
+    assert ate(mended, sequence) < 4.0
+    assert move_blocks(mended, Hypotheses.of(found), scorer)[1] == 0
+
+
+def test_weakest_cut_is_between_two_groups() -> None:
+    values = np.full((5, 5), 100.0)
+    values[3:, :3] = 0.0
+    values[3, 1] = 10.0
+    np.testing.assert_array_equal(weakest_cuts(np.tril(values, k=-1), 2)[0], [False, False, False, True, True])
+
+
+def test_a_map_of_contradictions_has_cuts_too() -> None:
+    assert len(weakest_cuts(np.full((3, 3), -5.0), 6)) == 2
+
+
+@pytest.mark.slow
+def test_shuffling_the_scans_permutes_the_result(sequence) -> None:
+    order = np.array([3, 0, 6, 2, 5, 1, 4])
+    one = register_globally(scans_of(sequence, is_ordered=False), CONFIG).poses
+    shuffled = planar_scans(sequence.points[order], sequence.mask[order], is_ordered=False)
+    other = register_globally(shuffled, CONFIG).poses
+    assert ate(one, sequence) < 4.0
+    assert absolute_trajectory_error(one[order][:, :2], other[:, :2]) < 4.0
+
+
+def half_circle(sequence: ScanSequence) -> ScanSequence:
+    """The same scans by a sensor that sees 180 degrees."""
+    is_seen = np.abs(np.arctan2(sequence.points[..., 1], sequence.points[..., 0])) < np.pi / 2
+    return replace(sequence, mask=sequence.mask & is_seen)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("is_ordered", "noise"), [(True, 2.0), (False, 0.0), (False, 2.0)])
+def test_scans_are_registered_at_180_degrees_and_with_noise(is_ordered: bool, noise: float) -> None:
+    # 30 px apart, so that half circles overlap; the world is 1024 px wide.
+    walk = half_circle(simulate_sequence(0, 37, seed=1, range_noise_px=noise).take(slice(0, None, 4)))
+    assert walk.mask.mean() < 0.6
+    found = register_globally(scans_of(walk, is_ordered=is_ordered), CONFIG)
+    assert ate(found.poses, walk) < 4.0
+    np.testing.assert_array_equal(found.poses[0], np.zeros(3))
+
+
+def test_scans_beyond_the_keyframes_find_their_poses(sequence) -> None:
+    start = register_globally(scans_of(sequence, is_ordered=False), replace(CONFIG, max_keyframes=4))
+    assert len(start.keyframes) == 4
+    assert ate(start.poses, sequence) < 4.0
+
+
+def test_refinement_without_order_is_exact(truth) -> None:
+    sequence = simulate_sequence(0, 49, seed=1, num_beams=128).take(slice(0, None, 8))
+    poses = truth + np.random.default_rng(0).normal(size=truth.shape) * [2.0, 2.0, 0.01]
+    assert ate(refine(scans_of(sequence, is_ordered=False), poses).poses, sequence) < 0.05
+
+
+def task_of(profiles: RangeProfiles, keyframes: list[int], config: GlobalConfig = CONFIG) -> _Task:
+    return _Task(profiles, WallDirections(profiles.scans), np.array(keyframes), False, config)
+
+
+def test_unregistered_scans_do_not_support_each_other(walk, walk_scans) -> None:
+    profiles, poses = make_profiles(walk_scans), np.array(walk.reference_poses)
+    assert len(find_unregistered(profiles, poses, GlobalConfig())) == 0
+    poses[[9, 10], :2] += 5000.0
+    assert set(find_unregistered(profiles, poses, GlobalConfig())) == {9, 10}
+
+
+def test_a_scan_that_sees_no_keyframe_is_found_by_the_others(monkeypatch: pytest.MonkeyPatch) -> None:
+    there = simulate_sequence(0, 97, seed=2).take(slice(0, None, 16))
+    truth, lost, profiles = np.asarray(there.reference_poses), 5, make_profiles(scans_of(there))
+
+    def know(profiles: RangeProfiles, source: np.ndarray, target: np.ndarray, *_: object, **__: object) -> Candidates:
+        """A search that is right where two scans share a third of their beams or more, and else finds nothing."""
+        relative = se2.relative(truth[target], truth[source])
+        matched = compare_pairs(profiles, source, target, relative).matched
+        scores = np.where(matched > 170.0, matched, 0.0)[:, None]
+        both = np.concatenate([scores, 0.0 * scores], axis=-1)
+        return Candidates(source, target, relative[:, None].repeat(2, 1), both)
+
+    monkeypatch.setattr(importlib.import_module("dpmjax.registration2d.global_registration"), "search_pairs", know)
+    poses = truth.copy()
+    poses[lost] += [5000.0, 0.0, 0.0]
+    task = task_of(profiles, [0, 1], replace(CONFIG, max_unregistered=4))
+    found = know(profiles, np.array([1]), np.array([0]))
+    more = know(profiles, np.array([1, 2, 3, 3]), np.array([2, 3, 4, 6]))
+    placed, more = place_others(task, poses, found, more)
+    partners = more.source[more.target == lost]
+    assert {0, 1} < set(partners)
+    assert len(partners) == 4
+    assert ate(placed, there) < 0.01
+
+
+def test_a_tour_goes_from_each_pose_to_the_nearest_left() -> None:
+    poses = np.array([[0.0, 0.0, 0.0], [5.0, 0.0, 0.0], [1.0, 0.0, 3.0], [-2.5, 0.0, 0.0]])
+    np.testing.assert_array_equal(nearest_tour(poses), [0, 2, 3, 1])

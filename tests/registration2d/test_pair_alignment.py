@@ -1,0 +1,112 @@
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from dpmjax.geometry import se2
+from dpmjax.registration2d import PlanarScans
+from dpmjax.registration2d.pair_alignment import FINE, PosePrior, linearise_pair, match_pairs
+
+GATE, KERNEL = 20.0, 4.0
+
+
+def residuals(
+    source: PlanarScans, target: PlanarScans, pose: np.ndarray, nearest: np.ndarray, metric: str
+) -> np.ndarray:
+    """Slow float64 distances of fixed pairs, (b, k)."""
+    points = se2.transform_points(pose[None], np.asarray(source.points, np.float64)[None])[0]
+    if metric == "point":
+        return points - np.asarray(target.points, np.float64)[nearest]
+    normals, centroids = (np.asarray(x, np.float64)[nearest] for x in (target.normals, target.centroids))
+    return ((points - centroids) * normals).sum(-1, keepdims=True)
+
+
+@pytest.mark.parametrize("metric", ["point", "plane"])
+def test_system_is_that_of_finite_differences(walk, walk_scans, metric: str) -> None:
+    source, target = (jax.tree.map(lambda x, row=row: x[row], walk_scans) for row in (1, 0))
+    pose = se2.relative(walk.reference_poses[0], walk.reference_poses[1]) + np.array([1.0, -0.7, 0.02])
+    with jax.default_matmul_precision("highest"):
+        system = linearise_pair(
+            source, target, jnp.asarray(pose, jnp.float32), (jnp.float32(GATE), jnp.float32(KERNEL)), metric=metric
+        )
+    moved = se2.transform_points(pose[None], np.asarray(source.points, np.float64)[None])[0]
+    apart = np.linalg.norm(moved[:, None] - np.asarray(target.points, np.float64), axis=-1)
+    apart[:, ~np.asarray(target.is_on_line)] = np.inf
+    nearest = apart.argmin(-1)
+    c, s = np.cos(pose[2]), np.sin(pose[2])
+    turned = np.asarray(source.normals, np.float64) @ np.array([[c, s], [-s, c]])
+    facing = (turned * np.asarray(target.normals)[nearest]).sum(-1) > 0.7
+    counts = np.asarray(source.is_on_line) & (apart.min(-1) < GATE) & facing
+    here = residuals(source, target, pose, nearest, metric)
+    step = 1e-6
+    jacobian = np.stack(
+        [
+            (
+                residuals(source, target, se2.compose(pose, delta), nearest, metric)
+                - residuals(source, target, se2.compose(pose, -delta), nearest, metric)
+            )
+            / (2 * step)
+            for delta in step * np.eye(3)
+        ],
+        axis=-1,
+    )
+    weight = counts * (KERNEL**2 / (KERNEL**2 + (here**2).sum(-1))) ** 2
+    size = np.sqrt(np.einsum("b,bki,bki->i", weight, jacobian, jacobian))
+    information = np.einsum("b,bki,bkj->ij", weight, jacobian, jacobian) / np.outer(size, size)
+    gradient = np.einsum("b,bki,bk->i", weight, jacobian, here) / size
+    np.testing.assert_allclose(np.asarray(system.information) / np.outer(size, size), information, atol=2e-3)
+    np.testing.assert_allclose(np.asarray(system.gradient) / size, gradient, atol=2e-2)
+    assert float(system.weight) == pytest.approx(weight.sum(), rel=2e-3)
+
+
+def corridor(shift: float) -> PlanarScans:
+    """Two parallel walls, seen from `shift` along them."""
+    x = np.tile(np.linspace(-50, 50, 60), 2)
+    y = np.repeat([-10.0, 10.0], 60)
+    points = jnp.asarray(np.stack([x - shift, y], -1), jnp.float32)[None]
+    normals = jnp.asarray(np.stack([0 * x, -np.sign(y)], -1), jnp.float32)[None]
+    mask = jnp.ones((1, 120), bool)
+    return PlanarScans(points, mask, normals, points, mask, jnp.zeros(1), jnp.full(1, 133.0))
+
+
+def test_prior_decides_along_a_corridor_and_the_walls_across_it() -> None:
+    guess = np.array([[[0.0, 1.0, 0.02]]])
+
+    def aligned(information: float) -> np.ndarray:
+        prior = PosePrior(np.array([[7.0, 3.0, 0.1]]), np.full((1, 3), information))
+        return match_pairs(corridor(7.0), corridor(0.0), guess, FINE, prior).poses[0]
+
+    with_prior, without = aligned(1.0), aligned(0.0)
+    np.testing.assert_allclose(with_prior, [7.0, 0.0, 0.0], atol=5e-2)
+    np.testing.assert_allclose(without, [0.0, 0.0, 0.0], atol=5e-2)
+
+
+def test_pairs_are_aligned_from_pixels_away(walk, walk_scans) -> None:
+    true = se2.relative(walk.reference_poses[:-1], walk.reference_poses[1:])
+    guesses = (true + np.random.default_rng(0).normal(size=true.shape) * [3.0, 3.0, 0.03])[:, None]
+    count = len(true)
+    found = match_pairs(walk_scans.take(slice(1, None)), walk_scans.take(slice(count)), guesses, FINE)
+    error = se2.relative(true, found.poses)
+    assert np.median(np.hypot(error[:, 0], error[:, 1])) < 0.01
+    assert (found.fitness > 0.3).all()
+
+
+def test_the_best_guess_wins_and_no_pair_is_no_match(walk, walk_scans) -> None:
+    true = se2.relative(walk.reference_poses[0], walk.reference_poses[1])
+    guesses = np.stack([true + np.array([80.0, 0.0, 2.0]), true, true - np.array([0.0, 90.0, 2.0])])[None]
+    found = match_pairs(walk_scans.take([1]), walk_scans.take([0]), guesses, FINE)
+    np.testing.assert_allclose(found.poses[0], true, atol=0.05)
+    none = walk_scans.take(slice(0))
+    empty = match_pairs(none, none, np.zeros((0, 3, 3)), FINE)
+    assert empty.poses.shape == (0, 3)
+
+
+def test_scans_without_a_beam_stay_at_their_guess(walk_scans) -> None:
+    one = walk_scans.replace(is_on_line=jnp.zeros_like(walk_scans.mask)).take([0])
+    guess = np.array([[[3.0, -2.0, 0.4]]])
+    found = match_pairs(one, one, guess, FINE)
+    np.testing.assert_allclose(found.poses, guess[0], atol=1e-6)
+    assert found.fitness.tolist() == [0.0]
+    assert found.weakest_eigenvalue().tolist() == [0.0]

@@ -1,0 +1,140 @@
+"""Scores of trajectories, the choice among them, and trust, without the truth."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from dpmjax.geometry import se2
+from dpmjax.registration2d import assess_trajectory, choose_trajectory, planar_scans, quality
+from dpmjax.registration2d.quality import map_code_length, view_misfit
+from dpmjax.simulation import scan_world, simulate_sequence
+
+
+def shaken(poses: np.ndarray, px: float, seed: int = 0) -> np.ndarray:
+    return poses + np.random.default_rng(seed).normal(size=poses.shape) * [px, px, 0.002 * px]
+
+
+@pytest.mark.parametrize("px", [0.5, 1.0, 5.0])
+def test_true_poses_need_fewer_nats_than_perturbed_ones(walk, walk_scans, px: float) -> None:
+    true = walk.reference_poses
+    assert map_code_length(walk_scans, true) < map_code_length(walk_scans, shaken(true, px))
+
+
+def test_larger_errors_need_more_nats(walk, walk_scans) -> None:
+    lengths = [map_code_length(walk_scans, shaken(walk.reference_poses, px, seed=1)) for px in (0.0, 1.0, 4.0, 16.0)]
+    assert lengths == sorted(lengths)
+
+
+def test_one_scan_that_is_turned_costs_nats(walk, walk_scans) -> None:
+    turned = walk.reference_poses.copy()
+    turned[15, 2] += 0.3
+    assert map_code_length(walk_scans, walk.reference_poses) < map_code_length(walk_scans, turned)
+
+
+@pytest.mark.parametrize("offset", [(300.0, -1234.5, 0.7), (-17.3, 5.1, 3.0)])
+def test_code_length_does_not_depend_on_the_world_frame(walk, walk_scans, offset) -> None:
+    moved = se2.compose(np.array([offset]), walk.reference_poses)
+    expected = map_code_length(walk_scans, walk.reference_poses)
+    assert map_code_length(walk_scans, moved) == pytest.approx(expected, rel=0.03)
+
+
+def test_the_better_of_two_trajectories_is_chosen(walk, walk_scans) -> None:
+    true = walk.reference_poses
+    torn = true.copy()
+    torn[12:] += [60.0, -40.0, 0.3]
+    # Nearly the same map: its surfaces decide. Another map, though each half is sharp: its code length decides.
+    for worse in (shaken(true, 0.3), torn):
+        chosen, scores = choose_trajectory(walk_scans, {"worse": worse, "true": true})
+        assert chosen == "true"
+        assert set(scores) == {"worse", "true"}
+    assert scores["worse"].code_length > 1.1 * scores["true"].code_length
+
+
+def test_the_sharper_map_is_not_chosen_where_it_is_the_wrong_map(walk, walk_scans) -> None:
+    # All scans far from each other: no surface contradicts another, and no map needs more words.
+    true = walk.reference_poses
+    scattered = true + 5000.0 * np.arange(len(true))[:, None] * [1.0, 0.0, 0.0]
+    assert choose_trajectory(walk_scans, {"scattered": scattered, "shaken": shaken(true, 1.0)})[0] == "shaken"
+
+
+@pytest.mark.parametrize("world", ["grove", "crowd", 0])
+def test_the_sharper_of_two_near_maps_is_chosen_with_and_without_walls(world) -> None:
+    sequence = simulate_sequence(world, 41, seed=2, num_beams=128, range_noise_px=2.0).take(slice(0, None, 4))
+    scans, true = planar_scans(sequence.points, sequence.mask), sequence.reference_poses
+    misfits = [view_misfit(scans, shaken(true, px)) for px in (0.0, 1.0, 3.0, 9.0)]
+    assert misfits == sorted(misfits)
+    assert choose_trajectory(scans, {"shaken": shaken(true, 1.0), "true": true})[0] == "true"
+
+
+@pytest.mark.parametrize(("noise_px", "expected"), [(1.0, "sharp"), (15.0, "short")])
+def test_surfaces_decide_only_where_the_noise_lets_them(noise_px: float, expected: str, monkeypatch) -> None:
+    sequence = simulate_sequence(0, 21, seed=2, num_beams=128, range_noise_px=noise_px).take(slice(0, None, 4))
+    scans, true = planar_scans(sequence.points, sequence.mask), sequence.reference_poses
+    scores = {0: (1.0, 0.5), 1: (1.05, 0.4), 2: (1.2, 0.3)}
+
+    def score(poses: np.ndarray) -> tuple[float, float]:
+        return scores[round(poses[0, 0] - true[0, 0])]
+
+    monkeypatch.setattr(quality, "map_code_length", lambda _, poses: score(poses)[0])
+    monkeypatch.setattr(quality, "view_misfit", lambda _, poses: score(poses)[1])
+    candidates = {"short": true, "sharp": true + 1.0, "long": true + 2.0}
+    assert choose_trajectory(scans, candidates)[0] == expected
+
+
+def test_misfit_is_the_share_of_the_visible_beams_in_a_square_room() -> None:
+    room = np.ones((202, 202), bool)
+    room[1:-1, 1:-1] = False
+    poses = np.array([[101.0, 101.0, 0.0], [101.0, 101.0, 0.5]])
+    scans = planar_scans(*scan_world(room, poses))
+    assert view_misfit(scans, poses) < 0.1
+    moved = poses + np.array([[0.0, 0.0, 0.0], [5.0, 0.0, 0.0]])
+    # A quarter of the beams ends 5 px before a wall, and a quarter behind one, where the other scan cannot see.
+    assert view_misfit(scans, moved) == pytest.approx(1 / 3, abs=0.05)
+    # A scan a world away sees nothing of the other.
+    assert view_misfit(scans, poses + np.array([[0.0, 0.0, 0.0], [5000.0, 0.0, 0.0]])) == pytest.approx(1.0)
+
+
+def test_a_choice_needs_a_candidate(walk_scans) -> None:
+    with pytest.raises(ValueError, match="at least one trajectory"):
+        choose_trajectory(walk_scans, {})
+
+
+@pytest.fixture(scope="module")
+def sparse():
+    """Eleven scans, 40 px apart, and their sequence."""
+    sequence = simulate_sequence(0, 41, seed=1).take(slice(0, None, 4))
+    return sequence, planar_scans(sequence.points, sequence.mask)
+
+
+def test_truth_is_trusted(sparse) -> None:
+    sequence, scans = sparse
+    assessment = assess_trajectory(scans, sequence.reference_poses)
+    assert assessment.is_trusted
+    assert assessment.contradiction < 0.01
+
+
+@pytest.mark.parametrize("shift", [(80.0, 0.0, 0.0), (0.0, 0.0, 0.6)])
+def test_a_torn_map_is_not_trusted(sparse, shift) -> None:
+    sequence, scans = sparse
+    poses = sequence.reference_poses.copy()
+    poses[len(poses) // 2 :] += shift
+    assert not assess_trajectory(scans, poses).is_trusted
+
+
+def test_collapsed_poses_are_not_trusted(sparse) -> None:
+    _, scans = sparse
+    assert not assess_trajectory(scans, np.zeros((len(scans), 3))).is_trusted
+
+
+def test_a_map_drowned_in_noise_is_not_trusted() -> None:
+    sequence = simulate_sequence(0, 41, seed=1, range_noise_px=12.0).take(slice(0, None, 4))
+    scans = planar_scans(sequence.points, sequence.mask)
+    assert not assess_trajectory(scans, sequence.reference_poses).is_trusted
+
+
+def test_trust_does_not_depend_on_the_world_frame(sparse) -> None:
+    sequence, scans = sparse
+    one = assess_trajectory(scans, sequence.reference_poses)
+    other = assess_trajectory(scans, sequence.reference_poses + np.array([500.0, -300.0, 0.0]))
+    assert one.weakest_connection == pytest.approx(other.weakest_connection, abs=1e-3)

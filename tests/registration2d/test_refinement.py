@@ -1,0 +1,178 @@
+"""The refinement, and the loops before it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from dpmjax.geometry import se2
+from dpmjax.io import ScanSequence
+from dpmjax.metrics import absolute_trajectory_error
+from dpmjax.pose_graph.graph import Edges
+from dpmjax.registration2d import LoopConfig, RefinementConfig, close_loops, planar_scans, refine
+from dpmjax.registration2d.joint_alignment import _rounded_up, choose_pairs
+from dpmjax.registration2d.loop_closure import LoopResult, count_support, find_candidates
+from dpmjax.simulation import simulate_sequence
+from dpmjax.types import ScanSet
+
+WITHOUT_LOOPS = RefinementConfig(loops=None)
+
+
+def ate(poses: np.ndarray, reference: np.ndarray) -> float:
+    return absolute_trajectory_error(poses[:, :2], reference[:, :2])
+
+
+def shaken(poses: np.ndarray, px: float, seed: int = 0) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    return poses + np.concatenate([np.zeros((1, 3)), rng.normal(size=(len(poses) - 1, 3)) * [px, px, 0.01 * px]])
+
+
+def test_refinement_is_exact_without_noise(walk, walk_scans) -> None:
+    start = shaken(walk.reference_poses, 10.0)
+    refined = refine(walk_scans, start, WITHOUT_LOOPS)
+    assert ate(start, walk.reference_poses) > 8.0
+    assert ate(refined.poses, walk.reference_poses) < 0.01
+    np.testing.assert_allclose(refined.poses[0], start[0], atol=1e-4)
+
+
+def test_refinement_is_bounded_under_noise(noisy_walk, noisy_walk_scans) -> None:
+    refined = refine(noisy_walk_scans, shaken(noisy_walk.reference_poses, 5.0))
+    assert ate(refined.poses, noisy_walk.reference_poses) < 0.7
+
+
+def test_refinement_never_uses_masked_beams(walk) -> None:
+    mask = walk.mask & (np.random.default_rng(2).uniform(size=walk.mask.shape) < 0.9)
+    start = shaken(walk.reference_poses, 5.0)
+    results = []
+    some_or_nothing = np.where(np.arange(mask.shape[1]) % 2, 77.0, np.nan)[:, None]
+    for filling in (0.0, some_or_nothing):
+        points = np.where(mask[..., None], walk.points, filling).astype(np.float32)
+        results.append(refine(planar_scans(points, mask), start, WITHOUT_LOOPS).poses)
+    np.testing.assert_array_equal(results[0], results[1])
+    assert ate(results[0], walk.reference_poses) < 0.05
+
+
+def test_refinement_stays_in_the_world_of_the_start(walk, walk_scans) -> None:
+    offset = np.array([[1000.0, -500.0, 2.0]])
+    refined = refine(walk_scans, se2.compose(offset, walk.reference_poses), WITHOUT_LOOPS)
+    np.testing.assert_allclose(refined.poses, se2.compose(offset, walk.reference_poses), atol=0.05)
+
+
+def test_scans_as_a_user_has_them_are_those_of_the_record(walk) -> None:
+    few = walk.take(slice(0, 6))
+    arrays = np.where(few.mask[..., None], few.points, np.nan)
+    start = shaken(few.reference_poses, 3.0)
+    expected = refine(planar_scans(few.points, few.mask), start, WITHOUT_LOOPS)
+    for scans, poses in ((arrays, start), (ScanSet(few.points, few.mask), se2.to_matrix(start))):
+        np.testing.assert_allclose(refine(scans, poses, WITHOUT_LOOPS).poses, expected.poses, atol=1e-6)
+    np.testing.assert_array_equal(expected.T_world_scan, se2.to_matrix(expected.poses))
+
+
+@pytest.mark.parametrize(
+    ("poses", "message"),
+    [(np.zeros((3, 3)), "poses: expected shape"), (np.full((24, 3), np.nan), "poses: expected")],
+)
+def test_bad_poses_are_named(walk_scans, poses, message) -> None:
+    with pytest.raises(ValueError, match=message):
+        refine(walk_scans, poses)
+    with pytest.raises(ValueError, match="scans: expected shape"):
+        refine(np.zeros((24, 3)), poses)
+
+
+def test_pairs_are_neighbours_in_time_and_of_other_visits(walk_scans) -> None:
+    out = np.stack([10.0 * np.arange(30), np.zeros(30), np.zeros(30)], -1)
+    poses = np.concatenate([out, out[::-1] + np.array([0.0, 1.0, 0.0])])
+    unit = walk_scans.typical_range
+    source, target = choose_pairs(walk_scans, poses, RefinementConfig(num_spatial=2, radius=40.0 / unit))
+    temporal = {(s, t) for s, t in zip(source, target, strict=True) if 1 <= s - t <= 3}
+    assert len(temporal) == 59 + 58 + 57
+    assert (5, 54) in set(zip(source.tolist(), target.tolist(), strict=True))
+    away = np.abs(source - target) > 3
+    assert np.hypot(*(poses[source[away]] - poses[target[away]])[:, :2].T).max() <= 40.0
+    assert (np.bincount(source[away], minlength=60) <= 2).all()
+
+
+def test_pairs_are_filled_up_to_few_sizes() -> None:
+    sizes = {num_pairs: _rounded_up(num_pairs) for num_pairs in range(1, 4097)}
+    assert all(size >= num_pairs for num_pairs, size in sizes.items())
+    assert set(sizes.values()) == {128, 256, 512, 1024, 2048, 3072, 4096}
+
+
+# A walk of five rounds would take minutes; a short way there and back sees every place twice.
+@pytest.fixture(scope="module")
+def revisit() -> ScanSequence:
+    there = simulate_sequence(0, 30, num_beams=64, seed=1)
+    order = np.concatenate([np.arange(30), np.arange(28, -1, -1)])
+    return ScanSequence(
+        "there-and-back", there.points[order], there.mask[order], "px", reference_poses=there.reference_poses[order]
+    )
+
+
+@pytest.mark.slow
+def test_a_drifted_trajectory_is_closed(revisit, monkeypatch) -> None:
+    monkeypatch.setattr(
+        "dpmjax.registration2d.loop_closure._BATCH", 128
+    )  # a batch is filled up, and here are few candidates
+    scans = planar_scans(revisit.points, revisit.mask)
+    true = revisit.reference_poses
+    steps = se2.relative(true[:-1], true[1:])
+    drifted = se2.chain(steps * [1.05, 1.05, 1.0] + [0.0, 0.0, np.radians(0.5)])
+    config = LoopConfig(min_way=0.3, drift=0.2, num_rounds=1, max_candidates=128)
+    closed, loops, weight = close_loops(scans, drifted, config)
+    assert len(loops.source) == len(weight) > 10
+    assert (loops.source > loops.target).all()
+    kept = se2.relative(true[loops.target], true[loops.source])[weight > 0.5]
+    assert np.median(np.abs(loops.measurements[weight > 0.5] - kept)[:, :2]) < 1.0
+    assert ate(closed, true) < 0.5 * ate(drifted, true)
+
+
+def test_a_trajectory_without_revisits_is_left_alone(walk_scans) -> None:
+    line = np.stack([60.0 * np.arange(24), np.zeros(24), np.zeros(24)], -1)
+    closed, loops, weight = close_loops(walk_scans, line)
+    np.testing.assert_array_equal(closed, line)
+    assert len(loops.source) == len(weight) == 0
+
+
+@pytest.fixture(scope="module")
+def wrong_poses(walk, walk_scans) -> np.ndarray:
+    """A walk that alignment does not put right: each scan is turned by 57 degrees against its neighbours.
+
+    From a start that alignment does put right, both candidates would end at the same map, and either may be kept.
+    """
+    wrong = walk.reference_poses + np.where(np.arange(len(walk)) % 2, 0.5, -0.5)[:, None] * [0.0, 0.0, 1.0]
+    assert ate(refine(walk_scans, wrong, WITHOUT_LOOPS).poses, walk.reference_poses) > 1.0
+    return wrong
+
+
+@pytest.mark.parametrize("are_loops_right", [False, True])
+def test_the_better_of_start_and_loops_is_kept(walk, walk_scans, wrong_poses, monkeypatch, are_loops_right) -> None:
+    right, wrong = walk.reference_poses, wrong_poses
+    start, closed = (wrong, right) if are_loops_right else (right, wrong)
+    nothing = np.zeros(0, np.int64)
+    loops = LoopResult(closed, Edges(nothing, nothing, np.zeros((0, 3)), np.zeros((0, 3, 3))), np.ones(5))
+    monkeypatch.setattr("dpmjax.registration2d.refinement._is_sound", lambda *_: False)
+    monkeypatch.setattr("dpmjax.registration2d.refinement.fitting_scans", lambda scans, _: np.ones(len(scans), bool))
+    monkeypatch.setattr("dpmjax.registration2d.refinement.close_loops", lambda *_args, **_named: loops)
+    found = refine(walk_scans, start)
+    assert ate(found.poses, right) < 0.01
+    assert found.num_loops == (5 if are_loops_right else 0)
+
+
+def test_candidates_are_near_in_space_and_far_along_the_way() -> None:
+    angle = np.linspace(0.0, 4 * np.pi, 60)
+    poses = np.stack([30 * np.cos(angle), 30 * np.sin(angle), angle], -1)
+    source, target = find_candidates(poses, LoopConfig(drift=0.0), typical_range=33.0)
+    assert len(source)
+    assert (np.hypot(*(poses[source] - poses[target])[:, :2].T) < 10.0).all()
+    assert (source - target > 5).all()
+    few, _ = find_candidates(poses, LoopConfig(drift=0.0, max_candidates=7), typical_range=33.0)
+    assert len(few) == 7
+
+
+def test_a_wrong_loop_has_no_support() -> None:
+    poses = np.zeros((40, 3))
+    source, target = np.array([30, 31, 32, 33]), np.array([1, 2, 3, 4])
+    measured = np.zeros((4, 3))
+    measured[2] = [50.0, 0.0, 0.0]
+    edges = Edges(source, target, measured, np.zeros((4, 3, 3)))
+    assert count_support(edges, poses, 10.0).tolist() == [2, 2, 0, 2]

@@ -1,0 +1,102 @@
+"""Sequences of scans that are not as they should be: logs in the manner of CARMEN, from ICP alone."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from dpmjax.geometry import se2
+from dpmjax.io.carmen import read_carmen_log
+from dpmjax.metrics import absolute_trajectory_error
+from dpmjax.registration2d import incremental_icp, planar_scans
+from dpmjax.registration2d.planar_scans import PlanarScans
+from dpmjax.registration2d.range_profiles import make_profiles
+from dpmjax.registration2d.step_scores import MotionPrior, fitting_scans, interpolate, pair_scores, weak_steps
+from dpmjax.simulation import simulate_sequence
+
+NUM_SCANS, METRES_A_PX = 24, 0.05
+STANDING, REPEATED, SWAPPED = (5, 6, 7), 12, 17
+
+
+def write_flaser(path: Path, ranges: np.ndarray, poses: np.ndarray) -> None:
+    lines = []
+    for time, (row, pose) in enumerate(zip(ranges, poses, strict=True)):
+        numbers = [*row, *pose, *pose]
+        lines.append(f"FLASER {len(row)} {' '.join(f'{x:.4f}' for x in numbers)} {time}.0 robot {time}.0")
+    path.write_text("\n".join(lines) + "\n")
+
+
+@pytest.fixture(scope="module")
+def log(tmp_path_factory) -> tuple[PlanarScans, np.ndarray]:
+    """A robot that stands still for three scans; one scan of the log is repeated, one is of another moment."""
+    walk = simulate_sequence(0, 4 * NUM_SCANS, seed=41, num_beams=256, range_noise_px=0.3)
+    walk = walk.take(slice(0, None, 4))
+    angle = np.arctan2(walk.points[0, :, 1], walk.points[0, :, 0])
+    beams = np.argsort(angle)[(np.sort(angle) >= -np.pi / 2) & (np.sort(angle) < np.pi / 2)]
+    ranges = METRES_A_PX * np.linalg.norm(walk.points, axis=-1)[:, beams]
+    poses = walk.reference_poses * [METRES_A_PX, METRES_A_PX, 1.0]
+    noise = np.random.default_rng(3).normal(scale=0.01, size=ranges.shape)
+    for scan in STANDING:
+        ranges[scan], poses[scan] = ranges[STANDING[0]] + noise[scan], poses[STANDING[0]]
+    ranges[REPEATED], ranges[SWAPPED] = ranges[REPEATED - 1], ranges[1]
+    path = tmp_path_factory.mktemp("carmen") / "robot.log"
+    write_flaser(path, ranges, poses)
+    read = read_carmen_log(path)
+    return planar_scans(read.points, read.mask), poses
+
+
+@pytest.mark.slow
+def test_scans_that_stand_still_repeat_or_are_swapped_do_not_break_the_sequence(log) -> None:
+    scans, truth = log
+    poses = incremental_icp(scans).poses
+    others = np.setdiff1d(np.arange(NUM_SCANS), [REPEATED, SWAPPED])
+    assert absolute_trajectory_error(poses[others, :2], truth[others, :2]) < 0.05
+    # A repeated scan lies between its neighbours in time.
+    before, here, after = poses[REPEATED - 1 : REPEATED + 2, :2]
+    assert max(np.hypot(*(here - before)), np.hypot(*(here - after))) < np.hypot(*(after - before))
+
+
+def test_a_repeated_scan_fits_nothing_and_no_right_one_is_left_out(log) -> None:
+    scans, truth = log
+    left_out = set(np.flatnonzero(~fitting_scans(scans, truth)).tolist())
+    assert REPEATED in left_out
+    assert left_out <= {REPEATED, SWAPPED}
+
+
+def test_right_steps_are_strong_and_torn_ones_weak(log) -> None:
+    scans, truth = log
+    profiles, rows = make_profiles(scans), np.setdiff1d(np.arange(NUM_SCANS), [REPEATED, SWAPPED])
+    assert not weak_steps(profiles, truth, rows).any()
+    torn = truth.copy()
+    torn[10:, :2] += 3.0
+    assert np.flatnonzero(weak_steps(profiles, torn, rows)).tolist() == [9]
+
+
+def test_a_scan_agrees_with_itself_best(log) -> None:
+    scans, _ = log
+    profiles, row = make_profiles(scans), np.arange(NUM_SCANS)
+    same = pair_scores(profiles, row, row, np.zeros((NUM_SCANS, 3)))
+    turned = pair_scores(profiles, row, row, np.tile([0.0, 0.0, 0.5], (NUM_SCANS, 1)))
+    assert (same > turned + 0.2).all()
+
+
+def test_usual_motion_surprises_least() -> None:
+    steps = np.array([[1.0, 0.0, 0.1], [1.1, 0.1, 0.0], [0.9, 0.0, -0.1]])
+    prior = MotionPrior.of(steps, typical_range=5.0)
+    ways = np.array([[1.0, 0.0, 0.0], [-1.0, 0.0, 0.0], [4.0, 0.0, 0.0], [1.0, 2.0, 0.0], [1.0, 0.0, 2.0]])
+    surprise = prior.surprise(ways, np.ones(len(ways), np.int64))
+    assert surprise.argmin() == 0
+    assert (surprise[1:] > 0.5).all()
+    np.testing.assert_allclose(prior.expected(2), [2.0, 0.0, 0.0], atol=0.05)
+    assert MotionPrior.of(np.zeros((0, 3)), 5.0).forward == 0.0
+
+
+def test_interpolation_keeps_what_is_given_and_stands_still_outside() -> None:
+    given = np.array([[1.0, 2.0, 0.3], [3.0, 2.0, 0.7]])
+    poses = interpolate(6, np.array([1, 3]), given)
+    np.testing.assert_allclose(poses[[1, 3]], given, atol=1e-9)
+    np.testing.assert_allclose(poses[[0, 4, 5]], given[[0, 1, 1]], atol=1e-9)
+    half = se2.relative(given[0], poses[2])
+    np.testing.assert_allclose(se2.compose(half, half), se2.relative(given[0], given[1]), atol=1e-6)

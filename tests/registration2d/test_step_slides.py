@@ -1,0 +1,138 @@
+"""Steps that may slide along a corridor: they are recognised, held by odometry, and not trusted without it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from dpmjax.geometry import se2
+from dpmjax.registration2d import PlanarScans, assess_trajectory, planar_scans, refine
+from dpmjax.registration2d.joint_alignment import AlignmentConfig
+from dpmjax.registration2d.odometry import calibrate_odometry
+from dpmjax.registration2d.range_profiles import make_profiles
+from dpmjax.registration2d.step_prior import StepPrior
+from dpmjax.registration2d.step_slides import slide_steps
+from dpmjax.registration2d.torn_steps import restore_torn
+from dpmjax.simulation import scan_world, simulate_odometry
+
+# A scan reaches the end rooms from none of the scans 8 to 15.
+IN_CORRIDOR, NUM_SCANS, STEP_PX, REACH_PX = slice(8, 15), 24, 25.0, 120.0
+
+
+@pytest.fixture(scope="module")
+def truth() -> np.ndarray:
+    """Poses through a room, a bare corridor, and another room."""
+    rng = np.random.default_rng(0)
+    x = 60.0 + STEP_PX * np.arange(NUM_SCANS) + rng.uniform(-4, 4, NUM_SCANS)
+    return np.column_stack([x, 100.0 + rng.uniform(-6, 6, NUM_SCANS), rng.normal(0, 0.12, NUM_SCANS)])
+
+
+@pytest.fixture(scope="module")
+def scans(truth) -> PlanarScans:
+    solid = np.ones((200, 700), bool)
+    solid[85:115, 20:680] = False
+    for left, right in ((20, 140), (560, 680)):
+        solid[40:160, left:right] = False
+        solid[60:75, left + 30 : left + 50] = solid[130:140, left + 60 : left + 95] = True
+    points, mask = scan_world(
+        solid, truth, max_range=REACH_PX, num_beams=256, range_noise_px=0.4, rng=np.random.default_rng(1)
+    )
+    return planar_scans(points * mask[..., None], mask)
+
+
+@pytest.fixture(scope="module")
+def odometry(truth) -> np.ndarray:
+    return simulate_odometry(truth, rng=np.random.default_rng(2), translation_noise=0.03, rotation_noise_deg=0.3)
+
+
+def torn_in_the_corridor(truth: np.ndarray, px: float) -> np.ndarray:
+    poses = truth.copy()
+    poses[11:, 0] += px
+    return poses
+
+
+def steps_of(poses: np.ndarray) -> np.ndarray:
+    return np.asarray(se2.relative(poses[:-1], poses[1:]))
+
+
+def test_steps_are_open_in_a_corridor_and_closed_in_rooms(scans, truth) -> None:
+    later = np.arange(1, NUM_SCANS)
+    slides = slide_steps(make_profiles(scans), later, later - 1, steps_of(truth))
+    assert slides.is_open[IN_CORRIDOR].all()
+    assert not slides.is_open[:3].any()
+    assert not slides.is_open[-3:].any()
+    # The corridor lies along x of a world in which the headings are small.
+    assert (np.abs(slides.directions[IN_CORRIDOR, 0]) > 0.9).all()
+
+
+def test_an_open_step_is_as_uncertain_as_its_odometry_and_moves_to_it(scans, truth) -> None:
+    later, deviation = np.arange(1, NUM_SCANS), 2.0
+    prior = StepPrior(steps_of(truth), np.full((NUM_SCANS - 1, 3), [deviation, deviation, 0.01]))
+    torn = steps_of(torn_in_the_corridor(truth, 18.0))
+    slides = slide_steps(make_profiles(scans), later, later - 1, torn, prior)
+    assert np.flatnonzero(slides.is_torn).tolist() == [10]
+    np.testing.assert_allclose(slides.moved(torn)[10, :2], steps_of(truth)[10, :2], atol=2.0)
+    assert 0.3 * deviation < slides.deviations[10] < 2.0 * deviation
+
+
+def test_odometry_is_calibrated_by_the_clear_steps(scans, truth, odometry) -> None:
+    found = calibrate_odometry(scans, odometry * [1.1, 1.1, 1.0])
+    assert found.fault is None
+    off = found.prior.steps - steps_of(truth)
+    np.testing.assert_allclose(np.median(off[:, 0]), 0.0, atol=1.0)
+    assert np.median(np.abs(off[:, 0]) / found.prior.deviations[:, 0]) < 2.0
+    assert (found.prior.deviations[:, 0] < 5.0).all()
+
+
+@pytest.mark.parametrize(
+    ("change", "word"),
+    [
+        (lambda poses: poses * [1.0, -1.0, -1.0], "mirrored"),
+        (lambda poses: np.column_stack([poses[:, :2], np.degrees(poses[:, 2])]), "degrees"),
+        (lambda poses: poses * [1000.0, 1000.0, 1.0], "millimetres"),
+        (lambda poses: poses * [100.0, 100.0, 1.0], "centimetres"),
+    ],
+)
+def test_faults_of_the_odometry_are_named_and_corrected(scans, odometry, change, word: str) -> None:
+    found = calibrate_odometry(scans, change(odometry))
+    assert word in str(found.fault)
+    assert found.is_mirrored == (word == "mirrored")
+    np.testing.assert_allclose(found.poses, odometry, atol=1e-6)
+
+
+def test_a_mirrored_map_is_not_trusted(scans, truth, odometry) -> None:
+    found = calibrate_odometry(scans, odometry * [1.0, -1.0, -1.0])
+    assert not assess_trajectory(scans, truth, prior=found.prior, fault=found.fault).is_trusted
+
+
+def test_a_refinement_takes_a_slid_step_back_to_the_odometry(scans, truth, odometry) -> None:
+    prior = calibrate_odometry(scans, odometry).prior
+    found = refine(scans, torn_in_the_corridor(truth, 18.0), prior=prior).poses
+    off = se2.relative(found[[0]], found) - se2.relative(truth[[0]], truth)
+    assert np.hypot(off[:, 0], off[:, 1]).max() < 6.0
+
+
+def test_trust_depends_on_what_holds_the_corridor(scans, truth, odometry) -> None:
+    # Nothing but the scans: the second room may lie anywhere along the corridor.
+    alone = assess_trajectory(scans, truth)
+    assert not alone.is_trusted
+    assert set(range(9, 14)) <= set(alone.uncertain_scans)
+    prior = calibrate_odometry(scans, odometry).prior
+    held = prior._replace(deviations=np.full_like(prior.deviations, 0.2))
+    assert assess_trajectory(scans, truth, prior=held._replace(steps=steps_of(truth))).is_trusted
+    # The odometry contradicts a step that the scans leave open.
+    torn = assess_trajectory(scans, torn_in_the_corridor(truth, 18.0), prior=prior)
+    assert not torn.is_trusted
+    assert {10, 11} <= set(torn.uncertain_scans)
+
+
+def test_a_scan_that_was_torn_out_is_put_back(scans, truth) -> None:
+    profiles, config = make_profiles(scans), AlignmentConfig()
+    prior = StepPrior.of_poses(truth, scans.typical_range)
+    assert restore_torn(profiles, steps_of(truth), truth, config, prior) is None
+    torn = truth.copy()
+    torn[3] += [25.0, -20.0, 0.3]
+    found = restore_torn(profiles, steps_of(truth), torn, config, prior)
+    assert found is not None
+    off = se2.relative(found[[0]], found) - se2.relative(truth[[0]], truth)
+    assert np.hypot(off[:, 0], off[:, 1]).max() < 2.0
