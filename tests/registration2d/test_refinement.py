@@ -9,7 +9,7 @@ from dpmjax.geometry import se2
 from dpmjax.io import ScanSequence
 from dpmjax.metrics import absolute_trajectory_error
 from dpmjax.pose_graph.graph import Edges
-from dpmjax.registration2d import LoopConfig, RefinementConfig, close_loops, planar_scans, refine
+from dpmjax.registration2d import LoopConfig, RefinementConfig, correct_by_loops, planar_scans, refine
 from dpmjax.registration2d.joint_alignment import _rounded_up, choose_pairs
 from dpmjax.registration2d.loop_closure import LoopResult, count_support, find_candidates
 from dpmjax.simulation import simulate_sequence
@@ -118,7 +118,7 @@ def test_a_drifted_trajectory_is_closed(revisit, monkeypatch) -> None:
     steps = se2.relative(true[:-1], true[1:])
     drifted = se2.chain(steps * [1.05, 1.05, 1.0] + [0.0, 0.0, np.radians(0.5)])
     config = LoopConfig(min_way=0.3, drift=0.2, num_rounds=1, max_candidates=128)
-    closed, loops, weight = close_loops(scans, drifted, config)
+    closed, loops, weight = correct_by_loops(scans, drifted, config)
     assert len(loops.source) == len(weight) > 10
     assert (loops.source > loops.target).all()
     kept = se2.relative(true[loops.target], true[loops.source])[weight > 0.5]
@@ -128,7 +128,7 @@ def test_a_drifted_trajectory_is_closed(revisit, monkeypatch) -> None:
 
 def test_a_trajectory_without_revisits_is_left_alone(walk_scans) -> None:
     line = np.stack([60.0 * np.arange(24), np.zeros(24), np.zeros(24)], -1)
-    closed, loops, weight = close_loops(walk_scans, line)
+    closed, loops, weight = correct_by_loops(walk_scans, line)
     np.testing.assert_array_equal(closed, line)
     assert len(loops.source) == len(weight) == 0
 
@@ -152,7 +152,7 @@ def test_the_better_of_start_and_loops_is_kept(walk, walk_scans, wrong_poses, mo
     loops = LoopResult(closed, Edges(nothing, nothing, np.zeros((0, 3)), np.zeros((0, 3, 3))), np.ones(5))
     monkeypatch.setattr("dpmjax.registration2d.refinement._is_sound", lambda *_: False)
     monkeypatch.setattr("dpmjax.registration2d.refinement.fitting_scans", lambda scans, _: np.ones(len(scans), bool))
-    monkeypatch.setattr("dpmjax.registration2d.refinement.close_loops", lambda *_args, **_named: loops)
+    monkeypatch.setattr("dpmjax.registration2d.refinement.correct_by_loops", lambda *_args, **_named: loops)
     found = refine(walk_scans, start)
     assert ate(found.poses, right) < 0.01
     assert found.num_loops == (5 if are_loops_right else 0)

@@ -7,7 +7,7 @@ import pytest
 
 from dpmjax.geometry import se2
 from dpmjax.registration2d import PlanarScans, assess_trajectory, planar_scans, refine
-from dpmjax.registration2d.joint_alignment import AlignmentConfig
+from dpmjax.registration2d.joint_alignment import JointAlignmentConfig
 from dpmjax.registration2d.odometry import calibrate_odometry
 from dpmjax.registration2d.range_profiles import make_profiles
 from dpmjax.registration2d.step_prior import StepPrior
@@ -127,7 +127,7 @@ def test_trust_depends_on_what_holds_the_corridor(scans, truth, odometry) -> Non
 
 
 def test_a_scan_that_was_torn_out_is_put_back(scans, truth) -> None:
-    profiles, config = make_profiles(scans), AlignmentConfig()
+    profiles, config = make_profiles(scans), JointAlignmentConfig()
     prior = StepPrior.of_poses(truth, scans.typical_range)
     assert restore_torn(profiles, steps_of(truth), truth, config, prior) is None
     torn = truth.copy()

@@ -81,18 +81,18 @@ def main(config: Config) -> dict[str, Any]:
         key = jax.random.key(config.seed)
         found = deepmapping.register_depth(images, settings, key=key, engine=recorder)
         metrics = {
-            **numbers_of(sequence, found),
+            **depth_numbers(sequence, found),
             "fit_s": recorder.run_s,
             "compile_s": recorder.compile_s,
             "steps": recorder.steps,
             "peak_rss_gb": peak_rss_gb(),
             "is_interrupted": stop.is_requested,
         }
-        write_results(folder, sequence, found.T_world_scan)
+        write_depth_results(folder, sequence, found.T_world_scan)
         draw(folder, sequence, found)
         metrics["wall_s"] = time.perf_counter() - started
         write_metrics(folder, metrics, seed=config.seed)
-        print(report(metrics), f"results in {folder.path}", sep="\n")
+        print(depth_report(metrics), f"results in {folder.path}", sep="\n")
     return metrics
 
 
@@ -111,7 +111,7 @@ def read_images(config: Config) -> DepthSequence:
     return chosen
 
 
-def numbers_of(sequence: DepthSequence, found: Registered) -> dict[str, Any]:
+def depth_numbers(sequence: DepthSequence, found: Registered) -> dict[str, Any]:
     """Returns the numbers of a registration under the names of `metrics.json`."""
     assert found.start is not None
     assert found.start_misfit is not None
@@ -161,7 +161,7 @@ def depth_errors(sequence: DepthSequence, T_world_camera: Floats) -> dict[str, f
     }
 
 
-def write_results(folder: RunFolder, sequence: DepthSequence, T_world_camera: Floats) -> None:
+def write_depth_results(folder: RunFolder, sequence: DepthSequence, T_world_camera: Floats) -> None:
     """Writes trajectory.npy, trajectory_tum.txt, trajectory_kitti.txt and map.ply."""
     from dpmjax import io
 
@@ -186,7 +186,7 @@ def draw(folder: RunFolder, sequence: DepthSequence, found: Registered) -> None:
     draw_loss(folder, "m")
 
 
-def report(numbers: dict[str, Any]) -> str:
+def depth_report(numbers: dict[str, Any]) -> str:
     """Returns the last lines on the console."""
     lines = [f"kept: {numbers['kept']}; the images agree to {numbers['consistency']:.0%}"]
     if "ate_m" in numbers:

@@ -34,7 +34,7 @@ from dpmjax import deepmapping, io, registration2d, simulation
 from dpmjax.cli.command import StopFlag, check_least, run_command
 from dpmjax.cli.drives import report_notes
 from dpmjax.cli.machine import peak_rss_gb
-from dpmjax.cli.map2d_files import as_scan_set, draw_map, draw_occupancy, registered_scans, write_trajectories
+from dpmjax.cli.map2d_files import draw_map, draw_occupancy, registered_scans, scan_set_of, write_trajectories
 from dpmjax.cli.map2d_numbers import (
     ate_of,
     before_and_after,
@@ -125,9 +125,9 @@ def main(config: Config) -> dict[str, Any]:
         notes = report_notes(sequence.notes)
         seconds = math.inf if config.seconds is None else config.seconds
         recorder = FitRecorder(folder, sequence.unit, stop=lambda run_s: stop.is_requested or run_s >= seconds)
-        result = register(sequence, start, config, recorder, stop)
+        result = register_sequence(sequence, start, config, recorder, stop)
         metrics = {
-            **numbers_of(sequence, result, config, measure),
+            **map_numbers(sequence, result, config, measure),
             **notes,
             "fit_s": recorder.run_s,
             "compile_s": recorder.compile_s,
@@ -151,7 +151,7 @@ def main(config: Config) -> dict[str, Any]:
     return metrics
 
 
-def register(
+def register_sequence(
     sequence: ScanSequence, start: str | Floats, config: Config, recorder: FitRecorder, stop: StopFlag
 ) -> RegisteredScans:
     """Registers the scans, the fit by the recorder; prints each stage where it begins."""
@@ -170,7 +170,7 @@ def register(
         return partial(recorder, measure=ate_of(fitted, typical_range(fitted.points, fitted.mask)))
 
     return registration2d.register_scans(
-        as_scan_set(sequence),
+        scan_set_of(sequence),
         registration_settings(config, sequence),
         key=jax.random.key(config.seed),
         start=start,
@@ -179,7 +179,7 @@ def register(
     )
 
 
-def numbers_of(
+def map_numbers(
     sequence: ScanSequence,
     result: RegisteredScans,
     config: Config,

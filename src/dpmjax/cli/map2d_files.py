@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from dpmjax.types import ScanSet
 
 
-def as_scan_set(sequence: ScanSequence) -> ScanSet:
+def scan_set_of(sequence: ScanSequence) -> ScanSet:
     """Returns the scans without their name, unit and poses."""
     import jax.numpy as jnp
 
@@ -45,7 +45,7 @@ def draw_map(
     folder: RunFolder, registered: ScanSequence, result: RegisteredScans, metrics: Mapping[str, Any]
 ) -> viz.Limits:
     """Draws map.png: the start, DeepMapping if it was trained, the kept one, the reference; returns its limits."""
-    scans, unit = as_scan_set(registered), registered.unit
+    scans, unit = scan_set_of(registered), registered.unit
     panels = []
     titles = dict(zip(result.candidates, metrics["candidates"], strict=True))
     for name in dict.fromkeys((result.start, registration2d.DEEPMAPPING, result.kept)):

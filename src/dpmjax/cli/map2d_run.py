@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from dpmjax.cli.map2d import NAME, Config, fit_settings, read_scans
-from dpmjax.cli.map2d_files import as_scan_set
+from dpmjax.cli.map2d_files import scan_set_of
 from dpmjax.cli.run_folder import CHECKPOINTS, find_run, load_config
 
 if TYPE_CHECKING:
@@ -59,7 +59,7 @@ def read_map2d_run(path: Path) -> Map2dRun:
     if sequence.unit == "m":
         raise ValueError(f"{path} is a run on {sequence.name}, in metres, whose fit may have a part of the scans")
     settings = fit_settings(config, sequence)
-    data, unit = mapping_data(as_scan_set(sequence), None if config.init == "zero" else np.load(trajectory))
+    data, unit = mapping_data(scan_set_of(sequence), None if config.init == "zero" else np.load(trajectory))
     problem = mapping_problem(settings, data)
     like = init(problem, data, key=jax.random.key(0))
     state = Checkpoints((path / CHECKPOINTS).resolve()).restore_latest(like, fallback=None)

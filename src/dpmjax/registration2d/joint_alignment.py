@@ -39,7 +39,7 @@ _NO_EDGES = Edges(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, 3))
 
 
 @dataclass(frozen=True)
-class AlignmentConfig:
+class JointAlignmentConfig:
     """Settings of the joint alignment. Lengths are in typical ranges of the scans.
 
     Attributes:
@@ -57,7 +57,7 @@ class AlignmentConfig:
     refresh: int = 4
 
 
-def align_all(scans: PlanarScans, poses: Floats, config: AlignmentConfig, prior: StepPrior | None) -> Floats:
+def align_all(scans: PlanarScans, poses: Floats, config: JointAlignmentConfig, prior: StepPrior | None) -> Floats:
     """Aligns all scans from nearby poses, point to line.
 
     Args:
@@ -89,7 +89,7 @@ def align_all(scans: PlanarScans, poses: Floats, config: AlignmentConfig, prior:
 
 
 def restore_open(
-    profiles: RangeProfiles, aligned: Floats, adjusted: Floats, config: AlignmentConfig, prior: StepPrior
+    profiles: RangeProfiles, aligned: Floats, adjusted: Floats, config: JointAlignmentConfig, prior: StepPrior
 ) -> Floats:
     """Puts steps back along their open directions after an adjustment that does not hold these.
 
@@ -138,7 +138,7 @@ class _AlignedPairs(NamedTuple):
 
 
 def _choose_aligned(
-    profiles: RangeProfiles, poses: Floats, config: AlignmentConfig, prior: StepPrior | None
+    profiles: RangeProfiles, poses: Floats, config: JointAlignmentConfig, prior: StepPrior | None
 ) -> _AlignedPairs:
     """Chooses the pairs to align at these poses; a torn step is held at its most probable place instead."""
     scans, later = profiles.scans, np.arange(1, len(poses))
@@ -175,7 +175,7 @@ def solve_step(num_poses: int, edges: Edges, gradient: Floats) -> Floats:
     return solve_blocks(np.stack([edges.target, edges.source], axis=1), blocks, gradients, num_poses)
 
 
-def choose_pairs(scans: PlanarScans, poses: Floats, config: AlignmentConfig) -> tuple[Indices, Indices]:
+def choose_pairs(scans: PlanarScans, poses: Floats, config: JointAlignmentConfig) -> tuple[Indices, Indices]:
     """Pairs (source, target) of neighbours in time and in space; of each visit of a place the nearest scan."""
     num_scans = len(poses)
     temporal = config.temporal if scans.is_ordered else ()

@@ -64,7 +64,7 @@ class LoopConfig:
 
 
 class LoopResult(NamedTuple):
-    """Result of `close_loops`.
+    """Result of `correct_by_loops`.
 
     Attributes:
         poses: (n, 3) corrected T_world_scan.
@@ -77,7 +77,7 @@ class LoopResult(NamedTuple):
     weights: Floats
 
 
-def close_loops(
+def correct_by_loops(
     scans: PlanarScans, poses: Floats, config: LoopConfig | None = None, *, steps: Edges | None = None
 ) -> LoopResult:
     """Corrects a drifted trajectory by the loops found in it.

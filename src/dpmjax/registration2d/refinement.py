@@ -15,9 +15,9 @@ from dpmjax.checks import as_beams
 from dpmjax.geometry import se2
 from dpmjax.registration2d.held_steps import matched_steps, settle_steps
 from dpmjax.registration2d.incremental import incremental_icp
-from dpmjax.registration2d.joint_alignment import AlignmentConfig, align_all, restore_open
+from dpmjax.registration2d.joint_alignment import JointAlignmentConfig, align_all, restore_open
 from dpmjax.registration2d.line_adjustment import adjust_to_lines
-from dpmjax.registration2d.loop_closure import LoopConfig, close_loops
+from dpmjax.registration2d.loop_closure import LoopConfig, correct_by_loops
 from dpmjax.registration2d.pair_alignment import FINE, match_pairs
 from dpmjax.registration2d.planar_scans import Floats, PlanarScans, planar_scans
 from dpmjax.registration2d.quality import choose_trajectory, map_code_length
@@ -37,7 +37,7 @@ _MIN_NOISE = 1.5e-4
 
 
 @dataclass(frozen=True)
-class RefinementConfig(AlignmentConfig):
+class RefinementConfig(JointAlignmentConfig):
     """Settings of the refinement: those of the alignment, and of the loop search.
 
     Attributes:
@@ -108,7 +108,7 @@ def refine(
             return fitting._replace(poses=_put_back(scans, fitting_steps, whole, config, prior))
         settled, slides = settle_steps(scans, steps, prior)
         matched = matched_steps(settled, slides, scans.typical_range)
-        candidates["loops"], _, weights = close_loops(scans, se2.chain(settled.poses), config.loops, steps=matched)
+        candidates["loops"], _, weights = correct_by_loops(scans, se2.chain(settled.poses), config.loops, steps=matched)
         num_loops["loops"] = int((weights > 0.25).sum())
         fitting_steps = _better_steps(make_profiles(scans), fitting_steps, settled.poses)
     aligned = {name: _align(scans, candidate, fitting_steps, config, prior) for name, candidate in candidates.items()}

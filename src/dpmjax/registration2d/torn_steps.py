@@ -10,7 +10,7 @@ import numpy as np
 
 from dpmjax.geometry import se2
 from dpmjax.pose_graph.graph import Edges, join_edges
-from dpmjax.registration2d.joint_alignment import AlignmentConfig, choose_pairs, solve_step
+from dpmjax.registration2d.joint_alignment import JointAlignmentConfig, choose_pairs, solve_step
 from dpmjax.registration2d.planar_scans import Floats
 from dpmjax.registration2d.range_profiles import RangeProfiles
 from dpmjax.registration2d.step_prior import StepPrior
@@ -24,7 +24,7 @@ _NUM_ROUNDS, _LEAST_WEIGHT = 5, 0.01
 
 
 def restore_torn(
-    profiles: RangeProfiles, steps: Floats, poses: Floats, config: AlignmentConfig, prior: StepPrior
+    profiles: RangeProfiles, steps: Floats, poses: Floats, config: JointAlignmentConfig, prior: StepPrior
 ) -> Floats | None:
     """Puts torn steps back and spreads the difference over the pairs that hold the map.
 
@@ -59,7 +59,7 @@ def restore_torn(
     return poses
 
 
-def _holding_pairs(profiles: RangeProfiles, poses: Floats, config: AlignmentConfig) -> Edges:
+def _holding_pairs(profiles: RangeProfiles, poses: Floats, config: JointAlignmentConfig) -> Edges:
     """Returns the pairs that fit, without steps; the weights are their scores (e,)."""
     source, target = choose_pairs(profiles.scans, poses, config)
     is_pair = source != target + 1
