@@ -174,10 +174,12 @@ def from_above_figure(
     figure = new_figure(4.4 * len(panels), 4.4 * limits.height / limits.width + 0.5)
     colors = time_colormap()(np.linspace(0.0, 1.0, len(cloud)))
     axes_row = figure.subplots(1, len(panels), squeeze=False)[0]
+    # Few points would hardly be seen.
+    size = float(np.clip(200 / np.sqrt(max(valid.sum(), 1)), 1.2, 4))
     for axes, (title, _), world, centres in zip(axes_row, panels, clouds, sensors, strict=True):
         for image, color in enumerate(colors):
             shown = world[image][valid[image] & (world[image][..., 1] > below_m)]
-            axes.plot(shown[:, 0], shown[:, 2], ".", ms=1.2, mew=0, color=color)
+            axes.plot(shown[:, 0], shown[:, 2], ".", ms=size, mew=0, color=color)
         axes.plot(centres[:, 0], centres[:, 2], "-o", color=INK, ms=3, lw=1)
         frame_map(axes, limits, "m" if axes is axes_row[0] else None)
         axes.set_title(title, fontsize=10, color=INK, loc="left")
