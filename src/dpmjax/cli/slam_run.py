@@ -5,7 +5,7 @@ from __future__ import annotations
 import collections
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from functools import partial
 from typing import Any
 
@@ -134,41 +134,38 @@ def run_scans(
     """
     watch, sequence = Stopwatch(), reader.sequence
     timed = methods._replace(matcher=Timed(methods.matcher, watch), geometry=Timed(methods.geometry, watch))
-    state, reports = beginning.state, list(beginning.reports)
+    state, reports, scan_s = beginning.state, list(beginning.reports), list[float]()
     first, failure, started = len(reports), None, watch.now_s()
     flushed = saved = time.perf_counter()
-    scan_s: list[float] = []
     resumable: RunState | None = None
-    bar = tqdm(total=len(sequence), initial=first, desc=sequence.name, unit=" scans", dynamic_ncols=True)
-    scans = reader.iterate(first)
-    try:
-        for _ in range(first, len(sequence)):
-            if is_stopped():
-                break
-            scan = watch.timed("read", next, scans)
-            before = watch.now_s()
-            state, report = slam.step_slam(timed, state, scan)
-            scan_s.append(watch.now_s() - before)
-            reports.append(report)
-            if report.is_keyframe:
-                resumable = RunState(state, tuple(reports))
-            if resumable is not None and time.perf_counter() - saved > SAVE_EVERY_S:
+    progress = tqdm(total=len(sequence), initial=first, desc=sequence.name, unit=" scans", dynamic_ncols=True)
+    with progress as bar, closing(reader.iterate(first)) as scans:
+        try:
+            for _ in range(first, len(sequence)):
+                if is_stopped():
+                    break
+                scan = watch.timed("read", next, scans)
+                before = watch.now_s()
+                state, report = slam.step_slam(timed, state, scan)
+                scan_s.append(watch.now_s() - before)
+                reports.append(report)
+                if report.is_keyframe:
+                    resumable = RunState(state, tuple(reports))
+                if resumable is not None and time.perf_counter() - saved > SAVE_EVERY_S:
+                    watch.timed("write", save_state, folder / STATE, *resumable)
+                    resumable, saved = None, time.perf_counter()
+                if on_scan is not None:
+                    watch.timed("viewer", on_scan, scan, state, report)
+                bar.set_postfix_str(_progress(state, report, watch), refresh=False)
+                bar.update(1)
+                if time.perf_counter() - flushed > FLUSH_EVERY_S:
+                    watch.timed("write", write_interim, folder, sequence, state, reports)
+                    flushed = time.perf_counter()
+        except Exception as error:  # what was found is written before it goes on
+            failure = error
+        finally:
+            if resumable is not None:
                 watch.timed("write", save_state, folder / STATE, *resumable)
-                resumable, saved = None, time.perf_counter()
-            if on_scan is not None:
-                watch.timed("viewer", on_scan, scan, state, report)
-            bar.set_postfix_str(_progress(state, report, watch), refresh=False)
-            bar.update(1)
-            if time.perf_counter() - flushed > FLUSH_EVERY_S:
-                watch.timed("write", write_interim, folder, sequence, state, reports)
-                flushed = time.perf_counter()
-    except Exception as error:  # what was found is written before it goes on
-        failure = error
-    finally:
-        scans.close()
-        if resumable is not None:
-            watch.timed("write", save_state, folder / STATE, *resumable)
-        bar.close()
     run_s = watch.now_s() - started
     watch.stages_s["rest"] = run_s - sum(watch.stages_s.values())
     return SlamRun(state, tuple(reports), dict(watch.stages_s), watch.compile_s, run_s, tuple(scan_s), failure)
