@@ -43,7 +43,7 @@ START_NAMES: dict[str, str] = {
     "odometry": "odometry",
     "zero": "zero poses",
 }
-"""Name of the candidate of each start."""
+"""Name of the candidate of each kind of initial poses."""
 
 STARTS_FROM_SCANS = ("icp-plane", "icp-point", "global")
 """Starts that use the scans alone."""
@@ -138,7 +138,7 @@ class RegisteredScans(NamedTuple):
 
     @property
     def T_world_scan(self) -> Floats:
-        """(n, 3, 3) the poses as matrices."""
+        """Poses as matrices (n, 3, 3)."""
         return se2.to_matrix(self.poses)
 
 
@@ -228,7 +228,7 @@ def _find_evidence(
     recording: Recording,
     hooks: RegistrationHooks,
 ) -> Odometry | None:
-    """Calibrates the odometry, or the given poses without any; None where the start uses the scans alone."""
+    """Calibrates the odometry, or given initial poses; returns None for initial poses from the scans alone."""
     given = odometry if isinstance(start, str) else (start if odometry is None else odometry)
     if given is None or (isinstance(start, str) and start != "odometry") or len(scans) < 2 or not scans.is_ordered:
         return None
@@ -239,7 +239,7 @@ def _find_evidence(
 def _checked_start(
     start: StartName | ArrayLike, odometry: Floats | None, count: int, config: RegistrationConfig
 ) -> str | Floats:
-    """Returns the start with "auto" resolved, or the given poses."""
+    """Returns the name of the initial poses with "auto" resolved, or the given initial poses."""
     if not config.is_ordered and odometry is not None:
         raise ValueError("odometry: expected None, because the scans are not ordered")
     if not isinstance(start, str):
@@ -258,7 +258,7 @@ def _checked_start(
 def _choose_scans(
     scans: ScanSet, odometry: Floats | None, start: str | Floats, config: RegistrationConfig, hooks: RegistrationHooks
 ) -> Recording:
-    """Chooses the registered scans by the odometry, or by scan odometry where the start uses the scans alone."""
+    """Chooses the registered scans by the odometry, or by scan odometry for initial poses from the scans alone."""
     motion = None if isinstance(start, str) and start in STARTS_FROM_SCANS else odometry
     if not config.is_ordered:
         return Recording(scans, np.arange(len(scans.points)), None, np.arange(len(scans.points)))
@@ -273,7 +273,7 @@ def _choose_scans(
 def _start_poses(
     scans: PlanarScans, start: str | Floats, evidence: Odometry | None, recording: Recording, hooks: RegistrationHooks
 ) -> tuple[str, Floats]:
-    """Returns the name of the start and the poses of the registered scans."""
+    """Returns the name and the values of the initial poses of the registered scans."""
     if not isinstance(start, str):
         return GIVEN_POSES, start[recording.chosen]
     name = START_NAMES[start]

@@ -60,7 +60,7 @@ class Refined(NamedTuple):
 
     @property
     def T_world_scan(self) -> Floats:
-        """(n, 3, 3) the poses as matrices."""
+        """Poses as matrices (n, 3, 3)."""
         return se2.to_matrix(self.poses)
 
 
