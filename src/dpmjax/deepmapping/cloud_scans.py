@@ -117,7 +117,7 @@ def _spacing(points: NDArray[np.float32]) -> float:
 
 
 def _evenly(points: NDArray[np.float64], voxel: float, num_points: int) -> NDArray[np.int64]:
-    """Selects one point for each voxel, with the smallest voxels that give up to `num_points` points."""
+    """Selects up to `num_points` points, one for each voxel, with the smallest possible voxels."""
     if len(points) <= num_points:
         return np.arange(len(points))
     low, high = voxel, voxel

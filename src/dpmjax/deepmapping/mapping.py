@@ -58,7 +58,7 @@ class Fitted(NamedTuple):
 
     @property
     def T_world_scan(self) -> NDArray[np.float64]:
-        """(n, 3, 3) or (n, 4, 4) the poses as matrices; the frame of a depth image is that of its camera."""
+        """Poses as matrices (n, 3, 3) or (n, 4, 4); the frame of a depth image is that of the camera."""
         return self.poses if self.poses.ndim == 3 else se2.to_matrix(self.poses)
 
 

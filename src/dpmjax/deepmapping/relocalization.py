@@ -61,8 +61,8 @@ class FoundPoses(NamedTuple):
 
     Attributes:
         poses: x, y, heading in typical ranges and radians.
-        nats: mean cost of a beam: cost of the hit plus mean cost of the free samples, weighted by the root of the
-            range, because near beams end on some surface everywhere; log 4 where the map is unknown.
+        nats: mean cost of a beam: cost of the hit plus mean cost of the free samples; log 4 where the map is unknown.
+            Beams are weighted by the root of the range, because near beams end on some surface everywhere.
     """
 
     poses: Float[Array, "m 3"]
@@ -166,7 +166,7 @@ class Relocalized(NamedTuple):
 
     @property
     def T_world_scan(self) -> NDArray[np.float64]:
-        """(3, 3), or (m, 3, 3) for m scans: the poses as matrices."""
+        """Poses as matrices (3, 3), or (m, 3, 3) for m scans."""
         return se2.to_matrix(self.pose)
 
 

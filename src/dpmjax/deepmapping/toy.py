@@ -1,7 +1,7 @@
 """Optimisation of a network instead of its output, in one dimension (DeepMapping supplement D, figure 14).
 
-The same function is minimised twice by plain gradient descent from the same initial value: over x, and over the weights
-and the input of a network whose output is x. Both are problems of the engine.
+The same function is minimised twice by plain gradient descent from the same initial value. The first variable is x. The
+second is the weights and the input of a network with the output x. Both are problems of the engine.
 """
 
 from __future__ import annotations
