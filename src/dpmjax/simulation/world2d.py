@@ -150,7 +150,7 @@ def _paint_frame(grid: BoolArray) -> None:
 
 
 def _paint_span(grid: BoolArray, along: int, at: float, span: tuple[float, float], doors: list[float]) -> None:
-    """Paints a wall along x (0) or y (1) at the other coordinate `at`, over `span`, with gaps that start at `doors`."""
+    """Paints a wall along x (0) or y (1) at the second coordinate `at`, over `span`, with gaps from `doors` on."""
     line = np.zeros(SIZE_PX, bool)
     line[max(int(span[0]), 0) : int(span[1])] = True
     for door in doors:
