@@ -183,6 +183,6 @@ def refine_trajectory(
 
 
 def tell(text: str) -> None:
-    """Prints, and writes to the log."""
+    """Prints a text and writes it to the log."""
     print(text, flush=True)
     LOGGER.info("%s", text)
