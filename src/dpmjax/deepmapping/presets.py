@@ -33,7 +33,7 @@ JOINT = PhaseConfig(
     num_free=19,
     is_sampled_as_published=True,
 )
-"""Phase of the paper: 3000 epochs of two batches for 256 scans, all beams, 19 free samples, gamma 0.1."""
+"""Phase of the paper: 3000 epochs of two batches for 256 scans, all beams, 19 free samples, gamma 0.1, windows of 4."""
 
 LOCALIZE_DEPTH = replace(
     LOCALIZE, num_steps=400, learning_rate=1e-3, beams_per_step=400, num_offsets=2, max_offset=3, scans_per_window=None

@@ -66,7 +66,7 @@ def incremental_icp(
         prior = prior or StepPrior.of_poses(odometry, unit)
         guesses = np.asarray(se2.relative(odometry[:-1], odometry[1:]))
         rough = _match_odometry(source, target, guesses, prior.as_pose_prior(_COARSE_RESIDUAL * unit), metric)
-    # The residual is the range noise where the scans constrain a step, and larger for other steps.
+    # The weight of the prior follows from the range noise; steps that the scans leave unconstrained have a larger one.
     num_beams = np.maximum(np.asarray(source.is_on_line.sum(1)), 1)
     is_open = rough.weakest_eigenvalue() < _MIN_EIGENVALUE * num_beams / COARSE.source_stride
     belief = prior.as_pose_prior(np.where(is_open, _OPEN_RESIDUAL * unit, 3.0 * scans.noise)[:, None])

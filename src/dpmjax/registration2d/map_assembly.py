@@ -269,7 +269,7 @@ def weakest_cuts(values: Floats, count: int) -> list[NDArray[np.bool_]]:
 def _better_motion(
     poses: Floats, block: NDArray[np.bool_], hypotheses: Hypotheses, scorer: PoseScorer, values: Floats
 ) -> Floats | None:
-    """Finds the motion (3,) of the block in the world with a better score, proposed by a pair across the cut."""
+    """Finds the best motion (3,) of the block in the world, proposed by a pair across the cut; None: none is better."""
     across = np.flatnonzero(block[hypotheses.scan] & ~block[hypotheses.anchor])
     across = across[np.argsort(-hypotheses.scores[across], kind="stable")[:_NUM_BLOCK_POSES]]
     best = hypotheses.take(across)
